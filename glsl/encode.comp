@@ -1,0 +1,63 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Windowed positional encoding (paper section 2.3) of the live samples. One invocation per padded sample.
+//   sample_phases[s] = phase of the sample's ray;
+//   features[q * capacity + s] = vec4 of numbers 4q..4q+3 of
+//   [x, y, z, then per band k: a_k sin(2^k (x,y,z)), a_k cos(2^k (x,y,z))], zero-padded.
+#include "inc/layout.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
+layout(binding = 3) readonly buffer B3 { uint live[]; };
+layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
+layout(binding = 5) readonly buffer B5 { uint sample_rays[]; };
+layout(binding = 6) readonly buffer B6 { Ray rays[]; };
+layout(binding = 7) writeonly buffer B7 { vec4 features[]; };
+layout(binding = 8) writeonly buffer B8 { uint sample_phases[]; };
+
+// Vulkan's sin is exact only near 0: subtract the nearest multiple of 2 pi in three parts.
+vec3 reduce_angle(vec3 a) {
+    vec3 n = round(a * 0.15915494309189535);
+    a -= n * 6.28125;
+    a -= n * 0.0019350051879882812;
+    return a - n * 3.01991598e-7;
+}
+
+void main() {
+    uint s = gl_GlobalInvocationID.x;
+    if (s >= live[1]) return;
+    uint groups = (3u + 6u * setup.n_bands + 3u) / 4u;
+    uint stride = setup.sample_capacity;
+    if (s >= live[0]) {
+        sample_phases[s] = 0u;
+        for (uint q = 0u; q < groups; q++) features[q * stride + s] = vec4(0.0);
+        return;
+    }
+    sample_phases[s] = rays[sample_rays[s] & 0x7fffffffu].phase;
+    float window = schedule[state[0]].window;
+    vec3 centre = vec3(setup.encode_centre_x, setup.encode_centre_y, setup.encode_centre_z);
+    vec3 x = (sample_points[s].xyz - centre) * setup.encode_scale;
+    // Two bands make 12 numbers, so three whole vec4 leave the carry (x, y, z) as it was.
+    vec3 carry = x;
+    for (uint k = 0u; k < setup.n_bands; k += 2u) {
+        vec3 a0 = reduce_angle(x * float(1u << k));
+        float open0 = clamp(window - float(k), 0.0, 1.0);
+        vec3 sin0 = open0 * sin(a0);
+        vec3 cos0 = open0 * cos(a0);
+        uint q = (3u + 6u * k) / 4u;
+        features[q * stride + s] = vec4(carry, sin0.x);
+        features[(q + 1u) * stride + s] = vec4(sin0.yz, cos0.xy);
+        if (k + 1u == setup.n_bands) {
+            features[(q + 2u) * stride + s] = vec4(cos0.z, 0.0, 0.0, 0.0);
+            return;
+        }
+        vec3 a1 = reduce_angle(x * float(2u << k));
+        float open1 = clamp(window - float(k + 1u), 0.0, 1.0);
+        vec3 sin1 = open1 * sin(a1);
+        vec3 cos1 = open1 * cos(a1);
+        features[(q + 2u) * stride + s] = vec4(cos0.z, sin1);
+        carry = cos1;
+    }
+    features[(groups - 1u) * stride + s] = vec4(carry, 0.0);
+}

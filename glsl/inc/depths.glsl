@@ -1,0 +1,21 @@
+// Stratified depths: each is jittered within its own interval between the mid-points of a regular
+// grid that includes both ends; without jitter, the grid itself.
+
+float grid_depth(uint k, uint n, float near, float far) {
+    return near + (far - near) * (float(k) / float(n - 1u));
+}
+
+float depth_at(uint k, uint n, float near, float far, uint jitter, uint seed, uint step, uint ray) {
+    float centre = grid_depth(k, n, near, far);
+    if (jitter == 0u) return centre;
+    float lower = k == 0u ? centre : 0.5 * (grid_depth(k - 1u, n, near, far) + centre);
+    float upper = k == n - 1u ? centre : 0.5 * (centre + grid_depth(k + 1u, n, near, far));
+    return lower + (upper - lower) * uniform01(seed, STREAM_DEPTH + (ray << 4u), step, k);
+}
+
+// Depth k and the path length it stands for; the last sample stands for (almost) none.
+vec2 depth_and_step(uint k, uint n, float near, float far, uint jitter, uint seed, uint step, uint ray, float norm) {
+    float here = depth_at(k, n, near, far, jitter, seed, step, ray);
+    if (k == n - 1u) return vec2(here, 1e-10 * norm);
+    return vec2(here, (depth_at(k + 1u, n, near, far, jitter, seed, step, ray) - here) * norm);
+}

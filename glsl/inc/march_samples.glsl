@@ -1,0 +1,22 @@
+// Shared by march_count and march_emit: one workgroup per ray, each lane owns a run of consecutive
+// depths, so that live samples come out in depth order.
+#include "inc/layout.glsl"
+#include "inc/random.glsl"
+#include "inc/depths.glsl"
+layout(local_size_x = 32, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 2) readonly buffer B2 { Ray rays[]; };
+layout(binding = 3) readonly buffer B3 { uint hull[]; };
+#include "inc/dynamic_box.glsl"
+
+uint run_length() {
+    return (setup.n_dynamic_samples + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
+}
+
+vec2 dynamic_sample(uint k, Ray ray) {
+    uint stream = setup.per_ray_depths != 0u ? ray.id + 1u : 0u;
+    return depth_and_step(k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far, setup.jitter,
+                          setup.seed, state[0], stream, ray.norm);
+}

@@ -1,0 +1,44 @@
+// Counter-based random numbers: pcg4d (Jarzynski and Olano, "Hash Functions for GPU Rendering", JCGT 2020).
+
+uvec4 pcg4d(uvec4 v) {
+    v = v * 1664525u + 1013904223u;
+    v.x += v.y * v.w;
+    v.y += v.z * v.x;
+    v.z += v.x * v.y;
+    v.w += v.y * v.z;
+    v ^= v >> 16u;
+    v.x += v.y * v.w;
+    v.y += v.z * v.x;
+    v.z += v.x * v.y;
+    v.w += v.y * v.z;
+    return v;
+}
+
+const uint STREAM_DEPTH = 1u;
+const uint STREAM_RAY = 2u;
+
+// Uniform in [0, 1), 24 bits.
+float uniform01(uint seed, uint stream, uint a, uint b) {
+    return float(pcg4d(uvec4(seed, stream, a, b)).x >> 8u) * (1.0 / 16777216.0);
+}
+
+// Element `index` of a pseudo-random permutation of [0, n): a balanced Feistel network on the next
+// even number of bits, walked until it lands inside.
+uint permute(uint index, uint n, uint seed, uint epoch, uint stream) {
+    uint half_bits = 1u;
+    while ((1u << (2u * half_bits)) < n && half_bits < 16u) half_bits++;
+    uint mask = (1u << half_bits) - 1u;
+    uint x = index;
+    do {
+        uint left = x >> half_bits;
+        uint right = x & mask;
+        for (uint round = 0u; round < 4u; round++) {
+            uint mixed = pcg4d(uvec4(right, seed ^ (stream << 28u), epoch, round)).x & mask;
+            uint next = left ^ mixed;
+            left = right;
+            right = next;
+        }
+        x = (left << half_bits) | right;
+    } while (x >= n);
+    return x;
+}

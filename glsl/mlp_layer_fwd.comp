@@ -1,0 +1,73 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+// One hidden layer: activations = relu(W_a input_a + W_b input_b + phase_bias[phase]).
+// A lane keeps SAMPLES samples x OUTPUTS neurons in registers; weights are uniform loads.
+//   input_*[q * capacity + s], activations[q * capacity + s]: vec4 of 4 consecutive features.
+//   weights row-major [out][in], 4 inputs to a vec4.
+#include "inc/layout.glsl"
+#include "inc/texels.glsl"
+#ifndef SAMPLES
+#define SAMPLES 4u
+#endif
+#ifndef OUTPUTS
+#define OUTPUTS 16u
+#endif
+layout(local_size_x = 32, local_size_x_id = 0) in;
+layout(push_constant) uniform Push {
+    uint a_groups; uint b_groups; uint a_weights4; uint b_weights4; uint bias; uint capacity; uint width;
+} push;
+READ_VEC4(0, B0, input_a);
+READ_VEC4(1, B1, input_b);
+READ_VEC4(2, B2, params);
+layout(binding = 3) readonly buffer B3 { uint live[]; };
+layout(binding = 4) readonly buffer B4 { uint sample_phases[]; };
+layout(binding = 5) readonly buffer B5 { vec4 phase_bias[]; };
+layout(binding = 6) writeonly buffer B6 { vec4 activations[]; };
+
+void main() {
+    uint base = gl_WorkGroupID.x * (gl_WorkGroupSize.x * SAMPLES) + gl_LocalInvocationID.x;
+    uint first = gl_WorkGroupID.y * OUTPUTS;
+    uint padded = live[1];
+    float sum[OUTPUTS][SAMPLES];
+    [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
+        uint s = min(base + t * gl_WorkGroupSize.x, padded - 1u);
+        uint row = (push.bias + sample_phases[s] * push.width + first) / 4u;
+        [[unroll]] for (uint j = 0u; j < OUTPUTS; j += 4u) {
+            vec4 bias = phase_bias[row + j / 4u];
+            sum[j][t] = bias.x;
+            sum[j + 1u][t] = bias.y;
+            sum[j + 2u][t] = bias.z;
+            sum[j + 3u][t] = bias.w;
+        }
+    }
+    [[dont_unroll]] for (uint q = 0u; q < push.a_groups; q++) {
+        vec4 x[SAMPLES];
+        [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
+            x[t] = FETCH(input_a, q * push.capacity + min(base + t * gl_WorkGroupSize.x, padded - 1u));
+        }
+        [[unroll]] for (uint j = 0u; j < OUTPUTS; j++) {
+            vec4 w = FETCH(params, push.a_weights4 + (first + j) * push.a_groups + q);
+            [[unroll]] for (uint t = 0u; t < SAMPLES; t++) sum[j][t] += dot(w, x[t]);
+        }
+    }
+    [[dont_unroll]] for (uint q = 0u; q < push.b_groups; q++) {
+        vec4 x[SAMPLES];
+        [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
+            x[t] = FETCH(input_b, q * push.capacity + min(base + t * gl_WorkGroupSize.x, padded - 1u));
+        }
+        [[unroll]] for (uint j = 0u; j < OUTPUTS; j++) {
+            vec4 w = FETCH(params, push.b_weights4 + (first + j) * push.b_groups + q);
+            [[unroll]] for (uint t = 0u; t < SAMPLES; t++) sum[j][t] += dot(w, x[t]);
+        }
+    }
+    [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
+        uint s = base + t * gl_WorkGroupSize.x;
+        if (s < padded) {
+            [[unroll]] for (uint j = 0u; j < OUTPUTS; j += 4u) {
+                activations[(first + j) / 4u * push.capacity + s] =
+                    max(vec4(sum[j][t], sum[j + 1u][t], sum[j + 2u][t], sum[j + 3u][t]), 0.0);
+            }
+        }
+    }
+}

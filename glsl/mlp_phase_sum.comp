@@ -1,0 +1,24 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Sums ray_dz over the rays of each phase: phase_dz[layer][phase][4 neurons]. One workgroup per
+// (4 neurons, phase), fixed order; later chunks of an iteration add.
+#include "inc/layout.glsl"
+layout(local_size_x = 32, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint first_ray; uint n_rays; uint row; uint groups; uint accumulate; } push;
+layout(binding = 0) readonly buffer B0 { Ray rays[]; };
+layout(binding = 1) readonly buffer B1 { vec4 ray_dz[]; };
+layout(binding = 2) buffer B2 { vec4 phase_dz[]; };
+#include "inc/reduce.glsl"
+
+void main() {
+    uint q = gl_WorkGroupID.x;
+    uint phase = gl_WorkGroupID.y;
+    vec4 sum = vec4(0.0);
+    for (uint r = gl_LocalInvocationID.x; r < push.n_rays; r += gl_WorkGroupSize.x) {
+        if (rays[push.first_ray + r].phase == phase) sum += ray_dz[q * push.n_rays + r];
+    }
+    vec4 total;
+    for (uint c = 0u; c < 4u; c++) total[c] = workgroup_sum(sum[c]);
+    uint at = (push.row + phase) * push.groups + q;
+    if (gl_LocalInvocationID.x == 0u) phase_dz[at] = total + (push.accumulate != 0u ? phase_dz[at] : vec4(0.0));
+}

@@ -1,0 +1,33 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Closes an iteration: sums the losses into a ring the host reads now and then, and counts the step.
+//   ring[step % ring_length] = (data, dynamic data, TV, occlusion), (squared error, live samples, step + 1, 0).
+#include "inc/layout.glsl"
+layout(local_size_x = 256, local_size_x_id = 0) in;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) buffer B1 { uint state[]; };
+layout(binding = 2) readonly buffer B2 { vec4 ray_loss[]; };
+layout(binding = 3) readonly buffer B3 { float tv_value[]; };
+layout(binding = 4) readonly buffer B4 { uint live[]; };
+layout(binding = 5) writeonly buffer B5 { vec4 ring[]; };
+#include "inc/reduce.glsl"
+
+void main() {
+    uint lane = gl_LocalInvocationID.x;
+    vec4 losses = vec4(0.0);
+    for (uint r = lane; r < setup.n_rays; r += gl_WorkGroupSize.x) losses += ray_loss[r];
+    float tv = 0.0;
+    for (uint i = lane; i < setup.static_params; i += gl_WorkGroupSize.x) tv += tv_value[i];
+    float data = workgroup_sum(losses.x);
+    float dynamic_data = workgroup_sum(losses.y);
+    float occlusion = workgroup_sum(losses.z);
+    float squared = workgroup_sum(losses.w);
+    tv = workgroup_sum(tv);
+    if (lane == 0u) {
+        uint step = state[0];
+        uint slot = 2u * (step % setup.ring_length);
+        ring[slot] = vec4(data, dynamic_data, tv, setup.occlusion_weight * occlusion);
+        ring[slot + 1u] = vec4(squared, float(live[2]), float(step + 1u), 0.0);
+        state[0] = step + 1u;
+    }
+}

@@ -1,0 +1,326 @@
+//! What can be typed.
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use nertca_vk::config::Preset;
+use nertca_vk::error::Result;
+use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::phantom::dataset::Setting;
+use std::path::PathBuf;
+
+/// 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views.
+#[derive(Debug, Parser)]
+#[command(version, about, arg_required_else_help = true)]
+pub struct Cli {
+    /// Vulkan device: index, part of the name, or UUID (see `devices`); the best one by default.
+    #[arg(long, global = true, value_name = "DEVICE")]
+    pub device: Option<String>,
+    /// Turn the Vulkan validation layers on (slow; messages make the program fail).
+    #[arg(long, global = true)]
+    pub validate: bool,
+    /// Say more on stderr.
+    #[arg(short, long, global = true)]
+    pub verbose: bool,
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// Commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// List Vulkan devices, their limits and the code paths they get.
+    Devices(DevicesArgs),
+    /// Make a synthetic dataset with exact masks.
+    Phantom(PhantomArgs),
+    /// Project voxel volumes, one per phase, into a dataset.
+    Project(ProjectArgs),
+    /// Reconstruct a dataset into a run directory.
+    Train(TrainArgs),
+    /// Score a run on the views it has not seen.
+    Eval(EvalArgs),
+    /// Render a run from any angle at any phase.
+    Render(RenderArgs),
+    /// Describe a dataset or a run.
+    Info(InfoArgs),
+    /// Print shell completions.
+    Completions(CompletionsArgs),
+}
+
+/// `devices`.
+#[derive(Debug, Args)]
+pub struct DevicesArgs {
+    /// JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Layout of a dataset on disk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LayoutArg {
+    /// `dataset.json`.
+    Native,
+    /// The NeRF-CA / NerT-CA authors' layout.
+    Nerfca,
+}
+
+/// `phantom`.
+#[derive(Debug, Args)]
+pub struct PhantomArgs {
+    /// Directory to make.
+    pub out: PathBuf,
+    /// C-arm and volume of a published set-up.
+    #[arg(long, value_enum, default_value_t = Setting::Xcat)]
+    pub geometry: Setting,
+    /// Columns and rows of the images.
+    #[arg(long, default_value_t = 100)]
+    pub size: usize,
+    /// Cardiac phases.
+    #[arg(long, default_value_t = 10)]
+    pub phases: u32,
+    /// Training views: 3, 4 or 9.
+    #[arg(long, default_value_t = 4)]
+    pub views: u32,
+    /// Seed of shape and noise.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u32,
+    /// Photons per unattenuated pixel; no noise without.
+    #[arg(long)]
+    pub photons: Option<f64>,
+    /// Breathing along the body, peak to peak, mm; each training view breathes on its own.
+    #[arg(long, default_value_t = 0.0, value_name = "MM")]
+    pub respiration: f64,
+    /// Layout to write.
+    #[arg(long, value_enum, default_value_t = LayoutArg::Native)]
+    pub layout: LayoutArg,
+    /// Coronary tree as JSON instead of the procedural one.
+    #[arg(long, value_name = "FILE")]
+    pub tree: Option<PathBuf>,
+    /// Chest CT in Hounsfield units behind the tree.
+    #[arg(long, value_name = "CT", requires = "tree")]
+    pub background: Option<PathBuf>,
+    /// Source to isocentre with --tree, mm.
+    #[arg(long, default_value_t = 750.0, value_name = "MM")]
+    pub sod: f64,
+    /// Source to detector with --tree, mm.
+    #[arg(long, default_value_t = 1100.0, value_name = "MM")]
+    pub sid: f64,
+    /// Field of view at the isocentre with --tree, mm.
+    #[arg(long, default_value_t = 160.0, value_name = "MM")]
+    pub fov: f64,
+    /// Attenuation of filled vessels with --tree, 1/mm.
+    #[arg(long, default_value_t = 0.10, value_name = "PER_MM")]
+    pub iodine: f64,
+    /// Do not write the voxel volumes (`volumes/*.nrrd`).
+    #[arg(long)]
+    pub no_volumes: bool,
+}
+
+/// `project`.
+#[derive(Debug, Args)]
+pub struct ProjectArgs {
+    /// Volumes, one per phase in order: .npy .nii .nii.gz .nrrd .mha or raw binaries.
+    #[arg(required = true, value_name = "VOLUME")]
+    pub volumes: Vec<PathBuf>,
+    /// Directory to make.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Columns and rows of the images.
+    #[arg(long, default_value_t = 200)]
+    pub size: usize,
+    /// Training views: 3, 4 or 9.
+    #[arg(long, default_value_t = 4)]
+    pub views: u32,
+    /// Source to isocentre, mm.
+    #[arg(long, default_value_t = 750.0, value_name = "MM")]
+    pub sod: f64,
+    /// Source to detector, mm.
+    #[arg(long, default_value_t = 1100.0, value_name = "MM")]
+    pub sid: f64,
+    /// Field of view at the isocentre, mm.
+    #[arg(long, default_value_t = 160.0, value_name = "MM")]
+    pub fov: f64,
+    /// Values are Hounsfield units, not attenuation per mm.
+    #[arg(long)]
+    pub hounsfield: bool,
+    /// Multiply values by this after reading.
+    #[arg(long, default_value_t = 1.0)]
+    pub scale: f32,
+    /// Voxels at or above this attenuation per mm are vessel, for the masks and the Dice threshold.
+    #[arg(long, value_name = "PER_MM")]
+    pub vessel: Option<f64>,
+    /// Voxel spacing of .npy and raw volumes, mm.
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', num_args = 3)]
+    pub spacing: Option<Vec<f64>>,
+    /// Size of raw volumes, voxels.
+    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', num_args = 3)]
+    pub raw_size: Option<Vec<usize>>,
+    /// Element type of raw volumes: f32, f64, i16, u16 or u8, little endian.
+    #[arg(long, value_name = "TYPE")]
+    pub raw_type: Option<String>,
+    /// Put the centre of each volume at the isocentre.
+    #[arg(long)]
+    pub centre: bool,
+    /// Layout to write.
+    #[arg(long, value_enum, default_value_t = LayoutArg::Native)]
+    pub layout: LayoutArg,
+}
+
+/// `train`.
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Dataset directory (native or authors' layout).
+    #[arg(required_unless_present = "print_config")]
+    pub data: Option<PathBuf>,
+    /// Run directory.
+    #[arg(short, long, value_name = "RUN", required_unless_present = "print_config")]
+    pub out: Option<PathBuf>,
+    /// Set of defaults: `fast`, unless a configuration file names one.
+    #[arg(long, value_enum)]
+    pub preset: Option<Preset>,
+    /// TOML file with hyper-parameters.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Set one hyper-parameter, e.g. --set dynamic.width=128. Repeatable; wins over the file.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Length of the run (same as --set train.iterations=N).
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<u32>,
+    /// Seed (same as --set seed=S).
+    #[arg(long, value_name = "S")]
+    pub seed: Option<u32>,
+    /// Continue from the newest checkpoint in RUN, with its configuration.
+    #[arg(long, conflicts_with_all = ["preset", "config", "set", "iterations", "seed"])]
+    pub resume: bool,
+    /// Save and stop after N iterations; schedules keep the full length.
+    #[arg(long, value_name = "N")]
+    pub stop_at: Option<u32>,
+    /// One JSON object per line on stdout instead of a progress bar.
+    #[arg(long)]
+    pub json: bool,
+    /// Start over in a directory that already holds a run.
+    #[arg(short, long)]
+    pub force: bool,
+    /// Print the configuration as TOML and exit.
+    #[arg(long)]
+    pub print_config: bool,
+    /// Export the motion hull as NRRD and exit without training.
+    #[arg(long, value_name = "FILE.nrrd")]
+    pub export_hull: Option<PathBuf>,
+}
+
+/// `eval`.
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Dataset with validation frames; the one the run was trained on by default.
+    #[arg(long, value_name = "DATA")]
+    pub data: Option<PathBuf>,
+    /// JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+    /// Leave comparison pictures here.
+    #[arg(long, value_name = "DIR")]
+    pub images: Option<PathBuf>,
+    /// Dice threshold on attenuation, 1/mm, instead of the rule.
+    #[arg(long, value_name = "PER_MM")]
+    pub threshold: Option<f64>,
+}
+
+/// Field to show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Component {
+    /// Both fields.
+    Total,
+    /// Still background.
+    Static,
+    /// Moving vessels.
+    Dynamic,
+}
+
+/// What a pixel shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Projection {
+    /// Line integral.
+    Drr,
+    /// Largest attenuation along the ray.
+    Mip,
+}
+
+/// `render`.
+#[derive(Debug, Args)]
+pub struct RenderArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Primary angle, degrees, LAO positive.
+    #[arg(long, allow_negative_numbers = true, value_name = "DEG")]
+    pub primary: f64,
+    /// Secondary angle, degrees, cranial positive.
+    #[arg(long, allow_negative_numbers = true, value_name = "DEG")]
+    pub secondary: f64,
+    /// Phase from 0, or `all`.
+    #[arg(long, default_value = "0")]
+    pub phase: String,
+    /// Field to show.
+    #[arg(long, value_enum, default_value_t = Component::Total)]
+    pub component: Component,
+    /// Line integral or maximum.
+    #[arg(long, value_enum, default_value_t = Projection::Drr)]
+    pub projection: Projection,
+    /// Columns and rows; those of the dataset by default.
+    #[arg(long)]
+    pub size: Option<usize>,
+    /// Output: .png, .npy (floats; all phases stacked) or .gif (all phases).
+    #[arg(short, long, value_name = "FILE")]
+    pub out: PathBuf,
+}
+
+/// `info`.
+#[derive(Debug, Args)]
+pub struct InfoArgs {
+    /// Dataset directory, run directory or checkpoint.
+    #[arg(required_unless_present = "schema")]
+    pub path: Option<PathBuf>,
+    /// JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
+    /// Print the JSON schema of `dataset.json` and exit.
+    #[arg(long)]
+    pub schema: bool,
+}
+
+/// `completions`.
+#[derive(Debug, Args)]
+pub struct CompletionsArgs {
+    /// Shell to print for.
+    pub shell: clap_complete::Shell,
+}
+
+impl Cli {
+    /// Opens the device the options ask for.
+    pub fn open_device(&self) -> Result<Gpu> {
+        Gpu::open(&DeviceOptions { select: self.device.clone(), validation: self.validate, cache_dir: cache_dir() })
+    }
+
+    /// Saves the pipeline cache and turns validation messages into a failure.
+    pub fn close_device(&self, gpu: &Gpu) -> Result<()> {
+        if let Err(error) = gpu.save_pipeline_cache() {
+            // A missing cache only costs time at the next start.
+            tracing::warn!("{error}");
+        }
+        match gpu.validation_messages().len() {
+            0 => Ok(()),
+            n => Err(nertca_vk::error::Error::Internal(format!("{n} Vulkan validation messages, printed above"))),
+        }
+    }
+}
+
+/// The user's cache directory (XDG), if there is one.
+fn cache_dir() -> Option<PathBuf> {
+    let base = std::env::var_os("XDG_CACHE_HOME")
+        .map(PathBuf::from)
+        .filter(|p| p.is_absolute())
+        .or_else(|| std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".cache")))?;
+    Some(base.join("nertca-vk"))
+}

@@ -1,0 +1,55 @@
+//! `devices` and `completions`.
+
+use super::args::{Cli, CompletionsArgs, DevicesArgs};
+use clap::CommandFactory;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::gpu::device::{DeviceInfo, list_devices};
+use nertca_vk::kernels::Tuning;
+use serde::Serialize;
+
+#[derive(Serialize)]
+struct Row {
+    #[serde(flatten)]
+    info: DeviceInfo,
+    paths: Tuning,
+}
+
+/// Lists devices.
+pub fn run(args: &DevicesArgs) -> Result<()> {
+    let rows: Vec<Row> =
+        list_devices()?.into_iter().map(|info| Row { paths: Tuning::for_device(&info), info }).collect();
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&rows).map_err(|e| Error::Internal(e.to_string()))?);
+    } else {
+        for Row { info, paths } in &rows {
+            println!("{}: {} ({}, {})", info.index, info.name, info.kind, info.driver);
+            println!("   uuid {}  Vulkan {}", info.uuid, info.api_version);
+            println!(
+                "   subgroup {}  shared memory {} KiB  workgroup {}  storage buffer {} MiB  memory {} MiB",
+                info.subgroup_size,
+                info.max_shared_memory >> 10,
+                info.max_workgroup_invocations,
+                info.max_storage_buffer_range >> 20,
+                info.device_memory >> 20
+            );
+            println!(
+                "   cooperative matrices {}  float16 {}  float atomics {}",
+                info.cooperative_matrix, info.float16, info.float_atomics
+            );
+            match &info.unusable {
+                Some(why) => println!("   not usable: {why}"),
+                None => paths.reasons.iter().for_each(|r| println!("   - {r}")),
+            }
+        }
+    }
+    if rows.iter().all(|r| r.info.unusable.is_some()) {
+        return Err(Error::NoDevice("install a Vulkan driver (Debian: mesa-vulkan-drivers for a CPU driver)".into()));
+    }
+    Ok(())
+}
+
+/// Prints shell completions.
+pub fn completions(args: &CompletionsArgs) -> Result<()> {
+    clap_complete::generate(args.shell, &mut Cli::command(), "nertca-vk", &mut std::io::stdout());
+    Ok(())
+}

@@ -1,0 +1,211 @@
+//! `eval`, `render` and `info`.
+
+use super::args::{Cli, Component, EvalArgs, InfoArgs, Projection, RenderArgs};
+use nertca_vk::data::dataset::{Dataset, Split, manifest_schema};
+use nertca_vk::data::geometry::{CArm, Geometry, MM_PER_UNIT};
+use nertca_vk::data::images;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::output::eval::Evaluation;
+use nertca_vk::output::pictures::{self, Window};
+use nertca_vk::output::render::Renderer;
+use nertca_vk::reconstruct::{RunInfo, evaluate_run};
+use nertca_vk::train::checkpoint::{self, Checkpoint};
+use std::path::Path;
+
+fn json(value: &impl serde::Serialize) -> Result<String> {
+    serde_json::to_string_pretty(value).map_err(|e| Error::Internal(e.to_string()))
+}
+
+/// Scores a run.
+pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
+    let data = match &args.data {
+        Some(path) => path.clone(),
+        None => RunInfo::read(&args.run)?.dataset,
+    };
+    if args.threshold.is_some_and(|t| !(t.is_finite() && t >= 0.0)) {
+        return Err(Error::config("--threshold", args.threshold.unwrap_or_default(), "must not be negative"));
+    }
+    let dataset = Dataset::open(&data)?;
+    let gpu = cli.open_device()?;
+    let evaluation = evaluate_run(&gpu, &args.run, &dataset, args.threshold, args.images.as_deref())?;
+    if args.json {
+        println!("{}", json(&evaluation)?);
+    } else {
+        print_table(&evaluation);
+    }
+    cli.close_device(&gpu)
+}
+
+/// Prints scores as a table with means.
+pub fn print_table(evaluation: &Evaluation) {
+    let dice = |d: Option<f64>| d.map_or("    -".into(), |d| format!("{d:.3}"));
+    let angle = |a: Option<f64>| a.map_or("    -".into(), |a| format!("{a:5.0}"));
+    println!("primary secondary phase  Dice dynamic  Dice total   PSNR dB   SSIM");
+    for i in &evaluation.images {
+        println!(
+            "{}   {}     {:3}         {}       {}    {:6.2}  {:.3}",
+            angle(i.primary_deg),
+            angle(i.secondary_deg),
+            i.phase,
+            dice(i.dice_dynamic),
+            dice(i.dice_total),
+            i.psnr,
+            i.ssim
+        );
+    }
+    println!(
+        "mean of {:3} images          {}       {}    {:6.2}  {:.3}",
+        evaluation.images.len(),
+        dice(evaluation.dice.dynamic),
+        dice(evaluation.dice.total),
+        evaluation.psnr,
+        evaluation.ssim
+    );
+    println!(
+        "Dice threshold {:.4e} / {:.4e} per mm (dynamic / total): {}",
+        evaluation.threshold.dynamic_per_mm, evaluation.threshold.total_per_mm, evaluation.threshold.rule
+    );
+}
+
+/// Renders a run.
+pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
+    let extension = args.out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
+    if !["png", "npy", "gif"].contains(&extension.as_str()) {
+        return Err(Error::config("--out", args.out.display(), "ends in none of .png .npy .gif"));
+    }
+    let model = Checkpoint::read(&checkpoint::newest(&args.run)?)?.model;
+    let n_phases = model.layout.phases as u32;
+    let phases: Vec<u32> = match args.phase.as_str() {
+        "all" => (0..n_phases).collect(),
+        text => vec![text.parse().ok().filter(|p| *p < n_phases).ok_or_else(|| {
+            Error::config("--phase", text, format!("`all` or a phase from 0 to {} is accepted", n_phases - 1))
+        })?],
+    };
+    if extension == "png" && phases.len() > 1 {
+        return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
+    }
+    let [width, height] = args.size.map_or(model.image_size, |n| [n, n]);
+    if !(1..=images::MAX_SIDE).contains(&width) {
+        return Err(Error::config("--size", width, format!("1 to {} is accepted", images::MAX_SIDE)));
+    }
+    // The same field of view on more or fewer pixels.
+    let c_arm = CArm {
+        primary_deg: args.primary,
+        secondary_deg: args.secondary,
+        pixel_mm: [
+            model.c_arm.pixel_mm[0] * model.image_size[0] as f64 / width as f64,
+            model.c_arm.pixel_mm[1] * model.image_size[1] as f64 / height as f64,
+        ],
+        ..model.c_arm.clone()
+    };
+    let rays =
+        Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| Error::config(field, "", problem))?;
+    let gpu = cli.open_device()?;
+    let renderer = Renderer::new(&gpu, &model)?;
+    let frames = phases
+        .iter()
+        .map(|phase| {
+            let seen = renderer.render(&rays, width, height, *phase)?;
+            let per_mm = |v: Vec<f32>| v.into_iter().map(|x| x / MM_PER_UNIT as f32).collect();
+            Ok(match (args.projection, args.component) {
+                (Projection::Drr, Component::Total) => seen.total_integral(),
+                (Projection::Drr, Component::Static) => seen.static_integral,
+                (Projection::Drr, Component::Dynamic) => seen.dynamic_integral,
+                (Projection::Mip, Component::Total) => per_mm(seen.total_max),
+                (Projection::Mip, Component::Static) => per_mm(seen.static_max),
+                (Projection::Mip, Component::Dynamic) => per_mm(seen.dynamic_max),
+            })
+        })
+        .collect::<Result<Vec<Vec<f32>>>>()?;
+    let window = Window::of(&frames.concat());
+    match extension.as_str() {
+        "npy" => {
+            let shape = if args.phase == "all" { vec![frames.len(), height, width] } else { vec![height, width] };
+            images::write_npy(&args.out, &shape, &frames.concat())?;
+        }
+        "gif" => pictures::write_gif(&args.out, &frames, width, window, 90)?,
+        _ => pictures::write_grey(&args.out, &frames[0], width, window)?,
+    }
+    cli.close_device(&gpu)
+}
+
+/// Describes a dataset or a run.
+pub fn info(args: &InfoArgs) -> Result<()> {
+    if args.schema {
+        print!("{}", manifest_schema());
+        return Ok(());
+    }
+    let path = args.path.as_deref().unwrap_or(Path::new("."));
+    let is_run = path.is_file() || checkpoint::list(path).is_ok_and(|found| !found.is_empty());
+    let described = if is_run { describe_run(path)? } else { describe_dataset(path)? };
+    if args.json {
+        println!("{}", json(&described)?);
+    } else {
+        print_tree(&described, 0);
+    }
+    Ok(())
+}
+
+fn describe_run(path: &Path) -> Result<serde_json::Value> {
+    let file = checkpoint::newest(path)?;
+    let model = Checkpoint::read(&file)?.model;
+    Ok(serde_json::json!({
+        "kind": "run",
+        "checkpoint": file,
+        "step": model.step,
+        "iterations": model.config.train.iterations,
+        "parameters": model.layout.len,
+        "phases": model.layout.phases,
+        "hull_share": model.hull.as_ref().map(|h| h.share()),
+        "scene": model.scene,
+        "config": model.config,
+    }))
+}
+
+fn describe_dataset(path: &Path) -> Result<serde_json::Value> {
+    let dataset = Dataset::open(path)?;
+    let views: Vec<_> = dataset
+        .views
+        .iter()
+        .enumerate()
+        .map(|(index, view)| {
+            let of = |split| dataset.frames.iter().filter(|f| f.view == index && f.split == split).count();
+            serde_json::json!({
+                "geometry": view.geometry,
+                "training_frames": of(Split::Train),
+                "validation_frames": of(Split::Validation),
+            })
+        })
+        .collect();
+    let range = Window::of(&dataset.training().iter().flat_map(|f| f.integrals.iter().copied()).collect::<Vec<_>>());
+    Ok(serde_json::json!({
+        "kind": "dataset",
+        "layout": dataset.layout,
+        "image": [dataset.width, dataset.height],
+        "phases": dataset.n_phases,
+        "depth_range_mm": [dataset.depth_range.0 * MM_PER_UNIT, dataset.depth_range.1 * MM_PER_UNIT],
+        "line_integrals": [range.low, range.high],
+        "vessel_attenuation_per_mm": dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+        "masks": dataset.frames.iter().filter(|f| f.mask.is_some()).count(),
+        "views": views,
+    }))
+}
+
+fn print_tree(value: &serde_json::Value, depth: usize) {
+    let Some(map) = value.as_object() else { return };
+    for (key, value) in map {
+        match value {
+            serde_json::Value::Object(_) => {
+                println!("{:indent$}{key}:", "", indent = 2 * depth);
+                print_tree(value, depth + 1);
+            }
+            serde_json::Value::Array(items) if items.iter().any(serde_json::Value::is_object) => {
+                for (index, item) in items.iter().enumerate() {
+                    println!("{:indent$}{key}[{index}]:", "", indent = 2 * depth);
+                    print_tree(item, depth + 1);
+                }
+            }
+            other => println!("{:indent$}{key}: {other}", "", indent = 2 * depth),
+        }
+    }
+}

@@ -1,0 +1,134 @@
+//! `train`: progress, Ctrl-C, report.
+
+use super::args::{Cli, TrainArgs};
+use super::results::print_table;
+use indicatif::{ProgressBar, ProgressStyle};
+use nertca_vk::config::Config;
+use nertca_vk::data::dataset::Dataset;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::reconstruct::{Event, RunInfo, RunOptions, evaluate_run, reconstruct};
+use nertca_vk::train::checkpoint;
+use nertca_vk::train::plan::Plan;
+use std::io::IsTerminal;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+fn config(args: &TrainArgs) -> Result<Config> {
+    let mut settings = args.set.clone();
+    settings.extend(args.iterations.map(|n| format!("train.iterations={n}")));
+    settings.extend(args.seed.map(|s| format!("seed={s}")));
+    Config::load(args.preset, args.config.as_deref(), &settings)
+}
+
+/// Trains.
+pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
+    let config = config(args)?;
+    if args.print_config {
+        print!("{}", config.to_toml()?);
+        return Ok(());
+    }
+    let (Some(data), Some(run)) = (&args.data, &args.out) else {
+        return Err(Error::Internal("clap lets no run without DATA and --out pass".into()));
+    };
+    let dataset = Dataset::open(data)?;
+    if let Some(file) = &args.export_hull {
+        return export_hull(&config, &dataset, file);
+    }
+    prepare_directory(run, args)?;
+    let cancel = Arc::new(AtomicBool::new(false));
+    let seen = cancel.clone();
+    ctrlc::set_handler(move || {
+        if seen.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+    })
+    .map_err(|e| Error::Internal(format!("Ctrl-C handler: {e}")))?;
+    let gpu = cli.open_device()?;
+    RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
+    let options = RunOptions { run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
+    let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
+    let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut observer);
+    drop(observer);
+    outcome?;
+    if !dataset.validation().is_empty() {
+        let report = run.join("report");
+        let evaluation = evaluate_run(&gpu, run, &dataset, None, Some(&report))?;
+        let text = serde_json::to_string_pretty(&evaluation).map_err(|e| Error::Internal(e.to_string()))?;
+        nertca_vk::files::write_atomic(&report.join("evaluation.json"), text.as_bytes())?;
+        if !args.json {
+            print_table(&evaluation);
+            println!("report and pictures: {}", report.display());
+        }
+    }
+    cli.close_device(&gpu)
+}
+
+fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {
+    if args.resume || !run.exists() {
+        return Ok(());
+    }
+    let old = checkpoint::list(run)?;
+    if old.is_empty() {
+        return Ok(());
+    }
+    if !args.force {
+        return Err(Error::config(
+            "--out",
+            run.display(),
+            "already holds a run: continue it with --resume, or start over with --force",
+        ));
+    }
+    for (_, path) in old {
+        std::fs::remove_file(&path).map_err(Error::io("remove", &path))?;
+    }
+    Ok(())
+}
+
+fn export_hull(config: &Config, dataset: &Dataset, file: &Path) -> Result<()> {
+    let plan = Plan::new(config, dataset)?;
+    plan.notes.iter().for_each(|note| eprintln!("{note}"));
+    let hull = plan.hull.ok_or_else(|| Error::config("hull", "", "this configuration and dataset give no hull"))?;
+    hull.to_volume().write_nrrd(file)
+}
+
+fn print_json(event: &Event) {
+    if let Ok(line) = serde_json::to_string(event) {
+        println!("{line}");
+    }
+}
+
+fn show_progress() -> impl FnMut(&Event) {
+    let terminal = std::io::stderr().is_terminal();
+    let bar = ProgressBar::new(1);
+    if let Ok(style) = ProgressStyle::with_template("[{bar:30}] {pos}/{len} {msg}") {
+        bar.set_style(style);
+    }
+    let say = move |bar: &ProgressBar, text: String| {
+        if terminal { bar.println(text) } else { eprintln!("{text}") }
+    };
+    move |event| match event {
+        Event::Started { device, step, iterations, parameters, notes } => {
+            bar.set_length(u64::from(*iterations));
+            bar.set_position(u64::from(*step));
+            say(&bar, format!("{device}: {parameters} parameters"));
+            notes.iter().for_each(|n| say(&bar, format!("- {n}")));
+        }
+        Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
+            bar.set_position(u64::from(loss.step));
+            bar.set_message(format!(
+                "loss {:.3e}  PSNR {psnr:.1} dB  {iterations_per_s:.1} it/s  {left_s:.0} s left",
+                loss.total()
+            ));
+        }
+        Event::Validation { step, train_s, dice_dynamic, psnr, ssim, .. } => {
+            let dice = dice_dynamic.map_or("-".into(), |d| format!("{d:.3}"));
+            say(&bar, format!("{step:6} iterations, {train_s:6.1} s: Dice {dice}  PSNR {psnr:.2} dB  SSIM {ssim:.3}"));
+        }
+        Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
+        Event::Finished { step, train_s, .. } => {
+            bar.finish_and_clear();
+            say(&bar, format!("{step} iterations in {train_s:.1} s of training"));
+        }
+    }
+}

@@ -1,0 +1,328 @@
+//! What moves in the angiograms, found without segmentation: each view's still background, its noise,
+//! and the motion hull, the set of points whose projection changes over time in every view that sees them.
+
+use super::dataset::Dataset;
+use super::geometry::{MM_PER_UNIT, ViewRays};
+use super::images::Image;
+use super::volume::Volume;
+use crate::config;
+use glam::{DAffine3, DMat3, DVec3};
+use rayon::prelude::*;
+
+/// Temporal behaviour of one training view.
+#[derive(Debug, Clone)]
+pub struct ViewMotion {
+    /// Index into [`Dataset::views`].
+    pub view: usize,
+    /// Still background: each pixel's smallest line integral over the phases, corrected for the bias that
+    /// taking a minimum of noisy values has.
+    pub background: Vec<f32>,
+    /// Largest integral above the background over the phases.
+    pub range: Vec<f32>,
+    /// Standard deviation of a pixel's noise.
+    pub noise: Vec<f32>,
+    /// Pixels that move.
+    pub moving: Vec<bool>,
+    /// Training phases of this view.
+    pub n_phases: usize,
+}
+
+/// Binary volume on a regular grid, world units, x fastest.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hull {
+    /// Cells along x, y, z.
+    pub size: [usize; 3],
+    /// Lower corner.
+    pub min: DVec3,
+    /// Side of a cell.
+    pub cell: f64,
+    /// 32 cells to a word, lowest bit first.
+    pub bits: Vec<u32>,
+}
+
+/// Expected range of `n` standard normal draws, over two: how far the minimum lies below the mean.
+fn expected_minimum(n: usize) -> f64 {
+    // Blom's approximation of the first normal order statistic.
+    if n < 2 {
+        return 0.0;
+    }
+    let p = (1.0 - 0.375) / (n as f64 + 0.25);
+    // Inverse normal by bisection of the logistic-free tail: accurate to 1e-6, called once per view.
+    let (mut low, mut high) = (0.0, 8.0);
+    for _ in 0..60 {
+        let mid = 0.5 * (low + high);
+        if upper_tail(mid) > p { low = mid } else { high = mid }
+    }
+    0.5 * (low + high)
+}
+
+/// P(X > z) of a standard normal (Abramowitz and Stegun 26.2.17, error below 7.5e-8).
+fn upper_tail(z: f64) -> f64 {
+    let t = 1.0 / (1.0 + 0.231_641_9 * z);
+    let poly =
+        t * (0.319_381_530 + t * (-0.356_563_782 + t * (1.781_477_937 + t * (-1.821_255_978 + t * 1.330_274_429))));
+    (-0.5 * z * z).exp() / std::f64::consts::TAU.sqrt() * poly
+}
+
+fn median(values: &mut [f32]) -> f32 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f32::total_cmp).1
+}
+
+/// Noise of each pixel: successive phases of a still pixel differ by noise alone, and noise depends on
+/// intensity; so pixels are grouped by intensity and each group's median temporal deviation is its noise.
+fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
+    const GROUPS: usize = 24;
+    let mut order: Vec<u32> = (0..mean.len() as u32).collect();
+    order.sort_unstable_by(|a, b| mean[*a as usize].total_cmp(&mean[*b as usize]));
+    let mut noise = vec![0.0; mean.len()];
+    for group in order.chunks(mean.len().div_ceil(GROUPS)) {
+        let level = median(&mut group.iter().map(|i| deviation[*i as usize]).collect::<Vec<_>>());
+        for i in group {
+            noise[*i as usize] = level;
+        }
+    }
+    noise
+}
+
+/// Analyses each training view.
+pub fn analyse(dataset: &Dataset, config: &config::Hull) -> Vec<ViewMotion> {
+    dataset
+        .training_views()
+        .into_par_iter()
+        .map(|view| {
+            let mut frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view).collect();
+            frames.sort_by_key(|f| f.phase);
+            let n = frames.len();
+            let pixels = dataset.n_pixels();
+            let at = |p: usize| frames.iter().map(move |f| f.integrals[p]);
+            let mean: Vec<f32> = (0..pixels).map(|p| at(p).sum::<f32>() / n as f32).collect();
+            // Successive differences over sqrt 2: slow change over the beat counts little.
+            let deviation: Vec<f32> = (0..pixels)
+                .map(|p| {
+                    let mut steps: Vec<f32> =
+                        frames.windows(2).map(|w| (w[1].integrals[p] - w[0].integrals[p]).abs()).collect();
+                    median(&mut steps) * (1.4826 / std::f32::consts::SQRT_2)
+                })
+                .collect();
+            let noise = noise_by_intensity(&mean, &deviation);
+            let bias = expected_minimum(n) as f32;
+            let lowest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::INFINITY, f32::min)).collect();
+            let highest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::NEG_INFINITY, f32::max)).collect();
+            let change = Image {
+                width: dataset.width,
+                height: dataset.height,
+                values: highest.iter().zip(&lowest).map(|(h, l)| h - l).collect(),
+            };
+            let thin = if config.structure_pixels > 0 {
+                top_hat(&change, config.structure_pixels as usize)
+            } else {
+                change.clone()
+            };
+            let strongest = percentile(&thin.values, 0.995);
+            let moving = Image {
+                values: (0..pixels)
+                    .map(|p| {
+                        let threshold =
+                            (config.noise_sigmas as f32 * noise[p]).max(config.min_share as f32 * strongest);
+                        f32::from(u8::from(n > 1 && thin.values[p] > threshold))
+                    })
+                    .collect(),
+                ..change.clone()
+            };
+            let grown = dilate(&moving, config.dilate_pixels as usize);
+            ViewMotion {
+                view,
+                background: lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { 0.0 }).collect(),
+                range: change.values,
+                noise,
+                moving: grown.values.iter().map(|v| *v > 0.0).collect(),
+                n_phases: n,
+            }
+        })
+        .collect()
+}
+
+/// The value below which `share` of the values lie.
+pub fn percentile(values: &[f32], share: f64) -> f32 {
+    let mut sorted = values.to_vec();
+    if sorted.is_empty() {
+        return 0.0;
+    }
+    let index = ((sorted.len() - 1) as f64 * share) as usize;
+    *sorted.select_nth_unstable_by(index, f32::total_cmp).1
+}
+
+fn filter(image: &Image, radius: usize, pick: impl Fn(f32, f32) -> f32 + Sync) -> Image {
+    let (w, h) = (image.width, image.height);
+    let window = |centre: usize, end: usize| centre.saturating_sub(radius)..(centre + radius + 1).min(end);
+    let mut rows = Image::zeros(w, h);
+    for y in 0..h {
+        for x in 0..w {
+            rows.values[y * w + x] = window(x, w).map(|k| image.values[y * w + k]).reduce(&pick).unwrap_or(0.0);
+        }
+    }
+    let mut out = Image::zeros(w, h);
+    for y in 0..h {
+        for x in 0..w {
+            out.values[y * w + x] = window(y, h).map(|k| rows.values[k * w + x]).reduce(&pick).unwrap_or(0.0);
+        }
+    }
+    out
+}
+
+/// Grey dilation by a square of `2 radius + 1` pixels.
+fn dilate(image: &Image, radius: usize) -> Image {
+    filter(image, radius, f32::max)
+}
+
+/// What is narrower than `2 radius + 1` pixels: the image minus its grey opening.
+fn top_hat(image: &Image, radius: usize) -> Image {
+    let opened = dilate(&filter(image, radius, f32::min), radius);
+    Image { values: image.values.iter().zip(&opened.values).map(|(a, b)| a - b).collect(), ..opened }
+}
+
+impl Hull {
+    /// Cells of a cube of half side `half` (world units) that every view seeing them shows moving; at least
+    /// two views (or the only one) must see them.
+    pub fn carve(dataset: &Dataset, motion: &[ViewMotion], half: f64, resolution: usize) -> Hull {
+        let n = resolution;
+        let cell = 2.0 * half / n as f64;
+        let min = DVec3::splat(-half);
+        let projectors: Vec<_> =
+            motion.iter().map(|m| Projector::new(&dataset.views[m.view].rays, m, dataset)).collect();
+        let needed = motion.len().min(2);
+        let keep: Vec<bool> = (0..n * n * n)
+            .into_par_iter()
+            .map(|index| {
+                let (x, y, z) = (index % n, index / n % n, index / (n * n));
+                let centre = min + (DVec3::new(x as f64, y as f64, z as f64) + 0.5) * cell;
+                let mut seen = 0;
+                for projector in &projectors {
+                    match projector.moving_at(centre) {
+                        Some(false) => return false,
+                        Some(true) => seen += 1,
+                        None => {}
+                    }
+                }
+                seen >= needed
+            })
+            .collect();
+        let mut bits = vec![0u32; (n * n * n).div_ceil(32)];
+        for (index, kept) in keep.iter().enumerate() {
+            bits[index / 32] |= u32::from(*kept) << (index % 32);
+        }
+        Hull { size: [n; 3], min, cell, bits }
+    }
+
+    /// Whether a cell is kept.
+    pub fn contains(&self, x: usize, y: usize, z: usize) -> bool {
+        let index = (z * self.size[1] + y) * self.size[0] + x;
+        self.bits[index / 32] >> (index % 32) & 1 == 1
+    }
+
+    /// The hull as a volume of zeros and ones, to look at.
+    pub fn to_volume(&self) -> Volume {
+        let [nx, ny, nz] = self.size;
+        let cell_mm = self.cell * MM_PER_UNIT;
+        // Index axes follow the world's (posterior, left, superior); LPS swaps the first two.
+        let axes = DMat3::from_cols(DVec3::Y * cell_mm, DVec3::X * cell_mm, DVec3::Z * cell_mm);
+        let first = (self.min + 0.5 * self.cell) * MM_PER_UNIT;
+        Volume {
+            size: self.size,
+            values: (0..nx * ny * nz).map(|i| (self.bits[i / 32] >> (i % 32) & 1) as f32).collect(),
+            index_to_lps: DAffine3::from_mat3_translation(axes, DVec3::new(first.y, first.x, first.z)),
+        }
+    }
+
+    /// Whether a point lies in a kept cell.
+    pub fn contains_point(&self, point: DVec3) -> bool {
+        let c = ((point - self.min) / self.cell).floor();
+        let inside = |v: f64, n: usize| v >= 0.0 && v < n as f64;
+        inside(c.x, self.size[0])
+            && inside(c.y, self.size[1])
+            && inside(c.z, self.size[2])
+            && self.contains(c.x as usize, c.y as usize, c.z as usize)
+    }
+
+    /// Kept share of all cells.
+    pub fn share(&self) -> f64 {
+        let kept: u32 = self.bits.iter().map(|w| w.count_ones()).sum();
+        f64::from(kept) / self.size.iter().product::<usize>() as f64
+    }
+
+    /// Lower and upper corner of the kept cells; `None` when nothing is kept.
+    pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        for z in 0..self.size[2] {
+            for y in 0..self.size[1] {
+                for x in 0..self.size[0] {
+                    if self.contains(x, y, z) {
+                        let corner = self.min + DVec3::new(x as f64, y as f64, z as f64) * self.cell;
+                        low = low.min(corner);
+                        high = high.max(corner + self.cell);
+                    }
+                }
+            }
+        }
+        low.is_finite().then_some((low, high))
+    }
+}
+
+struct Projector<'a> {
+    rays: &'a ViewRays,
+    inverse: glam::DMat3,
+    moving: &'a [bool],
+    width: i64,
+    height: i64,
+}
+
+impl<'a> Projector<'a> {
+    fn new(rays: &'a ViewRays, motion: &'a ViewMotion, dataset: &Dataset) -> Self {
+        let basis = glam::DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
+        Projector {
+            rays,
+            inverse: basis.inverse(),
+            moving: &motion.moving,
+            width: dataset.width as i64,
+            height: dataset.height as i64,
+        }
+    }
+
+    /// Whether the view shows motion where it sees the point; `None` when it does not see it.
+    fn moving_at(&self, point: DVec3) -> Option<bool> {
+        let h = self.inverse * (point - self.rays.source());
+        if h.z <= 0.0 {
+            return None;
+        }
+        let (i, j) = ((h.x / h.z).round() as i64, (h.y / h.z).round() as i64);
+        (i >= 0 && j >= 0 && i < self.width && j < self.height).then(|| self.moving[(j * self.width + i) as usize])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn expected_minimum_of_ten_normals() {
+        assert!((expected_minimum(10) - 1.5388).abs() < 0.01, "{}", expected_minimum(10));
+        assert_eq!(expected_minimum(1), 0.0);
+    }
+
+    #[test]
+    fn top_hat_keeps_thin_and_drops_wide() {
+        let mut image = Image::zeros(20, 20);
+        for y in 0..20 {
+            image.values[y * 20 + 3] = 1.0;
+            for x in 8..20 {
+                image.values[y * 20 + x] = 1.0;
+            }
+        }
+        let thin = top_hat(&image, 2);
+        assert_eq!((thin.values[5 * 20 + 3], thin.values[5 * 20 + 14]), (1.0, 0.0));
+    }
+}

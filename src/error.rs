@@ -1,0 +1,137 @@
+//! One error type: a variant per thing a caller can act on, with the exit code of the program.
+
+use std::path::{Path, PathBuf};
+
+/// Result of every fallible function of this crate.
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// What went wrong, where, and what to try.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A hyper-parameter or command-line value is not usable.
+    #[error("configuration: {field} = {value}: {problem}")]
+    Config {
+        /// Name of the key, as written in a TOML file.
+        field: String,
+        /// The value that was given.
+        value: String,
+        /// Why it is refused and what is accepted.
+        problem: String,
+    },
+    /// An input file is malformed.
+    #[error("{}: {field}: {problem}", file.display())]
+    Data {
+        /// The file that holds the fault.
+        file: PathBuf,
+        /// Field, frame or element inside the file.
+        field: String,
+        /// What is wrong and what is expected.
+        problem: String,
+    },
+    /// The operating system refused a file operation.
+    #[error("{}: {action} failed: {source}", path.display())]
+    Io {
+        /// What was attempted, e.g. `read`.
+        action: &'static str,
+        /// The path concerned.
+        path: PathBuf,
+        /// The system's own reason.
+        source: std::io::Error,
+    },
+    /// No Vulkan device fits.
+    #[error("no usable Vulkan device: {0}")]
+    NoDevice(String),
+    /// A Vulkan call failed.
+    #[error("Vulkan: {call} failed for {object}: {code}")]
+    Vulkan {
+        /// Name of the Vulkan entry point.
+        call: &'static str,
+        /// Debug name of the object or pass.
+        object: String,
+        /// The code the driver returned.
+        code: ash::vk::Result,
+    },
+    /// The device stopped answering.
+    #[error(
+        "the Vulkan device was lost during {pass}. The driver may have reset it after a time limit: \
+         try a smaller --set train.iterations_per_submit, another --device, or a newer driver. \
+         The last checkpoint is intact: continue with --resume"
+    )]
+    DeviceLost {
+        /// The submit that was in flight.
+        pass: String,
+    },
+    /// Memory ran out.
+    #[error(
+        "out of memory: {object} needs {bytes} bytes ({detail}). Try a smaller \
+         --set train.chunk_samples or train.rays, or another --device"
+    )]
+    OutOfMemory {
+        /// Debug name of the buffer.
+        object: String,
+        /// Requested size.
+        bytes: u64,
+        /// The allocator's words.
+        detail: String,
+    },
+    /// The optimisation produced a value that is not finite, or exploded.
+    #[error(
+        "training diverged at iteration {step}: {quantity} = {value}. The last good checkpoint is kept. \
+         Try a lower learning rate (--set dynamic.lr=..., static.lr=...) or the `fast` preset"
+    )]
+    Diverged {
+        /// Iteration at which it was seen.
+        step: u64,
+        /// Which quantity.
+        quantity: &'static str,
+        /// Its value.
+        value: f64,
+    },
+    /// The user asked to stop; state was saved.
+    #[error("interrupted")]
+    Interrupted,
+    /// An internal rule was broken: a fault of this program.
+    #[error("internal fault: {0}. Please report it")]
+    Internal(String),
+}
+
+impl Error {
+    /// Exit code of the program: 0 ok, 1 failure, 2 usage, 3 no suitable device, 130 interrupted.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Error::Config { .. } => 2,
+            Error::NoDevice(_) => 3,
+            Error::Interrupted => 130,
+            _ => 1,
+        }
+    }
+
+    /// A [`Error::Data`] for `field` of `file`.
+    pub fn data(file: impl AsRef<Path>, field: impl Into<String>, problem: impl Into<String>) -> Self {
+        Error::Data { file: file.as_ref().to_path_buf(), field: field.into(), problem: problem.into() }
+    }
+
+    /// A [`Error::Config`] for one key.
+    pub fn config(field: impl Into<String>, value: impl ToString, problem: impl Into<String>) -> Self {
+        Error::Config { field: field.into(), value: value.to_string(), problem: problem.into() }
+    }
+
+    /// Wraps a system error with the action and the path.
+    pub fn io(action: &'static str, path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.as_ref().to_path_buf();
+        move |source| Error::Io { action, path, source }
+    }
+
+    /// Wraps a Vulkan code with the call and the object it concerned.
+    pub(crate) fn vulkan(call: &'static str, object: impl Into<String>) -> impl FnOnce(ash::vk::Result) -> Self {
+        let object = object.into();
+        move |code| match code {
+            ash::vk::Result::ERROR_DEVICE_LOST => Error::DeviceLost { pass: object },
+            ash::vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | ash::vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
+                Error::OutOfMemory { object, bytes: 0, detail: format!("{call}: {code}") }
+            }
+            code => Error::Vulkan { call, object, code },
+        }
+    }
+}

@@ -1,0 +1,67 @@
+//! Output files appear whole or not at all: written beside their target, then renamed.
+
+use crate::error::{Error, Result};
+use std::io::Write;
+use std::path::Path;
+
+/// Writes `bytes` to `path` through a temporary file in the same directory; makes missing directories.
+///
+/// # Errors
+/// [`Error::Io`] naming the path.
+pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<()> {
+    write_atomic_with(path, |file| file.write_all(bytes))
+}
+
+/// Like [`write_atomic`], for content produced piece by piece.
+///
+/// # Errors
+/// As [`write_atomic`].
+pub fn write_atomic_with(
+    path: &Path,
+    produce: impl FnOnce(&mut std::io::BufWriter<&std::fs::File>) -> std::io::Result<()>,
+) -> Result<()> {
+    let directory = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    create_directory(directory)?;
+    let temporary = tempfile::Builder::new()
+        .prefix(".partial-")
+        .tempfile_in(directory)
+        .map_err(Error::io("create a temporary file in", directory))?;
+    let mut writer = std::io::BufWriter::new(temporary.as_file());
+    produce(&mut writer).and_then(|()| writer.flush()).map_err(Error::io("write", path))?;
+    drop(writer);
+    #[cfg(unix)]
+    {
+        // Temporary files are private by default; outputs are ordinary files.
+        use std::os::unix::fs::PermissionsExt;
+        let _ = temporary.as_file().set_permissions(std::fs::Permissions::from_mode(0o644));
+    }
+    temporary.as_file().sync_all().map_err(Error::io("flush", path))?;
+    temporary.persist(path).map_err(|e| e.error).map_err(Error::io("rename into place", path))?;
+    Ok(())
+}
+
+/// Makes a directory and its parents.
+///
+/// # Errors
+/// [`Error::Io`] naming the path.
+pub fn create_directory(path: &Path) -> Result<()> {
+    std::fs::create_dir_all(path).map_err(Error::io("create the directory", path))
+}
+
+/// Reads a whole file, refusing one larger than `limit` bytes.
+///
+/// # Errors
+/// [`Error::Io`] when it cannot be read, [`Error::Data`] when it is too large.
+pub fn read_limited(path: &Path, limit: u64) -> Result<Vec<u8>> {
+    let meta = std::fs::metadata(path).map_err(Error::io("read", path))?;
+    if !meta.is_file() {
+        return Err(Error::data(path, "file", "is not a regular file"));
+    }
+    if meta.len() > limit {
+        return Err(Error::data(path, "size", format!("{} bytes; at most {limit} are accepted", meta.len())));
+    }
+    std::fs::read(path).map_err(Error::io("read", path))
+}

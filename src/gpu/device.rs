@@ -1,0 +1,473 @@
+//! Instance, adapter choice, capability table, validation layer and debug names.
+
+use crate::error::{Error, Result};
+use ash::{ext, khr, vk};
+use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
+use serde::Serialize;
+use std::ffi::{CStr, CString, c_void};
+use std::mem::ManuallyDrop;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
+
+/// How to open a device.
+#[derive(Debug, Clone, Default)]
+pub struct DeviceOptions {
+    /// Index, part of the name (any case) or UUID; `None` takes the best device.
+    pub select: Option<String>,
+    /// Turn the Khronos validation layer on, with synchronisation validation.
+    pub validation: bool,
+    /// Directory for the pipeline cache; `None` keeps it in memory only.
+    pub cache_dir: Option<std::path::PathBuf>,
+}
+
+/// What a device is and can do, as far as this engine cares.
+#[derive(Debug, Clone, Serialize)]
+pub struct DeviceInfo {
+    /// Position in the list of the loader.
+    pub index: usize,
+    /// Name given by the driver.
+    pub name: String,
+    /// `discrete`, `integrated`, `virtual`, `cpu` or `other`.
+    pub kind: &'static str,
+    /// Device UUID, hexadecimal.
+    pub uuid: String,
+    /// Driver name and version text.
+    pub driver: String,
+    /// Supported Vulkan version.
+    pub api_version: String,
+    /// Whether the driver is Mesa's llvmpipe (CPU).
+    pub is_llvmpipe: bool,
+    /// Major version of Mesa, when the driver is from Mesa.
+    pub mesa_major: Option<u32>,
+    /// Default subgroup size.
+    pub subgroup_size: u32,
+    /// Shared memory of a workgroup, bytes.
+    pub max_shared_memory: u32,
+    /// Invocations of a workgroup.
+    pub max_workgroup_invocations: u32,
+    /// Workgroups of one dispatch along x.
+    pub max_workgroup_count: u32,
+    /// Range of one storage buffer binding, bytes.
+    pub max_storage_buffer_range: u32,
+    /// Elements of one texel buffer.
+    pub max_texel_buffer_elements: u32,
+    /// Bytes of push constants.
+    pub max_push_constants: u32,
+    /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
+    pub timestamp_period_ns: f32,
+    /// Device-local memory, bytes.
+    pub device_memory: u64,
+    /// Whether the device offers `VK_KHR_cooperative_matrix`.
+    pub cooperative_matrix: bool,
+    /// Whether the device offers 16-bit float arithmetic.
+    pub float16: bool,
+    /// Whether the device offers float atomics on buffers.
+    pub float_atomics: bool,
+    /// Why this device cannot be used, if so.
+    pub unusable: Option<String>,
+}
+
+/// An open device. Cheap to clone; everything is freed when the last user is gone.
+#[derive(Clone)]
+pub struct Gpu {
+    pub(super) shared: Arc<Shared>,
+}
+
+pub(super) struct Shared {
+    pub(super) device: ash::Device,
+    pub(super) debug_names: Option<ext::debug_utils::Device>,
+    pub(super) queue: Mutex<vk::Queue>,
+    pub(super) queue_family: u32,
+    pub(super) allocator: Mutex<ManuallyDrop<Allocator>>,
+    pub(super) pipeline_cache: vk::PipelineCache,
+    pub(super) timeline: vk::Semaphore,
+    pub(super) last_submitted: AtomicU64,
+    pub(super) live_objects: AtomicU64,
+    pub(super) info: DeviceInfo,
+    cache_file: Option<std::path::PathBuf>,
+    messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
+    messages: Box<Mutex<Vec<String>>>,
+    instance: ash::Instance,
+    _entry: ash::Entry,
+}
+
+/// A poisoned lock only means another thread panicked; the guarded state stays valid.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+struct Instance {
+    entry: ash::Entry,
+    instance: ash::Instance,
+}
+
+fn create_instance(validation: bool) -> Result<Instance> {
+    // SAFETY: loads the system's Vulkan loader, whose initialisers are trusted as any shared library's are.
+    let entry = unsafe { ash::Entry::load() }.map_err(|e| {
+        Error::NoDevice(format!(
+            "the Vulkan loader could not be opened ({e}). Install it (Debian: libvulkan1) together with a driver \
+             (GPU vendor's, or mesa-vulkan-drivers for a CPU driver)"
+        ))
+    })?;
+    let app = vk::ApplicationInfo::default()
+        .application_name(c"nertca-vk")
+        .engine_name(c"nertca-vk")
+        .api_version(vk::API_VERSION_1_2);
+    let mut layers = Vec::new();
+    let mut extensions = Vec::new();
+    if validation {
+        // SAFETY: entry is a loaded loader.
+        let found = unsafe { entry.enumerate_instance_layer_properties() }
+            .map_err(Error::vulkan("vkEnumerateInstanceLayerProperties", "loader"))?;
+        if !found.iter().any(|l| l.layer_name_as_c_str().is_ok_and(|n| n == VALIDATION_LAYER)) {
+            return Err(Error::NoDevice(
+                "validation was asked for, but VK_LAYER_KHRONOS_validation is not installed \
+                 (Debian: vulkan-validationlayers)"
+                    .into(),
+            ));
+        }
+        layers.push(VALIDATION_LAYER.as_ptr());
+        extensions.push(ext::debug_utils::NAME.as_ptr());
+    }
+    let enabled = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
+    let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&enabled);
+    let mut create = vk::InstanceCreateInfo::default()
+        .application_info(&app)
+        .enabled_layer_names(&layers)
+        .enabled_extension_names(&extensions);
+    if validation {
+        create = create.push_next(&mut features);
+    }
+    // SAFETY: `create` and all it points to live until the call returns.
+    let instance = unsafe { entry.create_instance(&create, None) }
+        .map_err(|code| Error::NoDevice(format!("vkCreateInstance failed: {code}")))?;
+    Ok(Instance { entry, instance })
+}
+
+fn c_chars(text: &[std::ffi::c_char]) -> String {
+    text.iter().take_while(|c| **c != 0).map(|c| char::from(*c as u8)).collect()
+}
+
+fn describe(instance: &ash::Instance, index: usize, physical: vk::PhysicalDevice) -> DeviceInfo {
+    let mut driver = vk::PhysicalDeviceDriverProperties::default();
+    let mut ids = vk::PhysicalDeviceIDProperties::default();
+    let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
+    let mut props =
+        vk::PhysicalDeviceProperties2::default().push_next(&mut driver).push_next(&mut ids).push_next(&mut subgroup);
+    // SAFETY: `physical` comes from this instance; the chain lives until the call returns.
+    unsafe { instance.get_physical_device_properties2(physical, &mut props) };
+    let properties = props.properties;
+    let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut f12);
+    // SAFETY: as above.
+    unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    // SAFETY: as above.
+    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
+    // SAFETY: as above.
+    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
+    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
+    let limits = properties.limits;
+    let version = properties.api_version;
+    let unusable = if version < vk::API_VERSION_1_2 {
+        Some("Vulkan 1.2 is needed".to_owned())
+    } else if f12.timeline_semaphore == vk::FALSE {
+        Some("timeline semaphores are needed".to_owned())
+    } else if compute_family(instance, physical).is_none() {
+        Some("it has no compute queue".to_owned())
+    } else {
+        None
+    };
+    let driver_info = c_chars(&driver.driver_info);
+    DeviceInfo {
+        index,
+        name: c_chars(&properties.device_name),
+        kind: match properties.device_type {
+            vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
+            vk::PhysicalDeviceType::INTEGRATED_GPU => "integrated",
+            vk::PhysicalDeviceType::VIRTUAL_GPU => "virtual",
+            vk::PhysicalDeviceType::CPU => "cpu",
+            _ => "other",
+        },
+        uuid: ids.device_uuid.iter().map(|b| format!("{b:02x}")).collect(),
+        mesa_major: driver_info.strip_prefix("Mesa ").and_then(|v| v.split('.').next()).and_then(|v| v.parse().ok()),
+        driver: format!("{} {}", c_chars(&driver.driver_name), driver_info),
+        api_version: format!(
+            "{}.{}.{}",
+            vk::api_version_major(version),
+            vk::api_version_minor(version),
+            vk::api_version_patch(version)
+        ),
+        is_llvmpipe: driver.driver_id == vk::DriverId::MESA_LLVMPIPE,
+        subgroup_size: subgroup.subgroup_size,
+        max_shared_memory: limits.max_compute_shared_memory_size,
+        max_workgroup_invocations: limits.max_compute_work_group_invocations,
+        max_workgroup_count: limits.max_compute_work_group_count[0],
+        max_storage_buffer_range: limits.max_storage_buffer_range,
+        max_texel_buffer_elements: limits.max_texel_buffer_elements,
+        max_push_constants: limits.max_push_constants_size,
+        timestamp_period_ns: if limits.timestamp_compute_and_graphics == vk::TRUE {
+            limits.timestamp_period
+        } else {
+            0.0
+        },
+        device_memory: memory.memory_heaps[..memory.memory_heap_count as usize]
+            .iter()
+            .filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
+            .map(|h| h.size)
+            .sum(),
+        cooperative_matrix: has(khr::cooperative_matrix::NAME),
+        float16: f12.shader_float16 == vk::TRUE,
+        float_atomics: has(ext::shader_atomic_float::NAME),
+        unusable,
+    }
+}
+
+fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<u32> {
+    // SAFETY: `physical` comes from this instance.
+    let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
+    families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE)).map(|i| i as u32)
+}
+
+fn enumerate(instance: &ash::Instance) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)>> {
+    // SAFETY: the instance is alive.
+    let physical = unsafe { instance.enumerate_physical_devices() }
+        .map_err(|code| Error::NoDevice(format!("vkEnumeratePhysicalDevices failed: {code}")))?;
+    Ok(physical.into_iter().enumerate().map(|(i, p)| (p, describe(instance, i, p))).collect())
+}
+
+/// Lists every device the loader offers, usable or not.
+///
+/// # Errors
+/// [`Error::NoDevice`] when there is no Vulkan loader.
+pub fn list_devices() -> Result<Vec<DeviceInfo>> {
+    let Instance { entry, instance } = create_instance(false)?;
+    let found = enumerate(&instance).map(|all| all.into_iter().map(|(_, info)| info).collect());
+    // SAFETY: nothing made from the instance survives.
+    unsafe { instance.destroy_instance(None) };
+    drop(entry);
+    found
+}
+
+fn choose(
+    all: Vec<(vk::PhysicalDevice, DeviceInfo)>,
+    select: Option<&str>,
+) -> Result<(vk::PhysicalDevice, DeviceInfo)> {
+    let names = || {
+        if all.is_empty() {
+            "the loader offers none: install a driver (Debian: mesa-vulkan-drivers for a CPU driver)".to_owned()
+        } else {
+            let list: Vec<_> = all.iter().map(|(_, d)| format!("{} = {}", d.index, d.name)).collect();
+            format!("found: {}", list.join(", "))
+        }
+    };
+    let rank = |d: &DeviceInfo| match d.kind {
+        "discrete" => 0,
+        "integrated" => 1,
+        "virtual" => 2,
+        _ => 3,
+    };
+    let wanted = select.map(str::to_lowercase);
+    let chosen = match &wanted {
+        None => all.iter().filter(|(_, d)| d.unusable.is_none()).min_by_key(|(_, d)| rank(d)),
+        Some(text) => all.iter().find(|(_, d)| {
+            d.index.to_string() == *text || d.uuid == text.replace('-', "") || d.name.to_lowercase().contains(text)
+        }),
+    };
+    match chosen {
+        None => Err(Error::NoDevice(match select {
+            Some(text) => format!("no device matches `{text}` ({})", names()),
+            None => names(),
+        })),
+        Some((_, DeviceInfo { name, unusable: Some(why), .. })) => Err(Error::NoDevice(format!("{name}: {why}"))),
+        Some(found) => Ok(found.clone()),
+    }
+}
+
+unsafe extern "system" fn on_message(
+    _severity: vk::DebugUtilsMessageSeverityFlagsEXT,
+    _kind: vk::DebugUtilsMessageTypeFlagsEXT,
+    data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
+    user: *mut c_void,
+) -> vk::Bool32 {
+    // SAFETY: the layer passes valid data; `user` is the boxed mutex, alive as long as the messenger.
+    let (data, sink) = unsafe { (&*data, &*user.cast::<Mutex<Vec<String>>>()) };
+    // SAFETY: the layer guarantees a valid text or none.
+    let text = unsafe { data.message_as_c_str() }.map_or(String::new(), |t| t.to_string_lossy().into_owned());
+    tracing::error!(target: "vulkan", "{text}");
+    lock(sink).push(text);
+    vk::FALSE
+}
+
+impl Gpu {
+    /// Opens a device.
+    ///
+    /// # Errors
+    /// [`Error::NoDevice`] when none fits, with the list of those found.
+    pub fn open(options: &DeviceOptions) -> Result<Gpu> {
+        let Instance { entry, instance } = create_instance(options.validation)?;
+        let opened = Self::open_on(&entry, &instance, options);
+        match opened {
+            Ok(parts) => Ok(Gpu { shared: Arc::new(parts(entry, instance)) }),
+            Err(e) => {
+                // SAFETY: nothing made from the instance survives a failed `open_on`.
+                unsafe { instance.destroy_instance(None) };
+                Err(e)
+            }
+        }
+    }
+
+    fn open_on(
+        entry: &ash::Entry,
+        instance: &ash::Instance,
+        options: &DeviceOptions,
+    ) -> Result<impl FnOnce(ash::Entry, ash::Instance) -> Shared + use<>> {
+        let (physical, info) = choose(enumerate(instance)?, options.select.as_deref())?;
+        let queue_family = compute_family(instance, physical)
+            .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?;
+        let priorities = [1.0];
+        let queues =
+            [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(&priorities)];
+        let mut f12 = vk::PhysicalDeviceVulkan12Features::default().timeline_semaphore(true);
+        let create = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut f12);
+        // SAFETY: the chain lives until the call returns; the features were checked in `describe`.
+        let device = unsafe { instance.create_device(physical, &create, None) }
+            .map_err(Error::vulkan("vkCreateDevice", &info.name))?;
+        // SAFETY: the family was requested with one queue.
+        let queue = unsafe { device.get_device_queue(queue_family, 0) };
+        let allocator = Allocator::new(&AllocatorCreateDesc {
+            instance: instance.clone(),
+            device: device.clone(),
+            physical_device: physical,
+            debug_settings: Default::default(),
+            buffer_device_address: false,
+            allocation_sizes: Default::default(),
+        })
+        .map_err(|e| Error::Internal(format!("gpu-allocator: {e}")))?;
+        let mut kind =
+            vk::SemaphoreTypeCreateInfo::default().semaphore_type(vk::SemaphoreType::TIMELINE).initial_value(0);
+        // SAFETY: the device is alive; timeline semaphores are enabled.
+        let timeline =
+            unsafe { device.create_semaphore(&vk::SemaphoreCreateInfo::default().push_next(&mut kind), None) }
+                .map_err(Error::vulkan("vkCreateSemaphore", "timeline"))?;
+        let cache_file = options
+            .cache_dir
+            .as_ref()
+            .map(|dir| dir.join(format!("pipelines-{}-{}.bin", info.uuid, env!("CARGO_PKG_VERSION"))));
+        // An unreadable or foreign cache is ignored by the driver, which checks its header.
+        let cached = cache_file.as_ref().and_then(|f| std::fs::read(f).ok()).unwrap_or_default();
+        // SAFETY: `cached` lives until the call returns.
+        let pipeline_cache = unsafe {
+            device.create_pipeline_cache(&vk::PipelineCacheCreateInfo::default().initial_data(&cached), None)
+        }
+        .map_err(Error::vulkan("vkCreatePipelineCache", &info.name))?;
+        let messages = Box::new(Mutex::new(Vec::new()));
+        let mut messenger = None;
+        let mut debug_names = None;
+        if options.validation {
+            let debug = ext::debug_utils::Instance::new(entry, instance);
+            let create = vk::DebugUtilsMessengerCreateInfoEXT::default()
+                .message_severity(
+                    vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
+                )
+                .message_type(
+                    vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
+                )
+                .pfn_user_callback(Some(on_message))
+                .user_data(std::ptr::from_ref::<Mutex<Vec<String>>>(&messages).cast_mut().cast());
+            // SAFETY: the callback and its data outlive the messenger, which `Shared::drop` destroys first.
+            let handle = unsafe { debug.create_debug_utils_messenger(&create, None) }
+                .map_err(Error::vulkan("vkCreateDebugUtilsMessengerEXT", "messenger"))?;
+            messenger = Some((debug, handle));
+            debug_names = Some(ext::debug_utils::Device::new(instance, &device));
+        }
+        Ok(move |entry, instance| Shared {
+            device,
+            debug_names,
+            queue: Mutex::new(queue),
+            queue_family,
+            allocator: Mutex::new(ManuallyDrop::new(allocator)),
+            pipeline_cache,
+            timeline,
+            last_submitted: AtomicU64::new(0),
+            live_objects: AtomicU64::new(0),
+            info,
+            cache_file,
+            messenger,
+            messages,
+            instance,
+            _entry: entry,
+        })
+    }
+
+    /// What this device is and can do.
+    pub fn info(&self) -> &DeviceInfo {
+        &self.shared.info
+    }
+
+    /// Errors and warnings of the validation layer so far; empty without validation.
+    pub fn validation_messages(&self) -> Vec<String> {
+        lock(&self.shared.messages).clone()
+    }
+
+    /// Buffers, pipelines and recordings alive at the moment; 0 once all are dropped.
+    pub fn live_objects(&self) -> u64 {
+        self.shared.live_objects.load(Ordering::Relaxed)
+    }
+
+    /// Writes the pipeline cache to disk so that the next start compiles nothing.
+    ///
+    /// # Errors
+    /// [`Error::Io`] when the directory cannot be written.
+    pub fn save_pipeline_cache(&self) -> Result<()> {
+        let Some(file) = &self.shared.cache_file else {
+            return Ok(());
+        };
+        // SAFETY: the cache belongs to this device.
+        let data = unsafe { self.shared.device.get_pipeline_cache_data(self.shared.pipeline_cache) }
+            .map_err(Error::vulkan("vkGetPipelineCacheData", "pipeline cache"))?;
+        crate::files::write_atomic(file, &data)
+    }
+}
+
+impl Shared {
+    pub(super) fn set_name<H: vk::Handle>(&self, handle: H, name: &str) {
+        if let (Some(debug), Ok(name)) = (&self.debug_names, CString::new(name)) {
+            let info = vk::DebugUtilsObjectNameInfoEXT::default().object_handle(handle).object_name(&name);
+            // A missing name only makes messages less readable, so a failure is not an error.
+            // SAFETY: the handle belongs to this device.
+            let _ = unsafe { debug.set_debug_utils_object_name(&info) };
+        }
+    }
+
+    pub(super) fn track(&self) {
+        self.live_objects.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(super) fn untrack(&self) {
+        self.live_objects.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+impl Drop for Shared {
+    fn drop(&mut self) {
+        let leaked = self.live_objects.load(Ordering::Relaxed);
+        if leaked > 0 {
+            tracing::error!(target: "vulkan", "{leaked} device objects were never freed");
+        }
+        // SAFETY: every object made from the device holds an `Arc` of this struct, so none is left;
+        // the queue is idle once the wait returns.
+        unsafe {
+            let _ = self.device.device_wait_idle();
+            ManuallyDrop::drop(&mut *lock(&self.allocator));
+            self.device.destroy_pipeline_cache(self.pipeline_cache, None);
+            self.device.destroy_semaphore(self.timeline, None);
+            self.device.destroy_device(None);
+            if let Some((debug, messenger)) = self.messenger.take() {
+                debug.destroy_debug_utils_messenger(messenger, None);
+            }
+            self.instance.destroy_instance(None);
+        }
+    }
+}

@@ -1,0 +1,158 @@
+//! One compute pipeline: SPIR-V, specialisation constants, binding table, limit checks.
+
+use super::device::{Gpu, Shared};
+use crate::error::{Error, Result};
+use ash::vk;
+use std::sync::Arc;
+
+/// A compiled shader with what reflection found in it.
+#[derive(Debug)]
+pub struct KernelCode {
+    /// Stage name: shader file, debug label and bench row share it.
+    pub name: &'static str,
+    /// SPIR-V bytes.
+    pub spirv: &'static [u8],
+    /// Bytes of push constants.
+    pub push_bytes: u32,
+    /// Buffers the shader uses.
+    pub bindings: &'static [BindingCode],
+    /// Name and id of each specialisation constant.
+    pub spec_constants: &'static [(&'static str, u32)],
+}
+
+/// One buffer a shader uses.
+#[derive(Debug)]
+pub struct BindingCode {
+    /// Binding number.
+    pub slot: u32,
+    /// Name in the shader.
+    pub name: &'static str,
+    /// Read through a texel-buffer view instead of as a storage buffer.
+    pub texel: bool,
+    /// The shader may read it.
+    pub reads: bool,
+    /// The shader may write it.
+    pub writes: bool,
+}
+
+/// A pipeline ready to be recorded.
+pub struct Pipeline {
+    gpu: Arc<Shared>,
+    pub(super) code: &'static KernelCode,
+    pub(super) raw: vk::Pipeline,
+    pub(super) layout: vk::PipelineLayout,
+    pub(super) set_layout: vk::DescriptorSetLayout,
+    /// Invocations per workgroup along x.
+    pub local_size: u32,
+}
+
+impl Gpu {
+    /// Builds a pipeline. `spec` gives values by name; constants not named keep the shader's default.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for an unknown constant, [`Error::Config`] beyond device limits,
+    /// [`Error::Vulkan`] when the driver refuses the shader.
+    pub fn pipeline(&self, code: &'static KernelCode, local_size: u32, spec: &[(&str, u32)]) -> Result<Pipeline> {
+        let info = self.info();
+        if local_size == 0 || local_size > info.max_workgroup_invocations || code.push_bytes > info.max_push_constants {
+            return Err(Error::Internal(format!(
+                "kernel {}: {local_size} invocations and {} bytes of push constants exceed {}",
+                code.name, code.push_bytes, info.name
+            )));
+        }
+        let mut entries = Vec::new();
+        let mut values: Vec<u32> = Vec::new();
+        for (name, value) in [("local_size_x", local_size)].iter().chain(spec) {
+            let (_, id) = code.spec_constants.iter().find(|(n, _)| n == name).ok_or_else(|| {
+                Error::Internal(format!("kernel {} has no specialisation constant `{name}`", code.name))
+            })?;
+            entries
+                .push(vk::SpecializationMapEntry::default().constant_id(*id).offset(4 * values.len() as u32).size(4));
+            values.push(*value);
+        }
+        let shared = &self.shared;
+        let device = &shared.device;
+        let slots: Vec<_> = code
+            .bindings
+            .iter()
+            .map(|b| {
+                vk::DescriptorSetLayoutBinding::default()
+                    .binding(b.slot)
+                    .descriptor_type(descriptor_type(b))
+                    .descriptor_count(1)
+                    .stage_flags(vk::ShaderStageFlags::COMPUTE)
+            })
+            .collect();
+        shared.track();
+        // From here on `Pipeline::drop` cleans up; null handles are ignored by Vulkan's destroy calls.
+        let mut pipeline = Pipeline {
+            gpu: shared.clone(),
+            code,
+            raw: vk::Pipeline::null(),
+            layout: vk::PipelineLayout::null(),
+            set_layout: vk::DescriptorSetLayout::null(),
+            local_size,
+        };
+        let create = vk::DescriptorSetLayoutCreateInfo::default().bindings(&slots);
+        // SAFETY: the create info and its slices live until the call returns.
+        pipeline.set_layout = unsafe { device.create_descriptor_set_layout(&create, None) }
+            .map_err(Error::vulkan("vkCreateDescriptorSetLayout", code.name))?;
+        let sets = [pipeline.set_layout];
+        let ranges =
+            [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(code.push_bytes)];
+        let mut create = vk::PipelineLayoutCreateInfo::default().set_layouts(&sets);
+        if code.push_bytes > 0 {
+            create = create.push_constant_ranges(&ranges);
+        }
+        // SAFETY: as above.
+        pipeline.layout = unsafe { device.create_pipeline_layout(&create, None) }
+            .map_err(Error::vulkan("vkCreatePipelineLayout", code.name))?;
+        let words: Vec<u32> = bytemuck::pod_collect_to_vec(code.spirv);
+        // SAFETY: the words are valid SPIR-V, made by shaderc at build time.
+        let module = unsafe { device.create_shader_module(&vk::ShaderModuleCreateInfo::default().code(&words), None) }
+            .map_err(Error::vulkan("vkCreateShaderModule", code.name))?;
+        let specialization =
+            vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&values));
+        let stage = vk::PipelineShaderStageCreateInfo::default()
+            .stage(vk::ShaderStageFlags::COMPUTE)
+            .module(module)
+            .name(c"main")
+            .specialization_info(&specialization);
+        let create = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(pipeline.layout)];
+        // SAFETY: as above; the module is alive during the call.
+        let made = unsafe { device.create_compute_pipelines(shared.pipeline_cache, &create, None) };
+        // SAFETY: a module is no longer needed once the pipeline exists.
+        unsafe { device.destroy_shader_module(module, None) };
+        pipeline.raw = made
+            .map_err(|(_, code)| code)
+            .map_err(Error::vulkan("vkCreateComputePipelines", code.name))?
+            .into_iter()
+            .next()
+            .unwrap_or_default();
+        shared.set_name(pipeline.raw, code.name);
+        Ok(pipeline)
+    }
+}
+
+impl Pipeline {
+    /// Buffers the shader uses.
+    pub fn bindings(&self) -> &'static [BindingCode] {
+        self.code.bindings
+    }
+}
+
+pub(super) fn descriptor_type(binding: &BindingCode) -> vk::DescriptorType {
+    if binding.texel { vk::DescriptorType::UNIFORM_TEXEL_BUFFER } else { vk::DescriptorType::STORAGE_BUFFER }
+}
+
+impl Drop for Pipeline {
+    fn drop(&mut self) {
+        // SAFETY: recordings hold an `Arc` of the pipelines they use; null handles are allowed.
+        unsafe {
+            self.gpu.device.destroy_pipeline(self.raw, None);
+            self.gpu.device.destroy_pipeline_layout(self.layout, None);
+            self.gpu.device.destroy_descriptor_set_layout(self.set_layout, None);
+        }
+        self.gpu.untrack();
+    }
+}

@@ -1,0 +1,463 @@
+//! A recording of dispatches. Each states what it reads and writes (from the shader's own
+//! qualifiers); barriers follow from that.
+
+use super::device::{Gpu, Shared, lock};
+use super::memory::Buffer;
+use super::pipeline::{Pipeline, descriptor_type};
+use crate::error::{Error, Result};
+use ash::vk;
+use std::collections::HashSet;
+use std::ffi::CString;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+/// How many workgroups to run.
+pub enum Groups<'a> {
+    /// Known now.
+    Direct([u32; 3]),
+    /// Read by the device from three `u32` at a byte offset.
+    Indirect(&'a Buffer, u64),
+}
+
+/// Time one pass took on the device.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct PassTime {
+    /// Stage name.
+    pub name: &'static str,
+    /// Milliseconds.
+    pub ms: f64,
+}
+
+/// Commands being recorded.
+pub struct Recording {
+    commands: Commands,
+    read: HashSet<vk::Buffer>,
+    written: HashSet<vk::Buffer>,
+    timed: Option<u32>,
+}
+
+/// Finished commands; may be submitted any number of times.
+pub struct Commands {
+    gpu: Arc<Shared>,
+    name: String,
+    pool: vk::CommandPool,
+    raw: vk::CommandBuffer,
+    descriptor_pools: Vec<vk::DescriptorPool>,
+    queries: vk::QueryPool,
+    passes: Vec<&'static str>,
+    buffers: Vec<Buffer>,
+    pipelines: Vec<Arc<Pipeline>>,
+    last_submit: std::sync::atomic::AtomicU64,
+}
+
+const SETS_PER_POOL: u32 = 64;
+const MAX_BINDINGS: u32 = 16;
+
+impl Recording {
+    /// Starts recording on `gpu`.
+    ///
+    /// # Errors
+    /// [`Error::Vulkan`] or [`Error::OutOfMemory`].
+    pub fn new(gpu: &Gpu, name: &str) -> Result<Recording> {
+        Self::start(gpu, name, None)
+    }
+
+    /// Like [`Recording::new`], with a timestamp around each of at most `max_passes` dispatches.
+    ///
+    /// # Errors
+    /// As [`Recording::new`].
+    pub fn timed(gpu: &Gpu, name: &str, max_passes: u32) -> Result<Recording> {
+        Self::start(gpu, name, (gpu.info().timestamp_period_ns > 0.0).then_some(max_passes))
+    }
+
+    fn start(gpu: &Gpu, name: &str, timed: Option<u32>) -> Result<Recording> {
+        let shared = &gpu.shared;
+        shared.track();
+        // From here on `Commands::drop` cleans up.
+        let mut commands = Commands {
+            gpu: shared.clone(),
+            name: name.to_owned(),
+            pool: vk::CommandPool::null(),
+            raw: vk::CommandBuffer::null(),
+            descriptor_pools: Vec::new(),
+            queries: vk::QueryPool::null(),
+            passes: Vec::new(),
+            buffers: Vec::new(),
+            pipelines: Vec::new(),
+            last_submit: std::sync::atomic::AtomicU64::new(0),
+        };
+        let device = &shared.device;
+        let create = vk::CommandPoolCreateInfo::default().queue_family_index(shared.queue_family);
+        // SAFETY: the device is alive; the family is the one it was made with.
+        commands.pool =
+            unsafe { device.create_command_pool(&create, None) }.map_err(Error::vulkan("vkCreateCommandPool", name))?;
+        let allocate = vk::CommandBufferAllocateInfo::default().command_pool(commands.pool).command_buffer_count(1);
+        // SAFETY: the pool was just made and is used by this thread alone.
+        commands.raw = unsafe { device.allocate_command_buffers(&allocate) }
+            .map_err(Error::vulkan("vkAllocateCommandBuffers", name))?[0];
+        shared.set_name(commands.raw, name);
+        // Two submits of the same commands may be in flight.
+        let begin = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::SIMULTANEOUS_USE);
+        // SAFETY: the buffer is in the initial state.
+        unsafe { device.begin_command_buffer(commands.raw, &begin) }
+            .map_err(Error::vulkan("vkBeginCommandBuffer", name))?;
+        if let Some(passes) = timed {
+            let create =
+                vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(2 * passes);
+            // SAFETY: the device is alive and its queue has timestamps.
+            commands.queries =
+                unsafe { device.create_query_pool(&create, None) }.map_err(Error::vulkan("vkCreateQueryPool", name))?;
+            // SAFETY: the command buffer is recording.
+            unsafe { device.cmd_reset_query_pool(commands.raw, commands.queries, 0, 2 * passes) };
+        }
+        let mut recording = Recording { commands, read: HashSet::new(), written: HashSet::new(), timed };
+        // Earlier submits may have left writes that this one reads.
+        recording.barrier();
+        Ok(recording)
+    }
+
+    fn barrier(&mut self) {
+        let access = vk::AccessFlags::SHADER_READ
+            | vk::AccessFlags::SHADER_WRITE
+            | vk::AccessFlags::TRANSFER_READ
+            | vk::AccessFlags::TRANSFER_WRITE;
+        let barrier = [vk::MemoryBarrier::default()
+            .src_access_mask(vk::AccessFlags::SHADER_WRITE | vk::AccessFlags::TRANSFER_WRITE)
+            .dst_access_mask(access | vk::AccessFlags::INDIRECT_COMMAND_READ)];
+        let work = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
+        // SAFETY: the command buffer is recording.
+        unsafe {
+            self.commands.gpu.device.cmd_pipeline_barrier(
+                self.commands.raw,
+                work,
+                work | vk::PipelineStageFlags::DRAW_INDIRECT,
+                vk::DependencyFlags::empty(),
+                &barrier,
+                &[],
+                &[],
+            );
+        }
+        self.read.clear();
+        self.written.clear();
+    }
+
+    /// Declares the accesses of the next command; inserts a barrier when it depends on an earlier one.
+    fn depend(&mut self, reads: &[&Buffer], writes: &[&Buffer]) {
+        let hazard = reads.iter().any(|b| self.written.contains(&b.raw()))
+            || writes.iter().any(|b| self.written.contains(&b.raw()) || self.read.contains(&b.raw()));
+        if hazard {
+            self.barrier();
+        }
+        for buffer in reads {
+            self.read.insert(buffer.raw());
+            self.commands.buffers.push((*buffer).clone());
+        }
+        for buffer in writes {
+            self.written.insert(buffer.raw());
+            self.commands.buffers.push((*buffer).clone());
+        }
+    }
+
+    /// Records one dispatch. `buffers` are bound by the names the shader gives them.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when a name, a push-constant size or a group count does not fit the shader.
+    pub fn dispatch<P: bytemuck::Pod>(
+        &mut self,
+        pipeline: &Arc<Pipeline>,
+        groups: Groups<'_>,
+        buffers: &[(&str, &Buffer)],
+        push: &P,
+    ) -> Result<()> {
+        let code = pipeline.code;
+        let fault = |problem: String| Error::Internal(format!("kernel {}: {problem}", code.name));
+        if size_of::<P>() as u32 != code.push_bytes {
+            return Err(fault(format!("{} bytes of push constants, expected {}", size_of::<P>(), code.push_bytes)));
+        }
+        if let Some((name, _)) = buffers.iter().find(|(n, _)| !code.bindings.iter().any(|b| b.name == *n)) {
+            return Err(fault(format!("it has no binding `{name}`")));
+        }
+        let mut bound = Vec::with_capacity(code.bindings.len());
+        for binding in code.bindings {
+            let (_, buffer) = buffers
+                .iter()
+                .find(|(n, _)| *n == binding.name)
+                .ok_or_else(|| fault(format!("nothing is bound to `{}`", binding.name)))?;
+            bound.push((binding, *buffer));
+        }
+        let mut reads: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.reads).map(|(_, x)| *x).collect();
+        let writes: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.writes).map(|(_, x)| *x).collect();
+        if let Groups::Indirect(buffer, offset) = groups {
+            buffer.check_range(offset, 12)?;
+            reads.push(buffer);
+        }
+        self.depend(&reads, &writes);
+        let set = self.descriptor_set(pipeline, &bound)?;
+        let device = self.commands.gpu.device.clone();
+        let raw = self.commands.raw;
+        self.begin_pass(code.name)?;
+        // SAFETY: the command buffer is recording; pipeline, layout, set and buffers are kept alive by `commands`.
+        unsafe {
+            device.cmd_bind_pipeline(raw, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
+            device.cmd_bind_descriptor_sets(raw, vk::PipelineBindPoint::COMPUTE, pipeline.layout, 0, &[set], &[]);
+            if code.push_bytes > 0 {
+                let bytes = bytemuck::bytes_of(push);
+                device.cmd_push_constants(raw, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, bytes);
+            }
+            match groups {
+                Groups::Direct([x, y, z]) => device.cmd_dispatch(raw, x, y, z),
+                Groups::Indirect(buffer, offset) => device.cmd_dispatch_indirect(raw, buffer.raw(), offset),
+            }
+        }
+        self.end_pass(code.name);
+        self.commands.pipelines.push(pipeline.clone());
+        Ok(())
+    }
+
+    fn begin_pass(&mut self, name: &'static str) -> Result<()> {
+        if let Some(debug) = &self.commands.gpu.debug_names {
+            let label = CString::new(name).unwrap_or_default();
+            let label = vk::DebugUtilsLabelEXT::default().label_name(&label);
+            // SAFETY: the command buffer is recording.
+            unsafe { debug.cmd_begin_debug_utils_label(self.commands.raw, &label) };
+        }
+        if let Some(max) = self.timed {
+            let pass = self.commands.passes.len() as u32;
+            if pass >= max {
+                return Err(Error::Internal(format!("{}: more than {max} timed passes", self.commands.name)));
+            }
+            // A barrier after each pass keeps passes from overlapping, so that times are theirs alone.
+            self.barrier();
+            // SAFETY: the query was reset at the start of this recording.
+            unsafe {
+                self.commands.gpu.device.cmd_write_timestamp(
+                    self.commands.raw,
+                    vk::PipelineStageFlags::COMPUTE_SHADER,
+                    self.commands.queries,
+                    2 * pass,
+                );
+            }
+        }
+        Ok(())
+    }
+
+    fn end_pass(&mut self, name: &'static str) {
+        if self.timed.is_some() {
+            let pass = self.commands.passes.len() as u32;
+            // SAFETY: as in `begin_pass`.
+            unsafe {
+                self.commands.gpu.device.cmd_write_timestamp(
+                    self.commands.raw,
+                    vk::PipelineStageFlags::COMPUTE_SHADER,
+                    self.commands.queries,
+                    2 * pass + 1,
+                );
+            }
+            self.commands.passes.push(name);
+            self.barrier();
+        }
+        if let Some(debug) = &self.commands.gpu.debug_names {
+            // SAFETY: a label was opened in `begin_pass`.
+            unsafe { debug.cmd_end_debug_utils_label(self.commands.raw) };
+        }
+    }
+
+    fn descriptor_set(
+        &mut self,
+        pipeline: &Pipeline,
+        bound: &[(&super::pipeline::BindingCode, &Buffer)],
+    ) -> Result<vk::DescriptorSet> {
+        let device = &self.commands.gpu.device;
+        let layouts = [pipeline.set_layout];
+        let from = |pool| {
+            let allocate = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
+            // SAFETY: pool and layout are alive.
+            unsafe { device.allocate_descriptor_sets(&allocate) }.map(|sets| sets[0])
+        };
+        let set = match self.commands.descriptor_pools.last().map(|pool| from(*pool)) {
+            Some(Ok(set)) => set,
+            // No pool yet, or the last is full.
+            _ => {
+                let sizes = [vk::DescriptorType::STORAGE_BUFFER, vk::DescriptorType::UNIFORM_TEXEL_BUFFER]
+                    .map(|ty| vk::DescriptorPoolSize::default().ty(ty).descriptor_count(SETS_PER_POOL * MAX_BINDINGS));
+                let create = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_PER_POOL).pool_sizes(&sizes);
+                // SAFETY: the device is alive.
+                let pool = unsafe { device.create_descriptor_pool(&create, None) }
+                    .map_err(Error::vulkan("vkCreateDescriptorPool", &self.commands.name))?;
+                self.commands.descriptor_pools.push(pool);
+                from(pool).map_err(Error::vulkan("vkAllocateDescriptorSets", pipeline.code.name))?
+            }
+        };
+        let infos: Vec<_> = bound
+            .iter()
+            .map(|(_, buffer)| [vk::DescriptorBufferInfo::default().buffer(buffer.raw()).range(vk::WHOLE_SIZE)])
+            .collect();
+        let mut views = Vec::with_capacity(bound.len());
+        for (binding, buffer) in bound {
+            views.push([match (binding.texel, buffer.texel_view()) {
+                (false, _) => vk::BufferView::null(),
+                (true, Some(view)) => view,
+                (true, None) => {
+                    return Err(Error::Internal(format!(
+                        "kernel {}: buffer `{}` for `{}` has no texel view",
+                        pipeline.code.name,
+                        buffer.name(),
+                        binding.name
+                    )));
+                }
+            }]);
+        }
+        let writes: Vec<_> = bound
+            .iter()
+            .zip(infos.iter().zip(&views))
+            .map(|((binding, _), (info, view))| {
+                let write = vk::WriteDescriptorSet::default()
+                    .dst_set(set)
+                    .dst_binding(binding.slot)
+                    .descriptor_type(descriptor_type(binding));
+                if binding.texel { write.texel_buffer_view(view) } else { write.buffer_info(info) }
+            })
+            .collect();
+        // SAFETY: the set is not in use; infos and views live until the call returns.
+        unsafe { device.update_descriptor_sets(&writes, &[]) };
+        Ok(set)
+    }
+
+    /// Records a copy of `bytes` bytes.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when a range does not fit.
+    pub fn copy(&mut self, from: &Buffer, from_at: u64, to: &Buffer, to_at: u64, bytes: u64) -> Result<()> {
+        from.check_range(from_at, bytes)?;
+        to.check_range(to_at, bytes)?;
+        self.depend(&[from], &[to]);
+        let region = [vk::BufferCopy::default().src_offset(from_at).dst_offset(to_at).size(bytes)];
+        // SAFETY: ranges were checked; the command buffer is recording.
+        unsafe { self.commands.gpu.device.cmd_copy_buffer(self.commands.raw, from.raw(), to.raw(), &region) };
+        Ok(())
+    }
+
+    /// Records filling a whole buffer with a 32-bit pattern.
+    pub fn fill(&mut self, buffer: &Buffer, pattern: u32) {
+        self.depend(&[], &[buffer]);
+        // SAFETY: the command buffer is recording; sizes are multiples of 16.
+        unsafe {
+            self.commands.gpu.device.cmd_fill_buffer(self.commands.raw, buffer.raw(), 0, vk::WHOLE_SIZE, pattern);
+        }
+    }
+
+    /// Ends the recording.
+    ///
+    /// # Errors
+    /// [`Error::Vulkan`] or [`Error::OutOfMemory`].
+    pub fn finish(mut self) -> Result<Commands> {
+        // Makes the last writes visible to host reads of read-back buffers.
+        let barrier = [vk::MemoryBarrier::default()
+            .src_access_mask(vk::AccessFlags::SHADER_WRITE | vk::AccessFlags::TRANSFER_WRITE)
+            .dst_access_mask(vk::AccessFlags::HOST_READ)];
+        let commands = &mut self.commands;
+        // SAFETY: the command buffer is recording.
+        unsafe {
+            commands.gpu.device.cmd_pipeline_barrier(
+                commands.raw,
+                vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER,
+                vk::PipelineStageFlags::HOST,
+                vk::DependencyFlags::empty(),
+                &barrier,
+                &[],
+                &[],
+            );
+            commands.gpu.device.end_command_buffer(commands.raw)
+        }
+        .map_err(Error::vulkan("vkEndCommandBuffer", &commands.name))?;
+        Ok(self.commands)
+    }
+}
+
+/// A point in the device's work; see [`Gpu::wait`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Ticket(u64);
+
+impl Commands {
+    /// Hands the commands to the device.
+    ///
+    /// # Errors
+    /// [`Error::DeviceLost`], [`Error::OutOfMemory`] or [`Error::Vulkan`].
+    pub fn submit(&self) -> Result<Ticket> {
+        let shared = &self.gpu;
+        let queue = lock(&shared.queue);
+        let value = shared.last_submitted.load(Ordering::Acquire) + 1;
+        let (values, semaphores, buffers) = ([value], [shared.timeline], [self.raw]);
+        let mut timeline = vk::TimelineSemaphoreSubmitInfo::default().signal_semaphore_values(&values);
+        let submit = [vk::SubmitInfo::default()
+            .command_buffers(&buffers)
+            .signal_semaphores(&semaphores)
+            .push_next(&mut timeline)];
+        // SAFETY: the queue is locked; the commands allow simultaneous use and outlive the submit (see Drop).
+        unsafe { shared.device.queue_submit(*queue, &submit, vk::Fence::null()) }
+            .map_err(Error::vulkan("vkQueueSubmit", &self.name))?;
+        shared.last_submitted.store(value, Ordering::Release);
+        self.last_submit.store(value, Ordering::Release);
+        Ok(Ticket(value))
+    }
+
+    /// Device time of each pass of the last submit, which must be complete. Empty without timestamps.
+    ///
+    /// # Errors
+    /// [`Error::Vulkan`].
+    pub fn pass_times(&self) -> Result<Vec<PassTime>> {
+        if self.passes.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut ticks = vec![0u64; 2 * self.passes.len()];
+        let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
+        // SAFETY: the pool has at least this many queries, all written by the submit.
+        unsafe { self.gpu.device.get_query_pool_results(self.queries, 0, &mut ticks, flags) }
+            .map_err(Error::vulkan("vkGetQueryPoolResults", &self.name))?;
+        let period_ms = f64::from(self.gpu.info.timestamp_period_ns) * 1e-6;
+        Ok(self
+            .passes
+            .iter()
+            .zip(ticks.chunks_exact(2))
+            .map(|(name, t)| PassTime { name, ms: t[1].saturating_sub(t[0]) as f64 * period_ms })
+            .collect())
+    }
+}
+
+impl Gpu {
+    /// Waits until the work up to `ticket` is done.
+    ///
+    /// # Errors
+    /// [`Error::DeviceLost`] or [`Error::Vulkan`].
+    pub fn wait(&self, ticket: Ticket) -> Result<()> {
+        self.shared.wait(ticket.0)
+    }
+}
+
+impl Shared {
+    fn wait(&self, value: u64) -> Result<()> {
+        let (semaphores, values) = ([self.timeline], [value]);
+        let wait = vk::SemaphoreWaitInfo::default().semaphores(&semaphores).values(&values);
+        // SAFETY: the semaphore is a timeline semaphore of this device.
+        unsafe { self.device.wait_semaphores(&wait, u64::MAX) }.map_err(Error::vulkan("vkWaitSemaphores", "timeline"))
+    }
+}
+
+impl Drop for Commands {
+    fn drop(&mut self) {
+        let submitted = self.last_submit.load(Ordering::Acquire);
+        if submitted > 0 {
+            // After a lost device nothing runs any more, so destroying is allowed all the same.
+            let _ = self.gpu.wait(submitted);
+        }
+        // SAFETY: the last submit is complete; null handles are ignored.
+        unsafe {
+            for pool in &self.descriptor_pools {
+                self.gpu.device.destroy_descriptor_pool(*pool, None);
+            }
+            self.gpu.device.destroy_query_pool(self.queries, None);
+            self.gpu.device.destroy_command_pool(self.pool, None);
+        }
+        self.gpu.untrack();
+    }
+}

@@ -1,0 +1,214 @@
+//! The compute stages. A stage has one name everywhere: shader file, field of [`Kernels`], CPU twin,
+//! debug label and bench row. Buffers are found by the names the shaders give them.
+
+use crate::error::{Error, Result};
+use crate::gpu::device::{DeviceInfo, Gpu};
+use crate::gpu::memory::Buffer;
+use crate::gpu::pipeline::{BindingCode, KernelCode, Pipeline};
+use crate::gpu::record::{Groups, Recording};
+use bytemuck::Pod;
+use serde::Serialize;
+use std::collections::HashMap;
+use std::sync::Arc;
+
+include!(concat!(env!("OUT_DIR"), "/kernel_table.rs"));
+
+/// Neurons a lane of `mlp_layer_fwd` computes; `OUTPUTS` there.
+pub const FWD_OUTPUTS: u32 = 16;
+/// Input groups (vec4) a lane of `mlp_layer_bwd_input` computes; `GROUPS` there.
+pub const BWD_GROUPS: u32 = 4;
+/// Samples a lane of the layer kernels keeps; `SAMPLES` there.
+pub const LANE_SAMPLES: u32 = 4;
+/// Side of the register tile of `mlp_layer_bwd_weight`.
+pub const WEIGHT_TILE: u32 = 8;
+/// Lanes that share the depths of a ray in `march_count` and `march_emit`.
+pub const MARCH_LANES: u32 = 32;
+
+/// Sizes and variants chosen for a device, with the reasons.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Tuning {
+    /// Read weights and activations through texel buffers.
+    pub texel: bool,
+    /// Invocations of a workgroup of the layer kernels.
+    pub layer_lanes: u32,
+    /// Invocations of a workgroup of the weight-gradient kernels.
+    pub weight_lanes: u32,
+    /// Parts the samples are split into for weight gradients.
+    pub splits: u32,
+    /// One sentence per choice.
+    pub reasons: Vec<String>,
+}
+
+impl Tuning {
+    /// Chooses for a device.
+    pub fn for_device(info: &DeviceInfo) -> Tuning {
+        let old_lavapipe = info.is_llvmpipe && info.mesa_major.is_some_and(|v| v < 24);
+        let mut reasons = Vec::new();
+        reasons.push(if old_lavapipe {
+            "operands through texel buffers: this llvmpipe reads storage buffers lane by lane".to_owned()
+        } else {
+            "operands through storage buffers".to_owned()
+        });
+        let (layer_lanes, weight_lanes, splits) = if info.is_llvmpipe {
+            reasons.push("one subgroup per workgroup and few splits: a CPU has few workgroups in flight".into());
+            (info.subgroup_size.clamp(4, 16), info.subgroup_size.clamp(4, 16), 4)
+        } else {
+            (64, 32, 16)
+        };
+        reasons.push("f32 layers: the cooperative-matrix path does not exist yet".into());
+        reasons.push("static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into());
+        Tuning { texel: old_lavapipe, layer_lanes, weight_lanes, splits, reasons }
+    }
+
+    /// Samples one workgroup of the layer kernels covers.
+    pub fn tile_samples(&self) -> u32 {
+        self.layer_lanes * LANE_SAMPLES
+    }
+}
+
+/// Buffers under the names the shaders use.
+#[derive(Clone, Default)]
+pub struct Buffers {
+    by_name: HashMap<&'static str, Buffer>,
+}
+
+impl Buffers {
+    /// Adds or replaces a buffer.
+    pub fn set(&mut self, name: &'static str, buffer: Buffer) {
+        self.by_name.insert(name, buffer);
+    }
+
+    /// A buffer by name.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when it was never set.
+    pub fn get(&self, name: &str) -> Result<&Buffer> {
+        self.by_name.get(name).ok_or_else(|| Error::Internal(format!("no buffer is called `{name}`")))
+    }
+}
+
+/// Finds a compiled kernel by its name.
+///
+/// # Errors
+/// [`Error::Internal`] for an unknown name.
+pub fn kernel_code(name: &str) -> Result<&'static KernelCode> {
+    KERNEL_TABLE.iter().find(|k| k.name == name).ok_or_else(|| Error::Internal(format!("no kernel is called `{name}`")))
+}
+
+macro_rules! stages {
+    ($($(#[$doc:meta])* $stage:ident($local:expr, $texel:ident $(, $spec:expr)?);)*) => {
+        /// Every stage's pipeline.
+        pub struct Kernels {
+            /// Choices they were built with.
+            pub tuning: Tuning,
+            $($(#[$doc])* pub $stage: Arc<Pipeline>,)*
+        }
+
+        impl Kernels {
+            /// Builds all pipelines for a device.
+            ///
+            /// # Errors
+            /// Errors of [`Gpu::pipeline`].
+            pub fn new(gpu: &Gpu, tuning: Tuning) -> Result<Kernels> {
+                let t = &tuning;
+                let make = |name: &str, texel: bool, local: u32, spec: &[(&str, u32)]| {
+                    let code = kernel_code(&if texel { format!("{name}_texel") } else { name.to_owned() })?;
+                    gpu.pipeline(code, local, spec).map(Arc::new)
+                };
+                Ok(Kernels {
+                    $($stage: {
+                        let local: fn(&Tuning) -> u32 = $local;
+                        #[allow(unused_mut, unused_assignments, reason = "only some stages have constants")]
+                        let mut spec: &[(&str, u32)] = &[];
+                        $(spec = $spec;)?
+                        make(stages!(@name $stage), stages!(@$texel t), local(t), spec)?
+                    },)*
+                    tuning,
+                })
+            }
+        }
+    };
+    (@name march_fwd_maxima) => { "march_fwd" };
+    (@name $stage:ident) => { stringify!($stage) };
+    (@plain $t:ident) => { false };
+    (@operands $t:ident) => { $t.texel };
+}
+
+stages! {
+    /// Draws the rays of an iteration.
+    batch(|_| 64, plain);
+    /// Rays of a pose, for rendering.
+    pose_rays(|_| 64, plain);
+    /// Counts live dynamic samples.
+    march_count(|_| MARCH_LANES, plain);
+    /// Offsets and indirect arguments.
+    march_scan(|_| 256, plain);
+    /// Writes live samples.
+    march_emit(|_| MARCH_LANES, plain);
+    /// Positional encoding.
+    encode(|_| 64, plain);
+    /// Bias and latent, one row per phase.
+    mlp_latent_fwd(|_| 64, plain);
+    /// One hidden layer.
+    mlp_layer_fwd(|t| t.layer_lanes, operands);
+    /// Output neuron and activation.
+    mlp_out_fwd(|_| 64, operands);
+    /// Line integrals.
+    march_fwd(|_| 32, operands);
+    /// Line integrals and maxima, for rendering.
+    march_fwd_maxima(|_| 32, operands, &[("with_maxima", 1)]);
+    /// Residuals and their gradients.
+    loss(|_| 64, plain);
+    /// Scatter to planes and lines.
+    march_bwd(|_| 32, operands);
+    /// Gradient at the output neuron.
+    mlp_out_bwd(|_| 64, operands);
+    /// Weight gradient of the output neuron.
+    mlp_out_bwd_weight(|t| t.weight_lanes, operands);
+    /// Gradient to a layer's hidden input.
+    mlp_layer_bwd_input(|t| t.layer_lanes, operands);
+    /// Weight gradient of a hidden layer.
+    mlp_layer_bwd_weight(|t| t.weight_lanes, operands);
+    /// Sums over each ray's samples.
+    mlp_ray_sum(|_| 64, operands);
+    /// Sums over each phase's rays.
+    mlp_phase_sum(|_| 32, plain);
+    /// Gradients of biases, latent weights and latents.
+    mlp_latent_bwd(|_| 64, plain);
+    /// Collects the gradient.
+    gradient(|_| 64, plain);
+    /// Total variation.
+    reg_tv(|_| 64, plain);
+    /// The optimiser.
+    adam(|_| 64, plain);
+    /// Losses and step count.
+    report(|_| 256, plain);
+}
+
+/// Records `stage`, binding each buffer its shader names from `buffers`; `renamed` takes precedence.
+///
+/// # Errors
+/// Errors of [`Recording::dispatch`].
+pub fn dispatch<P: Pod>(
+    recording: &mut Recording,
+    stage: &Arc<Pipeline>,
+    groups: Groups<'_>,
+    buffers: &Buffers,
+    renamed: &[(&str, &str)],
+    push: P,
+) -> Result<()> {
+    let bound = stage
+        .bindings()
+        .iter()
+        .map(|b| {
+            let source = renamed.iter().find(|(shader, _)| *shader == b.name).map_or(b.name, |(_, name)| name);
+            Ok((b.name, buffers.get(source)?))
+        })
+        .collect::<Result<Vec<_>>>()?;
+    recording.dispatch(stage, groups, &bound, &push)
+}
+
+/// `n` invocations in workgroups of `pipeline`'s size.
+pub fn groups_for(pipeline: &Pipeline, n: u32) -> Groups<'static> {
+    Groups::Direct([n.div_ceil(pipeline.local_size).max(1), 1, 1])
+}

@@ -1,0 +1,39 @@
+//! The command line: arguments, progress, exit codes. No algorithm lives here.
+
+mod cli {
+    pub mod args;
+    pub mod data;
+    pub mod devices;
+    pub mod results;
+    pub mod train;
+}
+
+use clap::Parser;
+use cli::args::{Cli, Command};
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_env_filter(tracing_subscriber::EnvFilter::new(if cli.verbose { "info,nertca_vk=debug" } else { "error" }))
+        .without_time()
+        .init();
+    let outcome = match &cli.command {
+        Command::Devices(args) => cli::devices::run(args),
+        Command::Phantom(args) => cli::data::phantom(&cli, args),
+        Command::Project(args) => cli::data::project(&cli, args),
+        Command::Train(args) => cli::train::run(&cli, args),
+        Command::Eval(args) => cli::results::eval(&cli, args),
+        Command::Render(args) => cli::results::render(&cli, args),
+        Command::Info(args) => cli::results::info(args),
+        Command::Completions(args) => cli::devices::completions(args),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("nertca-vk: {error}");
+            ExitCode::from(error.exit_code())
+        }
+    }
+}

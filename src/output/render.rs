@@ -1,0 +1,110 @@
+//! Projections of a reconstruction for any pose and phase, through the kernels that train it.
+
+use crate::data::geometry::ViewRays;
+use crate::error::{Error, Result};
+use crate::gpu::device::Gpu;
+use crate::gpu::record::Recording;
+use crate::kernels::{Buffers, Kernels, Tuning, dispatch, groups_for};
+use crate::layout::{RayOut, Setup};
+use crate::model::field::Model;
+use crate::train::step::{forward_buffers, hull_buffer, record_render};
+
+/// Pixels rendered by one submit.
+const RAYS_PER_SUBMIT: u32 = 8192;
+
+/// What every pixel of a view sees; all lists are rows first, attenuation per world unit.
+#[derive(Debug, Clone, Default)]
+pub struct Rendering {
+    /// Line integral of the static field.
+    pub static_integral: Vec<f32>,
+    /// Line integral of the dynamic field.
+    pub dynamic_integral: Vec<f32>,
+    /// Largest attenuation of the static field along the ray.
+    pub static_max: Vec<f32>,
+    /// Largest attenuation of the dynamic field along the ray.
+    pub dynamic_max: Vec<f32>,
+    /// Largest sum of both along the ray.
+    pub total_max: Vec<f32>,
+}
+
+impl Rendering {
+    /// Sum of both integrals.
+    pub fn total_integral(&self) -> Vec<f32> {
+        self.static_integral.iter().zip(&self.dynamic_integral).map(|(s, d)| s + d).collect()
+    }
+}
+
+/// Renders a model on a device.
+pub struct Renderer {
+    gpu: Gpu,
+    kernels: Kernels,
+    buffers: Buffers,
+    setup: Setup,
+    model_layout: crate::model::params::ParamLayout,
+}
+
+impl Renderer {
+    /// Loads a model.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn new(gpu: &Gpu, model: &Model) -> Result<Renderer> {
+        let kernels = Kernels::new(gpu, Tuning::for_device(gpu.info()))?;
+        let mut setup = model.scene.setup(&model.config, &model.layout, model.hull.as_ref());
+        setup.jitter = 0;
+        setup.n_static_samples = model.config.march.render_samples;
+        setup.n_dynamic_samples = model.config.march.render_samples;
+        let mut buffers = forward_buffers(gpu, &setup, &model.layout, RAYS_PER_SUBMIT)?;
+        buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
+        let renderer_state = [0u32; 4];
+        gpu.upload(buffers.get("state")?, 0, &renderer_state)?;
+        buffers.set("schedule", gpu.buffer_with("schedule", &[model.config.schedule(model.step)])?);
+        let renderer = Renderer { gpu: gpu.clone(), kernels, buffers, setup, model_layout: model.layout.clone() };
+        renderer.set_model(model)?;
+        Ok(renderer)
+    }
+
+    /// Replaces parameters and window by those of `model`, which must have the same layout.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for another layout; device errors.
+    pub fn set_model(&self, model: &Model) -> Result<()> {
+        if model.layout != self.model_layout {
+            return Err(Error::Internal("the model has another layout than the renderer".into()));
+        }
+        self.gpu.upload(self.buffers.get("params")?, 0, &model.params)?;
+        self.gpu.upload(self.buffers.get("schedule")?, 0, &[model.config.schedule(model.step)])
+    }
+
+    /// Renders a `width` x `height` view at a phase.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a phase the model does not have; device errors.
+    pub fn render(&self, rays: &ViewRays, width: usize, height: usize, phase: u32) -> Result<Rendering> {
+        if phase >= self.setup.n_phases {
+            return Err(Error::config("--phase", phase, format!("phases go from 0 to {}", self.setup.n_phases - 1)));
+        }
+        let mut buffers = self.buffers.clone();
+        buffers.set("views", self.gpu.buffer_with("views", &[rays.to_device()])?);
+        let pixels = (width * height) as u32;
+        let mut out = Rendering::default();
+        for first in (0..pixels).step_by(RAYS_PER_SUBMIT as usize) {
+            let n = RAYS_PER_SUBMIT.min(pixels - first);
+            let mut recording = Recording::new(&self.gpu, "render")?;
+            let push = [first, n, phase, width as u32, 0];
+            let stage = &self.kernels.pose_rays;
+            dispatch(&mut recording, stage, groups_for(stage, n), &buffers, &[], push)?;
+            record_render(&mut recording, &self.kernels, &buffers, &self.model_layout, &self.setup, n)?;
+            self.gpu.wait(recording.finish()?.submit()?)?;
+            let seen: Vec<RayOut> = self.gpu.download(buffers.get("ray_out")?, 0, n as usize)?;
+            for r in seen {
+                out.static_integral.push(r.static_integral);
+                out.dynamic_integral.push(r.dynamic_integral);
+                out.static_max.push(r.static_max);
+                out.dynamic_max.push(r.dynamic_max);
+                out.total_max.push(r.total_max);
+            }
+        }
+        Ok(out)
+    }
+}

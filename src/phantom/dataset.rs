@@ -1,0 +1,606 @@
+//! Phantom datasets: volumes and motion -> projections, exact masks, noise -> a dataset on disk.
+
+use super::tree::{Heart, Tree, contraction};
+use super::voxels::{self, Tissues};
+use crate::cpu::random::{STREAM_PHOTON, normal, uniform01};
+use crate::data::dataset::{Intensity, Layout, MANIFEST, Manifest, ManifestFrame, Split};
+use crate::data::geometry::{CArm, Geometry, ViewRays};
+use crate::data::images;
+use crate::data::nerfca;
+use crate::data::volume::{Volume, VolumeHints};
+use crate::error::{Error, Result};
+use crate::files;
+use crate::gpu::device::Gpu;
+use crate::output::projector::{LoadedVolume, Projector};
+use glam::DVec3;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// ln(8.670397): the value of an unattenuated pixel in the authors' images.
+pub const I0_LOG: f64 = 2.159_914_6;
+/// A vessel-only line integral above this share of a 1 mm vessel's marks a vessel pixel.
+const MASK_SHARE: f64 = 0.05;
+
+/// A published set-up of C-arm and volume.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+pub enum Setting {
+    /// The authors' XCAT set-up: DSD 2500, DSO 450, 0.25 mm voxels.
+    Xcat,
+    /// The authors' MAGIX set-up: DSD 2000, DSO 600, 0.9 mm voxels.
+    Magix,
+}
+
+/// What to make.
+#[derive(Debug, Clone)]
+pub struct PhantomOptions {
+    /// C-arm and volume when the anatomy is procedural.
+    pub setting: Setting,
+    /// Columns and rows of the images.
+    pub size: usize,
+    /// Cardiac phases.
+    pub phases: u32,
+    /// Training views: 3, 4 or 9.
+    pub views: u32,
+    /// Seed of shape and noise.
+    pub seed: u32,
+    /// Photons per unattenuated pixel; `None` = no noise.
+    pub photons: Option<f64>,
+    /// Amplitude of breathing along the body, mm; 0 = held breath.
+    pub respiration_mm: f64,
+    /// Layout to write.
+    pub layout: Layout,
+    /// Real anatomy instead of the procedural one.
+    pub anatomy: Option<Anatomy>,
+    /// Also write the voxel volumes.
+    pub volumes: bool,
+}
+
+/// A tree and a CT from files.
+#[derive(Debug, Clone)]
+pub struct Anatomy {
+    /// Tree as JSON.
+    pub tree: PathBuf,
+    /// CT in Hounsfield units.
+    pub background: Option<PathBuf>,
+    /// C-arm.
+    pub c_arm: CArmOptions,
+    /// Vessel attenuation, 1/mm.
+    pub iodine_per_mm: f64,
+}
+
+/// A C-arm given by what a user knows of it.
+#[derive(Debug, Clone, Copy)]
+pub struct CArmOptions {
+    /// Source to isocentre, mm.
+    pub sod_mm: f64,
+    /// Source to detector, mm.
+    pub sid_mm: f64,
+    /// Field of view at the isocentre, mm.
+    pub field_mm: f64,
+}
+
+/// A user's own volumes.
+#[derive(Debug, Clone)]
+pub struct VolumeOptions {
+    /// One file per phase, in order.
+    pub volumes: Vec<PathBuf>,
+    /// What the files cannot say of themselves.
+    pub hints: VolumeHints,
+    /// Values are Hounsfield units.
+    pub hounsfield: bool,
+    /// Factor on the values.
+    pub scale: f32,
+    /// Attenuation from which a voxel is vessel, 1/mm.
+    pub vessel_per_mm: Option<f64>,
+    /// C-arm.
+    pub c_arm: CArmOptions,
+    /// Columns and rows of the images.
+    pub size: usize,
+    /// Training views: 3, 4 or 9.
+    pub views: u32,
+    /// Layout to write.
+    pub layout: Layout,
+}
+
+/// Primary and secondary angle of the training views, degrees (method, section 1).
+pub fn training_angles(views: u32) -> Result<Vec<(f64, f64)>> {
+    let four = [(-30.0, 30.0), (-30.0, -30.0), (60.0, -30.0), (60.0, 30.0)];
+    match views {
+        3 => Ok(four[1..].to_vec()),
+        4 => Ok(four.to_vec()),
+        9 => {
+            let grid = [-60.0, 0.0, 60.0];
+            let all = grid.iter().flat_map(|a| grid.iter().map(move |b| (*a, *b)));
+            // A view next to a validation view would give the answer away.
+            Ok(all
+                .filter(|(a, b)| VALIDATION_ANGLES.iter().all(|(c, d)| (a - c).abs() + (b - d).abs() > 15.0))
+                .collect())
+        }
+        other => Err(Error::config("--views", other, "3, 4 or 9 is accepted")),
+    }
+}
+
+/// Primary and secondary angle of the validation views, degrees.
+pub const VALIDATION_ANGLES: [(f64, f64); 4] = [(-5.0, 40.0), (-5.0, -40.0), (90.0, 0.0), (-30.0, 0.0)];
+
+/// What a phantom dataset is shot from.
+struct Stage {
+    description: String,
+    c_arm: CArm,
+    depth_half_extent_mm: f64,
+    vessel_attenuation: Option<f64>,
+    still: Option<LoadedVolume>,
+    /// Per phase: what moves besides the vessels, and the vessels (for image and mask).
+    moving: Vec<(Option<LoadedVolume>, Option<LoadedVolume>)>,
+}
+
+/// How a stage is shot.
+struct Shooting {
+    size: usize,
+    views: u32,
+    seed: u32,
+    photons: Option<f64>,
+    respiration_mm: f64,
+    layout: Layout,
+    /// The vessels are part of the moving volume already; project them for the mask alone.
+    vessels_in_background: bool,
+}
+
+/// Makes a phantom dataset in `out`.
+///
+/// # Errors
+/// [`Error::Config`] for impossible options, [`Error::Data`] for unreadable anatomy, device errors.
+pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl FnMut(&str, u64, u64)) -> Result<()> {
+    if !(1..=200).contains(&options.phases) {
+        return Err(Error::config("--phases", options.phases, "1 to 200 is accepted"));
+    }
+    if let Some(photons) = options.photons.filter(|n| !(n.is_finite() && *n >= 1.0)) {
+        return Err(Error::config("--photons", photons, "at least 1 is needed"));
+    }
+    if !(options.respiration_mm.is_finite() && options.respiration_mm.abs() <= 100.0) {
+        return Err(Error::config("--respiration", options.respiration_mm, "at most 100 mm is accepted"));
+    }
+    let shooting = Shooting {
+        size: options.size,
+        views: options.views,
+        seed: options.seed,
+        photons: options.photons,
+        respiration_mm: options.respiration_mm,
+        layout: options.layout,
+        vessels_in_background: false,
+    };
+    check_output(&shooting, out)?;
+    let projector = Projector::new(gpu, options.size, options.size)?;
+    progress("volumes", 0, 1);
+    let stage = match &options.anatomy {
+        None => procedural(&projector, options, out)?,
+        Some(anatomy) => from_files(&projector, options, anatomy, out)?,
+    };
+    shoot(&projector, &stage, &shooting, out, progress)
+}
+
+/// Projects a user's volumes, one per phase, into a dataset in `out`.
+///
+/// # Errors
+/// As [`make`].
+pub fn project_volumes(
+    gpu: &Gpu,
+    options: &VolumeOptions,
+    out: &Path,
+    mut progress: impl FnMut(&str, u64, u64),
+) -> Result<()> {
+    let shooting = Shooting {
+        size: options.size,
+        views: options.views,
+        seed: 0,
+        photons: None,
+        respiration_mm: 0.0,
+        layout: options.layout,
+        vessels_in_background: true,
+    };
+    check_output(&shooting, out)?;
+    if options.vessel_per_mm.is_some_and(|v| !(v.is_finite() && v > 0.0)) {
+        return Err(Error::config("--vessel", options.vessel_per_mm.unwrap_or_default(), "must be positive"));
+    }
+    let projector = Projector::new(gpu, options.size, options.size)?;
+    let total = options.volumes.len() as u64;
+    let (mut moving, mut radius) = (Vec::new(), 0f64);
+    for (index, path) in options.volumes.iter().enumerate() {
+        progress("volumes", index as u64, total);
+        let mut volume = Volume::read(path, &options.hints)?;
+        volume.values.iter_mut().for_each(|v| *v *= options.scale);
+        if options.hounsfield {
+            voxels::attenuation_from_hounsfield(&mut volume);
+        }
+        radius = radius.max(volume.axial_radius_mm());
+        let vessels = options.vessel_per_mm.map(|threshold| Volume {
+            values: volume.values.iter().map(|v| if f64::from(*v) >= threshold { *v } else { 0.0 }).collect(),
+            ..volume.clone()
+        });
+        let vessels = vessels.map(|v| projector.load(v)).transpose()?;
+        moving.push((Some(projector.load(volume)?), vessels));
+    }
+    let stage = Stage {
+        description: format!("projected from {} volumes", options.volumes.len()),
+        c_arm: options.c_arm.c_arm(options.size)?,
+        depth_half_extent_mm: radius.min(0.9 * options.c_arm.sod_mm),
+        vessel_attenuation: options.vessel_per_mm,
+        still: None,
+        moving,
+    };
+    shoot(&projector, &stage, &shooting, out, progress)
+}
+
+impl CArmOptions {
+    fn c_arm(&self, size: usize) -> Result<CArm> {
+        for (field, value) in [("--sod", self.sod_mm), ("--sid", self.sid_mm), ("--fov", self.field_mm)] {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(Error::config(field, value, "must be a positive length in mm"));
+            }
+        }
+        let pixel = self.field_mm / size as f64 * self.sid_mm / self.sod_mm;
+        Ok(CArm {
+            primary_deg: 0.0,
+            secondary_deg: 0.0,
+            sid_mm: self.sid_mm,
+            sod_mm: self.sod_mm,
+            pixel_mm: [pixel; 2],
+            offset_mm: [0.0; 2],
+        })
+    }
+}
+
+/// Refuses impossible images and directories that already hold a dataset, before any work is done.
+fn check_output(shooting: &Shooting, out: &Path) -> Result<()> {
+    if !(16..=2048).contains(&shooting.size) {
+        return Err(Error::config("--size", shooting.size, "16 to 2048 is accepted"));
+    }
+    training_angles(shooting.views)?;
+    for name in [MANIFEST, nerfca::GENERAL] {
+        if out.join(name).exists() {
+            return Err(Error::config("OUT", out.display(), "already holds a dataset; choose another directory"));
+        }
+    }
+    Ok(())
+}
+
+/// Projects every view and phase of a stage and writes the dataset.
+fn shoot(
+    projector: &Projector,
+    stage: &Stage,
+    shooting: &Shooting,
+    out: &Path,
+    mut progress: impl FnMut(&str, u64, u64),
+) -> Result<()> {
+    let size = shooting.size;
+    let views: Vec<_> = training_angles(shooting.views)?
+        .into_iter()
+        .map(|a| (a, Split::Train))
+        .chain(VALIDATION_ANGLES.map(|a| (a, Split::Validation)))
+        .collect();
+    let geometries: Vec<Geometry> = views
+        .iter()
+        .map(|((primary_deg, secondary_deg), _)| {
+            Geometry::CArm(CArm { primary_deg: *primary_deg, secondary_deg: *secondary_deg, ..stage.c_arm.clone() })
+        })
+        .collect();
+    let rays = geometries
+        .iter()
+        .map(|g| g.rays(size, size).map_err(|(field, problem)| Error::config(field, "", problem)))
+        .collect::<Result<Vec<ViewRays>>>()?;
+    let mut writer = Writer::new(out, shooting, stage)?;
+    let still = match &stage.still {
+        Some(volume) => projector.project(volume, &rays, DVec3::ZERO)?,
+        None => vec![vec![0.0; size * size]; rays.len()],
+    };
+    let pixel_at_isocentre = stage.c_arm.pixel_mm[0] * stage.c_arm.sod_mm / stage.c_arm.sid_mm;
+    let mask_threshold = (MASK_SHARE * stage.vessel_attenuation.unwrap_or(0.0) * pixel_at_isocentre) as f32;
+    let total = stage.moving.len() as u64;
+    for (phase, (background, vessels)) in stage.moving.iter().enumerate() {
+        progress("projections", phase as u64, total);
+        let phase = phase as u32;
+        for (view, geometry) in geometries.iter().enumerate() {
+            // Breathing differs between runs, so each view has its own course of displacement.
+            let shift = DVec3::Z * breath(shooting, view, phase, views[view].1, total);
+            let project = |volume: &LoadedVolume| -> Result<Vec<f32>> {
+                Ok(projector.project(volume, std::slice::from_ref(&rays[view]), shift)?.swap_remove(0))
+            };
+            let mut image = still[view].clone();
+            if let Some(volume) = background {
+                add(&mut image, &project(volume)?);
+            }
+            let mut mask = None;
+            if let Some(volume) = vessels {
+                let vessel_image = project(volume)?;
+                if !shooting.vessels_in_background {
+                    add(&mut image, &vessel_image);
+                }
+                mask = Some(vessel_image.iter().map(|v| *v > mask_threshold).collect::<Vec<_>>());
+            }
+            if let Some(photons) = shooting.photons {
+                add_noise(&mut image, photons, shooting.seed, (view as u32) << 16 | phase);
+            }
+            writer.frame(geometry, views[view].1, view, phase, &image, mask.as_deref())?;
+        }
+    }
+    progress("projections", total, total);
+    writer.finish()
+}
+
+fn breath(options: &Shooting, view: usize, phase: u32, split: Split, phases: u64) -> f64 {
+    if split == Split::Validation {
+        return 0.0;
+    }
+    let start = uniform01(options.seed, STREAM_PHOTON, u32::MAX, view as u32);
+    let course = start + 0.25 * f64::from(phase) / phases as f64;
+    0.5 * options.respiration_mm * (std::f64::consts::TAU * course).sin()
+}
+
+fn add(image: &mut [f32], other: &[f32]) {
+    for (a, b) in image.iter_mut().zip(other) {
+        *a += b;
+    }
+}
+
+/// Counts are Poisson; beyond a few hundred photons a normal is indistinguishable from it.
+fn add_noise(image: &mut [f32], photons: f64, seed: u32, stream: u32) {
+    for (pixel, value) in image.iter_mut().enumerate() {
+        let expected = photons * (-f64::from(*value)).exp();
+        let counts = if expected > 200.0 {
+            (expected + expected.sqrt() * normal(seed, STREAM_PHOTON, stream, pixel as u32)).round()
+        } else {
+            poisson(expected, seed, stream, pixel as u32)
+        };
+        *value = -(counts.max(0.5) / photons).ln() as f32;
+    }
+}
+
+/// Knuth's product method; `expected` is at most 200.
+fn poisson(expected: f64, seed: u32, stream: u32, pixel: u32) -> f64 {
+    let mut log_product = 0.0;
+    let mut count = 0u32;
+    loop {
+        log_product += uniform01(seed ^ count.wrapping_mul(0x9e37_79b9), STREAM_PHOTON, stream, pixel).max(1e-9).ln();
+        if log_product < -expected {
+            return f64::from(count);
+        }
+        count += 1;
+    }
+}
+
+fn procedural(projector: &Projector, options: &PhantomOptions, out: &Path) -> Result<Stage> {
+    let scale_pixels = 200.0 / options.size as f64;
+    // Volume offsets are in the world's axes (posterior, left, superior); LPS swaps the first two.
+    let (tissues, sid_mm, sod_mm, anatomy_scale, centre_mm, half_mm) = match options.setting {
+        Setting::Xcat => (Tissues::XCAT, 2500.0, 450.0, 0.37, DVec3::new(-25.0, 10.0, 25.0), 64.0),
+        Setting::Magix => (Tissues::MAGIX, 2000.0, 600.0, 0.62, DVec3::ZERO, 230.0),
+    };
+    let heart = Heart::new(DVec3::ZERO, anatomy_scale);
+    let tree = Tree::procedural(&heart, anatomy_scale, options.phases, options.seed);
+    let (low, high) = tree.bounds_mm();
+    // The tree's middle is the isocentre, as on a real table.
+    let shift = -0.5 * (low + high);
+    let heart = Heart::new(shift, anatomy_scale);
+    let tree = Tree::procedural(&heart, anatomy_scale, options.phases, options.seed);
+    let still = voxels::thorax(tissues, shift, anatomy_scale, centre_mm, half_mm);
+    let spacing = 0.4 * anatomy_scale;
+    let mut moving = Vec::new();
+    for phase in 0..options.phases {
+        let squeeze = contraction(f64::from(phase) / f64::from(options.phases));
+        let background = voxels::heart_and_diaphragm(tissues, &heart, squeeze, shift, anatomy_scale, &still);
+        let vessels = voxels::vessels(&tree, phase as usize, tissues.vessel, spacing);
+        if options.volumes {
+            write_volumes(out, phase, &vessels, Some((&still, &background)))?;
+        }
+        moving.push((Some(projector.load(background)?), Some(projector.load(vessels)?)));
+    }
+    let radius = half_mm + centre_mm.x.abs().max(centre_mm.y.abs());
+    Ok(Stage {
+        description: format!("procedural phantom, {:?} set-up, seed {}", options.setting, options.seed),
+        c_arm: CArm {
+            primary_deg: 0.0,
+            secondary_deg: 0.0,
+            sid_mm,
+            sod_mm,
+            pixel_mm: [scale_pixels; 2],
+            offset_mm: [0.0; 2],
+        },
+        depth_half_extent_mm: (radius * std::f64::consts::SQRT_2).min(0.9 * sod_mm),
+        vessel_attenuation: Some(tissues.vessel),
+        still: Some(projector.load(still)?),
+        moving,
+    })
+}
+
+fn from_files(projector: &Projector, options: &PhantomOptions, anatomy: &Anatomy, out: &Path) -> Result<Stage> {
+    if !(anatomy.iodine_per_mm.is_finite() && anatomy.iodine_per_mm > 0.0) {
+        return Err(Error::config("--iodine", anatomy.iodine_per_mm, "must be positive"));
+    }
+    let tree = Tree::read(&anatomy.tree, options.phases)?;
+    let still = match &anatomy.background {
+        None => None,
+        Some(path) => {
+            let mut volume = Volume::read(path, &VolumeHints::default())?;
+            voxels::attenuation_from_hounsfield(&mut volume);
+            Some(volume)
+        }
+    };
+    let mut moving = Vec::new();
+    for phase in 0..options.phases {
+        let vessels = voxels::vessels(&tree, phase as usize, anatomy.iodine_per_mm, 0.5);
+        if options.volumes {
+            write_volumes(out, phase, &vessels, None)?;
+        }
+        moving.push((None, Some(projector.load(vessels)?)));
+    }
+    let c_arm = anatomy.c_arm;
+    let radius = still.as_ref().map_or(c_arm.field_mm, Volume::axial_radius_mm);
+    Ok(Stage {
+        description: format!("anatomy from {}", anatomy.tree.file_name().unwrap_or_default().to_string_lossy()),
+        c_arm: c_arm.c_arm(options.size)?,
+        depth_half_extent_mm: radius.min(0.9 * c_arm.sod_mm),
+        vessel_attenuation: Some(anatomy.iodine_per_mm),
+        still: still.map(|v| projector.load(v)).transpose()?,
+        moving,
+    })
+}
+
+fn write_volumes(out: &Path, phase: u32, vessels: &Volume, background: Option<(&Volume, &Volume)>) -> Result<()> {
+    let directory = out.join("volumes");
+    vessels.write_nrrd(&directory.join(format!("vessels-{phase:02}.nrrd")))?;
+    if let Some((still, moving)) = background {
+        let sum =
+            Volume { values: still.values.iter().zip(&moving.values).map(|(a, b)| a + b).collect(), ..still.clone() };
+        sum.write_nrrd(&directory.join(format!("background-{phase:02}.nrrd")))?;
+    }
+    Ok(())
+}
+
+/// Writes frames as they come and the manifest last, so that an interrupted run leaves no dataset.
+struct Writer<'a> {
+    out: &'a Path,
+    size: usize,
+    layout: Layout,
+    manifest: Manifest,
+    general: nerfca::General,
+    lists: [Vec<nerfca::FrameEntry>; 2],
+}
+
+impl<'a> Writer<'a> {
+    fn new(out: &'a Path, shooting: &Shooting, stage: &Stage) -> Result<Writer<'a>> {
+        files::create_directory(out)?;
+        let carm = &stage.c_arm;
+        let half_units = stage.depth_half_extent_mm / 100.0;
+        let n = shooting.size as f64;
+        Ok(Writer {
+            out,
+            size: shooting.size,
+            layout: shooting.layout,
+            manifest: Manifest {
+                format: "nertca-dataset".into(),
+                version: 1,
+                description: stage.description.clone(),
+                phases: stage.moving.len() as u32,
+                depth_half_extent_mm: stage.depth_half_extent_mm,
+                vessel_attenuation_per_mm: stage.vessel_attenuation,
+                frames: Vec::new(),
+            },
+            general: nerfca::General {
+                DSD: carm.sid_mm,
+                DSO: carm.sod_mm,
+                nDetector: vec![n, n],
+                dDetector: carm.pixel_mm.to_vec(),
+                nVoxel: vec![512.0; 3],
+                dVoxel: vec![2.0 * stage.depth_half_extent_mm / 512.0; 3],
+                offOrigin: vec![0.0; 3],
+                offDetector: vec![0.0; 2],
+                near_thresh: carm.sod_mm / 100.0 - half_units,
+                far_thresh: carm.sod_mm / 100.0 + half_units,
+                max_pixel_value: I0_LOG,
+            },
+            lists: [Vec::new(), Vec::new()],
+        })
+    }
+
+    fn frame(
+        &mut self,
+        geometry: &Geometry,
+        split: Split,
+        view: usize,
+        phase: u32,
+        integrals: &[f32],
+        mask: Option<&[bool]>,
+    ) -> Result<()> {
+        let kind = if split == Split::Train { "train" } else { "test" };
+        let name = format!("{kind}-view{view}-phase{phase:02}");
+        match self.layout {
+            Layout::Native => {
+                let image = PathBuf::from(format!("images/{name}.npy"));
+                let mask_file = PathBuf::from(format!("masks/{name}.png"));
+                images::write_npy(&self.out.join(&image), &[self.size, self.size], integrals)?;
+                if let Some(mask) = mask {
+                    let codes = mask.iter().map(|m| if *m { u16::MAX } else { 0 }).collect();
+                    images::write_png16(&self.out.join(&mask_file), self.size, self.size, codes)?;
+                }
+                self.manifest.frames.push(ManifestFrame {
+                    image,
+                    phase,
+                    split,
+                    geometry: geometry.clone(),
+                    intensity: Intensity::Integral { scale: 1.0, offset: 0.0 },
+                    mask: mask.map(|_| mask_file),
+                });
+            }
+            Layout::Nerfca => {
+                let values: Vec<f32> = integrals.iter().map(|y| (I0_LOG - f64::from(*y)) as f32).collect();
+                let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+                let range = f64::from(high) - f64::from(low);
+                let unit: Vec<f32> =
+                    values.iter().map(|v| ((f64::from(*v) - f64::from(low)) / range.max(1e-12)) as f32).collect();
+                let (image, mask_file) = (format!("{name}.npy"), format!("{name}-mask.npy"));
+                let shape = [self.size, self.size];
+                images::write_npy(&self.out.join(&image), &shape, &nerfca::transpose(&unit, self.size, self.size))?;
+                if let Some(mask) = mask {
+                    let masked: Vec<f32> =
+                        values.iter().zip(mask).map(|(v, m)| if *m { *v } else { I0_LOG as f32 }).collect();
+                    let stored = nerfca::transpose(&masked, self.size, self.size);
+                    images::write_npy(&self.out.join(&mask_file), &shape, &stored)?;
+                }
+                let (theta, phi) = geometry.angles_deg().unwrap_or_default();
+                self.lists[usize::from(split == Split::Validation)].push(nerfca::FrameEntry {
+                    file_path: image,
+                    img_min_max: [f64::from(low), f64::from(high).max(f64::from(low) + 1e-12)],
+                    mask_file_path: mask.map(|_| mask_file),
+                    weighted_file_path: None,
+                    heart_phase: f64::from(phase),
+                    theta,
+                    phi,
+                    larm: 0.0,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(self) -> Result<()> {
+        let write = |name: &str, text: serde_json::Result<String>| {
+            let text = text.map_err(|e| Error::Internal(e.to_string()))?;
+            files::write_atomic(&self.out.join(name), text.as_bytes())
+        };
+        match self.layout {
+            Layout::Native => write(MANIFEST, serde_json::to_string_pretty(&self.manifest)),
+            Layout::Nerfca => {
+                let [train, test] = self.lists;
+                write("train-0.json", serde_json::to_string_pretty(&nerfca::FrameList { frames: train }))?;
+                write("test-0.json", serde_json::to_string_pretty(&nerfca::FrameList { frames: test }))?;
+                write(nerfca::GENERAL, serde_json::to_string_pretty(&self.general))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nine_views_leave_validation_unseen() {
+        let nine = training_angles(9).unwrap();
+        assert_eq!(nine.len(), 9);
+        assert_eq!(training_angles(3).unwrap()[0], (-30.0, -30.0));
+        assert!(training_angles(5).is_err());
+    }
+
+    #[test]
+    fn noise_has_the_variance_of_its_counts() {
+        for (photons, integral) in [(1e6f64, 2.0f32), (500.0, 3.0)] {
+            let mut image = vec![integral; 20_000];
+            add_noise(&mut image, photons, 1, 0);
+            let mean = image.iter().map(|v| f64::from(*v)).sum::<f64>() / 20_000.0;
+            let var = image.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / 20_000.0;
+            let expected = photons * f64::from(-integral).exp();
+            let relative = var * expected;
+            assert!((0.9..1.25).contains(&relative), "{photons}: {relative}");
+        }
+    }
+}

@@ -1,0 +1,353 @@
+//! A coronary tree that moves: procedural, or read from a file.
+//!
+//! Positions are patient mm (LPS), isocentre at the origin. Lumen diameters follow Dodge et al., "Lumen
+//! diameter of normal human coronary arteries", Circulation 86:232-246 (1992): left main 4.5 mm, proximal
+//! LAD 3.7 mm, distal LAD 1.9 mm, proximal LCx 3.4 mm, first diagonal and marginals about 2.2 mm,
+//! septals about 1.2 mm.
+
+use crate::cpu::random::{STREAM_SHAPE, uniform01};
+use crate::error::{Error, Result};
+use crate::files;
+use glam::DVec3;
+use serde::Deserialize;
+use std::path::Path;
+
+/// One vessel: a polyline that moves.
+#[derive(Debug, Clone)]
+pub struct Branch {
+    /// Anatomical name.
+    pub name: String,
+    /// Points per phase, LPS mm.
+    pub points: Vec<Vec<DVec3>>,
+    /// Lumen radius at each point, mm.
+    pub radius_mm: Vec<f64>,
+    /// Contrast filling at each point, 0 to 1.
+    pub filling: Vec<f64>,
+}
+
+/// A tree over the phases of one beat.
+#[derive(Debug, Clone)]
+pub struct Tree {
+    /// All vessels.
+    pub branches: Vec<Branch>,
+}
+
+/// How far the ventricle has contracted at a fraction of the beat: 0 at end-diastole, 1 at end-systole
+/// (35 % of the beat), back to 0 at 75 %, then rest.
+pub fn contraction(fraction: f64) -> f64 {
+    let x = fraction.rem_euclid(1.0);
+    let half_wave = if x < 0.35 { 0.5 * x / 0.35 } else { (0.5 + 0.5 * (x - 0.35) / 0.4).min(1.0) };
+    (std::f64::consts::PI * half_wave).sin().powi(2)
+}
+
+/// A beating heart as an ellipsoid of revolution: where a point of its surface is at a contraction.
+#[derive(Debug, Clone)]
+pub struct Heart {
+    centre: DVec3,
+    axis: DVec3,
+    front: DVec3,
+    side: DVec3,
+    /// Half length from base to apex, mm.
+    pub long_mm: f64,
+    /// Radius at the equator, mm.
+    pub short_mm: f64,
+}
+
+impl Heart {
+    /// A left ventricle with its epicardium around `centre`, scaled by `scale`.
+    pub fn new(centre: DVec3, scale: f64) -> Heart {
+        // Apex to the left, front and down; LPS.
+        let axis = DVec3::new(0.62, -0.58, -0.53).normalize();
+        let front = (DVec3::new(-0.25, -1.0, 0.15) - axis * axis.dot(DVec3::new(-0.25, -1.0, 0.15))).normalize();
+        Heart { centre, axis, front, side: front.cross(axis), long_mm: 52.0 * scale, short_mm: 33.0 * scale }
+    }
+
+    /// Point of the wall. `along`: 0 at the base, 1 at the apex; `around`: radians from the anterior groove
+    /// to the lateral wall; `depth`: 1 on the epicardium, less inside; `squeeze`: see [`contraction`].
+    pub fn point(&self, along: f64, around: f64, depth: f64, squeeze: f64) -> DVec3 {
+        let polar = along * std::f64::consts::FRAC_PI_2 * 0.96;
+        let twist = squeeze * (10f64.to_radians() * along - 3f64.to_radians() * (1.0 - along));
+        // The base descends, the wall moves inwards, the apex stays nearly in place.
+        let radial = 1.0 - squeeze * (0.17 - 0.05 * along);
+        let descent = squeeze * 0.20 * (1.0 - along) * self.long_mm;
+        let shift = squeeze * self.short_mm * 0.08;
+        let angle = around + twist;
+        let out = self.front * angle.cos() + self.side * angle.sin();
+        self.centre
+            + self.axis * ((polar.sin() - 0.45) * self.long_mm * (0.5 + 0.5 * depth) + descent)
+            + out * (polar.cos() * self.short_mm * depth * radial)
+            + DVec3::new(0.3, -0.8, 0.2) * shift
+    }
+
+    /// Whether a point lies in the wall or chamber at a contraction.
+    pub fn contains(&self, point: DVec3, squeeze: f64) -> bool {
+        let p = point - self.centre - DVec3::new(0.3, -0.8, 0.2) * (squeeze * self.short_mm * 0.08);
+        let along = p.dot(self.axis) / self.long_mm + 0.45;
+        if along > 1.0 {
+            return false;
+        }
+        let radial = self.short_mm * 1.25 * (1.0 - squeeze * 0.12);
+        let across = (p - self.axis * p.dot(self.axis)).length();
+        // Atria continue the ventricle beyond the base.
+        let profile =
+            if along > 0.0 { (1.0 - along * along).sqrt() } else { (1.0 - (along / 0.9).powi(2)).max(0.0).sqrt() };
+        across < radial * profile
+    }
+}
+
+/// Course of a vessel on the heart: control points (along, around in degrees, depth).
+struct Course {
+    name: &'static str,
+    diameter_mm: (f64, f64),
+    controls: &'static [[f64; 3]],
+}
+
+const COURSES: &[Course] = &[
+    Course {
+        name: "LM",
+        diameter_mm: (4.5, 4.3),
+        controls: &[[-0.22, -8.0, 0.70], [-0.10, 6.0, 0.92], [0.02, 18.0, 1.0]],
+    },
+    Course {
+        name: "LAD",
+        diameter_mm: (3.7, 1.7),
+        controls: &[
+            [0.02, 18.0, 1.0],
+            [0.12, 8.0, 1.03],
+            [0.28, 3.0, 1.03],
+            [0.48, 6.0, 1.03],
+            [0.68, 1.0, 1.03],
+            [0.86, 5.0, 1.02],
+            [0.99, -10.0, 1.02],
+        ],
+    },
+    Course {
+        name: "LCx",
+        diameter_mm: (3.4, 1.8),
+        controls: &[
+            [0.02, 18.0, 1.0],
+            [0.0, 45.0, 1.04],
+            [0.03, 80.0, 1.04],
+            [0.06, 115.0, 1.04],
+            [0.10, 150.0, 1.03],
+            [0.16, 172.0, 1.02],
+        ],
+    },
+    Course {
+        name: "D1",
+        diameter_mm: (2.2, 1.2),
+        controls: &[[0.20, 5.5, 1.03], [0.32, 22.0, 1.04], [0.50, 34.0, 1.03], [0.72, 40.0, 1.02]],
+    },
+    Course {
+        name: "D2",
+        diameter_mm: (1.9, 1.1),
+        controls: &[[0.44, 5.6, 1.03], [0.55, 20.0, 1.03], [0.72, 28.0, 1.03], [0.88, 34.0, 1.02]],
+    },
+    Course {
+        name: "OM1",
+        diameter_mm: (2.2, 1.2),
+        controls: &[[0.01, 62.0, 1.04], [0.18, 68.0, 1.04], [0.42, 74.0, 1.03], [0.70, 68.0, 1.02]],
+    },
+    Course {
+        name: "OM2",
+        diameter_mm: (2.0, 1.1),
+        controls: &[[0.05, 105.0, 1.04], [0.22, 112.0, 1.04], [0.45, 116.0, 1.03], [0.66, 108.0, 1.02]],
+    },
+    Course {
+        name: "S1",
+        diameter_mm: (1.3, 0.9),
+        controls: &[[0.16, 7.0, 1.02], [0.25, -8.0, 0.92], [0.40, -22.0, 0.80]],
+    },
+    Course {
+        name: "S2",
+        diameter_mm: (1.2, 0.9),
+        controls: &[[0.36, 4.0, 1.02], [0.45, -8.0, 0.92], [0.58, -20.0, 0.80]],
+    },
+];
+
+impl Tree {
+    /// A left coronary tree on a beating heart. `scale` shrinks anatomy; `seed` varies its course by a few
+    /// degrees and the contrast along it.
+    pub fn procedural(heart: &Heart, scale: f64, n_phases: u32, seed: u32) -> Tree {
+        let branches = COURSES
+            .iter()
+            .enumerate()
+            .map(|(index, course)| {
+                let b = index as u32;
+                let random = |k: u32| 2.0 * uniform01(seed, STREAM_SHAPE, b, k) - 1.0;
+                let steps = 30 * (course.controls.len() - 1);
+                // Waves vanish at the start, so that branches stay attached.
+                let (wave, phase) = (2.0 + 1.2 * random(0), std::f64::consts::PI * random(1));
+                let amplitude = (2.0 + random(2)).to_radians();
+                let at = |i: usize| {
+                    let s = i as f64 / steps as f64;
+                    let [along, around, depth] = spline(course.controls, s);
+                    let sway = amplitude * (s * 4.0).min(1.0) * (std::f64::consts::TAU * wave * s + phase).sin();
+                    (along, around.to_radians() + sway, depth)
+                };
+                let points = (0..n_phases)
+                    .map(|p| {
+                        let squeeze = contraction(f64::from(p) / f64::from(n_phases));
+                        (0..=steps)
+                            .map(|i| {
+                                let (along, around, depth) = at(i);
+                                heart.point(along, around, depth, squeeze)
+                            })
+                            .collect()
+                    })
+                    .collect();
+                let share = |i: usize| i as f64 / steps as f64;
+                let (d0, d1) = course.diameter_mm;
+                Branch {
+                    name: course.name.to_owned(),
+                    points,
+                    radius_mm: (0..=steps).map(|i| 0.5 * scale * (d0 + (d1 - d0) * share(i))).collect(),
+                    // Contrast thins towards the periphery and comes in slow waves.
+                    filling: (0..=steps)
+                        .map(|i| 0.92 - 0.14 * share(i) + 0.08 * (5.0 * share(i) + 2.0 * random(3)).sin())
+                        .collect(),
+                }
+            })
+            .collect();
+        Tree { branches }
+    }
+
+    /// Reads a tree (see `docs/formats.md`) and interpolates its beat to `n_phases`, closing in time.
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming file and field.
+    pub fn read(path: &Path, n_phases: u32) -> Result<Tree> {
+        let bytes = files::read_limited(path, 1 << 30)?;
+        let file: TreeFile = serde_json::from_slice(&bytes)
+            .map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))?;
+        file.check(path)?;
+        let stored = file.points_mm.len();
+        let at = |phase: u32, i: usize| {
+            let x = f64::from(phase) / f64::from(n_phases) * stored as f64;
+            let (a, b) = (x as usize % stored, (x as usize + 1) % stored);
+            let ras = DVec3::from_array(file.points_mm[a][i]).lerp(DVec3::from_array(file.points_mm[b][i]), x.fract());
+            DVec3::new(-ras.x, -ras.y, ras.z)
+        };
+        let branches = file
+            .branches
+            .iter()
+            .map(|b| {
+                let range = b.first..b.first + b.count;
+                Branch {
+                    name: b.name.clone(),
+                    points: (0..n_phases).map(|p| range.clone().map(|i| at(p, i)).collect()).collect(),
+                    radius_mm: file.radius_mm[range.clone()].to_vec(),
+                    filling: vec![1.0; b.count],
+                }
+            })
+            .collect();
+        Ok(Tree { branches })
+    }
+
+    /// Lower and upper corner of all phases, radii included, LPS mm.
+    pub fn bounds_mm(&self) -> (DVec3, DVec3) {
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        for branch in &self.branches {
+            for points in &branch.points {
+                for (p, r) in points.iter().zip(&branch.radius_mm) {
+                    low = low.min(*p - *r);
+                    high = high.max(*p + *r);
+                }
+            }
+        }
+        (low, high)
+    }
+}
+
+/// Catmull-Rom through the control points, `s` in [0, 1].
+fn spline(controls: &[[f64; 3]], s: f64) -> [f64; 3] {
+    let last = controls.len() - 1;
+    let x = s * last as f64;
+    let i = (x as usize).min(last - 1);
+    let t = x - i as f64;
+    let p = |k: isize| controls[k.clamp(0, last as isize) as usize];
+    let (a, b, c, d) = (p(i as isize - 1), p(i as isize), p(i as isize + 1), p(i as isize + 2));
+    std::array::from_fn(|k| {
+        let (m0, m1) = (0.5 * (c[k] - a[k]), 0.5 * (d[k] - b[k]));
+        let (t2, t3) = (t * t, t * t * t);
+        (2.0 * t3 - 3.0 * t2 + 1.0) * b[k] + (t3 - 2.0 * t2 + t) * m0 + (3.0 * t2 - 2.0 * t3) * c[k] + (t3 - t2) * m1
+    })
+}
+
+#[derive(Deserialize)]
+struct TreeFile {
+    branches: Vec<TreeBranch>,
+    radius_mm: Vec<f64>,
+    points_mm: Vec<Vec<[f64; 3]>>,
+}
+
+#[derive(Deserialize)]
+struct TreeBranch {
+    name: String,
+    first: usize,
+    count: usize,
+}
+
+impl TreeFile {
+    fn check(&self, path: &Path) -> Result<()> {
+        let n = self.radius_mm.len();
+        if self.points_mm.is_empty() || self.branches.is_empty() {
+            return Err(Error::data(path, "points_mm", "no phase or no branch"));
+        }
+        if let Some(i) = self.radius_mm.iter().position(|r| !(r.is_finite() && *r > 0.0)) {
+            return Err(Error::data(path, format!("radius_mm[{i}]"), "is not a positive length"));
+        }
+        for (p, points) in self.points_mm.iter().enumerate() {
+            if points.len() != n {
+                return Err(Error::data(
+                    path,
+                    format!("points_mm[{p}]"),
+                    format!("{} points for {n} radii", points.len()),
+                ));
+            }
+            if let Some(i) = points.iter().position(|x| x.iter().any(|v| !v.is_finite())) {
+                return Err(Error::data(path, format!("points_mm[{p}][{i}]"), "is not finite"));
+            }
+        }
+        for (i, b) in self.branches.iter().enumerate() {
+            if b.count < 2 || b.first.checked_add(b.count).is_none_or(|end| end > n) {
+                return Err(Error::data(
+                    path,
+                    format!("branches[{i}]"),
+                    "its range leaves the point array or is shorter than 2",
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_beat_closes_and_moves() {
+        assert!(contraction(0.0) < 1e-12 && (contraction(0.35) - 1.0).abs() < 1e-12 && contraction(0.8) < 1e-12);
+        let tree = Tree::procedural(&Heart::new(DVec3::ZERO, 1.0), 1.0, 10, 1);
+        let lad = &tree.branches[1];
+        let moved: f64 = lad.points[0].iter().zip(&lad.points[3]).map(|(a, b)| a.distance(*b)).sum::<f64>()
+            / lad.points[0].len() as f64;
+        assert!((3.0..16.0).contains(&moved), "mean displacement {moved} mm");
+    }
+
+    #[test]
+    fn branches_are_attached() {
+        let tree = Tree::procedural(&Heart::new(DVec3::ZERO, 1.0), 1.0, 4, 3);
+        let by_name = |n: &str| tree.branches.iter().find(|b| b.name == n).unwrap();
+        for (child, parent) in
+            [("LAD", "LM"), ("LCx", "LM"), ("D1", "LAD"), ("D2", "LAD"), ("OM1", "LCx"), ("OM2", "LCx"), ("S1", "LAD")]
+        {
+            for phase in 0..4 {
+                let start = by_name(child).points[phase][0];
+                let gap = by_name(parent).points[phase].iter().map(|p| p.distance(start)).fold(f64::MAX, f64::min);
+                assert!(gap < 3.5, "{child} starts {gap} mm from {parent} at phase {phase}");
+            }
+        }
+    }
+}

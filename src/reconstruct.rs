@@ -1,0 +1,321 @@
+//! One reconstruction, from a dataset to a run directory: trains, validates, saves, and can be stopped.
+//!
+//! A run directory holds `config.toml`, `metrics.jsonl` (one object per line), the newest checkpoints and,
+//! when finished, `report/` with the evaluation and pictures.
+
+use crate::config::Config;
+use crate::data::dataset::Dataset;
+use crate::error::{Error, Result};
+use crate::files;
+use crate::gpu::device::Gpu;
+use crate::output::eval::{self, Evaluation, evaluate};
+use crate::output::pictures::{self, Window};
+use crate::output::render::Renderer;
+use crate::train::checkpoint::{self, Checkpoint};
+use crate::train::plan::Plan;
+use crate::train::trainer::{StepLoss, Trainer};
+use serde::Serialize;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// Losses are written and reported once per this many iterations.
+const REPORT_EVERY: u32 = 10;
+
+/// What a run tells its observer; also the lines of `metrics.jsonl`.
+#[derive(Debug, Clone, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// Training begins or continues.
+    Started {
+        /// Device name.
+        device: String,
+        /// Iterations already done.
+        step: u32,
+        /// Length of the run.
+        iterations: u32,
+        /// Parameters.
+        parameters: usize,
+        /// Decisions about data and device.
+        notes: Vec<String>,
+    },
+    /// Losses, every few iterations.
+    Progress {
+        /// Losses of the last iteration.
+        #[serde(flatten)]
+        loss: StepLoss,
+        /// PSNR of the training rays, dB, smoothed.
+        psnr: f64,
+        /// Iterations per second.
+        iterations_per_s: f64,
+        /// Seconds of training so far, validation and saving included.
+        elapsed_s: f64,
+        /// Estimated seconds to the end.
+        left_s: f64,
+    },
+    /// Metrics on some unseen images.
+    Validation {
+        /// Iterations done.
+        step: u32,
+        /// Seconds spent training until then, validation excluded.
+        train_s: f64,
+        /// Dice of the dynamic field.
+        dice_dynamic: Option<f64>,
+        /// Dice of both fields.
+        dice_total: Option<f64>,
+        /// dB.
+        psnr: f64,
+        /// Structural similarity.
+        ssim: f64,
+    },
+    /// A checkpoint was written.
+    Saved {
+        /// Iterations it holds.
+        step: u32,
+        /// File.
+        path: PathBuf,
+    },
+    /// The run reached its end or the requested stop.
+    Finished {
+        /// Iterations done.
+        step: u32,
+        /// Seconds spent training, validation excluded.
+        train_s: f64,
+        /// Seconds in all.
+        elapsed_s: f64,
+    },
+}
+
+/// What a run remembers of its surroundings: `run.json`.
+#[derive(Debug, Clone, Serialize, serde::Deserialize)]
+pub struct RunInfo {
+    /// Dataset it was trained on.
+    pub dataset: PathBuf,
+}
+
+impl RunInfo {
+    const FILE: &str = "run.json";
+
+    /// Writes it into a run directory.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, run: &Path) -> Result<()> {
+        let text = serde_json::to_string_pretty(self).map_err(|e| Error::Internal(e.to_string()))?;
+        files::write_atomic(&run.join(Self::FILE), text.as_bytes())
+    }
+
+    /// Reads it from a run directory, or from beside a checkpoint.
+    ///
+    /// # Errors
+    /// [`Error::Io`] or [`Error::Data`].
+    pub fn read(run: &Path) -> Result<RunInfo> {
+        let directory = if run.is_file() { run.parent().unwrap_or(Path::new(".")) } else { run };
+        let file = directory.join(Self::FILE);
+        let text = std::fs::read(&file).map_err(Error::io("read", &file))?;
+        serde_json::from_slice(&text).map_err(|e| Error::data(&file, "JSON", e.to_string()))
+    }
+}
+
+/// How to run.
+pub struct RunOptions<'a> {
+    /// Run directory.
+    pub run: &'a Path,
+    /// Continue from the newest checkpoint.
+    pub resume: bool,
+    /// Stop (and save) after this many iterations, leaving schedules as they are.
+    pub stop_at: Option<u32>,
+    /// Set to true to stop after the iterations in flight.
+    pub cancel: &'a AtomicBool,
+}
+
+/// Runs a reconstruction.
+///
+/// # Errors
+/// [`Error::Interrupted`] after a cancel (state is saved), [`Error::Diverged`] (the last good checkpoint is
+/// kept), and all errors of data and device.
+pub fn reconstruct(
+    gpu: &Gpu,
+    config: &Config,
+    dataset: &Dataset,
+    options: &RunOptions<'_>,
+    observe: &mut dyn FnMut(&Event),
+) -> Result<()> {
+    let mut trainer = if options.resume {
+        let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
+        let plan = Plan::with_scene(&saved.model.config, dataset, saved.model.scene.clone())?;
+        Trainer::resume(gpu, plan, dataset, &saved)?
+    } else {
+        files::create_directory(options.run)?;
+        Trainer::new(gpu, Plan::new(config, dataset)?, dataset)?
+    };
+    let config = trainer.plan().config.clone();
+    files::write_atomic(&options.run.join("config.toml"), config.to_toml()?.as_bytes())?;
+    let mut log = MetricsLog::open(&options.run.join("metrics.jsonl"), trainer.step())?;
+    let mut tell = |event: Event| -> Result<()> {
+        log.write(&event)?;
+        observe(&event);
+        Ok(())
+    };
+    let mut notes = trainer.plan().notes.clone();
+    notes.extend(trainer.tuning().reasons.iter().cloned());
+    tell(Event::Started {
+        device: gpu.info().name.clone(),
+        step: trainer.step(),
+        iterations: config.train.iterations,
+        parameters: trainer.plan().params.len,
+        notes,
+    })?;
+    let end = options.stop_at.unwrap_or(config.train.iterations).min(config.train.iterations);
+    let validation = eval::spread_validation(dataset, config.train.validate_images as usize);
+    let validate = config.train.validate_every > 0 && !validation.is_empty();
+    let range = Window::of(&trainer.plan().images);
+    let range = f64::from(range.high - range.low);
+    let (begin, first_step) = (Instant::now(), trainer.step());
+    let (mut train_s, mut mse) = (0.0, None);
+    let mut renderer: Option<Renderer> = None;
+    while trainer.step() < end {
+        if options.cancel.load(Ordering::Relaxed) {
+            let saved = trainer.checkpoint()?;
+            tell(Event::Saved { step: saved.model.step, path: saved.save(options.run)? })?;
+            return Err(Error::Interrupted);
+        }
+        let next = |every: u32| if every == 0 { end } else { (trainer.step() / every + 1) * every };
+        let target = end.min(next(config.train.checkpoint_every)).min(if validate {
+            next(config.train.validate_every)
+        } else {
+            end
+        });
+        let started = Instant::now();
+        let losses = trainer.advance(target)?;
+        train_s += started.elapsed().as_secs_f64();
+        for loss in losses {
+            let smoothed = mse.map_or(loss.squared_error, |m: f64| 0.95 * m + 0.05 * loss.squared_error);
+            mse = Some(smoothed);
+            if loss.step % REPORT_EVERY == 0 || loss.step == end {
+                let elapsed_s = begin.elapsed().as_secs_f64();
+                let rate = f64::from(loss.step - first_step) / elapsed_s.max(1e-9);
+                tell(Event::Progress {
+                    loss,
+                    psnr: -10.0 * (smoothed / (range * range)).max(1e-20).log10(),
+                    iterations_per_s: rate,
+                    elapsed_s,
+                    left_s: f64::from(end - loss.step) / rate,
+                })?;
+            }
+        }
+        let step = trainer.step();
+        if step < target {
+            continue;
+        }
+        if step % config.train.checkpoint_every == 0 || step == end {
+            let saved = trainer.checkpoint()?;
+            tell(Event::Saved { step, path: saved.save(options.run)? })?;
+        }
+        if validate && (step % config.train.validate_every == 0 || step == end) {
+            let model = trainer.model()?;
+            let renderer = match &mut renderer {
+                Some(renderer) => renderer,
+                none => none.insert(Renderer::new(gpu, &model)?),
+            };
+            renderer.set_model(&model)?;
+            let score = evaluate(renderer, dataset, &validation, step, None, |_, _, _| Ok(()))?;
+            tell(Event::Validation {
+                step,
+                train_s,
+                dice_dynamic: score.dice.dynamic,
+                dice_total: score.dice.total,
+                psnr: score.psnr,
+                ssim: score.ssim,
+            })?;
+        }
+    }
+    tell(Event::Finished { step: trainer.step(), train_s, elapsed_s: begin.elapsed().as_secs_f64() })
+}
+
+/// `metrics.jsonl`: appended line by line; on resume, lines beyond the resumed step are dropped first.
+struct MetricsLog {
+    path: PathBuf,
+    file: std::fs::File,
+}
+
+impl MetricsLog {
+    fn open(path: &Path, step: u32) -> Result<MetricsLog> {
+        let old = if step == 0 { String::new() } else { std::fs::read_to_string(path).unwrap_or_default() };
+        let kept: String = old
+            .lines()
+            .filter(|line| {
+                serde_json::from_str::<serde_json::Value>(line)
+                    .is_ok_and(|v| v["step"].as_u64().is_some_and(|s| s <= u64::from(step)))
+            })
+            .flat_map(|line| [line, "\n"])
+            .collect();
+        files::write_atomic(path, kept.as_bytes())?;
+        let file = std::fs::OpenOptions::new().append(true).open(path).map_err(Error::io("append to", path))?;
+        Ok(MetricsLog { path: path.to_path_buf(), file })
+    }
+
+    fn write(&mut self, event: &Event) -> Result<()> {
+        let line = serde_json::to_string(event).map_err(|e| Error::Internal(e.to_string()))? + "\n";
+        self.file.write_all(line.as_bytes()).map_err(Error::io("append to", &self.path))
+    }
+}
+
+/// Evaluates a run on all validation frames and leaves pictures in `directory`, if given: one comparison per
+/// frame and one animation per view.
+///
+/// # Errors
+/// Errors of data, device and files.
+pub fn evaluate_run(
+    gpu: &Gpu,
+    run: &Path,
+    dataset: &Dataset,
+    threshold_per_mm: Option<f64>,
+    directory: Option<&Path>,
+) -> Result<Evaluation> {
+    let saved = Checkpoint::read(&checkpoint::newest(run)?)?;
+    if saved.model.layout.phases != dataset.n_phases as usize {
+        return Err(Error::config(
+            "--data",
+            dataset.path.display(),
+            format!("has {} phases, the run {}", dataset.n_phases, saved.model.layout.phases),
+        ));
+    }
+    let renderer = Renderer::new(gpu, &saved.model)?;
+    let frames: Vec<_> = dataset.validation().iter().collect();
+    let threshold = threshold_per_mm.map(|t| t * crate::data::geometry::MM_PER_UNIT);
+    let evaluation = evaluate(&renderer, dataset, &frames, saved.model.step, threshold, |frame, seen, threshold| {
+        let Some(directory) = directory else { return Ok(()) };
+        pictures::write_comparison(
+            &directory.join(format!("{}.png", frame.name)),
+            frame,
+            seen,
+            threshold,
+            dataset.width,
+        )
+    })?;
+    if let Some(directory) = directory {
+        write_beats(&renderer, dataset, directory)?;
+    }
+    Ok(evaluation)
+}
+
+/// One animation of the dynamic field per validation view.
+fn write_beats(renderer: &Renderer, dataset: &Dataset, directory: &Path) -> Result<()> {
+    let mut views: Vec<usize> = dataset.validation().iter().map(|f| f.view).collect();
+    views.sort_unstable();
+    views.dedup();
+    for (index, view) in views.into_iter().enumerate() {
+        let beat = (0..dataset.n_phases)
+            .map(|phase| {
+                let rays = &dataset.views[view].rays;
+                Ok(renderer.render(rays, dataset.width, dataset.height, phase)?.dynamic_integral)
+            })
+            .collect::<Result<Vec<_>>>()?;
+        let high = beat.iter().flatten().copied().fold(f32::MIN_POSITIVE, f32::max);
+        let path = directory.join(format!("beat-view{index}.gif"));
+        pictures::write_gif(&path, &beat, dataset.width, Window { low: 0.0, high: 0.8 * high }, 90)?;
+    }
+    Ok(())
+}
