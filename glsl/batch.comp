@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Draws the rays of one iteration. One invocation per ray.
-//   rays[n_rays] <- permutation of all training rays (and of motion_rays), without replacement.
+//   rays[n_rays] <- permutations of motion_rays and of all training rays, without replacement.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -10,7 +10,7 @@ layout(binding = 1) readonly buffer B1 { uint state[]; };
 layout(binding = 2) readonly buffer B2 { View views[]; };
 layout(binding = 3) readonly buffer B3 { Frame frames[]; };
 layout(binding = 4) readonly buffer B4 { float images[]; };
-layout(binding = 5) readonly buffer B5 { float backgrounds[]; };
+layout(binding = 5) readonly buffer B5 { vec2 backgrounds[]; };
 layout(binding = 6) readonly buffer B6 { uint motion_rays[]; };
 layout(binding = 7) writeonly buffer B7 { Ray rays[]; };
 
@@ -39,8 +39,9 @@ void main() {
     ray.direction = view.direction00.xyz + i * view.direction_du.xyz + j * view.direction_dv.xyz;
     ray.norm = length(ray.direction);
     ray.target = images[frame.image_offset + pixel];
-    ray.temporal_target = ray.target - backgrounds[frame.background_offset + pixel];
+    vec2 background = backgrounds[frame.background_offset + pixel];
+    ray.temporal_low = ray.target - background.y;
     ray.id = id;
-    ray.spare = 0.0;
+    ray.temporal_high = ray.target - background.x;
     rays[r] = ray;
 }

@@ -2,9 +2,10 @@
 #extension GL_GOOGLE_include_directive : require
 // Photometric loss and its gradient: one number per ray and field, since the march is linear.
 //   absolute target: both fields share the residual S + D - y (paper, L_p).
-//   temporal target: D fits the integral above the pixel's still background, S fits what D leaves of y.
+//   temporal target: D lies between the bounds of the integral above the pixel's still background (outside
+//   them it is pulled to the nearer one), S fits what D leaves of y.
 //   ray_gradient[ray] = dL/dS, dL/dD;  ray_loss[ray] = L_p share, its dynamic part, occlusion, (S + D - y)^2.
-// Invariant: both gradients carry 2 / rays, so a batch is a mean.
+// Each term is a mean over the rays that take part in it.
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
@@ -13,17 +14,22 @@ layout(binding = 1) readonly buffer B1 { Ray rays[]; };
 layout(binding = 2) readonly buffer B2 { RayOut ray_out[]; };
 layout(binding = 3) writeonly buffer B3 { vec2 ray_gradient[]; };
 layout(binding = 4) writeonly buffer B4 { vec4 ray_loss[]; };
+#include "inc/static_rays.glsl"
 
 void main() {
     uint i = gl_GlobalInvocationID.x;
     if (i >= push.n_rays) return;
     uint r = push.first_ray + i;
     RayOut seen = ray_out[r];
-    float scale = 1.0 / float(setup.n_rays);
+    bool temporal = setup.temporal_target != 0u;
+    float mean_scale = skips_static(r) ? 0.0 : 1.0 / float(n_static_rays());
+    float static_scale = setup.static_weight * mean_scale;
     float total = seen.static_integral + seen.dynamic_integral - rays[r].target;
-    float dynamic_residual = setup.temporal_target != 0u ? seen.dynamic_integral - rays[r].temporal_target : total;
-    ray_gradient[r] = 2.0 * scale * vec2(setup.static_weight * total, setup.dynamic_weight * dynamic_residual);
-    float dynamic_loss = scale * setup.dynamic_weight * dynamic_residual * dynamic_residual;
-    float data = scale * setup.static_weight * total * total + (setup.temporal_target != 0u ? dynamic_loss : 0.0);
-    ray_loss[r] = vec4(data, dynamic_loss, seen.occlusion, scale * total * total);
+    float dynamic_scale = setup.dynamic_weight / float(setup.n_rays);
+    float d = seen.dynamic_integral;
+    float dynamic_residual = temporal ? d - clamp(d, rays[r].temporal_low, rays[r].temporal_high) : total;
+    ray_gradient[r] = 2.0 * vec2(static_scale * total, dynamic_scale * dynamic_residual);
+    float dynamic_loss = dynamic_scale * dynamic_residual * dynamic_residual;
+    float data = static_scale * total * total + (temporal ? dynamic_loss : 0.0);
+    ray_loss[r] = vec4(data, dynamic_loss, seen.occlusion, mean_scale * total * total);
 }

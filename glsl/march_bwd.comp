@@ -43,7 +43,7 @@ void main() {
     uint r = push.first_ray + gl_WorkGroupID.x;
     Ray ray = rays[r];
     float gradient = ray_gradient[r].x;
-    if (gradient == 0.0) return;
+    if (gradient == 0.0) return;  // rays that skip the static field, too
     uint stream = setup.per_ray_depths != 0u ? ray.id + 1u : 0u;
     float scale_high = exp2(float(setup.fixed_point_bits) - 32.0);
     for (uint k = gl_LocalInvocationID.x; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {

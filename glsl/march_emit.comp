@@ -20,7 +20,7 @@ void main() {
     for (uint k = begin; k < end; k++) {
         vec2 depth = dynamic_sample(k, ray);
         vec3 x = ray.anchor + depth.x * ray.direction;
-        if (!dynamic_inside(x)) continue;
+        if (!dynamic_inside(x, ray.phase)) continue;
         sample_points[slot] = vec4(x, depth.y);
         sample_rays[slot] = (push.first_ray + r) | (depth.x < setup.occlusion_depth ? 0x80000000u : 0u);
         slot++;

@@ -21,6 +21,7 @@ READ_VEC4(7, B7, static_params);
 layout(binding = 8) writeonly buffer B8 { RayOut ray_out[]; };
 #include "inc/tensor_vm.glsl"
 #include "inc/reduce.glsl"
+#include "inc/static_rays.glsl"
 
 void main() {
     uint lane = gl_LocalInvocationID.x;
@@ -29,7 +30,8 @@ void main() {
     uint stream = setup.per_ray_depths != 0u ? ray.id + 1u : 0u;
     float static_sum = 0.0;
     float static_max = 0.0;
-    for (uint k = lane; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {
+    uint n_static = with_maxima == 0u && skips_static(r) ? 0u : setup.n_static_samples;
+    for (uint k = lane; k < n_static; k += gl_WorkGroupSize.x) {
         vec2 depth = depth_and_step(k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
                                     setup.seed, state[0], stream, ray.norm);
         vec3 x = ray.anchor + depth.x * ray.direction;

@@ -8,7 +8,8 @@ layout(push_constant) uniform Push { uint first_ray; uint n_rays; uint row; uint
 layout(binding = 0) readonly buffer B0 { Ray rays[]; };
 layout(binding = 1) readonly buffer B1 { vec4 ray_dz[]; };
 layout(binding = 2) buffer B2 { vec4 phase_dz[]; };
-#include "inc/reduce.glsl"
+
+shared vec4 lanes_sum[gl_WorkGroupSize.x];
 
 void main() {
     uint q = gl_WorkGroupID.x;
@@ -17,8 +18,11 @@ void main() {
     for (uint r = gl_LocalInvocationID.x; r < push.n_rays; r += gl_WorkGroupSize.x) {
         if (rays[push.first_ray + r].phase == phase) sum += ray_dz[q * push.n_rays + r];
     }
-    vec4 total;
-    for (uint c = 0u; c < 4u; c++) total[c] = workgroup_sum(sum[c]);
+    lanes_sum[gl_LocalInvocationID.x] = sum;
+    barrier();
+    if (gl_LocalInvocationID.x != 0u) return;
+    vec4 total = lanes_sum[0];
+    for (uint l = 1u; l < gl_WorkGroupSize.x; l++) total += lanes_sum[l];
     uint at = (push.row + phase) * push.groups + q;
-    if (gl_LocalInvocationID.x == 0u) phase_dz[at] = total + (push.accumulate != 0u ? phase_dz[at] : vec4(0.0));
+    phase_dz[at] = total + (push.accumulate != 0u ? phase_dz[at] : vec4(0.0));
 }

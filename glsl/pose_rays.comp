@@ -20,8 +20,8 @@ void main() {
     ray.direction = view.direction00.xyz + i * view.direction_du.xyz + j * view.direction_dv.xyz;
     ray.norm = length(ray.direction);
     ray.target = 0.0;
-    ray.temporal_target = 0.0;
+    ray.temporal_low = 0.0;
     ray.id = pixel;
-    ray.spare = 0.0;
+    ray.temporal_high = 0.0;
     rays[r] = ray;
 }

@@ -183,14 +183,17 @@ pub struct Loss {
 pub struct Hull {
     /// Restrict the dynamic field to it.
     pub enabled: bool,
-    /// Cells along the longest side.
+    /// Carve each phase from its own images, not only from what moves over the whole beat.
+    pub per_phase: bool,
+    /// Cells along each side.
     pub resolution: u32,
     /// A pixel moves when its temporal range exceeds what noise gives by this many standard deviations.
     pub noise_sigmas: f64,
     /// ... and this share of the strongest change in its view.
     pub min_share: f64,
-    /// Width of the structures kept, in pixels; wider temporal change counts as background. 0 keeps all.
-    pub structure_pixels: u32,
+    /// Half width of the widest vessel, pixels: structures as thin as that may hide in the still background.
+    /// 0 trusts each pixel's minimum over the phases.
+    pub vessel_pixels: u32,
     /// Pixels by which moving regions grow.
     pub dilate_pixels: u32,
     /// Larger hulls (share of the box) are not used.
@@ -265,10 +268,11 @@ impl Config {
             loss: Loss { normalise: false, dynamic_target: DynamicTarget::Absolute },
             hull: Hull {
                 enabled: false,
+                per_phase: false,
                 resolution: 128,
                 noise_sigmas: 6.0,
                 min_share: 0.1,
-                structure_pixels: 0,
+                vessel_pixels: 3,
                 dilate_pixels: 1,
                 max_share: 0.35,
             },
@@ -289,12 +293,13 @@ impl Config {
                     iterations: 1500,
                     rays: 1024,
                     motion_share: 0.75,
+                    chunk_samples: 131_072,
                     validate_every: 250,
                     checkpoint_every: 500,
                     ..paper.train
                 },
                 march: March {
-                    static_samples: 64,
+                    static_samples: 32,
                     dynamic_samples: 128,
                     render_samples: 256,
                     per_ray_depths: true,
@@ -316,7 +321,7 @@ impl Config {
                     ..paper.dynamic
                 },
                 loss: Loss { normalise: true, dynamic_target: DynamicTarget::Temporal },
-                hull: Hull { enabled: true, ..paper.hull },
+                hull: Hull { enabled: true, per_phase: true, ..paper.hull },
                 ..paper
             },
         }
@@ -416,7 +421,7 @@ impl Config {
             ("hull.min_share", self.hull.min_share, 0.0, 1.0),
             ("hull.max_share", self.hull.max_share, 0.0, 1.0),
             ("hull.dilate_pixels", f64::from(self.hull.dilate_pixels), 0.0, 64.0),
-            ("hull.structure_pixels", f64::from(self.hull.structure_pixels), 0.0, 1024.0),
+            ("hull.vessel_pixels", f64::from(self.hull.vessel_pixels), 0.0, 1024.0),
             ("adam.beta1", self.adam.beta1, 0.0, 0.999_999),
             ("adam.beta2", self.adam.beta2, 0.0, 0.999_999),
             ("adam.epsilon", self.adam.epsilon, 1e-30, 1.0),

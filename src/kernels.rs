@@ -172,7 +172,7 @@ stages! {
     /// Sums over each ray's samples.
     mlp_ray_sum(|_| 64, operands);
     /// Sums over each phase's rays.
-    mlp_phase_sum(|_| 32, plain);
+    mlp_phase_sum(|t| t.weight_lanes, plain);
     /// Gradients of biases, latent weights and latents.
     mlp_latent_bwd(|_| 64, plain);
     /// Collects the gradient.

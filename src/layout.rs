@@ -34,7 +34,7 @@ shared! {
         static_weight: f32, dynamic_weight: f32, temporal_target: u32,
         occlusion_weight: f32, occlusion_depth: f32,
         hull_enabled: u32, hull_nx: u32, hull_ny: u32, hull_nz: u32,
-        hull_min_x: f32, hull_min_y: f32, hull_min_z: f32, hull_inv_cell: f32,
+        hull_min_x: f32, hull_min_y: f32, hull_min_z: f32, hull_inv_cell: f32, hull_phase_words: u32,
         sample_capacity: u32, latent_width: u32, n_layers: u32, mlp_width: u32,
         static_params: u32, n_params: u32, fixed_point_bits: u32,
         tv_plane: f32, tv_line: f32, beta1: f32, beta2: f32, epsilon: f32, ring_length: u32,
@@ -53,7 +53,7 @@ shared! {
     /// One ray of a batch.
     Ray {
         anchor: [f32; 3], phase: u32, direction: [f32; 3], norm: f32,
-        target: f32, temporal_target: f32, id: u32, spare: f32,
+        target: f32, temporal_low: f32, id: u32, temporal_high: f32,
     }
 }
 

@@ -29,8 +29,11 @@ pub mod model {
 }
 /// CPU twins.
 pub mod cpu {
+    pub mod field;
+    pub mod march;
     pub mod projector;
     pub mod random;
+    pub mod step;
 }
 /// Training.
 pub mod train {

@@ -55,6 +55,7 @@ struct Setup {
     float hull_min_y;
     float hull_min_z;
     float hull_inv_cell;
+    uint hull_phase_words;    // words from one phase's hull to the next; 0: one hull for all
     uint sample_capacity;     // samples one chunk can hold
     uint latent_width;
     uint n_layers;            // hidden layers
@@ -89,9 +90,9 @@ struct Ray {
     vec3 direction;
     float norm;
     float target;             // measured line integral
-    float temporal_target;    // integral above the pixel's still background
+    float temporal_low;       // bounds of the integral above the pixel's still background
     uint id;
-    float spare;
+    float temporal_high;
 };
 
 struct View {
@@ -107,7 +108,7 @@ struct Frame {
     uint view;
     uint phase;
     uint image_offset;        // floats into images
-    uint background_offset;   // floats into backgrounds
+    uint background_offset;   // vec2 into backgrounds
 };
 
 // What a ray sees.

@@ -14,20 +14,25 @@ use rayon::prelude::*;
 pub struct ViewMotion {
     /// Index into [`Dataset::views`].
     pub view: usize,
-    /// Still background: each pixel's smallest line integral over the phases, corrected for the bias that
+    /// Upper bound of the still background: each pixel's smallest line integral over the phases, corrected for the bias that
     /// taking a minimum of noisy values has.
     pub background: Vec<f32>,
+    /// Lower bound of the still background: what remains of it without structures as thin as vessels, since a
+    /// vessel that covers a pixel at every phase is part of the minimum.
+    pub background_low: Vec<f32>,
     /// Largest integral above the background over the phases.
     pub range: Vec<f32>,
     /// Standard deviation of a pixel's noise.
     pub noise: Vec<f32>,
-    /// Pixels that move.
+    /// Pixels that move at some phase.
     pub moving: Vec<bool>,
+    /// Pixels that stand out of the background at each phase of the dataset; empty for phases not seen.
+    pub moving_at: Vec<Vec<bool>>,
     /// Training phases of this view.
     pub n_phases: usize,
 }
 
-/// Binary volume on a regular grid, world units, x fastest.
+/// Binary volumes on a regular grid, one for all phases or one per phase; world units, x fastest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hull {
     /// Cells along x, y, z.
@@ -36,7 +41,9 @@ pub struct Hull {
     pub min: DVec3,
     /// Side of a cell.
     pub cell: f64,
-    /// 32 cells to a word, lowest bit first.
+    /// Volumes: 1, or one per phase.
+    pub n_phases: usize,
+    /// 32 cells to a word, lowest bit first; each phase starts a new word.
     pub bits: Vec<u32>,
 }
 
@@ -112,36 +119,30 @@ pub fn analyse(dataset: &Dataset, config: &config::Hull) -> Vec<ViewMotion> {
             let bias = expected_minimum(n) as f32;
             let lowest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::INFINITY, f32::min)).collect();
             let highest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::NEG_INFINITY, f32::max)).collect();
-            let change = Image {
-                width: dataset.width,
-                height: dataset.height,
-                values: highest.iter().zip(&lowest).map(|(h, l)| h - l).collect(),
-            };
-            let thin = if config.structure_pixels > 0 {
-                top_hat(&change, config.structure_pixels as usize)
+            let background: Vec<f32> =
+                lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { 0.0 }).collect();
+            let image = |values: Vec<f32>| Image { width: dataset.width, height: dataset.height, values };
+            let vessel = config.vessel_pixels as usize;
+            let background_low = if vessel > 0 && n > 1 {
+                opening(&image(background.clone()), vessel).values
             } else {
-                change.clone()
+                background.clone()
             };
-            let strongest = percentile(&thin.values, 0.995);
-            let moving = Image {
-                values: (0..pixels)
-                    .map(|p| {
-                        let threshold =
-                            (config.noise_sigmas as f32 * noise[p]).max(config.min_share as f32 * strongest);
-                        f32::from(u8::from(n > 1 && thin.values[p] > threshold))
-                    })
-                    .collect(),
-                ..change.clone()
+            let range: Vec<f32> = highest.iter().zip(&background).map(|(h, b)| (h - b).max(0.0)).collect();
+            let strongest = percentile(&range, 0.995);
+            let threshold = |p: usize| (config.noise_sigmas as f32 * noise[p]).max(config.min_share as f32 * strongest);
+            let grow = |marked: &dyn Fn(usize) -> bool| -> Vec<bool> {
+                let marked = (0..pixels).map(|p| f32::from(u8::from(n > 1 && marked(p))));
+                let grown = dilate(&image(marked.collect()), config.dilate_pixels as usize);
+                grown.values.iter().map(|v| *v > 0.0).collect()
             };
-            let grown = dilate(&moving, config.dilate_pixels as usize);
-            ViewMotion {
-                view,
-                background: lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { 0.0 }).collect(),
-                range: change.values,
-                noise,
-                moving: grown.values.iter().map(|v| *v > 0.0).collect(),
-                n_phases: n,
+            let mut moving_at = vec![Vec::new(); dataset.n_phases as usize];
+            for frame in &frames {
+                let stands_out = |p: usize| frame.integrals[p] - background_low[p] > threshold(p);
+                moving_at[frame.phase as usize] = grow(&|p| range[p] > threshold(p) && stands_out(p));
             }
+            let moving = grow(&|p| range[p] > threshold(p));
+            ViewMotion { view, moving, moving_at, background, background_low, range, noise, n_phases: n }
         })
         .collect()
 }
@@ -179,127 +180,133 @@ fn dilate(image: &Image, radius: usize) -> Image {
     filter(image, radius, f32::max)
 }
 
-/// What is narrower than `2 radius + 1` pixels: the image minus its grey opening.
-fn top_hat(image: &Image, radius: usize) -> Image {
-    let opened = dilate(&filter(image, radius, f32::min), radius);
-    Image { values: image.values.iter().zip(&opened.values).map(|(a, b)| a - b).collect(), ..opened }
+/// Grey opening: what is narrower than `2 radius + 1` pixels is cut down to its surroundings.
+fn opening(image: &Image, radius: usize) -> Image {
+    dilate(&filter(image, radius, f32::min), radius)
 }
 
 impl Hull {
     /// Cells of a cube of half side `half` (world units) that every view seeing them shows moving; at least
-    /// two views (or the only one) must see them.
-    pub fn carve(dataset: &Dataset, motion: &[ViewMotion], half: f64, resolution: usize) -> Hull {
+    /// two views (or the only one) must see them. With `per_phase`, cells are kept for the phases at which
+    /// every view that has the phase shows something there.
+    pub fn carve(dataset: &Dataset, motion: &[ViewMotion], half: f64, resolution: usize, per_phase: bool) -> Hull {
         let n = resolution;
+        let cells = n * n * n;
         let cell = 2.0 * half / n as f64;
         let min = DVec3::splat(-half);
         let projectors: Vec<_> =
-            motion.iter().map(|m| Projector::new(&dataset.views[m.view].rays, m, dataset)).collect();
+            motion.iter().map(|m| Projector::new(&dataset.views[m.view].rays, dataset.width, dataset.height)).collect();
         let needed = motion.len().min(2);
-        let keep: Vec<bool> = (0..n * n * n)
+        // For each kept cell, the pixel it falls on in each view.
+        let kept: Vec<(usize, Vec<Option<usize>>)> = (0..cells)
             .into_par_iter()
-            .map(|index| {
+            .filter_map(|index| {
                 let (x, y, z) = (index % n, index / n % n, index / (n * n));
                 let centre = min + (DVec3::new(x as f64, y as f64, z as f64) + 0.5) * cell;
-                let mut seen = 0;
-                for projector in &projectors {
-                    match projector.moving_at(centre) {
-                        Some(false) => return false,
-                        Some(true) => seen += 1,
-                        None => {}
+                let mut pixels = Vec::with_capacity(projectors.len());
+                for (projector, m) in projectors.iter().zip(motion) {
+                    let pixel = projector.pixel(centre);
+                    if pixel.is_some_and(|p| !m.moving[p]) {
+                        return None;
                     }
+                    pixels.push(pixel);
                 }
-                seen >= needed
+                (pixels.iter().flatten().count() >= needed).then_some((index, pixels))
             })
             .collect();
-        let mut bits = vec![0u32; (n * n * n).div_ceil(32)];
-        for (index, kept) in keep.iter().enumerate() {
-            bits[index / 32] |= u32::from(*kept) << (index % 32);
+        let n_phases = if per_phase { dataset.n_phases as usize } else { 1 };
+        let words = cells.div_ceil(32);
+        let mut bits = vec![0u32; words * n_phases];
+        for (phase, bits) in bits.chunks_mut(words).enumerate() {
+            for (index, pixels) in &kept {
+                let shown = |(pixel, m): (&Option<usize>, &ViewMotion)| {
+                    let at = &m.moving_at[phase];
+                    pixel.is_none_or(|p| !per_phase || at.is_empty() || at[p])
+                };
+                if pixels.iter().zip(motion).all(shown) {
+                    bits[index / 32] |= 1 << (index % 32);
+                }
+            }
         }
-        Hull { size: [n; 3], min, cell, bits }
+        Hull { size: [n; 3], min, cell, n_phases, bits }
     }
 
-    /// Whether a cell is kept.
-    pub fn contains(&self, x: usize, y: usize, z: usize) -> bool {
-        let index = (z * self.size[1] + y) * self.size[0] + x;
-        self.bits[index / 32] >> (index % 32) & 1 == 1
+    /// Words of one phase's volume.
+    pub fn words(&self) -> usize {
+        self.bits.len() / self.n_phases
     }
 
-    /// The hull as a volume of zeros and ones, to look at.
+    /// The hull as a volume, to look at: the number of phases at which a cell is kept.
     pub fn to_volume(&self) -> Volume {
-        let [nx, ny, nz] = self.size;
         let cell_mm = self.cell * MM_PER_UNIT;
         // Index axes follow the world's (posterior, left, superior); LPS swaps the first two.
         let axes = DMat3::from_cols(DVec3::Y * cell_mm, DVec3::X * cell_mm, DVec3::Z * cell_mm);
         let first = (self.min + 0.5 * self.cell) * MM_PER_UNIT;
+        let count = |i: usize| self.bits.chunks(self.words()).filter(|w| w[i / 32] >> (i % 32) & 1 == 1).count();
         Volume {
             size: self.size,
-            values: (0..nx * ny * nz).map(|i| (self.bits[i / 32] >> (i % 32) & 1) as f32).collect(),
+            values: (0..self.size.iter().product()).map(|i| count(i) as f32).collect(),
             index_to_lps: DAffine3::from_mat3_translation(axes, DVec3::new(first.y, first.x, first.z)),
         }
     }
 
-    /// Whether a point lies in a kept cell.
-    pub fn contains_point(&self, point: DVec3) -> bool {
+    /// Whether a point lies in a cell kept at a phase.
+    pub fn contains_point(&self, point: DVec3, phase: usize) -> bool {
         let c = ((point - self.min) / self.cell).floor();
         let inside = |v: f64, n: usize| v >= 0.0 && v < n as f64;
-        inside(c.x, self.size[0])
-            && inside(c.y, self.size[1])
-            && inside(c.z, self.size[2])
-            && self.contains(c.x as usize, c.y as usize, c.z as usize)
+        if !(inside(c.x, self.size[0]) && inside(c.y, self.size[1]) && inside(c.z, self.size[2])) {
+            return false;
+        }
+        let index = (c.z as usize * self.size[1] + c.y as usize) * self.size[0] + c.x as usize;
+        let start = if self.n_phases > 1 { phase * self.words() } else { 0 };
+        self.bits[start + index / 32] >> (index % 32) & 1 == 1
     }
 
-    /// Kept share of all cells.
+    /// Kept share of all cells, averaged over phases.
     pub fn share(&self) -> f64 {
-        let kept: u32 = self.bits.iter().map(|w| w.count_ones()).sum();
-        f64::from(kept) / self.size.iter().product::<usize>() as f64
+        let kept: u64 = self.bits.iter().map(|w| u64::from(w.count_ones())).sum();
+        kept as f64 / (self.size.iter().product::<usize>() * self.n_phases) as f64
     }
 
-    /// Lower and upper corner of the kept cells; `None` when nothing is kept.
+    /// Lower and upper corner of the cells kept at any phase; `None` when nothing is kept.
     pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
         let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-        for z in 0..self.size[2] {
-            for y in 0..self.size[1] {
-                for x in 0..self.size[0] {
-                    if self.contains(x, y, z) {
-                        let corner = self.min + DVec3::new(x as f64, y as f64, z as f64) * self.cell;
-                        low = low.min(corner);
-                        high = high.max(corner + self.cell);
-                    }
-                }
+        let [nx, ny, _] = self.size;
+        for (word, bits) in self.bits.iter().enumerate().filter(|(_, bits)| **bits != 0) {
+            for bit in (0..32).filter(|bit| bits >> bit & 1 == 1) {
+                let index = word % self.words() * 32 + bit;
+                let cell = DVec3::new((index % nx) as f64, (index / nx % ny) as f64, (index / (nx * ny)) as f64);
+                let corner = self.min + cell * self.cell;
+                low = low.min(corner);
+                high = high.max(corner + self.cell);
             }
         }
         low.is_finite().then_some((low, high))
     }
 }
 
-struct Projector<'a> {
-    rays: &'a ViewRays,
-    inverse: glam::DMat3,
-    moving: &'a [bool],
+/// World point to pixel.
+struct Projector {
+    source: DVec3,
+    inverse: DMat3,
     width: i64,
     height: i64,
 }
 
-impl<'a> Projector<'a> {
-    fn new(rays: &'a ViewRays, motion: &'a ViewMotion, dataset: &Dataset) -> Self {
-        let basis = glam::DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
-        Projector {
-            rays,
-            inverse: basis.inverse(),
-            moving: &motion.moving,
-            width: dataset.width as i64,
-            height: dataset.height as i64,
-        }
+impl Projector {
+    fn new(rays: &ViewRays, width: usize, height: usize) -> Self {
+        let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
+        Projector { source: rays.source(), inverse: basis.inverse(), width: width as i64, height: height as i64 }
     }
 
-    /// Whether the view shows motion where it sees the point; `None` when it does not see it.
-    fn moving_at(&self, point: DVec3) -> Option<bool> {
-        let h = self.inverse * (point - self.rays.source());
+    /// Index of the pixel a point falls on; `None` when the view does not see it.
+    fn pixel(&self, point: DVec3) -> Option<usize> {
+        let h = self.inverse * (point - self.source);
         if h.z <= 0.0 {
             return None;
         }
         let (i, j) = ((h.x / h.z).round() as i64, (h.y / h.z).round() as i64);
-        (i >= 0 && j >= 0 && i < self.width && j < self.height).then(|| self.moving[(j * self.width + i) as usize])
+        (i >= 0 && j >= 0 && i < self.width && j < self.height).then_some((j * self.width + i) as usize)
     }
 }
 
@@ -314,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn top_hat_keeps_thin_and_drops_wide() {
+    fn opening_cuts_thin_and_keeps_wide() {
         let mut image = Image::zeros(20, 20);
         for y in 0..20 {
             image.values[y * 20 + 3] = 1.0;
@@ -322,7 +329,7 @@ mod tests {
                 image.values[y * 20 + x] = 1.0;
             }
         }
-        let thin = top_hat(&image, 2);
-        assert_eq!((thin.values[5 * 20 + 3], thin.values[5 * 20 + 14]), (1.0, 0.0));
+        let opened = opening(&image, 2);
+        assert_eq!((opened.values[5 * 20 + 3], opened.values[5 * 20 + 14]), (0.0, 1.0));
     }
 }

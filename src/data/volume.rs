@@ -245,16 +245,19 @@ fn read_nifti(path: &Path) -> Result<Volume> {
     let size = check_size(path, "dim", &[header.dim[1].into(), header.dim[2].into(), header.dim[3].into()])?;
     let object = ReaderOptions::new().read_file(path).map_err(|e| bad("data", e.to_string()))?;
     let volume: InMemNiftiVolume = object.into_volume();
-    if volume.dim().len() < 3 {
-        return Err(bad("dim", "fewer than three axes".into()));
+    if volume.dim().len() != axes {
+        return Err(bad("dim", format!("{:?} disagrees with the header", volume.dim())));
     }
     let array = volume.into_ndarray::<f32>().map_err(|e| bad("data", e.to_string()))?;
     // The array is indexed (x, y, z, ...); memory order here is x fastest.
     let mut values = Vec::with_capacity(array.len());
-    let flat = array.into_shape_with_order((size[0], size[1], size[2])).or_else(|e| Err(bad("dim", e.to_string())))?;
+    let mut index = vec![0; array.ndim()];
     for z in 0..size[2] {
         for y in 0..size[1] {
-            values.extend((0..size[0]).map(|x| flat[[x, y, z]]));
+            for x in 0..size[0] {
+                index[..3].copy_from_slice(&[x, y, z]);
+                values.push(array[&index[..]]);
+            }
         }
     }
     let ras = nifti_affine(&header).ok_or_else(|| bad("sform", "neither sform nor qform is set".into()))?;

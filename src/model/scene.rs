@@ -183,6 +183,7 @@ impl Scene {
             hull_min_y: f(hull_min.y),
             hull_min_z: f(hull_min.z),
             hull_inv_cell: hull.map_or(0.0, |h| f(1.0 / h.cell)),
+            hull_phase_words: hull.map_or(0, |h| if h.n_phases > 1 { h.words() as u32 } else { 0 }),
             sample_capacity: config.train.chunk_samples,
             latent_width: params.latent as u32,
             n_layers: params.layers.len() as u32,

@@ -52,6 +52,7 @@ struct HullHeader {
     size: [usize; 3],
     min: [f64; 3],
     cell: f64,
+    n_phases: usize,
 }
 
 /// Name of the checkpoint of a step.
@@ -140,7 +141,12 @@ impl Checkpoint {
             c_arm: model.c_arm.clone(),
             image_size: model.image_size,
             data_fingerprint: self.data_fingerprint.clone(),
-            hull: model.hull.as_ref().map(|h| HullHeader { size: h.size, min: h.min.to_array(), cell: h.cell }),
+            hull: model.hull.as_ref().map(|h| HullHeader {
+                size: h.size,
+                min: h.min.to_array(),
+                cell: h.cell,
+                n_phases: h.n_phases,
+            }),
         };
         let header = serde_json::to_string(&header).map_err(|e| Error::Internal(e.to_string()))?;
         let views = tensors
@@ -205,9 +211,11 @@ impl Checkpoint {
             None => None,
             Some(h) => {
                 let view = tensors.tensor("hull.bits").map_err(|e| bad("hull.bits", e.to_string()))?;
-                let words = h.size.iter().try_fold(1usize, |n, s| n.checked_mul(*s)).unwrap_or(0).div_ceil(32);
+                let words =
+                    h.size.iter().try_fold(1usize, |n, s| n.checked_mul(*s)).unwrap_or(0).div_ceil(32) * h.n_phases;
                 if view.dtype() != Dtype::U32
                     || view.shape() != [words]
+                    || ![1, header.phases].contains(&h.n_phases)
                     || words == 0
                     || h.cell.is_nan()
                     || h.cell <= 0.0
@@ -218,7 +226,7 @@ impl Checkpoint {
                     ));
                 }
                 let bits = view.data().chunks_exact(4).map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
-                Some(Hull { size: h.size, min: DVec3::from_array(h.min), cell: h.cell, bits })
+                Some(Hull { size: h.size, min: DVec3::from_array(h.min), cell: h.cell, n_phases: h.n_phases, bits })
             }
         };
         Ok(Checkpoint {

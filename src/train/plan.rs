@@ -1,7 +1,7 @@
 //! From a dataset and a configuration to everything a run needs, in the device's terms: scales, boxes,
 //! hull, backgrounds, ray lists, schedule. Pure host code; both the engine and its CPU twin start here.
 
-use crate::config::Config;
+use crate::config::{Config, DynamicTarget};
 use crate::data::dataset::Dataset;
 use crate::data::motion::{self, Hull, ViewMotion};
 use crate::error::{Error, Result};
@@ -27,8 +27,8 @@ pub struct Plan {
     pub frames: Vec<layout::Frame>,
     /// Line integrals of all training frames.
     pub images: Vec<f32>,
-    /// Still background of each view.
-    pub backgrounds: Vec<f32>,
+    /// Bounds of the still background of each pixel of each view.
+    pub backgrounds: Vec<[f32; 2]>,
     /// Rays that meet the hull, as frame * pixels + pixel.
     pub motion_rays: Vec<u32>,
     /// The hull, when it is used.
@@ -81,7 +81,7 @@ impl Plan {
         for (slot, m) in motion.iter().enumerate() {
             slot_of_view[m.view] = slot as u32;
             views.push(dataset.views[m.view].rays.to_device());
-            backgrounds.extend_from_slice(&m.background);
+            backgrounds.extend(m.background_low.iter().zip(&m.background).map(|(low, high)| [*low, *high]));
         }
         let mut frames = Vec::with_capacity(training.len());
         let mut images = Vec::with_capacity(n_all);
@@ -96,9 +96,17 @@ impl Plan {
             });
             images.extend_from_slice(&frame.integrals);
             if hull.is_some() {
-                let moving = &motion[slot as usize].moving;
+                let m = &motion[slot as usize];
+                let moving = if config.hull.per_phase { &m.moving_at[frame.phase as usize] } else { &m.moving };
                 motion_rays.extend((0..pixels).filter(|p| moving[*p]).map(|p| (index * pixels + p) as u32));
             }
+        }
+        if config.loss.dynamic_target == DynamicTarget::Temporal && motion.iter().any(|m| m.n_phases < 2) {
+            return Err(Error::config(
+                "loss.dynamic_target",
+                "temporal",
+                "needs several phases in every view; use `absolute` for still objects",
+            ));
         }
         let params = ParamLayout::new(config, dataset.n_phases as usize);
         let n_motion_rays = if motion_rays.is_empty() {
@@ -139,7 +147,13 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
         notes.push(format!("motion hull not used: views {still:?} have a single phase"));
         return None;
     }
-    let hull = Hull::carve(dataset, motion, dynamic_half(config, dataset), config.hull.resolution as usize);
+    let hull = Hull::carve(
+        dataset,
+        motion,
+        dynamic_half(config, dataset),
+        config.hull.resolution as usize,
+        config.hull.per_phase,
+    );
     let share = hull.share();
     if share == 0.0 {
         notes.push("motion hull not used: no point moves in every view that sees it".into());
@@ -152,7 +166,7 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
         ));
         None
     } else {
-        notes.push(format!("motion hull keeps {:.2} % of the box", 100.0 * share));
+        notes.push(format!("motion hull keeps {:.3} % of the box", 100.0 * share));
         Some(hull)
     }
 }

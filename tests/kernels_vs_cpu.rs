@@ -1,0 +1,136 @@
+//! Every training kernel against its f64 twin, through whole iterations on the device, with validation on.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+
+use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
+use nertca_vk::cpu::{march, step};
+use nertca_vk::layout::Ray;
+use nertca_vk::train::plan::Plan;
+use nertca_vk::train::trainer::Trainer;
+
+/// Presets and variations whose gradients are checked. Each covers a branch the others do not.
+const CASES: &[(&str, &[&str])] = &[
+    ("paper", &["dynamic.occlusion=1e-3"]),
+    ("public-code", &["dynamic.occlusion=1e-3"]),
+    ("fast", &[]),
+    // odd bands, five ranks (two vec4), no power of two anywhere, batch of one ray
+    ("fast", &["dynamic.bands=5", "static.ranks=5", "static.grid=7", "train.rays=4", "march.dynamic_samples=33"]),
+    // a single hidden layer, skip in a deep net, wide layers
+    ("paper", &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
+    ("public-code", &["dynamic.layers=6", "dynamic.skip_layer=3", "dynamic.width=48", "dynamic.latent=12"]),
+];
+
+#[test]
+fn rays_and_depths_match() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    let plan =
+        Plan::new(&small_config("fast", &["hull.enabled=true", "hull.max_share=1", "hull.resolution=24"]), &dataset)
+            .unwrap();
+    assert!(plan.hull.is_some(), "this case is about the hull");
+    let mut trainer = Trainer::new(&gpu, plan, &dataset).unwrap();
+    let losses = trainer.advance(1).unwrap();
+    let plan = trainer.plan();
+    let got: Vec<Ray> = gpu.download(trainer.buffers().get("rays").unwrap(), 0, plan.setup.n_rays as usize).unwrap();
+    let want = march::batch(plan, losses.last().unwrap().step - 1);
+    let params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
+    let mut live = 0;
+    for (g, w) in got.iter().zip(&want) {
+        assert_eq!((g.id, g.phase as usize), (w.id, w.phase));
+        for axis in 0..3 {
+            assert!((f64::from(g.anchor[axis]) - w.anchor[axis]).abs() < 1e-6);
+            assert!((f64::from(g.direction[axis]) - w.direction[axis]).abs() < 1e-6);
+        }
+        assert!((f64::from(g.temporal_low) - w.temporal[0]).abs() < 1e-6);
+        assert!((f64::from(g.temporal_high) - w.temporal[1]).abs() < 1e-6);
+        live += march::fwd(plan, &params, 0, w, false).dynamics.len();
+    }
+    assert!(live > 20, "the case must have live samples, has {live}");
+    // A sample on a cell face may fall either way in f32.
+    assert!((losses[0].live_samples as i64 - live as i64).abs() <= 2, "{} live, twin {live}", losses[0].live_samples);
+    drop(trainer);
+    expect_silence(gpu);
+}
+
+#[test]
+fn losses_and_gradients_match() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    for (preset, settings) in CASES {
+        let plan = Plan::new(&small_config(preset, settings), &dataset).unwrap();
+        // Larger planes and lines than the default start, so that static gradients are not tiny products.
+        let mut params = plan.params.initial(&plan.config);
+        for p in &mut params[..plan.params.static_len] {
+            *p *= 30.0;
+        }
+        let twin: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
+        let mut trainer = Trainer::new(&gpu, plan, &dataset).unwrap();
+        gpu.upload(trainer.buffers().get("params").unwrap(), 0, &params).unwrap();
+        let got = trainer.advance(1).unwrap()[0];
+        let plan = trainer.plan();
+        let (want, gradient) = step::loss_and_gradient(plan, &twin, 0, &march::batch(plan, 0));
+        for (name, g, w) in [
+            ("data", got.data, want.data),
+            ("dynamic", got.dynamic, want.dynamic),
+            ("tv", got.tv, want.tv),
+            ("occlusion", got.occlusion, want.occlusion),
+        ] {
+            assert!((g - w).abs() <= 2e-5 * w.abs() + 1e-12, "{preset} {settings:?} {name}: {g} against {w}");
+        }
+        let on_device: Vec<f32> = gpu.download(trainer.buffers().get("gradient").unwrap(), 0, plan.params.len).unwrap();
+        // Tensor by tensor, so that a missing small gradient cannot hide behind a large one.
+        for tensor in plan.params.tensors() {
+            let pick = |v: &dyn Fn(usize) -> f64| tensor.positions.iter().map(|p| v(*p as usize)).collect::<Vec<_>>();
+            let want = pick(&|i| gradient[i]);
+            let got: Vec<f32> = tensor.positions.iter().map(|p| on_device[*p as usize]).collect();
+            let (error, at) = relative_error(&got, &want);
+            // f32 sums of a few thousand terms; ReLU kinks are not crossed by rounding in these cases.
+            assert!(
+                error < 1e-4,
+                "{preset} {settings:?} {}[{at}]: {} against {} ({error:.1e})",
+                tensor.name,
+                got[at],
+                want[at]
+            );
+            assert!(want.iter().any(|v| *v != 0.0), "{preset} {settings:?} {} has no gradient at all", tensor.name);
+        }
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn ten_updates_across_the_delay_match() {
+    let gpu = gpu();
+    let dataset = small_dataset(9, 8);
+    for preset in ["paper", "public-code", "fast"] {
+        // Starts at the sixth iteration; the optimiser is re-created there. A softer shift than -10 lets
+        // the network move, so that the comparison sees it.
+        let settings =
+            ["dynamic.delay=5", "dynamic.lr=1e-3", "dynamic.lr_end=1e-4", "adam.epsilon=1e-6", "loss.normalise=true"];
+        let plan = Plan::new(&small_config(preset, &settings), &dataset).unwrap();
+        let mut params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
+        let start = params.clone();
+        let mut moments = vec![[0.0; 2]; params.len()];
+        let mut trainer = Trainer::new(&gpu, plan, &dataset).unwrap();
+        while trainer.step() < 10 {
+            trainer.advance(10).unwrap();
+        }
+        let plan = trainer.plan();
+        for step in 0..10 {
+            let (_, gradient) = step::loss_and_gradient(plan, &params, step, &march::batch(plan, step));
+            step::adam(plan, step, &gradient, &mut params, &mut moments);
+        }
+        let got = trainer.model().unwrap().params;
+        let moved = |range: std::ops::Range<usize>| range.map(|i| (params[i] - start[i]).abs()).fold(0.0, f64::max);
+        let split = trainer.plan().params.static_len;
+        assert!(moved(0..split) > 1e-3 && moved(split..params.len()) > 1e-3, "{preset}: both fields must move");
+        let mut far = 0;
+        for (g, w) in got.iter().zip(&params) {
+            // Adam divides by the gradient's size, so a tiny gradient's rounding shows in full; few may.
+            far += usize::from((f64::from(*g) - w).abs() > 1e-4 * w.abs().max(1e-2));
+        }
+        assert!(far * 200 <= got.len(), "{preset}: {far} of {} parameters differ", got.len());
+    }
+    expect_silence(gpu);
+}
