@@ -29,19 +29,19 @@ COMMON = dict(
 PRESETS = {
     "paper": dict(
         layers=4, skip=0, bands=10, window_start=0.0, per_ray=True, temporal=False, decay="linear",
-        static_lr=(1e-2, 1e-3), dynamic_lr=(1e-2, 1e-3), tv=1e-2, occlusion=1e-3, eps=1e-6, motion_share=0.0,
+        static_lr=(1e-2, 1e-3), dynamic_lr=(1e-2, 1e-3), tv=1e-2, occlusion=1e-3, eps=1e-6, n_motion=0,
         scene=dict(static_half=0.5, dynamic_half=1.0, static_gain=1.0, static_shift=-4.0, dynamic_gain=1.0,
                    dynamic_shift=-3.0, static_weight=1.0, dynamic_weight=1.0, centre=(0.0, 0.0, 0.0), scale=1.0),
     ),
     "public-code": dict(
         layers=5, skip=4, bands=10, window_start=0.0, per_ray=False, temporal=False, decay="exponential",
-        static_lr=(2e-2, 2e-3), dynamic_lr=(1e-2, 1e-3), tv=1e-2, occlusion=1e-3, eps=1e-6, motion_share=0.0,
+        static_lr=(2e-2, 2e-3), dynamic_lr=(1e-2, 1e-3), tv=1e-2, occlusion=1e-3, eps=1e-6, n_motion=0,
         scene=dict(static_half=0.5, dynamic_half=1.0, static_gain=1.0, static_shift=-4.0, dynamic_gain=1.0,
                    dynamic_shift=-3.0, static_weight=1.0, dynamic_weight=1.0, centre=(0.0, 0.0, 0.0), scale=1.0),
     ),
     "fast": dict(
         layers=3, skip=0, bands=6, window_start=3.0, per_ray=True, temporal=True, decay="linear",
-        static_lr=(1e-2, 1e-3), dynamic_lr=(3e-3, 3e-4), tv=1e-3, occlusion=0.0, eps=1e-6, motion_share=0.6,
+        static_lr=(1e-2, 1e-3), dynamic_lr=(3e-3, 3e-4), tv=1e-3, occlusion=0.0, eps=1e-6, n_motion=12,
         scene=dict(static_half=0.9, dynamic_half=0.45, static_gain=0.5, static_shift=0.54, dynamic_gain=4.0,
                    dynamic_shift=-2.0, static_weight=1.2, dynamic_weight=9.0, centre=(0.02, -0.01, 0.03), scale=6.5),
     ),
@@ -125,31 +125,28 @@ def pixel_ray(c, view, pixel):
     return across * ARM["sod_mm"] / 100.0, across + r @ np.array([0.0, 0.0, 1.0])
 
 
-def motion_groups(c):
-    """Rays of a batch that come as whole groups of one pixel at all phases."""
-    if not c["temporal"]:
-        return 0
-    t = c["phases"]
-    return min(max(int(math.floor(c["rays"] * c["motion_share"] / t + 0.5)), 1) * t, c["rays"] // t * t)
+def still_background(c, frames, view):
+    """Bounds of each pixel's still background."""
+    high = np.stack([f[2] for f in frames if f[0] == view]).min(0)
+    return f32(high - 0.1), high
+
+
+def motion_rays(c, frames):
+    """Rays said to meet the hull: every third one."""
+    return list(range(0, len(frames) * c["width_px"] * c["height_px"], 3))
 
 
 def batch(c, frames, step):
     """Frame index, pixel and id of each ray."""
-    pixels, t = c["width_px"] * c["height_px"], c["phases"]
-    n_motion = motion_groups(c)
+    pixels, moving = c["width_px"] * c["height_px"], motion_rays(c, frames)
     out = []
     for r in range(c["rays"]):
-        if r < n_motion:
-            groups, n = n_motion // t, len(ANGLES) * pixels
-            counter = step * groups + r // t
-            chosen = permute(counter % n, n, c["seed"], counter // n, 3)
-            frame, pixel = chosen // pixels * t + r % t, chosen % pixels
-        else:
-            per, n = c["rays"] - n_motion, len(frames) * pixels
-            counter = step * per + r - n_motion
-            chosen = permute(counter % n, n, c["seed"], counter // n, 2)
-            frame, pixel = chosen // pixels, chosen % pixels
-        out.append((frame, pixel, frame * pixels + pixel))
+        first = r < c["n_motion"]
+        per, n = (c["n_motion"], len(moving)) if first else (c["rays"] - c["n_motion"], len(frames) * pixels)
+        counter = step * per + (r if first else r - c["n_motion"])
+        chosen = permute(counter % n, n, c["seed"], counter // n, 3 if first else 2)
+        ray_id = moving[chosen] if first else chosen
+        out.append((ray_id // pixels, ray_id % pixels, ray_id))
     return out
 
 
@@ -231,13 +228,15 @@ def losses(c, frames, p, step):
     since = max(step - c["delay"], 0)
     window = min(c["window_start"] + (c["bands"] - c["window_start"]) * since / c["window_iterations"], c["bands"])
     near_limit = -depth + 2 * depth * c["occlusion_share"]
-    n_motion = motion_groups(c)
-    s_int, d_int, target, occlusion, live = [], [], [], 0.0, 0
+    n_motion = c["n_motion"]
+    s_int, d_int, target, bounds, occlusion, live = [], [], [], [], 0.0, 0
     for r, (frame, pixel, ray_id) in enumerate(batch(c, frames, step)):
         view, phase, image = frames[frame]
         anchor, direction = pixel_ray(c, view, pixel)
         norm = float(np.linalg.norm(direction))
         target.append(image.flatten()[pixel])
+        low, high = still_background(c, frames, view)
+        bounds.append((target[-1] - high.flatten()[pixel], target[-1] - low.flatten()[pixel]))
         t, dl = depths(c, c["static_samples"], -depth, depth, step, ray_id, norm)
         x = anchor + t[:, None] * direction
         inside = (np.abs(x) <= scene["static_half"]).all(1)
@@ -262,8 +261,9 @@ def losses(c, frames, p, step):
             d_int.append(torch.zeros(()))
     s_int, d_int, target = torch.stack(s_int), torch.stack(d_int), torch.tensor(target)
     if c["temporal"]:
-        e = (d_int - target)[:n_motion].view(-1, c["phases"])
-        dynamic = scene["dynamic_weight"] * ((e - e.mean(1, keepdim=True)) ** 2).mean()
+        low, high = torch.tensor(bounds).unbind(1)
+        outside = d_int - torch.minimum(torch.maximum(d_int.detach(), low), high)
+        dynamic = scene["dynamic_weight"] * (outside**2).mean()
         rest = slice(n_motion if n_motion < c["rays"] else 0, None)
         data = scene["static_weight"] * ((s_int + d_int.detach() - target)[rest] ** 2).mean() + dynamic
     else:
@@ -298,6 +298,9 @@ def run(c):
     p = initial(c)
     out = {f"initial/{k}": v.detach().clone() for k, v in p.items()}
     out |= {f"image/{i}": torch.tensor(f[2]) for i, f in enumerate(frames)}
+    for view in range(len(ANGLES)):
+        low, high = still_background(c, frames, view)
+        out |= {f"background/{view}/low": torch.tensor(low), f"background/{view}/high": torch.tensor(high)}
     adam = optimiser(c, p)
     for step in range(10):
         if step == c["delay"]:
