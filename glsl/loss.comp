@@ -16,6 +16,15 @@ layout(binding = 3) writeonly buffer B3 { vec2 ray_gradient[]; };
 layout(binding = 4) writeonly buffer B4 { vec4 ray_loss[]; };
 #include "inc/static_rays.glsl"
 
+// Charbonnier: r^2 near 0, linear beyond robust_scale, so that thick vessels do not drown thin ones.
+// Value, and half its derivative.
+vec2 robust_square(float r) {
+    if (setup.robust_scale == 0.0) return vec2(r * r, r);
+    float s2 = setup.robust_scale * setup.robust_scale;
+    float root = sqrt(1.0 + r * r / s2);
+    return vec2(2.0 * s2 * (root - 1.0), r / root);
+}
+
 void main() {
     uint i = gl_GlobalInvocationID.x;
     if (i >= push.n_rays) return;
@@ -28,8 +37,9 @@ void main() {
     float dynamic_scale = setup.dynamic_weight / float(setup.n_rays);
     float d = seen.dynamic_integral;
     float dynamic_residual = temporal ? d - clamp(d, rays[r].temporal_low, rays[r].temporal_high) : total;
-    ray_gradient[r] = 2.0 * vec2(static_scale * total, dynamic_scale * dynamic_residual);
-    float dynamic_loss = dynamic_scale * dynamic_residual * dynamic_residual;
+    vec2 robust = robust_square(dynamic_residual);
+    ray_gradient[r] = 2.0 * vec2(static_scale * total, dynamic_scale * robust.y);
+    float dynamic_loss = dynamic_scale * robust.x;
     float data = static_scale * total * total + (temporal ? dynamic_loss : 0.0);
     ray_loss[r] = vec4(data, dynamic_loss, seen.occlusion, mean_scale * total * total);
 }

@@ -175,6 +175,9 @@ pub struct Loss {
     pub normalise: bool,
     /// What drives the dynamic field.
     pub dynamic_target: DynamicTarget,
+    /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly
+    /// when the problem is normalised; 0 = squared throughout.
+    pub robust: f64,
 }
 
 /// Motion hull: where every view shows temporal change.
@@ -265,7 +268,7 @@ impl Config {
                 occlusion: 1e-8,
                 occlusion_share: 0.2,
             },
-            loss: Loss { normalise: false, dynamic_target: DynamicTarget::Absolute },
+            loss: Loss { normalise: false, dynamic_target: DynamicTarget::Absolute, robust: 0.0 },
             hull: Hull {
                 enabled: false,
                 per_phase: false,
@@ -320,7 +323,7 @@ impl Config {
                     occlusion: 0.0,
                     ..paper.dynamic
                 },
-                loss: Loss { normalise: true, dynamic_target: DynamicTarget::Temporal },
+                loss: Loss { normalise: true, dynamic_target: DynamicTarget::Temporal, robust: 0.1 },
                 hull: Hull { enabled: true, per_phase: true, ..paper.hull },
                 ..paper
             },
@@ -416,6 +419,7 @@ impl Config {
             ("dynamic.normalised_shift", d.normalised_shift, -20.0, 20.0),
             ("dynamic.occlusion", d.occlusion, 0.0, 1e6),
             ("dynamic.occlusion_share", d.occlusion_share, 0.0, 1.0),
+            ("loss.robust", self.loss.robust, 0.0, 1e3),
             ("hull.resolution", f64::from(self.hull.resolution), 8.0, 512.0),
             ("hull.noise_sigmas", self.hull.noise_sigmas, 0.0, 1e3),
             ("hull.min_share", self.hull.min_share, 0.0, 1.0),

@@ -138,6 +138,7 @@ impl Golden {
             dynamic_shift: n("dynamic_shift"),
             static_weight: n("static_weight"),
             dynamic_weight: n("dynamic_weight"),
+            robust_scale: n("robust_scale"),
         }
     }
 }

@@ -31,19 +31,19 @@ PRESETS = {
         layers=4, skip=0, bands=10, window_start=0.0, per_ray=True, temporal=False, decay="linear",
         static_lr=(1e-2, 1e-3), dynamic_lr=(1e-2, 1e-3), tv=1e-2, occlusion=1e-3, eps=1e-6, n_motion=0,
         scene=dict(static_half=0.5, dynamic_half=1.0, static_gain=1.0, static_shift=-4.0, dynamic_gain=1.0,
-                   dynamic_shift=-3.0, static_weight=1.0, dynamic_weight=1.0, centre=(0.0, 0.0, 0.0), scale=1.0),
+                   dynamic_shift=-3.0, static_weight=1.0, dynamic_weight=1.0, robust_scale=0.0, centre=(0.0, 0.0, 0.0), scale=1.0),
     ),
     "public-code": dict(
         layers=5, skip=4, bands=10, window_start=0.0, per_ray=False, temporal=False, decay="exponential",
         static_lr=(2e-2, 2e-3), dynamic_lr=(1e-2, 1e-3), tv=1e-2, occlusion=1e-3, eps=1e-6, n_motion=0,
         scene=dict(static_half=0.5, dynamic_half=1.0, static_gain=1.0, static_shift=-4.0, dynamic_gain=1.0,
-                   dynamic_shift=-3.0, static_weight=1.0, dynamic_weight=1.0, centre=(0.0, 0.0, 0.0), scale=1.0),
+                   dynamic_shift=-3.0, static_weight=1.0, dynamic_weight=1.0, robust_scale=0.0, centre=(0.0, 0.0, 0.0), scale=1.0),
     ),
     "fast": dict(
         layers=3, skip=0, bands=6, window_start=3.0, per_ray=True, temporal=True, decay="linear",
         static_lr=(1e-2, 1e-3), dynamic_lr=(3e-3, 3e-4), tv=1e-3, occlusion=0.0, eps=1e-6, n_motion=12,
         scene=dict(static_half=0.9, dynamic_half=0.45, static_gain=0.5, static_shift=0.54, dynamic_gain=4.0,
-                   dynamic_shift=-2.0, static_weight=1.2, dynamic_weight=9.0, centre=(0.02, -0.01, 0.03), scale=6.5),
+                   dynamic_shift=-2.0, static_weight=1.2, dynamic_weight=9.0, robust_scale=0.05, centre=(0.02, -0.01, 0.03), scale=6.5),
     ),
 }
 
@@ -263,7 +263,8 @@ def losses(c, frames, p, step):
     if c["temporal"]:
         low, high = torch.tensor(bounds).unbind(1)
         outside = d_int - torch.minimum(torch.maximum(d_int.detach(), low), high)
-        dynamic = scene["dynamic_weight"] * (outside**2).mean()
+        s2 = scene["robust_scale"] ** 2
+        dynamic = scene["dynamic_weight"] * (2 * s2 * (torch.sqrt(1 + outside**2 / s2) - 1)).mean()
         rest = slice(n_motion if n_motion < c["rays"] else 0, None)
         data = scene["static_weight"] * ((s_int + d_int.detach() - target)[rest] ** 2).mean() + dynamic
     else:

@@ -44,6 +44,7 @@ struct Setup {
     float dynamic_gain;
     float static_weight;      // 1 / (mean integral)^2, 1 without normalisation
     float dynamic_weight;
+    float robust_scale;       // residuals of the dynamic field beyond this count linearly; 0: squared
     uint temporal_target;     // 1: the dynamic field is driven by temporal differences
     float occlusion_weight;
     float occlusion_depth;    // samples nearer than this are penalised

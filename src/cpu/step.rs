@@ -31,6 +31,15 @@ fn skips_static(plan: &Plan, r: usize) -> bool {
     s.temporal_target != 0 && (r as u32) < s.n_motion_rays && s.n_motion_rays < s.n_rays
 }
 
+/// Charbonnier's r^2 that turns linear beyond `scale` (0: never), and half its derivative.
+fn robust_square(scale: f64, r: f64) -> (f64, f64) {
+    if scale == 0.0 {
+        return (r * r, r);
+    }
+    let root = (1.0 + r * r / (scale * scale)).sqrt();
+    (2.0 * scale * scale * (root - 1.0), r / root)
+}
+
 /// Loss and gradient of given rays at a step.
 pub fn loss_and_gradient(plan: &Plan, params: &[f64], step: u32, rays: &[Ray]) -> (Losses, Vec<f64>) {
     let s = &plan.setup;
@@ -46,12 +55,13 @@ pub fn loss_and_gradient(plan: &Plan, params: &[f64], step: u32, rays: &[Ray]) -
         let d = seen.dynamic_integral;
         let total = seen.static_integral + d - ray.target;
         let dynamic_residual = if temporal { d - d.clamp(ray.temporal[0], ray.temporal[1]) } else { total };
-        let dynamic_loss = dynamic_scale * dynamic_residual * dynamic_residual;
+        let (value, slope) = robust_square(s.robust_scale.into(), dynamic_residual);
+        let dynamic_loss = dynamic_scale * value;
         losses.data += static_scale * total * total + if temporal { dynamic_loss } else { 0.0 };
         losses.dynamic += dynamic_loss;
         losses.occlusion += f64::from(s.occlusion_weight) * seen.occlusion;
         losses.live += seen.dynamics.len();
-        let (dl_ds, dl_dd) = (2.0 * static_scale * total, 2.0 * dynamic_scale * dynamic_residual);
+        let (dl_ds, dl_dd) = (2.0 * static_scale * total, 2.0 * dynamic_scale * slope);
         march::bwd(plan, params, ray, &seen, dl_ds, dl_dd, &mut gradient);
     }
     losses.tv = total_variation(plan, params, &mut gradient);

@@ -46,6 +46,8 @@ pub struct Scene {
     pub static_weight: f64,
     /// Weight of a squared residual of the dynamic field.
     pub dynamic_weight: f64,
+    /// Residual of the dynamic field from which the loss grows linearly; 0 = never.
+    pub robust_scale: f64,
 }
 
 impl Scene {
@@ -87,6 +89,7 @@ impl Scene {
             dynamic_shift: -10.0,
             static_weight: 1.0,
             dynamic_weight: 1.0,
+            robust_scale: 0.0,
         };
         if config.loss.normalise {
             scene.normalise(config, dataset, motion, static_half)?;
@@ -120,6 +123,7 @@ impl Scene {
         // A vessel fills a few percent of the field of view.
         self.dynamic_gain = change / (0.05 * field_of_view(dataset));
         self.dynamic_shift = config.dynamic.normalised_shift;
+        self.robust_scale = config.loss.robust * change;
         self.dynamic_weight = match config.loss.dynamic_target {
             DynamicTarget::Temporal => 1.0 / (change * change),
             DynamicTarget::Absolute => self.static_weight,
@@ -172,6 +176,7 @@ impl Scene {
             dynamic_gain: f(scene.dynamic_gain),
             static_weight: f(scene.static_weight),
             dynamic_weight: f(scene.dynamic_weight),
+            robust_scale: f(scene.robust_scale),
             temporal_target: u32::from(config.loss.dynamic_target == DynamicTarget::Temporal),
             occlusion_weight: f(config.dynamic.occlusion),
             occlusion_depth: f(near + (far - near) * config.dynamic.occlusion_share),
