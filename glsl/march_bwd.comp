@@ -47,11 +47,13 @@ void main() {
     uint stream = setup.per_ray_depths != 0u ? ray.id + 1u : 0u;
     float scale_high = exp2(float(setup.fixed_point_bits) - 32.0);
     for (uint k = gl_LocalInvocationID.x; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {
-        vec2 depth = depth_and_step(k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
-                                    setup.seed, state[0], stream, ray.norm);
-        vec3 x = ray.anchor + depth.x * ray.direction;
+        float depth = depth_at(k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
+                               setup.seed, state[0], stream);
+        vec3 x = ray.anchor + depth * ray.direction;
         if (!static_inside(x)) continue;
-        float at_feature = gradient * depth.y * setup.static_gain * sigmoid(vm_feature(x) + setup.static_shift);
+        float dl = path_length(depth, k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
+                                   setup.seed, state[0], stream, ray.norm);
+        float at_feature = gradient * dl * setup.static_gain * sigmoid(vm_feature(x) + setup.static_shift);
         vec3 coordinate = vm_coordinate(x);
         for (uint mode = 0u; mode < 3u; mode++) {
             VmTaps taps = vm_taps(coordinate, mode);

@@ -18,11 +18,13 @@ void main() {
     uint end = min(begin + run_length(), setup.n_dynamic_samples);
     uint slot = lane_counts[r * gl_WorkGroupSize.x + lane];
     for (uint k = begin; k < end; k++) {
-        vec2 depth = dynamic_sample(k, ray);
-        vec3 x = ray.anchor + depth.x * ray.direction;
+        float depth = dynamic_depth(k, ray);
+        vec3 x = ray.anchor + depth * ray.direction;
         if (!dynamic_inside(x, ray.phase)) continue;
-        sample_points[slot] = vec4(x, depth.y);
-        sample_rays[slot] = (push.first_ray + r) | (depth.x < setup.occlusion_depth ? 0x80000000u : 0u);
+        float dl = path_length(depth, k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far,
+                               setup.jitter, setup.seed, state[0], depth_stream(ray), ray.norm);
+        sample_points[slot] = vec4(x, dl);
+        sample_rays[slot] = (push.first_ray + r) | (depth < setup.occlusion_depth ? 0x80000000u : 0u);
         slot++;
     }
 }

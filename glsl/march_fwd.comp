@@ -32,12 +32,13 @@ void main() {
     float static_max = 0.0;
     uint n_static = with_maxima == 0u && skips_static(r) ? 0u : setup.n_static_samples;
     for (uint k = lane; k < n_static; k += gl_WorkGroupSize.x) {
-        vec2 depth = depth_and_step(k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
-                                    setup.seed, state[0], stream, ray.norm);
-        vec3 x = ray.anchor + depth.x * ray.direction;
+        float depth = depth_at(k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
+                               setup.seed, state[0], stream);
+        vec3 x = ray.anchor + depth * ray.direction;
         if (static_inside(x)) {
             float sigma = static_attenuation(x);
-            static_sum += sigma * depth.y;
+            static_sum += sigma * path_length(depth, k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
+                                       setup.seed, state[0], stream, ray.norm);
             static_max = max(static_max, sigma);
         }
     }

@@ -1,11 +1,12 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// From the per-phase sums of dz: gradients of bias, latent weights and (one dispatch per layer, added up)
-// of the latents themselves. One invocation per element of [bias | latent_weight | latents].
+// From the per-phase sums of dz of a layer that sees the input: gradients of its bias and latent weights, and
+// (one dispatch per such layer, added up) of the latents. One invocation per element of
+// [bias | latent_weight | latents].
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
-    uint layer; uint bias; uint latent_weight; uint has_latent; uint latents; uint accumulate_latents;
+    uint layer; uint bias; uint latent_weight; uint latents; uint accumulate_latents;
 } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { float params[]; };
@@ -26,7 +27,6 @@ void main() {
         gradient[push.bias + i] = sum;
         return;
     }
-    if (push.has_latent == 0u) return;
     i -= width;
     if (i < width * latent) {
         uint j = i / latent;

@@ -293,11 +293,11 @@ impl Config {
             Preset::Fast => Config {
                 preset,
                 train: Train {
-                    iterations: 1500,
-                    rays: 1024,
-                    motion_share: 0.75,
+                    iterations: 2500,
+                    rays: 512,
+                    motion_share: 0.85,
                     chunk_samples: 131_072,
-                    validate_every: 250,
+                    validate_every: 500,
                     checkpoint_every: 500,
                     ..paper.train
                 },
@@ -312,19 +312,26 @@ impl Config {
                 dynamic: DynamicField {
                     layers: 4,
                     width: 64,
-                    bands: 6,
-                    window_start: 3.0,
-                    window_iterations: 500,
+                    bands: 8,
+                    window_start: 4.0,
+                    window_iterations: 600,
                     half_extent_mm: 0.0,
                     encode_box: true,
                     delay: 0,
-                    lr: 3e-3,
+                    lr: 1.5e-2,
                     lr_end: 3e-4,
                     occlusion: 0.0,
                     ..paper.dynamic
                 },
                 loss: Loss { normalise: true, dynamic_target: DynamicTarget::Temporal, robust: 0.1 },
-                hull: Hull { enabled: true, per_phase: true, ..paper.hull },
+                hull: Hull {
+                    enabled: true,
+                    per_phase: true,
+                    resolution: 160,
+                    min_share: 0.05,
+                    dilate_pixels: 0,
+                    ..paper.hull
+                },
                 ..paper
             },
         }

@@ -2,6 +2,7 @@
 
 mod cli {
     pub mod args;
+    pub mod bench;
     pub mod data;
     pub mod devices;
     pub mod results;
@@ -26,6 +27,7 @@ fn main() -> ExitCode {
         Command::Train(args) => cli::train::run(&cli, args),
         Command::Eval(args) => cli::results::eval(&cli, args),
         Command::Render(args) => cli::results::render(&cli, args),
+        Command::Bench(args) => cli::bench::run(&cli, args),
         Command::Info(args) => cli::results::info(args),
         Command::Completions(args) => cli::devices::completions(args),
     };

@@ -181,7 +181,7 @@ pub fn reconstruct(
             tell(Event::Saved { step: saved.model.step, path: saved.save(options.run)? })?;
             return Err(Error::Interrupted);
         }
-        let next = |every: u32| if every == 0 { end } else { (trainer.step() / every + 1) * every };
+        let next = |every: u32| (trainer.step() / every.max(1) + 1) * every.max(1);
         let target = end.min(next(config.train.checkpoint_every)).min(if validate {
             next(config.train.validate_every)
         } else {

@@ -13,9 +13,9 @@ float depth_at(uint k, uint n, float near, float far, uint jitter, uint seed, ui
     return lower + (upper - lower) * uniform01(seed, STREAM_DEPTH + (ray << 4u), step, k);
 }
 
-// Depth k and the path length it stands for; the last sample stands for (almost) none.
-vec2 depth_and_step(uint k, uint n, float near, float far, uint jitter, uint seed, uint step, uint ray, float norm) {
-    float here = depth_at(k, n, near, far, jitter, seed, step, ray);
-    if (k == n - 1u) return vec2(here, 1e-10 * norm);
-    return vec2(here, (depth_at(k + 1u, n, near, far, jitter, seed, step, ray) - here) * norm);
+// Path length that depth `here` of index k stands for; the last sample stands for (almost) none.
+float path_length(float here, uint k, uint n, float near, float far, uint jitter, uint seed, uint step, uint ray,
+                  float norm) {
+    if (k == n - 1u) return 1e-10 * norm;
+    return (depth_at(k + 1u, n, near, far, jitter, seed, step, ray) - here) * norm;
 }

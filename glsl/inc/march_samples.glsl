@@ -15,8 +15,11 @@ uint run_length() {
     return (setup.n_dynamic_samples + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
 }
 
-vec2 dynamic_sample(uint k, Ray ray) {
-    uint stream = setup.per_ray_depths != 0u ? ray.id + 1u : 0u;
-    return depth_and_step(k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far, setup.jitter,
-                          setup.seed, state[0], stream, ray.norm);
+uint depth_stream(Ray ray) {
+    return setup.per_ray_depths != 0u ? ray.id + 1u : 0u;
+}
+
+float dynamic_depth(uint k, Ray ray) {
+    return depth_at(k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far, setup.jitter, setup.seed,
+                    state[0], depth_stream(ray));
 }

@@ -40,6 +40,8 @@ pub enum Command {
     Eval(EvalArgs),
     /// Render a run from any angle at any phase.
     Render(RenderArgs),
+    /// Time training iterations, in all and pass by pass.
+    Bench(BenchArgs),
     /// Describe a dataset or a run.
     Info(InfoArgs),
     /// Print shell completions.
@@ -274,6 +276,31 @@ pub struct RenderArgs {
     /// Output: .png, .npy (floats; all phases stacked) or .gif (all phases).
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
+}
+
+/// `bench`.
+#[derive(Debug, Args)]
+pub struct BenchArgs {
+    /// Dataset directory.
+    pub data: PathBuf,
+    /// Set of defaults.
+    #[arg(long, value_enum)]
+    pub preset: Option<Preset>,
+    /// TOML file with hyper-parameters.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Set one hyper-parameter. Repeatable.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Iterations of each timed repeat.
+    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub iterations: u32,
+    /// Timed repeats.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub repeats: u32,
+    /// JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `info`.

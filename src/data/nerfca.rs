@@ -85,7 +85,7 @@ pub fn open(path: &Path) -> Result<Dataset> {
     if !i0.is_finite() {
         return Err(Error::data(&general_file, "max_pixel_value", "is not finite"));
     }
-    if !(general.near_thresh < general.far_thresh) {
+    if general.near_thresh.partial_cmp(&general.far_thresh) != Some(std::cmp::Ordering::Less) {
         return Err(Error::data(&general_file, "near_thresh", "is not below far_thresh"));
     }
     // Depth thresholds are in world units (100 mm); distances may be in mm or already scaled.

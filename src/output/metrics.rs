@@ -69,7 +69,7 @@ pub fn ssim(truth: &[f64], prediction: &[f64], width: usize) -> f64 {
 pub fn otsu(values: &[f32]) -> f32 {
     const BINS: usize = 256;
     let (low, high) = values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
-    if !(high > low) {
+    if high <= low || values.is_empty() {
         return high;
     }
     let mut counts = [0f64; BINS];

@@ -87,8 +87,8 @@ impl Projector {
         let half_depth = bounding_radius(&volume);
         let mut recording = Recording::new(&self.gpu, "project")?;
         recording.fill(&integrals, 0);
-        for view in 0..views.len() {
-            let half = half_depth.min(views[view].sod);
+        for (view, rays) in views.iter().enumerate() {
+            let half = half_depth.min(rays.sod);
             let push = Push {
                 rows,
                 size: volume.size.map(|n| n as u32),

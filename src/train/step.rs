@@ -250,16 +250,20 @@ fn record_network_backward(
         let inputs = [("features", params.encode_groups as u32, layer.encoded), (previous, groups, layer.hidden)];
         for (input, in_groups, at) in inputs {
             let Some(at) = at else { continue };
-            let push = [in_groups, in_partials(at), capacity, splits, network, accumulate];
+            // Biases of layers without latents are summed here; the others come from the sums per phase.
+            let bias = if layer.latent.is_none() { in_partials(layer.bias) } else { u32::MAX };
+            let push = [in_groups, in_partials(at), capacity, splits, network, accumulate, bias];
             let tiles = [width / WEIGHT_TILE, (4 * in_groups).div_ceil(WEIGHT_TILE), splits];
             let names = [("dz", dz), ("inputs", input)];
             dispatch(r, &k.mlp_layer_bwd_weight, Groups::Direct(tiles), buffers, &names, push)?;
         }
-        let rays = Groups::Direct([n_rays.div_ceil(k.mlp_ray_sum.local_size), groups, 1]);
-        dispatch(r, &k.mlp_ray_sum, rays, buffers, &[("dz", dz)], [n_rays, capacity])?;
-        let push = [first_ray, n_rays, (i * params.phases) as u32, groups, accumulate];
-        let phases = Groups::Direct([groups, params.phases as u32, 1]);
-        dispatch(r, &k.mlp_phase_sum, phases, buffers, &[], push)?;
+        if layer.latent.is_some() {
+            let rays = Groups::Direct([n_rays.div_ceil(k.mlp_ray_sum.local_size), groups, 1]);
+            dispatch(r, &k.mlp_ray_sum, rays, buffers, &[("dz", dz)], [n_rays, capacity])?;
+            let push = [first_ray, n_rays, (i * params.phases) as u32, groups, accumulate];
+            let phases = Groups::Direct([groups, params.phases as u32, 1]);
+            dispatch(r, &k.mlp_phase_sum, phases, buffers, &[], push)?;
+        }
     }
     Ok(())
 }
@@ -270,19 +274,13 @@ fn record_update(r: &mut Recording, k: &Kernels, buffers: &Buffers, params: &Par
     let network = (params.len - params.static_len) as u32;
     let push = [0, setup.n_params, k.tuning.splits, network, static_len];
     dispatch(r, &k.gradient, groups_for(&k.gradient, setup.n_params), buffers, &[], push)?;
-    let mut seen_latents = 0;
+    let mut accumulate_latents = 0;
     for (i, layer) in params.layers.iter().enumerate() {
-        let push = [
-            i as u32,
-            layer.bias as u32,
-            layer.latent.unwrap_or(0) as u32,
-            u32::from(layer.latent.is_some()),
-            params.latents as u32,
-            seen_latents,
-        ];
-        let n = params.width + layer.latent.map_or(0, |_| params.latent * (params.width + params.phases));
+        let Some(latent) = layer.latent else { continue };
+        let push = [i as u32, layer.bias as u32, latent as u32, params.latents as u32, accumulate_latents];
+        let n = params.width + params.latent * (params.width + params.phases);
         dispatch(r, &k.mlp_latent_bwd, groups_for(&k.mlp_latent_bwd, n as u32), buffers, &[], push)?;
-        seen_latents |= u32::from(layer.latent.is_some());
+        accumulate_latents = 1;
     }
     dispatch(r, &k.adam, groups_for(&k.adam, setup.n_params), buffers, &[], ())?;
     dispatch(r, &k.report, Groups::Direct([1, 1, 1]), buffers, &[], ())

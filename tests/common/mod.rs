@@ -1,5 +1,5 @@
 //! Shared by the integration tests: a device with validation layers, a small dataset, comparisons.
-#![allow(dead_code, missing_docs, reason = "each test file uses its part")]
+#![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 
 use nertca_vk::config::Config;
 use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};

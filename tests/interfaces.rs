@@ -1,0 +1,338 @@
+//! The command line from outside: a whole life on a tiny phantom, exit codes, and input nobody should send.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn nertca(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_nertca-vk")).args(args).output().unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Runs with the validation layers on (messages make the program fail) and returns stdout.
+fn ok(args: &[&str]) -> String {
+    let out = nertca(&[&["--validate"], args].concat());
+    assert!(out.status.success(), "{args:?}: {}", String::from_utf8_lossy(&out.stderr));
+    String::from_utf8(out.stdout).unwrap()
+}
+
+/// Expects `code` and an error on stderr that names all `parts`; never a panic.
+fn fails(args: &[&str], code: i32, parts: &[&str]) {
+    let out = nertca(args);
+    let stderr = String::from_utf8_lossy(&out.stderr);
+    assert_eq!(out.status.code(), Some(code), "{args:?}: {stderr}");
+    assert!(!stderr.contains("panicked"), "{args:?}: {stderr}");
+    for part in parts {
+        assert!(stderr.contains(part), "{args:?} does not name `{part}`: {stderr}");
+    }
+}
+
+fn phantom(directory: &Path, extra: &[&str]) -> PathBuf {
+    let out = directory.join("phantom with spaces é");
+    ok(&[&["phantom", text(&out), "--size", "24", "--phases", "3", "--views", "3", "--no-volumes"], extra].concat());
+    out
+}
+
+const SHORT: &[&str] = &[
+    "--set",
+    "train.iterations=30",
+    "--set",
+    "train.rays=64",
+    "--set",
+    "dynamic.width=16",
+    "--set",
+    "march.render_samples=64",
+    "--set",
+    "train.validate_every=15",
+    "--set",
+    "train.chunk_samples=16384",
+    "--set",
+    "hull.resolution=32",
+];
+
+#[test]
+fn a_whole_life() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = phantom(directory.path(), &["--photons", "1e6", "--respiration", "2"]);
+    let run = directory.path().join("run");
+    let lines = ok(&[&["train", text(&data), "-o", text(&run), "--json", "--stop-at", "20"], SHORT].concat());
+    let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let kinds: Vec<_> = events.iter().map(|e| e["event"].as_str().unwrap()).collect();
+    assert_eq!((kinds[0], *kinds.last().unwrap()), ("started", "finished"));
+    assert!(kinds.contains(&"validation") && kinds.contains(&"saved"));
+    fails(&["train", text(&data), "-o", text(&run)], 2, &["--resume", "--force"]);
+    ok(&["train", text(&data), "-o", text(&run), "--json", "--resume"]);
+    assert!(run.join("checkpoint-0000030.safetensors").is_file());
+
+    let pictures = directory.path().join("pictures");
+    let scores: Value =
+        serde_json::from_str(&ok(&["eval", text(&run), "--json", "--images", text(&pictures)])).unwrap();
+    assert_eq!(scores["images"].as_array().unwrap().len(), 12);
+    for key in ["dynamic", "total"] {
+        assert!((0.0..=1.0).contains(&scores["dice"][key].as_f64().unwrap()));
+    }
+    assert!(scores["psnr"].as_f64().unwrap() > 0.0 && scores["ssim"].is_f64());
+    assert_eq!(std::fs::read_dir(&pictures).unwrap().count(), 12 + 4);
+    assert!(ok(&["eval", text(&run)]).contains("mean of  12 images"));
+
+    for (file, extra) in [
+        ("a.png", &["--component", "static"][..]),
+        ("a.npy", &["--phase", "all", "--projection", "mip", "--component", "dynamic"]),
+        ("a.gif", &["--phase", "all", "--size", "31"]),
+    ] {
+        let out = directory.path().join(file);
+        ok(&[&["render", text(&run), "--primary", "-20", "--secondary", "12.5", "-o", text(&out)], extra].concat());
+        assert!(out.metadata().unwrap().len() > 100);
+    }
+    let npy = nertca_vk::data::images::read_npy(&directory.path().join("a.npy")).unwrap();
+    assert_eq!(npy.0, [3, 24, 24]);
+    assert!(ok(&["info", text(&run)]).contains("step: 30"));
+    assert!(ok(&["info", text(&data)]).contains("phases: 3"));
+    let hull = directory.path().join("hull.nrrd");
+    ok(&["train", text(&data), "-o", text(&run), "--export-hull", text(&hull), "--set", "hull.max_share=1"]);
+    assert!(hull.is_file());
+    fails(&["render", text(&run), "--primary", "0", "--secondary", "0", "-o", "x.bmp"], 2, &["x.bmp", ".png"]);
+    fails(
+        &["render", text(&run), "--primary", "0", "--secondary", "0", "--phase", "3", "-o", "x.png"],
+        2,
+        &["--phase", "2"],
+    );
+}
+
+#[test]
+fn both_layouts_hold_the_same_data() {
+    let directory = tempfile::tempdir().unwrap();
+    let native = directory.path().join("native");
+    let authors = directory.path().join("authors");
+    let size = ["--size", "20", "--phases", "2", "--views", "3", "--no-volumes"];
+    ok(&[&["phantom", text(&native)], &size[..]].concat());
+    ok(&[&["phantom", text(&authors), "--layout", "nerfca"], &size[..]].concat());
+    // Stale absolute paths, as copied datasets have them.
+    let list = authors.join("train-0.json");
+    let moved = std::fs::read_to_string(&list).unwrap().replace("\"train-view", "\"/gone/elsewhere/train-view");
+    std::fs::write(&list, moved).unwrap();
+    let a = nertca_vk::data::dataset::Dataset::open(&native).unwrap();
+    let b = nertca_vk::data::dataset::Dataset::open(&authors).unwrap();
+    assert_eq!((a.frames.len(), a.width, a.n_phases), (b.frames.len(), b.width, b.n_phases));
+    for (x, y) in a.frames.iter().zip(&b.frames) {
+        assert_eq!((x.phase, x.split, &x.mask), (y.phase, y.split, &y.mask));
+        assert_eq!(a.views[x.view].geometry, b.views[y.view].geometry);
+        for (v, w) in x.integrals.iter().zip(&y.integrals) {
+            assert!((v - w).abs() < 1e-6, "{v} {w}");
+        }
+    }
+    assert!((a.depth_range.1 - b.depth_range.1).abs() < 1e-9);
+}
+
+#[test]
+fn real_anatomy_makes_a_dataset() {
+    let anatomy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/anatomy");
+    if !anatomy.is_dir() {
+        eprintln!("SKIPPED: {} is absent", anatomy.display());
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("real");
+    let (tree, ct) = (anatomy.join("coronary_tree_hra.json"), anatomy.join("thorax_ct.nii.gz"));
+    ok(&[
+        "phantom",
+        text(&out),
+        "--tree",
+        text(&tree),
+        "--background",
+        text(&ct),
+        "--size",
+        "32",
+        "--phases",
+        "2",
+        "--views",
+        "3",
+        "--no-volumes",
+    ]);
+    let dataset = nertca_vk::data::dataset::Dataset::open(&out).unwrap();
+    let deepest = dataset.frames[0].integrals.iter().copied().fold(0f32, f32::max);
+    assert!((2.0..12.0).contains(&deepest), "a chest attenuates e^-2 to e^-12, not e^-{deepest}");
+    assert!(dataset.frames.iter().all(|f| f.mask.as_ref().unwrap().iter().any(|m| *m)));
+}
+
+#[test]
+fn volumes_are_projected_in_every_format() {
+    let directory = tempfile::tempdir().unwrap();
+    let values: Vec<f32> = (0..16 * 16 * 16).map(|i| if (i % 16) > 8 { 0.02 } else { 0.001 }).collect();
+    let npy = directory.path().join("v.npy");
+    nertca_vk::data::images::write_npy(&npy, &[16, 16, 16], &values).unwrap();
+    let raw = directory.path().join("v.bin");
+    std::fs::write(&raw, values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>()).unwrap();
+    let nrrd = directory.path().join("v.nrrd");
+    nertca_vk::data::volume::Volume::centred([16; 3], 4.0, glam::DVec3::ZERO, values).write_nrrd(&nrrd).unwrap();
+    let common = ["--size", "16", "--views", "3", "--fov", "80", "--vessel", "0.015"];
+    let mut images = Vec::new();
+    for (name, file, extra) in [
+        ("npy", &npy, &["--spacing", "4,4,4"][..]),
+        ("raw", &raw, &["--spacing", "4,4,4", "--raw-size", "16,16,16", "--raw-type", "f32"]),
+        ("nrrd", &nrrd, &[]),
+    ] {
+        let out = directory.path().join(name);
+        ok(&[&["project", text(file), text(file), "--out", text(&out)], &common[..], extra].concat());
+        images.push(nertca_vk::data::dataset::Dataset::open(&out).unwrap().frames[0].integrals.clone());
+    }
+    assert_eq!(images[0], images[1]);
+    assert_eq!(images[0], images[2]);
+    fails(&["project", text(&npy), "--out", "nowhere"], 1, &["v.npy", "--spacing"]);
+    fails(
+        &["project", text(&raw), "--out", "nowhere", "--raw-size", "99,99,99", "--spacing", "1,1,1"],
+        1,
+        &["v.bin", "truncated"],
+    );
+}
+
+/// A valid two-frame dataset, changed by `spoil` before it is opened by the program.
+fn spoiled(directory: &Path, name: &str, spoil: impl FnOnce(&Path, &mut Value)) -> PathBuf {
+    let data = directory.join(name);
+    let frame = |phase: u32| {
+        json!({
+            "image": format!("{phase}.npy"), "phase": phase, "split": "train",
+            "geometry": {"primary_deg": 0.0, "secondary_deg": 0.0, "sid_mm": 1000.0, "sod_mm": 600.0, "pixel_mm": [1.0, 1.0]},
+            "intensity": {"kind": "integral"},
+        })
+    };
+    for phase in 0..2 {
+        nertca_vk::data::images::write_npy(&data.join(format!("{phase}.npy")), &[4, 5], &[0.5; 20]).unwrap();
+    }
+    let mut manifest = json!({
+        "format": "nertca-dataset", "version": 1, "phases": 2, "depth_half_extent_mm": 100.0, "frames": [frame(0), frame(1)],
+    });
+    spoil(&data, &mut manifest);
+    std::fs::write(data.join("dataset.json"), manifest.to_string()).unwrap();
+    data
+}
+
+type Spoil = fn(&Path, &mut Value);
+
+#[test]
+fn malformed_datasets_are_named_file_and_field() {
+    let directory = tempfile::tempdir().unwrap();
+    let cases: &[(&str, Spoil, &[&str])] = &[
+        ("missing image", |d, _| std::fs::remove_file(d.join("1.npy")).unwrap(), &["1.npy"]),
+        (
+            "truncated image",
+            |d, _| std::fs::write(d.join("1.npy"), &std::fs::read(d.join("0.npy")).unwrap()[..150]).unwrap(),
+            &["1.npy", "truncated"],
+        ),
+        ("empty image", |d, _| std::fs::write(d.join("1.npy"), b"").unwrap(), &["1.npy"]),
+        (
+            "wrong shape",
+            |d, _| nertca_vk::data::images::write_npy(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(),
+            &["1.npy", "shape"],
+        ),
+        (
+            "three axes",
+            |d, _| nertca_vk::data::images::write_npy(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(),
+            &["1.npy", "two axes"],
+        ),
+        (
+            "not a number",
+            |d, _| nertca_vk::data::images::write_npy(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(),
+            &["1.npy", "row 0"],
+        ),
+        ("phase", |_, m| m["frames"][1]["phase"] = json!(2), &["dataset.json", "frames[1].phase"]),
+        ("negative phase", |_, m| m["frames"][1]["phase"] = json!(-1), &["dataset.json", "line"]),
+        ("no frames", |_, m| m["frames"] = json!([]), &["dataset.json", "frames"]),
+        (
+            "no training",
+            |_, m| {
+                m["frames"][0]["split"] = json!("validation");
+                m["frames"][1]["split"] = json!("validation")
+            },
+            &["training"],
+        ),
+        ("zero SID", |_, m| m["frames"][0]["geometry"]["sid_mm"] = json!(0.0), &["frames[0].geometry.sid_mm"]),
+        ("SOD beyond SID", |_, m| m["frames"][0]["geometry"]["sod_mm"] = json!(1200.0), &["geometry.sod_mm"]),
+        ("source inside", |_, m| m["depth_half_extent_mm"] = json!(700.0), &["depth range"]),
+        (
+            "singular matrix",
+            |_, m| m["frames"][0]["geometry"] = json!({"matrix": [[1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0]]}),
+            &["geometry.matrix", "inverted"],
+        ),
+        ("unknown key", |_, m| m["frames"][0]["phaze"] = json!(1), &["dataset.json", "phaze"]),
+        ("zero phases", |_, m| m["phases"] = json!(0), &["phases"]),
+        (
+            "bad scale",
+            |_, m| m["frames"][0]["intensity"] = json!({"kind": "linear", "i0": -1}),
+            &["frames[0].intensity.i0"],
+        ),
+        (
+            "mask size",
+            |d, m| {
+                nertca_vk::data::images::write_npy(&d.join("m.npy"), &[2, 2], &[1.0; 4]).unwrap();
+                m["frames"][0]["mask"] = json!("m.npy")
+            },
+            &["m.npy", "shape"],
+        ),
+        (
+            "absurd header",
+            |d, _| {
+                let mut bytes = std::fs::read(d.join("0.npy")).unwrap();
+                let at = bytes.windows(6).position(|w| w == b"(4, 5)").unwrap();
+                bytes[at..at + 6].copy_from_slice(b"(9999,");
+                std::fs::write(d.join("1.npy"), bytes).unwrap();
+            },
+            &["1.npy"],
+        ),
+    ];
+    for (name, spoil, parts) in cases {
+        let data = spoiled(directory.path(), name, spoil);
+        fails(&["info", text(&data)], 1, parts);
+    }
+    // The unspoiled one is fine, so the cases fail for their own reasons.
+    ok(&["info", text(&spoiled(directory.path(), "fine", |_, _| {}))]);
+    fails(&["info", text(&directory.path().join("absent"))], 1, &["absent"]);
+    fails(&["info", text(directory.path())], 1, &["dataset.json", "general.json"]);
+}
+
+#[test]
+fn usage_errors_have_their_exit_codes() {
+    fails(&["train"], 2, &["DATA"]);
+    fails(&["train", "x", "-o", "y", "--set", "train.rayz=1"], 2, &["train.rayz"]);
+    fails(&["train", "x", "-o", "y", "--config", "absent.toml"], 1, &["absent.toml"]);
+    fails(&["--device", "no such device", "phantom", "never-made"], 3, &["no such device"]);
+    fails(&["phantom", "never-made", "--views", "5"], 2, &["--views"]);
+    fails(&["phantom", "never-made", "--size", "1"], 2, &["--size"]);
+    assert!(!Path::new("never-made").exists(), "a refused command must leave nothing behind");
+    assert!(ok(&["train", "--print-config", "--preset", "paper"]).contains("iterations = 30000"));
+    assert!(ok(&["completions", "bash"]).contains("nertca-vk"));
+    let devices: Value = serde_json::from_str(&ok(&["devices", "--json"])).unwrap();
+    assert!(devices[0]["paths"]["reasons"].is_array() && devices[0]["uuid"].is_string());
+}
+
+#[test]
+fn the_committed_schema_is_current() {
+    let committed = include_str!("../docs/dataset.schema.json");
+    assert_eq!(ok(&["info", "--schema"]), committed, "run: nertca-vk info --schema > docs/dataset.schema.json");
+}
+
+#[test]
+#[cfg(unix)]
+fn ctrl_c_saves_and_exits_130() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = phantom(directory.path(), &[]);
+    let run = directory.path().join("run");
+    let settings = [SHORT, &["--set", "train.iterations=100000", "--set", "train.validate_every=0"]].concat();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
+        .args([&["train", text(&data), "-o", text(&run), "--json"][..], &settings].concat())
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    // Training has begun once the first progress line is there.
+    let mut lines = std::io::BufRead::lines(std::io::BufReader::new(child.stdout.take().unwrap()));
+    assert!(lines.by_ref().any(|l| l.unwrap().contains("progress")));
+    Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    lines.for_each(drop);
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    let saved = nertca_vk::train::checkpoint::newest(&run).unwrap();
+    assert!(nertca_vk::train::checkpoint::Checkpoint::read(&saved).unwrap().model.step > 0);
+}

@@ -1,0 +1,207 @@
+//! Whole runs: the loss falls, runs repeat bit by bit, resume equals no interruption, rendering equals the twin.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+
+use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
+use nertca_vk::cpu::march;
+use nertca_vk::error::Error;
+use nertca_vk::output::render::Renderer;
+use nertca_vk::reconstruct::{Event, RunOptions, reconstruct};
+use nertca_vk::train::checkpoint::{self, Checkpoint};
+use nertca_vk::train::plan::Plan;
+use nertca_vk::train::trainer::Trainer;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+fn run(trainer: &mut Trainer, until: u32) -> Vec<f64> {
+    let mut losses = Vec::new();
+    while trainer.step() < until {
+        losses.extend(trainer.advance(until).unwrap().iter().map(|l| l.total()));
+    }
+    losses
+}
+
+#[test]
+fn the_loss_falls_and_runs_repeat_bit_by_bit() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    for preset in ["fast", "paper"] {
+        let config =
+            small_config(preset, &["loss.normalise=true", "dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
+        let train = || {
+            let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset).unwrap();
+            let losses = run(&mut trainer, 120);
+            (losses, trainer.model().unwrap().params)
+        };
+        let ((losses, params), (again, same)) = (train(), train());
+        let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
+        assert!(mean(&losses[100..]) < 0.3 * mean(&losses[..5]), "{preset}: {:?}", &losses[..5]);
+        assert_eq!(losses, again, "{preset}: losses differ between equal runs");
+        assert_eq!(params, same, "{preset}: parameters differ between equal runs");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn resume_equals_no_interruption() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    let config = small_config("fast", &["dynamic.delay=7", "train.checkpoint_every=1000", "train.validate_every=16"]);
+    let directory = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let go = |name: &str, resume: bool, stop_at: Option<u32>| {
+        let path = directory.path().join(name);
+        let options = RunOptions { run: &path, resume, stop_at, cancel: &never };
+        reconstruct(&gpu, &config, &dataset, &options, &mut |_| {}).unwrap();
+        Checkpoint::read(&checkpoint::newest(&path).unwrap()).unwrap()
+    };
+    let whole = go("whole", false, None);
+    let stopped = go("parts", false, Some(13));
+    assert_eq!(stopped.model.step, 13);
+    assert_ne!(stopped.model.params, whole.model.params);
+    let parts = go("parts", true, None);
+    assert_eq!((parts.model.step, whole.model.step), (40, 40));
+    assert_eq!(parts.model.params, whole.model.params);
+    assert_eq!(parts.moments, whole.moments);
+    let steps = |name: &str| -> Vec<(String, u64)> {
+        let text = std::fs::read_to_string(directory.path().join(name).join("metrics.jsonl")).unwrap();
+        // The stop adds a line of its own; the regular ones are the same.
+        let lines = text.lines().map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap());
+        lines
+            .filter(|v| v["event"] == "progress" && v["step"].as_u64().unwrap() % 10 == 0)
+            .map(|v| (v["data"].to_string(), v["step"].as_u64().unwrap()))
+            .collect()
+    };
+    assert_eq!(steps("parts"), steps("whole"), "metrics.jsonl differs");
+    expect_silence(gpu);
+}
+
+#[test]
+fn resuming_on_other_images_is_refused() {
+    let gpu = gpu();
+    let mut dataset = small_dataset(13, 11);
+    let config = small_config("fast", &[]);
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset).unwrap();
+    run(&mut trainer, 4);
+    let saved = trainer.checkpoint().unwrap();
+    dataset.frames[0].integrals[3] += 0.01;
+    let plan = Plan::with_scene(&saved.model.config, &dataset, saved.model.scene.clone()).unwrap();
+    let refused = Trainer::resume(&gpu, plan, &dataset, &saved).err().unwrap().to_string();
+    assert!(refused.contains("other images"), "{refused}");
+}
+
+#[test]
+fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    let directory = tempfile::tempdir().unwrap();
+    let cancel = AtomicBool::new(false);
+    let options = RunOptions { run: directory.path(), resume: false, stop_at: None, cancel: &cancel };
+    let mut stop_at_ten = |event: &Event| {
+        if let Event::Progress { .. } = event {
+            cancel.store(true, std::sync::atomic::Ordering::Relaxed);
+        }
+    };
+    let config = small_config("fast", &["train.iterations=1000"]);
+    let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut stop_at_ten);
+    assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
+    assert!(Checkpoint::read(&checkpoint::newest(directory.path()).unwrap()).unwrap().model.step >= 10);
+
+    let directory = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let options = RunOptions { run: directory.path(), resume: false, stop_at: None, cancel: &never };
+    let config = small_config(
+        "fast",
+        &[
+            "train.iterations=400",
+            "train.checkpoint_every=1",
+            "static.lr=100",
+            "static.lr_end=100",
+            "static.init_std=3",
+        ],
+    );
+    let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |_| {});
+    assert!(matches!(outcome, Err(Error::Diverged { .. })), "{outcome:?}");
+    let kept = Checkpoint::read(&checkpoint::newest(directory.path()).unwrap()).unwrap();
+    assert!(kept.model.params.iter().all(|p| p.is_finite()));
+}
+
+#[test]
+fn renderings_equal_the_twin() {
+    let gpu = gpu();
+    let dataset = small_dataset(12, 10);
+    for preset in ["paper", "fast"] {
+        let config = small_config(preset, &["loss.normalise=true", "train.chunk_samples=1500"]);
+        let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset).unwrap();
+        run(&mut trainer, 20);
+        let model = trainer.model().unwrap();
+        let renderer = Renderer::new(&gpu, &model).unwrap();
+        let view = &dataset.views[2].rays;
+        let got = renderer.render(view, 12, 10, 2).unwrap();
+        let mut plan = Plan::with_scene(&config, &dataset, model.scene.clone()).unwrap();
+        plan.setup.jitter = 0;
+        plan.setup.n_static_samples = config.march.render_samples;
+        plan.setup.n_dynamic_samples = config.march.render_samples;
+        let params: Vec<f64> = model.params.iter().map(|v| f64::from(*v)).collect();
+        let (mut s, mut d, mut most) = (Vec::new(), Vec::new(), Vec::new());
+        for pixel in 0..120u32 {
+            let (anchor, direction) = view.pixel(f64::from(pixel % 12), f64::from(pixel / 12));
+            let ray = march::Ray { anchor, direction, phase: 2, target: 0.0, temporal: [0.0; 2], id: pixel };
+            let seen = march::fwd(&plan, &params, 20, &ray, true);
+            s.push(seen.static_integral);
+            d.push(seen.dynamic_integral);
+            most.push(seen.dynamics.iter().fold(0.0, |m: f64, x| {
+                let gain = f64::from(plan.setup.dynamic_gain);
+                m.max(gain * nertca_vk::cpu::field::softplus(x.trace.feature + f64::from(plan.setup.dynamic_shift)))
+            }));
+        }
+        for (name, got, want) in [
+            ("static", &got.static_integral, &s),
+            ("dynamic", &got.dynamic_integral, &d),
+            ("max", &got.dynamic_max, &most),
+        ] {
+            let (error, at) = relative_error(got, want);
+            // A pixel whose ray grazes a box face may gain or lose one sample in f32.
+            assert!(error < 2e-3, "{preset} {name}[{at}]: {} against {}", got[at], want[at]);
+        }
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn damaged_checkpoints_are_refused() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset).unwrap();
+    run(&mut trainer, 2);
+    let directory = tempfile::tempdir().unwrap();
+    let path = trainer.checkpoint().unwrap().save(directory.path()).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    let refuse = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        let message = Checkpoint::read(&path).err().unwrap().to_string();
+        assert!(message.contains(Path::new(&path).file_name().unwrap().to_str().unwrap()), "{message}");
+    };
+    for keep in [0, 7, 100, bytes.len() / 2, bytes.len() - 1] {
+        refuse(&bytes[..keep]);
+    }
+    let mut poisoned = bytes.clone();
+    let last = poisoned.len() - 4;
+    poisoned[last..].copy_from_slice(&f32::NAN.to_le_bytes());
+    refuse(&poisoned);
+}
+
+#[test]
+fn older_checkpoints_follow_the_stated_rule() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset).unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    for step in 1..=5 {
+        run(&mut trainer, step);
+        trainer.checkpoint().unwrap().save(directory.path()).unwrap();
+    }
+    let steps: Vec<u32> = checkpoint::list(directory.path()).unwrap().iter().map(|(s, _)| *s).collect();
+    assert_eq!(steps, [3, 4, 5]);
+}
