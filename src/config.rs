@@ -293,12 +293,12 @@ impl Config {
             Preset::Fast => Config {
                 preset,
                 train: Train {
-                    iterations: 2500,
-                    rays: 512,
+                    iterations: 1200,
+                    rays: 1024,
                     motion_share: 0.85,
                     chunk_samples: 131_072,
-                    validate_every: 500,
-                    checkpoint_every: 500,
+                    validate_every: 200,
+                    checkpoint_every: 400,
                     ..paper.train
                 },
                 march: March {
@@ -311,14 +311,14 @@ impl Config {
                 static_field: StaticField { half_extent_mm: 0.0, tv: 1e-3, ..paper.static_field },
                 dynamic: DynamicField {
                     layers: 4,
-                    width: 64,
+                    width: 96,
                     bands: 8,
                     window_start: 4.0,
                     window_iterations: 600,
                     half_extent_mm: 0.0,
                     encode_box: true,
                     delay: 0,
-                    lr: 1.5e-2,
+                    lr: 1e-2,
                     lr_end: 3e-4,
                     occlusion: 0.0,
                     ..paper.dynamic
@@ -327,7 +327,7 @@ impl Config {
                 hull: Hull {
                     enabled: true,
                     per_phase: true,
-                    resolution: 160,
+                    resolution: 224,
                     min_share: 0.05,
                     dilate_pixels: 0,
                     ..paper.hull

@@ -43,7 +43,7 @@ pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
     if needed > config.train.iterations {
         return Err(Error::config("--iterations", args.iterations, format!("{needed} iterations exceed the run's")));
     }
-    let mut until = |trainer: &mut Trainer, n: u32| -> Result<u64> {
+    let until = |trainer: &mut Trainer, n: u32| -> Result<u64> {
         let target = trainer.step() + n;
         let mut live = 0;
         while trainer.step() < target {
