@@ -175,8 +175,8 @@ pub struct Loss {
     pub normalise: bool,
     /// What drives the dynamic field.
     pub dynamic_target: DynamicTarget,
-    /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly
-    /// when the problem is normalised; 0 = squared throughout.
+    /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly with a
+    /// temporal target, when the problem is normalised; 0 = squared throughout.
     pub robust: f64,
 }
 

@@ -24,15 +24,19 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     for (preset, settings) in [
         ("paper", &["dynamic.occlusion=1e-3", "loss.normalise=true"][..]),
         ("public-code", &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
-        // An absolute target, since the static residual treats D as given and so is no plain derivative.
         ("fast", &["loss.dynamic_target=absolute"]),
-        ("fast", &["loss.dynamic_target=absolute", "loss.robust=0"]),
+        ("fast", &["loss.robust=0"]),
+        ("fast", &["loss.robust=0.3"]),
     ] {
         let plan = plan(preset, settings);
         let params = start(&plan);
         let rays = march::batch(&plan, 3);
         let (_, gradient) = step::loss_and_gradient(&plan, &params, 3, &rays);
+        let temporal = plan.setup.temporal_target != 0;
         for tensor in plan.params.tensors() {
+            // With a temporal target S learns from what D leaves, D taken as given: the two fields descend
+            // different objectives, and each is checked against its own.
+            let is_static = tensor.name.starts_with("static");
             // A few elements of each tensor, those with the largest gradient among a stride.
             let mut at: Vec<usize> = tensor.positions.iter().map(|p| *p as usize).collect();
             at.sort_by(|a, b| gradient[*b].abs().total_cmp(&gradient[*a].abs()));
@@ -40,14 +44,17 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
                 let loss = |value: f64| {
                     let mut moved = params.clone();
                     moved[i] = value;
-                    step::loss_and_gradient(&plan, &moved, 3, &rays).0.total()
+                    let losses = step::loss_and_gradient(&plan, &moved, 3, &rays).0;
+                    if temporal && !is_static { losses.dynamic } else { losses.total() }
                 };
                 // Small enough to stay between ReLU kinks, large enough for f64 differences.
                 let h = 1e-7;
                 let difference = (loss(params[i] + h) - loss(params[i] - h)) / (2.0 * h);
                 let error = (difference - gradient[i]).abs();
+                // The loss's own last digits over the step.
+                let rounding = 1e-8 * (1.0 + loss(params[i]));
                 assert!(
-                    error <= 1e-4 * gradient[i].abs() + 1e-8,
+                    error <= 1e-4 * gradient[i].abs() + rounding,
                     "{preset} {}: {difference} against {}",
                     tensor.name,
                     gradient[i]

@@ -151,11 +151,11 @@ pub struct ProjectArgs {
     #[arg(long, value_name = "PER_MM")]
     pub vessel: Option<f64>,
     /// Voxel spacing of .npy and raw volumes, mm.
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', num_args = 3)]
-    pub spacing: Option<Vec<f64>>,
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple::<f64>)]
+    pub spacing: Option<[f64; 3]>,
     /// Size of raw volumes, voxels.
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', num_args = 3)]
-    pub raw_size: Option<Vec<usize>>,
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple::<usize>)]
+    pub raw_size: Option<[usize; 3]>,
     /// Element type of raw volumes: f32, f64, i16, u16 or u8, little endian.
     #[arg(long, value_name = "TYPE")]
     pub raw_type: Option<String>,
@@ -322,6 +322,12 @@ pub struct InfoArgs {
 pub struct CompletionsArgs {
     /// Shell to print for.
     pub shell: clap_complete::Shell,
+}
+
+/// Parses `X,Y,Z`.
+fn triple<T: std::str::FromStr>(text: &str) -> std::result::Result<[T; 3], String> {
+    let parts: Vec<T> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
+    parts.try_into().map_err(|_| "three numbers are needed, as X,Y,Z".to_owned())
 }
 
 impl Cli {

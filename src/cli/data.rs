@@ -59,8 +59,8 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
     let options = VolumeOptions {
         volumes: args.volumes.clone(),
         hints: VolumeHints {
-            spacing_mm: args.spacing.as_ref().map(|s| [s[0], s[1], s[2]]),
-            size: args.raw_size.as_ref().map(|s| [s[0], s[1], s[2]]),
+            spacing_mm: args.spacing,
+            size: args.raw_size,
             raw_type: args.raw_type.clone(),
             centre: args.centre,
         },

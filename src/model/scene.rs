@@ -123,10 +123,10 @@ impl Scene {
         // A vessel fills a few percent of the field of view.
         self.dynamic_gain = change / (0.05 * field_of_view(dataset));
         self.dynamic_shift = config.dynamic.normalised_shift;
-        self.robust_scale = config.loss.robust * change;
-        self.dynamic_weight = match config.loss.dynamic_target {
-            DynamicTarget::Temporal => 1.0 / (change * change),
-            DynamicTarget::Absolute => self.static_weight,
+        (self.dynamic_weight, self.robust_scale) = match config.loss.dynamic_target {
+            DynamicTarget::Temporal => (1.0 / (change * change), config.loss.robust * change),
+            // Both fields share one squared residual.
+            DynamicTarget::Absolute => (self.static_weight, 0.0),
         };
         Ok(())
     }
