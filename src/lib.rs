@@ -1,10 +1,26 @@
-//! 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views.
+//! 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views, on Vulkan compute.
+//!
+//! The way of the data, and where to read it:
+//!
+//! 1. [`data::dataset`]: angiograms with geometry and phase, validated -> line integrals
+//! 2. [`data::motion`]: what moves -> still backgrounds and the motion hull
+//! 3. [`train::plan`]: scales, boxes, schedules -> everything a run needs
+//! 4. [`train::step`]: one iteration, top to bottom: rays -> samples -> fields -> loss -> gradients -> Adam
+//! 5. [`train::trainer`]: many iterations per submit, two submits in flight -> losses
+//! 6. [`train::checkpoint`]: parameters, moments, step, configuration -> one safetensors file
+//! 7. [`output::render`], [`output::eval`]: any pose and phase -> pictures and scores
+//!
+//! [`reconstruct`] ties these to a run directory, [`phantom`] makes data to try them on, [`cpu`] holds an f64
+//! twin of every stage, and [`gpu`] is Vulkan without any knowledge of angiography. Public functions speak mm and
+//! degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
+
 pub mod config;
 pub mod error;
 pub mod files;
 pub mod kernels;
 pub mod layout;
 pub mod reconstruct;
+
 /// Vulkan compute, free of any knowledge of angiography.
 pub mod gpu {
     pub mod device;
@@ -12,7 +28,8 @@ pub mod gpu {
     pub mod pipeline;
     pub mod record;
 }
-/// What comes in.
+
+/// What comes in: geometry, angiograms, volumes, and what moves in them.
 pub mod data {
     pub mod dataset;
     pub mod geometry;
@@ -21,13 +38,15 @@ pub mod data {
     pub mod nerfca;
     pub mod volume;
 }
-/// The fields.
+
+/// The fields: their parameters, and the scene they live in.
 pub mod model {
     pub mod field;
     pub mod params;
     pub mod scene;
 }
-/// CPU twins.
+
+/// f64 twins of the compute stages: plain loops, no device.
 pub mod cpu {
     pub mod field;
     pub mod march;
@@ -35,7 +54,8 @@ pub mod cpu {
     pub mod random;
     pub mod step;
 }
-/// Training.
+
+/// From a plan to a checkpoint.
 pub mod train {
     pub mod checkpoint;
     pub mod plan;
@@ -43,17 +63,19 @@ pub mod train {
     pub mod trainer;
 }
 
-/// Synthetic data.
-pub mod phantom {
-    pub mod dataset;
-    pub mod tree;
-    pub mod voxels;
-}
-/// What goes out.
+/// What goes out: renderings, scores, pictures, projections of volumes.
 pub mod output {
     pub mod eval;
     pub mod metrics;
     pub mod pictures;
     pub mod projector;
     pub mod render;
+}
+
+/// Synthetic data with exact truth.
+pub mod phantom {
+    pub mod dataset;
+    pub mod tree;
+    pub mod voxels;
+    mod writer;
 }

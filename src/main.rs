@@ -1,5 +1,13 @@
 //! The command line: arguments, progress, exit codes. No algorithm lives here.
 
+/// Prints a line to stdout; a reader that has gone away (`| head`) is no error.
+macro_rules! out {
+    ($($text:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stdout(), $($text)*);
+    }};
+}
+
 mod cli {
     pub mod args;
     pub mod bench;

@@ -73,7 +73,7 @@ pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
         }
     }
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&outcome).map_err(|e| Error::Internal(e.to_string()))?);
+        out!("{}", serde_json::to_string_pretty(&outcome).map_err(|e| Error::Internal(e.to_string()))?);
     } else {
         print(&outcome);
     }
@@ -82,11 +82,11 @@ pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
 }
 
 fn print(outcome: &Outcome) {
-    println!("{} ({}), preset {}", outcome.device, outcome.driver, outcome.preset);
-    outcome.paths.iter().for_each(|p| println!("- {p}"));
+    out!("{} ({}), preset {}", outcome.device, outcome.driver, outcome.preset);
+    outcome.paths.iter().for_each(|p| out!("- {p}"));
     let mut sorted = outcome.ms_per_iteration.clone();
     sorted.sort_by(f64::total_cmp);
-    println!(
+    out!(
         "{:.2} ms per iteration (median of {}; {:.2} to {:.2}), {} live samples",
         sorted[sorted.len() / 2],
         sorted.len(),
@@ -96,5 +96,5 @@ fn print(outcome: &Outcome) {
     );
     let mut passes: Vec<_> = outcome.passes_ms.iter().collect();
     passes.sort_by(|a, b| b.1.total_cmp(a.1));
-    passes.iter().for_each(|(name, ms)| println!("{name:32} {ms:9.3} ms"));
+    passes.iter().for_each(|(name, ms)| out!("{name:32} {ms:9.3} ms"));
 }

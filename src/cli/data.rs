@@ -49,7 +49,7 @@ pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
         volumes: !args.no_volumes,
     };
     make(&gpu, &options, &args.out, bar())?;
-    println!("{}", args.out.display());
+    out!("{}", args.out.display());
     cli.close_device(&gpu)
 }
 
@@ -73,6 +73,6 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
         layout: args.layout.into(),
     };
     project_volumes(&gpu, &options, &args.out, bar())?;
-    println!("{}", args.out.display());
+    out!("{}", args.out.display());
     cli.close_device(&gpu)
 }

@@ -19,12 +19,12 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
     let rows: Vec<Row> =
         list_devices()?.into_iter().map(|info| Row { paths: Tuning::for_device(&info), info }).collect();
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&rows).map_err(|e| Error::Internal(e.to_string()))?);
+        out!("{}", serde_json::to_string_pretty(&rows).map_err(|e| Error::Internal(e.to_string()))?);
     } else {
         for Row { info, paths } in &rows {
-            println!("{}: {} ({}, {})", info.index, info.name, info.kind, info.driver);
-            println!("   uuid {}  Vulkan {}", info.uuid, info.api_version);
-            println!(
+            out!("{}: {} ({}, {})", info.index, info.name, info.kind, info.driver);
+            out!("   uuid {}  Vulkan {}", info.uuid, info.api_version);
+            out!(
                 "   subgroup {}  shared memory {} KiB  workgroup {}  storage buffer {} MiB  memory {} MiB",
                 info.subgroup_size,
                 info.max_shared_memory >> 10,
@@ -32,13 +32,15 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
                 info.max_storage_buffer_range >> 20,
                 info.device_memory >> 20
             );
-            println!(
+            out!(
                 "   cooperative matrices {}  float16 {}  float atomics {}",
-                info.cooperative_matrix, info.float16, info.float_atomics
+                info.cooperative_matrix,
+                info.float16,
+                info.float_atomics
             );
             match &info.unusable {
-                Some(why) => println!("   not usable: {why}"),
-                None => paths.reasons.iter().for_each(|r| println!("   - {r}")),
+                Some(why) => out!("   not usable: {why}"),
+                None => paths.reasons.iter().for_each(|r| out!("   - {r}")),
             }
         }
     }

@@ -29,7 +29,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     let gpu = cli.open_device()?;
     let evaluation = evaluate_run(&gpu, &args.run, &dataset, args.threshold, args.images.as_deref())?;
     if args.json {
-        println!("{}", json(&evaluation)?);
+        out!("{}", json(&evaluation)?);
     } else {
         print_table(&evaluation);
     }
@@ -40,9 +40,9 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
 pub fn print_table(evaluation: &Evaluation) {
     let dice = |d: Option<f64>| d.map_or("    -".into(), |d| format!("{d:.3}"));
     let angle = |a: Option<f64>| a.map_or("    -".into(), |a| format!("{a:5.0}"));
-    println!("primary secondary phase  Dice dynamic  Dice total   PSNR dB   SSIM");
+    out!("primary secondary phase  Dice dynamic  Dice total   PSNR dB   SSIM");
     for i in &evaluation.images {
-        println!(
+        out!(
             "{}   {}     {:3}         {}       {}    {:6.2}  {:.3}",
             angle(i.primary_deg),
             angle(i.secondary_deg),
@@ -53,7 +53,7 @@ pub fn print_table(evaluation: &Evaluation) {
             i.ssim
         );
     }
-    println!(
+    out!(
         "mean of {:3} images          {}       {}    {:6.2}  {:.3}",
         evaluation.images.len(),
         dice(evaluation.dice.dynamic),
@@ -61,9 +61,11 @@ pub fn print_table(evaluation: &Evaluation) {
         evaluation.psnr,
         evaluation.ssim
     );
-    println!(
+    out!(
         "Dice threshold {:.4e} / {:.4e} per mm (dynamic / total): {}",
-        evaluation.threshold.dynamic_per_mm, evaluation.threshold.total_per_mm, evaluation.threshold.rule
+        evaluation.threshold.dynamic_per_mm,
+        evaluation.threshold.total_per_mm,
+        evaluation.threshold.rule
     );
 }
 
@@ -132,14 +134,14 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
 /// Describes a dataset or a run.
 pub fn info(args: &InfoArgs) -> Result<()> {
     if args.schema {
-        print!("{}", manifest_schema());
+        out!("{}", manifest_schema().trim_end());
         return Ok(());
     }
     let path = args.path.as_deref().unwrap_or(Path::new("."));
     let is_run = path.is_file() || checkpoint::list(path).is_ok_and(|found| !found.is_empty());
     let described = if is_run { describe_run(path)? } else { describe_dataset(path)? };
     if args.json {
-        println!("{}", json(&described)?);
+        out!("{}", json(&described)?);
     } else {
         print_tree(&described, 0);
     }
@@ -196,16 +198,16 @@ fn print_tree(value: &serde_json::Value, depth: usize) {
     for (key, value) in map {
         match value {
             serde_json::Value::Object(_) => {
-                println!("{:indent$}{key}:", "", indent = 2 * depth);
+                out!("{:indent$}{key}:", "", indent = 2 * depth);
                 print_tree(value, depth + 1);
             }
             serde_json::Value::Array(items) if items.iter().any(serde_json::Value::is_object) => {
                 for (index, item) in items.iter().enumerate() {
-                    println!("{:indent$}{key}[{index}]:", "", indent = 2 * depth);
+                    out!("{:indent$}{key}[{index}]:", "", indent = 2 * depth);
                     print_tree(item, depth + 1);
                 }
             }
-            other => println!("{:indent$}{key}: {other}", "", indent = 2 * depth),
+            other => out!("{:indent$}{key}: {other}", "", indent = 2 * depth),
         }
     }
 }

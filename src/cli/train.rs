@@ -25,7 +25,7 @@ fn config(args: &TrainArgs) -> Result<Config> {
 pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     let config = config(args)?;
     if args.print_config {
-        print!("{}", config.to_toml()?);
+        out!("{}", config.to_toml()?.trim_end());
         return Ok(());
     }
     let (Some(data), Some(run)) = (&args.data, &args.out) else {
@@ -58,7 +58,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
         nertca_vk::files::write_atomic(&report.join("evaluation.json"), text.as_bytes())?;
         if !args.json {
             print_table(&evaluation);
-            println!("report and pictures: {}", report.display());
+            out!("report and pictures: {}", report.display());
         }
     }
     cli.close_device(&gpu)
@@ -94,7 +94,7 @@ fn export_hull(config: &Config, dataset: &Dataset, file: &Path) -> Result<()> {
 
 fn print_json(event: &Event) {
     if let Ok(line) = serde_json::to_string(event) {
-        println!("{line}");
+        out!("{line}");
     }
 }
 
