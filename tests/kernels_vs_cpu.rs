@@ -5,6 +5,7 @@ mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
 use nertca_vk::cpu::{march, step};
+use nertca_vk::kernels::Tuning;
 use nertca_vk::layout::Ray;
 use nertca_vk::train::plan::Plan;
 use nertca_vk::train::trainer::Trainer;
@@ -53,8 +54,24 @@ fn rays_and_depths_match() {
     expect_silence(gpu);
 }
 
+/// Both families of kernels: operands through texel buffers with small workgroups, as an old lavapipe gets
+/// them, and through storage buffers with large ones, as GPUs do.
+fn tunings() -> [Tuning; 2] {
+    let reasons = Vec::new();
+    [
+        Tuning { texel: true, layer_lanes: 8, weight_lanes: 8, splits: 4, reasons: reasons.clone() },
+        Tuning { texel: false, layer_lanes: 64, weight_lanes: 32, splits: 16, reasons },
+    ]
+}
+
 #[test]
 fn losses_and_gradients_match() {
+    for tuning in tunings() {
+        check_losses_and_gradients(&tuning);
+    }
+}
+
+fn check_losses_and_gradients(tuning: &Tuning) {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
     for (preset, settings) in CASES {
@@ -65,7 +82,7 @@ fn losses_and_gradients_match() {
             *p *= 30.0;
         }
         let twin: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
-        let mut trainer = Trainer::new(&gpu, plan, &dataset).unwrap();
+        let mut trainer = Trainer::with_tuning(&gpu, plan, &dataset, tuning.clone()).unwrap();
         gpu.upload(trainer.buffers().get("params").unwrap(), 0, &params).unwrap();
         let got = trainer.advance(1).unwrap()[0];
         let plan = trainer.plan();

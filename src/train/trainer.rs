@@ -85,8 +85,16 @@ impl Trainer {
     /// # Errors
     /// Device errors, [`Error::OutOfMemory`] first of all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset) -> Result<Trainer> {
+        Self::with_tuning(gpu, plan, dataset, Tuning::for_device(gpu.info()))
+    }
+
+    /// Starts a run with kernels chosen by the caller instead of for the device.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub fn with_tuning(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
         let params = plan.params.initial(&plan.config);
-        Self::start(gpu, plan, dataset, &params, None)
+        Self::start(gpu, plan, dataset, tuning, &params, None)
     }
 
     /// Continues a run: the result is the same as without interruption.
@@ -102,17 +110,19 @@ impl Trainer {
             ));
         }
         let model = &checkpoint.model;
-        Self::start(gpu, plan, dataset, &model.params, Some((&checkpoint.moments, model.step)))
+        let tuning = Tuning::for_device(gpu.info());
+        Self::start(gpu, plan, dataset, tuning, &model.params, Some((&checkpoint.moments, model.step)))
     }
 
     fn start(
         gpu: &Gpu,
         plan: Plan,
         dataset: &Dataset,
+        tuning: Tuning,
         params: &[f32],
         state: Option<(&[[f32; 2]], u32)>,
     ) -> Result<Trainer> {
-        let kernels = Kernels::new(gpu, Tuning::for_device(gpu.info()))?;
+        let kernels = Kernels::new(gpu, tuning)?;
         let buffers = training_buffers(gpu, &plan, kernels.tuning.splits)?;
         gpu.upload(buffers.get("params")?, 0, params)?;
         let step = state.map_or(0, |(_, step)| step);
