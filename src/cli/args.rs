@@ -1,7 +1,7 @@
 //! What can be typed.
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use nertca_vk::config::Preset;
+use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::phantom::dataset::Setting;
@@ -167,15 +167,9 @@ pub struct ProjectArgs {
     pub layout: LayoutArg,
 }
 
-/// `train`.
+/// Hyper-parameters, for every command that trains.
 #[derive(Debug, Args)]
-pub struct TrainArgs {
-    /// Dataset directory (native or authors' layout).
-    #[arg(required_unless_present = "print_config")]
-    pub data: Option<PathBuf>,
-    /// Run directory.
-    #[arg(short, long, value_name = "RUN", required_unless_present = "print_config")]
-    pub out: Option<PathBuf>,
+pub struct ConfigArgs {
     /// Set of defaults: `fast`, unless a configuration file names one.
     #[arg(long, value_enum)]
     pub preset: Option<Preset>,
@@ -185,6 +179,28 @@ pub struct TrainArgs {
     /// Set one hyper-parameter, e.g. --set dynamic.width=128. Repeatable; wins over the file.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
+}
+
+impl ConfigArgs {
+    /// Builds the configuration; `more` settings come after those given with --set.
+    pub fn load(&self, more: impl IntoIterator<Item = String>) -> Result<Config> {
+        let settings: Vec<String> = self.set.iter().cloned().chain(more).collect();
+        Config::load(self.preset, self.config.as_deref(), &settings)
+    }
+}
+
+/// `train`.
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Dataset directory (native or authors' layout).
+    #[arg(required_unless_present = "print_config")]
+    pub data: Option<PathBuf>,
+    /// Run directory.
+    #[arg(short, long, value_name = "RUN", required_unless_present = "print_config")]
+    pub out: Option<PathBuf>,
+    /// Hyper-parameters.
+    #[command(flatten)]
+    pub config: ConfigArgs,
     /// Length of the run (same as --set train.iterations=N).
     #[arg(long, value_name = "N")]
     pub iterations: Option<u32>,
@@ -283,15 +299,9 @@ pub struct RenderArgs {
 pub struct BenchArgs {
     /// Dataset directory.
     pub data: PathBuf,
-    /// Set of defaults.
-    #[arg(long, value_enum)]
-    pub preset: Option<Preset>,
-    /// TOML file with hyper-parameters.
-    #[arg(long, value_name = "FILE")]
-    pub config: Option<PathBuf>,
-    /// Set one hyper-parameter. Repeatable.
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    pub set: Vec<String>,
+    /// Hyper-parameters.
+    #[command(flatten)]
+    pub config: ConfigArgs,
     /// Iterations of each timed repeat.
     #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub iterations: u32,

@@ -15,10 +15,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 fn config(args: &TrainArgs) -> Result<Config> {
-    let mut settings = args.set.clone();
-    settings.extend(args.iterations.map(|n| format!("train.iterations={n}")));
-    settings.extend(args.seed.map(|s| format!("seed={s}")));
-    Config::load(args.preset, args.config.as_deref(), &settings)
+    let iterations = args.iterations.map(|n| format!("train.iterations={n}"));
+    args.config.load(iterations.into_iter().chain(args.seed.map(|s| format!("seed={s}"))))
 }
 
 /// Trains.

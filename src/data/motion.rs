@@ -14,8 +14,8 @@ use rayon::prelude::*;
 pub struct ViewMotion {
     /// Index into [`Dataset::views`].
     pub view: usize,
-    /// Upper bound of the still background: each pixel's smallest line integral over the phases, corrected for the bias that
-    /// taking a minimum of noisy values has.
+    /// Upper bound of the still background: each pixel's smallest line integral over the phases, corrected for
+    /// the bias that taking a minimum of noisy values has.
     pub background: Vec<f32>,
     /// Lower bound of the still background: what remains of it without structures as thin as vessels, since a
     /// vessel that covers a pixel at every phase is part of the minimum.
@@ -47,14 +47,14 @@ pub struct Hull {
     pub bits: Vec<u32>,
 }
 
-/// Expected range of `n` standard normal draws, over two: how far the minimum lies below the mean.
+/// How far the smallest of `n` standard normal draws lies below the mean, on average.
 fn expected_minimum(n: usize) -> f64 {
     // Blom's approximation of the first normal order statistic.
     if n < 2 {
         return 0.0;
     }
     let p = (1.0 - 0.375) / (n as f64 + 0.25);
-    // Inverse normal by bisection of the logistic-free tail: accurate to 1e-6, called once per view.
+    // Inverse of the normal tail by bisection.
     let (mut low, mut high) = (0.0, 8.0);
     for _ in 0..60 {
         let mid = 0.5 * (low + high);

@@ -56,8 +56,8 @@ impl Renderer {
         setup.n_dynamic_samples = model.config.march.render_samples;
         let mut buffers = forward_buffers(gpu, &setup, &model.layout, RAYS_PER_SUBMIT)?;
         buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
-        let renderer_state = [0u32; 4];
-        gpu.upload(buffers.get("state")?, 0, &renderer_state)?;
+        // The schedule below has a single row, that of the model's step.
+        gpu.upload(buffers.get("state")?, 0, &[0u32; 4])?;
         buffers.set("schedule", gpu.buffer_with("schedule", &[model.config.schedule(model.step)])?);
         let renderer = Renderer { gpu: gpu.clone(), kernels, buffers, setup, model_layout: model.layout.clone() };
         renderer.set_model(model)?;
