@@ -108,6 +108,8 @@ struct Binding {
 struct Reflected {
     bindings: Vec<Binding>,
     push_bytes: u32,
+    /// Buffers whose device address the shader wants as push constant `NAME_address`, with its offset.
+    addresses: Vec<(String, u32)>,
     spec_constants: Vec<(String, u32)>,
 }
 
@@ -166,7 +168,7 @@ fn reflect(words: &[u32]) -> Result<Reflected, Failure> {
                 && a.operands.get(2) == Some(&Operand::Decoration(wanted))
         })
     };
-    let mut out = Reflected { bindings: Vec::new(), push_bytes: 0, spec_constants: Vec::new() };
+    let mut out = Reflected { bindings: Vec::new(), push_bytes: 0, addresses: Vec::new(), spec_constants: Vec::new() };
     for variable in module.types_global_values.iter().filter(|i| i.class.opcode == Op::Variable) {
         let (Some(variable_id), Some(pointer)) = (variable.result_id, variable.result_type) else {
             continue;
@@ -187,7 +189,10 @@ fn reflect(words: &[u32]) -> Result<Reflected, Failure> {
                         Op::TypeVector => 4 * literal(t.operands.get(1)),
                         _ => 4,
                     });
-                    out.push_bytes = out.push_bytes.max(offset + size);
+                    match names.members.get(&(pointee, member)).and_then(|name| name.strip_suffix("_address")) {
+                        Some(buffer) => out.addresses.push((buffer.to_owned(), offset)),
+                        None => out.push_bytes = out.push_bytes.max(offset + size),
+                    }
                 }
             }
             (StorageClass::StorageBuffer, Some(slot)) => out.bindings.push(Binding {
@@ -230,7 +235,7 @@ fn reflect(words: &[u32]) -> Result<Reflected, Failure> {
 fn kernel_row(name: &str, file: &Path, kernel: &Reflected) -> String {
     let mut row = String::new();
     let _ = writeln!(row, "    KernelCode {{ name: {name:?}, spirv: include_bytes!({:?}),", file.display().to_string());
-    let _ = writeln!(row, "        push_bytes: {}, bindings: &[", kernel.push_bytes);
+    let _ = writeln!(row, "        push_bytes: {}, addresses: &{:?}, bindings: &[", kernel.push_bytes, kernel.addresses);
     for b in &kernel.bindings {
         let _ = writeln!(
             row,

@@ -8,7 +8,7 @@
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
 #include "inc/softplus.glsl"
-#include "inc/texels.glsl"
+#include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };

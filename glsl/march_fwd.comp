@@ -6,7 +6,7 @@
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
 #include "inc/softplus.glsl"
-#include "inc/texels.glsl"
+#include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint with_maxima = 0u;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;

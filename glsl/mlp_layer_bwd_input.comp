@@ -3,8 +3,8 @@
 #extension GL_EXT_control_flow_attributes : require
 // Gradient through one hidden layer to its hidden input: dz_in = (W_b^T dz) where the input neuron was on.
 // A lane keeps SAMPLES samples x GROUPS vec4 of inputs; weights are uniform loads.
+#include "inc/operands.glsl"
 #include "inc/layout.glsl"
-#include "inc/texels.glsl"
 #ifndef SAMPLES
 #define SAMPLES 4u
 #endif
@@ -12,10 +12,13 @@
 #define GROUPS 4u
 #endif
 layout(local_size_x = 32, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint out_groups; uint in_groups; uint weights4; uint capacity; } push;
+layout(push_constant) uniform Push {
+    uint out_groups; uint in_groups; uint weights4; uint capacity;
+    ADDRESS_OF(dz) ADDRESS_OF(params)
+} push;
 READ_VEC4(0, B0, dz);
 READ_VEC4(1, B1, params);
-READ_VEC4(2, B2, activations);
+layout(binding = 2) readonly buffer B2 { vec4 activations[]; };
 layout(binding = 3) readonly buffer B3 { uint live[]; };
 layout(binding = 4) writeonly buffer B4 { vec4 dz_in[]; };
 
@@ -32,20 +35,27 @@ void main() {
         [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
             g[t] = FETCH(dz, q * push.capacity + min(base + t * gl_WorkGroupSize.x, padded - 1u));
         }
-        [[unroll]] for (uint j = 0u; j < 4u; j++) {
-            uint row = push.weights4 + (4u * q + j) * push.in_groups + first;
-            [[unroll]] for (uint i = 0u; i < GROUPS; i++) {
-                vec4 w = FETCH(params, row + i);
-                [[unroll]] for (uint t = 0u; t < SAMPLES; t++) sum[i][t] += g[t][j] * w;
+        uint row = push.weights4 + 4u * q * push.in_groups;
+        [[unroll]] for (uint i = 0u; i < GROUPS; i++) {
+            // A tile may overhang the width and then repeats the last inputs, unstored.
+            uint at = row + min(first + i, push.in_groups - 1u);
+            vec4 w0 = FETCH(params, at);
+            vec4 w1 = FETCH(params, at + push.in_groups);
+            vec4 w2 = FETCH(params, at + 2u * push.in_groups);
+            vec4 w3 = FETCH(params, at + 3u * push.in_groups);
+            // One update of a sum for four products: sums live in memory when a device runs out of registers.
+            [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
+                sum[i][t] += g[t].x * w0 + g[t].y * w1 + g[t].z * w2 + g[t].w * w3;
             }
         }
     }
     [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
         uint s = base + t * gl_WorkGroupSize.x;
-        if (s < padded) {
-            [[unroll]] for (uint i = 0u; i < GROUPS; i++) {
+        if (s >= padded) continue;
+        [[unroll]] for (uint i = 0u; i < GROUPS; i++) {
+            if (first + i < push.in_groups) {
                 uint at = (first + i) * push.capacity + s;
-                dz_in[at] = sum[i][t] * vec4(greaterThan(FETCH(activations, at), vec4(0.0)));
+                dz_in[at] = sum[i][t] * vec4(greaterThan(activations[at], vec4(0.0)));
             }
         }
     }

@@ -5,8 +5,8 @@
 // A lane keeps SAMPLES samples x OUTPUTS neurons in registers; weights are uniform loads.
 //   input_*[q * capacity + s], activations[q * capacity + s]: vec4 of 4 consecutive features.
 //   weights row-major [out][in], 4 inputs to a vec4.
+#include "inc/operands.glsl"
 #include "inc/layout.glsl"
-#include "inc/texels.glsl"
 #ifndef SAMPLES
 #define SAMPLES 4u
 #endif
@@ -16,6 +16,7 @@
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
     uint a_groups; uint b_groups; uint a_weights4; uint b_weights4; uint bias; uint capacity; uint width;
+    ADDRESS_OF(input_a) ADDRESS_OF(input_b) ADDRESS_OF(params)
 } push;
 READ_VEC4(0, B0, input_a);
 READ_VEC4(1, B1, input_b);
@@ -25,46 +26,47 @@ layout(binding = 4) readonly buffer B4 { uint sample_phases[]; };
 layout(binding = 5) readonly buffer B5 { vec4 phase_bias[]; };
 layout(binding = 6) writeonly buffer B6 { vec4 activations[]; };
 
+// Widths are multiples of 16; a wider tile may overhang and then repeats the last neuron, unstored.
+#define ROW(J) min(first + (J), push.width - 1u)
+#define ADD_INPUT(INPUT, GROUPS, WEIGHTS4)                                                                  \
+    [[dont_unroll]] for (uint q = 0u; q < GROUPS; q++) {                                                    \
+        vec4 x[SAMPLES];                                                                                    \
+        [[unroll]] for (uint t = 0u; t < SAMPLES; t++) x[t] = FETCH(INPUT, q * push.capacity + sample_of(t)); \
+        [[unroll]] for (uint j = 0u; j < OUTPUTS; j++) {                                                    \
+            vec4 w = FETCH(params, WEIGHTS4 + ROW(j) * GROUPS + q);                                         \
+            [[unroll]] for (uint t = 0u; t < SAMPLES; t++) sum[j][t] += dot(w, x[t]);                       \
+        }                                                                                                   \
+    }
+
+uint base;
+uint padded;
+
+uint sample_of(uint t) {
+    return min(base + t * gl_WorkGroupSize.x, padded - 1u);
+}
+
 void main() {
-    uint base = gl_WorkGroupID.x * (gl_WorkGroupSize.x * SAMPLES) + gl_LocalInvocationID.x;
+    base = gl_WorkGroupID.x * (gl_WorkGroupSize.x * SAMPLES) + gl_LocalInvocationID.x;
+    padded = live[1];
     uint first = gl_WorkGroupID.y * OUTPUTS;
-    uint padded = live[1];
     float sum[OUTPUTS][SAMPLES];
     [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
-        uint s = min(base + t * gl_WorkGroupSize.x, padded - 1u);
-        uint row = (push.bias + sample_phases[s] * push.width + first) / 4u;
+        uint row = push.bias + sample_phases[sample_of(t)] * push.width;
         [[unroll]] for (uint j = 0u; j < OUTPUTS; j += 4u) {
-            vec4 bias = phase_bias[row + j / 4u];
+            vec4 bias = phase_bias[(row + min(first + j, push.width - 4u)) / 4u];
             sum[j][t] = bias.x;
             sum[j + 1u][t] = bias.y;
             sum[j + 2u][t] = bias.z;
             sum[j + 3u][t] = bias.w;
         }
     }
-    [[dont_unroll]] for (uint q = 0u; q < push.a_groups; q++) {
-        vec4 x[SAMPLES];
-        [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
-            x[t] = FETCH(input_a, q * push.capacity + min(base + t * gl_WorkGroupSize.x, padded - 1u));
-        }
-        [[unroll]] for (uint j = 0u; j < OUTPUTS; j++) {
-            vec4 w = FETCH(params, push.a_weights4 + (first + j) * push.a_groups + q);
-            [[unroll]] for (uint t = 0u; t < SAMPLES; t++) sum[j][t] += dot(w, x[t]);
-        }
-    }
-    [[dont_unroll]] for (uint q = 0u; q < push.b_groups; q++) {
-        vec4 x[SAMPLES];
-        [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
-            x[t] = FETCH(input_b, q * push.capacity + min(base + t * gl_WorkGroupSize.x, padded - 1u));
-        }
-        [[unroll]] for (uint j = 0u; j < OUTPUTS; j++) {
-            vec4 w = FETCH(params, push.b_weights4 + (first + j) * push.b_groups + q);
-            [[unroll]] for (uint t = 0u; t < SAMPLES; t++) sum[j][t] += dot(w, x[t]);
-        }
-    }
+    ADD_INPUT(input_a, push.a_groups, push.a_weights4)
+    ADD_INPUT(input_b, push.b_groups, push.b_weights4)
     [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
         uint s = base + t * gl_WorkGroupSize.x;
-        if (s < padded) {
-            [[unroll]] for (uint j = 0u; j < OUTPUTS; j += 4u) {
+        if (s >= padded) continue;
+        [[unroll]] for (uint j = 0u; j < OUTPUTS; j += 4u) {
+            if (first + j < push.width) {
                 activations[(first + j) / 4u * push.capacity + s] =
                     max(vec4(sum[j][t], sum[j + 1u][t], sum[j + 2u][t], sum[j + 3u][t]), 0.0);
             }

@@ -3,7 +3,7 @@
 // Gradient at the output neuron and at the last hidden layer. One invocation per padded sample.
 //   sample_feature_gradient[s] = dL/df;  dz[q * capacity + s] = w_out * dL/df where the neuron was on.
 #include "inc/layout.glsl"
-#include "inc/texels.glsl"
+#include "inc/operands.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint groups; uint weights4; uint capacity; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };

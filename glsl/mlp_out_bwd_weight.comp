@@ -3,7 +3,7 @@
 // Weight and bias gradient of the output neuron, partial sums per split. One workgroup per (4 weights, split).
 //   partials[split][parameter]; later chunks of an iteration add to what the first wrote.
 #include "inc/layout.glsl"
-#include "inc/texels.glsl"
+#include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint weights; uint bias; uint capacity; uint splits; uint n_partials; uint accumulate; } push;
 layout(binding = 0) readonly buffer B0 { uint live[]; };

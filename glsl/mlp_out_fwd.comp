@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 // Output neuron and activation: sample_sigma[s] = (sigma_s, d sigma_s / d feature). One invocation per sample.
 #include "inc/layout.glsl"
-#include "inc/texels.glsl"
+#include "inc/operands.glsl"
 #include "inc/softplus.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint groups; uint weights4; uint bias; uint capacity; } push;

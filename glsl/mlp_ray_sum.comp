@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 // Sums dz over the samples of each ray: ray_dz[q * n_rays + ray]. One invocation per (ray, 4 neurons).
 #include "inc/layout.glsl"
-#include "inc/texels.glsl"
+#include "inc/operands.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_rays; uint capacity; } push;
 READ_VEC4(0, B0, dz);

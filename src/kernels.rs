@@ -3,7 +3,7 @@
 
 use crate::error::{Error, Result};
 use crate::gpu::device::{DeviceInfo, Gpu};
-use crate::gpu::memory::Buffer;
+use crate::gpu::memory::{Buffer, Operands};
 use crate::gpu::pipeline::{BindingCode, KernelCode, Pipeline};
 use crate::gpu::record::{Groups, Recording};
 use bytemuck::Pod;
@@ -13,22 +13,16 @@ use std::sync::Arc;
 
 include!(concat!(env!("OUT_DIR"), "/kernel_table.rs"));
 
-/// Neurons a lane of `mlp_layer_fwd` computes; `OUTPUTS` there.
-pub const FWD_OUTPUTS: u32 = 16;
-/// Input groups (vec4) a lane of `mlp_layer_bwd_input` computes; `GROUPS` there.
-pub const BWD_GROUPS: u32 = 4;
-/// Samples a lane of the layer kernels keeps; `SAMPLES` there.
-pub const LANE_SAMPLES: u32 = 4;
-/// Side of the register tile of `mlp_layer_bwd_weight`.
-pub const WEIGHT_TILE: u32 = 8;
+/// Inputs a lane of `mlp_layer_bwd_weight` keeps; `INPUTS` there.
+pub const WEIGHT_INPUTS: u32 = 4;
 /// Lanes that share the depths of a ray in `march_count` and `march_emit`.
 pub const MARCH_LANES: u32 = 32;
 
 /// Sizes and variants chosen for a device, with the reasons.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Tuning {
-    /// Read weights and activations through texel buffers.
-    pub texel: bool,
+    /// How the network's kernels read weights and activations.
+    pub operands: Operands,
     /// Invocations of a workgroup of the layer kernels.
     pub layer_lanes: u32,
     /// Invocations of a workgroup of the weight-gradient kernels.
@@ -44,11 +38,14 @@ impl Tuning {
     pub fn for_device(info: &DeviceInfo) -> Tuning {
         let old_lavapipe = info.is_llvmpipe && info.mesa_major.is_some_and(|v| v < 24);
         let mut reasons = Vec::new();
-        reasons.push(if old_lavapipe {
-            "operands through texel buffers: this llvmpipe reads storage buffers lane by lane".to_owned()
+        let (operands, why) = if old_lavapipe {
+            (Operands::Texel, "operands through texel buffers: this llvmpipe reads storage buffers lane by lane")
+        } else if info.is_llvmpipe && info.buffer_device_address {
+            (Operands::Address, "operands through addresses: spares this llvmpipe bounds checks")
         } else {
-            "operands through storage buffers".to_owned()
-        });
+            (Operands::Storage, "operands through storage buffers")
+        };
+        reasons.push(why.to_owned());
         let (layer_lanes, weight_lanes, splits) = if info.is_llvmpipe {
             reasons.push("one subgroup per workgroup and few splits: a CPU has few workgroups in flight".into());
             (info.subgroup_size.clamp(4, 16), info.subgroup_size.clamp(4, 16), 4)
@@ -57,13 +54,35 @@ impl Tuning {
         };
         reasons.push("f32 layers: the cooperative-matrix path does not exist yet".into());
         reasons.push("static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into());
-        Tuning { texel: old_lavapipe, layer_lanes, weight_lanes, splits, reasons }
+        Tuning { operands, layer_lanes, weight_lanes, splits, reasons }
     }
 
     /// Samples one workgroup of the layer kernels covers.
     pub fn tile_samples(&self) -> u32 {
-        self.layer_lanes * LANE_SAMPLES
+        self.layer_lanes * self.tile().samples
     }
+
+    /// What a lane of the layer kernels keeps in registers; the defines of `glsl/variants.txt`.
+    pub fn tile(&self) -> LaneTile {
+        match self.operands {
+            Operands::Storage => LaneTile { samples: 4, fwd_neurons: 16, bwd_inputs: 16, weight_neurons: 16 },
+            Operands::Texel => LaneTile { samples: 8, fwd_neurons: 16, bwd_inputs: 16, weight_neurons: 32 },
+            Operands::Address => LaneTile { samples: 4, fwd_neurons: 32, bwd_inputs: 32, weight_neurons: 32 },
+        }
+    }
+}
+
+/// Register tiles of the layer kernels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LaneTile {
+    /// Samples a lane of `mlp_layer_fwd` and `mlp_layer_bwd_input` keeps.
+    pub samples: u32,
+    /// Neurons of `mlp_layer_fwd`.
+    pub fwd_neurons: u32,
+    /// Inputs of `mlp_layer_bwd_input`.
+    pub bwd_inputs: u32,
+    /// Neurons of `mlp_layer_bwd_weight`.
+    pub weight_neurons: u32,
 }
 
 /// Buffers under the names the shaders use.
@@ -111,8 +130,8 @@ macro_rules! stages {
             /// Errors of [`Gpu::pipeline`].
             pub fn new(gpu: &Gpu, tuning: Tuning) -> Result<Kernels> {
                 let t = &tuning;
-                let make = |name: &str, texel: bool, local: u32, spec: &[(&str, u32)]| {
-                    let code = kernel_code(&if texel { format!("{name}_texel") } else { name.to_owned() })?;
+                let make = |name: &str, variant: &str, local: u32, spec: &[(&str, u32)]| {
+                    let code = kernel_code(&format!("{name}{variant}"))?;
                     gpu.pipeline(code, local, spec).map(Arc::new)
                 };
                 Ok(Kernels {
@@ -130,8 +149,16 @@ macro_rules! stages {
     };
     (@name march_fwd_maxima) => { "march_fwd" };
     (@name $stage:ident) => { stringify!($stage) };
-    (@plain $t:ident) => { false };
-    (@operands $t:ident) => { $t.texel };
+    (@plain $t:ident) => { "" };
+    // Reads vec4 arrays; only the layers' time depends on doing so through addresses.
+    (@operands $t:ident) => { if $t.operands == Operands::Texel { "_texel" } else { "" } };
+    (@layers $t:ident) => {
+        match $t.operands {
+            Operands::Storage => "",
+            Operands::Texel => "_texel",
+            Operands::Address => "_address",
+        }
+    };
 }
 
 stages! {
@@ -150,7 +177,7 @@ stages! {
     /// Bias and latent, one row per phase.
     mlp_latent_fwd(|_| 64, plain);
     /// One hidden layer.
-    mlp_layer_fwd(|t| t.layer_lanes, operands);
+    mlp_layer_fwd(|t| t.layer_lanes, layers);
     /// Output neuron and activation.
     mlp_out_fwd(|_| 64, operands);
     /// Line integrals.
@@ -166,9 +193,9 @@ stages! {
     /// Weight gradient of the output neuron.
     mlp_out_bwd_weight(|t| t.weight_lanes, operands);
     /// Gradient to a layer's hidden input.
-    mlp_layer_bwd_input(|t| t.layer_lanes, operands);
+    mlp_layer_bwd_input(|t| t.layer_lanes, layers);
     /// Weight gradient of a hidden layer.
-    mlp_layer_bwd_weight(|t| t.weight_lanes, operands);
+    mlp_layer_bwd_weight(|t| t.weight_lanes, layers);
     /// Sums over each ray's samples.
     mlp_ray_sum(|_| 64, operands);
     /// Sums over each phase's rays.

@@ -5,6 +5,7 @@ mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
 use nertca_vk::cpu::{march, step};
+use nertca_vk::gpu::memory::Operands;
 use nertca_vk::kernels::Tuning;
 use nertca_vk::layout::Ray;
 use nertca_vk::train::plan::Plan;
@@ -56,11 +57,12 @@ fn rays_and_depths_match() {
 
 /// Both families of kernels: operands through texel buffers with small workgroups, as an old lavapipe gets
 /// them, and through storage buffers with large ones, as GPUs do.
-fn tunings() -> [Tuning; 2] {
+fn tunings() -> [Tuning; 3] {
     let reasons = Vec::new();
     [
-        Tuning { texel: true, layer_lanes: 8, weight_lanes: 8, splits: 4, reasons: reasons.clone() },
-        Tuning { texel: false, layer_lanes: 64, weight_lanes: 32, splits: 16, reasons },
+        Tuning { operands: Operands::Texel, layer_lanes: 8, weight_lanes: 8, splits: 4, reasons: reasons.clone() },
+        Tuning { operands: Operands::Storage, layer_lanes: 64, weight_lanes: 32, splits: 16, reasons: reasons.clone() },
+        Tuning { operands: Operands::Address, layer_lanes: 8, weight_lanes: 4, splits: 3, reasons },
     ]
 }
 

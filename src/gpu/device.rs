@@ -59,6 +59,8 @@ pub struct DeviceInfo {
     pub timestamp_period_ns: f32,
     /// Device-local memory, bytes.
     pub device_memory: u64,
+    /// Whether shaders can read buffers through their addresses.
+    pub buffer_device_address: bool,
     /// Whether the device offers `VK_KHR_cooperative_matrix`.
     pub cooperative_matrix: bool,
     /// Whether the device offers 16-bit float arithmetic.
@@ -217,6 +219,7 @@ fn describe(instance: &ash::Instance, index: usize, physical: vk::PhysicalDevice
             .filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
             .map(|h| h.size)
             .sum(),
+        buffer_device_address: f12.buffer_device_address == vk::TRUE,
         cooperative_matrix: has(khr::cooperative_matrix::NAME),
         float16: f12.shader_float16 == vk::TRUE,
         float_atomics: has(ext::shader_atomic_float::NAME),
@@ -329,7 +332,9 @@ impl Gpu {
         let priorities = [1.0];
         let queues =
             [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(&priorities)];
-        let mut f12 = vk::PhysicalDeviceVulkan12Features::default().timeline_semaphore(true);
+        let mut f12 = vk::PhysicalDeviceVulkan12Features::default()
+            .timeline_semaphore(true)
+            .buffer_device_address(info.buffer_device_address);
         let create = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut f12);
         // SAFETY: the chain lives until the call returns; the features were checked in `describe`.
         let device = unsafe { instance.create_device(physical, &create, None) }
@@ -341,7 +346,7 @@ impl Gpu {
             device: device.clone(),
             physical_device: physical,
             debug_settings: Default::default(),
-            buffer_device_address: false,
+            buffer_device_address: info.buffer_device_address,
             allocation_sizes: Default::default(),
         })
         .map_err(|e| Error::Internal(format!("gpu-allocator: {e}")))?;

@@ -21,6 +21,18 @@ pub enum Memory {
     Readback,
 }
 
+/// How shaders read a buffer of vec4.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Operands {
+    /// As a storage buffer.
+    Storage,
+    /// As a `rgba32f` texel buffer.
+    Texel,
+    /// Through its address, without bounds checks.
+    Address,
+}
+
 /// Bytes on the device. Clones share the same memory, freed with the last one.
 #[derive(Clone)]
 pub struct Buffer {
@@ -36,6 +48,10 @@ struct Inner {
     allocation: Mutex<ManuallyDrop<Allocation>>,
 }
 
+/// Drivers may read a little past the last element when a loop of uniform loads through an address ends (seen with
+/// llvmpipe of Mesa 26.2, which crashes without).
+const ADDRESS_TAIL_BYTES: u64 = 4096;
+
 /// Copies larger than this go through several staging buffers, to bound host memory.
 const STAGING_BYTES: usize = 32 << 20;
 
@@ -45,15 +61,16 @@ impl Gpu {
     /// # Errors
     /// [`Error::OutOfMemory`] naming the buffer, or [`Error::Config`] beyond the device's limits.
     pub fn buffer(&self, name: &str, bytes: u64, memory: Memory) -> Result<Buffer> {
-        self.make_buffer(name, bytes, memory, false)
+        self.make_buffer(name, bytes, memory, Operands::Storage)
     }
 
-    /// A device buffer that shaders may also read as a `rgba32f` texel buffer.
+    /// A device buffer that shaders may, besides as a storage buffer, read as `operands` says.
     ///
     /// # Errors
     /// As [`Gpu::buffer`].
-    pub fn texel_buffer(&self, name: &str, bytes: u64) -> Result<Buffer> {
-        self.make_buffer(name, bytes, Memory::Device, true)
+    pub fn operand_buffer(&self, name: &str, bytes: u64, operands: Operands) -> Result<Buffer> {
+        let tail = if operands == Operands::Address { ADDRESS_TAIL_BYTES } else { 0 };
+        self.make_buffer(name, bytes + tail, Memory::Device, operands)
     }
 
     /// A device buffer filled with `data`.
@@ -66,10 +83,11 @@ impl Gpu {
         Ok(buffer)
     }
 
-    fn make_buffer(&self, name: &str, bytes: u64, memory: Memory, texel: bool) -> Result<Buffer> {
+    fn make_buffer(&self, name: &str, bytes: u64, memory: Memory, operands: Operands) -> Result<Buffer> {
         let shared = &self.shared;
         let bytes = bytes.max(16).next_multiple_of(16);
         let info = self.info();
+        let texel = operands == Operands::Texel;
         if bytes > u64::from(info.max_storage_buffer_range) {
             return Err(Error::OutOfMemory {
                 object: name.into(),
@@ -93,6 +111,9 @@ impl Gpu {
             | vk::BufferUsageFlags::TRANSFER_DST;
         if texel {
             usage |= vk::BufferUsageFlags::UNIFORM_TEXEL_BUFFER;
+        }
+        if operands == Operands::Address {
+            usage |= vk::BufferUsageFlags::SHADER_DEVICE_ADDRESS;
         }
         let create = vk::BufferCreateInfo::default().size(bytes).usage(usage);
         // SAFETY: the device is alive and the create info is complete.
@@ -203,6 +224,13 @@ impl Buffer {
 
     pub(super) fn raw(&self) -> vk::Buffer {
         self.inner.raw
+    }
+
+    /// Where shaders find an [`Operands::Address`] buffer.
+    pub(super) fn address(&self) -> u64 {
+        let info = vk::BufferDeviceAddressInfo::default().buffer(self.inner.raw);
+        // SAFETY: pipelines that ask for addresses exist only on devices with the feature.
+        unsafe { self.inner.gpu.device.get_buffer_device_address(&info) }
     }
 
     pub(super) fn texel_view(&self) -> Option<vk::BufferView> {

@@ -12,8 +12,10 @@ pub struct KernelCode {
     pub name: &'static str,
     /// SPIR-V bytes.
     pub spirv: &'static [u8],
-    /// Bytes of push constants.
+    /// Bytes of push constants the caller gives.
     pub push_bytes: u32,
+    /// Buffers whose device address is pushed as well, with its offset.
+    pub addresses: &'static [(&'static str, u32)],
     /// Buffers the shader uses.
     pub bindings: &'static [BindingCode],
     /// Name and id of each specialisation constant.
@@ -35,6 +37,13 @@ pub struct BindingCode {
     pub writes: bool,
 }
 
+impl KernelCode {
+    /// Bytes of push constants, addresses included.
+    pub(super) fn all_push_bytes(&self) -> u32 {
+        self.addresses.iter().map(|(_, offset)| offset + 8).fold(self.push_bytes, u32::max)
+    }
+}
+
 /// A pipeline ready to be recorded.
 pub struct Pipeline {
     gpu: Arc<Shared>,
@@ -54,11 +63,16 @@ impl Gpu {
     /// [`Error::Vulkan`] when the driver refuses the shader.
     pub fn pipeline(&self, code: &'static KernelCode, local_size: u32, spec: &[(&str, u32)]) -> Result<Pipeline> {
         let info = self.info();
-        if local_size == 0 || local_size > info.max_workgroup_invocations || code.push_bytes > info.max_push_constants {
+        if local_size == 0 || local_size > info.max_workgroup_invocations || code.all_push_bytes() > info.max_push_constants {
             return Err(Error::Internal(format!(
                 "kernel {}: {local_size} invocations and {} bytes of push constants exceed {}",
-                code.name, code.push_bytes, info.name
+                code.name,
+                code.all_push_bytes(),
+                info.name
             )));
+        }
+        if !code.addresses.is_empty() && !info.buffer_device_address {
+            return Err(Error::Internal(format!("kernel {}: {} has no buffer addresses", code.name, info.name)));
         }
         let mut entries = Vec::new();
         let mut values: Vec<u32> = Vec::new();
@@ -99,9 +113,9 @@ impl Gpu {
             .map_err(Error::vulkan("vkCreateDescriptorSetLayout", code.name))?;
         let sets = [pipeline.set_layout];
         let ranges =
-            [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(code.push_bytes)];
+            [vk::PushConstantRange::default().stage_flags(vk::ShaderStageFlags::COMPUTE).size(code.all_push_bytes())];
         let mut create = vk::PipelineLayoutCreateInfo::default().set_layouts(&sets);
-        if code.push_bytes > 0 {
+        if code.all_push_bytes() > 0 {
             create = create.push_constant_ranges(&ranges);
         }
         // SAFETY: as above.

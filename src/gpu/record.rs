@@ -195,14 +195,21 @@ impl Recording {
         let set = self.descriptor_set(pipeline, &bound)?;
         let device = self.commands.gpu.device.clone();
         let raw = self.commands.raw;
+        let mut pushed = vec![0u8; code.all_push_bytes() as usize];
+        pushed[..size_of::<P>()].copy_from_slice(bytemuck::bytes_of(push));
+        for (name, offset) in code.addresses {
+            let (_, buffer) = bound.iter().find(|(b, _)| b.name == *name).ok_or_else(|| {
+                fault(format!("it wants the address of `{name}`, which it does not bind"))
+            })?;
+            pushed[*offset as usize..][..8].copy_from_slice(&buffer.address().to_le_bytes());
+        }
         self.begin_pass(code.name)?;
         // SAFETY: the command buffer is recording; pipeline, layout, set and buffers are kept alive by `commands`.
         unsafe {
             device.cmd_bind_pipeline(raw, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
             device.cmd_bind_descriptor_sets(raw, vk::PipelineBindPoint::COMPUTE, pipeline.layout, 0, &[set], &[]);
-            if code.push_bytes > 0 {
-                let bytes = bytemuck::bytes_of(push);
-                device.cmd_push_constants(raw, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, bytes);
+            if !pushed.is_empty() {
+                device.cmd_push_constants(raw, pipeline.layout, vk::ShaderStageFlags::COMPUTE, 0, &pushed);
             }
             match groups {
                 Groups::Direct([x, y, z]) => device.cmd_dispatch(raw, x, y, z),

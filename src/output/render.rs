@@ -54,7 +54,7 @@ impl Renderer {
         setup.jitter = 0;
         setup.n_static_samples = model.config.march.render_samples;
         setup.n_dynamic_samples = model.config.march.render_samples;
-        let mut buffers = forward_buffers(gpu, &setup, &model.layout, RAYS_PER_SUBMIT)?;
+        let mut buffers = forward_buffers(gpu, &kernels.tuning, &setup, &model.layout, RAYS_PER_SUBMIT)?;
         buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
         // The schedule below has a single row, that of the model's step.
         gpu.upload(buffers.get("state")?, 0, &[0u32; 4])?;

@@ -10,7 +10,7 @@ use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Groups, Recording};
-use crate::kernels::{BWD_GROUPS, Buffers, FWD_OUTPUTS, Kernels, MARCH_LANES, WEIGHT_TILE, dispatch, groups_for};
+use crate::kernels::{Buffers, Kernels, MARCH_LANES, Tuning, WEIGHT_INPUTS, dispatch, groups_for};
 use crate::layout::{Frame, Ray, RayOut, Setup, View};
 use crate::model::params::ParamLayout;
 
@@ -37,7 +37,7 @@ const DZ: [&str; 2] = ["dz_even", "dz_odd"];
 
 /// Rays handled at once: their samples fit one chunk even if all are live.
 pub fn chunk_rays(setup: &Setup) -> u32 {
-    (setup.sample_capacity / setup.n_dynamic_samples).max(1)
+    (setup.sample_capacity / 64 * 64 / setup.n_dynamic_samples).max(1)
 }
 
 fn chunks(setup: &Setup, n_rays: u32) -> impl Iterator<Item = [u32; 2]> + use<> {
@@ -49,7 +49,13 @@ fn chunks(setup: &Setup, n_rays: u32) -> impl Iterator<Item = [u32; 2]> + use<> 
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer.
-pub fn forward_buffers(gpu: &Gpu, setup: &Setup, params: &ParamLayout, n_rays: u32) -> Result<Buffers> {
+pub fn forward_buffers(
+    gpu: &Gpu,
+    tuning: &Tuning,
+    setup: &Setup,
+    params: &ParamLayout,
+    n_rays: u32,
+) -> Result<Buffers> {
     let mut buffers = Buffers::default();
     let per_chunk = u64::from(chunk_rays(setup).min(n_rays));
     let capacity = u64::from(setup.sample_capacity);
@@ -71,7 +77,7 @@ pub fn forward_buffers(gpu: &Gpu, setup: &Setup, params: &ParamLayout, n_rays: u
     plain("sample_sigma", capacity * 8)?;
     plain("phase_bias", (params.layers.len() * params.phases) as u64 * width * 4)?;
     let mut operand = |name: &'static str, bytes: u64| -> Result<()> {
-        buffers.set(name, gpu.texel_buffer(name, bytes)?);
+        buffers.set(name, gpu.operand_buffer(name, bytes, tuning.operands)?);
         Ok(())
     };
     operand("params", params.len as u64 * 4)?;
@@ -89,13 +95,13 @@ pub fn forward_buffers(gpu: &Gpu, setup: &Setup, params: &ParamLayout, n_rays: u
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer.
-pub fn training_buffers(gpu: &Gpu, plan: &Plan, splits: u32) -> Result<Buffers> {
+pub fn training_buffers(gpu: &Gpu, tuning: &Tuning, plan: &Plan) -> Result<Buffers> {
     let (setup, params) = (&plan.setup, &plan.params);
     let n_rays = u64::from(setup.n_rays);
     let capacity = u64::from(setup.sample_capacity);
     let per_chunk = u64::from(chunk_rays(setup)).min(n_rays);
     let network = (params.len - params.static_len) as u64;
-    let mut buffers = forward_buffers(gpu, setup, params, setup.n_rays)?;
+    let mut buffers = forward_buffers(gpu, tuning, setup, params, setup.n_rays)?;
     buffers.set("schedule", gpu.buffer_with("schedule", &plan.schedule)?);
     buffers.set("views", gpu.buffer_with::<View>("views", &plan.views)?);
     buffers.set("frames", gpu.buffer_with::<Frame>("frames", &plan.frames)?);
@@ -111,7 +117,7 @@ pub fn training_buffers(gpu: &Gpu, plan: &Plan, splits: u32) -> Result<Buffers> 
         ("tv_gradient", params.static_len as u64 * 4),
         ("tv_value", params.static_len as u64 * 4),
         ("sample_feature_gradient", capacity * 4),
-        ("partials", network * u64::from(splits) * 4),
+        ("partials", network * u64::from(tuning.splits) * 4),
         ("ray_dz", per_chunk * params.width as u64 * 4),
         ("phase_dz", (params.layers.len() * params.phases * params.width) as u64 * 4),
         ("gradient", params.len as u64 * 4),
@@ -120,7 +126,7 @@ pub fn training_buffers(gpu: &Gpu, plan: &Plan, splits: u32) -> Result<Buffers> 
         buffers.set(name, gpu.buffer(name, bytes, Memory::Device)?);
     }
     for name in DZ {
-        buffers.set(name, gpu.texel_buffer(name, capacity * params.width as u64 * 4)?);
+        buffers.set(name, gpu.operand_buffer(name, capacity * params.width as u64 * 4, tuning.operands)?);
     }
     let mut recording = Recording::new(gpu, "clear")?;
     for name in ["state", "static_gradient", "partials", "phase_dz", "gradient", "moments", "params"] {
@@ -173,9 +179,9 @@ fn record_network(
     let encode_groups = params.encode_groups as u32;
     let per_ray = || Groups::Direct([n_rays, 1, 1]);
     dispatch(r, &k.march_count, per_ray(), buffers, &[], chunk)?;
-    let tile = k.tuning.tile_samples();
-    let (fwd_y, bwd_y) = (params.width as u32 / FWD_OUTPUTS, groups / BWD_GROUPS);
-    let scan = [n_rays, MARCH_LANES, tile, fwd_y, bwd_y, u32::from(first_ray > 0)];
+    let (tile, width) = (k.tuning.tile(), params.width as u32);
+    let (fwd_y, bwd_y) = (width.div_ceil(tile.fwd_neurons), width.div_ceil(tile.bwd_inputs));
+    let scan = [n_rays, MARCH_LANES, k.tuning.tile_samples(), fwd_y, bwd_y, u32::from(first_ray > 0)];
     dispatch(r, &k.march_scan, Groups::Direct([1, 1, 1]), buffers, &[], scan)?;
     dispatch(r, &k.march_emit, per_ray(), buffers, &[], chunk)?;
     let arguments = buffers.get("arguments")?;
@@ -252,8 +258,13 @@ fn record_network_backward(
             let Some(at) = at else { continue };
             // Biases of layers without latents are summed here; the others come from the sums per phase.
             let bias = if layer.latent.is_none() { in_partials(layer.bias) } else { u32::MAX };
-            let push = [in_groups, in_partials(at), capacity, splits, network, accumulate, bias];
-            let tiles = [width / WEIGHT_TILE, (4 * in_groups).div_ceil(WEIGHT_TILE), splits];
+            let push = [in_groups, in_partials(at), capacity, splits, network, accumulate, bias, groups];
+            let inputs_per_group = WEIGHT_INPUTS * k.mlp_layer_bwd_weight.local_size;
+            let tiles = [
+                width.div_ceil(k.tuning.tile().weight_neurons),
+                (4 * in_groups).div_ceil(inputs_per_group),
+                splits,
+            ];
             let names = [("dz", dz), ("inputs", input)];
             dispatch(r, &k.mlp_layer_bwd_weight, Groups::Direct(tiles), buffers, &names, push)?;
         }

@@ -123,7 +123,7 @@ impl Trainer {
         state: Option<(&[[f32; 2]], u32)>,
     ) -> Result<Trainer> {
         let kernels = Kernels::new(gpu, tuning)?;
-        let buffers = training_buffers(gpu, &plan, kernels.tuning.splits)?;
+        let buffers = training_buffers(gpu, &kernels.tuning, &plan)?;
         gpu.upload(buffers.get("params")?, 0, params)?;
         let step = state.map_or(0, |(_, step)| step);
         if let Some((moments, step)) = state {
