@@ -16,7 +16,8 @@ void main() {
     if (i >= setup.n_params) return;
     Schedule now = schedule[state[0]];
     bool is_static = i < setup.static_params;
-    if (!is_static && now.dynamic_active == 0u) return;
+    // state[2]: the network's gradient overflowed, so this update is skipped.
+    if (!is_static && (now.dynamic_active == 0u || state[2] != 0u)) return;
     float g = gradient[i];
     vec2 moment = now.reset != 0u ? vec2(0.0) : moments[i];
     moment.x = setup.beta1 * moment.x + (1.0 - setup.beta1) * g;

@@ -1,9 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Windowed positional encoding (paper section 2.3) of the live samples. One invocation per padded sample.
+// Positional encoding of the live samples. One invocation per padded sample.
 //   sample_phases[s] = phase of the sample's ray;
-//   features[q * capacity + s] = vec4 of numbers 4q..4q+3 of
-//   [x, y, z, then per band k: a_k sin(2^k (x,y,z)), a_k cos(2^k (x,y,z))], zero-padded.
+//   features[q * capacity + s] = vec4 of numbers 4q..4q+3 of the encoding, zero-padded.
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
@@ -16,13 +15,7 @@ layout(binding = 6) readonly buffer B6 { Ray rays[]; };
 layout(binding = 7) writeonly buffer B7 { vec4 features[]; };
 layout(binding = 8) writeonly buffer B8 { uint sample_phases[]; };
 
-// Vulkan's sin is exact only near 0: subtract the nearest multiple of 2 pi in three parts.
-vec3 reduce_angle(vec3 a) {
-    vec3 n = round(a * 0.15915494309189535);
-    a -= n * 6.28125;
-    a -= n * 0.0019350051879882812;
-    return a - n * 3.01991598e-7;
-}
+#include "inc/encoding.glsl"
 
 void main() {
     uint s = gl_GlobalInvocationID.x;
@@ -36,15 +29,12 @@ void main() {
     }
     sample_phases[s] = rays[sample_rays[s] & 0x7fffffffu].phase;
     float window = schedule[state[0]].window;
-    vec3 centre = vec3(setup.encode_centre_x, setup.encode_centre_y, setup.encode_centre_z);
-    vec3 x = (sample_points[s].xyz - centre) * setup.encode_scale;
+    vec3 x = encoded_point(sample_points[s].xyz);
     // Two bands make 12 numbers, so three whole vec4 leave the carry (x, y, z) as it was.
     vec3 carry = x;
     for (uint k = 0u; k < setup.n_bands; k += 2u) {
-        vec3 a0 = reduce_angle(x * float(1u << k));
-        float open0 = clamp(window - float(k), 0.0, 1.0);
-        vec3 sin0 = open0 * sin(a0);
-        vec3 cos0 = open0 * cos(a0);
+        vec3 sin0, cos0;
+        encoded_band(x, k, window, sin0, cos0);
         uint q = (3u + 6u * k) / 4u;
         features[q * stride + s] = vec4(carry, sin0.x);
         features[(q + 1u) * stride + s] = vec4(sin0.yz, cos0.xy);
@@ -52,10 +42,8 @@ void main() {
             features[(q + 2u) * stride + s] = vec4(cos0.z, 0.0, 0.0, 0.0);
             return;
         }
-        vec3 a1 = reduce_angle(x * float(2u << k));
-        float open1 = clamp(window - float(k + 1u), 0.0, 1.0);
-        vec3 sin1 = open1 * sin(a1);
-        vec3 cos1 = open1 * cos(a1);
+        vec3 sin1, cos1;
+        encoded_band(x, k + 1u, window, sin1, cos1);
         features[(q + 2u) * stride + s] = vec4(cos0.z, sin1);
         carry = cos1;
     }

@@ -18,10 +18,22 @@ pub const WEIGHT_INPUTS: u32 = 4;
 /// Lanes that share the depths of a ray in `march_count` and `march_emit`.
 pub const MARCH_LANES: u32 = 32;
 
+/// How the network's layers are computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Layers {
+    /// f32 throughout.
+    F32,
+    /// Cooperative matrices: f16 operands, f32 sums.
+    Matrices,
+}
+
 /// Sizes and variants chosen for a device, with the reasons.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Tuning {
-    /// How the network's kernels read weights and activations.
+    /// How the network's layers are computed.
+    pub layers: Layers,
+    /// How kernels read weights and activations in f32.
     pub operands: Operands,
     /// Invocations of a workgroup of the layer kernels.
     pub layer_lanes: u32,
@@ -29,6 +41,10 @@ pub struct Tuning {
     pub weight_lanes: u32,
     /// Parts the samples are split into for weight gradients.
     pub splits: u32,
+    /// Workgroups of the backward passes on matrices, which stay on the device and share out the samples.
+    pub matrix_workgroups: u32,
+    /// Samples handled at once, at most; the configuration may ask for fewer.
+    pub chunk_samples: u32,
     /// One sentence per choice.
     pub reasons: Vec<String>,
 }
@@ -52,9 +68,47 @@ impl Tuning {
         } else {
             (64, 32, 16)
         };
-        reasons.push("f32 layers: the cooperative-matrix path does not exist yet".into());
+        let (layers, why) = match info.matrices.first() {
+            None => (Layers::F32, "f32 layers: the device has no cooperative matrices our kernels can use".to_owned()),
+            Some(_) if info.kind == "cpu" => {
+                (Layers::F32, "f32 layers: a CPU emulates cooperative matrices, several times slower".to_owned())
+            }
+            Some(s) => {
+                (Layers::Matrices, format!("layers on {}x{}x{} matrices: f16 operands, f32 sums", s.m, s.n, s.k))
+            }
+        };
+        reasons.push(why);
+        // Two workgroups per multiprocessor; 132 multiprocessors where the driver does not tell their number.
+        let matrix_workgroups = match info.multiprocessors {
+            _ if info.kind == "cpu" => 4,
+            0 => 264,
+            n => 2 * n,
+        };
+        let chunk_samples = if info.kind == "cpu" { 1 << 16 } else { 1 << 19 };
         reasons.push("static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into());
-        Tuning { operands, layer_lanes, weight_lanes, splits, reasons }
+        Tuning {
+            layers,
+            operands,
+            layer_lanes,
+            weight_lanes,
+            splits,
+            matrix_workgroups,
+            chunk_samples,
+            reasons,
+        }
+    }
+
+    /// With the layers on a path chosen by the caller, if any.
+    pub fn with_layers(mut self, layers: Option<Layers>) -> Tuning {
+        if let Some(layers) = layers {
+            self.layers = layers;
+            self.reasons.retain(|r| !r.contains("layers"));
+            self.reasons.push(match layers {
+                Layers::F32 => "layers in f32, as asked".into(),
+                Layers::Matrices => "layers on matrices, as asked: f16 operands, f32 sums".into(),
+            });
+        }
+        self
     }
 
     /// Samples one workgroup of the layer kernels covers.
@@ -115,32 +169,32 @@ pub fn kernel_code(name: &str) -> Result<&'static KernelCode> {
 }
 
 macro_rules! stages {
-    ($($(#[$doc:meta])* $stage:ident($local:expr, $texel:ident $(, $spec:expr)?);)*) => {
-        /// Every stage's pipeline.
-        pub struct Kernels {
+    ($(#[$about:meta])* $name:ident { $($(#[$doc:meta])* $stage:ident($local:expr, $variant:ident $(, $spec:expr)?);)* }) => {
+        $(#[$about])*
+        pub struct $name {
             /// Choices they were built with.
             pub tuning: Tuning,
             $($(#[$doc])* pub $stage: Arc<Pipeline>,)*
         }
 
-        impl Kernels {
-            /// Builds all pipelines for a device.
+        impl $name {
+            /// Builds the pipelines.
             ///
             /// # Errors
             /// Errors of [`Gpu::pipeline`].
-            pub fn new(gpu: &Gpu, tuning: Tuning) -> Result<Kernels> {
+            pub fn new(gpu: &Gpu, tuning: Tuning) -> Result<$name> {
                 let t = &tuning;
                 let make = |name: &str, variant: &str, local: u32, spec: &[(&str, u32)]| {
                     let code = kernel_code(&format!("{name}{variant}"))?;
                     gpu.pipeline(code, local, spec).map(Arc::new)
                 };
-                Ok(Kernels {
+                Ok($name {
                     $($stage: {
                         let local: fn(&Tuning) -> u32 = $local;
                         #[allow(unused_mut, unused_assignments, reason = "only some stages have constants")]
-                        let mut spec: &[(&str, u32)] = &[];
+                        let mut spec: fn(&Tuning) -> Vec<(&'static str, u32)> = |_| Vec::new();
                         $(spec = $spec;)?
-                        make(stages!(@name $stage), stages!(@$texel t), local(t), spec)?
+                        make(stages!(@name $stage), stages!(@$variant t), local(t), &spec(t))?
                     },)*
                     tuning,
                 })
@@ -162,54 +216,65 @@ macro_rules! stages {
 }
 
 stages! {
-    /// Draws the rays of an iteration.
-    batch(|_| 64, plain);
-    /// Rays of a pose, for rendering.
-    pose_rays(|_| 64, plain);
-    /// Counts live dynamic samples.
-    march_count(|_| MARCH_LANES, plain);
-    /// Offsets and indirect arguments.
-    march_scan(|_| 256, plain);
-    /// Writes live samples.
-    march_emit(|_| MARCH_LANES, plain);
-    /// Positional encoding.
-    encode(|_| 64, plain);
-    /// Bias and latent, one row per phase.
-    mlp_latent_fwd(|_| 64, plain);
-    /// One hidden layer.
-    mlp_layer_fwd(|t| t.layer_lanes, layers);
-    /// Output neuron and activation.
-    mlp_out_fwd(|_| 64, operands);
-    /// Line integrals.
-    march_fwd(|_| 32, operands);
-    /// Line integrals and maxima, for rendering.
-    march_fwd_maxima(|_| 32, operands, &[("with_maxima", 1)]);
-    /// Residuals and their gradients.
-    loss(|_| 64, plain);
-    /// Scatter to planes and lines.
-    march_bwd(|_| 32, operands);
-    /// Gradient at the output neuron.
-    mlp_out_bwd(|_| 64, operands);
-    /// Weight gradient of the output neuron.
-    mlp_out_bwd_weight(|t| t.weight_lanes, operands);
-    /// Gradient to a layer's hidden input.
-    mlp_layer_bwd_input(|t| t.layer_lanes, layers);
-    /// Weight gradient of a hidden layer.
-    mlp_layer_bwd_weight(|t| t.weight_lanes, layers);
-    /// Sums over each ray's samples.
-    mlp_ray_sum(|_| 64, operands);
-    /// Sums over each phase's rays.
-    mlp_phase_sum(|t| t.weight_lanes, plain);
-    /// Gradients of biases, latent weights and latents.
-    mlp_latent_bwd(|_| 64, plain);
-    /// Collects the gradient.
-    gradient(|_| 64, plain);
-    /// Total variation.
-    reg_tv(|_| 64, plain);
-    /// The optimiser.
-    adam(|_| 64, plain);
-    /// Losses and step count.
-    report(|_| 256, plain);
+    /// Pipelines of every path.
+    Kernels {
+        /// Draws the rays of an iteration.
+        batch(|_| 64, plain);
+        /// Rays of a pose, for rendering.
+        pose_rays(|_| 64, plain);
+        /// Counts live dynamic samples.
+        march_count(|_| MARCH_LANES, plain);
+        /// Offsets and indirect arguments.
+        march_scan(|_| 256, plain);
+        /// Writes live samples.
+        march_emit(|_| MARCH_LANES, plain);
+        /// Line integrals.
+        march_fwd(|_| 32, operands);
+        /// Line integrals and maxima, for rendering.
+        march_fwd_maxima(|_| 32, operands, |_| vec![("with_maxima", 1)]);
+        /// Residuals and their gradients.
+        loss(|_| 64, plain);
+        /// Scatter to planes and lines.
+        march_bwd(|_| 32, operands);
+        /// Bias and latent, one row per phase.
+        mlp_latent_fwd(|_| 64, plain);
+        /// Gradients of biases, latent weights and latents.
+        mlp_latent_bwd(|_| 64, plain);
+        /// Gradient of the static field.
+        gradient_static(|_| 64, plain);
+        /// Gradient of the network.
+        gradient_network(|_| 64, plain);
+        /// Total variation.
+        reg_tv(|_| 64, plain);
+        /// The optimiser.
+        adam(|_| 64, plain);
+        /// Losses, loss scale and step count.
+        report(|_| 256, plain, |t| vec![("loss_scaling", u32::from(t.layers == Layers::Matrices))]);
+    }
+}
+
+stages! {
+    /// Pipelines of the f32 network.
+    LayerKernels {
+        /// Positional encoding.
+        encode(|_| 64, plain);
+        /// One hidden layer.
+        mlp_layer_fwd(|t| t.layer_lanes, layers);
+        /// Output neuron and activation.
+        mlp_out_fwd(|_| 64, operands);
+        /// Gradient at the output neuron.
+        mlp_out_bwd(|_| 64, operands);
+        /// Weight gradient of the output neuron.
+        mlp_out_bwd_weight(|t| t.weight_lanes, operands);
+        /// Gradient to a layer's hidden input.
+        mlp_layer_bwd_input(|t| t.layer_lanes, layers);
+        /// Weight gradient of a hidden layer.
+        mlp_layer_bwd_weight(|t| t.weight_lanes, layers);
+        /// Sums over each ray's samples.
+        mlp_ray_sum(|_| 64, operands);
+        /// Sums over each phase's rays.
+        mlp_phase_sum(|t| t.weight_lanes, plain);
+    }
 }
 
 /// Records `stage`, binding each buffer its shader names from `buffers`; `renamed` takes precedence.

@@ -79,6 +79,20 @@ shared! {
     }
 }
 
+/// What the device counts from iteration to iteration: `state[4]` of the shaders.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub struct DeviceState {
+    /// Iterations done.
+    pub step: u32,
+    /// Factor on gradients in f16; 1 on the f32 path.
+    pub loss_scale: f32,
+    /// 1 while the gradient of an iteration is not finite.
+    pub overflowed: u32,
+    /// Updates since the scale changed.
+    pub good_updates: u32,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

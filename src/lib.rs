@@ -58,6 +58,9 @@ pub mod cpu {
 /// From a plan to a checkpoint.
 pub mod train {
     pub mod checkpoint;
+    pub mod fused;
+    pub mod layers;
+    pub mod network;
     pub mod plan;
     pub mod step;
     pub mod trainer;

@@ -8,6 +8,7 @@ use crate::data::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::gpu::device::Gpu;
+use crate::kernels::Tuning;
 use crate::output::eval::{self, Evaluation, evaluate};
 use crate::output::pictures::{self, Window};
 use crate::output::render::Renderer;
@@ -126,6 +127,8 @@ pub struct RunOptions<'a> {
     pub resume: bool,
     /// Stop (and save) after this many iterations, leaving schedules as they are.
     pub stop_at: Option<u32>,
+    /// Paths through the kernels.
+    pub tuning: &'a Tuning,
     /// Set to true to stop after the iterations in flight.
     pub cancel: &'a AtomicBool,
 }
@@ -145,10 +148,10 @@ pub fn reconstruct(
     let mut trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
         let plan = Plan::with_scene(&saved.model.config, dataset, saved.model.scene.clone())?;
-        Trainer::resume(gpu, plan, dataset, &saved)?
+        Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
         files::create_directory(options.run)?;
-        Trainer::new(gpu, Plan::new(config, dataset)?, dataset)?
+        Trainer::new(gpu, Plan::new(config, dataset)?, dataset, options.tuning.clone())?
     };
     let config = trainer.plan().config.clone();
     files::write_atomic(&options.run.join("config.toml"), config.to_toml()?.as_bytes())?;
@@ -217,7 +220,7 @@ pub fn reconstruct(
             let model = trainer.model()?;
             let renderer = match &mut renderer {
                 Some(renderer) => renderer,
-                none => none.insert(Renderer::new(gpu, &model)?),
+                none => none.insert(Renderer::new(gpu, &model, options.tuning.clone())?),
             };
             renderer.set_model(&model)?;
             let score = evaluate(renderer, dataset, &validation, step, None, |_, _, _| Ok(()))?;
@@ -269,6 +272,7 @@ impl MetricsLog {
 /// Errors of data, device and files.
 pub fn evaluate_run(
     gpu: &Gpu,
+    tuning: &Tuning,
     run: &Path,
     dataset: &Dataset,
     threshold_per_mm: Option<f64>,
@@ -282,7 +286,7 @@ pub fn evaluate_run(
             format!("has {} phases, the run {}", dataset.n_phases, saved.model.layout.phases),
         ));
     }
-    let renderer = Renderer::new(gpu, &saved.model)?;
+    let renderer = Renderer::new(gpu, &saved.model, tuning.clone())?;
     let frames: Vec<_> = dataset.validation().iter().collect();
     let threshold = threshold_per_mm.map(|t| t * crate::data::geometry::MM_PER_UNIT);
     let evaluation = evaluate(&renderer, dataset, &frames, saved.model.step, threshold, |frame, seen, threshold| {

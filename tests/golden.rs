@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{expect_silence, gpu, relative_error};
+use common::{expect_silence, gpu, tuning, relative_error};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::cpu::{march, step};
 use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
@@ -168,7 +168,7 @@ fn check(preset: Preset, name: &str) {
     plan.setup.n_motion_list = plan.motion_rays.len() as u32;
     plan.setup.n_motion_rays = golden.number("n_motion") as u32;
     let gpu = gpu();
-    let mut trainer = Trainer::new(&gpu, plan, &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let initial: Vec<f32> = gather(&golden, trainer.plan(), "initial").iter().map(|v| *v as f32).collect();
     gpu.upload(trainer.buffers().get("params").unwrap(), 0, &initial).unwrap();
     let compared = [0u32, golden.number("delay") as u32, golden.number("delay") as u32 + 3];

@@ -3,10 +3,10 @@
 
 mod common;
 
-use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
+use common::{expect_silence, gpu, tuning, relative_error, small_config, small_dataset};
 use nertca_vk::cpu::{march, step};
 use nertca_vk::gpu::memory::Operands;
-use nertca_vk::kernels::Tuning;
+use nertca_vk::kernels::{Layers, Tuning};
 use nertca_vk::layout::Ray;
 use nertca_vk::train::plan::Plan;
 use nertca_vk::train::trainer::Trainer;
@@ -31,7 +31,7 @@ fn rays_and_depths_match() {
         Plan::new(&small_config("fast", &["hull.enabled=true", "hull.max_share=1", "hull.resolution=24"]), &dataset)
             .unwrap();
     assert!(plan.hull.is_some(), "this case is about the hull");
-    let mut trainer = Trainer::new(&gpu, plan, &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let losses = trainer.advance(1).unwrap();
     let plan = trainer.plan();
     let got: Vec<Ray> = gpu.download(trainer.buffers().get("rays").unwrap(), 0, plan.setup.n_rays as usize).unwrap();
@@ -57,23 +57,32 @@ fn rays_and_depths_match() {
 
 /// Both families of kernels: operands through texel buffers with small workgroups, as an old lavapipe gets
 /// them, and through storage buffers with large ones, as GPUs do.
-fn tunings() -> [Tuning; 3] {
-    let reasons = Vec::new();
+fn paths() -> [Tuning; 3] {
+    let f32_layers = |operands, layer_lanes, weight_lanes, splits| Tuning {
+        layers: Layers::F32,
+        operands,
+        layer_lanes,
+        weight_lanes,
+        splits,
+        matrix_workgroups: 0,
+        chunk_samples: 1 << 16,
+        reasons: Vec::new(),
+    };
     [
-        Tuning { operands: Operands::Texel, layer_lanes: 8, weight_lanes: 8, splits: 4, reasons: reasons.clone() },
-        Tuning { operands: Operands::Storage, layer_lanes: 64, weight_lanes: 32, splits: 16, reasons: reasons.clone() },
-        Tuning { operands: Operands::Address, layer_lanes: 8, weight_lanes: 4, splits: 3, reasons },
+        f32_layers(Operands::Texel, 8, 8, 4),
+        f32_layers(Operands::Storage, 64, 32, 16),
+        f32_layers(Operands::Address, 8, 4, 3),
     ]
 }
 
 #[test]
 fn losses_and_gradients_match() {
-    for tuning in tunings() {
-        check_losses_and_gradients(&tuning);
+    for path in paths() {
+        check_losses_and_gradients(&path);
     }
 }
 
-fn check_losses_and_gradients(tuning: &Tuning) {
+fn check_losses_and_gradients(path: &Tuning) {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
     for (preset, settings) in CASES {
@@ -84,7 +93,7 @@ fn check_losses_and_gradients(tuning: &Tuning) {
             *p *= 30.0;
         }
         let twin: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
-        let mut trainer = Trainer::with_tuning(&gpu, plan, &dataset, tuning.clone()).unwrap();
+        let mut trainer = Trainer::new(&gpu, plan, &dataset, path.clone()).unwrap();
         gpu.upload(trainer.buffers().get("params").unwrap(), 0, &params).unwrap();
         let got = trainer.advance(1).unwrap()[0];
         let plan = trainer.plan();
@@ -131,7 +140,7 @@ fn ten_updates_across_the_delay_match() {
         let mut params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
         let start = params.clone();
         let mut moments = vec![[0.0; 2]; params.len()];
-        let mut trainer = Trainer::new(&gpu, plan, &dataset).unwrap();
+        let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
         while trainer.step() < 10 {
             trainer.advance(10).unwrap();
         }

@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
+use common::{expect_silence, gpu, tuning, relative_error, small_config, small_dataset};
 use nertca_vk::cpu::march;
 use nertca_vk::error::Error;
 use nertca_vk::output::render::Renderer;
@@ -30,7 +30,7 @@ fn the_loss_falls_and_runs_repeat_bit_by_bit() {
         let config =
             small_config(preset, &["loss.normalise=true", "dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
         let train = || {
-            let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset).unwrap();
+            let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
             let losses = run(&mut trainer, 120);
             (losses, trainer.model().unwrap().params)
         };
@@ -52,7 +52,7 @@ fn resume_equals_no_interruption() {
     let never = AtomicBool::new(false);
     let go = |name: &str, resume: bool, stop_at: Option<u32>| {
         let path = directory.path().join(name);
-        let options = RunOptions { run: &path, resume, stop_at, cancel: &never };
+        let options = RunOptions { tuning: &tuning(&gpu), run: &path, resume, stop_at, cancel: &never };
         reconstruct(&gpu, &config, &dataset, &options, &mut |_| {}).unwrap();
         Checkpoint::read(&checkpoint::newest(&path).unwrap()).unwrap()
     };
@@ -82,12 +82,12 @@ fn resuming_on_other_images_is_refused() {
     let gpu = gpu();
     let mut dataset = small_dataset(13, 11);
     let config = small_config("fast", &[]);
-    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 4);
     let saved = trainer.checkpoint().unwrap();
     dataset.frames[0].integrals[3] += 0.01;
     let plan = Plan::with_scene(&saved.model.config, &dataset, saved.model.scene.clone()).unwrap();
-    let refused = Trainer::resume(&gpu, plan, &dataset, &saved).err().unwrap().to_string();
+    let refused = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &saved).err().unwrap().to_string();
     assert!(refused.contains("other images"), "{refused}");
 }
 
@@ -97,7 +97,7 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
     let dataset = small_dataset(13, 11);
     let directory = tempfile::tempdir().unwrap();
     let cancel = AtomicBool::new(false);
-    let options = RunOptions { run: directory.path(), resume: false, stop_at: None, cancel: &cancel };
+    let options = RunOptions { tuning: &tuning(&gpu), run: directory.path(), resume: false, stop_at: None, cancel: &cancel };
     let mut stop_at_ten = |event: &Event| {
         if let Event::Progress { .. } = event {
             cancel.store(true, std::sync::atomic::Ordering::Relaxed);
@@ -110,7 +110,7 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
 
     let directory = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
-    let options = RunOptions { run: directory.path(), resume: false, stop_at: None, cancel: &never };
+    let options = RunOptions { tuning: &tuning(&gpu), run: directory.path(), resume: false, stop_at: None, cancel: &never };
     let config = small_config(
         "fast",
         &[
@@ -133,10 +133,10 @@ fn renderings_equal_the_twin() {
     let dataset = small_dataset(12, 10);
     for preset in ["paper", "fast"] {
         let config = small_config(preset, &["loss.normalise=true", "train.chunk_samples=1500"]);
-        let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset).unwrap();
+        let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
         run(&mut trainer, 20);
         let model = trainer.model().unwrap();
-        let renderer = Renderer::new(&gpu, &model).unwrap();
+        let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
         let view = &dataset.views[2].rays;
         let got = renderer.render(view, 12, 10, 2).unwrap();
         let mut plan = Plan::with_scene(&config, &dataset, model.scene.clone()).unwrap();
@@ -173,7 +173,7 @@ fn renderings_equal_the_twin() {
 fn damaged_checkpoints_are_refused() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 2);
     let directory = tempfile::tempdir().unwrap();
     let path = trainer.checkpoint().unwrap().save(directory.path()).unwrap();
@@ -196,7 +196,7 @@ fn damaged_checkpoints_are_refused() {
 fn older_checkpoints_follow_the_stated_rule() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let directory = tempfile::tempdir().unwrap();
     for step in 1..=5 {
         run(&mut trainer, step);

@@ -4,6 +4,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::kernels::{Layers, Tuning};
 use nertca_vk::phantom::dataset::Setting;
 use std::path::PathBuf;
 
@@ -14,6 +15,10 @@ pub struct Cli {
     /// Vulkan device: index, part of the name, or UUID (see `devices`); the best one by default.
     #[arg(long, global = true, value_name = "DEVICE")]
     pub device: Option<String>,
+    /// Path of the network's layers: `f32`, or `matrices` (cooperative matrices: f16 operands, f32 sums); by default
+    /// the faster one on the device.
+    #[arg(long, global = true, value_enum, value_name = "PATH")]
+    pub layers: Option<Layers>,
     /// Turn the Vulkan validation layers on (slow; messages make the program fail).
     #[arg(long, global = true)]
     pub validate: bool,
@@ -344,6 +349,11 @@ impl Cli {
     /// Opens the device the options ask for.
     pub fn open_device(&self) -> Result<Gpu> {
         Gpu::open(&DeviceOptions { select: self.device.clone(), validation: self.validate, cache_dir: cache_dir() })
+    }
+
+    /// Paths through the kernels on a device, as the options ask.
+    pub fn tuning(&self, gpu: &Gpu) -> Tuning {
+        Tuning::for_device(gpu.info()).with_layers(self.layers)
     }
 
     /// Saves the pipeline cache and turns validation messages into a failure.

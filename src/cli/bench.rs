@@ -36,7 +36,7 @@ pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
     let gpu = cli.open_device()?;
     let plan = Plan::new(&config, &dataset)?;
     let paths = plan.notes.clone();
-    let mut trainer = Trainer::new(&gpu, plan, &dataset)?;
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, cli.tuning(&gpu))?;
     let needed = WARM_UP + args.repeats * args.iterations + PROFILED;
     if needed > config.train.iterations {
         return Err(Error::config("--iterations", args.iterations, format!("{needed} iterations exceed the run's")));

@@ -34,7 +34,10 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
             );
             out!(
                 "   cooperative matrices {}  float16 {}  float atomics {}",
-                info.cooperative_matrix,
+                match info.matrices.first() {
+                    Some(s) => format!("{}x{}x{}", s.m, s.n, s.k),
+                    None => "none".to_owned(),
+                },
                 info.float16,
                 info.float_atomics
             );

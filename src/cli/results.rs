@@ -27,7 +27,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     }
     let dataset = Dataset::open(&data)?;
     let gpu = cli.open_device()?;
-    let evaluation = evaluate_run(&gpu, &args.run, &dataset, args.threshold, args.images.as_deref())?;
+    let evaluation = evaluate_run(&gpu, &cli.tuning(&gpu), &args.run, &dataset, args.threshold, args.images.as_deref())?;
     if args.json {
         out!("{}", json(&evaluation)?);
     } else {
@@ -103,7 +103,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     let rays =
         Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| Error::config(field, "", problem))?;
     let gpu = cli.open_device()?;
-    let renderer = Renderer::new(&gpu, &model)?;
+    let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu))?;
     let frames = phases
         .iter()
         .map(|phase| {

@@ -44,14 +44,15 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     .map_err(|e| Error::Internal(format!("Ctrl-C handler: {e}")))?;
     let gpu = cli.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
-    let options = RunOptions { run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
+    let tuning = cli.tuning(&gpu);
+    let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
     let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut observer);
     drop(observer);
     outcome?;
     if !dataset.validation().is_empty() {
         let report = run.join("report");
-        let evaluation = evaluate_run(&gpu, run, &dataset, None, Some(&report))?;
+        let evaluation = evaluate_run(&gpu, &tuning, run, &dataset, None, Some(&report))?;
         let text = serde_json::to_string_pretty(&evaluation).map_err(|e| Error::Internal(e.to_string()))?;
         nertca_vk::files::write_atomic(&report.join("evaluation.json"), text.as_bytes())?;
         if !args.json {

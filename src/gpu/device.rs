@@ -1,7 +1,7 @@
 //! Instance, adapter choice, capability table, validation layer and debug names.
 
 use crate::error::{Error, Result};
-use ash::{ext, khr, vk};
+use ash::{ext, khr, nv, vk};
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use serde::Serialize;
 use std::ffi::{CStr, CString, c_void};
@@ -61,14 +61,28 @@ pub struct DeviceInfo {
     pub device_memory: u64,
     /// Whether shaders can read buffers through their addresses.
     pub buffer_device_address: bool,
-    /// Whether the device offers `VK_KHR_cooperative_matrix`.
-    pub cooperative_matrix: bool,
+    /// Shapes of cooperative matrices with f16 operands and f32 sums at subgroup scope; empty when the device lacks
+    /// them or what their kernels need besides (16-bit floats, Vulkan's memory model, subgroups of a fixed size).
+    pub matrices: Vec<MatrixShape>,
+    /// Streaming multiprocessors or the like; 0 when the driver does not tell.
+    pub multiprocessors: u32,
     /// Whether the device offers 16-bit float arithmetic.
     pub float16: bool,
     /// Whether the device offers float atomics on buffers.
     pub float_atomics: bool,
     /// Why this device cannot be used, if so.
     pub unusable: Option<String>,
+}
+
+/// A product of cooperative matrices: `m` x `k` times `k` x `n`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct MatrixShape {
+    /// Rows of the left operand.
+    pub m: u32,
+    /// Columns of the right operand.
+    pub n: u32,
+    /// Columns of the left operand.
+    pub k: u32,
 }
 
 /// An open device. Cheap to clone; everything is freed when the last user is gone.
@@ -152,12 +166,70 @@ fn c_chars(text: &[std::ffi::c_char]) -> String {
     text.iter().take_while(|c| **c != 0).map(|c| char::from(*c as u8)).collect()
 }
 
-fn describe(instance: &ash::Instance, index: usize, physical: vk::PhysicalDevice) -> DeviceInfo {
+/// Device extensions the matrix kernels need.
+const MATRIX_EXTENSIONS: [&CStr; 2] = [khr::cooperative_matrix::NAME, ext::subgroup_size_control::NAME];
+
+/// Matrix shapes our kernels can use, most work per product first.
+fn matrix_shapes(entry: &ash::Entry, instance: &ash::Instance, physical: vk::PhysicalDevice) -> Vec<MatrixShape> {
+    // SAFETY: `physical` comes from this instance.
+    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
+    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
+    if !MATRIX_EXTENSIONS.iter().all(|name| has(name)) {
+        return Vec::new();
+    }
+    let mut matrix = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
+    let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+    let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut features =
+        vk::PhysicalDeviceFeatures2::default().push_next(&mut matrix).push_next(&mut size).push_next(&mut f12);
+    // SAFETY: the device offers the extensions whose structures are chained.
+    unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    let needed = [
+        matrix.cooperative_matrix,
+        size.subgroup_size_control,
+        size.compute_full_subgroups,
+        f12.shader_float16,
+        f12.vulkan_memory_model,
+    ];
+    if needed.contains(&vk::FALSE) {
+        return Vec::new();
+    }
+    let loader = khr::cooperative_matrix::Instance::new(entry, instance);
+    // SAFETY: the device offers the extension.
+    let found = unsafe { loader.get_physical_device_cooperative_matrix_properties(physical) }.unwrap_or_default();
+    let (f16, f32) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
+    let mut shapes: Vec<MatrixShape> = found
+        .iter()
+        .filter(|p| p.scope == vk::ScopeKHR::SUBGROUP && p.a_type == f16 && p.b_type == f16)
+        .filter(|p| p.c_type == f32 && p.result_type == f32)
+        // The mask of the backward pass is an f16 sum of the same shape, and rows are handled eight f16 at a time.
+        .filter(|p| {
+            [p.m_size, p.n_size, p.k_size].iter().all(|size| size % 8 == 0)
+                && found.iter().any(|q| {
+                    q.c_type == f16 && (q.m_size, q.n_size, q.k_size) == (p.m_size, p.n_size, p.k_size)
+                })
+        })
+        .map(|p| MatrixShape { m: p.m_size, n: p.n_size, k: p.k_size })
+        .collect();
+    // Widths are multiples of 16; among shapes that fit them the largest product reuses its operands most.
+    shapes.retain(|s| 16 % s.m == 0 && 16 % s.n == 0 && 16 % s.k == 0);
+    shapes.sort_by_key(|s| std::cmp::Reverse((s.m * s.n * s.k, s.m)));
+    shapes
+}
+
+fn describe(entry: &ash::Entry, instance: &ash::Instance, index: usize, physical: vk::PhysicalDevice) -> DeviceInfo {
     let mut driver = vk::PhysicalDeviceDriverProperties::default();
     let mut ids = vk::PhysicalDeviceIDProperties::default();
     let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
+    let mut multiprocessors = vk::PhysicalDeviceShaderSMBuiltinsPropertiesNV::default();
+    // SAFETY: `physical` comes from this instance.
+    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
+    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
     let mut props =
         vk::PhysicalDeviceProperties2::default().push_next(&mut driver).push_next(&mut ids).push_next(&mut subgroup);
+    if has(nv::shader_sm_builtins::NAME) {
+        props = props.push_next(&mut multiprocessors);
+    }
     // SAFETY: `physical` comes from this instance; the chain lives until the call returns.
     unsafe { instance.get_physical_device_properties2(physical, &mut props) };
     let properties = props.properties;
@@ -167,9 +239,6 @@ fn describe(instance: &ash::Instance, index: usize, physical: vk::PhysicalDevice
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
     // SAFETY: as above.
     let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
-    // SAFETY: as above.
-    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
-    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
     let limits = properties.limits;
     let version = properties.api_version;
     let unusable = if version < vk::API_VERSION_1_2 {
@@ -220,7 +289,8 @@ fn describe(instance: &ash::Instance, index: usize, physical: vk::PhysicalDevice
             .map(|h| h.size)
             .sum(),
         buffer_device_address: f12.buffer_device_address == vk::TRUE,
-        cooperative_matrix: has(khr::cooperative_matrix::NAME),
+        matrices: matrix_shapes(entry, instance, physical),
+        multiprocessors: multiprocessors.shader_sm_count,
         float16: f12.shader_float16 == vk::TRUE,
         float_atomics: has(ext::shader_atomic_float::NAME),
         unusable,
@@ -233,11 +303,11 @@ fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Opt
     families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE)).map(|i| i as u32)
 }
 
-fn enumerate(instance: &ash::Instance) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)>> {
+fn enumerate(entry: &ash::Entry, instance: &ash::Instance) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)>> {
     // SAFETY: the instance is alive.
     let physical = unsafe { instance.enumerate_physical_devices() }
         .map_err(|code| Error::NoDevice(format!("vkEnumeratePhysicalDevices failed: {code}")))?;
-    Ok(physical.into_iter().enumerate().map(|(i, p)| (p, describe(instance, i, p))).collect())
+    Ok(physical.into_iter().enumerate().map(|(i, p)| (p, describe(entry, instance, i, p))).collect())
 }
 
 /// Lists every device the loader offers, usable or not.
@@ -246,7 +316,7 @@ fn enumerate(instance: &ash::Instance) -> Result<Vec<(vk::PhysicalDevice, Device
 /// [`Error::NoDevice`] when there is no Vulkan loader.
 pub fn list_devices() -> Result<Vec<DeviceInfo>> {
     let Instance { entry, instance } = create_instance(false)?;
-    let found = enumerate(&instance).map(|all| all.into_iter().map(|(_, info)| info).collect());
+    let found = enumerate(&entry, &instance).map(|all| all.into_iter().map(|(_, info)| info).collect());
     // SAFETY: nothing made from the instance survives.
     unsafe { instance.destroy_instance(None) };
     drop(entry);
@@ -326,7 +396,7 @@ impl Gpu {
         instance: &ash::Instance,
         options: &DeviceOptions,
     ) -> Result<impl FnOnce(ash::Entry, ash::Instance) -> Shared + use<>> {
-        let (physical, info) = choose(enumerate(instance)?, options.select.as_deref())?;
+        let (physical, info) = choose(enumerate(entry, instance)?, options.select.as_deref())?;
         let queue_family = compute_family(instance, physical)
             .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?;
         let priorities = [1.0];
@@ -335,7 +405,17 @@ impl Gpu {
         let mut f12 = vk::PhysicalDeviceVulkan12Features::default()
             .timeline_semaphore(true)
             .buffer_device_address(info.buffer_device_address);
-        let create = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut f12);
+        let mut matrix = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
+        let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default()
+            .subgroup_size_control(true)
+            .compute_full_subgroups(true);
+        let extensions = MATRIX_EXTENSIONS.map(CStr::as_ptr);
+        let mut create = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+        if !info.matrices.is_empty() {
+            f12 = f12.shader_float16(true).vulkan_memory_model(true);
+            create = create.enabled_extension_names(&extensions).push_next(&mut matrix).push_next(&mut size);
+        }
+        let create = create.push_next(&mut f12);
         // SAFETY: the chain lives until the call returns; the features were checked in `describe`.
         let device = unsafe { instance.create_device(physical, &create, None) }
             .map_err(Error::vulkan("vkCreateDevice", &info.name))?;

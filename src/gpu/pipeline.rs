@@ -62,6 +62,33 @@ impl Gpu {
     /// [`Error::Internal`] for an unknown constant, [`Error::Config`] beyond device limits,
     /// [`Error::Vulkan`] when the driver refuses the shader.
     pub fn pipeline(&self, code: &'static KernelCode, local_size: u32, spec: &[(&str, u32)]) -> Result<Pipeline> {
+        self.make_pipeline(code, local_size, spec, false)
+    }
+
+    /// As [`Gpu::pipeline`], with subgroups of the device's default size, all of them full: for cooperative matrices,
+    /// which only devices with [`super::device::DeviceInfo::matrices`] have.
+    ///
+    /// # Errors
+    /// As [`Gpu::pipeline`].
+    pub fn matrix_pipeline(
+        &self,
+        code: &'static KernelCode,
+        local_size: u32,
+        spec: &[(&str, u32)],
+    ) -> Result<Pipeline> {
+        if self.info().matrices.is_empty() {
+            return Err(Error::Internal(format!("kernel {}: {} has no matrices", code.name, self.info().name)));
+        }
+        self.make_pipeline(code, local_size, spec, true)
+    }
+
+    fn make_pipeline(
+        &self,
+        code: &'static KernelCode,
+        local_size: u32,
+        spec: &[(&str, u32)],
+        full_subgroups: bool,
+    ) -> Result<Pipeline> {
         let info = self.info();
         if local_size == 0 || local_size > info.max_workgroup_invocations || code.all_push_bytes() > info.max_push_constants {
             return Err(Error::Internal(format!(
@@ -127,11 +154,18 @@ impl Gpu {
             .map_err(Error::vulkan("vkCreateShaderModule", code.name))?;
         let specialization =
             vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&values));
-        let stage = vk::PipelineShaderStageCreateInfo::default()
+        let mut subgroup_size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
+            .required_subgroup_size(info.subgroup_size);
+        let mut stage = vk::PipelineShaderStageCreateInfo::default()
             .stage(vk::ShaderStageFlags::COMPUTE)
             .module(module)
             .name(c"main")
             .specialization_info(&specialization);
+        if full_subgroups {
+            stage = stage
+                .flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS)
+                .push_next(&mut subgroup_size);
+        }
         let create = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(pipeline.layout)];
         // SAFETY: as above; the module is alive during the call.
         let made = unsafe { device.create_compute_pipelines(shared.pipeline_cache, &create, None) };

@@ -113,6 +113,11 @@ impl ParamLayout {
         }
     }
 
+    /// Parameters of the network, padding included; they follow those of the static field.
+    pub fn network_len(&self) -> usize {
+        self.len - self.static_len
+    }
+
     /// Position of plane element `(mode, rank, v, u)`; `u` runs along the plane's first axis.
     pub fn plane(&self, mode: usize, rank: usize, v: usize, u: usize) -> usize {
         ((mode * self.grid + v) * self.grid + u) * self.rank4 * 4 + rank

@@ -189,7 +189,9 @@ impl Scene {
             hull_min_z: f(hull_min.z),
             hull_inv_cell: hull.map_or(0.0, |h| f(1.0 / h.cell)),
             hull_phase_words: hull.map_or(0, |h| if h.n_phases > 1 { h.words() as u32 } else { 0 }),
-            sample_capacity: sample_capacity(config),
+            sample_capacity: sample_capacity(
+                config.train.chunk_samples.max(config.march.dynamic_samples).max(config.march.render_samples),
+            ),
             latent_width: params.latent as u32,
             n_layers: params.layers.len() as u32,
             mlp_width: params.width as u32,
@@ -231,11 +233,10 @@ pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
         field_of_view(dataset).min(half_depth(dataset))
     }
 }
-/// Samples a chunk can hold, which is also the stride between the features of a sample. Live samples are padded to
-/// 64; the remainder keeps strides off powers of two, which would map a sample's features to one cache set.
-fn sample_capacity(config: &Config) -> u32 {
-    let m = &config.march;
-    let samples = config.train.chunk_samples.max(m.dynamic_samples).max(m.render_samples);
-    samples.next_multiple_of(64) + 12
+/// Samples a chunk can hold that is to take `samples`; also the stride between the features of a sample. Live samples
+/// are padded to tiles of up to 128; the remainder keeps strides off powers of two, which would map a sample's features
+/// to one cache set.
+pub fn sample_capacity(samples: u32) -> u32 {
+    samples.next_multiple_of(128) + 12
 }
 

@@ -7,6 +7,8 @@ use crate::gpu::record::Recording;
 use crate::kernels::{Buffers, Kernels, Tuning, dispatch, groups_for};
 use crate::layout::{RayOut, Setup};
 use crate::model::field::Model;
+use crate::model::scene::sample_capacity;
+use crate::train::network::Network;
 use crate::train::step::{forward_buffers, hull_buffer, record_render};
 
 /// Pixels rendered by one submit.
@@ -38,6 +40,7 @@ impl Rendering {
 pub struct Renderer {
     gpu: Gpu,
     kernels: Kernels,
+    network: Network,
     buffers: Buffers,
     setup: Setup,
     model_layout: crate::model::params::ParamLayout,
@@ -48,18 +51,20 @@ impl Renderer {
     ///
     /// # Errors
     /// Device errors.
-    pub fn new(gpu: &Gpu, model: &Model) -> Result<Renderer> {
-        let kernels = Kernels::new(gpu, Tuning::for_device(gpu.info()))?;
+    pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
+        let network = Network::new(gpu, &tuning, &model.layout, false)?;
+        let kernels = Kernels::new(gpu, tuning)?;
         let mut setup = model.scene.setup(&model.config, &model.layout, model.hull.as_ref());
         setup.jitter = 0;
         setup.n_static_samples = model.config.march.render_samples;
         setup.n_dynamic_samples = model.config.march.render_samples;
-        let mut buffers = forward_buffers(gpu, &kernels.tuning, &setup, &model.layout, RAYS_PER_SUBMIT)?;
+        setup.sample_capacity = setup.sample_capacity.min(sample_capacity(kernels.tuning.chunk_samples));
+        let mut buffers = forward_buffers(gpu, &kernels.tuning, &network, &setup, &model.layout, RAYS_PER_SUBMIT)?;
         buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
         // The schedule below has a single row, that of the model's step.
         gpu.upload(buffers.get("state")?, 0, &[0u32; 4])?;
         buffers.set("schedule", gpu.buffer_with("schedule", &[model.config.schedule(model.step)])?);
-        let renderer = Renderer { gpu: gpu.clone(), kernels, buffers, setup, model_layout: model.layout.clone() };
+        let renderer = Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout: model.layout.clone() };
         renderer.set_model(model)?;
         Ok(renderer)
     }
@@ -94,7 +99,7 @@ impl Renderer {
             let push = [first, n, phase, width as u32, 0];
             let stage = &self.kernels.pose_rays;
             dispatch(&mut recording, stage, groups_for(stage, n), &buffers, &[], push)?;
-            record_render(&mut recording, &self.kernels, &buffers, &self.model_layout, &self.setup, n)?;
+            record_render(&mut recording, &self.kernels, &self.network, &buffers, &self.model_layout, &self.setup, n)?;
             self.gpu.wait(recording.finish()?.submit()?)?;
             let seen: Vec<RayOut> = self.gpu.download(buffers.get("ray_out")?, 0, n as usize)?;
             for r in seen {

@@ -28,8 +28,19 @@ pub struct Checkpoint {
     pub model: Model,
     /// Adam's first and second moment of each parameter, padded as the parameters.
     pub moments: Vec<[f32; 2]>,
+    /// Loss scale of a run on matrices.
+    pub loss_scale: Option<LossScale>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
+}
+
+/// Factor on gradients in f16, and how long it has held.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct LossScale {
+    /// The factor.
+    pub scale: f32,
+    /// Updates since it changed.
+    pub good_updates: u32,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -44,6 +55,8 @@ struct Header {
     c_arm: CArm,
     image_size: [usize; 2],
     data_fingerprint: String,
+    #[serde(default)]
+    loss_scale: Option<LossScale>,
     hull: Option<HullHeader>,
 }
 
@@ -141,6 +154,7 @@ impl Checkpoint {
             c_arm: model.c_arm.clone(),
             image_size: model.image_size,
             data_fingerprint: self.data_fingerprint.clone(),
+            loss_scale: self.loss_scale,
             hull: model.hull.as_ref().map(|h| HullHeader {
                 size: h.size,
                 min: h.min.to_array(),
@@ -177,6 +191,11 @@ impl Checkpoint {
             return Err(bad("format", format!("`{}`; this version reads `{FORMAT}`", header.format)));
         }
         header.config.check()?;
+        if let Some(LossScale { scale, .. }) = header.loss_scale {
+            if !(scale.is_finite() && scale >= 1.0) {
+                return Err(bad("loss_scale", format!("{scale} where at least 1 is needed")));
+            }
+        }
         if header.phases == 0 || header.phases > 4096 {
             return Err(bad("phases", header.phases.to_string()));
         }
@@ -242,6 +261,7 @@ impl Checkpoint {
                 image_size: header.image_size,
             },
             moments,
+            loss_scale: header.loss_scale,
             data_fingerprint: header.data_fingerprint,
         })
     }

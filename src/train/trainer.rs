@@ -1,7 +1,8 @@
 //! Owns the buffers and the step count of a run; hands iterations to the device, two submits in flight,
 //! and reads losses without stalling it.
 
-use super::checkpoint::Checkpoint;
+use super::checkpoint::{Checkpoint, LossScale};
+use super::network::Network;
 use super::plan::Plan;
 use super::step::{record_step, training_buffers};
 use crate::data::dataset::Dataset;
@@ -11,7 +12,8 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::{Buffers, Kernels, Tuning};
 use crate::model::field::Model;
-use crate::model::scene::RING_LENGTH;
+use crate::layout::DeviceState;
+use crate::model::scene::{RING_LENGTH, sample_capacity};
 use serde::Serialize;
 use std::collections::VecDeque;
 
@@ -36,6 +38,8 @@ pub struct StepLoss {
     pub squared_error: f64,
     /// Live dynamic samples of the batch.
     pub live_samples: u64,
+    /// Factor on gradients in f16; 1 on the f32 path.
+    pub loss_scale: f64,
 }
 
 impl StepLoss {
@@ -50,6 +54,7 @@ pub struct Trainer {
     gpu: Gpu,
     plan: Plan,
     kernels: Kernels,
+    network: Network,
     buffers: Buffers,
     several: Commands,
     single: Commands,
@@ -83,16 +88,9 @@ impl Trainer {
     /// Starts a run from scratch.
     ///
     /// # Errors
-    /// Device errors, [`Error::OutOfMemory`] first of all.
-    pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset) -> Result<Trainer> {
-        Self::with_tuning(gpu, plan, dataset, Tuning::for_device(gpu.info()))
-    }
-
-    /// Starts a run with kernels chosen by the caller instead of for the device.
-    ///
-    /// # Errors
-    /// As [`Trainer::new`].
-    pub fn with_tuning(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
+    /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
+    /// all.
+    pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
         let params = plan.params.initial(&plan.config);
         Self::start(gpu, plan, dataset, tuning, &params, None)
     }
@@ -101,7 +99,13 @@ impl Trainer {
     ///
     /// # Errors
     /// [`Error::Config`] when the checkpoint belongs to other data; device errors.
-    pub fn resume(gpu: &Gpu, plan: Plan, dataset: &Dataset, checkpoint: &Checkpoint) -> Result<Trainer> {
+    pub fn resume(
+        gpu: &Gpu,
+        plan: Plan,
+        dataset: &Dataset,
+        tuning: Tuning,
+        checkpoint: &Checkpoint,
+    ) -> Result<Trainer> {
         if checkpoint.data_fingerprint != data_fingerprint(dataset) {
             return Err(Error::config(
                 "--resume",
@@ -110,30 +114,37 @@ impl Trainer {
             ));
         }
         let model = &checkpoint.model;
-        let tuning = Tuning::for_device(gpu.info());
-        Self::start(gpu, plan, dataset, tuning, &model.params, Some((&checkpoint.moments, model.step)))
+        Self::start(gpu, plan, dataset, tuning, &model.params, Some(checkpoint))
     }
 
     fn start(
         gpu: &Gpu,
-        plan: Plan,
+        mut plan: Plan,
         dataset: &Dataset,
         tuning: Tuning,
         params: &[f32],
-        state: Option<(&[[f32; 2]], u32)>,
+        saved: Option<&Checkpoint>,
     ) -> Result<Trainer> {
+        let network = Network::new(gpu, &tuning, &plan.params, true)?;
         let kernels = Kernels::new(gpu, tuning)?;
-        let buffers = training_buffers(gpu, &kernels.tuning, &plan)?;
+        plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(kernels.tuning.chunk_samples));
+        let buffers = training_buffers(gpu, &kernels.tuning, &network, &plan)?;
         gpu.upload(buffers.get("params")?, 0, params)?;
-        let step = state.map_or(0, |(_, step)| step);
-        if let Some((moments, step)) = state {
-            gpu.upload(buffers.get("moments")?, 0, moments)?;
-            gpu.upload(buffers.get("state")?, 0, &[step])?;
+        let mut now = DeviceState { step: 0, loss_scale: network.first_loss_scale(), overflowed: 0, good_updates: 0 };
+        if let Some(saved) = saved {
+            gpu.upload(buffers.get("moments")?, 0, &saved.moments)?;
+            now.step = saved.model.step;
+            // A run may change from one path to the other; f32 needs no scale.
+            if let (Some(LossScale { scale, good_updates }), Network::Fused(_)) = (saved.loss_scale, &network) {
+                (now.loss_scale, now.good_updates) = (scale, good_updates);
+            }
         }
+        gpu.upload(buffers.get("state")?, 0, &[now])?;
+        let step = now.step;
         let record = |n: u32| -> Result<Commands> {
             let mut recording = Recording::new(gpu, &format!("{n} training iterations"))?;
             for _ in 0..n {
-                record_step(&mut recording, &kernels, &buffers, &plan)?;
+                record_step(&mut recording, &kernels, &network, &buffers, &plan)?;
             }
             recording.finish()
         };
@@ -141,6 +152,7 @@ impl Trainer {
         Ok(Trainer {
             gpu: gpu.clone(),
             kernels,
+            network,
             buffers,
             several,
             single,
@@ -211,6 +223,7 @@ impl Trainer {
                 occlusion: r[3],
                 squared_error: r[4],
                 live_samples: r[5] as u64,
+                loss_scale: r[7],
             };
             let first = *self.first_loss.get_or_insert(loss.total());
             if !loss.total().is_finite() || loss.total() > EXPLOSION * first.max(1e-12) {
@@ -228,7 +241,7 @@ impl Trainer {
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
-        record_step(&mut recording, &self.kernels, &self.buffers, &self.plan)?;
+        record_step(&mut recording, &self.kernels, &self.network, &self.buffers, &self.plan)?;
         let commands = recording.finish()?;
         self.gpu.wait(commands.submit()?)?;
         self.submitted += 1;
@@ -273,6 +286,13 @@ impl Trainer {
     pub fn checkpoint(&mut self) -> Result<Checkpoint> {
         let model = self.model()?;
         let moments = self.gpu.download(self.buffers.get("moments")?, 0, self.plan.params.len)?;
-        Ok(Checkpoint { model, moments, data_fingerprint: self.data_fingerprint.clone() })
+        let state: Vec<DeviceState> = self.gpu.download(self.buffers.get("state")?, 0, 1)?;
+        let loss_scale = match self.network {
+            Network::Layers(_) => None,
+            Network::Fused(_) => {
+                Some(LossScale { scale: state[0].loss_scale, good_updates: state[0].good_updates })
+            }
+        };
+        Ok(Checkpoint { model, moments, loss_scale, data_fingerprint: self.data_fingerprint.clone() })
     }
 }

@@ -4,6 +4,7 @@
 use nertca_vk::config::Config;
 use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::data::geometry::{CArm, Geometry};
+use nertca_vk::kernels::Tuning;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use std::path::PathBuf;
 
@@ -11,6 +12,11 @@ use std::path::PathBuf;
 pub fn gpu() -> Gpu {
     Gpu::open(&DeviceOptions { select: None, validation: true, cache_dir: None })
         .expect("tests need a Vulkan driver (Debian: mesa-vulkan-drivers) and vulkan-validationlayers")
+}
+
+/// The paths a device gets by default.
+pub fn tuning(gpu: &Gpu) -> Tuning {
+    Tuning::for_device(gpu.info())
 }
 
 /// Fails when the validation layers had anything to say, or when device objects leaked.

@@ -1,0 +1,30 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Gradient of the static field: fixed-point sums (then cleared for the next iteration) with the total-variation term.
+// One invocation per parameter.
+#include "inc/layout.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { float tv_gradient[]; };
+layout(binding = 2) buffer B2 { uint static_gradient[]; };
+layout(binding = 3) writeonly buffer B3 { float gradient[]; };
+
+float from_fixed(uint parameter) {
+    uint low = static_gradient[2u * parameter];
+    uint high = static_gradient[2u * parameter + 1u];
+    bool negative = (high & 0x80000000u) != 0u;
+    if (negative) {
+        low = ~low + 1u;
+        high = ~high + (low == 0u ? 1u : 0u);
+    }
+    float magnitude = (float(high) * 4294967296.0 + float(low)) * exp2(-float(setup.fixed_point_bits));
+    return negative ? -magnitude : magnitude;
+}
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= setup.static_params) return;
+    gradient[i] = from_fixed(i) + tv_gradient[i];
+    static_gradient[2u * i] = 0u;
+    static_gradient[2u * i + 1u] = 0u;
+}

@@ -1,0 +1,21 @@
+// Windowed positional encoding (paper section 2.3): [x, y, z, then per band k: a_k sin(2^k (x,y,z)), a_k cos(...)].
+// Needs `setup`.
+
+// Vulkan's sin is exact only near 0: subtract the nearest multiple of 2 pi in three parts.
+vec3 reduce_angle(vec3 a) {
+    vec3 n = round(a * 0.15915494309189535);
+    a -= n * 6.28125;
+    a -= n * 0.0019350051879882812;
+    return a - n * 3.01991598e-7;
+}
+
+vec3 encoded_point(vec3 x) {
+    return (x - vec3(setup.encode_centre_x, setup.encode_centre_y, setup.encode_centre_z)) * setup.encode_scale;
+}
+
+void encoded_band(vec3 x, uint band, float window, out vec3 sines, out vec3 cosines) {
+    vec3 angle = reduce_angle(x * float(1u << band));
+    float open = clamp(window - float(band), 0.0, 1.0);
+    sines = open * sin(angle);
+    cosines = open * cos(angle);
+}

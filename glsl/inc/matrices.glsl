@@ -1,0 +1,34 @@
+// Cooperative matrices: f16 operands, f32 sums, subgroup scope. Shapes are those the device reports.
+// Arrays of f16 are declared as uvec4, eight to an element, for wide copies; offsets and strides count uvec4.
+// To be included first: extensions precede all else.
+#pragma use_vulkan_memory_model
+#extension GL_KHR_memory_scope_semantics : require
+#extension GL_KHR_cooperative_matrix : require
+#extension GL_KHR_shader_subgroup_basic : require
+#extension GL_EXT_shader_explicit_arithmetic_types_float16 : require
+#extension GL_EXT_control_flow_attributes : require
+layout(local_size_x_id = 0) in;
+layout(constant_id = 1) const uint m = 16u;           // shape of a product: m x k times k x n
+layout(constant_id = 2) const uint n = 16u;
+layout(constant_id = 3) const uint k = 16u;
+layout(constant_id = 4) const uint tile = 64u;        // samples of a workgroup's tile
+layout(constant_id = 5) const uint subgroups = 8u;    // of a workgroup
+layout(constant_id = 6) const uint width = 128u;      // neurons of a hidden layer
+#define SUM coopmat<float, gl_ScopeSubgroup, m, n, gl_MatrixUseAccumulator>
+#define SUM16 coopmat<float16_t, gl_ScopeSubgroup, m, n, gl_MatrixUseAccumulator>
+#define LEFT coopmat<float16_t, gl_ScopeSubgroup, m, k, gl_MatrixUseA>
+#define RIGHT coopmat<float16_t, gl_ScopeSubgroup, k, n, gl_MatrixUseB>
+#define ROWS gl_CooperativeMatrixLayoutRowMajor
+#define COLUMNS gl_CooperativeMatrixLayoutColumnMajor
+// Unrolled, a CPU driver compiles these loops for minutes; a GPU keeps their operands in registers.
+#ifdef UNROLL
+#define STEPS [[unroll]]
+#else
+#define STEPS [[dont_unroll]]
+#endif
+// Largest f16; activations saturate rather than overflow.
+const float LARGEST = 65504.0;
+
+uint pack2(vec2 pair) {
+    return packHalf2x16(clamp(pair, vec2(-LARGEST), vec2(LARGEST)));
+}

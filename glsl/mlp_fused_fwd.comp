@@ -1,0 +1,149 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// The whole network for a tile of samples, in shared memory and registers: encoding, hidden layers, output,
+// activation. Bias and latent of a layer that sees the input are columns of its weights, picked by a one-hot phase
+// behind the encoding, so that their gradients come out of the weight gradient.
+//   features16[s][encoded], activations16_i[s][width]: f16, kept for the backward pass if `keep`;
+//   sample_sigma[s] = (sigma_s, d sigma_s / d feature).
+//   weights16: per layer [width][encoded] if it sees the input, then [width][width] unless it is the first; at last
+//   the output weights, n rows of which the first counts.
+#include "inc/matrices.glsl"
+#include "inc/layout.glsl"
+#include "inc/softplus.glsl"
+layout(constant_id = 7) const uint encoded = 80u;     // numbers of encoding and one-hot phase, padded
+layout(constant_id = 8) const uint layers = 4u;       // hidden layers
+layout(constant_id = 9) const uint skip = 0u;         // layer (from 0) that sees the input again; 0: none
+layout(constant_id = 10) const uint keep = 1u;
+layout(push_constant) uniform Push { uint out_bias; } push;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
+layout(binding = 3) readonly buffer B3 { uint live[]; };
+layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
+layout(binding = 5) readonly buffer B5 { uint sample_rays[]; };
+layout(binding = 6) readonly buffer B6 { Ray rays[]; };
+layout(binding = 7) readonly buffer B7 { uvec4 weights16[]; };
+layout(binding = 8) readonly buffer B8 { float bias_rows[]; };
+layout(binding = 9) readonly buffer B9 { float params[]; };
+layout(binding = 10) writeonly buffer B10 { uvec4 features16[]; };
+layout(binding = 11) writeonly buffer B11 { uvec4 activations16[]; };
+layout(binding = 12) writeonly buffer B12 { vec2 sample_sigma[]; };
+#include "inc/encoding.glsl"
+
+const uint width8 = width / 8u;
+const uint encoded8 = encoded / 8u;
+// One more uvec4 a row keeps rows off the same banks.
+const uint hidden_stride = width8 + 1u;
+const uint encoded_stride = encoded8 + 1u;
+// Without a skip layer nothing needs the encoding after the first layer, which may overwrite it.
+const uint encoded_at = skip > 0u ? tile * hidden_stride : 0u;
+const uint shared_size = skip > 0u ? encoded_at + tile * encoded_stride
+                                   : tile * (hidden_stride > encoded_stride ? hidden_stride : encoded_stride);
+const uint row_tiles = tile / m;
+const uint column_tiles = width / n / subgroups;
+shared uvec4 tile16[shared_size];
+shared float output_tile[tile * n];
+
+// Number i of a sample's input: encoding, then one-hot phase, then zeros.
+float input_number(uint i, vec3 x, uint phase, float window) {
+    if (i < 3u) return x[i];
+    uint band = (i - 3u) / 6u;
+    if (band < setup.n_bands) {
+        uint part = (i - 3u) % 6u;
+        float angle = reduce_angle(vec3(x[part % 3u] * float(1u << band))).x;
+        return clamp(window - float(band), 0.0, 1.0) * (part < 3u ? sin(angle) : cos(angle));
+    }
+    return i == 3u + 6u * setup.n_bands + phase ? 1.0 : 0.0;
+}
+
+// One invocation writes eight numbers of a sample at a time.
+void encode_tile(uint first) {
+    float window = schedule[state[0]].window;
+    for (uint e = gl_LocalInvocationIndex; e < tile * encoded8; e += gl_WorkGroupSize.x) {
+        uint row = e / encoded8;
+        uint s = first + row;
+        uvec4 packed = uvec4(0u);
+        if (s < live[0]) {
+            vec3 x = encoded_point(sample_points[s].xyz);
+            uint phase = rays[sample_rays[s] & 0x7fffffffu].phase;
+            for (uint pair = 0u; pair < 4u; pair++) {
+                uint i = 8u * (e % encoded8) + 2u * pair;
+                packed[pair] = pack2(vec2(input_number(i, x, phase, window), input_number(i + 1u, x, phase, window)));
+            }
+        }
+        tile16[encoded_at + row * encoded_stride + e % encoded8] = packed;
+        if (keep != 0u) features16[first * encoded8 + e] = packed;
+    }
+}
+
+SUM sums[row_tiles * column_tiles];
+
+// sums += input [tile][depth] times weights [width][depth] transposed.
+void multiply(uint input_at, uint input_stride, uint weights_at, uint depth, uint column0) {
+    STEPS for (uint step = 0u; step < depth / k; step++) {
+        [[unroll]] for (uint c = 0u; c < column_tiles; c++) {
+            RIGHT weights;
+            coopMatLoad(weights, weights16, (weights_at + (column0 + c * n) * depth + step * k) / 8u, depth / 8u, COLUMNS);
+            [[unroll]] for (uint r = 0u; r < row_tiles; r++) {
+                LEFT inputs;
+                coopMatLoad(inputs, tile16, input_at + r * m * input_stride + step * k / 8u, input_stride, ROWS);
+                sums[r * column_tiles + c] = coopMatMulAdd(inputs, weights, sums[r * column_tiles + c]);
+            }
+        }
+    }
+}
+
+void main() {
+    uint first = gl_WorkGroupID.x * tile;
+    uint column0 = gl_SubgroupID * (width / subgroups);
+    encode_tile(first);
+    barrier();
+    uint weights_at = 0u;
+    [[dont_unroll]] for (uint layer = 0u; layer < layers; layer++) {
+        [[unroll]] for (uint c = 0u; c < column_tiles; c++) {
+            SUM bias;
+            coopMatLoad(bias, bias_rows, layer * m * width + column0 + c * n, width, ROWS);
+            [[unroll]] for (uint r = 0u; r < row_tiles; r++) sums[r * column_tiles + c] = bias;
+        }
+        if (layer == 0u || layer == skip) {
+            multiply(encoded_at, encoded_stride, weights_at, encoded, column0);
+            weights_at += width * encoded;
+        }
+        if (layer > 0u) {
+            multiply(0u, hidden_stride, weights_at, width, column0);
+            weights_at += width * width;
+        }
+        barrier();
+        [[unroll]] for (uint r = 0u; r < row_tiles; r++) {
+            [[unroll]] for (uint c = 0u; c < column_tiles; c++) {
+                SUM sum = sums[r * column_tiles + c];
+                for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
+                SUM16 rectified = SUM16(sum);
+                uint column = (column0 + c * n) / 8u;
+                coopMatStore(rectified, tile16, r * m * hidden_stride + column, hidden_stride, ROWS);
+                if (keep != 0u) {
+                    uint at = layer * setup.sample_capacity + first + r * m;
+                    coopMatStore(rectified, activations16, at * width8 + column, width8, ROWS);
+                }
+            }
+        }
+        barrier();
+    }
+    // The output neuron: row tiles are shared out among subgroups.
+    for (uint r = gl_SubgroupID; r < row_tiles; r += subgroups) {
+        SUM sum = SUM(0.0);
+        STEPS for (uint step = 0u; step < width / k; step++) {
+            LEFT inputs;
+            RIGHT weights;
+            coopMatLoad(inputs, tile16, r * m * hidden_stride + step * k / 8u, hidden_stride, ROWS);
+            coopMatLoad(weights, weights16, (weights_at + step * k) / 8u, width8, COLUMNS);
+            sum = coopMatMulAdd(inputs, weights, sum);
+        }
+        coopMatStore(sum, output_tile, r * m * n, n, ROWS);
+    }
+    barrier();
+    for (uint row = gl_LocalInvocationIndex; row < tile; row += gl_WorkGroupSize.x) {
+        float x = output_tile[row * n] + params[push.out_bias] + setup.dynamic_shift;
+        sample_sigma[first + row] = setup.dynamic_gain * vec2(softplus(x), sigmoid(x));
+    }
+}

@@ -1,0 +1,30 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// f16 copies of the network's weights as the fused kernels read them, and f32 biases repeated over the rows of a
+// product. One invocation per pair of f16, then one per bias element.
+//   source[i]: where element i comes from: a parameter; PHASE_BIAS | index of phase_bias; or NOTHING, zero.
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint n_pairs; uint n_bias; } push;
+layout(binding = 0) readonly buffer B0 { float params[]; };
+layout(binding = 1) readonly buffer B1 { float phase_bias[]; };
+layout(binding = 2) readonly buffer B2 { uint pack_source[]; };
+layout(binding = 3) writeonly buffer B3 { uint weights16[]; };
+layout(binding = 4) writeonly buffer B4 { float bias_rows[]; };
+
+const uint NOTHING = 0xffffffffu;
+const uint PHASE_BIAS = 0x80000000u;
+
+float value(uint i) {
+    uint source = pack_source[i];
+    if (source == NOTHING) return 0.0;
+    return (source & PHASE_BIAS) != 0u ? phase_bias[source & ~PHASE_BIAS] : params[source];
+}
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i < push.n_pairs) {
+        weights16[i] = packHalf2x16(clamp(vec2(value(2u * i), value(2u * i + 1u)), vec2(-65504.0), vec2(65504.0)));
+    } else if (i < push.n_pairs + push.n_bias) {
+        bias_rows[i - push.n_pairs] = value(i + push.n_pairs);
+    }
+}
