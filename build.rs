@@ -235,7 +235,8 @@ fn reflect(words: &[u32]) -> Result<Reflected, Failure> {
 fn kernel_row(name: &str, file: &Path, kernel: &Reflected) -> String {
     let mut row = String::new();
     let _ = writeln!(row, "    KernelCode {{ name: {name:?}, spirv: include_bytes!({:?}),", file.display().to_string());
-    let _ = writeln!(row, "        push_bytes: {}, addresses: &{:?}, bindings: &[", kernel.push_bytes, kernel.addresses);
+    let _ =
+        writeln!(row, "        push_bytes: {}, addresses: &{:?}, bindings: &[", kernel.push_bytes, kernel.addresses);
     for b in &kernel.bindings {
         let _ = writeln!(
             row,

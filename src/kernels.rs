@@ -28,6 +28,17 @@ pub enum Layers {
     Matrices,
 }
 
+/// Sizes of the passes on cooperative matrices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct MatrixTuning {
+    /// Workgroups of the backward passes, which stay on the device and share out the samples.
+    pub workgroups: u32,
+    /// Samples of a workgroup's tile, at most; shared memory may allow fewer.
+    pub largest_tile: u32,
+    /// Unroll the loops over the inner dimension: operands stay in registers, compilation takes longer.
+    pub unroll: bool,
+}
+
 /// Sizes and variants chosen for a device, with the reasons.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Tuning {
@@ -41,8 +52,8 @@ pub struct Tuning {
     pub weight_lanes: u32,
     /// Parts the samples are split into for weight gradients.
     pub splits: u32,
-    /// Workgroups of the backward passes on matrices, which stay on the device and share out the samples.
-    pub matrix_workgroups: u32,
+    /// Sizes of the passes on matrices.
+    pub matrices: MatrixTuning,
     /// Samples handled at once, at most; the configuration may ask for fewer.
     pub chunk_samples: u32,
     /// One sentence per choice.
@@ -78,24 +89,15 @@ impl Tuning {
             }
         };
         reasons.push(why);
-        // Two workgroups per multiprocessor; 132 multiprocessors where the driver does not tell their number.
-        let matrix_workgroups = match info.multiprocessors {
-            _ if info.kind == "cpu" => 4,
-            0 => 264,
-            n => 2 * n,
+        let matrices = match info.multiprocessors {
+            // Unrolled, a CPU driver compiles these kernels for minutes.
+            _ if info.kind == "cpu" => MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false },
+            // Two workgroups per multiprocessor; 132 of them where the driver does not tell their number.
+            n => MatrixTuning { workgroups: if n == 0 { 264 } else { 2 * n }, largest_tile: 128, unroll: true },
         };
         let chunk_samples = if info.kind == "cpu" { 1 << 16 } else { 1 << 19 };
         reasons.push("static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into());
-        Tuning {
-            layers,
-            operands,
-            layer_lanes,
-            weight_lanes,
-            splits,
-            matrix_workgroups,
-            chunk_samples,
-            reasons,
-        }
+        Tuning { layers, operands, layer_lanes, weight_lanes, splits, matrices, chunk_samples, reasons }
     }
 
     /// With the layers on a path chosen by the caller, if any.

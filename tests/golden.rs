@@ -4,8 +4,9 @@
 
 mod common;
 
-use common::{expect_silence, gpu, tuning, relative_error};
+use common::{expect_silence, gpu, relative_error, tuning};
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::{march, step};
 use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::data::geometry::{CArm, Geometry};
@@ -177,8 +178,13 @@ fn check(preset: Preset, name: &str) {
         // reference's parameters are loaded where gradients are compared.
         if compared.contains(&step) {
             let params = gather(&golden, trainer.plan(), &format!("params{step}"));
-            let (losses, gradient) =
-                step::loss_and_gradient(trainer.plan(), &params, step, &march::batch(trainer.plan(), step));
+            let (losses, gradient) = step::loss_and_gradient(
+                trainer.plan(),
+                &params,
+                step,
+                &march::batch(trainer.plan(), step),
+                Precision::Exact,
+            );
             let reference = gather(&golden, trainer.plan(), &format!("gradient{step}"));
             assert_eq!(losses.live as f64, golden.get(&format!("loss{step}/live"))[0], "{name} step {step}");
             for (term, value) in [("data", losses.data), ("tv", losses.tv), ("occlusion", losses.occlusion)] {

@@ -6,6 +6,7 @@ mod common;
 
 use common::{small_config, small_dataset};
 use glam::DVec3;
+use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::{field, march, random, step};
 use nertca_vk::train::plan::Plan;
 
@@ -31,7 +32,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
         let plan = plan(preset, settings);
         let params = start(&plan);
         let rays = march::batch(&plan, 3);
-        let (_, gradient) = step::loss_and_gradient(&plan, &params, 3, &rays);
+        let (_, gradient) = step::loss_and_gradient(&plan, &params, 3, &rays, Precision::Exact);
         let temporal = plan.setup.temporal_target != 0;
         for tensor in plan.params.tensors() {
             // With a temporal target S learns from what D leaves, D taken as given: the two fields descend
@@ -44,7 +45,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
                 let loss = |value: f64| {
                     let mut moved = params.clone();
                     moved[i] = value;
-                    let losses = step::loss_and_gradient(&plan, &moved, 3, &rays).0;
+                    let losses = step::loss_and_gradient(&plan, &moved, 3, &rays, Precision::Exact).0;
                     if temporal && !is_static { losses.dynamic } else { losses.total() }
                 };
                 // Small enough to stay between ReLU kinks, large enough for f64 differences.
@@ -69,9 +70,9 @@ fn temporal_residual_is_flat_between_its_bounds() {
     let plan = plan("fast", &["loss.robust=0"]);
     let params = start(&plan);
     let mut ray = march::ray(&plan, 40);
-    let seen = march::fwd(&plan, &params, 0, &ray, true).dynamic_integral;
+    let seen = march::fwd(&plan, &params, 0, &ray, true, Precision::Exact).dynamic_integral;
     let gradient_with = |ray: &march::Ray| {
-        let (_, g) = step::loss_and_gradient(&plan, &params, 0, std::slice::from_ref(ray));
+        let (_, g) = step::loss_and_gradient(&plan, &params, 0, std::slice::from_ref(ray), Precision::Exact);
         g[plan.params.out_bias]
     };
     ray.temporal = [seen - 1.0, seen + 1.0];
@@ -118,7 +119,7 @@ fn ray_sum_and_its_adjoint_agree() {
     let rays = march::batch(&plan, 1);
     let (mut left, mut right) = (0.0, 0.0);
     for (index, ray) in rays.iter().enumerate() {
-        let seen = march::fwd(&plan, &params, 1, ray, true);
+        let seen = march::fwd(&plan, &params, 1, ray, true, Precision::Exact);
         let r = 0.3 + index as f64;
         left += r * seen.static_integral;
         for sample in &seen.statics {

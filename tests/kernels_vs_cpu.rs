@@ -3,10 +3,11 @@
 
 mod common;
 
-use common::{expect_silence, gpu, tuning, relative_error, small_config, small_dataset};
+use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
+use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::{march, step};
 use nertca_vk::gpu::memory::Operands;
-use nertca_vk::kernels::{Layers, Tuning};
+use nertca_vk::kernels::{Layers, MatrixTuning, Tuning};
 use nertca_vk::layout::Ray;
 use nertca_vk::train::plan::Plan;
 use nertca_vk::train::trainer::Trainer;
@@ -46,7 +47,7 @@ fn rays_and_depths_match() {
         }
         assert!((f64::from(g.temporal_low) - w.temporal[0]).abs() < 1e-6);
         assert!((f64::from(g.temporal_high) - w.temporal[1]).abs() < 1e-6);
-        live += march::fwd(plan, &params, 0, w, false).dynamics.len();
+        live += march::fwd(plan, &params, 0, w, false, Precision::Exact).dynamics.len();
     }
     assert!(live > 20, "the case must have live samples, has {live}");
     // A sample on a cell face may fall either way in f32.
@@ -64,7 +65,7 @@ fn paths() -> [Tuning; 3] {
         layer_lanes,
         weight_lanes,
         splits,
-        matrix_workgroups: 0,
+        matrices: MatrixTuning { workgroups: 1, largest_tile: 16, unroll: false },
         chunk_samples: 1 << 16,
         reasons: Vec::new(),
     };
@@ -97,7 +98,7 @@ fn check_losses_and_gradients(path: &Tuning) {
         gpu.upload(trainer.buffers().get("params").unwrap(), 0, &params).unwrap();
         let got = trainer.advance(1).unwrap()[0];
         let plan = trainer.plan();
-        let (want, gradient) = step::loss_and_gradient(plan, &twin, 0, &march::batch(plan, 0));
+        let (want, gradient) = step::loss_and_gradient(plan, &twin, 0, &march::batch(plan, 0), Precision::Exact);
         for (name, g, w) in [
             ("data", got.data, want.data),
             ("dynamic", got.dynamic, want.dynamic),
@@ -146,7 +147,8 @@ fn ten_updates_across_the_delay_match() {
         }
         let plan = trainer.plan();
         for step in 0..10 {
-            let (_, gradient) = step::loss_and_gradient(plan, &params, step, &march::batch(plan, step));
+            let (_, gradient) =
+                step::loss_and_gradient(plan, &params, step, &march::batch(plan, step), Precision::Exact);
             step::adam(plan, step, &gradient, &mut params, &mut moments);
         }
         let got = trainer.model().unwrap().params;

@@ -3,7 +3,8 @@
 
 mod common;
 
-use common::{expect_silence, gpu, tuning, relative_error, small_config, small_dataset};
+use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
+use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::march;
 use nertca_vk::error::Error;
 use nertca_vk::output::render::Renderer;
@@ -30,7 +31,8 @@ fn the_loss_falls_and_runs_repeat_bit_by_bit() {
         let config =
             small_config(preset, &["loss.normalise=true", "dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
         let train = || {
-            let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+            let mut trainer =
+                Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
             let losses = run(&mut trainer, 120);
             (losses, trainer.model().unwrap().params)
         };
@@ -97,7 +99,8 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
     let dataset = small_dataset(13, 11);
     let directory = tempfile::tempdir().unwrap();
     let cancel = AtomicBool::new(false);
-    let options = RunOptions { tuning: &tuning(&gpu), run: directory.path(), resume: false, stop_at: None, cancel: &cancel };
+    let options =
+        RunOptions { tuning: &tuning(&gpu), run: directory.path(), resume: false, stop_at: None, cancel: &cancel };
     let mut stop_at_ten = |event: &Event| {
         if let Event::Progress { .. } = event {
             cancel.store(true, std::sync::atomic::Ordering::Relaxed);
@@ -110,7 +113,8 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
 
     let directory = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
-    let options = RunOptions { tuning: &tuning(&gpu), run: directory.path(), resume: false, stop_at: None, cancel: &never };
+    let options =
+        RunOptions { tuning: &tuning(&gpu), run: directory.path(), resume: false, stop_at: None, cancel: &never };
     let config = small_config(
         "fast",
         &[
@@ -148,7 +152,7 @@ fn renderings_equal_the_twin() {
         for pixel in 0..120u32 {
             let (anchor, direction) = view.pixel(f64::from(pixel % 12), f64::from(pixel / 12));
             let ray = march::Ray { anchor, direction, phase: 2, target: 0.0, temporal: [0.0; 2], id: pixel };
-            let seen = march::fwd(&plan, &params, 20, &ray, true);
+            let seen = march::fwd(&plan, &params, 20, &ray, true, Precision::Exact);
             s.push(seen.static_integral);
             d.push(seen.dynamic_integral);
             most.push(seen.dynamics.iter().fold(0.0, |m: f64, x| {
@@ -173,7 +177,8 @@ fn renderings_equal_the_twin() {
 fn damaged_checkpoints_are_refused() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let mut trainer =
+        Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 2);
     let directory = tempfile::tempdir().unwrap();
     let path = trainer.checkpoint().unwrap().save(directory.path()).unwrap();
@@ -196,7 +201,8 @@ fn damaged_checkpoints_are_refused() {
 fn older_checkpoints_follow_the_stated_rule() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let mut trainer = Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let mut trainer =
+        Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let directory = tempfile::tempdir().unwrap();
     for step in 1..=5 {
         run(&mut trainer, step);

@@ -27,7 +27,8 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     }
     let dataset = Dataset::open(&data)?;
     let gpu = cli.open_device()?;
-    let evaluation = evaluate_run(&gpu, &cli.tuning(&gpu), &args.run, &dataset, args.threshold, args.images.as_deref())?;
+    let evaluation =
+        evaluate_run(&gpu, &cli.tuning(&gpu), &args.run, &dataset, args.threshold, args.images.as_deref())?;
     if args.json {
         out!("{}", json(&evaluation)?);
     } else {

@@ -95,6 +95,35 @@ pub fn encode(s: &Setup, window: f64, x: DVec3) -> Vec<f64> {
     out
 }
 
+/// Precision of the network's operands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Precision {
+    /// Everything in f64.
+    Exact,
+    /// Weights, encoding, activations and scaled gradients rounded to f16 where the fused kernels round them.
+    F16 {
+        /// Factor on gradients before they are rounded.
+        loss_scale: f64,
+    },
+}
+
+impl Precision {
+    fn round(self, x: f64) -> f64 {
+        match self {
+            Precision::Exact => x,
+            // The kernels hold f32 before they round.
+            Precision::F16 { .. } => half::f16::from_f32((x as f32).clamp(-65504.0, 65504.0)).to_f64(),
+        }
+    }
+
+    fn loss_scale(self) -> f64 {
+        match self {
+            Precision::Exact => 1.0,
+            Precision::F16 { loss_scale } => loss_scale,
+        }
+    }
+}
+
 /// Hidden activations of one sample, layer by layer, and the output feature.
 pub struct NetworkTrace {
     /// Encoded input.
@@ -106,31 +135,42 @@ pub struct NetworkTrace {
 }
 
 /// The network at one encoded point and phase.
-pub fn network_fwd(p: &ParamLayout, params: &[f64], encoded: Vec<f64>, phase: usize) -> NetworkTrace {
+pub fn network_fwd(
+    p: &ParamLayout,
+    params: &[f64],
+    encoded: &[f64],
+    phase: usize,
+    precision: Precision,
+) -> NetworkTrace {
+    let round = |x: f64| precision.round(x);
     let latent = &params[p.latents + phase * p.latent..][..p.latent];
+    let encoded: Vec<f64> = encoded.iter().map(|e| round(*e)).collect();
     let mut hidden: Vec<Vec<f64>> = Vec::new();
     for layer in &p.layers {
         let previous = hidden.last();
         let out = (0..p.width)
             .map(|j| {
                 let mut z = params[layer.bias + j];
-                if let Some(at) = layer.encoded {
-                    let row = at + j * p.encode_groups * 4;
-                    z += encoded.iter().enumerate().map(|(k, e)| params[row + k] * e).sum::<f64>();
-                }
                 if let Some(at) = layer.latent {
                     z += latent.iter().enumerate().map(|(l, v)| params[at + j * p.latent + l] * v).sum::<f64>();
+                    // On matrices, bias and latent are a column of the weights.
+                    z = round(z);
+                }
+                if let Some(at) = layer.encoded {
+                    let row = at + j * p.encode_groups * 4;
+                    z += encoded.iter().enumerate().map(|(k, e)| round(params[row + k]) * e).sum::<f64>();
                 }
                 if let (Some(at), Some(h)) = (layer.hidden, previous) {
-                    z += h.iter().enumerate().map(|(k, v)| params[at + j * p.width + k] * v).sum::<f64>();
+                    z += h.iter().enumerate().map(|(k, v)| round(params[at + j * p.width + k]) * v).sum::<f64>();
                 }
-                z.max(0.0)
+                round(z.max(0.0))
             })
             .collect();
         hidden.push(out);
     }
     let last = hidden.last().map_or(&[][..], |h| h);
-    let feature = params[p.out_bias] + last.iter().enumerate().map(|(k, h)| params[p.out_weights + k] * h).sum::<f64>();
+    let weight = |k: usize| round(params[p.out_weights + k]);
+    let feature = params[p.out_bias] + last.iter().enumerate().map(|(k, h)| weight(k) * h).sum::<f64>();
     NetworkTrace { encoded, hidden, feature }
 }
 
@@ -141,18 +181,23 @@ pub fn network_bwd(
     trace: &NetworkTrace,
     phase: usize,
     dl_dfeature: f64,
+    precision: Precision,
     gradient: &mut [f64],
 ) {
+    let round = |x: f64| precision.round(x);
+    let scale = precision.loss_scale();
     let last = p.layers.len() - 1;
     gradient[p.out_bias] += dl_dfeature;
+    // dz is kept multiplied by the loss scale, as in f16 memory.
     let mut dz = vec![0.0; p.width];
     for (j, (h, dz)) in trace.hidden[last].iter().zip(&mut dz).enumerate() {
         gradient[p.out_weights + j] += dl_dfeature * h;
-        *dz = if *h > 0.0 { dl_dfeature * params[p.out_weights + j] } else { 0.0 };
+        *dz = if *h > 0.0 { round(scale * dl_dfeature * round(params[p.out_weights + j])) } else { 0.0 };
     }
     for (i, layer) in p.layers.iter().enumerate().rev() {
         let mut dz_in = vec![0.0; p.width];
-        for (j, g) in dz.iter().enumerate() {
+        for (j, scaled) in dz.iter().enumerate() {
+            let g = scaled / scale;
             gradient[layer.bias + j] += g;
             if let Some(at) = layer.encoded {
                 let row = at + j * p.encode_groups * 4;
@@ -169,11 +214,11 @@ pub fn network_bwd(
                 for (k, h) in trace.hidden[i - 1].iter().enumerate() {
                     gradient[at + j * p.width + k] += g * h;
                     if *h > 0.0 {
-                        dz_in[k] += g * params[at + j * p.width + k];
+                        dz_in[k] += scaled * round(params[at + j * p.width + k]);
                     }
                 }
             }
         }
-        dz = dz_in;
+        dz = dz_in.into_iter().map(round).collect();
     }
 }

@@ -1,6 +1,6 @@
 //! f64 twins of ray drawing, depths and the march.
 
-use super::field::{self, NetworkTrace};
+use super::field::{self, NetworkTrace, Precision};
 use super::random::{STREAM_DEPTH, STREAM_MOTION_RAY, STREAM_RAY, permute, uniform01};
 use crate::layout::Setup;
 use crate::model::params::ParamLayout;
@@ -127,7 +127,7 @@ pub struct March {
 }
 
 /// Marches one ray (twin of `march_count`..`march_fwd`).
-pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool) -> March {
+pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool, precision: Precision) -> March {
     let (s, p): (&Setup, &ParamLayout) = (&plan.setup, &plan.params);
     let row = plan.schedule[step as usize];
     let mut out = March {
@@ -156,7 +156,7 @@ pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool)
         if !dynamic_inside(plan, x, ray.phase) {
             continue;
         }
-        let trace = field::network_fwd(p, params, field::encode(s, row.window.into(), x), ray.phase);
+        let trace = field::network_fwd(p, params, &field::encode(s, row.window.into(), x), ray.phase, precision);
         let sigma = f64::from(s.dynamic_gain) * field::softplus(trace.feature + f64::from(s.dynamic_shift));
         let near = t < f64::from(s.occlusion_depth);
         out.dynamic_integral += sigma * dl;
@@ -167,7 +167,15 @@ pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool)
 }
 
 /// Adds the gradient of a ray, given dL/dS and dL/dD of its integrals (twin of `march_bwd`, `mlp_*_bwd`).
-pub fn bwd(plan: &Plan, params: &[f64], ray: &Ray, march: &March, dl_ds: f64, dl_dd: f64, gradient: &mut [f64]) {
+pub fn bwd(
+    plan: &Plan,
+    params: &[f64],
+    ray: &Ray,
+    march: &March,
+    [dl_ds, dl_dd]: [f64; 2],
+    precision: Precision,
+    gradient: &mut [f64],
+) {
     let (s, p) = (&plan.setup, &plan.params);
     if dl_ds != 0.0 {
         for sample in &march.statics {
@@ -178,6 +186,7 @@ pub fn bwd(plan: &Plan, params: &[f64], ray: &Ray, march: &March, dl_ds: f64, dl
     for sample in &march.dynamics {
         let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
         let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
-        field::network_bwd(p, params, &sample.trace, ray.phase, per_integral * sample.dl * slope, gradient);
+        let dl_dfeature = per_integral * sample.dl * slope;
+        field::network_bwd(p, params, &sample.trace, ray.phase, dl_dfeature, precision, gradient);
     }
 }

@@ -1,5 +1,6 @@
 //! f64 twin of one training iteration: loss, gradient, Adam.
 
+use super::field::Precision;
 use super::march::{self, Ray};
 use crate::train::plan::Plan;
 
@@ -41,7 +42,13 @@ fn robust_square(scale: f64, r: f64) -> (f64, f64) {
 }
 
 /// Loss and gradient of given rays at a step.
-pub fn loss_and_gradient(plan: &Plan, params: &[f64], step: u32, rays: &[Ray]) -> (Losses, Vec<f64>) {
+pub fn loss_and_gradient(
+    plan: &Plan,
+    params: &[f64],
+    step: u32,
+    rays: &[Ray],
+    precision: Precision,
+) -> (Losses, Vec<f64>) {
     let s = &plan.setup;
     let mut gradient = vec![0.0; plan.params.len];
     let mut losses = Losses::default();
@@ -49,7 +56,7 @@ pub fn loss_and_gradient(plan: &Plan, params: &[f64], step: u32, rays: &[Ray]) -
     let temporal = s.temporal_target != 0;
     for (r, ray) in rays.iter().enumerate() {
         let skip = skips_static(plan, r);
-        let seen = march::fwd(plan, params, step, ray, !skip);
+        let seen = march::fwd(plan, params, step, ray, !skip, precision);
         let dynamic_scale = f64::from(s.dynamic_weight) / rays.len() as f64;
         let static_scale = if skip { 0.0 } else { f64::from(s.static_weight) / n_static };
         let d = seen.dynamic_integral;
@@ -61,8 +68,8 @@ pub fn loss_and_gradient(plan: &Plan, params: &[f64], step: u32, rays: &[Ray]) -
         losses.dynamic += dynamic_loss;
         losses.occlusion += f64::from(s.occlusion_weight) * seen.occlusion;
         losses.live += seen.dynamics.len();
-        let (dl_ds, dl_dd) = (2.0 * static_scale * total, 2.0 * dynamic_scale * slope);
-        march::bwd(plan, params, ray, &seen, dl_ds, dl_dd, &mut gradient);
+        let dl = [2.0 * static_scale * total, 2.0 * dynamic_scale * slope];
+        march::bwd(plan, params, ray, &seen, dl, precision, &mut gradient);
     }
     losses.tv = total_variation(plan, params, &mut gradient);
     (losses, gradient)

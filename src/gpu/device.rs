@@ -190,6 +190,8 @@ fn matrix_shapes(entry: &ash::Entry, instance: &ash::Instance, physical: vk::Phy
         size.compute_full_subgroups,
         f12.shader_float16,
         f12.vulkan_memory_model,
+        // Integer atomics of other kernels have device scope.
+        f12.vulkan_memory_model_device_scope,
     ];
     if needed.contains(&vk::FALSE) {
         return Vec::new();
@@ -205,9 +207,9 @@ fn matrix_shapes(entry: &ash::Entry, instance: &ash::Instance, physical: vk::Phy
         // The mask of the backward pass is an f16 sum of the same shape, and rows are handled eight f16 at a time.
         .filter(|p| {
             [p.m_size, p.n_size, p.k_size].iter().all(|size| size % 8 == 0)
-                && found.iter().any(|q| {
-                    q.c_type == f16 && (q.m_size, q.n_size, q.k_size) == (p.m_size, p.n_size, p.k_size)
-                })
+                && found
+                    .iter()
+                    .any(|q| q.c_type == f16 && (q.m_size, q.n_size, q.k_size) == (p.m_size, p.n_size, p.k_size))
         })
         .map(|p| MatrixShape { m: p.m_size, n: p.n_size, k: p.k_size })
         .collect();
@@ -412,7 +414,7 @@ impl Gpu {
         let extensions = MATRIX_EXTENSIONS.map(CStr::as_ptr);
         let mut create = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
         if !info.matrices.is_empty() {
-            f12 = f12.shader_float16(true).vulkan_memory_model(true);
+            f12 = f12.shader_float16(true).vulkan_memory_model(true).vulkan_memory_model_device_scope(true);
             create = create.enabled_extension_names(&extensions).push_next(&mut matrix).push_next(&mut size);
         }
         let create = create.push_next(&mut f12);

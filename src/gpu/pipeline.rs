@@ -90,7 +90,10 @@ impl Gpu {
         full_subgroups: bool,
     ) -> Result<Pipeline> {
         let info = self.info();
-        if local_size == 0 || local_size > info.max_workgroup_invocations || code.all_push_bytes() > info.max_push_constants {
+        if local_size == 0
+            || local_size > info.max_workgroup_invocations
+            || code.all_push_bytes() > info.max_push_constants
+        {
             return Err(Error::Internal(format!(
                 "kernel {}: {local_size} invocations and {} bytes of push constants exceed {}",
                 code.name,
@@ -154,17 +157,16 @@ impl Gpu {
             .map_err(Error::vulkan("vkCreateShaderModule", code.name))?;
         let specialization =
             vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&values));
-        let mut subgroup_size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
-            .required_subgroup_size(info.subgroup_size);
+        let mut subgroup_size =
+            vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default().required_subgroup_size(info.subgroup_size);
         let mut stage = vk::PipelineShaderStageCreateInfo::default()
             .stage(vk::ShaderStageFlags::COMPUTE)
             .module(module)
             .name(c"main")
             .specialization_info(&specialization);
         if full_subgroups {
-            stage = stage
-                .flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS)
-                .push_next(&mut subgroup_size);
+            stage =
+                stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS).push_next(&mut subgroup_size);
         }
         let create = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(pipeline.layout)];
         // SAFETY: as above; the module is alive during the call.

@@ -198,9 +198,10 @@ impl Recording {
         let mut pushed = vec![0u8; code.all_push_bytes() as usize];
         pushed[..size_of::<P>()].copy_from_slice(bytemuck::bytes_of(push));
         for (name, offset) in code.addresses {
-            let (_, buffer) = bound.iter().find(|(b, _)| b.name == *name).ok_or_else(|| {
-                fault(format!("it wants the address of `{name}`, which it does not bind"))
-            })?;
+            let (_, buffer) = bound
+                .iter()
+                .find(|(b, _)| b.name == *name)
+                .ok_or_else(|| fault(format!("it wants the address of `{name}`, which it does not bind")))?;
             pushed[*offset as usize..][..8].copy_from_slice(&buffer.address().to_le_bytes());
         }
         self.begin_pass(code.name)?;

@@ -239,4 +239,3 @@ pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
 pub fn sample_capacity(samples: u32) -> u32 {
     samples.next_multiple_of(128) + 12
 }
-

@@ -64,7 +64,8 @@ impl Renderer {
         // The schedule below has a single row, that of the model's step.
         gpu.upload(buffers.get("state")?, 0, &[0u32; 4])?;
         buffers.set("schedule", gpu.buffer_with("schedule", &[model.config.schedule(model.step)])?);
-        let renderer = Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout: model.layout.clone() };
+        let renderer =
+            Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout: model.layout.clone() };
         renderer.set_model(model)?;
         Ok(renderer)
     }

@@ -60,7 +60,7 @@ struct Shape {
 impl Shape {
     /// # Errors
     /// [`Error::Config`] when the network does not fit the device's shared memory or workgroups.
-    fn new(info: &DeviceInfo, matrix: MatrixShape, params: &ParamLayout) -> Result<Shape> {
+    fn new(info: &DeviceInfo, matrix: MatrixShape, largest: u32, params: &ParamLayout) -> Result<Shape> {
         let MatrixShape { m, n, k } = matrix;
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
@@ -71,7 +71,6 @@ impl Shape {
         }
         let skips = params.layers.iter().skip(1).any(|l| l.encoded.is_some());
         let budget = info.max_shared_memory - SHARED_RESERVE;
-        let largest = if info.kind == "cpu" { 32 } else { 128 };
         let tile_within = |largest: u32, bytes: &dyn Fn(u32) -> u32| {
             let tiles = [128, 64, 32, 16].into_iter().filter(|t| *t <= largest && t % m == 0 && t % k == 0);
             tiles.into_iter().find(|t| bytes(*t) <= budget)
@@ -125,9 +124,8 @@ impl Shape {
     fn pack_source(&self, params: &ParamLayout) -> Vec<u32> {
         let mut source = vec![NOTHING; self.weights_len];
         let width = params.width;
-        let phase_bias = |layer: usize, phase: usize, j: usize| {
-            PHASE_BIAS | ((layer * params.phases + phase) * width + j) as u32
-        };
+        let phase_bias =
+            |layer: usize, phase: usize, j: usize| PHASE_BIAS | ((layer * params.phases + phase) * width + j) as u32;
         for (l, (packed, layer)) in self.layers.iter().zip(&params.layers).enumerate() {
             for j in 0..width {
                 if let (Some(to), Some(from)) = (packed.encoded, layer.encoded) {
@@ -232,9 +230,9 @@ impl FusedKernels {
             let problem = "this device has no cooperative matrices our kernels can use: take f32 or auto";
             Error::config("layers", "matrices", format!("{}: {problem}", info.name))
         })?;
-        let shape = Shape::new(info, matrix, params)?;
+        let shape = Shape::new(info, matrix, tuning.matrices.largest_tile, params)?;
         let local = shape.subgroups * info.subgroup_size;
-        let variant = if info.kind == "cpu" { "" } else { "_unrolled" };
+        let variant = if tuning.matrices.unroll { "_unrolled" } else { "" };
         let common = |tile: u32| {
             [
                 ("m", matrix.m),
@@ -266,7 +264,7 @@ impl FusedKernels {
             gpu.matrix_pipeline(code, local, &spec).map(Arc::new)
         };
         Ok(FusedKernels {
-            workgroups: tuning.matrix_workgroups,
+            workgroups: tuning.matrices.workgroups,
             mlp_pack: Arc::new(gpu.pipeline(kernel_code("mlp_pack")?, 64, &[])?),
             mlp_fused_fwd: Arc::new(forward),
             backward: if train {
@@ -294,13 +292,7 @@ impl FusedKernels {
     }
 
     /// Adds the buffers of the forward pass.
-    pub fn forward_buffers(
-        &self,
-        gpu: &Gpu,
-        setup: &Setup,
-        params: &ParamLayout,
-        buffers: &mut Buffers,
-    ) -> Result<()> {
+    pub fn forward_buffers(&self, gpu: &Gpu, setup: &Setup, params: &ParamLayout, buffers: &mut Buffers) -> Result<()> {
         let shape = &self.shape;
         let kept = |per_sample: usize| match self.backward {
             Some(_) => u64::from(setup.sample_capacity) * per_sample as u64 * 2,
@@ -392,8 +384,7 @@ impl FusedKernels {
                     position(out_bias),
                     accumulate,
                 ];
-                let names =
-                    [("inputs16", input), ("outputs16", "activations16"), ("dz16", dz), ("dz_in16", below)];
+                let names = [("inputs16", input), ("outputs16", "activations16"), ("dz16", dz), ("dz_in16", below)];
                 dispatch(r, stage, Groups::Direct([self.workgroups, 1, 1]), buffers, &names, push)?;
             }
         }

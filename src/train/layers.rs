@@ -147,11 +147,8 @@ pub fn record_backward(
             let bias = if layer.latent.is_none() { in_partials(layer.bias) } else { u32::MAX };
             let push = [in_groups, in_partials(at), capacity, splits, network, accumulate, bias, groups];
             let inputs_per_group = WEIGHT_INPUTS * k.mlp_layer_bwd_weight.local_size;
-            let tiles = [
-                width.div_ceil(k.tuning.tile().weight_neurons),
-                (4 * in_groups).div_ceil(inputs_per_group),
-                splits,
-            ];
+            let tiles =
+                [width.div_ceil(k.tuning.tile().weight_neurons), (4 * in_groups).div_ceil(inputs_per_group), splits];
             let names = [("dz", dz), ("inputs", input)];
             dispatch(r, &k.mlp_layer_bwd_weight, Groups::Direct(tiles), buffers, &names, push)?;
         }

@@ -102,7 +102,13 @@ impl Network {
     ///
     /// # Errors
     /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit; so do all that follow.
-    pub fn record_weights(&self, r: &mut Recording, k: &Kernels, buffers: &Buffers, params: &ParamLayout) -> Result<()> {
+    pub fn record_weights(
+        &self,
+        r: &mut Recording,
+        k: &Kernels,
+        buffers: &Buffers,
+        params: &ParamLayout,
+    ) -> Result<()> {
         for (i, layer) in params.layers.iter().enumerate() {
             let push = [
                 i as u32,

@@ -11,8 +11,8 @@ use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::{Buffers, Kernels, Tuning};
-use crate::model::field::Model;
 use crate::layout::DeviceState;
+use crate::model::field::Model;
 use crate::model::scene::{RING_LENGTH, sample_capacity};
 use serde::Serialize;
 use std::collections::VecDeque;
@@ -289,9 +289,7 @@ impl Trainer {
         let state: Vec<DeviceState> = self.gpu.download(self.buffers.get("state")?, 0, 1)?;
         let loss_scale = match self.network {
             Network::Layers(_) => None,
-            Network::Fused(_) => {
-                Some(LossScale { scale: state[0].loss_scale, good_updates: state[0].good_updates })
-            }
+            Network::Fused(_) => Some(LossScale { scale: state[0].loss_scale, good_updates: state[0].good_updates }),
         };
         Ok(Checkpoint { model, moments, loss_scale, data_fingerprint: self.data_fingerprint.clone() })
     }

@@ -4,8 +4,8 @@
 use nertca_vk::config::Config;
 use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::data::geometry::{CArm, Geometry};
-use nertca_vk::kernels::Tuning;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::kernels::Tuning;
 use std::path::PathBuf;
 
 /// A device with validation on. A missing driver or layer fails the test: it is never skipped.
