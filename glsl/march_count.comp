@@ -12,7 +12,7 @@ void main() {
     uint end = min(begin + run_length(), setup.n_dynamic_samples);
     uint live = 0u;
     for (uint k = begin; k < end; k++) {
-        if (dynamic_inside(ray.anchor + dynamic_depth(k, ray) * ray.direction, ray.phase)) live++;
+        if (sample_lives(ray.anchor + dynamic_depth(k, ray) * ray.direction, ray.phase)) live++;
     }
     lane_counts[r * gl_WorkGroupSize.x + lane] = live;
 }

@@ -20,7 +20,7 @@ void main() {
     for (uint k = begin; k < end; k++) {
         float depth = dynamic_depth(k, ray);
         vec3 x = ray.anchor + depth * ray.direction;
-        if (!dynamic_inside(x, ray.phase)) continue;
+        if (!sample_lives(x, ray.phase)) continue;
         float dl = path_length(depth, k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far,
                                setup.jitter, setup.seed, state[0], depth_stream(ray), ray.norm);
         sample_points[slot] = vec4(x, dl);

@@ -61,6 +61,8 @@ pub struct Config {
     pub loss: Loss,
     /// Motion hull.
     pub hull: Hull,
+    /// Occupancy learned while training.
+    pub occupancy: Occupancy,
     /// The optimiser.
     pub adam: Adam,
 }
@@ -203,6 +205,21 @@ pub struct Hull {
     pub max_share: f64,
 }
 
+/// Occupancy learned while training: where the dynamic field is empty, samples are mostly left out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Occupancy {
+    /// Heed it.
+    pub enabled: bool,
+    /// Cells along each side of the dynamic field's box, for each phase.
+    pub cells: u32,
+    /// Iterations of the dynamic field before it is heeded.
+    pub start: u32,
+    /// Attenuation up to which a sample is empty, as a share of the dynamic field's scale: a typical vessel's when the
+    /// problem is normalised, 0.01 per mm otherwise.
+    pub threshold: f64,
+}
+
 /// The optimiser.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -279,6 +296,7 @@ impl Config {
                 dilate_pixels: 1,
                 max_share: 0.35,
             },
+            occupancy: Occupancy { enabled: false, cells: 64, start: 15_000, threshold: 0.01 },
             adam: Adam { beta1: 0.9, beta2: 0.99, epsilon: 1e-8 },
         };
         match preset {
@@ -332,6 +350,7 @@ impl Config {
                     dilate_pixels: 0,
                     ..paper.hull
                 },
+                occupancy: Occupancy { enabled: true, start: 256, ..paper.occupancy },
                 ..paper
             },
         }
@@ -433,6 +452,9 @@ impl Config {
             ("hull.max_share", self.hull.max_share, 0.0, 1.0),
             ("hull.dilate_pixels", f64::from(self.hull.dilate_pixels), 0.0, 64.0),
             ("hull.vessel_pixels", f64::from(self.hull.vessel_pixels), 0.0, 1024.0),
+            ("occupancy.cells", f64::from(self.occupancy.cells), 2.0, 256.0),
+            ("occupancy.start", f64::from(self.occupancy.start), 0.0, 1e6),
+            ("occupancy.threshold", self.occupancy.threshold, 0.0, 1.0),
             ("adam.beta1", self.adam.beta1, 0.0, 0.999_999),
             ("adam.beta2", self.adam.beta2, 0.0, 0.999_999),
             ("adam.epsilon", self.adam.epsilon, 1e-30, 1.0),

@@ -230,6 +230,10 @@ stages! {
         march_scan(|_| 256, plain);
         /// Writes live samples.
         march_emit(|_| MARCH_LANES, plain);
+        /// Notes which cells are empty.
+        occupancy_mark(|_| 64, plain);
+        /// Prepares the next epoch's notes.
+        occupancy_clear(|_| 64, plain);
         /// Line integrals.
         march_fwd(|_| 32, operands);
         /// Line integrals and maxima, for rendering.

@@ -36,6 +36,7 @@ shared! {
         occlusion_weight: f32, occlusion_depth: f32,
         hull_enabled: u32, hull_nx: u32, hull_ny: u32, hull_nz: u32,
         hull_min_x: f32, hull_min_y: f32, hull_min_z: f32, hull_inv_cell: f32, hull_phase_words: u32,
+        occupancy_cells: u32, occupancy_start: u32, occupancy_threshold: f32,
         sample_capacity: u32, latent_width: u32, n_layers: u32, mlp_width: u32,
         static_params: u32, n_params: u32, fixed_point_bits: u32,
         tv_plane: f32, tv_line: f32, beta1: f32, beta2: f32, epsilon: f32, ring_length: u32,
@@ -76,6 +77,16 @@ shared! {
     RayOut {
         static_integral: f32, dynamic_integral: f32, occlusion: f32,
         static_max: f32, dynamic_max: f32, total_max: f32, spare0: f32, spare1: f32,
+    }
+}
+
+/// Iterations of an epoch of occupancy; the same in `glsl/inc/occupancy.glsl`.
+pub const OCCUPANCY_EPOCH: u32 = 64;
+
+impl Setup {
+    /// Words of one epoch of occupancy: two bits per phase and cell.
+    pub fn occupancy_words(&self) -> usize {
+        (self.n_phases as usize * (self.occupancy_cells as usize).pow(3)).div_ceil(16)
     }
 }
 

@@ -50,6 +50,7 @@ pub mod model {
 pub mod cpu {
     pub mod field;
     pub mod march;
+    pub mod occupancy;
     pub mod projector;
     pub mod random;
     pub mod step;

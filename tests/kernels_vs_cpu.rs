@@ -5,7 +5,7 @@ mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
 use nertca_vk::cpu::field::Precision;
-use nertca_vk::cpu::{march, step};
+use nertca_vk::cpu::{march, occupancy, step};
 use nertca_vk::gpu::memory::Operands;
 use nertca_vk::kernels::{Layers, MatrixTuning, Tuning};
 use nertca_vk::layout::Ray;
@@ -125,6 +125,78 @@ fn check_losses_and_gradients(path: &Tuning) {
             assert!(want.iter().any(|v| *v != 0.0), "{preset} {settings:?} {} has no gradient at all", tensor.name);
         }
     }
+    expect_silence(gpu);
+}
+
+#[test]
+fn occupancy_is_learned_and_heeded() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    // A field that stays as it starts, and a threshold that most of its values are below, so that both kinds of cells occur.
+    let settings =
+        ["occupancy.start=100", "occupancy.cells=9", "dynamic.lr=0", "dynamic.lr_end=0", "train.iterations=200"];
+    let mut plan = Plan::new(&small_config("fast", &settings), &dataset).unwrap();
+    let mut first = Trainer::new(&gpu, Plan::new(&plan.config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let live = first.advance(1).unwrap()[0].live_samples as usize;
+    let mut sigma: Vec<[f32; 2]> = gpu.download(first.buffers().get("sample_sigma").unwrap(), 0, live).unwrap();
+    sigma.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    plan.setup.occupancy_threshold = sigma[live * 9 / 10][0];
+    drop(first);
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
+    let words = 3 * trainer.plan().setup.occupancy_words();
+    let notes = |trainer: &Trainer| -> Vec<u32> {
+        gpu.download(trainer.buffers().get("occupancy").unwrap(), 0, words).unwrap()
+    };
+    let advance = |trainer: &mut Trainer, until: u32| {
+        let mut last = None;
+        while trainer.step() < until {
+            last = trainer.advance(until).unwrap().last().copied().or(last);
+        }
+        last.unwrap()
+    };
+    // What one iteration notes: step 64 starts the second epoch.
+    advance(&mut trainer, 64);
+    let before = notes(&trainer);
+    let live = advance(&mut trainer, 65).live_samples as usize;
+    let after = notes(&trainer);
+    let setup = trainer.plan().setup;
+    let points: Vec<[f32; 4]> = gpu.download(trainer.buffers().get("sample_points").unwrap(), 0, live).unwrap();
+    let rays: Vec<u32> = gpu.download(trainer.buffers().get("sample_rays").unwrap(), 0, live).unwrap();
+    let sigma: Vec<[f32; 2]> = gpu.download(trainer.buffers().get("sample_sigma").unwrap(), 0, live).unwrap();
+    let batch: Vec<Ray> = gpu.download(trainer.buffers().get("rays").unwrap(), 0, setup.n_rays as usize).unwrap();
+    let mut want = before[words / 3..2 * words / 3].to_vec();
+    let mut kinds = [0; 2];
+    for ((point, ray), sigma) in points.iter().zip(&rays).zip(&sigma) {
+        let x = glam::DVec3::new(point[0].into(), point[1].into(), point[2].into());
+        let entry = occupancy::entry(&setup, x, batch[(ray & 0x7fff_ffff) as usize].phase);
+        let full = sigma[0] > setup.occupancy_threshold;
+        kinds[usize::from(full)] += 1;
+        let bits = occupancy::SEEN | if full { occupancy::OCCUPIED } else { 0 };
+        want[entry as usize / 16] |= bits << (2 * (entry % 16));
+    }
+    assert!(kinds.iter().all(|n| *n > 10), "the case must have both kinds, has {kinds:?}");
+    assert_eq!(after[words / 3..2 * words / 3], want);
+    assert_eq!(after[..words / 3], before[..words / 3], "the epoch before is left alone");
+    // Heeded: the samples of a later iteration are those the twin lets live.
+    advance(&mut trainer, 150);
+    let noted = notes(&trainer);
+    let live = advance(&mut trainer, 151).live_samples as i64;
+    let plan = trainer.plan();
+    let (mut all, mut kept) = (0, 0i64);
+    for ray in march::batch(plan, 150) {
+        let s = &plan.setup;
+        for (t, _) in march::depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, 150, &ray) {
+            let x = ray.anchor + t * ray.direction;
+            if march::dynamic_inside(plan, x, ray.phase) {
+                all += 1;
+                kept += i64::from(occupancy::occupied(s, &noted, x, ray.phase as u32, 150));
+            }
+        }
+    }
+    assert!(kept * 10 < all * 9, "{kept} of {all}: the case must leave samples out");
+    // A sample on a cell face may fall either way in f32.
+    assert!((live - kept).abs() <= 1 + kept / 50, "{live} live, twin {kept} of {all}");
+    drop(trainer);
     expect_silence(gpu);
 }
 

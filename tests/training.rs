@@ -178,7 +178,7 @@ fn damaged_checkpoints_are_refused() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
     let mut trainer =
-        Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+        Trainer::new(&gpu, Plan::new(&small_config("fast", &["occupancy.enabled=false"]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 2);
     let directory = tempfile::tempdir().unwrap();
     let path = trainer.checkpoint().unwrap().save(directory.path()).unwrap();

@@ -57,6 +57,9 @@ struct Setup {
     float hull_min_z;
     float hull_inv_cell;
     uint hull_phase_words;    // words from one phase's hull to the next; 0: one hull for all
+    uint occupancy_cells;     // cells per axis of the occupancy learned while training; 0: none
+    uint occupancy_start;     // iterations before it is heeded
+    float occupancy_threshold;  // attenuation up to which a sample is empty
     uint sample_capacity;     // samples one chunk can hold
     uint latent_width;
     uint n_layers;            // hidden layers

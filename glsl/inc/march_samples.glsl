@@ -9,7 +9,13 @@ layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { uint state[]; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 layout(binding = 3) readonly buffer B3 { uint hull[]; };
+layout(binding = 8) readonly buffer B8 { uint occupancy[]; };
 #include "inc/dynamic_box.glsl"
+#include "inc/occupied.glsl"
+
+bool sample_lives(vec3 x, uint phase) {
+    return dynamic_inside(x, phase) && occupied(x, phase, state[0]);
+}
 
 uint run_length() {
     return (setup.n_dynamic_samples + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;

@@ -16,6 +16,7 @@ uvec4 pcg4d(uvec4 v) {
 
 const uint STREAM_DEPTH = 1u;
 const uint STREAM_RAY = 2u;
+const uint STREAM_OCCUPANCY = 7u;
 
 // Uniform in [0, 1), 24 bits.
 float uniform01(uint seed, uint stream, uint a, uint b) {

@@ -14,6 +14,9 @@ pub const STREAM_PHOTON: u32 = 5;
 /// Shape variation of phantoms.
 pub const STREAM_SHAPE: u32 = 6;
 
+/// Which empty cells are looked at again.
+pub const STREAM_OCCUPANCY: u32 = 7;
+
 /// The hash: four words in, four words out.
 pub fn pcg4d(v: [u32; 4]) -> [u32; 4] {
     let mut v = v.map(|x| x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223));

@@ -189,6 +189,9 @@ impl Scene {
             hull_min_z: f(hull_min.z),
             hull_inv_cell: hull.map_or(0.0, |h| f(1.0 / h.cell)),
             hull_phase_words: hull.map_or(0, |h| if h.n_phases > 1 { h.words() as u32 } else { 0 }),
+            occupancy_cells: if config.occupancy.enabled { config.occupancy.cells } else { 0 },
+            occupancy_start: config.dynamic.delay + config.occupancy.start,
+            occupancy_threshold: f(config.occupancy.threshold * scene.dynamic_gain),
             sample_capacity: sample_capacity(
                 config.train.chunk_samples.max(config.march.dynamic_samples).max(config.march.render_samples),
             ),

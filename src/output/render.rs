@@ -56,6 +56,7 @@ impl Renderer {
         let kernels = Kernels::new(gpu, tuning)?;
         let mut setup = model.scene.setup(&model.config, &model.layout, model.hull.as_ref());
         setup.jitter = 0;
+        setup.occupancy_cells = 0;
         setup.n_static_samples = model.config.march.render_samples;
         setup.n_dynamic_samples = model.config.march.render_samples;
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(kernels.tuning.chunk_samples));

@@ -28,6 +28,8 @@ pub struct Checkpoint {
     pub model: Model,
     /// Adam's first and second moment of each parameter, padded as the parameters.
     pub moments: Vec<[f32; 2]>,
+    /// Occupancy of three epochs, as the shaders keep it; empty without.
+    pub occupancy: Vec<u32>,
     /// Loss scale of a run on matrices.
     pub loss_scale: Option<LossScale>,
     /// Fingerprint of the training data, to refuse resuming on other data.
@@ -108,6 +110,10 @@ pub fn newest(run: &Path) -> Result<PathBuf> {
         .ok_or_else(|| Error::data(run, "checkpoint", "no checkpoint-*.safetensors: has this run saved anything yet?"))
 }
 
+fn to_words(bytes: &[u8]) -> Vec<u32> {
+    bytes.chunks_exact(4).map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect()
+}
+
 impl Checkpoint {
     /// Writes the checkpoint into a run directory and removes all but the newest three.
     ///
@@ -142,6 +148,10 @@ impl Checkpoint {
         if let Some(hull) = &model.hull {
             let bytes = hull.bits.iter().flat_map(|w| w.to_le_bytes()).collect();
             tensors.push(("hull.bits".into(), Dtype::U32, vec![hull.bits.len()], bytes));
+        }
+        if !self.occupancy.is_empty() {
+            let bytes = self.occupancy.iter().flat_map(|w| w.to_le_bytes()).collect();
+            tensors.push(("occupancy.bits".into(), Dtype::U32, vec![self.occupancy.len()], bytes));
         }
         let header = Header {
             format: FORMAT.into(),
@@ -244,11 +254,16 @@ impl Checkpoint {
                         format!("{:?} does not fit a hull of {:?} cells", view.shape(), h.size),
                     ));
                 }
-                let bits = view.data().chunks_exact(4).map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
+                let bits = to_words(view.data());
                 Some(Hull { size: h.size, min: DVec3::from_array(h.min), cell: h.cell, n_phases: h.n_phases, bits })
             }
         };
+        let occupancy = match tensors.tensor("occupancy.bits") {
+            Ok(view) if view.dtype() == Dtype::U32 => to_words(view.data()),
+            _ => Vec::new(),
+        };
         Ok(Checkpoint {
+            occupancy,
             model: Model {
                 config: header.config,
                 scene: header.scene,

@@ -5,14 +5,14 @@
 //!
 //! Nothing here waits for the host: counters, schedules and random numbers live on the device.
 
-use super::network::{Chunk, Network};
+use super::network::{Chunk, Network, indirect};
 use super::plan::Plan;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::{Buffers, Kernels, MARCH_LANES, Tuning, dispatch, groups_for};
-use crate::layout::{Frame, Ray, RayOut, Setup, View};
+use crate::layout::{Frame, OCCUPANCY_EPOCH, Ray, RayOut, Setup, View};
 use crate::model::params::ParamLayout;
 
 /// Rays handled at once: their samples fit one chunk even if all are live.
@@ -23,6 +23,11 @@ pub fn chunk_rays(setup: &Setup) -> u32 {
 fn chunks(setup: &Setup, n_rays: u32) -> impl Iterator<Item = Chunk> + use<> {
     let per = chunk_rays(setup).min(n_rays).max(1);
     (0..n_rays.div_ceil(per)).map(move |i| Chunk { first_ray: i * per, n_rays: per.min(n_rays - i * per) })
+}
+
+/// Bytes of the three epochs of occupancy; none without it.
+pub fn occupancy_bytes(setup: &Setup) -> u64 {
+    if setup.occupancy_cells > 0 { 3 * 4 * setup.occupancy_words() as u64 } else { 0 }
 }
 
 /// Buffers the forward passes need for batches of `n_rays`; parameters are left undefined.
@@ -51,6 +56,7 @@ pub fn forward_buffers(
         ("sample_points", capacity * 16),
         ("sample_rays", capacity * 4),
         ("sample_sigma", capacity * 8),
+        ("occupancy", occupancy_bytes(setup)),
         ("phase_bias", (params.layers.len() * params.phases * params.width) as u64 * 4),
     ] {
         buffers.set(name, gpu.buffer(name, bytes, Memory::Device)?);
@@ -94,7 +100,7 @@ pub fn training_buffers(gpu: &Gpu, tuning: &Tuning, network: &Network, plan: &Pl
     let rays_per_chunk = u64::from(chunk_rays(setup)).min(n_rays);
     network.backward_buffers(gpu, tuning, setup, params, rays_per_chunk, &mut buffers)?;
     let mut recording = Recording::new(gpu, "clear")?;
-    for name in ["state", "static_gradient", "partials", "phase_dz", "gradient", "moments", "params"] {
+    for name in ["state", "static_gradient", "partials", "phase_dz", "gradient", "moments", "params", "occupancy"] {
         recording.fill(buffers.get(name)?, 0);
     }
     gpu.wait(recording.finish()?.submit()?)?;
@@ -121,6 +127,9 @@ pub fn record_step(r: &mut Recording, k: &Kernels, network: &Network, buffers: &
         let per_ray = || Groups::Direct([chunk.n_rays, 1, 1]);
         record_samples(r, k, network, buffers, params, chunk)?;
         network.record_forward(r, buffers, params, setup)?;
+        if setup.occupancy_cells > 0 {
+            dispatch(r, &k.occupancy_mark, indirect(buffers, 0)?, buffers, &[], ())?;
+        }
         dispatch(r, &k.march_fwd, per_ray(), buffers, &[], chunk.push())?;
         dispatch(r, &k.loss, groups_for(&k.loss, chunk.n_rays), buffers, &[], chunk.push())?;
         dispatch(r, &k.march_bwd, per_ray(), buffers, &[], chunk.push())?;
@@ -130,6 +139,10 @@ pub fn record_step(r: &mut Recording, k: &Kernels, network: &Network, buffers: &
     dispatch(r, &k.reg_tv, groups_for(&k.reg_tv, static_len), buffers, &[], [params.ranks as u32])?;
     dispatch(r, &k.gradient_static, groups_for(&k.gradient_static, static_len), buffers, &[], ())?;
     network.record_gradient(r, k, buffers, params)?;
+    if setup.occupancy_cells > 0 {
+        let slice = (setup.occupancy_words() as u32).div_ceil(OCCUPANCY_EPOCH);
+        dispatch(r, &k.occupancy_clear, groups_for(&k.occupancy_clear, slice), buffers, &[], ())?;
+    }
     dispatch(r, &k.adam, groups_for(&k.adam, setup.n_params), buffers, &[], ())?;
     dispatch(r, &k.report, Groups::Direct([1, 1, 1]), buffers, &[], ())
 }

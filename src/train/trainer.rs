@@ -4,7 +4,7 @@
 use super::checkpoint::{Checkpoint, LossScale};
 use super::network::Network;
 use super::plan::Plan;
-use super::step::{record_step, training_buffers};
+use super::step::{occupancy_bytes, record_step, training_buffers};
 use crate::data::dataset::Dataset;
 use crate::data::geometry::CArm;
 use crate::error::{Error, Result};
@@ -134,6 +134,10 @@ impl Trainer {
         if let Some(saved) = saved {
             gpu.upload(buffers.get("moments")?, 0, &saved.moments)?;
             now.step = saved.model.step;
+            // One of another size, as of an older version, starts anew.
+            if saved.occupancy.len() as u64 * 4 == occupancy_bytes(&plan.setup) && !saved.occupancy.is_empty() {
+                gpu.upload(buffers.get("occupancy")?, 0, &saved.occupancy)?;
+            }
             // A run may change from one path to the other; f32 needs no scale.
             if let (Some(LossScale { scale, good_updates }), Network::Fused(_)) = (saved.loss_scale, &network) {
                 (now.loss_scale, now.good_updates) = (scale, good_updates);
@@ -291,6 +295,8 @@ impl Trainer {
             Network::Layers(_) => None,
             Network::Fused(_) => Some(LossScale { scale: state[0].loss_scale, good_updates: state[0].good_updates }),
         };
-        Ok(Checkpoint { model, moments, loss_scale, data_fingerprint: self.data_fingerprint.clone() })
+        let occupancy =
+            self.gpu.download(self.buffers.get("occupancy")?, 0, occupancy_bytes(&self.plan.setup) as usize / 4)?;
+        Ok(Checkpoint { model, moments, occupancy, loss_scale, data_fingerprint: self.data_fingerprint.clone() })
     }
 }

@@ -1,0 +1,13 @@
+// Whether a sample is evaluated. Cells seen empty still get every eighth iteration, so that vessels can come back.
+#include "inc/occupancy.glsl"
+
+bool occupied(vec3 x, uint phase, uint step) {
+    if (setup.occupancy_cells == 0u || step < setup.occupancy_start) return true;
+    uint entry = occupancy_entry(x, phase);
+    uint epoch = step / OCCUPANCY_EPOCH;
+    uint word = occupancy[(epoch % 3u) * occupancy_words() + entry / 16u]
+              | occupancy[((epoch + 2u) % 3u) * occupancy_words() + entry / 16u];
+    uint bits = word >> (2u * (entry % 16u));
+    if ((bits & SEEN) == 0u || (bits & OCCUPIED) != 0u) return true;
+    return (pcg4d(uvec4(setup.seed, STREAM_OCCUPANCY, step, entry)).x & 7u) == 0u;
+}
