@@ -100,7 +100,7 @@ fn compile(
 struct Binding {
     slot: u32,
     name: String,
-    texel: bool,
+    kind: &'static str,
     reads: bool,
     writes: bool,
 }
@@ -198,19 +198,21 @@ fn reflect(words: &[u32]) -> Result<Reflected, Failure> {
             (StorageClass::StorageBuffer, Some(slot)) => out.bindings.push(Binding {
                 slot,
                 name: names.members.get(&(pointee, 0)).ok_or("storage buffer without a member name")?.to_string(),
-                texel: false,
+                kind: "Storage",
                 reads: member_decorated(pointee, 0, Decoration::NonReadable).is_none(),
                 writes: member_decorated(pointee, 0, Decoration::NonWritable).is_none(),
             }),
             (StorageClass::UniformConstant, Some(slot)) => {
                 let image = types.get(&pointee).and_then(|t| t.operands.first()).and_then(id).unwrap_or(0);
-                let buffer =
-                    types.get(&image).is_some_and(|t| t.operands.get(1) == Some(&Operand::Dim(Dim::DimBuffer)));
-                if !buffer {
-                    return Err("only storage buffers and texel buffers are supported".into());
-                }
-                let name = names.names.get(&variable_id).ok_or("texel buffer without a name")?.to_string();
-                out.bindings.push(Binding { slot, name, texel: true, reads: true, writes: false });
+                let dim = types.get(&image).and_then(|t| t.operands.get(1));
+                let kind = match dim {
+                    Some(Operand::Dim(Dim::DimBuffer)) => "Texel",
+                    // A combined image and sampler: the image's type is one step further.
+                    _ if types.get(&pointee).is_some_and(|t| t.class.opcode == Op::TypeSampledImage) => "Volume",
+                    _ => return Err("only storage buffers, texel buffers and 3D samplers are supported".into()),
+                };
+                let name = names.names.get(&variable_id).ok_or("texel buffer or sampler without a name")?.to_string();
+                out.bindings.push(Binding { slot, name, kind, reads: true, writes: false });
             }
             _ => {}
         }
@@ -240,8 +242,8 @@ fn kernel_row(name: &str, file: &Path, kernel: &Reflected) -> String {
     for b in &kernel.bindings {
         let _ = writeln!(
             row,
-            "            BindingCode {{ slot: {}, name: {:?}, texel: {}, reads: {}, writes: {} }},",
-            b.slot, b.name, b.texel, b.reads, b.writes
+            "            BindingCode {{ slot: {}, name: {:?}, kind: BindingKind::{}, reads: {}, writes: {} }},",
+            b.slot, b.name, b.kind, b.reads, b.writes
         );
     }
     let _ = writeln!(row, "        ], spec_constants: &{:?} }},", kernel.spec_constants);

@@ -4,8 +4,9 @@
 use crate::error::{Error, Result};
 use crate::gpu::device::{DeviceInfo, Gpu};
 use crate::gpu::memory::{Buffer, Operands};
-use crate::gpu::pipeline::{BindingCode, KernelCode, Pipeline};
-use crate::gpu::record::{Groups, Recording};
+use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
+use crate::gpu::record::{Bound, Groups, Recording};
+use crate::gpu::volume::Volume;
 use bytemuck::Pod;
 use serde::Serialize;
 use std::collections::HashMap;
@@ -145,12 +146,22 @@ pub struct LaneTile {
 #[derive(Clone, Default)]
 pub struct Buffers {
     by_name: HashMap<&'static str, Buffer>,
+    volumes: HashMap<&'static str, Volume>,
 }
 
 impl Buffers {
     /// Adds or replaces a buffer.
     pub fn set(&mut self, name: &'static str, buffer: Buffer) {
         self.by_name.insert(name, buffer);
+    }
+
+    /// Adds or replaces a volume.
+    pub fn set_volume(&mut self, name: &'static str, volume: Volume) {
+        self.volumes.insert(name, volume);
+    }
+
+    fn volume(&self, name: &str) -> Result<&Volume> {
+        self.volumes.get(name).ok_or_else(|| Error::Internal(format!("no volume is called `{name}`")))
     }
 
     /// A buffer by name.
@@ -238,6 +249,12 @@ stages! {
         march_fwd(|_| 32, operands);
         /// Line integrals and maxima, for rendering.
         march_fwd_maxima(|_| 32, operands, |_| vec![("with_maxima", 1)]);
+        /// Cells of the dynamic field.
+        volume_dynamic(|_| 64, plain);
+        /// Cells of the static field.
+        volume_static(|_| 64, operands);
+        /// Line integrals and maxima of baked volumes.
+        baked_march(|_| 64, plain);
         /// Residuals and their gradients.
         loss(|_| 64, plain);
         /// Scatter to planes and lines.
@@ -300,7 +317,13 @@ pub fn dispatch<P: Pod>(
         .iter()
         .map(|b| {
             let source = renamed.iter().find(|(shader, _)| *shader == b.name).map_or(b.name, |(_, name)| name);
-            Ok((b.name, buffers.get(source)?))
+            Ok((
+                b.name,
+                match b.kind {
+                    BindingKind::Volume => Bound::Volume(buffers.volume(source)?),
+                    _ => Bound::Buffer(buffers.get(source)?),
+                },
+            ))
         })
         .collect::<Result<Vec<_>>>()?;
     recording.dispatch(stage, groups, &bound, &push)

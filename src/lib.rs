@@ -27,6 +27,7 @@ pub mod gpu {
     pub mod memory;
     pub mod pipeline;
     pub mod record;
+    pub mod volume;
 }
 
 /// What comes in: geometry, angiograms, volumes, and what moves in them.
@@ -74,6 +75,7 @@ pub mod output {
     pub mod pictures;
     pub mod projector;
     pub mod render;
+    pub mod sampled;
 }
 
 /// Synthetic data with exact truth.

@@ -5,14 +5,16 @@ mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
 use nertca_vk::cpu::field::Precision;
-use nertca_vk::cpu::march;
+use nertca_vk::cpu::{field, march};
 use nertca_vk::error::Error;
 use nertca_vk::output::render::Renderer;
+use nertca_vk::output::sampled::{Baked, Components, Field, Grid};
 use nertca_vk::reconstruct::{Event, RunOptions, reconstruct};
 use nertca_vk::train::checkpoint::{self, Checkpoint};
 use nertca_vk::train::plan::Plan;
 use nertca_vk::train::trainer::Trainer;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 fn run(trainer: &mut Trainer, until: u32) -> Vec<f64> {
@@ -177,8 +179,13 @@ fn renderings_equal_the_twin() {
 fn damaged_checkpoints_are_refused() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let mut trainer =
-        Trainer::new(&gpu, Plan::new(&small_config("fast", &["occupancy.enabled=false"]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let mut trainer = Trainer::new(
+        &gpu,
+        Plan::new(&small_config("fast", &["occupancy.enabled=false"]), &dataset).unwrap(),
+        &dataset,
+        tuning(&gpu),
+    )
+    .unwrap();
     run(&mut trainer, 2);
     let directory = tempfile::tempdir().unwrap();
     let path = trainer.checkpoint().unwrap().save(directory.path()).unwrap();
@@ -210,4 +217,65 @@ fn older_checkpoints_follow_the_stated_rule() {
     }
     let steps: Vec<u32> = checkpoint::list(directory.path()).unwrap().iter().map(|(s, _)| *s).collect();
     assert_eq!(steps, [3, 4, 5]);
+}
+
+#[test]
+fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
+    let gpu = gpu();
+    let dataset = small_dataset(24, 20);
+    let config = small_config("fast", &["train.rays=64", "train.chunk_samples=2000", "march.render_samples=200"]);
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    run(&mut trainer, 40);
+    let model = trainer.model().unwrap();
+    let renderer = Arc::new(Renderer::new(&gpu, &model, tuning(&gpu)).unwrap());
+    let plan = Plan::with_scene(&config, &dataset, model.scene.clone()).unwrap();
+    let params: Vec<f64> = model.params.iter().map(|v| f64::from(*v)).collect();
+    let s = &plan.setup;
+    // Reaches beyond the boxes, is different along each axis, and takes several submits.
+    let grid = Grid {
+        origin: glam::DVec3::new(-1.113, -0.417, -0.323),
+        spacing: glam::DVec3::new(0.05, 0.1, 0.07),
+        size: [43, 9, 11],
+    };
+    for field in [Field::Static, Field::Dynamic(2)] {
+        let got = renderer.sample(field, &grid).unwrap();
+        let mut want = Vec::new();
+        for i in 0..grid.len() {
+            let at = glam::DVec3::new((i % 43) as f64, (i / 43 % 9) as f64, (i / (43 * 9)) as f64);
+            let x = grid.origin + at * grid.spacing;
+            want.push(match field {
+                Field::Static if field::static_inside(s, x) => field::static_attenuation(s, &plan.params, &params, x),
+                Field::Dynamic(phase) if march::dynamic_inside(&plan, x, phase as usize) => {
+                    let window = config.schedule(model.step).window;
+                    let encoded = field::encode(s, window.into(), x);
+                    let trace = field::network_fwd(&plan.params, &params, &encoded, phase as usize, Precision::Exact);
+                    f64::from(s.dynamic_gain) * field::softplus(trace.feature + f64::from(s.dynamic_shift))
+                }
+                _ => 0.0,
+            });
+        }
+        assert!(want.iter().any(|v| *v == 0.0) && want.iter().any(|v| *v > 0.0));
+        let (error, at) = relative_error(&got, &want);
+        assert!(error < 1e-4, "{field:?}[{at}]: {} against {}", got[at], want[at]);
+    }
+    let baked = Baked::new(renderer.clone(), 96).unwrap();
+    let both = Components { with_static: true, with_dynamic: true };
+    let (fast, exact) = (
+        baked.render(&dataset.views[1].rays, 24, 20, 1, both).unwrap(),
+        renderer.render(&dataset.views[1].rays, 24, 20, 1).unwrap(),
+    );
+    for (name, got, want, limit) in [
+        ("static", &fast.static_integral, &exact.static_integral, 1e-2),
+        ("dynamic", &fast.dynamic_integral, &exact.dynamic_integral, 2e-2),
+    ] {
+        let want: Vec<f64> = want.iter().map(|v| f64::from(*v)).collect();
+        let norm = want.iter().map(|w| w * w).sum::<f64>();
+        let off = got.iter().zip(&want).map(|(g, w)| (f64::from(*g) - w).powi(2)).sum::<f64>();
+        assert!(norm > 0.0 && (off / norm).sqrt() < limit, "{name}: {:.1e} off", (off / norm).sqrt());
+    }
+    let none = Components { with_static: false, with_dynamic: false };
+    let empty = baked.render(&dataset.views[1].rays, 24, 20, 1, none).unwrap();
+    assert!(empty.total_integral().iter().all(|v| *v == 0.0));
+    drop((baked, renderer, trainer));
+    expect_silence(gpu);
 }

@@ -22,15 +22,26 @@ pub struct KernelCode {
     pub spec_constants: &'static [(&'static str, u32)],
 }
 
-/// One buffer a shader uses.
+/// What a shader's binding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BindingKind {
+    /// A storage buffer.
+    Storage,
+    /// A buffer read through a texel-buffer view.
+    Texel,
+    /// A 3D image with its sampler.
+    Volume,
+}
+
+/// One buffer or volume a shader uses.
 #[derive(Debug)]
 pub struct BindingCode {
     /// Binding number.
     pub slot: u32,
     /// Name in the shader.
     pub name: &'static str,
-    /// Read through a texel-buffer view instead of as a storage buffer.
-    pub texel: bool,
+    /// What is bound.
+    pub kind: BindingKind,
     /// The shader may read it.
     pub reads: bool,
     /// The shader may write it.
@@ -192,7 +203,11 @@ impl Pipeline {
 }
 
 pub(super) fn descriptor_type(binding: &BindingCode) -> vk::DescriptorType {
-    if binding.texel { vk::DescriptorType::UNIFORM_TEXEL_BUFFER } else { vk::DescriptorType::STORAGE_BUFFER }
+    match binding.kind {
+        BindingKind::Storage => vk::DescriptorType::STORAGE_BUFFER,
+        BindingKind::Texel => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+        BindingKind::Volume => vk::DescriptorType::COMBINED_IMAGE_SAMPLER,
+    }
 }
 
 impl Drop for Pipeline {

@@ -3,13 +3,32 @@
 
 use super::device::{Gpu, Shared, lock};
 use super::memory::Buffer;
-use super::pipeline::{Pipeline, descriptor_type};
+use super::pipeline::{BindingKind, Pipeline, descriptor_type};
+use super::volume::Volume;
 use crate::error::{Error, Result};
 use ash::vk;
 use std::collections::HashSet;
 use std::ffi::CString;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+
+/// What a dispatch binds.
+#[derive(Clone, Copy)]
+pub enum Bound<'a> {
+    /// To a storage or texel buffer.
+    Buffer(&'a Buffer),
+    /// To a 3D sampler.
+    Volume(&'a Volume),
+}
+
+impl<'a> Bound<'a> {
+    fn buffer(&self) -> Option<&'a Buffer> {
+        match self {
+            Bound::Buffer(buffer) => Some(buffer),
+            Bound::Volume(_) => None,
+        }
+    }
+}
 
 /// How many workgroups to run.
 pub enum Groups<'a> {
@@ -46,6 +65,7 @@ pub struct Commands {
     queries: vk::QueryPool,
     passes: Vec<&'static str>,
     buffers: Vec<Buffer>,
+    volumes: Vec<Volume>,
     pipelines: Vec<Arc<Pipeline>>,
     last_submit: std::sync::atomic::AtomicU64,
 }
@@ -83,6 +103,7 @@ impl Recording {
             queries: vk::QueryPool::null(),
             passes: Vec::new(),
             buffers: Vec::new(),
+            volumes: Vec::new(),
             pipelines: Vec::new(),
             last_submit: std::sync::atomic::AtomicU64::new(0),
         };
@@ -158,7 +179,7 @@ impl Recording {
         }
     }
 
-    /// Records one dispatch. `buffers` are bound by the names the shader gives them.
+    /// Records one dispatch. `given` are bound by the names the shader gives them.
     ///
     /// # Errors
     /// [`Error::Internal`] when a name, a push-constant size or a group count does not fit the shader.
@@ -166,7 +187,7 @@ impl Recording {
         &mut self,
         pipeline: &Arc<Pipeline>,
         groups: Groups<'_>,
-        buffers: &[(&str, &Buffer)],
+        given: &[(&str, Bound<'_>)],
         push: &P,
     ) -> Result<()> {
         let code = pipeline.code;
@@ -174,19 +195,19 @@ impl Recording {
         if size_of::<P>() as u32 != code.push_bytes {
             return Err(fault(format!("{} bytes of push constants, expected {}", size_of::<P>(), code.push_bytes)));
         }
-        if let Some((name, _)) = buffers.iter().find(|(n, _)| !code.bindings.iter().any(|b| b.name == *n)) {
+        if let Some((name, _)) = given.iter().find(|(n, _)| !code.bindings.iter().any(|b| b.name == *n)) {
             return Err(fault(format!("it has no binding `{name}`")));
         }
         let mut bound = Vec::with_capacity(code.bindings.len());
         for binding in code.bindings {
-            let (_, buffer) = buffers
+            let (_, what) = given
                 .iter()
                 .find(|(n, _)| *n == binding.name)
                 .ok_or_else(|| fault(format!("nothing is bound to `{}`", binding.name)))?;
-            bound.push((binding, *buffer));
+            bound.push((binding, *what));
         }
-        let mut reads: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.reads).map(|(_, x)| *x).collect();
-        let writes: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.writes).map(|(_, x)| *x).collect();
+        let mut reads: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.reads).filter_map(|(_, x)| x.buffer()).collect();
+        let writes: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.writes).filter_map(|(_, x)| x.buffer()).collect();
         if let Groups::Indirect(buffer, offset) = groups {
             buffer.check_range(offset, 12)?;
             reads.push(buffer);
@@ -198,9 +219,10 @@ impl Recording {
         let mut pushed = vec![0u8; code.all_push_bytes() as usize];
         pushed[..size_of::<P>()].copy_from_slice(bytemuck::bytes_of(push));
         for (name, offset) in code.addresses {
-            let (_, buffer) = bound
+            let buffer = bound
                 .iter()
                 .find(|(b, _)| b.name == *name)
+                .and_then(|(_, what)| what.buffer())
                 .ok_or_else(|| fault(format!("it wants the address of `{name}`, which it does not bind")))?;
             pushed[*offset as usize..][..8].copy_from_slice(&buffer.address().to_le_bytes());
         }
@@ -273,9 +295,9 @@ impl Recording {
     fn descriptor_set(
         &mut self,
         pipeline: &Pipeline,
-        bound: &[(&super::pipeline::BindingCode, &Buffer)],
+        bound: &[(&super::pipeline::BindingCode, Bound<'_>)],
     ) -> Result<vk::DescriptorSet> {
-        let device = &self.commands.gpu.device;
+        let device = &self.commands.gpu.device.clone();
         let layouts = [pipeline.set_layout];
         let from = |pool| {
             let allocate = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
@@ -286,8 +308,12 @@ impl Recording {
             Some(Ok(set)) => set,
             // No pool yet, or the last is full.
             _ => {
-                let sizes = [vk::DescriptorType::STORAGE_BUFFER, vk::DescriptorType::UNIFORM_TEXEL_BUFFER]
-                    .map(|ty| vk::DescriptorPoolSize::default().ty(ty).descriptor_count(SETS_PER_POOL * MAX_BINDINGS));
+                let sizes = [
+                    vk::DescriptorType::STORAGE_BUFFER,
+                    vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+                    vk::DescriptorType::COMBINED_IMAGE_SAMPLER,
+                ]
+                .map(|ty| vk::DescriptorPoolSize::default().ty(ty).descriptor_count(SETS_PER_POOL * MAX_BINDINGS));
                 let create = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_PER_POOL).pool_sizes(&sizes);
                 // SAFETY: the device is alive.
                 let pool = unsafe { device.create_descriptor_pool(&create, None) }
@@ -296,34 +322,47 @@ impl Recording {
                 from(pool).map_err(Error::vulkan("vkAllocateDescriptorSets", pipeline.code.name))?
             }
         };
-        let infos: Vec<_> = bound
-            .iter()
-            .map(|(_, buffer)| [vk::DescriptorBufferInfo::default().buffer(buffer.raw()).range(vk::WHOLE_SIZE)])
-            .collect();
+        let mut buffers = Vec::with_capacity(bound.len());
         let mut views = Vec::with_capacity(bound.len());
-        for (binding, buffer) in bound {
-            views.push([match (binding.texel, buffer.texel_view()) {
-                (false, _) => vk::BufferView::null(),
-                (true, Some(view)) => view,
-                (true, None) => {
-                    return Err(Error::Internal(format!(
-                        "kernel {}: buffer `{}` for `{}` has no texel view",
-                        pipeline.code.name,
-                        buffer.name(),
-                        binding.name
-                    )));
+        let mut images = Vec::with_capacity(bound.len());
+        for (binding, what) in bound {
+            let unfit = |name: &str| {
+                let kernel = pipeline.code.name;
+                Error::Internal(format!(
+                    "kernel {kernel}: `{name}` is not {:?}, as `{}` must be",
+                    binding.kind, binding.name
+                ))
+            };
+            let (mut buffer, mut view, mut image) = Default::default();
+            match (binding.kind, what) {
+                (BindingKind::Storage, Bound::Buffer(b)) => {
+                    buffer = vk::DescriptorBufferInfo::default().buffer(b.raw()).range(vk::WHOLE_SIZE);
                 }
-            }]);
+                (BindingKind::Texel, Bound::Buffer(b)) => view = b.texel_view().ok_or_else(|| unfit(b.name()))?,
+                (BindingKind::Volume, Bound::Volume(v)) => image = v.descriptor(),
+                (_, Bound::Buffer(b)) => return Err(unfit(b.name())),
+                (_, Bound::Volume(_)) => return Err(unfit("a volume")),
+            }
+            if let Bound::Volume(v) = what {
+                self.commands.volumes.push((*v).clone());
+            }
+            buffers.push([buffer]);
+            views.push([view]);
+            images.push([image]);
         }
         let writes: Vec<_> = bound
             .iter()
-            .zip(infos.iter().zip(&views))
-            .map(|((binding, _), (info, view))| {
+            .enumerate()
+            .map(|(i, (binding, _))| {
                 let write = vk::WriteDescriptorSet::default()
                     .dst_set(set)
                     .dst_binding(binding.slot)
                     .descriptor_type(descriptor_type(binding));
-                if binding.texel { write.texel_buffer_view(view) } else { write.buffer_info(info) }
+                match binding.kind {
+                    BindingKind::Storage => write.buffer_info(&buffers[i]),
+                    BindingKind::Texel => write.texel_buffer_view(&views[i]),
+                    BindingKind::Volume => write.image_info(&images[i]),
+                }
             })
             .collect();
         // SAFETY: the set is not in use; infos and views live until the call returns.
@@ -342,6 +381,47 @@ impl Recording {
         let region = [vk::BufferCopy::default().src_offset(from_at).dst_offset(to_at).size(bytes)];
         // SAFETY: ranges were checked; the command buffer is recording.
         unsafe { self.commands.gpu.device.cmd_copy_buffer(self.commands.raw, from.raw(), to.raw(), &region) };
+        Ok(())
+    }
+
+    /// Records filling a whole volume from a buffer; afterwards it may be sampled.
+    pub(super) fn fill_volume(&mut self, from: &Buffer, to: &Volume, [width, height, depth]: [u32; 3]) -> Result<()> {
+        from.check_range(0, u64::from(width) * u64::from(height) * u64::from(depth) * 2)?;
+        self.depend(&[from], &[]);
+        self.commands.volumes.push(to.clone());
+        let (device, raw) = (&self.commands.gpu.device, self.commands.raw);
+        let barrier = |old, new, before, after| {
+            [vk::ImageMemoryBarrier::default()
+                .image(to.raw())
+                .subresource_range(Volume::RANGE)
+                .old_layout(old)
+                .new_layout(new)
+                .src_access_mask(before)
+                .dst_access_mask(after)
+                .src_queue_family_index(vk::QUEUE_FAMILY_IGNORED)
+                .dst_queue_family_index(vk::QUEUE_FAMILY_IGNORED)]
+        };
+        let copying = vk::ImageLayout::TRANSFER_DST_OPTIMAL;
+        let (write, none) = (vk::AccessFlags::TRANSFER_WRITE, vk::AccessFlags::empty());
+        let before = barrier(vk::ImageLayout::UNDEFINED, copying, none, write);
+        let after = barrier(copying, vk::ImageLayout::SHADER_READ_ONLY_OPTIMAL, write, vk::AccessFlags::SHADER_READ);
+        let region = [vk::BufferImageCopy::default()
+            .image_subresource(vk::ImageSubresourceLayers {
+                aspect_mask: vk::ImageAspectFlags::COLOR,
+                mip_level: 0,
+                base_array_layer: 0,
+                layer_count: 1,
+            })
+            .image_extent(vk::Extent3D { width, height, depth })];
+        let (transfer, compute) = (vk::PipelineStageFlags::TRANSFER, vk::PipelineStageFlags::COMPUTE_SHADER);
+        let top = vk::PipelineStageFlags::TOP_OF_PIPE;
+        let by_region = vk::DependencyFlags::empty();
+        // SAFETY: the command buffer is recording; the range was checked; buffer and volume are kept by `commands`.
+        unsafe {
+            device.cmd_pipeline_barrier(raw, top, transfer, by_region, &[], &[], &before);
+            device.cmd_copy_buffer_to_image(raw, from.raw(), to.raw(), copying, &region);
+            device.cmd_pipeline_barrier(raw, transfer, compute, by_region, &[], &[], &after);
+        }
         Ok(())
     }
 

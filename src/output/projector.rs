@@ -6,7 +6,7 @@ use crate::error::Result;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::pipeline::Pipeline;
-use crate::gpu::record::{Groups, Recording};
+use crate::gpu::record::{Bound, Groups, Recording};
 use crate::kernels::kernel_code;
 use crate::layout::View;
 use bytemuck::{Pod, Zeroable};
@@ -103,7 +103,8 @@ impl Projector {
                 spare: 0,
             };
             let groups = Groups::Direct([(pixels as u32).div_ceil(self.project.local_size), 1, 1]);
-            let buffers = [("views", &views_buffer), ("volume", &loaded.values), ("integrals", &integrals)];
+            let buffers = [("views", &views_buffer), ("volume", &loaded.values), ("integrals", &integrals)]
+                .map(|(name, buffer)| (name, Bound::Buffer(buffer)));
             recording.dispatch(&self.project, groups, &buffers, &push)?;
         }
         self.gpu.wait(recording.finish()?.submit()?)?;

@@ -8,11 +8,11 @@ use crate::kernels::{Buffers, Kernels, Tuning, dispatch, groups_for};
 use crate::layout::{RayOut, Setup};
 use crate::model::field::Model;
 use crate::model::scene::sample_capacity;
-use crate::train::network::Network;
-use crate::train::step::{forward_buffers, hull_buffer, record_render};
+use crate::train::network::{Network, indirect};
+use crate::train::step::{chunk_rays, forward_buffers, hull_buffer, record_live, record_render};
 
 /// Pixels rendered by one submit.
-const RAYS_PER_SUBMIT: u32 = 8192;
+const RAYS_PER_SUBMIT: u32 = 1 << 16;
 
 /// What every pixel of a view sees; all lists are rows first, attenuation per world unit.
 #[derive(Debug, Clone, Default)]
@@ -30,6 +30,22 @@ pub struct Rendering {
 }
 
 impl Rendering {
+    pub(super) fn from_device(seen: &[RayOut]) -> Rendering {
+        let mut out = Rendering::default();
+        out.extend(seen);
+        out
+    }
+
+    fn extend(&mut self, seen: &[RayOut]) {
+        for r in seen {
+            self.static_integral.push(r.static_integral);
+            self.dynamic_integral.push(r.dynamic_integral);
+            self.static_max.push(r.static_max);
+            self.dynamic_max.push(r.dynamic_max);
+            self.total_max.push(r.total_max);
+        }
+    }
+
     /// Sum of both integrals.
     pub fn total_integral(&self) -> Vec<f32> {
         self.static_integral.iter().zip(&self.dynamic_integral).map(|(s, d)| s + d).collect()
@@ -38,11 +54,11 @@ impl Rendering {
 
 /// Renders a model on a device.
 pub struct Renderer {
-    gpu: Gpu,
-    kernels: Kernels,
+    pub(super) gpu: Gpu,
+    pub(super) kernels: Kernels,
     network: Network,
-    buffers: Buffers,
-    setup: Setup,
+    pub(super) buffers: Buffers,
+    pub(super) setup: Setup,
     model_layout: crate::model::params::ParamLayout,
 }
 
@@ -83,14 +99,41 @@ impl Renderer {
         self.gpu.upload(self.buffers.get("schedule")?, 0, &[model.config.schedule(model.step)])
     }
 
+    pub(super) fn check_phase(&self, phase: u32) -> Result<()> {
+        if phase < self.setup.n_phases {
+            return Ok(());
+        }
+        Err(Error::config("--phase", phase, format!("phases go from 0 to {}", self.setup.n_phases - 1)))
+    }
+
+    /// Most samples a ray may have.
+    pub(super) fn largest_row(&self) -> u32 {
+        self.setup.sample_capacity / 128 * 128
+    }
+
+    /// Rays one recording may march whose samples are laid out as `setup` says.
+    pub(super) fn rays_at_once(&self, setup: &Setup) -> u32 {
+        chunk_rays(setup).min(RAYS_PER_SUBMIT)
+    }
+
+    /// Records the dynamic field at the samples of `n_rays` rays, put into the rows of `volume`.
+    pub(super) fn record_dynamic_cells(
+        &self,
+        r: &mut Recording,
+        buffers: &Buffers,
+        setup: &Setup,
+        n_rays: u32,
+    ) -> Result<()> {
+        record_live(r, &self.kernels, &self.network, buffers, &self.model_layout, setup, n_rays)?;
+        dispatch(r, &self.kernels.volume_dynamic, indirect(buffers, 0)?, buffers, &[], ())
+    }
+
     /// Renders a `width` x `height` view at a phase.
     ///
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have; device errors.
     pub fn render(&self, rays: &ViewRays, width: usize, height: usize, phase: u32) -> Result<Rendering> {
-        if phase >= self.setup.n_phases {
-            return Err(Error::config("--phase", phase, format!("phases go from 0 to {}", self.setup.n_phases - 1)));
-        }
+        self.check_phase(phase)?;
         let mut buffers = self.buffers.clone();
         buffers.set("views", self.gpu.buffer_with("views", &[rays.to_device()])?);
         let pixels = (width * height) as u32;
@@ -104,13 +147,7 @@ impl Renderer {
             record_render(&mut recording, &self.kernels, &self.network, &buffers, &self.model_layout, &self.setup, n)?;
             self.gpu.wait(recording.finish()?.submit()?)?;
             let seen: Vec<RayOut> = self.gpu.download(buffers.get("ray_out")?, 0, n as usize)?;
-            for r in seen {
-                out.static_integral.push(r.static_integral);
-                out.dynamic_integral.push(r.dynamic_integral);
-                out.static_max.push(r.static_max);
-                out.dynamic_max.push(r.dynamic_max);
-                out.total_max.push(r.total_max);
-            }
+            out.extend(&seen);
         }
         Ok(out)
     }

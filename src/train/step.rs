@@ -43,7 +43,8 @@ pub fn forward_buffers(
     n_rays: u32,
 ) -> Result<Buffers> {
     let mut buffers = Buffers::default();
-    let per_chunk = u64::from(chunk_rays(setup).min(n_rays));
+    // Samplers of volumes may have fewer samples a ray and more rays a chunk than `setup` says.
+    let per_chunk = u64::from(n_rays);
     let capacity = u64::from(setup.sample_capacity);
     for (name, bytes) in [
         ("state", 16),
@@ -160,6 +161,27 @@ fn record_samples(
     dispatch(r, &k.march_count, per_ray(), buffers, &[], chunk.push())?;
     dispatch(r, &k.march_scan, Groups::Direct([1, 1, 1]), buffers, &[], network.scan(params, chunk))?;
     dispatch(r, &k.march_emit, per_ray(), buffers, &[], chunk.push())
+}
+
+/// Records the dynamic field at the live samples of `n_rays` rays, which must fit one chunk: `sample_sigma`.
+///
+/// # Errors
+/// [`Error::Internal`] when they do not fit.
+pub fn record_live(
+    r: &mut Recording,
+    k: &Kernels,
+    network: &Network,
+    buffers: &Buffers,
+    params: &ParamLayout,
+    setup: &Setup,
+    n_rays: u32,
+) -> Result<()> {
+    if n_rays > chunk_rays(setup) {
+        return Err(Error::Internal(format!("{n_rays} rays exceed a chunk")));
+    }
+    network.record_weights(r, k, buffers, params)?;
+    record_samples(r, k, network, buffers, params, Chunk { first_ray: 0, n_rays })?;
+    network.record_forward(r, buffers, params, setup)
 }
 
 /// Records a rendering of `n_rays` rays already in `rays`: integrals and maxima land in `ray_out`.

@@ -1,0 +1,76 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Integrals and maxima of baked volumes along the rays of a pose, sampled by the hardware. One invocation per pixel.
+//   ray_out[pixel] as march_fwd writes it, without occlusion.
+#include "inc/layout.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint n_pixels; uint image_width; uint with_static; uint with_dynamic; } push;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { View views[]; };
+layout(binding = 2) uniform sampler3D static_volume;
+layout(binding = 3) uniform sampler3D dynamic_volume;
+layout(binding = 4) writeonly buffer B4 { RayOut ray_out[]; };
+
+// Depths between which a ray is inside a box.
+vec2 crossing(vec3 anchor, vec3 direction, vec3 low, vec3 high) {
+    vec3 a = (low - anchor) / direction;
+    vec3 b = (high - anchor) / direction;
+    vec3 near = min(a, b);
+    vec3 far = max(a, b);
+    return vec2(max(max(near.x, near.y), near.z), min(min(far.x, far.y), far.z));
+}
+
+// Integral and maximum of a volume over the box, in steps of about a cell, at their middles.
+vec2 along(sampler3D volume, vec3 anchor, vec3 direction, float norm, vec3 low, vec3 high) {
+    vec2 span = crossing(anchor, direction, low, high);
+    if (!(span.y > span.x)) return vec2(0.0);
+    vec3 cells = vec3(textureSize(volume, 0));
+    // Cell centres of the first and last cells lie on the faces of the box.
+    vec3 per_unit = (cells - 1.0) / (high - low);
+    float crossed = length(direction * per_unit) * (span.y - span.x);
+    uint n = uint(ceil(max(crossed, 1.0)));
+    float step = (span.y - span.x) / float(n);
+    vec3 start = ((anchor + (span.x + 0.5 * step) * direction - low) * per_unit + 0.5) / cells;
+    vec3 advance = step * direction * per_unit / cells;
+    float sum = 0.0;
+    float largest = 0.0;
+    for (uint i = 0u; i < n; i++) {
+        float sigma = textureLod(volume, start + float(i) * advance, 0.0).x;
+        sum += sigma;
+        largest = max(largest, sigma);
+    }
+    return vec2(sum * step * norm, largest);
+}
+
+void main() {
+    uint pixel = gl_GlobalInvocationID.x;
+    if (pixel >= push.n_pixels) return;
+    View view = views[0];
+    float i = float(pixel % push.image_width);
+    float j = float(pixel / push.image_width);
+    vec3 anchor = view.anchor00.xyz + i * view.anchor_du.xyz + j * view.anchor_dv.xyz;
+    vec3 direction = view.direction00.xyz + i * view.direction_du.xyz + j * view.direction_dv.xyz;
+    float norm = length(direction);
+    vec2 still = vec2(0.0);
+    vec2 moving = vec2(0.0);
+    if (push.with_static != 0u) {
+        still = setup.static_gain * along(static_volume, anchor, direction, norm,
+                      vec3(setup.static_min_x, setup.static_min_y, setup.static_min_z),
+                      vec3(setup.static_max_x, setup.static_max_y, setup.static_max_z));
+    }
+    if (push.with_dynamic != 0u) {
+        moving = setup.dynamic_gain * along(dynamic_volume, anchor, direction, norm,
+                      vec3(setup.dynamic_min_x, setup.dynamic_min_y, setup.dynamic_min_z),
+                      vec3(setup.dynamic_max_x, setup.dynamic_max_y, setup.dynamic_max_z));
+    }
+    RayOut seen;
+    seen.static_integral = still.x;
+    seen.dynamic_integral = moving.x;
+    seen.occlusion = 0.0;
+    seen.static_max = still.y;
+    seen.dynamic_max = moving.y;
+    seen.total_max = max(still.y, moving.y);
+    seen.spare0 = 0.0;
+    seen.spare1 = 0.0;
+    ray_out[pixel] = seen;
+}
