@@ -20,9 +20,10 @@ vec2 crossing(vec3 anchor, vec3 direction, vec3 low, vec3 high) {
     return vec2(max(max(near.x, near.y), near.z), min(min(far.x, far.y), far.z));
 }
 
-// Integral and maximum of a volume over the box, in steps of about a cell, at their middles.
-vec2 along(sampler3D volume, vec3 anchor, vec3 direction, float norm, vec3 low, vec3 high) {
+// Integral and maximum of a volume over the box, within a range of depths, in steps of about a cell, at their middles.
+vec2 along(sampler3D volume, vec3 anchor, vec3 direction, float norm, vec3 low, vec3 high, vec2 depths) {
     vec2 span = crossing(anchor, direction, low, high);
+    span = vec2(max(span.x, depths.x), min(span.y, depths.y));
     if (!(span.y > span.x)) return vec2(0.0);
     vec3 cells = vec3(textureSize(volume, 0));
     // Cell centres of the first and last cells lie on the faces of the box.
@@ -56,12 +57,14 @@ void main() {
     if (push.with_static != 0u) {
         still = setup.static_gain * along(static_volume, anchor, direction, norm,
                       vec3(setup.static_min_x, setup.static_min_y, setup.static_min_z),
-                      vec3(setup.static_max_x, setup.static_max_y, setup.static_max_z));
+                      vec3(setup.static_max_x, setup.static_max_y, setup.static_max_z),
+                      vec2(setup.static_near, setup.static_far));
     }
     if (push.with_dynamic != 0u) {
         moving = setup.dynamic_gain * along(dynamic_volume, anchor, direction, norm,
                       vec3(setup.dynamic_min_x, setup.dynamic_min_y, setup.dynamic_min_z),
-                      vec3(setup.dynamic_max_x, setup.dynamic_max_y, setup.dynamic_max_z));
+                      vec3(setup.dynamic_max_x, setup.dynamic_max_y, setup.dynamic_max_z),
+                      vec2(setup.dynamic_near, setup.dynamic_far));
     }
     RayOut seen;
     seen.static_integral = still.x;

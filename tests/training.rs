@@ -225,7 +225,7 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
     let dataset = small_dataset(24, 20);
     let config = small_config("fast", &["train.rays=64", "train.chunk_samples=2000", "march.render_samples=200"]);
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
-    run(&mut trainer, 40);
+    run(&mut trainer, 5);
     let model = trainer.model().unwrap();
     let renderer = Arc::new(Renderer::new(&gpu, &model, tuning(&gpu)).unwrap());
     let plan = Plan::with_scene(&config, &dataset, model.scene.clone()).unwrap();

@@ -277,10 +277,10 @@ pub struct RenderArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
     /// Primary angle, degrees, LAO positive.
-    #[arg(long, allow_negative_numbers = true, value_name = "DEG")]
+    #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
     pub primary: f64,
     /// Secondary angle, degrees, cranial positive.
-    #[arg(long, allow_negative_numbers = true, value_name = "DEG")]
+    #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
     pub secondary: f64,
     /// Phase from 0, or `all`.
     #[arg(long, default_value = "0")]
@@ -294,9 +294,16 @@ pub struct RenderArgs {
     /// Columns and rows; those of the dataset by default.
     #[arg(long)]
     pub size: Option<usize>,
+    /// Through volumes baked from the fields: faster, and as fine as their cells.
+    #[arg(long)]
+    pub baked: bool,
+    /// Measure frames per second, read back to the host, of the chosen component turning about the patient: both ways, at
+    /// 200 x 200, 512 x 512, and --size.
+    #[arg(long)]
+    pub fps: bool,
     /// Output: .png, .npy (floats; all phases stacked) or .gif (all phases).
-    #[arg(short, long, value_name = "FILE")]
-    pub out: PathBuf,
+    #[arg(short, long, value_name = "FILE", required_unless_present = "fps")]
+    pub out: Option<PathBuf>,
 }
 
 /// `bench`.

@@ -2,15 +2,18 @@
 
 use super::args::{Cli, Component, EvalArgs, InfoArgs, Projection, RenderArgs};
 use nertca_vk::data::dataset::{Dataset, Split, manifest_schema};
-use nertca_vk::data::geometry::{CArm, Geometry, MM_PER_UNIT};
+use nertca_vk::data::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
 use nertca_vk::data::images;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::model::field::Model;
 use nertca_vk::output::eval::Evaluation;
 use nertca_vk::output::pictures::{self, Window};
-use nertca_vk::output::render::Renderer;
+use nertca_vk::output::render::{Renderer, Rendering};
+use nertca_vk::output::sampled::{BAKED_CELLS, Baked, Components};
 use nertca_vk::reconstruct::{RunInfo, evaluate_run};
 use nertca_vk::train::checkpoint::{self, Checkpoint};
 use std::path::Path;
+use std::sync::Arc;
 
 fn json(value: &impl serde::Serialize) -> Result<String> {
     serde_json::to_string_pretty(value).map_err(|e| Error::Internal(e.to_string()))
@@ -70,13 +73,62 @@ pub fn print_table(evaluation: &Evaluation) {
     );
 }
 
+/// Where and what to render.
+struct Shot {
+    rays: ViewRays,
+    width: usize,
+    height: usize,
+}
+
+/// A view of the model's C-arm, over the same field of view on more or fewer pixels.
+fn shot(model: &Model, primary_deg: f64, secondary_deg: f64, [width, height]: [usize; 2]) -> Result<Shot> {
+    let c_arm = CArm {
+        primary_deg,
+        secondary_deg,
+        pixel_mm: [
+            model.c_arm.pixel_mm[0] * model.image_size[0] as f64 / width as f64,
+            model.c_arm.pixel_mm[1] * model.image_size[1] as f64 / height as f64,
+        ],
+        ..model.c_arm.clone()
+    };
+    let rays =
+        Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| Error::config(field, "", problem))?;
+    Ok(Shot { rays, width, height })
+}
+
+/// The fields themselves, or volumes baked from them.
+enum Renders {
+    Fields(Arc<Renderer>),
+    Baked(Box<Baked>),
+}
+
+impl Renders {
+    fn render(&self, shot: &Shot, phase: u32, component: Component) -> Result<Rendering> {
+        match self {
+            Renders::Fields(renderer) => renderer.render(&shot.rays, shot.width, shot.height, phase),
+            Renders::Baked(baked) => {
+                let components = Components {
+                    with_static: component != Component::Dynamic,
+                    with_dynamic: component != Component::Static,
+                };
+                baked.render(&shot.rays, shot.width, shot.height, phase, components)
+            }
+        }
+    }
+}
+
 /// Renders a run.
 pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
-    let extension = args.out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-    if !["png", "npy", "gif"].contains(&extension.as_str()) {
-        return Err(Error::config("--out", args.out.display(), "ends in none of .png .npy .gif"));
-    }
     let model = Checkpoint::read(&checkpoint::newest(&args.run)?)?.model;
+    let size = args.size.map_or(model.image_size, |n| [n, n]);
+    if !(1..=images::MAX_SIDE).contains(&size[0]) {
+        return Err(Error::config("--size", size[0], format!("1 to {} is accepted", images::MAX_SIDE)));
+    }
+    let Some(out) = &args.out else { return frame_rates(cli, args, &model) };
+    let extension = out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
+    if !["png", "npy", "gif"].contains(&extension.as_str()) {
+        return Err(Error::config("--out", out.display(), "ends in none of .png .npy .gif"));
+    }
     let n_phases = model.layout.phases as u32;
     let phases: Vec<u32> = match args.phase.as_str() {
         "all" => (0..n_phases).collect(),
@@ -87,28 +139,18 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     if extension == "png" && phases.len() > 1 {
         return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
     }
-    let [width, height] = args.size.map_or(model.image_size, |n| [n, n]);
-    if !(1..=images::MAX_SIDE).contains(&width) {
-        return Err(Error::config("--size", width, format!("1 to {} is accepted", images::MAX_SIDE)));
-    }
-    // The same field of view on more or fewer pixels.
-    let c_arm = CArm {
-        primary_deg: args.primary,
-        secondary_deg: args.secondary,
-        pixel_mm: [
-            model.c_arm.pixel_mm[0] * model.image_size[0] as f64 / width as f64,
-            model.c_arm.pixel_mm[1] * model.image_size[1] as f64 / height as f64,
-        ],
-        ..model.c_arm.clone()
-    };
-    let rays =
-        Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| Error::config(field, "", problem))?;
+    let shot = shot(&model, args.primary, args.secondary, size)?;
+    let (width, height) = (shot.width, shot.height);
     let gpu = cli.open_device()?;
-    let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu))?;
+    let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu))?);
+    let renders = match args.baked {
+        false => Renders::Fields(renderer),
+        true => Renders::Baked(Box::new(Baked::new(renderer, BAKED_CELLS)?)),
+    };
     let frames = phases
         .iter()
         .map(|phase| {
-            let seen = renderer.render(&rays, width, height, *phase)?;
+            let seen = renders.render(&shot, *phase, args.component)?;
             let per_mm = |v: Vec<f32>| v.into_iter().map(|x| x / MM_PER_UNIT as f32).collect();
             Ok(match (args.projection, args.component) {
                 (Projection::Drr, Component::Total) => seen.total_integral(),
@@ -124,11 +166,72 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     match extension.as_str() {
         "npy" => {
             let shape = if args.phase == "all" { vec![frames.len(), height, width] } else { vec![height, width] };
-            images::write_npy(&args.out, &shape, &frames.concat())?;
+            images::write_npy(out, &shape, &frames.concat())?;
         }
-        "gif" => pictures::write_gif(&args.out, &frames, width, window, 90)?,
-        _ => pictures::write_grey(&args.out, &frames[0], width, window)?,
+        "gif" => pictures::write_gif(out, &frames, width, window, 90)?,
+        _ => pictures::write_grey(out, &frames[0], width, window)?,
     }
+    drop(renders);
+    cli.close_device(&gpu)
+}
+
+/// Frames per second of a model turning about the patient, every phase in turn.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct FrameRate {
+    /// `fields` or `baked`.
+    pub way: &'static str,
+    /// Columns and rows.
+    pub size: usize,
+    /// Frames rendered.
+    pub frames: u32,
+    /// Per second of wall time, read back to the host.
+    pub fps: f64,
+}
+
+/// Renders for at least `seconds` at each size, both ways.
+pub fn measure_frame_rates(
+    renderer: &Arc<Renderer>,
+    model: &Model,
+    component: Component,
+    sizes: &[usize],
+    seconds: f64,
+) -> Result<Vec<FrameRate>> {
+    let baked = Renders::Baked(Box::new(Baked::new(renderer.clone(), BAKED_CELLS)?));
+    let mut rates = Vec::new();
+    for (way, renders) in [("fields", &Renders::Fields(renderer.clone())), ("baked", &baked)] {
+        for &size in sizes {
+            let frame = |i: u32| {
+                let shot = shot(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
+                renders.render(&shot, i % model.layout.phases as u32, component)
+            };
+            frame(0)?;
+            let (begin, mut frames) = (std::time::Instant::now(), 0);
+            while frames < 2 || begin.elapsed().as_secs_f64() < seconds {
+                frames += 1;
+                frame(frames)?;
+            }
+            rates.push(FrameRate { way, size, frames, fps: f64::from(frames) / begin.elapsed().as_secs_f64() });
+        }
+    }
+    Ok(rates)
+}
+
+/// Prints frame rates as a table.
+pub fn print_frame_rates(rates: &[FrameRate]) {
+    for r in rates {
+        out!("{:6} {:4} x {:<4} {:9.1} frames/s ({} frames)", r.way, r.size, r.size, r.fps, r.frames);
+    }
+}
+
+fn frame_rates(cli: &Cli, args: &RenderArgs, model: &Model) -> Result<()> {
+    let gpu = cli.open_device()?;
+    let renderer = Arc::new(Renderer::new(&gpu, model, cli.tuning(&gpu))?);
+    let mut sizes = vec![200, 512];
+    sizes.extend(args.size.filter(|n| ![200, 512].contains(n)));
+    let rates = measure_frame_rates(&renderer, model, args.component, &sizes, 2.0)?;
+    out!("{}, {:?}", gpu.info().name, args.component);
+    print_frame_rates(&rates);
+    drop(renderer);
     cli.close_device(&gpu)
 }
 
