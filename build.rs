@@ -15,6 +15,7 @@ fn main() -> Result<(), Failure> {
     let glsl = PathBuf::from("glsl");
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-env-changed=SHADERC_LIB_DIR");
+    println!("cargo:rustc-env=NERTCA_COMMIT={}", commit());
     let out = PathBuf::from(env::var("OUT_DIR")?);
     let variants = read_variants(&glsl.join("variants.txt"))?;
     let compiler = shaderc::Compiler::new()?;
@@ -40,6 +41,19 @@ fn main() -> Result<(), Failure> {
     table.push_str("];\n");
     fs::write(out.join("kernel_table.rs"), table)?;
     Ok(())
+}
+
+/// Commit of the checkout, for benchmark reports; "unknown" outside one.
+fn commit() -> String {
+    // Written by every commit and checkout, not by edits: a build of edited sources names the commit they are based on.
+    if Path::new(".git/logs/HEAD").exists() {
+        println!("cargo:rerun-if-changed=.git/logs/HEAD");
+    }
+    let described = std::process::Command::new("git").args(["describe", "--always", "--dirty"]).output();
+    match described {
+        Ok(output) if output.status.success() => String::from_utf8_lossy(&output.stdout).trim().to_owned(),
+        _ => "unknown".to_owned(),
+    }
 }
 
 /// `variants.txt`: `shader name [DEFINE[=VALUE]]...` per line; `#` starts a comment.

@@ -20,6 +20,17 @@ pub enum Preset {
     PublicCode,
 }
 
+impl Preset {
+    /// As typed on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Preset::Fast => "fast",
+            Preset::Paper => "paper",
+            Preset::PublicCode => "public-code",
+        }
+    }
+}
+
 /// How a learning rate goes from start to end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

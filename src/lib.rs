@@ -14,6 +14,7 @@
 //! twin of every stage, and [`gpu`] is Vulkan without any knowledge of angiography. Public functions speak mm and
 //! degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
 
+pub mod bench;
 pub mod config;
 pub mod error;
 pub mod files;

@@ -45,7 +45,7 @@ pub enum Command {
     Eval(EvalArgs),
     /// Render a run from any angle at any phase.
     Render(RenderArgs),
-    /// Time training iterations, in all and pass by pass.
+    /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
     Bench(BenchArgs),
     /// Describe a dataset or a run.
     Info(InfoArgs),
@@ -309,20 +309,32 @@ pub struct RenderArgs {
 /// `bench`.
 #[derive(Debug, Args)]
 pub struct BenchArgs {
-    /// Dataset directory.
-    pub data: PathBuf,
+    /// Dataset directory; the default phantom, made on the fly, without.
+    pub data: Option<PathBuf>,
     /// Hyper-parameters.
     #[command(flatten)]
     pub config: ConfigArgs,
     /// Iterations of each timed repeat.
-    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=2000))]
     pub iterations: u32,
     /// Timed repeats.
-    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=10))]
     pub repeats: u32,
-    /// JSON instead of text.
+    /// Also run the whole reconstruction, with time-to-Dice.
     #[arg(long)]
-    pub json: bool,
+    pub full: bool,
+    /// List the time of each pass.
+    #[arg(long)]
+    pub kernels: bool,
+    /// Also measure frames per second of renderings.
+    #[arg(long)]
+    pub render: bool,
+    /// Write everything, with raw samples, configuration and commit, as JSON.
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Compare with a file of an earlier --json.
+    #[arg(long, value_name = "FILE")]
+    pub compare: Option<PathBuf>,
 }
 
 /// `info`.

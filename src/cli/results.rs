@@ -176,10 +176,10 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
 }
 
 /// Frames per second of a model turning about the patient, every phase in turn.
-#[derive(Debug, Clone, serde::Serialize)]
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub struct FrameRate {
     /// `fields` or `baked`.
-    pub way: &'static str,
+    pub way: String,
     /// Columns and rows.
     pub size: usize,
     /// Frames rendered.
@@ -210,7 +210,12 @@ pub fn measure_frame_rates(
                 frames += 1;
                 frame(frames)?;
             }
-            rates.push(FrameRate { way, size, frames, fps: f64::from(frames) / begin.elapsed().as_secs_f64() });
+            rates.push(FrameRate {
+                way: way.into(),
+                size,
+                frames,
+                fps: f64::from(frames) / begin.elapsed().as_secs_f64(),
+            });
         }
     }
     Ok(rates)
