@@ -214,7 +214,7 @@ pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     let info = gpu.info();
     let is_cpu = info.kind == "cpu";
     // Some milliseconds on either kind of device.
-    let (lanes, steps): (u32, u32) = if is_cpu { (256, 20_000) } else { (1 << 19, 4096) };
+    let (lanes, steps): (u32, u32) = if is_cpu { (256, 8000) } else { (1 << 19, 1024) };
     let stage = Arc::new(gpu.pipeline(kernel_code("peak_f32")?, 64, &[])?);
     let sink = gpu.buffer("sink", u64::from(lanes) * 16, Memory::Device)?;
     #[repr(C)]
@@ -226,7 +226,7 @@ pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     }
     let push = F32Push { steps, a: 0.999, b: 0.001 };
     let seconds = best_seconds(gpu, &stage, [lanes / 64, 1, 1], &[("sink", &sink)], &push)?;
-    let f32_tflops = f64::from(lanes) * f64::from(steps) * 8.0 * 16.0 * 2.0 / seconds * 1e-12;
+    let f32_tflops = f64::from(lanes) * f64::from(steps) * 32.0 * 12.0 * 2.0 / seconds * 1e-12;
 
     let matrix_tflops = match info.matrices.first() {
         Some(shape) => Some(matrix_peak(gpu, *shape)?),

@@ -85,9 +85,7 @@ impl Tuning {
             Some(_) if info.kind == "cpu" => {
                 (Layers::F32, "f32 layers: a CPU emulates cooperative matrices, several times slower".to_owned())
             }
-            Some(s) => {
-                (Layers::Matrices, format!("layers on {}x{}x{} matrices: f16 operands, f32 sums", s.m, s.n, s.k))
-            }
+            Some(s) => (Layers::Matrices, format!("matrix layers, {}x{}x{}: f16 operands, f32 sums", s.m, s.n, s.k)),
         };
         reasons.push(why);
         let matrices = match info.multiprocessors {
@@ -101,16 +99,11 @@ impl Tuning {
         Tuning { layers, operands, layer_lanes, weight_lanes, splits, matrices, chunk_samples, reasons }
     }
 
-    /// With the layers on a path chosen by the caller, if any.
-    pub fn with_layers(mut self, layers: Option<Layers>) -> Tuning {
-        if let Some(layers) = layers {
-            self.layers = layers;
-            self.reasons.retain(|r| !r.contains("layers"));
-            self.reasons.push(match layers {
-                Layers::F32 => "layers in f32, as asked".into(),
-                Layers::Matrices => "layers on matrices, as asked: f16 operands, f32 sums".into(),
-            });
-        }
+    /// With the layers on another path, for the reason given.
+    pub fn with_layers(mut self, layers: Layers, reason: String) -> Tuning {
+        self.layers = layers;
+        self.reasons.retain(|r| !r.contains("layers"));
+        self.reasons.push(reason);
         self
     }
 

@@ -15,6 +15,7 @@
 //! degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
 
 pub mod bench;
+pub mod calibrate;
 pub mod config;
 pub mod error;
 pub mod files;

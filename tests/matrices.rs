@@ -6,6 +6,7 @@
 mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
+use nertca_vk::calibrate;
 use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::{march, step};
 use nertca_vk::gpu::device::Gpu;
@@ -27,7 +28,7 @@ fn matrices() -> Option<(Gpu, Tuning)> {
         eprintln!("SKIPPED: {} has no cooperative matrices", gpu.info().name);
         return None;
     }
-    let tuning = Tuning::for_device(gpu.info()).with_layers(Some(Layers::Matrices));
+    let tuning = Tuning::for_device(gpu.info()).with_layers(Layers::Matrices, String::new());
     Some((gpu, tuning))
 }
 
@@ -99,7 +100,7 @@ fn training_repeats_bit_by_bit_resumes_and_follows_f32() {
     let dataset = small_dataset(13, 11);
     let config = small_config("fast", &["dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
     let start = |layers| {
-        let tuning = tuning.clone().with_layers(Some(layers));
+        let tuning = tuning.clone().with_layers(layers, String::new());
         Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning).unwrap()
     };
     let mut whole = start(Layers::Matrices);
@@ -172,5 +173,27 @@ fn renderings_equal_the_twin() {
     // A pixel whose ray grazes a box face may gain or lose one sample in f32.
     assert!(error < 2e-3, "[{at}]: {} against {}", got[at], want[at]);
     drop((trainer, renderer));
+    expect_silence(gpu);
+}
+
+#[test]
+fn both_paths_are_timed_and_the_verdict_is_kept() {
+    let Some((gpu, tuning)) = matrices() else { return };
+    let config = small_config("fast", &[]);
+    let verdict = calibrate::measure(&gpu, &config, &small_dataset(13, 11), &tuning).unwrap();
+    assert!(verdict.f32_ms > 0.0 && verdict.matrices_ms > 0.0);
+    let faster = if verdict.matrices_ms < verdict.f32_ms { Layers::Matrices } else { Layers::F32 };
+    let applied = verdict.apply(tuning);
+    assert_eq!(applied.layers, faster);
+    assert!(applied.reasons.iter().any(|r| r.contains("timed once")), "{:?}", applied.reasons);
+    let cache = tempfile::tempdir().unwrap();
+    assert_eq!(calibrate::recall(cache.path(), gpu.info(), &config), None);
+    calibrate::remember(cache.path(), gpu.info(), &config, verdict).unwrap();
+    let recalled = calibrate::recall(cache.path(), gpu.info(), &config).unwrap();
+    assert!((recalled.f32_ms - verdict.f32_ms).abs() < 1e-9);
+    let wider = small_config("fast", &["dynamic.width=64"]);
+    assert_eq!(calibrate::recall(cache.path(), gpu.info(), &wider), None, "another network, another verdict");
+    std::fs::write(cache.path().join("paths.json"), "{").unwrap();
+    assert_eq!(calibrate::recall(cache.path(), gpu.info(), &config), None);
     expect_silence(gpu);
 }

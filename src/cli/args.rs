@@ -1,7 +1,9 @@
 //! What can be typed.
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use nertca_vk::calibrate;
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::data::dataset::Dataset;
 use nertca_vk::error::Result;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::{Layers, Tuning};
@@ -370,9 +372,37 @@ impl Cli {
         Gpu::open(&DeviceOptions { select: self.device.clone(), validation: self.validate, cache_dir: cache_dir() })
     }
 
-    /// Paths through the kernels on a device, as the options ask.
-    pub fn tuning(&self, gpu: &Gpu) -> Tuning {
-        Tuning::for_device(gpu.info()).with_layers(self.layers)
+    /// Paths through the kernels for a configuration: as the options ask, as an earlier training on this device found
+    /// faster, or as the device suggests.
+    pub fn tuning(&self, gpu: &Gpu, config: &Config) -> Tuning {
+        let tuning = Tuning::for_device(gpu.info());
+        let Some(layers) = self.layers else {
+            return match cache_dir().and_then(|cache| calibrate::recall(&cache, gpu.info(), config)) {
+                Some(verdict) if tuning.layers == Layers::Matrices => verdict.apply(tuning),
+                _ => tuning,
+            };
+        };
+        let reason = match layers {
+            Layers::F32 => "f32 layers, as asked",
+            Layers::Matrices => "matrix layers, as asked: f16 operands, f32 sums",
+        };
+        tuning.with_layers(layers, reason.into())
+    }
+
+    /// As [`Cli::tuning`], after timing both paths where that is still to be done.
+    pub fn training_tuning(&self, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<Tuning> {
+        let tuning = Tuning::for_device(gpu.info());
+        if let (None, Layers::Matrices, Some(cache)) = (self.layers, tuning.layers, cache_dir()) {
+            if calibrate::recall(&cache, gpu.info(), config).is_none() {
+                let verdict = calibrate::measure(gpu, config, dataset, &tuning)?;
+                if let Err(error) = calibrate::remember(&cache, gpu.info(), config, verdict) {
+                    // It only has to be measured again.
+                    tracing::warn!("{error}");
+                }
+                return Ok(verdict.apply(tuning));
+            }
+        }
+        Ok(self.tuning(gpu, config))
     }
 
     /// Saves the pipeline cache and turns validation messages into a failure.

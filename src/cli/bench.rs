@@ -118,7 +118,7 @@ fn measure(
     dataset: &Dataset,
     scratch: &Path,
 ) -> Result<Report> {
-    let tuning = cli.tuning(gpu);
+    let tuning = cli.training_tuning(gpu, config, dataset)?;
     let peaks = bench::peaks(gpu)?;
     let delay = config.dynamic.delay.min(config.train.iterations);
     let before = match delay {

@@ -30,8 +30,9 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     }
     let dataset = Dataset::open(&data)?;
     let gpu = cli.open_device()?;
-    let evaluation =
-        evaluate_run(&gpu, &cli.tuning(&gpu), &args.run, &dataset, args.threshold, args.images.as_deref())?;
+    let config = Checkpoint::read(&checkpoint::newest(&args.run)?)?.model.config;
+    let tuning = cli.tuning(&gpu, &config);
+    let evaluation = evaluate_run(&gpu, &tuning, &args.run, &dataset, args.threshold, args.images.as_deref())?;
     if args.json {
         out!("{}", json(&evaluation)?);
     } else {
@@ -142,7 +143,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     let shot = shot(&model, args.primary, args.secondary, size)?;
     let (width, height) = (shot.width, shot.height);
     let gpu = cli.open_device()?;
-    let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu))?);
+    let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?);
     let renders = match args.baked {
         false => Renders::Fields(renderer),
         true => Renders::Baked(Box::new(Baked::new(renderer, BAKED_CELLS)?)),
@@ -230,7 +231,7 @@ pub fn print_frame_rates(rates: &[FrameRate]) {
 
 fn frame_rates(cli: &Cli, args: &RenderArgs, model: &Model) -> Result<()> {
     let gpu = cli.open_device()?;
-    let renderer = Arc::new(Renderer::new(&gpu, model, cli.tuning(&gpu))?);
+    let renderer = Arc::new(Renderer::new(&gpu, model, cli.tuning(&gpu, &model.config))?);
     let mut sizes = vec![200, 512];
     sizes.extend(args.size.filter(|n| ![200, 512].contains(n)));
     let rates = measure_frame_rates(&renderer, model, args.component, &sizes, 2.0)?;

@@ -44,7 +44,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     .map_err(|e| Error::Internal(format!("Ctrl-C handler: {e}")))?;
     let gpu = cli.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
-    let tuning = cli.tuning(&gpu);
+    let tuning = cli.training_tuning(&gpu, &config, &dataset)?;
     let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
     let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut observer);

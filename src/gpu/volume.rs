@@ -130,10 +130,10 @@ impl Drop for Inner {
             self.gpu.device.destroy_sampler(self.sampler, None);
             self.gpu.device.destroy_image_view(self.view, None);
             self.gpu.device.destroy_image(self.raw, None);
-            if let Some(allocation) = lock(&self.allocation).take() {
-                if let Err(e) = lock(&self.gpu.allocator).free(ManuallyDrop::into_inner(allocation)) {
-                    tracing::error!(target: "vulkan", "freeing a volume: {e}");
-                }
+            if let Some(allocation) = lock(&self.allocation).take()
+                && let Err(e) = lock(&self.gpu.allocator).free(ManuallyDrop::into_inner(allocation))
+            {
+                tracing::error!(target: "vulkan", "freeing a volume: {e}");
             }
         }
         self.gpu.untrack();

@@ -201,10 +201,8 @@ impl Checkpoint {
             return Err(bad("format", format!("`{}`; this version reads `{FORMAT}`", header.format)));
         }
         header.config.check()?;
-        if let Some(LossScale { scale, .. }) = header.loss_scale {
-            if !(scale.is_finite() && scale >= 1.0) {
-                return Err(bad("loss_scale", format!("{scale} where at least 1 is needed")));
-            }
+        if let Some(LossScale { scale, .. }) = header.loss_scale.filter(|s| !(s.scale.is_finite() && s.scale >= 1.0)) {
+            return Err(bad("loss_scale", format!("{scale} where at least 1 is needed")));
         }
         if header.phases == 0 || header.phases > 4096 {
             return Err(bad("phases", header.phases.to_string()));

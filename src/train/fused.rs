@@ -65,7 +65,7 @@ impl Shape {
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
         let unfit = |what: String| Error::config("dynamic.width", width, what);
-        let subgroups = (1..=8).rev().find(|s| (width / n) % s == 0).unwrap_or(1);
+        let subgroups = (1..=8).rev().find(|s| (width / n).is_multiple_of(*s)).unwrap_or(1);
         if subgroups * info.subgroup_size < width / 8 {
             return Err(unfit("is too wide for the matrix kernels on this device".into()));
         }
@@ -258,7 +258,14 @@ impl FusedKernels {
                 ("columns", columns as u32),
                 ("with_input", u32::from(with_input)),
                 ("from_output", u32::from(from_output)),
-                ("halves", if shape.subgroups % 2 == 0 && (columns as u32 / matrix.n) % 2 == 0 { 2 } else { 1 }),
+                (
+                    "halves",
+                    if shape.subgroups.is_multiple_of(2) && (columns as u32 / matrix.n).is_multiple_of(2) {
+                        2
+                    } else {
+                        1
+                    },
+                ),
             ]);
             let code = kernel_code(&format!("mlp_fused_bwd{variant}"))?;
             gpu.matrix_pipeline(code, local, &spec).map(Arc::new)
