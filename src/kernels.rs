@@ -57,6 +57,8 @@ pub struct Tuning {
     pub matrices: MatrixTuning,
     /// Samples handled at once, at most; the configuration may ask for fewer.
     pub chunk_samples: u32,
+    /// Validate and save beside training instead of between iterations.
+    pub overlap: bool,
     /// One sentence per choice.
     pub reasons: Vec<String>,
 }
@@ -95,8 +97,9 @@ impl Tuning {
             n => MatrixTuning { workgroups: if n == 0 { 264 } else { 2 * n }, largest_tile: 128, unroll: true },
         };
         let chunk_samples = if info.kind == "cpu" { 1 << 16 } else { 1 << 19 };
+        let overlap = info.kind != "cpu";
         reasons.push("static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into());
-        Tuning { layers, operands, layer_lanes, weight_lanes, splits, matrices, chunk_samples, reasons }
+        Tuning { layers, operands, layer_lanes, weight_lanes, splits, matrices, chunk_samples, overlap, reasons }
     }
 
     /// With the layers on another path, for the reason given.

@@ -4,7 +4,7 @@
 //! when finished, `report/` with the evaluation and pictures.
 
 use crate::config::Config;
-use crate::data::dataset::Dataset;
+use crate::data::dataset::{Dataset, Frame};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::gpu::device::Gpu;
@@ -14,11 +14,12 @@ use crate::output::pictures::{self, Window};
 use crate::output::render::Renderer;
 use crate::train::checkpoint::{self, Checkpoint};
 use crate::train::plan::Plan;
-use crate::train::trainer::{StepLoss, Trainer};
+use crate::train::trainer::{Snapshot, StepLoss, Trainer};
 use serde::Serialize;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::time::Instant;
 
 /// Losses are written and reported once per this many iterations.
@@ -59,7 +60,7 @@ pub enum Event {
     Validation {
         /// Iterations done.
         step: u32,
-        /// Seconds spent training until then, validation excluded.
+        /// Seconds spent training until then; wall time where validation runs beside training, otherwise without it.
         train_s: f64,
         /// Dice of the dynamic field.
         dice_dynamic: Option<f64>,
@@ -170,71 +171,223 @@ pub fn reconstruct(
         parameters: trainer.plan().params.len,
         notes,
     })?;
-    let end = options.stop_at.unwrap_or(config.train.iterations).min(config.train.iterations);
-    let validation = eval::spread_validation(dataset, config.train.validate_images as usize);
-    let validate = config.train.validate_every > 0 && !validation.is_empty();
-    let range = Window::of(&trainer.plan().images);
-    let range = f64::from(range.high - range.low);
-    let (begin, first_step) = (Instant::now(), trainer.step());
-    let (mut train_s, mut mse) = (0.0, None);
-    let mut renderer: Option<Renderer> = None;
-    while trainer.step() < end {
-        if options.cancel.load(Ordering::Relaxed) {
-            let saved = trainer.checkpoint()?;
-            tell(Event::Saved { step: saved.model.step, path: saved.save(options.run)? })?;
-            return Err(Error::Interrupted);
-        }
-        let next = |every: u32| (trainer.step() / every.max(1) + 1) * every.max(1);
-        let target = end.min(next(config.train.checkpoint_every)).min(if validate {
-            next(config.train.validate_every)
-        } else {
-            end
-        });
-        let started = Instant::now();
-        let losses = trainer.advance(target)?;
-        train_s += started.elapsed().as_secs_f64();
-        for loss in losses {
-            let smoothed = mse.map_or(loss.squared_error, |m: f64| 0.95 * m + 0.05 * loss.squared_error);
-            mse = Some(smoothed);
-            if loss.step % REPORT_EVERY == 0 || loss.step == end {
-                let elapsed_s = begin.elapsed().as_secs_f64();
-                let rate = f64::from(loss.step - first_step) / elapsed_s.max(1e-9);
-                tell(Event::Progress {
-                    loss,
-                    psnr: -10.0 * (smoothed / (range * range)).max(1e-20).log10(),
-                    iterations_per_s: rate,
-                    elapsed_s,
-                    left_s: f64::from(end - loss.step) / rate,
-                })?;
+    let begin = Instant::now();
+    let keeper = Keeper {
+        gpu,
+        tuning: options.tuning,
+        run: options.run,
+        dataset,
+        validation: eval::spread_validation(dataset, config.train.validate_images as usize),
+        begin,
+    };
+    std::thread::scope(|scope| {
+        // At most two snapshots wait: beyond that training waits for the keeper.
+        let (jobs, to_do) = sync_channel::<Job>(2);
+        let (done, news) = channel::<News>();
+        scope.spawn(move || keeper.work(&to_do, &done));
+        Loop::new(&mut trainer, &config, options, begin, &mut tell).run(jobs, &news)
+    })
+}
+
+/// What the keeper says: an event, or nothing more about a job.
+type News = Result<Option<Event>>;
+
+/// A snapshot and what to do with it.
+struct Job {
+    snapshot: Snapshot,
+    save: bool,
+    validate: bool,
+    /// Seconds of training until then; none when training goes on meanwhile and only the clock tells.
+    train_s: Option<f64>,
+}
+
+/// Saves and validates snapshots.
+struct Keeper<'a> {
+    gpu: &'a Gpu,
+    tuning: &'a Tuning,
+    run: &'a Path,
+    dataset: &'a Dataset,
+    validation: Vec<&'a Frame>,
+    begin: Instant,
+}
+
+impl Keeper<'_> {
+    fn work(&self, jobs: &Receiver<Job>, done: &Sender<News>) {
+        let mut renderer = None;
+        for job in jobs {
+            let mut events = Vec::new();
+            let outcome = self.handle(job, &mut renderer, &mut events);
+            // A receiver that has gone away no longer wants to know.
+            events.into_iter().for_each(|event| drop(done.send(Ok(Some(event)))));
+            let failed = outcome.is_err();
+            drop(done.send(outcome.map(|()| None)));
+            if failed {
+                return;
             }
         }
-        let step = trainer.step();
-        if step < target {
-            continue;
+    }
+
+    fn handle(&self, job: Job, renderer: &mut Option<Renderer>, events: &mut Vec<Event>) -> Result<()> {
+        let saved = job.snapshot.wait()?;
+        let train_s = job.train_s.unwrap_or_else(|| self.begin.elapsed().as_secs_f64());
+        let step = saved.model.step;
+        if job.save {
+            events.push(Event::Saved { step, path: saved.save(self.run)? });
         }
-        if step % config.train.checkpoint_every == 0 || step == end {
-            let saved = trainer.checkpoint()?;
-            tell(Event::Saved { step, path: saved.save(options.run)? })?;
-        }
-        if validate && (step % config.train.validate_every == 0 || step == end) {
-            let model = trainer.model()?;
-            let renderer = match &mut renderer {
+        if job.validate && !self.validation.is_empty() {
+            let renderer = match renderer {
                 Some(renderer) => renderer,
-                none => none.insert(Renderer::new(gpu, &model, options.tuning.clone())?),
+                none => none.insert(Renderer::new(self.gpu, &saved.model, self.tuning.clone())?),
             };
-            renderer.set_model(&model)?;
-            let score = evaluate(renderer, dataset, &validation, step, None, |_, _, _| Ok(()))?;
-            tell(Event::Validation {
+            renderer.set_model(&saved.model)?;
+            let score = evaluate(renderer, self.dataset, &self.validation, step, None, |_, _, _| Ok(()))?;
+            events.push(Event::Validation {
                 step,
                 train_s,
                 dice_dynamic: score.dice.dynamic,
                 dice_total: score.dice.total,
                 psnr: score.psnr,
                 ssim: score.ssim,
-            })?;
+            });
+        }
+        Ok(())
+    }
+}
+
+/// Runs the iterations. Snapshots go to the keeper, which works beside training where `tuning.overlap` says so, and
+/// while training waits otherwise.
+struct Loop<'a> {
+    trainer: &'a mut Trainer,
+    config: &'a Config,
+    options: &'a RunOptions<'a>,
+    begin: Instant,
+    tell: &'a mut dyn FnMut(Event) -> Result<()>,
+    first_step: u32,
+    end: u32,
+    /// Span of the training images.
+    range: f64,
+    smoothed_mse: Option<f64>,
+    train_s: f64,
+    /// Jobs the keeper has not finished.
+    waiting: u32,
+}
+
+impl<'a> Loop<'a> {
+    fn new(
+        trainer: &'a mut Trainer,
+        config: &'a Config,
+        options: &'a RunOptions<'a>,
+        begin: Instant,
+        tell: &'a mut dyn FnMut(Event) -> Result<()>,
+    ) -> Loop<'a> {
+        let window = Window::of(&trainer.plan().images);
+        Loop {
+            first_step: trainer.step(),
+            end: options.stop_at.unwrap_or(config.train.iterations).min(config.train.iterations),
+            range: f64::from(window.high - window.low),
+            smoothed_mse: None,
+            train_s: 0.0,
+            waiting: 0,
+            trainer,
+            config,
+            options,
+            begin,
+            tell,
         }
     }
-    tell(Event::Finished { step: trainer.step(), train_s, elapsed_s: begin.elapsed().as_secs_f64() })
+
+    fn run(mut self, jobs: SyncSender<Job>, news: &Receiver<News>) -> Result<()> {
+        let overlap = self.options.tuning.overlap;
+        loop {
+            let cancelled = self.cancelled();
+            let step = self.trainer.submitted();
+            let (save, validate) = (self.saves_at(step) || cancelled, self.validates_at(step) && !cancelled);
+            if (save || validate) && (step > self.first_step || cancelled) {
+                let train_s = (!overlap).then_some(self.train_s);
+                let job = Job { snapshot: self.trainer.snapshot()?, save, validate, train_s };
+                self.waiting += 1;
+                if jobs.send(job).is_err() {
+                    break; // the keeper failed, and says why below
+                }
+            }
+            if !overlap {
+                self.hear_all(news)?;
+            }
+            if cancelled || step >= self.end {
+                break;
+            }
+            let stop = (step + 1..self.end).find(|s| self.saves_at(*s) || self.validates_at(*s)).unwrap_or(self.end);
+            while self.trainer.submitted() < stop && !self.cancelled() {
+                self.advance(stop)?;
+                news.try_iter().try_for_each(|item| self.hear(item))?;
+            }
+            if !overlap || stop == self.end || self.cancelled() {
+                while self.trainer.step() < self.trainer.submitted() {
+                    self.advance(self.trainer.submitted())?;
+                }
+            }
+        }
+        drop(jobs);
+        self.hear_all(news)?;
+        if self.trainer.step() < self.end {
+            return Err(Error::Interrupted);
+        }
+        let (step, elapsed_s) = (self.trainer.step(), self.begin.elapsed().as_secs_f64());
+        (self.tell)(Event::Finished { step, train_s: self.train_s, elapsed_s })
+    }
+
+    fn cancelled(&self) -> bool {
+        self.options.cancel.load(Ordering::Relaxed)
+    }
+
+    fn saves_at(&self, step: u32) -> bool {
+        step == self.end || step.is_multiple_of(self.config.train.checkpoint_every)
+    }
+
+    fn validates_at(&self, step: u32) -> bool {
+        let every = self.config.train.validate_every;
+        every > 0 && (step == self.end || step.is_multiple_of(every))
+    }
+
+    fn advance(&mut self, until: u32) -> Result<()> {
+        let started = Instant::now();
+        let losses = self.trainer.advance(until)?;
+        self.train_s += started.elapsed().as_secs_f64();
+        for loss in losses {
+            let mse = self.smoothed_mse.map_or(loss.squared_error, |m| 0.95 * m + 0.05 * loss.squared_error);
+            self.smoothed_mse = Some(mse);
+            if loss.step.is_multiple_of(REPORT_EVERY) || loss.step == self.end {
+                let elapsed_s = self.begin.elapsed().as_secs_f64();
+                let rate = f64::from(loss.step - self.first_step) / elapsed_s.max(1e-9);
+                (self.tell)(Event::Progress {
+                    loss,
+                    psnr: -10.0 * (mse / (self.range * self.range)).max(1e-20).log10(),
+                    iterations_per_s: rate,
+                    elapsed_s,
+                    left_s: f64::from(self.end - loss.step) / rate,
+                })?;
+            }
+        }
+        Ok(())
+    }
+
+    fn hear(&mut self, item: News) -> Result<()> {
+        match item? {
+            Some(event) => (self.tell)(event),
+            None => {
+                self.waiting -= 1;
+                Ok(())
+            }
+        }
+    }
+
+    fn hear_all(&mut self, news: &Receiver<News>) -> Result<()> {
+        while self.waiting > 0 {
+            let item = news.recv().map_err(|_| Error::Internal("the keeper of snapshots is gone".into()))?;
+            self.hear(item)?;
+        }
+        Ok(())
+    }
 }
 
 /// `metrics.jsonl`: appended line by line; on resume, lines beyond the resumed step are dropped first.

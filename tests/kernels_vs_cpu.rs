@@ -67,6 +67,7 @@ fn paths() -> [Tuning; 3] {
         splits,
         matrices: MatrixTuning { workgroups: 1, largest_tile: 16, unroll: false },
         chunk_samples: 1 << 16,
+        overlap: false,
         reasons: Vec::new(),
     };
     [

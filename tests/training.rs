@@ -7,6 +7,7 @@ use common::{expect_silence, gpu, relative_error, small_config, small_dataset, t
 use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::{field, march};
 use nertca_vk::error::Error;
+use nertca_vk::kernels::Tuning;
 use nertca_vk::output::render::Renderer;
 use nertca_vk::output::sampled::{Baked, Components, Field, Grid};
 use nertca_vk::reconstruct::{Event, RunOptions, reconstruct};
@@ -277,5 +278,33 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
     let empty = baked.render(&dataset.views[1].rays, 24, 20, 1, none).unwrap();
     assert!(empty.total_integral().iter().all(|v| *v == 0.0));
     drop((baked, renderer, trainer));
+    expect_silence(gpu);
+}
+
+#[test]
+fn keeping_snapshots_beside_training_changes_nothing() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    let config = small_config("fast", &["train.checkpoint_every=12", "train.validate_every=8"]);
+    let directory = tempfile::tempdir().unwrap();
+    let never = AtomicBool::new(false);
+    let go = |name: &str, overlap: bool| {
+        let path = directory.path().join(name);
+        let tuning = Tuning { overlap, ..tuning(&gpu) };
+        let options = RunOptions { tuning: &tuning, run: &path, resume: false, stop_at: None, cancel: &never };
+        let (mut saved, mut validated) = (Vec::new(), Vec::new());
+        reconstruct(&gpu, &config, &dataset, &options, &mut |event| match event {
+            Event::Saved { step, .. } => saved.push(*step),
+            Event::Validation { step, psnr, .. } => validated.push((*step, psnr.to_bits())),
+            _ => {}
+        })
+        .unwrap();
+        let last = Checkpoint::read(&checkpoint::newest(&path).unwrap()).unwrap();
+        (saved, validated, last.model.params, last.moments)
+    };
+    let (between, beside) = (go("between", false), go("beside", true));
+    assert_eq!(between.0, [12, 24, 36, 40]);
+    assert_eq!(between.1.iter().map(|v| v.0).collect::<Vec<_>>(), [8, 16, 24, 32, 40]);
+    assert_eq!(between, beside);
     expect_silence(gpu);
 }

@@ -392,17 +392,16 @@ impl Cli {
     /// As [`Cli::tuning`], after timing both paths where that is still to be done.
     pub fn training_tuning(&self, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<Tuning> {
         let tuning = Tuning::for_device(gpu.info());
-        if let (None, Layers::Matrices, Some(cache)) = (self.layers, tuning.layers, cache_dir()) {
-            if calibrate::recall(&cache, gpu.info(), config).is_none() {
-                let verdict = calibrate::measure(gpu, config, dataset, &tuning)?;
-                if let Err(error) = calibrate::remember(&cache, gpu.info(), config, verdict) {
-                    // It only has to be measured again.
-                    tracing::warn!("{error}");
-                }
-                return Ok(verdict.apply(tuning));
-            }
+        let cache = cache_dir().filter(|_| self.layers.is_none() && tuning.layers == Layers::Matrices);
+        let Some(cache) = cache.filter(|cache| calibrate::recall(cache, gpu.info(), config).is_none()) else {
+            return Ok(self.tuning(gpu, config));
+        };
+        let verdict = calibrate::measure(gpu, config, dataset, &tuning)?;
+        if let Err(error) = calibrate::remember(&cache, gpu.info(), config, verdict) {
+            // It only has to be measured again.
+            tracing::warn!("{error}");
         }
-        Ok(self.tuning(gpu, config))
+        Ok(verdict.apply(tuning))
     }
 
     /// Saves the pipeline cache and turns validation messages into a failure.

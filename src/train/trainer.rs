@@ -9,6 +9,7 @@ use crate::data::dataset::Dataset;
 use crate::data::geometry::CArm;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
+use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::{Buffers, Kernels, Tuning};
 use crate::layout::DeviceState;
@@ -254,49 +255,125 @@ impl Trainer {
         commands.pass_times()
     }
 
-    /// The fields as they are now; waits for work in flight.
+    /// Iterations handed to the device.
+    pub fn submitted(&self) -> u32 {
+        self.submitted
+    }
+
+    /// Copies the state after the iterations submitted so far, behind them on the device; returns at once, and training
+    /// may go on.
     ///
     /// # Errors
-    /// [`Error::Diverged`] when a parameter is not finite; device errors.
-    pub fn model(&mut self) -> Result<Model> {
-        while !self.in_flight.is_empty() {
-            self.advance(self.submitted)?;
-        }
-        let params: Vec<f32> = self.gpu.download(self.buffers.get("params")?, 0, self.plan.params.len)?;
-        if let Some(bad) = params.iter().find(|p| !p.is_finite()) {
-            return Err(Error::Diverged {
-                step: u64::from(self.completed),
-                quantity: "parameter",
-                value: f64::from(*bad),
-            });
-        }
-        Ok(Model {
-            config: self.plan.config.clone(),
-            scene: self.plan.scene.clone(),
-            layout: self.plan.params.clone(),
-            hull: self.plan.hull.clone(),
+    /// Device errors.
+    pub fn snapshot(&self) -> Result<Snapshot> {
+        let mut recording = Recording::new(&self.gpu, "snapshot")?;
+        let mut copy = |name: &str, bytes: u64| -> Result<Buffer> {
+            let staging = self.gpu.buffer(&format!("{name} snapshot"), bytes, Memory::Readback)?;
+            if bytes > 0 {
+                recording.copy(self.buffers.get(name)?, 0, &staging, 0, bytes)?;
+            }
+            Ok(staging)
+        };
+        let n = self.plan.params.len as u64;
+        let params = copy("params", 4 * n)?;
+        let moments = copy("moments", 8 * n)?;
+        let state = copy("state", 16)?;
+        let occupancy = copy("occupancy", occupancy_bytes(&self.plan.setup))?;
+        let commands = recording.finish()?;
+        let ticket = commands.submit()?;
+        Ok(Snapshot {
+            gpu: self.gpu.clone(),
+            ticket,
+            _commands: commands,
             params,
-            step: self.completed,
-            vessel_attenuation: self.vessel_attenuation,
-            c_arm: self.c_arm.clone(),
-            image_size: self.image_size,
+            moments,
+            state,
+            occupancy,
+            occupancy_words: occupancy_bytes(&self.plan.setup) as usize / 4,
+            scaled: matches!(self.network, Network::Fused(_)),
+            model: Model {
+                config: self.plan.config.clone(),
+                scene: self.plan.scene.clone(),
+                layout: self.plan.params.clone(),
+                hull: self.plan.hull.clone(),
+                params: Vec::new(),
+                step: self.submitted,
+                vessel_attenuation: self.vessel_attenuation,
+                c_arm: self.c_arm.clone(),
+                image_size: self.image_size,
+            },
+            data_fingerprint: self.data_fingerprint.clone(),
         })
     }
 
-    /// Everything needed to continue.
+    /// The fields after the iterations submitted so far; waits for them.
     ///
     /// # Errors
-    /// As [`Trainer::model`].
+    /// As [`Snapshot::wait`].
+    pub fn model(&mut self) -> Result<Model> {
+        Ok(self.checkpoint()?.model)
+    }
+
+    /// Everything needed to continue; waits for the iterations submitted so far.
+    ///
+    /// # Errors
+    /// As [`Snapshot::wait`].
     pub fn checkpoint(&mut self) -> Result<Checkpoint> {
-        let model = self.model()?;
-        let moments = self.gpu.download(self.buffers.get("moments")?, 0, self.plan.params.len)?;
-        let state: Vec<DeviceState> = self.gpu.download(self.buffers.get("state")?, 0, 1)?;
-        let loss_scale = match self.network {
-            Network::Layers(_) => None,
-            Network::Fused(_) => Some(LossScale { scale: state[0].loss_scale, good_updates: state[0].good_updates }),
-        };
-        let occupancy =
-            self.gpu.download(self.buffers.get("occupancy")?, 0, occupancy_bytes(&self.plan.setup) as usize / 4)?;
-        Ok(Checkpoint { model, moments, occupancy, loss_scale, data_fingerprint: self.data_fingerprint.clone() })
+        while !self.in_flight.is_empty() {
+            self.advance(self.submitted)?;
+        }
+        self.snapshot()?.wait()
+    }
+}
+
+/// A run's state on its way to the host.
+pub struct Snapshot {
+    gpu: Gpu,
+    ticket: Ticket,
+    _commands: Commands,
+    params: Buffer,
+    moments: Buffer,
+    state: Buffer,
+    occupancy: Buffer,
+    occupancy_words: usize,
+    scaled: bool,
+    model: Model,
+    data_fingerprint: String,
+}
+
+impl Snapshot {
+    /// Iterations it holds.
+    pub fn step(&self) -> u32 {
+        self.model.step
+    }
+
+    /// Waits until the device has come this far.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when a parameter is not finite; device errors.
+    pub fn wait(mut self) -> Result<Checkpoint> {
+        self.gpu.wait(self.ticket)?;
+        let n = self.model.layout.len;
+        let mut params = vec![0f32; n];
+        self.params.read(&mut params)?;
+        if let Some(bad) = params.iter().find(|p| !p.is_finite()) {
+            let (step, value) = (u64::from(self.model.step), f64::from(*bad));
+            return Err(Error::Diverged { step, quantity: "parameter", value });
+        }
+        self.model.params = params;
+        let mut moments = vec![[0f32; 2]; n];
+        self.moments.read(&mut moments)?;
+        let mut state = [DeviceState { step: 0, loss_scale: 1.0, overflowed: 0, good_updates: 0 }];
+        self.state.read(&mut state)?;
+        let mut occupancy = vec![0u32; self.occupancy_words];
+        self.occupancy.read(&mut occupancy)?;
+        let [DeviceState { loss_scale: scale, good_updates, .. }] = state;
+        Ok(Checkpoint {
+            model: self.model,
+            moments,
+            occupancy,
+            loss_scale: self.scaled.then_some(LossScale { scale, good_updates }),
+            data_fingerprint: self.data_fingerprint,
+        })
     }
 }
