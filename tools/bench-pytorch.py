@@ -1,0 +1,165 @@
+#!/usr/bin/env python3
+"""Times the same work in PyTorch: the paper's fields, batch and sampling, forward, backward and Adam.
+
+The counterpart of `nertca-vk bench`, to be run beside it on one machine:
+
+    python3 tools/bench-pytorch.py --preset paper --device cuda                 # eager
+    python3 tools/bench-pytorch.py --preset paper --device cuda --compile       # torch.compile
+    python3 tools/bench-pytorch.py --preset paper --rays 256 --device cpu --threads 2
+
+Data are random: time does not depend on them. Only torch is needed. Rays and samples are those of a batch in which
+every dynamic sample is live, as with the authors' code; `--live` keeps a share of them, as a hull does.
+"""
+
+import argparse
+import json
+import statistics
+import time
+
+import torch
+
+PRESETS = {
+    "paper": dict(rays=2048, static=256, dynamic=256, width=128, layers=4, skip=0, bands=10),
+    "public-code": dict(rays=2048, static=256, dynamic=256, width=128, layers=5, skip=4, bands=10),
+    "fast": dict(rays=1024, static=32, dynamic=128, width=96, layers=4, skip=0, bands=8),
+}
+GRID, RANKS, PHASES, LATENT = 48, 3, 10, 8
+
+
+class StaticField(torch.nn.Module):
+    """Three plane x line modes, as TensoRF looks them up."""
+
+    def __init__(self):
+        super().__init__()
+        self.planes = torch.nn.Parameter(0.1 * torch.randn(3, RANKS, GRID, GRID))
+        self.lines = torch.nn.Parameter(0.1 * torch.randn(3, RANKS, GRID, 1))
+
+    def forward(self, x):
+        sample = torch.nn.functional.grid_sample
+        plane = torch.stack((x[..., [0, 1]], x[..., [0, 2]], x[..., [1, 2]])).view(3, -1, 1, 2)
+        line = torch.stack((x[..., 2], x[..., 1], x[..., 0])).view(3, -1, 1)
+        line = torch.stack((torch.zeros_like(line), line), -1)
+        on_planes = sample(self.planes, plane, align_corners=True).view(3 * RANKS, -1)
+        on_lines = sample(self.lines, line, align_corners=True).view(3 * RANKS, -1)
+        feature = (on_planes * on_lines).sum(0).view(x.shape[:-1])
+        inside = (x.abs() <= 1).all(-1)
+        return torch.nn.functional.softplus(feature - 10) * inside
+
+    def total_variation(self):
+        p, l = self.planes, self.lines
+        return 1e-2 * ((p[:, :, 1:] - p[:, :, :-1]).square().mean() + (p[..., 1:] - p[..., :-1]).square().mean()) \
+            + 1e-3 * (l[:, :, 1:] - l[:, :, :-1]).square().mean()
+
+
+class DynamicField(torch.nn.Module):
+    """Multi-layer perceptron on a windowed encoding and a latent per phase."""
+
+    def __init__(self, width, layers, skip, bands):
+        super().__init__()
+        inputs = 3 + 6 * bands + LATENT
+        sizes = [inputs if i == 0 else width + (inputs if skip and i == skip - 1 else 0) for i in range(layers)]
+        self.hidden = torch.nn.ModuleList(torch.nn.Linear(n, width) for n in sizes)
+        self.out = torch.nn.Linear(width, 1)
+        self.latents = torch.nn.Parameter(torch.rand(PHASES, LATENT))
+        self.skip, self.bands = skip, bands
+
+    def forward(self, x, phase, window):
+        frequency = 2.0 ** torch.arange(self.bands, device=x.device)
+        weight = (window - torch.arange(self.bands, device=x.device)).clamp(0, 1)
+        angle = x[:, None, :] * frequency[:, None]
+        waves = torch.stack((angle.sin(), angle.cos()), 2) * weight[:, None, None]
+        inputs = torch.cat((x, waves.flatten(1), self.latents[phase]), -1)
+        h = inputs
+        for i, layer in enumerate(self.hidden):
+            h = torch.relu(layer(torch.cat((inputs, h), -1) if self.skip and i == self.skip - 1 else h))
+        return torch.nn.functional.softplus(self.out(h)[:, 0] - 10)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--preset", choices=PRESETS, default="paper")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--rays", type=int, help="rays of a batch instead of the preset's")
+    parser.add_argument("--live", type=float, default=1.0, help="share of the dynamic samples that is evaluated")
+    parser.add_argument("--compile", action="store_true", help="torch.compile the iteration's forward pass")
+    parser.add_argument("--tf32", action="store_true", help="allow TF32 matrix products (CUDA)")
+    parser.add_argument("--threads", type=int, help="CPU threads")
+    parser.add_argument("--warm-up", type=int, default=3)
+    parser.add_argument("--iterations", type=int, default=10)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    torch.backends.cuda.matmul.allow_tf32 = args.tf32
+    torch.manual_seed(1)
+    shape = dict(PRESETS[args.preset], **({"rays": args.rays} if args.rays else {}))
+    device, rays = torch.device(args.device), shape["rays"]
+    static = StaticField().to(device)
+    dynamic = DynamicField(shape["width"], shape["layers"], shape["skip"], shape["bands"]).to(device)
+    optimiser = torch.optim.Adam([*static.parameters(), *dynamic.parameters()], lr=1e-4, betas=(0.9, 0.99))
+    anchor = 0.3 * torch.randn(rays, 1, 3, device=device)
+    direction = torch.nn.functional.normalize(torch.randn(rays, 1, 3, device=device), dim=-1)
+    target, phase = torch.rand(rays, device=device), torch.randint(PHASES, (rays,), device=device)
+    live = torch.rand(rays, shape["dynamic"], device=device) < args.live
+
+    def points(n):
+        """Stratified depths of every ray."""
+        depth = (torch.arange(n, device=device) + torch.rand(rays, n, device=device)) / n * 1.8 - 0.9
+        depth, _ = depth.sort(-1)
+        length = torch.cat((depth[:, 1:] - depth[:, :-1], torch.full((rays, 1), 1e-10, device=device)), -1)
+        return anchor + depth[..., None] * direction, length
+
+    def forward(x_static, dl_static, x_dynamic, dl_dynamic, rays_of, phases, window):
+        still = (static(x_static) * dl_static).sum(-1)
+        sigma = dynamic(x_dynamic, phases, window)
+        moving = torch.zeros(rays, device=device).index_add(0, rays_of, sigma * dl_dynamic)
+        return (still + moving - target).square().mean() + static.total_variation()
+
+    if args.compile:
+        forward = torch.compile(forward)
+
+    def iteration():
+        x_static, dl_static = points(shape["static"])
+        x_dynamic, dl_dynamic = points(shape["dynamic"])
+        rays_of = live.nonzero()[:, 0]
+        loss = forward(x_static, dl_static, x_dynamic[live], dl_dynamic[live], rays_of, phase[rays_of], 5.0)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+
+    def synchronise():
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+
+    for _ in range(args.warm_up):
+        iteration()
+    ms = []
+    for _ in range(args.iterations):
+        synchronise()
+        begin = time.perf_counter()
+        iteration()
+        synchronise()
+        ms.append(1e3 * (time.perf_counter() - begin))
+    inputs, width = 3 + 6 * shape["bands"], shape["width"]
+    hidden = (shape["layers"] - 1) * width * width
+    encoded = inputs * width * (2 if shape["skip"] else 1)
+    # Latents and biases left out, as nertca-vk counts.
+    gflop = 2e-9 * int(live.sum()) * (2 * (encoded + hidden + width) + hidden + width)
+    median = statistics.median(ms)
+    result = dict(
+        torch=torch.__version__, device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
+        threads=torch.get_num_threads(), compiled=args.compile, tf32=args.tf32, preset=args.preset, rays=rays,
+        live_samples=int(live.sum()), ms=ms, median_ms=median, network_tflops=gflop / median, cost_gflop=gflop,
+    )
+    if args.json:
+        print(json.dumps(result))
+    else:
+        way = "compiled" if args.compile else "eager"
+        print(f"PyTorch {torch.__version__} on {result['device']} ({result['threads']} threads), {way}, {args.preset}")
+        print(f"{median:.2f} ms per iteration (median of {len(ms)}; {min(ms):.2f} to {max(ms):.2f}), {rays} rays, "
+              f"{result['live_samples']} live samples")
+        print(f"{gflop / median:.4f} TFLOP/s over whole iterations; 30,000 of them take {30 * median / 60:.1f} minutes")
+
+
+if __name__ == "__main__":
+    main()
