@@ -3,6 +3,8 @@
 #extension GL_EXT_control_flow_attributes : require
 // Scatters dL/d sigma_l to planes and lines: one workgroup per ray. Contributions are summed as 64-bit
 // fixed point in pairs of 32-bit integer atomics, which is exact and hence independent of order.
+// Every sample of every ray meets the few texels of the lines: with `private_lines` a workgroup sums its own in shared
+// memory first, so that they reach memory once per ray.
 //   static_gradient[2 * parameter] = low, high word.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
@@ -10,6 +12,7 @@
 #include "inc/softplus.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
+layout(constant_id = 1) const uint private_lines = 0u;  // numbers on all lines, or 0: straight to memory
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { uint state[]; };
@@ -19,9 +22,10 @@ READ_VEC4(4, B4, static_params);
 layout(binding = 5) buffer B5 { uint static_gradient[]; };
 #include "inc/tensor_vm.glsl"
 
-// The magnitude is split exactly into words, then negated in two's complement.
-void add_fixed(uint parameter, float value, float scale_high) {
-    if (value == 0.0) return;
+shared uint line_sums[2u * private_lines + 1u];
+
+// A number in 64-bit fixed point; the magnitude is split exactly into words, then negated in two's complement.
+uvec2 to_fixed(float value, float scale_high) {
     float scaled = abs(value) * scale_high;
     float whole = floor(scaled);
     uint high = uint(whole);
@@ -30,13 +34,35 @@ void add_fixed(uint parameter, float value, float scale_high) {
         low = ~low + 1u;
         high = ~high + (low == 0u ? 1u : 0u);
     }
-    uint before = atomicAdd(static_gradient[2u * parameter], low);
-    high += before + low < before ? 1u : 0u;
+    return uvec2(low, high);
+}
+
+void add_to_memory(uint parameter, uvec2 fixed_point) {
+    uint before = atomicAdd(static_gradient[2u * parameter], fixed_point.x);
+    uint high = fixed_point.y + (before + fixed_point.x < before ? 1u : 0u);
     if (high != 0u) atomicAdd(static_gradient[2u * parameter + 1u], high);
 }
 
-void add_fixed4(uint texel, vec4 value, float scale_high) {
-    [[unroll]] for (uint c = 0u; c < 4u; c++) add_fixed(4u * texel + c, value[c], scale_high);
+void add_to_plane(uint texel, vec4 value, float scale_high) {
+    [[unroll]] for (uint c = 0u; c < 4u; c++) {
+        if (value[c] != 0.0) add_to_memory(4u * texel + c, to_fixed(value[c], scale_high));
+    }
+}
+
+void add_to_line(uint texel, vec4 value, float scale_high) {
+    uint first = setup.static_params - private_lines;
+    [[unroll]] for (uint c = 0u; c < 4u; c++) {
+        if (value[c] == 0.0) continue;
+        uvec2 fixed_point = to_fixed(value[c], scale_high);
+        if (private_lines == 0u) {
+            add_to_memory(4u * texel + c, fixed_point);
+        } else {
+            uint at = 2u * (4u * texel + c - first);
+            uint before = atomicAdd(line_sums[at], fixed_point.x);
+            uint high = fixed_point.y + (before + fixed_point.x < before ? 1u : 0u);
+            if (high != 0u) atomicAdd(line_sums[at + 1u], high);
+        }
+    }
 }
 
 void main() {
@@ -44,6 +70,8 @@ void main() {
     Ray ray = rays[r];
     float gradient = ray_gradient[r].x;
     if (gradient == 0.0) return;  // rays that skip the static field, too
+    for (uint i = gl_LocalInvocationID.x; i < 2u * private_lines; i += gl_WorkGroupSize.x) line_sums[i] = 0u;
+    barrier();
     uint stream = setup.per_ray_depths != 0u ? ray.id + 1u : 0u;
     float scale_high = exp2(float(setup.fixed_point_bits) - 32.0);
     for (uint k = gl_LocalInvocationID.x; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {
@@ -61,12 +89,17 @@ void main() {
                 vec4 to_plane = at_feature * vm_line(taps, c);
                 vec4 to_line = at_feature * vm_plane(taps, c);
                 [[unroll]] for (uint t = 0u; t < 4u; t++) {
-                    add_fixed4(taps.plane[t] * setup.rank4 + c, taps.plane_weight[t] * to_plane, scale_high);
+                    add_to_plane(taps.plane[t] * setup.rank4 + c, taps.plane_weight[t] * to_plane, scale_high);
                 }
                 [[unroll]] for (uint t = 0u; t < 2u; t++) {
-                    add_fixed4(taps.line[t] * setup.rank4 + c, taps.line_weight[t] * to_line, scale_high);
+                    add_to_line(taps.line[t] * setup.rank4 + c, taps.line_weight[t] * to_line, scale_high);
                 }
             }
         }
+    }
+    barrier();
+    for (uint i = gl_LocalInvocationID.x; i < private_lines; i += gl_WorkGroupSize.x) {
+        uvec2 sum = uvec2(line_sums[2u * i], line_sums[2u * i + 1u]);
+        if (sum != uvec2(0u)) add_to_memory(setup.static_params - private_lines + i, sum);
     }
 }

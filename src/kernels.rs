@@ -55,6 +55,8 @@ pub struct Tuning {
     pub splits: u32,
     /// Sizes of the passes on matrices.
     pub matrices: MatrixTuning,
+    /// Shared memory in which a workgroup may sum the static field's lines before they go to memory, bytes.
+    pub private_line_bytes: u32,
     /// Samples handled at once, at most; the configuration may ask for fewer.
     pub chunk_samples: u32,
     /// Validate and save beside training instead of between iterations.
@@ -98,8 +100,29 @@ impl Tuning {
         };
         let chunk_samples = if info.kind == "cpu" { 1 << 16 } else { 1 << 19 };
         let overlap = info.kind != "cpu";
-        reasons.push("static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into());
-        Tuning { layers, operands, layer_lanes, weight_lanes, splits, matrices, chunk_samples, overlap, reasons }
+        // Shared memory is no faster on a CPU.
+        let private_line_bytes = if info.kind == "cpu" { 0 } else { info.max_shared_memory / 2 };
+        reasons.push(match private_line_bytes {
+            0 => "static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into(),
+            _ => "static gradients through 32-bit integer atomics, lines in shared memory first: exact sums".into(),
+        });
+        Tuning {
+            layers,
+            operands,
+            layer_lanes,
+            weight_lanes,
+            splits,
+            matrices,
+            private_line_bytes,
+            chunk_samples,
+            overlap,
+            reasons,
+        }
+    }
+
+    /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_bwd`.
+    fn private_lines(&self, line_params: u32) -> u32 {
+        if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
     }
 
     /// With the layers on another path, for the reason given.
@@ -187,11 +210,11 @@ macro_rules! stages {
         }
 
         impl $name {
-            /// Builds the pipelines.
+            /// Builds the pipelines; `line_params` are the numbers on the lines of the static field.
             ///
             /// # Errors
             /// Errors of [`Gpu::pipeline`].
-            pub fn new(gpu: &Gpu, tuning: Tuning) -> Result<$name> {
+            pub fn new(gpu: &Gpu, tuning: Tuning, line_params: u32) -> Result<$name> {
                 let t = &tuning;
                 let make = |name: &str, variant: &str, local: u32, spec: &[(&str, u32)]| {
                     let code = kernel_code(&format!("{name}{variant}"))?;
@@ -201,9 +224,9 @@ macro_rules! stages {
                     $($stage: {
                         let local: fn(&Tuning) -> u32 = $local;
                         #[allow(unused_mut, unused_assignments, reason = "only some stages have constants")]
-                        let mut spec: fn(&Tuning) -> Vec<(&'static str, u32)> = |_| Vec::new();
+                        let mut spec: fn(&Tuning, u32) -> Vec<(&'static str, u32)> = |_, _| Vec::new();
                         $(spec = $spec;)?
-                        make(stages!(@name $stage), stages!(@$variant t), local(t), &spec(t))?
+                        make(stages!(@name $stage), stages!(@$variant t), local(t), &spec(t, line_params))?
                     },)*
                     tuning,
                 })
@@ -244,7 +267,7 @@ stages! {
         /// Line integrals.
         march_fwd(|_| 32, operands);
         /// Line integrals and maxima, for rendering.
-        march_fwd_maxima(|_| 32, operands, |_| vec![("with_maxima", 1)]);
+        march_fwd_maxima(|_| 32, operands, |_, _| vec![("with_maxima", 1)]);
         /// Cells of the dynamic field.
         volume_dynamic(|_| 64, plain);
         /// Cells of the static field.
@@ -254,7 +277,7 @@ stages! {
         /// Residuals and their gradients.
         loss(|_| 64, plain);
         /// Scatter to planes and lines.
-        march_bwd(|_| 32, operands);
+        march_bwd(|_| 32, operands, |t, line_params| vec![("private_lines", t.private_lines(line_params))]);
         /// Bias and latent, one row per phase.
         mlp_latent_fwd(|_| 64, plain);
         /// Gradients of biases, latent weights and latents.
@@ -268,7 +291,7 @@ stages! {
         /// The optimiser.
         adam(|_| 64, plain);
         /// Losses, loss scale and step count.
-        report(|_| 256, plain, |t| vec![("loss_scaling", u32::from(t.layers == Layers::Matrices))]);
+        report(|_| 256, plain, |t, _| vec![("loss_scaling", u32::from(t.layers == Layers::Matrices))]);
     }
 }
 

@@ -59,21 +59,22 @@ fn rays_and_depths_match() {
 /// Both families of kernels: operands through texel buffers with small workgroups, as an old lavapipe gets
 /// them, and through storage buffers with large ones, as GPUs do.
 fn paths() -> [Tuning; 3] {
-    let f32_layers = |operands, layer_lanes, weight_lanes, splits| Tuning {
+    let f32_layers = |operands, layer_lanes, weight_lanes, splits, private_line_bytes| Tuning {
         layers: Layers::F32,
         operands,
         layer_lanes,
         weight_lanes,
         splits,
         matrices: MatrixTuning { workgroups: 1, largest_tile: 16, unroll: false },
+        private_line_bytes,
         chunk_samples: 1 << 16,
         overlap: false,
         reasons: Vec::new(),
     };
     [
-        f32_layers(Operands::Texel, 8, 8, 4),
-        f32_layers(Operands::Storage, 64, 32, 16),
-        f32_layers(Operands::Address, 8, 4, 3),
+        f32_layers(Operands::Texel, 8, 8, 4, 0),
+        f32_layers(Operands::Storage, 64, 32, 16, 16384),
+        f32_layers(Operands::Address, 8, 4, 3, 0),
     ]
 }
 

@@ -118,6 +118,11 @@ impl ParamLayout {
         self.len - self.static_len
     }
 
+    /// Numbers on the lines of the static field, padding included; they are its last.
+    pub fn line_len(&self) -> usize {
+        3 * self.grid * self.rank4 * 4
+    }
+
     /// Position of plane element `(mode, rank, v, u)`; `u` runs along the plane's first axis.
     pub fn plane(&self, mode: usize, rank: usize, v: usize, u: usize) -> usize {
         ((mode * self.grid + v) * self.grid + u) * self.rank4 * 4 + rank

@@ -69,7 +69,7 @@ impl Renderer {
     /// Device errors.
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
         let network = Network::new(gpu, &tuning, &model.layout, false)?;
-        let kernels = Kernels::new(gpu, tuning)?;
+        let kernels = Kernels::new(gpu, tuning, model.layout.line_len() as u32)?;
         let mut setup = model.scene.setup(&model.config, &model.layout, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;

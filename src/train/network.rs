@@ -48,7 +48,7 @@ impl Network {
     /// [`crate::error::Error::Config`] when matrices are asked for and do not fit; errors of the device.
     pub fn new(gpu: &Gpu, tuning: &Tuning, params: &ParamLayout, train: bool) -> Result<Network> {
         Ok(match tuning.layers {
-            Layers::F32 => Network::Layers(Box::new(LayerKernels::new(gpu, tuning.clone())?)),
+            Layers::F32 => Network::Layers(Box::new(LayerKernels::new(gpu, tuning.clone(), params.line_len() as u32)?)),
             Layers::Matrices => Network::Fused(Box::new(FusedKernels::new(gpu, tuning, params, train)?)),
         })
     }

@@ -127,7 +127,7 @@ impl Trainer {
         saved: Option<&Checkpoint>,
     ) -> Result<Trainer> {
         let network = Network::new(gpu, &tuning, &plan.params, true)?;
-        let kernels = Kernels::new(gpu, tuning)?;
+        let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32)?;
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(kernels.tuning.chunk_samples));
         let buffers = training_buffers(gpu, &kernels.tuning, &network, &plan)?;
         gpu.upload(buffers.get("params")?, 0, params)?;
