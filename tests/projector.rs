@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{expect_silence, gpu, relative_error, tuning};
+use common::{expect_silence, gpu, relative_error};
 use glam::{DAffine3, DMat3, DVec3};
 use nertca_vk::cpu::projector::project_pixel;
 use nertca_vk::data::geometry::{CArm, Geometry};
