@@ -4,10 +4,11 @@
 //   sample_points[s] = (x, y, z, path length);  sample_rays[s] = ray of the batch.
 //   Near samples subject to occlusion minimisation carry the top bit of sample_rays.
 #include "inc/march_samples.glsl"
-layout(binding = 4) readonly buffer B4 { uint lane_counts[]; };
+layout(binding = 4) readonly buffer B4 { uint lane_offsets[]; };
 layout(binding = 5) readonly buffer B5 { uint live[]; };
 layout(binding = 6) writeonly buffer B6 { vec4 sample_points[]; };
 layout(binding = 7) writeonly buffer B7 { uint sample_rays[]; };
+layout(binding = 9) readonly buffer B9 { uint ray_start[]; };
 
 void main() {
     if (live[0] == 0u) return;
@@ -16,7 +17,7 @@ void main() {
     Ray ray = rays[push.first_ray + r];
     uint begin = lane * run_length();
     uint end = min(begin + run_length(), setup.n_dynamic_samples);
-    uint slot = lane_counts[r * gl_WorkGroupSize.x + lane];
+    uint slot = ray_start[r] + lane_offsets[r * gl_WorkGroupSize.x + lane];
     for (uint k = begin; k < end; k++) {
         float depth = dynamic_depth(k, ray);
         vec3 x = ray.anchor + depth * ray.direction;

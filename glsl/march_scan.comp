@@ -1,16 +1,14 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Turns the counts of a chunk into offsets (exclusive prefix sum over rays x lanes, one workgroup) and
-// writes the indirect arguments of all passes over live samples. While the dynamic field is delayed
-// nothing is live.
-//   lane_counts[n_counts] -> offsets, in place;  ray_start[n_rays + 1];  live = live, padded to 64, live of the
-//   iteration so far.
+// Turns the counts of a chunk into offsets (exclusive prefix sum over rays, one workgroup) and writes the
+// indirect arguments of all passes over live samples. While the dynamic field is delayed nothing is live.
+//   ray_counts[n_rays] -> ray_start[n_rays + 1];  live = live, padded to 64, live of the iteration so far.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint n_rays; uint lanes; uint tile_samples; uint fwd_y; uint bwd_y; uint accumulate; } push;
+layout(push_constant) uniform Push { uint n_rays; uint tile_samples; uint fwd_y; uint bwd_y; uint accumulate; } push;
 layout(binding = 0) readonly buffer B0 { uint state[]; };
 layout(binding = 1) readonly buffer B1 { Schedule schedule[]; };
-layout(binding = 2) buffer B2 { uint lane_counts[]; };
+layout(binding = 2) readonly buffer B2 { uint ray_counts[]; };
 layout(binding = 3) writeonly buffer B3 { uint ray_start[]; };
 layout(binding = 4) buffer B4 { uint live[]; };
 layout(binding = 5) writeonly buffer B5 { uint arguments[]; };
@@ -24,7 +22,7 @@ void main() {
     uint begin = min(lane * per, push.n_rays);
     uint end = min(begin + per, push.n_rays);
     uint sum = 0u;
-    for (uint i = begin * push.lanes; i < end * push.lanes; i++) sum += lane_counts[i];
+    for (uint r = begin; r < end; r++) sum += ray_counts[r];
     totals[lane] = sum * active_now;
     barrier();
     if (lane == 0u) {
@@ -56,10 +54,6 @@ void main() {
     uint running = totals[lane];
     for (uint r = begin; r < end; r++) {
         ray_start[r] = running;
-        for (uint l = 0u; l < push.lanes; l++) {
-            uint here = lane_counts[r * push.lanes + l] * active_now;
-            lane_counts[r * push.lanes + l] = running;
-            running += here;
-        }
+        running += ray_counts[r] * active_now;
     }
 }

@@ -88,7 +88,7 @@ pub struct Train {
     pub rays: u32,
     /// Share of the batch drawn from rays that meet the motion hull.
     pub motion_share: f64,
-    /// Samples evaluated at once; bounds device memory, not results.
+    /// Samples evaluated at once, at most: bounds device memory, not results. A device may allow fewer.
     pub chunk_samples: u32,
     /// Iterations handed to the device at once.
     pub iterations_per_submit: u32,
@@ -253,7 +253,7 @@ impl Config {
                 iterations: 30_000,
                 rays: 2048,
                 motion_share: 0.0,
-                chunk_samples: 65_536,
+                chunk_samples: 524_288,
                 iterations_per_submit: 16,
                 checkpoint_every: 1000,
                 validate_every: 1000,
@@ -325,7 +325,6 @@ impl Config {
                     iterations: 1200,
                     rays: 1024,
                     motion_share: 0.85,
-                    chunk_samples: 131_072,
                     validate_every: 200,
                     checkpoint_every: 400,
                     ..paper.train

@@ -98,7 +98,11 @@ impl Tuning {
             // Two workgroups per multiprocessor; 132 of them where the driver does not tell their number.
             n => MatrixTuning { workgroups: if n == 0 { 264 } else { 2 * n }, largest_tile: 128, unroll: true },
         };
-        let chunk_samples = if info.kind == "cpu" { 1 << 16 } else { 1 << 19 };
+        // Some kilobytes per sample must fit beside all else.
+        let chunk_samples = match info.kind {
+            "cpu" => 1 << 17,
+            _ => (info.device_memory >> 14).clamp(1 << 16, 1 << 19) as u32,
+        };
         let overlap = info.kind != "cpu";
         // Shared memory is no faster on a CPU.
         let private_line_bytes = if info.kind == "cpu" { 0 } else { info.max_shared_memory / 2 };

@@ -75,7 +75,8 @@ impl Renderer {
         setup.occupancy_cells = 0;
         setup.n_static_samples = model.config.march.render_samples;
         setup.n_dynamic_samples = model.config.march.render_samples;
-        setup.sample_capacity = setup.sample_capacity.min(sample_capacity(kernels.tuning.chunk_samples));
+        let largest = kernels.tuning.chunk_samples.min(network.largest_chunk(gpu, &model.layout));
+        setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
         let mut buffers = forward_buffers(gpu, &kernels.tuning, &network, &setup, &model.layout, RAYS_PER_SUBMIT)?;
         buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
         // The schedule below has a single row, that of the model's step.

@@ -5,7 +5,7 @@ use super::layers;
 use crate::error::Result;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
-use crate::kernels::{Buffers, Kernels, LayerKernels, Layers, MARCH_LANES, Tuning, dispatch, groups_for};
+use crate::kernels::{Buffers, Kernels, LayerKernels, Layers, Tuning, dispatch, groups_for};
 use crate::layout::Setup;
 use crate::model::params::ParamLayout;
 
@@ -51,6 +51,16 @@ impl Network {
             Layers::F32 => Network::Layers(Box::new(LayerKernels::new(gpu, tuning.clone(), params.line_len() as u32)?)),
             Layers::Matrices => Network::Fused(Box::new(FusedKernels::new(gpu, tuning, params, train)?)),
         })
+    }
+
+    /// Samples a chunk may have, by the range of one storage buffer.
+    pub fn largest_chunk(&self, gpu: &Gpu, params: &ParamLayout) -> u32 {
+        let bytes_per_sample = match self {
+            Network::Layers(_) => 4 * params.width,
+            Network::Fused(_) => 2 * params.width * params.layers.len(),
+        };
+        // Less what capacities are padded with.
+        (gpu.info().max_storage_buffer_range / bytes_per_sample as u32).saturating_sub(256)
     }
 
     /// Loss scale to start with.
@@ -199,7 +209,7 @@ impl Network {
 
     /// Push constants of `march_scan` for a chunk: among them samples per tile, and tiles across a layer forward and
     /// backward, for its indirect arguments.
-    pub fn scan(&self, params: &ParamLayout, chunk: Chunk) -> [u32; 6] {
+    pub fn scan(&self, params: &ParamLayout, chunk: Chunk) -> [u32; 5] {
         let [tile, forward, backward] = match self {
             Network::Layers(k) => {
                 let (tile, width) = (k.tuning.tile(), params.width as u32);
@@ -207,6 +217,6 @@ impl Network {
             }
             Network::Fused(k) => [k.tile_samples(), 1, 1],
         };
-        [chunk.n_rays, MARCH_LANES, tile, forward, backward, u32::from(chunk.first_ray > 0)]
+        [chunk.n_rays, tile, forward, backward, u32::from(chunk.first_ray > 0)]
     }
 }

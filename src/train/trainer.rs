@@ -128,7 +128,8 @@ impl Trainer {
     ) -> Result<Trainer> {
         let network = Network::new(gpu, &tuning, &plan.params, true)?;
         let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32)?;
-        plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(kernels.tuning.chunk_samples));
+        let largest = kernels.tuning.chunk_samples.min(network.largest_chunk(gpu, &plan.params));
+        plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
         let buffers = training_buffers(gpu, &kernels.tuning, &network, &plan)?;
         gpu.upload(buffers.get("params")?, 0, params)?;
         let mut now = DeviceState { step: 0, loss_scale: network.first_loss_scale(), overflowed: 0, good_updates: 0 };
