@@ -1,15 +1,15 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Integrals and maxima of baked volumes along the rays of a pose, sampled by the hardware. One invocation per pixel.
-//   ray_out[pixel] as march_fwd writes it, without occlusion.
+// Integral or maximum of baked volumes along the rays of a pose, sampled by the hardware. One invocation per pixel.
+//   image[pixel]: line integral, or largest attenuation per world unit, of the fields asked for.
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint n_pixels; uint image_width; uint with_static; uint with_dynamic; } push;
+layout(push_constant) uniform Push { uint n_pixels; uint image_width; uint with_static; uint with_dynamic; uint maximum; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { View views[]; };
 layout(binding = 2) uniform sampler3D static_volume;
 layout(binding = 3) uniform sampler3D dynamic_volume;
-layout(binding = 4) writeonly buffer B4 { RayOut ray_out[]; };
+layout(binding = 4) writeonly buffer B4 { float image[]; };
 
 // Depths between which a ray is inside a box.
 vec2 crossing(vec3 anchor, vec3 direction, vec3 low, vec3 high) {
@@ -66,14 +66,5 @@ void main() {
                       vec3(setup.dynamic_max_x, setup.dynamic_max_y, setup.dynamic_max_z),
                       vec2(setup.dynamic_near, setup.dynamic_far));
     }
-    RayOut seen;
-    seen.static_integral = still.x;
-    seen.dynamic_integral = moving.x;
-    seen.occlusion = 0.0;
-    seen.static_max = still.y;
-    seen.dynamic_max = moving.y;
-    seen.total_max = max(still.y, moving.y);
-    seen.spare0 = 0.0;
-    seen.spare1 = 0.0;
-    ray_out[pixel] = seen;
+    image[pixel] = push.maximum != 0u ? max(still.y, moving.y) : still.x + moving.x;
 }

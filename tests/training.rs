@@ -9,7 +9,7 @@ use nertca_vk::cpu::{field, march};
 use nertca_vk::error::Error;
 use nertca_vk::kernels::Tuning;
 use nertca_vk::output::render::Renderer;
-use nertca_vk::output::sampled::{Baked, Components, Field, Grid};
+use nertca_vk::output::sampled::{Baked, Field, Grid, Quantity};
 use nertca_vk::reconstruct::{Event, RunOptions, reconstruct};
 use nertca_vk::train::checkpoint::{self, Checkpoint};
 use nertca_vk::train::plan::Plan;
@@ -260,23 +260,28 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
         assert!(error < 1e-4, "{field:?}[{at}]: {} against {}", got[at], want[at]);
     }
     let baked = Baked::new(renderer.clone(), 96).unwrap();
-    let both = Components { with_static: true, with_dynamic: true };
-    let (fast, exact) = (
-        baked.render(&dataset.views[1].rays, 24, 20, 1, both).unwrap(),
-        renderer.render(&dataset.views[1].rays, 24, 20, 1).unwrap(),
-    );
+    let view = &dataset.views[1].rays;
+    let exact = renderer.render(view, 24, 20, 1).unwrap();
+    let show = |with_static, with_dynamic, maximum| {
+        baked.render(view, 24, 20, 1, Quantity { with_static, with_dynamic, maximum }).unwrap()
+    };
     for (name, got, want, limit) in [
-        ("static", &fast.static_integral, &exact.static_integral, 1e-2),
-        ("dynamic", &fast.dynamic_integral, &exact.dynamic_integral, 2e-2),
+        ("static", show(true, false, false), exact.static_integral.clone(), 1e-2),
+        ("dynamic", show(false, true, false), exact.dynamic_integral.clone(), 2e-2),
+        ("total", show(true, true, false), exact.total_integral(), 1e-2),
+        ("static maximum", show(true, false, true), exact.static_max.clone(), 2e-2),
+        ("dynamic maximum", show(false, true, true), exact.dynamic_max.clone(), 2e-2),
     ] {
         let want: Vec<f64> = want.iter().map(|v| f64::from(*v)).collect();
         let norm = want.iter().map(|w| w * w).sum::<f64>();
         let off = got.iter().zip(&want).map(|(g, w)| (f64::from(*g) - w).powi(2)).sum::<f64>();
         assert!(norm > 0.0 && (off / norm).sqrt() < limit, "{name}: {:.1e} off", (off / norm).sqrt());
     }
-    let none = Components { with_static: false, with_dynamic: false };
-    let empty = baked.render(&dataset.views[1].rays, 24, 20, 1, none).unwrap();
-    assert!(empty.total_integral().iter().all(|v| *v == 0.0));
+    assert!(show(false, false, false).iter().all(|v| *v == 0.0));
+    // A recorded shot serves any view.
+    let other = Quantity { with_static: true, with_dynamic: false, maximum: false };
+    let turned = baked.render(&dataset.views[0].rays, 24, 20, 1, other).unwrap();
+    assert_ne!(turned, show(true, false, false));
     drop((baked, renderer, trainer));
     expect_silence(gpu);
 }

@@ -8,8 +8,8 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::model::field::Model;
 use nertca_vk::output::eval::Evaluation;
 use nertca_vk::output::pictures::{self, Window};
-use nertca_vk::output::render::{Renderer, Rendering};
-use nertca_vk::output::sampled::{BAKED_CELLS, Baked, Components};
+use nertca_vk::output::render::Renderer;
+use nertca_vk::output::sampled::{BAKED_CELLS, Baked, Quantity};
 use nertca_vk::reconstruct::{RunInfo, evaluate_run};
 use nertca_vk::train::checkpoint::{self, Checkpoint};
 use std::path::Path;
@@ -104,17 +104,33 @@ enum Renders {
 }
 
 impl Renders {
-    fn render(&self, shot: &Shot, phase: u32, component: Component) -> Result<Rendering> {
-        match self {
-            Renders::Fields(renderer) => renderer.render(&shot.rays, shot.width, shot.height, phase),
+    /// Line integrals, or maxima per mm.
+    fn render(&self, shot: &Shot, phase: u32, component: Component, projection: Projection) -> Result<Vec<f32>> {
+        let image = match self {
+            Renders::Fields(renderer) => {
+                let seen = renderer.render(&shot.rays, shot.width, shot.height, phase)?;
+                match (projection, component) {
+                    (Projection::Drr, Component::Total) => seen.total_integral(),
+                    (Projection::Drr, Component::Static) => seen.static_integral,
+                    (Projection::Drr, Component::Dynamic) => seen.dynamic_integral,
+                    (Projection::Mip, Component::Total) => seen.total_max,
+                    (Projection::Mip, Component::Static) => seen.static_max,
+                    (Projection::Mip, Component::Dynamic) => seen.dynamic_max,
+                }
+            }
             Renders::Baked(baked) => {
-                let components = Components {
+                let quantity = Quantity {
                     with_static: component != Component::Dynamic,
                     with_dynamic: component != Component::Static,
+                    maximum: projection == Projection::Mip,
                 };
-                baked.render(&shot.rays, shot.width, shot.height, phase, components)
+                baked.render(&shot.rays, shot.width, shot.height, phase, quantity)?
             }
-        }
+        };
+        Ok(match projection {
+            Projection::Drr => image,
+            Projection::Mip => image.into_iter().map(|x| x / MM_PER_UNIT as f32).collect(),
+        })
     }
 }
 
@@ -150,18 +166,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     };
     let frames = phases
         .iter()
-        .map(|phase| {
-            let seen = renders.render(&shot, *phase, args.component)?;
-            let per_mm = |v: Vec<f32>| v.into_iter().map(|x| x / MM_PER_UNIT as f32).collect();
-            Ok(match (args.projection, args.component) {
-                (Projection::Drr, Component::Total) => seen.total_integral(),
-                (Projection::Drr, Component::Static) => seen.static_integral,
-                (Projection::Drr, Component::Dynamic) => seen.dynamic_integral,
-                (Projection::Mip, Component::Total) => per_mm(seen.total_max),
-                (Projection::Mip, Component::Static) => per_mm(seen.static_max),
-                (Projection::Mip, Component::Dynamic) => per_mm(seen.dynamic_max),
-            })
-        })
+        .map(|phase| renders.render(&shot, *phase, args.component, args.projection))
         .collect::<Result<Vec<Vec<f32>>>>()?;
     let window = Window::of(&frames.concat());
     match extension.as_str() {
@@ -203,7 +208,7 @@ pub fn measure_frame_rates(
         for &size in sizes {
             let frame = |i: u32| {
                 let shot = shot(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
-                renders.render(&shot, i % model.layout.phases as u32, component)
+                renders.render(&shot, i % model.layout.phases as u32, component, Projection::Drr)
             };
             frame(0)?;
             let (begin, mut frames) = (std::time::Instant::now(), 0);

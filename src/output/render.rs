@@ -30,12 +30,6 @@ pub struct Rendering {
 }
 
 impl Rendering {
-    pub(super) fn from_device(seen: &[RayOut]) -> Rendering {
-        let mut out = Rendering::default();
-        out.extend(seen);
-        out
-    }
-
     fn extend(&mut self, seen: &[RayOut]) {
         for r in seen {
             self.static_integral.push(r.static_integral);

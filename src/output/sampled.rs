@@ -1,15 +1,17 @@
 //! Fields sampled on a regular grid: for export, and baked into 3D images for display rates.
 
-use super::render::{Renderer, Rendering};
+use super::render::Renderer;
 use crate::data::geometry::ViewRays;
 use crate::error::{Error, Result};
-use crate::gpu::record::Recording;
+use crate::gpu::memory::{Buffer, Memory};
+use crate::gpu::record::{Commands, Recording};
 use crate::gpu::volume::Volume;
 use crate::kernels::{dispatch, groups_for};
-use crate::layout::{RayOut, View};
+use crate::layout::View;
 use glam::DVec3;
 use half::f16;
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// A regular grid of points in world units (100 mm), x fastest.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -88,7 +90,7 @@ impl Renderer {
         let rows = ny * nz;
         let rows_at_once = self.rays_at_once(&setup).min(rows);
         let bytes = u64::from(rows_at_once) * u64::from(nx) * 4;
-        let cells = self.gpu.buffer("volume", bytes, crate::gpu::memory::Memory::Device)?;
+        let cells = self.gpu.buffer("volume", bytes, Memory::Device)?;
         buffers.set("volume", cells.clone());
         let mut out = Vec::with_capacity(grid.len());
         for first in (0..rows).step_by(rows_at_once as usize) {
@@ -116,21 +118,33 @@ impl Renderer {
 /// Cells of a baked volume along its longest side.
 pub const BAKED_CELLS: u32 = 192;
 
+/// What a pixel of a baked view shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Quantity {
+    /// Include the still background.
+    pub with_static: bool,
+    /// Include the moving vessels.
+    pub with_dynamic: bool,
+    /// The largest attenuation per world unit along the ray (of both fields, the larger) instead of the line integral.
+    pub maximum: bool,
+}
+
 /// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates;
 /// finer detail than a cell is lost.
 pub struct Baked {
     renderer: Arc<Renderer>,
     still: Volume,
     moving: Vec<Volume>,
+    /// Recorded once per size, phase and quantity: a frame is a view written, a submit and a picture read.
+    shots: Mutex<HashMap<(usize, usize, u32, Quantity), Arc<Shot>>>,
 }
 
-/// What to integrate.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Components {
-    /// The still background.
-    pub with_static: bool,
-    /// The moving vessels.
-    pub with_dynamic: bool,
+struct Shot {
+    commands: Commands,
+    view: Buffer,
+    image: Buffer,
+    /// A shot's buffers hold one frame.
+    in_use: Mutex<()>,
 }
 
 impl Baked {
@@ -159,11 +173,10 @@ impl Baked {
         let still = bake(Field::Static, &still, s.static_gain)?;
         let moving =
             (0..s.n_phases).map(|phase| bake(Field::Dynamic(phase), &moving, s.dynamic_gain)).collect::<Result<_>>()?;
-        Ok(Baked { still, moving, renderer })
+        Ok(Baked { still, moving, renderer, shots: Mutex::default() })
     }
 
-    /// Renders a `width` x `height` view at a phase; components left out are zero. `total_max` is the larger of the two
-    /// maxima.
+    /// Renders a `width` x `height` view at a phase, rows first.
     ///
     /// # Errors
     /// As [`Renderer::render`].
@@ -173,25 +186,44 @@ impl Baked {
         width: usize,
         height: usize,
         phase: u32,
-        components: Components,
-    ) -> Result<Rendering> {
-        let renderer = &self.renderer;
-        renderer.check_phase(phase)?;
-        let pixels = (width * height) as u32;
-        let mut buffers = renderer.buffers.clone();
-        buffers.set("views", renderer.gpu.buffer_with("views", &[rays.to_device()])?);
-        let bytes = u64::from(pixels) * size_of::<RayOut>() as u64;
-        let seen = renderer.gpu.buffer("ray_out", bytes, crate::gpu::memory::Memory::Readback)?;
-        buffers.set("ray_out", seen.clone());
+        quantity: Quantity,
+    ) -> Result<Vec<f32>> {
+        self.renderer.check_phase(phase)?;
+        let shot = self.shot(width, height, phase, quantity)?;
+        let _alone = shot.in_use.lock().unwrap_or_else(PoisonError::into_inner);
+        shot.view.write(&[rays.to_device()])?;
+        self.renderer.gpu.wait(shot.commands.submit()?)?;
+        let mut image = vec![0f32; width * height];
+        shot.image.read(&mut image)?;
+        Ok(image)
+    }
+
+    fn shot(&self, width: usize, height: usize, phase: u32, quantity: Quantity) -> Result<Arc<Shot>> {
+        let mut shots = self.shots.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = (width, height, phase, quantity);
+        if let Some(shot) = shots.get(&key) {
+            return Ok(shot.clone());
+        }
+        let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
+        let mut buffers = self.renderer.buffers.clone();
+        let view = gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
+        let image = gpu.buffer("image", u64::from(pixels) * 4, Memory::Readback)?;
+        buffers.set("views", view.clone());
+        buffers.set("image", image.clone());
         buffers.set_volume("static_volume", self.still.clone());
         buffers.set_volume("dynamic_volume", self.moving[phase as usize].clone());
-        let stage = &renderer.kernels.baked_march;
-        let push = [pixels, width as u32, u32::from(components.with_static), u32::from(components.with_dynamic)];
-        let mut r = Recording::new(&renderer.gpu, "baked render")?;
-        dispatch(&mut r, stage, groups_for(stage, pixels), &buffers, &[], push)?;
-        renderer.gpu.wait(r.finish()?.submit()?)?;
-        let mut pixels = vec![RayOut::default(); pixels as usize];
-        seen.read(&mut pixels)?;
-        Ok(Rendering::from_device(&pixels))
+        let stage = &self.renderer.kernels.baked_march;
+        let push = [
+            pixels,
+            width as u32,
+            u32::from(quantity.with_static),
+            u32::from(quantity.with_dynamic),
+            u32::from(quantity.maximum),
+        ];
+        let mut recording = Recording::new(gpu, "baked render")?;
+        dispatch(&mut recording, stage, groups_for(stage, pixels), &buffers, &[], push)?;
+        let shot = Arc::new(Shot { commands: recording.finish()?, view, image, in_use: Mutex::default() });
+        shots.insert(key, shot.clone());
+        Ok(shot)
     }
 }
