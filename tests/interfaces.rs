@@ -348,3 +348,59 @@ fn ctrl_c_saves_and_exits_130() {
     let saved = nertca_vk::train::checkpoint::newest(&run).unwrap();
     assert!(nertca_vk::train::checkpoint::Checkpoint::read(&saved).unwrap().model.step > 0);
 }
+
+#[test]
+fn measurements_and_baked_views() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = phantom(directory.path(), &[]);
+    let run = directory.path().join("run");
+    ok(&[&["train", text(&data), "-o", text(&run)], SHORT].concat());
+    let (file, quick) = (directory.path().join("bench.json"), ["--iterations", "2", "--repeats", "3"]);
+    let full = [&["bench", text(&data), "--full", "--json", text(&file), "--set", "dynamic.delay=5"], SHORT, &quick];
+    let said = ok(&full.concat());
+    for part in ["before the network starts", "peaks: f32", "37:00", "really run", "network passes alone"] {
+        assert!(said.contains(part), "`{part}` is missing: {said}");
+    }
+    let report: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    assert_eq!(report["after"]["ms"].as_array().unwrap().len(), 3);
+    assert!(report["peaks"]["f32_tflops"].as_f64().unwrap() > 0.0);
+    assert_eq!(report["config"]["train"]["rays"], 64);
+    // 5 iterations without the network and 25 with it.
+    let median = |part: &str| {
+        let mut ms: Vec<f64> = report[part]["ms"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
+        ms.sort_by(f64::total_cmp);
+        ms[1]
+    };
+    let whole = (5.0 * median("before") + 25.0 * median("after")) * 1e-3;
+    assert!((report["whole_run_s"].as_f64().unwrap() - whole).abs() < 1e-9);
+    // Counted operations: 16 neurons, 4 layers, 8 bands: 51 inputs.
+    let forward = 2 * (51 * 16 + 3 * 16 * 16 + 16);
+    assert_eq!(report["network_cost"]["forward"], forward);
+    assert_eq!(report["network_cost"]["weights"], forward);
+    assert_eq!(report["network_cost"]["inputs"], 2 * (3 * 16 * 16 + 16));
+    let compared = [&["bench", text(&data), "--kernels", "--compare", text(&file)], SHORT, &quick];
+    let said = ok(&compared.concat());
+    assert!(said.contains("with the network, ms") && said.contains("another configuration"), "{said}");
+    fails(&["bench", text(&data), "--compare", text(&data.join("dataset.json"))], 1, &["dataset.json", "bench --json"]);
+
+    let picture = directory.path().join("baked.npy");
+    let pose = ["render", text(&run), "--primary", "10", "--component", "dynamic", "--phase", "1"];
+    ok(&[&pose[..], &["--baked", "--out", text(&picture)]].concat());
+    assert!(std::fs::metadata(&picture).unwrap().len() >= 24 * 24 * 4);
+    let said = ok(&["render", text(&run), "--fps", "--size", "16"]);
+    assert_eq!(said.lines().filter(|l| l.contains("frames/s")).count(), 6, "{said}");
+}
+
+#[test]
+fn matrices_are_refused_where_there_are_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let devices: Value = serde_json::from_str(&ok(&["devices", "--json"])).unwrap();
+    if !devices[0]["matrices"].as_array().unwrap().is_empty() {
+        eprintln!("SKIPPED: this device has matrices");
+        return;
+    }
+    let data = phantom(directory.path(), &[]);
+    let run = directory.path().join("run");
+    let asked = [&["--layers", "matrices", "train", text(&data), "-o", text(&run)], SHORT];
+    fails(&asked.concat(), 2, &["cooperative matrices", "f32"]);
+}
