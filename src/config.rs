@@ -205,8 +205,10 @@ pub struct Hull {
     pub resolution: u32,
     /// A pixel moves when its temporal range exceeds what noise gives by this many standard deviations.
     pub noise_sigmas: f64,
-    /// ... and this share of the strongest change in its view.
+    /// ... and this share of the strongest change in its view, with four views or more.
     pub min_share: f64,
+    /// The same with fewer views: each carves less, so more has to be asked of it.
+    pub min_share_few_views: f64,
     /// Half width of the widest vessel, pixels: structures as thin as that may hide in the still background.
     /// 0 trusts each pixel's minimum over the phases.
     pub vessel_pixels: u32,
@@ -303,6 +305,7 @@ impl Config {
                 resolution: 128,
                 noise_sigmas: 6.0,
                 min_share: 0.1,
+                min_share_few_views: 0.1,
                 vessel_pixels: 3,
                 dilate_pixels: 1,
                 max_share: 0.35,
@@ -357,6 +360,7 @@ impl Config {
                     per_phase: true,
                     resolution: 224,
                     min_share: 0.05,
+                    min_share_few_views: 0.08,
                     dilate_pixels: 0,
                     ..paper.hull
                 },
@@ -459,6 +463,7 @@ impl Config {
             ("hull.resolution", f64::from(self.hull.resolution), 8.0, 512.0),
             ("hull.noise_sigmas", self.hull.noise_sigmas, 0.0, 1e3),
             ("hull.min_share", self.hull.min_share, 0.0, 1.0),
+            ("hull.min_share_few_views", self.hull.min_share_few_views, 0.0, 1.0),
             ("hull.max_share", self.hull.max_share, 0.0, 1.0),
             ("hull.dilate_pixels", f64::from(self.hull.dilate_pixels), 0.0, 64.0),
             ("hull.vessel_pixels", f64::from(self.hull.vessel_pixels), 0.0, 1024.0),

@@ -97,8 +97,9 @@ fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
 
 /// Analyses each training view.
 pub fn analyse(dataset: &Dataset, config: &config::Hull) -> Vec<ViewMotion> {
-    dataset
-        .training_views()
+    let views = dataset.training_views();
+    let min_share = if views.len() < 4 { config.min_share_few_views } else { config.min_share } as f32;
+    views
         .into_par_iter()
         .map(|view| {
             let mut frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view).collect();
@@ -130,7 +131,7 @@ pub fn analyse(dataset: &Dataset, config: &config::Hull) -> Vec<ViewMotion> {
             };
             let range: Vec<f32> = highest.iter().zip(&background).map(|(h, b)| (h - b).max(0.0)).collect();
             let strongest = percentile(&range, 0.995);
-            let threshold = |p: usize| (config.noise_sigmas as f32 * noise[p]).max(config.min_share as f32 * strongest);
+            let threshold = |p: usize| (config.noise_sigmas as f32 * noise[p]).max(min_share * strongest);
             let grow = |marked: &dyn Fn(usize) -> bool| -> Vec<bool> {
                 let marked = (0..pixels).map(|p| f32::from(u8::from(n > 1 && marked(p))));
                 let grown = dilate(&image(marked.collect()), config.dilate_pixels as usize);

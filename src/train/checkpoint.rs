@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-const FORMAT: &str = "nertca-checkpoint-1";
+const FORMAT: &str = "nertca-checkpoint-2";
 const MAX_BYTES: u64 = 4 << 30;
 /// Checkpoints kept besides the newest.
 const KEEP_OLDER: usize = 2;
