@@ -1,10 +1,16 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Counts the live dynamic samples of each ray of a chunk.
-//   lane_offsets[ray][lane] = samples of the lanes before;  ray_counts[ray] = samples of the ray.
+// Finds and counts the live dynamic samples of each ray of a chunk.
+//   lane_masks: which depths are live;  lane_offsets[ray][lane] = live samples of the lanes before;
+//   ray_counts[ray] = live samples of the ray.
 #include "inc/march_samples.glsl"
-layout(binding = 4) writeonly buffer B4 { uint lane_offsets[]; };
-layout(binding = 5) writeonly buffer B5 { uint ray_counts[]; };
+layout(binding = 3) readonly buffer B3 { uint hull[]; };
+layout(binding = 4) readonly buffer B4 { uint occupancy[]; };
+layout(binding = 5) writeonly buffer B5 { uint lane_masks[]; };
+layout(binding = 6) writeonly buffer B6 { uint lane_offsets[]; };
+layout(binding = 7) writeonly buffer B7 { uint ray_counts[]; };
+#include "inc/dynamic_box.glsl"
+#include "inc/occupied.glsl"
 
 shared uint counts[gl_WorkGroupSize.x];
 
@@ -15,8 +21,15 @@ void main() {
     uint begin = lane * run_length();
     uint end = min(begin + run_length(), setup.n_dynamic_samples);
     uint live = 0u;
-    for (uint k = begin; k < end; k++) {
-        if (sample_lives(ray.anchor + dynamic_depth(k, ray) * ray.direction, ray.phase)) live++;
+    for (uint word = 0u; word < mask_words(); word++) {
+        uint mask = 0u;
+        uint first = begin + 32u * word;
+        for (uint k = first; k < min(first + 32u, end); k++) {
+            vec3 x = ray.anchor + dynamic_depth(k, ray) * ray.direction;
+            if (dynamic_inside(x, ray.phase) && occupied(x, ray.phase, state[0])) mask |= 1u << (k - first);
+        }
+        lane_masks[(r * gl_WorkGroupSize.x + lane) * mask_words() + word] = mask;
+        live += bitCount(mask);
     }
     counts[lane] = live;
     barrier();

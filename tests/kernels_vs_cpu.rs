@@ -19,6 +19,8 @@ const CASES: &[(&str, &[&str])] = &[
     ("fast", &[]),
     // odd bands, five ranks (two vec4), no power of two anywhere, batch of one ray
     ("fast", &["dynamic.bands=5", "static.ranks=5", "static.grid=7", "train.rays=4", "march.dynamic_samples=33"]),
+    // more than 32 depths a lane
+    ("fast", &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
     // a single hidden layer, skip in a deep net, wide layers
     ("paper", &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
     ("public-code", &["dynamic.layers=6", "dynamic.skip_layer=3", "dynamic.width=48", "dynamic.latent=12"]),

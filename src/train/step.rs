@@ -46,10 +46,13 @@ pub fn forward_buffers(
     // Samplers of volumes may have fewer samples a ray and more rays a chunk than `setup` says.
     let per_chunk = u64::from(n_rays);
     let capacity = u64::from(setup.sample_capacity);
+    // A bit per sample, each lane's rounded up to words.
+    let mask_words = capacity / 32 + per_chunk * u64::from(MARCH_LANES);
     for (name, bytes) in [
         ("state", 16),
         ("rays", u64::from(n_rays) * size_of::<Ray>() as u64),
         ("ray_out", u64::from(n_rays) * size_of::<RayOut>() as u64),
+        ("lane_masks", mask_words * 4),
         ("lane_offsets", per_chunk * u64::from(MARCH_LANES) * 4),
         ("ray_counts", per_chunk * 4),
         ("ray_start", (per_chunk + 1) * 4),
