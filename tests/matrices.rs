@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::{expect_silence, gpu, relative_error, small_config, small_dataset};
+use common::{expect_silence, gpu, relative_error, run, small_config, small_dataset};
 use nertca_vk::calibrate;
 use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::{march, step};
@@ -84,14 +84,6 @@ fn losses_and_gradients_match() {
         assert!(off < 3e-2, "{preset} {settings:?}: f16 puts the gradient {off:.1e} off");
     }
     expect_silence(gpu);
-}
-
-fn run(trainer: &mut Trainer, until: u32) -> Vec<f64> {
-    let mut losses = Vec::new();
-    while trainer.step() < until {
-        losses.extend(trainer.advance(until).unwrap().iter().map(|l| l.total()));
-    }
-    losses
 }
 
 #[test]

@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
+use common::{expect_silence, gpu, relative_error, run, small_config, small_dataset, tuning};
 use nertca_vk::cpu::field::Precision;
 use nertca_vk::cpu::{field, march};
 use nertca_vk::error::Error;
@@ -17,14 +17,6 @@ use nertca_vk::train::trainer::Trainer;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-
-fn run(trainer: &mut Trainer, until: u32) -> Vec<f64> {
-    let mut losses = Vec::new();
-    while trainer.step() < until {
-        losses.extend(trainer.advance(until).unwrap().iter().map(|l| l.total()));
-    }
-    losses
-}
 
 #[test]
 fn the_loss_falls_and_runs_repeat_bit_by_bit() {

@@ -136,8 +136,11 @@ pub struct Baked {
     still: Volume,
     moving: Vec<Volume>,
     /// Recorded once per size, phase and quantity: a frame is a view written, a submit and a picture read.
-    shots: Mutex<HashMap<(usize, usize, u32, Quantity), Arc<Shot>>>,
+    shots: Mutex<HashMap<ShotKey, Arc<Shot>>>,
 }
+
+/// Columns, rows, phase, quantity.
+type ShotKey = (usize, usize, u32, Quantity);
 
 struct Shot {
     commands: Commands,

@@ -6,6 +6,7 @@ use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::data::geometry::{CArm, Geometry};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::Tuning;
+use nertca_vk::train::trainer::Trainer;
 use std::path::PathBuf;
 
 /// A device with validation on. A missing driver or layer fails the test: it is never skipped.
@@ -17,6 +18,15 @@ pub fn gpu() -> Gpu {
 /// The paths a device gets by default.
 pub fn tuning(gpu: &Gpu) -> Tuning {
     Tuning::for_device(gpu.info())
+}
+
+/// Trains up to an iteration; the objective of each on the way.
+pub fn run(trainer: &mut Trainer, until: u32) -> Vec<f64> {
+    let mut losses = Vec::new();
+    while trainer.step() < until {
+        losses.extend(trainer.advance(until).unwrap().iter().map(|l| l.total()));
+    }
+    losses
 }
 
 /// Fails when the validation layers had anything to say, or when device objects leaked.
