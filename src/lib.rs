@@ -10,9 +10,9 @@
 //! 6. [`train::checkpoint`]: parameters, moments, step, configuration -> one safetensors file
 //! 7. [`output::render`], [`output::eval`]: any pose and phase -> pictures and scores
 //!
-//! [`reconstruct`] ties these to a run directory, [`report`] scores it, [`mod@bench`] times it, [`phantom`] makes data to try them on, [`cpu`] holds an f64
-//! twin of every stage, and [`gpu`] is Vulkan without any knowledge of angiography. Public functions speak mm and
-//! degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
+//! [`reconstruct`] ties these to a run directory, [`report`] scores it, [`mod@bench`] times it, [`phantom`] makes data to
+//! try them on, [`cpu`] holds an f64 twin of every stage, and [`gpu`] is Vulkan without any knowledge of angiography.
+//! Public functions speak mm and degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
 
 pub mod bench;
 pub mod calibrate;
