@@ -172,7 +172,7 @@ pub struct DynamicField {
     pub lr_end: f64,
     /// How it decays.
     pub decay: Decay,
-    /// Shift inside its softplus when the problem is normalised.
+    /// Shift inside its softplus when the problem is normalised, at most: deep hulls start lower.
     pub normalised_shift: f64,
     /// Weight of occlusion minimisation, lambda_o.
     pub occlusion: f64,

@@ -92,13 +92,20 @@ impl Scene {
             robust_scale: 0.0,
         };
         if config.loss.normalise {
-            scene.normalise(config, dataset, motion, static_half)?;
+            scene.normalise(config, dataset, motion, hull, static_half)?;
         }
         Ok(scene)
     }
 
     /// Chooses gains, shifts and weights so that features, integrals and losses are near 1.
-    fn normalise(&mut self, config: &Config, dataset: &Dataset, motion: &[ViewMotion], static_half: f64) -> Result<()> {
+    fn normalise(
+        &mut self,
+        config: &Config,
+        dataset: &Dataset,
+        motion: &[ViewMotion],
+        hull: Option<&Hull>,
+        static_half: f64,
+    ) -> Result<()> {
         let training = dataset.training();
         let count = (training.len() * dataset.n_pixels()) as f64;
         let sum: f64 = training.iter().flat_map(|f| &f.integrals).map(|v| f64::from(*v)).sum();
@@ -121,8 +128,13 @@ impl Scene {
         let change = f64::from(motion::percentile(&moving, 0.9));
         let change = if change > 0.0 { change } else { mean };
         // A vessel fills a few percent of the field of view.
-        self.dynamic_gain = change / (0.05 * field_of_view(dataset));
-        self.dynamic_shift = config.dynamic.normalised_shift;
+        let vessel = 0.05 * field_of_view(dataset);
+        self.dynamic_gain = change / vessel;
+        let depth = hull
+            .map_or((DVec3::from_array(self.dynamic_max) - DVec3::from_array(self.dynamic_min)).max_element(), |h| {
+                mean_depth(h, dataset, motion)
+            });
+        self.dynamic_shift = first_shift(config.dynamic.normalised_shift, depth / vessel);
         (self.dynamic_weight, self.robust_scale) = match config.loss.dynamic_target {
             DynamicTarget::Temporal => (1.0 / (change * change), config.loss.robust * change),
             // Both fields share one squared residual.
@@ -224,6 +236,37 @@ fn field_of_view(dataset: &Dataset) -> f64 {
     radius
 }
 
+/// How deep rays that meet the hull run inside it, on average: its volume over the area of the pixels that see it.
+fn mean_depth(hull: &Hull, dataset: &Dataset, motion: &[ViewMotion]) -> f64 {
+    let (mut sum, mut n) = (0.0, 0);
+    for m in motion {
+        let at = |i: f64, j: f64| dataset.views[m.view].rays.pixel(i, j).0;
+        let pixel_area = (at(1.0, 0.0) - at(0.0, 0.0)).cross(at(0.0, 1.0) - at(0.0, 0.0)).length();
+        for phase in 0..hull.n_phases {
+            let seen = if hull.n_phases > 1 { &m.moving_at[phase] } else { &m.moving };
+            let pixels = seen.iter().filter(|moving| **moving).count();
+            if pixels > 0 {
+                let bits = &hull.bits[phase * hull.words()..][..hull.words()];
+                let cells: u32 = bits.iter().map(|w| w.count_ones()).sum();
+                sum += f64::from(cells) * hull.cell.powi(3) / (pixels as f64 * pixel_area);
+                n += 1;
+            }
+        }
+    }
+    if n > 0 { sum / f64::from(n) } else { 0.0 }
+}
+
+/// The shift inside the dynamic field's softplus that a run starts with. A field that is `depth_in_vessels` times as deep
+/// as a vessel starts with as many times too large an integral, whose gradients can switch the whole network off: then
+/// it starts nearer to zero.
+fn first_shift(normalised_shift: f64, depth_in_vessels: f64) -> f64 {
+    if depth_in_vessels <= DEEP {
+        return normalised_shift;
+    }
+    let attenuation = normalised_shift.exp().ln_1p() / (depth_in_vessels / DEEP).powi(2);
+    attenuation.exp_m1().ln().max(normalised_shift.min(-5.0))
+}
+
 fn half_depth(dataset: &Dataset) -> f64 {
     dataset.depth_range.0.abs().max(dataset.depth_range.1.abs())
 }
@@ -236,9 +279,27 @@ pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
         field_of_view(dataset).min(half_depth(dataset))
     }
 }
+/// Depth of the dynamic field, in vessels, from which a run starts nearer to zero. Tight hulls of 3 and 4 views reach 2.4.
+const DEEP: f64 = 2.5;
+
 /// Samples a chunk can hold that is to take `samples`; also the stride between the features of a sample. Live samples
 /// are padded to tiles of up to 128; the remainder keeps strides off powers of two, which would map a sample's features
 /// to one cache set.
 pub fn sample_capacity(samples: u32) -> u32 {
     samples.next_multiple_of(128) + 12
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn deep_fields_start_nearer_to_zero() {
+        assert_eq!(first_shift(-2.0, 2.4), -2.0);
+        // Twice as deep as a run bears: a quarter of the attenuation.
+        let softplus = |x: f64| x.exp().ln_1p();
+        assert!((softplus(first_shift(-2.0, 2.0 * DEEP)) - softplus(-2.0) / 4.0).abs() < 1e-12);
+        assert_eq!(first_shift(-2.0, 1e6), -5.0);
+        assert_eq!(first_shift(-10.0, 1e6), -10.0, "a shift that was asked for is never raised");
+    }
 }
