@@ -23,6 +23,7 @@ pub mod kernels;
 pub mod layout;
 pub mod reconstruct;
 pub mod report;
+pub mod schedule;
 
 /// Vulkan compute, free of any knowledge of angiography.
 pub mod gpu {
