@@ -185,7 +185,7 @@ impl Subject {
     }
 }
 
-/// Runs a dispatch again and again, for longer and longer, and returns the shortest time per run of the last round.
+/// Runs a dispatch eight times and returns the shortest time, of the submit and the wait for it.
 fn best_seconds(
     gpu: &Gpu,
     stage: &Arc<Pipeline>,

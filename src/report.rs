@@ -4,37 +4,36 @@ use crate::data::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::Tuning;
+use crate::model::field::Model;
 use crate::output::eval::{Evaluation, evaluate};
 use crate::output::pictures::{self, Window};
 use crate::output::render::Renderer;
-use crate::train::checkpoint::{self, Checkpoint};
 use std::path::Path;
 
-/// Evaluates a run on all validation frames and leaves pictures in `directory`, if given: one comparison per
+/// Evaluates a model on all validation frames and leaves pictures in `directory`, if given: one comparison per
 /// frame and one animation per view.
 ///
 /// # Errors
 /// Errors of data, device and files.
-pub fn evaluate_run(
+pub fn evaluate_model(
     gpu: &Gpu,
     tuning: &Tuning,
-    run: &Path,
+    model: &Model,
     dataset: &Dataset,
     threshold_per_mm: Option<f64>,
     directory: Option<&Path>,
 ) -> Result<Evaluation> {
-    let saved = Checkpoint::read(&checkpoint::newest(run)?)?;
-    if saved.model.layout.phases != dataset.n_phases as usize {
+    if model.layout.phases != dataset.n_phases as usize {
         return Err(Error::config(
             "--data",
             dataset.path.display(),
-            format!("has {} phases, the run {}", dataset.n_phases, saved.model.layout.phases),
+            format!("has {} phases, the run {}", dataset.n_phases, model.layout.phases),
         ));
     }
-    let renderer = Renderer::new(gpu, &saved.model, tuning.clone())?;
+    let renderer = Renderer::new(gpu, model, tuning.clone())?;
     let frames: Vec<_> = dataset.validation().iter().collect();
     let threshold = threshold_per_mm.map(|t| t * crate::data::geometry::MM_PER_UNIT);
-    let evaluation = evaluate(&renderer, dataset, &frames, saved.model.step, threshold, |frame, seen, threshold| {
+    let evaluation = evaluate(&renderer, dataset, &frames, model.step, threshold, |frame, seen, threshold| {
         let Some(directory) = directory else { return Ok(()) };
         pictures::write_comparison(
             &directory.join(format!("{}.png", frame.name)),

@@ -1,7 +1,7 @@
 //! `bench`: iterations, passes and renderings against the device's own limits and the paper's 37 minutes.
 
 use super::args::{BenchArgs, Cli, Component};
-use super::results::{FrameRate, measure_frame_rates, print_frame_rates};
+use super::results::{FrameRate, measure_frame_rates, newest_model, print_frame_rates};
 use nertca_vk::bench::{self, NetworkCost, PAPER_SECONDS, Peaks, Subject, Timing};
 use nertca_vk::config::Config;
 use nertca_vk::data::dataset::{Dataset, Layout};
@@ -10,7 +10,7 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::output::render::Renderer;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk::reconstruct::{Event, RunOptions, reconstruct};
-use nertca_vk::report::evaluate_run;
+use nertca_vk::report::evaluate_model;
 use nertca_vk::train::plan::Plan;
 use nertca_vk::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
@@ -158,7 +158,7 @@ fn measure(
             })?;
             let score = match dataset.validation().is_empty() {
                 true => None,
-                false => Some(evaluate_run(gpu, &tuning, &directory, dataset, None, None)?),
+                false => Some(evaluate_model(gpu, &tuning, &newest_model(&directory)?, dataset, None, None)?),
             };
             Some(FullRun {
                 train_s,

@@ -11,7 +11,7 @@ use nertca_vk::output::pictures::{self, Window};
 use nertca_vk::output::render::Renderer;
 use nertca_vk::output::sampled::{BAKED_CELLS, Baked, Quantity};
 use nertca_vk::reconstruct::RunInfo;
-use nertca_vk::report::evaluate_run;
+use nertca_vk::report::evaluate_model;
 use nertca_vk::train::checkpoint::{self, Checkpoint};
 use std::path::Path;
 use std::sync::Arc;
@@ -31,9 +31,9 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     }
     let dataset = Dataset::open(&data)?;
     let gpu = cli.open_device()?;
-    let config = Checkpoint::read(&checkpoint::newest(&args.run)?)?.model.config;
-    let tuning = cli.tuning(&gpu, &config);
-    let evaluation = evaluate_run(&gpu, &tuning, &args.run, &dataset, args.threshold, args.images.as_deref())?;
+    let model = newest_model(&args.run)?;
+    let tuning = cli.tuning(&gpu, &model.config);
+    let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, args.threshold, args.images.as_deref())?;
     if args.json {
         out!("{}", json(&evaluation)?);
     } else {
@@ -73,6 +73,11 @@ pub fn print_table(evaluation: &Evaluation) {
         evaluation.threshold.total_per_mm,
         evaluation.threshold.rule
     );
+}
+
+/// The fields of a run's newest checkpoint, or of a checkpoint file.
+pub fn newest_model(run: &Path) -> Result<Model> {
+    Ok(Checkpoint::read(&checkpoint::newest(run)?)?.model)
 }
 
 /// Where and what to render.
@@ -137,7 +142,7 @@ impl Renders {
 
 /// Renders a run.
 pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
-    let model = Checkpoint::read(&checkpoint::newest(&args.run)?)?.model;
+    let model = newest_model(&args.run)?;
     let size = args.size.map_or(model.image_size, |n| [n, n]);
     if !(1..=images::MAX_SIDE).contains(&size[0]) {
         return Err(Error::config("--size", size[0], format!("1 to {} is accepted", images::MAX_SIDE)));

@@ -1,13 +1,13 @@
 //! `train`: progress, Ctrl-C, report.
 
 use super::args::{Cli, TrainArgs};
-use super::results::print_table;
+use super::results::{newest_model, print_table};
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::config::Config;
 use nertca_vk::data::dataset::Dataset;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::reconstruct::{Event, RunInfo, RunOptions, reconstruct};
-use nertca_vk::report::evaluate_run;
+use nertca_vk::report::evaluate_model;
 use nertca_vk::train::checkpoint;
 use nertca_vk::train::plan::Plan;
 use std::io::IsTerminal;
@@ -45,6 +45,8 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     .map_err(|e| Error::Internal(format!("Ctrl-C handler: {e}")))?;
     let gpu = cli.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
+    // A resumed run keeps its own configuration, so that is what paths are chosen for.
+    let config = if args.resume { newest_model(run)?.config } else { config };
     let tuning = cli.training_tuning(&gpu, &config, &dataset)?;
     let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
     let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
@@ -53,7 +55,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     outcome?;
     if !dataset.validation().is_empty() {
         let report = run.join("report");
-        let evaluation = evaluate_run(&gpu, &tuning, run, &dataset, None, Some(&report))?;
+        let evaluation = evaluate_model(&gpu, &tuning, &newest_model(run)?, &dataset, None, Some(&report))?;
         let text = serde_json::to_string_pretty(&evaluation).map_err(|e| Error::Internal(e.to_string()))?;
         nertca_vk::files::write_atomic(&report.join("evaluation.json"), text.as_bytes())?;
         if !args.json {

@@ -32,7 +32,7 @@ const RANGE: vk::ImageSubresourceRange = vk::ImageSubresourceRange {
 };
 
 impl Gpu {
-    /// A volume of `size` cells, x fastest, zero outside.
+    /// A volume of `size` cells, x fastest; outside, its nearest cell repeats.
     ///
     /// # Errors
     /// [`Error::Internal`] when data and size differ, [`Error::OutOfMemory`], errors of the upload.
