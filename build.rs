@@ -11,11 +11,30 @@ use std::{env, fs};
 
 type Failure = Box<dyn std::error::Error>;
 
+/// The shared library carries its ABI version in its soname and is never unmapped: threads of its own, and of drivers it
+/// loaded, may outlive a `dlclose`.
+fn link_library() -> Result<(), Failure> {
+    if env::var("CARGO_CFG_TARGET_OS")? != "linux" {
+        return Ok(());
+    }
+    println!("cargo:rustc-cdylib-link-arg=-Wl,-z,nodelete");
+    // cargo-c sets a soname of its own.
+    if env::var_os("CARGO_FEATURE_CAPI").is_none() {
+        let source = fs::read_to_string("src/capi/types.rs")?;
+        let version = source.split("NERTCA_ABI_VERSION: u32 = ").nth(1).and_then(|rest| rest.split(';').next());
+        let version = version.ok_or("src/capi/types.rs names no ABI version")?;
+        println!("cargo:rustc-cdylib-link-arg=-Wl,-soname,libnertca_vk.so.{version}");
+    }
+    println!("cargo:rerun-if-changed=src/capi/types.rs");
+    Ok(())
+}
+
 fn main() -> Result<(), Failure> {
     let glsl = PathBuf::from("glsl");
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-env-changed=SHADERC_LIB_DIR");
     println!("cargo:rustc-env=NERTCA_COMMIT={}", commit());
+    link_library()?;
     let out = PathBuf::from(env::var("OUT_DIR")?);
     let variants = read_variants(&glsl.join("variants.txt"))?;
     let compiler = shaderc::Compiler::new()?;

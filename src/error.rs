@@ -88,6 +88,12 @@ pub enum Error {
         /// Its value.
         value: f64,
     },
+    /// What was asked for cannot be done while something else goes on.
+    #[error("busy: {0}")]
+    Busy(String),
+    /// What was asked for needs something that is still to come.
+    #[error("not ready: {0}")]
+    NotReady(String),
     /// The user asked to stop; state was saved.
     #[error("interrupted")]
     Interrupted,

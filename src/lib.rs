@@ -10,6 +10,7 @@
 //! 6. [`train::checkpoint`]: parameters, moments, step, configuration -> one safetensors file
 //! 7. [`output::render`], [`output::eval`]: any pose and phase -> pictures and scores
 //!
+//! [`session`] is a reconstruction in memory that grows with its frames, [`capi`] the same for C.
 //! [`reconstruct`] ties these to a run directory, [`report`] scores it, [`mod@bench`] times it, [`phantom`] makes data to
 //! try them on, [`cpu`] holds an f64 twin of every stage, and [`gpu`] is Vulkan without any knowledge of angiography.
 //! Public functions speak mm and degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
@@ -24,6 +25,7 @@ pub mod layout;
 pub mod reconstruct;
 pub mod report;
 pub mod schedule;
+pub mod session;
 
 /// Vulkan compute, free of any knowledge of angiography.
 pub mod gpu {
@@ -37,6 +39,7 @@ pub mod gpu {
 /// What comes in: geometry, angiograms, volumes, and what moves in them.
 pub mod data {
     pub mod dataset;
+    pub mod gating;
     pub mod geometry;
     pub mod images;
     pub mod motion;
@@ -75,11 +78,27 @@ pub mod train {
 /// What goes out: renderings, scores, pictures, projections of volumes.
 pub mod output {
     pub mod eval;
+    pub mod live;
     pub mod metrics;
     pub mod pictures;
     pub mod projector;
     pub mod render;
     pub mod sampled;
+}
+
+/// The C ABI: `include/nertca_vk.h` is generated from here.
+#[allow(non_camel_case_types, reason = "types have the names they have in C")]
+#[allow(unreachable_pub, reason = "what the modules share among themselves")]
+pub mod capi {
+    pub mod context;
+    pub mod handles;
+    pub mod log;
+    pub mod options;
+    pub mod output;
+    pub mod reconstruction;
+    pub mod status;
+    pub mod training;
+    pub mod types;
 }
 
 /// Synthetic data with exact truth.

@@ -59,6 +59,7 @@ impl Golden {
                 sod_mm: arm["sod_mm"].as_f64().unwrap(),
                 pixel_mm: arm_pair("pixel_mm"),
                 offset_mm: arm_pair("offset_mm"),
+                table_mm: [0.0; 3],
             });
             views.push(View { rays: geometry.rays(width, height).unwrap(), geometry });
             for phase in 0..phases {

@@ -33,6 +33,7 @@ fn device_and_f64_projector_agree() {
                 sod_mm: 750.0,
                 pixel_mm: [6.0, 5.0],
                 offset_mm: [3.0, 0.0],
+                table_mm: [0.0; 3],
             };
             Geometry::CArm(arm).rays(21, 19).unwrap()
         })

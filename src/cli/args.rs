@@ -369,7 +369,12 @@ fn triple<T: std::str::FromStr>(text: &str) -> std::result::Result<[T; 3], Strin
 impl Cli {
     /// Opens the device the options ask for.
     pub fn open_device(&self) -> Result<Gpu> {
-        Gpu::open(&DeviceOptions { select: self.device.clone(), validation: self.validate, cache_dir: cache_dir() })
+        Gpu::open(&DeviceOptions {
+            select: self.device.clone(),
+            validation: self.validate,
+            cache_dir: cache_dir(),
+            memory_limit: None,
+        })
     }
 
     /// Paths through the kernels for a configuration: as the options ask, as an earlier training on this device found

@@ -65,6 +65,7 @@ mod tests {
             sod_mm: 700.0,
             pixel_mm: [1.0, 1.0],
             offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
         };
         let rays = Geometry::CArm(carm).rays(11, 11).unwrap();
         for (i, j) in [(5, 5), (2, 7)] {

@@ -281,6 +281,7 @@ impl Dataset {
                     sod_mm,
                     pixel_mm: [view.rays.direction[1].length() * sid_mm, view.rays.direction[2].length() * sid_mm],
                     offset_mm: [0.0; 2],
+                    table_mm: [0.0; 3],
                 }
             }
         }

@@ -46,6 +46,14 @@ pub struct CArm {
     /// Offset of the detector centre along columns and rows, mm.
     #[serde(default)]
     pub offset_mm: [f64; 2],
+    /// How far the table has carried the patient along (left, posterior, superior), mm, from where patient
+    /// coordinates have their origin at the isocentre.
+    #[serde(default, skip_serializing_if = "is_at_rest")]
+    pub table_mm: [f64; 3],
+}
+
+fn is_at_rest(table_mm: &[f64; 3]) -> bool {
+    *table_mm == [0.0; 3]
 }
 
 /// A 3 x 4 projection from patient mm (LPS, origin at the isocentre) to homogeneous pixels
@@ -118,6 +126,9 @@ impl CArm {
         if !self.offset_mm.iter().all(|o| o.is_finite()) {
             return Err(("offset_mm".into(), "is not finite".into()));
         }
+        if !self.table_mm.iter().all(|t| t.is_finite() && t.abs() < 1e4) {
+            return Err(("table_mm".into(), "is not a position in mm".into()));
+        }
         if self.sod_mm >= self.sid_mm {
             return Err((
                 "sod_mm".into(),
@@ -130,8 +141,12 @@ impl CArm {
         let du = r * DVec3::new(self.pixel_mm[0] / self.sid_mm, 0.0, 0.0);
         let dv = r * DVec3::new(0.0, self.pixel_mm[1] / self.sid_mm, 0.0);
         let across = r * DVec3::new(u0 / self.sid_mm, v0 / self.sid_mm, 0.0);
-        let sod = self.sod_mm / MM_PER_UNIT;
-        Ok(ViewRays { anchor: [across * sod, du * sod, dv * sod], direction: [across + r * DVec3::Z, du, dv], sod })
+        let direction = [across + r * DVec3::Z, du, dv];
+        // Seen from the patient, source and detector move against the table; depth counts from the patient's origin.
+        let table = world_from_lps_mm(DVec3::from_array(self.table_mm));
+        let sod = self.sod_mm / MM_PER_UNIT + table.dot(r * DVec3::Z);
+        let source = r * DVec3::new(0.0, 0.0, -self.sod_mm / MM_PER_UNIT) - table;
+        Ok(ViewRays { anchor: [source + direction[0] * sod, du * sod, dv * sod], direction, sod })
     }
 }
 
@@ -202,7 +217,22 @@ mod tests {
     use super::*;
 
     fn carm(primary_deg: f64, secondary_deg: f64) -> CArm {
-        CArm { primary_deg, secondary_deg, sid_mm: 1100.0, sod_mm: 750.0, pixel_mm: [0.5, 0.7], offset_mm: [3.0, -2.0] }
+        CArm { primary_deg, secondary_deg, sid_mm: 1100.0, sod_mm: 750.0, pixel_mm: [0.5, 0.7], offset_mm: [3.0, -2.0], table_mm: [0.0; 3] }
+    }
+
+    #[test]
+    fn a_moved_table_carries_the_patient_along() {
+        let mut moved = carm(30.0, 20.0);
+        moved.table_mm = [12.0, -7.0, 25.0];
+        let (at_rest, moved) = (carm(30.0, 20.0).rays(64, 48).unwrap(), moved.rays(64, 48).unwrap());
+        // The room sees a patient point where it is, plus the table's way.
+        let point = DVec3::new(5.0, 10.0, -15.0);
+        let here = moved.project(world_from_lps_mm(point)).unwrap();
+        let there = at_rest.project(world_from_lps_mm(point + DVec3::new(12.0, -7.0, 25.0))).unwrap();
+        assert!((here.0 - there.0).abs() < 1e-9 && (here.1 - there.1).abs() < 1e-9);
+        // Depth zero is the plane through the patient's origin.
+        let axis = rotation(30.0, 20.0) * DVec3::Z;
+        assert!(moved.pixel(3.0, 40.0).0.dot(axis).abs() < 1e-12);
     }
 
     #[test]

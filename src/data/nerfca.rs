@@ -136,6 +136,7 @@ pub fn open(path: &Path) -> Result<Dataset> {
                 sod_mm: general.DSO * to_mm,
                 pixel_mm: pixel.map(|p| p * to_mm),
                 offset_mm: offset.map(|p| p * to_mm),
+                table_mm: [0.0; 3],
             }),
             phase: phases[&entry.heart_phase.to_bits()],
             split: *split,

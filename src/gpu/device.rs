@@ -1,7 +1,8 @@
-//! Instance, adapter choice, capability table, validation layer and debug names.
+//! Instance, adapter choice, adoption of someone else's device, capability table, validation layer and debug names.
 
 use crate::error::{Error, Result};
 use ash::{ext, khr, nv, vk};
+use gpu_allocator::AllocationSizes;
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use serde::Serialize;
 use std::ffi::{CStr, CString, c_void};
@@ -20,6 +21,38 @@ pub struct DeviceOptions {
     pub validation: bool,
     /// Directory for the pipeline cache; `None` keeps it in memory only.
     pub cache_dir: Option<std::path::PathBuf>,
+    /// Most bytes of buffers and volumes alive at once; `None` leaves the limit to the device.
+    pub memory_limit: Option<u64>,
+}
+
+/// A device that someone else made and goes on owning; see [`Gpu::adopt`].
+pub struct Adoption {
+    /// `vkGetInstanceProcAddr` of the owner's loader; `None` takes the system's loader.
+    pub get_instance_proc_addr: Option<vk::PFN_vkGetInstanceProcAddr>,
+    /// Instance made for Vulkan 1.2 or newer.
+    pub instance: vk::Instance,
+    /// The physical device.
+    pub physical_device: vk::PhysicalDevice,
+    /// Device with the feature `timelineSemaphore`.
+    pub device: vk::Device,
+    /// A queue of it that computes.
+    pub queue: vk::Queue,
+    /// Family of the queue.
+    pub queue_family: u32,
+    /// The device was made with the feature `bufferDeviceAddress`.
+    pub buffer_device_address: bool,
+    /// The device was made with `VK_KHR_external_memory_fd`.
+    pub external_memory_fd: bool,
+    /// Held around every use of the queue; `None` when the queue is ours alone.
+    pub queue_lock: Option<Box<dyn QueueLock>>,
+}
+
+/// Keeps several users of one queue apart.
+pub trait QueueLock: Send + Sync {
+    /// Waits until the queue is free and takes it.
+    fn lock(&self);
+    /// Gives it back.
+    fn unlock(&self);
 }
 
 /// What a device is and can do, as far as this engine cares.
@@ -70,6 +103,8 @@ pub struct DeviceInfo {
     pub float16: bool,
     /// Whether the device offers float atomics on buffers.
     pub float_atomics: bool,
+    /// Whether memory can be exported as file descriptors (`VK_KHR_external_memory_fd`).
+    pub external_memory_fd: bool,
     /// Why this device cannot be used, if so.
     pub unusable: Option<String>,
 }
@@ -102,11 +137,44 @@ pub(super) struct Shared {
     pub(super) last_submitted: AtomicU64,
     pub(super) live_objects: AtomicU64,
     pub(super) info: DeviceInfo,
+    pub(super) instance: ash::Instance,
+    pub(super) physical: vk::PhysicalDevice,
+    memory: Memory,
+    /// Instance and device belong to someone else.
+    adopted: bool,
+    queue_lock: Option<Box<dyn QueueLock>>,
     cache_file: Option<std::path::PathBuf>,
     messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     messages: Box<Mutex<Vec<String>>>,
-    instance: ash::Instance,
     _entry: ash::Entry,
+}
+
+/// Bytes of buffers and volumes.
+struct Memory {
+    in_use: AtomicU64,
+    limit: u64,
+}
+
+/// A queue that is locked for its owner as well.
+pub(super) struct LockedQueue<'a> {
+    queue: MutexGuard<'a, vk::Queue>,
+    theirs: Option<&'a dyn QueueLock>,
+}
+
+impl std::ops::Deref for LockedQueue<'_> {
+    type Target = vk::Queue;
+
+    fn deref(&self) -> &vk::Queue {
+        &self.queue
+    }
+}
+
+impl Drop for LockedQueue<'_> {
+    fn drop(&mut self) {
+        if let Some(theirs) = self.theirs {
+            theirs.unlock();
+        }
+    }
 }
 
 /// A poisoned lock only means another thread panicked; the guarded state stays valid.
@@ -301,6 +369,7 @@ fn describe(entry: &ash::Entry, instance: &ash::Instance, index: usize, physical
         multiprocessors: multiprocessors.shader_sm_count,
         float16: f12.shader_float16 == vk::TRUE,
         float_atomics: has(ext::shader_atomic_float::NAME),
+        external_memory_fd: has(khr::external_memory_fd::NAME),
         unusable,
     }
 }
@@ -381,6 +450,100 @@ unsafe extern "system" fn on_message(
     vk::FALSE
 }
 
+/// A device on its way to [`Shared`].
+struct Own {
+    physical: vk::PhysicalDevice,
+    info: DeviceInfo,
+    device: ash::Device,
+    queue: vk::Queue,
+    queue_family: u32,
+    adopted: bool,
+    queue_lock: Option<Box<dyn QueueLock>>,
+}
+
+impl Own {
+    fn prepare(
+        self,
+        entry: &ash::Entry,
+        instance: &ash::Instance,
+        options: &DeviceOptions,
+    ) -> Result<impl FnOnce(ash::Entry, ash::Instance) -> Shared + use<>> {
+        let Own { physical, info, device, queue, queue_family, adopted, queue_lock } = self;
+        let allocator = Allocator::new(&AllocatorCreateDesc {
+            instance: instance.clone(),
+            device: device.clone(),
+            physical_device: physical,
+            debug_settings: Default::default(),
+            buffer_device_address: info.buffer_device_address,
+            allocation_sizes: match options.memory_limit {
+                None => Default::default(),
+                // Blocks are never smaller than 4 MiB.
+                Some(limit) => AllocationSizes::new((limit / 8).min(256 << 20), (limit / 16).min(64 << 20)),
+            },
+        })
+        .map_err(|e| Error::Internal(format!("gpu-allocator: {e}")))?;
+        let mut kind =
+            vk::SemaphoreTypeCreateInfo::default().semaphore_type(vk::SemaphoreType::TIMELINE).initial_value(0);
+        // SAFETY: the device is alive; timeline semaphores are enabled.
+        let timeline =
+            unsafe { device.create_semaphore(&vk::SemaphoreCreateInfo::default().push_next(&mut kind), None) }
+                .map_err(Error::vulkan("vkCreateSemaphore", "timeline"))?;
+        let cache_file = options
+            .cache_dir
+            .as_ref()
+            .map(|dir| dir.join(format!("pipelines-{}-{}.bin", info.uuid, env!("CARGO_PKG_VERSION"))));
+        // An unreadable or foreign cache is ignored by the driver, which checks its header.
+        let cached = cache_file.as_ref().and_then(|f| std::fs::read(f).ok()).unwrap_or_default();
+        // SAFETY: `cached` lives until the call returns.
+        let pipeline_cache = unsafe {
+            device.create_pipeline_cache(&vk::PipelineCacheCreateInfo::default().initial_data(&cached), None)
+        }
+        .map_err(Error::vulkan("vkCreatePipelineCache", &info.name))?;
+        let messages = Box::new(Mutex::new(Vec::new()));
+        let mut messenger = None;
+        let mut debug_names = None;
+        if options.validation && !adopted {
+            let debug = ext::debug_utils::Instance::new(entry, instance);
+            let create = vk::DebugUtilsMessengerCreateInfoEXT::default()
+                .message_severity(
+                    vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
+                )
+                .message_type(
+                    vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
+                )
+                .pfn_user_callback(Some(on_message))
+                .user_data(std::ptr::from_ref::<Mutex<Vec<String>>>(&messages).cast_mut().cast());
+            // SAFETY: the callback and its data outlive the messenger, which `Shared::drop` destroys first.
+            let handle = unsafe { debug.create_debug_utils_messenger(&create, None) }
+                .map_err(Error::vulkan("vkCreateDebugUtilsMessengerEXT", "messenger"))?;
+            messenger = Some((debug, handle));
+            debug_names = Some(ext::debug_utils::Device::new(instance, &device));
+        }
+        let memory = Memory { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) };
+        Ok(move |entry, instance| Shared {
+            device,
+            debug_names,
+            queue: Mutex::new(queue),
+            queue_family,
+            allocator: Mutex::new(ManuallyDrop::new(allocator)),
+            pipeline_cache,
+            timeline,
+            last_submitted: AtomicU64::new(0),
+            live_objects: AtomicU64::new(0),
+            info,
+            instance,
+            physical,
+            memory,
+            adopted,
+            queue_lock,
+            cache_file,
+            messenger,
+            messages,
+            _entry: entry,
+        })
+    }
+}
+
 impl Gpu {
     /// Opens a device.
     ///
@@ -417,81 +580,72 @@ impl Gpu {
         let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default()
             .subgroup_size_control(true)
             .compute_full_subgroups(true);
-        let extensions = MATRIX_EXTENSIONS.map(CStr::as_ptr);
+        let mut extensions = Vec::new();
+        if info.external_memory_fd {
+            extensions.push(khr::external_memory_fd::NAME.as_ptr());
+        }
         let mut create = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
         if !info.matrices.is_empty() {
             f12 = f12.shader_float16(true).vulkan_memory_model(true).vulkan_memory_model_device_scope(true);
-            create = create.enabled_extension_names(&extensions).push_next(&mut matrix).push_next(&mut size);
+            extensions.extend(MATRIX_EXTENSIONS.map(CStr::as_ptr));
+            create = create.push_next(&mut matrix).push_next(&mut size);
         }
-        let create = create.push_next(&mut f12);
+        let create = create.enabled_extension_names(&extensions).push_next(&mut f12);
         // SAFETY: the chain lives until the call returns; the features were checked in `describe`.
         let device = unsafe { instance.create_device(physical, &create, None) }
             .map_err(Error::vulkan("vkCreateDevice", &info.name))?;
         // SAFETY: the family was requested with one queue.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
-        let allocator = Allocator::new(&AllocatorCreateDesc {
-            instance: instance.clone(),
-            device: device.clone(),
-            physical_device: physical,
-            debug_settings: Default::default(),
-            buffer_device_address: info.buffer_device_address,
-            allocation_sizes: Default::default(),
-        })
-        .map_err(|e| Error::Internal(format!("gpu-allocator: {e}")))?;
-        let mut kind =
-            vk::SemaphoreTypeCreateInfo::default().semaphore_type(vk::SemaphoreType::TIMELINE).initial_value(0);
-        // SAFETY: the device is alive; timeline semaphores are enabled.
-        let timeline =
-            unsafe { device.create_semaphore(&vk::SemaphoreCreateInfo::default().push_next(&mut kind), None) }
-                .map_err(Error::vulkan("vkCreateSemaphore", "timeline"))?;
-        let cache_file = options
-            .cache_dir
-            .as_ref()
-            .map(|dir| dir.join(format!("pipelines-{}-{}.bin", info.uuid, env!("CARGO_PKG_VERSION"))));
-        // An unreadable or foreign cache is ignored by the driver, which checks its header.
-        let cached = cache_file.as_ref().and_then(|f| std::fs::read(f).ok()).unwrap_or_default();
-        // SAFETY: `cached` lives until the call returns.
-        let pipeline_cache = unsafe {
-            device.create_pipeline_cache(&vk::PipelineCacheCreateInfo::default().initial_data(&cached), None)
+        let own = Own { physical, info, device, queue, queue_family, adopted: false, queue_lock: None };
+        own.prepare(entry, instance, options)
+    }
+
+    /// Works on a device someone else made. Instance and device must outlive the last clone, and are left as they are.
+    ///
+    /// # Errors
+    /// [`Error::NoDevice`] when the device lacks what the engine needs.
+    ///
+    /// # Safety
+    /// The handles must be valid and belong together; the device must have been made with what `adoption` says, and
+    /// the queue be used by others only while they hold the lock.
+    pub unsafe fn adopt(adoption: Adoption, options: &DeviceOptions) -> Result<Gpu> {
+        let entry = match adoption.get_instance_proc_addr {
+            Some(get_instance_proc_addr) => {
+                let functions = ash::StaticFn { get_instance_proc_addr };
+                // SAFETY: the caller vouches for the function.
+                unsafe { ash::Entry::from_static_fn(functions) }
+            }
+            // SAFETY: loads the system's Vulkan loader, whose initialisers are trusted as any shared library's are.
+            None => unsafe { ash::Entry::load() }.map_err(|e| Error::NoDevice(format!("no Vulkan loader: {e}")))?,
+        };
+        // SAFETY: the caller vouches for the instance.
+        let instance = unsafe { ash::Instance::load(entry.static_fn(), adoption.instance) };
+        let mut info = describe(&entry, &instance, 0, adoption.physical_device);
+        if let Some(why) = &info.unusable {
+            return Err(Error::NoDevice(format!("{}: {why}", info.name)));
         }
-        .map_err(Error::vulkan("vkCreatePipelineCache", &info.name))?;
-        let messages = Box::new(Mutex::new(Vec::new()));
-        let mut messenger = None;
-        let mut debug_names = None;
-        if options.validation {
-            let debug = ext::debug_utils::Instance::new(entry, instance);
-            let create = vk::DebugUtilsMessengerCreateInfoEXT::default()
-                .message_severity(
-                    vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
-                )
-                .message_type(
-                    vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
-                )
-                .pfn_user_callback(Some(on_message))
-                .user_data(std::ptr::from_ref::<Mutex<Vec<String>>>(&messages).cast_mut().cast());
-            // SAFETY: the callback and its data outlive the messenger, which `Shared::drop` destroys first.
-            let handle = unsafe { debug.create_debug_utils_messenger(&create, None) }
-                .map_err(Error::vulkan("vkCreateDebugUtilsMessengerEXT", "messenger"))?;
-            messenger = Some((debug, handle));
-            debug_names = Some(ext::debug_utils::Device::new(instance, &device));
+        // SAFETY: as above.
+        let device = unsafe { ash::Device::load(instance.fp_v1_0(), adoption.device) };
+        // SAFETY: as above.
+        let wait = unsafe { instance.get_device_proc_addr(adoption.device, c"vkWaitSemaphores".as_ptr()) };
+        if wait.is_none() {
+            return Err(Error::NoDevice(format!("{}: the device was not made for Vulkan 1.2", info.name)));
         }
-        Ok(move |entry, instance| Shared {
-            device,
-            debug_names,
-            queue: Mutex::new(queue),
-            queue_family,
-            allocator: Mutex::new(ManuallyDrop::new(allocator)),
-            pipeline_cache,
-            timeline,
-            last_submitted: AtomicU64::new(0),
-            live_objects: AtomicU64::new(0),
+        // What a device was made with cannot be asked of it.
+        info.buffer_device_address &= adoption.buffer_device_address;
+        info.external_memory_fd &= adoption.external_memory_fd;
+        info.matrices.clear();
+        let own = Own {
+            physical: adoption.physical_device,
             info,
-            cache_file,
-            messenger,
-            messages,
-            instance,
-            _entry: entry,
-        })
+            device,
+            queue: adoption.queue,
+            queue_family: adoption.queue_family,
+            adopted: true,
+            queue_lock: adoption.queue_lock,
+        };
+        let finish = own.prepare(&entry, &instance, options)?;
+        Ok(Gpu { shared: Arc::new(finish(entry, instance)) })
     }
 
     /// What this device is and can do.
@@ -507,6 +661,11 @@ impl Gpu {
     /// Buffers, pipelines and recordings alive at the moment; 0 once all are dropped.
     pub fn live_objects(&self) -> u64 {
         self.shared.live_objects.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of buffers and volumes alive at the moment.
+    pub fn memory_in_use(&self) -> u64 {
+        self.shared.memory.in_use.load(Ordering::Relaxed)
     }
 
     /// Writes the pipeline cache to disk so that the next start compiles nothing.
@@ -534,6 +693,35 @@ impl Shared {
         }
     }
 
+    /// The queue, for a submit.
+    pub(super) fn locked_queue(&self) -> LockedQueue<'_> {
+        let queue = lock(&self.queue);
+        let theirs = self.queue_lock.as_deref();
+        if let Some(theirs) = theirs {
+            theirs.lock();
+        }
+        LockedQueue { queue, theirs }
+    }
+
+    /// Counts `bytes` that are about to be allocated.
+    pub(super) fn reserve(&self, object: &str, bytes: u64) -> Result<()> {
+        let before = self.memory.in_use.fetch_add(bytes, Ordering::Relaxed);
+        if before.saturating_add(bytes) <= self.memory.limit {
+            return Ok(());
+        }
+        self.release(bytes);
+        Err(Error::OutOfMemory {
+            object: object.into(),
+            bytes,
+            detail: format!("{before} bytes of the limit of {} are in use", self.memory.limit),
+        })
+    }
+
+    /// Gives back what [`Shared::reserve`] counted.
+    pub(super) fn release(&self, bytes: u64) {
+        self.memory.in_use.fetch_sub(bytes, Ordering::Relaxed);
+    }
+
     pub(super) fn track(&self) {
         self.live_objects.fetch_add(1, Ordering::Relaxed);
     }
@@ -549,13 +737,17 @@ impl Drop for Shared {
         if leaked > 0 {
             tracing::error!(target: "vulkan", "{leaked} device objects were never freed");
         }
-        // SAFETY: every object made from the device holds an `Arc` of this struct, so none is left;
-        // the queue is idle once the wait returns.
+        // A lost device has nothing left to wait for.
+        let _ = self.wait(self.last_submitted.load(Ordering::Acquire));
+        // SAFETY: every object made from the device holds an `Arc` of this struct, so none is left; nothing of ours is
+        // on the queue once the wait returns.
         unsafe {
-            let _ = self.device.device_wait_idle();
             ManuallyDrop::drop(&mut *lock(&self.allocator));
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
             self.device.destroy_semaphore(self.timeline, None);
+            if self.adopted {
+                return;
+            }
             self.device.destroy_device(None);
             if let Some((debug, messenger)) = self.messenger.take() {
                 debug.destroy_debug_utils_messenger(messenger, None);

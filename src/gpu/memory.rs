@@ -45,7 +45,15 @@ struct Inner {
     raw: vk::Buffer,
     texel_view: Option<vk::BufferView>,
     bytes: u64,
-    allocation: Mutex<ManuallyDrop<Allocation>>,
+    backing: Backing,
+}
+
+/// Where a buffer's bytes are.
+enum Backing {
+    /// In a block of the allocator.
+    Block(Mutex<ManuallyDrop<Allocation>>),
+    /// In memory of its own, which may be exported.
+    Own(vk::DeviceMemory),
 }
 
 /// Drivers may read a little past the last element when a loop of uniform loads through an address ends (seen with
@@ -121,6 +129,11 @@ impl Gpu {
             unsafe { shared.device.create_buffer(&create, None) }.map_err(Error::vulkan("vkCreateBuffer", name))?;
         // SAFETY: `raw` was just made.
         let requirements = unsafe { shared.device.get_buffer_memory_requirements(raw) };
+        if let Err(e) = shared.reserve(name, bytes) {
+            // SAFETY: nothing uses `raw` yet.
+            unsafe { shared.device.destroy_buffer(raw, None) };
+            return Err(e);
+        }
         let allocated = lock(&shared.allocator).allocate(&AllocationCreateDesc {
             name,
             requirements,
@@ -137,8 +150,13 @@ impl Gpu {
             Err(e) => {
                 // SAFETY: nothing uses `raw` yet.
                 unsafe { shared.device.destroy_buffer(raw, None) };
+                shared.release(bytes);
                 return Err(Error::OutOfMemory { object: name.into(), bytes, detail: e.to_string() });
             }
+        };
+        let (memory, offset) = {
+            // SAFETY: the memory is used for this buffer alone, whose `Inner` gives it back to the allocator.
+            (unsafe { allocation.memory() }, allocation.offset())
         };
         shared.set_name(raw, name);
         shared.track();
@@ -149,14 +167,11 @@ impl Gpu {
             raw,
             texel_view: None,
             bytes,
-            allocation: Mutex::new(ManuallyDrop::new(allocation)),
+            backing: Backing::Block(Mutex::new(ManuallyDrop::new(allocation))),
         };
-        {
-            let allocation = lock(&inner.allocation);
-            // SAFETY: memory and offset come from the allocator for exactly these requirements.
-            unsafe { shared.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset()) }
-                .map_err(Error::vulkan("vkBindBufferMemory", name))?;
-        }
+        // SAFETY: memory and offset come from the allocator for exactly these requirements.
+        unsafe { shared.device.bind_buffer_memory(raw, memory, offset) }
+            .map_err(Error::vulkan("vkBindBufferMemory", name))?;
         if texel {
             let view = vk::BufferViewCreateInfo::default()
                 .buffer(raw)
@@ -169,6 +184,78 @@ impl Gpu {
             inner.texel_view = Some(view);
         }
         Ok(Buffer { inner: Arc::new(inner) })
+    }
+
+    /// A device buffer whose memory other processes and APIs can import: an opaque file descriptor of
+    /// [`Buffer::bytes`] bytes at offset 0. The descriptor is the caller's to close, or to hand to an import.
+    ///
+    /// # Errors
+    /// [`Error::NoDevice`] where `VK_KHR_external_memory_fd` is missing; [`Error::OutOfMemory`].
+    #[cfg(unix)]
+    pub fn exported_buffer(&self, name: &str, bytes: u64) -> Result<(Buffer, std::os::fd::OwnedFd)> {
+        use std::os::fd::FromRawFd;
+        let shared = &self.shared;
+        let info = self.info();
+        if !info.external_memory_fd {
+            return Err(Error::NoDevice(format!("{}: no VK_KHR_external_memory_fd", info.name)));
+        }
+        let bytes = bytes.max(16).next_multiple_of(16);
+        shared.reserve(name, bytes)?;
+        shared.track();
+        let opaque = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
+        let mut external = vk::ExternalMemoryBufferCreateInfo::default().handle_types(opaque);
+        let usage = vk::BufferUsageFlags::STORAGE_BUFFER
+            | vk::BufferUsageFlags::TRANSFER_SRC
+            | vk::BufferUsageFlags::TRANSFER_DST;
+        let create = vk::BufferCreateInfo::default().size(bytes).usage(usage).push_next(&mut external);
+        // From here on `Inner::drop` cleans up; null handles are ignored by Vulkan's destroy calls.
+        let mut inner = Inner {
+            gpu: shared.clone(),
+            name: name.to_owned(),
+            raw: vk::Buffer::null(),
+            texel_view: None,
+            bytes,
+            backing: Backing::Own(vk::DeviceMemory::null()),
+        };
+        // SAFETY: the device is alive and has the extension.
+        inner.raw =
+            unsafe { shared.device.create_buffer(&create, None) }.map_err(Error::vulkan("vkCreateBuffer", name))?;
+        // SAFETY: the buffer was just made; the physical device is this device's.
+        let (requirements, memories) = unsafe {
+            (
+                shared.device.get_buffer_memory_requirements(inner.raw),
+                shared.instance.get_physical_device_memory_properties(shared.physical),
+            )
+        };
+        let kind = (0..memories.memory_type_count)
+            .filter(|i| requirements.memory_type_bits >> i & 1 == 1)
+            .max_by_key(|i| {
+                memories.memory_types[*i as usize].property_flags.contains(vk::MemoryPropertyFlags::DEVICE_LOCAL)
+            })
+            .ok_or_else(|| Error::NoDevice(format!("{}: no memory can be exported", info.name)))?;
+        let mut export = vk::ExportMemoryAllocateInfo::default().handle_types(opaque);
+        let mut dedicated = vk::MemoryDedicatedAllocateInfo::default().buffer(inner.raw);
+        let allocate = vk::MemoryAllocateInfo::default()
+            .allocation_size(requirements.size)
+            .memory_type_index(kind)
+            .push_next(&mut export)
+            .push_next(&mut dedicated);
+        // SAFETY: the chain lives until the call returns.
+        let memory = unsafe { shared.device.allocate_memory(&allocate, None) }
+            .map_err(Error::vulkan("vkAllocateMemory", name))?;
+        inner.backing = Backing::Own(memory);
+        // SAFETY: size and type fit the buffer, which is bound once.
+        unsafe { shared.device.bind_buffer_memory(inner.raw, memory, 0) }
+            .map_err(Error::vulkan("vkBindBufferMemory", name))?;
+        shared.set_name(inner.raw, name);
+        let get = vk::MemoryGetFdInfoKHR::default().memory(memory).handle_type(opaque);
+        let export = ash::khr::external_memory_fd::Device::new(&shared.instance, &shared.device);
+        // SAFETY: the memory was made exportable; the descriptor is ours, and owned from here on.
+        let fd = unsafe {
+            let fd = export.get_memory_fd(&get).map_err(Error::vulkan("vkGetMemoryFdKHR", name))?;
+            std::os::fd::OwnedFd::from_raw_fd(fd)
+        };
+        Ok((Buffer { inner: Arc::new(inner) }, fd))
     }
 
     /// Copies `data` into `buffer` at `offset` bytes and waits.
@@ -237,7 +324,11 @@ impl Buffer {
         self.inner.texel_view
     }
 
-    pub(super) fn check_range(&self, offset: u64, bytes: u64) -> Result<()> {
+    /// Refuses a range that is not inside the buffer.
+    ///
+    /// # Errors
+    /// [`Error::Internal`].
+    pub fn check_range(&self, offset: u64, bytes: u64) -> Result<()> {
         match offset.checked_add(bytes) {
             Some(end) if end <= self.inner.bytes => Ok(()),
             _ => Err(Error::Internal(format!(
@@ -254,7 +345,8 @@ impl Buffer {
     pub fn write<T: Pod>(&self, data: &[T]) -> Result<()> {
         let bytes: &[u8] = bytemuck::cast_slice(data);
         self.check_range(0, bytes.len() as u64)?;
-        let mut allocation = lock(&self.inner.allocation);
+        let Backing::Block(allocation) = &self.inner.backing else { return Err(self.not_mapped()) };
+        let mut allocation = lock(allocation);
         let mapped = allocation.mapped_slice_mut().ok_or_else(|| self.not_mapped())?;
         mapped[..bytes.len()].copy_from_slice(bytes);
         Ok(())
@@ -267,7 +359,8 @@ impl Buffer {
     pub fn read<T: Pod>(&self, out: &mut [T]) -> Result<()> {
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(out);
         self.check_range(0, bytes.len() as u64)?;
-        let allocation = lock(&self.inner.allocation);
+        let Backing::Block(allocation) = &self.inner.backing else { return Err(self.not_mapped()) };
+        let allocation = lock(allocation);
         let mapped = allocation.mapped_slice().ok_or_else(|| self.not_mapped())?;
         bytes.copy_from_slice(&mapped[..bytes.len()]);
         Ok(())
@@ -287,11 +380,17 @@ impl Drop for Inner {
                 self.gpu.device.destroy_buffer_view(view, None);
             }
             self.gpu.device.destroy_buffer(self.raw, None);
-            let allocation = ManuallyDrop::take(&mut *lock(&self.allocation));
-            if let Err(e) = lock(&self.gpu.allocator).free(allocation) {
-                tracing::error!(target: "vulkan", "freeing `{}`: {e}", self.name);
+            match &self.backing {
+                Backing::Own(memory) => self.gpu.device.free_memory(*memory, None),
+                Backing::Block(allocation) => {
+                    let allocation = ManuallyDrop::take(&mut *lock(allocation));
+                    if let Err(e) = lock(&self.gpu.allocator).free(allocation) {
+                        tracing::error!(target: "vulkan", "freeing `{}`: {e}", self.name);
+                    }
+                }
             }
         }
+        self.gpu.release(self.bytes);
         self.gpu.untrack();
     }
 }

@@ -1,7 +1,7 @@
 //! A recording of dispatches. Each states what it reads and writes (from the shader's own
 //! qualifiers); barriers follow from that.
 
-use super::device::{Gpu, Shared, lock};
+use super::device::{Gpu, Shared};
 use super::memory::Buffer;
 use super::pipeline::{BindingKind, Pipeline, descriptor_type};
 use super::volume::Volume;
@@ -418,7 +418,8 @@ impl Recording {
         let by_region = vk::DependencyFlags::empty();
         // SAFETY: the command buffer is recording; the range was checked; buffer and volume are kept by `commands`.
         unsafe {
-            device.cmd_pipeline_barrier(raw, top, transfer, by_region, &[], &[], &before);
+            // Frames submitted earlier may still read what is replaced.
+            device.cmd_pipeline_barrier(raw, top | compute, transfer, by_region, &[], &[], &before);
             device.cmd_copy_buffer_to_image(raw, from.raw(), to.raw(), copying, &region);
             device.cmd_pipeline_barrier(raw, transfer, compute, by_region, &[], &[], &after);
         }
@@ -473,7 +474,7 @@ impl Commands {
     /// [`Error::DeviceLost`], [`Error::OutOfMemory`] or [`Error::Vulkan`].
     pub fn submit(&self) -> Result<Ticket> {
         let shared = &self.gpu;
-        let queue = lock(&shared.queue);
+        let queue = shared.locked_queue();
         let value = shared.last_submitted.load(Ordering::Acquire) + 1;
         let (values, semaphores, buffers) = ([value], [shared.timeline], [self.raw]);
         let mut timeline = vk::TimelineSemaphoreSubmitInfo::default().signal_semaphore_values(&values);
@@ -523,7 +524,7 @@ impl Gpu {
 }
 
 impl Shared {
-    fn wait(&self, value: u64) -> Result<()> {
+    pub(super) fn wait(&self, value: u64) -> Result<()> {
         let (semaphores, values) = ([self.timeline], [value]);
         let wait = vk::SemaphoreWaitInfo::default().semaphores(&semaphores).values(&values);
         // SAFETY: the semaphore is a timeline semaphore of this device.

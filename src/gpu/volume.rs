@@ -20,6 +20,8 @@ struct Inner {
     raw: vk::Image,
     view: vk::ImageView,
     sampler: vk::Sampler,
+    size: [u32; 3],
+    bytes: u64,
     allocation: Mutex<Option<ManuallyDrop<Allocation>>>,
 }
 
@@ -42,6 +44,8 @@ impl Gpu {
             return Err(Error::Internal(format!("{name}: {} cells where {size:?} are needed", cells.len())));
         }
         let shared = &self.shared;
+        let bytes = 2 * n as u64;
+        shared.reserve(name, bytes)?;
         shared.track();
         // From here on `Inner::drop` cleans up; null handles are ignored by Vulkan's destroy calls.
         let mut inner = Inner {
@@ -49,6 +53,8 @@ impl Gpu {
             raw: vk::Image::null(),
             view: vk::ImageView::null(),
             sampler: vk::Sampler::null(),
+            size,
+            bytes,
             allocation: Mutex::new(None),
         };
         let device = &shared.device;
@@ -97,17 +103,29 @@ impl Gpu {
         inner.sampler =
             unsafe { device.create_sampler(&create, None) }.map_err(Error::vulkan("vkCreateSampler", name))?;
         let volume = Volume { inner: Arc::new(inner) };
-        let bytes: &[u8] = bytemuck::cast_slice(cells);
-        let staging = self.buffer("volume staging", bytes.len() as u64, Memory::Upload)?;
-        staging.write(bytes)?;
-        let mut recording = super::record::Recording::new(self, "volume upload")?;
-        recording.fill_volume(&staging, &volume, size)?;
-        self.wait(recording.finish()?.submit()?)?;
+        volume.fill(cells)?;
         Ok(volume)
     }
 }
 
 impl Volume {
+    /// Replaces all cells, x fastest, after everything submitted so far.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for another number of cells; errors of the upload.
+    pub fn fill(&self, cells: &[half::f16]) -> Result<()> {
+        let bytes: &[u8] = bytemuck::cast_slice(cells);
+        if bytes.len() as u64 != self.inner.bytes {
+            return Err(Error::Internal(format!("{} bytes for a volume of {}", bytes.len(), self.inner.bytes)));
+        }
+        let gpu = Gpu { shared: self.inner.gpu.clone() };
+        let staging = gpu.buffer("volume staging", self.inner.bytes, Memory::Upload)?;
+        staging.write(bytes)?;
+        let mut recording = super::record::Recording::new(&gpu, "volume upload")?;
+        recording.fill_volume(&staging, self, self.inner.size)?;
+        gpu.wait(recording.finish()?.submit()?)
+    }
+
     pub(super) fn raw(&self) -> vk::Image {
         self.inner.raw
     }
@@ -136,6 +154,7 @@ impl Drop for Inner {
                 tracing::error!(target: "vulkan", "freeing a volume: {e}");
             }
         }
+        self.gpu.release(self.bytes);
         self.gpu.untrack();
     }
 }

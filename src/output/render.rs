@@ -3,10 +3,12 @@
 use crate::data::geometry::ViewRays;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
+use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::Recording;
 use crate::kernels::{Buffers, Kernels, Tuning, dispatch, groups_for};
-use crate::layout::{RayOut, Setup};
+use crate::layout::{RayOut, Schedule, Setup};
 use crate::model::field::Model;
+use crate::model::params::ParamLayout;
 use crate::model::scene::sample_capacity;
 use crate::train::network::{Network, indirect};
 use crate::train::step::{chunk_rays, forward_buffers, hull_buffer, record_live, record_render};
@@ -53,7 +55,7 @@ pub struct Renderer {
     network: Network,
     pub(super) buffers: Buffers,
     pub(super) setup: Setup,
-    model_layout: crate::model::params::ParamLayout,
+    model_layout: ParamLayout,
 }
 
 impl Renderer {
@@ -75,7 +77,8 @@ impl Renderer {
         buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
         // The schedule below has a single row, that of the model's step.
         gpu.upload(buffers.get("state")?, 0, &[0u32; 4])?;
-        buffers.set("schedule", gpu.buffer_with("schedule", &[model.config.schedule(model.step)])?);
+        let row = size_of::<Schedule>() as u64;
+        buffers.set("schedule", gpu.buffer("schedule", row, Memory::Upload)?);
         let renderer =
             Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout: model.layout.clone() };
         renderer.set_model(model)?;
@@ -91,7 +94,19 @@ impl Renderer {
             return Err(Error::Internal("the model has another layout than the renderer".into()));
         }
         self.gpu.upload(self.buffers.get("params")?, 0, &model.params)?;
-        self.gpu.upload(self.buffers.get("schedule")?, 0, &[model.config.schedule(model.step)])
+        self.buffers.get("schedule")?.write(&[model.config.schedule(model.step)])
+    }
+
+    /// Takes the parameters in `params`, of a run in training, as they are after everything submitted so far.
+    /// `schedule` is that of the run's present iteration.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when the buffer has another size; device errors.
+    pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<()> {
+        let mut recording = Recording::new(&self.gpu, "follow")?;
+        recording.copy(params, 0, self.buffers.get("params")?, 0, self.model_layout.len as u64 * 4)?;
+        self.gpu.wait(recording.finish()?.submit()?)?;
+        self.buffers.get("schedule")?.write(&[schedule])
     }
 
     pub(super) fn check_phase(&self, phase: u32) -> Result<()> {

@@ -1,7 +1,7 @@
 //! Fields sampled on a regular grid: for export, and baked into 3D images for display rates.
 
 use super::render::Renderer;
-use crate::data::geometry::ViewRays;
+use crate::data::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::error::{Error, Result};
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, Recording};
@@ -44,6 +44,50 @@ impl Grid {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
+}
+
+/// A regular grid of points in patient coordinates (left, posterior, superior), mm; left is the fastest axis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PatientGrid {
+    /// First point.
+    pub origin_mm: DVec3,
+    /// Distance between neighbours along each axis.
+    pub spacing_mm: DVec3,
+    /// Points along each axis.
+    pub size: [u32; 3],
+}
+
+impl PatientGrid {
+    /// Refuses grids that cannot be sampled.
+    ///
+    /// # Errors
+    /// [`Error::Config`].
+    pub fn check(&self) -> Result<()> {
+        let spacing = self.spacing_mm;
+        if !(self.origin_mm.is_finite() && spacing.is_finite() && spacing.min_element() > 0.0) {
+            return Err(Error::config("grid", spacing, "origin and spacing must be finite, spacing positive"));
+        }
+        if self.size.iter().any(|n| *n == 0 || *n > 4096) {
+            return Err(Error::config("grid", format!("{:?}", self.size), "1 to 4096 points along each axis"));
+        }
+        Ok(())
+    }
+
+    /// Some of its slices.
+    pub fn slices(&self, slices: std::ops::Range<u32>) -> PatientGrid {
+        let [nx, ny, _] = self.size;
+        let origin_mm = self.origin_mm + DVec3::Z * self.spacing_mm.z * f64::from(slices.start);
+        PatientGrid { origin_mm, size: [nx, ny, slices.len() as u32], ..*self }
+    }
+}
+
+/// Which fields to sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Fields {
+    /// Include the still background.
+    pub with_static: bool,
+    /// Include the moving vessels, at this phase.
+    pub dynamic_phase: Option<u32>,
 }
 
 /// Which field to sample.
@@ -115,6 +159,38 @@ impl Renderer {
     }
 }
 
+impl Renderer {
+    /// Attenuation per mm of the sum of fields at the points of a grid; zero outside their boxes and hull.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for an impossible grid or phase; device errors.
+    pub fn sample_patient(&self, fields: Fields, grid: &PatientGrid) -> Result<Vec<f32>> {
+        grid.check()?;
+        let swap = |v: DVec3| DVec3::new(v.y, v.x, v.z);
+        let [nl, np, ns] = grid.size;
+        // A row of the world's grid, along posterior, has two points or more.
+        let rows = Grid {
+            origin: world_from_lps_mm(grid.origin_mm),
+            spacing: swap(grid.spacing_mm) / MM_PER_UNIT,
+            size: [np.max(2), nl, ns],
+        };
+        let mut out = vec![0f32; (nl * np) as usize * ns as usize];
+        let wanted = fields.dynamic_phase.map(Field::Dynamic).into_iter();
+        for field in wanted.chain(fields.with_static.then_some(Field::Static)) {
+            let cells = self.sample(field, &rows)?;
+            let (row, plane) = (rows.size[0] as usize, (rows.size[0] * nl) as usize);
+            for (slice, out) in out.chunks_mut((nl * np) as usize).enumerate() {
+                for (p, out) in out.chunks_mut(nl as usize).enumerate() {
+                    for (l, out) in out.iter_mut().enumerate() {
+                        *out += cells[slice * plane + l * row + p] / MM_PER_UNIT as f32;
+                    }
+                }
+            }
+        }
+        Ok(out)
+    }
+}
+
 /// Cells of a baked volume along its longest side.
 pub const BAKED_CELLS: u32 = 192;
 
@@ -130,14 +206,19 @@ pub struct Quantity {
 }
 
 /// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates;
-/// finer detail than a cell is lost.
+/// finer detail than a cell is lost. Volumes are baked when first needed, or when asked for.
 pub struct Baked {
     renderer: Arc<Renderer>,
-    still: Volume,
-    moving: Vec<Volume>,
+    still: Grid,
+    moving: Grid,
+    /// The static field, then each phase.
+    volumes: Mutex<Vec<Option<Volume>>>,
     /// Recorded once per size, phase and quantity: a frame is a view written, a submit and a picture read.
     shots: Mutex<HashMap<ShotKey, Arc<Shot>>>,
 }
+
+/// Recorded frames kept; a viewer in use has far fewer.
+const MOST_SHOTS: usize = 256;
 
 /// Columns, rows, phase, quantity.
 type ShotKey = (usize, usize, u32, Quantity);
@@ -156,27 +237,77 @@ impl Baked {
     /// # Errors
     /// Device errors, [`Error::OutOfMemory`] first of all.
     pub fn new(renderer: Arc<Renderer>, cells: u32) -> Result<Baked> {
+        let baked = Self::empty(renderer, cells, cells);
+        baked.bake(Field::Static)?;
+        for phase in 0..baked.renderer.setup.n_phases {
+            baked.bake(Field::Dynamic(phase))?;
+        }
+        Ok(baked)
+    }
+
+    /// Prepares volumes of `still_cells` and `moving_cells` cells along the longest side of each box; bakes none yet.
+    pub fn empty(renderer: Arc<Renderer>, still_cells: u32, moving_cells: u32) -> Baked {
         let s = &renderer.setup;
         let v = |x: f32, y: f32, z: f32| DVec3::new(x.into(), y.into(), z.into());
         let still = Grid::over(
             v(s.static_min_x, s.static_min_y, s.static_min_z),
             v(s.static_max_x, s.static_max_y, s.static_max_z),
-            cells,
+            still_cells,
         );
         let moving = Grid::over(
             v(s.dynamic_min_x, s.dynamic_min_y, s.dynamic_min_z),
             v(s.dynamic_max_x, s.dynamic_max_y, s.dynamic_max_z),
-            cells,
+            moving_cells,
         );
-        let bake = |field: Field, grid: &Grid, gain: f32| {
-            // In units of the field's scale, values are near 1 and f16 loses a thousandth at most.
-            let cells: Vec<f16> = renderer.sample(field, grid)?.iter().map(|x| f16::from_f32(x / gain)).collect();
-            renderer.gpu.volume("baked", grid.size, &cells)
+        let volumes = Mutex::new(vec![None; 1 + s.n_phases as usize]);
+        Baked { still, moving, volumes, renderer, shots: Mutex::default() }
+    }
+
+    /// What the volumes are baked from.
+    pub fn renderer(&self) -> &Renderer {
+        &self.renderer
+    }
+
+    /// Bakes a field as the renderer's parameters are now, for the first time or again.
+    ///
+    /// # Errors
+    /// As [`Renderer::sample`]; [`Error::OutOfMemory`].
+    pub fn bake(&self, field: Field) -> Result<()> {
+        let setup = &self.renderer.setup;
+        let (grid, gain, slot) = match field {
+            Field::Static => (&self.still, setup.static_gain, 0),
+            Field::Dynamic(phase) => (&self.moving, setup.dynamic_gain, 1 + phase as usize),
         };
-        let still = bake(Field::Static, &still, s.static_gain)?;
-        let moving =
-            (0..s.n_phases).map(|phase| bake(Field::Dynamic(phase), &moving, s.dynamic_gain)).collect::<Result<_>>()?;
-        Ok(Baked { still, moving, renderer, shots: Mutex::default() })
+        // In units of the field's scale, values are near 1 and f16 loses a thousandth at most.
+        let cells: Vec<f16> = self.renderer.sample(field, grid)?.iter().map(|x| f16::from_f32(x / gain)).collect();
+        let mut volumes = self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
+        match &volumes[slot] {
+            Some(volume) => volume.fill(&cells),
+            None => {
+                volumes[slot] = Some(self.renderer.gpu.volume("baked", grid.size, &cells)?);
+                Ok(())
+            }
+        }
+    }
+
+    /// Whether a field has been baked.
+    pub fn has(&self, field: Field) -> bool {
+        self.volume(field).is_some()
+    }
+
+    fn volume(&self, field: Field) -> Option<Volume> {
+        let slot = match field {
+            Field::Static => 0,
+            Field::Dynamic(phase) => 1 + phase as usize,
+        };
+        self.volumes.lock().unwrap_or_else(PoisonError::into_inner)[slot].clone()
+    }
+
+    fn volume_or_bake(&self, field: Field) -> Result<Volume> {
+        if !self.has(field) {
+            self.bake(field)?;
+        }
+        self.volume(field).ok_or_else(|| Error::Internal(format!("{field:?} was baked into nothing")))
     }
 
     /// Renders a `width` x `height` view at a phase, rows first.
@@ -201,20 +332,64 @@ impl Baked {
         Ok(image)
     }
 
+    /// As [`Baked::render`], into a buffer on the device: `width` x `height` floats.
+    ///
+    /// # Errors
+    /// As [`Baked::render`]; [`Error::Internal`] when the buffer is too small.
+    pub fn render_into(
+        &self,
+        target: &Buffer,
+        rays: &ViewRays,
+        (width, height): (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<()> {
+        self.renderer.check_phase(phase)?;
+        target.check_range(0, (width * height * 4) as u64)?;
+        let view = self.renderer.gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
+        view.write(&[rays.to_device()])?;
+        let commands = self.record(&view, target, (width, height), phase, quantity)?;
+        self.renderer.gpu.wait(commands.submit()?)
+    }
+
     fn shot(&self, width: usize, height: usize, phase: u32, quantity: Quantity) -> Result<Arc<Shot>> {
         let mut shots = self.shots.lock().unwrap_or_else(PoisonError::into_inner);
         let key = (width, height, phase, quantity);
         if let Some(shot) = shots.get(&key) {
             return Ok(shot.clone());
         }
+        if shots.len() >= MOST_SHOTS {
+            shots.clear();
+        }
         let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
-        let mut buffers = self.renderer.buffers.clone();
         let view = gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
         let image = gpu.buffer("image", u64::from(pixels) * 4, Memory::Readback)?;
+        let commands = self.record(&view, &image, (width, height), phase, quantity)?;
+        let shot = Arc::new(Shot { commands, view, image, in_use: Mutex::default() });
+        shots.insert(key, shot.clone());
+        Ok(shot)
+    }
+
+    fn record(
+        &self,
+        view: &Buffer,
+        image: &Buffer,
+        (width, height): (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<Commands> {
+        let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
+        let mut buffers = self.renderer.buffers.clone();
         buffers.set("views", view.clone());
         buffers.set("image", image.clone());
-        buffers.set_volume("static_volume", self.still.clone());
-        buffers.set_volume("dynamic_volume", self.moving[phase as usize].clone());
+        // A field that is not shown is bound, since the kernel names it, but not read.
+        let shown = |field, wanted| if wanted { self.volume_or_bake(field).map(Some) } else { Ok(None) };
+        let still = shown(Field::Static, quantity.with_static)?;
+        let moving = shown(Field::Dynamic(phase), quantity.with_dynamic || still.is_none())?;
+        let any = still.as_ref().or(moving.as_ref());
+        let any = any.ok_or_else(|| Error::Internal("no volume to render".into()))?;
+        buffers.set_volume("static_volume", still.as_ref().unwrap_or(any).clone());
+        buffers.set_volume("dynamic_volume", moving.as_ref().unwrap_or(any).clone());
         let stage = &self.renderer.kernels.baked_march;
         let push = [
             pixels,
@@ -225,8 +400,6 @@ impl Baked {
         ];
         let mut recording = Recording::new(gpu, "baked render")?;
         dispatch(&mut recording, stage, groups_for(stage, pixels), &buffers, &[], push)?;
-        let shot = Arc::new(Shot { commands: recording.finish()?, view, image, in_use: Mutex::default() });
-        shots.insert(key, shot.clone());
-        Ok(shot)
+        recording.finish()
     }
 }

@@ -243,6 +243,7 @@ impl CArmOptions {
             sod_mm: self.sod_mm,
             pixel_mm: [pixel; 2],
             offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
         })
     }
 }
@@ -401,6 +402,7 @@ fn procedural(projector: &Projector, options: &PhantomOptions, out: &Path) -> Re
             sod_mm,
             pixel_mm: [scale_pixels; 2],
             offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
         },
         depth_half_extent_mm: (radius * std::f64::consts::SQRT_2).min(0.9 * sod_mm),
         vessel_attenuation: Some(tissues.vessel),

@@ -130,7 +130,19 @@ impl Checkpoint {
         Ok(path)
     }
 
-    fn write(&self, path: &Path) -> Result<()> {
+    /// Writes the checkpoint to a file.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, path: &Path) -> Result<()> {
+        files::write_atomic(path, &self.to_bytes()?)
+    }
+
+    /// The content of a checkpoint file.
+    ///
+    /// # Errors
+    /// [`Error::Internal`].
+    pub fn to_bytes(&self) -> Result<Vec<u8>> {
         let model = &self.model;
         let mut tensors: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = Vec::new();
         for tensor in model.layout.tensors() {
@@ -182,8 +194,7 @@ impl Checkpoint {
             })
             .collect::<Result<Vec<_>>>()?;
         let metadata = HashMap::from([("nertca".to_owned(), header)]);
-        let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| Error::Internal(e.to_string()))?;
-        files::write_atomic(path, &bytes)
+        safetensors::serialize(views, Some(metadata)).map_err(|e| Error::Internal(e.to_string()))
     }
 
     /// Reads a checkpoint file.
@@ -191,9 +202,16 @@ impl Checkpoint {
     /// # Errors
     /// [`Error::Data`] naming the tensor that is missing, misshapen or not finite.
     pub fn read(path: &Path) -> Result<Checkpoint> {
-        let bytes = files::read_limited(path, MAX_BYTES)?;
+        Self::from_bytes(&files::read_limited(path, MAX_BYTES)?, path)
+    }
+
+    /// Reads the content of a checkpoint file; `path` is for messages.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::read`].
+    pub fn from_bytes(bytes: &[u8], path: &Path) -> Result<Checkpoint> {
         let bad = |field: &str, problem: String| Error::data(path, field, problem);
-        let (_, metadata) = SafeTensors::read_metadata(&bytes).map_err(|e| bad("header", e.to_string()))?;
+        let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|e| bad("header", e.to_string()))?;
         let text = metadata.metadata().as_ref().and_then(|m| m.get("nertca")).cloned();
         let text = text.ok_or_else(|| bad("metadata", "is not a checkpoint of this program".into()))?;
         let header: Header = serde_json::from_str(&text).map_err(|e| bad("metadata", e.to_string()))?;
@@ -207,7 +225,7 @@ impl Checkpoint {
         if header.phases == 0 || header.phases > 4096 {
             return Err(bad("phases", header.phases.to_string()));
         }
-        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| bad("tensors", e.to_string()))?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(|e| bad("tensors", e.to_string()))?;
         let layout = ParamLayout::new(&header.config, header.phases);
         let mut params = vec![0f32; layout.len];
         let mut moments = vec![[0f32; 2]; layout.len];

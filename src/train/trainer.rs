@@ -114,8 +114,24 @@ impl Trainer {
                 "the checkpoint was trained on other images or geometry",
             ));
         }
-        let model = &checkpoint.model;
-        Self::start(gpu, plan, dataset, tuning, &model.params, Some(checkpoint))
+        Self::carry_on(gpu, plan, dataset, tuning, checkpoint)
+    }
+
+    /// Continues a run on other images than it was begun on, as when more of them arrived.
+    ///
+    /// # Errors
+    /// [`Error::Config`] when parameters and plan do not fit; device errors.
+    pub fn carry_on(
+        gpu: &Gpu,
+        plan: Plan,
+        dataset: &Dataset,
+        tuning: Tuning,
+        checkpoint: &Checkpoint,
+    ) -> Result<Trainer> {
+        if checkpoint.model.layout != plan.params {
+            return Err(Error::config("checkpoint", checkpoint.model.layout.len, "its fields have another shape"));
+        }
+        Self::start(gpu, plan, dataset, tuning, &checkpoint.model.params, Some(checkpoint))
     }
 
     fn start(
@@ -256,6 +272,21 @@ impl Trainer {
         commands.pass_times()
     }
 
+    /// The model without its parameters, which are on the device: what a renderer that follows the run needs.
+    pub fn outline(&self) -> Model {
+        Model {
+            config: self.plan.config.clone(),
+            scene: self.plan.scene.clone(),
+            layout: self.plan.params.clone(),
+            hull: self.plan.hull.clone(),
+            params: Vec::new(),
+            step: self.submitted,
+            vessel_attenuation: self.vessel_attenuation,
+            c_arm: self.c_arm.clone(),
+            image_size: self.image_size,
+        }
+    }
+
     /// Iterations handed to the device.
     pub fn submitted(&self) -> u32 {
         self.submitted
@@ -292,17 +323,7 @@ impl Trainer {
             occupancy,
             occupancy_words: occupancy_bytes(&self.plan.setup) as usize / 4,
             scaled: matches!(self.network, Network::Fused(_)),
-            model: Model {
-                config: self.plan.config.clone(),
-                scene: self.plan.scene.clone(),
-                layout: self.plan.params.clone(),
-                hull: self.plan.hull.clone(),
-                params: Vec::new(),
-                step: self.submitted,
-                vessel_attenuation: self.vessel_attenuation,
-                c_arm: self.c_arm.clone(),
-                image_size: self.image_size,
-            },
+            model: self.outline(),
             data_fingerprint: self.data_fingerprint.clone(),
         })
     }

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 
 /// A device with validation on. A missing driver or layer fails the test: it is never skipped.
 pub fn gpu() -> Gpu {
-    Gpu::open(&DeviceOptions { select: None, validation: true, cache_dir: None })
+    Gpu::open(&DeviceOptions { select: None, validation: true, cache_dir: None, memory_limit: None })
         .expect("tests need a Vulkan driver (Debian: mesa-vulkan-drivers) and vulkan-validationlayers")
 }
 
@@ -48,6 +48,7 @@ pub fn small_dataset(width: usize, height: usize) -> Dataset {
             sod_mm: 600.0,
             pixel_mm: [120.0 / width as f64, 120.0 / height as f64],
             offset_mm: [1.0, -2.0],
+            table_mm: [0.0; 3],
         });
         views.push(View { rays: geometry.rays(width, height).unwrap(), geometry });
         for phase in 0..phases {

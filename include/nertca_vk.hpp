@@ -1,0 +1,2 @@
+#pragma once
+#include "nertca_vk.h"

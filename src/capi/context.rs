@@ -1,0 +1,341 @@
+//! Contexts: a device, a log, limits.
+
+use super::handles::{self, Kind, Object};
+use super::log;
+use super::options::{Options, text};
+use super::status::{Failure, NERTCA_ERROR_BUSY, Outcome, call, copy_text, nertca_status};
+use super::types::{nertca_log, nertca_vulkan, read};
+use crate::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
+use crate::kernels::{Layers, Tuning};
+use ash::vk::{self, Handle};
+use std::ffi::{c_char, c_void};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use tracing::Dispatch;
+
+/// A device with a log and limits. Make one per device, and any number of reconstructions in it.
+pub struct nertca_context {
+    _opaque: [u8; 0],
+}
+
+/// Behind [`nertca_context`].
+pub(super) struct Context {
+    pub gpu: Option<Gpu>,
+    pub tuning: Option<Tuning>,
+    pub log: Dispatch,
+    pub deterministic: bool,
+    /// Reconstructions and buffers alive.
+    pub children: AtomicU32,
+    process: u32,
+}
+
+impl Kind for Context {
+    const NAME: &'static str = "context";
+
+    fn wrap(this: Arc<Self>) -> Object {
+        Object::Context(this)
+    }
+
+    fn unwrap(object: Object) -> Option<Arc<Self>> {
+        if let Object::Context(context) = object { Some(context) } else { None }
+    }
+
+    fn process(&self) -> u32 {
+        self.process
+    }
+}
+
+impl Context {
+    pub fn device(&self) -> Outcome<&Gpu> {
+        let none = || crate::error::Error::NoDevice("the context was made without a device".into());
+        Ok(self.gpu.as_ref().ok_or_else(none)?)
+    }
+}
+
+/// A child's claim on its context.
+pub(super) struct Claim {
+    pub context: Arc<Context>,
+}
+
+impl Claim {
+    pub fn new(context: &Arc<Context>) -> Claim {
+        context.children.fetch_add(1, Ordering::AcqRel);
+        Claim { context: context.clone() }
+    }
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        self.context.children.fetch_sub(1, Ordering::AcqRel);
+    }
+}
+
+/// Takes a handle and runs a body on what it stands for, with the context's log.
+pub(super) fn on_context<H>(handle: *const H, body: impl FnOnce(&Arc<Context>) -> Outcome<()>) -> nertca_status {
+    call(handle, || {
+        let context = handles::get::<Context, H>(handle)?;
+        tracing::dispatcher::with_default(&context.log, || body(&context))
+    })
+}
+
+/// Options every context understands.
+const KNOWN: &str = "device, validation, cache_dir, memory_limit_mib, deterministic, layers";
+
+struct Parsed {
+    device: DeviceOptions,
+    without_device: bool,
+    deterministic: bool,
+    layers: Option<Layers>,
+}
+
+fn parse(mut options: Options) -> Outcome<Parsed> {
+    let truth = "true or false";
+    let select = options.take("device").filter(|d| !d.is_empty());
+    let without_device = select.as_deref() == Some("none");
+    let memory_limit = match options.take_as::<u64>("memory_limit_mib", "a number of MiB")? {
+        Some(0) => return Err(Failure::argument("memory_limit_mib", "is 0")),
+        limit => limit.map(|mib| mib.saturating_mul(1 << 20)),
+    };
+    let layers = match options.take("layers").as_deref() {
+        None => None,
+        Some("f32") => Some(Layers::F32),
+        Some("matrices") => Some(Layers::Matrices),
+        Some(other) => return Err(Failure::argument("layers", format!("`{other}` is neither f32 nor matrices"))),
+    };
+    let parsed = Parsed {
+        device: DeviceOptions {
+            select,
+            validation: options.take_as("validation", truth)?.unwrap_or(false),
+            cache_dir: options.take("cache_dir").map(Into::into),
+            memory_limit,
+        },
+        without_device,
+        deterministic: options.take_as("deterministic", truth)?.unwrap_or(false),
+        layers,
+    };
+    options.finish(KNOWN)?;
+    Ok(parsed)
+}
+
+fn tuning(gpu: &Gpu, layers: Option<Layers>) -> Tuning {
+    let tuning = Tuning::for_device(gpu.info());
+    match layers {
+        None => tuning,
+        Some(layers) => tuning.with_layers(layers, format!("{layers:?} layers, as asked")),
+    }
+}
+
+/// # Safety
+/// As the functions that call it.
+unsafe fn create(
+    options: *const c_char,
+    log: *const nertca_log,
+    out: *mut *mut nertca_context,
+    open: impl FnOnce(&Parsed) -> Outcome<Option<Gpu>>,
+) -> Outcome<()> {
+    if out.is_null() {
+        return Err(Failure::argument("context", "is null"));
+    }
+    // SAFETY: the caller vouches for it.
+    unsafe { out.write_unaligned(std::ptr::null_mut()) };
+    // SAFETY: as above.
+    let log = log::dispatch(if log.is_null() { None } else { Some(unsafe { read(log) }?) })?;
+    // SAFETY: as above.
+    let parsed = parse(Options::parse(unsafe { text("options", options) }?.unwrap_or_default())?)?;
+    tracing::dispatcher::with_default(&log, || {
+        let gpu = open(&parsed)?;
+        let tuning = gpu.as_ref().map(|gpu| tuning(gpu, parsed.layers));
+        if let (Some(gpu), Some(tuning)) = (&gpu, &tuning) {
+            tracing::info!("{}: {}", gpu.info().name, tuning.reasons.join("; "));
+        }
+        let context = Arc::new(Context {
+            gpu,
+            tuning,
+            log: log.clone(),
+            deterministic: parsed.deterministic,
+            children: AtomicU32::new(0),
+            process: std::process::id(),
+        });
+        let handle = handles::insert(context)?;
+        // SAFETY: as above.
+        unsafe { out.write_unaligned(std::ptr::without_provenance_mut(handle)) };
+        Ok(())
+    })
+}
+
+/// Opens a device.
+///
+/// `options` are lines of `key = value` or a JSON object, or null for defaults:
+/// `device` (index, part of the name or UUID; `none` for a context that checks and keeps frames but cannot train; the
+/// best device without), `validation` (true for the Khronos layer, which then reports to the log), `cache_dir` (where
+/// compiled kernels are kept between processes), `memory_limit_mib` (ceiling on device memory of everything made from
+/// the context), `deterministic` (true refuses whatever would make results depend on timing: frames added while
+/// training in the background), `layers` (f32 or matrices: how the network is computed, for which the device decides
+/// otherwise).
+///
+/// `log` may be null. `*context` is null on failure; the text is then found by `nertca_last_error(NULL, ...)`.
+/// Any thread.
+///
+/// # Safety
+/// `options` must be null or end with a zero, `log` be null or as long as it says, `context` be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_context_create(
+    options: *const c_char,
+    log: *const nertca_log,
+    context: *mut *mut nertca_context,
+) -> nertca_status {
+    call(std::ptr::null::<c_void>(), || {
+        // SAFETY: as the caller vouches.
+        unsafe {
+            create(options, log, context, |parsed| {
+                if parsed.without_device { Ok(None) } else { Ok(Some(Gpu::open(&parsed.device)?)) }
+            })
+        }
+    })
+}
+
+struct CallerLock {
+    lock: unsafe extern "C" fn(*mut c_void),
+    unlock: unsafe extern "C" fn(*mut c_void),
+    user: *mut c_void,
+}
+
+// SAFETY: the header asks for functions and a pointer that may be used on any thread.
+unsafe impl Send for CallerLock {}
+// SAFETY: as above.
+unsafe impl Sync for CallerLock {}
+
+impl QueueLock for CallerLock {
+    fn lock(&self) {
+        // SAFETY: the caller gave the function for exactly this.
+        unsafe { (self.lock)(self.user) }
+    }
+
+    fn unlock(&self) {
+        // SAFETY: as above.
+        unsafe { (self.unlock)(self.user) }
+    }
+}
+
+/// As `nertca_context_create`, on a device of the caller: both then share one GPU, its memory and, if wanted, buffers.
+/// Of the options, `device` and `validation` do not apply. Instance, device and queue must outlive the context, which
+/// leaves them as they are.
+///
+/// # Safety
+/// As `nertca_context_create`; the handles in `vulkan` must be valid and made as its fields say.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_context_adopt(
+    vulkan: *const nertca_vulkan,
+    options: *const c_char,
+    log: *const nertca_log,
+    context: *mut *mut nertca_context,
+) -> nertca_status {
+    call(std::ptr::null::<c_void>(), || {
+        // SAFETY: as the caller vouches.
+        let theirs = unsafe { read(vulkan) }?;
+        for (name, handle) in [
+            ("vulkan.instance", theirs.instance),
+            ("vulkan.physical_device", theirs.physical_device),
+            ("vulkan.device", theirs.device),
+            ("vulkan.queue", theirs.queue),
+        ] {
+            if handle.is_null() {
+                return Err(Failure::argument(name, "is null"));
+            }
+        }
+        let queue_lock: Option<Box<dyn QueueLock>> = match (theirs.lock, theirs.unlock) {
+            (None, None) => None,
+            (Some(lock), Some(unlock)) => Some(Box::new(CallerLock { lock, unlock, user: theirs.user })),
+            _ => return Err(Failure::argument("vulkan.lock", "needs unlock, and the other way round")),
+        };
+        let raw = |handle: *mut c_void| handle.expose_provenance() as u64;
+        let adoption = Adoption {
+            get_instance_proc_addr: (!theirs.get_instance_proc_addr.is_null()).then(|| {
+                // SAFETY: the caller vouches that it is this function.
+                unsafe {
+                    std::mem::transmute::<*const c_void, vk::PFN_vkGetInstanceProcAddr>(theirs.get_instance_proc_addr)
+                }
+            }),
+            instance: vk::Instance::from_raw(raw(theirs.instance)),
+            physical_device: vk::PhysicalDevice::from_raw(raw(theirs.physical_device)),
+            device: vk::Device::from_raw(raw(theirs.device)),
+            queue: vk::Queue::from_raw(raw(theirs.queue)),
+            queue_family: theirs.queue_family,
+            buffer_device_address: theirs.buffer_device_address != 0,
+            external_memory_fd: theirs.external_memory_fd != 0,
+            queue_lock,
+        };
+        // SAFETY: as the caller vouches.
+        unsafe { create(options, log, context, |parsed| Ok(Some(Gpu::adopt(adoption, &parsed.device)?))) }
+    })
+}
+
+/// The device and the paths chosen for it, as JSON; `text`, `size` and `length` as for `nertca_last_error`. Any thread.
+///
+/// # Safety
+/// `text` must hold `size` bytes; `length` must be writable or null.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_context_describe(
+    context: *mut nertca_context,
+    text: *mut c_char,
+    size: usize,
+    length: *mut usize,
+) -> nertca_status {
+    on_context(context, |context| {
+        let described = serde_json::json!({
+            "device": context.gpu.as_ref().map(Gpu::info),
+            "tuning": context.tuning,
+            "memory_in_use": context.gpu.as_ref().map(Gpu::memory_in_use),
+            "validation_messages": context.gpu.as_ref().map(Gpu::validation_messages),
+            "deterministic": context.deterministic,
+        });
+        // SAFETY: as the caller vouches.
+        unsafe { copy_text(&described.to_string(), text, size, length) }
+    })
+}
+
+/// All Vulkan devices of this machine, usable or not, as a JSON list; `text`, `size` and `length` as for
+/// `nertca_last_error`. Any thread.
+///
+/// # Safety
+/// `text` must hold `size` bytes; `length` must be writable or null.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_devices(text: *mut c_char, size: usize, length: *mut usize) -> nertca_status {
+    call(std::ptr::null::<c_void>(), || {
+        let devices = serde_json::json!(list_devices()?);
+        // SAFETY: as the caller vouches.
+        unsafe { copy_text(&devices.to_string(), text, size, length) }
+    })
+}
+
+/// Closes the device. Null is allowed, and does nothing.
+///
+/// Waits for calls on the context in other threads.
+///
+/// @return NERTCA_ERROR_BUSY, and nothing is done, while reconstructions or buffers made from it exist, or from inside
+/// a callback of a call on it.
+///
+/// # Safety
+/// None: a stale handle is an error.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_context_destroy(context: *mut nertca_context) -> nertca_status {
+    if context.is_null() {
+        return super::status::NERTCA_OK;
+    }
+    call(context, || {
+        if handles::is_active(context) {
+            return Err(Failure::new(NERTCA_ERROR_BUSY, "context: a call on it is under way in this thread"));
+        }
+        let children = handles::get::<Context, nertca_context>(context)?.children.load(Ordering::Acquire);
+        if children > 0 {
+            let problem = format!("context: {children} reconstructions or buffers made from it still exist");
+            return Err(Failure::new(NERTCA_ERROR_BUSY, problem));
+        }
+        let context = handles::remove::<Context, nertca_context>(context)?;
+        if let Some(Err(error)) = context.gpu.as_ref().map(Gpu::save_pipeline_cache) {
+            // A missing cache only costs time at the next start.
+            tracing::dispatcher::with_default(&context.log, || tracing::warn!("{error}"));
+        }
+        Ok(())
+    })
+}

@@ -1,0 +1,90 @@
+//! What the engine has to say goes to the caller's log callback; nothing is printed.
+
+use super::status::{Failure, Outcome};
+use super::types::nertca_log;
+use std::ffi::{CString, c_char, c_void};
+use std::fmt::Write as _;
+use tracing::field::{Field, Visit};
+use tracing::span::{Attributes, Id, Record};
+use tracing::{Dispatch, Event, Level, Metadata, Subscriber};
+
+/// Severity of a log message: an error.
+pub const NERTCA_LOG_ERROR: u32 = 1;
+/// Severity of a log message: something to look at.
+pub const NERTCA_LOG_WARNING: u32 = 2;
+/// Severity of a log message: what is being done, and why.
+pub const NERTCA_LOG_INFO: u32 = 3;
+
+/// Receives log messages: level, UTF-8 text, and the caller's pointer. Called on whichever thread a message arises,
+/// also on the training thread, possibly on several at once. It must not call into the library.
+pub type nertca_log_callback = Option<unsafe extern "C" fn(level: u32, text: *const c_char, user: *mut c_void)>;
+
+struct Callback {
+    call: unsafe extern "C" fn(u32, *const c_char, *mut c_void),
+    user: *mut c_void,
+    most: u32,
+}
+
+// SAFETY: the header asks for a callback and a pointer that may be used on any thread.
+unsafe impl Send for Callback {}
+// SAFETY: as above.
+unsafe impl Sync for Callback {}
+
+/// Where a context's messages go.
+pub(super) fn dispatch(log: Option<nertca_log>) -> Outcome<Dispatch> {
+    let Some(log) = log else { return Ok(Dispatch::none()) };
+    if log.level == 0 || log.level > NERTCA_LOG_INFO {
+        return Err(Failure::argument("log.level", format!("{}; 1 to 3 are accepted", log.level)));
+    }
+    let Some(call) = log.callback else { return Err(Failure::argument("log.callback", "is null")) };
+    Ok(Dispatch::new(Callback { call, user: log.user, most: log.level }))
+}
+
+fn severity(level: Level) -> u32 {
+    match level {
+        Level::ERROR => NERTCA_LOG_ERROR,
+        Level::WARN => NERTCA_LOG_WARNING,
+        Level::INFO => NERTCA_LOG_INFO,
+        _ => u32::MAX,
+    }
+}
+
+struct Text(String);
+
+impl Visit for Text {
+    fn record_debug(&mut self, field: &Field, value: &dyn std::fmt::Debug) {
+        // Writing to a string cannot fail.
+        let _ = match field.name() {
+            "message" => write!(self.0, "{value:?}"),
+            name => write!(self.0, " {name}={value:?}"),
+        };
+    }
+}
+
+impl Subscriber for Callback {
+    fn enabled(&self, metadata: &Metadata<'_>) -> bool {
+        metadata.is_event() && metadata.target().starts_with("nertca") | (metadata.target() == "vulkan")
+            && severity(*metadata.level()) <= self.most
+    }
+
+    fn new_span(&self, _: &Attributes<'_>) -> Id {
+        Id::from_u64(1)
+    }
+
+    fn record(&self, _: &Id, _: &Record<'_>) {}
+
+    fn record_follows_from(&self, _: &Id, _: &Id) {}
+
+    fn event(&self, event: &Event<'_>) {
+        let mut text = Text(String::new());
+        event.record(&mut text);
+        // A text with a zero inside would end there.
+        let text = CString::new(text.0.replace('\0', "?")).unwrap_or_default();
+        // SAFETY: the caller gave a callback for exactly this.
+        unsafe { (self.call)(severity(*event.metadata().level()), text.as_ptr(), self.user) };
+    }
+
+    fn enter(&self, _: &Id) {}
+
+    fn exit(&self, _: &Id) {}
+}

@@ -1,0 +1,382 @@
+//! What comes out: views, volumes, scores, and buffers shared with other APIs.
+
+use super::context::{Claim, Context, nertca_context, on_context};
+use super::handles::{self, Kind, Object};
+use super::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
+use super::status::{Failure, NERTCA_OK, Outcome, call, nertca_status};
+use super::types::{
+    NERTCA_COMPONENT_DYNAMIC, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_TOTAL, NERTCA_PIXELS_F32, NERTCA_PIXELS_U8,
+    NERTCA_PROJECTION_DRR, NERTCA_PROJECTION_MIP, NERTCA_QUALITY_EXACT, NERTCA_QUALITY_LIVE, nertca_grid, nertca_image,
+    nertca_scores, nertca_view, pixel_bytes, read, sides, stride, write,
+};
+use crate::data::geometry::{MM_PER_UNIT, ViewRays};
+use crate::gpu::memory::Buffer;
+use crate::output::pictures::Window;
+use crate::output::sampled::{Fields, PatientGrid, Quantity};
+use glam::DVec3;
+use std::os::fd::{AsFd, IntoRawFd, OwnedFd};
+use std::sync::Arc;
+
+/// Memory on the device that other APIs and processes can import.
+pub struct nertca_buffer {
+    _opaque: [u8; 0],
+}
+
+/// Behind [`nertca_buffer`].
+pub(super) struct SharedBuffer {
+    buffer: Buffer,
+    fd: OwnedFd,
+    claim: Claim,
+    process: u32,
+}
+
+impl Kind for SharedBuffer {
+    const NAME: &'static str = "buffer";
+
+    fn wrap(this: Arc<Self>) -> Object {
+        Object::Buffer(this)
+    }
+
+    fn unwrap(object: Object) -> Option<Arc<Self>> {
+        if let Object::Buffer(buffer) = object { Some(buffer) } else { None }
+    }
+
+    fn process(&self) -> u32 {
+        self.process
+    }
+}
+
+/// A view, checked.
+struct Shot {
+    rays: ViewRays,
+    size: (usize, usize),
+    phase: u32,
+    quantity: Quantity,
+    exact: bool,
+}
+
+fn fields_of(component: u32) -> Outcome<(bool, bool)> {
+    match component {
+        NERTCA_COMPONENT_TOTAL => Ok((true, true)),
+        NERTCA_COMPONENT_STATIC => Ok((true, false)),
+        NERTCA_COMPONENT_DYNAMIC => Ok((false, true)),
+        other => Err(Failure::argument("component", format!("{other} is none of NERTCA_COMPONENT_*"))),
+    }
+}
+
+/// # Safety
+/// As the functions that call it.
+unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
+    // SAFETY: as the caller vouches.
+    let view = unsafe { read(view) }?;
+    let size = sides(view.width, view.height)?;
+    let (with_static, with_dynamic) = fields_of(view.component)?;
+    let maximum = match view.projection {
+        NERTCA_PROJECTION_DRR => false,
+        NERTCA_PROJECTION_MIP => true,
+        other => return Err(Failure::argument("projection", format!("{other} is none of NERTCA_PROJECTION_*"))),
+    };
+    let exact = match view.quality {
+        NERTCA_QUALITY_LIVE => false,
+        NERTCA_QUALITY_EXACT => true,
+        other => return Err(Failure::argument("quality", format!("{other} is none of NERTCA_QUALITY_*"))),
+    };
+    // SAFETY: as the caller vouches.
+    let geometry = unsafe { view.geometry.geometry() }?;
+    let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Failure::argument(&field, problem))?;
+    let quantity = Quantity { with_static, with_dynamic, maximum };
+    Ok(Shot { rays, size, phase: view.phase, quantity, exact })
+}
+
+/// Line integrals, or attenuation per mm.
+fn draw(reconstruction: &Reconstruction, shot: &Shot) -> Outcome<Vec<f32>> {
+    let session = &reconstruction.session;
+    let image = if shot.exact {
+        let seen = session.render_fields(&shot.rays, shot.size, shot.phase)?;
+        let Quantity { with_static, with_dynamic, maximum } = shot.quantity;
+        match (maximum, with_static, with_dynamic) {
+            (false, true, true) => seen.total_integral(),
+            (false, true, false) => seen.static_integral,
+            (false, false, _) => seen.dynamic_integral,
+            (true, true, true) => seen.total_max,
+            (true, true, false) => seen.static_max,
+            (true, false, _) => seen.dynamic_max,
+        }
+    } else {
+        session.render(&shot.rays, shot.size, shot.phase, shot.quantity)?
+    };
+    let per_mm = if shot.quantity.maximum { 1.0 / MM_PER_UNIT as f32 } else { 1.0 };
+    Ok(image.into_iter().map(|v| v * per_mm).collect())
+}
+
+/// Draws a view into the caller's memory: line integrals, or attenuation per mm for a maximum projection. Works while
+/// training too, from the parameters as they then are: `NERTCA_QUALITY_LIVE` at display rates, from volumes that are
+/// refreshed as fast as is possible in a fifth of the time, `NERTCA_QUALITY_EXACT` from the fields themselves.
+///
+/// Any thread; calls on one reconstruction draw one after the other.
+///
+/// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT naming what is wrong.
+///
+/// # Safety
+/// `view` and `image` must be as long as they say, and their pointers valid as far as they say.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_render(
+    reconstruction: *mut nertca_reconstruction,
+    view: *const nertca_view,
+    image: *const nertca_image,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: as the caller vouches.
+        let shot = unsafe { shot(view) }?;
+        // SAFETY: as the caller vouches.
+        let image = unsafe { read(image) }?;
+        let (width, height) = shot.size;
+        if ![NERTCA_PIXELS_F32, NERTCA_PIXELS_U8].contains(&image.format) {
+            return Err(Failure::argument("format", format!("{} is neither F32 nor U8", image.format)));
+        }
+        let bytes = pixel_bytes(image.format)?;
+        if image.pixels.is_null() {
+            return Err(Failure::argument("pixels", "is null"));
+        }
+        let apart = stride("pixels", width * bytes, height, image.stride_bytes, image.pixels_bytes)?;
+        if !(image.low.is_finite() && image.high.is_finite() && image.low <= image.high) {
+            return Err(Failure::argument("low, high", format!("{} to {} is no window", image.low, image.high)));
+        }
+        let values = draw(reconstruction, &shot)?;
+        let rows: Vec<u8> = if image.format == NERTCA_PIXELS_F32 {
+            values.iter().flat_map(|v| v.to_ne_bytes()).collect()
+        } else if image.low < image.high {
+            Window { low: image.low as f32, high: image.high as f32 }.codes(&values)
+        } else {
+            Window::of(&values).codes(&values)
+        };
+        for (row, content) in rows.chunks_exact(width * bytes).enumerate() {
+            // SAFETY: `stride` checked that every row lies within the bytes the caller vouches for.
+            unsafe {
+                let to = image.pixels.cast::<u8>().add(row * apart);
+                std::ptr::copy_nonoverlapping(content.as_ptr(), to, content.len());
+            }
+        }
+        Ok(())
+    })
+}
+
+/// As `nertca_reconstruction_render`, into a buffer of the same context: `width * height` floats, rows first. Live
+/// quality is written by the device itself, without a copy; maxima are then per 100 mm (divide by 100). The buffer is
+/// complete when the call returns.
+///
+/// # Safety
+/// `view` must be as long as it says.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_render_buffer(
+    reconstruction: *mut nertca_reconstruction,
+    view: *const nertca_view,
+    buffer: *mut nertca_buffer,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: as the caller vouches.
+        let shot = unsafe { shot(view) }?;
+        let target = handles::get::<SharedBuffer, _>(buffer)?;
+        check_target(reconstruction, &target, shot.size.0 * shot.size.1)?;
+        if shot.exact {
+            let per_unit = if shot.quantity.maximum { MM_PER_UNIT as f32 } else { 1.0 };
+            let image: Vec<f32> = draw(reconstruction, &shot)?.into_iter().map(|v| v * per_unit).collect();
+            return Ok(reconstruction.claim.context.device()?.upload(&target.buffer, 0, &image)?);
+        }
+        let Shot { rays, size, phase, quantity, .. } = &shot;
+        Ok(reconstruction.session.render_into(&target.buffer, rays, *size, *phase, *quantity)?)
+    })
+}
+
+fn check_target(reconstruction: &Reconstruction, target: &SharedBuffer, floats: usize) -> Outcome<()> {
+    if !Arc::ptr_eq(&reconstruction.claim.context, &target.claim.context) {
+        return Err(Failure::argument("buffer", "belongs to another context"));
+    }
+    let needed = floats as u64 * 4;
+    if target.buffer.bytes() < needed {
+        return Err(Failure::argument("buffer", format!("{} bytes where {needed} are needed", target.buffer.bytes())));
+    }
+    Ok(())
+}
+
+/// # Safety
+/// As the functions that call it.
+unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Fields)> {
+    // SAFETY: as the caller vouches.
+    let grid = unsafe { read(grid) }?;
+    let (with_static, with_dynamic) = fields_of(grid.component)?;
+    let patient = PatientGrid {
+        origin_mm: DVec3::from_array(grid.origin_mm),
+        spacing_mm: DVec3::from_array(grid.spacing_mm),
+        size: grid.points,
+    };
+    patient.check()?;
+    if patient.size.iter().map(|n| u64::from(*n)).product::<u64>() > 1 << 30 {
+        return Err(Failure::argument("points", "more than 2^30 in all"));
+    }
+    Ok((patient, Fields { with_static, dynamic_phase: with_dynamic.then_some(grid.phase) }))
+}
+
+/// Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Zero outside
+/// what was reconstructed. Any thread, also while training.
+///
+/// # Safety
+/// `grid` must be as long as it says; `values` must be writable for `count` floats.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_sample(
+    reconstruction: *mut nertca_reconstruction,
+    grid: *const nertca_grid,
+    values: *mut f32,
+    count: usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: as the caller vouches.
+        let (grid, fields) = unsafe { grid_of(grid) }?;
+        if values.is_null() {
+            return Err(Failure::argument("values", "is null"));
+        }
+        let needed = grid.size.iter().map(|n| *n as usize).product::<usize>();
+        if count < needed {
+            return Err(Failure::argument("count", format!("{count} where {needed} are needed")));
+        }
+        let cells = reconstruction.session.sample(fields, &grid)?;
+        // SAFETY: as the caller vouches, and checked.
+        unsafe { std::ptr::copy_nonoverlapping(cells.as_ptr().cast::<u8>(), values.cast::<u8>(), 4 * cells.len()) };
+        Ok(())
+    })
+}
+
+/// As `nertca_reconstruction_sample`, into a buffer of the same context.
+///
+/// # Safety
+/// `grid` must be as long as it says.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
+    reconstruction: *mut nertca_reconstruction,
+    grid: *const nertca_grid,
+    buffer: *mut nertca_buffer,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: as the caller vouches.
+        let (grid, fields) = unsafe { grid_of(grid) }?;
+        let target = handles::get::<SharedBuffer, _>(buffer)?;
+        check_target(reconstruction, &target, grid.size.iter().map(|n| *n as usize).product())?;
+        let cells = reconstruction.session.sample(fields, &grid)?;
+        Ok(reconstruction.claim.context.device()?.upload(&target.buffer, 0, &cells)?)
+    })
+}
+
+/// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`. `threshold_per_mm` is the attenuation from which
+/// the moving field counts as vessel; 0 for a third of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
+/// Any thread, also while training.
+///
+/// # Safety
+/// `scores` must be writable, with its size set.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_evaluate(
+    reconstruction: *mut nertca_reconstruction,
+    threshold_per_mm: f64,
+    scores: *mut nertca_scores,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if !(threshold_per_mm.is_finite() && threshold_per_mm >= 0.0) {
+            return Err(Failure::argument("threshold_per_mm", format!("{threshold_per_mm} is no attenuation")));
+        }
+        if scores.is_null() {
+            return Err(Failure::argument("scores", "is null"));
+        }
+        let found = reconstruction.session.evaluate((threshold_per_mm > 0.0).then_some(threshold_per_mm))?;
+        // SAFETY: as the caller vouches.
+        unsafe {
+            write(scores, |size| nertca_scores {
+                size,
+                step: found.step,
+                images: found.images.len() as u32,
+                dice_dynamic: found.dice.dynamic.unwrap_or(f64::NAN),
+                dice_total: found.dice.total.unwrap_or(f64::NAN),
+                psnr_db: found.psnr,
+                ssim: found.ssim,
+                threshold_per_mm: found.threshold.dynamic_per_mm,
+            })
+        }
+    })
+}
+
+/// Makes a buffer on the device that can be shared through `VK_KHR_external_memory_fd`. `*buffer` is null on failure.
+/// Any thread.
+///
+/// @return NERTCA_ERROR_DEVICE where the device lacks the extension (`external_memory_fd` of
+/// `nertca_context_describe`).
+///
+/// # Safety
+/// `buffer` must be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_buffer_create(
+    context: *mut nertca_context,
+    bytes: u64,
+    buffer: *mut *mut nertca_buffer,
+) -> nertca_status {
+    on_context(context, |context: &Arc<Context>| {
+        if buffer.is_null() {
+            return Err(Failure::argument("buffer", "is null"));
+        }
+        // SAFETY: as the caller vouches.
+        unsafe { buffer.write_unaligned(std::ptr::null_mut()) };
+        if bytes == 0 || bytes > 1 << 40 {
+            return Err(Failure::argument("bytes", format!("{bytes} is no size of a buffer")));
+        }
+        let (made, fd) = context.device()?.exported_buffer("shared buffer", bytes)?;
+        let shared = SharedBuffer { buffer: made, fd, claim: Claim::new(context), process: std::process::id() };
+        let handle = handles::insert(Arc::new(shared))?;
+        // SAFETY: as above.
+        unsafe { buffer.write_unaligned(std::ptr::without_provenance_mut(handle)) };
+        Ok(())
+    })
+}
+
+/// A new file descriptor of the buffer's memory (`VK_EXTERNAL_MEMORY_HANDLE_TYPE_OPAQUE_FD_BIT`), the caller's to
+/// import or close, and the size of the allocation's buffer in bytes. Any thread.
+///
+/// # Safety
+/// `fd` must be writable; `bytes` must be writable or null.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_buffer_export_fd(
+    buffer: *mut nertca_buffer,
+    fd: *mut i32,
+    bytes: *mut u64,
+) -> nertca_status {
+    call(buffer, || {
+        let shared = handles::get::<SharedBuffer, _>(buffer)?;
+        if fd.is_null() {
+            return Err(Failure::argument("fd", "is null"));
+        }
+        let copy = shared.fd.as_fd().try_clone_to_owned();
+        let copy = copy.map_err(crate::error::Error::io("duplicate the descriptor of", "a shared buffer"))?;
+        // SAFETY: as the caller vouches.
+        unsafe {
+            if !bytes.is_null() {
+                bytes.write_unaligned(shared.buffer.bytes());
+            }
+            fd.write_unaligned(copy.into_raw_fd());
+        }
+        Ok(())
+    })
+}
+
+/// Frees a buffer; what others imported stays theirs. Null is allowed, and does nothing. Waits for calls on it in other
+/// threads.
+#[unsafe(no_mangle)]
+pub extern "C" fn nertca_buffer_destroy(buffer: *mut nertca_buffer) -> nertca_status {
+    if buffer.is_null() {
+        return NERTCA_OK;
+    }
+    call(buffer, || {
+        if handles::is_active(buffer) {
+            return Err(Failure::new(
+                super::status::NERTCA_ERROR_BUSY,
+                "buffer: a call on it is under way in this thread",
+            ));
+        }
+        handles::remove::<SharedBuffer, _>(buffer).map(drop)
+    })
+}

@@ -1,0 +1,343 @@
+//! Reconstructions: frames in, checkpoints in and out.
+
+use super::context::{Claim, Context, nertca_context, on_context};
+use super::handles::{self, Kind, Object};
+use super::options::{Options, text};
+use super::status::{
+    Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_OK, Outcome, call, copy_text, nertca_status,
+};
+use super::training::state_code;
+use super::types::{nertca_frame, nertca_progress, read, write};
+use crate::config::{Config, Preset};
+use crate::data::gating::RPeaks;
+use crate::session::{Progress, Session, SessionOptions};
+use crate::train::checkpoint::Checkpoint;
+use clap::ValueEnum;
+use std::ffi::{c_char, c_void};
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+/// A reconstruction: its frames, its training, its fields.
+pub struct nertca_reconstruction {
+    _opaque: [u8; 0],
+}
+
+/// Behind [`nertca_reconstruction`].
+pub(super) struct Reconstruction {
+    // Dropped in this order: the session's memory belongs to the context's device.
+    pub session: Session,
+    pub latest: Arc<Mutex<Option<Progress>>>,
+    pub claim: Claim,
+    process: u32,
+}
+
+impl Kind for Reconstruction {
+    const NAME: &'static str = "reconstruction";
+
+    fn wrap(this: Arc<Self>) -> Object {
+        Object::Reconstruction(this)
+    }
+
+    fn unwrap(object: Object) -> Option<Arc<Self>> {
+        if let Object::Reconstruction(reconstruction) = object { Some(reconstruction) } else { None }
+    }
+
+    fn process(&self) -> u32 {
+        self.process
+    }
+}
+
+/// Takes a handle and runs a body on what it stands for, with the context's log.
+pub(super) fn on_reconstruction(
+    handle: *mut nertca_reconstruction,
+    body: impl FnOnce(&Arc<Reconstruction>) -> Outcome<()>,
+) -> nertca_status {
+    call(handle, || {
+        let reconstruction = handles::get::<Reconstruction, _>(handle)?;
+        let log = reconstruction.claim.context.log.clone();
+        tracing::dispatcher::with_default(&log, || body(&reconstruction))
+    })
+}
+
+fn session(context: &Context, mut options: Options) -> Outcome<Session> {
+    let number = "a number";
+    let phases = options.take_as("phases", number)?;
+    let depth = options.take_as("depth_half_extent_mm", number)?;
+    let vessel = options.take_as("vessel_attenuation_per_mm", number)?;
+    let preset = match options.take("preset") {
+        None => None,
+        Some(name) => Some(Preset::from_str(&name, true).map_err(|_| {
+            Failure::argument("preset", format!("`{name}` is none of fast, paper, public-code"))
+        })?),
+    };
+    let config = Config::load(preset, None, &options.settings())?;
+    let options = SessionOptions {
+        config,
+        phases: phases.ok_or_else(|| Failure::argument("phases", "is missing: how many cardiac phases are there?"))?,
+        depth_half_extent_mm: depth.unwrap_or(100.0),
+        vessel_attenuation_per_mm: vessel,
+        deterministic: context.deterministic,
+    };
+    Ok(Session::new(context.gpu.clone(), context.tuning.clone(), options)?)
+}
+
+/// Begins a reconstruction without frames.
+///
+/// `options` are lines of `key = value` or a JSON object: `phases` (cardiac phases; needed), `depth_half_extent_mm`
+/// (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (of filled
+/// vessels, where known: sets the Dice threshold), `preset` (fast, paper or public-code) and every key that
+/// `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
+///
+/// `*reconstruction` is null on failure. Any thread.
+///
+/// # Safety
+/// `options` must be null or end with a zero; `reconstruction` must be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_create(
+    context: *mut nertca_context,
+    options: *const c_char,
+    reconstruction: *mut *mut nertca_reconstruction,
+) -> nertca_status {
+    on_context(context, |context| {
+        if reconstruction.is_null() {
+            return Err(Failure::argument("reconstruction", "is null"));
+        }
+        // SAFETY: the caller vouches for it.
+        unsafe { reconstruction.write_unaligned(std::ptr::null_mut()) };
+        // SAFETY: as above.
+        let options = Options::parse(unsafe { text("options", options) }?.unwrap_or_default())?;
+        let made = Arc::new(Reconstruction {
+            session: session(context, options)?,
+            latest: Arc::default(),
+            claim: Claim::new(context),
+            process: std::process::id(),
+        });
+        let handle = handles::insert(made)?;
+        // SAFETY: as above.
+        unsafe { reconstruction.write_unaligned(std::ptr::without_provenance_mut(handle)) };
+        Ok(())
+    })
+}
+
+/// Ends a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
+/// allowed, and does nothing. Any thread but that of its own callbacks.
+///
+/// @return NERTCA_ERROR_BUSY, and nothing is done, from inside a callback of a call on it.
+///
+/// # Safety
+/// None: a stale handle is an error.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_destroy(reconstruction: *mut nertca_reconstruction) -> nertca_status {
+    if reconstruction.is_null() {
+        return NERTCA_OK;
+    }
+    call(reconstruction, || {
+        if handles::is_active(reconstruction) {
+            return Err(Failure::new(NERTCA_ERROR_BUSY, "reconstruction: a call on it is under way in this thread"));
+        }
+        let log = {
+            let found = handles::get::<Reconstruction, _>(reconstruction)?;
+            found.session.stop()?;
+            found.claim.context.log.clone()
+        };
+        tracing::dispatcher::with_default(&log, || {
+            handles::remove::<Reconstruction, _>(reconstruction).map(drop)
+        })
+    })
+}
+
+/// Adds a frame, whose pixels are copied. It may come at any time: training in the background takes it in by itself
+/// (soon: frames that come in quick succession are taken in together), other training when it next begins.
+/// Any thread.
+///
+/// @return NERTCA_ERROR_ARGUMENT naming the field that is wrong; NERTCA_ERROR_BUSY while training in the background in a
+/// deterministic context.
+///
+/// # Safety
+/// `frame` must be as long as it says, and its pointers readable as far as it says.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_add_frame(
+    reconstruction: *mut nertca_reconstruction,
+    frame: *const nertca_frame,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: as the caller vouches.
+        let frame = unsafe { read(frame)?.new_frame() }?;
+        Ok(reconstruction.session.add_frame(frame)?)
+    })
+}
+
+/// Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them. Replaces those
+/// given earlier, so that a growing list can be given again and again. Any thread.
+///
+/// # Safety
+/// `times_s` must be readable for `count` numbers.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_set_r_peaks(
+    reconstruction: *mut nertca_reconstruction,
+    times_s: *const f64,
+    count: usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if times_s.is_null() {
+            return Err(Failure::argument("times_s", "is null"));
+        }
+        if count > 1 << 20 {
+            return Err(Failure::argument("count", format!("{count}; at most 2^20 are accepted")));
+        }
+        // SAFETY: as the caller vouches.
+        let times = (0..count).map(|i| unsafe { times_s.add(i).read_unaligned() }).collect::<Vec<_>>();
+        reconstruction.session.set_r_peaks(RPeaks::new(&times)?);
+        Ok(())
+    })
+}
+
+/// State and progress. Any thread, at any time.
+///
+/// @return NERTCA_OK also when training has failed: `state` is then `NERTCA_STATE_FAILED`, and the reason found by
+/// `nertca_reconstruction_failure`.
+///
+/// # Safety
+/// `progress` must be writable, with its size set.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_progress(
+    reconstruction: *mut nertca_reconstruction,
+    progress: *mut nertca_progress,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        let latest = *reconstruction.latest.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let state = state_code(reconstruction.session.state());
+        let step = reconstruction.session.step();
+        // SAFETY: as the caller vouches.
+        unsafe {
+            write(progress, |size| nertca_progress {
+                size,
+                state,
+                step,
+                iterations: latest.map_or(0, |l| l.iterations),
+                frames: latest.map_or(0, |l| l.frames),
+                loss: latest.map_or(f64::NAN, |l| l.loss.total()),
+                psnr_db: latest.map_or(f64::NAN, |l| l.psnr_db),
+                iterations_per_s: latest.map_or(0.0, |l| l.iterations_per_s),
+            })
+        }
+    })
+}
+
+/// Why training in the background failed; empty when it did not. `text`, `size` and `length` as for
+/// `nertca_last_error`. Any thread.
+///
+/// # Safety
+/// `text` must hold `size` bytes; `length` must be writable or null.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_failure(
+    reconstruction: *mut nertca_reconstruction,
+    text: *mut c_char,
+    size: usize,
+    length: *mut usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        let failure = reconstruction.session.failure().unwrap_or_default();
+        // SAFETY: as the caller vouches.
+        unsafe { copy_text(&failure, text, size, length) }
+    })
+}
+
+/// Writes everything needed to continue into a file, which appears whole or not at all. Any thread, also while training.
+///
+/// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded.
+///
+/// # Safety
+/// `path` must end with a zero.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_save(
+    reconstruction: *mut nertca_reconstruction,
+    path: *const c_char,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: as the caller vouches.
+        let path = unsafe { text("path", path) }?.filter(|p| !p.is_empty());
+        let path = path.ok_or_else(|| Failure::argument("path", "is null or empty"))?;
+        Ok(reconstruction.session.checkpoint()?.write(Path::new(path))?)
+    })
+}
+
+/// As `nertca_reconstruction_save`, into memory. `*length` gets the bytes needed; with a null `bytes` and a `size` of
+/// 0 nothing else is done.
+///
+/// @return NERTCA_ERROR_BUFFER when `size` is too small. While training in the background the length may change by a
+/// few bytes from call to call: leave some room.
+///
+/// # Safety
+/// `bytes` must hold `size` bytes; `length` must be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_save_memory(
+    reconstruction: *mut nertca_reconstruction,
+    bytes: *mut c_void,
+    size: usize,
+    length: *mut usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if length.is_null() {
+            return Err(Failure::argument("length", "is null"));
+        }
+        if bytes.is_null() && size > 0 {
+            return Err(Failure::argument("bytes", "is null"));
+        }
+        let content = reconstruction.session.checkpoint()?.to_bytes()?;
+        // SAFETY: as the caller vouches.
+        unsafe { length.write_unaligned(content.len()) };
+        if bytes.is_null() {
+            return Ok(());
+        }
+        if content.len() > size {
+            return Err(Failure::new(NERTCA_ERROR_BUFFER, format!("{} bytes are needed", content.len())));
+        }
+        // SAFETY: as the caller vouches, and checked.
+        unsafe { std::ptr::copy_nonoverlapping(content.as_ptr(), bytes.cast(), content.len()) };
+        Ok(())
+    })
+}
+
+/// Takes over a checkpoint file, of this library or of `nertca-vk train`, with its hyper-parameters and phases: it can
+/// be drawn at once, and trained further with the frames of this reconstruction. Any thread.
+///
+/// @return NERTCA_ERROR_BUSY while training in the background; NERTCA_ERROR_DATA for a malformed file.
+///
+/// # Safety
+/// `path` must end with a zero.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_load(
+    reconstruction: *mut nertca_reconstruction,
+    path: *const c_char,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: as the caller vouches.
+        let path = unsafe { text("path", path) }?.filter(|p| !p.is_empty());
+        let path = path.ok_or_else(|| Failure::argument("path", "is null or empty"))?;
+        Ok(reconstruction.session.load(Checkpoint::read(Path::new(path))?)?)
+    })
+}
+
+/// As `nertca_reconstruction_load`, from memory.
+///
+/// # Safety
+/// `bytes` must be readable for `size` bytes.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_load_memory(
+    reconstruction: *mut nertca_reconstruction,
+    bytes: *const c_void,
+    size: usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if bytes.is_null() {
+            return Err(Failure::argument("bytes", "is null"));
+        }
+        if size > 4 << 30 {
+            return Err(Failure::argument("size", format!("{size}; at most 4 GiB are accepted")));
+        }
+        // SAFETY: as the caller vouches.
+        let content = unsafe { std::slice::from_raw_parts(bytes.cast::<u8>(), size) };
+        Ok(reconstruction.session.load(Checkpoint::from_bytes(content, Path::new("memory"))?)?)
+    })
+}

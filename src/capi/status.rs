@@ -1,0 +1,239 @@
+//! Status codes, error texts, and the boundary that no panic crosses.
+
+use super::handles;
+use crate::error::Error;
+use crate::session::TRAINING_THREAD;
+use std::cell::{Cell, RefCell};
+use std::collections::HashMap;
+use std::ffi::{c_char, c_void};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Once;
+
+/// What a call returns: 0 for success, negative for an error whose text `nertca_last_error` gives.
+pub type nertca_status = i32;
+
+/// Done.
+pub const NERTCA_OK: nertca_status = 0;
+/// An argument is null, out of range, or contradicts another.
+pub const NERTCA_ERROR_ARGUMENT: nertca_status = -1;
+/// A handle was destroyed, is of another type, or never was one.
+pub const NERTCA_ERROR_HANDLE: nertca_status = -2;
+/// Data given (a checkpoint, say) is malformed.
+pub const NERTCA_ERROR_DATA: nertca_status = -3;
+/// The operating system refused a file operation.
+pub const NERTCA_ERROR_IO: nertca_status = -4;
+/// No device fits, or it lacks what was asked for.
+pub const NERTCA_ERROR_DEVICE: nertca_status = -5;
+/// The device stopped answering: destroy everything made from the context, then the context.
+pub const NERTCA_ERROR_DEVICE_LOST: nertca_status = -6;
+/// Memory ran out, or the context's limit was reached.
+pub const NERTCA_ERROR_MEMORY: nertca_status = -7;
+/// Training diverged; the last good state is kept.
+pub const NERTCA_ERROR_DIVERGED: nertca_status = -8;
+/// A callback ended the call.
+pub const NERTCA_ERROR_CANCELLED: nertca_status = -9;
+/// It cannot be done while something else goes on (training, or handles that still exist).
+pub const NERTCA_ERROR_BUSY: nertca_status = -10;
+/// The buffer given is too small; the length needed was written.
+pub const NERTCA_ERROR_BUFFER: nertca_status = -11;
+/// It needs something that is still to come: frames, or training.
+pub const NERTCA_ERROR_NOT_READY: nertca_status = -12;
+/// A handle of the parent process was used after a fork.
+pub const NERTCA_ERROR_FORKED: nertca_status = -13;
+/// A fault of this library. Please report it.
+pub const NERTCA_ERROR_INTERNAL: nertca_status = -14;
+
+/// Why a call failed.
+#[derive(Debug)]
+pub(super) struct Failure {
+    pub status: nertca_status,
+    pub text: String,
+}
+
+pub(super) type Outcome<T> = Result<T, Failure>;
+
+impl Failure {
+    pub fn new(status: nertca_status, text: impl Into<String>) -> Failure {
+        Failure { status, text: text.into() }
+    }
+
+    pub fn argument(name: &str, problem: impl std::fmt::Display) -> Failure {
+        Failure::new(NERTCA_ERROR_ARGUMENT, format!("{name}: {problem}"))
+    }
+}
+
+impl From<Error> for Failure {
+    fn from(error: Error) -> Failure {
+        let status = match &error {
+            Error::Config { .. } => NERTCA_ERROR_ARGUMENT,
+            Error::Data { .. } => NERTCA_ERROR_DATA,
+            Error::Io { .. } => NERTCA_ERROR_IO,
+            Error::NoDevice(_) | Error::Vulkan { .. } => NERTCA_ERROR_DEVICE,
+            Error::DeviceLost { .. } => NERTCA_ERROR_DEVICE_LOST,
+            Error::OutOfMemory { .. } => NERTCA_ERROR_MEMORY,
+            Error::Diverged { .. } => NERTCA_ERROR_DIVERGED,
+            Error::Interrupted => NERTCA_ERROR_CANCELLED,
+            Error::Busy(_) => NERTCA_ERROR_BUSY,
+            Error::NotReady(_) => NERTCA_ERROR_NOT_READY,
+            Error::Internal(_) => NERTCA_ERROR_INTERNAL,
+        };
+        Failure::new(status, error.to_string())
+    }
+}
+
+/// Texts kept per thread; beyond that, those of destroyed handles go.
+const MOST_TEXTS: usize = 64;
+
+thread_local! {
+    /// Text of the last failure by handle; that of any handle under 0.
+    static LAST: RefCell<HashMap<usize, String>> = RefCell::default();
+    /// Inside a call: a panic is reported as its failure and not printed.
+    static PANIC: RefCell<Option<String>> = const { RefCell::new(None) };
+    static DEPTH: Cell<u32> = const { Cell::new(0) };
+}
+
+fn remember(handle: usize, text: &str) {
+    // A thread that is going away has no texts any more.
+    let _ = LAST.try_with(|last| {
+        let mut last = last.borrow_mut();
+        if last.len() >= MOST_TEXTS {
+            last.retain(|handle, _| *handle == 0 || handles::exists(*handle));
+        }
+        last.insert(handle, text.to_owned());
+        last.insert(0, text.to_owned());
+    });
+}
+
+/// Panics inside a call, or in threads that work for one, are kept for its failure; all others go where they went before.
+fn catch_reports() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            let training = std::thread::current().name() == Some(TRAINING_THREAD);
+            if training || rayon::current_thread_index().is_some() || DEPTH.try_with(Cell::get).unwrap_or(0) > 0 {
+                let _ = PANIC.try_with(|panic| *panic.borrow_mut() = Some(info.to_string()));
+            } else {
+                before(info);
+            }
+        }));
+    });
+}
+
+/// Marks this thread as inside the library while it lives.
+struct Inside;
+
+impl Inside {
+    fn enter() -> Inside {
+        catch_reports();
+        let _ = DEPTH.try_with(|depth| depth.set(depth.get() + 1));
+        Inside
+    }
+}
+
+impl Drop for Inside {
+    fn drop(&mut self) {
+        let _ = DEPTH.try_with(|depth| depth.set(depth.get() - 1));
+    }
+}
+
+/// Runs the body of a call on `handle` (null for none): its failure, or panic, becomes a status and a text.
+pub(super) fn call<H>(handle: *const H, body: impl FnOnce() -> Outcome<()>) -> nertca_status {
+    let inside = Inside::enter();
+    let outcome = catch_unwind(AssertUnwindSafe(body));
+    drop(inside);
+    let failure = match outcome {
+        Ok(Ok(())) => return NERTCA_OK,
+        Ok(Err(failure)) => failure,
+        Err(_) => {
+            let report = PANIC.try_with(|panic| panic.borrow_mut().take()).ok().flatten();
+            let report = report.unwrap_or_else(|| "panic".into());
+            Failure::new(NERTCA_ERROR_INTERNAL, format!("internal fault: {report}. Please report it"))
+        }
+    };
+    remember(handle.addr(), &failure.text);
+    failure.status
+}
+
+/// Copies a text with its closing zero into a caller's buffer, cut to fit; `length` gets its full length without the
+/// zero.
+///
+/// # Safety
+/// `buffer` must hold `size` bytes, unless null; `length` must be writable, unless null.
+pub(super) unsafe fn copy_text(text: &str, buffer: *mut c_char, size: usize, length: *mut usize) -> Outcome<()> {
+    if !length.is_null() {
+        // SAFETY: the caller vouches for it.
+        unsafe { length.write_unaligned(text.len()) };
+    }
+    if buffer.is_null() {
+        let asks = size == 0 && !length.is_null();
+        return if asks { Ok(()) } else { Err(Failure::argument("buffer", "is null")) };
+    }
+    if size == 0 {
+        return Err(Failure::argument("size", "is 0"));
+    }
+    let n = text.len().min(size - 1);
+    // SAFETY: the caller vouches for `size` bytes.
+    unsafe {
+        std::ptr::copy_nonoverlapping(text.as_ptr(), buffer.cast(), n);
+        buffer.add(n).write(0);
+    }
+    if n < text.len() {
+        return Err(Failure::new(NERTCA_ERROR_BUFFER, format!("{} bytes are needed", text.len() + 1)));
+    }
+    Ok(())
+}
+
+/// Text of the last failed call on `handle` (of any type) in this thread, or of the last failed call at all when
+/// `handle` is null; empty when there was none. UTF-8, with a closing zero, cut to `size` bytes; `*length` gets the
+/// full length without the zero. With a null `text` and a `size` of 0, only the length is given.
+///
+/// Any thread. Texts of calls without a handle (those that create one) are found under null.
+///
+/// @return NERTCA_OK, NERTCA_ERROR_BUFFER when the text was cut, NERTCA_ERROR_ARGUMENT.
+///
+/// # Safety
+/// `text` must hold `size` bytes; `length` must be writable or null.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_last_error(
+    handle: *const c_void,
+    text: *mut c_char,
+    size: usize,
+    length: *mut usize,
+) -> nertca_status {
+    let inside = Inside::enter();
+    let last = LAST.try_with(|last| last.borrow().get(&handle.addr()).cloned()).ok().flatten().unwrap_or_default();
+    // SAFETY: as the caller vouches.
+    let outcome = catch_unwind(AssertUnwindSafe(|| unsafe { copy_text(&last, text, size, length) }));
+    drop(inside);
+    // A failure here leaves the text that was asked for as it is.
+    match outcome {
+        Ok(Ok(())) => NERTCA_OK,
+        Ok(Err(failure)) => failure.status,
+        Err(_) => NERTCA_ERROR_INTERNAL,
+    }
+}
+
+/// A short description of a status, for logs. Never null; the text is static. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn nertca_status_text(status: nertca_status) -> *const c_char {
+    (match status {
+        NERTCA_OK => c"ok",
+        NERTCA_ERROR_ARGUMENT => c"invalid argument",
+        NERTCA_ERROR_HANDLE => c"invalid handle",
+        NERTCA_ERROR_DATA => c"malformed data",
+        NERTCA_ERROR_IO => c"file error",
+        NERTCA_ERROR_DEVICE => c"device error",
+        NERTCA_ERROR_DEVICE_LOST => c"device lost",
+        NERTCA_ERROR_MEMORY => c"out of memory",
+        NERTCA_ERROR_DIVERGED => c"training diverged",
+        NERTCA_ERROR_CANCELLED => c"cancelled",
+        NERTCA_ERROR_BUSY => c"busy",
+        NERTCA_ERROR_BUFFER => c"buffer too small",
+        NERTCA_ERROR_NOT_READY => c"not ready",
+        NERTCA_ERROR_FORKED => c"used after fork",
+        NERTCA_ERROR_INTERNAL => c"internal fault",
+        _ => c"unknown status",
+    })
+    .as_ptr()
+}

@@ -1,0 +1,490 @@
+//! Structs that cross the boundary. Each begins with its size, so that later versions can add to its end.
+
+use super::status::{Failure, Outcome};
+use crate::data::dataset::{Intensity, Split};
+use crate::data::geometry::{CArm, Geometry, Matrix};
+use crate::session::{Moment, NewFrame};
+use std::ffi::{c_char, c_void};
+
+/// Pixels of 8 bits without sign.
+pub const NERTCA_PIXELS_U8: u32 = 1;
+/// Pixels of 16 bits without sign, in the machine's byte order.
+pub const NERTCA_PIXELS_U16: u32 = 2;
+/// Pixels of 32-bit floats.
+pub const NERTCA_PIXELS_F32: u32 = 3;
+
+/// Pixel values `p` are line integrals of attenuation: `p * scale + offset`.
+pub const NERTCA_INTENSITY_INTEGRAL: u32 = 1;
+/// Logarithmic detector: the line integral is `(i0 - p) * scale`.
+pub const NERTCA_INTENSITY_LOG: u32 = 2;
+/// Detector linear in intensity: the line integral is `-ln(p / i0)`.
+pub const NERTCA_INTENSITY_LINEAR: u32 = 3;
+
+/// A frame to train on.
+pub const NERTCA_SPLIT_TRAIN: u32 = 0;
+/// A frame to score with only.
+pub const NERTCA_SPLIT_VALIDATION: u32 = 1;
+
+/// Both fields.
+pub const NERTCA_COMPONENT_TOTAL: u32 = 0;
+/// The still background.
+pub const NERTCA_COMPONENT_STATIC: u32 = 1;
+/// The moving vessels.
+pub const NERTCA_COMPONENT_DYNAMIC: u32 = 2;
+
+/// Line integrals of attenuation, as an angiogram shows them.
+pub const NERTCA_PROJECTION_DRR: u32 = 0;
+/// The largest attenuation along each ray, 1/mm.
+pub const NERTCA_PROJECTION_MIP: u32 = 1;
+
+/// Through volumes baked from the fields: display rates, also while training; as fine as their cells (about 0.8 mm).
+pub const NERTCA_QUALITY_LIVE: u32 = 0;
+/// Through the fields themselves: exact, and many times slower.
+pub const NERTCA_QUALITY_EXACT: u32 = 1;
+
+/// Not training.
+pub const NERTCA_STATE_IDLE: u32 = 0;
+/// Training in the background.
+pub const NERTCA_STATE_RUNNING: u32 = 1;
+/// Held by `nertca_reconstruction_pause`.
+pub const NERTCA_STATE_PAUSED: u32 = 2;
+/// Will train in the background as soon as there are frames enough.
+pub const NERTCA_STATE_WAITING: u32 = 3;
+/// All iterations are done.
+pub const NERTCA_STATE_FINISHED: u32 = 4;
+/// The progress callback ended it.
+pub const NERTCA_STATE_CANCELLED: u32 = 5;
+/// An error ended it.
+pub const NERTCA_STATE_FAILED: u32 = 6;
+
+/// Where log messages go.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_log {
+    /// `sizeof(nertca_log)`.
+    pub size: usize,
+    /// Called for each message.
+    pub callback: super::log::nertca_log_callback,
+    /// Handed to the callback.
+    pub user: *mut c_void,
+    /// Least severe level wanted, one of `NERTCA_LOG_*`.
+    pub level: u32,
+}
+
+/// A Vulkan device that the caller made and goes on owning. It must outlive the context made from it.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_vulkan {
+    /// `sizeof(nertca_vulkan)`.
+    pub size: usize,
+    /// `vkGetInstanceProcAddr`; null takes that of the system's loader.
+    pub get_instance_proc_addr: *const c_void,
+    /// `VkInstance`, made for Vulkan 1.2 or newer.
+    pub instance: *mut c_void,
+    /// `VkPhysicalDevice`.
+    pub physical_device: *mut c_void,
+    /// `VkDevice`, made with the feature `timelineSemaphore`.
+    pub device: *mut c_void,
+    /// `VkQueue` that computes.
+    pub queue: *mut c_void,
+    /// Its family.
+    pub queue_family: u32,
+    /// Non-zero when the device was made with the feature `bufferDeviceAddress`.
+    pub buffer_device_address: u32,
+    /// Non-zero when the device was made with `VK_KHR_external_memory_fd`.
+    pub external_memory_fd: u32,
+    /// Taken around every use of the queue, for a short time, on any thread; null when the queue is the library's alone.
+    pub lock: Option<unsafe extern "C" fn(user: *mut c_void)>,
+    /// Gives it back; null exactly when `lock` is.
+    pub unlock: Option<unsafe extern "C" fn(user: *mut c_void)>,
+    /// Handed to both.
+    pub user: *mut c_void,
+}
+
+/// How an image is taken. Patient coordinates are left, posterior, superior (LPS), mm, from the isocentre.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_geometry {
+    /// `sizeof(nertca_geometry)`.
+    pub size: usize,
+    /// Primary angle in degrees, LAO positive (DICOM PositionerPrimaryAngle).
+    pub primary_deg: f64,
+    /// Secondary angle in degrees, cranial positive (DICOM PositionerSecondaryAngle).
+    pub secondary_deg: f64,
+    /// Source to detector, mm.
+    pub sid_mm: f64,
+    /// Source to isocentre, mm.
+    pub sod_mm: f64,
+    /// Pixel pitch on the detector along columns and rows, mm.
+    pub pixel_mm: [f64; 2],
+    /// Offset of the detector's centre along columns and rows, mm.
+    pub offset_mm: [f64; 2],
+    /// How far the table has carried the patient (LPS), mm.
+    pub table_mm: [f64; 3],
+    /// Null, or 12 numbers that replace all of the above: a row-major 3 x 4 projection from patient mm to homogeneous
+    /// pixels (column, row; integers are pixel centres).
+    pub matrix: *const f64,
+}
+
+/// A calibrated angiogram.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_frame {
+    /// `sizeof(nertca_frame)`.
+    pub size: usize,
+    /// How it was taken.
+    pub geometry: nertca_geometry,
+    /// First row; copied during the call.
+    pub pixels: *const c_void,
+    /// Bytes readable from `pixels`.
+    pub pixels_bytes: usize,
+    /// Bytes from one row to the next; 0 when rows follow each other at once.
+    pub stride_bytes: usize,
+    /// Columns, 1 to 8192. All frames of a reconstruction have one size.
+    pub width: u32,
+    /// Rows, 1 to 8192.
+    pub height: u32,
+    /// One of `NERTCA_PIXELS_*`.
+    pub format: u32,
+    /// What values mean, one of `NERTCA_INTENSITY_*`.
+    pub intensity: u32,
+    /// For `INTEGRAL` and `LOG`; 0 stands for 1.
+    pub scale: f64,
+    /// For `INTEGRAL`.
+    pub offset: f64,
+    /// Value of an unattenuated ray, for `LOG` and `LINEAR`.
+    pub i0: f64,
+    /// Cardiac phase from 0; negative to find it from `time_s` and the R-peaks.
+    pub phase: i32,
+    /// `NERTCA_SPLIT_TRAIN` or `NERTCA_SPLIT_VALIDATION`.
+    pub split: u32,
+    /// Time stamp on the clock of the R-peaks, seconds.
+    pub time_s: f64,
+    /// Null, or a vessel mask of a byte per pixel, non-zero inside vessels.
+    pub mask: *const u8,
+    /// Bytes readable from `mask`.
+    pub mask_bytes: usize,
+    /// Bytes from one row of the mask to the next; 0 when rows follow each other at once.
+    pub mask_stride_bytes: usize,
+}
+
+/// What to draw.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_view {
+    /// `sizeof(nertca_view)`.
+    pub size: usize,
+    /// From where.
+    pub geometry: nertca_geometry,
+    /// Columns, 1 to 8192.
+    pub width: u32,
+    /// Rows, 1 to 8192.
+    pub height: u32,
+    /// Cardiac phase, from 0.
+    pub phase: u32,
+    /// One of `NERTCA_COMPONENT_*`.
+    pub component: u32,
+    /// One of `NERTCA_PROJECTION_*`.
+    pub projection: u32,
+    /// One of `NERTCA_QUALITY_*`.
+    pub quality: u32,
+}
+
+/// Where to draw to.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_image {
+    /// `sizeof(nertca_image)`.
+    pub size: usize,
+    /// First row.
+    pub pixels: *mut c_void,
+    /// Bytes writable from `pixels`.
+    pub pixels_bytes: usize,
+    /// Bytes from one row to the next; 0 when rows follow each other at once.
+    pub stride_bytes: usize,
+    /// `NERTCA_PIXELS_F32` or `NERTCA_PIXELS_U8`.
+    pub format: u32,
+    /// For `U8`: the value shown as 0. With `low` = `high`, both are the image's own extremes.
+    pub low: f64,
+    /// For `U8`: the value shown as 255.
+    pub high: f64,
+}
+
+/// A regular grid of points in patient coordinates (LPS), left fastest, superior slowest.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_grid {
+    /// `sizeof(nertca_grid)`.
+    pub size: usize,
+    /// First point, mm.
+    pub origin_mm: [f64; 3],
+    /// Distance between neighbours, mm.
+    pub spacing_mm: [f64; 3],
+    /// Points along each axis, 1 to 4096; at most 2^30 in all.
+    pub points: [u32; 3],
+    /// One of `NERTCA_COMPONENT_*`.
+    pub component: u32,
+    /// Cardiac phase, from 0.
+    pub phase: u32,
+}
+
+/// How far training is.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_progress {
+    /// `sizeof(nertca_progress)`.
+    pub size: usize,
+    /// One of `NERTCA_STATE_*`.
+    pub state: u32,
+    /// Iterations done.
+    pub step: u32,
+    /// Length of the run.
+    pub iterations: u32,
+    /// Frames trained on.
+    pub frames: u32,
+    /// Loss of the last iteration.
+    pub loss: f64,
+    /// PSNR of the last iteration's rays, dB.
+    pub psnr_db: f64,
+    /// Iterations per second since training was last begun.
+    pub iterations_per_s: f64,
+}
+
+/// Scores on the frames added for validation.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_scores {
+    /// `sizeof(nertca_scores)`.
+    pub size: usize,
+    /// Iterations of the model.
+    pub step: u32,
+    /// Images scored.
+    pub images: u32,
+    /// Mean Dice of the moving vessels; NaN without masks.
+    pub dice_dynamic: f64,
+    /// Mean Dice of both fields; NaN without masks.
+    pub dice_total: f64,
+    /// Mean PSNR, dB.
+    pub psnr_db: f64,
+    /// Mean structural similarity.
+    pub ssim: f64,
+    /// Attenuation from which the moving field counts as vessel, 1/mm.
+    pub threshold_per_mm: f64,
+}
+
+/// Told now and then how far training is; a non-zero result ends it. `progress` is valid during the call. Called on the
+/// thread that trains, with no lock held: it may call into the library, but not stop, train or destroy the same
+/// reconstruction.
+pub type nertca_progress_callback =
+    Option<unsafe extern "C" fn(progress: *const nertca_progress, user: *mut c_void) -> i32>;
+
+/// A struct that begins with its size, of which every bit pattern is a value.
+///
+/// # Safety
+/// `#[repr(C)]`, with a `usize` first, and no field with invalid bit patterns.
+pub(super) unsafe trait Versioned: Copy {
+    const NAME: &'static str;
+}
+
+macro_rules! versioned {
+    ($($name:ident)*) => { $(
+        // SAFETY: integers, floats, pointers and optional function pointers after a `usize`.
+        unsafe impl Versioned for $name {
+            const NAME: &'static str = stringify!($name);
+        }
+    )* };
+}
+versioned!(nertca_log nertca_vulkan nertca_geometry nertca_frame nertca_view nertca_image nertca_grid nertca_progress
+       nertca_scores);
+
+fn check_size<T: Versioned>(size: usize) -> Outcome<()> {
+    if size < size_of::<T>() || size > 4096 {
+        let name = T::NAME;
+        let problem = format!("{size} where sizeof({name}) = {} is needed: was the struct set up?", size_of::<T>());
+        return Err(Failure::argument(&format!("{name}.size"), problem));
+    }
+    Ok(())
+}
+
+/// Reads a struct of the caller. A longer one, of a later version, is accepted if what is unknown here is zero.
+///
+/// # Safety
+/// `from` must be null or point to a struct as long as it says.
+pub(super) unsafe fn read<T: Versioned>(from: *const T) -> Outcome<T> {
+    if from.is_null() {
+        return Err(Failure::argument(T::NAME, "is null"));
+    }
+    // SAFETY: a size comes first.
+    let size = unsafe { from.cast::<usize>().read_unaligned() };
+    check_size::<T>(size)?;
+    // SAFETY: the struct is as long as it says.
+    let rest = unsafe {
+        let end = from.cast::<u8>().add(size_of::<T>());
+        std::slice::from_raw_parts(end, size - size_of::<T>())
+    };
+    if rest.iter().any(|byte| *byte != 0) {
+        return Err(Failure::argument(T::NAME, "asks for what this version of the library does not know"));
+    }
+    // SAFETY: as above; every bit pattern is a value.
+    Ok(unsafe { from.read_unaligned() })
+}
+
+/// Writes a struct to the caller, whose `size` must be set.
+///
+/// # Safety
+/// `to` must be null or point to a struct as long as it says.
+pub(super) unsafe fn write<T: Versioned>(to: *mut T, value: impl FnOnce(usize) -> T) -> Outcome<()> {
+    if to.is_null() {
+        return Err(Failure::argument(T::NAME, "is null"));
+    }
+    // SAFETY: a size comes first.
+    let size = unsafe { to.cast::<usize>().read_unaligned() };
+    check_size::<T>(size)?;
+    // SAFETY: the struct is at least as long as ours.
+    unsafe { to.write_unaligned(value(size)) };
+    Ok(())
+}
+
+impl nertca_geometry {
+    /// # Safety
+    /// `matrix` must be null or point to 12 numbers.
+    pub(super) unsafe fn geometry(&self) -> Outcome<Geometry> {
+        check_size::<nertca_geometry>(self.size)?;
+        if self.matrix.is_null() {
+            return Ok(Geometry::CArm(CArm {
+                primary_deg: self.primary_deg,
+                secondary_deg: self.secondary_deg,
+                sid_mm: self.sid_mm,
+                sod_mm: self.sod_mm,
+                pixel_mm: self.pixel_mm,
+                offset_mm: self.offset_mm,
+                table_mm: self.table_mm,
+            }));
+        }
+        // SAFETY: the caller vouches for 12 numbers.
+        let m = unsafe { self.matrix.cast::<[[f64; 4]; 3]>().read_unaligned() };
+        Ok(Geometry::Matrix(Matrix { matrix: m }))
+    }
+}
+
+/// Largest side of an image.
+const MAX_SIDE: u32 = crate::data::images::MAX_SIDE as u32;
+
+/// Checks a size.
+pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {
+    for (name, side) in [("width", width), ("height", height)] {
+        if side == 0 || side > MAX_SIDE {
+            return Err(Failure::argument(name, format!("{side}; 1 to {MAX_SIDE} are accepted")));
+        }
+    }
+    Ok((width as usize, height as usize))
+}
+
+/// Checks that rows of `row_bytes` fit, and gives the distance between them.
+pub(super) fn stride(name: &str, row_bytes: usize, height: usize, stride: usize, bytes: usize) -> Outcome<usize> {
+    let stride = if stride == 0 { row_bytes } else { stride };
+    if stride < row_bytes {
+        return Err(Failure::argument(&format!("{name} stride"), format!("{stride} bytes for rows of {row_bytes}")));
+    }
+    let needed = stride.checked_mul(height - 1).and_then(|n| n.checked_add(row_bytes));
+    match needed {
+        Some(needed) if needed <= bytes => Ok(stride),
+        _ => Err(Failure::argument(
+            &format!("{name}_bytes"),
+            format!("{bytes} where {height} rows {stride} bytes apart need {}", needed.unwrap_or(usize::MAX)),
+        )),
+    }
+}
+
+/// Bytes of a pixel.
+pub(super) fn pixel_bytes(format: u32) -> Outcome<usize> {
+    match format {
+        NERTCA_PIXELS_U8 => Ok(1),
+        NERTCA_PIXELS_U16 => Ok(2),
+        NERTCA_PIXELS_F32 => Ok(4),
+        other => Err(Failure::argument("format", format!("{other} is none of NERTCA_PIXELS_*"))),
+    }
+}
+
+impl nertca_frame {
+    /// Copies the pixels as line integrals.
+    ///
+    /// # Safety
+    /// Pointers must be null or readable as far as stated.
+    pub(super) unsafe fn new_frame(&self) -> Outcome<NewFrame> {
+        let (width, height) = sides(self.width, self.height)?;
+        let bytes = pixel_bytes(self.format)?;
+        if self.pixels.is_null() {
+            return Err(Failure::argument("pixels", "is null"));
+        }
+        let apart = stride("pixels", width * bytes, height, self.stride_bytes, self.pixels_bytes)?;
+        let scale = if self.scale == 0.0 { 1.0 } else { self.scale };
+        let finite = |name: &str, value: f64| {
+            if value.is_finite() { Ok(value) } else { Err(Failure::argument(name, format!("{value} is not finite"))) }
+        };
+        finite("scale", scale)?;
+        let intensity = match self.intensity {
+            NERTCA_INTENSITY_INTEGRAL => Intensity::Integral { scale, offset: finite("offset", self.offset)? },
+            // (i0 - p) * scale = p * -scale + i0 * scale
+            NERTCA_INTENSITY_LOG => Intensity::Integral { scale: -scale, offset: finite("i0", self.i0)? * scale },
+            NERTCA_INTENSITY_LINEAR if self.i0 > 0.0 && self.i0.is_finite() => Intensity::Linear { i0: self.i0 },
+            NERTCA_INTENSITY_LINEAR => return Err(Failure::argument("i0", format!("{} is not positive", self.i0))),
+            other => return Err(Failure::argument("intensity", format!("{other} is none of NERTCA_INTENSITY_*"))),
+        };
+        let mut integrals = Vec::with_capacity(width * height);
+        for row in 0..height {
+            // SAFETY: `stride` checked that every row lies within the bytes the caller vouches for.
+            let row = unsafe { std::slice::from_raw_parts(self.pixels.cast::<u8>().add(row * apart), width * bytes) };
+            integrals.extend(row.chunks_exact(bytes).map(|p| {
+                intensity.integral(match *p {
+                    [a] => f32::from(a),
+                    [a, b] => f32::from(u16::from_ne_bytes([a, b])),
+                    [a, b, c, d] => f32::from_ne_bytes([a, b, c, d]),
+                    _ => f32::NAN,
+                })
+            }));
+        }
+        let mask = if self.mask.is_null() {
+            None
+        } else {
+            let apart = stride("mask", width, height, self.mask_stride_bytes, self.mask_bytes)?;
+            let mut mask = Vec::with_capacity(width * height);
+            for row in 0..height {
+                // SAFETY: as above.
+                let row = unsafe { std::slice::from_raw_parts(self.mask.add(row * apart), width) };
+                mask.extend(row.iter().map(|m| *m != 0));
+            }
+            Some(mask)
+        };
+        Ok(NewFrame {
+            // SAFETY: as the caller vouches.
+            geometry: unsafe { self.geometry.geometry() }?,
+            moment: u32::try_from(self.phase).map_or(Moment::TimeS(self.time_s), Moment::Phase),
+            split: match self.split {
+                NERTCA_SPLIT_TRAIN => Split::Train,
+                NERTCA_SPLIT_VALIDATION => Split::Validation,
+                other => return Err(Failure::argument("split", format!("{other} is none of NERTCA_SPLIT_*"))),
+            },
+            width,
+            height,
+            integrals,
+            mask,
+        })
+    }
+}
+
+/// Version of the ABI: of functions, structs and constants. A library serves callers built against its own number; it
+/// is also the number in its soname.
+pub const NERTCA_ABI_VERSION: u32 = 0;
+
+/// Version of the library, as `major.minor.patch`. Static text. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn nertca_version() -> *const c_char {
+    concat!(env!("CARGO_PKG_VERSION"), "\0").as_ptr().cast()
+}
+
+/// `NERTCA_ABI_VERSION` of the library in use, to compare with that of the header. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn nertca_abi_version() -> u32 {
+    NERTCA_ABI_VERSION
+}

@@ -1,0 +1,132 @@
+//! Views of a run while it trains: baked volumes that are refreshed as fast as the device can afford.
+
+use super::render::{Renderer, Rendering};
+use super::sampled::{Baked, Field, Quantity};
+use crate::config::Config;
+use crate::data::geometry::ViewRays;
+use crate::error::Result;
+use crate::gpu::device::Gpu;
+use crate::gpu::memory::Buffer;
+use crate::kernels::Tuning;
+use crate::model::field::Model;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Side of a cell of the moving field, world units: half a millimetre less than a thin vessel.
+const CELL: f64 = 0.008;
+/// After a refresh that took some time, this many times as long passes before the next.
+const REST: u32 = 4;
+
+/// Where a run in training keeps what a view needs.
+#[derive(Clone)]
+pub struct Source {
+    /// Its model, with parameters if `params` has none.
+    pub outline: Model,
+    /// Its parameters on the device.
+    pub params: Option<Buffer>,
+}
+
+/// Draws the present state of a source.
+pub struct Live {
+    baked: Baked,
+    config: Config,
+    params: Option<Buffer>,
+    /// Iteration the static field and each phase were baked at.
+    baked_at: Vec<u32>,
+    rest_until: Instant,
+}
+
+impl Live {
+    /// Prepares to draw; bakes nothing yet.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
+        let model = &source.outline;
+        let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
+        let scene = &model.scene;
+        let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
+        let moving_cells = ((extent / CELL).ceil() as u32).clamp(32, super::sampled::BAKED_CELLS);
+        Ok(Live {
+            // The static field has no detail between the cells of its grid.
+            baked: Baked::empty(renderer, (2 * model.config.static_field.grid).clamp(32, 192), moving_cells),
+            config: model.config.clone(),
+            params: source.params.clone(),
+            baked_at: vec![0; 1 + model.layout.phases],
+            rest_until: Instant::now(),
+        })
+    }
+
+    /// Through baked volumes. A volume older than `step`, the source's present iteration, is baked anew unless the last
+    /// refresh was too recent: refreshing takes at most a fifth of the time.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn render(
+        &mut self,
+        step: u32,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>> {
+        self.refresh(step, phase, quantity)?;
+        self.baked.render(rays, size.0, size.1, phase, quantity)
+    }
+
+    /// As [`Live::render`], into a buffer on the device.
+    ///
+    /// # Errors
+    /// As [`Baked::render_into`].
+    pub fn render_into(
+        &mut self,
+        target: &Buffer,
+        step: u32,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<()> {
+        self.refresh(step, phase, quantity)?;
+        self.baked.render_into(target, rays, size, phase, quantity)
+    }
+
+    fn refresh(&mut self, step: u32, phase: u32, quantity: Quantity) -> Result<()> {
+        self.baked.renderer().check_phase(phase)?;
+        let moving = (quantity.with_dynamic, Field::Dynamic(phase), 1 + phase as usize);
+        for (wanted, field, slot) in [(quantity.with_static, Field::Static, 0), moving] {
+            let old = || self.baked_at[slot] != step && Instant::now() >= self.rest_until;
+            if wanted && (!self.baked.has(field) || old()) {
+                let begin = Instant::now();
+                self.follow(step)?;
+                self.baked.bake(field)?;
+                self.baked_at[slot] = step;
+                self.rest_until = Instant::now() + begin.elapsed() * REST;
+            }
+        }
+        Ok(())
+    }
+
+    /// Through the fields themselves, as they are at the source's present iteration.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn render_fields(&self, step: u32, rays: &ViewRays, size: (usize, usize), phase: u32) -> Result<Rendering> {
+        self.follow(step)?;
+        self.baked.renderer().render(rays, size.0, size.1, phase)
+    }
+
+    /// The renderer, brought up to the source's present iteration.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn renderer(&self, step: u32) -> Result<&Renderer> {
+        self.follow(step)?;
+        Ok(self.baked.renderer())
+    }
+
+    fn follow(&self, step: u32) -> Result<()> {
+        let Some(params) = &self.params else { return Ok(()) };
+        self.baked.renderer().follow(params, self.config.schedule(step))
+    }
+}
