@@ -477,6 +477,13 @@ impl nertca_frame {
 /// is also the number in its soname.
 pub const NERTCA_ABI_VERSION: u32 = 0;
 
+/// Version this header was made with.
+pub const NERTCA_VERSION_MAJOR: u32 = 0;
+/// See `NERTCA_VERSION_MAJOR`.
+pub const NERTCA_VERSION_MINOR: u32 = 1;
+/// See `NERTCA_VERSION_MAJOR`.
+pub const NERTCA_VERSION_PATCH: u32 = 0;
+
 /// Version of the library, as `major.minor.patch`. Static text. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_version() -> *const c_char {
@@ -487,4 +494,17 @@ pub extern "C" fn nertca_version() -> *const c_char {
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_abi_version() -> u32 {
     NERTCA_ABI_VERSION
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn versions_agree() {
+        let macros = format!("{NERTCA_VERSION_MAJOR}.{NERTCA_VERSION_MINOR}.{NERTCA_VERSION_PATCH}");
+        assert_eq!(macros, env!("CARGO_PKG_VERSION"));
+        let cmake = std::fs::read_to_string("include/cmake/nertca_vkConfigVersion.cmake").unwrap();
+        assert!(cmake.contains(&format!("PACKAGE_VERSION {macros})")));
+    }
 }

@@ -2,6 +2,7 @@
 
 use super::device::{Gpu, Shared, lock};
 use super::memory::Memory;
+use super::record::{Commands, Recording};
 use crate::error::{Error, Result};
 use ash::vk;
 use gpu_allocator::MemoryLocation;
@@ -34,14 +35,14 @@ const RANGE: vk::ImageSubresourceRange = vk::ImageSubresourceRange {
 };
 
 impl Gpu {
-    /// A volume of `size` cells, x fastest; outside, its nearest cell repeats.
+    /// A volume of `size` cells, still to be filled; outside, its nearest cell repeats.
     ///
     /// # Errors
-    /// [`Error::Internal`] when data and size differ, [`Error::OutOfMemory`], errors of the upload.
-    pub fn volume(&self, name: &str, size: [u32; 3], cells: &[half::f16]) -> Result<Volume> {
+    /// [`Error::Internal`] for a size of zero, [`Error::OutOfMemory`].
+    pub fn volume(&self, name: &str, size: [u32; 3]) -> Result<Volume> {
         let n = size.iter().map(|s| *s as usize).product::<usize>();
-        if cells.len() != n || n == 0 {
-            return Err(Error::Internal(format!("{name}: {} cells where {size:?} are needed", cells.len())));
+        if n == 0 {
+            return Err(Error::Internal(format!("{name}: a volume of {size:?} cells")));
         }
         let shared = &self.shared;
         let bytes = 2 * n as u64;
@@ -102,18 +103,17 @@ impl Gpu {
         // SAFETY: the device is alive.
         inner.sampler =
             unsafe { device.create_sampler(&create, None) }.map_err(Error::vulkan("vkCreateSampler", name))?;
-        let volume = Volume { inner: Arc::new(inner) };
-        volume.fill(cells)?;
-        Ok(volume)
+        Ok(Volume { inner: Arc::new(inner) })
     }
 }
 
 impl Volume {
-    /// Replaces all cells, x fastest, after everything submitted so far.
+    /// Replaces all cells, x fastest, between what was submitted so far and what is submitted next. Dropping the result
+    /// waits.
     ///
     /// # Errors
     /// [`Error::Internal`] for another number of cells; errors of the upload.
-    pub fn fill(&self, cells: &[half::f16]) -> Result<()> {
+    pub fn fill(&self, cells: &[half::f16]) -> Result<Commands> {
         let bytes: &[u8] = bytemuck::cast_slice(cells);
         if bytes.len() as u64 != self.inner.bytes {
             return Err(Error::Internal(format!("{} bytes for a volume of {}", bytes.len(), self.inner.bytes)));
@@ -121,9 +121,11 @@ impl Volume {
         let gpu = Gpu { shared: self.inner.gpu.clone() };
         let staging = gpu.buffer("volume staging", self.inner.bytes, Memory::Upload)?;
         staging.write(bytes)?;
-        let mut recording = super::record::Recording::new(&gpu, "volume upload")?;
+        let mut recording = Recording::new(&gpu, "volume upload")?;
         recording.fill_volume(&staging, self, self.inner.size)?;
-        gpu.wait(recording.finish()?.submit()?)
+        let commands = recording.finish()?;
+        commands.submit()?;
+        Ok(commands)
     }
 
     pub(super) fn raw(&self) -> vk::Image {

@@ -7,6 +7,7 @@ use crate::data::geometry::ViewRays;
 use crate::error::Result;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::Buffer;
+use crate::gpu::record::Commands;
 use crate::kernels::Tuning;
 use crate::model::field::Model;
 use std::sync::Arc;
@@ -70,7 +71,7 @@ impl Live {
         phase: u32,
         quantity: Quantity,
     ) -> Result<Vec<f32>> {
-        self.refresh(step, phase, quantity)?;
+        let _under_way = self.refresh(step, phase, quantity)?;
         self.baked.render(rays, size.0, size.1, phase, quantity)
     }
 
@@ -87,24 +88,25 @@ impl Live {
         phase: u32,
         quantity: Quantity,
     ) -> Result<()> {
-        self.refresh(step, phase, quantity)?;
+        let _under_way = self.refresh(step, phase, quantity)?;
         self.baked.render_into(target, rays, size, phase, quantity)
     }
 
-    fn refresh(&mut self, step: u32, phase: u32, quantity: Quantity) -> Result<()> {
+    fn refresh(&mut self, step: u32, phase: u32, quantity: Quantity) -> Result<Vec<Commands>> {
+        let mut under_way = Vec::new();
         self.baked.renderer().check_phase(phase)?;
         let moving = (quantity.with_dynamic, Field::Dynamic(phase), 1 + phase as usize);
         for (wanted, field, slot) in [(quantity.with_static, Field::Static, 0), moving] {
             let old = || self.baked_at[slot] != step && Instant::now() >= self.rest_until;
             if wanted && (!self.baked.has(field) || old()) {
                 let begin = Instant::now();
-                self.follow(step)?;
-                self.baked.bake(field)?;
+                under_way.extend(self.follow(step)?);
+                under_way.push(self.baked.bake(field)?);
                 self.baked_at[slot] = step;
                 self.rest_until = Instant::now() + begin.elapsed() * REST;
             }
         }
-        Ok(())
+        Ok(under_way)
     }
 
     /// Through the fields themselves, as they are at the source's present iteration.
@@ -112,7 +114,7 @@ impl Live {
     /// # Errors
     /// As [`Renderer::render`].
     pub fn render_fields(&self, step: u32, rays: &ViewRays, size: (usize, usize), phase: u32) -> Result<Rendering> {
-        self.follow(step)?;
+        let _under_way = self.follow(step)?;
         self.baked.renderer().render(rays, size.0, size.1, phase)
     }
 
@@ -125,8 +127,8 @@ impl Live {
         Ok(self.baked.renderer())
     }
 
-    fn follow(&self, step: u32) -> Result<()> {
-        let Some(params) = &self.params else { return Ok(()) };
-        self.baked.renderer().follow(params, self.config.schedule(step))
+    fn follow(&self, step: u32) -> Result<Option<Commands>> {
+        let Some(params) = &self.params else { return Ok(None) };
+        self.baked.renderer().follow(params, self.config.schedule(step)).map(Some)
     }
 }

@@ -4,17 +4,17 @@ use crate::data::geometry::ViewRays;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
-use crate::gpu::record::Recording;
+use crate::gpu::record::{Commands, Recording};
 use crate::kernels::{Buffers, Kernels, Tuning, dispatch, groups_for};
 use crate::layout::{RayOut, Schedule, Setup};
 use crate::model::field::Model;
 use crate::model::params::ParamLayout;
 use crate::model::scene::sample_capacity;
-use crate::train::network::{Network, indirect};
-use crate::train::step::{chunk_rays, forward_buffers, hull_buffer, record_live, record_render};
+use crate::train::network::Network;
+use crate::train::step::{forward_buffers, hull_buffer, record_render, record_volume};
 
 /// Pixels rendered by one submit.
-const RAYS_PER_SUBMIT: u32 = 1 << 16;
+pub(super) const RAYS_PER_SUBMIT: u32 = 1 << 16;
 
 /// What every pixel of a view sees; all lists are rows first, attenuation per world unit.
 #[derive(Debug, Clone, Default)]
@@ -97,16 +97,19 @@ impl Renderer {
         self.buffers.get("schedule")?.write(&[model.config.schedule(model.step)])
     }
 
-    /// Takes the parameters in `params`, of a run in training, as they are after everything submitted so far.
-    /// `schedule` is that of the run's present iteration.
+    /// Takes the parameters in `params`, of a run in training, as they are after everything submitted so far; returns
+    /// at once. `schedule` is that of the run's present iteration. Keep the result until what is rendered next is done:
+    /// dropping it waits. No rendering may be under way.
     ///
     /// # Errors
     /// [`Error::Internal`] when the buffer has another size; device errors.
-    pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<()> {
+    pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<Commands> {
         let mut recording = Recording::new(&self.gpu, "follow")?;
         recording.copy(params, 0, self.buffers.get("params")?, 0, self.model_layout.len as u64 * 4)?;
-        self.gpu.wait(recording.finish()?.submit()?)?;
-        self.buffers.get("schedule")?.write(&[schedule])
+        self.buffers.get("schedule")?.write(&[schedule])?;
+        let commands = recording.finish()?;
+        commands.submit()?;
+        Ok(commands)
     }
 
     pub(super) fn check_phase(&self, phase: u32) -> Result<()> {
@@ -121,11 +124,6 @@ impl Renderer {
         self.setup.sample_capacity / 128 * 128
     }
 
-    /// Rays one recording may march whose samples are laid out as `setup` says.
-    pub(super) fn rays_at_once(&self, setup: &Setup) -> u32 {
-        chunk_rays(setup).min(RAYS_PER_SUBMIT)
-    }
-
     /// Records the dynamic field at the samples of `n_rays` rays, put into the rows of `volume`.
     pub(super) fn record_dynamic_cells(
         &self,
@@ -134,8 +132,7 @@ impl Renderer {
         setup: &Setup,
         n_rays: u32,
     ) -> Result<()> {
-        record_live(r, &self.kernels, &self.network, buffers, &self.model_layout, setup, n_rays)?;
-        dispatch(r, &self.kernels.volume_dynamic, indirect(buffers, 0)?, buffers, &[], ())
+        record_volume(r, &self.kernels, &self.network, buffers, &self.model_layout, setup, n_rays)
     }
 
     /// Renders a `width` x `height` view at a phase.

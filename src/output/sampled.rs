@@ -1,6 +1,6 @@
 //! Fields sampled on a regular grid: for export, and baked into 3D images for display rates.
 
-use super::render::Renderer;
+use super::render::{RAYS_PER_SUBMIT, Renderer};
 use crate::data::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::error::{Error, Result};
 use crate::gpu::memory::{Buffer, Memory};
@@ -12,6 +12,9 @@ use glam::DVec3;
 use half::f16;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
+
+/// Cells sampled by one submit: 16 MiB on their way to the host.
+const CELLS_PER_SUBMIT: u32 = 1 << 22;
 
 /// A regular grid of points in world units (100 mm), x fastest.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -128,18 +131,26 @@ impl Renderer {
         setup.n_dynamic_samples = nx;
         setup.dynamic_near = grid.origin.x as f32;
         setup.dynamic_far = (grid.origin.x + grid.spacing.x * f64::from(nx - 1)) as f32;
-        let mut buffers = self.buffers.clone();
-        buffers.set("views", self.gpu.buffer_with("views", &[view])?);
-        buffers.set("setup", self.gpu.buffer_with("setup", &[setup])?);
         let rows = ny * nz;
-        let rows_at_once = self.rays_at_once(&setup).min(rows);
+        let rows_at_once = RAYS_PER_SUBMIT.min((CELLS_PER_SUBMIT / nx).max(1)).min(rows);
         let bytes = u64::from(rows_at_once) * u64::from(nx) * 4;
         let cells = self.gpu.buffer("volume", bytes, Memory::Device)?;
+        let read = self.gpu.buffer("volume read-back", bytes, Memory::Readback)?;
+        let mut buffers = self.buffers.clone();
         buffers.set("volume", cells.clone());
-        let mut out = Vec::with_capacity(grid.len());
-        for first in (0..rows).step_by(rows_at_once as usize) {
+        let mut out = vec![0f32; grid.len()];
+        for (i, out) in out.chunks_mut((rows_at_once * nx) as usize).enumerate() {
+            let first = i as u32 * rows_at_once;
             let n = rows_at_once.min(rows - first);
+            // One submit, the constants included: behind a run in training, each would wait its turn.
             let mut r = Recording::new(&self.gpu, "sample")?;
+            for (name, bytes) in [("views", bytemuck::bytes_of(&view)), ("setup", bytemuck::bytes_of(&setup))] {
+                let staging = self.gpu.buffer(name, bytes.len() as u64, Memory::Upload)?;
+                staging.write(bytes)?;
+                let on_device = self.gpu.buffer(name, bytes.len() as u64, Memory::Device)?;
+                r.copy(&staging, 0, &on_device, 0, bytes.len() as u64)?;
+                buffers.set(name, on_device);
+            }
             let k = &self.kernels;
             dispatch(&mut r, &k.pose_rays, groups_for(&k.pose_rays, n), &buffers, &[], [first, n, phase, ny, 0])?;
             match field {
@@ -152,8 +163,9 @@ impl Renderer {
                     self.record_dynamic_cells(&mut r, &buffers, &setup, n)?;
                 }
             }
+            r.copy(&cells, 0, &read, 0, u64::from(n) * u64::from(nx) * 4)?;
             self.gpu.wait(r.finish()?.submit()?)?;
-            out.extend(self.gpu.download::<f32>(&cells, 0, (n * nx) as usize)?);
+            read.read(out)?;
         }
         Ok(out)
     }
@@ -268,11 +280,12 @@ impl Baked {
         &self.renderer
     }
 
-    /// Bakes a field as the renderer's parameters are now, for the first time or again.
+    /// Bakes a field as the renderer's parameters are now, for the first time or again. The last copy may be under way:
+    /// it is in order with what is rendered next; dropping the result waits for it.
     ///
     /// # Errors
     /// As [`Renderer::sample`]; [`Error::OutOfMemory`].
-    pub fn bake(&self, field: Field) -> Result<()> {
+    pub fn bake(&self, field: Field) -> Result<Commands> {
         let setup = &self.renderer.setup;
         let (grid, gain, slot) = match field {
             Field::Static => (&self.still, setup.static_gain, 0),
@@ -284,8 +297,10 @@ impl Baked {
         match &volumes[slot] {
             Some(volume) => volume.fill(&cells),
             None => {
-                volumes[slot] = Some(self.renderer.gpu.volume("baked", grid.size, &cells)?);
-                Ok(())
+                let volume = self.renderer.gpu.volume("baked", grid.size)?;
+                let filling = volume.fill(&cells)?;
+                volumes[slot] = Some(volume);
+                Ok(filling)
             }
         }
     }

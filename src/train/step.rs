@@ -167,11 +167,11 @@ fn record_samples(
     dispatch(r, &k.march_emit, per_ray(), buffers, &[], chunk.push())
 }
 
-/// Records the dynamic field at the live samples of `n_rays` rays, which must fit one chunk: `sample_sigma`.
+/// Records the dynamic field at the live samples of `n_rays` rays already in `rays`, put into the rows of `volume`.
 ///
 /// # Errors
-/// [`Error::Internal`] when they do not fit.
-pub fn record_live(
+/// [`Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_volume(
     r: &mut Recording,
     k: &Kernels,
     network: &Network,
@@ -180,12 +180,13 @@ pub fn record_live(
     setup: &Setup,
     n_rays: u32,
 ) -> Result<()> {
-    if n_rays > chunk_rays(setup) {
-        return Err(Error::Internal(format!("{n_rays} rays exceed a chunk")));
-    }
     network.record_weights(r, k, buffers, params)?;
-    record_samples(r, k, network, buffers, params, Chunk { first_ray: 0, n_rays })?;
-    network.record_forward(r, buffers, params, setup)
+    for chunk in chunks(setup, n_rays) {
+        record_samples(r, k, network, buffers, params, chunk)?;
+        network.record_forward(r, buffers, params, setup)?;
+        dispatch(r, &k.volume_dynamic, indirect(buffers, 0)?, buffers, &[], ())?;
+    }
+    Ok(())
 }
 
 /// Records a rendering of `n_rays` rays already in `rays`: integrals and maxima land in `ray_out`.

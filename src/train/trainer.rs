@@ -1,4 +1,4 @@
-//! Owns the buffers and the step count of a run; hands iterations to the device, two submits in flight,
+//! Owns the buffers and the step count of a run; hands iterations to the device, two submits in flight on a GPU,
 //! and reads losses without stalling it.
 
 use super::checkpoint::{Checkpoint, LossScale};
@@ -20,7 +20,12 @@ use std::collections::VecDeque;
 
 /// A loss this many times the first one means the run exploded.
 const EXPLOSION: f64 = 1e6;
-const SUBMITS_IN_FLIGHT: usize = 2;
+
+/// Submits under way at once: two keep a GPU from waiting for the host; on a CPU nothing waits, and views of a run in
+/// training come up sooner.
+fn submits_in_flight(gpu: &Gpu) -> usize {
+    if gpu.info().kind == "cpu" { 1 } else { 2 }
+}
 
 /// Losses of one iteration.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -217,7 +222,7 @@ impl Trainer {
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite or exploded; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
-        while self.submitted < until && self.in_flight.len() < SUBMITS_IN_FLIGHT {
+        while self.submitted < until && self.in_flight.len() < submits_in_flight(&self.gpu) {
             let several = self.plan.config.train.iterations_per_submit;
             let (commands, n) =
                 if until - self.submitted >= several { (&self.several, several) } else { (&self.single, 1) };

@@ -1,0 +1,133 @@
+/* Frames arrive phase by phase while training goes on in the background and a render loop draws the moving vessels:
+ * prints how long drawing took, and how much it slowed training down.
+ *
+ *   cc live.c -o live $(pkg-config --cflags --libs nertca_vk) -lm -lpthread
+ *   ./live [SECONDS] [FRAMES PER SECOND] [CONTEXT OPTIONS]
+ */
+#define _POSIX_C_SOURCE 200809L
+#include "nertca_vk.h"
+#include "phantom.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+
+#define SIZE 100u
+#define SHOWN 200u
+#define MOST 100000
+
+static void check(nertca_status status, const void *handle, const char *call) {
+  char text[512] = "";
+  if (status == NERTCA_OK) return;
+  nertca_last_error(handle, text, sizeof text, NULL);
+  fprintf(stderr, "%s: %s: %s\n", call, nertca_status_text(status), text);
+  exit(1);
+}
+
+static double now_s(void) {
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static void sleep_s(double seconds) {
+  struct timespec t;
+  if (seconds <= 0) return;
+  t.tv_sec = (time_t)seconds;
+  t.tv_nsec = (long)(1e9 * (seconds - (double)t.tv_sec));
+  nanosleep(&t, NULL);
+}
+
+static int by_size(const void *a, const void *b) {
+  double x = *(const double *)a, y = *(const double *)b;
+  return (x > y) - (x < y);
+}
+
+static nertca_progress look(nertca_reconstruction *reconstruction) {
+  nertca_progress progress;
+  memset(&progress, 0, sizeof progress);
+  progress.size = sizeof progress;
+  check(nertca_reconstruction_progress(reconstruction, &progress), reconstruction, "nertca_reconstruction_progress");
+  if (progress.state == NERTCA_STATE_FAILED) {
+    char text[512];
+    nertca_reconstruction_failure(reconstruction, text, sizeof text, NULL);
+    fprintf(stderr, "training failed: %s\n", text);
+    exit(1);
+  }
+  return progress;
+}
+
+int main(int argc, char **argv) {
+  double seconds = argc > 1 ? atof(argv[1]) : 20, rate = argc > 2 ? atof(argv[2]) : 10;
+  nertca_context *context;
+  nertca_reconstruction *reconstruction;
+  char options[256];
+  static float pixels[SIZE * SIZE], shown[SHOWN * SHOWN];
+  static double took[MOST];
+  int drawn = 0, early = 0;
+
+  check(nertca_context_create(argc > 3 ? argv[3] : NULL, NULL, &context), NULL, "nertca_context_create");
+  sprintf(options, "phases = %d\ntrain.iterations = 100000\nvessel_attenuation_per_mm = 0.05", PHANTOM_PHASES);
+  check(nertca_reconstruction_create(context, options, &reconstruction), context, "nertca_reconstruction_create");
+  check(nertca_reconstruction_start(reconstruction, NULL, NULL), reconstruction, "nertca_reconstruction_start");
+
+  /* The C-arm's side: one phase of all views at a time. */
+  for (int phase = 0; phase < PHANTOM_PHASES; phase++) {
+    for (size_t view = 0; view < PHANTOM_VIEWS; view++) {
+      nertca_geometry g = phantom_geometry(phantom_views[view][0], phantom_views[view][1], SIZE);
+      phantom_image(&g, SIZE, phase, pixels, NULL);
+      nertca_frame frame = phantom_frame(&g, SIZE, phase, pixels, NULL);
+      check(nertca_reconstruction_add_frame(reconstruction, &frame), reconstruction, "nertca_reconstruction_add_frame");
+    }
+    sleep_s(0.2);
+  }
+  while (look(reconstruction).frames < PHANTOM_PHASES * PHANTOM_VIEWS) sleep_s(0.05);
+
+  nertca_view view;
+  memset(&view, 0, sizeof view);
+  view.size = sizeof view;
+  view.geometry = phantom_geometry(10, 20, SHOWN);
+  view.width = view.height = SHOWN;
+  view.component = NERTCA_COMPONENT_DYNAMIC;
+  nertca_image image;
+  memset(&image, 0, sizeof image);
+  image.size = sizeof image;
+  image.pixels = shown;
+  image.pixels_bytes = sizeof shown;
+  image.format = NERTCA_PIXELS_F32;
+
+  /* In turn: a stretch of training alone, and one with the render loop, so that both see the same machine. */
+  double alone_s = 0, beside_s = 0, alone_steps = 0, beside_steps = 0, begin = now_s();
+  while (now_s() - begin < seconds) {
+    uint32_t first = look(reconstruction).step;
+    double from = now_s();
+    sleep_s(2);
+    alone_steps += look(reconstruction).step - first;
+    alone_s += now_s() - from;
+    first = look(reconstruction).step;
+    from = now_s();
+    while (now_s() - from < 2 && drawn < MOST) {
+      double start = now_s();
+      view.phase = (uint32_t)(early + drawn) % PHANTOM_PHASES;
+      check(nertca_reconstruction_render(reconstruction, &view, &image), reconstruction, "nertca_reconstruction_render");
+      /* The first picture of each phase also builds its volume. */
+      if (early < PHANTOM_PHASES) early++; else took[drawn++] = now_s() - start;
+      sleep_s(1 / rate - (now_s() - start));
+    }
+    beside_steps += look(reconstruction).step - first;
+    beside_s += now_s() - from;
+  }
+  check(nertca_reconstruction_stop(reconstruction), reconstruction, "nertca_reconstruction_stop");
+
+  if (drawn == 0) return 1;
+  qsort(took, (size_t)drawn, sizeof *took, by_size);
+  printf("%d pictures of %u x %u while training: median %.1f ms, p90 %.1f ms, p99 %.1f ms, most %.1f ms\n", drawn, SHOWN,
+         SHOWN, 1e3 * took[drawn / 2], 1e3 * took[drawn * 9 / 10], 1e3 * took[drawn * 99 / 100], 1e3 * took[drawn - 1]);
+  double alone = alone_steps / alone_s, beside = beside_steps / beside_s;
+  printf("training: %.1f iterations/s alone, %.1f beside %.0f pictures/s: %.1f %% slower\n", alone, beside, rate,
+         100 * (1 - beside / alone));
+
+  check(nertca_reconstruction_destroy(reconstruction), reconstruction, "nertca_reconstruction_destroy");
+  check(nertca_context_destroy(context), context, "nertca_context_destroy");
+  return 0;
+}
