@@ -132,6 +132,21 @@
 #define NERTCA_ABI_VERSION 0
 
 /**
+ * Version this header was made with.
+ */
+#define NERTCA_VERSION_MAJOR 0
+
+/**
+ * See `NERTCA_VERSION_MAJOR`.
+ */
+#define NERTCA_VERSION_MINOR 1
+
+/**
+ * See `NERTCA_VERSION_MAJOR`.
+ */
+#define NERTCA_VERSION_PATCH 0
+
+/**
  * Severity of a log message: an error.
  */
 #define NERTCA_LOG_ERROR 1

@@ -399,13 +399,7 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::NotReady`] before anything was trained or loaded; as [`Live::render`].
-    pub fn render(
-        &self,
-        rays: &ViewRays,
-        size: (usize, usize),
-        phase: u32,
-        quantity: Quantity,
-    ) -> Result<Vec<f32>> {
+    pub fn render(&self, rays: &ViewRays, size: (usize, usize), phase: u32, quantity: Quantity) -> Result<Vec<f32>> {
         self.shared.with_viewer(|live, step| live.render(step, rays, size, phase, quantity))
     }
 
@@ -508,7 +502,8 @@ fn nothing_yet() -> Error {
 
 impl Inbox {
     fn add(&mut self, new: NewFrame) -> Result<()> {
-        let bad = |field: &str, value: String, problem: String| Error::config(format!("frame: {field}"), value, problem);
+        let bad =
+            |field: &str, value: String, problem: String| Error::config(format!("frame: {field}"), value, problem);
         let pixels = new.width.checked_mul(new.height).filter(|n| *n > 0);
         if pixels != Some(new.integrals.len()) || new.mask.as_ref().is_some_and(|m| Some(m.len()) != pixels) {
             let size = format!("{} x {}", new.width, new.height);
@@ -532,10 +527,8 @@ impl Inbox {
             }
             _ => (),
         }
-        let rays = new
-            .geometry
-            .rays(new.width, new.height)
-            .map_err(|(field, problem)| bad(&field, String::new(), problem))?;
+        let rays =
+            new.geometry.rays(new.width, new.height).map_err(|(field, problem)| bad(&field, String::new(), problem))?;
         let depth = self.options.depth_half_extent_mm / MM_PER_UNIT;
         if rays.sod <= depth {
             let problem = format!("the source stands inside the depth range of {} mm", depth * MM_PER_UNIT);
@@ -822,9 +815,8 @@ impl Shared {
 /// Whether fields trained in an old scene can go on in a new one: their box holds it, and numbers are of a like size.
 fn holds(old: &crate::model::scene::Scene, new: &crate::model::scene::Scene) -> bool {
     let slack = 0.02 * (0..3).map(|i| old.dynamic_max[i] - old.dynamic_min[i]).fold(0.0, f64::max);
-    let inside = (0..3).all(|i| {
-        new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack
-    });
+    let inside = (0..3)
+        .all(|i| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
     inside && alike(old.static_gain, new.static_gain) && alike(old.dynamic_gain, new.dynamic_gain)
 }

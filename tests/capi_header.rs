@@ -76,8 +76,11 @@ fn the_abi_is_what_it_was() {
     names.sort_unstable();
     assert!(names.iter().all(|n| n.starts_with("nertca_")), "foreign symbols are exported: {names:?}");
     names.iter().for_each(|n| writeln!(abi, "{n}").unwrap());
-    let constants: Vec<_> =
-        header.lines().filter_map(|l| l.strip_prefix("#define NERTCA_")?.split(' ').next()).filter(|n| *n != "VK_H").collect();
+    let constants: Vec<_> = header
+        .lines()
+        .filter_map(|l| l.strip_prefix("#define NERTCA_")?.split(' ').next())
+        .filter(|n| *n != "VK_H")
+        .collect();
     // Sizes and offsets, as a C compiler sees them.
     let mut program = String::from("#include \"nertca_vk.h\"\n#include <stdio.h>\nint main(void) {\n");
     for name in constants {

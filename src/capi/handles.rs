@@ -109,9 +109,8 @@ fn find<T: Kind>(handle: usize) -> Outcome<Arc<T>> {
     }
     let object = {
         let table = TABLE.read().unwrap_or_else(PoisonError::into_inner);
-        let slot = parts(handle).and_then(|(index, generation)| {
-            table.slots.get(index).filter(|slot| slot.generation == generation)
-        });
+        let slot = parts(handle)
+            .and_then(|(index, generation)| table.slots.get(index).filter(|slot| slot.generation == generation));
         slot.and_then(|slot| slot.object.clone())
     };
     let object = object.ok_or_else(|| bad("was destroyed, or never existed"))?;

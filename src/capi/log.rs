@@ -63,7 +63,8 @@ impl Visit for Text {
 
 impl Subscriber for Callback {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        metadata.is_event() && metadata.target().starts_with("nertca") | (metadata.target() == "vulkan")
+        metadata.is_event()
+            && metadata.target().starts_with("nertca") | (metadata.target() == "vulkan")
             && severity(*metadata.level()) <= self.most
     }
 

@@ -11,7 +11,6 @@ use super::types::{
 };
 use crate::data::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::memory::Buffer;
-use crate::output::pictures::Window;
 use crate::output::sampled::{Fields, PatientGrid, Quantity};
 use glam::DVec3;
 use std::os::fd::{AsFd, IntoRawFd, OwnedFd};
@@ -145,10 +144,15 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
         let values = draw(reconstruction, &shot)?;
         let rows: Vec<u8> = if image.format == NERTCA_PIXELS_F32 {
             values.iter().flat_map(|v| v.to_ne_bytes()).collect()
-        } else if image.low < image.high {
-            Window { low: image.low as f32, high: image.high as f32 }.codes(&values)
         } else {
-            Window::of(&values).codes(&values)
+            let (low, high) = if image.low < image.high {
+                (image.low as f32, image.high as f32)
+            } else {
+                values.iter().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(*v), high.max(*v)))
+            };
+            // A picture of one value is black.
+            let scale = if low < high { 255.0 / (high - low) } else { 0.0 };
+            values.iter().map(|v| ((v - low) * scale).round() as u8).collect()
         };
         for (row, content) in rows.chunks_exact(width * bytes).enumerate() {
             // SAFETY: `stride` checked that every row lies within the bytes the caller vouches for.

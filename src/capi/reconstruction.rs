@@ -66,9 +66,10 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
     let vessel = options.take_as("vessel_attenuation_per_mm", number)?;
     let preset = match options.take("preset") {
         None => None,
-        Some(name) => Some(Preset::from_str(&name, true).map_err(|_| {
-            Failure::argument("preset", format!("`{name}` is none of fast, paper, public-code"))
-        })?),
+        Some(name) => Some(
+            Preset::from_str(&name, true)
+                .map_err(|_| Failure::argument("preset", format!("`{name}` is none of fast, paper, public-code")))?,
+        ),
     };
     let config = Config::load(preset, None, &options.settings())?;
     let options = SessionOptions {
@@ -140,9 +141,7 @@ pub unsafe extern "C" fn nertca_reconstruction_destroy(reconstruction: *mut nert
             found.session.stop()?;
             found.claim.context.log.clone()
         };
-        tracing::dispatcher::with_default(&log, || {
-            handles::remove::<Reconstruction, _>(reconstruction).map(drop)
-        })
+        tracing::dispatcher::with_default(&log, || handles::remove::<Reconstruction, _>(reconstruction).map(drop))
     })
 }
 

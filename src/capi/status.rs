@@ -237,3 +237,21 @@ pub extern "C" fn nertca_status_text(status: nertca_status) -> *const c_char {
     })
     .as_ptr()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_becomes_a_status_and_a_text() {
+        let handle = std::ptr::without_provenance::<c_void>(12_345);
+        let status = call(handle, || panic!("the sky fell"));
+        assert_eq!(status, NERTCA_ERROR_INTERNAL);
+        let mut text = [0; 256];
+        // SAFETY: the text has room.
+        unsafe { nertca_last_error(handle, text.as_mut_ptr(), text.len(), std::ptr::null_mut()) };
+        // SAFETY: it ends with a zero.
+        let text = unsafe { std::ffi::CStr::from_ptr(text.as_ptr()) }.to_string_lossy().into_owned();
+        assert!(text.contains("the sky fell") && text.contains("status.rs"), "{text}");
+    }
+}

@@ -217,7 +217,15 @@ mod tests {
     use super::*;
 
     fn carm(primary_deg: f64, secondary_deg: f64) -> CArm {
-        CArm { primary_deg, secondary_deg, sid_mm: 1100.0, sod_mm: 750.0, pixel_mm: [0.5, 0.7], offset_mm: [3.0, -2.0], table_mm: [0.0; 3] }
+        CArm {
+            primary_deg,
+            secondary_deg,
+            sid_mm: 1100.0,
+            sod_mm: 750.0,
+            pixel_mm: [0.5, 0.7],
+            offset_mm: [3.0, -2.0],
+            table_mm: [0.0; 3],
+        }
     }
 
     #[test]

@@ -20,7 +20,9 @@ pub fn library() -> PathBuf {
 pub fn library_directory(scratch: &Path) -> PathBuf {
     let directory = scratch.join("lib");
     std::fs::create_dir_all(&directory).unwrap();
-    for name in ["libnertca_vk.so".to_owned(), format!("libnertca_vk.so.{}", nertca_vk::capi::types::NERTCA_ABI_VERSION)] {
+    for name in
+        ["libnertca_vk.so".to_owned(), format!("libnertca_vk.so.{}", nertca_vk::capi::types::NERTCA_ABI_VERSION)]
+    {
         let link = directory.join(name);
         if !link.exists() {
             std::os::unix::fs::symlink(library(), link).unwrap();
@@ -50,3 +52,5 @@ pub fn compile(compiler: &str, flags: &[&str], source: &Path, scratch: &Path) ->
     assert!(outcome.status.success(), "{compiler} {}: {}", source.display(), String::from_utf8_lossy(&outcome.stderr));
     binary
 }
+
+pub mod scene;

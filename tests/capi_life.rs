@@ -1,0 +1,665 @@
+//! What the C ABI promises: formats, gating, determinism, limits, sharing a device, many threads.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
+
+mod capi;
+
+use ash::vk::{self, Handle};
+use capi::scene::*;
+use nertca_vk::capi::context::*;
+use nertca_vk::capi::output::*;
+use nertca_vk::capi::reconstruction::*;
+use nertca_vk::capi::status::*;
+use nertca_vk::capi::training::*;
+use nertca_vk::capi::types::*;
+use std::ffi::{CString, c_char, c_void};
+use std::ptr::{null, null_mut};
+use std::sync::atomic::{AtomicI64, AtomicU32, Ordering};
+use std::time::Duration;
+
+#[track_caller]
+fn train(reconstruction: *mut nertca_reconstruction, iterations: u32) -> u32 {
+    let mut done = 0;
+    let status = unsafe { nertca_reconstruction_train(reconstruction, iterations, None, null_mut(), &mut done) };
+    ok(status, reconstruction);
+    done
+}
+
+fn bytes_of(reconstruction: *mut nertca_reconstruction) -> Vec<u8> {
+    let mut length = 0;
+    ok(unsafe { nertca_reconstruction_save_memory(reconstruction, null_mut(), 0, &mut length) }, reconstruction);
+    let mut bytes = vec![0u8; length + 1024];
+    let to = bytes.as_mut_ptr().cast();
+    ok(unsafe { nertca_reconstruction_save_memory(reconstruction, to, bytes.len(), &mut length) }, reconstruction);
+    bytes.truncate(length);
+    bytes
+}
+
+fn load(reconstruction: *mut nertca_reconstruction, bytes: &[u8]) {
+    let status = unsafe { nertca_reconstruction_load_memory(reconstruction, bytes.as_ptr().cast(), bytes.len()) };
+    ok(status, reconstruction);
+}
+
+#[track_caller]
+fn drawn(reconstruction: *mut nertca_reconstruction, view: &nertca_view) -> Vec<f32> {
+    let mut pixels = vec![f32::NAN; (view.width * view.height) as usize];
+    ok(unsafe { nertca_reconstruction_render(reconstruction, view, &image(&mut pixels)) }, reconstruction);
+    assert!(pixels.iter().all(|p| p.is_finite()));
+    pixels
+}
+
+fn exact(phase: u32, component: u32) -> nertca_view {
+    nertca_view { quality: NERTCA_QUALITY_EXACT, component, ..view(phase) }
+}
+
+fn far(a: &[f32], b: &[f32]) -> f32 {
+    let scale = b.iter().fold(1e-9f32, |m, v| m.max(v.abs()));
+    a.iter().zip(b).map(|(a, b)| (a - b).abs() / scale).fold(0.0, f32::max)
+}
+
+#[test]
+fn pixel_formats_strides_and_intensities_mean_the_same() {
+    let context = context("validation = true\ndeterministic = true");
+    // 16-bit codes that all formats can carry exactly.
+    let codes = |view, phase| pixels(view, phase).iter().map(|v| (v * 10_000.0) as u16).collect::<Vec<_>>();
+    let checkpoint = |prepare: &dyn Fn(usize, u32, &mut dyn FnMut(&nertca_frame))| {
+        let made = reconstruction(context, SMALL);
+        for view in 0..3 {
+            for phase in 0..PHASES {
+                prepare(view, phase, &mut |frame| {
+                    ok(unsafe { nertca_reconstruction_add_frame(made, frame) }, made);
+                });
+            }
+        }
+        train(made, 3);
+        let bytes = bytes_of(made);
+        ok(unsafe { nertca_reconstruction_destroy(made) }, made);
+        bytes
+    };
+    let floats = checkpoint(&|view, phase, add| {
+        let pixels: Vec<f32> = codes(view, phase).iter().map(|c| f32::from(*c)).collect();
+        add(&nertca_frame { scale: 1e-4, ..frame(view, phase, &pixels) });
+    });
+    let shorts = checkpoint(&|view, phase, add| {
+        // Rows 7 pixels further apart than they are long.
+        let mut padded = Vec::new();
+        for row in codes(view, phase).chunks(SIZE as usize) {
+            padded.extend_from_slice(row);
+            padded.extend([u16::MAX; 7]);
+        }
+        add(&nertca_frame {
+            pixels: padded.as_ptr().cast(),
+            pixels_bytes: 2 * padded.len(),
+            stride_bytes: 2 * (SIZE as usize + 7),
+            format: NERTCA_PIXELS_U16,
+            scale: 1e-4,
+            ..frame(view, phase, &[])
+        });
+    });
+    assert_eq!(floats, shorts, "16-bit frames with a stride");
+    let log = checkpoint(&|view, phase, add| {
+        let inverted: Vec<u16> = codes(view, phase).iter().map(|c| 20_000 - c).collect();
+        add(&nertca_frame {
+            pixels: inverted.as_ptr().cast(),
+            pixels_bytes: 2 * inverted.len(),
+            format: NERTCA_PIXELS_U16,
+            intensity: NERTCA_INTENSITY_LOG,
+            i0: 20_000.0,
+            scale: 1e-4,
+            ..frame(view, phase, &[])
+        });
+    });
+    let (a, b) = (reconstruction(context, SMALL), reconstruction(context, SMALL));
+    load(a, &floats);
+    load(b, &log);
+    let (of_a, of_b) = (drawn(a, &exact(1, NERTCA_COMPONENT_TOTAL)), drawn(b, &exact(1, NERTCA_COMPONENT_TOTAL)));
+    assert!(far(&of_a, &of_b) < 1e-3, "a logarithmic detector: {}", far(&of_a, &of_b));
+    close(context, &[a, b]);
+}
+
+#[test]
+fn a_reconstruction_lives_from_frames_to_scores() {
+    let context = context("validation = true");
+    // A hull and smooth fields, so that vessels come out in few iterations.
+    let settings = SMALL
+        .replace("hull.enabled = false", "hull.resolution = 48\nhull.noise_sigmas = 0\nhull.dilate_pixels = 1")
+        .replace(
+            "march.render_samples = 32",
+            "march.render_samples = 256\ndynamic.bands = 3\ndynamic.window_start = 3",
+        );
+    let made = reconstruction(context, &settings);
+    add_frames(made, 0..3);
+    let pixels_of = pixels(1, 2);
+    let mask: Vec<u8> = pixels_of.iter().map(|p| u8::from(*p > 1.1)).collect();
+    let unseen = nertca_frame {
+        split: NERTCA_SPLIT_VALIDATION,
+        mask: mask.as_ptr(),
+        mask_bytes: mask.len(),
+        ..frame(1, 2, &pixels_of)
+    };
+    ok(unsafe { nertca_reconstruction_add_frame(made, &unseen) }, made);
+    assert_eq!(train(made, 40), 40);
+    assert_eq!(train(made, 40), 20, "the run has 60 iterations");
+    assert_eq!(train(made, 40), 0);
+    // Live quality is what the fields say, but for its cells; both come from the same parameters.
+    for component in [NERTCA_COMPONENT_TOTAL, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_DYNAMIC] {
+        let live = drawn(made, &nertca_view { component, ..view(2) });
+        let fields = drawn(made, &exact(2, component));
+        assert!(far(&live, &fields) < 0.15, "component {component}: {}", far(&live, &fields));
+        assert!(fields.iter().any(|p| *p > 0.0));
+    }
+    let total = drawn(made, &exact(2, NERTCA_COMPONENT_TOTAL));
+    let parts = [NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_DYNAMIC].map(|c| drawn(made, &exact(2, c)));
+    let sum: Vec<f32> = parts[0].iter().zip(&parts[1]).map(|(s, d)| s + d).collect();
+    assert!(far(&total, &sum) < 1e-5);
+    // 8 bits, with a stride that leaves what is between rows alone.
+    let apart = SIZE as usize + 5;
+    let mut codes = vec![77u8; apart * SIZE as usize];
+    let (low, high) = (0.0, f64::from(total.iter().fold(0f32, |m, v| m.max(*v))));
+    let eight_bits = nertca_image {
+        size: size_of::<nertca_image>(),
+        pixels: codes.as_mut_ptr().cast(),
+        pixels_bytes: codes.len(),
+        stride_bytes: apart,
+        format: NERTCA_PIXELS_U8,
+        low,
+        high,
+    };
+    ok(unsafe { nertca_reconstruction_render(made, &exact(2, NERTCA_COMPONENT_TOTAL), &eight_bits) }, made);
+    for (row, shown) in codes.chunks(apart).zip(total.chunks(SIZE as usize)) {
+        assert_eq!(row[SIZE as usize..], [77; 5]);
+        for (code, value) in row.iter().zip(shown) {
+            assert!((f64::from(*code) - 255.0 * f64::from(*value) / high).abs() <= 1.0);
+        }
+    }
+    // The volume integrates to the picture: sums over left of a straight look from the patient's left, almost parallel.
+    let n = 40u32;
+    let grid = nertca_grid {
+        size: size_of::<nertca_grid>(),
+        origin_mm: [-60.0; 3],
+        spacing_mm: [120.0 / f64::from(n - 1); 3],
+        points: [n; 3],
+        component: NERTCA_COMPONENT_DYNAMIC,
+        phase: 2,
+    };
+    let mut cells = vec![f32::NAN; (n * n * n) as usize];
+    ok(unsafe { nertca_reconstruction_sample(made, &grid, cells.as_mut_ptr(), cells.len()) }, made);
+    let (sid, sod) = (50_000.0, 49_000.0);
+    let lateral = nertca_view {
+        geometry: nertca_geometry {
+            primary_deg: 90.0,
+            secondary_deg: 0.0,
+            sid_mm: sid,
+            sod_mm: sod,
+            pixel_mm: [120.0 / f64::from(n) * sid / sod; 2],
+            ..geometry(0)
+        },
+        width: n,
+        height: n,
+        ..exact(2, NERTCA_COMPONENT_DYNAMIC)
+    };
+    let picture = drawn(made, &lateral);
+    // Columns run along posterior (towards the image's right at LAO 90), rows from superior to inferior.
+    let step = 120.0 / (n - 1) as f32;
+    let summed =
+        |p: usize, s: usize| (0..n as usize).map(|l| cells[(s * n as usize + p) * n as usize + l]).sum::<f32>() * step;
+    let all: f32 = picture.iter().sum();
+    let mean = |of: &dyn Fn(usize, usize) -> f32, weight: &dyn Fn(usize, usize) -> f32| {
+        let pairs = (0..n as usize).flat_map(|j| (0..n as usize).map(move |i| (i, j)));
+        pairs.map(|(i, j)| of(i, j) * weight(i, j)).sum::<f32>()
+    };
+    let volume: f32 = mean(&|p, s| summed(p, s), &|_, _| 1.0);
+    assert!(all > 0.5, "there is something to see: {all}");
+    assert!((volume / all - 1.0).abs() < 0.1, "sum of the volume {volume}, of the picture {all}");
+    // Centres of mass: posterior against columns, superior against rows.
+    let half = (n - 1) as f32 / 2.0;
+    let across = mean(&|i, j| picture[j * n as usize + i], &|i, _| i as f32 - half) / all;
+    let down = mean(&|i, j| picture[j * n as usize + i], &|_, j| j as f32 - half) / all;
+    let posterior = mean(&|p, s| summed(p, s), &|p, _| p as f32 - half) / volume;
+    let superior = mean(&|p, s| summed(p, s), &|_, s| s as f32 - half) / volume;
+    assert!(
+        (across.abs() - posterior.abs()).abs() < 0.5 && (down + superior).abs() < 0.5,
+        "picture at ({across}, {down}), volume at posterior {posterior}, superior {superior}"
+    );
+    let mut scores = nertca_scores { size: size_of::<nertca_scores>(), ..zeroed() };
+    ok(unsafe { nertca_reconstruction_evaluate(made, 0.0, &mut scores) }, made);
+    assert_eq!((scores.step, scores.images), (60, 1));
+    assert!(scores.psnr_db > 5.0 && (0.0..=1.0).contains(&scores.dice_dynamic), "{}", scores.psnr_db);
+    assert!((scores.threshold_per_mm - 0.01 / 3.0).abs() < 1e-9);
+    close(context, &[made]);
+}
+
+#[test]
+fn saved_and_continued_is_as_if_never_stopped_and_runs_repeat() {
+    let context = context("validation = true\ndeterministic = true");
+    let once = reconstruction(context, SMALL);
+    add_frames(once, 0..3);
+    train(once, 30);
+    let halfway = bytes_of(once);
+    train(once, 20);
+    let straight = bytes_of(once);
+
+    let again = reconstruction(context, SMALL);
+    add_frames(again, 0..3);
+    train(again, 50);
+    assert_eq!(bytes_of(again), straight, "the same calls give the same bytes");
+
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("half way ü.safetensors");
+    std::fs::write(&path, &halfway).unwrap();
+    let resumed = reconstruction(context, SMALL);
+    add_frames(resumed, 0..3);
+    let path = CString::new(path.to_str().unwrap()).unwrap();
+    ok(unsafe { nertca_reconstruction_load(resumed, path.as_ptr()) }, resumed);
+    train(resumed, 20);
+    assert_eq!(bytes_of(resumed), straight, "as if never stopped");
+    ok(unsafe { nertca_reconstruction_save(resumed, path.as_ptr()) }, resumed);
+
+    // What a deterministic context refuses.
+    ok(unsafe { nertca_reconstruction_start(resumed, None, null_mut()) }, resumed);
+    let more = pixels(0, 0);
+    let status = unsafe { nertca_reconstruction_add_frame(resumed, &frame(0, 0, &more)) };
+    assert!(status == NERTCA_ERROR_BUSY || status == NERTCA_OK && progress(resumed).state == NERTCA_STATE_FINISHED);
+    ok(nertca_reconstruction_stop(resumed), resumed);
+    close(context, &[once, again, resumed]);
+}
+
+fn progress(reconstruction: *mut nertca_reconstruction) -> nertca_progress {
+    let mut progress = nertca_progress { size: size_of::<nertca_progress>(), ..zeroed() };
+    ok(unsafe { nertca_reconstruction_progress(reconstruction, &mut progress) }, reconstruction);
+    progress
+}
+
+#[test]
+fn time_stamps_and_r_peaks_give_phases() {
+    let context = context("validation = true\ndeterministic = true");
+    let stamped = reconstruction(context, SMALL);
+    for view in 0..3 {
+        for phase in 0..PHASES {
+            let pixels = pixels(view, phase);
+            // Views are taken at different beats: 0.8 s long, the second R-peak at 1.0 s.
+            let time_s = 0.2 + 0.8 * view as f64 + 0.8 * (f64::from(phase) + 0.5) / f64::from(PHASES);
+            let frame = nertca_frame { phase: -1, time_s, ..frame(view, phase, &pixels) };
+            ok(unsafe { nertca_reconstruction_add_frame(stamped, &frame) }, stamped);
+        }
+    }
+    let status = unsafe { nertca_reconstruction_train(stamped, 1, None, null_mut(), null_mut()) };
+    assert_eq!(status, NERTCA_ERROR_NOT_READY, "without R-peaks no phase is known");
+    let peaks = [0.2, 1.0, 1.8];
+    ok(unsafe { nertca_reconstruction_set_r_peaks(stamped, peaks.as_ptr(), peaks.len()) }, stamped);
+    train(stamped, 3);
+    let given = reconstruction(context, SMALL);
+    add_frames(given, 0..3);
+    train(given, 3);
+    assert_eq!(bytes_of(stamped), bytes_of(given));
+    close(context, &[stamped, given]);
+}
+
+#[test]
+fn frames_come_in_while_training_goes_on() {
+    let context = context("validation = true");
+    let live = reconstruction(context, &SMALL.replace("train.iterations = 60", "train.iterations = 100000"));
+    ok(unsafe { nertca_reconstruction_start(live, None, null_mut()) }, live);
+    for view in 0..3 {
+        add_frames(live, view..view + 1);
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let began = std::time::Instant::now();
+    while progress(live).frames < 9 || progress(live).step < 10 {
+        assert!(began.elapsed().as_secs() < 60, "all frames are taken in");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert_eq!(progress(live).state, NERTCA_STATE_RUNNING);
+    ok(nertca_reconstruction_pause(live), live);
+    while progress(live).state != NERTCA_STATE_PAUSED {
+        assert!(began.elapsed().as_secs() < 60);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let held = progress(live).step;
+    drawn(live, &view(1));
+    std::thread::sleep(Duration::from_millis(100));
+    assert_eq!(progress(live).step, held, "paused is paused");
+    ok(nertca_reconstruction_resume(live), live);
+    let mut ended = 7;
+    ok(unsafe { nertca_reconstruction_wait(live, 200, &mut ended) }, live);
+    assert_eq!(ended, 0);
+    assert!(progress(live).step > held);
+    ok(nertca_reconstruction_stop(live), live);
+    ok(unsafe { nertca_reconstruction_wait(live, 0, &mut ended) }, live);
+    assert_eq!((ended, progress(live).state), (1, NERTCA_STATE_IDLE));
+    close(context, &[live]);
+}
+
+/// A handle that threads may share, as the header says they may.
+#[derive(Clone, Copy)]
+struct Shared(*mut nertca_reconstruction);
+unsafe impl Send for Shared {}
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    fn get(self) -> *mut nertca_reconstruction {
+        self.0
+    }
+}
+
+unsafe extern "C" fn after(progress: *const nertca_progress, user: *mut c_void) -> i32 {
+    let limit = unsafe { &*user.cast::<AtomicU32>() };
+    i32::from(unsafe { (*progress).step } >= limit.load(Ordering::Relaxed))
+}
+
+#[test]
+fn threads_draw_save_and_cancel_while_two_reconstructions_train() {
+    let context = context("validation = true");
+    let endless = SMALL.replace("train.iterations = 60", "train.iterations = 100000");
+    let both = [reconstruction(context, &endless), reconstruction(context, &endless)];
+    both.iter().for_each(|r| add_frames(*r, 0..3));
+    let drawings = AtomicU32::new(0);
+    let mut pauses = 1u64;
+    for round in 0..6u64 {
+        let limits = [AtomicU32::new(u32::MAX), AtomicU32::new(u32::MAX)];
+        for (r, limit) in both.iter().zip(&limits) {
+            let user = std::ptr::from_ref(limit).cast_mut().cast();
+            ok(unsafe { nertca_reconstruction_start(*r, Some(after), user) }, *r);
+        }
+        std::thread::scope(|scope| {
+            for (thread, r) in both.iter().chain(&both).map(|r| Shared(*r)).enumerate() {
+                let drawings = &drawings;
+                scope.spawn(move || {
+                    for phase in 0..PHASES {
+                        let mut pixels = vec![0f32; (SIZE * SIZE) as usize];
+                        let view = nertca_view { component: phase % 3, quality: (thread % 2) as u32, ..view(phase) };
+                        match unsafe { nertca_reconstruction_render(r.get(), &view, &image(&mut pixels)) } {
+                            NERTCA_ERROR_NOT_READY => std::thread::sleep(Duration::from_millis(30)),
+                            status => {
+                                ok(status, r.get());
+                                drawings.fetch_add(1, Ordering::Relaxed);
+                            }
+                        }
+                        if thread == 3 && drawings.load(Ordering::Relaxed) > 2 {
+                            assert!(bytes_of(r.get()).len() > 1000);
+                        }
+                    }
+                });
+            }
+            // Ended at a different moment every time: by the callback, or by a stop.
+            pauses = pauses.wrapping_mul(6_364_136_223_846_793_005) % 997;
+            std::thread::sleep(Duration::from_millis(20 + pauses % 150));
+            limits.iter().for_each(|limit| limit.store(0, Ordering::Relaxed));
+            if round % 2 == 0 {
+                both.iter().for_each(|r| ok(nertca_reconstruction_stop(*r), *r));
+            }
+        });
+        for r in both {
+            let mut ended = 0;
+            ok(unsafe { nertca_reconstruction_wait(r, 30_000, &mut ended) }, r);
+            assert_eq!(ended, 1);
+            let state = progress(r).state;
+            assert!([NERTCA_STATE_CANCELLED, NERTCA_STATE_IDLE].contains(&state), "state {state}");
+        }
+    }
+    assert!(drawings.load(Ordering::Relaxed) > 20);
+    // Destroying one that trains stops it first.
+    ok(unsafe { nertca_reconstruction_start(both[0], None, null_mut()) }, both[0]);
+    close(context, &both);
+}
+
+struct Within {
+    reconstruction: *mut nertca_reconstruction,
+    context: *mut nertca_context,
+    seen: AtomicU32,
+}
+
+unsafe extern "C" fn meddle(_: *const nertca_progress, user: *mut c_void) -> i32 {
+    let within = unsafe { &*user.cast::<Within>() };
+    let r = within.reconstruction;
+    assert_eq!(unsafe { nertca_reconstruction_destroy(r) }, NERTCA_ERROR_BUSY);
+    assert_eq!(unsafe { nertca_context_destroy(within.context) }, NERTCA_ERROR_BUSY);
+    drawn(r, &view(0));
+    within.seen.fetch_add(1, Ordering::Relaxed);
+    i32::from(within.seen.load(Ordering::Relaxed) >= 3)
+}
+
+#[test]
+fn a_callback_may_draw_but_not_destroy() {
+    let context = context("validation = true");
+    let made = reconstruction(context, SMALL);
+    add_frames(made, 0..3);
+    let within = Within { reconstruction: made, context, seen: AtomicU32::new(0) };
+    let user = std::ptr::from_ref(&within).cast_mut().cast();
+    let mut done = 77;
+    let status = unsafe { nertca_reconstruction_train(made, 50, Some(meddle), user, &mut done) };
+    assert_eq!(status, NERTCA_ERROR_CANCELLED);
+    assert!((3..50).contains(&done), "{done}");
+    ok(unsafe { nertca_reconstruction_start(made, Some(meddle), user) }, made);
+    let mut ended = 0;
+    ok(unsafe { nertca_reconstruction_wait(made, 30_000, &mut ended) }, made);
+    assert_eq!((ended, progress(made).state), (1, NERTCA_STATE_CANCELLED));
+    close(context, &[made]);
+}
+
+#[test]
+fn memory_has_a_ceiling() {
+    let limited = context("memory_limit_mib = 4");
+    let made = reconstruction(limited, &SMALL.replace("train.chunk_samples = 1024", "train.chunk_samples = 65536"));
+    add_frames(made, 0..3);
+    let status = unsafe { nertca_reconstruction_train(made, 1, None, null_mut(), null_mut()) };
+    assert_eq!(status, NERTCA_ERROR_MEMORY);
+    assert!(last_error(made).contains("limit of 4194304"), "{}", last_error(made));
+    close(limited, &[made]);
+    let enough = context("memory_limit_mib = 64");
+    let made = reconstruction(enough, SMALL);
+    add_frames(made, 0..3);
+    train(made, 2);
+    close(enough, &[made]);
+}
+
+unsafe extern "C" fn count(level: u32, text: *const c_char, user: *mut c_void) {
+    assert!((1..=3).contains(&level) && !text.is_null());
+    unsafe { &*user.cast::<AtomicU32>() }.fetch_add(1, Ordering::Relaxed);
+}
+
+#[test]
+fn each_context_has_its_own_log() {
+    let counts = [AtomicU32::new(0), AtomicU32::new(0)];
+    let open = |count_in: &AtomicU32, level| {
+        let user = std::ptr::from_ref(count_in).cast_mut().cast();
+        let log = nertca_log { size: size_of::<nertca_log>(), callback: Some(count), user, level };
+        let mut context = null_mut();
+        ok(unsafe { nertca_context_create(null(), &log, &mut context) }, null::<c_void>());
+        context
+    };
+    let talkative = open(&counts[0], 3);
+    let quiet = open(&counts[1], 1);
+    let before = counts[0].load(Ordering::Relaxed);
+    assert!(before > 0, "the device and its paths are told");
+    for context in [talkative, quiet] {
+        let made = reconstruction(context, SMALL);
+        add_frames(made, 0..3);
+        train(made, 1);
+        close(context, &[made]);
+    }
+    assert!(counts[0].load(Ordering::Relaxed) > before);
+    assert_eq!(counts[1].load(Ordering::Relaxed), 0);
+}
+
+static LOCKED: AtomicI64 = AtomicI64::new(0);
+static UNLOCKED: AtomicI64 = AtomicI64::new(0);
+
+unsafe extern "C" fn lock(_: *mut c_void) {
+    LOCKED.fetch_add(1, Ordering::SeqCst);
+}
+
+unsafe extern "C" fn unlock(_: *mut c_void) {
+    assert_eq!(LOCKED.load(Ordering::SeqCst), UNLOCKED.fetch_add(1, Ordering::SeqCst) + 1, "one holder at a time");
+}
+
+/// A Vulkan application with a device of its own, under the validation layers.
+struct Application {
+    entry: ash::Entry,
+    instance: ash::Instance,
+    physical: vk::PhysicalDevice,
+    device: ash::Device,
+    exports: bool,
+    messages: Box<std::sync::Mutex<Vec<String>>>,
+    debug: (ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT),
+}
+
+unsafe extern "system" fn heard(
+    _: vk::DebugUtilsMessageSeverityFlagsEXT,
+    _: vk::DebugUtilsMessageTypeFlagsEXT,
+    data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
+    user: *mut c_void,
+) -> vk::Bool32 {
+    let text = unsafe { (*data).message_as_c_str() }.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
+    unsafe { &*user.cast::<std::sync::Mutex<Vec<String>>>() }.lock().unwrap().push(text);
+    vk::FALSE
+}
+
+impl Application {
+    fn new() -> Application {
+        unsafe {
+            let entry = ash::Entry::load().unwrap();
+            let info = vk::ApplicationInfo::default().api_version(vk::API_VERSION_1_2);
+            let layers = [c"VK_LAYER_KHRONOS_validation".as_ptr()];
+            let extensions = [ash::ext::debug_utils::NAME.as_ptr()];
+            let create = vk::InstanceCreateInfo::default()
+                .application_info(&info)
+                .enabled_layer_names(&layers)
+                .enabled_extension_names(&extensions);
+            let instance = entry.create_instance(&create, None).unwrap();
+            let messages = Box::new(std::sync::Mutex::new(Vec::new()));
+            let debug = ash::ext::debug_utils::Instance::new(&entry, &instance);
+            let create = vk::DebugUtilsMessengerCreateInfoEXT::default()
+                .message_severity(vk::DebugUtilsMessageSeverityFlagsEXT::ERROR)
+                .message_type(vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION)
+                .pfn_user_callback(Some(heard))
+                .user_data(std::ptr::from_ref(&*messages).cast_mut().cast());
+            let messenger = debug.create_debug_utils_messenger(&create, None).unwrap();
+            let physical = instance.enumerate_physical_devices().unwrap()[0];
+            let known = instance.enumerate_device_extension_properties(physical).unwrap();
+            let export = ash::khr::external_memory_fd::NAME;
+            let exports = known.iter().any(|e| e.extension_name_as_c_str() == Ok(export));
+            let names = if exports { vec![export.as_ptr()] } else { Vec::new() };
+            let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(0).queue_priorities(&[1.0])];
+            let mut features = vk::PhysicalDeviceVulkan12Features::default().timeline_semaphore(true);
+            let create = vk::DeviceCreateInfo::default()
+                .queue_create_infos(&queues)
+                .enabled_extension_names(&names)
+                .push_next(&mut features);
+            let device = instance.create_device(physical, &create, None).unwrap();
+            Application { entry, instance, physical, device, exports, messages, debug: (debug, messenger) }
+        }
+    }
+
+    fn describe(&self) -> nertca_vulkan {
+        let raw = |handle: u64| std::ptr::with_exposed_provenance_mut(handle as usize);
+        nertca_vulkan {
+            size: size_of::<nertca_vulkan>(),
+            get_instance_proc_addr: self.entry.static_fn().get_instance_proc_addr as *const c_void,
+            instance: raw(self.instance.handle().as_raw()),
+            physical_device: raw(self.physical.as_raw()),
+            device: raw(self.device.handle().as_raw()),
+            queue: raw(unsafe { self.device.get_device_queue(0, 0) }.as_raw()),
+            queue_family: 0,
+            external_memory_fd: self.exports.into(),
+            lock: Some(lock),
+            unlock: Some(unlock),
+            ..zeroed()
+        }
+    }
+
+    fn close(self) {
+        unsafe {
+            // Ours to destroy: the library left it alone, and nothing of its own in it.
+            self.device.device_wait_idle().unwrap();
+            self.device.destroy_device(None);
+            self.debug.0.destroy_debug_utils_messenger(self.debug.1, None);
+            self.instance.destroy_instance(None);
+        }
+        assert_eq!(*self.messages.lock().unwrap(), Vec::<String>::new());
+    }
+
+    /// Bytes of a descriptor's memory, imported as another API would.
+    fn import(&self, fd: i32, bytes: u64) -> Vec<f32> {
+        unsafe {
+            let opaque = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
+            let mut external = vk::ExternalMemoryBufferCreateInfo::default().handle_types(opaque);
+            let usage = vk::BufferUsageFlags::TRANSFER_SRC
+                | vk::BufferUsageFlags::STORAGE_BUFFER
+                | vk::BufferUsageFlags::TRANSFER_DST;
+            let create = vk::BufferCreateInfo::default().size(bytes).usage(usage).push_next(&mut external);
+            let buffer = self.device.create_buffer(&create, None).unwrap();
+            let needs = self.device.get_buffer_memory_requirements(buffer);
+            let types = self.instance.get_physical_device_memory_properties(self.physical);
+            let kind = (0..types.memory_type_count)
+                .find(|i| {
+                    needs.memory_type_bits >> i & 1 == 1
+                        && types.memory_types[*i as usize]
+                            .property_flags
+                            .contains(vk::MemoryPropertyFlags::DEVICE_LOCAL | vk::MemoryPropertyFlags::HOST_VISIBLE)
+                })
+                .unwrap();
+            let mut import = vk::ImportMemoryFdInfoKHR::default().handle_type(opaque).fd(fd);
+            let mut dedicated = vk::MemoryDedicatedAllocateInfo::default().buffer(buffer);
+            let allocate = vk::MemoryAllocateInfo::default()
+                .allocation_size(needs.size)
+                .memory_type_index(kind)
+                .push_next(&mut import)
+                .push_next(&mut dedicated);
+            let memory = self.device.allocate_memory(&allocate, None).unwrap();
+            self.device.bind_buffer_memory(buffer, memory, 0).unwrap();
+            let mapped = self.device.map_memory(memory, 0, bytes, vk::MemoryMapFlags::empty()).unwrap();
+            let values = std::slice::from_raw_parts(mapped.cast::<f32>(), bytes as usize / 4).to_vec();
+            self.device.unmap_memory(memory);
+            self.device.destroy_buffer(buffer, None);
+            self.device.free_memory(memory, None);
+            values
+        }
+    }
+}
+
+#[test]
+fn a_device_is_shared_with_its_owner() {
+    let application = Application::new();
+    let mut context = null_mut();
+    ok(unsafe { nertca_context_adopt(&application.describe(), null(), null(), &mut context) }, null::<c_void>());
+    let made = reconstruction(context, SMALL);
+    add_frames(made, 0..3);
+    train(made, 3);
+    let ours = drawn(made, &view(1));
+    if application.exports {
+        let bytes = u64::from(SIZE * SIZE * 4);
+        let (mut buffer, mut fd, mut size) = (null_mut(), -1, 0);
+        ok(unsafe { nertca_buffer_create(context, bytes, &mut buffer) }, context);
+        ok(unsafe { nertca_reconstruction_render_buffer(made, &view(1), buffer) }, made);
+        ok(unsafe { nertca_buffer_export_fd(buffer, &mut fd, &mut size) }, buffer);
+        assert!(size >= bytes);
+        let theirs = application.import(fd, size);
+        assert_eq!(theirs[..ours.len()], ours, "what was drawn, in memory of another API");
+        // Freed here, it stays theirs: a second descriptor outlives the buffer.
+        ok(unsafe { nertca_buffer_export_fd(buffer, &mut fd, null_mut()) }, buffer);
+        assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_ERROR_BUSY);
+        ok(nertca_buffer_destroy(buffer), buffer);
+        assert_eq!(application.import(fd, size)[..ours.len()], ours);
+    } else {
+        println!("no VK_KHR_external_memory_fd here: sharing memory was not tested");
+    }
+    close(context, &[made]);
+    assert!(LOCKED.load(Ordering::SeqCst) > 5);
+    assert_eq!(LOCKED.load(Ordering::SeqCst), UNLOCKED.load(Ordering::SeqCst));
+    application.close();
+}
+
+#[test]
+fn texts_are_kept_by_handle_and_thread() {
+    let context = context("device = none");
+    let made = reconstruction(context, "phases = 2");
+    assert_eq!(unsafe { nertca_reconstruction_train(made, 1, None, null_mut(), null_mut()) }, NERTCA_ERROR_DEVICE);
+    assert!(last_error(made).contains("without a device"));
+    assert_eq!(last_error(context), "", "texts are kept by handle");
+    let heard = std::thread::scope(|s| {
+        let shared = Shared(made);
+        s.spawn(move || last_error(shared.get())).join().unwrap()
+    });
+    assert_eq!(heard, "", "and by thread");
+    close(context, &[made]);
+}
