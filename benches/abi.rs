@@ -94,7 +94,12 @@ fn main() {
         })
         .collect();
     ratios.sort_by(f64::total_cmp);
-    println!("through the ABI / directly: median {:.4} ({:.4} to {:.4})", ratios[ratios.len() / 2], ratios[0], ratios[ratios.len() - 1]);
+    println!(
+        "through the ABI / directly: median {:.4} ({:.4} to {:.4})",
+        ratios[ratios.len() / 2],
+        ratios[0],
+        ratios[ratios.len() - 1]
+    );
     unsafe {
         assert_eq!(nertca_reconstruction_destroy(through), 0);
         assert_eq!(nertca_context_destroy(context), 0);

@@ -39,12 +39,16 @@ pub mod gpu {
 /// What comes in: geometry, angiograms, volumes, and what moves in them.
 pub mod data {
     pub mod dataset;
+    pub mod dicom;
+    pub mod ecg;
     pub mod gating;
     pub mod geometry;
     pub mod images;
+    pub mod import;
     pub mod motion;
     pub mod nerfca;
     pub mod volume;
+    pub mod writer;
 }
 
 /// The fields: their parameters, and the scene they live in.
@@ -78,7 +82,9 @@ pub mod train {
 /// What goes out: renderings, scores, pictures, projections of volumes.
 pub mod output {
     pub mod eval;
+    pub mod export;
     pub mod live;
+    pub mod mesh;
     pub mod metrics;
     pub mod pictures;
     pub mod projector;
@@ -106,5 +112,4 @@ pub mod phantom {
     pub mod dataset;
     pub mod tree;
     pub mod voxels;
-    mod writer;
 }

@@ -13,6 +13,7 @@ mod cli {
     pub mod bench;
     pub mod data;
     pub mod devices;
+    pub mod export;
     pub mod results;
     pub mod train;
 }
@@ -32,9 +33,12 @@ fn main() -> ExitCode {
         Command::Devices(args) => cli::devices::run(args),
         Command::Phantom(args) => cli::data::phantom(&cli, args),
         Command::Project(args) => cli::data::project(&cli, args),
+        Command::Import(args) => cli::data::import(args),
         Command::Train(args) => cli::train::run(&cli, args),
         Command::Eval(args) => cli::results::eval(&cli, args),
         Command::Render(args) => cli::results::render(&cli, args),
+        Command::Export(args) => cli::export::export(&cli, args),
+        Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),
         Command::Info(args) => cli::results::info(args),
         Command::Completions(args) => cli::devices::completions(args),

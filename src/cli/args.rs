@@ -7,6 +7,7 @@ use nertca_vk::data::dataset::Dataset;
 use nertca_vk::error::Result;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::{Layers, Tuning};
+use nertca_vk::output::export::Format;
 use nertca_vk::phantom::dataset::Setting;
 use std::path::PathBuf;
 
@@ -41,12 +42,18 @@ pub enum Command {
     Phantom(PhantomArgs),
     /// Project voxel volumes, one per phase, into a dataset.
     Project(ProjectArgs),
+    /// Import clinical data as a dataset.
+    Import(ImportArgs),
     /// Reconstruct a dataset into a run directory.
     Train(TrainArgs),
     /// Score a run on the views it has not seen.
     Eval(EvalArgs),
     /// Render a run from any angle at any phase.
     Render(RenderArgs),
+    /// Export volumes or vessel surfaces of a run for other tools.
+    Export(ExportArgs),
+    /// Convert a dataset between the native and the authors' layout.
+    Convert(ConvertArgs),
     /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
     Bench(BenchArgs),
     /// Describe a dataset or a run.
@@ -172,6 +179,78 @@ pub struct ProjectArgs {
     /// Layout to write.
     #[arg(long, value_enum, default_value_t = LayoutArg::Native)]
     pub layout: LayoutArg,
+}
+
+/// `import`.
+#[derive(Debug, Args)]
+pub struct ImportArgs {
+    /// What to import.
+    #[command(subcommand)]
+    pub source: ImportSource,
+}
+
+/// What can be imported.
+#[derive(Debug, Subcommand)]
+pub enum ImportSource {
+    /// X-ray angiography runs (DICOM XA or RF, multi-frame), one file per view.
+    Dicom(ImportDicomArgs),
+}
+
+/// `import dicom`.
+#[derive(Debug, Args)]
+pub struct ImportDicomArgs {
+    /// One file per view.
+    #[arg(required = true, value_name = "FILE")]
+    pub files: Vec<PathBuf>,
+    /// Directory to make.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Cardiac phases.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub phases: u32,
+    /// Nothing moves: average each run. Phase 0 is the object, phase 1 what it looks like without vessels.
+    #[arg(long, conflicts_with_all = ["r_peaks", "heart_rate", "phase_list"])]
+    pub still: bool,
+    /// R-peaks in seconds from the first frame, one per line, instead of the files' ECG.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["heart_rate", "phase_list"])]
+    pub r_peaks: Option<PathBuf>,
+    /// Beats per minute of a steady heart with an R-peak at the first frame.
+    #[arg(long, value_name = "PER_MIN", conflicts_with = "phase_list")]
+    pub heart_rate: Option<f64>,
+    /// A phase from 0 for each selected frame, one per line, the same for all runs.
+    #[arg(long, value_name = "FILE")]
+    pub phase_list: Option<PathBuf>,
+    /// Frames of each run, from 1; those filled with contrast by default.
+    #[arg(long, value_name = "FIRST-LAST", value_parser = frame_range)]
+    pub frames: Option<std::ops::RangeInclusive<usize>>,
+    /// Pixel pitch on the detector along columns and rows, mm: one number or two.
+    #[arg(long, value_name = "MM[,MM]", value_parser = pitch)]
+    pub pixel_spacing: Option<[f64; 2]>,
+    /// Longest side of the images, pixels: larger ones are averaged down.
+    #[arg(long)]
+    pub size: Option<usize>,
+    /// Depth searched before and behind the isocentre, mm.
+    #[arg(long, default_value_t = 100.0, value_name = "MM")]
+    pub depth: f64,
+}
+
+/// Parses `FIRST-LAST`.
+fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize>, String> {
+    let (first, last) = text.split_once('-').unwrap_or((text, text));
+    match (first.trim().parse(), last.trim().parse()) {
+        (Ok(first), Ok(last)) if first <= last => Ok(first..=last),
+        _ => Err("write it as FIRST-LAST, as in 5-12".into()),
+    }
+}
+
+/// Parses one length for both directions, or two.
+fn pitch(text: &str) -> std::result::Result<[f64; 2], String> {
+    let parts: Vec<f64> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
+    match parts[..] {
+        [x] if x > 0.0 => Ok([x, x]),
+        [x, y] if x > 0.0 && y > 0.0 => Ok([x, y]),
+        _ => Err("one or two positive lengths in mm are needed".into()),
+    }
 }
 
 /// Hyper-parameters, for every command that trains.
@@ -306,6 +385,47 @@ pub struct RenderArgs {
     /// Output: .png, .npy (floats; all phases stacked) or .gif (all phases).
     #[arg(short, long, value_name = "FILE", required_unless_present = "fps")]
     pub out: Option<PathBuf>,
+}
+
+/// `export`.
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Field to export.
+    #[arg(long, value_enum, default_value_t = Component::Dynamic)]
+    pub component: Component,
+    /// Phase from 0, or `all`: a fourth axis, or a file per phase.
+    #[arg(long, default_value = "all")]
+    pub phase: String,
+    /// Distance between points, mm.
+    #[arg(long, default_value_t = 0.5, value_name = "MM")]
+    pub spacing: f64,
+    /// Format; by the end of --out otherwise.
+    #[arg(long, value_enum)]
+    pub format: Option<Format>,
+    /// Surfaces of the vessels instead of volumes: --out ends in .stl, .ply, .obj (a file per phase) or .glb (animated).
+    #[arg(long, conflicts_with = "format")]
+    pub mesh: bool,
+    /// Attenuation of the surface, 1/mm; the Dice threshold otherwise.
+    #[arg(long, requires = "mesh", value_name = "PER_MM")]
+    pub iso: Option<f64>,
+    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .mha, .npy or .vtk.
+    #[arg(short, long, value_name = "FILE")]
+    pub out: PathBuf,
+}
+
+/// `convert`.
+#[derive(Debug, Args)]
+pub struct ConvertArgs {
+    /// Dataset directory in either layout.
+    pub data: PathBuf,
+    /// Layout to write.
+    #[arg(long, value_enum)]
+    pub layout: LayoutArg,
+    /// Directory to make.
+    #[arg(short, long)]
+    pub out: PathBuf,
 }
 
 /// `bench`.

@@ -1,11 +1,15 @@
-//! `phantom` and `project`.
+//! `phantom`, `project` and `import`.
 
-use super::args::{Cli, LayoutArg, PhantomArgs, ProjectArgs};
+use super::args::{Cli, ImportArgs, ImportDicomArgs, ImportSource, LayoutArg, PhantomArgs, ProjectArgs};
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::data::dataset::Layout;
+use nertca_vk::data::gating::RPeaks;
+use nertca_vk::data::import::{Gating, ImportOptions, import_dicom};
 use nertca_vk::data::volume::VolumeHints;
-use nertca_vk::error::Result;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::files;
 use nertca_vk::phantom::dataset::{Anatomy, CArmOptions, PhantomOptions, VolumeOptions, make, project_volumes};
+use std::path::Path;
 
 impl From<LayoutArg> for Layout {
     fn from(layout: LayoutArg) -> Layout {
@@ -16,7 +20,8 @@ impl From<LayoutArg> for Layout {
     }
 }
 
-fn bar() -> impl FnMut(&str, u64, u64) {
+/// A progress bar for work whose length is known as it goes.
+pub fn bar() -> impl FnMut(&str, u64, u64) {
     let bar = ProgressBar::new(1);
     if let Ok(style) = ProgressStyle::with_template("{msg:12} [{bar:30}] {pos}/{len} {elapsed}") {
         bar.set_style(style);
@@ -75,4 +80,48 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
     project_volumes(&gpu, &options, &args.out, bar())?;
     out!("{}", args.out.display());
     cli.close_device(&gpu)
+}
+
+/// Imports clinical data.
+pub fn import(args: &ImportArgs) -> Result<()> {
+    match &args.source {
+        ImportSource::Dicom(args) => dicom(args),
+    }
+}
+
+/// One value per line; what follows a `#` is left out.
+fn list<T: std::str::FromStr>(path: &Path) -> Result<Vec<T>> {
+    let text =
+        String::from_utf8(files::read_limited(path, 1 << 20)?).map_err(|e| Error::data(path, "text", e.to_string()))?;
+    let lines = text.lines().map(|l| l.split('#').next().unwrap_or_default().trim()).enumerate();
+    lines
+        .filter(|(_, line)| !line.is_empty())
+        .map(|(i, line)| {
+            line.parse().map_err(|_| Error::data(path, format!("line {}", i + 1), format!("`{line}` is not a number")))
+        })
+        .collect()
+}
+
+fn dicom(args: &ImportDicomArgs) -> Result<()> {
+    let gating = match (args.still, &args.r_peaks, args.heart_rate, &args.phase_list) {
+        (true, ..) => Gating::Still,
+        (_, Some(file), ..) => Gating::RPeaks(RPeaks::new(&list::<f64>(file)?)?),
+        (_, _, Some(rate), _) => Gating::HeartRate(rate),
+        (_, _, _, Some(file)) => Gating::Phases(list(file)?),
+        _ => Gating::Ecg,
+    };
+    let options = ImportOptions {
+        phases: args.phases,
+        gating,
+        frames: args.frames.clone(),
+        pixel_mm: args.pixel_spacing,
+        size: args.size,
+        depth_half_extent_mm: args.depth,
+    };
+    if !(args.depth.is_finite() && args.depth > 0.0) {
+        return Err(Error::config("--depth", args.depth, "is not a positive length in mm"));
+    }
+    import_dicom(&args.files, &options, &args.out)?.iter().for_each(|note| eprintln!("{note}"));
+    out!("{}", args.out.display());
+    Ok(())
 }

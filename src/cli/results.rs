@@ -152,13 +152,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     if !["png", "npy", "gif"].contains(&extension.as_str()) {
         return Err(Error::config("--out", out.display(), "ends in none of .png .npy .gif"));
     }
-    let n_phases = model.layout.phases as u32;
-    let phases: Vec<u32> = match args.phase.as_str() {
-        "all" => (0..n_phases).collect(),
-        text => vec![text.parse().ok().filter(|p| *p < n_phases).ok_or_else(|| {
-            Error::config("--phase", text, format!("`all` or a phase from 0 to {} is accepted", n_phases - 1))
-        })?],
-    };
+    let (phases, _) = super::export::phases(&args.phase, model.layout.phases as u32)?;
     if extension == "png" && phases.len() > 1 {
         return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
     }

@@ -182,7 +182,7 @@ fn dilate(image: &Image, radius: usize) -> Image {
 }
 
 /// Grey opening: what is narrower than `2 radius + 1` pixels is cut down to its surroundings.
-fn opening(image: &Image, radius: usize) -> Image {
+pub(super) fn opening(image: &Image, radius: usize) -> Image {
     dilate(&filter(image, radius, f32::min), radius)
 }
 

@@ -2,12 +2,12 @@
 
 use super::tree::{Heart, Tree, contraction};
 use super::voxels::{self, Tissues};
-use super::writer::Writer;
 use crate::cpu::random::{STREAM_PHOTON, normal, uniform01};
 use crate::data::dataset::{Layout, MANIFEST, Split};
 use crate::data::geometry::{CArm, Geometry, ViewRays};
 use crate::data::nerfca;
 use crate::data::volume::{Volume, VolumeHints};
+use crate::data::writer::{About, Writer};
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::output::projector::{LoadedVolume, Projector};
@@ -286,7 +286,15 @@ fn shoot(
         .iter()
         .map(|g| g.rays(size, size).map_err(|(field, problem)| Error::config(field, "", problem)))
         .collect::<Result<Vec<ViewRays>>>()?;
-    let mut writer = Writer::new(out, shooting.size, shooting.layout, stage)?;
+    let about = About {
+        description: stage.description.clone(),
+        phases: stage.moving.len() as u32,
+        depth_half_extent_mm: stage.depth_half_extent_mm,
+        vessel_attenuation_per_mm: stage.vessel_attenuation,
+        size: [size, size],
+        c_arm: stage.c_arm.clone(),
+    };
+    let mut writer = Writer::new(out, shooting.layout, about)?;
     let still = match &stage.still {
         Some(volume) => projector.project(volume, &rays, DVec3::ZERO)?,
         None => vec![vec![0.0; size * size]; rays.len()],

@@ -1,0 +1,89 @@
+//! `export` and `convert`.
+
+use super::args::{Cli, Component, ConvertArgs, ExportArgs};
+use super::data::bar;
+use super::results::newest_model;
+use nertca_vk::data::dataset::Dataset;
+use nertca_vk::data::geometry::MM_PER_UNIT;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::model::field::Model;
+use nertca_vk::output::export::{Format, VolumeExport, grid_over};
+use nertca_vk::output::mesh::{MeshFormat, write_meshes};
+use nertca_vk::output::metrics::otsu;
+use nertca_vk::output::render::Renderer;
+use nertca_vk::output::sampled::{Fields, PatientGrid};
+
+/// The phases `--phase` names, and whether it names all.
+pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
+    match text {
+        "all" => Ok(((0..n_phases).collect(), true)),
+        text => match text.parse() {
+            Ok(phase) if phase < n_phases => Ok((vec![phase], false)),
+            _ => {
+                Err(Error::config("--phase", text, format!("`all` or a phase from 0 to {} is accepted", n_phases - 1)))
+            }
+        },
+    }
+}
+
+/// Exports volumes or surfaces.
+pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
+    let model = newest_model(&args.run)?;
+    let (phases, all) = phases(&args.phase, model.layout.phases as u32)?;
+    let with_static = args.component != Component::Dynamic;
+    if args.mesh && with_static {
+        return Err(Error::config("--component", "", "surfaces are those of the moving vessels: --component dynamic"));
+    }
+    let unknown = |known: &str| Error::config("--out", args.out.display(), format!("ends in none of {known}"));
+    let grid = grid_over(&model.scene, with_static, args.spacing)?;
+    let gpu = cli.open_device()?;
+    let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?;
+    let mut progress = bar();
+    let made = if args.mesh {
+        let format = MeshFormat::of(&args.out).ok_or_else(|| unknown(".stl .ply .obj .glb"))?;
+        let iso = match args.iso {
+            Some(iso) => iso,
+            None => dice_threshold_per_mm(&renderer, &model, &grid)?,
+        };
+        write_meshes(&renderer, &grid, &phases, iso, format, &args.out, |n, of| progress("surfaces", n, of))?
+    } else {
+        let named = args.format.or_else(|| Format::of(&args.out));
+        let export = VolumeExport {
+            grid,
+            with_static,
+            with_dynamic: args.component != Component::Static,
+            // The still background is the same at every phase.
+            sequence: all && args.component != Component::Static,
+            phases: if args.component == Component::Static { vec![0] } else { phases },
+            format: named.ok_or_else(|| unknown(".nrrd .nii .mha .npy .vtk; say which with --format"))?,
+        };
+        export.write(&renderer, &args.out, |n, of| progress("volume", n, of))?
+    };
+    made.iter().for_each(|path| out!("{}", path.display()));
+    let [nx, ny, nz] = grid.size;
+    let o = grid.origin_mm;
+    eprintln!(
+        "{nx} x {ny} x {nz} points (left, posterior, superior), {} mm apart, the first at ({:.2}, {:.2}, {:.2}) mm LPS",
+        args.spacing, o.x, o.y, o.z
+    );
+    drop(renderer);
+    cli.close_device(&gpu)
+}
+
+/// The attenuation from which the dynamic field counts as vessel: a third of the stated one, or Otsu's.
+fn dice_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid) -> Result<f64> {
+    if let Some(attenuation) = model.vessel_attenuation {
+        return Ok(attenuation / 3.0 / MM_PER_UNIT);
+    }
+    let values = renderer.sample_patient(Fields { with_static: false, dynamic_phase: Some(0) }, grid)?;
+    let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();
+    Ok(f64::from(otsu(&inside)))
+}
+
+/// Converts a dataset between layouts.
+pub fn convert(args: &ConvertArgs) -> Result<()> {
+    let dataset = Dataset::open(&args.data)?;
+    nertca_vk::data::writer::convert(&dataset, args.layout.into(), &args.out)?;
+    out!("{}", args.out.display());
+    Ok(())
+}
