@@ -86,6 +86,7 @@ pub mod output {
     pub mod live;
     pub mod mesh;
     pub mod metrics;
+    pub mod page;
     pub mod pictures;
     pub mod projector;
     pub mod render;

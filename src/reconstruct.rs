@@ -8,6 +8,7 @@ use crate::data::dataset::{Dataset, Frame};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::gpu::device::Gpu;
+use crate::gpu::record::PassTime;
 use crate::kernels::Tuning;
 use crate::output::eval::{self, evaluate};
 use crate::output::pictures::Window;
@@ -77,6 +78,13 @@ pub enum Event {
         step: u32,
         /// File.
         path: PathBuf,
+    },
+    /// Device time of each pass of one more iteration, whose result is not kept.
+    Profile {
+        /// Iterations done before.
+        step: u32,
+        /// In order.
+        passes: Vec<PassTime>,
     },
     /// The run reached its end or the requested stop.
     Finished {
@@ -333,6 +341,7 @@ impl<'a> Loop<'a> {
             return Err(Error::Interrupted);
         }
         let (step, elapsed_s) = (self.trainer.step(), self.begin.elapsed().as_secs_f64());
+        (self.tell)(Event::Profile { step, passes: self.trainer.profile_step()? })?;
         (self.tell)(Event::Finished { step, train_s: self.train_s, elapsed_s })
     }
 

@@ -324,7 +324,7 @@ pub struct EvalArgs {
     /// JSON instead of a table.
     #[arg(long)]
     pub json: bool,
-    /// Leave comparison pictures here.
+    /// Leave comparison pictures and `report.html` here; without, a page without pictures is left in RUN as `eval.html`.
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
     /// Dice threshold on attenuation, 1/mm, instead of the rule.

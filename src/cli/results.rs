@@ -11,7 +11,7 @@ use nertca_vk::output::pictures::{self, Window};
 use nertca_vk::output::render::Renderer;
 use nertca_vk::output::sampled::{BAKED_CELLS, Baked, Quantity};
 use nertca_vk::reconstruct::RunInfo;
-use nertca_vk::report::evaluate_model;
+use nertca_vk::report::{evaluate_model, write_page};
 use nertca_vk::train::checkpoint::{self, Checkpoint};
 use std::path::Path;
 use std::sync::Arc;
@@ -34,6 +34,12 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let tuning = cli.tuning(&gpu, &model.config);
     let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, args.threshold, args.images.as_deref())?;
+    let run = if args.run.is_dir() { args.run.as_path() } else { args.run.parent().unwrap_or(Path::new("")) };
+    let (pictures, page) = match &args.images {
+        Some(images) => (images.as_path(), images.join("report.html")),
+        None => (Path::new(""), run.join("eval.html")),
+    };
+    write_page(&gpu, &tuning, &model, &dataset, Some(&evaluation), (run, pictures), &page)?;
     if args.json {
         out!("{}", json(&evaluation)?);
     } else {

@@ -7,7 +7,7 @@ use nertca_vk::config::Config;
 use nertca_vk::data::dataset::Dataset;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::reconstruct::{Event, RunInfo, RunOptions, reconstruct};
-use nertca_vk::report::evaluate_model;
+use nertca_vk::report::{evaluate_model, write_page};
 use nertca_vk::train::checkpoint;
 use nertca_vk::train::plan::Plan;
 use std::io::IsTerminal;
@@ -53,14 +53,18 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut observer);
     drop(observer);
     outcome?;
-    if !dataset.validation().is_empty() {
-        let report = run.join("report");
-        let evaluation = evaluate_model(&gpu, &tuning, &newest_model(run)?, &dataset, None, Some(&report))?;
+    let report = run.join("report");
+    let (model, page) = (newest_model(run)?, run.join("report.html"));
+    if dataset.validation().is_empty() {
+        write_page(&gpu, &tuning, &model, &dataset, None, (run, &report), &page)?;
+    } else {
+        let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, None, Some(&report))?;
+        write_page(&gpu, &tuning, &model, &dataset, Some(&evaluation), (run, &report), &page)?;
         let text = serde_json::to_string_pretty(&evaluation).map_err(|e| Error::Internal(e.to_string()))?;
         nertca_vk::files::write_atomic(&report.join("evaluation.json"), text.as_bytes())?;
         if !args.json {
             print_table(&evaluation);
-            out!("report and pictures: {}", report.display());
+            out!("report: {}, pictures: {}", page.display(), report.display());
         }
     }
     cli.close_device(&gpu)
@@ -127,6 +131,7 @@ fn show_progress() -> impl FnMut(&Event) {
             let dice = dice_dynamic.map_or("-".into(), |d| format!("{d:.3}"));
             say(&bar, format!("{step:6} iterations, {train_s:6.1} s: Dice {dice}  PSNR {psnr:.2} dB  SSIM {ssim:.3}"));
         }
+        Event::Profile { .. } => (),
         Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
         Event::Finished { step, train_s, .. } => {
             bar.finish_and_clear();

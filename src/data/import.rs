@@ -5,7 +5,7 @@ use super::dicom::{Relationship, Run};
 use super::gating::RPeaks;
 use super::geometry::{CArm, Geometry};
 use super::images::Image;
-use super::motion::{opening, percentile};
+use super::motion::{dilate, opening, percentile};
 use super::writer::{About, Writer};
 use crate::error::{Error, Result};
 use rayon::prelude::*;
@@ -16,6 +16,8 @@ use std::path::{Path, PathBuf};
 const WIDEST_VESSEL_MM: f64 = 6.0;
 /// Frames whose vessels show this share of the strongest contrast count as filled.
 const FILLED_SHARE: f64 = 0.6;
+/// A structure stands out when it does by this many standard deviations of the noise.
+const NOISE_SIGMAS: f32 = 4.0;
 /// Display grey values span this many line integrals of attenuation.
 const DISPLAY_SPAN: f64 = 3.0;
 
@@ -267,7 +269,7 @@ fn phases(
     let phase_of: Vec<Option<u32>> = match &options.gating {
         Gating::Still => {
             let mean = mean(frames, selected);
-            let background = opening(&mean, vessel);
+            let background = without_vessels(&mean, vessel);
             notes.push(format!(
                 "{}: {} frames averaged; phase 1 is the image without structures up to {WIDEST_VESSEL_MM} mm wide",
                 run.name(),
@@ -308,6 +310,36 @@ fn phases(
     }
     notes.push(format!("{}: {} of {n_phases} phases from {} frames", run.name(), images.len(), selected.len()));
     Ok(images)
+}
+
+/// The image without structures as thin as vessels: where something stands out of its surroundings by more than noise
+/// does, it is cut down to them.
+fn without_vessels(image: &Image, vessel: usize) -> Image {
+    let mut background = opening(image, vessel);
+    let stand_out: Vec<f32> = image.values.iter().zip(&background.values).map(|(v, b)| v - b).collect();
+    // An opening follows the lowest of its surroundings, and noise makes some low.
+    let typical = percentile(&stand_out, 0.5);
+    let spread = percentile(&stand_out.iter().map(|s| (s - typical).abs()).collect::<Vec<_>>(), 0.5);
+    let limit = typical + NOISE_SIGMAS * 1.4826 * spread;
+    let closed = closed(&background, 2 * vessel);
+    for (p, b) in background.values.iter_mut().enumerate() {
+        *b = if stand_out[p] > limit && !closed[p] { *b + typical } else { image.values[p] };
+    }
+    background
+}
+
+/// Pixels within `margin` of the edge, or of areas so dark that the collimator or the detector's rim must be there:
+/// their outlines are as thin as vessels.
+fn closed(background: &Image, margin: usize) -> Vec<bool> {
+    let (w, h) = (background.width, background.height);
+    let dark = background.values.iter().map(|v| f32::from(u8::from(f64::from(*v) > 0.85 * DISPLAY_SPAN))).collect();
+    let grown = dilate(&Image { values: dark, ..*background }, margin);
+    (0..w * h)
+        .map(|p| {
+            let (x, y) = (p % w, p / w);
+            grown.values[p] > 0.0 || x.min(w - 1 - x).min(y).min(h - 1 - y) < margin
+        })
+        .collect()
 }
 
 fn mean(frames: &[Image], which: &[usize]) -> Image {

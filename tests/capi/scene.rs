@@ -26,6 +26,7 @@ march.render_samples = 32
 static.grid = 9
 dynamic.width = 32
 dynamic.window_iterations = 20
+dynamic.half_extent_mm = 20
 hull.enabled = false";
 
 pub fn last_error<H>(handle: *const H) -> String {
