@@ -16,6 +16,7 @@ mod cli {
     pub mod export;
     pub mod results;
     pub mod train;
+    pub mod view;
 }
 
 use clap::Parser;
@@ -37,6 +38,7 @@ fn main() -> ExitCode {
         Command::Train(args) => cli::train::run(&cli, args),
         Command::Eval(args) => cli::results::eval(&cli, args),
         Command::Render(args) => cli::results::render(&cli, args),
+        Command::View(args) => cli::view::view(&cli, args),
         Command::Export(args) => cli::export::export(&cli, args),
         Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),

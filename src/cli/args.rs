@@ -50,6 +50,8 @@ pub enum Command {
     Eval(EvalArgs),
     /// Render a run from any angle at any phase.
     Render(RenderArgs),
+    /// Look at a run in a browser: turn the C-arm with the mouse while the beat plays.
+    View(ViewArgs),
     /// Export volumes or vessel surfaces of a run for other tools.
     Export(ExportArgs),
     /// Convert a dataset between the native and the authors' layout.
@@ -385,6 +387,16 @@ pub struct RenderArgs {
     /// Output: .png, .npy (floats; all phases stacked) or .gif (all phases).
     #[arg(short, long, value_name = "FILE", required_unless_present = "fps")]
     pub out: Option<PathBuf>,
+}
+
+/// `view`.
+#[derive(Debug, Args)]
+pub struct ViewArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Port on 127.0.0.1; a free one by default.
+    #[arg(long, default_value_t = 0)]
+    pub port: u16,
 }
 
 /// `export`.

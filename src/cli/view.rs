@@ -1,0 +1,244 @@
+//! `view`: one page on this machine, on which the C-arm is turned with the mouse while the beat plays.
+//!
+//! Listens on 127.0.0.1 alone. Every request needs the token of the printed address, a host name that is this machine's,
+//! and, where a browser says so, to come from the page itself.
+
+use super::args::{Cli, ViewArgs};
+use super::results::newest_model;
+use axum::Router;
+use axum::extract::{Query, Request, State};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::middleware::{self, Next};
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::get;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use nertca_vk::data::geometry::{CArm, Geometry};
+use nertca_vk::error::{Error, Result};
+use nertca_vk::model::field::Model;
+use nertca_vk::output::render::Renderer;
+use nertca_vk::output::sampled::{Baked, Quantity};
+use serde::Deserialize;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::{Arc, Mutex, PoisonError};
+
+const PAGE: &str = include_str!("view.html");
+/// Side of a picture, pixels.
+const SIDES: std::ops::RangeInclusive<usize> = 16..=2048;
+/// Cells of the still volume; its field has no more detail.
+const STILL_CELLS: u32 = 96;
+const MOVING_CELLS: u32 = 160;
+
+struct Viewer {
+    model: Model,
+    /// One picture at a time: they share the device.
+    baked: Mutex<Baked>,
+    /// Largest line integral and attenuation of a typical view, by component and projection.
+    ranges: Vec<f32>,
+    token: String,
+    port: u16,
+}
+
+/// What a picture shows.
+#[derive(Debug, Deserialize)]
+struct Shot {
+    primary: f64,
+    secondary: f64,
+    phase: u32,
+    /// `total`, `static` or `dynamic`.
+    component: String,
+    /// `drr` or `mip`.
+    projection: String,
+    size: usize,
+    low: f32,
+    high: f32,
+}
+
+const COMPONENTS: [&str; 3] = ["dynamic", "static", "total"];
+const PROJECTIONS: [&str; 2] = ["drr", "mip"];
+
+fn position(field: &str, known: &[&str], value: &str) -> Result<usize> {
+    let problem = || Error::config(field, value, format!("one of {} is accepted", known.join(", ")));
+    known.iter().position(|k| *k == value).ok_or_else(problem)
+}
+
+impl Viewer {
+    fn values(&self, shot: &Shot) -> Result<(Vec<f32>, usize)> {
+        if !SIDES.contains(&shot.size) {
+            let problem = format!("{} to {} is accepted", SIDES.start(), SIDES.end());
+            return Err(Error::config("size", shot.size, problem));
+        }
+        let (component, projection) = (
+            position("component", &COMPONENTS, &shot.component)?,
+            position("projection", &PROJECTIONS, &shot.projection)?,
+        );
+        let c_arm = &self.model.c_arm;
+        let [w, h] = self.model.image_size;
+        let pixel = c_arm.pixel_mm[0].max(c_arm.pixel_mm[1]) * w.max(h) as f64 / shot.size as f64;
+        let turned = CArm {
+            primary_deg: shot.primary,
+            secondary_deg: shot.secondary,
+            pixel_mm: [pixel; 2],
+            table_mm: [0.0; 3],
+            ..c_arm.clone()
+        };
+        let rays = Geometry::CArm(turned)
+            .rays(shot.size, shot.size)
+            .map_err(|(field, problem)| Error::config(field, "", problem))?;
+        let quantity =
+            Quantity { with_static: component > 0, with_dynamic: component != 1, maximum: projection == 1 };
+        let baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
+        Ok((baked.render(&rays, shot.size, shot.size, shot.phase, quantity)?, 2 * component + projection))
+    }
+
+    /// A grey PNG: vessels dark, as in an angiogram. `low` and `high` are shares of the typical range.
+    fn picture(&self, shot: &Shot) -> Result<Vec<u8>> {
+        if !(shot.low.is_finite() && shot.high.is_finite() && shot.low < shot.high) {
+            return Err(Error::config("low, high", format!("{} to {}", shot.low, shot.high), "is no window"));
+        }
+        let (values, kind) = self.values(shot)?;
+        let range = self.ranges[kind];
+        let (low, width) = (shot.low * range, (shot.high - shot.low) * range);
+        let codes: Vec<u8> = values.iter().map(|v| (255.0 * (1.0 - (v - low) / width)) as u8).collect();
+        let mut png = Vec::new();
+        let side = shot.size as u32;
+        PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub)
+            .write_image(&codes, side, side, ExtendedColorType::L8)
+            .map_err(|e| Error::Internal(format!("PNG: {e}")))?;
+        Ok(png)
+    }
+}
+
+/// Whether a request comes from the page that was printed.
+fn welcome(viewer: &Viewer, headers: &HeaderMap, query: &str) -> bool {
+    let here = |name: &str| {
+        [format!("127.0.0.1:{}", viewer.port), format!("localhost:{}", viewer.port)].iter().any(|h| h == name)
+    };
+    let text = |name: header::HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
+    // A foreign name for this address would be a page that had its own name point here.
+    let host = text(header::HOST).is_some_and(here);
+    let origin = text(header::ORIGIN).is_none_or(|o| o.strip_prefix("http://").is_some_and(here));
+    let site = headers.get("sec-fetch-site").and_then(|v| v.to_str().ok());
+    let site = site.is_none_or(|s| ["same-origin", "none"].contains(&s));
+    let token = query.split('&').find_map(|pair| pair.strip_prefix("token=")).unwrap_or_default();
+    let same = token.len() == viewer.token.len()
+        && token.bytes().zip(viewer.token.bytes()).fold(0, |differ, (a, b)| differ | (a ^ b)) == 0;
+    host && origin && site && same
+}
+
+async fn guard(State(viewer): State<Arc<Viewer>>, request: Request, next: Next) -> Response {
+    let query = request.uri().query().unwrap_or_default().to_owned();
+    if !welcome(&viewer, request.headers(), &query) {
+        return (StatusCode::FORBIDDEN, "open the address that `nertca-vk view` printed\n").into_response();
+    }
+    let mut response = next.run(request).await;
+    for (name, value) in [
+        (header::CACHE_CONTROL, "no-store"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::X_FRAME_OPTIONS, "DENY"),
+        (
+            header::CONTENT_SECURITY_POLICY,
+            "default-src 'none'; img-src blob:; connect-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'",
+        ),
+    ] {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+async fn info(State(viewer): State<Arc<Viewer>>) -> Response {
+    let m = &viewer.model;
+    let described = serde_json::json!({
+        "phases": m.layout.phases,
+        "primary": m.c_arm.primary_deg,
+        "secondary": m.c_arm.secondary_deg,
+        "step": m.step,
+        "preset": m.config.preset.name(),
+    });
+    ([(header::CONTENT_TYPE, "application/json")], described.to_string()).into_response()
+}
+
+async fn frame(State(viewer): State<Arc<Viewer>>, Query(shot): Query<Shot>) -> Response {
+    let drawn = tokio::task::spawn_blocking(move || viewer.picture(&shot)).await;
+    match drawn {
+        Ok(Ok(png)) => ([(header::CONTENT_TYPE, "image/png")], png).into_response(),
+        Ok(Err(error @ Error::Config { .. })) => (StatusCode::BAD_REQUEST, format!("{error}\n")).into_response(),
+        Ok(Err(error)) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")).into_response(),
+        Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, format!("{error}\n")).into_response(),
+    }
+}
+
+/// Serves the page until Ctrl-C.
+pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
+    let model = newest_model(&args.run)?;
+    let gpu = cli.open_device()?;
+    let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?);
+    eprintln!("preparing {} phases on {} ...", model.layout.phases, gpu.info().name);
+    let baked = Baked::empty(renderer, STILL_CELLS, MOVING_CELLS);
+    let mut secret = [0u8; 16];
+    getrandom::fill(&mut secret).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .map_err(Error::io("start", "the server"))?;
+    runtime.block_on(async {
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, args.port));
+        let listener = tokio::net::TcpListener::bind(address).await.map_err(Error::io("listen on", address.to_string()))?;
+        let port = listener.local_addr().map_err(Error::io("listen on", address.to_string()))?.port();
+        let mut viewer = Viewer {
+            model,
+            baked: Mutex::new(baked),
+            ranges: vec![1.0; COMPONENTS.len() * PROJECTIONS.len()],
+            token: secret.iter().map(|b| format!("{b:02x}")).collect(),
+            port,
+        };
+        viewer.ranges = typical_ranges(&viewer)?;
+        out!("http://127.0.0.1:{port}/?token={}", viewer.token);
+        let viewer = Arc::new(viewer);
+        let app = Router::new()
+            .route("/", get(|| async { Html(PAGE) }))
+            .route("/info", get(info))
+            .route("/frame", get(frame))
+            .layer(middleware::from_fn_with_state(viewer.clone(), guard))
+            .with_state(viewer);
+        axum::serve(listener, app)
+            .with_graceful_shutdown(async {
+                // Without a handler there is no Ctrl-C to wait for: the process then ends at once.
+                let _ = tokio::signal::ctrl_c().await;
+            })
+            .await
+            .map_err(Error::io("serve", address.to_string()))
+    })?;
+    drop(runtime);
+    cli.close_device(&gpu)
+}
+
+/// Largest value of each kind of picture from the model's own angle; also bakes every phase.
+fn typical_ranges(viewer: &Viewer) -> Result<Vec<f32>> {
+    let mut ranges = Vec::new();
+    for component in COMPONENTS {
+        for projection in PROJECTIONS {
+            let mut most = f32::MIN_POSITIVE;
+            for phase in 0..viewer.model.layout.phases as u32 {
+                let shot = Shot {
+                    primary: viewer.model.c_arm.primary_deg,
+                    secondary: viewer.model.c_arm.secondary_deg,
+                    phase,
+                    component: component.into(),
+                    projection: projection.into(),
+                    size: 64,
+                    low: 0.0,
+                    high: 1.0,
+                };
+                most = viewer.values(&shot)?.0.into_iter().fold(most, f32::max);
+                if component == "static" {
+                    break; // the same at every phase
+                }
+            }
+            ranges.push(most);
+        }
+    }
+    Ok(ranges)
+}
