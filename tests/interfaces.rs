@@ -76,7 +76,7 @@ fn a_whole_life() {
         assert!((0.0..=1.0).contains(&scores["dice"][key].as_f64().unwrap()));
     }
     assert!(scores["psnr"].as_f64().unwrap() > 0.0 && scores["ssim"].is_f64());
-    assert_eq!(std::fs::read_dir(&pictures).unwrap().count(), 12 + 4);
+    assert_eq!(std::fs::read_dir(&pictures).unwrap().count(), 12 + 4 + 1, "pictures, animations and the page");
     assert!(ok(&["eval", text(&run)]).contains("mean of  12 images"));
 
     for (file, extra) in [

@@ -17,7 +17,7 @@ use nertca_vk::data::geometry::{CArm, Geometry};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::model::field::Model;
 use nertca_vk::output::render::Renderer;
-use nertca_vk::output::sampled::{Baked, Quantity};
+use nertca_vk::output::sampled::{BAKED_CELLS, Baked, Quantity};
 use serde::Deserialize;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -25,9 +25,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 const PAGE: &str = include_str!("view.html");
 /// Side of a picture, pixels.
 const SIDES: std::ops::RangeInclusive<usize> = 16..=2048;
-/// Cells of the still volume; its field has no more detail.
-const STILL_CELLS: u32 = 96;
-const MOVING_CELLS: u32 = 160;
+/// Side of a cell of the moving field, world units: finer than a vessel, coarse enough to draw while dragging.
+const CELL: f64 = 0.005;
 
 struct Viewer {
     model: Model,
@@ -85,8 +84,7 @@ impl Viewer {
         let rays = Geometry::CArm(turned)
             .rays(shot.size, shot.size)
             .map_err(|(field, problem)| Error::config(field, "", problem))?;
-        let quantity =
-            Quantity { with_static: component > 0, with_dynamic: component != 1, maximum: projection == 1 };
+        let quantity = Quantity { with_static: component > 0, with_dynamic: component != 1, maximum: projection == 1 };
         let baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
         Ok((baked.render(&rays, shot.size, shot.size, shot.phase, quantity)?, 2 * component + projection))
     }
@@ -175,7 +173,11 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
     let gpu = cli.open_device()?;
     let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?);
     eprintln!("preparing {} phases on {} ...", model.layout.phases, gpu.info().name);
-    let baked = Baked::empty(renderer, STILL_CELLS, MOVING_CELLS);
+    let scene = &model.scene;
+    let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
+    let moving_cells = ((extent / CELL).ceil() as u32).clamp(48, BAKED_CELLS);
+    // The static field has no detail between the cells of its grid.
+    let baked = Baked::empty(renderer, (2 * model.config.static_field.grid).clamp(32, BAKED_CELLS), moving_cells);
     let mut secret = [0u8; 16];
     getrandom::fill(&mut secret).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -185,7 +187,8 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
         .map_err(Error::io("start", "the server"))?;
     runtime.block_on(async {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, args.port));
-        let listener = tokio::net::TcpListener::bind(address).await.map_err(Error::io("listen on", address.to_string()))?;
+        let listener =
+            tokio::net::TcpListener::bind(address).await.map_err(Error::io("listen on", address.to_string()))?;
         let port = listener.local_addr().map_err(Error::io("listen on", address.to_string()))?.port();
         let mut viewer = Viewer {
             model,
