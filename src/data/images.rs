@@ -88,6 +88,7 @@ pub fn read_npy(path: &Path) -> Result<(Vec<usize>, Vec<f32>)> {
 pub fn read_npy_limited(path: &Path, limit: u64) -> Result<(Vec<usize>, Vec<f32>)> {
     let bytes = files::read_limited(path, limit)?;
     let bad = |problem: String| Error::data(path, "npy", problem);
+    check_npy_shape(&bytes).map_err(|shape| bad(format!("absurd shape ({shape})")))?;
     let npy = npyz::NpyFile::new(&bytes[..]).map_err(|e| bad(format!("header: {e}")))?;
     let mut shape = Vec::new();
     let mut elements: u64 = 1;
@@ -127,6 +128,16 @@ pub fn read_npy_limited(path: &Path, limit: u64) -> Result<(Vec<usize>, Vec<f32>
         return Err(bad(format!("{} elements for shape {shape:?}", values.len())));
     }
     Ok((shape.clone(), if fortran { fortran_to_c(&shape, &values) } else { values }))
+}
+
+/// The library multiplies the axes of a header's shape without a look at their size.
+fn check_npy_shape(bytes: &[u8]) -> std::result::Result<(), String> {
+    let header = String::from_utf8_lossy(&bytes[..bytes.len().min(1 << 16)]);
+    let Some((_, rest)) = header.split_once("'shape'") else { return Ok(()) };
+    let shape = rest.split_once('(').and_then(|(_, r)| r.split_once(')')).map_or("", |(s, _)| s);
+    let axes = shape.split(',').map(str::trim).filter(|axis| !axis.is_empty());
+    let elements = axes.map(|axis| axis.parse::<u64>().ok()).try_fold(1u64, |n, axis| n.checked_mul(axis?));
+    elements.map(drop).ok_or_else(|| shape.to_owned())
 }
 
 fn fortran_to_c(shape: &[usize], values: &[f32]) -> Vec<f32> {

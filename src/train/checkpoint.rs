@@ -226,6 +226,13 @@ impl Checkpoint {
             return Err(bad("phases", header.phases.to_string()));
         }
         let tensors = SafeTensors::deserialize(bytes).map_err(|e| bad("tensors", e.to_string()))?;
+        let (s, d) = (&header.config.static_field, &header.config.dynamic);
+        let [grid, ranks, layers, width] = [s.grid, s.ranks, d.layers, d.width].map(u64::from);
+        let needed =
+            3 * ranks * grid * (grid + 1) + layers * width * width + header.phases as u64 * u64::from(d.latent);
+        if needed > bytes.len() as u64 / 4 {
+            return Err(bad("config", format!("{needed} parameters do not fit the file's {} bytes", bytes.len())));
+        }
         let layout = ParamLayout::new(&header.config, header.phases);
         let mut params = vec![0f32; layout.len];
         let mut moments = vec![[0f32; 2]; layout.len];
@@ -256,8 +263,8 @@ impl Checkpoint {
             None => None,
             Some(h) => {
                 let view = tensors.tensor("hull.bits").map_err(|e| bad("hull.bits", e.to_string()))?;
-                let words =
-                    h.size.iter().try_fold(1usize, |n, s| n.checked_mul(*s)).unwrap_or(0).div_ceil(32) * h.n_phases;
+                let cells = h.size.iter().try_fold(1usize, |n, s| n.checked_mul(*s)).unwrap_or(0);
+                let words = cells.div_ceil(32).checked_mul(h.n_phases).unwrap_or(0);
                 if view.dtype() != Dtype::U32
                     || view.shape() != [words]
                     || ![1, header.phases].contains(&h.n_phases)
