@@ -40,6 +40,7 @@ pub mod gpu {
 pub mod data {
     pub mod dataset;
     pub mod dicom;
+    mod dicom_lengths;
     pub mod ecg;
     pub mod gating;
     pub mod geometry;

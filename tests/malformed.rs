@@ -130,11 +130,6 @@ fn scratch() -> tempfile::TempDir {
 
 /// Feeds damaged copies of the seeds, as a file called `name`, to a parser.
 fn feed(name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
-    feed_within(512 << 20, name, seeds, parse);
-}
-
-/// As [`feed`], with a bound on a single allocation, bytes.
-fn feed_within(bound: usize, name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
     // One parser at a time: the largest allocation is everybody's.
     static ALONE: Mutex<()> = Mutex::new(());
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -162,7 +157,7 @@ fn feed_within(bound: usize, name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path
             }
         }
         let largest = LARGEST.load(Ordering::Relaxed);
-        assert!(largest < bound, "{name}: input {input} made it allocate {largest} bytes");
+        assert!(largest < 512 << 20, "{name}: input {input} made it allocate {largest} bytes");
         assert!(begin.elapsed() < Duration::from_secs(20), "{name}: input {input} took {:?}", begin.elapsed());
     }
     println!("{name}: {count} inputs, {accepted} of them still good");
@@ -259,10 +254,7 @@ fn angiograms() {
     let dir = scratch();
     let file = dir.path().join("a.dcm");
     dicom::angiogram(&file, |_| ());
-    // dicom-rs reserves what an element claims to hold, up to 4 GiB; memory that is never written is never used.
-    feed_within(5 << 30, "a.dcm", &[std::fs::read(&file).unwrap()], |p| {
-        nertca_vk::data::dicom::Run::read(p, None).is_ok()
-    });
+    feed("a.dcm", &[std::fs::read(&file).unwrap()], |p| nertca_vk::data::dicom::Run::read(p, None).is_ok());
 }
 
 #[test]

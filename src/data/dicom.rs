@@ -1,5 +1,6 @@
 //! One X-ray angiography run from a DICOM file: frames, geometry, times, ECG. Nothing that identifies a patient is kept.
 
+use super::dicom_lengths;
 use super::ecg;
 use super::gating::RPeaks;
 use super::geometry::CArm;
@@ -124,6 +125,7 @@ impl Run {
             let problem = format!("{} bytes; a DICOM file of 132 bytes to 4 GiB is accepted", meta.len());
             return Err(Error::data(path, "size", problem));
         }
+        dicom_lengths::check(path)?;
         let object = OpenFileOptions::new()
             .open_file(path)
             .map_err(|e| Error::data(path, "DICOM", format!("cannot be read: {}", describe(&e))))?;
