@@ -56,12 +56,15 @@ fn far(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b).abs() / scale).fold(0.0, f32::max)
 }
 
+/// Makes the frame of a view and phase and hands it on, while its pixels live.
+type Prepare<'a> = dyn Fn(usize, u32, &mut dyn FnMut(&nertca_frame)) + 'a;
+
 #[test]
 fn pixel_formats_strides_and_intensities_mean_the_same() {
     let context = context("validation = true\ndeterministic = true");
     // 16-bit codes that all formats can carry exactly.
     let codes = |view, phase| pixels(view, phase).iter().map(|v| (v * 10_000.0) as u16).collect::<Vec<_>>();
-    let checkpoint = |prepare: &dyn Fn(usize, u32, &mut dyn FnMut(&nertca_frame))| {
+    let checkpoint = |prepare: &Prepare<'_>| {
         let made = reconstruction(context, SMALL);
         for view in 0..3 {
             for phase in 0..PHASES {

@@ -70,9 +70,9 @@ fn centreline(mask: &[bool], width: usize) -> Vec<(f64, f64)> {
                     let turns = (0..8).filter(|i| !ring[*i] && ring[(i + 1) % 8]).count();
                     let [north, _, east, _, south, _, west, _] = ring;
                     let open = if pass == 0 {
-                        !(north && east && south) && !(east && south && west)
+                        !(east && south && (north || west))
                     } else {
-                        !(north && east && west) && !(north && south && west)
+                        !(north && west && (east || south))
                     };
                     if at(0, 0) && (2..=6).contains(&n) && turns == 1 && open {
                         gone.push(y * width + x);

@@ -2,7 +2,7 @@
 //! fills, what they claim: up to 4 GiB for a damaged file of a few bytes.
 
 use crate::error::{Error, Result};
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{BufReader, Read};
 use std::path::Path;
 
 /// Sequences inside sequences.

@@ -235,12 +235,13 @@ fn select(
         })
         .collect();
     let most = contrast.iter().copied().fold(0.0, f64::max);
-    let filled: Vec<bool> = contrast.iter().map(|c| *c >= FILLED_SHARE * most).collect();
+    // Closed by a frame that is not, so that a stretch may last to the end.
+    let filled = contrast.iter().map(|c| *c >= FILLED_SHARE * most).chain([false]);
     // The longest stretch.
     let mut best = 0..0;
     let mut start = 0;
-    for i in 0..=n {
-        if i == n || !filled[i] {
+    for (i, filled) in filled.enumerate() {
+        if !filled {
             if i - start > best.len() {
                 best = start..i;
             }
