@@ -4,7 +4,8 @@
 use crate::config::Config;
 use crate::data::dataset::Dataset;
 use crate::error::Result;
-use crate::gpu::device::{Gpu, MatrixShape};
+use crate::gpu::capabilities::MatrixShape;
+use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::pipeline::Pipeline;
 use crate::gpu::record::{Bound, Groups, Recording};

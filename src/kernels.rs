@@ -2,7 +2,8 @@
 //! debug label and bench row. Buffers are found by the names the shaders give them.
 
 use crate::error::{Error, Result};
-use crate::gpu::device::{DeviceInfo, Gpu};
+use crate::gpu::capabilities::DeviceInfo;
+use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Operands};
 use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
 use crate::gpu::record::{Bound, Groups, Recording};

@@ -29,6 +29,7 @@ pub mod session;
 
 /// Vulkan compute, free of any knowledge of angiography.
 pub mod gpu {
+    pub mod capabilities;
     pub mod device;
     pub mod memory;
     pub mod pipeline;

@@ -3,7 +3,8 @@
 use super::args::{Cli, CompletionsArgs, DevicesArgs};
 use clap::CommandFactory;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::gpu::device::{DeviceInfo, list_devices};
+use nertca_vk::gpu::capabilities::DeviceInfo;
+use nertca_vk::gpu::device::list_devices;
 use nertca_vk::kernels::Tuning;
 use serde::Serialize;
 

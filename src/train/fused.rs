@@ -8,7 +8,8 @@
 //! A sum that is not finite skips the update and halves the scale; many good ones double it (`report`).
 
 use crate::error::{Error, Result};
-use crate::gpu::device::{DeviceInfo, Gpu, MatrixShape};
+use crate::gpu::capabilities::{DeviceInfo, MatrixShape};
+use crate::gpu::device::Gpu;
 use crate::gpu::memory::Memory;
 use crate::gpu::pipeline::Pipeline;
 use crate::gpu::record::{Groups, Recording};

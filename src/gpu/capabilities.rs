@@ -1,0 +1,225 @@
+//! What a device is and can do: the capability table, and the faults of drivers that shape it.
+
+use ash::{ext, khr, nv, vk};
+use serde::Serialize;
+use std::ffi::CStr;
+
+/// What a device is and can do, as far as this engine cares.
+#[derive(Debug, Clone, Serialize)]
+pub struct DeviceInfo {
+    /// Position in the list of the loader.
+    pub index: usize,
+    /// Name given by the driver.
+    pub name: String,
+    /// `discrete`, `integrated`, `virtual`, `cpu` or `other`.
+    pub kind: &'static str,
+    /// Device UUID, hexadecimal.
+    pub uuid: String,
+    /// Driver name and version text.
+    pub driver: String,
+    /// Supported Vulkan version.
+    pub api_version: String,
+    /// Whether the driver is Mesa's llvmpipe (CPU).
+    pub is_llvmpipe: bool,
+    /// Major version of Mesa, when the driver is from Mesa.
+    pub mesa_major: Option<u32>,
+    /// Default subgroup size.
+    pub subgroup_size: u32,
+    /// Shared memory of a workgroup, bytes.
+    pub max_shared_memory: u32,
+    /// Invocations of a workgroup.
+    pub max_workgroup_invocations: u32,
+    /// Workgroups of one dispatch along x.
+    pub max_workgroup_count: u32,
+    /// Range of one storage buffer binding, bytes.
+    pub max_storage_buffer_range: u32,
+    /// Elements of one texel buffer.
+    pub max_texel_buffer_elements: u32,
+    /// Bytes of push constants.
+    pub max_push_constants: u32,
+    /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
+    pub timestamp_period_ns: f32,
+    /// Device-local memory, bytes.
+    pub device_memory: u64,
+    /// Whether shaders can read buffers through their addresses.
+    pub buffer_device_address: bool,
+    /// Shapes of cooperative matrices with f16 operands and f32 sums at subgroup scope; empty when the device lacks
+    /// them or what their kernels need besides (16-bit floats, Vulkan's memory model, subgroups of a fixed size).
+    pub matrices: Vec<MatrixShape>,
+    /// Streaming multiprocessors or the like; 0 when the driver does not tell.
+    pub multiprocessors: u32,
+    /// Whether the device offers 16-bit float arithmetic.
+    pub float16: bool,
+    /// Whether the device offers float atomics on buffers.
+    pub float_atomics: bool,
+    /// Whether memory can be exported as file descriptors (`VK_KHR_external_memory_fd`).
+    pub external_memory_fd: bool,
+    /// Why this device cannot be used, if so.
+    pub unusable: Option<String>,
+}
+
+/// A product of cooperative matrices: `m` x `k` times `k` x `n`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct MatrixShape {
+    /// Rows of the left operand.
+    pub m: u32,
+    /// Columns of the right operand.
+    pub n: u32,
+    /// Columns of the left operand.
+    pub k: u32,
+}
+
+fn c_chars(text: &[std::ffi::c_char]) -> String {
+    text.iter().take_while(|c| **c != 0).map(|c| char::from(*c as u8)).collect()
+}
+
+/// Device extensions the matrix kernels need.
+pub(super) const MATRIX_EXTENSIONS: [&CStr; 2] = [khr::cooperative_matrix::NAME, ext::subgroup_size_control::NAME];
+
+/// Matrix shapes our kernels can use, most work per product first.
+fn matrix_shapes(entry: &ash::Entry, instance: &ash::Instance, physical: vk::PhysicalDevice) -> Vec<MatrixShape> {
+    // SAFETY: `physical` comes from this instance.
+    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
+    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
+    if !MATRIX_EXTENSIONS.iter().all(|name| has(name)) {
+        return Vec::new();
+    }
+    let mut matrix = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
+    let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+    let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut features =
+        vk::PhysicalDeviceFeatures2::default().push_next(&mut matrix).push_next(&mut size).push_next(&mut f12);
+    // SAFETY: the device offers the extensions whose structures are chained.
+    unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    let needed = [
+        matrix.cooperative_matrix,
+        size.subgroup_size_control,
+        size.compute_full_subgroups,
+        f12.shader_float16,
+        f12.vulkan_memory_model,
+        // Integer atomics of other kernels have device scope.
+        f12.vulkan_memory_model_device_scope,
+    ];
+    if needed.contains(&vk::FALSE) {
+        return Vec::new();
+    }
+    let loader = khr::cooperative_matrix::Instance::new(entry, instance);
+    // SAFETY: the device offers the extension.
+    let found = unsafe { loader.get_physical_device_cooperative_matrix_properties(physical) }.unwrap_or_default();
+    let (f16, f32) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
+    let mut shapes: Vec<MatrixShape> = found
+        .iter()
+        .filter(|p| p.scope == vk::ScopeKHR::SUBGROUP && p.a_type == f16 && p.b_type == f16)
+        .filter(|p| p.c_type == f32 && p.result_type == f32)
+        // The mask of the backward pass is an f16 sum of the same shape, and rows are handled eight f16 at a time.
+        .filter(|p| {
+            [p.m_size, p.n_size, p.k_size].iter().all(|size| size % 8 == 0)
+                && found
+                    .iter()
+                    .any(|q| q.c_type == f16 && (q.m_size, q.n_size, q.k_size) == (p.m_size, p.n_size, p.k_size))
+        })
+        .map(|p| MatrixShape { m: p.m_size, n: p.n_size, k: p.k_size })
+        .collect();
+    // Widths are multiples of 16; among shapes that fit them the largest product reuses its operands most.
+    shapes.retain(|s| 16 % s.m == 0 && 16 % s.n == 0 && 16 % s.k == 0);
+    shapes.sort_by_key(|s| std::cmp::Reverse((s.m * s.n * s.k, s.m)));
+    shapes
+}
+
+pub(super) fn describe(
+    entry: &ash::Entry,
+    instance: &ash::Instance,
+    index: usize,
+    physical: vk::PhysicalDevice,
+) -> DeviceInfo {
+    let mut driver = vk::PhysicalDeviceDriverProperties::default();
+    let mut ids = vk::PhysicalDeviceIDProperties::default();
+    let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
+    let mut multiprocessors = vk::PhysicalDeviceShaderSMBuiltinsPropertiesNV::default();
+    // SAFETY: `physical` comes from this instance.
+    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
+    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
+    let mut props =
+        vk::PhysicalDeviceProperties2::default().push_next(&mut driver).push_next(&mut ids).push_next(&mut subgroup);
+    if has(nv::shader_sm_builtins::NAME) {
+        props = props.push_next(&mut multiprocessors);
+    }
+    // SAFETY: `physical` comes from this instance; the chain lives until the call returns.
+    unsafe { instance.get_physical_device_properties2(physical, &mut props) };
+    let properties = props.properties;
+    let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut f12);
+    // SAFETY: as above.
+    unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    // SAFETY: as above.
+    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
+    let limits = properties.limits;
+    let version = properties.api_version;
+    let unusable = if version < vk::API_VERSION_1_2 {
+        Some("Vulkan 1.2 is needed".to_owned())
+    } else if f12.timeline_semaphore == vk::FALSE {
+        Some("timeline semaphores are needed".to_owned())
+    } else if compute_family(instance, physical).is_none() {
+        Some("it has no compute queue".to_owned())
+    } else {
+        None
+    };
+    let driver_info = c_chars(&driver.driver_info);
+    DeviceInfo {
+        index,
+        name: c_chars(&properties.device_name),
+        kind: match properties.device_type {
+            vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
+            vk::PhysicalDeviceType::INTEGRATED_GPU => "integrated",
+            vk::PhysicalDeviceType::VIRTUAL_GPU => "virtual",
+            vk::PhysicalDeviceType::CPU => "cpu",
+            _ => "other",
+        },
+        uuid: ids.device_uuid.iter().map(|b| format!("{b:02x}")).collect(),
+        mesa_major: driver_info.strip_prefix("Mesa ").and_then(|v| v.split('.').next()).and_then(|v| v.parse().ok()),
+        driver: format!("{} {}", c_chars(&driver.driver_name), driver_info),
+        api_version: format!(
+            "{}.{}.{}",
+            vk::api_version_major(version),
+            vk::api_version_minor(version),
+            vk::api_version_patch(version)
+        ),
+        is_llvmpipe: driver.driver_id == vk::DriverId::MESA_LLVMPIPE,
+        subgroup_size: subgroup.subgroup_size,
+        max_shared_memory: limits.max_compute_shared_memory_size,
+        max_workgroup_invocations: limits.max_compute_work_group_invocations,
+        max_workgroup_count: limits.max_compute_work_group_count[0],
+        max_storage_buffer_range: limits.max_storage_buffer_range,
+        max_texel_buffer_elements: limits.max_texel_buffer_elements,
+        max_push_constants: limits.max_push_constants_size,
+        timestamp_period_ns: if limits.timestamp_compute_and_graphics == vk::TRUE {
+            limits.timestamp_period
+        } else {
+            0.0
+        },
+        device_memory: memory.memory_heaps[..memory.memory_heap_count as usize]
+            .iter()
+            .filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
+            .map(|h| h.size)
+            .sum(),
+        buffer_device_address: f12.buffer_device_address == vk::TRUE,
+        // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives,
+        // the simplest product crashes the process.
+        matrices: if driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8 {
+            Vec::new()
+        } else {
+            matrix_shapes(entry, instance, physical)
+        },
+        multiprocessors: multiprocessors.shader_sm_count,
+        float16: f12.shader_float16 == vk::TRUE,
+        float_atomics: has(ext::shader_atomic_float::NAME),
+        external_memory_fd: has(khr::external_memory_fd::NAME),
+        unusable,
+    }
+}
+
+pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<u32> {
+    // SAFETY: `physical` comes from this instance.
+    let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
+    families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE)).map(|i| i as u32)
+}

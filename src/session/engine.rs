@@ -1,0 +1,302 @@
+//! What trains a session and what is drawn of it, shared by the threads that do so.
+
+use super::inbox::Inbox;
+use super::{Observer, Progress, State, lock};
+use crate::error::{Error, Result};
+use crate::gpu::device::Gpu;
+use crate::kernels::Tuning;
+use crate::output::live::{Live, Source};
+use crate::train::checkpoint::Checkpoint;
+use crate::train::plan::Plan;
+use crate::train::trainer::Trainer;
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::ThreadId;
+use std::time::{Duration, Instant};
+
+/// After taking in new frames, this many times as long passes before the next ones are taken in.
+const SETTLE: u32 = 4;
+/// While others wait for the engine, training looks again after this long.
+const GIVE_WAY: Duration = Duration::from_micros(200);
+
+/// What the threads of a session share.
+pub(super) struct Shared {
+    pub(super) gpu: Option<Gpu>,
+    pub(super) tuning: Option<Tuning>,
+    pub(super) inbox: Mutex<Inbox>,
+    /// Rises with every change of the inbox.
+    pub(super) version: AtomicU64,
+    pub(super) engine: Mutex<Engine>,
+    /// Who waits for the engine, other than training in the background.
+    pub(super) visitors: AtomicU32,
+    pub(super) published: Mutex<Published>,
+    /// Iterations handed to the device.
+    pub(super) step: AtomicU32,
+    pub(super) viewer: Mutex<Option<(u64, Live)>>,
+    pub(super) control: Mutex<Control>,
+    pub(super) changed: Condvar,
+    pub(super) stop: AtomicBool,
+    pub(super) pause: AtomicBool,
+}
+
+/// The run under way.
+#[derive(Default)]
+pub(super) struct Engine {
+    pub(super) trainer: Option<Trainer>,
+    /// State to begin from where there is no trainer, and to fall back to.
+    pub(super) saved: Option<Checkpoint>,
+    /// Of the inbox the trainer was built from.
+    pub(super) version: u64,
+    pub(super) frames: u32,
+    /// Span of their line integrals.
+    pub(super) image_range: f64,
+    /// New frames are left waiting until then.
+    pub(super) settled: Option<Instant>,
+}
+
+/// What is drawn.
+#[derive(Default)]
+pub(super) struct Published {
+    pub(super) generation: u64,
+    pub(super) source: Option<Source>,
+}
+
+/// What training is doing, for those who wait for it.
+pub(super) struct Control {
+    pub(super) state: State,
+    pub(super) failure: Option<String>,
+    pub(super) worker: Option<ThreadId>,
+}
+
+pub(super) fn nothing_yet() -> Error {
+    Error::NotReady("there is no reconstruction yet: train, or load a checkpoint".into())
+}
+
+impl Engine {
+    pub(super) fn length(&self) -> u32 {
+        self.trainer.as_ref().map_or(0, |t| t.plan().config.train.iterations)
+    }
+}
+
+impl Shared {
+    pub(super) fn device(&self) -> Result<(&Gpu, &Tuning)> {
+        match (&self.gpu, &self.tuning) {
+            (Some(gpu), Some(tuning)) => Ok((gpu, tuning)),
+            _ => Err(Error::NoDevice("the context was made without a device".into())),
+        }
+    }
+
+    /// The engine, before training in the background takes it again.
+    pub(super) fn visit(&self) -> MutexGuard<'_, Engine> {
+        self.visitors.fetch_add(1, Ordering::AcqRel);
+        let engine = lock(&self.engine);
+        self.visitors.fetch_sub(1, Ordering::AcqRel);
+        engine
+    }
+
+    pub(super) fn publish(&self, source: Source) {
+        let mut published = lock(&self.published);
+        published.generation += 1;
+        published.source = Some(source);
+    }
+
+    pub(super) fn with_viewer<T>(&self, draw: impl FnOnce(&mut Live, u32) -> Result<T>) -> Result<T> {
+        let (gpu, tuning) = self.device()?;
+        let mut viewer = lock(&self.viewer);
+        let step = self.step.load(Ordering::Acquire);
+        let (generation, source) = {
+            let published = lock(&self.published);
+            let current = viewer.as_ref().is_some_and(|(of, _)| *of == published.generation);
+            (published.generation, if current { None } else { published.source.clone() })
+        };
+        if let Some(source) = source {
+            // The old one's memory is needed first.
+            *viewer = None;
+            *viewer = Some((generation, Live::new(gpu, &source, tuning.clone())?));
+        }
+        match &mut *viewer {
+            Some((_, live)) => draw(live, step),
+            None => Err(nothing_yet()),
+        }
+    }
+
+    /// Brings the trainer up to the frames there are.
+    pub(super) fn take_in_frames(&self, engine: &mut Engine) -> Result<()> {
+        let (gpu, tuning) = self.device()?;
+        let version = self.version.load(Ordering::Acquire);
+        if engine.version == version && engine.trainer.is_some() {
+            return Ok(());
+        }
+        let begin = Instant::now();
+        let (dataset, mut config) = {
+            let inbox = lock(&self.inbox);
+            (inbox.training_dataset()?, inbox.options.config.clone())
+        };
+        if gpu.info().kind == "cpu" {
+            // Views wait for what was submitted before them.
+            config.train.iterations_per_submit = 1;
+        }
+        let fresh = Plan::new(&config, &dataset)?;
+        if let Some(trainer) = &mut engine.trainer {
+            let state = trainer.checkpoint()?;
+            let fits = holds(&state.model.scene, &fresh.scene);
+            if !fits {
+                tracing::warn!("new frames show vessels outside the box trained so far: training starts over");
+            }
+            engine.saved = fits.then_some(state);
+        }
+        (engine.trainer, engine.version) = (None, 0); // its memory is needed
+        let trainer = match &engine.saved {
+            None => Trainer::new(gpu, fresh, &dataset, tuning.clone())?,
+            Some(state) => {
+                let plan = Plan::with_scene(&config, &dataset, state.model.scene.clone())?;
+                Trainer::carry_on(gpu, plan, &dataset, tuning.clone(), state)?
+            }
+        };
+        tracing::info!("training on {} frames from iteration {}", dataset.training().len(), trainer.step());
+        trainer.plan().notes.iter().for_each(|note| tracing::info!("{note}"));
+        engine.frames = dataset.training().len() as u32;
+        engine.version = version;
+        engine.settled = Some(Instant::now() + begin.elapsed() * SETTLE);
+        self.step.store(trainer.step(), Ordering::Release);
+        let params = Some(trainer.buffers().get("params")?.clone());
+        self.publish(Source { outline: trainer.outline(), params });
+        engine.image_range = image_range(&trainer.plan().images);
+        engine.trainer = Some(trainer);
+        Ok(())
+    }
+
+    /// Keeps the device busy towards `end`.
+    pub(super) fn advance(
+        &self,
+        engine: &mut Engine,
+        end: u32,
+        first: u32,
+        begin: Instant,
+    ) -> Result<Option<Progress>> {
+        let (frames, range) = (engine.frames, engine.image_range);
+        let Some(trainer) = &mut engine.trainer else { return Ok(None) };
+        let before = trainer.step();
+        let losses = match trainer.advance(end) {
+            Ok(losses) => losses,
+            Err(error) => {
+                self.fall_back(engine);
+                return Err(error);
+            }
+        };
+        self.step.store(trainer.submitted(), Ordering::Release);
+        let config = &trainer.plan().config;
+        let every = config.train.checkpoint_every;
+        let progress = losses.last().map(|loss| Progress {
+            loss: *loss,
+            iterations: config.train.iterations,
+            frames,
+            psnr_db: -10.0 * (loss.squared_error / (range * range)).max(1e-20).log10(),
+            iterations_per_s: f64::from(loss.step - first) / begin.elapsed().as_secs_f64().max(1e-9),
+        });
+        if before / every != trainer.step() / every {
+            engine.saved = Some(trainer.checkpoint()?);
+        }
+        Ok(progress)
+    }
+
+    /// Lets the iterations under way finish.
+    pub(super) fn drain(&self, engine: &mut Engine) -> Result<()> {
+        let Some(trainer) = &mut engine.trainer else { return Ok(()) };
+        while trainer.step() < trainer.submitted() {
+            trainer.advance(trainer.submitted())?;
+        }
+        Ok(())
+    }
+
+    /// After a failure, shows the last good state, if there is one.
+    pub(super) fn fall_back(&self, engine: &mut Engine) {
+        engine.trainer = None;
+        engine.version = 0;
+        let source = engine.saved.as_ref().map(|saved| Source { outline: saved.model.clone(), params: None });
+        self.step.store(engine.saved.as_ref().map_or(0, |s| s.model.step), Ordering::Release);
+        let mut published = lock(&self.published);
+        published.generation += 1;
+        published.source = source;
+        drop(published);
+        *lock(&self.viewer) = None;
+    }
+
+    pub(super) fn set_state(&self, state: State) {
+        lock(&self.control).state = state;
+        self.changed.notify_all();
+    }
+
+    /// Waits for a change, at most until `limit`.
+    pub(super) fn rest(&self, limit: Duration, reason: impl Fn() -> bool) {
+        let control = lock(&self.control);
+        if reason() && !self.stop.load(Ordering::Acquire) {
+            drop(self.changed.wait_timeout(control, limit).unwrap_or_else(PoisonError::into_inner));
+        }
+    }
+
+    /// Training in the background.
+    pub(super) fn work(&self, observe: &mut Observer<'_>) -> Result<State> {
+        let mut begin = Instant::now();
+        let mut first = None;
+        loop {
+            if self.stop.load(Ordering::Acquire) {
+                self.drain(&mut lock(&self.engine))?;
+                return Ok(State::Idle);
+            }
+            if self.pause.load(Ordering::Acquire) {
+                self.drain(&mut lock(&self.engine))?;
+                self.set_state(State::Paused);
+                self.rest(Duration::from_secs(1), || self.pause.load(Ordering::Acquire));
+                (begin, first) = (Instant::now(), None);
+                continue;
+            }
+            while self.visitors.load(Ordering::Acquire) > 0 {
+                std::thread::sleep(GIVE_WAY);
+            }
+            let mut engine = lock(&self.engine);
+            let version = self.version.load(Ordering::Acquire);
+            if engine.version != version && engine.settled.is_none_or(|until| Instant::now() >= until) {
+                match self.take_in_frames(&mut engine) {
+                    Ok(()) => (begin, first) = (Instant::now(), None),
+                    Err(Error::NotReady(why)) if engine.trainer.is_none() => {
+                        drop(engine);
+                        tracing::info!("waiting for frames: {why}");
+                        self.set_state(State::Waiting);
+                        self.rest(Duration::from_secs(60), || self.version.load(Ordering::Acquire) == version);
+                        continue;
+                    }
+                    Err(error) => return Err(error),
+                }
+            }
+            self.set_state(State::Running);
+            let step = engine.trainer.as_ref().map_or(0, Trainer::step);
+            let first = *first.get_or_insert(step);
+            let length = engine.length();
+            let progress = self.advance(&mut engine, length, first, begin)?;
+            let done = engine.trainer.as_ref().is_none_or(|t| t.step() >= length) && engine.version == version;
+            drop(engine);
+            if progress.is_some_and(|p| !observe(&p)) {
+                self.drain(&mut lock(&self.engine))?;
+                return Ok(State::Cancelled);
+            }
+            if done {
+                return Ok(State::Finished);
+            }
+        }
+    }
+}
+
+/// Whether fields trained in an old scene can go on in a new one: their box holds it, and numbers are of a like size.
+fn holds(old: &crate::model::scene::Scene, new: &crate::model::scene::Scene) -> bool {
+    let slack = 0.02 * (0..3).map(|i| old.dynamic_max[i] - old.dynamic_min[i]).fold(0.0, f64::max);
+    let inside = (0..3)
+        .all(|i| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack);
+    let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
+    inside && alike(old.static_gain, new.static_gain) && alike(old.dynamic_gain, new.dynamic_gain)
+}
+
+fn image_range(images: &[f32]) -> f64 {
+    let (low, high) = images.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+    f64::from(high - low)
+}

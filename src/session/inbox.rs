@@ -1,0 +1,163 @@
+//! Frames of a session, as they came.
+
+use crate::config::{Config, DynamicTarget};
+use crate::data::dataset::{Dataset, Frame, Layout, Split, View};
+use crate::data::gating::RPeaks;
+use crate::data::geometry::{Geometry, MM_PER_UNIT};
+use crate::error::{Error, Result};
+use std::path::PathBuf;
+
+/// What a session is about.
+#[derive(Debug, Clone)]
+pub struct SessionOptions {
+    /// Hyper-parameters.
+    pub config: Config,
+    /// Cardiac phases; 1 for a still object.
+    pub phases: u32,
+    /// Attenuation is searched within this distance before and behind the isocentre plane, mm.
+    pub depth_half_extent_mm: f64,
+    /// Attenuation of contrast-filled vessels, 1/mm, where known; a third of it is the Dice threshold.
+    pub vessel_attenuation_per_mm: Option<f64>,
+    /// Refuse frames while training in the background, so that results never depend on timing.
+    pub deterministic: bool,
+}
+
+/// When a frame was taken.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Moment {
+    /// At a known cardiac phase, from 0.
+    Phase(u32),
+    /// At a time in seconds, on the clock of the R-peaks.
+    TimeS(f64),
+}
+
+/// A calibrated angiogram.
+#[derive(Debug, Clone)]
+pub struct NewFrame {
+    /// How it was taken.
+    pub geometry: Geometry,
+    /// When.
+    pub moment: Moment,
+    /// To train on, or to score with.
+    pub split: Split,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Line integrals, rows first.
+    pub integrals: Vec<f32>,
+    /// Vessel mask, where known.
+    pub mask: Option<Vec<bool>>,
+}
+
+/// Checked frames, and how they are to be used.
+pub(super) struct Inbox {
+    pub(super) options: SessionOptions,
+    pub(super) size: Option<(usize, usize)>,
+    pub(super) views: Vec<View>,
+    pub(super) frames: Vec<(Frame, Moment)>,
+    pub(super) r_peaks: Option<RPeaks>,
+}
+
+impl Inbox {
+    pub(super) fn add(&mut self, new: NewFrame) -> Result<()> {
+        let bad =
+            |field: &str, value: String, problem: String| Error::config(format!("frame: {field}"), value, problem);
+        let pixels = new.width.checked_mul(new.height).filter(|n| *n > 0);
+        if pixels != Some(new.integrals.len()) || new.mask.as_ref().is_some_and(|m| Some(m.len()) != pixels) {
+            let size = format!("{} x {}", new.width, new.height);
+            return Err(bad("size", size, "does not fit its pixels or mask".into()));
+        }
+        if let Some(size) = self.size.filter(|size| *size != (new.width, new.height)) {
+            let problem = format!("earlier frames have {} x {}; all must be of one size", size.0, size.1);
+            return Err(bad("size", format!("{} x {}", new.width, new.height), problem));
+        }
+        if let Some(at) = new.integrals.iter().position(|v| !v.is_finite()) {
+            let pixel = format!("column {}, row {}", at % new.width, at / new.width);
+            return Err(bad("pixels", pixel, format!("{} is no line integral", new.integrals[at])));
+        }
+        match new.moment {
+            Moment::Phase(phase) if phase >= self.options.phases => {
+                let problem = format!("phases go from 0 to {}", self.options.phases - 1);
+                return Err(bad("phase", phase.to_string(), problem));
+            }
+            Moment::TimeS(time) if !time.is_finite() => {
+                return Err(bad("time", time.to_string(), "is not a time in seconds".into()));
+            }
+            _ => (),
+        }
+        let rays =
+            new.geometry.rays(new.width, new.height).map_err(|(field, problem)| bad(&field, String::new(), problem))?;
+        let depth = self.options.depth_half_extent_mm / MM_PER_UNIT;
+        if rays.sod <= depth {
+            let problem = format!("the source stands inside the depth range of {} mm", depth * MM_PER_UNIT);
+            return Err(bad("sod_mm", format!("{:.0}", rays.sod * MM_PER_UNIT), problem));
+        }
+        self.size = Some((new.width, new.height));
+        let view = match self.views.iter().position(|v| v.geometry == new.geometry) {
+            Some(view) => view,
+            None => {
+                self.views.push(View { geometry: new.geometry, rays });
+                self.views.len() - 1
+            }
+        };
+        let frame = Frame {
+            name: format!("frame-{}", self.frames.len()),
+            view,
+            phase: if let Moment::Phase(phase) = new.moment { phase } else { 0 },
+            split: new.split,
+            integrals: new.integrals,
+            mask: new.mask,
+        };
+        self.frames.push((frame, new.moment));
+        Ok(())
+    }
+
+    /// The frames whose phase is known and that `keep` wants.
+    pub(super) fn dataset(&self, keep: impl Fn(&Frame, &[Frame]) -> bool) -> Result<Dataset> {
+        let phase = |moment: Moment| match (moment, &self.r_peaks) {
+            (Moment::Phase(phase), _) => Some(phase),
+            (Moment::TimeS(time), Some(peaks)) => peaks.phase(time, self.options.phases),
+            (Moment::TimeS(_), None) => None,
+        };
+        let known: Vec<Frame> = self
+            .frames
+            .iter()
+            .filter_map(|(frame, moment)| phase(*moment).map(|phase| Frame { phase, ..frame.clone() }))
+            .collect();
+        let mut frames: Vec<Frame> = known.iter().filter(|f| keep(f, &known)).cloned().collect();
+        frames.sort_by_key(|f| f.split);
+        let Some((width, height)) = self.size.filter(|_| !frames.is_empty()) else {
+            let n = self.frames.len();
+            return Err(Error::NotReady(format!(
+                "none of {n} frames can be used: a phase, or a time stamp and R-peaks, is needed, and two phases of a view"
+            )));
+        };
+        let half = self.options.depth_half_extent_mm / MM_PER_UNIT;
+        Ok(Dataset {
+            path: PathBuf::from("session"),
+            layout: Layout::Native,
+            views: self.views.clone(),
+            frames,
+            width,
+            height,
+            n_phases: self.options.phases,
+            depth_range: (-half, half),
+            vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
+        })
+    }
+
+    /// The training frames: with a temporal target, those of views seen at two phases or more.
+    pub(super) fn training_dataset(&self) -> Result<Dataset> {
+        let temporal = self.options.config.loss.dynamic_target == DynamicTarget::Temporal;
+        let dataset = self.dataset(|frame, known| {
+            let beats = |f: &&Frame| f.view == frame.view && f.split == Split::Train && f.phase != frame.phase;
+            frame.split == Split::Train && (!temporal || known.iter().any(|f| beats(&f)))
+        })?;
+        let views = dataset.training_views().len();
+        if temporal && views < 2 {
+            return Err(Error::NotReady(format!("{views} views at two phases or more, where at least two are needed")));
+        }
+        Ok(dataset)
+    }
+}
