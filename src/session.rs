@@ -177,6 +177,7 @@ impl Session {
     /// [`Error::Busy`] while training in the background, [`Error::NotReady`] without frames enough, [`Error::NoDevice`];
     /// [`Error::Diverged`]: the last good state stays; device errors.
     pub fn train(&self, iterations: u32, observe: &mut Observer<'_>) -> Result<u32> {
+        self.not_from_observer()?;
         if lock(&self.worker).as_ref().is_some_and(|w| !w.is_finished()) {
             return Err(Error::Busy("the session is training in the background".into()));
         }
@@ -209,6 +210,7 @@ impl Session {
     /// # Errors
     /// [`Error::Busy`] when it trains already; [`Error::NoDevice`].
     pub fn start(&self, mut observe: Box<dyn FnMut(&Progress) -> bool + Send>) -> Result<()> {
+        self.not_from_observer()?;
         let mut worker = lock(&self.worker);
         if worker.as_ref().is_some_and(|w| !w.is_finished()) {
             return Err(Error::Busy("the session is training in the background already".into()));
@@ -268,15 +270,23 @@ impl Session {
     /// # Errors
     /// [`Error::Busy`] from the observer itself, which ends training by its result instead.
     pub fn stop(&self) -> Result<()> {
-        if lock(&self.shared.control).worker == Some(std::thread::current().id()) {
-            return Err(Error::Busy("an observer ends training by what it returns".into()));
-        }
+        self.not_from_observer()?;
         self.shared.stop.store(true, Ordering::Release);
         drop(lock(&self.shared.control));
         self.shared.changed.notify_all();
-        if let Some(handle) = lock(&self.worker).take() {
+        // Taken out first: nobody else is to wait for the lock while this waits for the worker.
+        let handle = lock(&self.worker).take();
+        if let Some(handle) = handle {
             // A panic of the worker has become its failure.
             let _ = handle.join();
+        }
+        Ok(())
+    }
+
+    /// Refuses what would wait for the very thread it is called from.
+    fn not_from_observer(&self) -> Result<()> {
+        if lock(&self.shared.control).worker == Some(std::thread::current().id()) {
+            return Err(Error::Busy("an observer ends training by what it returns, and begins none".into()));
         }
         Ok(())
     }
@@ -296,10 +306,10 @@ impl Session {
         }
     }
 
-    /// Draws a view through baked volumes, at display rates, also while training; see [`Live::render`].
+    /// Draws a view through baked volumes, at display rates, also while training; see [`crate::output::live::Live::render`].
     ///
     /// # Errors
-    /// [`Error::NotReady`] before anything was trained or loaded; as [`Live::render`].
+    /// [`Error::NotReady`] before anything was trained or loaded; as [`crate::output::live::Live::render`].
     pub fn render(&self, rays: &ViewRays, size: (usize, usize), phase: u32, quantity: Quantity) -> Result<Vec<f32>> {
         self.shared.with_viewer(|live, step| live.render(step, rays, size, phase, quantity))
     }

@@ -416,6 +416,11 @@ unsafe extern "C" fn meddle(_: *const nertca_progress, user: *mut c_void) -> i32
     let r = within.reconstruction;
     assert_eq!(unsafe { nertca_reconstruction_destroy(r) }, NERTCA_ERROR_BUSY);
     assert_eq!(unsafe { nertca_context_destroy(within.context) }, NERTCA_ERROR_BUSY);
+    if std::thread::current().name() == Some("nertca-train") {
+        assert_eq!(nertca_reconstruction_stop(r), NERTCA_ERROR_BUSY);
+        assert_eq!(unsafe { nertca_reconstruction_start(r, None, null_mut()) }, NERTCA_ERROR_BUSY);
+        assert_eq!(unsafe { nertca_reconstruction_train(r, 1, None, null_mut(), null_mut()) }, NERTCA_ERROR_BUSY);
+    }
     drawn(r, &view(0));
     within.seen.fetch_add(1, Ordering::Relaxed);
     i32::from(within.seen.load(Ordering::Relaxed) >= 3)

@@ -99,7 +99,19 @@ impl Walker<'_> {
         // Types nobody knows have long lengths, as the newer ones do.
         const SHORT: &[u8] = b"AE AS AT CS DA DS DT FL FD IS LO LT PN SH SL SS ST TM UI UL US";
         if SHORT.chunks(3).any(|known| known[..2] == kind[..]) {
-            return Ok((group, element, self.u16()?.into()));
+            let length = self.u16()?;
+            // Of a value that ends inside a number, the rest would be taken for the next element.
+            let number = match &kind[..] {
+                b"FD" => 8,
+                b"AT" | b"FL" | b"SL" | b"UL" => 4,
+                b"SS" | b"US" => 2,
+                _ => 1,
+            };
+            if length % number != 0 {
+                let problem = format!("{length} bytes hold no whole numbers of {number} bytes");
+                return Err(Error::data(self.path, format!("({group:04X},{element:04X})"), problem));
+            }
+            return Ok((group, element, length.into()));
         }
         self.take(2)?;
         Ok((group, element, self.u32()?))

@@ -77,7 +77,7 @@ impl Gpu {
     }
 
     /// As [`Gpu::pipeline`], with subgroups of the device's default size, all of them full: for cooperative matrices,
-    /// which only devices with [`super::device::DeviceInfo::matrices`] have.
+    /// which only devices with [`super::capabilities::DeviceInfo::matrices`] have.
     ///
     /// # Errors
     /// As [`Gpu::pipeline`].
