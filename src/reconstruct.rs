@@ -156,7 +156,7 @@ pub fn reconstruct(
 ) -> Result<()> {
     let mut trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
-        let plan = Plan::with_scene(&saved.model.config, dataset, saved.model.scene.clone())?;
+        let plan = Plan::new(&saved.model.config, dataset)?.in_scene(saved.model.scene.clone());
         Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
         files::create_directory(options.run)?;

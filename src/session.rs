@@ -18,12 +18,12 @@ use crate::output::live::Source;
 use crate::output::render::Rendering;
 use crate::output::sampled::{Fields, PatientGrid, Quantity};
 use crate::train::checkpoint::Checkpoint;
-use crate::train::trainer::{StepLoss, Trainer};
+use crate::train::trainer::StepLoss;
 use engine::{Control, Shared, nothing_yet};
 use inbox::Inbox;
 pub use inbox::{Moment, NewFrame, SessionOptions};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -75,6 +75,8 @@ pub type Observer<'a> = dyn FnMut(&Progress) -> bool + 'a;
 pub struct Session {
     shared: Arc<Shared>,
     worker: Mutex<Option<JoinHandle<()>>>,
+    /// Held by training in a caller's thread.
+    blocking: Mutex<()>,
 }
 
 impl Session {
@@ -113,6 +115,7 @@ impl Session {
                 pause: AtomicBool::new(false),
             }),
             worker: Mutex::new(None),
+            blocking: Mutex::default(),
         })
     }
 
@@ -174,18 +177,16 @@ impl Session {
     /// the run, or when the observer ends it.
     ///
     /// # Errors
-    /// [`Error::Busy`] while training in the background, [`Error::NotReady`] without frames enough, [`Error::NoDevice`];
+    /// [`Error::Busy`] while it trains already, [`Error::NotReady`] without frames enough, [`Error::NoDevice`];
     /// [`Error::Diverged`]: the last good state stays; device errors.
     pub fn train(&self, iterations: u32, observe: &mut Observer<'_>) -> Result<u32> {
         self.not_from_observer()?;
-        if lock(&self.worker).as_ref().is_some_and(|w| !w.is_finished()) {
-            return Err(Error::Busy("the session is training in the background".into()));
-        }
+        let _alone = self.alone()?;
         let shared = &self.shared;
         let first = {
             let mut engine = shared.visit();
             shared.take_in_frames(&mut engine)?;
-            engine.trainer.as_ref().map_or(0, Trainer::step)
+            engine.step()
         };
         let begin = Instant::now();
         loop {
@@ -194,13 +195,13 @@ impl Session {
                 let length = engine.length();
                 let end = length.min(first.saturating_add(iterations));
                 let progress = shared.advance(&mut engine, end, first, begin)?;
-                (progress, engine.trainer.as_ref().is_none_or(|t| t.step() >= end))
+                (progress, engine.step() >= end)
             };
             let go_on = progress.is_none_or(|p| observe(&p));
             if done || !go_on {
                 let mut engine = shared.visit();
                 shared.drain(&mut engine)?;
-                return Ok(engine.trainer.as_ref().map_or(0, Trainer::step) - first);
+                return Ok(engine.step() - first);
             }
         }
     }
@@ -211,10 +212,8 @@ impl Session {
     /// [`Error::Busy`] when it trains already; [`Error::NoDevice`].
     pub fn start(&self, mut observe: Box<dyn FnMut(&Progress) -> bool + Send>) -> Result<()> {
         self.not_from_observer()?;
+        let _alone = self.alone()?;
         let mut worker = lock(&self.worker);
-        if worker.as_ref().is_some_and(|w| !w.is_finished()) {
-            return Err(Error::Busy("the session is training in the background already".into()));
-        }
         self.shared.device()?;
         let shared = self.shared.clone();
         shared.stop.store(false, Ordering::Release);
@@ -281,6 +280,21 @@ impl Session {
             let _ = handle.join();
         }
         Ok(())
+    }
+
+    /// The right to train, or to change what is trained; refused while someone else has it.
+    fn alone(&self) -> Result<MutexGuard<'_, ()>> {
+        let blocking = match self.blocking.try_lock() {
+            Ok(guard) => guard,
+            Err(TryLockError::Poisoned(guard)) => guard.into_inner(),
+            Err(TryLockError::WouldBlock) => {
+                return Err(Error::Busy("the session is training in another call".into()));
+            }
+        };
+        if lock(&self.worker).as_ref().is_some_and(|w| !w.is_finished()) {
+            return Err(Error::Busy("the session is training in the background already".into()));
+        }
+        Ok(blocking)
     }
 
     /// Refuses what would wait for the very thread it is called from.
@@ -375,11 +389,9 @@ impl Session {
     /// Takes over a checkpoint with its hyper-parameters; training continues from it with the frames of this session.
     ///
     /// # Errors
-    /// [`Error::Busy`] while training in the background; [`Error::Config`] when frames of more phases were added already.
+    /// [`Error::Busy`] while it trains; [`Error::Config`] when frames of more phases were added already.
     pub fn load(&self, checkpoint: Checkpoint) -> Result<()> {
-        if lock(&self.worker).as_ref().is_some_and(|w| !w.is_finished()) {
-            return Err(Error::Busy("the session is training in the background: stop it first".into()));
-        }
+        let _alone = self.alone()?;
         let model = &checkpoint.model;
         let mut engine = self.shared.visit();
         let mut inbox = lock(&self.shared.inbox);

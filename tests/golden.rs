@@ -159,7 +159,7 @@ fn gather(golden: &Golden, plan: &Plan, prefix: &str) -> Vec<f64> {
 fn check(preset: Preset, name: &str) {
     let golden = Golden::open(name);
     let (config, dataset) = (golden.config(preset), golden.dataset());
-    let mut plan = Plan::with_scene(&config, &dataset, golden.scene()).unwrap();
+    let mut plan = Plan::new(&config, &dataset).unwrap().in_scene(golden.scene());
     plan.backgrounds = (0..dataset.views.len())
         .flat_map(|v| {
             let bound = |which: &str| golden.get(&format!("background/{v}/{which}"));

@@ -100,7 +100,7 @@ fn training_repeats_bit_by_bit_resumes_and_follows_f32() {
     let mut parts = start(Layers::Matrices);
     let mut again = run(&mut parts, 47);
     let saved = parts.checkpoint().unwrap();
-    let plan = Plan::with_scene(&config, &dataset, saved.model.scene.clone()).unwrap();
+    let plan = Plan::new(&config, &dataset).unwrap().in_scene(saved.model.scene.clone());
     let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning.clone(), &saved).unwrap();
     again.extend(run(&mut resumed, 120));
     assert_eq!(losses, again, "losses differ between equal runs");
@@ -150,7 +150,7 @@ fn renderings_equal_the_twin() {
     let renderer = Renderer::new(&gpu, &model, tuning).unwrap();
     let view = &dataset.views[2].rays;
     let got = renderer.render(view, 12, 10, 2).unwrap().dynamic_integral;
-    let mut plan = Plan::with_scene(&config, &dataset, model.scene.clone()).unwrap();
+    let mut plan = Plan::new(&config, &dataset).unwrap().in_scene(model.scene.clone());
     plan.setup.jitter = 0;
     plan.setup.n_dynamic_samples = config.march.render_samples;
     let params: Vec<f64> = model.params.iter().map(|v| f64::from(*v)).collect();

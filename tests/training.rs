@@ -83,7 +83,7 @@ fn resuming_on_other_images_is_refused() {
     run(&mut trainer, 4);
     let saved = trainer.checkpoint().unwrap();
     dataset.frames[0].integrals[3] += 0.01;
-    let plan = Plan::with_scene(&saved.model.config, &dataset, saved.model.scene.clone()).unwrap();
+    let plan = Plan::new(&saved.model.config, &dataset).unwrap().in_scene(saved.model.scene.clone());
     let refused = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &saved).err().unwrap().to_string();
     assert!(refused.contains("other images"), "{refused}");
 }
@@ -138,7 +138,7 @@ fn renderings_equal_the_twin() {
         let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
         let view = &dataset.views[2].rays;
         let got = renderer.render(view, 12, 10, 2).unwrap();
-        let mut plan = Plan::with_scene(&config, &dataset, model.scene.clone()).unwrap();
+        let mut plan = Plan::new(&config, &dataset).unwrap().in_scene(model.scene.clone());
         plan.setup.jitter = 0;
         plan.setup.n_static_samples = config.march.render_samples;
         plan.setup.n_dynamic_samples = config.march.render_samples;
@@ -221,7 +221,7 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
     run(&mut trainer, 5);
     let model = trainer.model().unwrap();
     let renderer = Arc::new(Renderer::new(&gpu, &model, tuning(&gpu)).unwrap());
-    let plan = Plan::with_scene(&config, &dataset, model.scene.clone()).unwrap();
+    let plan = Plan::new(&config, &dataset).unwrap().in_scene(model.scene.clone());
     let params: Vec<f64> = model.params.iter().map(|v| f64::from(*v)).collect();
     let s = &plan.setup;
     // Reaches beyond the boxes, is different along each axis, and takes several submits.

@@ -17,7 +17,7 @@ use nertca_vk::data::geometry::{CArm, Geometry};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::model::field::Model;
 use nertca_vk::output::render::Renderer;
-use nertca_vk::output::sampled::{BAKED_CELLS, Baked, Quantity};
+use nertca_vk::output::sampled::{Baked, Quantity};
 use serde::Deserialize;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -25,8 +25,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 const PAGE: &str = include_str!("view.html");
 /// Side of a picture, pixels.
 const SIDES: std::ops::RangeInclusive<usize> = 16..=2048;
-/// Side of a cell of the moving field, world units: finer than a vessel, coarse enough to draw while dragging.
-const CELL: f64 = 0.005;
+/// Side of a cell of the moving field: finer than a vessel, coarse enough to draw while dragging.
+const CELL_MM: f64 = 0.5;
 
 struct Viewer {
     model: Model,
@@ -173,11 +173,7 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
     let gpu = cli.open_device()?;
     let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?);
     eprintln!("preparing {} phases on {} ...", model.layout.phases, gpu.info().name);
-    let scene = &model.scene;
-    let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
-    let moving_cells = ((extent / CELL).ceil() as u32).clamp(48, BAKED_CELLS);
-    // The static field has no detail between the cells of its grid.
-    let baked = Baked::empty(renderer, (2 * model.config.static_field.grid).clamp(32, BAKED_CELLS), moving_cells);
+    let baked = Baked::for_display(renderer, &model, CELL_MM);
     let mut secret = [0u8; 16];
     getrandom::fill(&mut secret).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
     let runtime = tokio::runtime::Builder::new_multi_thread()

@@ -13,8 +13,8 @@ use crate::model::field::Model;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Side of a cell of the moving field, world units: half a millimetre less than a thin vessel.
-const CELL: f64 = 0.008;
+/// Side of a cell of the moving field: finer than a thin vessel, coarse enough to be baked again and again.
+const CELL_MM: f64 = 0.8;
 /// After a refresh that took some time, this many times as long passes before the next.
 const REST: u32 = 4;
 
@@ -45,12 +45,8 @@ impl Live {
     pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
         let model = &source.outline;
         let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
-        let scene = &model.scene;
-        let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
-        let moving_cells = ((extent / CELL).ceil() as u32).clamp(32, super::sampled::BAKED_CELLS);
         Ok(Live {
-            // The static field has no detail between the cells of its grid.
-            baked: Baked::empty(renderer, (2 * model.config.static_field.grid).clamp(32, 192), moving_cells),
+            baked: Baked::for_display(renderer, model, CELL_MM),
             config: model.config.clone(),
             params: source.params.clone(),
             baked_at: vec![0; 1 + model.layout.phases],

@@ -8,6 +8,7 @@ use crate::gpu::record::{Commands, Recording};
 use crate::gpu::volume::Volume;
 use crate::kernels::{dispatch, groups_for};
 use crate::layout::View;
+use crate::model::field::Model;
 use glam::DVec3;
 use half::f16;
 use std::collections::HashMap;
@@ -257,8 +258,18 @@ impl Baked {
         Ok(baked)
     }
 
+    /// Prepares volumes whose moving cells have sides of `cell_mm`, for drawing at display rates; bakes none yet. The
+    /// static field has no detail between the cells of its grid, of which there are two to one of those.
+    pub fn for_display(renderer: Arc<Renderer>, model: &Model, cell_mm: f64) -> Baked {
+        let scene = &model.scene;
+        let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
+        let moving_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(32, BAKED_CELLS);
+        let still_cells = (2 * model.config.static_field.grid).clamp(32, BAKED_CELLS);
+        Self::empty(renderer, still_cells, moving_cells)
+    }
+
     /// Prepares volumes of `still_cells` and `moving_cells` cells along the longest side of each box; bakes none yet.
-    pub fn empty(renderer: Arc<Renderer>, still_cells: u32, moving_cells: u32) -> Baked {
+    fn empty(renderer: Arc<Renderer>, still_cells: u32, moving_cells: u32) -> Baked {
         let s = &renderer.setup;
         let v = |x: f32, y: f32, z: f32| DVec3::new(x.into(), y.into(), z.into());
         let still = Grid::over(

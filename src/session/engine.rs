@@ -73,6 +73,12 @@ pub(super) fn nothing_yet() -> Error {
 }
 
 impl Engine {
+    /// Iterations done.
+    pub(super) fn step(&self) -> u32 {
+        self.trainer.as_ref().map_or(0, Trainer::step)
+    }
+
+    /// Of the run.
     pub(super) fn length(&self) -> u32 {
         self.trainer.as_ref().map_or(0, |t| t.plan().config.train.iterations)
     }
@@ -149,7 +155,7 @@ impl Shared {
         let trainer = match &engine.saved {
             None => Trainer::new(gpu, fresh, &dataset, tuning.clone())?,
             Some(state) => {
-                let plan = Plan::with_scene(&config, &dataset, state.model.scene.clone())?;
+                let plan = fresh.in_scene(state.model.scene.clone());
                 Trainer::carry_on(gpu, plan, &dataset, tuning.clone(), state)?
             }
         };
@@ -166,7 +172,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Keeps the device busy towards `end`.
+    /// Keeps the device busy towards `end`. After an error the last good state is shown, if there is one.
     pub(super) fn advance(
         &self,
         engine: &mut Engine,
@@ -174,16 +180,18 @@ impl Shared {
         first: u32,
         begin: Instant,
     ) -> Result<Option<Progress>> {
+        let advanced = self.try_advance(engine, end, first, begin);
+        if advanced.is_err() {
+            self.fall_back(engine);
+        }
+        advanced
+    }
+
+    fn try_advance(&self, engine: &mut Engine, end: u32, first: u32, begin: Instant) -> Result<Option<Progress>> {
         let (frames, range) = (engine.frames, engine.image_range);
         let Some(trainer) = &mut engine.trainer else { return Ok(None) };
         let before = trainer.step();
-        let losses = match trainer.advance(end) {
-            Ok(losses) => losses,
-            Err(error) => {
-                self.fall_back(engine);
-                return Err(error);
-            }
-        };
+        let losses = trainer.advance(end)?;
         self.step.store(trainer.submitted(), Ordering::Release);
         let config = &trainer.plan().config;
         let every = config.train.checkpoint_every;
@@ -202,15 +210,13 @@ impl Shared {
 
     /// Lets the iterations under way finish.
     pub(super) fn drain(&self, engine: &mut Engine) -> Result<()> {
-        let Some(trainer) = &mut engine.trainer else { return Ok(()) };
-        while trainer.step() < trainer.submitted() {
-            trainer.advance(trainer.submitted())?;
+        while let Some(under_way) = engine.trainer.as_ref().map(Trainer::submitted).filter(|n| engine.step() < *n) {
+            self.advance(engine, under_way, engine.step(), Instant::now())?;
         }
         Ok(())
     }
 
-    /// After a failure, shows the last good state, if there is one.
-    pub(super) fn fall_back(&self, engine: &mut Engine) {
+    fn fall_back(&self, engine: &mut Engine) {
         engine.trainer = None;
         engine.version = 0;
         let source = engine.saved.as_ref().map(|saved| Source { outline: saved.model.clone(), params: None });
@@ -270,11 +276,10 @@ impl Shared {
                 }
             }
             self.set_state(State::Running);
-            let step = engine.trainer.as_ref().map_or(0, Trainer::step);
-            let first = *first.get_or_insert(step);
+            let first = *first.get_or_insert(engine.step());
             let length = engine.length();
             let progress = self.advance(&mut engine, length, first, begin)?;
-            let done = engine.trainer.as_ref().is_none_or(|t| t.step() >= length) && engine.version == version;
+            let done = engine.step() >= length && engine.version == version;
             drop(engine);
             if progress.is_some_and(|p| !observe(&p)) {
                 self.drain(&mut lock(&self.engine))?;

@@ -47,28 +47,6 @@ impl Plan {
         let motion = motion::analyse(dataset, &config.hull);
         let hull = choose_hull(config, dataset, &motion, &mut notes);
         let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
-        Self::assemble(config, dataset, &motion, hull, scene, notes)
-    }
-
-    /// Prepares a run whose scene is known, as when resuming.
-    ///
-    /// # Errors
-    /// As [`Plan::new`].
-    pub fn with_scene(config: &Config, dataset: &Dataset, scene: Scene) -> Result<Plan> {
-        let mut notes = Vec::new();
-        let motion = motion::analyse(dataset, &config.hull);
-        let hull = choose_hull(config, dataset, &motion, &mut notes);
-        Self::assemble(config, dataset, &motion, hull, scene, notes)
-    }
-
-    fn assemble(
-        config: &Config,
-        dataset: &Dataset,
-        motion: &[ViewMotion],
-        hull: Option<Hull>,
-        scene: Scene,
-        notes: Vec<String>,
-    ) -> Result<Plan> {
         let pixels = dataset.n_pixels();
         let training = dataset.training();
         let n_all = training.len() * pixels;
@@ -135,6 +113,19 @@ impl Plan {
             hull,
             notes,
         })
+    }
+
+    /// The same in a scene that is known, as when resuming.
+    pub fn in_scene(self, scene: Scene) -> Plan {
+        let setup = Setup {
+            n_motion_rays: self.setup.n_motion_rays,
+            n_motion_list: self.setup.n_motion_list,
+            n_all_rays: self.setup.n_all_rays,
+            n_pixels: self.setup.n_pixels,
+            image_width: self.setup.image_width,
+            ..scene.setup(&self.config, &self.params, self.hull.as_ref())
+        };
+        Plan { scene, setup, ..self }
     }
 }
 
