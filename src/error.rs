@@ -1,4 +1,4 @@
-//! One error type: a variant per thing a caller can act on, with the exit code of the program.
+//! One error type: a variant per thing a caller can act on.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A hyper-parameter or command-line value is not usable.
+    /// A hyper-parameter or an option is not usable.
     #[error("configuration: {field} = {value}: {problem}")]
     Config {
         /// Name of the key, as written in a TOML file.
@@ -55,8 +55,8 @@ pub enum Error {
     /// The device stopped answering.
     #[error(
         "the Vulkan device was lost during {pass}. The driver may have reset it after a time limit: \
-         try a smaller --set train.iterations_per_submit, another --device, or a newer driver. \
-         The last checkpoint is intact: continue with --resume"
+         try a smaller train.iterations_per_submit, another device, or a newer driver. \
+         The last checkpoint is intact: training can be resumed from it"
     )]
     DeviceLost {
         /// The submit that was in flight.
@@ -65,7 +65,7 @@ pub enum Error {
     /// Memory ran out.
     #[error(
         "out of memory: {object} needs {bytes} bytes ({detail}). Try a smaller \
-         --set train.chunk_samples or train.rays, or another --device"
+         train.chunk_samples or train.rays, or another device"
     )]
     OutOfMemory {
         /// Debug name of the buffer.
@@ -74,11 +74,13 @@ pub enum Error {
         bytes: u64,
         /// The allocator's words.
         detail: String,
+        /// Whether it may fit later: no limit stands against it, others hold the memory.
+        may_pass: bool,
     },
     /// The optimisation produced a value that is not finite, or exploded.
     #[error(
         "training diverged at iteration {step}: {quantity} = {value}. The last good checkpoint is kept. \
-         Try a lower learning rate (--set dynamic.lr=..., static.lr=...) or the `fast` preset"
+         Try a lower learning rate (dynamic.lr, static.lr) or the `fast` preset"
     )]
     Diverged {
         /// Iteration at which it was seen.
@@ -103,16 +105,6 @@ pub enum Error {
 }
 
 impl Error {
-    /// Exit code of the program: 0 ok, 1 failure, 2 usage, 3 no suitable device, 130 interrupted.
-    pub fn exit_code(&self) -> u8 {
-        match self {
-            Error::Config { .. } => 2,
-            Error::NoDevice(_) => 3,
-            Error::Interrupted => 130,
-            _ => 1,
-        }
-    }
-
     /// A [`Error::Data`] for `field` of `file`.
     pub fn data(file: impl AsRef<Path>, field: impl Into<String>, problem: impl Into<String>) -> Self {
         Error::Data { file: file.as_ref().to_path_buf(), field: field.into(), problem: problem.into() }
@@ -135,7 +127,7 @@ impl Error {
         move |code| match code {
             ash::vk::Result::ERROR_DEVICE_LOST => Error::DeviceLost { pass: object },
             ash::vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | ash::vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
-                Error::OutOfMemory { object, bytes: 0, detail: format!("{call}: {code}") }
+                Error::OutOfMemory { object, bytes: 0, detail: format!("{call}: {code}"), may_pass: true }
             }
             code => Error::Vulkan { call, object, code },
         }

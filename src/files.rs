@@ -43,6 +43,14 @@ pub fn write_atomic_with(
     Ok(())
 }
 
+/// A value as indented JSON.
+///
+/// # Errors
+/// [`Error::Internal`] for a value JSON cannot hold.
+pub fn pretty_json(value: &impl serde::Serialize) -> Result<String> {
+    serde_json::to_string_pretty(value).map_err(|e| Error::Internal(e.to_string()))
+}
+
 /// Makes a directory and its parents.
 ///
 /// # Errors

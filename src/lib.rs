@@ -2,30 +2,26 @@
 //!
 //! The way of the data, and where to read it:
 //!
-//! 1. [`data::dataset`]: angiograms with geometry and phase, validated -> line integrals
-//! 2. [`data::motion`]: what moves -> still backgrounds and the motion hull
-//! 3. [`train::plan`]: scales, boxes, schedules -> everything a run needs
-//! 4. [`train::step`]: one iteration, top to bottom: rays -> samples -> fields -> loss -> gradients -> Adam
-//! 5. [`train::trainer`]: many iterations per submit, two submits in flight -> losses
-//! 6. [`train::checkpoint`]: parameters, moments, step, configuration -> one safetensors file
-//! 7. [`output::render`], [`output::eval`]: any pose and phase -> pictures and scores
+//! 1. [`scan`]: angiograms with geometry and phase, validated -> line integrals (`import`, of the feature `dicom`, brings them in)
+//! 2. [`plan`]: what moves -> still backgrounds, the motion hull, scales and boxes: everything a run needs
+//! 3. [`train::step`]: one iteration, top to bottom: rays -> samples -> [`network`] -> loss -> gradients -> Adam
+//! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses
+//! 5. [`model`]: parameters, scales, hull and configuration; [`model::checkpoint`] keeps them in one safetensors file
+//! 6. [`render`]: any pose and phase -> projections and samples of the fields
+//! 7. [`score`] compares them with what was seen, [`export`] hands them to other tools
 //!
-//! [`session`] is a reconstruction in memory that grows with its frames, [`capi`] the same for C.
-//! [`reconstruct`] ties these to a run directory, [`report`] scores it, [`mod@bench`] times it, [`phantom`] makes data to
-//! try them on, [`cpu`] holds an f64 twin of every stage, and [`gpu`] is Vulkan without any knowledge of angiography.
+//! [`run`] ties these to a run directory, [`session`] is a reconstruction in memory that grows with its frames, and
+//! [`capi`] the same for C. [`mod@bench`] times the engine, [`phantom`] makes data to try it on, and [`reference`] holds an
+//! f64 twin of every compute stage, for tests. Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
+//! without any knowledge of angiography. Modules use only what stands above them in this file.
+//!
 //! Public functions speak mm and degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
 
-pub mod bench;
-pub mod calibrate;
-pub mod config;
+pub mod choice;
 pub mod error;
 pub mod files;
-pub mod kernels;
-pub mod layout;
-pub mod reconstruct;
-pub mod report;
-pub mod schedule;
-pub mod session;
+pub mod random;
+pub mod raster;
 
 /// Vulkan compute, free of any knowledge of angiography.
 pub mod gpu {
@@ -37,63 +33,88 @@ pub mod gpu {
     pub mod volume;
 }
 
-/// What comes in: geometry, angiograms, volumes, and what moves in them.
-pub mod data {
-    pub mod dataset;
-    pub mod dicom;
-    mod dicom_lengths;
-    pub mod ecg;
-    pub mod gating;
-    pub mod geometry;
+pub mod config;
+
+/// The compute stages.
+pub mod kernels {
+    pub mod dispatch;
+    pub mod layout;
+    pub mod stages;
+    pub mod tuning;
+}
+
+pub mod geometry;
+
+/// Files that other tools read and write.
+pub mod formats {
     pub mod images;
-    pub mod import;
-    pub mod motion;
-    pub mod nerfca;
     pub mod volume;
+}
+
+/// Angiograms with their geometry and phase.
+pub mod scan {
+    pub mod dataset;
+    pub mod gating;
+    pub mod nerfca;
     pub mod writer;
 }
 
-/// The fields: their parameters, and the scene they live in.
-pub mod model {
-    pub mod field;
-    pub mod params;
-    pub mod scene;
+/// Clinical runs -> a dataset.
+#[cfg(feature = "dicom")]
+pub mod import {
+    pub mod angiograms;
+    pub mod dicom;
+    pub mod ecg;
+    mod lengths;
 }
 
-/// f64 twins of the compute stages: plain loops, no device.
-pub mod cpu {
-    pub mod field;
-    pub mod march;
-    pub mod occupancy;
-    pub mod projector;
-    pub mod random;
-    pub mod step;
+pub mod model;
+pub mod network;
+pub mod plan;
+
+/// Drawing a model, for any pose and phase.
+pub mod render {
+    pub mod baked;
+    pub mod grid;
+    pub mod live;
+    pub mod quantity;
+    pub mod renderer;
+    pub mod sample;
 }
 
 /// From a plan to a checkpoint.
 pub mod train {
-    pub mod checkpoint;
-    pub mod fused;
-    pub mod layers;
-    pub mod network;
-    pub mod plan;
+    pub mod calibrate;
     pub mod step;
+    pub mod timing;
     pub mod trainer;
+    pub mod training;
 }
 
-/// What goes out: renderings, scores, pictures, projections of volumes.
-pub mod output {
+/// What a reconstruction is worth.
+pub mod score {
     pub mod eval;
-    pub mod export;
-    pub mod live;
-    pub mod mesh;
     pub mod metrics;
-    pub mod page;
     pub mod pictures;
-    pub mod projector;
-    pub mod render;
-    pub mod sampled;
 }
+
+/// A model for other tools: volumes and surfaces.
+pub mod export {
+    pub mod surfaces;
+    pub mod volumes;
+}
+
+/// One run, from a dataset to a run directory.
+pub mod run {
+    pub mod events;
+    pub mod info;
+    mod log;
+    pub mod reconstruct;
+    pub mod score;
+    mod snapshots;
+}
+
+pub mod session;
 
 /// The C ABI: `include/nertca_vk.h` is generated from here.
 #[allow(non_camel_case_types, reason = "types have the names they have in C")]
@@ -113,6 +134,18 @@ pub mod capi {
 /// Synthetic data with exact truth.
 pub mod phantom {
     pub mod dataset;
+    pub mod projector;
     pub mod tree;
     pub mod voxels;
+}
+
+pub mod bench;
+
+/// f64 twins of the compute stages: plain loops, no device. For tests; nothing else uses them.
+pub mod reference {
+    pub mod field;
+    pub mod march;
+    pub mod occupancy;
+    pub mod projector;
+    pub mod step;
 }

@@ -13,8 +13,14 @@ mod cli {
     pub mod bench;
     pub mod data;
     pub mod devices;
+    pub mod eval;
+    pub mod exit;
     pub mod export;
-    pub mod results;
+    pub mod frame_rates;
+    pub mod info;
+    pub mod page;
+    pub mod render;
+    pub mod report;
     pub mod train;
     pub mod view;
 }
@@ -36,20 +42,23 @@ fn main() -> ExitCode {
         Command::Project(args) => cli::data::project(&cli, args),
         Command::Import(args) => cli::data::import(args),
         Command::Train(args) => cli::train::run(&cli, args),
-        Command::Eval(args) => cli::results::eval(&cli, args),
-        Command::Render(args) => cli::results::render(&cli, args),
+        Command::Eval(args) => cli::eval::eval(&cli, args),
+        Command::Render(args) => cli::render::render(&cli, args),
         Command::View(args) => cli::view::view(&cli, args),
         Command::Export(args) => cli::export::export(&cli, args),
         Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),
-        Command::Info(args) => cli::results::info(args),
+        Command::Info(args) => cli::info::info(args),
         Command::Completions(args) => cli::devices::completions(args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("nertca-vk: {error}");
-            ExitCode::from(error.exit_code())
+            if let Some(hint) = cli::exit::hint(&error) {
+                eprintln!("nertca-vk: {hint}");
+            }
+            ExitCode::from(cli::exit::code(&error))
         }
     }
 }

@@ -7,17 +7,19 @@
 mod engine;
 mod inbox;
 
-use crate::data::gating::RPeaks;
-use crate::data::geometry::{MM_PER_UNIT, ViewRays};
 use crate::error::{Error, Result};
+use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::Buffer;
-use crate::kernels::Tuning;
-use crate::output::eval::{Evaluation, evaluate};
-use crate::output::live::Source;
-use crate::output::render::Rendering;
-use crate::output::sampled::{Fields, PatientGrid, Quantity};
-use crate::train::checkpoint::Checkpoint;
+use crate::kernels::tuning::Tuning;
+use crate::model::checkpoint::Checkpoint;
+use crate::model::component::Component;
+use crate::render::grid::PatientGrid;
+use crate::render::live::Source;
+use crate::render::quantity::Quantity;
+use crate::render::renderer::Rendering;
+use crate::scan::gating::RPeaks;
+use crate::score::eval::{Evaluation, evaluate};
 use crate::train::trainer::StepLoss;
 use engine::{Control, Shared, nothing_yet};
 use inbox::Inbox;
@@ -186,15 +188,15 @@ impl Session {
         let first = {
             let mut engine = shared.visit();
             shared.take_in_frames(&mut engine)?;
+            engine.start_clock();
             engine.step()
         };
-        let begin = Instant::now();
         loop {
             let (progress, done) = {
                 let mut engine = shared.visit();
                 let length = engine.length();
                 let end = length.min(first.saturating_add(iterations));
-                let progress = shared.advance(&mut engine, end, first, begin)?;
+                let progress = shared.advance(&mut engine, end)?;
                 (progress, engine.step() >= end)
             };
             let go_on = progress.is_none_or(|p| observe(&p));
@@ -320,10 +322,10 @@ impl Session {
         }
     }
 
-    /// Draws a view through baked volumes, at display rates, also while training; see [`crate::output::live::Live::render`].
+    /// Draws a view through baked volumes, at display rates, also while training; see [`crate::render::live::Live::render`].
     ///
     /// # Errors
-    /// [`Error::NotReady`] before anything was trained or loaded; as [`crate::output::live::Live::render`].
+    /// [`Error::NotReady`] before anything was trained or loaded; as [`crate::render::live::Live::render`].
     pub fn render(&self, rays: &ViewRays, size: (usize, usize), phase: u32, quantity: Quantity) -> Result<Vec<f32>> {
         self.shared.with_viewer(|live, step| live.render(step, rays, size, phase, quantity))
     }
@@ -351,12 +353,12 @@ impl Session {
         self.shared.with_viewer(|live, step| live.render_fields(step, rays, size, phase))
     }
 
-    /// Attenuation per mm at the points of a grid.
+    /// Attenuation per mm at the points of a grid, of a component at a phase.
     ///
     /// # Errors
-    /// As [`Session::render`] and [`crate::output::render::Renderer::sample_patient`].
-    pub fn sample(&self, fields: Fields, grid: &PatientGrid) -> Result<Vec<f32>> {
-        self.shared.with_viewer(|live, step| live.renderer(step)?.sample_patient(fields, grid))
+    /// As [`Session::render`] and [`crate::render::renderer::Renderer::sample_patient`].
+    pub fn sample(&self, component: Component, phase: u32, grid: &PatientGrid) -> Result<Vec<f32>> {
+        self.shared.with_viewer(|live, step| live.renderer(step)?.sample_patient(component, phase, grid))
     }
 
     /// Scores the frames that were added for validation. `threshold_per_mm` replaces the rule for the Dice threshold.
@@ -379,8 +381,8 @@ impl Session {
     pub fn checkpoint(&self) -> Result<Checkpoint> {
         let mut engine = self.shared.visit();
         let engine = &mut *engine;
-        match (&mut engine.trainer, &engine.saved) {
-            (Some(trainer), _) => trainer.checkpoint(),
+        match (&mut engine.training, &engine.saved) {
+            (Some(training), _) => training.trainer_mut().checkpoint(),
             (None, Some(saved)) => Ok(saved.clone()),
             (None, None) => Err(nothing_yet()),
         }
@@ -402,7 +404,7 @@ impl Session {
         }
         inbox.options.phases = phases;
         inbox.options.config = model.config.clone();
-        engine.trainer = None;
+        engine.training = None;
         engine.version = 0;
         self.shared.publish(Source { outline: model.clone(), params: None });
         self.shared.step.store(model.step, Ordering::Release);

@@ -6,12 +6,12 @@ mod common;
 
 use common::{expect_silence, gpu, relative_error, tuning};
 use nertca_vk::config::{Config, Preset};
-use nertca_vk::cpu::field::Precision;
-use nertca_vk::cpu::{march, step};
-use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
-use nertca_vk::data::geometry::{CArm, Geometry};
+use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::model::scene::Scene;
-use nertca_vk::train::plan::Plan;
+use nertca_vk::plan::Plan;
+use nertca_vk::reference::field::Precision;
+use nertca_vk::reference::{march, step};
+use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::train::trainer::Trainer;
 use safetensors::SafeTensors;
 use serde_json::Value;

@@ -6,9 +6,10 @@ mod common;
 
 use common::{small_config, small_dataset};
 use glam::DVec3;
-use nertca_vk::cpu::field::Precision;
-use nertca_vk::cpu::{field, march, random, step};
-use nertca_vk::train::plan::Plan;
+use nertca_vk::plan::Plan;
+use nertca_vk::random;
+use nertca_vk::reference::field::{self, Precision};
+use nertca_vk::reference::{march, step};
 
 fn plan(preset: &str, settings: &[&str]) -> Plan {
     Plan::new(&small_config(preset, settings), &small_dataset(9, 8)).unwrap()

@@ -88,7 +88,7 @@ fn a_whole_life() {
         ok(&[&["render", text(&run), "--primary", "-20", "--secondary", "12.5", "-o", text(&out)], extra].concat());
         assert!(out.metadata().unwrap().len() > 100);
     }
-    let npy = nertca_vk::data::images::read_npy(&directory.path().join("a.npy")).unwrap();
+    let npy = nertca_vk::formats::images::read_npy(&directory.path().join("a.npy")).unwrap();
     assert_eq!(npy.0, [3, 24, 24]);
     assert!(ok(&["info", text(&run)]).contains("step: 30"));
     assert!(ok(&["info", text(&data)]).contains("phases: 3"));
@@ -126,8 +126,8 @@ fn both_layouts_hold_the_same_data() {
     let list = authors.join("train-0.json");
     let moved = std::fs::read_to_string(&list).unwrap().replace("\"train-view", "\"/gone/elsewhere/train-view");
     std::fs::write(&list, moved).unwrap();
-    let a = nertca_vk::data::dataset::Dataset::open(&native).unwrap();
-    let b = nertca_vk::data::dataset::Dataset::open(&authors).unwrap();
+    let a = nertca_vk::scan::dataset::Dataset::open(&native).unwrap();
+    let b = nertca_vk::scan::dataset::Dataset::open(&authors).unwrap();
     assert_eq!((a.frames.len(), a.width, a.n_phases), (b.frames.len(), b.width, b.n_phases));
     for (x, y) in a.frames.iter().zip(&b.frames) {
         assert_eq!((x.phase, x.split, &x.mask), (y.phase, y.split, &y.mask));
@@ -164,7 +164,7 @@ fn real_anatomy_makes_a_dataset() {
         "3",
         "--no-volumes",
     ]);
-    let dataset = nertca_vk::data::dataset::Dataset::open(&out).unwrap();
+    let dataset = nertca_vk::scan::dataset::Dataset::open(&out).unwrap();
     let deepest = dataset.frames[0].integrals.iter().copied().fold(0f32, f32::max);
     assert!((2.0..12.0).contains(&deepest), "a chest attenuates e^-2 to e^-12, not e^-{deepest}");
     assert!(dataset.frames.iter().all(|f| f.mask.as_ref().unwrap().iter().any(|m| *m)));
@@ -175,11 +175,11 @@ fn volumes_are_projected_in_every_format() {
     let directory = tempfile::tempdir().unwrap();
     let values: Vec<f32> = (0..16 * 16 * 16).map(|i| if (i % 16) > 8 { 0.02 } else { 0.001 }).collect();
     let npy = directory.path().join("v.npy");
-    nertca_vk::data::images::write_npy(&npy, &[16, 16, 16], &values).unwrap();
+    nertca_vk::formats::images::write_npy(&npy, &[16, 16, 16], &values).unwrap();
     let raw = directory.path().join("v.bin");
     std::fs::write(&raw, values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>()).unwrap();
     let nrrd = directory.path().join("v.nrrd");
-    nertca_vk::data::volume::Volume::centred([16; 3], 4.0, glam::DVec3::ZERO, values).write_nrrd(&nrrd).unwrap();
+    nertca_vk::formats::volume::Volume::centred([16; 3], 4.0, glam::DVec3::ZERO, values).write_nrrd(&nrrd).unwrap();
     let common = ["--size", "16", "--views", "3", "--fov", "80", "--vessel", "0.015"];
     let mut images = Vec::new();
     for (name, file, extra) in [
@@ -189,7 +189,7 @@ fn volumes_are_projected_in_every_format() {
     ] {
         let out = directory.path().join(name);
         ok(&[&["project", text(file), text(file), "--out", text(&out)], &common[..], extra].concat());
-        images.push(nertca_vk::data::dataset::Dataset::open(&out).unwrap().frames[0].integrals.clone());
+        images.push(nertca_vk::scan::dataset::Dataset::open(&out).unwrap().frames[0].integrals.clone());
     }
     assert_eq!(images[0], images[1]);
     assert_eq!(images[0], images[2]);
@@ -212,7 +212,7 @@ fn spoiled(directory: &Path, name: &str, spoil: impl FnOnce(&Path, &mut Value)) 
         })
     };
     for phase in 0..2 {
-        nertca_vk::data::images::write_npy(&data.join(format!("{phase}.npy")), &[4, 5], &[0.5; 20]).unwrap();
+        nertca_vk::formats::images::write_npy(&data.join(format!("{phase}.npy")), &[4, 5], &[0.5; 20]).unwrap();
     }
     let mut manifest = json!({
         "format": "nertca-dataset", "version": 1, "phases": 2, "depth_half_extent_mm": 100.0, "frames": [frame(0), frame(1)],
@@ -237,17 +237,17 @@ fn malformed_datasets_are_named_file_and_field() {
         ("empty image", |d, _| std::fs::write(d.join("1.npy"), b"").unwrap(), &["1.npy"]),
         (
             "wrong shape",
-            |d, _| nertca_vk::data::images::write_npy(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(),
+            |d, _| nertca_vk::formats::images::write_npy(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(),
             &["1.npy", "shape"],
         ),
         (
             "three axes",
-            |d, _| nertca_vk::data::images::write_npy(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(),
+            |d, _| nertca_vk::formats::images::write_npy(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(),
             &["1.npy", "two axes"],
         ),
         (
             "not a number",
-            |d, _| nertca_vk::data::images::write_npy(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(),
+            |d, _| nertca_vk::formats::images::write_npy(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(),
             &["1.npy", "row 0"],
         ),
         ("phase", |_, m| m["frames"][1]["phase"] = json!(2), &["dataset.json", "frames[1].phase"]),
@@ -279,7 +279,7 @@ fn malformed_datasets_are_named_file_and_field() {
         (
             "mask size",
             |d, m| {
-                nertca_vk::data::images::write_npy(&d.join("m.npy"), &[2, 2], &[1.0; 4]).unwrap();
+                nertca_vk::formats::images::write_npy(&d.join("m.npy"), &[2, 2], &[1.0; 4]).unwrap();
                 m["frames"][0]["mask"] = json!("m.npy")
             },
             &["m.npy", "shape"],
@@ -345,8 +345,8 @@ fn ctrl_c_saves_and_exits_130() {
     Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     lines.for_each(drop);
     assert_eq!(child.wait().unwrap().code(), Some(130));
-    let saved = nertca_vk::train::checkpoint::newest(&run).unwrap();
-    assert!(nertca_vk::train::checkpoint::Checkpoint::read(&saved).unwrap().model.step > 0);
+    let saved = nertca_vk::model::checkpoint::newest(&run).unwrap();
+    assert!(nertca_vk::model::checkpoint::Checkpoint::read(&saved).unwrap().model.step > 0);
 }
 
 #[test]

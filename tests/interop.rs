@@ -80,8 +80,10 @@ fn exports_open_in_the_tools_people_use() {
     std::fs::copy(run.join("checkpoint-0000150.safetensors"), to("checkpoint.safetensors")).unwrap();
     std::fs::copy(run.join("report/evaluation.json"), to("evaluation.json")).unwrap();
     // What the files must say is asked of the library itself.
-    let model = nertca_vk::train::checkpoint::Checkpoint::read(&to("checkpoint.safetensors")).unwrap().model;
-    let grid = nertca_vk::output::export::grid_over(&model.scene, false, 1.5).unwrap();
+    let model = nertca_vk::model::checkpoint::Checkpoint::read(&to("checkpoint.safetensors")).unwrap().model;
+    let grid =
+        nertca_vk::export::volumes::grid_over(&model.scene, nertca_vk::model::component::Component::Dynamic, 1.5)
+            .unwrap();
     let expected = serde_json::json!({
         "origin_mm": grid.origin_mm.to_array(), "spacing_mm": grid.spacing_mm.to_array(), "size": grid.size,
         "phases": 3, "iso_per_mm": iso,
@@ -123,11 +125,11 @@ fn datasets_convert_both_ways() {
     let (theirs, ours) = (dir.path().join("theirs"), dir.path().join("ours"));
     ok(&["convert", text(data), "--layout", "nerfca", "-o", text(&theirs)]);
     ok(&["convert", text(&theirs), "--layout", "native", "-o", text(&ours)]);
-    let [first, last] = [data, &ours].map(|p| nertca_vk::data::dataset::Dataset::open(p).unwrap());
+    let [first, last] = [data, &ours].map(|p| nertca_vk::scan::dataset::Dataset::open(p).unwrap());
     assert_eq!((first.frames.len(), first.n_phases, first.width), (last.frames.len(), last.n_phases, last.width));
     for frame in &first.frames {
         let angles = first.views[frame.view].geometry.angles_deg();
-        let same = |f: &&nertca_vk::data::dataset::Frame| {
+        let same = |f: &&nertca_vk::scan::dataset::Frame| {
             f.phase == frame.phase && f.split == frame.split && last.views[f.view].geometry.angles_deg() == angles
         };
         let other = last.frames.iter().find(same).expect("the same view at the same phase");
@@ -265,7 +267,7 @@ fn dicom_runs_get_phases_and_lose_their_patient() {
     let run = |args: &[String]| nertca(&args.iter().map(String::as_str).collect::<Vec<_>>());
     // 100 beats per minute: 0.6 s, six frames of 0.1 s.
     assert!(run(&import(&["--phases", "6", "--heart-rate", "100"])).status.success());
-    let dataset = nertca_vk::data::dataset::Dataset::open(&out).unwrap();
+    let dataset = nertca_vk::scan::dataset::Dataset::open(&out).unwrap();
     assert_eq!((dataset.n_phases, dataset.training().len(), dataset.width), (6, 12, 64));
     let frame = dataset.training().iter().find(|f| f.phase == 2 && f.view == 0).unwrap();
     let row = &frame.integrals[30 * 64..31 * 64];
@@ -278,7 +280,7 @@ fn dicom_runs_get_phases_and_lose_their_patient() {
     let mut args = import(&["--phases", "6", "--phase-list", text(&list)]);
     args[5] = text(&again).to_owned();
     assert!(run(&args).status.success());
-    for (a, b) in nertca_vk::data::dataset::Dataset::open(&again).unwrap().frames.iter().zip(&dataset.frames) {
+    for (a, b) in nertca_vk::scan::dataset::Dataset::open(&again).unwrap().frames.iter().zip(&dataset.frames) {
         assert_eq!((a.phase, &a.integrals), (b.phase, &b.integrals));
     }
     let manifest = std::fs::read_to_string(out.join("dataset.json")).unwrap();

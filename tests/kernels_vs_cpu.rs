@@ -4,12 +4,12 @@
 mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
-use nertca_vk::cpu::field::Precision;
-use nertca_vk::cpu::{march, occupancy, step};
 use nertca_vk::gpu::memory::Operands;
-use nertca_vk::kernels::{Layers, MatrixTuning, Tuning};
-use nertca_vk::layout::Ray;
-use nertca_vk::train::plan::Plan;
+use nertca_vk::kernels::layout::Ray;
+use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
+use nertca_vk::plan::Plan;
+use nertca_vk::reference::field::Precision;
+use nertca_vk::reference::{march, occupancy, step};
 use nertca_vk::train::trainer::Trainer;
 
 /// Presets and variations whose gradients are checked. Each covers a branch the others do not.
@@ -70,6 +70,7 @@ fn paths() -> [Tuning; 3] {
         matrices: MatrixTuning { workgroups: 1, largest_tile: 16, unroll: false },
         private_line_bytes,
         chunk_samples: 1 << 16,
+        iterations_per_submit: None,
         overlap: false,
         reasons: Vec::new(),
     };

@@ -8,13 +8,13 @@ mod common;
 mod dicom;
 
 use glam::DVec3;
-use nertca_vk::data::dataset::Dataset;
-use nertca_vk::data::ecg;
-use nertca_vk::data::images;
-use nertca_vk::data::volume::{Volume, VolumeHints};
+use nertca_vk::formats::images;
+use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::train::checkpoint::Checkpoint;
-use nertca_vk::train::plan::Plan;
+use nertca_vk::import::ecg;
+use nertca_vk::model::checkpoint::Checkpoint;
+use nertca_vk::plan::Plan;
+use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::{Path, PathBuf};
@@ -211,14 +211,14 @@ fn npy_volumes_and_images() {
 }
 
 /// A dataset on disk, small.
-fn dataset(layout: nertca_vk::data::dataset::Layout) -> (tempfile::TempDir, PathBuf) {
+fn dataset(layout: nertca_vk::scan::dataset::Layout) -> (tempfile::TempDir, PathBuf) {
     let dir = scratch();
     let out = dir.path().join("data");
-    nertca_vk::data::writer::convert(&common::small_dataset(8, 8), layout, &out).unwrap();
+    nertca_vk::scan::writer::convert(&common::small_dataset(8, 8), layout, &out).unwrap();
     (dir, out)
 }
 
-fn feed_dataset(layout: nertca_vk::data::dataset::Layout, manifest: &str) {
+fn feed_dataset(layout: nertca_vk::scan::dataset::Layout, manifest: &str) {
     let (_dir, out) = dataset(layout);
     let seed = std::fs::read(out.join(manifest)).unwrap();
     feed(manifest, &[seed], |path| {
@@ -229,17 +229,17 @@ fn feed_dataset(layout: nertca_vk::data::dataset::Layout, manifest: &str) {
 
 #[test]
 fn manifests() {
-    feed_dataset(nertca_vk::data::dataset::Layout::Native, "dataset.json");
+    feed_dataset(nertca_vk::scan::dataset::Layout::Native, "dataset.json");
 }
 
 #[test]
 fn the_authors_geometry() {
-    feed_dataset(nertca_vk::data::dataset::Layout::Nerfca, "general.json");
+    feed_dataset(nertca_vk::scan::dataset::Layout::Nerfca, "general.json");
 }
 
 #[test]
 fn the_authors_frames() {
-    feed_dataset(nertca_vk::data::dataset::Layout::Nerfca, "train-0.json");
+    feed_dataset(nertca_vk::scan::dataset::Layout::Nerfca, "train-0.json");
 }
 
 #[test]
@@ -260,7 +260,7 @@ fn angiograms() {
     let dir = scratch();
     let file = dir.path().join("a.dcm");
     dicom::angiogram(&file, |_| ());
-    feed("a.dcm", &[std::fs::read(&file).unwrap()], |p| nertca_vk::data::dicom::Run::read(p, None).is_ok());
+    feed("a.dcm", &[std::fs::read(&file).unwrap()], |p| nertca_vk::import::dicom::Run::read(p, None).is_ok());
 }
 
 #[test]

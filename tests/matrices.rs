@@ -6,15 +6,15 @@
 mod common;
 
 use common::{expect_silence, gpu, relative_error, run, small_config, small_dataset};
-use nertca_vk::calibrate;
-use nertca_vk::cpu::field::Precision;
-use nertca_vk::cpu::{march, step};
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::kernels::{Layers, MatrixTuning, Tuning};
-use nertca_vk::layout::DeviceState;
-use nertca_vk::output::render::Renderer;
-use nertca_vk::train::network::FIRST_LOSS_SCALE;
-use nertca_vk::train::plan::Plan;
+use nertca_vk::kernels::layout::DeviceState;
+use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
+use nertca_vk::network::FIRST_LOSS_SCALE;
+use nertca_vk::plan::Plan;
+use nertca_vk::reference::field::Precision;
+use nertca_vk::reference::{march, step};
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::train::calibrate;
 use nertca_vk::train::trainer::Trainer;
 
 /// The twin rounds where the kernels round.

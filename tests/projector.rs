@@ -5,10 +5,10 @@ mod common;
 
 use common::{expect_silence, gpu, relative_error};
 use glam::{DAffine3, DMat3, DVec3};
-use nertca_vk::cpu::projector::project_pixel;
-use nertca_vk::data::geometry::{CArm, Geometry};
-use nertca_vk::data::volume::Volume;
-use nertca_vk::output::projector::Projector;
+use nertca_vk::formats::volume::Volume;
+use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::phantom::projector::Projector;
+use nertca_vk::reference::projector::project_pixel;
 
 #[test]
 fn device_and_f64_projector_agree() {

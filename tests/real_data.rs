@@ -3,13 +3,13 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 use nertca_vk::config::{Config, Preset};
-use nertca_vk::data::dataset::Dataset;
-use nertca_vk::data::import::{Gating, ImportOptions, import_dicom};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::kernels::Tuning;
-use nertca_vk::output::metrics::otsu;
-use nertca_vk::output::render::Renderer;
-use nertca_vk::train::plan::Plan;
+use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
+use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::plan::Plan;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::metrics::otsu;
 use nertca_vk::train::trainer::Trainer;
 use std::path::PathBuf;
 

@@ -4,15 +4,19 @@
 mod common;
 
 use common::{expect_silence, gpu, relative_error, run, small_config, small_dataset, tuning};
-use nertca_vk::cpu::field::Precision;
-use nertca_vk::cpu::{field, march};
 use nertca_vk::error::Error;
-use nertca_vk::kernels::Tuning;
-use nertca_vk::output::render::Renderer;
-use nertca_vk::output::sampled::{Baked, Field, Grid, Quantity};
-use nertca_vk::reconstruct::{Event, RunOptions, reconstruct};
-use nertca_vk::train::checkpoint::{self, Checkpoint};
-use nertca_vk::train::plan::Plan;
+use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::model::checkpoint::{self, Checkpoint};
+use nertca_vk::model::component::Component;
+use nertca_vk::plan::Plan;
+use nertca_vk::reference::field::{self, Precision};
+use nertca_vk::reference::march;
+use nertca_vk::render::baked::Baked;
+use nertca_vk::render::grid::Grid;
+use nertca_vk::render::quantity::{Projection, Quantity};
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::run::events::Event;
+use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::train::trainer::Trainer;
 use std::path::Path;
 use std::sync::Arc;
@@ -152,7 +156,9 @@ fn renderings_equal_the_twin() {
             d.push(seen.dynamic_integral);
             most.push(seen.dynamics.iter().fold(0.0, |m: f64, x| {
                 let gain = f64::from(plan.setup.dynamic_gain);
-                m.max(gain * nertca_vk::cpu::field::softplus(x.trace.feature + f64::from(plan.setup.dynamic_shift)))
+                m.max(
+                    gain * nertca_vk::reference::field::softplus(x.trace.feature + f64::from(plan.setup.dynamic_shift)),
+                )
             }));
         }
         for (name, got, want) in [
@@ -230,15 +236,18 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
         spacing: glam::DVec3::new(0.05, 0.1, 0.07),
         size: [43, 9, 11],
     };
-    for field in [Field::Static, Field::Dynamic(2)] {
-        let got = renderer.sample(field, &grid).unwrap();
+    let phase = 2;
+    for field in [Component::Static, Component::Dynamic] {
+        let got = renderer.sample(field, phase, &grid).unwrap();
         let mut want = Vec::new();
         for i in 0..grid.len() {
             let at = glam::DVec3::new((i % 43) as f64, (i / 43 % 9) as f64, (i / (43 * 9)) as f64);
             let x = grid.origin + at * grid.spacing;
             want.push(match field {
-                Field::Static if field::static_inside(s, x) => field::static_attenuation(s, &plan.params, &params, x),
-                Field::Dynamic(phase) if march::dynamic_inside(&plan, x, phase as usize) => {
+                Component::Static if field::static_inside(s, x) => {
+                    field::static_attenuation(s, &plan.params, &params, x)
+                }
+                Component::Dynamic if march::dynamic_inside(&plan, x, phase as usize) => {
                     let window = config.schedule(model.step).window;
                     let encoded = field::encode(s, window.into(), x);
                     let trace = field::network_fwd(&plan.params, &params, &encoded, phase as usize, Precision::Exact);
@@ -254,26 +263,24 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
     let baked = Baked::new(renderer.clone(), 96).unwrap();
     let view = &dataset.views[1].rays;
     let exact = renderer.render(view, 24, 20, 1).unwrap();
-    let show = |with_static, with_dynamic, maximum| {
-        baked.render(view, 24, 20, 1, Quantity { with_static, with_dynamic, maximum }).unwrap()
-    };
+    let show = |component, projection| baked.render(view, 24, 20, 1, Quantity { component, projection }).unwrap();
+    let (drr, mip) = (Projection::Drr, Projection::Mip);
     for (name, got, want, limit) in [
-        ("static", show(true, false, false), exact.static_integral.clone(), 1e-2),
-        ("dynamic", show(false, true, false), exact.dynamic_integral.clone(), 2e-2),
-        ("total", show(true, true, false), exact.total_integral(), 1e-2),
-        ("static maximum", show(true, false, true), exact.static_max.clone(), 2e-2),
-        ("dynamic maximum", show(false, true, true), exact.dynamic_max.clone(), 2e-2),
+        ("static", show(Component::Static, drr), exact.static_integral.clone(), 1e-2),
+        ("dynamic", show(Component::Dynamic, drr), exact.dynamic_integral.clone(), 2e-2),
+        ("total", show(Component::Total, drr), exact.total_integral(), 1e-2),
+        ("static maximum", show(Component::Static, mip), exact.static_max.clone(), 2e-2),
+        ("dynamic maximum", show(Component::Dynamic, mip), exact.dynamic_max.clone(), 2e-2),
     ] {
         let want: Vec<f64> = want.iter().map(|v| f64::from(*v)).collect();
         let norm = want.iter().map(|w| w * w).sum::<f64>();
         let off = got.iter().zip(&want).map(|(g, w)| (f64::from(*g) - w).powi(2)).sum::<f64>();
         assert!(norm > 0.0 && (off / norm).sqrt() < limit, "{name}: {:.1e} off", (off / norm).sqrt());
     }
-    assert!(show(false, false, false).iter().all(|v| *v == 0.0));
     // A recorded shot serves any view.
-    let other = Quantity { with_static: true, with_dynamic: false, maximum: false };
+    let other = Quantity { component: Component::Static, projection: drr };
     let turned = baked.render(&dataset.views[0].rays, 24, 20, 1, other).unwrap();
-    assert_ne!(turned, show(true, false, false));
+    assert_ne!(turned, show(Component::Static, drr));
     drop((baked, renderer, trainer));
     expect_silence(gpu);
 }

@@ -1,12 +1,12 @@
 //! Contexts: a device, a log, limits.
 
-use super::handles::{self, Kind, Object};
-use super::log;
-use super::options::{Options, text};
-use super::status::{Failure, NERTCA_ERROR_BUSY, Outcome, call, copy_text, nertca_status};
-use super::types::{nertca_log, nertca_vulkan, read};
+use crate::capi::handles::{self, Kind, Object};
+use crate::capi::log;
+use crate::capi::options::{Options, text};
+use crate::capi::status::{Failure, NERTCA_ERROR_BUSY, Outcome, call, copy_text, nertca_status};
+use crate::capi::types::{nertca_log, nertca_vulkan, read};
 use crate::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
-use crate::kernels::{Layers, Tuning};
+use crate::kernels::tuning::{Layers, Tuning};
 use ash::vk::{self, Handle};
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;

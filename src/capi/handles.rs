@@ -1,10 +1,10 @@
 //! Handles are indices with a generation into one table of what is alive, so that one that was destroyed, is of another
 //! type or never was one is told apart without touching memory. The table is the library's only process-wide state.
 
-use super::context::Context;
-use super::output::SharedBuffer;
-use super::reconstruction::Reconstruction;
-use super::status::{Failure, NERTCA_ERROR_FORKED, NERTCA_ERROR_HANDLE, Outcome};
+use crate::capi::context::Context;
+use crate::capi::output::SharedBuffer;
+use crate::capi::reconstruction::Reconstruction;
+use crate::capi::status::{Failure, NERTCA_ERROR_FORKED, NERTCA_ERROR_HANDLE, Outcome};
 use std::cell::RefCell;
 use std::sync::{Arc, PoisonError, RwLock};
 

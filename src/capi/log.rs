@@ -1,7 +1,7 @@
 //! What the engine has to say goes to the caller's log callback; nothing is printed.
 
-use super::status::{Failure, Outcome};
-use super::types::nertca_log;
+use crate::capi::status::{Failure, Outcome};
+use crate::capi::types::nertca_log;
 use std::ffi::{CString, c_char, c_void};
 use std::fmt::Write as _;
 use tracing::field::{Field, Visit};

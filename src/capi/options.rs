@@ -1,6 +1,6 @@
 //! Options as text, so that new ones never change the ABI: lines of `key = value`, or a JSON object.
 
-use super::status::{Failure, Outcome};
+use crate::capi::status::{Failure, Outcome};
 use std::ffi::{CStr, c_char};
 
 /// Options as they were given, in order.

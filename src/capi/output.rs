@@ -1,17 +1,19 @@
 //! What comes out: views, volumes, scores, and buffers shared with other APIs.
 
-use super::context::{Claim, Context, nertca_context, on_context};
-use super::handles::{self, Kind, Object};
-use super::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
-use super::status::{Failure, NERTCA_OK, Outcome, call, nertca_status};
-use super::types::{
+use crate::capi::context::{Claim, Context, nertca_context, on_context};
+use crate::capi::handles::{self, Kind, Object};
+use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
+use crate::capi::status::{Failure, NERTCA_OK, Outcome, call, nertca_status};
+use crate::capi::types::{
     NERTCA_COMPONENT_DYNAMIC, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_TOTAL, NERTCA_PIXELS_F32, NERTCA_PIXELS_U8,
     NERTCA_PROJECTION_DRR, NERTCA_PROJECTION_MIP, NERTCA_QUALITY_EXACT, NERTCA_QUALITY_LIVE, nertca_grid, nertca_image,
     nertca_scores, nertca_view, pixel_bytes, read, sides, stride, write,
 };
-use crate::data::geometry::{MM_PER_UNIT, ViewRays};
+use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::memory::Buffer;
-use crate::output::sampled::{Fields, PatientGrid, Quantity};
+use crate::model::component::Component;
+use crate::render::grid::PatientGrid;
+use crate::render::quantity::{Projection, Quantity};
 use glam::DVec3;
 use std::os::fd::{AsFd, IntoRawFd, OwnedFd};
 use std::sync::Arc;
@@ -54,11 +56,11 @@ struct Shot {
     exact: bool,
 }
 
-fn fields_of(component: u32) -> Outcome<(bool, bool)> {
+fn component_of(component: u32) -> Outcome<Component> {
     match component {
-        NERTCA_COMPONENT_TOTAL => Ok((true, true)),
-        NERTCA_COMPONENT_STATIC => Ok((true, false)),
-        NERTCA_COMPONENT_DYNAMIC => Ok((false, true)),
+        NERTCA_COMPONENT_TOTAL => Ok(Component::Total),
+        NERTCA_COMPONENT_STATIC => Ok(Component::Static),
+        NERTCA_COMPONENT_DYNAMIC => Ok(Component::Dynamic),
         other => Err(Failure::argument("component", format!("{other} is none of NERTCA_COMPONENT_*"))),
     }
 }
@@ -69,10 +71,10 @@ unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
     // SAFETY: as the caller vouches.
     let view = unsafe { read(view) }?;
     let size = sides(view.width, view.height)?;
-    let (with_static, with_dynamic) = fields_of(view.component)?;
-    let maximum = match view.projection {
-        NERTCA_PROJECTION_DRR => false,
-        NERTCA_PROJECTION_MIP => true,
+    let component = component_of(view.component)?;
+    let projection = match view.projection {
+        NERTCA_PROJECTION_DRR => Projection::Drr,
+        NERTCA_PROJECTION_MIP => Projection::Mip,
         other => return Err(Failure::argument("projection", format!("{other} is none of NERTCA_PROJECTION_*"))),
     };
     let exact = match view.quality {
@@ -83,7 +85,7 @@ unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
     // SAFETY: as the caller vouches.
     let geometry = unsafe { view.geometry.geometry() }?;
     let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Failure::argument(&field, problem))?;
-    let quantity = Quantity { with_static, with_dynamic, maximum };
+    let quantity = Quantity { component, projection };
     Ok(Shot { rays, size, phase: view.phase, quantity, exact })
 }
 
@@ -91,20 +93,11 @@ unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
 fn draw(reconstruction: &Reconstruction, shot: &Shot) -> Outcome<Vec<f32>> {
     let session = &reconstruction.session;
     let image = if shot.exact {
-        let seen = session.render_fields(&shot.rays, shot.size, shot.phase)?;
-        let Quantity { with_static, with_dynamic, maximum } = shot.quantity;
-        match (maximum, with_static, with_dynamic) {
-            (false, true, true) => seen.total_integral(),
-            (false, true, false) => seen.static_integral,
-            (false, false, _) => seen.dynamic_integral,
-            (true, true, true) => seen.total_max,
-            (true, true, false) => seen.static_max,
-            (true, false, _) => seen.dynamic_max,
-        }
+        session.render_fields(&shot.rays, shot.size, shot.phase)?.show(shot.quantity)
     } else {
         session.render(&shot.rays, shot.size, shot.phase, shot.quantity)?
     };
-    let per_mm = if shot.quantity.maximum { 1.0 / MM_PER_UNIT as f32 } else { 1.0 };
+    let per_mm = if shot.quantity.projection == Projection::Mip { 1.0 / MM_PER_UNIT as f32 } else { 1.0 };
     Ok(image.into_iter().map(|v| v * per_mm).collect())
 }
 
@@ -183,7 +176,7 @@ pub unsafe extern "C" fn nertca_reconstruction_render_buffer(
         let target = handles::get::<SharedBuffer, _>(buffer)?;
         check_target(reconstruction, &target, shot.size.0 * shot.size.1)?;
         if shot.exact {
-            let per_unit = if shot.quantity.maximum { MM_PER_UNIT as f32 } else { 1.0 };
+            let per_unit = if shot.quantity.projection == Projection::Mip { MM_PER_UNIT as f32 } else { 1.0 };
             let image: Vec<f32> = draw(reconstruction, &shot)?.into_iter().map(|v| v * per_unit).collect();
             return Ok(reconstruction.claim.context.device()?.upload(&target.buffer, 0, &image)?);
         }
@@ -205,10 +198,10 @@ fn check_target(reconstruction: &Reconstruction, target: &SharedBuffer, floats: 
 
 /// # Safety
 /// As the functions that call it.
-unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Fields)> {
+unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Component, u32)> {
     // SAFETY: as the caller vouches.
     let grid = unsafe { read(grid) }?;
-    let (with_static, with_dynamic) = fields_of(grid.component)?;
+    let component = component_of(grid.component)?;
     let patient = PatientGrid {
         origin_mm: DVec3::from_array(grid.origin_mm),
         spacing_mm: DVec3::from_array(grid.spacing_mm),
@@ -218,7 +211,7 @@ unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Fields)> {
     if patient.size.iter().map(|n| u64::from(*n)).product::<u64>() > 1 << 30 {
         return Err(Failure::argument("points", "more than 2^30 in all"));
     }
-    Ok((patient, Fields { with_static, dynamic_phase: with_dynamic.then_some(grid.phase) }))
+    Ok((patient, component, grid.phase))
 }
 
 /// Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Zero outside
@@ -235,7 +228,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
         // SAFETY: as the caller vouches.
-        let (grid, fields) = unsafe { grid_of(grid) }?;
+        let (grid, component, phase) = unsafe { grid_of(grid) }?;
         if values.is_null() {
             return Err(Failure::argument("values", "is null"));
         }
@@ -243,7 +236,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
         if count < needed {
             return Err(Failure::argument("count", format!("{count} where {needed} are needed")));
         }
-        let cells = reconstruction.session.sample(fields, &grid)?;
+        let cells = reconstruction.session.sample(component, phase, &grid)?;
         // SAFETY: as the caller vouches, and checked.
         unsafe { std::ptr::copy_nonoverlapping(cells.as_ptr().cast::<u8>(), values.cast::<u8>(), 4 * cells.len()) };
         Ok(())
@@ -262,10 +255,10 @@ pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
         // SAFETY: as the caller vouches.
-        let (grid, fields) = unsafe { grid_of(grid) }?;
+        let (grid, component, phase) = unsafe { grid_of(grid) }?;
         let target = handles::get::<SharedBuffer, _>(buffer)?;
         check_target(reconstruction, &target, grid.size.iter().map(|n| *n as usize).product())?;
-        let cells = reconstruction.session.sample(fields, &grid)?;
+        let cells = reconstruction.session.sample(component, phase, &grid)?;
         Ok(reconstruction.claim.context.device()?.upload(&target.buffer, 0, &cells)?)
     })
 }

@@ -1,18 +1,18 @@
 //! Reconstructions: frames in, checkpoints in and out.
 
-use super::context::{Claim, Context, nertca_context, on_context};
-use super::handles::{self, Kind, Object};
-use super::options::{Options, text};
-use super::status::{
+use crate::capi::context::{Claim, Context, nertca_context, on_context};
+use crate::capi::handles::{self, Kind, Object};
+use crate::capi::options::{Options, text};
+use crate::capi::status::{
     Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_OK, Outcome, call, copy_text, nertca_status,
 };
-use super::training::state_code;
-use super::types::{nertca_frame, nertca_progress, read, write};
+use crate::capi::training::state_code;
+use crate::capi::types::{nertca_frame, nertca_progress, read, write};
+use crate::choice::Choice;
 use crate::config::{Config, Preset};
-use crate::data::gating::RPeaks;
+use crate::model::checkpoint::Checkpoint;
+use crate::scan::gating::RPeaks;
 use crate::session::{Progress, Session, SessionOptions};
-use crate::train::checkpoint::Checkpoint;
-use clap::ValueEnum;
 use std::ffi::{c_char, c_void};
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -67,8 +67,8 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
     let preset = match options.take("preset") {
         None => None,
         Some(name) => Some(
-            Preset::from_str(&name, true)
-                .map_err(|_| Failure::argument("preset", format!("`{name}` is none of fast, paper, public-code")))?,
+            Preset::named(&name)
+                .ok_or_else(|| Failure::argument("preset", format!("`{name}` is none of {}", Preset::names())))?,
         ),
     };
     let config = Config::load(preset, None, &options.settings())?;

@@ -1,6 +1,6 @@
 //! Status codes, error texts, and the boundary that no panic crosses.
 
-use super::handles;
+use crate::capi::handles;
 use crate::error::Error;
 use crate::session::TRAINING_THREAD;
 use std::cell::{Cell, RefCell};

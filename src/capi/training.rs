@@ -1,8 +1,8 @@
 //! Training: in the calling thread, or in the background.
 
-use super::reconstruction::{nertca_reconstruction, on_reconstruction};
-use super::status::{Failure, nertca_status};
-use super::types::{
+use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
+use crate::capi::status::{Failure, nertca_status};
+use crate::capi::types::{
     NERTCA_STATE_CANCELLED, NERTCA_STATE_FAILED, NERTCA_STATE_FINISHED, NERTCA_STATE_IDLE, NERTCA_STATE_PAUSED,
     NERTCA_STATE_RUNNING, NERTCA_STATE_WAITING, nertca_progress, nertca_progress_callback,
 };

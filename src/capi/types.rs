@@ -1,8 +1,8 @@
 //! Structs that cross the boundary. Each begins with its size, so that later versions can add to its end.
 
-use super::status::{Failure, Outcome};
-use crate::data::dataset::{Intensity, Split};
-use crate::data::geometry::{CArm, Geometry, Matrix};
+use crate::capi::status::{Failure, Outcome};
+use crate::geometry::{CArm, Geometry, Matrix};
+use crate::scan::dataset::{Intensity, Split};
 use crate::session::{Moment, NewFrame};
 use std::ffi::{c_char, c_void};
 
@@ -368,7 +368,7 @@ impl nertca_geometry {
 }
 
 /// Largest side of an image.
-const MAX_SIDE: u32 = crate::data::images::MAX_SIDE as u32;
+const MAX_SIDE: u32 = crate::formats::images::MAX_SIDE as u32;
 
 /// Checks a size.
 pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {

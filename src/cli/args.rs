@@ -1,14 +1,18 @@
 //! What can be typed.
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
-use nertca_vk::calibrate;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::{Args, Parser, Subcommand};
+use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset};
-use nertca_vk::data::dataset::Dataset;
 use nertca_vk::error::Result;
+use nertca_vk::export::volumes::Format;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::kernels::{Layers, Tuning};
-use nertca_vk::output::export::Format;
+use nertca_vk::kernels::tuning::{Layers, Tuning};
+use nertca_vk::model::component::Component;
 use nertca_vk::phantom::dataset::Setting;
+use nertca_vk::render::quantity::Projection;
+use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::train::calibrate;
 use std::path::PathBuf;
 
 /// 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views.
@@ -20,7 +24,7 @@ pub struct Cli {
     pub device: Option<String>,
     /// Path of the network's layers: `f32`, or `matrices` (cooperative matrices: f16 operands, f32 sums); by default
     /// the faster one on the device.
-    #[arg(long, global = true, value_enum, value_name = "PATH")]
+    #[arg(long, global = true, value_parser = choice::<Layers>(), value_name = "PATH")]
     pub layers: Option<Layers>,
     /// Turn the Vulkan validation layers on (slow; messages make the program fail).
     #[arg(long, global = true)]
@@ -72,22 +76,13 @@ pub struct DevicesArgs {
     pub json: bool,
 }
 
-/// Layout of a dataset on disk.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum LayoutArg {
-    /// `dataset.json`.
-    Native,
-    /// The NeRF-CA / NerT-CA authors' layout.
-    Nerfca,
-}
-
 /// `phantom`.
 #[derive(Debug, Args)]
 pub struct PhantomArgs {
     /// Directory to make.
     pub out: PathBuf,
-    /// C-arm and volume of a published set-up.
-    #[arg(long, value_enum, default_value_t = Setting::Xcat)]
+    /// C-arm and volume of a published set-up: `xcat` (DSD 2500, DSO 450) or `magix` (DSD 2000, DSO 600).
+    #[arg(long, value_parser = choice::<Setting>(), default_value = Setting::Xcat.name())]
     pub geometry: Setting,
     /// Columns and rows of the images.
     #[arg(long, default_value_t = 100)]
@@ -107,9 +102,9 @@ pub struct PhantomArgs {
     /// Breathing along the body, peak to peak, mm; each training view breathes on its own.
     #[arg(long, default_value_t = 0.0, value_name = "MM")]
     pub respiration: f64,
-    /// Layout to write.
-    #[arg(long, value_enum, default_value_t = LayoutArg::Native)]
-    pub layout: LayoutArg,
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
+    pub layout: Layout,
     /// Coronary tree as JSON instead of the procedural one.
     #[arg(long, value_name = "FILE")]
     pub tree: Option<PathBuf>,
@@ -178,9 +173,9 @@ pub struct ProjectArgs {
     /// Put the centre of each volume at the isocentre.
     #[arg(long)]
     pub centre: bool,
-    /// Layout to write.
-    #[arg(long, value_enum, default_value_t = LayoutArg::Native)]
-    pub layout: LayoutArg,
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
+    pub layout: Layout,
 }
 
 /// `import`.
@@ -236,6 +231,12 @@ pub struct ImportDicomArgs {
     pub depth: f64,
 }
 
+/// Parses one of the names of a choice.
+fn choice<T: Choice>() -> impl TypedValueParser<Value = T> {
+    PossibleValuesParser::new(T::ALL.iter().map(|choice| choice.name()))
+        .try_map(|name| T::named(&name).ok_or("is none of the choices"))
+}
+
 /// Parses `FIRST-LAST`.
 fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize>, String> {
     let (first, last) = text.split_once('-').unwrap_or((text, text));
@@ -258,8 +259,9 @@ fn pitch(text: &str) -> std::result::Result<[f64; 2], String> {
 /// Hyper-parameters, for every command that trains.
 #[derive(Debug, Args)]
 pub struct ConfigArgs {
-    /// Set of defaults: `fast`, unless a configuration file names one.
-    #[arg(long, value_enum)]
+    /// Set of defaults: `fast` (normalised, hull-gated, tuned), `paper` (as the paper states it) or `public-code` (as the
+    /// authors' code does it); `fast`, unless a configuration file names one.
+    #[arg(long, value_parser = choice::<Preset>())]
     pub preset: Option<Preset>,
     /// TOML file with hyper-parameters.
     #[arg(long, value_name = "FILE")]
@@ -334,26 +336,6 @@ pub struct EvalArgs {
     pub threshold: Option<f64>,
 }
 
-/// Field to show.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Component {
-    /// Both fields.
-    Total,
-    /// Still background.
-    Static,
-    /// Moving vessels.
-    Dynamic,
-}
-
-/// What a pixel shows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Projection {
-    /// Line integral.
-    Drr,
-    /// Largest attenuation along the ray.
-    Mip,
-}
-
 /// `render`.
 #[derive(Debug, Args)]
 pub struct RenderArgs {
@@ -368,11 +350,11 @@ pub struct RenderArgs {
     /// Phase from 0, or `all`.
     #[arg(long, default_value = "0")]
     pub phase: String,
-    /// Field to show.
-    #[arg(long, value_enum, default_value_t = Component::Total)]
+    /// Field to show: both, the still background or the moving vessels.
+    #[arg(long, value_parser = choice::<Component>(), default_value = Component::Total.name())]
     pub component: Component,
-    /// Line integral or maximum.
-    #[arg(long, value_enum, default_value_t = Projection::Drr)]
+    /// Line integral (`drr`) or largest attenuation along the ray (`mip`).
+    #[arg(long, value_parser = choice::<Projection>(), default_value = Projection::Drr.name())]
     pub projection: Projection,
     /// Columns and rows; those of the dataset by default.
     #[arg(long)]
@@ -404,8 +386,8 @@ pub struct ViewArgs {
 pub struct ExportArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
-    /// Field to export.
-    #[arg(long, value_enum, default_value_t = Component::Dynamic)]
+    /// Field to export: both, the still background or the moving vessels.
+    #[arg(long, value_parser = choice::<Component>(), default_value = Component::Dynamic.name())]
     pub component: Component,
     /// Phase from 0, or `all`: a fourth axis, or a file per phase.
     #[arg(long, default_value = "all")]
@@ -414,7 +396,7 @@ pub struct ExportArgs {
     #[arg(long, default_value_t = 0.5, value_name = "MM")]
     pub spacing: f64,
     /// Format; by the end of --out otherwise.
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = choice::<Format>())]
     pub format: Option<Format>,
     /// Surfaces of the vessels instead of volumes: --out ends in .stl, .ply, .obj (a file per phase) or .glb (animated).
     #[arg(long, conflicts_with = "format")]
@@ -432,9 +414,9 @@ pub struct ExportArgs {
 pub struct ConvertArgs {
     /// Dataset directory in either layout.
     pub data: PathBuf,
-    /// Layout to write.
-    #[arg(long, value_enum)]
-    pub layout: LayoutArg,
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    #[arg(long, value_parser = choice::<Layout>())]
+    pub layout: Layout,
     /// Directory to make.
     #[arg(short, long)]
     pub out: PathBuf,

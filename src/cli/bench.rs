@@ -1,17 +1,23 @@
 //! `bench`: iterations, passes and renderings against the device's own limits and the paper's 37 minutes.
 
-use super::args::{BenchArgs, Cli, Component};
-use super::results::{FrameRate, measure_frame_rates, newest_model, print_frame_rates};
-use nertca_vk::bench::{self, NetworkCost, PAPER_SECONDS, Peaks, Subject, Timing};
+use super::args::{BenchArgs, Cli};
+use super::frame_rates::{FrameRate, measure_frame_rates, print_frame_rates};
+use nertca_vk::bench::{self, PAPER_SECONDS, Peaks};
+use nertca_vk::choice::Choice;
 use nertca_vk::config::Config;
-use nertca_vk::data::dataset::{Dataset, Layout};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::output::render::Renderer;
+use nertca_vk::model::checkpoint::newest_model;
+use nertca_vk::model::component::Component;
+use nertca_vk::network::cost::NetworkCost;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
-use nertca_vk::reconstruct::{Event, RunOptions, reconstruct};
-use nertca_vk::report::evaluate_model;
-use nertca_vk::train::plan::Plan;
+use nertca_vk::plan::Plan;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::run::events::Event;
+use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
+use nertca_vk::run::score::evaluate_model;
+use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::train::timing::{Subject, Timing};
 use nertca_vk::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -81,7 +87,7 @@ pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
         compare(&report, &other);
     }
     if let Some(file) = &args.json {
-        let text = serde_json::to_string_pretty(&report).map_err(|e| Error::Internal(e.to_string()))?;
+        let text = nertca_vk::files::pretty_json(&report)?;
         nertca_vk::files::write_atomic(file, text.as_bytes())?;
     }
     cli.close_device(&gpu)

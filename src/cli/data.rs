@@ -1,24 +1,14 @@
 //! `phantom`, `project` and `import`.
 
-use super::args::{Cli, ImportArgs, ImportDicomArgs, ImportSource, LayoutArg, PhantomArgs, ProjectArgs};
+use super::args::{Cli, ImportArgs, ImportDicomArgs, ImportSource, PhantomArgs, ProjectArgs};
 use indicatif::{ProgressBar, ProgressStyle};
-use nertca_vk::data::dataset::Layout;
-use nertca_vk::data::gating::RPeaks;
-use nertca_vk::data::import::{Gating, ImportOptions, import_dicom};
-use nertca_vk::data::volume::VolumeHints;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
+use nertca_vk::formats::volume::VolumeHints;
+use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
 use nertca_vk::phantom::dataset::{Anatomy, CArmOptions, PhantomOptions, VolumeOptions, make, project_volumes};
+use nertca_vk::scan::gating::RPeaks;
 use std::path::Path;
-
-impl From<LayoutArg> for Layout {
-    fn from(layout: LayoutArg) -> Layout {
-        match layout {
-            LayoutArg::Native => Layout::Native,
-            LayoutArg::Nerfca => Layout::Nerfca,
-        }
-    }
-}
 
 /// A progress bar for work whose length is known as it goes.
 pub fn bar() -> impl FnMut(&str, u64, u64) {
@@ -44,7 +34,7 @@ pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
         seed: args.seed,
         photons: args.photons,
         respiration_mm: args.respiration,
-        layout: args.layout.into(),
+        layout: args.layout,
         anatomy: args.tree.as_ref().map(|tree| Anatomy {
             tree: tree.clone(),
             background: args.background.clone(),
@@ -75,7 +65,7 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
         c_arm: CArmOptions { sod_mm: args.sod, sid_mm: args.sid, field_mm: args.fov },
         size: args.size,
         views: args.views,
-        layout: args.layout.into(),
+        layout: args.layout,
     };
     project_volumes(&gpu, &options, &args.out, bar())?;
     out!("{}", args.out.display());
@@ -119,7 +109,7 @@ fn dicom(args: &ImportDicomArgs) -> Result<()> {
         depth_half_extent_mm: args.depth,
     };
     if !(args.depth.is_finite() && args.depth > 0.0) {
-        return Err(Error::config("--depth", args.depth, "is not a positive length in mm"));
+        return Err(Error::config("depth", args.depth, "is not a positive length in mm"));
     }
     import_dicom(&args.files, &options, &args.out)?.iter().for_each(|note| eprintln!("{note}"));
     out!("{}", args.out.display());

@@ -5,7 +5,7 @@ use clap::CommandFactory;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
 use nertca_vk::gpu::device::list_devices;
-use nertca_vk::kernels::Tuning;
+use nertca_vk::kernels::tuning::Tuning;
 use serde::Serialize;
 
 #[derive(Serialize)]
@@ -20,7 +20,7 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
     let rows: Vec<Row> =
         list_devices()?.into_iter().map(|info| Row { paths: Tuning::for_device(&info), info }).collect();
     if args.json {
-        out!("{}", serde_json::to_string_pretty(&rows).map_err(|e| Error::Internal(e.to_string()))?);
+        out!("{}", nertca_vk::files::pretty_json(&rows)?);
     } else {
         for Row { info, paths } in &rows {
             out!("{}: {} ({}, {})", info.index, info.name, info.kind, info.driver);

@@ -1,17 +1,18 @@
 //! `export` and `convert`.
 
-use super::args::{Cli, Component, ConvertArgs, ExportArgs};
+use super::args::{Cli, ConvertArgs, ExportArgs};
 use super::data::bar;
-use super::results::newest_model;
-use nertca_vk::data::dataset::Dataset;
-use nertca_vk::data::geometry::MM_PER_UNIT;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::model::field::Model;
-use nertca_vk::output::export::{Format, VolumeExport, grid_over};
-use nertca_vk::output::mesh::{MeshFormat, write_meshes};
-use nertca_vk::output::metrics::otsu;
-use nertca_vk::output::render::Renderer;
-use nertca_vk::output::sampled::{Fields, PatientGrid};
+use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
+use nertca_vk::export::volumes::{Format, VolumeExport, grid_over};
+use nertca_vk::geometry::MM_PER_UNIT;
+use nertca_vk::model::Model;
+use nertca_vk::model::checkpoint::newest_model;
+use nertca_vk::model::component::Component;
+use nertca_vk::render::grid::PatientGrid;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::metrics::otsu;
 
 /// The phases `--phase` names, and whether it names all.
 pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
@@ -30,12 +31,11 @@ pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
 pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, model.layout.phases as u32)?;
-    let with_static = args.component != Component::Dynamic;
-    if args.mesh && with_static {
+    if args.mesh && args.component.has_static() {
         return Err(Error::config("--component", "", "surfaces are those of the moving vessels: --component dynamic"));
     }
     let unknown = |known: &str| Error::config("--out", args.out.display(), format!("ends in none of {known}"));
-    let grid = grid_over(&model.scene, with_static, args.spacing)?;
+    let grid = grid_over(&model.scene, args.component, args.spacing)?;
     let gpu = cli.open_device()?;
     let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?;
     let mut progress = bar();
@@ -50,11 +50,10 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
         let named = args.format.or_else(|| Format::of(&args.out));
         let export = VolumeExport {
             grid,
-            with_static,
-            with_dynamic: args.component != Component::Static,
+            component: args.component,
             // The still background is the same at every phase.
-            sequence: all && args.component != Component::Static,
-            phases: if args.component == Component::Static { vec![0] } else { phases },
+            sequence: all && args.component.has_dynamic(),
+            phases: if args.component.has_dynamic() { phases } else { vec![0] },
             format: named.ok_or_else(|| unknown(".nrrd .nii .mha .npy .vtk; say which with --format"))?,
         };
         export.write(&renderer, &args.out, |n, of| progress("volume", n, of))?
@@ -75,7 +74,7 @@ fn dice_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid)
     if let Some(attenuation) = model.vessel_attenuation {
         return Ok(attenuation / 3.0 / MM_PER_UNIT);
     }
-    let values = renderer.sample_patient(Fields { with_static: false, dynamic_phase: Some(0) }, grid)?;
+    let values = renderer.sample_patient(Component::Dynamic, 0, grid)?;
     let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();
     Ok(f64::from(otsu(&inside)))
 }
@@ -83,7 +82,7 @@ fn dice_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid)
 /// Converts a dataset between layouts.
 pub fn convert(args: &ConvertArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
-    nertca_vk::data::writer::convert(&dataset, args.layout.into(), &args.out)?;
+    nertca_vk::scan::writer::convert(&dataset, args.layout, &args.out)?;
     out!("{}", args.out.display());
     Ok(())
 }

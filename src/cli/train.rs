@@ -1,15 +1,18 @@
 //! `train`: progress, Ctrl-C, report.
 
 use super::args::{Cli, TrainArgs};
-use super::results::{newest_model, print_table};
+use super::eval::print_table;
+use super::report::write_page;
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::config::Config;
-use nertca_vk::data::dataset::Dataset;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::reconstruct::{Event, RunInfo, RunOptions, reconstruct};
-use nertca_vk::report::{evaluate_model, write_page};
-use nertca_vk::train::checkpoint;
-use nertca_vk::train::plan::Plan;
+use nertca_vk::model::checkpoint::{self, newest_model};
+use nertca_vk::plan::Plan;
+use nertca_vk::run::events::Event;
+use nertca_vk::run::info::RunInfo;
+use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
+use nertca_vk::run::score::evaluate_model;
+use nertca_vk::scan::dataset::Dataset;
 use std::io::IsTerminal;
 use std::path::Path;
 use std::sync::Arc;
@@ -60,7 +63,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     } else {
         let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, None, Some(&report))?;
         write_page(&gpu, &tuning, &model, &dataset, Some(&evaluation), (run, &report), &page)?;
-        let text = serde_json::to_string_pretty(&evaluation).map_err(|e| Error::Internal(e.to_string()))?;
+        let text = nertca_vk::files::pretty_json(&evaluation)?;
         nertca_vk::files::write_atomic(&report.join("evaluation.json"), text.as_bytes())?;
         if !args.json {
             print_table(&evaluation);

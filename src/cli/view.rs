@@ -4,7 +4,6 @@
 //! and, where a browser says so, to come from the page itself.
 
 use super::args::{Cli, ViewArgs};
-use super::results::newest_model;
 use axum::Router;
 use axum::extract::{Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -13,12 +12,17 @@ use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
-use nertca_vk::data::geometry::{CArm, Geometry};
+use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::model::field::Model;
-use nertca_vk::output::render::Renderer;
-use nertca_vk::output::sampled::{Baked, Quantity};
+use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::model::Model;
+use nertca_vk::model::checkpoint::newest_model;
+use nertca_vk::model::component::Component;
+use nertca_vk::render::baked::Baked;
+use nertca_vk::render::quantity::{Projection, Quantity};
+use nertca_vk::render::renderer::Renderer;
 use serde::Deserialize;
+use std::collections::HashMap;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -32,8 +36,8 @@ struct Viewer {
     model: Model,
     /// One picture at a time: they share the device.
     baked: Mutex<Baked>,
-    /// Largest line integral and attenuation of a typical view, by component and projection.
-    ranges: Vec<f32>,
+    /// Largest value of a typical view.
+    ranges: HashMap<Quantity, f32>,
     token: String,
     port: u16,
 }
@@ -53,24 +57,21 @@ struct Shot {
     high: f32,
 }
 
-const COMPONENTS: [&str; 3] = ["dynamic", "static", "total"];
-const PROJECTIONS: [&str; 2] = ["drr", "mip"];
-
-fn position(field: &str, known: &[&str], value: &str) -> Result<usize> {
-    let problem = || Error::config(field, value, format!("one of {} is accepted", known.join(", ")));
-    known.iter().position(|k| *k == value).ok_or_else(problem)
+/// The value a query names.
+fn chosen<T: Choice>(field: &str, name: &str) -> Result<T> {
+    T::named(name).ok_or_else(|| Error::config(field, name, format!("one of {} is accepted", T::names())))
 }
 
 impl Viewer {
-    fn values(&self, shot: &Shot) -> Result<(Vec<f32>, usize)> {
+    fn values(&self, shot: &Shot) -> Result<(Vec<f32>, Quantity)> {
         if !SIDES.contains(&shot.size) {
             let problem = format!("{} to {} is accepted", SIDES.start(), SIDES.end());
             return Err(Error::config("size", shot.size, problem));
         }
-        let (component, projection) = (
-            position("component", &COMPONENTS, &shot.component)?,
-            position("projection", &PROJECTIONS, &shot.projection)?,
-        );
+        let quantity = Quantity {
+            component: chosen("component", &shot.component)?,
+            projection: chosen("projection", &shot.projection)?,
+        };
         let c_arm = &self.model.c_arm;
         let [w, h] = self.model.image_size;
         let pixel = c_arm.pixel_mm[0].max(c_arm.pixel_mm[1]) * w.max(h) as f64 / shot.size as f64;
@@ -84,9 +85,8 @@ impl Viewer {
         let rays = Geometry::CArm(turned)
             .rays(shot.size, shot.size)
             .map_err(|(field, problem)| Error::config(field, "", problem))?;
-        let quantity = Quantity { with_static: component > 0, with_dynamic: component != 1, maximum: projection == 1 };
         let baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
-        Ok((baked.render(&rays, shot.size, shot.size, shot.phase, quantity)?, 2 * component + projection))
+        Ok((baked.render(&rays, shot.size, shot.size, shot.phase, quantity)?, quantity))
     }
 
     /// A grey PNG: vessels dark, as in an angiogram. `low` and `high` are shares of the typical range.
@@ -94,8 +94,8 @@ impl Viewer {
         if !(shot.low.is_finite() && shot.high.is_finite() && shot.low < shot.high) {
             return Err(Error::config("low, high", format!("{} to {}", shot.low, shot.high), "is no window"));
         }
-        let (values, kind) = self.values(shot)?;
-        let range = self.ranges[kind];
+        let (values, quantity) = self.values(shot)?;
+        let range = self.ranges.get(&quantity).copied().unwrap_or(1.0);
         let (low, width) = (shot.low * range, (shot.high - shot.low) * range);
         let codes: Vec<u8> = values.iter().map(|v| (255.0 * (1.0 - (v - low) / width)) as u8).collect();
         let mut png = Vec::new();
@@ -108,7 +108,7 @@ impl Viewer {
 }
 
 /// Whether a request comes from the page that was printed.
-fn welcome(viewer: &Viewer, headers: &HeaderMap, query: &str) -> bool {
+fn authorised(viewer: &Viewer, headers: &HeaderMap, query: &str) -> bool {
     let here = |name: &str| {
         [format!("127.0.0.1:{}", viewer.port), format!("localhost:{}", viewer.port)].iter().any(|h| h == name)
     };
@@ -126,7 +126,7 @@ fn welcome(viewer: &Viewer, headers: &HeaderMap, query: &str) -> bool {
 
 async fn guard(State(viewer): State<Arc<Viewer>>, request: Request, next: Next) -> Response {
     let query = request.uri().query().unwrap_or_default().to_owned();
-    if !welcome(&viewer, request.headers(), &query) {
+    if !authorised(&viewer, request.headers(), &query) {
         return (StatusCode::FORBIDDEN, "open the address that `nertca-vk view` printed\n").into_response();
     }
     let mut response = next.run(request).await;
@@ -189,7 +189,7 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
         let mut viewer = Viewer {
             model,
             baked: Mutex::new(baked),
-            ranges: vec![1.0; COMPONENTS.len() * PROJECTIONS.len()],
+            ranges: HashMap::new(),
             token: secret.iter().map(|b| format!("{b:02x}")).collect(),
             port,
         };
@@ -215,28 +215,27 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
 }
 
 /// Largest value of each kind of picture from the model's own angle; also bakes every phase.
-fn typical_ranges(viewer: &Viewer) -> Result<Vec<f32>> {
-    let mut ranges = Vec::new();
-    for component in COMPONENTS {
-        for projection in PROJECTIONS {
+fn typical_ranges(viewer: &Viewer) -> Result<HashMap<Quantity, f32>> {
+    let mut ranges = HashMap::new();
+    for &component in Component::ALL {
+        // The still background is the same at every phase.
+        let phases = if component.has_dynamic() { viewer.model.layout.phases as u32 } else { 1 };
+        for &projection in Projection::ALL {
             let mut most = f32::MIN_POSITIVE;
-            for phase in 0..viewer.model.layout.phases as u32 {
+            for phase in 0..phases {
                 let shot = Shot {
                     primary: viewer.model.c_arm.primary_deg,
                     secondary: viewer.model.c_arm.secondary_deg,
                     phase,
-                    component: component.into(),
-                    projection: projection.into(),
+                    component: component.name().into(),
+                    projection: projection.name().into(),
                     size: 64,
                     low: 0.0,
                     high: 1.0,
                 };
                 most = viewer.values(&shot)?.0.into_iter().fold(most, f32::max);
-                if component == "static" {
-                    break; // the same at every phase
-                }
             }
-            ranges.push(most);
+            ranges.insert(Quantity { component, projection }, most);
         }
     }
     Ok(ranges)

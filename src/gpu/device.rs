@@ -499,6 +499,7 @@ impl Shared {
             object: object.into(),
             bytes,
             detail: format!("{before} bytes of the limit of {} are in use", self.memory.limit),
+            may_pass: false,
         })
     }
 

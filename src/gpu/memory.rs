@@ -101,6 +101,7 @@ impl Gpu {
                 object: name.into(),
                 bytes,
                 detail: format!("one buffer of {} is limited to {} bytes", info.name, info.max_storage_buffer_range),
+                may_pass: false,
             });
         }
         if texel && bytes / 16 > u64::from(info.max_texel_buffer_elements) {
@@ -111,6 +112,7 @@ impl Gpu {
                     "a texel buffer of {} has at most {} elements",
                     info.name, info.max_texel_buffer_elements
                 ),
+                may_pass: false,
             });
         }
         let mut usage = vk::BufferUsageFlags::STORAGE_BUFFER
@@ -151,7 +153,7 @@ impl Gpu {
                 // SAFETY: nothing uses `raw` yet.
                 unsafe { shared.device.destroy_buffer(raw, None) };
                 shared.release(bytes);
-                return Err(Error::OutOfMemory { object: name.into(), bytes, detail: e.to_string() });
+                return Err(Error::OutOfMemory { object: name.into(), bytes, detail: e.to_string(), may_pass: true });
             }
         };
         let (memory, offset) = {

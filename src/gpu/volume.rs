@@ -80,7 +80,12 @@ impl Gpu {
                 linear: false,
                 allocation_scheme: AllocationScheme::GpuAllocatorManaged,
             })
-            .map_err(|e| Error::OutOfMemory { object: name.into(), bytes: requirements.size, detail: e.to_string() })?;
+            .map_err(|e| Error::OutOfMemory {
+                object: name.into(),
+                bytes: requirements.size,
+                detail: e.to_string(),
+                may_pass: true,
+            })?;
         // SAFETY: memory and offset come from the allocator for exactly these requirements.
         unsafe { device.bind_image_memory(inner.raw, allocation.memory(), allocation.offset()) }
             .map_err(Error::vulkan("vkBindImageMemory", name))?;

@@ -6,7 +6,7 @@
 //! gets zero gradient and so stays zero.
 
 use crate::config::Config;
-use crate::cpu::random::{STREAM_INIT, normal, uniform01};
+use crate::random::{STREAM_INIT, normal, uniform01};
 
 /// Where the parts of one hidden layer live.
 #[derive(Debug, Clone, PartialEq, Eq)]

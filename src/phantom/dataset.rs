@@ -1,16 +1,17 @@
 //! Phantom datasets: volumes and motion -> projections, exact masks, noise -> a dataset on disk.
 
-use super::tree::{Heart, Tree, contraction};
-use super::voxels::{self, Tissues};
-use crate::cpu::random::{STREAM_PHOTON, normal, uniform01};
-use crate::data::dataset::{Layout, MANIFEST, Split};
-use crate::data::geometry::{CArm, Geometry, ViewRays};
-use crate::data::nerfca;
-use crate::data::volume::{Volume, VolumeHints};
-use crate::data::writer::{About, Writer};
+use crate::choice::Choice;
 use crate::error::{Error, Result};
+use crate::formats::volume::{Volume, VolumeHints};
+use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::gpu::device::Gpu;
-use crate::output::projector::{LoadedVolume, Projector};
+use crate::phantom::projector::{LoadedVolume, Projector};
+use crate::phantom::tree::{Heart, Tree, contraction};
+use crate::phantom::voxels::{self, Tissues};
+use crate::random::{STREAM_PHOTON, normal, uniform01};
+use crate::scan::dataset::{Layout, MANIFEST, Split};
+use crate::scan::nerfca;
+use crate::scan::writer::{About, Writer};
 use glam::DVec3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -19,12 +20,23 @@ use std::path::{Path, PathBuf};
 const MASK_SHARE: f64 = 0.05;
 
 /// A published set-up of C-arm and volume.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Setting {
     /// The authors' XCAT set-up: DSD 2500, DSO 450, 0.25 mm voxels.
     Xcat,
     /// The authors' MAGIX set-up: DSD 2000, DSO 600, 0.9 mm voxels.
     Magix,
+}
+
+impl Choice for Setting {
+    const ALL: &'static [Setting] = &[Setting::Xcat, Setting::Magix];
+
+    fn name(self) -> &'static str {
+        match self {
+            Setting::Xcat => "xcat",
+            Setting::Magix => "magix",
+        }
+    }
 }
 
 /// What to make.
@@ -113,7 +125,7 @@ pub fn training_angles(views: u32) -> Result<Vec<(f64, f64)>> {
                 .filter(|(a, b)| VALIDATION_ANGLES.iter().all(|(c, d)| (a - c).abs() + (b - d).abs() > 15.0))
                 .collect())
         }
-        other => Err(Error::config("--views", other, "3, 4 or 9 is accepted")),
+        other => Err(Error::config("views", other, "3, 4 or 9 is accepted")),
     }
 }
 
@@ -149,13 +161,13 @@ struct Shooting {
 /// [`Error::Config`] for impossible options, [`Error::Data`] for unreadable anatomy, device errors.
 pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl FnMut(&str, u64, u64)) -> Result<()> {
     if !(1..=200).contains(&options.phases) {
-        return Err(Error::config("--phases", options.phases, "1 to 200 is accepted"));
+        return Err(Error::config("phases", options.phases, "1 to 200 is accepted"));
     }
     if let Some(photons) = options.photons.filter(|n| !(n.is_finite() && *n >= 1.0)) {
-        return Err(Error::config("--photons", photons, "at least 1 is needed"));
+        return Err(Error::config("photons", photons, "at least 1 is needed"));
     }
     if !(options.respiration_mm.is_finite() && options.respiration_mm.abs() <= 100.0) {
-        return Err(Error::config("--respiration", options.respiration_mm, "at most 100 mm is accepted"));
+        return Err(Error::config("respiration_mm", options.respiration_mm, "at most 100 mm is accepted"));
     }
     let shooting = Shooting {
         size: options.size,
@@ -197,7 +209,7 @@ pub fn project_volumes(
     };
     check_output(&shooting, out)?;
     if options.vessel_per_mm.is_some_and(|v| !(v.is_finite() && v > 0.0)) {
-        return Err(Error::config("--vessel", options.vessel_per_mm.unwrap_or_default(), "must be positive"));
+        return Err(Error::config("vessel_per_mm", options.vessel_per_mm.unwrap_or_default(), "must be positive"));
     }
     let projector = Projector::new(gpu, options.size, options.size)?;
     let total = options.volumes.len() as u64;
@@ -230,7 +242,7 @@ pub fn project_volumes(
 
 impl CArmOptions {
     fn c_arm(&self, size: usize) -> Result<CArm> {
-        for (field, value) in [("--sod", self.sod_mm), ("--sid", self.sid_mm), ("--fov", self.field_mm)] {
+        for (field, value) in [("sod_mm", self.sod_mm), ("sid_mm", self.sid_mm), ("field_mm", self.field_mm)] {
             if !(value.is_finite() && value > 0.0) {
                 return Err(Error::config(field, value, "must be a positive length in mm"));
             }
@@ -251,7 +263,7 @@ impl CArmOptions {
 /// Refuses impossible images and directories that already hold a dataset, before any work is done.
 fn check_output(shooting: &Shooting, out: &Path) -> Result<()> {
     if !(16..=2048).contains(&shooting.size) {
-        return Err(Error::config("--size", shooting.size, "16 to 2048 is accepted"));
+        return Err(Error::config("size", shooting.size, "16 to 2048 is accepted"));
     }
     training_angles(shooting.views)?;
     for name in [MANIFEST, nerfca::GENERAL] {
@@ -421,7 +433,7 @@ fn procedural(projector: &Projector, options: &PhantomOptions, out: &Path) -> Re
 
 fn from_files(projector: &Projector, options: &PhantomOptions, anatomy: &Anatomy, out: &Path) -> Result<Stage> {
     if !(anatomy.iodine_per_mm.is_finite() && anatomy.iodine_per_mm > 0.0) {
-        return Err(Error::config("--iodine", anatomy.iodine_per_mm, "must be positive"));
+        return Err(Error::config("iodine_per_mm", anatomy.iodine_per_mm, "must be positive"));
     }
     let tree = Tree::read(&anatomy.tree, options.phases)?;
     let still = match &anatomy.background {

@@ -5,9 +5,9 @@
 //! LAD 3.7 mm, distal LAD 1.9 mm, proximal LCx 3.4 mm, first diagonal and marginals about 2.2 mm,
 //! septals about 1.2 mm.
 
-use crate::cpu::random::{STREAM_SHAPE, uniform01};
 use crate::error::{Error, Result};
 use crate::files;
+use crate::random::{STREAM_SHAPE, uniform01};
 use glam::DVec3;
 use serde::Deserialize;
 use std::path::Path;

@@ -1,7 +1,7 @@
 //! Attenuation volumes: the procedural thorax, a real CT, and vessels drawn into voxels.
 
-use super::tree::{Heart, Tree};
-use crate::data::volume::Volume;
+use crate::formats::volume::Volume;
+use crate::phantom::tree::{Heart, Tree};
 use glam::DVec3;
 use rayon::prelude::*;
 

@@ -1,14 +1,15 @@
 //! What trains a session and what is drawn of it, shared by the threads that do so.
 
-use super::inbox::Inbox;
-use super::{Observer, Progress, State, lock};
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
-use crate::kernels::Tuning;
-use crate::output::live::{Live, Source};
-use crate::train::checkpoint::Checkpoint;
-use crate::train::plan::Plan;
+use crate::kernels::tuning::Tuning;
+use crate::model::checkpoint::Checkpoint;
+use crate::plan::Plan;
+use crate::render::live::{Live, Source};
+use crate::session::inbox::Inbox;
+use crate::session::{Observer, Progress, State, lock};
 use crate::train::trainer::Trainer;
+use crate::train::training::Training;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::ThreadId;
@@ -42,14 +43,12 @@ pub(super) struct Shared {
 /// The run under way.
 #[derive(Default)]
 pub(super) struct Engine {
-    pub(super) trainer: Option<Trainer>,
+    pub(super) training: Option<Training>,
     /// State to begin from where there is no trainer, and to fall back to.
     pub(super) saved: Option<Checkpoint>,
     /// Of the inbox the trainer was built from.
     pub(super) version: u64,
     pub(super) frames: u32,
-    /// Span of their line integrals.
-    pub(super) image_range: f64,
     /// New frames are left waiting until then.
     pub(super) settled: Option<Instant>,
 }
@@ -75,12 +74,19 @@ pub(super) fn nothing_yet() -> Error {
 impl Engine {
     /// Iterations done.
     pub(super) fn step(&self) -> u32 {
-        self.trainer.as_ref().map_or(0, Trainer::step)
+        self.training.as_ref().map_or(0, |t| t.trainer().step())
+    }
+
+    /// Counts time and iterations from now on.
+    pub(super) fn start_clock(&mut self) {
+        if let Some(training) = &mut self.training {
+            training.start_clock();
+        }
     }
 
     /// Of the run.
     pub(super) fn length(&self) -> u32 {
-        self.trainer.as_ref().map_or(0, |t| t.plan().config.train.iterations)
+        self.training.as_ref().map_or(0, |t| t.trainer().plan().config.train.iterations)
     }
 }
 
@@ -130,33 +136,34 @@ impl Shared {
     pub(super) fn take_in_frames(&self, engine: &mut Engine) -> Result<()> {
         let (gpu, tuning) = self.device()?;
         let version = self.version.load(Ordering::Acquire);
-        if engine.version == version && engine.trainer.is_some() {
+        if engine.version == version && engine.training.is_some() {
             return Ok(());
         }
         let begin = Instant::now();
-        let (dataset, mut config) = {
+        let (dataset, config) = {
             let inbox = lock(&self.inbox);
             (inbox.training_dataset()?, inbox.options.config.clone())
         };
+        let mut tuning = tuning.clone();
         if gpu.info().kind == "cpu" {
             // Views wait for what was submitted before them.
-            config.train.iterations_per_submit = 1;
+            tuning.iterations_per_submit = Some(1);
         }
         let fresh = Plan::new(&config, &dataset)?;
-        if let Some(trainer) = &mut engine.trainer {
-            let state = trainer.checkpoint()?;
+        if let Some(training) = &mut engine.training {
+            let state = training.trainer_mut().checkpoint()?;
             let fits = holds(&state.model.scene, &fresh.scene);
             if !fits {
                 tracing::warn!("new frames show vessels outside the box trained so far: training starts over");
             }
             engine.saved = fits.then_some(state);
         }
-        (engine.trainer, engine.version) = (None, 0); // its memory is needed
+        (engine.training, engine.version) = (None, 0); // its memory is needed
         let trainer = match &engine.saved {
-            None => Trainer::new(gpu, fresh, &dataset, tuning.clone())?,
+            None => Trainer::new(gpu, fresh, &dataset, tuning)?,
             Some(state) => {
                 let plan = fresh.in_scene(state.model.scene.clone());
-                Trainer::carry_on(gpu, plan, &dataset, tuning.clone(), state)?
+                Trainer::carry_on(gpu, plan, &dataset, tuning, state)?
             }
         };
         tracing::info!("training on {} frames from iteration {}", dataset.training().len(), trainer.step());
@@ -167,40 +174,34 @@ impl Shared {
         self.step.store(trainer.step(), Ordering::Release);
         let params = Some(trainer.buffers().get("params")?.clone());
         self.publish(Source { outline: trainer.outline(), params });
-        engine.image_range = image_range(&trainer.plan().images);
-        engine.trainer = Some(trainer);
+        engine.training = Some(Training::new(trainer));
         Ok(())
     }
 
     /// Keeps the device busy towards `end`. After an error the last good state is shown, if there is one.
-    pub(super) fn advance(
-        &self,
-        engine: &mut Engine,
-        end: u32,
-        first: u32,
-        begin: Instant,
-    ) -> Result<Option<Progress>> {
-        let advanced = self.try_advance(engine, end, first, begin);
+    pub(super) fn advance(&self, engine: &mut Engine, end: u32) -> Result<Option<Progress>> {
+        let advanced = self.try_advance(engine, end);
         if advanced.is_err() {
             self.fall_back(engine);
         }
         advanced
     }
 
-    fn try_advance(&self, engine: &mut Engine, end: u32, first: u32, begin: Instant) -> Result<Option<Progress>> {
-        let (frames, range) = (engine.frames, engine.image_range);
-        let Some(trainer) = &mut engine.trainer else { return Ok(None) };
-        let before = trainer.step();
-        let losses = trainer.advance(end)?;
+    fn try_advance(&self, engine: &mut Engine, end: u32) -> Result<Option<Progress>> {
+        let frames = engine.frames;
+        let Some(training) = &mut engine.training else { return Ok(None) };
+        let before = training.trainer().step();
+        let progress = training.advance(end)?;
+        let trainer = training.trainer_mut();
         self.step.store(trainer.submitted(), Ordering::Release);
         let config = &trainer.plan().config;
         let every = config.train.checkpoint_every;
-        let progress = losses.last().map(|loss| Progress {
-            loss: *loss,
+        let progress = progress.last().map(|p| Progress {
+            loss: p.loss,
             iterations: config.train.iterations,
             frames,
-            psnr_db: -10.0 * (loss.squared_error / (range * range)).max(1e-20).log10(),
-            iterations_per_s: f64::from(loss.step - first) / begin.elapsed().as_secs_f64().max(1e-9),
+            psnr_db: p.psnr_db,
+            iterations_per_s: p.iterations_per_s,
         });
         if before / every != trainer.step() / every {
             engine.saved = Some(trainer.checkpoint()?);
@@ -210,14 +211,15 @@ impl Shared {
 
     /// Lets the iterations under way finish.
     pub(super) fn drain(&self, engine: &mut Engine) -> Result<()> {
-        while let Some(under_way) = engine.trainer.as_ref().map(Trainer::submitted).filter(|n| engine.step() < *n) {
-            self.advance(engine, under_way, engine.step(), Instant::now())?;
+        let submitted = |engine: &Engine| engine.training.as_ref().map_or(0, |t| t.trainer().submitted());
+        while engine.step() < submitted(engine) {
+            self.advance(engine, submitted(engine))?;
         }
         Ok(())
     }
 
     fn fall_back(&self, engine: &mut Engine) {
-        engine.trainer = None;
+        engine.training = None;
         engine.version = 0;
         let source = engine.saved.as_ref().map(|saved| Source { outline: saved.model.clone(), params: None });
         self.step.store(engine.saved.as_ref().map_or(0, |s| s.model.step), Ordering::Release);
@@ -243,8 +245,7 @@ impl Shared {
 
     /// Training in the background.
     pub(super) fn work(&self, observe: &mut Observer<'_>) -> Result<State> {
-        let mut begin = Instant::now();
-        let mut first = None;
+        lock(&self.engine).start_clock();
         loop {
             if self.stop.load(Ordering::Acquire) {
                 self.drain(&mut lock(&self.engine))?;
@@ -254,7 +255,7 @@ impl Shared {
                 self.drain(&mut lock(&self.engine))?;
                 self.set_state(State::Paused);
                 self.rest(Duration::from_secs(1), || self.pause.load(Ordering::Acquire));
-                (begin, first) = (Instant::now(), None);
+                lock(&self.engine).start_clock();
                 continue;
             }
             while self.visitors.load(Ordering::Acquire) > 0 {
@@ -264,8 +265,8 @@ impl Shared {
             let version = self.version.load(Ordering::Acquire);
             if engine.version != version && engine.settled.is_none_or(|until| Instant::now() >= until) {
                 match self.take_in_frames(&mut engine) {
-                    Ok(()) => (begin, first) = (Instant::now(), None),
-                    Err(Error::NotReady(why)) if engine.trainer.is_none() => {
+                    Ok(()) => (),
+                    Err(Error::NotReady(why)) if engine.training.is_none() => {
                         drop(engine);
                         tracing::info!("waiting for frames: {why}");
                         self.set_state(State::Waiting);
@@ -276,9 +277,8 @@ impl Shared {
                 }
             }
             self.set_state(State::Running);
-            let first = *first.get_or_insert(engine.step());
             let length = engine.length();
-            let progress = self.advance(&mut engine, length, first, begin)?;
+            let progress = self.advance(&mut engine, length)?;
             let done = engine.step() >= length && engine.version == version;
             drop(engine);
             if progress.is_some_and(|p| !observe(&p)) {
@@ -299,9 +299,4 @@ fn holds(old: &crate::model::scene::Scene, new: &crate::model::scene::Scene) -> 
         .all(|i| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
     inside && alike(old.static_gain, new.static_gain) && alike(old.dynamic_gain, new.dynamic_gain)
-}
-
-fn image_range(images: &[f32]) -> f64 {
-    let (low, high) = images.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
-    f64::from(high - low)
 }

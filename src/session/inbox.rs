@@ -1,10 +1,10 @@
 //! Frames of a session, as they came.
 
 use crate::config::{Config, DynamicTarget};
-use crate::data::dataset::{Dataset, Frame, Layout, Split, View};
-use crate::data::gating::RPeaks;
-use crate::data::geometry::{Geometry, MM_PER_UNIT};
 use crate::error::{Error, Result};
+use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use crate::scan::gating::RPeaks;
 use std::path::PathBuf;
 
 /// What a session is about.

@@ -1,20 +1,23 @@
 //! Owns the buffers and the step count of a run; hands iterations to the device, two submits in flight on a GPU,
 //! and reads losses without stalling it.
 
-use super::checkpoint::{Checkpoint, LossScale};
-use super::network::Network;
-use super::plan::Plan;
-use super::step::{occupancy_bytes, record_step, training_buffers};
-use crate::data::dataset::Dataset;
-use crate::data::geometry::CArm;
 use crate::error::{Error, Result};
+use crate::geometry::CArm;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
-use crate::kernels::{Buffers, Kernels, Tuning};
-use crate::layout::DeviceState;
-use crate::model::field::Model;
-use crate::model::scene::{RING_LENGTH, sample_capacity};
+use crate::kernels::dispatch::Buffers;
+use crate::kernels::layout::DeviceState;
+use crate::kernels::stages::Kernels;
+use crate::kernels::tuning::Tuning;
+use crate::model::Model;
+use crate::model::checkpoint::{Checkpoint, LossScale};
+use crate::model::setup::{RING_LENGTH, sample_capacity};
+use crate::network::Network;
+use crate::network::forward::occupancy_bytes;
+use crate::plan::Plan;
+use crate::scan::dataset::Dataset;
+use crate::train::step::{record_step, training_buffers};
 use serde::Serialize;
 use std::collections::VecDeque;
 
@@ -62,6 +65,8 @@ pub struct Trainer {
     kernels: Kernels,
     network: Network,
     buffers: Buffers,
+    /// Iterations of `several`.
+    per_submit: u32,
     several: Commands,
     single: Commands,
     in_flight: VecDeque<(Ticket, u32)>,
@@ -114,7 +119,7 @@ impl Trainer {
     ) -> Result<Trainer> {
         if checkpoint.data_fingerprint != data_fingerprint(dataset) {
             return Err(Error::config(
-                "--resume",
+                "dataset",
                 dataset.path.display(),
                 "the checkpoint was trained on other images or geometry",
             ));
@@ -175,12 +180,14 @@ impl Trainer {
             }
             recording.finish()
         };
-        let (several, single) = (record(plan.config.train.iterations_per_submit)?, record(1)?);
+        let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
+        let (several, single) = (record(per_submit)?, record(1)?);
         Ok(Trainer {
             gpu: gpu.clone(),
             kernels,
             network,
             buffers,
+            per_submit,
             several,
             single,
             in_flight: VecDeque::new(),
@@ -223,9 +230,11 @@ impl Trainer {
     /// [`Error::Diverged`] on a loss that is not finite or exploded; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
         while self.submitted < until && self.in_flight.len() < submits_in_flight(&self.gpu) {
-            let several = self.plan.config.train.iterations_per_submit;
-            let (commands, n) =
-                if until - self.submitted >= several { (&self.several, several) } else { (&self.single, 1) };
+            let (commands, n) = if until - self.submitted >= self.per_submit {
+                (&self.several, self.per_submit)
+            } else {
+                (&self.single, 1)
+            };
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
         }

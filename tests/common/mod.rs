@@ -2,10 +2,10 @@
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 
 use nertca_vk::config::Config;
-use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
-use nertca_vk::data::geometry::{CArm, Geometry};
+use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::kernels::Tuning;
+use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::train::trainer::Trainer;
 use std::path::PathBuf;
 
@@ -97,7 +97,7 @@ pub fn small_config(preset: &str, settings: &[&str]) -> Config {
     .map(String::from)
     .to_vec();
     all.extend(settings.iter().map(|s| (*s).to_owned()));
-    let preset = clap::ValueEnum::from_str(preset, true).unwrap();
+    let preset = nertca_vk::choice::Choice::named(preset).unwrap();
     Config::load(Some(preset), None, &all).unwrap()
 }
 

@@ -1,0 +1,73 @@
+//! `eval`.
+
+use super::args::{Cli, EvalArgs};
+use super::report::write_page;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::files::pretty_json;
+use nertca_vk::model::checkpoint::newest_model;
+use nertca_vk::run::info::RunInfo;
+use nertca_vk::run::score::evaluate_model;
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::eval::Evaluation;
+use std::path::Path;
+
+/// Scores a run.
+pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
+    let data = match &args.data {
+        Some(path) => path.clone(),
+        None => RunInfo::read(&args.run)?.dataset,
+    };
+    if args.threshold.is_some_and(|t| !(t.is_finite() && t >= 0.0)) {
+        return Err(Error::config("--threshold", args.threshold.unwrap_or_default(), "must not be negative"));
+    }
+    let dataset = Dataset::open(&data)?;
+    let gpu = cli.open_device()?;
+    let model = newest_model(&args.run)?;
+    let tuning = cli.tuning(&gpu, &model.config);
+    let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, args.threshold, args.images.as_deref())?;
+    let run = if args.run.is_dir() { args.run.as_path() } else { args.run.parent().unwrap_or(Path::new("")) };
+    let (pictures, page) = match &args.images {
+        Some(images) => (images.as_path(), images.join("report.html")),
+        None => (Path::new(""), run.join("eval.html")),
+    };
+    write_page(&gpu, &tuning, &model, &dataset, Some(&evaluation), (run, pictures), &page)?;
+    if args.json {
+        out!("{}", pretty_json(&evaluation)?);
+    } else {
+        print_table(&evaluation);
+    }
+    cli.close_device(&gpu)
+}
+
+/// Prints scores as a table with means.
+pub fn print_table(evaluation: &Evaluation) {
+    let dice = |d: Option<f64>| d.map_or("    -".into(), |d| format!("{d:.3}"));
+    let angle = |a: Option<f64>| a.map_or("    -".into(), |a| format!("{a:5.0}"));
+    out!("primary secondary phase  Dice dynamic  Dice total   PSNR dB   SSIM");
+    for i in &evaluation.images {
+        out!(
+            "{}   {}     {:3}         {}       {}    {:6.2}  {:.3}",
+            angle(i.primary_deg),
+            angle(i.secondary_deg),
+            i.phase,
+            dice(i.dice_dynamic),
+            dice(i.dice_total),
+            i.psnr,
+            i.ssim
+        );
+    }
+    out!(
+        "mean of {:3} images          {}       {}    {:6.2}  {:.3}",
+        evaluation.images.len(),
+        dice(evaluation.dice.dynamic),
+        dice(evaluation.dice.total),
+        evaluation.psnr,
+        evaluation.ssim
+    );
+    out!(
+        "Dice threshold {:.4e} / {:.4e} per mm (dynamic / total): {}",
+        evaluation.threshold.dynamic_per_mm,
+        evaluation.threshold.total_per_mm,
+        evaluation.threshold.rule
+    );
+}

@@ -1,0 +1,39 @@
+//! How the program ends: exit codes, and what to type after an error.
+
+use nertca_vk::error::Error;
+
+/// A command or an option is not usable.
+const USAGE: u8 = 2;
+/// No Vulkan device fits.
+const NO_DEVICE: u8 = 3;
+/// What failed may succeed when it is tried again (`EX_TEMPFAIL`): for schedulers.
+const TRY_AGAIN: u8 = 75;
+/// Stopped by Ctrl-C or SIGTERM; what was done is saved.
+const INTERRUPTED: u8 = 130;
+
+/// Exit code of an error; 1 for all that has none of its own.
+pub fn code(error: &Error) -> u8 {
+    match error {
+        Error::Config { .. } => USAGE,
+        Error::NoDevice(_) => NO_DEVICE,
+        Error::DeviceLost { .. } => TRY_AGAIN,
+        Error::OutOfMemory { may_pass: true, .. } => TRY_AGAIN,
+        Error::Interrupted => INTERRUPTED,
+        _ => 1,
+    }
+}
+
+/// What to try on the command line, where the error itself cannot say.
+pub fn hint(error: &Error) -> Option<&'static str> {
+    match error {
+        Error::DeviceLost { .. } => Some(
+            "a run that was training goes on from its last checkpoint with --resume; \
+             --set train.iterations_per_submit=N and --device choose smaller submits and another device",
+        ),
+        Error::OutOfMemory { .. } => {
+            Some("--set train.chunk_samples=N, --set train.rays=N and --device need less or offer more")
+        }
+        Error::Diverged { .. } => Some("learning rates are set with --set dynamic.lr=X and --set static.lr=X"),
+        _ => None,
+    }
+}

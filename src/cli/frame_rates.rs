@@ -1,0 +1,78 @@
+//! Frames per second of renderings.
+
+use super::args::{Cli, RenderArgs};
+use super::render::{Renders, shot};
+use nertca_vk::error::Result;
+use nertca_vk::model::Model;
+use nertca_vk::model::component::Component;
+use nertca_vk::render::baked::{BAKED_CELLS, Baked};
+use nertca_vk::render::quantity::{Projection, Quantity};
+use nertca_vk::render::renderer::Renderer;
+use std::sync::Arc;
+
+/// Frames per second of a model turning about the patient, every phase in turn.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+pub struct FrameRate {
+    /// `fields` or `baked`.
+    pub way: String,
+    /// Columns and rows.
+    pub size: usize,
+    /// Frames rendered.
+    pub frames: u32,
+    /// Per second of wall time, read back to the host.
+    pub fps: f64,
+}
+
+/// Renders for at least `seconds` at each size, both ways.
+pub fn measure_frame_rates(
+    renderer: &Arc<Renderer>,
+    model: &Model,
+    component: Component,
+    sizes: &[usize],
+    seconds: f64,
+) -> Result<Vec<FrameRate>> {
+    let baked = Renders::Baked(Box::new(Baked::new(renderer.clone(), BAKED_CELLS)?));
+    let quantity = Quantity { component, projection: Projection::Drr };
+    let mut rates = Vec::new();
+    for (way, renders) in [("fields", &Renders::Fields(renderer.clone())), ("baked", &baked)] {
+        for &size in sizes {
+            let frame = |i: u32| {
+                let shot = shot(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
+                renders.render(&shot, i % model.layout.phases as u32, quantity)
+            };
+            frame(0)?;
+            let (begin, mut frames) = (std::time::Instant::now(), 0);
+            while frames < 2 || begin.elapsed().as_secs_f64() < seconds {
+                frames += 1;
+                frame(frames)?;
+            }
+            rates.push(FrameRate {
+                way: way.into(),
+                size,
+                frames,
+                fps: f64::from(frames) / begin.elapsed().as_secs_f64(),
+            });
+        }
+    }
+    Ok(rates)
+}
+
+/// Prints frame rates as a table.
+pub fn print_frame_rates(rates: &[FrameRate]) {
+    for r in rates {
+        out!("{:6} {:4} x {:<4} {:9.1} frames/s ({} frames)", r.way, r.size, r.size, r.fps, r.frames);
+    }
+}
+
+/// Measures and prints.
+pub fn print_measured(cli: &Cli, args: &RenderArgs, model: &Model) -> Result<()> {
+    let gpu = cli.open_device()?;
+    let renderer = Arc::new(Renderer::new(&gpu, model, cli.tuning(&gpu, &model.config))?);
+    let mut sizes = vec![200, 512];
+    sizes.extend(args.size.filter(|n| ![200, 512].contains(n)));
+    let rates = measure_frame_rates(&renderer, model, args.component, &sizes, 2.0)?;
+    out!("{}, {:?}", gpu.info().name, args.component);
+    print_frame_rates(&rates);
+    drop(renderer);
+    cli.close_device(&gpu)
+}

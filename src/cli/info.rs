@@ -1,0 +1,91 @@
+//! `info`.
+
+use super::args::InfoArgs;
+use nertca_vk::error::Result;
+use nertca_vk::files::pretty_json;
+use nertca_vk::geometry::MM_PER_UNIT;
+use nertca_vk::model::checkpoint::{self, Checkpoint};
+use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
+use nertca_vk::score::pictures::Window;
+use std::path::Path;
+
+/// Describes a dataset or a run.
+pub fn info(args: &InfoArgs) -> Result<()> {
+    if args.schema {
+        out!("{}", manifest_schema().trim_end());
+        return Ok(());
+    }
+    let path = args.path.as_deref().unwrap_or(Path::new("."));
+    let is_run = path.is_file() || checkpoint::list(path).is_ok_and(|found| !found.is_empty());
+    let described = if is_run { describe_run(path)? } else { describe_dataset(path)? };
+    if args.json {
+        out!("{}", pretty_json(&described)?);
+    } else {
+        print_tree(&described, 0);
+    }
+    Ok(())
+}
+
+fn describe_run(path: &Path) -> Result<serde_json::Value> {
+    let file = checkpoint::newest(path)?;
+    let model = Checkpoint::read(&file)?.model;
+    Ok(serde_json::json!({
+        "kind": "run",
+        "checkpoint": file,
+        "step": model.step,
+        "iterations": model.config.train.iterations,
+        "parameters": model.layout.len,
+        "phases": model.layout.phases,
+        "hull_share": model.hull.as_ref().map(|h| h.share()),
+        "scene": model.scene,
+        "config": model.config,
+    }))
+}
+
+fn describe_dataset(path: &Path) -> Result<serde_json::Value> {
+    let dataset = Dataset::open(path)?;
+    let views: Vec<_> = dataset
+        .views
+        .iter()
+        .enumerate()
+        .map(|(index, view)| {
+            let of = |split| dataset.frames.iter().filter(|f| f.view == index && f.split == split).count();
+            serde_json::json!({
+                "geometry": view.geometry,
+                "training_frames": of(Split::Train),
+                "validation_frames": of(Split::Validation),
+            })
+        })
+        .collect();
+    let range = Window::of(&dataset.training().iter().flat_map(|f| f.integrals.iter().copied()).collect::<Vec<_>>());
+    Ok(serde_json::json!({
+        "kind": "dataset",
+        "layout": dataset.layout,
+        "image": [dataset.width, dataset.height],
+        "phases": dataset.n_phases,
+        "depth_range_mm": [dataset.depth_range.0 * MM_PER_UNIT, dataset.depth_range.1 * MM_PER_UNIT],
+        "line_integrals": [range.low, range.high],
+        "vessel_attenuation_per_mm": dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+        "masks": dataset.frames.iter().filter(|f| f.mask.is_some()).count(),
+        "views": views,
+    }))
+}
+
+fn print_tree(value: &serde_json::Value, depth: usize) {
+    let Some(map) = value.as_object() else { return };
+    for (key, value) in map {
+        match value {
+            serde_json::Value::Object(_) => {
+                out!("{:indent$}{key}:", "", indent = 2 * depth);
+                print_tree(value, depth + 1);
+            }
+            serde_json::Value::Array(items) if items.iter().any(serde_json::Value::is_object) => {
+                for (index, item) in items.iter().enumerate() {
+                    out!("{:indent$}{key}[{index}]:", "", indent = 2 * depth);
+                    print_tree(item, depth + 1);
+                }
+            }
+            other => out!("{:indent$}{key}: {other}", "", indent = 2 * depth),
+        }
+    }
+}

@@ -1,0 +1,298 @@
+//! `report.html`: one page that needs nothing but itself. Plots are SVG, pictures are embedded, and phases are chosen by
+//! radio buttons, so that no script is needed.
+
+use base64::Engine;
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+use nertca_vk::error::{Error, Result};
+use nertca_vk::files;
+use nertca_vk::score::eval::Evaluation;
+use plotters::prelude::*;
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The paper's time on an RTX A5000, seconds.
+const PAPER_S: f64 = 37.0 * 60.0;
+/// Pictures embedded at most.
+const MOST_PICTURES: usize = 120;
+
+/// What a page tells.
+pub struct Page<'a> {
+    /// Name of the run.
+    pub title: String,
+    /// Facts about the run: name and value.
+    pub facts: Vec<(String, String)>,
+    /// Things to look at.
+    pub warnings: Vec<String>,
+    /// Lines of `metrics.jsonl`; empty when there are none.
+    pub metrics: Vec<Value>,
+    /// Scores, where there were views to score.
+    pub evaluation: Option<&'a Evaluation>,
+    /// Comparison picture of each scored frame: view, phase, file.
+    pub pictures: Vec<(usize, u32, PathBuf)>,
+    /// The whole configuration.
+    pub config: String,
+}
+
+const STYLE: &str = "
+:root{color-scheme:light dark;--ink:#1b1d21;--paper:#fcfcfb;--soft:#6c7078;--line:#d9dbdf;--mark:#b3261e}
+@media(prefers-color-scheme:dark){:root{--ink:#e7e8ea;--paper:#17181b;--soft:#9a9ea7;--line:#3a3d44;--mark:#ff8a80}
+.plot svg{filter:invert(.91) hue-rotate(180deg)}}
+body{font:16px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--paper);max-width:70rem;margin:2rem auto;padding:0 1rem}
+h1{font-size:1.6rem;margin:0}h2{font-size:1.15rem;margin:2.2rem 0 .6rem}p.lead{color:var(--soft);margin:.2rem 0 1rem}
+table{border-collapse:collapse;font-variant-numeric:tabular-nums}td,th{padding:.2rem .8rem .2rem 0;text-align:right;border-bottom:1px solid var(--line)}
+th:first-child,td:first-child{text-align:left}.facts td{text-align:left}.facts td:first-child{color:var(--soft)}
+.numbers{display:flex;flex-wrap:wrap;gap:2.5rem;margin:1rem 0}.numbers b{display:block;font-size:1.7rem;font-weight:600}
+.warn{border-left:3px solid var(--mark);padding:.2rem .8rem;margin:.4rem 0}.plot svg{width:100%;height:auto;max-width:56rem}
+fieldset{border:0;padding:0;margin:0 0 1.5rem}legend{padding:0;color:var(--soft)}input.p{position:absolute;opacity:0}
+label.p{display:inline-block;min-width:1.6rem;text-align:center;padding:.1rem .4rem;border:1px solid var(--line);cursor:pointer}
+input.p:focus-visible+label.p{outline:2px solid}.shot{display:none}.shot img{width:100%;image-rendering:pixelated}
+.bars div{background:var(--soft);height:.7rem}pre{overflow:auto;border:1px solid var(--line);padding:.6rem;font-size:.85rem}
+.scroll{overflow-x:auto;max-height:26rem}";
+
+/// Series of a plot.
+struct Line {
+    name: &'static str,
+    colour: RGBColor,
+    points: Vec<(f64, f64)>,
+}
+
+/// A plot over the time of training, on a logarithmic axis that reaches the paper's 37 minutes.
+fn plot(title: &str, lines: &[Line], log_y: bool) -> Result<String> {
+    let fault = |e: &dyn std::fmt::Display| Error::Internal(format!("plot: {e}"));
+    let all: Vec<(f64, f64)> = lines.iter().flat_map(|l| l.points.iter().copied()).filter(|p| p.0 > 0.0).collect();
+    if all.is_empty() {
+        return Ok(String::new());
+    }
+    let fold = |pick: fn(&(f64, f64)) -> f64, start: f64, f: fn(f64, f64) -> f64| all.iter().map(pick).fold(start, f);
+    let first = fold(|p| p.0, f64::MAX, f64::min).max(1e-3);
+    let last = fold(|p| p.0, 0.0, f64::max).max(PAPER_S * 1.3);
+    let (mut low, mut high) = (fold(|p| p.1, f64::MAX, f64::min), fold(|p| p.1, f64::MIN, f64::max));
+    if log_y {
+        (low, high) = (low.max(1e-12).log10(), high.max(1e-12).log10());
+    } else {
+        low = low.min(0.0);
+    }
+    let room = 0.06 * (high - low).max(1e-6);
+    let mut svg = String::new();
+    {
+        let area = SVGBackend::with_string(&mut svg, (900, 320)).into_drawing_area();
+        let mut chart = ChartBuilder::on(&area)
+            .margin(12)
+            .x_label_area_size(38)
+            .y_label_area_size(64)
+            .caption(title, ("sans-serif", 18))
+            .build_cartesian_2d(first.log10()..last.log10(), low..high + room)
+            .map_err(|e| fault(&e))?;
+        chart
+            .configure_mesh()
+            .light_line_style(TRANSPARENT)
+            .x_desc("seconds of training")
+            .x_label_formatter(&|x| match 10f64.powf(*x) {
+                s if s < 10.0 => format!("{s:.1}"),
+                s => format!("{s:.0}"),
+            })
+            .y_label_formatter(&|y| if log_y { format!("{:.1e}", 10f64.powf(*y)) } else { format!("{y:.2}") })
+            .draw()
+            .map_err(|e| fault(&e))?;
+        let paper = [(PAPER_S.log10(), low), (PAPER_S.log10(), high + room)];
+        chart
+            .draw_series(std::iter::once(PathElement::new(paper, RGBColor(180, 40, 30).stroke_width(1))))
+            .map_err(|e| fault(&e))?
+            .label("the paper: 37 minutes of an RTX A5000")
+            .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], RGBColor(180, 40, 30)));
+        for line in lines.iter().filter(|l| !l.points.is_empty()) {
+            let colour = line.colour;
+            let at = |p: &(f64, f64)| (p.0.max(first).log10(), if log_y { p.1.max(1e-12).log10() } else { p.1 });
+            let style = colour.stroke_width(2);
+            chart
+                .draw_series(LineSeries::new(line.points.iter().map(at), style))
+                .map_err(|e| fault(&e))?
+                .label(line.name)
+                .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], colour));
+            if line.points.len() < 40 {
+                let dots = line.points.iter().map(|p| Circle::new(at(p), 3, colour.filled()));
+                chart.draw_series(dots).map_err(|e| fault(&e))?;
+            }
+        }
+        chart
+            .configure_series_labels()
+            .position(if log_y { SeriesLabelPosition::LowerLeft } else { SeriesLabelPosition::LowerRight })
+            .background_style(WHITE.mix(0.7))
+            .label_font(("sans-serif", 14))
+            .draw()
+            .map_err(|e| fault(&e))?;
+        area.present().map_err(|e| fault(&e))?;
+    }
+    Ok(svg)
+}
+
+impl Page<'_> {
+    fn series(&self, event: &str, time: &str, value: &str) -> Vec<(f64, f64)> {
+        let of_event = self.metrics.iter().filter(|line| line["event"] == event);
+        of_event.filter_map(|line| Some((line[time].as_f64()?, line[value].as_f64()?))).collect()
+    }
+
+    fn plots(&self) -> Result<Markup> {
+        let (blue, orange, green) = (RGBColor(30, 100, 190), RGBColor(215, 120, 20), RGBColor(40, 130, 70));
+        let loss = plot(
+            "Loss",
+            &[
+                Line { name: "data", colour: blue, points: self.series("progress", "elapsed_s", "data") },
+                Line { name: "dynamic field", colour: orange, points: self.series("progress", "elapsed_s", "dynamic") },
+            ],
+            true,
+        )?;
+        let dice = plot(
+            "Unseen views",
+            &[
+                Line {
+                    name: "Dice, dynamic field",
+                    colour: orange,
+                    points: self.series("validation", "train_s", "dice_dynamic"),
+                },
+                Line { name: "Dice, both", colour: green, points: self.series("validation", "train_s", "dice_total") },
+                Line { name: "SSIM", colour: blue, points: self.series("validation", "train_s", "ssim") },
+            ],
+            false,
+        )?;
+        Ok(html! {
+            @if !loss.is_empty() || !dice.is_empty() { h2 { "Over time" } }
+            @for svg in [loss, dice] { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } }
+        })
+    }
+
+    fn kernels(&self) -> Markup {
+        let Some(passes) = self.metrics.iter().rev().find_map(|line| line["passes"].as_array()) else {
+            return html! {};
+        };
+        let mut by_name: BTreeMap<&str, f64> = BTreeMap::new();
+        for pass in passes {
+            if let (Some(name), Some(ms)) = (pass["name"].as_str(), pass["ms"].as_f64()) {
+                *by_name.entry(name).or_default() += ms;
+            }
+        }
+        let total: f64 = by_name.values().sum();
+        let mut rows: Vec<_> = by_name.into_iter().collect();
+        rows.sort_by(|a, b| b.1.total_cmp(&a.1));
+        html! {
+            @if total > 0.0 {
+                h2 { "Time of one iteration on the device: " (format!("{total:.2}")) " ms" }
+                table.bars {
+                    @for (name, ms) in rows.iter().take(14) {
+                        tr { td { (name) } td { (format!("{ms:.3}")) " ms" } td { (format!("{:.1}", 100.0 * ms / total)) " %" }
+                            td style="width:20rem" { div style=(format!("width:{:.1}%", 100.0 * ms / rows[0].1)) {} } }
+                    }
+                }
+            }
+        }
+    }
+
+    fn scores(&self) -> Markup {
+        let Some(e) = self.evaluation else { return html! {} };
+        let dice = |d: Option<f64>| d.map_or("-".into(), |d| format!("{d:.3}"));
+        html! {
+            div.numbers {
+                div { b { (dice(e.dice.dynamic)) } "Dice, dynamic field" }
+                div { b { (dice(e.dice.total)) } "Dice, both fields" }
+                div { b { (format!("{:.1}", e.psnr)) } "PSNR, dB" }
+                div { b { (format!("{:.3}", e.ssim)) } "SSIM" }
+            }
+            h2 { "Scores of " (e.images.len()) " unseen images" }
+            p.lead { "Vessel where attenuation exceeds " (format!("{:.3e}", e.threshold.dynamic_per_mm)) " per mm (" (e.threshold.rule) ")" }
+            div.scroll { table {
+                tr { th { "image" } th { "primary" } th { "secondary" } th { "phase" } th { "Dice dynamic" } th { "Dice total" } th { "PSNR dB" } th { "SSIM" } }
+                @for i in &e.images {
+                    tr {
+                        td { (i.name) }
+                        td { (i.primary_deg.map_or("-".into(), |a| format!("{a:.1}°"))) }
+                        td { (i.secondary_deg.map_or("-".into(), |a| format!("{a:.1}°"))) }
+                        td { (i.phase) } td { (dice(i.dice_dynamic)) } td { (dice(i.dice_total)) }
+                        td { (format!("{:.2}", i.psnr)) } td { (format!("{:.3}", i.ssim)) }
+                    }
+                }
+            } }
+        }
+    }
+
+    fn views(&self) -> Result<Markup> {
+        let mut by_view: BTreeMap<usize, Vec<(u32, &PathBuf)>> = BTreeMap::new();
+        // Evenly thinned out where there are too many.
+        let step = self.pictures.len().div_ceil(MOST_PICTURES).max(1);
+        for (view, phase, path) in self.pictures.iter().step_by(step) {
+            by_view.entry(*view).or_default().push((*phase, path));
+        }
+        let mut rules = String::new();
+        let mut views = Vec::new();
+        for (index, (view, mut frames)) in by_view.into_iter().enumerate() {
+            frames.sort();
+            let mut shots = Vec::new();
+            for (slot, (phase, path)) in frames.into_iter().enumerate() {
+                let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+                rules += &format!(
+                    "#v{index}s{slot}:checked~.v{index}s{slot}{{display:block}}#v{index}s{slot}:checked+label{{background:var(--ink);color:var(--paper)}}"
+                );
+                shots.push((slot, phase, base64::engine::general_purpose::STANDARD.encode(bytes)));
+            }
+            views.push((index, view, shots));
+        }
+        Ok(html! {
+            @if !views.is_empty() {
+                h2 { "Unseen views" }
+                p.lead { "Truth, prediction, static field, dynamic field, vessel overlap (green found, red missed, blue added); choose the phase."
+                    @if step > 1 { " Every " (step) "th image is shown." } }
+                style { (PreEscaped(rules)) }
+                @for (index, view, shots) in &views {
+                    fieldset {
+                        legend { "View " (view) ", phase" }
+                        @for (slot, phase, _) in shots {
+                            @let id = format!("v{index}s{slot}");
+                            @if *slot == 0 {
+                                input.p type="radio" name=(format!("v{index}")) id=(id) checked;
+                            } @else {
+                                input.p type="radio" name=(format!("v{index}")) id=(id);
+                            }
+                            label.p for=(id) { (phase) }
+                        }
+                        @for (slot, phase, data) in shots {
+                            div class=(format!("shot v{index}s{slot}")) {
+                                img alt=(format!("view {view} at phase {phase}")) src=(format!("data:image/png;base64,{data}"));
+                            }
+                        }
+                    }
+                }
+            }
+        })
+    }
+
+    /// Writes the page.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let page = html! {
+            (DOCTYPE)
+            html lang="en" {
+                head {
+                    meta charset="utf-8";
+                    meta name="viewport" content="width=device-width";
+                    title { (self.title) " - nertca-vk" }
+                    style { (PreEscaped(STYLE)) }
+                }
+                body {
+                    h1 { (self.title) }
+                    p.lead { "4D reconstruction of the coronary arteries, nertca-vk " (env!("CARGO_PKG_VERSION")) }
+                    @for warning in &self.warnings { p.warn { (warning) } }
+                    (self.scores())
+                    (self.plots()?)
+                    (self.views()?)
+                    (self.kernels())
+                    h2 { "What ran on what" }
+                    table.facts { @for (name, value) in &self.facts { tr { td { (name) } td { (value) } } } }
+                    details { summary { "Configuration" } pre { (self.config) } }
+                }
+            }
+        };
+        files::write_atomic(path, page.into_string().as_bytes())
+    }
+}

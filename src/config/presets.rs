@@ -1,0 +1,144 @@
+//! The presets.
+
+use crate::config::sections::{Adam, DynamicField, Hull, Loss, March, Occupancy, StaticField, Train};
+use crate::config::{Config, Decay, DynamicTarget, Preset};
+
+impl Config {
+    /// Defaults of a preset.
+    pub fn preset(preset: Preset) -> Config {
+        match preset {
+            Preset::Fast => fast(paper()),
+            Preset::Paper => paper(),
+            Preset::PublicCode => public_code(paper()),
+        }
+    }
+}
+
+/// As the paper states it (section 4).
+fn paper() -> Config {
+    Config {
+        preset: Preset::Paper,
+        seed: 1,
+        train: Train {
+            iterations: 30_000,
+            rays: 2048,
+            motion_share: 0.0,
+            chunk_samples: 524_288,
+            iterations_per_submit: 16,
+            checkpoint_every: 1000,
+            validate_every: 1000,
+            validate_images: 8,
+        },
+        march: March {
+            static_samples: 256,
+            dynamic_samples: 256,
+            render_samples: 256,
+            per_ray_depths: true,
+            fit_dynamic_range: false,
+        },
+        static_field: StaticField {
+            grid: 48,
+            ranks: 3,
+            half_extent_mm: 50.0,
+            init_std: 0.01,
+            lr: 1e-2,
+            lr_end: 1e-3,
+            decay: Decay::Linear,
+            tv: 1e-2,
+            tv_plane: 1e-2,
+            tv_line: 1e-3,
+        },
+        dynamic: DynamicField {
+            layers: 4,
+            width: 128,
+            skip_layer: 0,
+            latent: 8,
+            bands: 10,
+            window_start: 0.0,
+            window_iterations: 15_000,
+            half_extent_mm: 100.0,
+            encode_box: false,
+            delay: 1500,
+            lr: 1e-1,
+            lr_end: 1e-2,
+            decay: Decay::Linear,
+            normalised_shift: -2.0,
+            occlusion: 1e-8,
+            occlusion_share: 0.2,
+        },
+        loss: Loss { normalise: false, dynamic_target: DynamicTarget::Absolute, robust: 0.0 },
+        hull: Hull {
+            enabled: false,
+            per_phase: false,
+            resolution: 128,
+            noise_sigmas: 6.0,
+            min_share: 0.1,
+            min_share_few_views: 0.1,
+            vessel_pixels: 3,
+            dilate_pixels: 1,
+            max_share: 0.35,
+        },
+        occupancy: Occupancy { enabled: false, cells: 64, start: 15_000, threshold: 0.01 },
+        adam: Adam { beta1: 0.9, beta2: 0.99, epsilon: 1e-8 },
+    }
+}
+
+/// Where the authors' public code differs from the paper.
+fn public_code(paper: Config) -> Config {
+    Config {
+        preset: Preset::PublicCode,
+        march: March { per_ray_depths: false, ..paper.march },
+        static_field: StaticField { lr: 2e-2, lr_end: 2e-3, decay: Decay::Exponential, ..paper.static_field },
+        dynamic: DynamicField { layers: 5, skip_layer: 4, decay: Decay::Exponential, ..paper.dynamic },
+        ..paper
+    }
+}
+
+/// Normalised, hull-gated, tuned.
+fn fast(paper: Config) -> Config {
+    Config {
+        preset: Preset::Fast,
+        train: Train {
+            iterations: 1200,
+            rays: 1024,
+            motion_share: 0.85,
+            validate_every: 200,
+            checkpoint_every: 400,
+            ..paper.train
+        },
+        march: March {
+            static_samples: 32,
+            dynamic_samples: 128,
+            render_samples: 256,
+            per_ray_depths: true,
+            fit_dynamic_range: true,
+        },
+        static_field: StaticField { half_extent_mm: 0.0, tv: 1e-3, ..paper.static_field },
+        dynamic: DynamicField {
+            layers: 4,
+            width: 96,
+            bands: 8,
+            window_start: 4.0,
+            window_iterations: 600,
+            half_extent_mm: 0.0,
+            encode_box: true,
+            delay: 0,
+            lr: 1e-2,
+            lr_end: 3e-4,
+            occlusion: 0.0,
+            ..paper.dynamic
+        },
+        loss: Loss { normalise: true, dynamic_target: DynamicTarget::Temporal, robust: 0.1 },
+        hull: Hull {
+            enabled: true,
+            per_phase: true,
+            resolution: 224,
+            min_share: 0.05,
+            min_share_few_views: 0.08,
+            dilate_pixels: 0,
+            ..paper.hull
+        },
+        occupancy: Occupancy { enabled: true, start: 256, ..paper.occupancy },
+        ..paper
+    }
+}

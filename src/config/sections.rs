@@ -1,0 +1,202 @@
+//! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
+
+use crate::config::{Decay, DynamicTarget};
+use crate::error::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+/// Declares a section; `in LOW to HIGH` after a number's type is the range that [`Config::check`](super::Config::check)
+/// accepts.
+macro_rules! section {
+    ($(#[$about:meta])* $name:ident, $prefix:literal {
+        $($(#[$doc:meta])* $field:ident: $ty:ident $(in $low:literal to $high:literal)?,)*
+    }) => {
+        $(#[$about])*
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct $name {
+            $($(#[$doc])* pub $field: $ty,)*
+        }
+
+        impl $name {
+            pub(super) fn check_ranges(&self) -> Result<()> {
+                $($(check_range(concat!($prefix, ".", stringify!($field)), f64::from(self.$field), $low, $high)?;)?)*
+                Ok(())
+            }
+        }
+    };
+}
+
+pub(super) fn check_range(field: &str, value: f64, low: f64, high: f64) -> Result<()> {
+    // A value that is not a number is in no range.
+    if value >= low && value <= high {
+        return Ok(());
+    }
+    Err(Error::config(field, value, format!("{low} to {high} is accepted")))
+}
+
+section! {
+    /// The loop.
+    Train, "train" {
+        /// Length of the run; schedules refer to it.
+        iterations: u32 in 1.0 to 1e6,
+        /// Rays of a batch.
+        rays: u32 in 1.0 to 65_535.0,
+        /// Share of the batch drawn from rays that meet the motion hull.
+        motion_share: f64 in 0.0 to 1.0,
+        /// Samples evaluated at once, at most: bounds device memory, not results. A device may allow fewer.
+        chunk_samples: u32 in 1024.0 to 1_048_576.0,
+        /// Iterations handed to the device at once.
+        iterations_per_submit: u32 in 1.0 to 256.0,
+        /// Iterations between checkpoints.
+        checkpoint_every: u32 in 1.0 to 1e6,
+        /// Iterations between validations; 0 turns them off.
+        validate_every: u32,
+        /// Validation images used during training; evenly spread over all of them.
+        validate_images: u32,
+    }
+}
+
+section! {
+    /// Sampling along rays.
+    March, "march" {
+        /// Depths per ray for the static field.
+        static_samples: u32 in 2.0 to 4096.0,
+        /// Depths per ray for the dynamic field.
+        dynamic_samples: u32 in 2.0 to 4096.0,
+        /// Depths per ray when rendering.
+        render_samples: u32 in 2.0 to 4096.0,
+        /// Draw depths for each ray instead of once per iteration.
+        per_ray_depths: bool,
+        /// Spread the dynamic field's depths over its own box instead of the whole depth range.
+        fit_dynamic_range: bool,
+    }
+}
+
+section! {
+    /// The low-rank static field.
+    StaticField, "static" {
+        /// Cells per axis, D.
+        grid: u32 in 2.0 to 512.0,
+        /// Ranks per mode, R.
+        ranks: u32 in 1.0 to 64.0,
+        /// Half side of its box, mm; 0 = the dataset's depth range.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Standard deviation of the initial planes and lines.
+        init_std: f64 in 0.0 to 10.0,
+        /// Learning rate at the start.
+        lr: f64 in 0.0 to 100.0,
+        /// Learning rate at the end.
+        lr_end: f64 in 0.0 to 100.0,
+        /// How it decays.
+        decay: Decay,
+        /// Weight of total variation, lambda_TV.
+        tv: f64 in 0.0 to 1e6,
+        /// Share of the planes in it.
+        tv_plane: f64,
+        /// Share of the lines in it.
+        tv_line: f64,
+    }
+}
+
+section! {
+    /// The dynamic neural field.
+    DynamicField, "dynamic" {
+        /// Hidden layers.
+        layers: u32 in 1.0 to 16.0,
+        /// Neurons per hidden layer, a multiple of 16.
+        width: u32 in 16.0 to 1024.0,
+        /// Hidden layer (from 1) that sees the encoded input again; 0 = none.
+        skip_layer: u32,
+        /// Numbers of a phase's latent.
+        latent: u32 in 1.0 to 64.0,
+        /// Frequency bands of the encoding.
+        bands: u32 in 1.0 to 16.0,
+        /// Bands open when the field starts.
+        window_start: f64,
+        /// Iterations until all bands are open, counted from the delay.
+        window_iterations: u32,
+        /// Half side of its box, mm; 0 = the field of view.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Encode coordinates relative to the field's box instead of world units.
+        encode_box: bool,
+        /// Iterations before the field starts; the optimiser is re-created then.
+        delay: u32,
+        /// Learning rate at the start.
+        lr: f64 in 0.0 to 100.0,
+        /// Learning rate at the end.
+        lr_end: f64 in 0.0 to 100.0,
+        /// How it decays.
+        decay: Decay,
+        /// Shift inside its softplus when the problem is normalised, at most: deep hulls start lower.
+        normalised_shift: f64 in -20.0 to 20.0,
+        /// Weight of occlusion minimisation, lambda_o.
+        occlusion: f64 in 0.0 to 1e6,
+        /// Share of the depth range, from the source, it covers.
+        occlusion_share: f64 in 0.0 to 1.0,
+    }
+}
+
+section! {
+    /// Loss terms.
+    Loss, "loss" {
+        /// Scale both fields and residuals by the data, so that numbers are near 1.
+        normalise: bool,
+        /// What drives the dynamic field.
+        dynamic_target: DynamicTarget,
+        /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly with a
+        /// temporal target, when the problem is normalised; 0 = squared throughout.
+        robust: f64 in 0.0 to 1e3,
+    }
+}
+
+section! {
+    /// Motion hull: where every view shows temporal change.
+    Hull, "hull" {
+        /// Restrict the dynamic field to it.
+        enabled: bool,
+        /// Carve each phase from its own images, not only from what moves over the whole beat.
+        per_phase: bool,
+        /// Cells along each side.
+        resolution: u32 in 8.0 to 512.0,
+        /// A pixel moves when its temporal range exceeds what noise gives by this many standard deviations.
+        noise_sigmas: f64 in 0.0 to 1e3,
+        /// A pixel moves, with four views or more, when its range also exceeds this share of the strongest change in its view.
+        min_share: f64 in 0.0 to 1.0,
+        /// As `min_share`, with fewer than four views: each carves less, so more has to be asked of it.
+        min_share_few_views: f64 in 0.0 to 1.0,
+        /// Half width of the widest vessel, pixels: structures as thin as that may hide in the still background.
+        /// 0 trusts each pixel's minimum over the phases.
+        vessel_pixels: u32 in 0.0 to 1024.0,
+        /// Pixels by which moving regions grow.
+        dilate_pixels: u32 in 0.0 to 64.0,
+        /// Larger hulls (share of the box) are not used.
+        max_share: f64 in 0.0 to 1.0,
+    }
+}
+
+section! {
+    /// Occupancy learned while training: where the dynamic field is empty, samples are mostly left out.
+    Occupancy, "occupancy" {
+        /// Heed it.
+        enabled: bool,
+        /// Cells along each side of the dynamic field's box, for each phase.
+        cells: u32 in 2.0 to 256.0,
+        /// Iterations of the dynamic field before it is heeded.
+        start: u32 in 0.0 to 1e6,
+        /// Attenuation up to which a sample is empty, as a share of the dynamic field's scale: a typical vessel's when the
+        /// problem is normalised, 0.01 per mm otherwise.
+        threshold: f64 in 0.0 to 1.0,
+    }
+}
+
+section! {
+    /// The optimiser.
+    Adam, "adam" {
+        /// Decay of the first moment.
+        beta1: f64 in 0.0 to 0.999_999,
+        /// Decay of the second moment.
+        beta2: f64 in 0.0 to 0.999_999,
+        /// Added to the denominator.
+        epsilon: f64 in 1e-30 to 1.0,
+    }
+}

@@ -1,0 +1,284 @@
+//! C-arm geometry in f64: pose (degrees, mm) or projection matrix -> rays.
+//!
+//! World axes are (posterior, left, superior), a left-handed triple in units of 100 mm with the
+//! isocentre at the origin: `world = (LPS.y, LPS.x, LPS.z) / 100`. The source stands at
+//! `R (0, 0, -SOD)` and pixel `(i, j)` looks along `R (u / SID, v / SID, 1)` with
+//! `R = Rz(-primary) Rz(90 deg) Rx(secondary) Rx(-90 deg)`. Directions have unit depth, not unit
+//! length; depth is counted from the isocentre plane.
+
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+
+/// One world unit in mm.
+pub const MM_PER_UNIT: f64 = 100.0;
+
+/// World point (100 mm; posterior, left, superior) of a patient point in mm (left, posterior, superior).
+pub fn world_from_lps_mm(lps: DVec3) -> DVec3 {
+    DVec3::new(lps.y, lps.x, lps.z) / MM_PER_UNIT
+}
+
+/// How an image was taken.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub enum Geometry {
+    /// Angles and distances of a C-arm.
+    CArm(CArm),
+    /// An explicit projection.
+    Matrix(Matrix),
+}
+
+/// C-arm angles and distances.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct CArm {
+    /// Primary angle in degrees, LAO positive (DICOM PositionerPrimaryAngle).
+    pub primary_deg: f64,
+    /// Secondary angle in degrees, cranial positive (DICOM PositionerSecondaryAngle).
+    pub secondary_deg: f64,
+    /// Source to detector, mm.
+    pub sid_mm: f64,
+    /// Source to isocentre, mm.
+    pub sod_mm: f64,
+    /// Pixel pitch on the detector along columns and rows, mm.
+    pub pixel_mm: [f64; 2],
+    /// Offset of the detector centre along columns and rows, mm.
+    #[serde(default)]
+    pub offset_mm: [f64; 2],
+    /// How far the table has carried the patient along (left, posterior, superior), mm, from where patient
+    /// coordinates have their origin at the isocentre.
+    #[serde(default, skip_serializing_if = "is_at_rest")]
+    pub table_mm: [f64; 3],
+}
+
+fn is_at_rest(table_mm: &[f64; 3]) -> bool {
+    *table_mm == [0.0; 3]
+}
+
+/// A 3 x 4 projection from patient mm (LPS, origin at the isocentre) to homogeneous pixels
+/// (column, row; integers are pixel centres).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Matrix {
+    /// Row-major entries.
+    pub matrix: [[f64; 4]; 3],
+}
+
+/// Rays of one view: affine in pixel column `i` and row `j`, in world units.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewRays {
+    /// Point of pixel (0, 0)'s ray at the isocentre plane, and its change per column and row.
+    pub anchor: [DVec3; 3],
+    /// Direction of pixel (0, 0)'s ray (unit depth), and its change per column and row.
+    pub direction: [DVec3; 3],
+    /// Source to isocentre plane, world units.
+    pub sod: f64,
+}
+
+/// Rotation of a C-arm at the given angles, degrees.
+pub fn rotation(primary_deg: f64, secondary_deg: f64) -> DMat3 {
+    DMat3::from_rotation_z(-primary_deg.to_radians())
+        * DMat3::from_rotation_z(90f64.to_radians())
+        * DMat3::from_rotation_x(secondary_deg.to_radians())
+        * DMat3::from_rotation_x((-90f64).to_radians())
+}
+
+impl Geometry {
+    /// Rays of a `width` x `height` image.
+    ///
+    /// # Errors
+    /// Field and problem, for an impossible geometry.
+    pub fn rays(&self, width: usize, height: usize) -> Result<ViewRays, (String, String)> {
+        match self {
+            Geometry::CArm(carm) => carm.rays(width, height),
+            Geometry::Matrix(matrix) => matrix.rays(),
+        }
+    }
+
+    /// Primary and secondary angle in degrees, when given as such.
+    pub fn angles_deg(&self) -> Option<(f64, f64)> {
+        match self {
+            Geometry::CArm(c) => Some((c.primary_deg, c.secondary_deg)),
+            Geometry::Matrix(_) => None,
+        }
+    }
+}
+
+impl CArm {
+    fn rays(&self, width: usize, height: usize) -> Result<ViewRays, (String, String)> {
+        let positive = [
+            ("sid_mm", self.sid_mm),
+            ("sod_mm", self.sod_mm),
+            ("pixel_mm[0]", self.pixel_mm[0]),
+            ("pixel_mm[1]", self.pixel_mm[1]),
+        ];
+        for (field, value) in positive {
+            if !(value.is_finite() && value > 0.0 && value < 1e5) {
+                return Err((field.into(), format!("{value} is not a positive length in mm")));
+            }
+        }
+        for (field, value) in [("primary_deg", self.primary_deg), ("secondary_deg", self.secondary_deg)] {
+            if !(value.is_finite() && value.abs() <= 360.0) {
+                return Err((field.into(), format!("{value} is not an angle in degrees")));
+            }
+        }
+        if !self.offset_mm.iter().all(|o| o.is_finite()) {
+            return Err(("offset_mm".into(), "is not finite".into()));
+        }
+        if !self.table_mm.iter().all(|t| t.is_finite() && t.abs() < 1e4) {
+            return Err(("table_mm".into(), "is not a position in mm".into()));
+        }
+        if self.sod_mm >= self.sid_mm {
+            return Err((
+                "sod_mm".into(),
+                format!("{} mm puts the isocentre behind the detector (sid_mm = {})", self.sod_mm, self.sid_mm),
+            ));
+        }
+        let r = rotation(self.primary_deg, self.secondary_deg);
+        let u0 = (0.5 - width as f64 / 2.0) * self.pixel_mm[0] + self.offset_mm[0];
+        let v0 = (0.5 - height as f64 / 2.0) * self.pixel_mm[1] + self.offset_mm[1];
+        let du = r * DVec3::new(self.pixel_mm[0] / self.sid_mm, 0.0, 0.0);
+        let dv = r * DVec3::new(0.0, self.pixel_mm[1] / self.sid_mm, 0.0);
+        let across = r * DVec3::new(u0 / self.sid_mm, v0 / self.sid_mm, 0.0);
+        let direction = [across + r * DVec3::Z, du, dv];
+        // Seen from the patient, source and detector move against the table; depth counts from the patient's origin.
+        let table = world_from_lps_mm(DVec3::from_array(self.table_mm));
+        let sod = self.sod_mm / MM_PER_UNIT + table.dot(r * DVec3::Z);
+        let source = r * DVec3::new(0.0, 0.0, -self.sod_mm / MM_PER_UNIT) - table;
+        Ok(ViewRays { anchor: [source + direction[0] * sod, du * sod, dv * sod], direction, sod })
+    }
+}
+
+impl Matrix {
+    fn rays(&self) -> Result<ViewRays, (String, String)> {
+        let field = "matrix".to_owned();
+        let m = &self.matrix;
+        if !m.iter().flatten().all(|v| v.is_finite()) {
+            return Err((field, "has an entry that is not finite".into()));
+        }
+        // Columns: LPS mm -> world axes (swap x and y).
+        let rows = [0, 1, 2].map(|r| DVec3::new(m[r][1], m[r][0], m[r][2]));
+        let square = DMat3::from_cols(rows[0], rows[1], rows[2]).transpose();
+        let scale = rows.iter().map(|r| r.length()).product::<f64>();
+        if square.determinant().abs() <= 1e-9 * scale || scale == 0.0 {
+            return Err((field, "its left 3 x 3 part cannot be inverted".into()));
+        }
+        let inverse = square.inverse();
+        let source = -(inverse * DVec3::new(m[0][3], m[1][3], m[2][3])) / MM_PER_UNIT;
+        let axis = rows[2].normalize();
+        let depth_of_origin = -source.dot(axis);
+        if depth_of_origin == 0.0 {
+            return Err((field, "puts the source in the isocentre plane".into()));
+        }
+        // A matrix is defined up to sign: look from the source towards the isocentre.
+        let scale = rows[2].length() * depth_of_origin.signum();
+        let direction = [DVec3::Z, DVec3::X, DVec3::Y].map(|p| inverse * p * scale);
+        let sod = depth_of_origin.abs();
+        Ok(ViewRays { anchor: [source + direction[0] * sod, direction[1] * sod, direction[2] * sod], direction, sod })
+    }
+}
+
+impl ViewRays {
+    /// Anchor and direction of pixel `(i, j)`.
+    pub fn pixel(&self, i: f64, j: f64) -> (DVec3, DVec3) {
+        let at = |p: &[DVec3; 3]| p[0] + i * p[1] + j * p[2];
+        (at(&self.anchor), at(&self.direction))
+    }
+
+    /// Source position, world units.
+    pub fn source(&self) -> DVec3 {
+        self.anchor[0] - self.direction[0] * self.sod
+    }
+
+    /// Column and row (pixel centres at integers) a world point projects to; `None` behind the source.
+    pub fn project(&self, point: DVec3) -> Option<(f64, f64)> {
+        let basis = DMat3::from_cols(self.direction[1], self.direction[2], self.direction[0]);
+        let h = basis.inverse() * (point - self.source());
+        (h.z > 0.0).then(|| (h.x / h.z, h.y / h.z))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn carm(primary_deg: f64, secondary_deg: f64) -> CArm {
+        CArm {
+            primary_deg,
+            secondary_deg,
+            sid_mm: 1100.0,
+            sod_mm: 750.0,
+            pixel_mm: [0.5, 0.7],
+            offset_mm: [3.0, -2.0],
+            table_mm: [0.0; 3],
+        }
+    }
+
+    #[test]
+    fn a_moved_table_carries_the_patient_along() {
+        let mut moved = carm(30.0, 20.0);
+        moved.table_mm = [12.0, -7.0, 25.0];
+        let (at_rest, moved) = (carm(30.0, 20.0).rays(64, 48).unwrap(), moved.rays(64, 48).unwrap());
+        // The room sees a patient point where it is, plus the table's way.
+        let point = DVec3::new(5.0, 10.0, -15.0);
+        let here = moved.project(world_from_lps_mm(point)).unwrap();
+        let there = at_rest.project(world_from_lps_mm(point + DVec3::new(12.0, -7.0, 25.0))).unwrap();
+        assert!((here.0 - there.0).abs() < 1e-9 && (here.1 - there.1).abs() < 1e-9);
+        // Depth zero is the plane through the patient's origin.
+        let axis = rotation(30.0, 20.0) * DVec3::Z;
+        assert!(moved.pixel(3.0, 40.0).0.dot(axis).abs() < 1e-12);
+    }
+
+    #[test]
+    fn lao_looks_from_the_right_back_to_the_left_front() {
+        // At 0/0 the beam runs from back to front (posterior = +x), columns grow to the patient's left.
+        let rays = carm(0.0, 0.0).rays(10, 10).unwrap();
+        let centre = rays.direction[0] + rays.direction[1] * 4.5 + rays.direction[2] * 4.5;
+        assert!(centre.x < -0.99, "{centre}");
+        assert!(rays.direction[1].y > 0.0 && rays.direction[2].z < 0.0);
+        // LAO 90 puts the detector on the patient's left.
+        let lao = rotation(90.0, 0.0) * DVec3::Z;
+        assert!(lao.y > 0.99, "{lao}");
+        // Cranial puts the detector towards the head.
+        let cranial = rotation(0.0, 30.0) * DVec3::Z;
+        assert!((cranial.z - 0.5).abs() < 1e-12, "{cranial}");
+    }
+
+    #[test]
+    fn projection_inverts_rays() {
+        let rays = carm(-30.0, 25.0).rays(64, 48).unwrap();
+        let (anchor, direction) = rays.pixel(17.25, 40.5);
+        let (i, j) = rays.project(anchor + direction * 0.3).unwrap();
+        assert!((i - 17.25).abs() < 1e-9 && (j - 40.5).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_matrix_gives_the_rays_of_its_c_arm() {
+        let want = carm(40.0, -20.0).rays(64, 48).unwrap();
+        // P = [B^-1 | -B^-1 s] in world units, brought to LPS mm; the sign is free.
+        let basis = DMat3::from_cols(want.direction[1], want.direction[2], want.direction[0]).inverse();
+        let shift = -(basis * want.source()) * MM_PER_UNIT;
+        let rows = [0, 1, 2].map(|r| {
+            let row = basis.row(r);
+            [-3.0 * row.y, -3.0 * row.x, -3.0 * row.z, -3.0 * shift[r]]
+        });
+        let got = Matrix { matrix: rows }.rays().unwrap();
+        assert!((got.sod - want.sod).abs() < 1e-9);
+        for (a, b) in got.direction.iter().zip(&want.direction) {
+            assert!((*a - *b).length() < 1e-9, "{a} {b}");
+        }
+        assert!((got.anchor[0] - want.anchor[0]).length() < 1e-9);
+    }
+
+    #[test]
+    fn impossible_geometry_names_the_field() {
+        let mut bad = carm(0.0, 0.0);
+        bad.sid_mm = -5.0;
+        assert_eq!(bad.rays(4, 4).unwrap_err().0, "sid_mm");
+        bad.sid_mm = 700.0;
+        assert_eq!(bad.rays(4, 4).unwrap_err().0, "sod_mm");
+        assert_eq!(Matrix { matrix: [[1.0, 0.0, 0.0, 0.0]; 3] }.rays().unwrap_err().0, "matrix");
+    }
+}

@@ -1,0 +1,385 @@
+//! DICOM runs -> a dataset: frames chosen, phases assigned, collimator cut away, runs checked against one another.
+
+use crate::error::{Error, Result};
+use crate::geometry::{CArm, Geometry};
+use crate::import::dicom::{Relationship, Run};
+use crate::raster::{Image, dilate, opening, percentile};
+use crate::scan::dataset::{Layout, Split};
+use crate::scan::gating::RPeaks;
+use crate::scan::writer::{About, Writer};
+use rayon::prelude::*;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+
+/// Width of the widest vessel looked for, mm at the isocentre.
+const WIDEST_VESSEL_MM: f64 = 6.0;
+/// Frames whose vessels show this share of the strongest contrast count as filled.
+const FILLED_SHARE: f64 = 0.6;
+/// A structure stands out when it does by this many standard deviations of the noise.
+const NOISE_SIGMAS: f32 = 4.0;
+/// Display grey values span this many line integrals of attenuation.
+const DISPLAY_SPAN: f64 = 3.0;
+
+/// Where phases come from.
+#[derive(Debug, Clone)]
+pub enum Gating {
+    /// The ECG of each file.
+    Ecg,
+    /// R-peaks in seconds from the first frame, the same for all runs.
+    RPeaks(RPeaks),
+    /// A steady heart, with an R-peak at the first frame.
+    HeartRate(f64),
+    /// A phase for each selected frame of each run, in order.
+    Phases(Vec<u32>),
+    /// Nothing moves: the frames of a run are averaged. Phase 0 is the object, phase 1 what it looks like without
+    /// vessels, as in subtraction angiography, so that the rest of the engine sees vessels come and go.
+    Still,
+}
+
+/// How to import.
+#[derive(Debug, Clone)]
+pub struct ImportOptions {
+    /// Cardiac phases.
+    pub phases: u32,
+    /// Where they come from.
+    pub gating: Gating,
+    /// Frames of each run, from 1; those filled with contrast without.
+    pub frames: Option<RangeInclusive<usize>>,
+    /// Pixel pitch on the detector along columns and rows, mm, instead of what the files say.
+    pub pixel_mm: Option<[f64; 2]>,
+    /// Longest side of the images, pixels: larger ones are averaged down.
+    pub size: Option<usize>,
+    /// Depth searched before and behind the isocentre, mm.
+    pub depth_half_extent_mm: f64,
+}
+
+/// Imports runs as a dataset and returns what a user should know.
+///
+/// # Errors
+/// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. Nothing is written then.
+pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
+    if files.is_empty() || files.len() > 64 {
+        return Err(Error::config("FILE", files.len(), "1 to 64 runs are accepted"));
+    }
+    let mut runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
+    let mut notes: Vec<String> =
+        runs.iter().flat_map(|run| run.notes.iter().map(|note| format!("{}: {note}", run.name()))).collect();
+    notes.extend(cross_check(&mut runs));
+    let views = runs.par_iter().map(|run| View::prepare(run, options)).collect::<Result<Vec<_>>>()?;
+    notes.extend(views.iter().flat_map(|view| view.notes.iter().cloned()));
+    // One size for all: the smallest open area, around the middle of each.
+    let width = views.iter().map(|v| v.images[0].1.width).min().unwrap_or(1);
+    let height = views.iter().map(|v| v.images[0].1.height).min().unwrap_or(1);
+    let phases = if matches!(options.gating, Gating::Still) { 2 } else { options.phases };
+    let about = About {
+        description: format!("{} X-ray angiography runs", runs.len()),
+        phases,
+        depth_half_extent_mm: options.depth_half_extent_mm,
+        vessel_attenuation_per_mm: None,
+        size: [width, height],
+        c_arm: views[0].c_arm.clone(),
+    };
+    let mut writer = Writer::new(out, Layout::Native, about)?;
+    for (index, view) in views.iter().enumerate() {
+        for (phase, image) in &view.images {
+            let (image, offset) = cut(image, width, height);
+            let pixel_mm = view.c_arm.pixel_mm;
+            let moved = |k: usize| view.c_arm.offset_mm[k] + offset[k] * pixel_mm[k];
+            let geometry = Geometry::CArm(CArm { offset_mm: [moved(0), moved(1)], ..view.c_arm.clone() });
+            writer.frame(&geometry, Split::Train, index, *phase, &image.values, None)?;
+        }
+    }
+    writer.finish()?;
+    notes.push(format!("{} views of {width} x {height} pixels at {phases} phases", views.len()));
+    Ok(notes)
+}
+
+/// What does not fit together; the table is taken from the first run's.
+fn cross_check(runs: &mut [Run]) -> Vec<String> {
+    let mut notes = Vec::new();
+    let (first_identity, first_table, first_name) = (runs[0].identity, runs[0].c_arms[0].table_mm, runs[0].name());
+    for run in runs.iter_mut() {
+        let name = run.name();
+        if run.identity[0] != first_identity[0] {
+            notes.push(format!("warning: {name} is of another patient than {first_name}"));
+        } else if run.identity[1] != first_identity[1] {
+            notes.push(format!("warning: {name} is of another study than {first_name}"));
+        }
+        for c_arm in &mut run.c_arms {
+            for (now, first) in c_arm.table_mm.iter_mut().zip(first_table) {
+                *now -= first;
+            }
+        }
+        let [left, down, along] = run.c_arms[0].table_mm;
+        if [left, down, along] != [0.0; 3] {
+            notes.push(format!(
+                "{name}: the table moved by {left} mm to the left and {down} mm down since {first_name}, which was taken \
+                 into account; a move along the patient is not in public tags"
+            ));
+        }
+    }
+    let arms: Vec<_> = runs.iter().map(|r| (r.c_arms[0].primary_deg, r.c_arms[0].secondary_deg, r.name())).collect();
+    for (i, a) in arms.iter().enumerate() {
+        for b in &arms[i + 1..] {
+            if (a.0 - b.0).abs() < 5.0 && (a.1 - b.1).abs() < 5.0 {
+                notes.push(format!("warning: {} and {} look from almost the same angle", a.2, b.2));
+            }
+        }
+    }
+    notes
+}
+
+/// A run, ready to be written.
+struct View {
+    c_arm: CArm,
+    images: Vec<(u32, Image)>,
+    notes: Vec<String>,
+}
+
+impl View {
+    fn prepare(run: &Run, options: &ImportOptions) -> Result<View> {
+        let mut notes = Vec::new();
+        let (columns, rows) = run.open.clone();
+        if (columns.len(), rows.len()) != (run.width, run.height) {
+            notes.push(format!("{}: {} x {} pixels inside the shutters", run.name(), columns.len(), rows.len()));
+        }
+        let factor = options.size.map_or(1, |size| columns.len().max(rows.len()).div_ceil(size.max(1)));
+        let (width, height) = (columns.len() / factor, rows.len() / factor);
+        if width < 16 || height < 16 {
+            let problem = format!("leaves {width} x {height} pixels of {}", run.name());
+            return Err(Error::config("size", options.size.unwrap_or_default(), problem));
+        }
+        let text = burnt_in_text(run);
+        if !text.is_empty() {
+            notes.push(format!("{}: {} pixels of burnt-in text were filled from beside them", run.name(), text.len()));
+        }
+        let integral = intensity(run);
+        let frames: Vec<Image> = run
+            .frames
+            .iter()
+            .map(|frame| {
+                let frame = without_text(frame, run.width, &text);
+                let mut image = Image::zeros(width, height);
+                for (p, value) in image.values.iter_mut().enumerate() {
+                    let (x, y) = (columns.start + p % width * factor, rows.start + p / width * factor);
+                    let cells = (0..factor * factor).map(|k| frame[(y + k / factor) * run.width + x + k % factor]);
+                    *value = integral(cells.sum::<f32>() / (factor * factor) as f32);
+                }
+                image
+            })
+            .collect();
+        // The image's middle moves with what was cut away.
+        let middle = |range: &std::ops::Range<usize>, kept: usize, all: usize| {
+            range.start as f64 + 0.5 * (kept * factor) as f64 - 0.5 * all as f64
+        };
+        let of = &run.c_arms[0];
+        let (x, y) = (middle(&columns, width, run.width), middle(&rows, height, run.height));
+        let c_arm = CArm {
+            pixel_mm: of.pixel_mm.map(|p| p * factor as f64),
+            offset_mm: [of.offset_mm[0] + x * of.pixel_mm[0], of.offset_mm[1] + y * of.pixel_mm[1]],
+            ..of.clone()
+        };
+        if run.c_arms.iter().any(|arm| arm != of) {
+            let problem = "the C-arm or table moves during the run: its frames have no common view; choose frames without movement";
+            let selected = options.frames.clone().unwrap_or(1..=run.frames.len());
+            let still = selected.clone().all(|f| run.c_arms.get(f - 1) == run.c_arms.get(selected.start() - 1));
+            if !still {
+                return Err(Error::data(&run.path, "PositionerMotion", problem));
+            }
+        }
+        let at_isocentre = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
+        let vessel = ((0.5 * WIDEST_VESSEL_MM / at_isocentre).ceil() as usize).max(2);
+        let selected = select(run, &frames, vessel, options, &mut notes)?;
+        let images = phases(run, &frames, &selected, vessel, options, &mut notes)?;
+        Ok(View { c_arm, images, notes })
+    }
+}
+
+/// From a value, brighter where less is absorbed, to a line integral.
+fn intensity(run: &Run) -> impl Fn(f32) -> f32 + use<> {
+    let (white, relationship) = (f64::from(run.white), run.relationship);
+    move |value: f32| {
+        let v = f64::from(value);
+        (match relationship {
+            Relationship::Linear => -((v / white).max(1e-4)).ln(),
+            Relationship::Log | Relationship::Display => (white - v) / white.max(1e-9) * DISPLAY_SPAN,
+        }) as f32
+    }
+}
+
+/// Frames filled with contrast, or those asked for; indices from 0.
+fn select(
+    run: &Run,
+    frames: &[Image],
+    vessel: usize,
+    options: &ImportOptions,
+    notes: &mut Vec<String>,
+) -> Result<Vec<usize>> {
+    let n = frames.len();
+    if let Some(asked) = &options.frames {
+        if *asked.start() == 0 || *asked.end() > n || asked.is_empty() {
+            let problem = format!("{} has frames 1 to {n}", run.name());
+            return Err(Error::config("frames", format!("{}-{}", asked.start(), asked.end()), problem));
+        }
+        return Ok((asked.start() - 1..*asked.end()).collect());
+    }
+    // How strongly thin dark structures stand out.
+    let contrast: Vec<f64> = frames
+        .par_iter()
+        .map(|frame| {
+            let background = opening(frame, vessel).values;
+            let stand_out: Vec<f32> = frame.values.iter().zip(&background).map(|(v, b)| (v - b).max(0.0)).collect();
+            f64::from(percentile(&stand_out, 0.98))
+        })
+        .collect();
+    let most = contrast.iter().copied().fold(0.0, f64::max);
+    // Closed by a frame that is not, so that a stretch may last to the end.
+    let filled = contrast.iter().map(|c| *c >= FILLED_SHARE * most).chain([false]);
+    // The longest stretch.
+    let mut best = 0..0;
+    let mut start = 0;
+    for (i, filled) in filled.enumerate() {
+        if !filled {
+            if i - start > best.len() {
+                best = start..i;
+            }
+            start = i + 1;
+        }
+    }
+    notes.push(format!(
+        "{}: frames {} to {} of {n} are filled with contrast; others can be chosen",
+        run.name(),
+        best.start + 1,
+        best.end
+    ));
+    Ok(best.collect())
+}
+
+fn phases(
+    run: &Run,
+    frames: &[Image],
+    selected: &[usize],
+    vessel: usize,
+    options: &ImportOptions,
+    notes: &mut Vec<String>,
+) -> Result<Vec<(u32, Image)>> {
+    let n_phases = options.phases;
+    let none = |problem: &str| Error::data(&run.path, "phases", problem.to_owned());
+    let phase_of: Vec<Option<u32>> = match &options.gating {
+        Gating::Still => {
+            let mean = mean(frames, selected);
+            let background = without_vessels(&mean, vessel);
+            notes.push(format!(
+                "{}: {} frames averaged; phase 1 is the image without structures up to {WIDEST_VESSEL_MM} mm wide",
+                run.name(),
+                selected.len()
+            ));
+            return Ok(vec![(0, mean), (1, background)]);
+        }
+        Gating::Phases(list) if list.len() == selected.len() => list.iter().map(|p| Some(*p)).collect(),
+        Gating::Phases(list) => {
+            return Err(none(&format!("{} are given for {} selected frames", list.len(), selected.len())));
+        }
+        Gating::HeartRate(rate) => {
+            let peaks = RPeaks::steady(*rate, 0.0, run.times_s.last().copied().unwrap_or(0.0))?;
+            selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases)).collect()
+        }
+        Gating::RPeaks(peaks) => selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases)).collect(),
+        Gating::Ecg => {
+            let peaks = run.r_peaks.as_ref().ok_or_else(|| {
+                none("the file has no ECG: give R-peaks, a heart rate or a list of phases, or say that the object is at rest")
+            })?;
+            selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases)).collect()
+        }
+    };
+    let mut images = Vec::new();
+    for phase in 0..n_phases {
+        let of_phase: Vec<usize> =
+            selected.iter().zip(&phase_of).filter(|(_, p)| **p == Some(phase)).map(|(i, _)| *i).collect();
+        // Frames of the same phase from several beats.
+        if !of_phase.is_empty() {
+            images.push((phase, mean(frames, &of_phase)));
+        }
+    }
+    if let Some(bad) = phase_of.iter().flatten().find(|p| **p >= n_phases) {
+        return Err(none(&format!("{bad} is given where phases go from 0 to {}", n_phases - 1)));
+    }
+    if images.len() < 2 {
+        return Err(none(&format!("{} of {n_phases} are seen; at least two are needed", images.len())));
+    }
+    notes.push(format!("{}: {} of {n_phases} phases from {} frames", run.name(), images.len(), selected.len()));
+    Ok(images)
+}
+
+/// The image without structures as thin as vessels: where something stands out of its surroundings by more than noise
+/// does, it is cut down to them.
+fn without_vessels(image: &Image, vessel: usize) -> Image {
+    let mut background = opening(image, vessel);
+    let stand_out: Vec<f32> = image.values.iter().zip(&background.values).map(|(v, b)| v - b).collect();
+    // An opening follows the lowest of its surroundings, and noise makes some low.
+    let typical = percentile(&stand_out, 0.5);
+    let spread = percentile(&stand_out.iter().map(|s| (s - typical).abs()).collect::<Vec<_>>(), 0.5);
+    let limit = typical + NOISE_SIGMAS * 1.4826 * spread;
+    let closed = closed(&background, 2 * vessel);
+    for (p, b) in background.values.iter_mut().enumerate() {
+        *b = if stand_out[p] > limit && !closed[p] { *b + typical } else { image.values[p] };
+    }
+    background
+}
+
+/// Pixels within `margin` of the edge, or of areas so dark that the collimator or the detector's rim must be there:
+/// their outlines are as thin as vessels.
+fn closed(background: &Image, margin: usize) -> Vec<bool> {
+    let (w, h) = (background.width, background.height);
+    let dark = background.values.iter().map(|v| f32::from(u8::from(f64::from(*v) > 0.85 * DISPLAY_SPAN))).collect();
+    let grown = dilate(&Image { values: dark, ..*background }, margin);
+    (0..w * h)
+        .map(|p| {
+            let (x, y) = (p % w, p / w);
+            grown.values[p] > 0.0 || x.min(w - 1 - x).min(y).min(h - 1 - y) < margin
+        })
+        .collect()
+}
+
+fn mean(frames: &[Image], which: &[usize]) -> Image {
+    let mut sum = Image::zeros(frames[0].width, frames[0].height);
+    for i in which {
+        sum.values.iter_mut().zip(&frames[*i].values).for_each(|(s, v)| *s += v / which.len() as f32);
+    }
+    sum
+}
+
+/// Pixels that are as bright or dark as can be, in every frame, beside others that are not: letters. Only looked for
+/// where the file does not say that there are none.
+fn burnt_in_text(run: &Run) -> Vec<usize> {
+    if !run.burnt_in || run.frames.len() < 2 {
+        return Vec::new();
+    }
+    let darkest = run.frames.iter().flatten().copied().fold(f32::MAX, f32::min);
+    let fixed = |p: usize, value: f32| run.frames.iter().all(|f| f[p] == value);
+    (0..run.width * run.height).filter(|p| fixed(*p, run.white) || fixed(*p, darkest)).collect()
+}
+
+fn without_text(frame: &[f32], width: usize, text: &[usize]) -> Vec<f32> {
+    let mut out = frame.to_vec();
+    let marked: std::collections::HashSet<usize> = text.iter().copied().collect();
+    for p in text {
+        // The nearest pixels to the left and right that are no text.
+        let row = p / width * width;
+        let left = (row..*p).rev().find(|q| !marked.contains(q));
+        let right = (*p + 1..row + width).find(|q| !marked.contains(q));
+        let beside: Vec<f32> = left.into_iter().chain(right).map(|q| frame[q]).collect();
+        if !beside.is_empty() {
+            out[*p] = beside.iter().sum::<f32>() / beside.len() as f32;
+        }
+    }
+    out
+}
+
+/// The middle `width` x `height` pixels, and by how many pixels the middle moved.
+fn cut(image: &Image, width: usize, height: usize) -> (Image, [f64; 2]) {
+    let (x, y) = ((image.width - width) / 2, (image.height - height) / 2);
+    let values = (0..height).flat_map(|j| image.values[(y + j) * image.width + x..][..width].iter().copied()).collect();
+    let moved = |start: usize, kept: usize, all: usize| start as f64 + 0.5 * kept as f64 - 0.5 * all as f64;
+    (Image { width, height, values }, [moved(x, width, image.width), moved(y, height, image.height)])
+}

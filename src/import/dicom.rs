@@ -1,0 +1,453 @@
+//! One X-ray angiography run from a DICOM file: frames, geometry, times, ECG. Nothing that identifies a patient is kept.
+
+use crate::error::{Error, Result};
+use crate::geometry::CArm;
+use crate::import::{ecg, lengths};
+use crate::scan::gating::RPeaks;
+use dicom_core::Tag;
+use dicom_core::header::HasLength;
+use dicom_dictionary_std::tags;
+use dicom_object::{FileDicomObject, InMemDicomObject, OpenFileOptions};
+use dicom_pixeldata::{ConvertOptions, ModalityLutOption, PixelDecoder, VoiLutOption};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+const MAX_FILE_BYTES: u64 = 4 << 30;
+const MAX_SIDE: u32 = 4096;
+const MAX_FRAMES: u32 = 2000;
+/// Pixels of a run, which are kept as 32-bit floats.
+const MAX_PIXELS: u64 = 1 << 29;
+
+/// What pixel values are, as the file says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Relationship {
+    /// Linear in intensity.
+    Linear,
+    /// Logarithmic.
+    Log,
+    /// Display grey values: taken as logarithmic, of unknown scale.
+    Display,
+}
+
+/// A run.
+#[derive(Debug, Clone)]
+pub struct Run {
+    /// Where it came from.
+    pub path: PathBuf,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Frames, brighter where less is absorbed, rows first.
+    pub frames: Vec<Vec<f32>>,
+    /// Value of a pixel as bright as can be.
+    pub white: f32,
+    /// Meaning of the values.
+    pub relationship: Relationship,
+    /// How each frame was taken; offset and table as the file says, relative to nothing.
+    pub c_arms: Vec<CArm>,
+    /// Time of each frame, seconds from the first.
+    pub times_s: Vec<f64>,
+    /// R-peaks on the same clock, where the file has an ECG.
+    pub r_peaks: Option<RPeaks>,
+    /// Columns and rows inside the collimator's shutters.
+    pub open: (Range<usize>, Range<usize>),
+    /// Whether the file says that text is burnt into the pixels.
+    pub burnt_in: bool,
+    /// What tells patients and studies apart, hashed: only equality means anything.
+    pub identity: [u64; 2],
+    /// What was assumed, and what is odd.
+    pub notes: Vec<String>,
+}
+
+type Object = FileDicomObject<InMemDicomObject>;
+
+struct Reader<'a> {
+    object: &'a Object,
+    path: &'a Path,
+}
+
+impl Reader<'_> {
+    fn bad(&self, tag: Tag, name: &str, problem: impl Into<String>) -> Error {
+        Error::data(self.path, format!("({:04X},{:04X}) {name}", tag.group(), tag.element()), problem)
+    }
+
+    fn text(&self, tag: Tag) -> Option<String> {
+        let text = self.object.get(tag)?.to_str().ok()?;
+        let text = text.trim_matches(|c: char| c.is_whitespace() || c == '\0').to_owned();
+        (!text.is_empty()).then_some(text)
+    }
+
+    fn numbers(&self, tag: Tag, name: &str) -> Result<Option<Vec<f64>>> {
+        let Some(element) = self.object.get(tag).filter(|e| !e.is_empty()) else { return Ok(None) };
+        let numbers = element.to_multi_float64().map_err(|e| self.bad(tag, name, format!("is no number: {e}")))?;
+        match numbers.iter().find(|v| !v.is_finite()) {
+            Some(bad) => Err(self.bad(tag, name, format!("{bad} is not finite"))),
+            None => Ok(Some(numbers).filter(|n| !n.is_empty())),
+        }
+    }
+
+    fn number(&self, tag: Tag, name: &str) -> Result<Option<f64>> {
+        Ok(self.numbers(tag, name)?.map(|n| n[0]))
+    }
+
+    fn needed(&self, tag: Tag, name: &str) -> Result<f64> {
+        self.number(tag, name)?.ok_or_else(|| self.bad(tag, name, "is missing"))
+    }
+
+    /// One value per frame: a base and increments, of which the first may stand for all.
+    fn per_frame(&self, base: f64, tag: Tag, name: &str, frames: usize) -> Result<Vec<f64>> {
+        Ok(match self.numbers(tag, name)? {
+            Some(steps) if steps.len() == frames => steps.iter().map(|s| base + s).collect(),
+            Some(steps) if steps.len() == 1 => (0..frames).map(|i| base + i as f64 * steps[0]).collect(),
+            Some(steps) => {
+                return Err(self.bad(tag, name, format!("{} values for {frames} frames", steps.len())));
+            }
+            None => vec![base; frames],
+        })
+    }
+}
+
+/// FNV-1a.
+fn hash(text: &str) -> u64 {
+    text.bytes().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
+}
+
+impl Run {
+    /// Reads a run. `pixel_mm` is the pixel pitch on the detector where the file does not say it.
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming file and tag; [`Error::Io`].
+    pub fn read(path: &Path, pixel_mm: Option<[f64; 2]>) -> Result<Run> {
+        let meta = std::fs::metadata(path).map_err(Error::io("read", path))?;
+        if !meta.is_file() || meta.len() > MAX_FILE_BYTES || meta.len() < 132 {
+            let problem = format!("{} bytes; a DICOM file of 132 bytes to 4 GiB is accepted", meta.len());
+            return Err(Error::data(path, "size", problem));
+        }
+        lengths::check(path)?;
+        let object = OpenFileOptions::new()
+            .open_file(path)
+            .map_err(|e| Error::data(path, "DICOM", format!("cannot be read: {}", describe(&e))))?;
+        let r = Reader { object: &object, path };
+        let mut notes = Vec::new();
+        r.check_modality()?;
+        let side = |tag, name| -> Result<usize> {
+            let n = r.needed(tag, name)?;
+            if n.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE)).contains(&n) {
+                Ok(n as usize)
+            } else {
+                Err(r.bad(tag, name, format!("{n}; 1 to {MAX_SIDE} are accepted")))
+            }
+        };
+        let (width, height) = (side(tags::COLUMNS, "Columns")?, side(tags::ROWS, "Rows")?);
+        let n = r.number(tags::NUMBER_OF_FRAMES, "NumberOfFrames")?.unwrap_or(1.0);
+        if n.fract() != 0.0 || !(1.0..=f64::from(MAX_FRAMES)).contains(&n) {
+            let problem = format!("{n}; 1 to {MAX_FRAMES} are accepted");
+            return Err(r.bad(tags::NUMBER_OF_FRAMES, "NumberOfFrames", problem));
+        }
+        let n = n as usize;
+        if (width * height * n) as u64 > MAX_PIXELS {
+            return Err(r.bad(tags::NUMBER_OF_FRAMES, "NumberOfFrames", "frames hold more pixels than are accepted"));
+        }
+        let c_arms = r.c_arms(n, [width, height], pixel_mm, &mut notes)?;
+        let times_s = r.times(n, &mut notes)?;
+        let relationship = r.relationship(&mut notes);
+        let (frames, white) = r.frames(n, width * height, &mut notes)?;
+        let r_peaks = r.r_peaks(&times_s, &mut notes);
+        let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(|tag| hash(&r.text(tag).unwrap_or_default()));
+        Ok(Run {
+            path: path.to_path_buf(),
+            width,
+            height,
+            frames,
+            white,
+            relationship,
+            c_arms,
+            times_s,
+            r_peaks,
+            open: r.open_area(width, height)?,
+            burnt_in: r.text(tags::BURNED_IN_ANNOTATION).is_some_and(|t| t.eq_ignore_ascii_case("YES")),
+            identity,
+            notes,
+        })
+    }
+
+    /// Name for messages and files: that of the file, without its extension.
+    pub fn name(&self) -> String {
+        self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    }
+}
+
+/// An error with its causes.
+fn describe(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(next) = cause {
+        text = format!("{text}: {next}");
+        cause = next.source();
+    }
+    text
+}
+
+impl Reader<'_> {
+    fn check_modality(&self) -> Result<()> {
+        let modality = self.text(tags::MODALITY).unwrap_or_default();
+        if !["XA", "RF"].contains(&modality.as_str()) {
+            let problem = format!("`{modality}`; X-ray angiography (XA) or fluoroscopy (RF) is accepted");
+            return Err(self.bad(tags::MODALITY, "Modality", problem));
+        }
+        let samples = self.number(tags::SAMPLES_PER_PIXEL, "SamplesPerPixel")?.unwrap_or(1.0);
+        let colour = self.text(tags::PHOTOMETRIC_INTERPRETATION).unwrap_or_default();
+        if samples != 1.0 || !["MONOCHROME1", "MONOCHROME2"].contains(&colour.as_str()) {
+            let problem = format!("`{colour}` with {samples} samples per pixel; grey values are accepted");
+            return Err(self.bad(tags::PHOTOMETRIC_INTERPRETATION, "PhotometricInterpretation", problem));
+        }
+        Ok(())
+    }
+
+    fn c_arms(
+        &self,
+        n: usize,
+        size: [usize; 2],
+        given: Option<[f64; 2]>,
+        notes: &mut Vec<String>,
+    ) -> Result<Vec<CArm>> {
+        let primary = self.needed(tags::POSITIONER_PRIMARY_ANGLE, "PositionerPrimaryAngle")?;
+        let secondary = self.needed(tags::POSITIONER_SECONDARY_ANGLE, "PositionerSecondaryAngle")?;
+        let turn = tags::POSITIONER_PRIMARY_ANGLE_INCREMENT;
+        let primary = self.per_frame(primary, turn, "PositionerPrimaryAngleIncrement", n)?;
+        let turn = tags::POSITIONER_SECONDARY_ANGLE_INCREMENT;
+        let secondary = self.per_frame(secondary, turn, "PositionerSecondaryAngleIncrement", n)?;
+        let sid_mm = self.needed(tags::DISTANCE_SOURCE_TO_DETECTOR, "DistanceSourceToDetector")?;
+        let sod_mm = self.needed(tags::DISTANCE_SOURCE_TO_PATIENT, "DistanceSourceToPatient")?;
+        let spacing = self.numbers(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing")?;
+        let pixel_mm = match (given, spacing, self.numbers(tags::FIELD_OF_VIEW_DIMENSIONS, "FieldOfViewDimensions")?) {
+            (Some(pixel_mm), ..) => pixel_mm,
+            // DICOM gives rows first.
+            (None, Some(spacing), _) if spacing.len() >= 2 => [spacing[1], spacing[0]],
+            (None, _, Some(field)) if field[0] > 0.0 => {
+                let pitch = field[0] / size[0].max(size[1]) as f64;
+                notes.push(format!(
+                    "ImagerPixelSpacing is missing: {pitch:.6} mm, from FieldOfViewDimensions; a pixel spacing that is given overrides it"
+                ));
+                [pitch; 2]
+            }
+            _ => {
+                let problem = "is missing; the pixel spacing at the detector must be given, in mm";
+                return Err(self.bad(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing", problem));
+            }
+        };
+        // Above the isocentre the table's height is negative (DICOM: below is positive), so a rise is anterior.
+        let height = self.number(tags::TABLE_HEIGHT, "TableHeight")?.unwrap_or(0.0);
+        let lateral = self.number(tags::TABLE_TRAVERSE, "TableTraverse")?.unwrap_or(0.0);
+        let down = self.per_frame(height, tags::TABLE_VERTICAL_INCREMENT, "TableVerticalIncrement", n)?;
+        let left = self.per_frame(lateral, tags::TABLE_LATERAL_INCREMENT, "TableLateralIncrement", n)?;
+        let along = self.per_frame(0.0, tags::TABLE_LONGITUDINAL_INCREMENT, "TableLongitudinalIncrement", n)?;
+        let position = self.text(tags::PATIENT_POSITION).unwrap_or_default();
+        if !["HFS", ""].contains(&position.as_str()) {
+            notes
+                .push(format!("patient position {position}: axes are named as for a patient supine, head first (HFS)"));
+        }
+        let arms: Vec<CArm> = (0..n)
+            .map(|i| CArm {
+                primary_deg: primary[i],
+                secondary_deg: secondary[i],
+                sid_mm,
+                sod_mm,
+                pixel_mm,
+                offset_mm: [0.0; 2],
+                table_mm: [left[i], down[i], along[i]],
+            })
+            .collect();
+        let rays =
+            crate::geometry::Geometry::CArm(CArm { table_mm: [0.0; 3], ..arms[0].clone() }).rays(size[0], size[1]);
+        rays.map(|_| arms).map_err(|(field, problem)| Error::data(self.path, tag_of(&field), problem))
+    }
+
+    fn times(&self, n: usize, notes: &mut Vec<String>) -> Result<Vec<f64>> {
+        let vector = tags::FRAME_TIME_VECTOR;
+        if let Some(steps) = self.numbers(vector, "FrameTimeVector")? {
+            if steps.len() != n {
+                return Err(self.bad(vector, "FrameTimeVector", format!("{} values for {n} frames", steps.len())));
+            }
+            let mut now = 0.0;
+            return Ok(steps
+                .iter()
+                .enumerate()
+                .map(|(i, step)| {
+                    now += if i == 0 { 0.0 } else { step / 1e3 };
+                    now
+                })
+                .collect());
+        }
+        let step_ms = match self.number(tags::FRAME_TIME, "FrameTime")? {
+            Some(ms) => ms,
+            None => match self.number(tags::CINE_RATE, "CineRate")? {
+                Some(rate) if rate > 0.0 => 1e3 / rate,
+                _ => {
+                    notes.push("no frame times: 15 frames per second are assumed".into());
+                    1e3 / 15.0
+                }
+            },
+        };
+        if step_ms <= 0.0 {
+            return Err(self.bad(tags::FRAME_TIME, "FrameTime", format!("{step_ms} ms is not positive")));
+        }
+        Ok((0..n).map(|i| i as f64 * step_ms / 1e3).collect())
+    }
+
+    fn relationship(&self, notes: &mut Vec<String>) -> Relationship {
+        match self.text(tags::PIXEL_INTENSITY_RELATIONSHIP).as_deref() {
+            Some("LIN") => Relationship::Linear,
+            Some("LOG") => Relationship::Log,
+            other => {
+                let said = other.unwrap_or("missing");
+                notes.push(format!(
+                    "PixelIntensityRelationship {said}: taken as logarithmic of unknown scale; attenuation is relative"
+                ));
+                Relationship::Display
+            }
+        }
+    }
+
+    /// All frames after the modality LUT, and the brightest value there can be.
+    fn frames(&self, n: usize, pixels: usize, notes: &mut Vec<String>) -> Result<(Vec<Vec<f32>>, f32)> {
+        let tag = tags::PIXEL_DATA;
+        if self.object.get(tag).is_none() {
+            return Err(self.bad(tag, "PixelData", "is missing"));
+        }
+        let bits = self.number(tags::BITS_STORED, "BitsStored")?.unwrap_or(8.0);
+        if !(1.0..=16.0).contains(&bits) {
+            return Err(self.bad(tags::BITS_STORED, "BitsStored", format!("{bits}; 8 to 16 are accepted")));
+        }
+        let signed = self.number(tags::PIXEL_REPRESENTATION, "PixelRepresentation")?.unwrap_or(0.0) != 0.0;
+        let slope = self.number(tags::RESCALE_SLOPE, "RescaleSlope")?.unwrap_or(1.0);
+        let intercept = self.number(tags::RESCALE_INTERCEPT, "RescaleIntercept")?.unwrap_or(0.0);
+        let has_table = self.object.get(tags::MODALITY_LUT_SEQUENCE).is_some();
+        if has_table || slope != 1.0 || intercept != 0.0 {
+            notes.push("the modality LUT was applied; VOI LUT and window were not".into());
+        }
+        // A decoder that panics on malformed data is theirs; the run ends with an error all the same.
+        let decode = |frame: usize| -> std::result::Result<Vec<f32>, String> {
+            let decoded = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+                let options = ConvertOptions::new()
+                    .with_modality_lut(ModalityLutOption::Default)
+                    .with_voi_lut(VoiLutOption::Identity);
+                let frame = self.object.decode_pixel_data_frame(frame as u32).map_err(|e| describe(&e))?;
+                frame.to_vec_with_options::<f32>(&options).map_err(|e| describe(&e))
+            }));
+            decoded.unwrap_or_else(|_| Err("the decoder failed".into()))
+        };
+        let mut frames = (0..n)
+            .map(|i| {
+                let bad = |problem: String| self.bad(tag, "PixelData", format!("frame {i}: {problem}"));
+                let values = decode(i).map_err(bad)?;
+                match values.len() {
+                    found if found == pixels && values.iter().all(|v| v.is_finite()) => Ok(values),
+                    found => Err(bad(format!("{found} finite values, {pixels} are needed"))),
+                }
+            })
+            .collect::<Result<Vec<Vec<f32>>>>()?;
+        let span = (2f64.powf(bits) - 1.0) as f32;
+        let (mut low, mut white) = if signed { (-(span + 1.0) / 2.0, (span - 1.0) / 2.0) } else { (0.0, span) };
+        if has_table || slope != 1.0 || intercept != 0.0 {
+            let all = || frames.iter().flatten().copied();
+            (low, white) = (all().fold(f32::MAX, f32::min), all().fold(f32::MIN, f32::max));
+        }
+        if self.text(tags::PHOTOMETRIC_INTERPRETATION).as_deref() == Some("MONOCHROME1") {
+            notes.push("MONOCHROME1: inverted, so that brighter is less absorbed".into());
+            frames.iter_mut().flatten().for_each(|v| *v = low + white - *v);
+        }
+        Ok((frames, white))
+    }
+
+    /// Inside the shutters of the collimator.
+    fn open_area(&self, width: usize, height: usize) -> Result<(Range<usize>, Range<usize>)> {
+        let edge = |tag, name, otherwise: usize, most: usize| -> Result<usize> {
+            // Edges are counted from 1, and belong to the shutter.
+            Ok(self.number(tag, name)?.map_or(otherwise, |e| e.clamp(0.0, most as f64 + 1.0) as usize))
+        };
+        let left = edge(tags::SHUTTER_LEFT_VERTICAL_EDGE, "ShutterLeftVerticalEdge", 0, width)?;
+        let right = edge(tags::SHUTTER_RIGHT_VERTICAL_EDGE, "ShutterRightVerticalEdge", width + 1, width)?;
+        let top = edge(tags::SHUTTER_UPPER_HORIZONTAL_EDGE, "ShutterUpperHorizontalEdge", 0, height)?;
+        let bottom = edge(tags::SHUTTER_LOWER_HORIZONTAL_EDGE, "ShutterLowerHorizontalEdge", height + 1, height)?;
+        if right < left + 2 || bottom < top + 2 {
+            let problem = format!("columns {left} to {right}, rows {top} to {bottom} leave nothing open");
+            return Err(self.bad(tags::SHUTTER_LEFT_VERTICAL_EDGE, "ShutterLeftVerticalEdge", problem));
+        }
+        Ok((left..right - 1, top..bottom - 1))
+    }
+
+    /// R-peaks as the file lists them, or found in its ECG.
+    fn r_peaks(&self, times_s: &[f64], notes: &mut Vec<String>) -> Option<RPeaks> {
+        let listed = self.numbers(tags::R_WAVE_TIME_VECTOR, "RWaveTimeVector").ok().flatten();
+        if let Some(peaks) = listed.and_then(|ms| RPeaks::new(&ms.iter().map(|t| t / 1e3).collect::<Vec<_>>()).ok()) {
+            notes.push("R-peaks from RWaveTimeVector".into());
+            return Some(peaks);
+        }
+        let (source, trace, rate) = self.waveform().or_else(|| self.curve(times_s))?;
+        match ecg::r_peaks(&trace, rate) {
+            Ok(peaks) => {
+                notes.push(format!(
+                    "R-peaks found in the ECG of {source}: {:.0} beats per minute",
+                    60.0 / peaks.beat_s()
+                ));
+                Some(peaks)
+            }
+            Err(error) => {
+                notes.push(format!("the ECG of {source} was not used: {error}"));
+                None
+            }
+        }
+    }
+
+    /// First channel of the first waveform.
+    fn waveform(&self) -> Option<(&'static str, Vec<f64>, f64)> {
+        let item = self.object.get(tags::WAVEFORM_SEQUENCE)?.items()?.first()?;
+        let number = |tag| item.get(tag)?.to_float64().ok();
+        let channels = number(tags::NUMBER_OF_WAVEFORM_CHANNELS)? as usize;
+        let rate = number(tags::SAMPLING_FREQUENCY)?;
+        let signed = item.get(tags::WAVEFORM_SAMPLE_INTERPRETATION)?.to_str().ok()?.trim() == "SS";
+        let bytes = item.get(tags::WAVEFORM_DATA)?.to_bytes().ok()?;
+        let step = 2 * channels;
+        if channels == 0 || channels > 64 || !signed || bytes.len() > 64 << 20 {
+            return None;
+        }
+        let trace = bytes.chunks_exact(step).map(|s| f64::from(i16::from_le_bytes([s[0], s[1]]))).collect();
+        Some(("WaveformSequence", trace, rate))
+    }
+
+    /// The retired curve of group 5000, which spans the run.
+    fn curve(&self, times_s: &[f64]) -> Option<(&'static str, Vec<f64>, f64)> {
+        if self.text(Tag(0x5000, 0x0020))? != "ECG" {
+            return None;
+        }
+        let dimensions = self.number(Tag(0x5000, 0x0005), "CurveDimensions").ok().flatten().unwrap_or(1.0);
+        let kind = self.number(Tag(0x5000, 0x0103), "DataValueRepresentation").ok().flatten()?;
+        let bytes = self.object.get(Tag(0x5000, 0x3000))?.to_bytes().ok()?;
+        if dimensions != 1.0 || bytes.len() > 64 << 20 {
+            return None;
+        }
+        let trace: Vec<f64> = match kind as u32 {
+            0 => bytes.chunks_exact(2).map(|b| f64::from(u16::from_le_bytes([b[0], b[1]]))).collect(),
+            1 => bytes.chunks_exact(2).map(|b| f64::from(i16::from_le_bytes([b[0], b[1]]))).collect(),
+            2 => bytes.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect(),
+            _ => return None,
+        };
+        let length_s = times_s.last()? + times_s.get(1).copied().unwrap_or(0.0);
+        Some(("CurveData", trace.clone(), trace.len() as f64 / length_s))
+    }
+}
+
+/// The tag a field of the geometry came from.
+fn tag_of(field: &str) -> String {
+    let name = match field {
+        "sid_mm" => "(0018,1110) DistanceSourceToDetector",
+        "sod_mm" => "(0018,1111) DistanceSourceToPatient",
+        "primary_deg" => "(0018,1510) PositionerPrimaryAngle",
+        "secondary_deg" => "(0018,1511) PositionerSecondaryAngle",
+        field if field.starts_with("pixel_mm") => "(0018,1164) ImagerPixelSpacing",
+        other => other,
+    };
+    name.to_owned()
+}

@@ -1,0 +1,166 @@
+//! Sizes and variants of the kernels, chosen for a device, with the reasons.
+
+use crate::choice::Choice;
+use crate::gpu::capabilities::DeviceInfo;
+use crate::gpu::memory::Operands;
+use serde::Serialize;
+
+/// How the network's layers are computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Layers {
+    /// f32 throughout.
+    F32,
+    /// Cooperative matrices: f16 operands, f32 sums.
+    Matrices,
+}
+
+impl Choice for Layers {
+    const ALL: &'static [Layers] = &[Layers::F32, Layers::Matrices];
+
+    fn name(self) -> &'static str {
+        match self {
+            Layers::F32 => "f32",
+            Layers::Matrices => "matrices",
+        }
+    }
+}
+
+/// Sizes of the passes on cooperative matrices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct MatrixTuning {
+    /// Workgroups of the backward passes, which stay on the device and share out the samples.
+    pub workgroups: u32,
+    /// Samples of a workgroup's tile, at most; shared memory may allow fewer.
+    pub largest_tile: u32,
+    /// Unroll the loops over the inner dimension: operands stay in registers, compilation takes longer.
+    pub unroll: bool,
+}
+
+/// Sizes and variants chosen for a device, with the reasons.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Tuning {
+    /// How the network's layers are computed.
+    pub layers: Layers,
+    /// How kernels read weights and activations in f32.
+    pub operands: Operands,
+    /// Invocations of a workgroup of the layer kernels.
+    pub layer_lanes: u32,
+    /// Invocations of a workgroup of the weight-gradient kernels.
+    pub weight_lanes: u32,
+    /// Parts the samples are split into for weight gradients.
+    pub splits: u32,
+    /// Sizes of the passes on matrices.
+    pub matrices: MatrixTuning,
+    /// Shared memory in which a workgroup may sum the static field's lines before they go to memory, bytes.
+    pub private_line_bytes: u32,
+    /// Samples handled at once, at most; the configuration may ask for fewer.
+    pub chunk_samples: u32,
+    /// Iterations handed to the device at once, instead of what the configuration says.
+    pub iterations_per_submit: Option<u32>,
+    /// Validate and save beside training instead of between iterations.
+    pub overlap: bool,
+    /// One sentence per choice.
+    pub reasons: Vec<String>,
+}
+
+impl Tuning {
+    /// Chooses for a device.
+    pub fn for_device(info: &DeviceInfo) -> Tuning {
+        let old_lavapipe = info.is_llvmpipe && info.mesa_major.is_some_and(|v| v < 24);
+        let mut reasons = Vec::new();
+        let (operands, why) = if old_lavapipe {
+            (Operands::Texel, "operands through texel buffers: this llvmpipe reads storage buffers lane by lane")
+        } else if info.is_llvmpipe && info.buffer_device_address {
+            (Operands::Address, "operands through addresses: spares this llvmpipe bounds checks")
+        } else {
+            (Operands::Storage, "operands through storage buffers")
+        };
+        reasons.push(why.to_owned());
+        let (layer_lanes, weight_lanes, splits) = if info.is_llvmpipe {
+            reasons.push("one subgroup per workgroup and few splits: a CPU has few workgroups in flight".into());
+            (info.subgroup_size.clamp(4, 16), info.subgroup_size.clamp(4, 16), 4)
+        } else {
+            (64, 32, 16)
+        };
+        let (layers, why) = match info.matrices.first() {
+            None => (Layers::F32, "f32 layers: the device has no cooperative matrices our kernels can use".to_owned()),
+            Some(_) if info.kind == "cpu" => {
+                (Layers::F32, "f32 layers: a CPU emulates cooperative matrices, several times slower".to_owned())
+            }
+            Some(s) => (Layers::Matrices, format!("matrix layers, {}x{}x{}: f16 operands, f32 sums", s.m, s.n, s.k)),
+        };
+        reasons.push(why);
+        let matrices = match info.multiprocessors {
+            // Unrolled, a CPU driver compiles these kernels for minutes.
+            _ if info.kind == "cpu" => MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false },
+            // Two workgroups per multiprocessor; 132 of them where the driver does not tell their number.
+            n => MatrixTuning { workgroups: if n == 0 { 264 } else { 2 * n }, largest_tile: 128, unroll: true },
+        };
+        // Some kilobytes per sample must fit beside all else.
+        let chunk_samples = match info.kind {
+            "cpu" => 1 << 17,
+            _ => (info.device_memory >> 14).clamp(1 << 16, 1 << 19) as u32,
+        };
+        let overlap = info.kind != "cpu";
+        // Shared memory is no faster on a CPU.
+        let private_line_bytes = if info.kind == "cpu" { 0 } else { info.max_shared_memory / 2 };
+        reasons.push(match private_line_bytes {
+            0 => "static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into(),
+            _ => "static gradients through 32-bit integer atomics, lines in shared memory first: exact sums".into(),
+        });
+        Tuning {
+            layers,
+            operands,
+            layer_lanes,
+            weight_lanes,
+            splits,
+            matrices,
+            private_line_bytes,
+            chunk_samples,
+            iterations_per_submit: None,
+            overlap,
+            reasons,
+        }
+    }
+
+    /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_bwd`.
+    pub(super) fn private_lines(&self, line_params: u32) -> u32 {
+        if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
+    }
+
+    /// With the layers on another path, for the reason given.
+    pub fn with_layers(mut self, layers: Layers, reason: String) -> Tuning {
+        self.layers = layers;
+        self.reasons.retain(|r| !r.contains("layers"));
+        self.reasons.push(reason);
+        self
+    }
+
+    /// Samples one workgroup of the layer kernels covers.
+    pub fn tile_samples(&self) -> u32 {
+        self.layer_lanes * self.tile().samples
+    }
+
+    /// What a lane of the layer kernels keeps in registers; the defines of `glsl/variants.txt`.
+    pub fn tile(&self) -> LaneTile {
+        match self.operands {
+            Operands::Storage => LaneTile { samples: 4, fwd_neurons: 16, bwd_inputs: 16, weight_neurons: 16 },
+            Operands::Texel => LaneTile { samples: 8, fwd_neurons: 16, bwd_inputs: 16, weight_neurons: 32 },
+            Operands::Address => LaneTile { samples: 4, fwd_neurons: 32, bwd_inputs: 32, weight_neurons: 32 },
+        }
+    }
+}
+
+/// Register tiles of the layer kernels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LaneTile {
+    /// Samples a lane of `mlp_layer_fwd` and `mlp_layer_bwd_input` keeps.
+    pub samples: u32,
+    /// Neurons of `mlp_layer_fwd`.
+    pub fwd_neurons: u32,
+    /// Inputs of `mlp_layer_bwd_input`.
+    pub bwd_inputs: u32,
+    /// Neurons of `mlp_layer_bwd_weight`.
+    pub weight_neurons: u32,
+}

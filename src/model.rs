@@ -1,0 +1,38 @@
+//! A reconstruction: parameters with everything needed to evaluate them, independent of any dataset.
+
+pub mod checkpoint;
+pub mod component;
+pub mod hull;
+pub mod params;
+pub mod scene;
+mod schedule;
+pub mod setup;
+
+use crate::config::Config;
+use crate::geometry::CArm;
+use crate::model::hull::Hull;
+use crate::model::params::ParamLayout;
+use crate::model::scene::Scene;
+
+/// The fields at one moment of training.
+#[derive(Debug, Clone)]
+pub struct Model {
+    /// Hyper-parameters of the run.
+    pub config: Config,
+    /// Scales and boxes.
+    pub scene: Scene,
+    /// Where each parameter lives.
+    pub layout: ParamLayout,
+    /// Motion hull, when the run uses one.
+    pub hull: Option<Hull>,
+    /// Parameters, padded as [`ParamLayout`] says.
+    pub params: Vec<f32>,
+    /// Iterations done.
+    pub step: u32,
+    /// Vessel attenuation per world unit, where the dataset states it.
+    pub vessel_attenuation: Option<f64>,
+    /// A C-arm like that of the training views, for rendering from other angles.
+    pub c_arm: CArm,
+    /// Columns and rows of the training images.
+    pub image_size: [usize; 2],
+}

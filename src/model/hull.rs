@@ -1,0 +1,75 @@
+//! The motion hull: where the dynamic field may exist.
+
+use crate::formats::volume::Volume;
+use crate::geometry::MM_PER_UNIT;
+use glam::{DAffine3, DMat3, DVec3};
+
+/// Binary volumes on a regular grid, one for all phases or one per phase; world units, x fastest.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hull {
+    /// Cells along x, y, z.
+    pub size: [usize; 3],
+    /// Lower corner.
+    pub min: DVec3,
+    /// Side of a cell.
+    pub cell: f64,
+    /// Volumes: 1, or one per phase.
+    pub n_phases: usize,
+    /// 32 cells to a word, lowest bit first; each phase starts a new word.
+    pub bits: Vec<u32>,
+}
+
+impl Hull {
+    /// Words of one phase's volume.
+    pub fn words(&self) -> usize {
+        self.bits.len() / self.n_phases
+    }
+
+    /// The hull as a volume, to look at: the number of phases at which a cell is kept.
+    pub fn to_volume(&self) -> Volume {
+        let cell_mm = self.cell * MM_PER_UNIT;
+        // Index axes follow the world's (posterior, left, superior); LPS swaps the first two.
+        let axes = DMat3::from_cols(DVec3::Y * cell_mm, DVec3::X * cell_mm, DVec3::Z * cell_mm);
+        let first = (self.min + 0.5 * self.cell) * MM_PER_UNIT;
+        let count = |i: usize| self.bits.chunks(self.words()).filter(|w| w[i / 32] >> (i % 32) & 1 == 1).count();
+        Volume {
+            size: self.size,
+            values: (0..self.size.iter().product()).map(|i| count(i) as f32).collect(),
+            index_to_lps: DAffine3::from_mat3_translation(axes, DVec3::new(first.y, first.x, first.z)),
+        }
+    }
+
+    /// Whether a point lies in a cell kept at a phase.
+    pub fn contains_point(&self, point: DVec3, phase: usize) -> bool {
+        let c = ((point - self.min) / self.cell).floor();
+        let inside = |v: f64, n: usize| v >= 0.0 && v < n as f64;
+        if !(inside(c.x, self.size[0]) && inside(c.y, self.size[1]) && inside(c.z, self.size[2])) {
+            return false;
+        }
+        let index = (c.z as usize * self.size[1] + c.y as usize) * self.size[0] + c.x as usize;
+        let start = if self.n_phases > 1 { phase * self.words() } else { 0 };
+        self.bits[start + index / 32] >> (index % 32) & 1 == 1
+    }
+
+    /// Kept share of all cells, averaged over phases.
+    pub fn share(&self) -> f64 {
+        let kept: u64 = self.bits.iter().map(|w| u64::from(w.count_ones())).sum();
+        kept as f64 / (self.size.iter().product::<usize>() * self.n_phases) as f64
+    }
+
+    /// Lower and upper corner of the cells kept at any phase; `None` when nothing is kept.
+    pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+        let [nx, ny, _] = self.size;
+        for (word, bits) in self.bits.iter().enumerate().filter(|(_, bits)| **bits != 0) {
+            for bit in (0..32).filter(|bit| bits >> bit & 1 == 1) {
+                let index = word % self.words() * 32 + bit;
+                let cell = DVec3::new((index % nx) as f64, (index / nx % ny) as f64, (index / (nx * ny)) as f64);
+                let corner = self.min + cell * self.cell;
+                low = low.min(corner);
+                high = high.max(corner + self.cell);
+            }
+        }
+        low.is_finite().then_some((low, high))
+    }
+}

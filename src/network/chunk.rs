@@ -1,0 +1,30 @@
+//! Rays whose samples are handled at once.
+
+use crate::kernels::layout::Setup;
+
+/// Rays whose samples are handled at once.
+#[derive(Debug, Clone, Copy)]
+pub struct Chunk {
+    /// First ray of the batch.
+    pub first_ray: u32,
+    /// How many.
+    pub n_rays: u32,
+}
+
+impl Chunk {
+    /// As the shaders' push constants.
+    pub fn push(self) -> [u32; 2] {
+        [self.first_ray, self.n_rays]
+    }
+}
+
+/// Rays handled at once: their samples fit one chunk even if all are live.
+pub fn chunk_rays(setup: &Setup) -> u32 {
+    (setup.sample_capacity / 128 * 128 / setup.n_dynamic_samples).max(1)
+}
+
+/// A batch in chunks.
+pub fn chunks(setup: &Setup, n_rays: u32) -> impl Iterator<Item = Chunk> + use<> {
+    let per = chunk_rays(setup).min(n_rays).max(1);
+    (0..n_rays.div_ceil(per)).map(move |i| Chunk { first_ray: i * per, n_rays: per.min(n_rays - i * per) })
+}

@@ -1,0 +1,127 @@
+//! Line integrals through voxel volumes on the device: what phantoms and `project` are made with.
+
+use crate::error::Result;
+use crate::formats::volume::Volume;
+use crate::geometry::{MM_PER_UNIT, ViewRays};
+use crate::gpu::device::Gpu;
+use crate::gpu::memory::{Buffer, Memory};
+use crate::gpu::pipeline::Pipeline;
+use crate::gpu::record::{Bound, Groups, Recording};
+use crate::kernels::layout::View;
+use crate::kernels::stages::kernel_code;
+use bytemuck::{Pod, Zeroable};
+use glam::DVec3;
+use std::sync::Arc;
+
+#[repr(C)]
+#[derive(Clone, Copy, Pod, Zeroable)]
+struct Push {
+    rows: [[f32; 4]; 3],
+    size: [u32; 3],
+    view: u32,
+    near: f32,
+    far: f32,
+    steps: u32,
+    scale: f32,
+    image_width: u32,
+    n_pixels: u32,
+    first_pixel: u32,
+    spare: u32,
+}
+
+/// Depth steps of a projection through `volume` seen over `half_depth` (world units): half a voxel each.
+pub fn depth_steps(volume: &Volume, half_depth: f64) -> u32 {
+    (2.0 * half_depth * MM_PER_UNIT / (0.5 * volume.spacing_mm())).ceil() as u32
+}
+
+/// A device projector for images of one size.
+pub struct Projector {
+    gpu: Gpu,
+    project: Arc<Pipeline>,
+    width: usize,
+    height: usize,
+}
+
+/// A volume on the device.
+pub struct LoadedVolume {
+    values: Buffer,
+    volume: Volume,
+}
+
+impl Projector {
+    /// A projector for `width` x `height` images.
+    ///
+    /// # Errors
+    /// Errors of the pipeline's creation.
+    pub fn new(gpu: &Gpu, width: usize, height: usize) -> Result<Projector> {
+        let project = Arc::new(gpu.pipeline(kernel_code("project")?, 64, &[])?);
+        Ok(Projector { gpu: gpu.clone(), project, width, height })
+    }
+
+    /// Puts a volume on the device; its host values are dropped.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::OutOfMemory`].
+    pub fn load(&self, mut volume: Volume) -> Result<LoadedVolume> {
+        let values = self.gpu.buffer_with("volume", &volume.values)?;
+        volume.values = Vec::new();
+        Ok(LoadedVolume { values, volume })
+    }
+
+    /// Line integrals (attenuation per mm times mm) of `volume`, moved by `shift_mm` (LPS), for each view.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn project(&self, loaded: &LoadedVolume, views: &[ViewRays], shift_mm: DVec3) -> Result<Vec<Vec<f32>>> {
+        let pixels = self.width * self.height;
+        let device_views: Vec<View> = views.iter().map(View::of).collect();
+        let views_buffer = self.gpu.buffer_with("views", &device_views)?;
+        let integrals = self.gpu.buffer("integrals", (views.len() * pixels * 4) as u64, Memory::Device)?;
+        let mut volume = loaded.volume.clone();
+        volume.index_to_lps.translation += shift_mm;
+        let to_index = volume.world_to_index();
+        let rows = [0, 1, 2].map(|r| {
+            let row = to_index.matrix3.row(r);
+            [row.x as f32, row.y as f32, row.z as f32, to_index.translation[r] as f32]
+        });
+        let half_depth = bounding_radius(&volume);
+        let mut recording = Recording::new(&self.gpu, "project")?;
+        recording.fill(&integrals, 0);
+        for (view, rays) in views.iter().enumerate() {
+            let half = half_depth.min(rays.sod);
+            let push = Push {
+                rows,
+                size: volume.size.map(|n| n as u32),
+                view: view as u32,
+                near: -half as f32,
+                far: half as f32,
+                steps: depth_steps(&volume, half),
+                scale: MM_PER_UNIT as f32,
+                image_width: self.width as u32,
+                n_pixels: pixels as u32,
+                first_pixel: (view * pixels) as u32,
+                spare: 0,
+            };
+            let groups = Groups::Direct([(pixels as u32).div_ceil(self.project.local_size), 1, 1]);
+            let buffers = [("views", &views_buffer), ("volume", &loaded.values), ("integrals", &integrals)]
+                .map(|(name, buffer)| (name, Bound::Buffer(buffer)));
+            recording.dispatch(&self.project, groups, &buffers, &push)?;
+        }
+        self.gpu.wait(recording.finish()?.submit()?)?;
+        let all: Vec<f32> = self.gpu.download(&integrals, 0, views.len() * pixels)?;
+        Ok(all.chunks(pixels).map(<[f32]>::to_vec).collect())
+    }
+}
+
+/// Largest distance of a volume's corner from the isocentre, world units.
+pub fn bounding_radius(volume: &Volume) -> f64 {
+    let mut radius = 0f64;
+    for corner in 0..8 {
+        let at = |axis: usize| {
+            if corner >> axis & 1 == 1 { volume.size[axis] as f64 } else { -1.0 }
+        };
+        let p = volume.index_to_lps.transform_point3(DVec3::new(at(0), at(1), at(2)));
+        radius = radius.max(p.length());
+    }
+    radius / MM_PER_UNIT
+}

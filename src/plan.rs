@@ -1,0 +1,169 @@
+//! From a dataset and a configuration to everything a run needs, in the device's terms: scales, boxes,
+//! hull, backgrounds, ray lists, schedule. Pure host code; both the engine and its CPU twin start here.
+
+pub mod carve;
+pub mod motion;
+pub mod scale;
+
+use crate::config::{Config, DynamicTarget};
+use crate::error::{Error, Result};
+use crate::kernels::layout::{self, Setup};
+use crate::model::hull::Hull;
+use crate::model::params::ParamLayout;
+use crate::model::scene::Scene;
+use crate::plan::motion::ViewMotion;
+use crate::plan::scale::dynamic_half;
+use crate::scan::dataset::Dataset;
+
+/// A run, ready to start.
+pub struct Plan {
+    /// The configuration it came from.
+    pub config: Config,
+    /// Scales and boxes.
+    pub scene: Scene,
+    /// Constants for the shaders.
+    pub setup: Setup,
+    /// Where each parameter lives.
+    pub params: ParamLayout,
+    /// One row per iteration.
+    pub schedule: Vec<layout::Schedule>,
+    /// Training views.
+    pub views: Vec<layout::View>,
+    /// Training frames.
+    pub frames: Vec<layout::Frame>,
+    /// Line integrals of all training frames.
+    pub images: Vec<f32>,
+    /// Bounds of the still background of each pixel of each view.
+    pub backgrounds: Vec<[f32; 2]>,
+    /// Rays that meet the hull, as frame * pixels + pixel.
+    pub motion_rays: Vec<u32>,
+    /// The hull, when it is used.
+    pub hull: Option<Hull>,
+    /// Decisions worth telling the user.
+    pub notes: Vec<String>,
+}
+
+impl Plan {
+    /// Prepares a run.
+    ///
+    /// # Errors
+    /// [`Error::Config`] when the dataset and the configuration do not fit.
+    pub fn new(config: &Config, dataset: &Dataset) -> Result<Plan> {
+        let mut notes = Vec::new();
+        let motion = motion::analyse(dataset, &config.hull);
+        let hull = choose_hull(config, dataset, &motion, &mut notes);
+        let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
+        let pixels = dataset.n_pixels();
+        let training = dataset.training();
+        let n_all = training.len() * pixels;
+        if n_all > (1 << 30) {
+            return Err(Error::config("dataset", n_all, "at most 2^30 training pixels are supported"));
+        }
+        let mut views = Vec::new();
+        let mut backgrounds = Vec::with_capacity(motion.len() * pixels);
+        let mut slot_of_view = vec![u32::MAX; dataset.views.len()];
+        for (slot, m) in motion.iter().enumerate() {
+            slot_of_view[m.view] = slot as u32;
+            views.push(layout::View::of(&dataset.views[m.view].rays));
+            backgrounds.extend(m.background_low.iter().zip(&m.background).map(|(low, high)| [*low, *high]));
+        }
+        let mut frames = Vec::with_capacity(training.len());
+        let mut images = Vec::with_capacity(n_all);
+        let mut motion_rays = Vec::new();
+        for (index, frame) in training.iter().enumerate() {
+            let slot = slot_of_view[frame.view];
+            frames.push(layout::Frame {
+                view: slot,
+                phase: frame.phase,
+                image_offset: (index * pixels) as u32,
+                background_offset: slot * pixels as u32,
+            });
+            images.extend_from_slice(&frame.integrals);
+            if hull.is_some() {
+                let m = &motion[slot as usize];
+                let moving = if config.hull.per_phase { &m.moving_at[frame.phase as usize] } else { &m.moving };
+                motion_rays.extend((0..pixels).filter(|p| moving[*p]).map(|p| (index * pixels + p) as u32));
+            }
+        }
+        if config.loss.dynamic_target == DynamicTarget::Temporal && motion.iter().any(|m| m.n_phases < 2) {
+            return Err(Error::config(
+                "loss.dynamic_target",
+                "temporal",
+                "needs several phases in every view; use `absolute` for still objects",
+            ));
+        }
+        let params = ParamLayout::new(config, dataset.n_phases as usize);
+        let n_motion_rays = if motion_rays.is_empty() {
+            0
+        } else {
+            (f64::from(config.train.rays) * config.train.motion_share).round() as u32
+        };
+        let mut setup = scene.setup(config, &params, hull.as_ref());
+        setup.n_motion_rays = n_motion_rays;
+        setup.n_motion_list = motion_rays.len() as u32;
+        setup.n_all_rays = n_all as u32;
+        setup.n_pixels = pixels as u32;
+        setup.image_width = dataset.width as u32;
+        let schedule = config.schedule_table();
+        Ok(Plan {
+            config: config.clone(),
+            scene,
+            setup,
+            params,
+            schedule,
+            views,
+            frames,
+            images,
+            backgrounds,
+            motion_rays,
+            hull,
+            notes,
+        })
+    }
+
+    /// The same in a scene that is known, as when resuming.
+    pub fn in_scene(self, scene: Scene) -> Plan {
+        let setup = Setup {
+            n_motion_rays: self.setup.n_motion_rays,
+            n_motion_list: self.setup.n_motion_list,
+            n_all_rays: self.setup.n_all_rays,
+            n_pixels: self.setup.n_pixels,
+            image_width: self.setup.image_width,
+            ..scene.setup(&self.config, &self.params, self.hull.as_ref())
+        };
+        Plan { scene, setup, ..self }
+    }
+}
+
+fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes: &mut Vec<String>) -> Option<Hull> {
+    if !config.hull.enabled {
+        return None;
+    }
+    let still: Vec<_> = motion.iter().filter(|m| m.n_phases < 2).map(|m| m.view).collect();
+    if !still.is_empty() {
+        notes.push(format!("motion hull not used: views {still:?} have a single phase"));
+        return None;
+    }
+    let hull = carve::carve(
+        dataset,
+        motion,
+        dynamic_half(config, dataset),
+        config.hull.resolution as usize,
+        config.hull.per_phase,
+    );
+    let share = hull.share();
+    if share == 0.0 {
+        notes.push("motion hull not used: no point moves in every view that sees it".into());
+        None
+    } else if share > config.hull.max_share {
+        notes.push(format!(
+            "motion hull not used: it would keep {:.0} % of the box (hull.max_share = {:.0} %), so it excludes little",
+            100.0 * share,
+            100.0 * config.hull.max_share
+        ));
+        None
+    } else {
+        notes.push(format!("motion hull keeps {:.3} % of the box", 100.0 * share));
+        Some(hull)
+    }
+}

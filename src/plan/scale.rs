@@ -1,0 +1,178 @@
+//! Choosing scales and boxes for a dataset.
+
+use crate::config::{Config, DynamicTarget};
+use crate::error::{Error, Result};
+use crate::geometry::MM_PER_UNIT;
+use crate::model::hull::Hull;
+use crate::model::scene::Scene;
+use crate::plan::motion::ViewMotion;
+use crate::raster::percentile;
+use crate::scan::dataset::Dataset;
+use glam::DVec3;
+
+impl Scene {
+    /// Chooses scales and boxes for a dataset.
+    ///
+    /// # Errors
+    /// [`Error::Data`] when the images cannot be normalised.
+    pub fn new(config: &Config, dataset: &Dataset, motion: &[ViewMotion], hull: Option<&Hull>) -> Result<Scene> {
+        let (near, far) = dataset.depth_range;
+        let static_half = if config.static_field.half_extent_mm > 0.0 {
+            config.static_field.half_extent_mm / MM_PER_UNIT
+        } else {
+            half_depth(dataset)
+        };
+        let half = dynamic_half(config, dataset);
+        let (dynamic_min, dynamic_max) =
+            hull.and_then(Hull::bounds).unwrap_or((DVec3::splat(-half), DVec3::splat(half)));
+        let corner = dynamic_min.abs().max(dynamic_max.abs()).length();
+        let dynamic_depth =
+            if config.march.fit_dynamic_range { [near.max(-corner), far.min(corner)] } else { [near, far] };
+        let (encode_centre, encode_scale) = if config.dynamic.encode_box {
+            let centre = 0.5 * (dynamic_min + dynamic_max);
+            (centre, std::f64::consts::PI / (0.5 * (dynamic_max - dynamic_min)).max_element())
+        } else {
+            (DVec3::ZERO, 1.0)
+        };
+        let mut scene = Scene {
+            static_min: [-static_half; 3],
+            static_max: [static_half; 3],
+            dynamic_min: dynamic_min.to_array(),
+            dynamic_max: dynamic_max.to_array(),
+            static_depth: [near, far],
+            dynamic_depth,
+            encode_centre: encode_centre.to_array(),
+            encode_scale,
+            static_gain: 1.0,
+            static_shift: -10.0,
+            dynamic_gain: 1.0,
+            dynamic_shift: -10.0,
+            static_weight: 1.0,
+            dynamic_weight: 1.0,
+            robust_scale: 0.0,
+        };
+        if config.loss.normalise {
+            scene.normalise(config, dataset, motion, hull, static_half)?;
+        }
+        Ok(scene)
+    }
+
+    /// Chooses gains, shifts and weights so that features, integrals and losses are near 1.
+    fn normalise(
+        &mut self,
+        config: &Config,
+        dataset: &Dataset,
+        motion: &[ViewMotion],
+        hull: Option<&Hull>,
+        static_half: f64,
+    ) -> Result<()> {
+        let training = dataset.training();
+        let count = (training.len() * dataset.n_pixels()) as f64;
+        let sum: f64 = training.iter().flat_map(|f| &f.integrals).map(|v| f64::from(*v)).sum();
+        let mean = sum / count;
+        if !(mean.is_finite() && mean > 0.0) {
+            return Err(Error::data(
+                &dataset.path,
+                "images",
+                format!("their mean line integral is {mean}; it must be positive (is the intensity model right?)"),
+            ));
+        }
+        // softplus(ln(e - 1)) = 1: a feature of zero is the mean attenuation.
+        self.static_gain = mean / (2.0 * static_half);
+        self.static_shift = (std::f64::consts::E - 1.0).ln();
+        self.static_weight = 1.0 / (mean * mean);
+        let moving: Vec<f32> = motion
+            .iter()
+            .flat_map(|m| m.range.iter().zip(&m.moving).filter(|(_, moving)| **moving).map(|(r, _)| *r))
+            .collect();
+        let change = f64::from(percentile(&moving, 0.9));
+        let change = if change > 0.0 { change } else { mean };
+        // A vessel fills a few percent of the field of view.
+        let vessel = 0.05 * field_of_view(dataset);
+        self.dynamic_gain = change / vessel;
+        let depth = hull
+            .map_or((DVec3::from_array(self.dynamic_max) - DVec3::from_array(self.dynamic_min)).max_element(), |h| {
+                mean_depth(h, dataset, motion)
+            });
+        self.dynamic_shift = first_shift(config.dynamic.normalised_shift, depth / vessel);
+        (self.dynamic_weight, self.robust_scale) = match config.loss.dynamic_target {
+            DynamicTarget::Temporal => (1.0 / (change * change), config.loss.robust * change),
+            // Both fields share one squared residual.
+            DynamicTarget::Absolute => (self.static_weight, 0.0),
+        };
+        Ok(())
+    }
+}
+
+/// Radius around the isocentre that the views see, world units.
+fn field_of_view(dataset: &Dataset) -> f64 {
+    let (w, h) = (dataset.width as f64 - 0.5, dataset.height as f64 - 0.5);
+    let mut radius = 0f64;
+    for view in dataset.training_views() {
+        for (i, j) in [(-0.5, -0.5), (w, -0.5), (-0.5, h), (w, h)] {
+            radius = radius.max(dataset.views[view].rays.pixel(i, j).0.length());
+        }
+    }
+    radius
+}
+
+/// How deep rays that meet the hull run inside it, on average: its volume over the area of the pixels that see it.
+fn mean_depth(hull: &Hull, dataset: &Dataset, motion: &[ViewMotion]) -> f64 {
+    let (mut sum, mut n) = (0.0, 0);
+    for m in motion {
+        let at = |i: f64, j: f64| dataset.views[m.view].rays.pixel(i, j).0;
+        let pixel_area = (at(1.0, 0.0) - at(0.0, 0.0)).cross(at(0.0, 1.0) - at(0.0, 0.0)).length();
+        for phase in 0..hull.n_phases {
+            let seen = if hull.n_phases > 1 { &m.moving_at[phase] } else { &m.moving };
+            let pixels = seen.iter().filter(|moving| **moving).count();
+            if pixels > 0 {
+                let bits = &hull.bits[phase * hull.words()..][..hull.words()];
+                let cells: u32 = bits.iter().map(|w| w.count_ones()).sum();
+                sum += f64::from(cells) * hull.cell.powi(3) / (pixels as f64 * pixel_area);
+                n += 1;
+            }
+        }
+    }
+    if n > 0 { sum / f64::from(n) } else { 0.0 }
+}
+
+/// The shift inside the dynamic field's softplus that a run starts with. A field that is `depth_in_vessels` times as deep
+/// as a vessel starts with as many times too large an integral, whose gradients can switch the whole network off: then
+/// it starts nearer to zero.
+fn first_shift(normalised_shift: f64, depth_in_vessels: f64) -> f64 {
+    if depth_in_vessels <= DEEP {
+        return normalised_shift;
+    }
+    let attenuation = normalised_shift.exp().ln_1p() / (depth_in_vessels / DEEP).powi(2);
+    attenuation.exp_m1().ln().max(normalised_shift.min(-5.0))
+}
+
+fn half_depth(dataset: &Dataset) -> f64 {
+    dataset.depth_range.0.abs().max(dataset.depth_range.1.abs())
+}
+
+/// Half side of the box the dynamic field is searched in, world units.
+pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
+    if config.dynamic.half_extent_mm > 0.0 {
+        config.dynamic.half_extent_mm / MM_PER_UNIT
+    } else {
+        field_of_view(dataset).min(half_depth(dataset))
+    }
+}
+/// Depth of the dynamic field, in vessels, from which a run starts nearer to zero. Tight hulls of 3 and 4 views reach 2.4.
+const DEEP: f64 = 2.5;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn deep_fields_start_nearer_to_zero() {
+        assert_eq!(first_shift(-2.0, 2.4), -2.0);
+        // Twice as deep as a run bears: a quarter of the attenuation.
+        let softplus = |x: f64| x.exp().ln_1p();
+        assert!((softplus(first_shift(-2.0, 2.0 * DEEP)) - softplus(-2.0) / 4.0).abs() < 1e-12);
+        assert_eq!(first_shift(-2.0, 1e6), -5.0);
+        assert_eq!(first_shift(-10.0, 1e6), -10.0, "a shift that was asked for is never raised");
+    }
+}

@@ -1,0 +1,192 @@
+//! f64 twins of ray drawing, depths and the march.
+
+use crate::kernels::layout::Setup;
+use crate::model::params::ParamLayout;
+use crate::plan::Plan;
+use crate::random::{STREAM_DEPTH, STREAM_MOTION_RAY, STREAM_RAY, permute, uniform01};
+use crate::reference::field::{self, NetworkTrace, Precision};
+use glam::DVec3;
+
+/// One ray; see `Ray` in the shaders.
+#[derive(Debug, Clone)]
+pub struct Ray {
+    /// Point at the isocentre plane.
+    pub anchor: DVec3,
+    /// Direction of unit depth.
+    pub direction: DVec3,
+    /// Cardiac phase.
+    pub phase: usize,
+    /// Measured line integral.
+    pub target: f64,
+    /// Bounds of the integral above the pixel's still background.
+    pub temporal: [f64; 2],
+    /// frame * pixels + pixel.
+    pub id: u32,
+}
+
+/// Rays of iteration `step` (twin of `batch`).
+pub fn batch(plan: &Plan, step: u32) -> Vec<Ray> {
+    let s = &plan.setup;
+    let draw = |slot: u32, per_step: u32, n: u32, stream: u32| {
+        let counter = step * per_step + slot;
+        permute(counter % n, n, s.seed, counter / n, stream)
+    };
+    (0..s.n_rays)
+        .map(|r| {
+            let id = if r < s.n_motion_rays {
+                plan.motion_rays[draw(r, s.n_motion_rays, s.n_motion_list, STREAM_MOTION_RAY) as usize]
+            } else {
+                draw(r - s.n_motion_rays, s.n_rays - s.n_motion_rays, s.n_all_rays, STREAM_RAY)
+            };
+            ray(plan, id)
+        })
+        .collect()
+}
+
+/// A training ray by its id.
+pub fn ray(plan: &Plan, id: u32) -> Ray {
+    let s = &plan.setup;
+    let frame = plan.frames[(id / s.n_pixels) as usize];
+    let view = plan.views[frame.view as usize];
+    let pixel = id % s.n_pixels;
+    let (i, j) = (f64::from(pixel % s.image_width), f64::from(pixel / s.image_width));
+    let target = f64::from(plan.images[(frame.image_offset + pixel) as usize]);
+    let [low, high] = plan.backgrounds[(frame.background_offset + pixel) as usize];
+    let v = |a: [f32; 4]| DVec3::new(a[0].into(), a[1].into(), a[2].into());
+    Ray {
+        anchor: v(view.anchor00) + i * v(view.anchor_du) + j * v(view.anchor_dv),
+        direction: v(view.direction00) + i * v(view.direction_du) + j * v(view.direction_dv),
+        phase: frame.phase as usize,
+        target,
+        temporal: [high, low].map(|background| target - f64::from(background)),
+        id,
+    }
+}
+
+/// Depths of a ray and the path lengths they stand for.
+pub fn depths(s: &Setup, n: u32, near: f32, far: f32, step: u32, ray: &Ray) -> Vec<(f64, f64)> {
+    let (near, far) = (f64::from(near), f64::from(far));
+    let grid = |k: u32| near + (far - near) * f64::from(k) / f64::from(n - 1);
+    let stream = if s.per_ray_depths != 0 { ray.id + 1 } else { 0 };
+    let at: Vec<f64> = (0..n)
+        .map(|k| {
+            if s.jitter == 0 {
+                return grid(k);
+            }
+            let lower = if k == 0 { grid(0) } else { 0.5 * (grid(k - 1) + grid(k)) };
+            let upper = if k == n - 1 { grid(k) } else { 0.5 * (grid(k) + grid(k + 1)) };
+            lower + (upper - lower) * uniform01(s.seed, STREAM_DEPTH.wrapping_add(stream << 4), step, k)
+        })
+        .collect();
+    let norm = ray.direction.length();
+    (0..n as usize).map(|k| (at[k], if k + 1 < n as usize { at[k + 1] - at[k] } else { 1e-10 } * norm)).collect()
+}
+
+/// Whether the dynamic field may exist at a point: its box and, if used, the hull.
+pub fn dynamic_inside(plan: &Plan, x: DVec3, phase: usize) -> bool {
+    let s = &plan.setup;
+    let low = DVec3::new(s.dynamic_min_x.into(), s.dynamic_min_y.into(), s.dynamic_min_z.into());
+    let high = DVec3::new(s.dynamic_max_x.into(), s.dynamic_max_y.into(), s.dynamic_max_z.into());
+    x.cmpge(low).all() && x.cmple(high).all() && plan.hull.as_ref().is_none_or(|h| h.contains_point(x, phase))
+}
+
+/// A static sample: where, path length, feature.
+pub struct StaticSample {
+    /// Position.
+    pub x: DVec3,
+    /// Path length.
+    pub dl: f64,
+    /// Feature before the activation.
+    pub feature: f64,
+}
+
+/// A live dynamic sample.
+pub struct DynamicSample {
+    /// Position.
+    pub x: DVec3,
+    /// Path length.
+    pub dl: f64,
+    /// Subject to occlusion minimisation.
+    pub near: bool,
+    /// The network there.
+    pub trace: NetworkTrace,
+}
+
+/// What a ray sees, with everything its backward pass needs.
+pub struct March {
+    /// Samples in the static box.
+    pub statics: Vec<StaticSample>,
+    /// Live dynamic samples.
+    pub dynamics: Vec<DynamicSample>,
+    /// Line integral of the static field.
+    pub static_integral: f64,
+    /// Line integral of the dynamic field.
+    pub dynamic_integral: f64,
+    /// Integral over the penalised near part.
+    pub occlusion: f64,
+}
+
+/// Marches one ray (twin of `march_count`..`march_fwd`).
+pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool, precision: Precision) -> March {
+    let (s, p): (&Setup, &ParamLayout) = (&plan.setup, &plan.params);
+    let row = plan.schedule[step as usize];
+    let mut out = March {
+        statics: Vec::new(),
+        dynamics: Vec::new(),
+        static_integral: 0.0,
+        dynamic_integral: 0.0,
+        occlusion: 0.0,
+    };
+    if with_static {
+        for (t, dl) in depths(s, s.n_static_samples, s.static_near, s.static_far, step, ray) {
+            let x = ray.anchor + t * ray.direction;
+            if field::static_inside(s, x) {
+                let feature = field::vm_feature(s, p, params, x);
+                out.static_integral +=
+                    dl * f64::from(s.static_gain) * field::softplus(feature + f64::from(s.static_shift));
+                out.statics.push(StaticSample { x, dl, feature });
+            }
+        }
+    }
+    if row.dynamic_active == 0 {
+        return out;
+    }
+    for (t, dl) in depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray) {
+        let x = ray.anchor + t * ray.direction;
+        if !dynamic_inside(plan, x, ray.phase) {
+            continue;
+        }
+        let trace = field::network_fwd(p, params, &field::encode(s, row.window.into(), x), ray.phase, precision);
+        let sigma = f64::from(s.dynamic_gain) * field::softplus(trace.feature + f64::from(s.dynamic_shift));
+        let near = t < f64::from(s.occlusion_depth);
+        out.dynamic_integral += sigma * dl;
+        out.occlusion += if near { sigma * dl } else { 0.0 };
+        out.dynamics.push(DynamicSample { x, dl, near, trace });
+    }
+    out
+}
+
+/// Adds the gradient of a ray, given dL/dS and dL/dD of its integrals (twin of `march_bwd`, `mlp_*_bwd`).
+pub fn bwd(
+    plan: &Plan,
+    params: &[f64],
+    ray: &Ray,
+    march: &March,
+    [dl_ds, dl_dd]: [f64; 2],
+    precision: Precision,
+    gradient: &mut [f64],
+) {
+    let (s, p) = (&plan.setup, &plan.params);
+    if dl_ds != 0.0 {
+        for sample in &march.statics {
+            let slope = f64::from(s.static_gain) * field::sigmoid(sample.feature + f64::from(s.static_shift));
+            field::vm_feature_bwd(s, p, params, sample.x, dl_ds * sample.dl * slope, gradient);
+        }
+    }
+    for sample in &march.dynamics {
+        let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
+        let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
+        let dl_dfeature = per_integral * sample.dl * slope;
+        field::network_bwd(p, params, &sample.trace, ray.phase, dl_dfeature, precision, gradient);
+    }
+}

@@ -1,0 +1,130 @@
+//! f64 twin of one training iteration: loss, gradient, Adam.
+
+use crate::plan::Plan;
+use crate::reference::field::Precision;
+use crate::reference::march::{self, Ray};
+
+/// Losses of an iteration; see `report`.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Losses {
+    /// Weighted data terms.
+    pub data: f64,
+    /// Weighted data term of the dynamic field.
+    pub dynamic: f64,
+    /// Total variation.
+    pub tv: f64,
+    /// Occlusion, weighted.
+    pub occlusion: f64,
+    /// Live dynamic samples.
+    pub live: usize,
+}
+
+impl Losses {
+    /// The objective.
+    pub fn total(&self) -> f64 {
+        self.data + self.tv + self.occlusion
+    }
+}
+
+/// Whether a ray of the batch leaves the static field out (twin of `skips_static`).
+fn skips_static(plan: &Plan, r: usize) -> bool {
+    let s = &plan.setup;
+    s.temporal_target != 0 && (r as u32) < s.n_motion_rays && s.n_motion_rays < s.n_rays
+}
+
+/// Charbonnier's r^2 that turns linear beyond `scale` (0: never), and half its derivative.
+fn robust_square(scale: f64, r: f64) -> (f64, f64) {
+    if scale == 0.0 {
+        return (r * r, r);
+    }
+    let root = (1.0 + r * r / (scale * scale)).sqrt();
+    (2.0 * scale * scale * (root - 1.0), r / root)
+}
+
+/// Loss and gradient of given rays at a step.
+pub fn loss_and_gradient(
+    plan: &Plan,
+    params: &[f64],
+    step: u32,
+    rays: &[Ray],
+    precision: Precision,
+) -> (Losses, Vec<f64>) {
+    let s = &plan.setup;
+    let mut gradient = vec![0.0; plan.params.len];
+    let mut losses = Losses::default();
+    let n_static = (0..rays.len()).filter(|r| !skips_static(plan, *r)).count() as f64;
+    let temporal = s.temporal_target != 0;
+    for (r, ray) in rays.iter().enumerate() {
+        let skip = skips_static(plan, r);
+        let seen = march::fwd(plan, params, step, ray, !skip, precision);
+        let dynamic_scale = f64::from(s.dynamic_weight) / rays.len() as f64;
+        let static_scale = if skip { 0.0 } else { f64::from(s.static_weight) / n_static };
+        let d = seen.dynamic_integral;
+        let total = seen.static_integral + d - ray.target;
+        let dynamic_residual = if temporal { d - d.clamp(ray.temporal[0], ray.temporal[1]) } else { total };
+        let (value, slope) = robust_square(s.robust_scale.into(), dynamic_residual);
+        let dynamic_loss = dynamic_scale * value;
+        losses.data += static_scale * total * total + if temporal { dynamic_loss } else { 0.0 };
+        losses.dynamic += dynamic_loss;
+        losses.occlusion += f64::from(s.occlusion_weight) * seen.occlusion;
+        losses.live += seen.dynamics.len();
+        let dl = [2.0 * static_scale * total, 2.0 * dynamic_scale * slope];
+        march::bwd(plan, params, ray, &seen, dl, precision, &mut gradient);
+    }
+    losses.tv = total_variation(plan, params, &mut gradient);
+    (losses, gradient)
+}
+
+/// Value of the total variation; adds its gradient (twin of `reg_tv`; method, section 4).
+pub fn total_variation(plan: &Plan, params: &[f64], gradient: &mut [f64]) -> f64 {
+    let (s, p) = (&plan.setup, &plan.params);
+    let (d, ranks) = (p.grid, p.ranks);
+    let mut value = 0.0;
+    let mut pair = |a: usize, b: usize, weight: f64| {
+        let difference = params[b] - params[a];
+        value += weight * difference * difference;
+        gradient[b] += 2.0 * weight * difference;
+        gradient[a] -= 2.0 * weight * difference;
+    };
+    let plane_weight = f64::from(s.tv_plane) * 2.0 / (ranks * d * (d - 1)) as f64;
+    let line_weight = f64::from(s.tv_line) * 2.0 / (ranks * (d - 1)) as f64;
+    for mode in 0..3 {
+        for r in 0..ranks {
+            for v in 0..d {
+                for u in 0..d {
+                    if u + 1 < d {
+                        pair(p.plane(mode, r, v, u), p.plane(mode, r, v, u + 1), plane_weight);
+                    }
+                    if v + 1 < d {
+                        pair(p.plane(mode, r, v, u), p.plane(mode, r, v + 1, u), plane_weight);
+                    }
+                }
+                if v + 1 < d {
+                    pair(p.line(mode, r, v), p.line(mode, r, v + 1), line_weight);
+                }
+            }
+        }
+    }
+    value
+}
+
+/// One Adam update (twin of `adam`).
+pub fn adam(plan: &Plan, step: u32, gradient: &[f64], params: &mut [f64], moments: &mut [[f64; 2]]) {
+    let (s, row) = (&plan.setup, plan.schedule[step as usize]);
+    let (beta1, beta2) = (f64::from(s.beta1), f64::from(s.beta2));
+    for (i, g) in gradient.iter().enumerate() {
+        let is_static = i < plan.params.static_len;
+        if !is_static && row.dynamic_active == 0 {
+            continue;
+        }
+        let m = &mut moments[i];
+        if row.reset != 0 {
+            *m = [0.0; 2];
+        }
+        m[0] = beta1 * m[0] + (1.0 - beta1) * g;
+        m[1] = beta2 * m[1] + (1.0 - beta2) * g * g;
+        let rate = f64::from(if is_static { row.static_lr } else { row.dynamic_lr });
+        let denominator = (m[1] / f64::from(row.bias_correction2)).sqrt() + f64::from(s.epsilon);
+        params[i] -= rate / f64::from(row.bias_correction1) * m[0] / denominator;
+    }
+}

@@ -1,0 +1,241 @@
+//! Fields baked into 3D images, for display rates.
+
+use crate::error::{Error, Result};
+use crate::geometry::{MM_PER_UNIT, ViewRays};
+use crate::gpu::memory::{Buffer, Memory};
+use crate::gpu::record::{Commands, Recording};
+use crate::gpu::volume::Volume;
+use crate::kernels::dispatch::{dispatch, groups_for};
+use crate::kernels::layout::View;
+use crate::model::Model;
+use crate::model::component::Component;
+use crate::render::grid::Grid;
+use crate::render::quantity::{Projection, Quantity};
+use crate::render::renderer::Renderer;
+use glam::DVec3;
+use half::f16;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Cells of a baked volume along its longest side.
+pub const BAKED_CELLS: u32 = 192;
+
+/// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates;
+/// finer detail than a cell is lost. Volumes are baked when first needed, or when asked for.
+pub struct Baked {
+    renderer: Arc<Renderer>,
+    still: Grid,
+    moving: Grid,
+    /// The static field, then each phase.
+    volumes: Mutex<Vec<Option<Volume>>>,
+    /// Recorded once per size, phase and quantity: a frame is a view written, a submit and a picture read.
+    shots: Mutex<HashMap<ShotKey, Arc<Shot>>>,
+}
+
+/// Recorded frames kept; a viewer in use has far fewer.
+const MOST_SHOTS: usize = 256;
+
+/// Columns, rows, phase, quantity.
+type ShotKey = (usize, usize, u32, Quantity);
+
+struct Shot {
+    commands: Commands,
+    view: Buffer,
+    image: Buffer,
+    /// A shot's buffers hold one frame.
+    in_use: Mutex<()>,
+}
+
+/// Where a field's volume is kept: the static field, then each phase.
+fn slot(field: Component, phase: u32) -> usize {
+    if field == Component::Static { 0 } else { 1 + phase as usize }
+}
+
+impl Baked {
+    /// Bakes all phases with `cells` cells along the longest side of each box.
+    ///
+    /// # Errors
+    /// Device errors, [`Error::OutOfMemory`] first of all.
+    pub fn new(renderer: Arc<Renderer>, cells: u32) -> Result<Baked> {
+        let baked = Self::empty(renderer, cells, cells);
+        baked.bake(Component::Static, 0)?;
+        for phase in 0..baked.renderer.setup.n_phases {
+            baked.bake(Component::Dynamic, phase)?;
+        }
+        Ok(baked)
+    }
+
+    /// Prepares volumes whose moving cells have sides of `cell_mm`, for drawing at display rates; bakes none yet. The
+    /// static field has no detail between the cells of its grid, of which there are two to one of those.
+    pub fn for_display(renderer: Arc<Renderer>, model: &Model, cell_mm: f64) -> Baked {
+        let scene = &model.scene;
+        let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
+        let moving_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(32, BAKED_CELLS);
+        let still_cells = (2 * model.config.static_field.grid).clamp(32, BAKED_CELLS);
+        Self::empty(renderer, still_cells, moving_cells)
+    }
+
+    /// Prepares volumes of `still_cells` and `moving_cells` cells along the longest side of each box; bakes none yet.
+    fn empty(renderer: Arc<Renderer>, still_cells: u32, moving_cells: u32) -> Baked {
+        let s = &renderer.setup;
+        let v = |x: f32, y: f32, z: f32| DVec3::new(x.into(), y.into(), z.into());
+        let still = Grid::over(
+            v(s.static_min_x, s.static_min_y, s.static_min_z),
+            v(s.static_max_x, s.static_max_y, s.static_max_z),
+            still_cells,
+        );
+        let moving = Grid::over(
+            v(s.dynamic_min_x, s.dynamic_min_y, s.dynamic_min_z),
+            v(s.dynamic_max_x, s.dynamic_max_y, s.dynamic_max_z),
+            moving_cells,
+        );
+        let volumes = Mutex::new(vec![None; 1 + s.n_phases as usize]);
+        Baked { still, moving, volumes, renderer, shots: Mutex::default() }
+    }
+
+    /// What the volumes are baked from.
+    pub fn renderer(&self) -> &Renderer {
+        &self.renderer
+    }
+
+    /// Bakes the fields of a component as the renderer's parameters are now, for the first time or again. The last copies
+    /// may be under way: they are in order with what is rendered next; dropping the result waits for them.
+    ///
+    /// # Errors
+    /// As [`Renderer::sample`]; [`Error::OutOfMemory`].
+    pub fn bake(&self, component: Component, phase: u32) -> Result<Vec<Commands>> {
+        self.renderer.check_phase(phase)?;
+        component.fields().iter().map(|field| self.bake_field(*field, phase)).collect()
+    }
+
+    fn bake_field(&self, field: Component, phase: u32) -> Result<Commands> {
+        let setup = &self.renderer.setup;
+        let (grid, gain) = match field {
+            Component::Static => (&self.still, setup.static_gain),
+            _ => (&self.moving, setup.dynamic_gain),
+        };
+        // In units of the field's scale, values are near 1 and f16 loses a thousandth at most.
+        let cells = self.renderer.sample(field, phase, grid)?;
+        let cells: Vec<f16> = cells.iter().map(|x| f16::from_f32(x / gain)).collect();
+        let mut volumes = self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
+        match &mut volumes[slot(field, phase)] {
+            Some(volume) => volume.fill(&cells),
+            none => {
+                let volume = self.renderer.gpu.volume("baked", grid.size)?;
+                let filling = volume.fill(&cells)?;
+                *none = Some(volume);
+                Ok(filling)
+            }
+        }
+    }
+
+    /// Whether every field of a component has been baked.
+    pub fn has(&self, component: Component, phase: u32) -> bool {
+        component.fields().iter().all(|field| self.volume(*field, phase).is_some())
+    }
+
+    fn volume(&self, field: Component, phase: u32) -> Option<Volume> {
+        self.volumes.lock().unwrap_or_else(PoisonError::into_inner)[slot(field, phase)].clone()
+    }
+
+    fn volume_or_bake(&self, field: Component, phase: u32) -> Result<Volume> {
+        if !self.has(field, phase) {
+            self.bake(field, phase)?;
+        }
+        self.volume(field, phase).ok_or_else(|| Error::Internal(format!("{field:?} was baked into nothing")))
+    }
+
+    /// Renders a `width` x `height` view at a phase, rows first.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn render(
+        &self,
+        rays: &ViewRays,
+        width: usize,
+        height: usize,
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>> {
+        self.renderer.check_phase(phase)?;
+        let shot = self.shot(width, height, phase, quantity)?;
+        let _alone = shot.in_use.lock().unwrap_or_else(PoisonError::into_inner);
+        shot.view.write(&[View::of(rays)])?;
+        self.renderer.gpu.wait(shot.commands.submit()?)?;
+        let mut image = vec![0f32; width * height];
+        shot.image.read(&mut image)?;
+        Ok(image)
+    }
+
+    /// As [`Baked::render`], into a buffer on the device: `width` x `height` floats.
+    ///
+    /// # Errors
+    /// As [`Baked::render`]; [`Error::Internal`] when the buffer is too small.
+    pub fn render_into(
+        &self,
+        target: &Buffer,
+        rays: &ViewRays,
+        (width, height): (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<()> {
+        self.renderer.check_phase(phase)?;
+        target.check_range(0, (width * height * 4) as u64)?;
+        let view = self.renderer.gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
+        view.write(&[View::of(rays)])?;
+        let commands = self.record(&view, target, (width, height), phase, quantity)?;
+        self.renderer.gpu.wait(commands.submit()?)
+    }
+
+    fn shot(&self, width: usize, height: usize, phase: u32, quantity: Quantity) -> Result<Arc<Shot>> {
+        let mut shots = self.shots.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = (width, height, phase, quantity);
+        if let Some(shot) = shots.get(&key) {
+            return Ok(shot.clone());
+        }
+        if shots.len() >= MOST_SHOTS {
+            shots.clear();
+        }
+        let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
+        let view = gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
+        let image = gpu.buffer("image", u64::from(pixels) * 4, Memory::Readback)?;
+        let commands = self.record(&view, &image, (width, height), phase, quantity)?;
+        let shot = Arc::new(Shot { commands, view, image, in_use: Mutex::default() });
+        shots.insert(key, shot.clone());
+        Ok(shot)
+    }
+
+    fn record(
+        &self,
+        view: &Buffer,
+        image: &Buffer,
+        (width, height): (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<Commands> {
+        let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
+        let mut buffers = self.renderer.buffers.clone();
+        buffers.set("views", view.clone());
+        buffers.set("image", image.clone());
+        // A field that is not shown is bound, since the kernel names it, but not read.
+        let component = quantity.component;
+        let shown = |field, wanted| if wanted { self.volume_or_bake(field, phase).map(Some) } else { Ok(None) };
+        let still = shown(Component::Static, component.has_static())?;
+        let moving = shown(Component::Dynamic, component.has_dynamic())?;
+        let any = still.as_ref().or(moving.as_ref());
+        let any = any.ok_or_else(|| Error::Internal("no volume to render".into()))?;
+        buffers.set_volume("static_volume", still.as_ref().unwrap_or(any).clone());
+        buffers.set_volume("dynamic_volume", moving.as_ref().unwrap_or(any).clone());
+        let stage = &self.renderer.kernels.baked_march;
+        let push = [
+            pixels,
+            width as u32,
+            u32::from(component.has_static()),
+            u32::from(component.has_dynamic()),
+            u32::from(quantity.projection == Projection::Mip),
+        ];
+        let mut recording = Recording::new(gpu, "baked render")?;
+        dispatch(&mut recording, stage, groups_for(stage, pixels), &buffers, &[], push)?;
+        recording.finish()
+    }
+}

@@ -1,0 +1,134 @@
+//! Views of a run while it trains: baked volumes that are refreshed as fast as the device can afford.
+
+use crate::config::Config;
+use crate::error::Result;
+use crate::geometry::ViewRays;
+use crate::gpu::device::Gpu;
+use crate::gpu::memory::Buffer;
+use crate::gpu::record::Commands;
+use crate::kernels::tuning::Tuning;
+use crate::model::Model;
+use crate::model::component::Component;
+use crate::render::baked::Baked;
+use crate::render::quantity::Quantity;
+use crate::render::renderer::{Renderer, Rendering};
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Side of a cell of the moving field: finer than a thin vessel, coarse enough to be baked again and again.
+const CELL_MM: f64 = 0.8;
+/// After a refresh that took some time, this many times as long passes before the next.
+const REST: u32 = 4;
+
+/// Where a run in training keeps what a view needs.
+#[derive(Clone)]
+pub struct Source {
+    /// Its model, with parameters if `params` has none.
+    pub outline: Model,
+    /// Its parameters on the device.
+    pub params: Option<Buffer>,
+}
+
+/// Draws the present state of a source.
+pub struct Live {
+    baked: Baked,
+    config: Config,
+    params: Option<Buffer>,
+    /// Iteration the static field and each phase were baked at.
+    baked_at: Vec<u32>,
+    rest_until: Instant,
+}
+
+impl Live {
+    /// Prepares to draw; bakes nothing yet.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
+        let model = &source.outline;
+        let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
+        Ok(Live {
+            baked: Baked::for_display(renderer, model, CELL_MM),
+            config: model.config.clone(),
+            params: source.params.clone(),
+            baked_at: vec![0; 1 + model.layout.phases],
+            rest_until: Instant::now(),
+        })
+    }
+
+    /// Through baked volumes. A volume older than `step`, the source's present iteration, is baked anew unless the last
+    /// refresh was too recent: refreshing takes at most a fifth of the time.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn render(
+        &mut self,
+        step: u32,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>> {
+        let _under_way = self.refresh(step, phase, quantity)?;
+        self.baked.render(rays, size.0, size.1, phase, quantity)
+    }
+
+    /// As [`Live::render`], into a buffer on the device.
+    ///
+    /// # Errors
+    /// As [`Baked::render_into`].
+    pub fn render_into(
+        &mut self,
+        target: &Buffer,
+        step: u32,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<()> {
+        let _under_way = self.refresh(step, phase, quantity)?;
+        self.baked.render_into(target, rays, size, phase, quantity)
+    }
+
+    fn refresh(&mut self, step: u32, phase: u32, quantity: Quantity) -> Result<Vec<Commands>> {
+        let mut under_way = Vec::new();
+        self.baked.renderer().check_phase(phase)?;
+        let component = quantity.component;
+        let still = (component.has_static(), Component::Static, 0);
+        let moving = (component.has_dynamic(), Component::Dynamic, 1 + phase as usize);
+        for (wanted, field, slot) in [still, moving] {
+            let old = || self.baked_at[slot] != step && Instant::now() >= self.rest_until;
+            if wanted && (!self.baked.has(field, phase) || old()) {
+                let begin = Instant::now();
+                under_way.extend(self.follow(step)?);
+                under_way.extend(self.baked.bake(field, phase)?);
+                self.baked_at[slot] = step;
+                self.rest_until = Instant::now() + begin.elapsed() * REST;
+            }
+        }
+        Ok(under_way)
+    }
+
+    /// Through the fields themselves, as they are at the source's present iteration.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn render_fields(&self, step: u32, rays: &ViewRays, size: (usize, usize), phase: u32) -> Result<Rendering> {
+        let _under_way = self.follow(step)?;
+        self.baked.renderer().render(rays, size.0, size.1, phase)
+    }
+
+    /// The renderer, brought up to the source's present iteration.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn renderer(&self, step: u32) -> Result<&Renderer> {
+        self.follow(step)?;
+        Ok(self.baked.renderer())
+    }
+
+    fn follow(&self, step: u32) -> Result<Option<Commands>> {
+        let Some(params) = &self.params else { return Ok(None) };
+        self.baked.renderer().follow(params, self.config.schedule(step)).map(Some)
+    }
+}

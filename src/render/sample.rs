@@ -1,0 +1,120 @@
+//! Fields sampled on a regular grid.
+
+use crate::error::{Error, Result};
+use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
+use crate::gpu::memory::Memory;
+use crate::gpu::record::Recording;
+use crate::kernels::dispatch::{dispatch, groups_for};
+use crate::kernels::layout::View;
+use crate::model::component::Component;
+use crate::render::grid::{Grid, PatientGrid};
+use crate::render::renderer::{RAYS_PER_SUBMIT, Renderer};
+use glam::DVec3;
+
+/// Cells sampled by one submit: 16 MiB on their way to the host.
+const CELLS_PER_SUBMIT: u32 = 1 << 22;
+
+impl Renderer {
+    /// Attenuation per world unit at the points of a grid, of a component at a phase; each field is zero outside its box
+    /// and hull.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a phase the model does not have or more points along x than fit; device errors.
+    pub fn sample(&self, component: Component, phase: u32, grid: &Grid) -> Result<Vec<f32>> {
+        self.check_phase(phase)?;
+        let mut sum = vec![0f32; grid.len()];
+        for field in component.fields() {
+            let cells = self.sample_field(*field, phase, grid)?;
+            sum.iter_mut().zip(cells).for_each(|(sum, cell)| *sum += cell);
+        }
+        Ok(sum)
+    }
+
+    /// A single field at the points of a grid.
+    fn sample_field(&self, field: Component, phase: u32, grid: &Grid) -> Result<Vec<f32>> {
+        let [nx, ny, nz] = grid.size;
+        if nx < 2 || nx > self.largest_row() {
+            return Err(Error::config("grid", nx, format!("2 to {} points along x are accepted", self.largest_row())));
+        }
+        // Rows along x are rays: the depth is x.
+        let f = |v: DVec3| [v.x as f32, v.y as f32, v.z as f32, 0.0];
+        let view = View {
+            anchor00: f(DVec3::new(0.0, grid.origin.y, grid.origin.z)),
+            anchor_du: f(DVec3::Y * grid.spacing.y),
+            anchor_dv: f(DVec3::Z * grid.spacing.z),
+            direction00: f(DVec3::X),
+            direction_du: [0.0; 4],
+            direction_dv: [0.0; 4],
+        };
+        let mut setup = self.setup;
+        setup.n_dynamic_samples = nx;
+        setup.dynamic_near = grid.origin.x as f32;
+        setup.dynamic_far = (grid.origin.x + grid.spacing.x * f64::from(nx - 1)) as f32;
+        let rows = ny * nz;
+        let rows_at_once = RAYS_PER_SUBMIT.min((CELLS_PER_SUBMIT / nx).max(1)).min(rows);
+        let bytes = u64::from(rows_at_once) * u64::from(nx) * 4;
+        let cells = self.gpu.buffer("volume", bytes, Memory::Device)?;
+        let read = self.gpu.buffer("volume read-back", bytes, Memory::Readback)?;
+        let mut buffers = self.buffers.clone();
+        buffers.set("volume", cells.clone());
+        let mut out = vec![0f32; grid.len()];
+        for (i, out) in out.chunks_mut((rows_at_once * nx) as usize).enumerate() {
+            let first = i as u32 * rows_at_once;
+            let n = rows_at_once.min(rows - first);
+            // One submit, the constants included: behind a run in training, each would wait its turn.
+            let mut r = Recording::new(&self.gpu, "sample")?;
+            for (name, bytes) in [("views", bytemuck::bytes_of(&view)), ("setup", bytemuck::bytes_of(&setup))] {
+                let staging = self.gpu.buffer(name, bytes.len() as u64, Memory::Upload)?;
+                staging.write(bytes)?;
+                let on_device = self.gpu.buffer(name, bytes.len() as u64, Memory::Device)?;
+                r.copy(&staging, 0, &on_device, 0, bytes.len() as u64)?;
+                buffers.set(name, on_device);
+            }
+            let k = &self.kernels;
+            dispatch(&mut r, &k.pose_rays, groups_for(&k.pose_rays, n), &buffers, &[], [first, n, phase, ny, 0])?;
+            match field {
+                Component::Static => {
+                    let groups = groups_for(&k.volume_static, n * nx);
+                    dispatch(&mut r, &k.volume_static, groups, &buffers, &[], [n])?;
+                }
+                _ => {
+                    r.fill(&cells, 0);
+                    self.record_dynamic_cells(&mut r, &buffers, &setup, n)?;
+                }
+            }
+            r.copy(&cells, 0, &read, 0, u64::from(n) * u64::from(nx) * 4)?;
+            self.gpu.wait(r.finish()?.submit()?)?;
+            read.read(out)?;
+        }
+        Ok(out)
+    }
+
+    /// Attenuation per mm at the points of a grid, of a component at a phase; zero outside the fields' boxes and hull.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for an impossible grid or phase; device errors.
+    pub fn sample_patient(&self, component: Component, phase: u32, grid: &PatientGrid) -> Result<Vec<f32>> {
+        grid.check()?;
+        let swap = |v: DVec3| DVec3::new(v.y, v.x, v.z);
+        let [nl, np, ns] = grid.size;
+        // A row of the world's grid, along posterior, has two points or more.
+        let rows = Grid {
+            origin: world_from_lps_mm(grid.origin_mm),
+            spacing: swap(grid.spacing_mm) / MM_PER_UNIT,
+            size: [np.max(2), nl, ns],
+        };
+        let mut out = vec![0f32; (nl * np) as usize * ns as usize];
+        for field in component.fields() {
+            let cells = self.sample(*field, phase, &rows)?;
+            let (row, plane) = (rows.size[0] as usize, (rows.size[0] * nl) as usize);
+            for (slice, out) in out.chunks_mut((nl * np) as usize).enumerate() {
+                for (p, out) in out.chunks_mut(nl as usize).enumerate() {
+                    for (l, out) in out.iter_mut().enumerate() {
+                        *out += cells[slice * plane + l * row + p] / MM_PER_UNIT as f32;
+                    }
+                }
+            }
+        }
+        Ok(out)
+    }
+}

@@ -1,0 +1,77 @@
+//! What a run tells its observer.
+
+use crate::gpu::record::PassTime;
+use crate::train::trainer::StepLoss;
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// What a run tells its observer; also the lines of `metrics.jsonl`.
+#[derive(Debug, Clone, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// Training begins or continues.
+    Started {
+        /// Device name.
+        device: String,
+        /// Iterations already done.
+        step: u32,
+        /// Length of the run.
+        iterations: u32,
+        /// Parameters.
+        parameters: usize,
+        /// Decisions about data and device.
+        notes: Vec<String>,
+    },
+    /// Losses, every few iterations.
+    Progress {
+        /// Losses of the last iteration.
+        #[serde(flatten)]
+        loss: StepLoss,
+        /// PSNR of the training rays, dB, smoothed.
+        psnr: f64,
+        /// Iterations per second.
+        iterations_per_s: f64,
+        /// Seconds of training so far, validation and saving included.
+        elapsed_s: f64,
+        /// Estimated seconds to the end.
+        left_s: f64,
+    },
+    /// Metrics on some unseen images.
+    Validation {
+        /// Iterations done.
+        step: u32,
+        /// Seconds spent training until then; wall time where validation runs beside training, otherwise without it.
+        train_s: f64,
+        /// Dice of the dynamic field.
+        dice_dynamic: Option<f64>,
+        /// Dice of both fields.
+        dice_total: Option<f64>,
+        /// dB.
+        psnr: f64,
+        /// Structural similarity.
+        ssim: f64,
+    },
+    /// A checkpoint was written.
+    Saved {
+        /// Iterations it holds.
+        step: u32,
+        /// File.
+        path: PathBuf,
+    },
+    /// Device time of each pass of one more iteration, whose result is not kept.
+    Profile {
+        /// Iterations done before.
+        step: u32,
+        /// In order.
+        passes: Vec<PassTime>,
+    },
+    /// The run reached its end or the requested stop.
+    Finished {
+        /// Iterations done.
+        step: u32,
+        /// Seconds spent training, validation excluded.
+        train_s: f64,
+        /// Seconds in all.
+        elapsed_s: f64,
+    },
+}

@@ -1,0 +1,37 @@
+//! What a run remembers of its surroundings.
+
+use crate::error::{Error, Result};
+use crate::files;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// What a run remembers of its surroundings: `run.json`.
+#[derive(Debug, Clone, Serialize, serde::Deserialize)]
+pub struct RunInfo {
+    /// Dataset it was trained on.
+    pub dataset: PathBuf,
+}
+
+impl RunInfo {
+    const FILE: &str = "run.json";
+
+    /// Writes it into a run directory.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, run: &Path) -> Result<()> {
+        let text = crate::files::pretty_json(&self)?;
+        files::write_atomic(&run.join(Self::FILE), text.as_bytes())
+    }
+
+    /// Reads it from a run directory, or from beside a checkpoint.
+    ///
+    /// # Errors
+    /// [`Error::Io`] or [`Error::Data`].
+    pub fn read(run: &Path) -> Result<RunInfo> {
+        let directory = if run.is_file() { run.parent().unwrap_or(Path::new(".")) } else { run };
+        let file = directory.join(Self::FILE);
+        let text = std::fs::read(&file).map_err(Error::io("read", &file))?;
+        serde_json::from_slice(&text).map_err(|e| Error::data(&file, "JSON", e.to_string()))
+    }
+}

@@ -1,0 +1,216 @@
+//! One reconstruction, from a dataset to a run directory: trains, validates, saves, and can be stopped.
+//!
+//! A run directory holds `config.toml`, `metrics.jsonl` (one object per line), the newest checkpoints and,
+//! when finished, `report/` with the evaluation and pictures.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::files;
+use crate::gpu::device::Gpu;
+use crate::kernels::tuning::Tuning;
+use crate::model::checkpoint::{self, Checkpoint};
+use crate::plan::Plan;
+use crate::run::events::Event;
+use crate::run::log::MetricsLog;
+use crate::run::snapshots::{Job, Keeper, News};
+use crate::scan::dataset::Dataset;
+use crate::score::eval;
+use crate::train::trainer::Trainer;
+use crate::train::training::{Progress, Training};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
+use std::time::Instant;
+
+/// Losses are written and reported once per this many iterations.
+const REPORT_EVERY: u32 = 10;
+
+/// How to run.
+pub struct RunOptions<'a> {
+    /// Run directory.
+    pub run: &'a Path,
+    /// Continue from the newest checkpoint.
+    pub resume: bool,
+    /// Stop (and save) after this many iterations, leaving schedules as they are.
+    pub stop_at: Option<u32>,
+    /// Paths through the kernels.
+    pub tuning: &'a Tuning,
+    /// Set to true to stop after the iterations in flight.
+    pub cancel: &'a AtomicBool,
+}
+
+/// Runs a reconstruction.
+///
+/// # Errors
+/// [`Error::Interrupted`] after a cancel (state is saved), [`Error::Diverged`] (the last good checkpoint is
+/// kept), and all errors of data and device.
+pub fn reconstruct(
+    gpu: &Gpu,
+    config: &Config,
+    dataset: &Dataset,
+    options: &RunOptions<'_>,
+    observe: &mut dyn FnMut(&Event),
+) -> Result<()> {
+    let trainer = if options.resume {
+        let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
+        let plan = Plan::new(&saved.model.config, dataset)?.in_scene(saved.model.scene.clone());
+        Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
+    } else {
+        files::create_directory(options.run)?;
+        Trainer::new(gpu, Plan::new(config, dataset)?, dataset, options.tuning.clone())?
+    };
+    let config = trainer.plan().config.clone();
+    files::write_atomic(&options.run.join("config.toml"), config.to_toml()?.as_bytes())?;
+    let mut log = MetricsLog::open(&options.run.join("metrics.jsonl"), trainer.step())?;
+    let mut tell = |event: Event| -> Result<()> {
+        log.write(&event)?;
+        observe(&event);
+        Ok(())
+    };
+    let mut notes = trainer.plan().notes.clone();
+    notes.extend(trainer.tuning().reasons.iter().cloned());
+    tell(Event::Started {
+        device: gpu.info().name.clone(),
+        step: trainer.step(),
+        iterations: config.train.iterations,
+        parameters: trainer.plan().params.len,
+        notes,
+    })?;
+    let mut training = Training::new(trainer);
+    let begin = Instant::now();
+    let keeper = Keeper {
+        gpu,
+        tuning: options.tuning,
+        run: options.run,
+        dataset,
+        validation: eval::spread_validation(dataset, config.train.validate_images as usize),
+        begin,
+    };
+    std::thread::scope(|scope| {
+        // At most two snapshots wait: beyond that training waits for the keeper.
+        let (jobs, to_do) = sync_channel::<Job>(2);
+        let (done, news) = channel::<News>();
+        scope.spawn(move || keeper.work(&to_do, &done));
+        Loop::new(&mut training, &config, options, &mut tell).run(jobs, &news)
+    })
+}
+
+/// Runs the iterations. Snapshots go to the keeper, which works beside training where `tuning.overlap` says so, and
+/// while training waits otherwise.
+struct Loop<'a> {
+    training: &'a mut Training,
+    config: &'a Config,
+    options: &'a RunOptions<'a>,
+    tell: &'a mut dyn FnMut(Event) -> Result<()>,
+    first_step: u32,
+    end: u32,
+    /// Jobs the keeper has not finished.
+    waiting: u32,
+}
+
+impl<'a> Loop<'a> {
+    fn new(
+        training: &'a mut Training,
+        config: &'a Config,
+        options: &'a RunOptions<'a>,
+        tell: &'a mut dyn FnMut(Event) -> Result<()>,
+    ) -> Loop<'a> {
+        Loop {
+            first_step: training.trainer().step(),
+            end: options.stop_at.unwrap_or(config.train.iterations).min(config.train.iterations),
+            waiting: 0,
+            training,
+            config,
+            options,
+            tell,
+        }
+    }
+
+    fn run(mut self, jobs: SyncSender<Job>, news: &Receiver<News>) -> Result<()> {
+        let overlap = self.options.tuning.overlap;
+        loop {
+            let cancelled = self.cancelled();
+            let step = self.training.trainer().submitted();
+            let (save, validate) = (self.saves_at(step) || cancelled, self.validates_at(step) && !cancelled);
+            if (save || validate) && (step > self.first_step || cancelled) {
+                let train_s = (!overlap).then_some(self.training.train_s());
+                let job = Job { snapshot: self.training.trainer().snapshot()?, save, validate, train_s };
+                self.waiting += 1;
+                if jobs.send(job).is_err() {
+                    break; // the keeper failed, and says why below
+                }
+            }
+            if !overlap {
+                self.hear_all(news)?;
+            }
+            if cancelled || step >= self.end {
+                break;
+            }
+            let stop = (step + 1..self.end).find(|s| self.saves_at(*s) || self.validates_at(*s)).unwrap_or(self.end);
+            while self.training.trainer().submitted() < stop && !self.cancelled() {
+                let progress = self.training.advance(stop)?;
+                self.report(progress)?;
+                news.try_iter().try_for_each(|item| self.hear(item))?;
+            }
+            if !overlap || stop == self.end || self.cancelled() {
+                let progress = self.training.drain()?;
+                self.report(progress)?;
+            }
+        }
+        drop(jobs);
+        self.hear_all(news)?;
+        if self.training.trainer().step() < self.end {
+            return Err(Error::Interrupted);
+        }
+        let (step, elapsed_s) = (self.training.trainer().step(), self.training.elapsed_s());
+        (self.tell)(Event::Profile { step, passes: self.training.trainer_mut().profile_step()? })?;
+        (self.tell)(Event::Finished { step, train_s: self.training.train_s(), elapsed_s })
+    }
+
+    fn cancelled(&self) -> bool {
+        self.options.cancel.load(Ordering::Relaxed)
+    }
+
+    fn saves_at(&self, step: u32) -> bool {
+        step == self.end || step.is_multiple_of(self.config.train.checkpoint_every)
+    }
+
+    fn validates_at(&self, step: u32) -> bool {
+        let every = self.config.train.validate_every;
+        every > 0 && (step == self.end || step.is_multiple_of(every))
+    }
+
+    /// Tells of every few iterations, and the last.
+    fn report(&mut self, progress: Vec<Progress>) -> Result<()> {
+        for p in progress {
+            if p.loss.step.is_multiple_of(REPORT_EVERY) || p.loss.step == self.end {
+                (self.tell)(Event::Progress {
+                    loss: p.loss,
+                    psnr: p.smoothed_psnr_db,
+                    iterations_per_s: p.iterations_per_s,
+                    elapsed_s: p.elapsed_s,
+                    left_s: f64::from(self.end - p.loss.step) / p.iterations_per_s,
+                })?;
+            }
+        }
+        Ok(())
+    }
+
+    fn hear(&mut self, item: News) -> Result<()> {
+        match item? {
+            Some(event) => (self.tell)(event),
+            None => {
+                self.waiting -= 1;
+                Ok(())
+            }
+        }
+    }
+
+    fn hear_all(&mut self, news: &Receiver<News>) -> Result<()> {
+        while self.waiting > 0 {
+            let item = news.recv().map_err(|_| Error::Internal("the keeper of snapshots is gone".into()))?;
+            self.hear(item)?;
+        }
+        Ok(())
+    }
+}

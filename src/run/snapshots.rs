@@ -1,0 +1,78 @@
+//! Saving and validating snapshots of a run, beside training or between its iterations.
+
+use crate::error::Result;
+use crate::gpu::device::Gpu;
+use crate::kernels::tuning::Tuning;
+use crate::render::renderer::Renderer;
+use crate::run::events::Event;
+use crate::scan::dataset::{Dataset, Frame};
+use crate::score::eval::evaluate;
+use crate::train::trainer::Snapshot;
+use std::path::Path;
+use std::sync::mpsc::{Receiver, Sender};
+use std::time::Instant;
+
+/// What the keeper says: an event, or nothing more about a job.
+pub(super) type News = Result<Option<Event>>;
+
+/// A snapshot and what to do with it.
+pub(super) struct Job {
+    pub(super) snapshot: Snapshot,
+    pub(super) save: bool,
+    pub(super) validate: bool,
+    /// Seconds of training until then; none when training goes on meanwhile and only the clock tells.
+    pub(super) train_s: Option<f64>,
+}
+
+/// Saves and validates snapshots.
+pub(super) struct Keeper<'a> {
+    pub(super) gpu: &'a Gpu,
+    pub(super) tuning: &'a Tuning,
+    pub(super) run: &'a Path,
+    pub(super) dataset: &'a Dataset,
+    pub(super) validation: Vec<&'a Frame>,
+    pub(super) begin: Instant,
+}
+
+impl Keeper<'_> {
+    pub(super) fn work(&self, jobs: &Receiver<Job>, done: &Sender<News>) {
+        let mut renderer = None;
+        for job in jobs {
+            let mut events = Vec::new();
+            let outcome = self.handle(job, &mut renderer, &mut events);
+            // A receiver that has gone away no longer wants to know.
+            events.into_iter().for_each(|event| drop(done.send(Ok(Some(event)))));
+            let failed = outcome.is_err();
+            drop(done.send(outcome.map(|()| None)));
+            if failed {
+                return;
+            }
+        }
+    }
+
+    fn handle(&self, job: Job, renderer: &mut Option<Renderer>, events: &mut Vec<Event>) -> Result<()> {
+        let saved = job.snapshot.wait()?;
+        let train_s = job.train_s.unwrap_or_else(|| self.begin.elapsed().as_secs_f64());
+        let step = saved.model.step;
+        if job.save {
+            events.push(Event::Saved { step, path: saved.save(self.run)? });
+        }
+        if job.validate && !self.validation.is_empty() {
+            let renderer = match renderer {
+                Some(renderer) => renderer,
+                none => none.insert(Renderer::new(self.gpu, &saved.model, self.tuning.clone())?),
+            };
+            renderer.set_model(&saved.model)?;
+            let score = evaluate(renderer, self.dataset, &self.validation, step, None, |_, _, _| Ok(()))?;
+            events.push(Event::Validation {
+                step,
+                train_s,
+                dice_dynamic: score.dice.dynamic,
+                dice_total: score.dice.total,
+                psnr: score.psnr,
+                ssim: score.ssim,
+            });
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,454 @@
+//! A dataset in memory and its native layout on disk (`dataset.json` + images; see `docs/formats.md`).
+
+use crate::choice::Choice;
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::images;
+use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
+use crate::raster::Image;
+use crate::scan::nerfca;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Name of the manifest inside a native dataset.
+pub const MANIFEST: &str = "dataset.json";
+const MAX_MANIFEST_BYTES: u64 = 256 << 20;
+const MAX_FRAMES: usize = 100_000;
+
+/// What pixel values mean.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Intensity {
+    /// `value * scale + offset` is the line integral of attenuation (no unit).
+    Integral {
+        /// Factor on the stored value.
+        #[serde(default = "one")]
+        scale: f64,
+        /// Added after the factor.
+        #[serde(default)]
+        offset: f64,
+    },
+    /// `i0 - value` is the line integral: logarithmic detector, Beer-Lambert in the log domain.
+    Log {
+        /// Value of an unattenuated ray.
+        i0: f64,
+    },
+    /// `-ln(value / i0)` is the line integral: detector linear in intensity.
+    Linear {
+        /// Value of an unattenuated ray.
+        i0: f64,
+    },
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+impl Intensity {
+    fn check(&self) -> std::result::Result<(), (String, String)> {
+        let (field, ok) = match self {
+            Intensity::Integral { scale, offset } => {
+                ("scale", scale.is_finite() && *scale != 0.0 && offset.is_finite())
+            }
+            Intensity::Log { i0 } => ("i0", i0.is_finite()),
+            Intensity::Linear { i0 } => ("i0", i0.is_finite() && *i0 > 0.0),
+        };
+        if ok { Ok(()) } else { Err((format!("intensity.{field}"), "is not usable".into())) }
+    }
+
+    /// Line integral of a stored value. Dark pixels of a linear detector are held at one part in 1e7.
+    pub fn integral(&self, value: f32) -> f32 {
+        let v = f64::from(value);
+        (match self {
+            Intensity::Integral { scale, offset } => v * scale + offset,
+            Intensity::Log { i0 } => i0 - v,
+            Intensity::Linear { i0 } => -(v / i0).max(1e-7).ln(),
+        }) as f32
+    }
+}
+
+/// What a frame is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum Split {
+    /// The reconstruction may see it.
+    Train,
+    /// Kept for evaluation.
+    Validation,
+}
+
+/// `dataset.json`.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// Always `nertca-dataset`.
+    pub format: String,
+    /// Version of this layout: 1.
+    pub version: u32,
+    /// Free text.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub description: String,
+    /// Number of cardiac phases T; frames carry 0..T-1.
+    pub phases: u32,
+    /// Attenuation is searched within this distance before and behind the isocentre plane, mm.
+    pub depth_half_extent_mm: f64,
+    /// Attenuation of contrast-filled vessels, 1/mm, where known; a third of it is the Dice threshold.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub vessel_attenuation_per_mm: Option<f64>,
+    /// All images.
+    pub frames: Vec<ManifestFrame>,
+}
+
+/// One image of a manifest.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct ManifestFrame {
+    /// Image file (`.npy` of shape rows x columns, or grey `.png`), relative to the manifest.
+    pub image: PathBuf,
+    /// Cardiac phase, from 0.
+    pub phase: u32,
+    /// Training or validation.
+    pub split: Split,
+    /// How it was taken.
+    pub geometry: Geometry,
+    /// What its values mean.
+    pub intensity: Intensity,
+    /// Vessel mask of the same size: non-zero inside vessels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mask: Option<PathBuf>,
+}
+
+/// One image, ready for use.
+#[derive(Debug, Clone)]
+pub struct Frame {
+    /// For messages and picture names.
+    pub name: String,
+    /// Index into [`Dataset::views`].
+    pub view: usize,
+    /// Cardiac phase, from 0.
+    pub phase: u32,
+    /// Training or validation.
+    pub split: Split,
+    /// Line integrals, rows first.
+    pub integrals: Vec<f32>,
+    /// Vessel mask, where known.
+    pub mask: Option<Vec<bool>>,
+}
+
+/// A geometry shared by frames.
+#[derive(Debug, Clone)]
+pub struct View {
+    /// As stated in the file.
+    pub geometry: Geometry,
+    /// Rays in world units.
+    pub rays: ViewRays,
+}
+
+/// Which layout a dataset was read from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Layout {
+    /// `dataset.json`.
+    Native,
+    /// The NeRF-CA / NerT-CA authors' `general.json`.
+    Nerfca,
+}
+
+impl Choice for Layout {
+    const ALL: &'static [Layout] = &[Layout::Native, Layout::Nerfca];
+
+    fn name(self) -> &'static str {
+        match self {
+            Layout::Native => "native",
+            Layout::Nerfca => "nerfca",
+        }
+    }
+}
+
+/// Angiograms with geometry and phase, validated.
+#[derive(Debug, Clone)]
+pub struct Dataset {
+    /// Directory it came from.
+    pub path: PathBuf,
+    /// Its layout.
+    pub layout: Layout,
+    /// Distinct geometries.
+    pub views: Vec<View>,
+    /// All images; those of training first.
+    pub frames: Vec<Frame>,
+    /// Image columns.
+    pub width: usize,
+    /// Image rows.
+    pub height: usize,
+    /// Cardiac phases.
+    pub n_phases: u32,
+    /// Depth range around the isocentre plane, world units.
+    pub depth_range: (f64, f64),
+    /// Vessel attenuation per world unit, where stated.
+    pub vessel_attenuation: Option<f64>,
+}
+
+impl Dataset {
+    /// Reads a dataset, detecting its layout.
+    ///
+    /// # Errors
+    /// [`Error::Data`] or [`Error::Io`] naming file and field.
+    pub fn open(path: &Path) -> Result<Dataset> {
+        if path.join(MANIFEST).is_file() {
+            return Self::open_native(path);
+        }
+        if path.join(nerfca::GENERAL).is_file() {
+            return nerfca::open(path);
+        }
+        if !path.is_dir() {
+            return Err(Error::data(path, "dataset", "is not a directory"));
+        }
+        Err(Error::data(
+            path,
+            "dataset",
+            format!("holds neither {MANIFEST} (native layout) nor {} (NeRF-CA layout)", nerfca::GENERAL),
+        ))
+    }
+
+    fn open_native(path: &Path) -> Result<Dataset> {
+        let file = path.join(MANIFEST);
+        let text = files::read_limited(&file, MAX_MANIFEST_BYTES)?;
+        let manifest: Manifest = serde_json::from_slice(&text)
+            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
+        if manifest.format != "nertca-dataset" || manifest.version != 1 {
+            return Err(Error::data(
+                &file,
+                "format",
+                format!("`{}` version {}; expected `nertca-dataset` version 1", manifest.format, manifest.version),
+            ));
+        }
+        let half = manifest.depth_half_extent_mm / MM_PER_UNIT;
+        if !(half.is_finite() && half > 0.0 && half < 1e3) {
+            return Err(Error::data(&file, "depth_half_extent_mm", "is not a positive length in mm"));
+        }
+        let vessel = manifest.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT);
+        let mut builder = Builder::new(&file, manifest.phases, (-half, half), vessel)?;
+        for (index, frame) in manifest.frames.iter().enumerate() {
+            frame
+                .intensity
+                .check()
+                .map_err(|(field, problem)| Error::data(&file, format!("frames[{index}].{field}"), problem))?;
+            let image_path = path.join(&frame.image);
+            let image = images::read_image(&image_path)?;
+            let mask = match &frame.mask {
+                None => None,
+                Some(name) => {
+                    let mask = images::read_image(&path.join(name))?;
+                    if (mask.width, mask.height) != (image.width, image.height) {
+                        return Err(Error::data(path.join(name), "shape", "differs from its image's"));
+                    }
+                    Some(mask.values.iter().map(|v| *v != 0.0).collect())
+                }
+            };
+            builder.add(NewFrame {
+                index,
+                source: &image_path,
+                geometry: frame.geometry.clone(),
+                phase: frame.phase,
+                split: frame.split,
+                image,
+                to_integral: |v| frame.intensity.integral(v),
+                mask,
+            })?;
+        }
+        builder.finish(path, Layout::Native)
+    }
+
+    /// Frames the reconstruction may see; they come first in [`Dataset::frames`].
+    pub fn training(&self) -> &[Frame] {
+        &self.frames[..self.n_training()]
+    }
+
+    /// Frames kept for evaluation.
+    pub fn validation(&self) -> &[Frame] {
+        &self.frames[self.n_training()..]
+    }
+
+    fn n_training(&self) -> usize {
+        self.frames.iter().take_while(|f| f.split == Split::Train).count()
+    }
+
+    /// Pixels of one image.
+    pub fn n_pixels(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// The C-arm of the first training view; for an explicit matrix, one with the same magnification.
+    pub fn reference_c_arm(&self) -> CArm {
+        let view = &self.views[self.frames[0].view];
+        match &view.geometry {
+            Geometry::CArm(c_arm) => c_arm.clone(),
+            Geometry::Matrix(_) => {
+                let sod_mm = view.rays.sod * MM_PER_UNIT;
+                let sid_mm = 1.5 * sod_mm;
+                CArm {
+                    primary_deg: 0.0,
+                    secondary_deg: 0.0,
+                    sid_mm,
+                    sod_mm,
+                    pixel_mm: [view.rays.direction[1].length() * sid_mm, view.rays.direction[2].length() * sid_mm],
+                    offset_mm: [0.0; 2],
+                    table_mm: [0.0; 3],
+                }
+            }
+        }
+    }
+
+    /// Views that training frames use.
+    pub fn training_views(&self) -> Vec<usize> {
+        let mut views: Vec<usize> = self.training().iter().map(|f| f.view).collect();
+        views.sort_unstable();
+        views.dedup();
+        views
+    }
+}
+
+/// Collects frames, checking each as it comes.
+pub(super) struct Builder {
+    file: PathBuf,
+    n_phases: u32,
+    depth_range: (f64, f64),
+    vessel_attenuation: Option<f64>,
+    size: Option<(usize, usize)>,
+    views: Vec<View>,
+    frames: Vec<Frame>,
+}
+
+pub(super) struct NewFrame<'a, F: Fn(f32) -> f32> {
+    pub index: usize,
+    pub source: &'a Path,
+    pub geometry: Geometry,
+    pub phase: u32,
+    pub split: Split,
+    pub image: Image,
+    pub to_integral: F,
+    pub mask: Option<Vec<bool>>,
+}
+
+impl Builder {
+    pub(super) fn new(
+        file: &Path,
+        n_phases: u32,
+        depth_range: (f64, f64),
+        vessel_attenuation: Option<f64>,
+    ) -> Result<Builder> {
+        if n_phases == 0 || n_phases > 4096 {
+            return Err(Error::data(file, "phases", format!("{n_phases}; 1 to 4096 are accepted")));
+        }
+        if vessel_attenuation.is_some_and(|a| !(a.is_finite() && a > 0.0)) {
+            return Err(Error::data(file, "vessel_attenuation_per_mm", "is not a positive number"));
+        }
+        Ok(Builder {
+            file: file.to_path_buf(),
+            n_phases,
+            depth_range,
+            vessel_attenuation,
+            size: None,
+            views: Vec::new(),
+            frames: Vec::new(),
+        })
+    }
+
+    pub(super) fn add<F: Fn(f32) -> f32>(&mut self, new: NewFrame<'_, F>) -> Result<()> {
+        let field = |name: &str| format!("frames[{}].{name}", new.index);
+        if self.frames.len() >= MAX_FRAMES {
+            return Err(Error::data(&self.file, "frames", format!("more than {MAX_FRAMES}")));
+        }
+        if new.phase >= self.n_phases {
+            return Err(Error::data(
+                &self.file,
+                field("phase"),
+                format!("{} with {} phases; phases count from 0", new.phase, self.n_phases),
+            ));
+        }
+        let size = (new.image.width, new.image.height);
+        match self.size {
+            Some(first) if first != size => {
+                return Err(Error::data(
+                    new.source,
+                    "shape",
+                    format!("{} x {} where earlier images have {} x {}", size.0, size.1, first.0, first.1),
+                ));
+            }
+            _ => self.size = Some(size),
+        }
+        if let Some(at) = new.image.values.iter().position(|v| !v.is_finite()) {
+            return Err(Error::data(
+                new.source,
+                format!("pixel (column {}, row {})", at % size.0, at / size.0),
+                format!("{} is not a finite number", new.image.values[at]),
+            ));
+        }
+        let view = match self.views.iter().position(|v| v.geometry == new.geometry) {
+            Some(view) => view,
+            None => {
+                let rays = new
+                    .geometry
+                    .rays(size.0, size.1)
+                    .map_err(|(name, problem)| Error::data(&self.file, field(&format!("geometry.{name}")), problem))?;
+                if rays.sod + self.depth_range.0 <= 0.0 {
+                    return Err(Error::data(
+                        &self.file,
+                        field("geometry"),
+                        format!(
+                            "the source, {:.0} mm before the isocentre, stands inside the depth range ({:.0} mm)",
+                            rays.sod * MM_PER_UNIT,
+                            -self.depth_range.0 * MM_PER_UNIT
+                        ),
+                    ));
+                }
+                self.views.push(View { geometry: new.geometry, rays });
+                self.views.len() - 1
+            }
+        };
+        self.frames.push(Frame {
+            name: new
+                .source
+                .file_stem()
+                .map_or_else(|| format!("frame-{}", new.index), |s| s.to_string_lossy().into_owned()),
+            view,
+            phase: new.phase,
+            split: new.split,
+            integrals: new.image.values.iter().map(|v| (new.to_integral)(*v)).collect(),
+            mask: new.mask,
+        });
+        Ok(())
+    }
+
+    pub(super) fn finish(mut self, path: &Path, layout: Layout) -> Result<Dataset> {
+        let Some((width, height)) = self.size else {
+            return Err(Error::data(&self.file, "frames", "is empty"));
+        };
+        if !self.frames.iter().any(|f| f.split == Split::Train) {
+            return Err(Error::data(&self.file, "frames", "none is for training"));
+        }
+        self.frames.sort_by_key(|f| f.split);
+        Ok(Dataset {
+            path: path.to_path_buf(),
+            layout,
+            views: self.views,
+            frames: self.frames,
+            width,
+            height,
+            n_phases: self.n_phases,
+            depth_range: self.depth_range,
+            vessel_attenuation: self.vessel_attenuation,
+        })
+    }
+}
+
+/// JSON schema of the manifest.
+#[cfg(feature = "schema")]
+pub fn manifest_schema() -> String {
+    let schema = schemars::schema_for!(Manifest);
+    serde_json::to_string_pretty(&schema).unwrap_or_default() + "\n"
+}

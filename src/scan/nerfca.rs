@@ -1,0 +1,231 @@
+//! The layout of the NeRF-CA / NerT-CA authors, read (and written) as it is.
+//!
+//! `general.json` plus `train-*.json` / `test-*.json`. Images are `.npy` arrays normalised to [0, 1] by
+//! `img_min_max`, stored so that `reshape(W, H)` transposed is the picture; pixel = I0 - line integral.
+//! Masks hold image values inside vessels and I0 elsewhere. Paths may be absolute and stale.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::images;
+use crate::geometry::{CArm, Geometry};
+use crate::raster::Image;
+use crate::scan::dataset::{Builder, Dataset, Layout, NewFrame, Split};
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// Name of the geometry file.
+pub const GENERAL: &str = "general.json";
+const MAX_JSON_BYTES: u64 = 256 << 20;
+
+/// `general.json`: lengths in mm before the authors' 1e-2 scale, or already scaled (`near_thresh` tells).
+#[derive(Debug, Serialize, Deserialize)]
+#[allow(non_snake_case, reason = "the authors' spelling")]
+pub(crate) struct General {
+    pub DSD: f64,
+    pub DSO: f64,
+    pub nDetector: Vec<f64>,
+    pub dDetector: Vec<f64>,
+    pub nVoxel: Vec<f64>,
+    pub dVoxel: Vec<f64>,
+    #[serde(default)]
+    pub offOrigin: Vec<f64>,
+    #[serde(default)]
+    pub offDetector: Vec<f64>,
+    pub near_thresh: f64,
+    pub far_thresh: f64,
+    pub max_pixel_value: f64,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+pub(crate) struct FrameList {
+    pub frames: Vec<FrameEntry>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+pub(crate) struct FrameEntry {
+    pub file_path: String,
+    pub img_min_max: [f64; 2],
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mask_file_path: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub weighted_file_path: Option<String>,
+    pub heart_phase: f64,
+    pub theta: f64,
+    pub phi: f64,
+    #[serde(default)]
+    pub larm: f64,
+}
+
+fn read_json<T: serde::de::DeserializeOwned>(file: &Path) -> Result<T> {
+    let text = files::read_limited(file, MAX_JSON_BYTES)?;
+    serde_json::from_slice(&text).map_err(|e| Error::data(file, format!("line {}", e.line()), e.to_string()))
+}
+
+/// Reads a dataset in the authors' layout.
+///
+/// # Errors
+/// [`Error::Data`] or [`Error::Io`] naming file and field.
+pub fn open(path: &Path) -> Result<Dataset> {
+    let general_file = path.join(GENERAL);
+    let general: General = read_json(&general_file)?;
+    let pair = |field: &str, v: &[f64]| -> Result<[f64; 2]> {
+        match v {
+            [a, b, ..] if a.is_finite() && b.is_finite() => Ok([*a, *b]),
+            _ => Err(Error::data(&general_file, field, "needs two finite numbers")),
+        }
+    };
+    let [columns, rows] = pair("nDetector", &general.nDetector)?;
+    if !(columns >= 1.0 && rows >= 1.0 && columns <= images::MAX_SIDE as f64 && rows <= images::MAX_SIDE as f64) {
+        return Err(Error::data(&general_file, "nDetector", format!("{columns} x {rows} is not an image size")));
+    }
+    let (width, height) = (columns as usize, rows as usize);
+    let pixel = pair("dDetector", &general.dDetector)?;
+    let offset = if general.offDetector.is_empty() { [0.0; 2] } else { pair("offDetector", &general.offDetector)? };
+    let i0 = general.max_pixel_value;
+    if !i0.is_finite() {
+        return Err(Error::data(&general_file, "max_pixel_value", "is not finite"));
+    }
+    if general.near_thresh.partial_cmp(&general.far_thresh) != Some(std::cmp::Ordering::Less) {
+        return Err(Error::data(&general_file, "near_thresh", "is not below far_thresh"));
+    }
+    // Depth thresholds are in world units (100 mm); distances may be in mm or already scaled.
+    let to_mm = if general.DSO > general.far_thresh * 2.0 { 1.0 } else { 100.0 };
+    let sod = general.DSO * to_mm / 100.0;
+    let depth_range = (general.near_thresh - sod, general.far_thresh - sod);
+    let lists = frame_lists(path)?;
+    let by_name = files_by_name(path)?;
+    let mut entries = Vec::new();
+    for (file, split) in lists {
+        let list: FrameList = read_json(&file)?;
+        entries.extend(list.frames.into_iter().map(|frame| (file.clone(), split, frame)));
+    }
+    let phases = phase_index(&entries)?;
+    let mut builder = Builder::new(&general_file, phases.len().max(1) as u32, depth_range, None)?;
+    for (index, (file, split, entry)) in entries.iter().enumerate() {
+        let read = |field: &str, name: &str| -> Result<(PathBuf, Image)> {
+            let found = resolve(path, &by_name, name).ok_or_else(|| {
+                Error::data(file, format!("frames[{index}].{field}"), format!("{name} is not below {}", path.display()))
+            })?;
+            let image = read_picture(&found, width, height)?;
+            Ok((found, image))
+        };
+        let (source, image) = read("file_path", &entry.file_path)?;
+        let [low, high] = entry.img_min_max;
+        if !(low.is_finite() && high.is_finite() && high > low) {
+            return Err(Error::data(
+                file,
+                format!("frames[{index}].img_min_max"),
+                format!("[{low}, {high}] is not a range"),
+            ));
+        }
+        let mask = match &entry.mask_file_path {
+            None => None,
+            Some(name) => {
+                let (_, mask) = read("mask_file_path", name)?;
+                let top = mask.values.iter().copied().fold(f32::MIN, f32::max);
+                Some(mask.values.iter().map(|v| *v < top).collect())
+            }
+        };
+        builder.add(NewFrame {
+            index,
+            source: &source,
+            geometry: Geometry::CArm(CArm {
+                primary_deg: entry.theta,
+                secondary_deg: entry.phi,
+                sid_mm: general.DSD * to_mm,
+                sod_mm: general.DSO * to_mm,
+                pixel_mm: pixel.map(|p| p * to_mm),
+                offset_mm: offset.map(|p| p * to_mm),
+                table_mm: [0.0; 3],
+            }),
+            phase: phases[&entry.heart_phase.to_bits()],
+            split: *split,
+            image,
+            to_integral: |v| (i0 - (f64::from(v) * (high - low) + low)) as f32,
+            mask,
+        })?;
+    }
+    builder.finish(path, Layout::Nerfca)
+}
+
+/// `train-*.json` and `test-*.json` of the directory, sorted.
+fn frame_lists(path: &Path) -> Result<Vec<(PathBuf, Split)>> {
+    let mut lists = Vec::new();
+    for entry in std::fs::read_dir(path).map_err(Error::io("list", path))? {
+        let file = entry.map_err(Error::io("list", path))?.path();
+        let Some(name) = file.file_name().and_then(|n| n.to_str()) else {
+            continue;
+        };
+        if !name.ends_with(".json") {
+            continue;
+        }
+        if name.starts_with("train") {
+            lists.push((file, Split::Train));
+        } else if name.starts_with("test") {
+            lists.push((file, Split::Validation));
+        }
+    }
+    lists.sort();
+    Ok(lists)
+}
+
+/// Every `.npy` below the directory (three levels), by file name, for stale absolute paths.
+fn files_by_name(path: &Path) -> Result<HashMap<String, PathBuf>> {
+    let mut found = HashMap::new();
+    let mut open = vec![(path.to_path_buf(), 0)];
+    while let Some((directory, depth)) = open.pop() {
+        for entry in std::fs::read_dir(&directory).map_err(Error::io("list", &directory))? {
+            let file = entry.map_err(Error::io("list", &directory))?.path();
+            if file.is_dir() && depth < 3 {
+                open.push((file, depth + 1));
+            } else if file.extension().is_some_and(|e| e == "npy")
+                && let Some(name) = file.file_name().and_then(|n| n.to_str())
+            {
+                found.entry(name.to_owned()).or_insert(file);
+            }
+        }
+    }
+    Ok(found)
+}
+
+fn resolve(root: &Path, by_name: &HashMap<String, PathBuf>, stated: &str) -> Option<PathBuf> {
+    let stated_path = Path::new(stated);
+    let direct = root.join(stated_path);
+    if stated_path.is_relative() && direct.is_file() {
+        return Some(direct);
+    }
+    // A path written on another system may use either separator.
+    by_name.get(stated.rsplit(['/', '\\']).next()?).cloned()
+}
+
+fn phase_index(entries: &[(PathBuf, Split, FrameEntry)]) -> Result<HashMap<u64, u32>> {
+    let mut values = Vec::new();
+    for (index, (file, _, entry)) in entries.iter().enumerate() {
+        if !entry.heart_phase.is_finite() {
+            return Err(Error::data(file, format!("frames[{index}].heart_phase"), "is not finite"));
+        }
+        values.push(entry.heart_phase);
+    }
+    values.sort_by(f64::total_cmp);
+    values.dedup();
+    Ok(values.iter().enumerate().map(|(i, v)| (v.to_bits(), i as u32)).collect())
+}
+
+/// Array of W x H values in the authors' order: `reshape(W, H)` transposed is rows x columns.
+fn read_picture(path: &Path, width: usize, height: usize) -> Result<Image> {
+    let (shape, values) = images::read_npy(path)?;
+    if values.len() != width * height {
+        return Err(Error::data(path, "shape", format!("{shape:?} does not hold {width} x {height} pixels")));
+    }
+    Ok(Image { width, height, values: transpose(&values, width, height) })
+}
+
+/// `[column][row]` <-> `[row][column]` for an array with `outer` leading entries of `inner` values.
+pub(crate) fn transpose(values: &[f32], outer: usize, inner: usize) -> Vec<f32> {
+    let mut out = Vec::with_capacity(values.len());
+    for i in 0..inner {
+        out.extend((0..outer).map(|o| values[o * inner + i]));
+    }
+    out
+}

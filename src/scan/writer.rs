@@ -1,0 +1,217 @@
+//! Writes datasets in either layout.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::images;
+use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
+use crate::scan::dataset::{Dataset, Intensity, Layout, MANIFEST, Manifest, ManifestFrame, Split};
+use crate::scan::nerfca;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// ln(8.670397): the value of an unattenuated pixel in the authors' images.
+pub const I0_LOG: f64 = 2.159_914_6;
+
+/// What a dataset says besides its frames.
+#[derive(Debug, Clone)]
+pub struct About {
+    /// Free text.
+    pub description: String,
+    /// Cardiac phases.
+    pub phases: u32,
+    /// Depth searched before and behind the isocentre plane, mm.
+    pub depth_half_extent_mm: f64,
+    /// Attenuation of filled vessels, 1/mm, where known.
+    pub vessel_attenuation_per_mm: Option<f64>,
+    /// Columns and rows.
+    pub size: [usize; 2],
+    /// The authors' layout has distances and pixels once for all views: those of this C-arm.
+    pub c_arm: CArm,
+}
+
+/// Writes frames as they come and the manifest last, so that an interrupted run leaves no dataset.
+pub struct Writer<'a> {
+    out: &'a Path,
+    size: [usize; 2],
+    /// Frames written under a name, to tell several of one view and phase apart.
+    names: HashMap<String, u32>,
+    c_arm: CArm,
+    layout: Layout,
+    manifest: Manifest,
+    general: nerfca::General,
+    lists: [Vec<nerfca::FrameEntry>; 2],
+}
+
+impl<'a> Writer<'a> {
+    /// Makes the directory.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn new(out: &'a Path, layout: Layout, about: About) -> Result<Writer<'a>> {
+        files::create_directory(out)?;
+        let carm = &about.c_arm;
+        let half_units = about.depth_half_extent_mm / MM_PER_UNIT;
+        Ok(Writer {
+            out,
+            size: about.size,
+            names: HashMap::new(),
+            c_arm: about.c_arm.clone(),
+            layout,
+            manifest: Manifest {
+                format: "nertca-dataset".into(),
+                version: 1,
+                description: about.description,
+                phases: about.phases,
+                depth_half_extent_mm: about.depth_half_extent_mm,
+                vessel_attenuation_per_mm: about.vessel_attenuation_per_mm,
+                frames: Vec::new(),
+            },
+            general: nerfca::General {
+                DSD: carm.sid_mm,
+                DSO: carm.sod_mm,
+                nDetector: about.size.map(|n| n as f64).to_vec(),
+                dDetector: carm.pixel_mm.to_vec(),
+                nVoxel: vec![512.0; 3],
+                dVoxel: vec![2.0 * about.depth_half_extent_mm / 512.0; 3],
+                offOrigin: vec![0.0; 3],
+                offDetector: carm.offset_mm.to_vec(),
+                near_thresh: carm.sod_mm / MM_PER_UNIT - half_units,
+                far_thresh: carm.sod_mm / MM_PER_UNIT + half_units,
+                max_pixel_value: I0_LOG,
+            },
+            lists: [Vec::new(), Vec::new()],
+        })
+    }
+
+    /// Writes a frame's image and mask.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a geometry the authors' layout cannot state; [`Error::Io`].
+    pub fn frame(
+        &mut self,
+        geometry: &Geometry,
+        split: Split,
+        view: usize,
+        phase: u32,
+        integrals: &[f32],
+        mask: Option<&[bool]>,
+    ) -> Result<()> {
+        let kind = if split == Split::Train { "train" } else { "test" };
+        let name = format!("{kind}-view{view}-phase{phase:02}");
+        let seen = self.names.entry(name.clone()).or_default();
+        *seen += 1;
+        let name = if *seen > 1 { format!("{name}-{seen}") } else { name };
+        let [width, height] = self.size;
+        match self.layout {
+            Layout::Native => {
+                let image = PathBuf::from(format!("images/{name}.npy"));
+                let mask_file = PathBuf::from(format!("masks/{name}.png"));
+                images::write_npy(&self.out.join(&image), &[height, width], integrals)?;
+                if let Some(mask) = mask {
+                    let codes = mask.iter().map(|m| if *m { u16::MAX } else { 0 }).collect();
+                    images::write_png16(&self.out.join(&mask_file), width, height, codes)?;
+                }
+                self.manifest.frames.push(ManifestFrame {
+                    image,
+                    phase,
+                    split,
+                    geometry: geometry.clone(),
+                    intensity: Intensity::Integral { scale: 1.0, offset: 0.0 },
+                    mask: mask.map(|_| mask_file),
+                });
+            }
+            Layout::Nerfca => {
+                let values: Vec<f32> = integrals.iter().map(|y| (I0_LOG - f64::from(*y)) as f32).collect();
+                let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+                let range = f64::from(high) - f64::from(low);
+                let unit: Vec<f32> =
+                    values.iter().map(|v| ((f64::from(*v) - f64::from(low)) / range.max(1e-12)) as f32).collect();
+                let (image, mask_file) = (format!("{name}.npy"), format!("{name}-mask.npy"));
+                let shape = [width, height];
+                images::write_npy(&self.out.join(&image), &shape, &nerfca::transpose(&unit, height, width))?;
+                if let Some(mask) = mask {
+                    let masked: Vec<f32> =
+                        values.iter().zip(mask).map(|(v, m)| if *m { *v } else { I0_LOG as f32 }).collect();
+                    let stored = nerfca::transpose(&masked, height, width);
+                    images::write_npy(&self.out.join(&mask_file), &shape, &stored)?;
+                }
+                let (theta, phi) = self.authors_angles(geometry)?;
+                self.lists[usize::from(split == Split::Validation)].push(nerfca::FrameEntry {
+                    file_path: image,
+                    img_min_max: [f64::from(low), f64::from(high).max(f64::from(low) + 1e-12)],
+                    mask_file_path: mask.map(|_| mask_file),
+                    weighted_file_path: None,
+                    heart_phase: f64::from(phase),
+                    theta,
+                    phi,
+                    larm: 0.0,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Angles of a geometry that differs from the common one by nothing else.
+    fn authors_angles(&self, geometry: &Geometry) -> Result<(f64, f64)> {
+        let c_arm = match geometry {
+            Geometry::CArm(c_arm) => c_arm,
+            Geometry::Matrix(_) => {
+                return Err(Error::config("layout", "nerfca", "has angles and distances, no projection matrices"));
+            }
+        };
+        let common = CArm { primary_deg: c_arm.primary_deg, secondary_deg: c_arm.secondary_deg, ..self.c_arm.clone() };
+        if *c_arm != common {
+            let problem = "has distances, pixels and table once for all views, and those of this dataset differ";
+            return Err(Error::config("layout", "nerfca", problem));
+        }
+        Ok((c_arm.primary_deg, c_arm.secondary_deg))
+    }
+
+    /// Writes what names the frames: from now on there is a dataset.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn finish(self) -> Result<()> {
+        let write = |name: &str, text: serde_json::Result<String>| {
+            let text = text.map_err(|e| Error::Internal(e.to_string()))?;
+            files::write_atomic(&self.out.join(name), text.as_bytes())
+        };
+        match self.layout {
+            Layout::Native => write(MANIFEST, serde_json::to_string_pretty(&self.manifest)),
+            Layout::Nerfca => {
+                let [train, test] = self.lists;
+                write("train-0.json", serde_json::to_string_pretty(&nerfca::FrameList { frames: train }))?;
+                write("test-0.json", serde_json::to_string_pretty(&nerfca::FrameList { frames: test }))?;
+                write(nerfca::GENERAL, serde_json::to_string_pretty(&self.general))
+            }
+        }
+    }
+}
+
+/// Writes a dataset in a layout. Values become line integrals.
+///
+/// # Errors
+/// [`Error::Config`] for what the layout cannot state; [`Error::Io`].
+pub fn convert(dataset: &Dataset, layout: Layout, out: &Path) -> Result<()> {
+    let (low, high) = dataset.depth_range;
+    if layout == Layout::Nerfca && (low + high).abs() > 1e-9 {
+        return Err(Error::config("layout", "nerfca", "the depth range is not centred"));
+    }
+    let mut writer = Writer::new(
+        out,
+        layout,
+        About {
+            description: format!("converted from {:?}", dataset.layout).to_lowercase(),
+            phases: dataset.n_phases,
+            depth_half_extent_mm: low.abs().max(high.abs()) * MM_PER_UNIT,
+            vessel_attenuation_per_mm: dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+            size: [dataset.width, dataset.height],
+            c_arm: dataset.reference_c_arm(),
+        },
+    )?;
+    for frame in &dataset.frames {
+        let geometry = &dataset.views[frame.view].geometry;
+        writer.frame(geometry, frame.split, frame.view, frame.phase, &frame.integrals, frame.mask.as_deref())?;
+    }
+    writer.finish()
+}

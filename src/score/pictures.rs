@@ -1,0 +1,129 @@
+//! Pictures a person can look at. Vessels are dark, as on an angiogram.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::images::write_png;
+use crate::render::renderer::Rendering;
+use crate::scan::dataset::Frame;
+use image::{DynamicImage, Rgb, RgbImage};
+use std::path::Path;
+
+/// Smallest side of a panel; smaller images are enlarged by a whole factor.
+const PANEL_PIXELS: usize = 200;
+const GAP: usize = 4;
+
+/// Window of line integrals shown: `low` is white, `high` black.
+#[derive(Debug, Clone, Copy)]
+pub struct Window {
+    /// Shown white.
+    pub low: f32,
+    /// Shown black.
+    pub high: f32,
+}
+
+impl Window {
+    /// The range of an image.
+    pub fn of(values: &[f32]) -> Window {
+        let (low, high) = values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
+        Window { low, high: if high > low { high } else { low + 1.0 } }
+    }
+
+    /// Grey code of a value.
+    pub fn code(&self, value: f32) -> u8 {
+        (255.0 * (1.0 - ((value - self.low) / (self.high - self.low)).clamp(0.0, 1.0))) as u8
+    }
+
+    /// All codes of an image.
+    pub fn codes(&self, values: &[f32]) -> Vec<u8> {
+        values.iter().map(|v| self.code(*v)).collect()
+    }
+}
+
+/// Grey codes as an enlarged colour image.
+fn panel(width: usize, colour: impl Fn(usize) -> Rgb<u8>, pixels: usize) -> RgbImage {
+    let height = pixels / width;
+    let factor = PANEL_PIXELS.div_ceil(width.min(height)).max(1);
+    RgbImage::from_fn((width * factor) as u32, (height * factor) as u32, |x, y| {
+        colour(y as usize / factor * width + x as usize / factor)
+    })
+}
+
+fn beside(panels: &[RgbImage]) -> RgbImage {
+    let height = panels.iter().map(RgbImage::height).max().unwrap_or(1);
+    let width: u32 = panels.iter().map(|p| p.width() + GAP as u32).sum::<u32>().saturating_sub(GAP as u32);
+    let mut out = RgbImage::from_pixel(width.max(1), height, Rgb([255, 255, 255]));
+    let mut x = 0;
+    for p in panels {
+        image::imageops::replace(&mut out, p, i64::from(x), 0);
+        x += p.width() + GAP as u32;
+    }
+    out
+}
+
+/// Truth, prediction, static field, dynamic field, and the vessel mask over the truth: overlap green,
+/// missed red, added blue.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn write_comparison(path: &Path, frame: &Frame, seen: &Rendering, threshold: f64, width: usize) -> Result<()> {
+    let window = Window::of(&frame.integrals);
+    let grey = |values: &[f32], window: Window| {
+        let codes = window.codes(values);
+        panel(width, |i| Rgb([codes[i]; 3]), values.len())
+    };
+    let codes = window.codes(&frame.integrals);
+    let overlay = panel(
+        width,
+        |i| {
+            let truth = frame.mask.as_ref().is_some_and(|m| m[i]);
+            let found = f64::from(seen.dynamic_max[i]) > threshold;
+            let base = codes[i] / 2 + 100;
+            match (truth, found) {
+                (true, true) => Rgb([base / 3, 200, base / 3]),
+                (true, false) => Rgb([230, base / 4, base / 4]),
+                (false, true) => Rgb([base / 3, base / 3, 230]),
+                (false, false) => Rgb([base; 3]),
+            }
+        },
+        frame.integrals.len(),
+    );
+    let picture = beside(&[
+        grey(&frame.integrals, window),
+        grey(&seen.total_integral(), window),
+        grey(&seen.static_integral, window),
+        grey(&seen.dynamic_integral, Window { low: 0.0, ..Window::of(&seen.dynamic_integral) }),
+        overlay,
+    ]);
+    write_png(path, &DynamicImage::ImageRgb8(picture))
+}
+
+/// A looping animation of grey images, `width` columns each, `ms` milliseconds apart.
+///
+/// # Errors
+/// [`Error::Io`] or [`Error::Internal`].
+pub fn write_gif(path: &Path, frames: &[Vec<f32>], width: usize, window: Window, ms: u32) -> Result<()> {
+    use image::codecs::gif::{GifEncoder, Repeat};
+    let mut bytes = Vec::new();
+    {
+        let mut encoder = GifEncoder::new(&mut bytes);
+        let fault = |e: image::ImageError| Error::Internal(format!("encoding {}: {e}", path.display()));
+        encoder.set_repeat(Repeat::Infinite).map_err(fault)?;
+        for values in frames {
+            let codes = window.codes(values);
+            let picture = panel(width, |i| Rgb([codes[i]; 3]), values.len());
+            let delay = image::Delay::from_numer_denom_ms(ms, 1);
+            let rgba = DynamicImage::ImageRgb8(picture).to_rgba8();
+            encoder.encode_frame(image::Frame::from_parts(rgba, 0, 0, delay)).map_err(fault)?;
+        }
+    }
+    files::write_atomic(path, &bytes)
+}
+
+/// One grey image.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn write_grey(path: &Path, values: &[f32], width: usize, window: Window) -> Result<()> {
+    let codes = window.codes(values);
+    write_png(path, &DynamicImage::ImageRgb8(panel(width, |i| Rgb([codes[i]; 3]), values.len())))
+}
