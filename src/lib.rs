@@ -15,6 +15,26 @@
 //! f64 twin of every compute stage, for tests. Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
 //! without any knowledge of angiography. Modules use only what stands above them in this file.
 //!
+//! A dataset becomes a reconstruction, in memory:
+//!
+//! ```no_run
+//! use nertca_vk::{config::*, gpu::device::*, kernels::tuning::Tuning, plan::Plan};
+//! use nertca_vk::{render::renderer::Renderer, scan::dataset::Dataset, train::trainer::Trainer};
+//!
+//! let dataset = Dataset::open("out/phantom".as_ref())?;
+//! let gpu = Gpu::open(&DeviceOptions::default())?;
+//! let tuning = Tuning::for_device(gpu.info());
+//! let config = Config::preset(Preset::Fast);
+//! let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
+//! while trainer.step() < config.train.iterations {
+//!     trainer.advance(config.train.iterations)?;
+//! }
+//! let renderer = Renderer::new(&gpu, &trainer.model()?, tuning)?;
+//! let view = renderer.render(&dataset.views[0].rays, dataset.width, dataset.height, 0)?;
+//! println!("the moving vessels' largest line integral: {}", view.dynamic_integral.iter().fold(0.0, |m, v| v.max(m)));
+//! # Ok::<(), nertca_vk::error::Error>(())
+//! ```
+//!
 //! Public functions speak mm and degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
 
 pub mod choice;
