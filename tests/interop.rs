@@ -4,11 +4,14 @@
 
 #[path = "common/dicom.rs"]
 mod dicom;
+#[path = "common/python.rs"]
+mod python;
 
 use dicom::angiogram;
 use dicom_core::{DataElement, PrimitiveValue, VR};
 use dicom_dictionary_std::tags;
 use dicom_object::InMemDicomObject;
+use python::python;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -90,15 +93,8 @@ fn exports_open_in_the_tools_people_use() {
     });
     std::fs::write(to("expected.json"), expected.to_string()).unwrap();
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let own = root.join(".cache/python/bin/python3");
-    let python = if own.is_file() { own } else { "python3".into() };
-    let outcome = Command::new(python).arg(root.join("tests/python/check_exports.py")).arg(&out).output().unwrap();
-    let stderr = String::from_utf8_lossy(&outcome.stderr);
-    if stderr.contains("ModuleNotFoundError") && std::env::var_os("NERTCA_PYTHON").is_none_or(|v| v != "require") {
-        eprintln!("SKIPPED: {stderr} (pip install -r tests/python/requirements.txt)");
-        return;
-    }
-    assert!(outcome.status.success(), "{stderr}");
+    let outcome = python().arg(root.join("tests/python/check_exports.py")).arg(&out).output().unwrap();
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
 }
 
 #[test]
@@ -220,20 +216,17 @@ fn the_viewer_answers_its_own_page_alone() {
     server.wait().unwrap();
 }
 
-/// The page in a headless browser, where there is one: it draws vessels.
+/// The page in a headless browser: it draws vessels.
 fn browse(url: &str, dir: &Path) {
     let shot = dir.join("view.png");
-    let started = Command::new("chromium")
+    Command::new("chromium")
         .args(["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"])
         .args(["--disable-component-update", "--disable-sync", "--window-size=900,600", "--virtual-time-budget=20000"])
         .arg(format!("--user-data-dir={}", dir.join("browser").display()))
         .arg(format!("--screenshot={}", shot.display()))
         .arg(url)
-        .output();
-    if started.is_err() {
-        eprintln!("SKIPPED: no chromium to look at the viewer with");
-        return;
-    }
+        .output()
+        .unwrap_or_else(|e| panic!("chromium is needed to look at the viewer with: {e}"));
     let picture = image::open(&shot).unwrap().to_luma8();
     // Left is the picture: white with dark vessels in its middle.
     let stage: Vec<u8> =
