@@ -53,7 +53,7 @@ fn best_seconds(
 /// Device errors.
 pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     let info = gpu.info();
-    let is_cpu = info.kind == "cpu";
+    let is_cpu = info.is_cpu();
     // Some milliseconds on either kind of device.
     let (lanes, steps): (u32, u32) = if is_cpu { (256, 8000) } else { (1 << 19, 1024) };
     let stage = Arc::new(gpu.pipeline(kernel_code("peak_f32")?, 64, &[])?);
@@ -87,7 +87,7 @@ pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
 fn matrix_peak(gpu: &Gpu, MatrixShape { m, n, k }: MatrixShape) -> Result<f64> {
     let info = gpu.info();
     let subgroups = 8;
-    let (groups, steps): (u32, u32) = if info.kind == "cpu" { (4, 2000) } else { (4096, 2048) };
+    let (groups, steps): (u32, u32) = if info.is_cpu() { (4, 2000) } else { (4096, 2048) };
     let spec = [("m", m), ("n", n), ("k", k), ("subgroups", subgroups)];
     let code = kernel_code("peak_matrix")?;
     let stage = Arc::new(gpu.matrix_pipeline(code, subgroups * info.subgroup_size, &spec)?);

@@ -3,6 +3,7 @@
 use ash::{ext, khr, nv, vk};
 use serde::Serialize;
 use std::ffi::CStr;
+use std::fmt;
 
 /// What a device is and can do, as far as this engine cares.
 #[derive(Debug, Clone, Serialize)]
@@ -11,8 +12,8 @@ pub struct DeviceInfo {
     pub index: usize,
     /// Name given by the driver.
     pub name: String,
-    /// `discrete`, `integrated`, `virtual`, `cpu` or `other`.
-    pub kind: &'static str,
+    /// What kind of processor it is.
+    pub kind: DeviceKind,
     /// Device UUID, hexadecimal.
     pub uuid: String,
     /// Driver name and version text.
@@ -56,6 +57,41 @@ pub struct DeviceInfo {
     pub external_memory_fd: bool,
     /// Why this device cannot be used, if so.
     pub unusable: Option<String>,
+}
+
+impl DeviceInfo {
+    /// Whether the device is the host's own processor.
+    pub fn is_cpu(&self) -> bool {
+        self.kind == DeviceKind::Cpu
+    }
+}
+
+/// What kind of processor a device is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DeviceKind {
+    /// A GPU with memory of its own.
+    Discrete,
+    /// A GPU that shares the host's memory.
+    Integrated,
+    /// A GPU handed on by a virtual machine.
+    Virtual,
+    /// The host's own processor.
+    Cpu,
+    /// None of these.
+    Other,
+}
+
+impl fmt::Display for DeviceKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            DeviceKind::Discrete => "discrete",
+            DeviceKind::Integrated => "integrated",
+            DeviceKind::Virtual => "virtual",
+            DeviceKind::Cpu => "cpu",
+            DeviceKind::Other => "other",
+        })
+    }
 }
 
 /// A product of cooperative matrices: `m` x `k` times `k` x `n`.
@@ -169,11 +205,11 @@ pub(super) fn describe(
         index,
         name: c_chars(&properties.device_name),
         kind: match properties.device_type {
-            vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
-            vk::PhysicalDeviceType::INTEGRATED_GPU => "integrated",
-            vk::PhysicalDeviceType::VIRTUAL_GPU => "virtual",
-            vk::PhysicalDeviceType::CPU => "cpu",
-            _ => "other",
+            vk::PhysicalDeviceType::DISCRETE_GPU => DeviceKind::Discrete,
+            vk::PhysicalDeviceType::INTEGRATED_GPU => DeviceKind::Integrated,
+            vk::PhysicalDeviceType::VIRTUAL_GPU => DeviceKind::Virtual,
+            vk::PhysicalDeviceType::CPU => DeviceKind::Cpu,
+            _ => DeviceKind::Other,
         },
         uuid: ids.device_uuid.iter().map(|b| format!("{b:02x}")).collect(),
         mesa_major: driver_info.strip_prefix("Mesa ").and_then(|v| v.split('.').next()).and_then(|v| v.parse().ok()),
@@ -222,4 +258,20 @@ pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDev
     // SAFETY: `physical` comes from this instance.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
     families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE)).map(|i| i as u32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kinds_are_written_as_they_are_shown() {
+        use DeviceKind::*;
+        for (kind, name) in
+            [(Discrete, "discrete"), (Integrated, "integrated"), (Virtual, "virtual"), (Cpu, "cpu"), (Other, "other")]
+        {
+            assert_eq!(kind.to_string(), name);
+            assert_eq!(serde_json::to_value(kind).unwrap(), name);
+        }
+    }
 }

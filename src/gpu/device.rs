@@ -1,6 +1,6 @@
 //! Instance, adapter choice, adoption of someone else's device, validation layer and debug names.
 
-use super::capabilities::{DeviceInfo, MATRIX_EXTENSIONS, compute_family, describe};
+use super::capabilities::{DeviceInfo, DeviceKind, MATRIX_EXTENSIONS, compute_family, describe};
 use crate::error::{Error, Result};
 use ash::{ext, khr, vk};
 use gpu_allocator::AllocationSizes;
@@ -198,10 +198,10 @@ fn choose(
         }
     };
     let rank = |d: &DeviceInfo| match d.kind {
-        "discrete" => 0,
-        "integrated" => 1,
-        "virtual" => 2,
-        _ => 3,
+        DeviceKind::Discrete => 0,
+        DeviceKind::Integrated => 1,
+        DeviceKind::Virtual => 2,
+        DeviceKind::Cpu | DeviceKind::Other => 3,
     };
     let wanted = select.map(str::to_lowercase);
     let chosen = match &wanted {

@@ -1,7 +1,7 @@
 //! Sizes and variants of the kernels, chosen for a device, with the reasons.
 
 use crate::choice::Choice;
-use crate::gpu::capabilities::DeviceInfo;
+use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
 use crate::gpu::memory::Operands;
 use serde::Serialize;
 
@@ -85,7 +85,7 @@ impl Tuning {
         };
         let (layers, why) = match info.matrices.first() {
             None => (Layers::F32, "f32 layers: the device has no cooperative matrices our kernels can use".to_owned()),
-            Some(_) if info.kind == "cpu" => {
+            Some(_) if info.is_cpu() => {
                 (Layers::F32, "f32 layers: a CPU emulates cooperative matrices, several times slower".to_owned())
             }
             Some(s) => (Layers::Matrices, format!("matrix layers, {}x{}x{}: f16 operands, f32 sums", s.m, s.n, s.k)),
@@ -93,18 +93,18 @@ impl Tuning {
         reasons.push(why);
         let matrices = match info.multiprocessors {
             // Unrolled, a CPU driver compiles these kernels for minutes.
-            _ if info.kind == "cpu" => MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false },
+            _ if info.is_cpu() => MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false },
             // Two workgroups per multiprocessor; 132 of them where the driver does not tell their number.
             n => MatrixTuning { workgroups: if n == 0 { 264 } else { 2 * n }, largest_tile: 128, unroll: true },
         };
         // Some kilobytes per sample must fit beside all else.
         let chunk_samples = match info.kind {
-            "cpu" => 1 << 17,
+            DeviceKind::Cpu => 1 << 17,
             _ => (info.device_memory >> 14).clamp(1 << 16, 1 << 19) as u32,
         };
-        let overlap = info.kind != "cpu";
+        let overlap = !info.is_cpu();
         // Shared memory is no faster on a CPU.
-        let private_line_bytes = if info.kind == "cpu" { 0 } else { info.max_shared_memory / 2 };
+        let private_line_bytes = if info.is_cpu() { 0 } else { info.max_shared_memory / 2 };
         reasons.push(match private_line_bytes {
             0 => "static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into(),
             _ => "static gradients through 32-bit integer atomics, lines in shared memory first: exact sums".into(),

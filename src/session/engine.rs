@@ -145,7 +145,7 @@ impl Shared {
             (inbox.training_dataset()?, inbox.options.config.clone())
         };
         let mut tuning = tuning.clone();
-        if gpu.info().kind == "cpu" {
+        if gpu.info().is_cpu() {
             // Views wait for what was submitted before them.
             tuning.iterations_per_submit = Some(1);
         }

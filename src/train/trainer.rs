@@ -27,7 +27,7 @@ const EXPLOSION: f64 = 1e6;
 /// Submits under way at once: two keep a GPU from waiting for the host; on a CPU nothing waits, and views of a run in
 /// training come up sooner.
 fn submits_in_flight(gpu: &Gpu) -> usize {
-    if gpu.info().kind == "cpu" { 1 } else { 2 }
+    if gpu.info().is_cpu() { 1 } else { 2 }
 }
 
 /// Losses of one iteration.
