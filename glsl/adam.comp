@@ -5,7 +5,7 @@
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
 layout(binding = 3) readonly buffer B3 { float gradient[]; };
 layout(binding = 4) buffer B4 { vec2 moments[]; };
@@ -14,10 +14,10 @@ layout(binding = 5) buffer B5 { float params[]; };
 void main() {
     uint i = gl_GlobalInvocationID.x;
     if (i >= setup.n_params) return;
-    Schedule now = schedule[state[0]];
+    Schedule now = schedule[state.step];
     bool is_static = i < setup.static_params;
-    // state[2]: the network's gradient overflowed, so this update is skipped.
-    if (!is_static && (now.dynamic_active == 0u || state[2] != 0u)) return;
+    // The network's gradient overflowed, so this update is skipped.
+    if (!is_static && (now.dynamic_active == 0u || state.overflowed != 0u)) return;
     float g = gradient[i];
     vec2 moment = now.reset != 0u ? vec2(0.0) : moments[i];
     moment.x = setup.beta1 * moment.x + (1.0 - setup.beta1) * g;

@@ -3,8 +3,11 @@
 // Integral or maximum of baked volumes along the rays of a pose, sampled by the hardware. One invocation per pixel.
 //   image[pixel]: line integral, or largest attenuation per world unit, of the fields asked for.
 #include "inc/layout.glsl"
+#include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint n_pixels; uint image_width; uint with_static; uint with_dynamic; uint maximum; } push;
+layout(push_constant) uniform Push {
+    uint n_pixels; uint image_width; uint with_static; uint with_dynamic; uint maximum;
+} push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { View views[]; };
 layout(binding = 2) uniform sampler3D static_volume;
@@ -12,27 +15,27 @@ layout(binding = 3) uniform sampler3D dynamic_volume;
 layout(binding = 4) writeonly buffer B4 { float image[]; };
 
 // Depths between which a ray is inside a box.
-vec2 crossing(vec3 anchor, vec3 direction, vec3 low, vec3 high) {
-    vec3 a = (low - anchor) / direction;
-    vec3 b = (high - anchor) / direction;
+vec2 crossing(Line line, vec3 low, vec3 high) {
+    vec3 a = (low - line.anchor) / line.direction;
+    vec3 b = (high - line.anchor) / line.direction;
     vec3 near = min(a, b);
     vec3 far = max(a, b);
     return vec2(max(max(near.x, near.y), near.z), min(min(far.x, far.y), far.z));
 }
 
 // Integral and maximum of a volume over the box, within a range of depths, in steps of about a cell, at their middles.
-vec2 along(sampler3D volume, vec3 anchor, vec3 direction, float norm, vec3 low, vec3 high, vec2 depths) {
-    vec2 span = crossing(anchor, direction, low, high);
+vec2 along(sampler3D volume, Line line, float norm, vec3 low, vec3 high, vec2 depths) {
+    vec2 span = crossing(line, low, high);
     span = vec2(max(span.x, depths.x), min(span.y, depths.y));
     if (!(span.y > span.x)) return vec2(0.0);
     vec3 cells = vec3(textureSize(volume, 0));
     // Cell centres of the first and last cells lie on the faces of the box.
     vec3 per_unit = (cells - 1.0) / (high - low);
-    float crossed = length(direction * per_unit) * (span.y - span.x);
+    float crossed = length(line.direction * per_unit) * (span.y - span.x);
     uint n = uint(ceil(max(crossed, 1.0)));
     float step = (span.y - span.x) / float(n);
-    vec3 start = ((anchor + (span.x + 0.5 * step) * direction - low) * per_unit + 0.5) / cells;
-    vec3 advance = step * direction * per_unit / cells;
+    vec3 start = ((line.anchor + (span.x + 0.5 * step) * line.direction - low) * per_unit + 0.5) / cells;
+    vec3 advance = step * line.direction * per_unit / cells;
     float sum = 0.0;
     float largest = 0.0;
     for (uint i = 0u; i < n; i++) {
@@ -46,25 +49,17 @@ vec2 along(sampler3D volume, vec3 anchor, vec3 direction, float norm, vec3 low, 
 void main() {
     uint pixel = gl_GlobalInvocationID.x;
     if (pixel >= push.n_pixels) return;
-    View view = views[0];
-    float i = float(pixel % push.image_width);
-    float j = float(pixel / push.image_width);
-    vec3 anchor = view.anchor00.xyz + i * view.anchor_du.xyz + j * view.anchor_dv.xyz;
-    vec3 direction = view.direction00.xyz + i * view.direction_du.xyz + j * view.direction_dv.xyz;
-    float norm = length(direction);
+    Line line = line_through(views[0], pixel, push.image_width);
+    float norm = length(line.direction);
     vec2 still = vec2(0.0);
     vec2 moving = vec2(0.0);
     if (push.with_static != 0u) {
-        still = setup.static_gain * along(static_volume, anchor, direction, norm,
-                      vec3(setup.static_min_x, setup.static_min_y, setup.static_min_z),
-                      vec3(setup.static_max_x, setup.static_max_y, setup.static_max_z),
-                      vec2(setup.static_near, setup.static_far));
+        still = setup.static_gain * along(static_volume, line, norm, setup.static_min, setup.static_max,
+                                          vec2(setup.static_near, setup.static_far));
     }
     if (push.with_dynamic != 0u) {
-        moving = setup.dynamic_gain * along(dynamic_volume, anchor, direction, norm,
-                      vec3(setup.dynamic_min_x, setup.dynamic_min_y, setup.dynamic_min_z),
-                      vec3(setup.dynamic_max_x, setup.dynamic_max_y, setup.dynamic_max_z),
-                      vec2(setup.dynamic_near, setup.dynamic_far));
+        moving = setup.dynamic_gain * along(dynamic_volume, line, norm, setup.dynamic_min, setup.dynamic_max,
+                                            vec2(setup.dynamic_near, setup.dynamic_far));
     }
     image[pixel] = push.maximum != 0u ? max(still.y, moving.y) : still.x + moving.x;
 }

@@ -4,9 +4,10 @@
 //   rays[n_rays] <- permutations of motion_rays and of all training rays, without replacement.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
+#include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { View views[]; };
 layout(binding = 3) readonly buffer B3 { Frame frames[]; };
 layout(binding = 4) readonly buffer B4 { float images[]; };
@@ -15,7 +16,7 @@ layout(binding = 6) readonly buffer B6 { uint motion_rays[]; };
 layout(binding = 7) writeonly buffer B7 { Ray rays[]; };
 
 uint draw(uint slot, uint per_step, uint n, uint stream) {
-    uint counter = state[0] * per_step + slot;
+    uint counter = state.step * per_step + slot;
     return permute(counter % n, n, setup.seed, counter / n, stream);
 }
 
@@ -24,20 +25,19 @@ void main() {
     if (r >= setup.n_rays) return;
     uint id;
     if (r < setup.n_motion_rays) {
-        id = motion_rays[draw(r, setup.n_motion_rays, setup.n_motion_list, STREAM_RAY + 1u)];
+        id = motion_rays[draw(r, setup.n_motion_rays, setup.n_motion_list, STREAM_MOTION_RAY)];
     } else {
         id = draw(r - setup.n_motion_rays, setup.n_rays - setup.n_motion_rays, setup.n_all_rays, STREAM_RAY);
     }
     Frame frame = frames[id / setup.n_pixels];
     View view = views[frame.view];
     uint pixel = id % setup.n_pixels;
-    float i = float(pixel % setup.image_width);
-    float j = float(pixel / setup.image_width);
+    Line line = line_through(view, pixel, setup.image_width);
     Ray ray;
-    ray.anchor = view.anchor00.xyz + i * view.anchor_du.xyz + j * view.anchor_dv.xyz;
+    ray.anchor = line.anchor;
     ray.phase = frame.phase;
-    ray.direction = view.direction00.xyz + i * view.direction_du.xyz + j * view.direction_dv.xyz;
-    ray.norm = length(ray.direction);
+    ray.direction = line.direction;
+    ray.norm = length(line.direction);
     ray.target = images[frame.image_offset + pixel];
     vec2 background = backgrounds[frame.background_offset + pixel];
     ray.temporal_low = ray.target - background.y;

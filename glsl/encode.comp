@@ -4,11 +4,12 @@
 //   sample_phases[s] = phase of the sample's ray;
 //   features[q * capacity + s] = vec4 of numbers 4q..4q+3 of the encoding, zero-padded.
 #include "inc/layout.glsl"
+#include "inc/sample_rays.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
-layout(binding = 3) readonly buffer B3 { uint live[]; };
+layout(binding = 3) readonly buffer B3 { LiveSamples live; };
 layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
 layout(binding = 5) readonly buffer B5 { uint sample_rays[]; };
 layout(binding = 6) readonly buffer B6 { Ray rays[]; };
@@ -19,16 +20,16 @@ layout(binding = 8) writeonly buffer B8 { uint sample_phases[]; };
 
 void main() {
     uint s = gl_GlobalInvocationID.x;
-    if (s >= live[1]) return;
+    if (s >= live.padded) return;
     uint groups = (3u + 6u * setup.n_bands + 3u) / 4u;
     uint stride = setup.sample_capacity;
-    if (s >= live[0]) {
+    if (s >= live.count) {
         sample_phases[s] = 0u;
         for (uint q = 0u; q < groups; q++) features[q * stride + s] = vec4(0.0);
         return;
     }
-    sample_phases[s] = rays[sample_rays[s] & 0x7fffffffu].phase;
-    float window = schedule[state[0]].window;
+    sample_phases[s] = rays[ray_of(sample_rays[s])].phase;
+    float window = schedule[state.step].window;
     vec3 x = encoded_point(sample_points[s].xyz);
     // Two bands make 12 numbers, so three whole vec4 leave the carry (x, y, z) as it was.
     vec3 carry = x;

@@ -15,7 +15,7 @@ layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint private_lines = 0u;  // numbers on all lines, or 0: straight to memory
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 layout(binding = 3) readonly buffer B3 { vec2 ray_gradient[]; };
 READ_VEC4(4, B4, static_params);
@@ -76,11 +76,11 @@ void main() {
     float scale_high = exp2(float(setup.fixed_point_bits) - 32.0);
     for (uint k = gl_LocalInvocationID.x; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {
         float depth = depth_at(k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
-                               setup.seed, state[0], stream);
+                               setup.seed, state.step, stream);
         vec3 x = ray.anchor + depth * ray.direction;
         if (!static_inside(x)) continue;
         float dl = path_length(depth, k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
-                                   setup.seed, state[0], stream, ray.norm);
+                                   setup.seed, state.step, stream, ray.norm);
         float at_feature = gradient * dl * setup.static_gain * sigmoid(vm_feature(x) + setup.static_shift);
         vec3 coordinate = vm_coordinate(x);
         for (uint mode = 0u; mode < 3u; mode++) {

@@ -26,7 +26,7 @@ void main() {
         uint first = begin + 32u * word;
         for (uint k = first; k < min(first + 32u, end); k++) {
             vec3 x = ray.anchor + dynamic_depth(k, ray) * ray.direction;
-            if (dynamic_inside(x, ray.phase) && occupied(x, ray.phase, state[0])) mask |= 1u << (k - first);
+            if (dynamic_inside(x, ray.phase) && occupied(x, ray.phase, state.step)) mask |= 1u << (k - first);
         }
         lane_masks[(r * gl_WorkGroupSize.x + lane) * mask_words() + word] = mask;
         live += bitCount(mask);

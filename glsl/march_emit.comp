@@ -1,10 +1,10 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Writes the live dynamic samples of a chunk, in ray and depth order.
-//   sample_points[s] = (x, y, z, path length);  sample_rays[s] = ray of the batch.
-//   Near samples subject to occlusion minimisation carry the top bit of sample_rays.
+//   sample_points[s] = (x, y, z, path length);  sample_rays[s] = ray of the batch, and whether near.
 #include "inc/march_samples.glsl"
-layout(binding = 3) readonly buffer B3 { uint live[]; };
+#include "inc/sample_rays.glsl"
+layout(binding = 3) readonly buffer B3 { LiveSamples live; };
 layout(binding = 4) readonly buffer B4 { uint lane_masks[]; };
 layout(binding = 5) readonly buffer B5 { uint lane_offsets[]; };
 layout(binding = 6) readonly buffer B6 { uint ray_start[]; };
@@ -12,7 +12,7 @@ layout(binding = 7) writeonly buffer B7 { vec4 sample_points[]; };
 layout(binding = 8) writeonly buffer B8 { uint sample_rays[]; };
 
 void main() {
-    if (live[0] == 0u) return;
+    if (live.count == 0u) return;
     uint lane = gl_LocalInvocationID.x;
     uint r = gl_WorkGroupID.x;
     uint slot = ray_start[r] + lane_offsets[r * gl_WorkGroupSize.x + lane];
@@ -24,9 +24,9 @@ void main() {
             uint k = lane * run_length() + 32u * word + uint(findLSB(mask));
             float depth = dynamic_depth(k, ray);
             float dl = path_length(depth, k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far,
-                                   setup.jitter, setup.seed, state[0], depth_stream(ray), ray.norm);
+                                   setup.jitter, setup.seed, state.step, depth_stream(ray), ray.norm);
             sample_points[slot] = vec4(ray.anchor + depth * ray.direction, dl);
-            sample_rays[slot] = (push.first_ray + r) | (depth < setup.occlusion_depth ? 0x80000000u : 0u);
+            sample_rays[slot] = sample_ray(push.first_ray + r, depth < setup.occlusion_depth);
             slot++;
         }
     }

@@ -6,12 +6,13 @@
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
 #include "inc/softplus.glsl"
+#include "inc/sample_rays.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint with_maxima = 0u;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 layout(binding = 3) readonly buffer B3 { uint ray_start[]; };
 layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
@@ -33,12 +34,12 @@ void main() {
     uint n_static = with_maxima == 0u && skips_static(r) ? 0u : setup.n_static_samples;
     for (uint k = lane; k < n_static; k += gl_WorkGroupSize.x) {
         float depth = depth_at(k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
-                               setup.seed, state[0], stream);
+                               setup.seed, state.step, stream);
         vec3 x = ray.anchor + depth * ray.direction;
         if (static_inside(x)) {
             float sigma = static_attenuation(x);
             static_sum += sigma * path_length(depth, k, setup.n_static_samples, setup.static_near, setup.static_far, setup.jitter,
-                                       setup.seed, state[0], stream, ray.norm);
+                                       setup.seed, state.step, stream, ray.norm);
             static_max = max(static_max, sigma);
         }
     }
@@ -51,7 +52,7 @@ void main() {
         vec4 point = sample_points[s];
         float sigma = sample_sigma[s].x;
         dynamic_sum += sigma * point.w;
-        if ((sample_rays[s] & 0x80000000u) != 0u) occlusion += sigma * point.w;
+        if (is_near(sample_rays[s])) occlusion += sigma * point.w;
         if (with_maxima != 0u) {
             dynamic_max = max(dynamic_max, sigma);
             total_max = max(total_max, sigma + (static_inside(point.xyz) ? static_attenuation(point.xyz) : 0.0));
@@ -69,7 +70,5 @@ void main() {
         result.dynamic_max = workgroup_max(dynamic_max);
         result.total_max = max(workgroup_max(total_max), result.static_max);
     }
-    result.spare0 = 0.0;
-    result.spare1 = 0.0;
     if (lane == 0u) ray_out[r] = result;
 }

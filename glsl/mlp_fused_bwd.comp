@@ -7,9 +7,11 @@
 //   inputs16[s][columns]: activations of the layer below, or the encoding.
 //   dz_in16[s][columns] = (W^T dz) where the input was on, if `with_input`.
 //   partials[workgroup][n_partials]: weight gradient [width][columns] at `weights`, bias gradient at `bias`, and for
-//   the last layer those of the output neuron at `out_weights` and `out_bias`; ~0 skips one.
+//   the last layer those of the output neuron at `out_weights` and `out_bias`; NOWHERE skips one.
 #include "inc/matrices.glsl"
 #include "inc/layout.glsl"
+#include "inc/positions.glsl"
+#include "inc/sample_rays.glsl"
 layout(constant_id = 7) const uint columns = 128u;
 layout(constant_id = 8) const uint with_input = 1u;
 layout(constant_id = 9) const uint from_output = 0u;  // the layer is the last
@@ -19,8 +21,8 @@ layout(push_constant) uniform Push {
     uint out_weights; uint out_bias; uint accumulate;
 } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
-layout(binding = 2) readonly buffer B2 { uint live[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
+layout(binding = 2) readonly buffer B2 { LiveSamples live; };
 layout(binding = 3) readonly buffer B3 { vec4 sample_points[]; };
 layout(binding = 4) readonly buffer B4 { uint sample_rays[]; };
 layout(binding = 5) readonly buffer B5 { vec2 sample_sigma[]; };
@@ -59,11 +61,10 @@ float out_sum[8];
 float out_bias_sum;
 
 float sample_gradient(uint s) {
-    if (s >= live[0]) return 0.0;
+    if (s >= live.count) return 0.0;
     uint ray = sample_rays[s];
-    float per_integral = ray_gradient[ray & 0x7fffffffu].y
-                       + ((ray & 0x80000000u) != 0u ? setup.occlusion_weight : 0.0);
-    return uintBitsToFloat(state[1]) * per_integral * sample_points[s].w * sample_sigma[s].y;
+    float per_integral = ray_gradient[ray_of(ray)].y + (is_near(ray) ? setup.occlusion_weight : 0.0);
+    return state.loss_scale * per_integral * sample_points[s].w * sample_sigma[s].y;
 }
 
 void stage(uint first) {
@@ -180,7 +181,7 @@ void main() {
         out_sum[i] = 0.0;
     }
     out_bias_sum = 0.0;
-    uint tiles = (live[1] + tile - 1u) / tile;
+    uint tiles = (live.padded + tile - 1u) / tile;
     [[dont_unroll]] for (uint t = gl_WorkGroupID.x; t < tiles; t += gl_NumWorkGroups.x) {
         stage(t * tile);
         if (with_input != 0u) input_gradient(t * tile);
@@ -202,8 +203,8 @@ void main() {
             }
         }
     }
-    if (push.bias != ~0u) put_neuron_sums(bias_sum, mine + push.bias);
-    if (push.out_weights != ~0u) {
+    if (push.bias != NOWHERE) put_neuron_sums(bias_sum, mine + push.bias);
+    if (push.out_weights != NOWHERE) {
         put_neuron_sums(out_sum, mine + push.out_weights);
         barrier();
         tile_dz[gl_LocalInvocationIndex].x = floatBitsToUint(out_bias_sum);

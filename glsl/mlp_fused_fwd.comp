@@ -9,6 +9,7 @@
 //   the output weights, n rows of which the first counts.
 #include "inc/matrices.glsl"
 #include "inc/layout.glsl"
+#include "inc/sample_rays.glsl"
 #include "inc/softplus.glsl"
 layout(constant_id = 7) const uint encoded = 80u;     // numbers of encoding and one-hot phase, padded
 layout(constant_id = 8) const uint layers = 4u;       // hidden layers
@@ -16,9 +17,9 @@ layout(constant_id = 9) const uint skip = 0u;         // layer (from 0) that see
 layout(constant_id = 10) const uint keep = 1u;
 layout(push_constant) uniform Push { uint out_bias; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
-layout(binding = 3) readonly buffer B3 { uint live[]; };
+layout(binding = 3) readonly buffer B3 { LiveSamples live; };
 layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
 layout(binding = 5) readonly buffer B5 { uint sample_rays[]; };
 layout(binding = 6) readonly buffer B6 { Ray rays[]; };
@@ -58,14 +59,14 @@ float input_number(uint i, vec3 x, uint phase, float window) {
 
 // One invocation writes eight numbers of a sample at a time.
 void encode_tile(uint first) {
-    float window = schedule[state[0]].window;
+    float window = schedule[state.step].window;
     for (uint e = gl_LocalInvocationIndex; e < tile * encoded8; e += gl_WorkGroupSize.x) {
         uint row = e / encoded8;
         uint s = first + row;
         uvec4 packed = uvec4(0u);
-        if (s < live[0]) {
+        if (s < live.count) {
             vec3 x = encoded_point(sample_points[s].xyz);
-            uint phase = rays[sample_rays[s] & 0x7fffffffu].phase;
+            uint phase = rays[ray_of(sample_rays[s])].phase;
             for (uint pair = 0u; pair < 4u; pair++) {
                 uint i = 8u * (e % encoded8) + 2u * pair;
                 packed[pair] = pack2(vec2(input_number(i, x, phase, window), input_number(i + 1u, x, phase, window)));

@@ -19,13 +19,13 @@ layout(push_constant) uniform Push {
 READ_VEC4(0, B0, dz);
 READ_VEC4(1, B1, params);
 layout(binding = 2) readonly buffer B2 { vec4 activations[]; };
-layout(binding = 3) readonly buffer B3 { uint live[]; };
+layout(binding = 3) readonly buffer B3 { LiveSamples live; };
 layout(binding = 4) writeonly buffer B4 { vec4 dz_in[]; };
 
 void main() {
     uint base = gl_WorkGroupID.x * (gl_WorkGroupSize.x * SAMPLES) + gl_LocalInvocationID.x;
     uint first = gl_WorkGroupID.y * GROUPS;
-    uint padded = live[1];
+    uint padded = live.padded;
     vec4 sum[GROUPS][SAMPLES];
     [[unroll]] for (uint i = 0u; i < GROUPS; i++) {
         [[unroll]] for (uint t = 0u; t < SAMPLES; t++) sum[i][t] = vec4(0.0);

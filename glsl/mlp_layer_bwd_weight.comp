@@ -8,6 +8,7 @@
 //   partials[split][parameter]; later chunks of an iteration add to what the first wrote.
 #include "inc/operands.glsl"
 #include "inc/layout.glsl"
+#include "inc/positions.glsl"
 #ifndef NEURONS4
 #define NEURONS4 4u
 #endif
@@ -19,13 +20,13 @@
 layout(local_size_x = 16, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
     uint in_groups; uint weights; uint capacity; uint splits; uint n_partials; uint accumulate;
-    uint bias;  // also sum dz into this parameter, unless it is ~0
+    uint bias;  // also sum dz into this parameter, unless it is NOWHERE
     uint out_groups;
     ADDRESS_OF(dz) ADDRESS_OF(inputs)
 } push;
 READ_VEC4(0, B0, dz);
 READ_VEC4(1, B1, inputs);
-layout(binding = 2) readonly buffer B2 { uint live[]; };
+layout(binding = 2) readonly buffer B2 { LiveSamples live; };
 layout(binding = 3) buffer B3 { float partials[]; };
 
 vec4 sum[NEURONS4][INPUTS];
@@ -64,14 +65,14 @@ void walk(bool with_bias, uint j4, uint k0, uint begin, uint end) {
 void main() {
     uint j4 = gl_WorkGroupID.x * NEURONS4;
     uint k0 = gl_WorkGroupID.y * INPUTS * gl_WorkGroupSize.x + gl_LocalInvocationID.x;
-    uint per = (live[1] / STEP + push.splits - 1u) / push.splits * STEP;  // live[1] is a multiple of 64
+    uint per = (live.padded / STEP + push.splits - 1u) / push.splits * STEP;  // live.padded is a multiple of STEP
     uint begin = gl_WorkGroupID.z * per;
-    uint end = min(begin + per, live[1]);
+    uint end = min(begin + per, live.padded);
     [[unroll]] for (uint j = 0u; j < NEURONS4; j++) {
         bias_sum[j] = vec4(0.0);
         [[unroll]] for (uint i = 0u; i < INPUTS; i++) sum[j][i] = vec4(0.0);
     }
-    bool with_bias = push.bias != ~0u && gl_WorkGroupID.y == 0u;
+    bool with_bias = push.bias != NOWHERE && gl_WorkGroupID.y == 0u;
     if (with_bias) walk(true, j4, k0, begin, end);
     else walk(false, j4, k0, begin, end);
     [[unroll]] for (uint j = 0u; j < NEURONS4; j++) {

@@ -21,7 +21,7 @@ layout(push_constant) uniform Push {
 READ_VEC4(0, B0, input_a);
 READ_VEC4(1, B1, input_b);
 READ_VEC4(2, B2, params);
-layout(binding = 3) readonly buffer B3 { uint live[]; };
+layout(binding = 3) readonly buffer B3 { LiveSamples live; };
 layout(binding = 4) readonly buffer B4 { uint sample_phases[]; };
 layout(binding = 5) readonly buffer B5 { vec4 phase_bias[]; };
 layout(binding = 6) writeonly buffer B6 { vec4 activations[]; };
@@ -47,7 +47,7 @@ uint sample_of(uint t) {
 
 void main() {
     base = gl_WorkGroupID.x * (gl_WorkGroupSize.x * SAMPLES) + gl_LocalInvocationID.x;
-    padded = live[1];
+    padded = live.padded;
     uint first = gl_WorkGroupID.y * OUTPUTS;
     float sum[OUTPUTS][SAMPLES];
     [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {

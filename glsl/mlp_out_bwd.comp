@@ -3,11 +3,12 @@
 // Gradient at the output neuron and at the last hidden layer. One invocation per padded sample.
 //   sample_feature_gradient[s] = dL/df;  dz[q * capacity + s] = w_out * dL/df where the neuron was on.
 #include "inc/layout.glsl"
+#include "inc/sample_rays.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint groups; uint weights4; uint capacity; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint live[]; };
+layout(binding = 1) readonly buffer B1 { LiveSamples live; };
 layout(binding = 2) readonly buffer B2 { vec4 sample_points[]; };
 layout(binding = 3) readonly buffer B3 { uint sample_rays[]; };
 layout(binding = 4) readonly buffer B4 { vec2 sample_sigma[]; };
@@ -19,12 +20,11 @@ layout(binding = 9) writeonly buffer B9 { vec4 dz[]; };
 
 void main() {
     uint s = gl_GlobalInvocationID.x;
-    if (s >= live[1]) return;
+    if (s >= live.padded) return;
     float gradient = 0.0;
-    if (s < live[0]) {
+    if (s < live.count) {
         uint ray = sample_rays[s];
-        float per_integral = ray_gradient[ray & 0x7fffffffu].y
-                           + ((ray & 0x80000000u) != 0u ? setup.occlusion_weight : 0.0);
+        float per_integral = ray_gradient[ray_of(ray)].y + (is_near(ray) ? setup.occlusion_weight : 0.0);
         gradient = per_integral * sample_points[s].w * sample_sigma[s].y;
     }
     sample_feature_gradient[s] = gradient;

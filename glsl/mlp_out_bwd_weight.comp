@@ -6,7 +6,7 @@
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint weights; uint bias; uint capacity; uint splits; uint n_partials; uint accumulate; } push;
-layout(binding = 0) readonly buffer B0 { uint live[]; };
+layout(binding = 0) readonly buffer B0 { LiveSamples live; };
 layout(binding = 1) readonly buffer B1 { float sample_feature_gradient[]; };
 READ_VEC4(2, B2, activations);
 layout(binding = 3) buffer B3 { float partials[]; };
@@ -19,9 +19,9 @@ void put(uint parameter, float value) {
 
 void main() {
     uint q = gl_WorkGroupID.x;
-    uint per = (live[1] + push.splits - 1u) / push.splits;
+    uint per = (live.padded + push.splits - 1u) / push.splits;
     uint begin = gl_WorkGroupID.y * per;
-    uint end = min(begin + per, live[1]);
+    uint end = min(begin + per, live.padded);
     vec4 sum = vec4(0.0);
     float bias = 0.0;
     for (uint s = begin + gl_LocalInvocationID.x; s < end; s += gl_WorkGroupSize.x) {

@@ -2,7 +2,8 @@
 #extension GL_GOOGLE_include_directive : require
 // f16 copies of the network's weights as the fused kernels read them, and f32 biases repeated over the rows of a
 // product. One invocation per pair of f16, then one per bias element.
-//   source[i]: where element i comes from: a parameter; PHASE_BIAS | index of phase_bias; or NOTHING, zero.
+//   source[i]: where element i comes from: a parameter; PHASE_BIAS | index of phase_bias; or NOWHERE, zero.
+#include "inc/positions.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_pairs; uint n_bias; } push;
 layout(binding = 0) readonly buffer B0 { float params[]; };
@@ -11,12 +12,9 @@ layout(binding = 2) readonly buffer B2 { uint pack_source[]; };
 layout(binding = 3) writeonly buffer B3 { uint weights16[]; };
 layout(binding = 4) writeonly buffer B4 { float bias_rows[]; };
 
-const uint NOTHING = 0xffffffffu;
-const uint PHASE_BIAS = 0x80000000u;
-
 float value(uint i) {
     uint source = pack_source[i];
-    if (source == NOTHING) return 0.0;
+    if (source == NOWHERE) return 0.0;
     return (source & PHASE_BIAS) != 0u ? phase_bias[source & ~PHASE_BIAS] : params[source];
 }
 

@@ -2,10 +2,11 @@
 #extension GL_GOOGLE_include_directive : require
 // Notes for the cell of each live sample that it was seen, and whether it was occupied. One invocation per sample.
 #include "inc/layout.glsl"
+#include "inc/sample_rays.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
-layout(binding = 2) readonly buffer B2 { uint live[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
+layout(binding = 2) readonly buffer B2 { LiveSamples live; };
 layout(binding = 3) readonly buffer B3 { vec4 sample_points[]; };
 layout(binding = 4) readonly buffer B4 { uint sample_rays[]; };
 layout(binding = 5) readonly buffer B5 { Ray rays[]; };
@@ -15,9 +16,10 @@ layout(binding = 7) buffer B7 { uint occupancy[]; };
 
 void main() {
     uint s = gl_GlobalInvocationID.x;
-    if (s >= live[0]) return;
-    uint entry = occupancy_entry(sample_points[s].xyz, rays[sample_rays[s] & 0x7fffffffu].phase);
+    if (s >= live.count) return;
+    uint entry = occupancy_entry(sample_points[s].xyz, rays[ray_of(sample_rays[s])].phase);
     uint bits = SEEN | (sample_sigma[s].x > setup.occupancy_threshold ? OCCUPIED : 0u);
-    uint epoch = state[0] / OCCUPANCY_EPOCH;
-    atomicOr(occupancy[(epoch % 3u) * occupancy_words() + entry / 16u], bits << (2u * (entry % 16u)));
+    uint epoch = state.step / OCCUPANCY_EPOCH;
+    uint word = (epoch % OCCUPANCY_EPOCHS) * occupancy_words() + entry / CELLS_PER_WORD;
+    atomicOr(occupancy[word], bits << (2u * (entry % CELLS_PER_WORD)));
 }

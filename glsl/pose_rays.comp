@@ -2,6 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 // Rays of consecutive pixels of one pose, for rendering. One invocation per ray.
 #include "inc/layout.glsl"
+#include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_pixel; uint n_rays; uint phase; uint image_width; uint view; } push;
 layout(binding = 0) readonly buffer B0 { View views[]; };
@@ -10,15 +11,13 @@ layout(binding = 1) writeonly buffer B1 { Ray rays[]; };
 void main() {
     uint r = gl_GlobalInvocationID.x;
     if (r >= push.n_rays) return;
-    View view = views[push.view];
     uint pixel = push.first_pixel + r;
-    float i = float(pixel % push.image_width);
-    float j = float(pixel / push.image_width);
+    Line line = line_through(views[push.view], pixel, push.image_width);
     Ray ray;
-    ray.anchor = view.anchor00.xyz + i * view.anchor_du.xyz + j * view.anchor_dv.xyz;
+    ray.anchor = line.anchor;
     ray.phase = push.phase;
-    ray.direction = view.direction00.xyz + i * view.direction_du.xyz + j * view.direction_dv.xyz;
-    ray.norm = length(ray.direction);
+    ray.direction = line.direction;
+    ray.norm = length(line.direction);
     ray.target = 0.0;
     ray.temporal_low = 0.0;
     ray.id = pixel;

@@ -4,20 +4,21 @@
 // equal depth steps between near and far, zero outside.
 //   integrals[first_pixel + pixel] += scale * sum sigma * path length
 #include "inc/layout.glsl"
+#include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
     vec4 row_x; vec4 row_y; vec4 row_z;   // world units -> voxel index
-    uint nx; uint ny; uint nz; uint view;
+    uvec3 size; uint view;
     float near; float far; uint steps; float scale;
-    uint image_width; uint n_pixels; uint first_pixel; uint spare;
+    uint image_width; uint n_pixels; uint first_pixel;
 } push;
 layout(binding = 0) readonly buffer B0 { View views[]; };
 layout(binding = 1) readonly buffer B1 { float volume[]; };
 layout(binding = 2) buffer B2 { float integrals[]; };
 
 float voxel(ivec3 cell) {
-    if (any(lessThan(cell, ivec3(0))) || any(greaterThanEqual(cell, ivec3(push.nx, push.ny, push.nz)))) return 0.0;
-    return volume[(uint(cell.z) * push.ny + uint(cell.y)) * push.nx + uint(cell.x)];
+    if (any(lessThan(cell, ivec3(0))) || any(greaterThanEqual(cell, ivec3(push.size)))) return 0.0;
+    return volume[(uint(cell.z) * push.size.y + uint(cell.y)) * push.size.x + uint(cell.x)];
 }
 
 float trilinear(vec3 index) {
@@ -35,16 +36,13 @@ float trilinear(vec3 index) {
 void main() {
     uint pixel = gl_GlobalInvocationID.x;
     if (pixel >= push.n_pixels) return;
-    View view = views[push.view];
-    float i = float(pixel % push.image_width);
-    float j = float(pixel / push.image_width);
-    vec3 anchor = view.anchor00.xyz + i * view.anchor_du.xyz + j * view.anchor_dv.xyz;
-    vec3 direction = view.direction00.xyz + i * view.direction_du.xyz + j * view.direction_dv.xyz;
+    Line line = line_through(views[push.view], pixel, push.image_width);
     // March in index space; skip to the slab where the ray meets the volume.
-    vec3 start = vec3(dot(push.row_x.xyz, anchor) + push.row_x.w, dot(push.row_y.xyz, anchor) + push.row_y.w,
-                      dot(push.row_z.xyz, anchor) + push.row_z.w);
-    vec3 rate = vec3(dot(push.row_x.xyz, direction), dot(push.row_y.xyz, direction), dot(push.row_z.xyz, direction));
-    vec3 size = vec3(push.nx, push.ny, push.nz);
+    vec3 start = vec3(dot(push.row_x.xyz, line.anchor) + push.row_x.w, dot(push.row_y.xyz, line.anchor) + push.row_y.w,
+                      dot(push.row_z.xyz, line.anchor) + push.row_z.w);
+    vec3 rate = vec3(dot(push.row_x.xyz, line.direction), dot(push.row_y.xyz, line.direction),
+                     dot(push.row_z.xyz, line.direction));
+    vec3 size = vec3(push.size);
     vec3 safe_rate = mix(rate, vec3(1e-12), lessThan(abs(rate), vec3(1e-12)));
     vec3 t0 = (vec3(-1.0) - start) / safe_rate;
     vec3 t1 = (size - start) / safe_rate;
@@ -62,5 +60,5 @@ void main() {
             sum += trilinear(start + t * rate);
         }
     }
-    integrals[push.first_pixel + pixel] += push.scale * sum * depth_step * length(direction);
+    integrals[push.first_pixel + pixel] += push.scale * sum * depth_step * length(line.direction);
 }

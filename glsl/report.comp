@@ -2,33 +2,32 @@
 #extension GL_GOOGLE_include_directive : require
 // Closes an iteration: sums the losses into a ring the host reads now and then, adapts the loss scale, and counts
 // the step.
-//   ring[step % ring_length] = (data, dynamic data, TV, occlusion), (squared error, live samples, step + 1, scale).
-//   state = step, loss scale, whether the gradient overflowed, good updates since the scale changed.
+//   ring[step % ring_length]: what the iteration came to.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint loss_scaling = 0u;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) buffer B1 { uint state[]; };
+layout(binding = 1) buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { vec4 ray_loss[]; };
 layout(binding = 3) readonly buffer B3 { float tv_value[]; };
-layout(binding = 4) readonly buffer B4 { uint live[]; };
-layout(binding = 5) writeonly buffer B5 { vec4 ring[]; };
+layout(binding = 4) readonly buffer B4 { LiveSamples live; };
+layout(binding = 5) writeonly buffer B5 { StepReport ring[]; };
 #include "inc/reduce.glsl"
 
 const uint GOOD_UPDATES_TO_GROW = 500u;
 const float LARGEST_SCALE = 16777216.0;
 
 void adapt_scale(float scale) {
-    bool overflowed = state[2] != 0u;
-    uint good = overflowed ? 0u : state[3] + 1u;
+    bool overflowed = state.overflowed != 0u;
+    uint good = overflowed ? 0u : state.good_updates + 1u;
     if (overflowed) scale = max(0.5 * scale, 1.0);
     if (good == GOOD_UPDATES_TO_GROW) {
         scale = min(2.0 * scale, LARGEST_SCALE);
         good = 0u;
     }
-    state[1] = floatBitsToUint(scale);
-    state[2] = 0u;
-    state[3] = good;
+    state.loss_scale = scale;
+    state.overflowed = 0u;
+    state.good_updates = good;
 }
 
 void main() {
@@ -43,11 +42,11 @@ void main() {
     float squared = workgroup_sum(losses.w);
     tv = workgroup_sum(tv);
     if (lane == 0u) {
-        uint step = state[0];
-        uint slot = 2u * (step % setup.ring_length);
-        ring[slot] = vec4(data, dynamic_data, tv, setup.occlusion_weight * occlusion);
-        ring[slot + 1u] = vec4(squared, float(live[2]), float(step + 1u), uintBitsToFloat(state[1]));
-        if (loss_scaling != 0u && live[2] > 0u) adapt_scale(uintBitsToFloat(state[1]));
-        state[0] = step + 1u;
+        uint step = state.step;
+        ring[step % setup.ring_length] =
+            StepReport(data, dynamic_data, tv, setup.occlusion_weight * occlusion, squared, live.of_iteration,
+                       step + 1u, state.loss_scale);
+        if (loss_scaling != 0u && live.of_iteration > 0u) adapt_scale(state.loss_scale);
+        state.step = step + 1u;
     }
 }

@@ -3,9 +3,10 @@
 // Puts the attenuation of live samples into the rows of a volume whose cells they are. One invocation per sample.
 //   volume[row][n_dynamic_samples], cleared before; row = ray of the batch.
 #include "inc/layout.glsl"
+#include "inc/sample_rays.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint live[]; };
+layout(binding = 1) readonly buffer B1 { LiveSamples live; };
 layout(binding = 2) readonly buffer B2 { vec4 sample_points[]; };
 layout(binding = 3) readonly buffer B3 { uint sample_rays[]; };
 layout(binding = 4) readonly buffer B4 { vec2 sample_sigma[]; };
@@ -13,9 +14,9 @@ layout(binding = 5) writeonly buffer B5 { float volume[]; };
 
 void main() {
     uint s = gl_GlobalInvocationID.x;
-    if (s >= live[0]) return;
+    if (s >= live.count) return;
     uint n = setup.n_dynamic_samples;
     float cell = (sample_points[s].x - setup.dynamic_near) / (setup.dynamic_far - setup.dynamic_near) * float(n - 1u);
-    uint row = sample_rays[s] & 0x7fffffffu;
+    uint row = ray_of(sample_rays[s]);
     volume[row * n + min(uint(round(cell)), n - 1u)] = sample_sigma[s].x;
 }

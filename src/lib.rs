@@ -57,6 +57,7 @@ pub mod config;
 
 /// The compute stages.
 pub mod kernels {
+    pub mod constants;
     pub mod dispatch;
     pub mod layout;
     pub mod stages;

@@ -29,8 +29,8 @@ pub enum Network {
 }
 
 /// Groups of a dispatch over live samples, at a byte offset of the arguments `march_scan` wrote.
-pub fn indirect(buffers: &Buffers, offset: u64) -> Result<Groups<'_>> {
-    Ok(Groups::Indirect(buffers.get("arguments")?, offset))
+pub fn indirect(buffers: &Buffers, offset: usize) -> Result<Groups<'_>> {
+    Ok(Groups::Indirect(buffers.get("arguments")?, offset as u64))
 }
 
 impl Network {

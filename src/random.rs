@@ -1,21 +1,8 @@
 //! Counter-based random numbers, bit-equal to `glsl/inc/random.glsl`: pcg4d (Jarzynski and Olano,
 //! "Hash Functions for GPU Rendering", JCGT 2020).
 
-/// Depth jitter.
-pub const STREAM_DEPTH: u32 = 1;
-/// Order of all training rays.
-pub const STREAM_RAY: u32 = 2;
-/// Order of the rays that meet the hull.
-pub const STREAM_MOTION_RAY: u32 = 3;
-/// Initial parameters.
-pub const STREAM_INIT: u32 = 4;
-/// Photon noise of phantoms.
-pub const STREAM_PHOTON: u32 = 5;
-/// Shape variation of phantoms.
-pub const STREAM_SHAPE: u32 = 6;
-
-/// Which empty cells are looked at again.
-pub const STREAM_OCCUPANCY: u32 = 7;
+// Streams, `STREAM_*`: made by build.rs.
+include!(concat!(env!("OUT_DIR"), "/constants_random.rs"));
 
 /// The hash: four words in, four words out.
 pub fn pcg4d(v: [u32; 4]) -> [u32; 4] {

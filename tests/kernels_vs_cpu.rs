@@ -5,6 +5,7 @@ mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
 use nertca_vk::gpu::memory::Operands;
+use nertca_vk::kernels::constants::{CELLS_PER_WORD, NEAR_SAMPLE, OCCUPIED, SEEN};
 use nertca_vk::kernels::layout::Ray;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
@@ -173,11 +174,11 @@ fn occupancy_is_learned_and_heeded() {
     let mut kinds = [0; 2];
     for ((point, ray), sigma) in points.iter().zip(&rays).zip(&sigma) {
         let x = glam::DVec3::new(point[0].into(), point[1].into(), point[2].into());
-        let entry = occupancy::entry(&setup, x, batch[(ray & 0x7fff_ffff) as usize].phase);
+        let entry = occupancy::entry(&setup, x, batch[(ray & !NEAR_SAMPLE) as usize].phase);
         let full = sigma[0] > setup.occupancy_threshold;
         kinds[usize::from(full)] += 1;
-        let bits = occupancy::SEEN | if full { occupancy::OCCUPIED } else { 0 };
-        want[entry as usize / 16] |= bits << (2 * (entry % 16));
+        let bits = SEEN | if full { OCCUPIED } else { 0 };
+        want[(entry / CELLS_PER_WORD) as usize] |= bits << (2 * (entry % CELLS_PER_WORD));
     }
     assert!(kinds.iter().all(|n| *n > 10), "the case must have both kinds, has {kinds:?}");
     assert_eq!(after[words / 3..2 * words / 3], want);

@@ -10,7 +10,7 @@ vec3 reduce_angle(vec3 a) {
 }
 
 vec3 encoded_point(vec3 x) {
-    return (x - vec3(setup.encode_centre_x, setup.encode_centre_y, setup.encode_centre_z)) * setup.encode_scale;
+    return (x - setup.encode_centre) * setup.encode_scale;
 }
 
 void encoded_band(vec3 x, uint band, float window, out vec3 sines, out vec3 cosines) {

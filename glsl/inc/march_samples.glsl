@@ -6,7 +6,7 @@
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
-layout(binding = 1) readonly buffer B1 { uint state[]; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 uint run_length() {
     return (setup.n_dynamic_samples + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
@@ -23,5 +23,5 @@ uint depth_stream(Ray ray) {
 
 float dynamic_depth(uint k, Ray ray) {
     return depth_at(k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far, setup.jitter, setup.seed,
-                    state[0], depth_stream(ray));
+                    state.step, depth_stream(ray));
 }

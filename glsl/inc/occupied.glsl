@@ -5,9 +5,9 @@ bool occupied(vec3 x, uint phase, uint step) {
     if (setup.occupancy_cells == 0u || step < setup.occupancy_start) return true;
     uint entry = occupancy_entry(x, phase);
     uint epoch = step / OCCUPANCY_EPOCH;
-    uint word = occupancy[(epoch % 3u) * occupancy_words() + entry / 16u]
-              | occupancy[((epoch + 2u) % 3u) * occupancy_words() + entry / 16u];
-    uint bits = word >> (2u * (entry % 16u));
+    uint word = occupancy[(epoch % OCCUPANCY_EPOCHS) * occupancy_words() + entry / CELLS_PER_WORD]
+              | occupancy[((epoch + OCCUPANCY_EPOCHS - 1u) % OCCUPANCY_EPOCHS) * occupancy_words() + entry / CELLS_PER_WORD];
+    uint bits = word >> (2u * (entry % CELLS_PER_WORD));
     if ((bits & SEEN) == 0u || (bits & OCCUPIED) != 0u) return true;
     return (pcg4d(uvec4(setup.seed, STREAM_OCCUPANCY, step, entry)).x & 7u) == 0u;
 }

@@ -1,4 +1,4 @@
-// Read-only vec4 arrays, read the way that is fastest on a device (chosen in src/kernels.rs):
+// Read-only vec4 arrays, read the way that is fastest on a device (chosen in src/kernels/tuning.rs):
 //   storage buffers           GPUs
 //   -DTEXEL: texel buffers    lavapipe before Mesa 24, which reads storage buffers lane by lane
 //   -DADDRESS: addresses      newer lavapipe, which then checks no bounds; for kernels whose push constants end in

@@ -14,9 +14,14 @@ uvec4 pcg4d(uvec4 v) {
     return v;
 }
 
-const uint STREAM_DEPTH = 1u;
-const uint STREAM_RAY = 2u;
-const uint STREAM_OCCUPANCY = 7u;
+// Streams of random numbers; those of the host stand here, too, so that none is taken twice.
+const uint STREAM_DEPTH = 1u;         // depth jitter
+const uint STREAM_RAY = 2u;           // order of all training rays
+const uint STREAM_MOTION_RAY = 3u;    // order of the rays that meet the hull
+const uint STREAM_INIT = 4u;          // initial parameters
+const uint STREAM_PHOTON = 5u;        // photon noise of phantoms
+const uint STREAM_SHAPE = 6u;         // shape variation of phantoms
+const uint STREAM_OCCUPANCY = 7u;     // which empty cells are looked at again
 
 // Uniform in [0, 1), 24 bits.
 float uniform01(uint seed, uint stream, uint a, uint b) {

@@ -11,15 +11,12 @@ struct VmTaps {
 };
 
 bool static_inside(vec3 x) {
-    return all(greaterThanEqual(x, vec3(setup.static_min_x, setup.static_min_y, setup.static_min_z)))
-        && all(lessThanEqual(x, vec3(setup.static_max_x, setup.static_max_y, setup.static_max_z)));
+    return all(greaterThanEqual(x, setup.static_min)) && all(lessThanEqual(x, setup.static_max));
 }
 
 // Grid coordinate in [0, grid - 1], corners aligned with the box faces.
 vec3 vm_coordinate(vec3 x) {
-    vec3 lo = vec3(setup.static_min_x, setup.static_min_y, setup.static_min_z);
-    vec3 hi = vec3(setup.static_max_x, setup.static_max_y, setup.static_max_z);
-    return (x - lo) / (hi - lo) * float(setup.grid - 1u);
+    return (x - setup.static_min) / (setup.static_max - setup.static_min) * float(setup.grid - 1u);
 }
 
 VmTaps vm_taps(vec3 coordinate, uint mode) {

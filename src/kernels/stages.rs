@@ -8,7 +8,7 @@ use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
 use crate::kernels::tuning::{Layers, Tuning};
 use std::sync::Arc;
 
-include!(concat!(env!("OUT_DIR"), "/kernel_table.rs"));
+include!(concat!(env!("OUT_DIR"), "/table.rs"));
 
 /// Inputs a lane of `mlp_layer_bwd_weight` keeps; `INPUTS` there.
 pub const WEIGHT_INPUTS: u32 = 4;

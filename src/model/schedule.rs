@@ -27,7 +27,6 @@ impl Config {
             reset: u32::from(updates == 1),
             bias_correction1: (1.0 - self.adam.beta1.powi(updates as i32)) as f32,
             bias_correction2: (1.0 - self.adam.beta2.powi(updates as i32)) as f32,
-            spare: 0,
         }
     }
 }

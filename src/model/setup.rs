@@ -5,7 +5,6 @@ use crate::kernels::layout::Setup;
 use crate::model::hull::Hull;
 use crate::model::params::ParamLayout;
 use crate::model::scene::Scene;
-use glam::DVec3;
 
 /// Iterations whose losses the device keeps for the host.
 pub const RING_LENGTH: u32 = 1024;
@@ -15,83 +14,97 @@ pub const FIXED_POINT_BITS: u32 = 50;
 impl Scene {
     /// Constants for the shaders; those of a training set (ray counts, image size) stay 0.
     pub fn setup(&self, config: &Config, params: &ParamLayout, hull: Option<&Hull>) -> Setup {
-        let scene = self;
-        let f = |v: f64| v as f32;
-        let (lo, hi, dlo, dhi) = (scene.static_min, scene.static_max, scene.dynamic_min, scene.dynamic_max);
-        let [near, far] = scene.static_depth;
-        let hull_min = hull.map_or(DVec3::ZERO, |h| h.min);
-        let size = hull.map_or([0; 3], |h| h.size.map(|n| n as u32));
-        Setup {
+        let mut setup = Setup {
             seed: config.seed,
             n_rays: config.train.rays,
-            n_phases: params.phases as u32,
-            n_static_samples: config.march.static_samples,
-            n_dynamic_samples: config.march.dynamic_samples,
-            static_near: f(scene.static_depth[0]),
-            static_far: f(scene.static_depth[1]),
-            dynamic_near: f(scene.dynamic_depth[0]),
-            dynamic_far: f(scene.dynamic_depth[1]),
-            jitter: 1,
-            per_ray_depths: u32::from(config.march.per_ray_depths),
-            static_min_x: f(lo[0]),
-            static_min_y: f(lo[1]),
-            static_min_z: f(lo[2]),
-            static_max_x: f(hi[0]),
-            static_max_y: f(hi[1]),
-            static_max_z: f(hi[2]),
-            dynamic_min_x: f(dlo[0]),
-            dynamic_min_y: f(dlo[1]),
-            dynamic_min_z: f(dlo[2]),
-            dynamic_max_x: f(dhi[0]),
-            dynamic_max_y: f(dhi[1]),
-            dynamic_max_z: f(dhi[2]),
-            encode_centre_x: f(scene.encode_centre[0]),
-            encode_centre_y: f(scene.encode_centre[1]),
-            encode_centre_z: f(scene.encode_centre[2]),
-            encode_scale: f(scene.encode_scale),
-            n_bands: config.dynamic.bands,
-            grid: params.grid as u32,
-            rank4: params.rank4 as u32,
-            static_shift: f(scene.static_shift),
-            static_gain: f(scene.static_gain),
-            dynamic_shift: f(scene.dynamic_shift),
-            dynamic_gain: f(scene.dynamic_gain),
-            static_weight: f(scene.static_weight),
-            dynamic_weight: f(scene.dynamic_weight),
-            robust_scale: f(scene.robust_scale),
-            temporal_target: u32::from(config.loss.dynamic_target == DynamicTarget::Temporal),
-            occlusion_weight: f(config.dynamic.occlusion),
-            occlusion_depth: f(near + (far - near) * config.dynamic.occlusion_share),
-            hull_enabled: u32::from(hull.is_some()),
-            hull_nx: size[0],
-            hull_ny: size[1],
-            hull_nz: size[2],
-            hull_min_x: f(hull_min.x),
-            hull_min_y: f(hull_min.y),
-            hull_min_z: f(hull_min.z),
-            hull_inv_cell: hull.map_or(0.0, |h| f(1.0 / h.cell)),
-            hull_phase_words: hull.map_or(0, |h| if h.n_phases > 1 { h.words() as u32 } else { 0 }),
-            occupancy_cells: if config.occupancy.enabled { config.occupancy.cells } else { 0 },
-            occupancy_start: config.dynamic.delay + config.occupancy.start,
-            occupancy_threshold: f(config.occupancy.threshold * scene.dynamic_gain),
-            sample_capacity: sample_capacity(
-                config.train.chunk_samples.max(config.march.dynamic_samples).max(config.march.render_samples),
-            ),
-            latent_width: params.latent as u32,
-            n_layers: params.layers.len() as u32,
-            mlp_width: params.width as u32,
-            static_params: params.static_len as u32,
-            n_params: params.len as u32,
             fixed_point_bits: FIXED_POINT_BITS,
-            tv_plane: f(config.static_field.tv * config.static_field.tv_plane),
-            tv_line: f(config.static_field.tv * config.static_field.tv_line),
-            beta1: f(config.adam.beta1),
-            beta2: f(config.adam.beta2),
-            epsilon: f(config.adam.epsilon),
             ring_length: RING_LENGTH,
             ..Setup::default()
+        };
+        self.place_fields(&mut setup);
+        if let Some(hull) = hull {
+            place_hull(&mut setup, hull);
         }
+        choose_samples(&mut setup, config);
+        shape_fields(&mut setup, config, params);
+        self.weigh_losses(&mut setup, config);
+        self.set_occupancy(&mut setup, config);
+        set_optimiser(&mut setup, config);
+        setup
     }
+
+    /// Boxes and depths of both fields, and their scales.
+    fn place_fields(&self, setup: &mut Setup) {
+        let corner = |at: [f64; 3]| at.map(|x| x as f32);
+        (setup.static_min, setup.static_max) = (corner(self.static_min), corner(self.static_max));
+        (setup.dynamic_min, setup.dynamic_max) = (corner(self.dynamic_min), corner(self.dynamic_max));
+        [setup.static_near, setup.static_far] = self.static_depth.map(|d| d as f32);
+        [setup.dynamic_near, setup.dynamic_far] = self.dynamic_depth.map(|d| d as f32);
+        setup.encode_centre = corner(self.encode_centre);
+        setup.encode_scale = self.encode_scale as f32;
+        setup.static_shift = self.static_shift as f32;
+        setup.static_gain = self.static_gain as f32;
+        setup.dynamic_shift = self.dynamic_shift as f32;
+        setup.dynamic_gain = self.dynamic_gain as f32;
+    }
+
+    /// What counts how much in the objective.
+    fn weigh_losses(&self, setup: &mut Setup, config: &Config) {
+        let [near, far] = self.static_depth;
+        setup.static_weight = self.static_weight as f32;
+        setup.dynamic_weight = self.dynamic_weight as f32;
+        setup.robust_scale = self.robust_scale as f32;
+        setup.temporal_target = u32::from(config.loss.dynamic_target == DynamicTarget::Temporal);
+        setup.occlusion_weight = config.dynamic.occlusion as f32;
+        setup.occlusion_depth = (near + (far - near) * config.dynamic.occlusion_share) as f32;
+        setup.tv_plane = (config.static_field.tv * config.static_field.tv_plane) as f32;
+        setup.tv_line = (config.static_field.tv * config.static_field.tv_line) as f32;
+    }
+
+    /// When the dynamic field counts as empty.
+    fn set_occupancy(&self, setup: &mut Setup, config: &Config) {
+        setup.occupancy_cells = if config.occupancy.enabled { config.occupancy.cells } else { 0 };
+        setup.occupancy_start = config.dynamic.delay + config.occupancy.start;
+        setup.occupancy_threshold = (config.occupancy.threshold * self.dynamic_gain) as f32;
+    }
+}
+
+fn place_hull(setup: &mut Setup, hull: &Hull) {
+    setup.hull_enabled = 1;
+    setup.hull_min = hull.min.as_vec3().into();
+    setup.hull_size = hull.size.map(|n| n as u32);
+    setup.hull_inv_cell = (1.0 / hull.cell) as f32;
+    setup.hull_phase_words = if hull.n_phases > 1 { hull.words() as u32 } else { 0 };
+}
+
+/// Samples of a ray and of a chunk.
+fn choose_samples(setup: &mut Setup, config: &Config) {
+    let march = &config.march;
+    setup.n_static_samples = march.static_samples;
+    setup.n_dynamic_samples = march.dynamic_samples;
+    setup.jitter = 1;
+    setup.per_ray_depths = u32::from(march.per_ray_depths);
+    let most = config.train.chunk_samples.max(march.dynamic_samples).max(march.render_samples);
+    setup.sample_capacity = sample_capacity(most);
+}
+
+/// Sizes of planes, lines and network.
+fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamLayout) {
+    setup.n_phases = params.phases as u32;
+    setup.n_bands = config.dynamic.bands;
+    setup.grid = params.grid as u32;
+    setup.rank4 = params.rank4 as u32;
+    setup.latent_width = params.latent as u32;
+    setup.n_layers = params.layers.len() as u32;
+    setup.mlp_width = params.width as u32;
+    setup.static_params = params.static_len as u32;
+    setup.n_params = params.len as u32;
+}
+
+fn set_optimiser(setup: &mut Setup, config: &Config) {
+    setup.beta1 = config.adam.beta1 as f32;
+    setup.beta2 = config.adam.beta2 as f32;
+    setup.epsilon = config.adam.epsilon as f32;
 }
 
 /// Samples a chunk can hold that is to take `samples`; also the stride between the features of a sample. Live samples

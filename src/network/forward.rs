@@ -4,17 +4,19 @@ use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants::OCCUPANCY_EPOCHS;
 use crate::kernels::dispatch::{Buffers, dispatch};
-use crate::kernels::layout::{Ray, RayOut, Setup};
+use crate::kernels::layout::{DeviceState, IndirectArguments, LiveSamples, Ray, RayOut, Setup};
 use crate::kernels::stages::{Kernels, MARCH_LANES};
 use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamLayout;
 use crate::network::chunk::{Chunk, chunks};
 use crate::network::{Network, indirect};
+use std::mem::offset_of;
 
 /// Bytes of the three epochs of occupancy; none without it.
 pub fn occupancy_bytes(setup: &Setup) -> u64 {
-    if setup.occupancy_cells > 0 { 3 * 4 * setup.occupancy_words() as u64 } else { 0 }
+    if setup.occupancy_cells > 0 { u64::from(OCCUPANCY_EPOCHS) * 4 * setup.occupancy_words() as u64 } else { 0 }
 }
 
 /// Buffers the forward passes need for batches of `n_rays`; parameters are left undefined.
@@ -36,15 +38,15 @@ pub fn forward_buffers(
     // A bit per sample, each lane's rounded up to words.
     let mask_words = capacity / 32 + per_chunk * u64::from(MARCH_LANES);
     for (name, bytes) in [
-        ("state", 16),
+        ("state", size_of::<DeviceState>() as u64),
         ("rays", u64::from(n_rays) * size_of::<Ray>() as u64),
         ("ray_out", u64::from(n_rays) * size_of::<RayOut>() as u64),
         ("lane_masks", mask_words * 4),
         ("lane_offsets", per_chunk * u64::from(MARCH_LANES) * 4),
         ("ray_counts", per_chunk * 4),
         ("ray_start", (per_chunk + 1) * 4),
-        ("live", 16),
-        ("arguments", 48),
+        ("live", size_of::<LiveSamples>() as u64),
+        ("arguments", size_of::<IndirectArguments>() as u64),
         ("sample_points", capacity * 16),
         ("sample_rays", capacity * 4),
         ("sample_sigma", capacity * 8),
@@ -101,7 +103,7 @@ pub fn record_volume(
     for chunk in chunks(setup, n_rays) {
         record_samples(r, k, network, buffers, params, chunk)?;
         network.record_forward(r, buffers, params, setup)?;
-        dispatch(r, &k.volume_dynamic, indirect(buffers, 0)?, buffers, &[], ())?;
+        dispatch(r, &k.volume_dynamic, indirect(buffers, offset_of!(IndirectArguments, samples))?, buffers, &[], ())?;
     }
     Ok(())
 }

@@ -4,7 +4,7 @@
 //! A layer that sees the input has one weight matrix on `[encoding, one-hot phase, zeros]`: the columns of the phases
 //! hold bias and latent contribution, so that their gradient, summed per phase, is part of the weight gradient.
 //!
-//! Gradients are multiplied by a loss scale (`state[1]`) before they become f16 and divided by it after the sums.
+//! Gradients are multiplied by a loss scale (`state.loss_scale`) before they become f16 and divided by it after the sums.
 //! A sum that is not finite skips the update and halves the scale; many good ones double it (`report`).
 
 use crate::error::{Error, Result};
@@ -13,21 +13,17 @@ use crate::gpu::device::Gpu;
 use crate::gpu::memory::Memory;
 use crate::gpu::pipeline::Pipeline;
 use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants::{NOWHERE, PHASE_BIAS};
 use crate::kernels::dispatch::{Buffers, dispatch, groups_for};
-use crate::kernels::layout::Setup;
+use crate::kernels::layout::{IndirectArguments, Setup};
 use crate::kernels::stages::kernel_code;
 use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamLayout;
 use crate::network::chunk::Chunk;
 use crate::network::indirect;
+use std::mem::offset_of;
 use std::sync::Arc;
 
-/// `NOTHING` of `mlp_pack` and `gradient_network`.
-const NOTHING: u32 = u32::MAX;
-/// `PHASE_BIAS` of `mlp_pack`.
-const PHASE_BIAS: u32 = 1 << 31;
-/// Pushed for a sum that a pass does not write.
-const SKIP: u32 = u32::MAX;
 /// Shared memory beside the tiles, bytes.
 const SHARED_RESERVE: u32 = 512;
 const DZ: [&str; 2] = ["dz16_even", "dz16_odd"];
@@ -126,7 +122,7 @@ impl Shape {
 
     /// Where each packed weight, then each row of biases, comes from.
     fn pack_source(&self, params: &ParamLayout) -> Vec<u32> {
-        let mut source = vec![NOTHING; self.weights_len];
+        let mut source = vec![NOWHERE; self.weights_len];
         let width = params.width;
         let phase_bias =
             |layer: usize, phase: usize, j: usize| PHASE_BIAS | ((layer * params.phases + phase) * width + j) as u32;
@@ -154,7 +150,7 @@ impl Shape {
         for layer in &params.layers {
             for _ in 0..self.matrix.m {
                 source.extend((0..width).map(|j| match layer.latent {
-                    Some(_) => NOTHING,
+                    Some(_) => NOWHERE,
                     None => (layer.bias + j) as u32,
                 }));
             }
@@ -164,7 +160,7 @@ impl Shape {
 
     /// Where the gradient of each network parameter lies in the partial sums.
     fn gradient_source(&self, params: &ParamLayout) -> Vec<u32> {
-        let mut source = vec![NOTHING; params.network_len()];
+        let mut source = vec![NOWHERE; params.network_len()];
         let width = params.width;
         let mut put = |at: usize, from: usize| source[at - params.static_len] = from as u32;
         for (packed, layer) in self.layers.iter().zip(&params.layers) {
@@ -194,7 +190,7 @@ impl Shape {
             for phase in 0..params.phases {
                 source.extend((0..params.width).map(|j| match packed.encoded {
                     Some(from) => (from + j * self.encoded + params.encoded_len + phase) as u32,
-                    None => NOTHING,
+                    None => NOWHERE,
                 }));
             }
         }
@@ -352,7 +348,14 @@ impl FusedKernels {
 
     /// Records the forward pass: `sample_sigma`.
     pub fn record_forward(&self, r: &mut Recording, buffers: &Buffers, params: &ParamLayout) -> Result<()> {
-        dispatch(r, &self.mlp_fused_fwd, indirect(buffers, 16)?, buffers, &[], params.out_bias as u32)
+        dispatch(
+            r,
+            &self.mlp_fused_fwd,
+            indirect(buffers, offset_of!(IndirectArguments, forward_tiles))?,
+            buffers,
+            &[],
+            params.out_bias as u32,
+        )
     }
 
     /// Records the backward pass of a chunk: `partials`.
@@ -369,7 +372,7 @@ impl FusedKernels {
         let accumulate = u32::from(chunk.first_ray > 0);
         let layer_activations = |l: usize| l as u32 * setup.sample_capacity * params.width as u32 / 8;
         let last = params.layers.len() - 1;
-        let position = |at: Option<usize>| at.map_or(SKIP, |at| at as u32);
+        let position = |at: Option<usize>| at.map_or(NOWHERE, |at| at as u32);
         for (l, packed) in shape.layers.iter().enumerate().rev() {
             let (dz, below) = (DZ[l % 2], DZ[(l + 1) % 2]);
             let is_last = l == last;

@@ -4,13 +4,15 @@ use crate::error::Result;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::Memory;
 use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants::NOWHERE;
 use crate::kernels::dispatch::{Buffers, dispatch};
-use crate::kernels::layout::Setup;
+use crate::kernels::layout::{IndirectArguments, Setup};
 use crate::kernels::stages::{LayerKernels, WEIGHT_INPUTS};
 use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamLayout;
 use crate::network::chunk::Chunk;
 use crate::network::indirect;
+use std::mem::offset_of;
 
 const ACTIVATIONS: [&str; 17] = [
     "activations_0",
@@ -91,7 +93,10 @@ pub fn record_forward(
 ) -> Result<()> {
     let capacity = setup.sample_capacity;
     let (groups, encode_groups) = (params.width as u32 / 4, params.encode_groups as u32);
-    let (per_sample, per_tile) = (|| indirect(buffers, 0), || indirect(buffers, 16));
+    let (per_sample, per_tile) = (
+        || indirect(buffers, offset_of!(IndirectArguments, samples)),
+        || indirect(buffers, offset_of!(IndirectArguments, forward_tiles)),
+    );
     dispatch(r, &k.encode, per_sample()?, buffers, &[], ())?;
     for (i, layer) in params.layers.iter().enumerate() {
         let previous = if i == 0 { "features" } else { ACTIVATIONS[i - 1] };
@@ -130,7 +135,7 @@ pub fn record_backward(
     let last = params.layers.len() - 1;
     let push = [groups, params.out_weights as u32 / 4, capacity];
     let names = [("activations", ACTIVATIONS[last]), ("dz", DZ[last % 2])];
-    dispatch(r, &k.mlp_out_bwd, indirect(buffers, 0)?, buffers, &names, push)?;
+    dispatch(r, &k.mlp_out_bwd, indirect(buffers, offset_of!(IndirectArguments, samples))?, buffers, &names, push)?;
     let push = [in_partials(params.out_weights), in_partials(params.out_bias), capacity, splits, network, accumulate];
     let names = [("activations", ACTIVATIONS[last])];
     dispatch(r, &k.mlp_out_bwd_weight, Groups::Direct([groups, splits, 1]), buffers, &names, push)?;
@@ -140,14 +145,21 @@ pub fn record_backward(
             // The input gradient goes first: nothing below writes what it reads, so the three may overlap.
             let push = [groups, groups, at as u32 / 4, capacity];
             let names = [("dz", dz), ("activations", ACTIVATIONS[i - 1]), ("dz_in", DZ[(i + 1) % 2])];
-            dispatch(r, &k.mlp_layer_bwd_input, indirect(buffers, 32)?, buffers, &names, push)?;
+            dispatch(
+                r,
+                &k.mlp_layer_bwd_input,
+                indirect(buffers, offset_of!(IndirectArguments, backward_tiles))?,
+                buffers,
+                &names,
+                push,
+            )?;
         }
         let previous = if i == 0 { "features" } else { ACTIVATIONS[i - 1] };
         let inputs = [("features", params.encode_groups as u32, layer.encoded), (previous, groups, layer.hidden)];
         for (input, in_groups, at) in inputs {
             let Some(at) = at else { continue };
             // Biases of layers without latents are summed here; the others come from the sums per phase.
-            let bias = if layer.latent.is_none() { in_partials(layer.bias) } else { u32::MAX };
+            let bias = if layer.latent.is_none() { in_partials(layer.bias) } else { NOWHERE };
             let push = [in_groups, in_partials(at), capacity, splits, network, accumulate, bias, groups];
             let inputs_per_group = WEIGHT_INPUTS * k.mlp_layer_bwd_weight.local_size;
             let tiles =

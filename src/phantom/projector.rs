@@ -26,7 +26,6 @@ struct Push {
     image_width: u32,
     n_pixels: u32,
     first_pixel: u32,
-    spare: u32,
 }
 
 /// Depth steps of a projection through `volume` seen over `half_depth` (world units): half a voxel each.
@@ -100,7 +99,6 @@ impl Projector {
                 image_width: self.width as u32,
                 n_pixels: pixels as u32,
                 first_pixel: (view * pixels) as u32,
-                spare: 0,
             };
             let groups = Groups::Direct([(pixels as u32).div_ceil(self.project.local_size), 1, 1]);
             let buffers = [("views", &views_buffer), ("volume", &loaded.values), ("integrals", &integrals)]

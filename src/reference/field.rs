@@ -2,7 +2,7 @@
 
 use crate::kernels::layout::Setup;
 use crate::model::params::ParamLayout;
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 
 /// log(1 + e^x), the identity beyond 20 as in torch.
 pub fn softplus(x: f64) -> f64 {
@@ -14,10 +14,14 @@ pub fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
+/// A point of the constants that twin and shaders share.
+pub(super) fn point(at: [f32; 3]) -> DVec3 {
+    Vec3::from(at).as_dvec3()
+}
+
 /// Whether a point lies in the static field's box.
 pub fn static_inside(s: &Setup, x: DVec3) -> bool {
-    let low = DVec3::new(s.static_min_x.into(), s.static_min_y.into(), s.static_min_z.into());
-    let high = DVec3::new(s.static_max_x.into(), s.static_max_y.into(), s.static_max_z.into());
+    let (low, high) = (point(s.static_min), point(s.static_max));
     x.cmpge(low).all() && x.cmple(high).all()
 }
 
@@ -34,8 +38,7 @@ struct ModeTaps {
 
 /// Positions (without rank) and weights of the taps of each mode: XY x Z, XZ x Y, YZ x X.
 fn vm_taps(s: &Setup, p: &ParamLayout, x: DVec3) -> [ModeTaps; 3] {
-    let low = DVec3::new(s.static_min_x.into(), s.static_min_y.into(), s.static_min_z.into());
-    let high = DVec3::new(s.static_max_x.into(), s.static_max_y.into(), s.static_max_z.into());
+    let (low, high) = (point(s.static_min), point(s.static_max));
     let c = (x - low) / (high - low) * (p.grid - 1) as f64;
     [[0, 1, 2], [0, 2, 1], [1, 2, 0]].map(|[u, v, w]| {
         let mode = 2 - w;
@@ -83,8 +86,7 @@ pub fn static_attenuation(s: &Setup, p: &ParamLayout, params: &[f64], x: DVec3) 
 
 /// Windowed positional encoding: `[x, a_k sin(2^k x), a_k cos(2^k x)]`.
 pub fn encode(s: &Setup, window: f64, x: DVec3) -> Vec<f64> {
-    let centre = DVec3::new(s.encode_centre_x.into(), s.encode_centre_y.into(), s.encode_centre_z.into());
-    let x = (x - centre) * f64::from(s.encode_scale);
+    let x = (x - point(s.encode_centre)) * f64::from(s.encode_scale);
     let mut out = x.to_array().to_vec();
     for k in 0..s.n_bands {
         let open = (window - f64::from(k)).clamp(0.0, 1.0);

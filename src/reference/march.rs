@@ -85,8 +85,7 @@ pub fn depths(s: &Setup, n: u32, near: f32, far: f32, step: u32, ray: &Ray) -> V
 /// Whether the dynamic field may exist at a point: its box and, if used, the hull.
 pub fn dynamic_inside(plan: &Plan, x: DVec3, phase: usize) -> bool {
     let s = &plan.setup;
-    let low = DVec3::new(s.dynamic_min_x.into(), s.dynamic_min_y.into(), s.dynamic_min_z.into());
-    let high = DVec3::new(s.dynamic_max_x.into(), s.dynamic_max_y.into(), s.dynamic_max_z.into());
+    let (low, high) = (field::point(s.dynamic_min), field::point(s.dynamic_max));
     x.cmpge(low).all() && x.cmple(high).all() && plan.hull.as_ref().is_none_or(|h| h.contains_point(x, phase))
 }
 

@@ -12,7 +12,7 @@ use crate::model::component::Component;
 use crate::render::grid::Grid;
 use crate::render::quantity::{Projection, Quantity};
 use crate::render::renderer::Renderer;
-use glam::DVec3;
+use glam::Vec3;
 use half::f16;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -78,17 +78,9 @@ impl Baked {
     /// Prepares volumes of `still_cells` and `moving_cells` cells along the longest side of each box; bakes none yet.
     fn empty(renderer: Arc<Renderer>, still_cells: u32, moving_cells: u32) -> Baked {
         let s = &renderer.setup;
-        let v = |x: f32, y: f32, z: f32| DVec3::new(x.into(), y.into(), z.into());
-        let still = Grid::over(
-            v(s.static_min_x, s.static_min_y, s.static_min_z),
-            v(s.static_max_x, s.static_max_y, s.static_max_z),
-            still_cells,
-        );
-        let moving = Grid::over(
-            v(s.dynamic_min_x, s.dynamic_min_y, s.dynamic_min_z),
-            v(s.dynamic_max_x, s.dynamic_max_y, s.dynamic_max_z),
-            moving_cells,
-        );
+        let corner = |at: [f32; 3]| Vec3::from(at).as_dvec3();
+        let still = Grid::over(corner(s.static_min), corner(s.static_max), still_cells);
+        let moving = Grid::over(corner(s.dynamic_min), corner(s.dynamic_max), moving_cells);
         let volumes = Mutex::new(vec![None; 1 + s.n_phases as usize]);
         Baked { still, moving, volumes, renderer, shots: Mutex::default() }
     }

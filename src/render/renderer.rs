@@ -6,7 +6,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, Recording};
 use crate::kernels::dispatch::{Buffers, dispatch, groups_for};
-use crate::kernels::layout::{RayOut, Schedule, Setup, View};
+use crate::kernels::layout::{DeviceState, RayOut, Schedule, Setup, View};
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
@@ -92,7 +92,7 @@ impl Renderer {
         let mut buffers = forward_buffers(gpu, &kernels.tuning, &network, &setup, &model.layout, RAYS_PER_SUBMIT)?;
         buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
         // The schedule below has a single row, that of the model's step.
-        gpu.upload(buffers.get("state")?, 0, &[0u32; 4])?;
+        gpu.upload(buffers.get("state")?, 0, &[DeviceState::default()])?;
         let row = size_of::<Schedule>() as u64;
         buffers.set("schedule", gpu.buffer("schedule", row, Memory::Upload)?);
         let renderer =

@@ -9,14 +9,16 @@ use crate::error::Result;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::Memory;
 use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants::OCCUPANCY_EPOCH;
 use crate::kernels::dispatch::{Buffers, dispatch, groups_for};
-use crate::kernels::layout::{Frame, OCCUPANCY_EPOCH, View};
+use crate::kernels::layout::{Frame, IndirectArguments, StepReport, View};
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::network::chunk::{chunk_rays, chunks};
 use crate::network::forward::{forward_buffers, hull_buffer, record_samples};
 use crate::network::{Network, indirect};
 use crate::plan::Plan;
+use std::mem::offset_of;
 
 /// All buffers of a training run, filled from the plan; moments zero, step 0.
 ///
@@ -33,7 +35,10 @@ pub fn training_buffers(gpu: &Gpu, tuning: &Tuning, network: &Network, plan: &Pl
     buffers.set("backgrounds", gpu.buffer_with("backgrounds", &plan.backgrounds)?);
     buffers.set("motion_rays", gpu.buffer_with("motion_rays", &plan.motion_rays)?);
     buffers.set("hull", hull_buffer(gpu, plan.hull.as_ref())?);
-    buffers.set("ring", gpu.buffer("ring", u64::from(setup.ring_length) * 32, Memory::Readback)?);
+    buffers.set(
+        "ring",
+        gpu.buffer("ring", u64::from(setup.ring_length) * size_of::<StepReport>() as u64, Memory::Readback)?,
+    );
     for (name, bytes) in [
         ("ray_gradient", n_rays * 8),
         ("ray_loss", n_rays * 16),
@@ -69,7 +74,14 @@ pub fn record_step(r: &mut Recording, k: &Kernels, network: &Network, buffers: &
         record_samples(r, k, network, buffers, params, chunk)?;
         network.record_forward(r, buffers, params, setup)?;
         if setup.occupancy_cells > 0 {
-            dispatch(r, &k.occupancy_mark, indirect(buffers, 0)?, buffers, &[], ())?;
+            dispatch(
+                r,
+                &k.occupancy_mark,
+                indirect(buffers, offset_of!(IndirectArguments, samples))?,
+                buffers,
+                &[],
+                (),
+            )?;
         }
         dispatch(r, &k.march_fwd, per_ray(), buffers, &[], chunk.push())?;
         dispatch(r, &k.loss, groups_for(&k.loss, chunk.n_rays), buffers, &[], chunk.push())?;

@@ -7,7 +7,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::dispatch::Buffers;
-use crate::kernels::layout::DeviceState;
+use crate::kernels::layout::{DeviceState, StepReport};
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
@@ -245,21 +245,21 @@ impl Trainer {
     }
 
     fn read_losses(&mut self) -> Result<Vec<StepLoss>> {
-        let mut ring = vec![[0f32; 8]; RING_LENGTH as usize];
+        let mut ring = vec![StepReport::default(); RING_LENGTH as usize];
         self.buffers.get("ring")?.read(&mut ring)?;
         let mut losses = Vec::new();
         while self.reported < self.completed {
-            let r = ring[(self.reported % RING_LENGTH) as usize].map(f64::from);
+            let report = ring[(self.reported % RING_LENGTH) as usize];
             self.reported += 1;
             let loss = StepLoss {
                 step: self.reported,
-                data: r[0],
-                dynamic: r[1],
-                tv: r[2],
-                occlusion: r[3],
-                squared_error: r[4],
-                live_samples: r[5] as u64,
-                loss_scale: r[7],
+                data: report.data.into(),
+                dynamic: report.dynamic_data.into(),
+                tv: report.tv.into(),
+                occlusion: report.occlusion.into(),
+                squared_error: report.squared_error.into(),
+                live_samples: report.live_samples.into(),
+                loss_scale: report.loss_scale.into(),
             };
             let first = *self.first_loss.get_or_insert(loss.total());
             if !loss.total().is_finite() || loss.total() > EXPLOSION * first.max(1e-12) {
@@ -323,7 +323,7 @@ impl Trainer {
         let n = self.plan.params.len as u64;
         let params = copy("params", 4 * n)?;
         let moments = copy("moments", 8 * n)?;
-        let state = copy("state", 16)?;
+        let state = copy("state", size_of::<DeviceState>() as u64)?;
         let occupancy = copy("occupancy", occupancy_bytes(&self.plan.setup))?;
         let commands = recording.finish()?;
         let ticket = commands.submit()?;
@@ -399,7 +399,7 @@ impl Snapshot {
         self.model.params = params;
         let mut moments = vec![[0f32; 2]; n];
         self.moments.read(&mut moments)?;
-        let mut state = [DeviceState { step: 0, loss_scale: 1.0, overflowed: 0, good_updates: 0 }];
+        let mut state = [DeviceState::default()];
         self.state.read(&mut state)?;
         let mut occupancy = vec![0u32; self.occupancy_words];
         self.occupancy.read(&mut occupancy)?;

@@ -1,0 +1,104 @@
+//! `glsl/*.comp`, times the variants in `glsl/variants.txt` -> SPIR-V.
+
+use crate::Failure;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// A name and its value, as of `-DNAME=VALUE`.
+pub type Define = (String, String);
+
+/// A shader, or one of its variants.
+pub struct Kernel {
+    /// Name of the shader's file.
+    pub shader: String,
+    /// Name of the variant; of the shader itself where it is none.
+    pub name: String,
+    /// What sets the variant apart.
+    pub defines: Vec<Define>,
+    /// The shader's text.
+    pub source: String,
+    /// Not optimised, with all names.
+    pub for_reflection: Vec<u32>,
+    /// Optimised.
+    pub shipped: Vec<u8>,
+}
+
+/// Compiles every shader and every variant, in the order of their names.
+pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
+    let variants = read_variants(&glsl.join("variants.txt"))?;
+    let compiler = shaderc::Compiler::new()?;
+    let mut sources: Vec<PathBuf> = fs::read_dir(glsl)?
+        .filter_map(|entry| entry.ok().map(|e| e.path()))
+        .filter(|path| path.extension().is_some_and(|e| e == "comp"))
+        .collect();
+    sources.sort();
+    let mut kernels = Vec::new();
+    for path in sources {
+        let shader = path.file_stem().and_then(|s| s.to_str()).ok_or("shader name is not UTF-8")?.to_owned();
+        let source = fs::read_to_string(&path)?;
+        let mut builds = vec![(shader.clone(), Vec::new())];
+        builds.extend(variants.get(&shader).cloned().unwrap_or_default());
+        for (name, defines) in builds {
+            let build = |optimise| compile(&compiler, glsl, &path, &source, &defines, optimise);
+            let for_reflection = build(false)?.as_binary().to_vec();
+            let shipped = build(true)?.as_binary_u8().to_vec();
+            let (shader, source) = (shader.clone(), source.clone());
+            kernels.push(Kernel { shader, name, defines, source, for_reflection, shipped });
+        }
+    }
+    Ok(kernels)
+}
+
+/// `variants.txt`: `shader name [DEFINE[=VALUE]]...` per line; `#` starts a comment.
+fn read_variants(path: &Path) -> Result<BTreeMap<String, Vec<(String, Vec<Define>)>>, Failure> {
+    let mut variants: BTreeMap<String, Vec<_>> = BTreeMap::new();
+    for line in fs::read_to_string(path)?.lines() {
+        let mut words = line.split('#').next().unwrap_or("").split_whitespace();
+        let (Some(shader), Some(name)) = (words.next(), words.next()) else {
+            continue;
+        };
+        let defines = words
+            .map(|word| match word.split_once('=') {
+                Some((key, value)) => (key.to_owned(), value.to_owned()),
+                None => (word.to_owned(), "1".to_owned()),
+            })
+            .collect();
+        variants.entry(shader.to_owned()).or_default().push((name.to_owned(), defines));
+    }
+    Ok(variants)
+}
+
+fn compile(
+    compiler: &shaderc::Compiler,
+    root: &Path,
+    path: &Path,
+    source: &str,
+    defines: &[Define],
+    optimise: bool,
+) -> Result<shaderc::CompilationArtifact, Failure> {
+    let mut options = shaderc::CompileOptions::new()?;
+    options.set_target_env(shaderc::TargetEnv::Vulkan, shaderc::EnvVersion::Vulkan1_2 as u32);
+    options.set_warnings_as_errors();
+    options.set_optimization_level(if optimise {
+        shaderc::OptimizationLevel::Performance
+    } else {
+        shaderc::OptimizationLevel::Zero
+    });
+    for (key, value) in defines {
+        options.add_macro_definition(key, Some(value));
+    }
+    let include_root = root.to_path_buf();
+    options.set_include_callback(move |name, _, _, _| {
+        let file = include_root.join(name);
+        let content = fs::read_to_string(&file).map_err(|e| format!("{}: {e}", file.display()))?;
+        Ok(shaderc::ResolvedInclude { resolved_name: file.display().to_string(), content })
+    });
+    Ok(compiler.compile_into_spirv(
+        source,
+        shaderc::ShaderKind::Compute,
+        &path.display().to_string(),
+        "main",
+        Some(&options),
+    )?)
+}
