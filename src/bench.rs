@@ -5,11 +5,11 @@ use crate::error::Result;
 use crate::gpu::capabilities::MatrixShape;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
-use crate::gpu::pipeline::Pipeline;
-use crate::gpu::record::{Bound, Groups, Recording};
-use crate::kernels::stages::kernel_code;
+use crate::gpu::record::{Groups, Recording};
+use crate::kernels::dispatch::{Binding, dispatch};
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::stages::{Build, Stage};
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
 use std::time::Instant;
 
 /// Seconds the paper needs for a reconstruction on an RTX A5000 (section 4: 37 minutes).
@@ -27,16 +27,16 @@ pub struct Peaks {
 }
 
 /// Runs a dispatch eight times and returns the shortest time, of the submit and the wait for it.
-fn best_seconds(
+fn best_seconds<P: PushConstants>(
     gpu: &Gpu,
-    stage: &Arc<Pipeline>,
+    stage: &Stage<P>,
     groups: [u32; 3],
-    buffers: &[(&str, &Buffer)],
-    push: &impl bytemuck::Pod,
+    buffers: &[(Binding, &Buffer)],
+    push: P,
 ) -> Result<f64> {
-    let bound: Vec<_> = buffers.iter().map(|(name, b)| (*name, Bound::Buffer(b))).collect();
+    let bound: Vec<_> = buffers.iter().map(|(name, buffer)| (*name, (*buffer).into())).collect();
     let mut recording = Recording::new(gpu, "peak")?;
-    recording.dispatch(stage, Groups::Direct(groups), &bound, push)?;
+    dispatch(&mut recording, stage, Groups::Direct(groups), &bound, push)?;
     let commands = recording.finish()?;
     let mut best = f64::INFINITY;
     for _ in 0..8 {
@@ -56,17 +56,10 @@ pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     let is_cpu = info.is_cpu();
     // Some milliseconds on either kind of device.
     let (lanes, steps): (u32, u32) = if is_cpu { (256, 8000) } else { (1 << 19, 1024) };
-    let stage = Arc::new(gpu.pipeline(kernel_code("peak_f32")?, 64, &[])?);
+    let stage: Stage<push::PeakF32> = Build::default().stage(gpu)?;
     let sink = gpu.buffer("sink", u64::from(lanes) * 16, Memory::Device)?;
-    #[repr(C)]
-    #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-    struct F32Push {
-        steps: u32,
-        a: f32,
-        b: f32,
-    }
-    let push = F32Push { steps, a: 0.999, b: 0.001 };
-    let seconds = best_seconds(gpu, &stage, [lanes / 64, 1, 1], &[("sink", &sink)], &push)?;
+    let push = push::PeakF32 { steps, a: 0.999, b: 0.001 };
+    let seconds = best_seconds(gpu, &stage, [lanes / stage.local_size(), 1, 1], &[(Binding::sink, &sink)], push)?;
     let f32_tflops = f64::from(lanes) * f64::from(steps) * 32.0 * 12.0 * 2.0 / seconds * 1e-12;
 
     let matrix_tflops = match info.matrices.first() {
@@ -75,12 +68,13 @@ pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     };
 
     let bytes = u64::from(info.max_storage_buffer_range).min(if is_cpu { 64 << 20 } else { 1 << 30 }) / 4096 * 4096;
-    let stage = Arc::new(gpu.pipeline(kernel_code("peak_copy")?, 64, &[])?);
+    let stage: Stage<push::PeakCopy> = Build::default().stage(gpu)?;
     let (from, to) = (gpu.buffer("from", bytes, Memory::Device)?, gpu.buffer("to", bytes, Memory::Device)?);
     let count = (bytes / 16) as u32;
     let per_row = 16_384;
-    let groups = [per_row, count.div_ceil(64 * per_row), 1];
-    let seconds = best_seconds(gpu, &stage, groups, &[("from", &from), ("to", &to)], &count)?;
+    let groups = [per_row, count.div_ceil(stage.local_size() * per_row), 1];
+    let buffers = [(Binding::from, &from), (Binding::to, &to)];
+    let seconds = best_seconds(gpu, &stage, groups, &buffers, push::PeakCopy { count })?;
     Ok(Peaks { f32_tflops, matrix_tflops, copy_gb_per_s: 2.0 * bytes as f64 / seconds * 1e-9 })
 }
 
@@ -88,14 +82,15 @@ fn matrix_peak(gpu: &Gpu, MatrixShape { m, n, k }: MatrixShape) -> Result<f64> {
     let info = gpu.info();
     let subgroups = 8;
     let (groups, steps): (u32, u32) = if info.is_cpu() { (4, 2000) } else { (4096, 2048) };
-    let spec = [("m", m), ("n", n), ("k", k), ("subgroups", subgroups)];
-    let code = kernel_code("peak_matrix")?;
-    let stage = Arc::new(gpu.matrix_pipeline(code, subgroups * info.subgroup_size, &spec)?);
+    let constants = [("m", m), ("n", n), ("k", k), ("subgroups", subgroups)];
+    let lanes = Some(subgroups * info.subgroup_size);
+    let stage: Stage<push::PeakMatrix> =
+        Build { lanes, constants: &constants, matrices: true, ..Build::default() }.stage(gpu)?;
     let random: Vec<half::f16> =
         (0..2 * (m * k).max(k * n)).map(|i| half::f16::from_f64(crate::random::uniform01(1, 0, i, 0) - 0.5)).collect();
     let operands = gpu.buffer_with("operands16", &random)?;
     let sink = gpu.buffer("sink", u64::from(groups * subgroups * m * n) * 4, Memory::Device)?;
-    let buffers = [("operands16", &operands), ("sink", &sink)];
-    let seconds = best_seconds(gpu, &stage, [groups, 1, 1], &buffers, &steps)?;
+    let buffers = [(Binding::operands16, &operands), (Binding::sink, &sink)];
+    let seconds = best_seconds(gpu, &stage, [groups, 1, 1], &buffers, push::PeakMatrix { steps })?;
     Ok(f64::from(groups * subgroups) * f64::from(steps) * 4.0 * f64::from(2 * m * n * k) / seconds * 1e-12)
 }

@@ -60,6 +60,7 @@ pub mod kernels {
     pub mod constants;
     pub mod dispatch;
     pub mod layout;
+    pub mod push;
     pub mod stages;
     pub mod tuning;
 }

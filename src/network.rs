@@ -5,210 +5,236 @@ pub mod cost;
 pub mod forward;
 pub mod fused;
 pub mod layers;
+pub mod pass;
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
-use crate::gpu::record::{Groups, Recording};
-use crate::kernels::dispatch::{Buffers, dispatch, groups_for};
+use crate::gpu::memory::{Buffer, Memory};
+use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
-use crate::kernels::stages::{Kernels, LayerKernels};
+use crate::kernels::push;
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::params::ParamLayout;
 use crate::network::chunk::Chunk;
-use crate::network::fused::FusedKernels;
+use crate::network::fused::FusedNetwork;
+use crate::network::layers::LayerNetwork;
+use crate::network::pass::Pass;
 
 /// Loss scale a run on matrices starts with.
 pub const FIRST_LOSS_SCALE: f32 = 65_536.0;
 
-/// The network's kernels.
-pub enum Network {
-    /// One f32 pass per layer.
-    Layers(Box<LayerKernels>),
-    /// Cooperative matrices.
-    Fused(Box<FusedKernels>),
+/// What a network is built for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// The forward pass alone.
+    Render,
+    /// Forward and backward.
+    Train,
 }
 
-/// Groups of a dispatch over live samples, at a byte offset of the arguments `march_scan` wrote.
-pub fn indirect(buffers: &Buffers, offset: usize) -> Result<Groups<'_>> {
-    Ok(Groups::Indirect(buffers.get("arguments")?, offset as u64))
+/// One way to compute the network: its kernels and the buffers that it alone needs.
+trait Path: Send + Sync {
+    /// The buffer of that name, if it is among the path's.
+    fn find(&self, name: Binding) -> Option<&Buffer>;
+
+    /// Samples per tile, and tiles across a layer forward and backward.
+    fn tiles(&self, params: &ParamLayout) -> Tiles;
+
+    /// How the backward pass leaves the gradient.
+    fn partial_sums(&self, params: &ParamLayout) -> PartialSums;
+
+    /// Where in a part of the samples' sums the gradient of each network parameter lies.
+    fn gradient_source(&self, params: &ParamLayout) -> Vec<u32>;
+
+    /// Records what depends on parameters alone; `phase_bias` is there.
+    fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()>;
+
+    /// Records the network over the live samples: `sample_sigma`.
+    fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()>;
+
+    /// Records the backward pass of a chunk: `partials`.
+    fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()>;
+
+    /// Records the sums of dz over each phase, unless they are there: `phase_dz`.
+    fn record_phase_sums(&self, pass: &mut Pass<'_>, gradient: &GradientBuffers) -> Result<()>;
+}
+
+/// Tiles that the layers are computed in.
+struct Tiles {
+    /// Samples of a tile.
+    samples: u32,
+    /// Tiles across a layer, forward.
+    forward: u32,
+    /// Tiles across a layer, backward to its input.
+    backward: u32,
+}
+
+/// Sums of the gradient over parts of the samples, still to be added up.
+struct PartialSums {
+    /// How many parts.
+    splits: u32,
+    /// Numbers of each.
+    len: u32,
+}
+
+buffer_set! {
+    /// The network's gradient on its way to the optimiser.
+    pub struct GradientBuffers {
+        /// Sums over parts of the samples, `[part][number]`.
+        partials,
+        /// Where in a part the gradient of each network parameter lies.
+        source,
+        /// Sums of dz over each phase, `[layer][phase][neuron]`.
+        phase_dz,
+    }
+}
+
+/// The dynamic field's network: kernels and buffers.
+pub struct Network {
+    layers: Layers,
+    path: Box<dyn Path>,
+    phase_bias: Buffer,
+    gradient: Option<GradientBuffers>,
+}
+
+/// Samples a chunk may have, by the range of one storage buffer.
+pub fn largest_chunk(gpu: &Gpu, tuning: &Tuning, params: &ParamLayout) -> u32 {
+    let bytes_per_sample = match tuning.layers {
+        Layers::F32 => 4 * params.width,
+        Layers::Matrices => 2 * params.width * params.layers.len(),
+    };
+    // Less what capacities are padded with.
+    (gpu.info().max_storage_buffer_range / bytes_per_sample as u32).saturating_sub(256)
 }
 
 impl Network {
-    /// Builds the kernels `tuning` asks for; `train` includes the backward passes.
+    /// Builds the kernels `tuning` asks for and the buffers for chunks as large as `setup` says.
     ///
     /// # Errors
-    /// [`crate::error::Error::Config`] when matrices are asked for and do not fit; errors of the device.
-    pub fn new(gpu: &Gpu, tuning: &Tuning, params: &ParamLayout, train: bool) -> Result<Network> {
-        Ok(match tuning.layers {
-            Layers::F32 => Network::Layers(Box::new(LayerKernels::new(gpu, tuning.clone(), params.line_len() as u32)?)),
-            Layers::Matrices => Network::Fused(Box::new(FusedKernels::new(gpu, tuning, params, train)?)),
-        })
+    /// [`Error::Config`] when matrices are asked for and do not fit; errors of the device, among them
+    /// [`Error::OutOfMemory`] naming the buffer.
+    pub fn new(gpu: &Gpu, tuning: &Tuning, setup: &Setup, params: &ParamLayout, purpose: Purpose) -> Result<Network> {
+        let path: Box<dyn Path> = match tuning.layers {
+            Layers::F32 => Box::new(LayerNetwork::new(gpu, tuning, setup, params, purpose)?),
+            Layers::Matrices => Box::new(FusedNetwork::new(gpu, tuning, setup, params, purpose)?),
+        };
+        let rows = (params.layers.len() * params.phases * params.width) as u64;
+        let phase_bias = gpu.buffer("phase_bias", rows * 4, Memory::Device)?;
+        let gradient = match purpose {
+            Purpose::Render => None,
+            Purpose::Train => {
+                let sums = path.partial_sums(params);
+                let bytes = u64::from(sums.splits) * u64::from(sums.len) * 4;
+                Some(GradientBuffers {
+                    partials: gpu.buffer("partials", bytes, Memory::Device)?,
+                    source: gpu.buffer_with("gradient_source", &path.gradient_source(params))?,
+                    phase_dz: gpu.buffer("phase_dz", rows * 4, Memory::Device)?,
+                })
+            }
+        };
+        Ok(Network { layers: tuning.layers, path, phase_bias, gradient })
     }
 
-    /// Samples a chunk may have, by the range of one storage buffer.
-    pub fn largest_chunk(&self, gpu: &Gpu, params: &ParamLayout) -> u32 {
-        let bytes_per_sample = match self {
-            Network::Layers(_) => 4 * params.width,
-            Network::Fused(_) => 2 * params.width * params.layers.len(),
-        };
-        // Less what capacities are padded with.
-        (gpu.info().max_storage_buffer_range / bytes_per_sample as u32).saturating_sub(256)
+    /// The path that computes the layers.
+    pub fn layers(&self) -> Layers {
+        self.layers
     }
 
     /// Loss scale to start with.
     pub fn first_loss_scale(&self) -> f32 {
-        match self {
-            Network::Layers(_) => 1.0,
-            Network::Fused(_) => FIRST_LOSS_SCALE,
+        match self.layers {
+            Layers::F32 => 1.0,
+            Layers::Matrices => FIRST_LOSS_SCALE,
         }
     }
 
-    /// Adds the buffers of the forward pass.
-    ///
-    /// # Errors
-    /// [`crate::error::Error::OutOfMemory`] naming the buffer.
-    pub fn forward_buffers(
-        &self,
-        gpu: &Gpu,
-        tuning: &Tuning,
-        setup: &Setup,
-        params: &ParamLayout,
-        buffers: &mut Buffers,
-    ) -> Result<()> {
-        match self {
-            Network::Layers(_) => layers::forward_buffers(gpu, tuning, setup, params, buffers),
-            Network::Fused(k) => k.forward_buffers(gpu, setup, params, buffers),
-        }
+    /// Where the gradient is summed; none when built for rendering.
+    pub fn gradient(&self) -> Option<&GradientBuffers> {
+        self.gradient.as_ref()
     }
 
-    /// Adds the buffers of the backward pass.
-    ///
-    /// # Errors
-    /// As [`Network::forward_buffers`].
-    pub fn backward_buffers(
-        &self,
-        gpu: &Gpu,
-        tuning: &Tuning,
-        setup: &Setup,
-        params: &ParamLayout,
-        rays_per_chunk: u64,
-        buffers: &mut Buffers,
-    ) -> Result<()> {
-        match self {
-            Network::Layers(_) => layers::backward_buffers(gpu, tuning, setup, params, rays_per_chunk, buffers),
-            Network::Fused(k) => k.backward_buffers(gpu, setup, params, buffers),
-        }
+    fn find(&self, name: Binding) -> Option<&Buffer> {
+        let phase_bias = (name == Binding::phase_bias).then_some(&self.phase_bias);
+        phase_bias.or_else(|| self.path.find(name)).or_else(|| self.gradient.as_ref()?.find(name))
     }
 
     /// Records what depends on parameters alone: once per iteration.
     ///
     /// # Errors
-    /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit; so do all that follow.
-    pub fn record_weights(
-        &self,
-        r: &mut Recording,
-        k: &Kernels,
-        buffers: &Buffers,
-        params: &ParamLayout,
-    ) -> Result<()> {
+    /// As [`Pass::run`]; so do all that follow.
+    pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
+        let (stage, params) = (&pass.kernels.mlp_latent_fwd, pass.params);
         for (i, layer) in params.layers.iter().enumerate() {
-            let push = [
-                i as u32,
-                layer.bias as u32,
-                layer.latent.unwrap_or(0) as u32,
-                u32::from(layer.latent.is_some()),
-                params.latents as u32,
-            ];
-            let n = (params.phases * params.width) as u32;
-            dispatch(r, &k.mlp_latent_fwd, groups_for(&k.mlp_latent_fwd, n), buffers, &[], push)?;
+            let push = push::MlpLatentFwd {
+                layer: i as u32,
+                bias: layer.bias as u32,
+                latent_weight: layer.latent.unwrap_or(0) as u32,
+                has_latent: u32::from(layer.latent.is_some()),
+                latents: params.latents as u32,
+            };
+            pass.run(stage, stage.groups_for((params.phases * params.width) as u32), push)?;
         }
-        match self {
-            Network::Layers(_) => Ok(()),
-            Network::Fused(fused) => fused.record_pack(r, buffers, params),
-        }
+        self.path.record_weights(pass)
     }
 
     /// Records the network over the live samples: `sample_sigma`.
     ///
     /// # Errors
     /// As [`Network::record_weights`].
-    pub fn record_forward(
-        &self,
-        r: &mut Recording,
-        buffers: &Buffers,
-        params: &ParamLayout,
-        setup: &Setup,
-    ) -> Result<()> {
-        match self {
-            Network::Layers(k) => layers::record_forward(r, k, buffers, params, setup),
-            Network::Fused(k) => k.record_forward(r, buffers, params),
-        }
+    pub fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
+        self.path.record_forward(pass)
     }
 
     /// Records the backward pass of a chunk: partial sums of the gradient.
     ///
     /// # Errors
     /// As [`Network::record_weights`].
-    pub fn record_backward(
-        &self,
-        r: &mut Recording,
-        buffers: &Buffers,
-        params: &ParamLayout,
-        setup: &Setup,
-        chunk: Chunk,
-    ) -> Result<()> {
-        match self {
-            Network::Layers(k) => layers::record_backward(r, k, buffers, params, setup, chunk),
-            Network::Fused(k) => k.record_backward(r, buffers, params, setup, chunk),
-        }
+    pub fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        self.path.record_backward(pass, chunk)
     }
 
     /// Records the sums of the partial sums, and what follows from the sums per phase: the network's gradient.
     ///
     /// # Errors
     /// As [`Network::record_weights`].
-    pub fn record_gradient(
-        &self,
-        r: &mut Recording,
-        k: &Kernels,
-        buffers: &Buffers,
-        params: &ParamLayout,
-    ) -> Result<()> {
-        let network = params.network_len() as u32;
-        let (splits, n_partials) = match self {
-            Network::Layers(k) => (k.tuning.splits, network),
-            Network::Fused(k) => (k.workgroups, k.partials_len()),
-        };
-        let names = [("source", "gradient_source")];
-        let push = [params.static_len as u32, network, splits, n_partials];
-        dispatch(r, &k.gradient_network, groups_for(&k.gradient_network, network), buffers, &names, push)?;
-        if let Network::Fused(_) = self {
-            let n = (params.layers.len() * params.phases * params.width) as u32;
-            let names = [("source", "phase_source"), ("gradient", "phase_dz")];
-            let groups = groups_for(&k.gradient_network, n);
-            dispatch(r, &k.gradient_network, groups, buffers, &names, [0, n, splits, n_partials])?;
-        }
+    pub fn record_gradient(&self, pass: &mut Pass<'_>) -> Result<()> {
+        let Some(gradient) = &self.gradient else { return Err(built_for_rendering()) };
+        let (k, params) = (pass.kernels, pass.params);
+        let PartialSums { splits, len: n_partials } = self.path.partial_sums(params);
+        let (first, count) = (params.static_len as u32, params.network_len() as u32);
+        let push = push::GradientNetwork { first, count, splits, n_partials };
+        pass.run(&k.gradient_network, k.gradient_network.groups_for(count), push)?;
+        self.path.record_phase_sums(pass, gradient)?;
         let mut accumulate_latents = 0;
         for (i, layer) in params.layers.iter().enumerate() {
             let Some(latent) = layer.latent else { continue };
-            let push = [i as u32, layer.bias as u32, latent as u32, params.latents as u32, accumulate_latents];
+            let push = push::MlpLatentBwd {
+                layer: i as u32,
+                bias: layer.bias as u32,
+                latent_weight: latent as u32,
+                latents: params.latents as u32,
+                accumulate_latents,
+            };
             let n = params.width + params.latent * (params.width + params.phases);
-            dispatch(r, &k.mlp_latent_bwd, groups_for(&k.mlp_latent_bwd, n as u32), buffers, &[], push)?;
+            pass.run(&k.mlp_latent_bwd, k.mlp_latent_bwd.groups_for(n as u32), push)?;
             accumulate_latents = 1;
         }
         Ok(())
     }
 
-    /// Push constants of `march_scan` for a chunk: among them samples per tile, and tiles across a layer forward and
-    /// backward, for its indirect arguments.
-    pub fn scan(&self, params: &ParamLayout, chunk: Chunk) -> [u32; 5] {
-        let [tile, forward, backward] = match self {
-            Network::Layers(k) => {
-                let (tile, width) = (k.tuning.tile(), params.width as u32);
-                [k.tuning.tile_samples(), width.div_ceil(tile.fwd_neurons), width.div_ceil(tile.bwd_inputs)]
-            }
-            Network::Fused(k) => [k.tile_samples(), 1, 1],
-        };
-        [chunk.n_rays, tile, forward, backward, u32::from(chunk.first_ray > 0)]
+    /// Push constants of `march_scan` for a chunk.
+    pub fn scan(&self, params: &ParamLayout, chunk: Chunk) -> push::MarchScan {
+        let tiles = self.path.tiles(params);
+        push::MarchScan {
+            n_rays: chunk.n_rays,
+            tile_samples: tiles.samples,
+            forward_rows: tiles.forward,
+            backward_rows: tiles.backward,
+            accumulate: chunk.accumulate(),
+        }
     }
+}
+
+fn built_for_rendering() -> Error {
+    Error::Internal("the network was built for rendering only".into())
 }

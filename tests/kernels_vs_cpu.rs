@@ -38,7 +38,7 @@ fn rays_and_depths_match() {
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let losses = trainer.advance(1).unwrap();
     let plan = trainer.plan();
-    let got: Vec<Ray> = gpu.download(trainer.buffers().get("rays").unwrap(), 0, plan.setup.n_rays as usize).unwrap();
+    let got: Vec<Ray> = gpu.download(&trainer.forward().rays, 0, plan.setup.n_rays as usize).unwrap();
     let want = march::batch(plan, losses.last().unwrap().step - 1);
     let params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
     let mut live = 0;
@@ -101,7 +101,7 @@ fn check_losses_and_gradients(path: &Tuning) {
         }
         let twin: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
         let mut trainer = Trainer::new(&gpu, plan, &dataset, path.clone()).unwrap();
-        gpu.upload(trainer.buffers().get("params").unwrap(), 0, &params).unwrap();
+        gpu.upload(&trainer.forward().params, 0, &params).unwrap();
         let got = trainer.advance(1).unwrap()[0];
         let plan = trainer.plan();
         let (want, gradient) = step::loss_and_gradient(plan, &twin, 0, &march::batch(plan, 0), Precision::Exact);
@@ -113,7 +113,7 @@ fn check_losses_and_gradients(path: &Tuning) {
         ] {
             assert!((g - w).abs() <= 2e-5 * w.abs() + 1e-12, "{preset} {settings:?} {name}: {g} against {w}");
         }
-        let on_device: Vec<f32> = gpu.download(trainer.buffers().get("gradient").unwrap(), 0, plan.params.len).unwrap();
+        let on_device: Vec<f32> = gpu.download(&trainer.training().gradient, 0, plan.params.len).unwrap();
         // Tensor by tensor, so that a missing small gradient cannot hide behind a large one.
         for tensor in plan.params.tensors() {
             let pick = |v: &dyn Fn(usize) -> f64| tensor.positions.iter().map(|p| v(*p as usize)).collect::<Vec<_>>();
@@ -144,15 +144,13 @@ fn occupancy_is_learned_and_heeded() {
     let mut plan = Plan::new(&small_config("fast", &settings), &dataset).unwrap();
     let mut first = Trainer::new(&gpu, Plan::new(&plan.config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let live = first.advance(1).unwrap()[0].live_samples as usize;
-    let mut sigma: Vec<[f32; 2]> = gpu.download(first.buffers().get("sample_sigma").unwrap(), 0, live).unwrap();
+    let mut sigma: Vec<[f32; 2]> = gpu.download(&first.forward().sample_sigma, 0, live).unwrap();
     sigma.sort_by(|a, b| a[0].total_cmp(&b[0]));
     plan.setup.occupancy_threshold = sigma[live * 9 / 10][0];
     drop(first);
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let words = 3 * trainer.plan().setup.occupancy_words();
-    let notes = |trainer: &Trainer| -> Vec<u32> {
-        gpu.download(trainer.buffers().get("occupancy").unwrap(), 0, words).unwrap()
-    };
+    let notes = |trainer: &Trainer| -> Vec<u32> { gpu.download(&trainer.forward().occupancy, 0, words).unwrap() };
     let advance = |trainer: &mut Trainer, until: u32| {
         let mut last = None;
         while trainer.step() < until {
@@ -166,10 +164,10 @@ fn occupancy_is_learned_and_heeded() {
     let live = advance(&mut trainer, 65).live_samples as usize;
     let after = notes(&trainer);
     let setup = trainer.plan().setup;
-    let points: Vec<[f32; 4]> = gpu.download(trainer.buffers().get("sample_points").unwrap(), 0, live).unwrap();
-    let rays: Vec<u32> = gpu.download(trainer.buffers().get("sample_rays").unwrap(), 0, live).unwrap();
-    let sigma: Vec<[f32; 2]> = gpu.download(trainer.buffers().get("sample_sigma").unwrap(), 0, live).unwrap();
-    let batch: Vec<Ray> = gpu.download(trainer.buffers().get("rays").unwrap(), 0, setup.n_rays as usize).unwrap();
+    let points: Vec<[f32; 4]> = gpu.download(&trainer.forward().sample_points, 0, live).unwrap();
+    let rays: Vec<u32> = gpu.download(&trainer.forward().sample_rays, 0, live).unwrap();
+    let sigma: Vec<[f32; 2]> = gpu.download(&trainer.forward().sample_sigma, 0, live).unwrap();
+    let batch: Vec<Ray> = gpu.download(&trainer.forward().rays, 0, setup.n_rays as usize).unwrap();
     let mut want = before[words / 3..2 * words / 3].to_vec();
     let mut kinds = [0; 2];
     for ((point, ray), sigma) in points.iter().zip(&rays).zip(&sigma) {

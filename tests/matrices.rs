@@ -64,7 +64,7 @@ fn losses_and_gradients_match() {
         for (name, g, w) in [("data", got.data, want.data), ("occlusion", got.occlusion, want.occlusion)] {
             assert!((g - w).abs() <= 1e-4 * w.abs() + 1e-12, "{preset} {settings:?} {name}: {g} against {w}");
         }
-        let on_device: Vec<f32> = gpu.download(trainer.buffers().get("gradient").unwrap(), 0, plan.params.len).unwrap();
+        let on_device: Vec<f32> = gpu.download(&trainer.training().gradient, 0, plan.params.len).unwrap();
         for tensor in plan.params.tensors() {
             let (mut error, mut norm) = (0.0, 0.0);
             for at in &tensor.positions {
@@ -123,13 +123,12 @@ fn an_overflow_skips_the_update_and_halves_the_scale() {
     let (before, first) = (plan.params.initial(&plan.config), plan.params.static_len);
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning).unwrap();
     let huge = DeviceState { step: 0, loss_scale: 2f32.powi(60), overflowed: 0, good_updates: 7 };
-    gpu.upload(trainer.buffers().get("state").unwrap(), 0, &[huge]).unwrap();
+    gpu.upload(&trainer.forward().state, 0, &[huge]).unwrap();
     trainer.advance(1).unwrap();
     let after = trainer.model().unwrap().params;
     assert_eq!(before[first..], after[first..], "the network moved");
     assert_ne!(before[..first], after[..first], "the static field needs no scale");
-    let state =
-        |trainer: &Trainer| -> DeviceState { gpu.download(trainer.buffers().get("state").unwrap(), 0, 1).unwrap()[0] };
+    let state = |trainer: &Trainer| -> DeviceState { gpu.download(&trainer.forward().state, 0, 1).unwrap()[0] };
     assert_eq!(state(&trainer), DeviceState { step: 1, loss_scale: 2f32.powi(59), overflowed: 0, good_updates: 0 });
     // Back and back until gradients fit; then the network moves again.
     run(&mut trainer, 40);

@@ -195,13 +195,6 @@ impl Gpu {
     }
 }
 
-impl Pipeline {
-    /// Buffers the shader uses.
-    pub fn bindings(&self) -> &'static [BindingCode] {
-        self.code.bindings
-    }
-}
-
 pub(super) fn descriptor_type(binding: &BindingCode) -> vk::DescriptorType {
     match binding.kind {
         BindingKind::Storage => vk::DescriptorType::STORAGE_BUFFER,

@@ -2,74 +2,84 @@
 
 use crate::error::{Error, Result};
 use crate::gpu::memory::Buffer;
-use crate::gpu::pipeline::{BindingKind, Pipeline};
 use crate::gpu::record::{Bound, Groups, Recording};
 use crate::gpu::volume::Volume;
-use bytemuck::Pod;
-use std::collections::HashMap;
-use std::sync::Arc;
+use crate::kernels::push::PushConstants;
+use crate::kernels::stages::Stage;
 
-/// Buffers under the names the shaders use.
-#[derive(Clone, Default)]
-pub struct Buffers {
-    by_name: HashMap<&'static str, Buffer>,
-    volumes: HashMap<&'static str, Volume>,
+include!(concat!(env!("OUT_DIR"), "/bindings.rs"));
+
+/// Buffers that shaders find by name.
+pub trait BufferSet {
+    /// The buffer of that name, if it is among them.
+    fn find(&self, name: Binding) -> Option<&Buffer>;
 }
 
-impl Buffers {
-    /// Adds or replaces a buffer.
-    pub fn set(&mut self, name: &'static str, buffer: Buffer) {
-        self.by_name.insert(name, buffer);
-    }
+/// Declares a struct of buffers, which shaders find under the names of its fields.
+macro_rules! buffer_set {
+    ($(#[$about:meta])* $visibility:vis struct $name:ident { $($(#[$doc:meta])* $field:ident,)* }) => {
+        $(#[$about])*
+        #[derive(Clone)]
+        $visibility struct $name { $($(#[$doc])* pub $field: $crate::gpu::memory::Buffer,)* }
 
-    /// Adds or replaces a volume.
-    pub fn set_volume(&mut self, name: &'static str, volume: Volume) {
-        self.volumes.insert(name, volume);
-    }
+        impl $crate::kernels::dispatch::BufferSet for $name {
+            fn find(&self, name: $crate::kernels::dispatch::Binding) -> Option<&$crate::gpu::memory::Buffer> {
+                match name {
+                    $($crate::kernels::dispatch::Binding::$field => Some(&self.$field),)*
+                    _ => None,
+                }
+            }
+        }
+    };
+}
+pub(crate) use buffer_set;
 
-    fn volume(&self, name: &str) -> Result<&Volume> {
-        self.volumes.get(name).ok_or_else(|| Error::Internal(format!("no volume is called `{name}`")))
-    }
-
-    /// A buffer by name.
-    ///
-    /// # Errors
-    /// [`Error::Internal`] when it was never set.
-    pub fn get(&self, name: &str) -> Result<&Buffer> {
-        self.by_name.get(name).ok_or_else(|| Error::Internal(format!("no buffer is called `{name}`")))
+impl<'a> From<&'a Buffer> for Bound<'a> {
+    fn from(buffer: &'a Buffer) -> Bound<'a> {
+        Bound::Buffer(buffer)
     }
 }
 
-/// Records `stage`, binding each buffer its shader names from `buffers`; `renamed` takes precedence.
+impl<'a> From<&'a Volume> for Bound<'a> {
+    fn from(volume: &'a Volume) -> Bound<'a> {
+        Bound::Volume(volume)
+    }
+}
+
+/// Records `stage`, binding everything its shader names from `bound`.
 ///
 /// # Errors
-/// Errors of [`Recording::dispatch`].
-pub fn dispatch<P: Pod>(
+/// [`Error::Internal`] naming what is not bound; errors of [`Recording::dispatch`].
+pub fn dispatch<P: PushConstants>(
     recording: &mut Recording,
-    stage: &Arc<Pipeline>,
+    stage: &Stage<P>,
     groups: Groups<'_>,
-    buffers: &Buffers,
-    renamed: &[(&str, &str)],
+    bound: &[(Binding, Bound<'_>)],
     push: P,
 ) -> Result<()> {
-    let bound = stage
-        .bindings()
-        .iter()
-        .map(|b| {
-            let source = renamed.iter().find(|(shader, _)| *shader == b.name).map_or(b.name, |(_, name)| name);
-            Ok((
-                b.name,
-                match b.kind {
-                    BindingKind::Volume => Bound::Volume(buffers.volume(source)?),
-                    _ => Bound::Buffer(buffers.get(source)?),
-                },
-            ))
-        })
-        .collect::<Result<Vec<_>>>()?;
-    recording.dispatch(stage, groups, &bound, &push)
+    dispatch_finding(recording, stage, groups, bound, |_| None, push)
 }
 
-/// `n` invocations in workgroups of `pipeline`'s size.
-pub fn groups_for(pipeline: &Pipeline, n: u32) -> Groups<'static> {
-    Groups::Direct([n.div_ceil(pipeline.local_size).max(1), 1, 1])
+/// Records `stage` as [`dispatch`] does; what is not in `bound` is found by `find`.
+///
+/// # Errors
+/// As [`dispatch`].
+pub fn dispatch_finding<'a, P: PushConstants>(
+    recording: &mut Recording,
+    stage: &Stage<P>,
+    groups: Groups<'_>,
+    bound: &[(Binding, Bound<'a>)],
+    find: impl Fn(Binding) -> Option<&'a Buffer>,
+    push: P,
+) -> Result<()> {
+    let source = |name: Binding| {
+        let direct = bound.iter().find(|(n, _)| *n == name).map(|(_, what)| *what);
+        let source = direct.or_else(|| find(name).map(Bound::Buffer));
+        let source = source.ok_or_else(|| {
+            Error::Internal(format!("kernel {}: nothing is there to bind to `{}`", P::SHADER, name.name()))
+        })?;
+        Ok((name.name(), source))
+    };
+    let bound = P::BINDINGS.iter().map(|name| source(*name)).collect::<Result<Vec<_>>>()?;
+    recording.dispatch(stage.pipeline(), groups, &bound, &push)
 }

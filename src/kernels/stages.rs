@@ -5,139 +5,225 @@ use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::Operands;
 use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
+use crate::gpu::record::Groups;
+use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
+use std::marker::PhantomData;
 use std::sync::Arc;
 
 include!(concat!(env!("OUT_DIR"), "/table.rs"));
 
-/// Inputs a lane of `mlp_layer_bwd_weight` keeps; `INPUTS` there.
-pub const WEIGHT_INPUTS: u32 = 4;
 /// Lanes that share the depths of a ray in `march_count` and `march_emit`.
-pub const MARCH_LANES: u32 = 32;
+pub const MARCH_LANES: u32 = push::MarchCount::LOCAL_SIZE;
+const _: () = assert!(push::MarchEmit::LOCAL_SIZE == MARCH_LANES);
 
 /// Finds a compiled kernel by its name.
-///
-/// # Errors
-/// [`Error::Internal`] for an unknown name.
-pub fn kernel_code(name: &str) -> Result<&'static KernelCode> {
+fn kernel_code(name: &str) -> Result<&'static KernelCode> {
     KERNEL_TABLE.iter().find(|k| k.name == name).ok_or_else(|| Error::Internal(format!("no kernel is called `{name}`")))
 }
 
-macro_rules! stages {
-    ($(#[$about:meta])* $name:ident { $($(#[$doc:meta])* $stage:ident($local:expr, $variant:ident $(, $spec:expr)?);)* }) => {
-        $(#[$about])*
-        pub struct $name {
-            /// Choices they were built with.
-            pub tuning: Tuning,
-            $($(#[$doc])* pub $stage: Arc<Pipeline>,)*
-        }
-
-        impl $name {
-            /// Builds the pipelines; `line_params` are the numbers on the lines of the static field.
-            ///
-            /// # Errors
-            /// Errors of [`Gpu::pipeline`].
-            pub fn new(gpu: &Gpu, tuning: Tuning, line_params: u32) -> Result<$name> {
-                let t = &tuning;
-                let make = |name: &str, variant: &str, local: u32, spec: &[(&str, u32)]| {
-                    let code = kernel_code(&format!("{name}{variant}"))?;
-                    gpu.pipeline(code, local, spec).map(Arc::new)
-                };
-                Ok($name {
-                    $($stage: {
-                        let local: fn(&Tuning) -> u32 = $local;
-                        #[allow(unused_mut, unused_assignments, reason = "only some stages have constants")]
-                        let mut spec: fn(&Tuning, u32) -> Vec<(&'static str, u32)> = |_, _| Vec::new();
-                        $(spec = $spec;)?
-                        make(stages!(@name $stage), stages!(@$variant t), local(t), &spec(t, line_params))?
-                    },)*
-                    tuning,
-                })
-            }
-        }
-    };
-    (@name march_fwd_maxima) => { "march_fwd" };
-    (@name $stage:ident) => { stringify!($stage) };
-    (@plain $t:ident) => { "" };
-    // Reads vec4 arrays; only the layers' time depends on doing so through addresses.
-    (@operands $t:ident) => { if $t.operands == Operands::Texel { "_texel" } else { "" } };
-    (@layers $t:ident) => {
-        match $t.operands {
-            Operands::Storage => "",
-            Operands::Texel => "_texel",
-            Operands::Address => "_address",
-        }
-    };
+/// A pipeline of the shader whose push constants are `P`; clones share it.
+pub struct Stage<P> {
+    pipeline: Arc<Pipeline>,
+    push: PhantomData<P>,
 }
 
-stages! {
-    /// Pipelines of every path.
-    Kernels {
-        /// Draws the rays of an iteration.
-        batch(|_| 64, plain);
-        /// Rays of a pose, for rendering.
-        pose_rays(|_| 64, plain);
-        /// Counts live dynamic samples.
-        march_count(|_| MARCH_LANES, plain);
-        /// Offsets and indirect arguments.
-        march_scan(|_| 256, plain);
-        /// Writes live samples.
-        march_emit(|_| MARCH_LANES, plain);
-        /// Notes which cells are empty.
-        occupancy_mark(|_| 64, plain);
-        /// Prepares the next epoch's notes.
-        occupancy_clear(|_| 64, plain);
-        /// Line integrals.
-        march_fwd(|_| 32, operands);
-        /// Line integrals and maxima, for rendering.
-        march_fwd_maxima(|_| 32, operands, |_, _| vec![("with_maxima", 1)]);
-        /// Cells of the dynamic field.
-        volume_dynamic(|_| 64, plain);
-        /// Cells of the static field.
-        volume_static(|_| 64, operands);
-        /// Line integrals and maxima of baked volumes.
-        baked_march(|_| 64, plain);
-        /// Residuals and their gradients.
-        loss(|_| 64, plain);
-        /// Scatter to planes and lines.
-        march_bwd(|_| 32, operands, |t, line_params| vec![("private_lines", t.private_lines(line_params))]);
-        /// Bias and latent, one row per phase.
-        mlp_latent_fwd(|_| 64, plain);
-        /// Gradients of biases, latent weights and latents.
-        mlp_latent_bwd(|_| 64, plain);
-        /// Gradient of the static field.
-        gradient_static(|_| 64, plain);
-        /// Gradient of the network.
-        gradient_network(|_| 64, plain);
-        /// Total variation.
-        reg_tv(|_| 64, plain);
-        /// The optimiser.
-        adam(|_| 64, plain);
-        /// Losses, loss scale and step count.
-        report(|_| 256, plain, |t, _| vec![("loss_scaling", u32::from(t.layers == Layers::Matrices))]);
+impl<P> Clone for Stage<P> {
+    fn clone(&self) -> Stage<P> {
+        Stage { pipeline: self.pipeline.clone(), push: PhantomData }
     }
 }
 
-stages! {
-    /// Pipelines of the f32 network.
-    LayerKernels {
-        /// Positional encoding.
-        encode(|_| 64, plain);
-        /// One hidden layer.
-        mlp_layer_fwd(|t| t.layer_lanes, layers);
-        /// Output neuron and activation.
-        mlp_out_fwd(|_| 64, operands);
-        /// Gradient at the output neuron.
-        mlp_out_bwd(|_| 64, operands);
-        /// Weight gradient of the output neuron.
-        mlp_out_bwd_weight(|t| t.weight_lanes, operands);
-        /// Gradient to a layer's hidden input.
-        mlp_layer_bwd_input(|t| t.layer_lanes, layers);
-        /// Weight gradient of a hidden layer.
-        mlp_layer_bwd_weight(|t| t.weight_lanes, layers);
-        /// Sums over each ray's samples.
-        mlp_ray_sum(|_| 64, operands);
-        /// Sums over each phase's rays.
-        mlp_phase_sum(|t| t.weight_lanes, plain);
+impl<P: PushConstants> Stage<P> {
+    pub(super) fn pipeline(&self) -> &Arc<Pipeline> {
+        &self.pipeline
+    }
+
+    /// Invocations of a workgroup.
+    pub fn local_size(&self) -> u32 {
+        self.pipeline.local_size
+    }
+
+    /// Workgroups for `n` invocations.
+    pub fn groups_for(&self, n: u32) -> Groups<'static> {
+        Groups::Direct([n.div_ceil(self.local_size()).max(1), 1, 1])
+    }
+}
+
+/// How a stage is built: as its shader says, unless stated otherwise.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Build<'a> {
+    /// Suffix of the shader's variant in `glsl/variants.txt`.
+    pub variant: &'a str,
+    /// Invocations of a workgroup.
+    pub lanes: Option<u32>,
+    /// Values of specialisation constants.
+    pub constants: &'a [(&'a str, u32)],
+    /// With full subgroups, for cooperative matrices.
+    pub matrices: bool,
+}
+
+impl Build<'_> {
+    /// Builds the stage.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn stage<P: PushConstants>(self, gpu: &Gpu) -> Result<Stage<P>> {
+        let code = kernel_code(&format!("{}{}", P::SHADER, self.variant))?;
+        let lanes = self.lanes.unwrap_or(P::LOCAL_SIZE);
+        let pipeline = if self.matrices {
+            gpu.matrix_pipeline(code, lanes, self.constants)?
+        } else {
+            gpu.pipeline(code, lanes, self.constants)?
+        };
+        Ok(Stage { pipeline: Arc::new(pipeline), push: PhantomData })
+    }
+}
+
+/// Pipelines of every path.
+pub struct Kernels {
+    /// Choices they were built with.
+    pub tuning: Tuning,
+    /// Draws the rays of an iteration.
+    pub batch: Stage<push::Batch>,
+    /// Rays of a pose, for rendering.
+    pub pose_rays: Stage<push::PoseRays>,
+    /// Counts live dynamic samples.
+    pub march_count: Stage<push::MarchCount>,
+    /// Offsets and indirect arguments.
+    pub march_scan: Stage<push::MarchScan>,
+    /// Writes live samples.
+    pub march_emit: Stage<push::MarchEmit>,
+    /// Notes which cells are empty.
+    pub occupancy_mark: Stage<push::OccupancyMark>,
+    /// Prepares the next epoch's notes.
+    pub occupancy_clear: Stage<push::OccupancyClear>,
+    /// Line integrals.
+    pub march_fwd: Stage<push::MarchFwd>,
+    /// Line integrals and maxima, for rendering.
+    pub march_fwd_maxima: Stage<push::MarchFwd>,
+    /// Cells of the dynamic field.
+    pub volume_dynamic: Stage<push::VolumeDynamic>,
+    /// Cells of the static field.
+    pub volume_static: Stage<push::VolumeStatic>,
+    /// Line integrals and maxima of baked volumes.
+    pub baked_march: Stage<push::BakedMarch>,
+    /// Residuals and their gradients.
+    pub loss: Stage<push::Loss>,
+    /// Scatter to planes and lines.
+    pub march_bwd: Stage<push::MarchBwd>,
+    /// Bias and latent, one row per phase.
+    pub mlp_latent_fwd: Stage<push::MlpLatentFwd>,
+    /// Gradients of biases, latent weights and latents.
+    pub mlp_latent_bwd: Stage<push::MlpLatentBwd>,
+    /// Gradient of the static field.
+    pub gradient_static: Stage<push::GradientStatic>,
+    /// Gradient of the network.
+    pub gradient_network: Stage<push::GradientNetwork>,
+    /// Total variation.
+    pub reg_tv: Stage<push::RegTv>,
+    /// The optimiser.
+    pub adam: Stage<push::Adam>,
+    /// Losses, loss scale and step count.
+    pub report: Stage<push::Report>,
+}
+
+impl Kernels {
+    /// Builds the pipelines; `line_params` are the numbers on the lines of the static field.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu, tuning: Tuning, line_params: u32) -> Result<Kernels> {
+        let plain = Build::default();
+        let vec4 = Build { variant: vec4_variant(&tuning), ..plain };
+        let private_lines = [("private_lines", tuning.private_lines(line_params))];
+        let loss_scaling = [("loss_scaling", u32::from(tuning.layers == Layers::Matrices))];
+        Ok(Kernels {
+            batch: plain.stage(gpu)?,
+            pose_rays: plain.stage(gpu)?,
+            march_count: plain.stage(gpu)?,
+            march_scan: plain.stage(gpu)?,
+            march_emit: plain.stage(gpu)?,
+            occupancy_mark: plain.stage(gpu)?,
+            occupancy_clear: plain.stage(gpu)?,
+            march_fwd: vec4.stage(gpu)?,
+            march_fwd_maxima: Build { constants: &[("with_maxima", 1)], ..vec4 }.stage(gpu)?,
+            volume_dynamic: plain.stage(gpu)?,
+            volume_static: vec4.stage(gpu)?,
+            baked_march: plain.stage(gpu)?,
+            loss: plain.stage(gpu)?,
+            march_bwd: Build { constants: &private_lines, ..vec4 }.stage(gpu)?,
+            mlp_latent_fwd: plain.stage(gpu)?,
+            mlp_latent_bwd: plain.stage(gpu)?,
+            gradient_static: plain.stage(gpu)?,
+            gradient_network: plain.stage(gpu)?,
+            reg_tv: plain.stage(gpu)?,
+            adam: plain.stage(gpu)?,
+            report: Build { constants: &loss_scaling, ..plain }.stage(gpu)?,
+            tuning,
+        })
+    }
+}
+
+/// Pipelines of the f32 network.
+pub struct LayerKernels {
+    /// Choices they were built with.
+    pub tuning: Tuning,
+    /// Positional encoding.
+    pub encode: Stage<push::Encode>,
+    /// One hidden layer.
+    pub mlp_layer_fwd: Stage<push::MlpLayerFwd>,
+    /// Output neuron and activation.
+    pub mlp_out_fwd: Stage<push::MlpOutFwd>,
+    /// Gradient at the output neuron.
+    pub mlp_out_bwd: Stage<push::MlpOutBwd>,
+    /// Weight gradient of the output neuron.
+    pub mlp_out_bwd_weight: Stage<push::MlpOutBwdWeight>,
+    /// Gradient to a layer's hidden input.
+    pub mlp_layer_bwd_input: Stage<push::MlpLayerBwdInput>,
+    /// Weight gradient of a hidden layer.
+    pub mlp_layer_bwd_weight: Stage<push::MlpLayerBwdWeight>,
+    /// Sums over each ray's samples.
+    pub mlp_ray_sum: Stage<push::MlpRaySum>,
+    /// Sums over each phase's rays.
+    pub mlp_phase_sum: Stage<push::MlpPhaseSum>,
+}
+
+impl LayerKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu, tuning: Tuning) -> Result<LayerKernels> {
+        let plain = Build::default();
+        let vec4 = Build { variant: vec4_variant(&tuning), ..plain };
+        let layer = Build { variant: layer_variant(&tuning), lanes: Some(tuning.layer_lanes), ..plain };
+        let weight_lanes = Some(tuning.weight_lanes);
+        Ok(LayerKernels {
+            encode: plain.stage(gpu)?,
+            mlp_layer_fwd: layer.stage(gpu)?,
+            mlp_out_fwd: vec4.stage(gpu)?,
+            mlp_out_bwd: vec4.stage(gpu)?,
+            mlp_out_bwd_weight: Build { lanes: weight_lanes, ..vec4 }.stage(gpu)?,
+            mlp_layer_bwd_input: layer.stage(gpu)?,
+            mlp_layer_bwd_weight: Build { lanes: weight_lanes, ..layer }.stage(gpu)?,
+            mlp_ray_sum: vec4.stage(gpu)?,
+            mlp_phase_sum: Build { lanes: weight_lanes, ..plain }.stage(gpu)?,
+            tuning,
+        })
+    }
+}
+
+/// Variant of the shaders that read arrays of vec4; only the layers' time depends on doing so through addresses.
+fn vec4_variant(tuning: &Tuning) -> &'static str {
+    if tuning.operands == Operands::Texel { "_texel" } else { "" }
+}
+
+/// Variant of the layers' shaders.
+fn layer_variant(tuning: &Tuning) -> &'static str {
+    match tuning.operands {
+        Operands::Storage => "",
+        Operands::Texel => "_texel",
+        Operands::Address => "_address",
     }
 }

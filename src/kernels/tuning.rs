@@ -3,7 +3,22 @@
 use crate::choice::Choice;
 use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
 use crate::gpu::memory::Operands;
+use crate::kernels::constants;
 use serde::Serialize;
+
+/// The register tile of three kernels that work together, from what their text defines.
+macro_rules! lane_tile {
+    ($forward:ident, $input:ident, $weight:ident) => {{
+        const { assert!(constants::$forward::SAMPLES == constants::$input::SAMPLES) };
+        LaneTile {
+            samples: constants::$forward::SAMPLES,
+            fwd_neurons: constants::$forward::OUTPUTS,
+            bwd_inputs: 4 * constants::$input::GROUPS,
+            weight_neurons: 4 * constants::$weight::NEURONS4,
+            weight_inputs: constants::$weight::INPUTS,
+        }
+    }};
+}
 
 /// How the network's layers are computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -142,12 +157,14 @@ impl Tuning {
         self.layer_lanes * self.tile().samples
     }
 
-    /// What a lane of the layer kernels keeps in registers; the defines of `glsl/variants.txt`.
+    /// What a lane of the layer kernels keeps in registers.
     pub fn tile(&self) -> LaneTile {
         match self.operands {
-            Operands::Storage => LaneTile { samples: 4, fwd_neurons: 16, bwd_inputs: 16, weight_neurons: 16 },
-            Operands::Texel => LaneTile { samples: 8, fwd_neurons: 16, bwd_inputs: 16, weight_neurons: 32 },
-            Operands::Address => LaneTile { samples: 4, fwd_neurons: 32, bwd_inputs: 32, weight_neurons: 32 },
+            Operands::Storage => lane_tile!(mlp_layer_fwd, mlp_layer_bwd_input, mlp_layer_bwd_weight),
+            Operands::Texel => lane_tile!(mlp_layer_fwd_texel, mlp_layer_bwd_input_texel, mlp_layer_bwd_weight_texel),
+            Operands::Address => {
+                lane_tile!(mlp_layer_fwd_address, mlp_layer_bwd_input_address, mlp_layer_bwd_weight_address)
+            }
         }
     }
 }
@@ -163,4 +180,6 @@ pub struct LaneTile {
     pub bwd_inputs: u32,
     /// Neurons of `mlp_layer_bwd_weight`.
     pub weight_neurons: u32,
+    /// Inputs of `mlp_layer_bwd_weight`.
+    pub weight_inputs: u32,
 }

@@ -1,5 +1,6 @@
 //! Rays whose samples are handled at once.
 
+use crate::gpu::record::Groups;
 use crate::kernels::layout::Setup;
 
 /// Rays whose samples are handled at once.
@@ -12,9 +13,14 @@ pub struct Chunk {
 }
 
 impl Chunk {
-    /// As the shaders' push constants.
-    pub fn push(self) -> [u32; 2] {
-        [self.first_ray, self.n_rays]
+    /// One workgroup per ray.
+    pub fn per_ray(self) -> Groups<'static> {
+        Groups::Direct([self.n_rays, 1, 1])
+    }
+
+    /// 1 for all chunks of a batch but the first: sums add to what that one wrote.
+    pub fn accumulate(self) -> u32 {
+        u32::from(self.first_ray > 0)
     }
 }
 

@@ -3,133 +3,177 @@
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
-use crate::gpu::record::{Groups, Recording};
+use crate::gpu::record::Groups;
 use crate::kernels::constants::OCCUPANCY_EPOCHS;
-use crate::kernels::dispatch::{Buffers, dispatch};
-use crate::kernels::layout::{DeviceState, IndirectArguments, LiveSamples, Ray, RayOut, Setup};
-use crate::kernels::stages::{Kernels, MARCH_LANES};
+use crate::kernels::dispatch::{Binding, buffer_set};
+use crate::kernels::layout::{DeviceState, DispatchSize, IndirectArguments, LiveSamples, Ray, RayOut, Setup};
+use crate::kernels::push;
+use crate::kernels::stages::MARCH_LANES;
 use crate::kernels::tuning::Tuning;
+use crate::model::hull::Hull;
 use crate::model::params::ParamLayout;
 use crate::network::chunk::{Chunk, chunks};
-use crate::network::{Network, indirect};
+use crate::network::pass::Pass;
 use std::mem::offset_of;
 
-/// Bytes of the three epochs of occupancy; none without it.
+buffer_set! {
+    /// Buffers of the forward pass, but for those of the network.
+    pub struct ForwardBuffers {
+        /// [`Setup`].
+        setup,
+        /// [`DeviceState`].
+        state,
+        /// [`crate::kernels::layout::Schedule`] of each iteration.
+        schedule,
+        /// The motion hull's cells, a bit each.
+        hull,
+        /// Parameters, as [`ParamLayout`] says.
+        params,
+        /// The same buffer: parameters of the static field come first.
+        static_params,
+        /// [`Ray`]s of the batch.
+        rays,
+        /// [`RayOut`] of each ray.
+        ray_out,
+        /// Which depths of each lane are live, a bit each.
+        lane_masks,
+        /// Live samples of a ray's lanes before each.
+        lane_offsets,
+        /// Live samples of each ray.
+        ray_counts,
+        /// Live samples of the rays before each.
+        ray_start,
+        /// [`LiveSamples`].
+        live,
+        /// [`IndirectArguments`].
+        arguments,
+        /// Position and path length of each live sample.
+        sample_points,
+        /// Ray of each live sample, and whether it is near.
+        sample_rays,
+        /// Attenuation of each live sample and its derivative.
+        sample_sigma,
+        /// Where the dynamic field has been seen empty.
+        occupancy,
+    }
+}
+
+impl ForwardBuffers {
+    /// Buffers for batches of `n_rays`; parameters are left undefined.
+    ///
+    /// # Errors
+    /// [`Error::OutOfMemory`] naming the buffer.
+    pub fn new(
+        gpu: &Gpu,
+        tuning: &Tuning,
+        setup: &Setup,
+        params: &ParamLayout,
+        n_rays: u32,
+        schedule: Buffer,
+        hull: Option<&Hull>,
+    ) -> Result<ForwardBuffers> {
+        // Samplers of volumes may have fewer samples a ray and more rays a chunk than `setup` says.
+        let n_rays = u64::from(n_rays);
+        let lanes = n_rays * u64::from(MARCH_LANES);
+        let capacity = u64::from(setup.sample_capacity);
+        let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
+        let params = gpu.operand_buffer("params", params.len as u64 * 4, tuning.operands)?;
+        Ok(ForwardBuffers {
+            setup: gpu.buffer_with("setup", &[*setup])?,
+            state: new(Binding::state, size_of::<DeviceState>() as u64)?,
+            schedule,
+            // A single empty word without a hull.
+            hull: gpu.buffer_with("hull", hull.map_or(&[0][..], |h| &h.bits))?,
+            static_params: params.clone(),
+            params,
+            rays: new(Binding::rays, n_rays * size_of::<Ray>() as u64)?,
+            ray_out: new(Binding::ray_out, n_rays * size_of::<RayOut>() as u64)?,
+            // A bit per sample, each lane's rounded up to words.
+            lane_masks: new(Binding::lane_masks, (capacity / 32 + lanes) * 4)?,
+            lane_offsets: new(Binding::lane_offsets, lanes * 4)?,
+            ray_counts: new(Binding::ray_counts, n_rays * 4)?,
+            ray_start: new(Binding::ray_start, (n_rays + 1) * 4)?,
+            live: new(Binding::live, size_of::<LiveSamples>() as u64)?,
+            arguments: new(Binding::arguments, size_of::<IndirectArguments>() as u64)?,
+            sample_points: new(Binding::sample_points, capacity * 16)?,
+            sample_rays: new(Binding::sample_rays, capacity * 4)?,
+            sample_sigma: new(Binding::sample_sigma, capacity * 8)?,
+            occupancy: new(Binding::occupancy, occupancy_bytes(setup))?,
+        })
+    }
+
+    /// One invocation per padded sample.
+    pub fn per_sample(&self) -> Groups<'_> {
+        self.indirect(offset_of!(IndirectArguments, samples))
+    }
+
+    /// One workgroup per tile of samples and of a layer's neurons.
+    pub fn forward_tiles(&self) -> Groups<'_> {
+        self.indirect(offset_of!(IndirectArguments, forward_tiles))
+    }
+
+    /// One workgroup per tile of samples and of a layer's inputs.
+    pub fn backward_tiles(&self) -> Groups<'_> {
+        self.indirect(offset_of!(IndirectArguments, backward_tiles))
+    }
+
+    fn indirect(&self, offset: usize) -> Groups<'_> {
+        // The device reads three words.
+        const { assert!(size_of::<DispatchSize>() == 12) };
+        Groups::Indirect(&self.arguments, offset as u64)
+    }
+}
+
+/// Bytes of all epochs of occupancy; none without it.
 pub fn occupancy_bytes(setup: &Setup) -> u64 {
     if setup.occupancy_cells > 0 { u64::from(OCCUPANCY_EPOCHS) * 4 * setup.occupancy_words() as u64 } else { 0 }
 }
 
-/// Buffers the forward passes need for batches of `n_rays`; parameters are left undefined.
-///
-/// # Errors
-/// [`Error::OutOfMemory`] naming the buffer.
-pub fn forward_buffers(
-    gpu: &Gpu,
-    tuning: &Tuning,
-    network: &Network,
-    setup: &Setup,
-    params: &ParamLayout,
-    n_rays: u32,
-) -> Result<Buffers> {
-    let mut buffers = Buffers::default();
-    // Samplers of volumes may have fewer samples a ray and more rays a chunk than `setup` says.
-    let per_chunk = u64::from(n_rays);
-    let capacity = u64::from(setup.sample_capacity);
-    // A bit per sample, each lane's rounded up to words.
-    let mask_words = capacity / 32 + per_chunk * u64::from(MARCH_LANES);
-    for (name, bytes) in [
-        ("state", size_of::<DeviceState>() as u64),
-        ("rays", u64::from(n_rays) * size_of::<Ray>() as u64),
-        ("ray_out", u64::from(n_rays) * size_of::<RayOut>() as u64),
-        ("lane_masks", mask_words * 4),
-        ("lane_offsets", per_chunk * u64::from(MARCH_LANES) * 4),
-        ("ray_counts", per_chunk * 4),
-        ("ray_start", (per_chunk + 1) * 4),
-        ("live", size_of::<LiveSamples>() as u64),
-        ("arguments", size_of::<IndirectArguments>() as u64),
-        ("sample_points", capacity * 16),
-        ("sample_rays", capacity * 4),
-        ("sample_sigma", capacity * 8),
-        ("occupancy", occupancy_bytes(setup)),
-        ("phase_bias", (params.layers.len() * params.phases * params.width) as u64 * 4),
-    ] {
-        buffers.set(name, gpu.buffer(name, bytes, Memory::Device)?);
+impl Pass<'_> {
+    /// Records the live dynamic samples of a chunk: counts, offsets and indirect arguments, points.
+    ///
+    /// # Errors
+    /// As [`Pass::run`].
+    pub fn samples(&mut self, chunk: Chunk) -> Result<()> {
+        let k = self.kernels;
+        let Chunk { first_ray, n_rays } = chunk;
+        self.run(&k.march_count, chunk.per_ray(), push::MarchCount { first_ray, n_rays })?;
+        self.run(&k.march_scan, Groups::Direct([1, 1, 1]), self.network.scan(self.params, chunk))?;
+        self.run(&k.march_emit, chunk.per_ray(), push::MarchEmit { first_ray, n_rays })
     }
-    let params_buffer = gpu.operand_buffer("params", params.len as u64 * 4, tuning.operands)?;
-    buffers.set("static_params", params_buffer.clone());
-    buffers.set("params", params_buffer);
-    buffers.set("setup", gpu.buffer_with("setup", &[*setup])?);
-    network.forward_buffers(gpu, tuning, setup, params, &mut buffers)?;
-    Ok(buffers)
-}
 
-/// The hull's cells as the shaders read them; a single empty word without a hull.
-///
-/// # Errors
-/// [`Error::OutOfMemory`].
-pub fn hull_buffer(gpu: &Gpu, hull: Option<&crate::model::hull::Hull>) -> Result<Buffer> {
-    gpu.buffer_with("hull", hull.map_or(&[0][..], |h| &h.bits))
-}
-
-/// Records the live dynamic samples of a chunk: counts, offsets and indirect arguments, points.
-pub fn record_samples(
-    r: &mut Recording,
-    k: &Kernels,
-    network: &Network,
-    buffers: &Buffers,
-    params: &ParamLayout,
-    chunk: Chunk,
-) -> Result<()> {
-    let per_ray = || Groups::Direct([chunk.n_rays, 1, 1]);
-    dispatch(r, &k.march_count, per_ray(), buffers, &[], chunk.push())?;
-    dispatch(r, &k.march_scan, Groups::Direct([1, 1, 1]), buffers, &[], network.scan(params, chunk))?;
-    dispatch(r, &k.march_emit, per_ray(), buffers, &[], chunk.push())
-}
-
-/// Records the dynamic field at the live samples of `n_rays` rays already in `rays`, put into the rows of `volume`.
-///
-/// # Errors
-/// [`Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_volume(
-    r: &mut Recording,
-    k: &Kernels,
-    network: &Network,
-    buffers: &Buffers,
-    params: &ParamLayout,
-    setup: &Setup,
-    n_rays: u32,
-) -> Result<()> {
-    network.record_weights(r, k, buffers, params)?;
-    for chunk in chunks(setup, n_rays) {
-        record_samples(r, k, network, buffers, params, chunk)?;
-        network.record_forward(r, buffers, params, setup)?;
-        dispatch(r, &k.volume_dynamic, indirect(buffers, offset_of!(IndirectArguments, samples))?, buffers, &[], ())?;
+    /// Records the dynamic field at the live samples of `n_rays` rays already in `rays`, put into the rows of `volume`.
+    ///
+    /// # Errors
+    /// As [`Pass::run`].
+    pub fn volume(&mut self, n_rays: u32, volume: &Buffer) -> Result<()> {
+        let (k, network, buffers) = (self.kernels, self.network, self.buffers);
+        network.record_weights(self)?;
+        for chunk in chunks(self.setup, n_rays) {
+            self.samples(chunk)?;
+            network.record_forward(self)?;
+            let bound = [(Binding::volume, volume.into())];
+            self.run_with(&k.volume_dynamic, buffers.per_sample(), &bound, push::VolumeDynamic {})?;
+        }
+        Ok(())
     }
-    Ok(())
-}
 
-/// Records a rendering of `n_rays` rays already in `rays`: integrals and maxima land in `ray_out`.
-///
-/// # Errors
-/// [`Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_render(
-    r: &mut Recording,
-    k: &Kernels,
-    network: &Network,
-    buffers: &Buffers,
-    params: &ParamLayout,
-    setup: &Setup,
-    n_rays: u32,
-) -> Result<()> {
-    if setup.jitter != 0 {
-        return Err(Error::Internal("rendering wants regular depths".into()));
+    /// Records a rendering of `n_rays` rays already in `rays`: integrals and maxima land in `ray_out`.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for jittered depths; else as [`Pass::run`].
+    pub fn render(&mut self, n_rays: u32) -> Result<()> {
+        if self.setup.jitter != 0 {
+            return Err(Error::Internal("rendering wants regular depths".into()));
+        }
+        let (k, network) = (self.kernels, self.network);
+        network.record_weights(self)?;
+        for chunk in chunks(self.setup, n_rays) {
+            self.samples(chunk)?;
+            network.record_forward(self)?;
+            let Chunk { first_ray, n_rays } = chunk;
+            self.run(&k.march_fwd_maxima, chunk.per_ray(), push::MarchFwd { first_ray, n_rays })?;
+        }
+        Ok(())
     }
-    network.record_weights(r, k, buffers, params)?;
-    for chunk in chunks(setup, n_rays) {
-        record_samples(r, k, network, buffers, params, chunk)?;
-        network.record_forward(r, buffers, params, setup)?;
-        let per_ray = Groups::Direct([chunk.n_rays, 1, 1]);
-        dispatch(r, &k.march_fwd_maxima, per_ray, buffers, &[], chunk.push())?;
-    }
-    Ok(())
 }

@@ -10,23 +10,21 @@
 use crate::error::{Error, Result};
 use crate::gpu::capabilities::{DeviceInfo, MatrixShape};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::Memory;
-use crate::gpu::pipeline::Pipeline;
-use crate::gpu::record::{Groups, Recording};
+use crate::gpu::memory::{Buffer, Memory};
+use crate::gpu::record::Groups;
 use crate::kernels::constants::{NOWHERE, PHASE_BIAS};
-use crate::kernels::dispatch::{Buffers, dispatch, groups_for};
-use crate::kernels::layout::{IndirectArguments, Setup};
-use crate::kernels::stages::kernel_code;
+use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
+use crate::kernels::layout::Setup;
+use crate::kernels::push;
+use crate::kernels::stages::{Build, Stage};
 use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamLayout;
 use crate::network::chunk::Chunk;
-use crate::network::indirect;
-use std::mem::offset_of;
-use std::sync::Arc;
+use crate::network::pass::Pass;
+use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
 
 /// Shared memory beside the tiles, bytes.
 const SHARED_RESERVE: u32 = 512;
-const DZ: [&str; 2] = ["dz16_even", "dz16_odd"];
 
 /// Positions of one hidden layer in the packed weights, which are also those of its gradient in the partial sums.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -198,210 +196,254 @@ impl Shape {
     }
 }
 
-/// Pipelines of the fused network.
-pub struct FusedKernels {
+/// Kernels and buffers of the fused network.
+pub(super) struct FusedNetwork {
     shape: Shape,
     /// Workgroups of the backward passes, each with its own partial sums.
-    pub workgroups: u32,
-    mlp_pack: Arc<Pipeline>,
-    mlp_fused_fwd: Arc<Pipeline>,
-    backward: Option<Backward>,
+    workgroups: u32,
+    mlp_pack: Stage<push::MlpPack>,
+    mlp_fused_fwd: Stage<push::MlpFusedFwd>,
+    buffers: FusedBuffers,
+    training: Option<FusedTraining>,
 }
 
-struct Backward {
+buffer_set! {
+    /// Buffers of the forward pass.
+    struct FusedBuffers {
+        /// f16 copies of the weights.
+        weights16,
+        /// Biases, repeated over the rows of a product.
+        bias_rows,
+        /// Encodings, kept for the backward pass.
+        features16,
+        /// Activations of all layers, kept for the backward pass.
+        activations16,
+        /// Where each packed weight, then each row of biases, comes from.
+        pack_source,
+    }
+}
+
+/// What the backward pass needs besides.
+struct FusedTraining {
+    kernels: BackwardKernels,
+    /// Gradients at the neurons of even and odd layers.
+    dz16: [Buffer; 2],
+    /// Where the sum of dz over each phase lies in the partial sums.
+    phase_source: Buffer,
+}
+
+struct BackwardKernels {
     /// Through the last hidden layer, whose dz it forms.
-    last: Arc<Pipeline>,
+    last: Stage<push::MlpFusedBwd>,
     /// Through the others.
-    hidden: Arc<Pipeline>,
+    hidden: Stage<push::MlpFusedBwd>,
     /// Weights on the encoding.
-    encoded: Arc<Pipeline>,
-    /// The same for the last hidden layer.
-    last_encoded: Arc<Pipeline>,
+    encoded: Stage<push::MlpFusedBwd>,
+    /// Weights of the last hidden layer on the encoding.
+    last_encoded: Stage<push::MlpFusedBwd>,
 }
 
-impl FusedKernels {
-    /// Builds the pipelines; `train` includes the backward passes.
-    ///
+/// Builds the passes on matrices.
+struct Builder<'a> {
+    gpu: &'a Gpu,
+    shape: &'a Shape,
+    params: &'a ParamLayout,
+    build: Build<'a>,
+}
+
+impl Builder<'_> {
+    fn new<'a>(gpu: &'a Gpu, tuning: &Tuning, shape: &'a Shape, params: &'a ParamLayout) -> Builder<'a> {
+        let build = Build {
+            // Unrolled or not, they compute the same.
+            variant: if tuning.matrices.unroll { "_unrolled" } else { "" },
+            lanes: Some(shape.subgroups * gpu.info().subgroup_size),
+            constants: &[],
+            matrices: true,
+        };
+        Builder { gpu, shape, params, build }
+    }
+
+    fn common(&self, tile: u32) -> [(&'static str, u32); 6] {
+        let MatrixShape { m, n, k } = self.shape.matrix;
+        let (subgroups, width) = (self.shape.subgroups, self.params.width as u32);
+        [("m", m), ("n", n), ("k", k), ("tile", tile), ("subgroups", subgroups), ("width", width)]
+    }
+
+    fn forward(&self, purpose: Purpose) -> Result<Stage<push::MlpFusedFwd>> {
+        let layers = &self.params.layers;
+        let skip = layers.iter().skip(1).position(|l| l.encoded.is_some()).map_or(0, |i| i + 1);
+        let mut constants = self.common(self.shape.fwd_tile).to_vec();
+        constants.extend([
+            ("encoded", self.shape.encoded as u32),
+            ("layers", layers.len() as u32),
+            ("skip", skip as u32),
+            ("keep", u32::from(purpose == Purpose::Train)),
+        ]);
+        Build { constants: &constants, ..self.build }.stage(self.gpu)
+    }
+
+    fn backward(&self, columns: usize, with_input: bool, from_output: bool) -> Result<Stage<push::MlpFusedBwd>> {
+        let column_tiles = columns as u32 / self.shape.matrix.n;
+        let halves = if self.shape.subgroups.is_multiple_of(2) && column_tiles.is_multiple_of(2) { 2 } else { 1 };
+        let mut constants = self.common(self.shape.bwd_tile).to_vec();
+        constants.extend([
+            ("columns", columns as u32),
+            ("with_input", u32::from(with_input)),
+            ("from_output", u32::from(from_output)),
+            ("halves", halves),
+        ]);
+        Build { constants: &constants, ..self.build }.stage(self.gpu)
+    }
+}
+
+impl FusedNetwork {
     /// # Errors
     /// [`Error::Config`] when device and network do not fit; errors of [`Gpu::matrix_pipeline`].
-    pub fn new(gpu: &Gpu, tuning: &Tuning, params: &ParamLayout, train: bool) -> Result<FusedKernels> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        tuning: &Tuning,
+        setup: &Setup,
+        params: &ParamLayout,
+        purpose: Purpose,
+    ) -> Result<FusedNetwork> {
         let info = gpu.info();
         let matrix = *info.matrices.first().ok_or_else(|| {
             let problem = "this device has no cooperative matrices our kernels can use: take f32 or auto";
             Error::config("layers", "matrices", format!("{}: {problem}", info.name))
         })?;
         let shape = Shape::new(info, matrix, tuning.matrices.largest_tile, params)?;
-        let local = shape.subgroups * info.subgroup_size;
-        let variant = if tuning.matrices.unroll { "_unrolled" } else { "" };
-        let common = |tile: u32| {
-            [
-                ("m", matrix.m),
-                ("n", matrix.n),
-                ("k", matrix.k),
-                ("tile", tile),
-                ("subgroups", shape.subgroups),
-                ("width", params.width as u32),
-            ]
+        let builder = Builder::new(gpu, tuning, &shape, params);
+        let (width, encoded) = (params.width, shape.encoded);
+        let capacity = u64::from(setup.sample_capacity);
+        let training = match purpose {
+            Purpose::Render => None,
+            Purpose::Train => Some(FusedTraining {
+                kernels: BackwardKernels {
+                    last: builder.backward(width, true, true)?,
+                    hidden: builder.backward(width, true, false)?,
+                    encoded: builder.backward(encoded, false, false)?,
+                    last_encoded: builder.backward(encoded, false, true)?,
+                },
+                dz16: [
+                    gpu.buffer("dz16_even", capacity * width as u64 * 2, Memory::Device)?,
+                    gpu.buffer("dz16_odd", capacity * width as u64 * 2, Memory::Device)?,
+                ],
+                phase_source: gpu.buffer_with("phase_source", &shape.phase_source(params))?,
+            }),
         };
-        let skip = params.layers.iter().skip(1).position(|l| l.encoded.is_some()).map_or(0, |i| i + 1);
-        let mut spec = common(shape.fwd_tile).to_vec();
-        spec.extend([
-            ("encoded", shape.encoded as u32),
-            ("layers", params.layers.len() as u32),
-            ("skip", skip as u32),
-            ("keep", u32::from(train)),
-        ]);
-        let forward = gpu.matrix_pipeline(kernel_code(&format!("mlp_fused_fwd{variant}"))?, local, &spec)?;
-        let backward = |columns: usize, with_input: bool, from_output: bool| {
-            let mut spec = common(shape.bwd_tile).to_vec();
-            spec.extend([
-                ("columns", columns as u32),
-                ("with_input", u32::from(with_input)),
-                ("from_output", u32::from(from_output)),
-                (
-                    "halves",
-                    if shape.subgroups.is_multiple_of(2) && (columns as u32 / matrix.n).is_multiple_of(2) {
-                        2
-                    } else {
-                        1
-                    },
-                ),
-            ]);
-            let code = kernel_code(&format!("mlp_fused_bwd{variant}"))?;
-            gpu.matrix_pipeline(code, local, &spec).map(Arc::new)
+        let kept = |per_sample: usize| if training.is_some() { capacity * per_sample as u64 * 2 } else { 16 };
+        let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
+        let bias_len = params.layers.len() * matrix.m as usize * width;
+        let buffers = FusedBuffers {
+            weights16: new(Binding::weights16, shape.weights_len as u64 * 2)?,
+            bias_rows: new(Binding::bias_rows, bias_len as u64 * 4)?,
+            features16: new(Binding::features16, kept(encoded))?,
+            activations16: new(Binding::activations16, kept(params.layers.len() * width))?,
+            pack_source: gpu.buffer_with("pack_source", &shape.pack_source(params))?,
         };
-        Ok(FusedKernels {
+        Ok(FusedNetwork {
             workgroups: tuning.matrices.workgroups,
-            mlp_pack: Arc::new(gpu.pipeline(kernel_code("mlp_pack")?, 64, &[])?),
-            mlp_fused_fwd: Arc::new(forward),
-            backward: if train {
-                Some(Backward {
-                    last: backward(params.width, true, true)?,
-                    hidden: backward(params.width, true, false)?,
-                    encoded: backward(shape.encoded, false, false)?,
-                    last_encoded: backward(shape.encoded, false, true)?,
-                })
-            } else {
-                None
-            },
+            mlp_pack: Build::default().stage(gpu)?,
+            mlp_fused_fwd: builder.forward(purpose)?,
+            buffers,
+            training,
             shape,
         })
     }
 
-    /// Samples a workgroup of the forward pass covers.
-    pub fn tile_samples(&self) -> u32 {
-        self.shape.fwd_tile
+    fn training(&self) -> Result<&FusedTraining> {
+        self.training.as_ref().ok_or_else(built_for_rendering)
     }
 
-    /// Elements of a workgroup's partial sums.
-    pub fn partials_len(&self) -> u32 {
-        self.shape.partials_len as u32
-    }
-
-    /// Adds the buffers of the forward pass.
-    pub fn forward_buffers(&self, gpu: &Gpu, setup: &Setup, params: &ParamLayout, buffers: &mut Buffers) -> Result<()> {
-        let shape = &self.shape;
-        let kept = |per_sample: usize| match self.backward {
-            Some(_) => u64::from(setup.sample_capacity) * per_sample as u64 * 2,
-            None => 16,
-        };
-        let bias_len = params.layers.len() * shape.matrix.m as usize * params.width;
-        for (name, bytes) in [
-            ("weights16", shape.weights_len as u64 * 2),
-            ("bias_rows", bias_len as u64 * 4),
-            ("features16", kept(shape.encoded)),
-            ("activations16", kept(params.layers.len() * params.width)),
-        ] {
-            buffers.set(name, gpu.buffer(name, bytes, Memory::Device)?);
-        }
-        buffers.set("pack_source", gpu.buffer_with("pack_source", &shape.pack_source(params))?);
-        Ok(())
-    }
-
-    /// Adds the buffers of the backward pass, and what `gradient_network` needs to know of the partial sums.
-    pub fn backward_buffers(
-        &self,
-        gpu: &Gpu,
-        setup: &Setup,
-        params: &ParamLayout,
-        buffers: &mut Buffers,
-    ) -> Result<()> {
-        let shape = &self.shape;
-        let dz_bytes = u64::from(setup.sample_capacity) * params.width as u64 * 2;
-        for name in DZ {
-            buffers.set(name, gpu.buffer(name, dz_bytes, Memory::Device)?);
-        }
-        let bytes = u64::from(self.workgroups) * shape.partials_len as u64 * 4;
-        buffers.set("partials", gpu.buffer("partials", bytes, Memory::Device)?);
-        buffers.set("gradient_source", gpu.buffer_with("gradient_source", &shape.gradient_source(params))?);
-        buffers.set("phase_source", gpu.buffer_with("phase_source", &shape.phase_source(params))?);
-        Ok(())
-    }
-
-    /// Records the f16 copies of the weights; `phase_bias` must be there.
-    pub fn record_pack(&self, r: &mut Recording, buffers: &Buffers, params: &ParamLayout) -> Result<()> {
-        let pairs = (self.shape.weights_len / 2) as u32;
-        let bias = params.layers.len() as u32 * self.shape.matrix.m * params.width as u32;
-        let groups = groups_for(&self.mlp_pack, pairs + bias);
-        dispatch(r, &self.mlp_pack, groups, buffers, &[], [pairs, bias])
-    }
-
-    /// Records the forward pass: `sample_sigma`.
-    pub fn record_forward(&self, r: &mut Recording, buffers: &Buffers, params: &ParamLayout) -> Result<()> {
-        dispatch(
-            r,
-            &self.mlp_fused_fwd,
-            indirect(buffers, offset_of!(IndirectArguments, forward_tiles))?,
-            buffers,
-            &[],
-            params.out_bias as u32,
-        )
-    }
-
-    /// Records the backward pass of a chunk: `partials`.
-    pub fn record_backward(
-        &self,
-        r: &mut Recording,
-        buffers: &Buffers,
-        params: &ParamLayout,
-        setup: &Setup,
-        chunk: Chunk,
-    ) -> Result<()> {
-        let shape = &self.shape;
-        let k = self.backward.as_ref().ok_or_else(|| Error::Internal("built for rendering only".into()))?;
-        let accumulate = u32::from(chunk.first_ray > 0);
-        let layer_activations = |l: usize| l as u32 * setup.sample_capacity * params.width as u32 / 8;
-        let last = params.layers.len() - 1;
+    /// Records one or two passes through layer `l`: over the layer below, and over the encoding if it sees that.
+    fn record_layer_backward(&self, pass: &mut Pass<'_>, l: usize, chunk: Chunk) -> Result<()> {
+        let (shape, training, params) = (&self.shape, self.training()?, pass.params);
+        let (k, packed) = (&training.kernels, &self.shape.layers[l]);
+        let is_last = l + 1 == params.layers.len();
+        let capacity = pass.setup.sample_capacity;
+        let activations_at = |l: usize| l as u32 * capacity * params.width as u32 / 8;
+        let (on_hidden, on_encoded) = if is_last { (&k.last, &k.last_encoded) } else { (&k.hidden, &k.encoded) };
+        let parts = [
+            (packed.hidden, &self.buffers.activations16, l.checked_sub(1).map_or(0, activations_at), on_hidden),
+            (packed.encoded, &self.buffers.features16, 0, on_encoded),
+        ];
         let position = |at: Option<usize>| at.map_or(NOWHERE, |at| at as u32);
-        for (l, packed) in shape.layers.iter().enumerate().rev() {
-            let (dz, below) = (DZ[l % 2], DZ[(l + 1) % 2]);
-            let is_last = l == last;
-            let parts = [
-                (packed.hidden, "activations16", if is_last { &k.last } else { &k.hidden }),
-                (packed.encoded, "features16", if is_last { &k.last_encoded } else { &k.encoded }),
+        let mut bias = packed.bias;
+        let mut out = is_last.then_some((shape.out_weights, shape.out_bias));
+        let outputs_at = activations_at(l);
+        for (at, input, inputs_at, stage) in parts {
+            let Some(at) = at else { continue };
+            // The first pass over a layer's dz also sums what depends on dz alone.
+            let (out_weights, out_bias) = out.take().unzip();
+            let push = push::MlpFusedBwd {
+                weights_at: at as u32,
+                inputs_at,
+                outputs_at,
+                out_weights_at: shape.out_weights as u32,
+                n_partials: shape.partials_len as u32,
+                weights: at as u32,
+                bias: position(bias.take()),
+                out_weights: position(out_weights),
+                out_bias: position(out_bias),
+                accumulate: chunk.accumulate(),
+            };
+            let bound = [
+                (Binding::inputs16, input.into()),
+                (Binding::outputs16, (&self.buffers.activations16).into()),
+                (Binding::dz16, (&training.dz16[l % 2]).into()),
+                (Binding::dz_in16, (&training.dz16[(l + 1) % 2]).into()),
             ];
-            let mut bias = packed.bias;
-            let mut out = is_last.then_some((shape.out_weights, shape.out_bias));
-            for (at, input, stage) in parts {
-                let Some(at) = at else { continue };
-                // The first pass over a layer's dz also sums what depends on dz alone.
-                let (out_weights, out_bias) = out.take().unzip();
-                let push = [
-                    at as u32,
-                    if input == "features16" { 0 } else { layer_activations(l - 1) },
-                    layer_activations(l),
-                    shape.out_weights as u32,
-                    shape.partials_len as u32,
-                    at as u32,
-                    position(bias.take()),
-                    position(out_weights),
-                    position(out_bias),
-                    accumulate,
-                ];
-                let names = [("inputs16", input), ("outputs16", "activations16"), ("dz16", dz), ("dz_in16", below)];
-                dispatch(r, stage, Groups::Direct([self.workgroups, 1, 1]), buffers, &names, push)?;
-            }
+            pass.run_with(stage, Groups::Direct([self.workgroups, 1, 1]), &bound, push)?;
         }
         Ok(())
+    }
+}
+
+impl Path for FusedNetwork {
+    fn find(&self, name: Binding) -> Option<&Buffer> {
+        self.buffers.find(name)
+    }
+
+    fn tiles(&self, _: &ParamLayout) -> Tiles {
+        Tiles { samples: self.shape.fwd_tile, forward: 1, backward: 1 }
+    }
+
+    fn partial_sums(&self, _: &ParamLayout) -> PartialSums {
+        PartialSums { splits: self.workgroups, len: self.shape.partials_len as u32 }
+    }
+
+    fn gradient_source(&self, params: &ParamLayout) -> Vec<u32> {
+        self.shape.gradient_source(params)
+    }
+
+    /// f16 copies of the weights.
+    fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
+        let n_pairs = (self.shape.weights_len / 2) as u32;
+        let n_bias = pass.params.layers.len() as u32 * self.shape.matrix.m * pass.params.width as u32;
+        pass.run(&self.mlp_pack, self.mlp_pack.groups_for(n_pairs + n_bias), push::MlpPack { n_pairs, n_bias })
+    }
+
+    fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
+        let push = push::MlpFusedFwd { out_bias: pass.params.out_bias as u32 };
+        pass.run(&self.mlp_fused_fwd, pass.buffers.forward_tiles(), push)
+    }
+
+    fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        (0..pass.params.layers.len()).rev().try_for_each(|l| self.record_layer_backward(pass, l, chunk))
+    }
+
+    /// They are part of the partial sums.
+    fn record_phase_sums(&self, pass: &mut Pass<'_>, gradient: &GradientBuffers) -> Result<()> {
+        let (stage, params, training) = (&pass.kernels.gradient_network, pass.params, self.training()?);
+        let count = (params.layers.len() * params.phases * params.width) as u32;
+        let PartialSums { splits, len: n_partials } = self.partial_sums(params);
+        let bound =
+            [(Binding::source, (&training.phase_source).into()), (Binding::gradient, (&gradient.phase_dz).into())];
+        pass.run_with(
+            stage,
+            stage.groups_for(count),
+            &bound,
+            push::GradientNetwork { first: 0, count, splits, n_partials },
+        )
     }
 }

@@ -2,178 +2,264 @@
 
 use crate::error::Result;
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::Memory;
-use crate::gpu::record::{Groups, Recording};
+use crate::gpu::memory::{Buffer, Memory};
+use crate::gpu::record::Groups;
 use crate::kernels::constants::NOWHERE;
-use crate::kernels::dispatch::{Buffers, dispatch};
-use crate::kernels::layout::{IndirectArguments, Setup};
-use crate::kernels::stages::{LayerKernels, WEIGHT_INPUTS};
+use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
+use crate::kernels::layout::Setup;
+use crate::kernels::push;
+use crate::kernels::stages::LayerKernels;
 use crate::kernels::tuning::Tuning;
-use crate::model::params::ParamLayout;
-use crate::network::chunk::Chunk;
-use crate::network::indirect;
-use std::mem::offset_of;
+use crate::model::params::{Layer, ParamLayout};
+use crate::network::chunk::{Chunk, chunk_rays};
+use crate::network::pass::Pass;
+use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
 
-const ACTIVATIONS: [&str; 17] = [
-    "activations_0",
-    "activations_1",
-    "activations_2",
-    "activations_3",
-    "activations_4",
-    "activations_5",
-    "activations_6",
-    "activations_7",
-    "activations_8",
-    "activations_9",
-    "activations_10",
-    "activations_11",
-    "activations_12",
-    "activations_13",
-    "activations_14",
-    "activations_15",
-    "activations_16",
-];
-const DZ: [&str; 2] = ["dz_even", "dz_odd"];
-
-/// Adds the buffers of the forward pass.
-pub fn forward_buffers(
-    gpu: &Gpu,
-    tuning: &Tuning,
-    setup: &Setup,
-    params: &ParamLayout,
-    buffers: &mut Buffers,
-) -> Result<()> {
-    let capacity = u64::from(setup.sample_capacity);
-    buffers.set("sample_phases", gpu.buffer("sample_phases", capacity * 4, Memory::Device)?);
-    let mut operand = |name: &'static str, bytes: u64| -> Result<()> {
-        buffers.set(name, gpu.operand_buffer(name, bytes, tuning.operands)?);
-        Ok(())
-    };
-    operand("features", capacity * params.encode_groups as u64 * 16)?;
-    for name in ACTIVATIONS.iter().take(params.layers.len()) {
-        operand(name, capacity * params.width as u64 * 4)?;
-    }
-    Ok(())
+/// Kernels and buffers of the f32 network.
+pub(super) struct LayerNetwork {
+    kernels: LayerKernels,
+    buffers: LayerBuffers,
+    /// What each hidden layer gives.
+    activations: Vec<Buffer>,
+    training: Option<LayerTraining>,
 }
 
-/// Adds the buffers of the backward pass, and what `gradient_network` needs to know of the partial sums.
-pub fn backward_buffers(
-    gpu: &Gpu,
-    tuning: &Tuning,
-    setup: &Setup,
-    params: &ParamLayout,
-    rays_per_chunk: u64,
-    buffers: &mut Buffers,
-) -> Result<()> {
-    let capacity = u64::from(setup.sample_capacity);
-    let network = params.network_len() as u64;
-    for (name, bytes) in [
-        ("sample_feature_gradient", capacity * 4),
-        ("partials", network * u64::from(tuning.splits) * 4),
-        ("ray_dz", rays_per_chunk * params.width as u64 * 4),
-    ] {
-        buffers.set(name, gpu.buffer(name, bytes, Memory::Device)?);
+buffer_set! {
+    /// Buffers of the forward pass.
+    struct LayerBuffers {
+        /// Phase of each live sample.
+        sample_phases,
+        /// Encoding of each live sample.
+        features,
     }
-    for name in DZ {
-        let bytes = capacity * params.width as u64 * 4;
-        buffers.set(name, gpu.operand_buffer(name, bytes, tuning.operands)?);
-    }
-    let in_order: Vec<u32> = (0..network as u32).collect();
-    buffers.set("gradient_source", gpu.buffer_with("gradient_source", &in_order)?);
-    Ok(())
 }
 
-/// Records `encode`, `mlp_layer_fwd` of each layer and `mlp_out_fwd`.
-pub fn record_forward(
-    r: &mut Recording,
-    k: &LayerKernels,
-    buffers: &Buffers,
-    params: &ParamLayout,
-    setup: &Setup,
-) -> Result<()> {
-    let capacity = setup.sample_capacity;
-    let (groups, encode_groups) = (params.width as u32 / 4, params.encode_groups as u32);
-    let (per_sample, per_tile) = (
-        || indirect(buffers, offset_of!(IndirectArguments, samples)),
-        || indirect(buffers, offset_of!(IndirectArguments, forward_tiles)),
-    );
-    dispatch(r, &k.encode, per_sample()?, buffers, &[], ())?;
-    for (i, layer) in params.layers.iter().enumerate() {
-        let previous = if i == 0 { "features" } else { ACTIVATIONS[i - 1] };
-        let push = [
-            layer.encoded.map_or(0, |_| encode_groups),
-            layer.hidden.map_or(0, |_| groups),
-            layer.encoded.unwrap_or(0) as u32 / 4,
-            layer.hidden.unwrap_or(0) as u32 / 4,
-            (i * params.phases * params.width) as u32,
+/// What the backward pass needs besides.
+struct LayerTraining {
+    sums: LayerSums,
+    /// Gradients at the neurons of even and odd layers.
+    dz: [Buffer; 2],
+}
+
+buffer_set! {
+    /// Gradients per sample and per ray.
+    struct LayerSums {
+        /// Gradient at the output neuron.
+        sample_feature_gradient,
+        /// Sums of dz over each ray's samples.
+        ray_dz,
+    }
+}
+
+impl LayerNetwork {
+    pub(super) fn new(
+        gpu: &Gpu,
+        tuning: &Tuning,
+        setup: &Setup,
+        params: &ParamLayout,
+        purpose: Purpose,
+    ) -> Result<LayerNetwork> {
+        let capacity = u64::from(setup.sample_capacity);
+        let neurons_bytes = capacity * params.width as u64 * 4;
+        let operand = |name: &str, bytes: u64| gpu.operand_buffer(name, bytes, tuning.operands);
+        let training = match purpose {
+            Purpose::Render => None,
+            Purpose::Train => {
+                let ray_bytes = u64::from(chunk_rays(setup).min(setup.n_rays)) * params.width as u64 * 4;
+                Some(LayerTraining {
+                    sums: LayerSums {
+                        sample_feature_gradient: gpu.buffer("sample_feature_gradient", capacity * 4, Memory::Device)?,
+                        ray_dz: gpu.buffer("ray_dz", ray_bytes, Memory::Device)?,
+                    },
+                    dz: [operand("dz_even", neurons_bytes)?, operand("dz_odd", neurons_bytes)?],
+                })
+            }
+        };
+        Ok(LayerNetwork {
+            kernels: LayerKernels::new(gpu, tuning.clone())?,
+            buffers: LayerBuffers {
+                sample_phases: gpu.buffer("sample_phases", capacity * 4, Memory::Device)?,
+                features: operand("features", capacity * params.encode_groups as u64 * 16)?,
+            },
+            activations: (0..params.layers.len())
+                .map(|i| operand(&format!("activations_{i}"), neurons_bytes))
+                .collect::<Result<_>>()?,
+            training,
+        })
+    }
+
+    /// What a hidden layer sees of the layer below; the first sees the encoding.
+    fn below(&self, layer: usize) -> &Buffer {
+        if layer == 0 { &self.buffers.features } else { &self.activations[layer - 1] }
+    }
+
+    fn training(&self) -> Result<&LayerTraining> {
+        self.training.as_ref().ok_or_else(built_for_rendering)
+    }
+
+    /// Records the gradient at the output neuron and of its weights, and dz of the last layer.
+    fn record_output_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        let (k, params, training) = (&self.kernels, pass.params, self.training()?);
+        let capacity = pass.setup.sample_capacity;
+        let groups = params.width as u32 / 4;
+        let last = params.layers.len() - 1;
+        let activations = (Binding::activations, (&self.activations[last]).into());
+        let dz = (Binding::dz, (&training.dz[last % 2]).into());
+        let push = push::MlpOutBwd { groups, weights4: params.out_weights as u32 / 4, capacity };
+        pass.run_with(&k.mlp_out_bwd, pass.buffers.per_sample(), &[activations, dz], push)?;
+        let PartialSums { splits, len: n_partials } = self.partial_sums(params);
+        let push = push::MlpOutBwdWeight {
+            weights: in_partials(params, params.out_weights),
+            bias: in_partials(params, params.out_bias),
             capacity,
-            params.width as u32,
-        ];
-        let names = [("input_a", "features"), ("input_b", previous), ("activations", ACTIVATIONS[i])];
-        dispatch(r, &k.mlp_layer_fwd, per_tile()?, buffers, &names, push)?;
+            splits,
+            n_partials,
+            accumulate: chunk.accumulate(),
+        };
+        pass.run_with(&k.mlp_out_bwd_weight, Groups::Direct([groups, splits, 1]), &[activations], push)
     }
-    let last = ACTIVATIONS[params.layers.len() - 1];
-    let push = [groups, params.out_weights as u32 / 4, params.out_bias as u32, capacity];
-    dispatch(r, &k.mlp_out_fwd, per_sample()?, buffers, &[("activations", last)], push)
-}
 
-/// Records the backward pass of a chunk: `partials` and `phase_dz`.
-pub fn record_backward(
-    r: &mut Recording,
-    k: &LayerKernels,
-    buffers: &Buffers,
-    params: &ParamLayout,
-    setup: &Setup,
-    chunk: Chunk,
-) -> Result<()> {
-    let capacity = setup.sample_capacity;
-    let (width, groups) = (params.width as u32, params.width as u32 / 4);
-    let network = params.network_len() as u32;
-    let splits = k.tuning.splits;
-    let accumulate = u32::from(chunk.first_ray > 0);
-    let in_partials = |at: usize| (at - params.static_len) as u32;
-    let last = params.layers.len() - 1;
-    let push = [groups, params.out_weights as u32 / 4, capacity];
-    let names = [("activations", ACTIVATIONS[last]), ("dz", DZ[last % 2])];
-    dispatch(r, &k.mlp_out_bwd, indirect(buffers, offset_of!(IndirectArguments, samples))?, buffers, &names, push)?;
-    let push = [in_partials(params.out_weights), in_partials(params.out_bias), capacity, splits, network, accumulate];
-    let names = [("activations", ACTIVATIONS[last])];
-    dispatch(r, &k.mlp_out_bwd_weight, Groups::Direct([groups, splits, 1]), buffers, &names, push)?;
-    for (i, layer) in params.layers.iter().enumerate().rev() {
-        let dz = DZ[i % 2];
-        if let (Some(at), true) = (layer.hidden, i > 0) {
-            // The input gradient goes first: nothing below writes what it reads, so the three may overlap.
-            let push = [groups, groups, at as u32 / 4, capacity];
-            let names = [("dz", dz), ("activations", ACTIVATIONS[i - 1]), ("dz_in", DZ[(i + 1) % 2])];
-            dispatch(
-                r,
-                &k.mlp_layer_bwd_input,
-                indirect(buffers, offset_of!(IndirectArguments, backward_tiles))?,
-                buffers,
-                &names,
-                push,
-            )?;
-        }
-        let previous = if i == 0 { "features" } else { ACTIVATIONS[i - 1] };
-        let inputs = [("features", params.encode_groups as u32, layer.encoded), (previous, groups, layer.hidden)];
+    /// Records dz of the layer below `i`, which has one.
+    fn record_input_gradient(&self, pass: &mut Pass<'_>, i: usize, weights: usize) -> Result<()> {
+        let (k, training) = (&self.kernels, self.training()?);
+        let groups = pass.params.width as u32 / 4;
+        let bound = [
+            (Binding::dz, (&training.dz[i % 2]).into()),
+            (Binding::activations, (&self.activations[i - 1]).into()),
+            (Binding::dz_in, (&training.dz[(i + 1) % 2]).into()),
+        ];
+        let push = push::MlpLayerBwdInput {
+            out_groups: groups,
+            in_groups: groups,
+            weights4: weights as u32 / 4,
+            capacity: pass.setup.sample_capacity,
+        };
+        pass.run_with(&k.mlp_layer_bwd_input, pass.buffers.backward_tiles(), &bound, push)
+    }
+
+    /// Records the gradient of a layer's weights on each of its inputs.
+    fn record_weight_gradients(&self, pass: &mut Pass<'_>, i: usize, layer: &Layer, chunk: Chunk) -> Result<()> {
+        let (k, params, training) = (&self.kernels, pass.params, self.training()?);
+        let (width, groups) = (params.width as u32, params.width as u32 / 4);
+        let PartialSums { splits, len: n_partials } = self.partial_sums(params);
+        let tile = k.tuning.tile();
+        let inputs = [
+            (&self.buffers.features, params.encode_groups as u32, layer.encoded),
+            (self.below(i), groups, layer.hidden),
+        ];
         for (input, in_groups, at) in inputs {
             let Some(at) = at else { continue };
-            // Biases of layers without latents are summed here; the others come from the sums per phase.
-            let bias = if layer.latent.is_none() { in_partials(layer.bias) } else { NOWHERE };
-            let push = [in_groups, in_partials(at), capacity, splits, network, accumulate, bias, groups];
-            let inputs_per_group = WEIGHT_INPUTS * k.mlp_layer_bwd_weight.local_size;
-            let tiles =
-                [width.div_ceil(k.tuning.tile().weight_neurons), (4 * in_groups).div_ceil(inputs_per_group), splits];
-            let names = [("dz", dz), ("inputs", input)];
-            dispatch(r, &k.mlp_layer_bwd_weight, Groups::Direct(tiles), buffers, &names, push)?;
+            let push = push::MlpLayerBwdWeight {
+                in_groups,
+                weights: in_partials(params, at),
+                capacity: pass.setup.sample_capacity,
+                splits,
+                n_partials,
+                accumulate: chunk.accumulate(),
+                // Biases of layers without latents are summed here; the others come from the sums per phase.
+                bias: if layer.latent.is_none() { in_partials(params, layer.bias) } else { NOWHERE },
+                out_groups: groups,
+            };
+            let inputs_per_group = tile.weight_inputs * k.mlp_layer_bwd_weight.local_size();
+            let tiles = [width.div_ceil(tile.weight_neurons), (4 * in_groups).div_ceil(inputs_per_group), splits];
+            let bound = [(Binding::dz, (&training.dz[i % 2]).into()), (Binding::inputs, input.into())];
+            pass.run_with(&k.mlp_layer_bwd_weight, Groups::Direct(tiles), &bound, push)?;
         }
-        if layer.latent.is_some() {
-            let rays = Groups::Direct([chunk.n_rays.div_ceil(k.mlp_ray_sum.local_size), groups, 1]);
-            dispatch(r, &k.mlp_ray_sum, rays, buffers, &[("dz", dz)], [chunk.n_rays, capacity])?;
-            let push = [chunk.first_ray, chunk.n_rays, (i * params.phases) as u32, groups, accumulate];
-            let phases = Groups::Direct([groups, params.phases as u32, 1]);
-            dispatch(r, &k.mlp_phase_sum, phases, buffers, &[], push)?;
+        Ok(())
+    }
+
+    /// Records the sums of dz over the rays of each phase.
+    fn record_phase_sum(&self, pass: &mut Pass<'_>, i: usize, chunk: Chunk) -> Result<()> {
+        let (k, params, training) = (&self.kernels, pass.params, self.training()?);
+        let groups = params.width as u32 / 4;
+        let Chunk { first_ray, n_rays } = chunk;
+        let rays = Groups::Direct([n_rays.div_ceil(k.mlp_ray_sum.local_size()), groups, 1]);
+        let push = push::MlpRaySum { n_rays, capacity: pass.setup.sample_capacity };
+        pass.run_with(&k.mlp_ray_sum, rays, &[(Binding::dz, (&training.dz[i % 2]).into())], push)?;
+        let phases = Groups::Direct([groups, params.phases as u32, 1]);
+        let row = (i * params.phases) as u32;
+        let push = push::MlpPhaseSum { first_ray, n_rays, row, groups, accumulate: chunk.accumulate() };
+        pass.run(&k.mlp_phase_sum, phases, push)
+    }
+}
+
+/// Where a parameter of the network lies in a part of the partial sums: in the order of the parameters.
+fn in_partials(params: &ParamLayout, at: usize) -> u32 {
+    (at - params.static_len) as u32
+}
+
+impl Path for LayerNetwork {
+    fn find(&self, name: Binding) -> Option<&Buffer> {
+        self.buffers.find(name).or_else(|| self.training.as_ref()?.sums.find(name))
+    }
+
+    fn tiles(&self, params: &ParamLayout) -> Tiles {
+        let (tile, width) = (self.kernels.tuning.tile(), params.width as u32);
+        Tiles {
+            samples: self.kernels.tuning.tile_samples(),
+            forward: width.div_ceil(tile.fwd_neurons),
+            backward: width.div_ceil(tile.bwd_inputs),
         }
     }
-    Ok(())
+
+    fn partial_sums(&self, params: &ParamLayout) -> PartialSums {
+        PartialSums { splits: self.kernels.tuning.splits, len: params.network_len() as u32 }
+    }
+
+    fn gradient_source(&self, params: &ParamLayout) -> Vec<u32> {
+        (0..params.network_len() as u32).collect()
+    }
+
+    fn record_weights(&self, _: &mut Pass<'_>) -> Result<()> {
+        Ok(())
+    }
+
+    /// `encode`, `mlp_layer_fwd` of each layer and `mlp_out_fwd`.
+    fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
+        let (k, params, buffers) = (&self.kernels, pass.params, pass.buffers);
+        let capacity = pass.setup.sample_capacity;
+        let (groups, encode_groups) = (params.width as u32 / 4, params.encode_groups as u32);
+        pass.run(&k.encode, buffers.per_sample(), push::Encode {})?;
+        for (i, layer) in params.layers.iter().enumerate() {
+            let push = push::MlpLayerFwd {
+                a_groups: layer.encoded.map_or(0, |_| encode_groups),
+                b_groups: layer.hidden.map_or(0, |_| groups),
+                a_weights4: layer.encoded.unwrap_or(0) as u32 / 4,
+                b_weights4: layer.hidden.unwrap_or(0) as u32 / 4,
+                bias: (i * params.phases * params.width) as u32,
+                capacity,
+                width: params.width as u32,
+            };
+            let bound = [
+                (Binding::input_a, (&self.buffers.features).into()),
+                (Binding::input_b, self.below(i).into()),
+                (Binding::activations, (&self.activations[i]).into()),
+            ];
+            pass.run_with(&k.mlp_layer_fwd, buffers.forward_tiles(), &bound, push)?;
+        }
+        let push =
+            push::MlpOutFwd { groups, weights4: params.out_weights as u32 / 4, bias: params.out_bias as u32, capacity };
+        let bound = [(Binding::activations, self.below(params.layers.len()).into())];
+        pass.run_with(&k.mlp_out_fwd, buffers.per_sample(), &bound, push)
+    }
+
+    /// `partials` and `phase_dz`.
+    fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        self.record_output_backward(pass, chunk)?;
+        for (i, layer) in pass.params.layers.iter().enumerate().rev() {
+            if let (Some(weights), true) = (layer.hidden, i > 0) {
+                // The input gradient goes first: nothing below writes what it reads, so the three may overlap.
+                self.record_input_gradient(pass, i, weights)?;
+            }
+            self.record_weight_gradients(pass, i, layer, chunk)?;
+            if layer.latent.is_some() {
+                self.record_phase_sum(pass, i, chunk)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn record_phase_sums(&self, _: &mut Pass<'_>, _: &GradientBuffers) -> Result<()> {
+        Ok(())
+    }
 }

@@ -5,28 +5,12 @@ use crate::formats::volume::Volume;
 use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
-use crate::gpu::pipeline::Pipeline;
-use crate::gpu::record::{Bound, Groups, Recording};
+use crate::gpu::record::Recording;
+use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::layout::View;
-use crate::kernels::stages::kernel_code;
-use bytemuck::{Pod, Zeroable};
+use crate::kernels::push;
+use crate::kernels::stages::{Build, Stage};
 use glam::DVec3;
-use std::sync::Arc;
-
-#[repr(C)]
-#[derive(Clone, Copy, Pod, Zeroable)]
-struct Push {
-    rows: [[f32; 4]; 3],
-    size: [u32; 3],
-    view: u32,
-    near: f32,
-    far: f32,
-    steps: u32,
-    scale: f32,
-    image_width: u32,
-    n_pixels: u32,
-    first_pixel: u32,
-}
 
 /// Depth steps of a projection through `volume` seen over `half_depth` (world units): half a voxel each.
 pub fn depth_steps(volume: &Volume, half_depth: f64) -> u32 {
@@ -36,7 +20,7 @@ pub fn depth_steps(volume: &Volume, half_depth: f64) -> u32 {
 /// A device projector for images of one size.
 pub struct Projector {
     gpu: Gpu,
-    project: Arc<Pipeline>,
+    project: Stage<push::Project>,
     width: usize,
     height: usize,
 }
@@ -53,8 +37,7 @@ impl Projector {
     /// # Errors
     /// Errors of the pipeline's creation.
     pub fn new(gpu: &Gpu, width: usize, height: usize) -> Result<Projector> {
-        let project = Arc::new(gpu.pipeline(kernel_code("project")?, 64, &[])?);
-        Ok(Projector { gpu: gpu.clone(), project, width, height })
+        Ok(Projector { gpu: gpu.clone(), project: Build::default().stage(gpu)?, width, height })
     }
 
     /// Puts a volume on the device; its host values are dropped.
@@ -79,7 +62,7 @@ impl Projector {
         let mut volume = loaded.volume.clone();
         volume.index_to_lps.translation += shift_mm;
         let to_index = volume.world_to_index();
-        let rows = [0, 1, 2].map(|r| {
+        let [row_x, row_y, row_z] = [0, 1, 2].map(|r| {
             let row = to_index.matrix3.row(r);
             [row.x as f32, row.y as f32, row.z as f32, to_index.translation[r] as f32]
         });
@@ -88,8 +71,10 @@ impl Projector {
         recording.fill(&integrals, 0);
         for (view, rays) in views.iter().enumerate() {
             let half = half_depth.min(rays.sod);
-            let push = Push {
-                rows,
+            let push = push::Project {
+                row_x,
+                row_y,
+                row_z,
                 size: volume.size.map(|n| n as u32),
                 view: view as u32,
                 near: -half as f32,
@@ -100,10 +85,12 @@ impl Projector {
                 n_pixels: pixels as u32,
                 first_pixel: (view * pixels) as u32,
             };
-            let groups = Groups::Direct([(pixels as u32).div_ceil(self.project.local_size), 1, 1]);
-            let buffers = [("views", &views_buffer), ("volume", &loaded.values), ("integrals", &integrals)]
-                .map(|(name, buffer)| (name, Bound::Buffer(buffer)));
-            recording.dispatch(&self.project, groups, &buffers, &push)?;
+            let bound = [
+                (Binding::views, (&views_buffer).into()),
+                (Binding::volume, (&loaded.values).into()),
+                (Binding::integrals, (&integrals).into()),
+            ];
+            dispatch(&mut recording, &self.project, self.project.groups_for(pixels as u32), &bound, push)?;
         }
         self.gpu.wait(recording.finish()?.submit()?)?;
         let all: Vec<f32> = self.gpu.download(&integrals, 0, views.len() * pixels)?;

@@ -5,8 +5,9 @@ use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, Recording};
 use crate::gpu::volume::Volume;
-use crate::kernels::dispatch::{dispatch, groups_for};
+use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::layout::View;
+use crate::kernels::push;
 use crate::model::Model;
 use crate::model::component::Component;
 use crate::render::grid::Grid;
@@ -206,9 +207,6 @@ impl Baked {
         quantity: Quantity,
     ) -> Result<Commands> {
         let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
-        let mut buffers = self.renderer.buffers.clone();
-        buffers.set("views", view.clone());
-        buffers.set("image", image.clone());
         // A field that is not shown is bound, since the kernel names it, but not read.
         let component = quantity.component;
         let shown = |field, wanted| if wanted { self.volume_or_bake(field, phase).map(Some) } else { Ok(None) };
@@ -216,18 +214,23 @@ impl Baked {
         let moving = shown(Component::Dynamic, component.has_dynamic())?;
         let any = still.as_ref().or(moving.as_ref());
         let any = any.ok_or_else(|| Error::Internal("no volume to render".into()))?;
-        buffers.set_volume("static_volume", still.as_ref().unwrap_or(any).clone());
-        buffers.set_volume("dynamic_volume", moving.as_ref().unwrap_or(any).clone());
-        let stage = &self.renderer.kernels.baked_march;
-        let push = [
-            pixels,
-            width as u32,
-            u32::from(component.has_static()),
-            u32::from(component.has_dynamic()),
-            u32::from(quantity.projection == Projection::Mip),
+        let bound = [
+            (Binding::setup, (&self.renderer.buffers.setup).into()),
+            (Binding::views, view.into()),
+            (Binding::static_volume, still.as_ref().unwrap_or(any).into()),
+            (Binding::dynamic_volume, moving.as_ref().unwrap_or(any).into()),
+            (Binding::image, image.into()),
         ];
+        let push = push::BakedMarch {
+            n_pixels: pixels,
+            image_width: width as u32,
+            with_static: u32::from(component.has_static()),
+            with_dynamic: u32::from(component.has_dynamic()),
+            maximum: u32::from(quantity.projection == Projection::Mip),
+        };
+        let stage = &self.renderer.kernels.baked_march;
         let mut recording = Recording::new(gpu, "baked render")?;
-        dispatch(&mut recording, stage, groups_for(stage, pixels), &buffers, &[], push)?;
+        dispatch(&mut recording, stage, stage.groups_for(pixels), &bound, push)?;
         recording.finish()
     }
 }

@@ -5,16 +5,18 @@ use crate::geometry::ViewRays;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, Recording};
-use crate::kernels::dispatch::{Buffers, dispatch, groups_for};
+use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::layout::{DeviceState, RayOut, Schedule, Setup, View};
+use crate::kernels::push;
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
 use crate::model::params::ParamLayout;
 use crate::model::setup::sample_capacity;
-use crate::network::Network;
-use crate::network::forward::{forward_buffers, hull_buffer, record_render, record_volume};
+use crate::network::forward::ForwardBuffers;
+use crate::network::pass::Pass;
+use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
 
 /// Pixels rendered by one submit.
@@ -69,7 +71,7 @@ pub struct Renderer {
     pub(super) gpu: Gpu,
     pub(super) kernels: Kernels,
     network: Network,
-    pub(super) buffers: Buffers,
+    pub(super) buffers: ForwardBuffers,
     pub(super) setup: Setup,
     model_layout: ParamLayout,
 }
@@ -80,21 +82,20 @@ impl Renderer {
     /// # Errors
     /// Device errors.
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
-        let network = Network::new(gpu, &tuning, &model.layout, false)?;
-        let kernels = Kernels::new(gpu, tuning, model.layout.line_len() as u32)?;
         let mut setup = model.scene.setup(&model.config, &model.layout, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;
         setup.n_static_samples = model.config.march.render_samples;
         setup.n_dynamic_samples = model.config.march.render_samples;
-        let largest = kernels.tuning.chunk_samples.min(network.largest_chunk(gpu, &model.layout));
+        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.layout));
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
-        let mut buffers = forward_buffers(gpu, &kernels.tuning, &network, &setup, &model.layout, RAYS_PER_SUBMIT)?;
-        buffers.set("hull", hull_buffer(gpu, model.hull.as_ref())?);
-        // The schedule below has a single row, that of the model's step.
-        gpu.upload(buffers.get("state")?, 0, &[DeviceState::default()])?;
-        let row = size_of::<Schedule>() as u64;
-        buffers.set("schedule", gpu.buffer("schedule", row, Memory::Upload)?);
+        let network = Network::new(gpu, &tuning, &setup, &model.layout, Purpose::Render)?;
+        let kernels = Kernels::new(gpu, tuning, model.layout.line_len() as u32)?;
+        let schedule = gpu.buffer("schedule", size_of::<Schedule>() as u64, Memory::Upload)?;
+        let (tuning, layout, hull) = (&kernels.tuning, &model.layout, model.hull.as_ref());
+        let buffers = ForwardBuffers::new(gpu, tuning, &setup, layout, RAYS_PER_SUBMIT, schedule, hull)?;
+        // The schedule has a single row, that of the model's step.
+        gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
         let renderer =
             Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout: model.layout.clone() };
         renderer.set_model(model)?;
@@ -109,8 +110,8 @@ impl Renderer {
         if model.layout != self.model_layout {
             return Err(Error::Internal("the model has another layout than the renderer".into()));
         }
-        self.gpu.upload(self.buffers.get("params")?, 0, &model.params)?;
-        self.buffers.get("schedule")?.write(&[model.config.schedule(model.step)])
+        self.gpu.upload(&self.buffers.params, 0, &model.params)?;
+        self.buffers.schedule.write(&[model.config.schedule(model.step)])
     }
 
     /// Takes the parameters in `params`, of a run in training, as they are after everything submitted so far; returns
@@ -121,8 +122,8 @@ impl Renderer {
     /// [`Error::Internal`] when the buffer has another size; device errors.
     pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<Commands> {
         let mut recording = Recording::new(&self.gpu, "follow")?;
-        recording.copy(params, 0, self.buffers.get("params")?, 0, self.model_layout.len as u64 * 4)?;
-        self.buffers.get("schedule")?.write(&[schedule])?;
+        recording.copy(params, 0, &self.buffers.params, 0, self.model_layout.len as u64 * 4)?;
+        self.buffers.schedule.write(&[schedule])?;
         let commands = recording.finish()?;
         commands.submit()?;
         Ok(commands)
@@ -144,15 +145,28 @@ impl Renderer {
         self.setup.sample_capacity / 128 * 128
     }
 
-    /// Records the dynamic field at the samples of `n_rays` rays, put into the rows of `volume`.
-    pub(super) fn record_dynamic_cells(
+    /// What forward stages work with; `buffers` and `setup` may differ from the renderer's own in what they sample.
+    pub(super) fn pass<'a>(
+        &'a self,
+        recording: &'a mut Recording,
+        buffers: &'a ForwardBuffers,
+        setup: &'a Setup,
+    ) -> Pass<'a> {
+        let (kernels, network, params) = (&self.kernels, &self.network, &self.model_layout);
+        Pass { recording, kernels, network, buffers, training: None, params, setup }
+    }
+
+    /// Records the rays of `push.n_rays` pixels of a view.
+    pub(super) fn record_rays(
         &self,
-        r: &mut Recording,
-        buffers: &Buffers,
-        setup: &Setup,
-        n_rays: u32,
+        recording: &mut Recording,
+        buffers: &ForwardBuffers,
+        views: &Buffer,
+        push: push::PoseRays,
     ) -> Result<()> {
-        record_volume(r, &self.kernels, &self.network, buffers, &self.model_layout, setup, n_rays)
+        let stage = &self.kernels.pose_rays;
+        let bound = [(Binding::views, views.into()), (Binding::rays, (&buffers.rays).into())];
+        dispatch(recording, stage, stage.groups_for(push.n_rays), &bound, push)
     }
 
     /// Renders a `width` x `height` view at a phase.
@@ -161,19 +175,17 @@ impl Renderer {
     /// [`Error::Config`] for a phase the model does not have; device errors.
     pub fn render(&self, rays: &ViewRays, width: usize, height: usize, phase: u32) -> Result<Rendering> {
         self.check_phase(phase)?;
-        let mut buffers = self.buffers.clone();
-        buffers.set("views", self.gpu.buffer_with("views", &[View::of(rays)])?);
+        let views = self.gpu.buffer_with("views", &[View::of(rays)])?;
         let pixels = (width * height) as u32;
         let mut out = Rendering::default();
-        for first in (0..pixels).step_by(RAYS_PER_SUBMIT as usize) {
-            let n = RAYS_PER_SUBMIT.min(pixels - first);
+        for first_pixel in (0..pixels).step_by(RAYS_PER_SUBMIT as usize) {
+            let n_rays = RAYS_PER_SUBMIT.min(pixels - first_pixel);
             let mut recording = Recording::new(&self.gpu, "render")?;
-            let push = [first, n, phase, width as u32, 0];
-            let stage = &self.kernels.pose_rays;
-            dispatch(&mut recording, stage, groups_for(stage, n), &buffers, &[], push)?;
-            record_render(&mut recording, &self.kernels, &self.network, &buffers, &self.model_layout, &self.setup, n)?;
+            let push = push::PoseRays { first_pixel, n_rays, phase, image_width: width as u32, view: 0 };
+            self.record_rays(&mut recording, &self.buffers, &views, push)?;
+            self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
             self.gpu.wait(recording.finish()?.submit()?)?;
-            let seen: Vec<RayOut> = self.gpu.download(buffers.get("ray_out")?, 0, n as usize)?;
+            let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
             out.extend(&seen);
         }
         Ok(out)

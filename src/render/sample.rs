@@ -2,11 +2,13 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
-use crate::gpu::memory::Memory;
+use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::Recording;
-use crate::kernels::dispatch::{dispatch, groups_for};
+use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::View;
+use crate::kernels::push;
 use crate::model::component::Component;
+use crate::network::forward::ForwardBuffers;
 use crate::render::grid::{Grid, PatientGrid};
 use crate::render::renderer::{RAYS_PER_SUBMIT, Renderer};
 use glam::DVec3;
@@ -55,31 +57,27 @@ impl Renderer {
         let bytes = u64::from(rows_at_once) * u64::from(nx) * 4;
         let cells = self.gpu.buffer("volume", bytes, Memory::Device)?;
         let read = self.gpu.buffer("volume read-back", bytes, Memory::Readback)?;
-        let mut buffers = self.buffers.clone();
-        buffers.set("volume", cells.clone());
         let mut out = vec![0f32; grid.len()];
         for (i, out) in out.chunks_mut((rows_at_once * nx) as usize).enumerate() {
             let first = i as u32 * rows_at_once;
             let n = rows_at_once.min(rows - first);
             // One submit, the constants included: behind a run in training, each would wait its turn.
             let mut r = Recording::new(&self.gpu, "sample")?;
-            for (name, bytes) in [("views", bytemuck::bytes_of(&view)), ("setup", bytemuck::bytes_of(&setup))] {
-                let staging = self.gpu.buffer(name, bytes.len() as u64, Memory::Upload)?;
-                staging.write(bytes)?;
-                let on_device = self.gpu.buffer(name, bytes.len() as u64, Memory::Device)?;
-                r.copy(&staging, 0, &on_device, 0, bytes.len() as u64)?;
-                buffers.set(name, on_device);
-            }
-            let k = &self.kernels;
-            dispatch(&mut r, &k.pose_rays, groups_for(&k.pose_rays, n), &buffers, &[], [first, n, phase, ny, 0])?;
+            let views = self.constants(&mut r, "views", bytemuck::bytes_of(&view))?;
+            let setup_buffer = self.constants(&mut r, "setup", bytemuck::bytes_of(&setup))?;
+            let buffers = ForwardBuffers { setup: setup_buffer, ..self.buffers.clone() };
+            let push = push::PoseRays { first_pixel: first, n_rays: n, phase, image_width: ny, view: 0 };
+            self.record_rays(&mut r, &buffers, &views, push)?;
+            let mut pass = self.pass(&mut r, &buffers, &setup);
             match field {
                 Component::Static => {
-                    let groups = groups_for(&k.volume_static, n * nx);
-                    dispatch(&mut r, &k.volume_static, groups, &buffers, &[], [n])?;
+                    let stage = &self.kernels.volume_static;
+                    let bound = [(Binding::volume, (&cells).into())];
+                    pass.run_with(stage, stage.groups_for(n * nx), &bound, push::VolumeStatic { n_rays: n })?;
                 }
                 _ => {
-                    r.fill(&cells, 0);
-                    self.record_dynamic_cells(&mut r, &buffers, &setup, n)?;
+                    pass.recording.fill(&cells, 0);
+                    pass.volume(n, &cells)?;
                 }
             }
             r.copy(&cells, 0, &read, 0, u64::from(n) * u64::from(nx) * 4)?;
@@ -87,6 +85,15 @@ impl Renderer {
             read.read(out)?;
         }
         Ok(out)
+    }
+
+    /// Bytes on their way to the device, behind what was recorded so far.
+    fn constants(&self, recording: &mut Recording, name: &str, bytes: &[u8]) -> Result<Buffer> {
+        let staging = self.gpu.buffer(name, bytes.len() as u64, Memory::Upload)?;
+        staging.write(bytes)?;
+        let on_device = self.gpu.buffer(name, bytes.len() as u64, Memory::Device)?;
+        recording.copy(&staging, 0, &on_device, 0, bytes.len() as u64)?;
+        Ok(on_device)
     }
 
     /// Attenuation per mm at the points of a grid, of a component at a phase; zero outside the fields' boxes and hull.

@@ -172,7 +172,7 @@ impl Shared {
         engine.version = version;
         engine.settled = Some(Instant::now() + begin.elapsed() * SETTLE);
         self.step.store(trainer.step(), Ordering::Release);
-        let params = Some(trainer.buffers().get("params")?.clone());
+        let params = Some(trainer.forward().params.clone());
         self.publish(Source { outline: trainer.outline(), params });
         engine.training = Some(Training::new(trainer));
         Ok(())

@@ -10,92 +10,133 @@ use crate::gpu::device::Gpu;
 use crate::gpu::memory::Memory;
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::constants::OCCUPANCY_EPOCH;
-use crate::kernels::dispatch::{Buffers, dispatch, groups_for};
-use crate::kernels::layout::{Frame, IndirectArguments, StepReport, View};
-use crate::kernels::stages::Kernels;
+use crate::kernels::dispatch::{Binding, buffer_set};
+use crate::kernels::layout::StepReport;
+use crate::kernels::push;
 use crate::kernels::tuning::Tuning;
-use crate::network::chunk::{chunk_rays, chunks};
-use crate::network::forward::{forward_buffers, hull_buffer, record_samples};
-use crate::network::{Network, indirect};
+use crate::network::Network;
+use crate::network::chunk::{Chunk, chunks};
+use crate::network::forward::ForwardBuffers;
+use crate::network::pass::Pass;
 use crate::plan::Plan;
-use std::mem::offset_of;
 
-/// All buffers of a training run, filled from the plan; moments zero, step 0.
+buffer_set! {
+    /// Buffers of a training run beside those of the forward pass and the network.
+    pub struct TrainingBuffers {
+        /// [`crate::kernels::layout::View`]s of the training images.
+        views,
+        /// [`crate::kernels::layout::Frame`]s of the training images.
+        frames,
+        /// Line integrals of all training images.
+        images,
+        /// Still backgrounds of each view: lower and upper bound per pixel.
+        backgrounds,
+        /// Rays that meet the hull.
+        motion_rays,
+        /// [`StepReport`]s of the last iterations.
+        ring,
+        /// Gradient of each ray's two integrals.
+        ray_gradient,
+        /// Each ray's share of the losses.
+        ray_loss,
+        /// Gradient of the static field in 64-bit fixed point.
+        static_gradient,
+        /// Gradient of the total variation.
+        tv_gradient,
+        /// Total variation of each static parameter.
+        tv_value,
+        /// Gradient of all parameters.
+        gradient,
+        /// First and second moment of each parameter's gradient.
+        moments,
+    }
+}
+
+impl TrainingBuffers {
+    /// Buffers filled from the plan, else undefined.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::OutOfMemory`] naming the buffer.
+    pub fn new(gpu: &Gpu, plan: &Plan) -> Result<TrainingBuffers> {
+        let n_rays = u64::from(plan.setup.n_rays);
+        let (static_len, len) = (plan.params.static_len as u64, plan.params.len as u64);
+        let ring_bytes = u64::from(plan.setup.ring_length) * size_of::<StepReport>() as u64;
+        let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
+        Ok(TrainingBuffers {
+            views: gpu.buffer_with("views", &plan.views)?,
+            frames: gpu.buffer_with("frames", &plan.frames)?,
+            images: gpu.buffer_with("images", &plan.images)?,
+            backgrounds: gpu.buffer_with("backgrounds", &plan.backgrounds)?,
+            motion_rays: gpu.buffer_with("motion_rays", &plan.motion_rays)?,
+            ring: gpu.buffer("ring", ring_bytes, Memory::Readback)?,
+            ray_gradient: new(Binding::ray_gradient, n_rays * 8)?,
+            ray_loss: new(Binding::ray_loss, n_rays * 16)?,
+            static_gradient: new(Binding::static_gradient, static_len * 8)?,
+            tv_gradient: new(Binding::tv_gradient, static_len * 4)?,
+            tv_value: new(Binding::tv_value, static_len * 4)?,
+            gradient: new(Binding::gradient, len * 4)?,
+            moments: new(Binding::moments, len * 8)?,
+        })
+    }
+}
+
+/// Buffers of the forward pass for the plan's batches; parameters are left undefined.
 ///
 /// # Errors
-/// [`Error::OutOfMemory`] naming the buffer.
-pub fn training_buffers(gpu: &Gpu, tuning: &Tuning, network: &Network, plan: &Plan) -> Result<Buffers> {
-    let (setup, params) = (&plan.setup, &plan.params);
-    let n_rays = u64::from(setup.n_rays);
-    let mut buffers = forward_buffers(gpu, tuning, network, setup, params, setup.n_rays)?;
-    buffers.set("schedule", gpu.buffer_with("schedule", &plan.schedule)?);
-    buffers.set("views", gpu.buffer_with::<View>("views", &plan.views)?);
-    buffers.set("frames", gpu.buffer_with::<Frame>("frames", &plan.frames)?);
-    buffers.set("images", gpu.buffer_with("images", &plan.images)?);
-    buffers.set("backgrounds", gpu.buffer_with("backgrounds", &plan.backgrounds)?);
-    buffers.set("motion_rays", gpu.buffer_with("motion_rays", &plan.motion_rays)?);
-    buffers.set("hull", hull_buffer(gpu, plan.hull.as_ref())?);
-    buffers.set(
-        "ring",
-        gpu.buffer("ring", u64::from(setup.ring_length) * size_of::<StepReport>() as u64, Memory::Readback)?,
-    );
-    for (name, bytes) in [
-        ("ray_gradient", n_rays * 8),
-        ("ray_loss", n_rays * 16),
-        ("static_gradient", params.static_len as u64 * 8),
-        ("tv_gradient", params.static_len as u64 * 4),
-        ("tv_value", params.static_len as u64 * 4),
-        ("phase_dz", (params.layers.len() * params.phases * params.width) as u64 * 4),
-        ("gradient", params.len as u64 * 4),
-        ("moments", params.len as u64 * 8),
-    ] {
-        buffers.set(name, gpu.buffer(name, bytes, Memory::Device)?);
-    }
-    let rays_per_chunk = u64::from(chunk_rays(setup)).min(n_rays);
-    network.backward_buffers(gpu, tuning, setup, params, rays_per_chunk, &mut buffers)?;
+/// [`crate::error::Error::OutOfMemory`] naming the buffer.
+pub fn forward_buffers(gpu: &Gpu, tuning: &Tuning, plan: &Plan) -> Result<ForwardBuffers> {
+    let (setup, schedule) = (&plan.setup, gpu.buffer_with("schedule", &plan.schedule)?);
+    ForwardBuffers::new(gpu, tuning, setup, &plan.params, setup.n_rays, schedule, plan.hull.as_ref())
+}
+
+/// Starts from zero: parameters, moments, gradients, occupancy and the device's counters.
+///
+/// # Errors
+/// Device errors.
+pub fn clear(gpu: &Gpu, network: &Network, forward: &ForwardBuffers, training: &TrainingBuffers) -> Result<()> {
     let mut recording = Recording::new(gpu, "clear")?;
-    for name in ["state", "static_gradient", "partials", "phase_dz", "gradient", "moments", "params", "occupancy"] {
-        recording.fill(buffers.get(name)?, 0);
+    for buffer in [&forward.state, &forward.params, &forward.occupancy] {
+        recording.fill(buffer, 0);
     }
-    gpu.wait(recording.finish()?.submit()?)?;
-    Ok(buffers)
+    for buffer in [&training.static_gradient, &training.gradient, &training.moments] {
+        recording.fill(buffer, 0);
+    }
+    if let Some(sums) = network.gradient() {
+        recording.fill(&sums.partials, 0);
+        recording.fill(&sums.phase_dz, 0);
+    }
+    gpu.wait(recording.finish()?.submit()?)
 }
 
 /// Records one iteration.
 ///
 /// # Errors
-/// [`Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_step(r: &mut Recording, k: &Kernels, network: &Network, buffers: &Buffers, plan: &Plan) -> Result<()> {
-    let (setup, params) = (&plan.setup, &plan.params);
-    dispatch(r, &k.batch, groups_for(&k.batch, setup.n_rays), buffers, &[], ())?;
-    network.record_weights(r, k, buffers, params)?;
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
+    let (k, network, buffers) = (pass.kernels, pass.network, pass.buffers);
+    let (setup, params) = (pass.setup, pass.params);
+    pass.run(&k.batch, k.batch.groups_for(setup.n_rays), push::Batch {})?;
+    network.record_weights(pass)?;
     for chunk in chunks(setup, setup.n_rays) {
-        let per_ray = || Groups::Direct([chunk.n_rays, 1, 1]);
-        record_samples(r, k, network, buffers, params, chunk)?;
-        network.record_forward(r, buffers, params, setup)?;
+        let Chunk { first_ray, n_rays } = chunk;
+        pass.samples(chunk)?;
+        network.record_forward(pass)?;
         if setup.occupancy_cells > 0 {
-            dispatch(
-                r,
-                &k.occupancy_mark,
-                indirect(buffers, offset_of!(IndirectArguments, samples))?,
-                buffers,
-                &[],
-                (),
-            )?;
+            pass.run(&k.occupancy_mark, buffers.per_sample(), push::OccupancyMark {})?;
         }
-        dispatch(r, &k.march_fwd, per_ray(), buffers, &[], chunk.push())?;
-        dispatch(r, &k.loss, groups_for(&k.loss, chunk.n_rays), buffers, &[], chunk.push())?;
-        dispatch(r, &k.march_bwd, per_ray(), buffers, &[], chunk.push())?;
-        network.record_backward(r, buffers, params, setup, chunk)?;
+        pass.run(&k.march_fwd, chunk.per_ray(), push::MarchFwd { first_ray, n_rays })?;
+        pass.run(&k.loss, k.loss.groups_for(n_rays), push::Loss { first_ray, n_rays })?;
+        pass.run(&k.march_bwd, chunk.per_ray(), push::MarchBwd { first_ray, n_rays })?;
+        network.record_backward(pass, chunk)?;
     }
     let static_len = params.static_len as u32;
-    dispatch(r, &k.reg_tv, groups_for(&k.reg_tv, static_len), buffers, &[], [params.ranks as u32])?;
-    dispatch(r, &k.gradient_static, groups_for(&k.gradient_static, static_len), buffers, &[], ())?;
-    network.record_gradient(r, k, buffers, params)?;
+    pass.run(&k.reg_tv, k.reg_tv.groups_for(static_len), push::RegTv { ranks: params.ranks as u32 })?;
+    pass.run(&k.gradient_static, k.gradient_static.groups_for(static_len), push::GradientStatic {})?;
+    network.record_gradient(pass)?;
     if setup.occupancy_cells > 0 {
         let slice = (setup.occupancy_words() as u32).div_ceil(OCCUPANCY_EPOCH);
-        dispatch(r, &k.occupancy_clear, groups_for(&k.occupancy_clear, slice), buffers, &[], ())?;
+        pass.run(&k.occupancy_clear, k.occupancy_clear.groups_for(slice), push::OccupancyClear {})?;
     }
-    dispatch(r, &k.adam, groups_for(&k.adam, setup.n_params), buffers, &[], ())?;
-    dispatch(r, &k.report, Groups::Direct([1, 1, 1]), buffers, &[], ())
+    pass.run(&k.adam, k.adam.groups_for(setup.n_params), push::Adam {})?;
+    pass.run(&k.report, Groups::Direct([1, 1, 1]), push::Report {})
 }

@@ -6,18 +6,18 @@ use crate::geometry::CArm;
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
-use crate::kernels::dispatch::Buffers;
 use crate::kernels::layout::{DeviceState, StepReport};
 use crate::kernels::stages::Kernels;
-use crate::kernels::tuning::Tuning;
+use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::setup::{RING_LENGTH, sample_capacity};
-use crate::network::Network;
-use crate::network::forward::occupancy_bytes;
+use crate::network::forward::{ForwardBuffers, occupancy_bytes};
+use crate::network::pass::Pass;
+use crate::network::{Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
-use crate::train::step::{record_step, training_buffers};
+use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use serde::Serialize;
 use std::collections::VecDeque;
 
@@ -64,7 +64,8 @@ pub struct Trainer {
     plan: Plan,
     kernels: Kernels,
     network: Network,
-    buffers: Buffers,
+    forward: ForwardBuffers,
+    training: TrainingBuffers,
     /// Iterations of `several`.
     per_submit: u32,
     several: Commands,
@@ -152,31 +153,41 @@ impl Trainer {
         params: &[f32],
         saved: Option<&Checkpoint>,
     ) -> Result<Trainer> {
-        let network = Network::new(gpu, &tuning, &plan.params, true)?;
-        let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32)?;
-        let largest = kernels.tuning.chunk_samples.min(network.largest_chunk(gpu, &plan.params));
+        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params));
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
-        let buffers = training_buffers(gpu, &kernels.tuning, &network, &plan)?;
-        gpu.upload(buffers.get("params")?, 0, params)?;
+        let network = Network::new(gpu, &tuning, &plan.setup, &plan.params, Purpose::Train)?;
+        let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32)?;
+        let (forward, training) = (forward_buffers(gpu, &kernels.tuning, &plan)?, TrainingBuffers::new(gpu, &plan)?);
+        clear(gpu, &network, &forward, &training)?;
+        gpu.upload(&forward.params, 0, params)?;
         let mut now = DeviceState { step: 0, loss_scale: network.first_loss_scale(), overflowed: 0, good_updates: 0 };
         if let Some(saved) = saved {
-            gpu.upload(buffers.get("moments")?, 0, &saved.moments)?;
+            gpu.upload(&training.moments, 0, &saved.moments)?;
             now.step = saved.model.step;
             // One of another size, as of an older version, starts anew.
             if saved.occupancy.len() as u64 * 4 == occupancy_bytes(&plan.setup) && !saved.occupancy.is_empty() {
-                gpu.upload(buffers.get("occupancy")?, 0, &saved.occupancy)?;
+                gpu.upload(&forward.occupancy, 0, &saved.occupancy)?;
             }
             // A run may change from one path to the other; f32 needs no scale.
-            if let (Some(LossScale { scale, good_updates }), Network::Fused(_)) = (saved.loss_scale, &network) {
+            if let (Some(LossScale { scale, good_updates }), Layers::Matrices) = (saved.loss_scale, network.layers()) {
                 (now.loss_scale, now.good_updates) = (scale, good_updates);
             }
         }
-        gpu.upload(buffers.get("state")?, 0, &[now])?;
+        gpu.upload(&forward.state, 0, &[now])?;
         let step = now.step;
         let record = |n: u32| -> Result<Commands> {
             let mut recording = Recording::new(gpu, &format!("{n} training iterations"))?;
+            let mut pass = Pass {
+                recording: &mut recording,
+                kernels: &kernels,
+                network: &network,
+                buffers: &forward,
+                training: Some(&training),
+                params: &plan.params,
+                setup: &plan.setup,
+            };
             for _ in 0..n {
-                record_step(&mut recording, &kernels, &network, &buffers, &plan)?;
+                record_step(&mut pass)?;
             }
             recording.finish()
         };
@@ -186,7 +197,8 @@ impl Trainer {
             gpu: gpu.clone(),
             kernels,
             network,
-            buffers,
+            forward,
+            training,
             per_submit,
             several,
             single,
@@ -218,9 +230,14 @@ impl Trainer {
         &self.kernels.tuning
     }
 
-    /// Buffers, for rendering while training and for tests.
-    pub fn buffers(&self) -> &Buffers {
-        &self.buffers
+    /// Buffers of the forward pass, for rendering while training and for tests.
+    pub fn forward(&self) -> &ForwardBuffers {
+        &self.forward
+    }
+
+    /// Buffers of training, for tests.
+    pub fn training(&self) -> &TrainingBuffers {
+        &self.training
     }
 
     /// Keeps the device busy towards `until` and returns the losses that became known. Returns with work
@@ -246,7 +263,7 @@ impl Trainer {
 
     fn read_losses(&mut self) -> Result<Vec<StepLoss>> {
         let mut ring = vec![StepReport::default(); RING_LENGTH as usize];
-        self.buffers.get("ring")?.read(&mut ring)?;
+        self.training.ring.read(&mut ring)?;
         let mut losses = Vec::new();
         while self.reported < self.completed {
             let report = ring[(self.reported % RING_LENGTH) as usize];
@@ -277,7 +294,15 @@ impl Trainer {
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
-        record_step(&mut recording, &self.kernels, &self.network, &self.buffers, &self.plan)?;
+        record_step(&mut Pass {
+            recording: &mut recording,
+            kernels: &self.kernels,
+            network: &self.network,
+            buffers: &self.forward,
+            training: Some(&self.training),
+            params: &self.plan.params,
+            setup: &self.plan.setup,
+        })?;
         let commands = recording.finish()?;
         self.gpu.wait(commands.submit()?)?;
         self.submitted += 1;
@@ -313,18 +338,18 @@ impl Trainer {
     /// Device errors.
     pub fn snapshot(&self) -> Result<Snapshot> {
         let mut recording = Recording::new(&self.gpu, "snapshot")?;
-        let mut copy = |name: &str, bytes: u64| -> Result<Buffer> {
-            let staging = self.gpu.buffer(&format!("{name} snapshot"), bytes, Memory::Readback)?;
+        let mut copy = |from: &Buffer, bytes: u64| -> Result<Buffer> {
+            let staging = self.gpu.buffer(&format!("{} snapshot", from.name()), bytes, Memory::Readback)?;
             if bytes > 0 {
-                recording.copy(self.buffers.get(name)?, 0, &staging, 0, bytes)?;
+                recording.copy(from, 0, &staging, 0, bytes)?;
             }
             Ok(staging)
         };
         let n = self.plan.params.len as u64;
-        let params = copy("params", 4 * n)?;
-        let moments = copy("moments", 8 * n)?;
-        let state = copy("state", size_of::<DeviceState>() as u64)?;
-        let occupancy = copy("occupancy", occupancy_bytes(&self.plan.setup))?;
+        let params = copy(&self.forward.params, 4 * n)?;
+        let moments = copy(&self.training.moments, 8 * n)?;
+        let state = copy(&self.forward.state, size_of::<DeviceState>() as u64)?;
+        let occupancy = copy(&self.forward.occupancy, occupancy_bytes(&self.plan.setup))?;
         let commands = recording.finish()?;
         let ticket = commands.submit()?;
         Ok(Snapshot {
@@ -336,7 +361,7 @@ impl Trainer {
             state,
             occupancy,
             occupancy_words: occupancy_bytes(&self.plan.setup) as usize / 4,
-            scaled: matches!(self.network, Network::Fused(_)),
+            scaled: self.network.layers() == Layers::Matrices,
             model: self.outline(),
             data_fingerprint: self.data_fingerprint.clone(),
         })

@@ -1,0 +1,58 @@
+//! What the stages of one recording share.
+
+use crate::error::Result;
+use crate::gpu::memory::Buffer;
+use crate::gpu::record::{Bound, Groups, Recording};
+use crate::kernels::dispatch::{Binding, BufferSet, dispatch_finding};
+use crate::kernels::layout::Setup;
+use crate::kernels::push::PushConstants;
+use crate::kernels::stages::{Kernels, Stage};
+use crate::model::params::ParamLayout;
+use crate::network::Network;
+use crate::network::forward::ForwardBuffers;
+
+/// Where stages are recorded, and what they work with.
+pub struct Pass<'a> {
+    /// Takes the stages down.
+    pub recording: &'a mut Recording,
+    /// Pipelines of every path.
+    pub kernels: &'a Kernels,
+    /// The dynamic field's network.
+    pub network: &'a Network,
+    /// Buffers of the forward pass.
+    pub buffers: &'a ForwardBuffers,
+    /// Further buffers when training.
+    pub training: Option<&'a dyn BufferSet>,
+    /// Where each parameter lives.
+    pub params: &'a ParamLayout,
+    /// What stays fixed; `buffers` holds the same.
+    pub setup: &'a Setup,
+}
+
+impl<'a> Pass<'a> {
+    /// Records a stage on the buffers that go by the names its shader gives them.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+    pub fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
+        self.run_with(stage, groups, &[], push)
+    }
+
+    /// Records a stage like [`Pass::run`]; those `bound` come first.
+    ///
+    /// # Errors
+    /// As [`Pass::run`].
+    pub fn run_with<P: PushConstants>(
+        &mut self,
+        stage: &Stage<P>,
+        groups: Groups<'_>,
+        bound: &[(Binding, Bound<'_>)],
+        push: P,
+    ) -> Result<()> {
+        let (network, buffers, training) = (self.network, self.buffers, self.training);
+        let find = |name: Binding| -> Option<&Buffer> {
+            buffers.find(name).or_else(|| network.find(name)).or_else(|| training?.find(name))
+        };
+        dispatch_finding(self.recording, stage, groups, bound, find, push)
+    }
+}
