@@ -2,9 +2,9 @@
 //! run against the paper's 37 minutes.
 
 use crate::error::Result;
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::capabilities::MatrixShape;
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::push::{self, PushConstants};

@@ -45,12 +45,15 @@ pub mod raster;
 
 /// Vulkan compute, free of any knowledge of angiography.
 pub mod gpu {
+    pub mod buffer;
     pub mod capabilities;
     pub mod device;
-    pub mod memory;
+    pub mod image;
+    pub mod instance;
+    mod lock;
     pub mod pipeline;
     pub mod record;
-    pub mod volume;
+    mod transfer;
 }
 
 pub mod config;

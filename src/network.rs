@@ -8,8 +8,8 @@ pub mod layers;
 pub mod pass;
 
 use crate::error::{Error, Result};
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;

@@ -9,8 +9,8 @@ mod inbox;
 
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, ViewRays};
+use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::Buffer;
 use crate::kernels::tuning::Tuning;
 use crate::model::checkpoint::Checkpoint;
 use crate::model::component::Component;

@@ -4,7 +4,7 @@
 mod common;
 
 use common::{expect_silence, gpu, relative_error, small_config, small_dataset, tuning};
-use nertca_vk::gpu::memory::Operands;
+use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::kernels::constants::{CELLS_PER_WORD, NEAR_SAMPLE, OCCUPIED, SEEN};
 use nertca_vk::kernels::layout::Ray;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};

@@ -10,7 +10,7 @@ use crate::capi::types::{
     nertca_scores, nertca_view, pixel_bytes, read, sides, stride, write,
 };
 use crate::geometry::{MM_PER_UNIT, ViewRays};
-use crate::gpu::memory::Buffer;
+use crate::gpu::buffer::Buffer;
 use crate::model::component::Component;
 use crate::render::grid::PatientGrid;
 use crate::render::quantity::{Projection, Quantity};

@@ -487,7 +487,7 @@ impl Cli {
             select: self.device.clone(),
             validation: self.validate,
             cache_dir: cache_dir(),
-            memory_limit: None,
+            ..DeviceOptions::default()
         })
     }
 

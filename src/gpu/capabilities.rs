@@ -112,20 +112,19 @@ fn c_chars(text: &[std::ffi::c_char]) -> String {
 /// Device extensions the matrix kernels need.
 pub(super) const MATRIX_EXTENSIONS: [&CStr; 2] = [khr::cooperative_matrix::NAME, ext::subgroup_size_control::NAME];
 
-/// Matrix shapes our kernels can use, most work per product first.
-fn matrix_shapes(entry: &ash::Entry, instance: &ash::Instance, physical: vk::PhysicalDevice) -> Vec<MatrixShape> {
-    // SAFETY: `physical` comes from this instance.
-    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
-    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
-    if !MATRIX_EXTENSIONS.iter().all(|name| has(name)) {
-        return Vec::new();
-    }
+/// Matrix shapes our kernels can use on a device with [`MATRIX_EXTENSIONS`], most work per product first; or why they
+/// cannot be told.
+fn matrix_shapes(
+    entry: &ash::Entry,
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+) -> Result<Vec<MatrixShape>, String> {
     let mut matrix = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
     let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
     let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
     let mut features =
         vk::PhysicalDeviceFeatures2::default().push_next(&mut matrix).push_next(&mut size).push_next(&mut f12);
-    // SAFETY: the device offers the extensions whose structures are chained.
+    // SAFETY: the device offers the extensions whose structures are chained; these live until the call returns.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
     let needed = [
         matrix.cooperative_matrix,
@@ -137,11 +136,12 @@ fn matrix_shapes(entry: &ash::Entry, instance: &ash::Instance, physical: vk::Phy
         f12.vulkan_memory_model_device_scope,
     ];
     if needed.contains(&vk::FALSE) {
-        return Vec::new();
+        return Ok(Vec::new());
     }
     let loader = khr::cooperative_matrix::Instance::new(entry, instance);
-    // SAFETY: the device offers the extension.
-    let found = unsafe { loader.get_physical_device_cooperative_matrix_properties(physical) }.unwrap_or_default();
+    // SAFETY: the caller checked that this device of the instance offers the extension.
+    let found = unsafe { loader.get_physical_device_cooperative_matrix_properties(physical) }
+        .map_err(|code| format!("vkGetPhysicalDeviceCooperativeMatrixPropertiesKHR failed: {code}"))?;
     let (f16, f32) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
     let mut shapes: Vec<MatrixShape> = found
         .iter()
@@ -159,7 +159,7 @@ fn matrix_shapes(entry: &ash::Entry, instance: &ash::Instance, physical: vk::Phy
     // Widths are multiples of 16; among shapes that fit them the largest product reuses its operands most.
     shapes.retain(|s| 16 % s.m == 0 && 16 % s.n == 0 && 16 % s.k == 0);
     shapes.sort_by_key(|s| std::cmp::Reverse((s.m * s.n * s.k, s.m)));
-    shapes
+    Ok(shapes)
 }
 
 pub(super) fn describe(
@@ -172,26 +172,42 @@ pub(super) fn describe(
     let mut ids = vk::PhysicalDeviceIDProperties::default();
     let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
     let mut multiprocessors = vk::PhysicalDeviceShaderSMBuiltinsPropertiesNV::default();
-    // SAFETY: `physical` comes from this instance.
-    let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
+    // SAFETY: callers take `physical` from this instance.
+    let (extensions, mut fault) = match unsafe { instance.enumerate_device_extension_properties(physical) } {
+        Ok(extensions) => (extensions, None),
+        Err(code) => (Vec::new(), Some(format!("vkEnumerateDeviceExtensionProperties failed: {code}"))),
+    };
     let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
     let mut props =
         vk::PhysicalDeviceProperties2::default().push_next(&mut driver).push_next(&mut ids).push_next(&mut subgroup);
     if has(nv::shader_sm_builtins::NAME) {
         props = props.push_next(&mut multiprocessors);
     }
-    // SAFETY: `physical` comes from this instance; the chain lives until the call returns.
+    // SAFETY: the chain lives until the call returns, and holds an extension's structure only where the device has it.
     unsafe { instance.get_physical_device_properties2(physical, &mut props) };
     let properties = props.properties;
     let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
     let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut f12);
-    // SAFETY: as above.
+    // SAFETY: the chain lives until the call returns; its structure is of Vulkan 1.2, and ignored by older devices.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    // SAFETY: as above.
+    // SAFETY: callers take `physical` from this instance.
     let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
     let limits = properties.limits;
     let version = properties.api_version;
-    let unusable = if version < vk::API_VERSION_1_2 {
+    // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives,
+    // the simplest product crashes the process.
+    let crashes = driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8;
+    let matrices = if crashes || !MATRIX_EXTENSIONS.iter().all(|name| has(name)) {
+        Vec::new()
+    } else {
+        matrix_shapes(entry, instance, physical).unwrap_or_else(|why| {
+            fault = Some(why);
+            Vec::new()
+        })
+    };
+    let unusable = if fault.is_some() {
+        fault
+    } else if version < vk::API_VERSION_1_2 {
         Some("Vulkan 1.2 is needed".to_owned())
     } else if f12.timeline_semaphore == vk::FALSE {
         Some("timeline semaphores are needed".to_owned())
@@ -239,13 +255,7 @@ pub(super) fn describe(
             .map(|h| h.size)
             .sum(),
         buffer_device_address: f12.buffer_device_address == vk::TRUE,
-        // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives,
-        // the simplest product crashes the process.
-        matrices: if driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8 {
-            Vec::new()
-        } else {
-            matrix_shapes(entry, instance, physical)
-        },
+        matrices,
         multiprocessors: multiprocessors.shader_sm_count,
         float16: f12.shader_float16 == vk::TRUE,
         float_atomics: has(ext::shader_atomic_float::NAME),
@@ -255,7 +265,7 @@ pub(super) fn describe(
 }
 
 pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<u32> {
-    // SAFETY: `physical` comes from this instance.
+    // SAFETY: callers take `physical` from this instance.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
     families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE)).map(|i| i as u32)
 }

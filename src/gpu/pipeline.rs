@@ -33,7 +33,7 @@ pub enum BindingKind {
     Volume,
 }
 
-/// One buffer or volume a shader uses.
+/// One buffer or image a shader uses.
 #[derive(Debug)]
 pub struct BindingCode {
     /// Binding number.
@@ -149,7 +149,7 @@ impl Gpu {
             local_size,
         };
         let create = vk::DescriptorSetLayoutCreateInfo::default().bindings(&slots);
-        // SAFETY: the create info and its slices live until the call returns.
+        // SAFETY: the create info and `slots` live until the call returns; `pipeline` keeps the device alive.
         pipeline.set_layout = unsafe { device.create_descriptor_set_layout(&create, None) }
             .map_err(Error::vulkan("vkCreateDescriptorSetLayout", code.name))?;
         let sets = [pipeline.set_layout];
@@ -159,7 +159,7 @@ impl Gpu {
         if code.all_push_bytes() > 0 {
             create = create.push_constant_ranges(&ranges);
         }
-        // SAFETY: as above.
+        // SAFETY: the create info, `sets` and `ranges` live until the call returns; the set layout was just made.
         pipeline.layout = unsafe { device.create_pipeline_layout(&create, None) }
             .map_err(Error::vulkan("vkCreatePipelineLayout", code.name))?;
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(code.spirv);
@@ -180,9 +180,10 @@ impl Gpu {
                 stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS).push_next(&mut subgroup_size);
         }
         let create = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(pipeline.layout)];
-        // SAFETY: as above; the module is alive during the call.
+        // SAFETY: module and layout were just made; entries and values live until the call returns, and the entries lie
+        // inside the values.
         let made = unsafe { device.create_compute_pipelines(shared.pipeline_cache, &create, None) };
-        // SAFETY: a module is no longer needed once the pipeline exists.
+        // SAFETY: the module was made above and is no longer needed, whether the pipeline came to be or not.
         unsafe { device.destroy_shader_module(module, None) };
         pipeline.raw = made
             .map_err(|(_, code)| code)
@@ -205,7 +206,8 @@ pub(super) fn descriptor_type(binding: &BindingCode) -> vk::DescriptorType {
 
 impl Drop for Pipeline {
     fn drop(&mut self) {
-        // SAFETY: recordings hold an `Arc` of the pipelines they use; null handles are allowed.
+        // SAFETY: recordings hold an `Arc` of the pipelines they use, so no submit in flight needs this one; null handles
+        // are ignored.
         unsafe {
             self.gpu.device.destroy_pipeline(self.raw, None);
             self.gpu.device.destroy_pipeline_layout(self.layout, None);

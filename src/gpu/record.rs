@@ -1,10 +1,10 @@
 //! A recording of dispatches. Each states what it reads and writes (from the shader's own
 //! qualifiers); barriers follow from that.
 
+use super::buffer::Buffer;
 use super::device::{Gpu, Shared};
-use super::memory::Buffer;
-use super::pipeline::{BindingKind, Pipeline, descriptor_type};
-use super::volume::Volume;
+use super::image::Image3d;
+use super::pipeline::{BindingCode, BindingKind, Pipeline, descriptor_type};
 use crate::error::{Error, Result};
 use ash::vk;
 use std::collections::HashSet;
@@ -18,14 +18,14 @@ pub enum Bound<'a> {
     /// To a storage or texel buffer.
     Buffer(&'a Buffer),
     /// To a 3D sampler.
-    Volume(&'a Volume),
+    Image(&'a Image3d),
 }
 
 impl<'a> Bound<'a> {
     fn buffer(&self) -> Option<&'a Buffer> {
         match self {
             Bound::Buffer(buffer) => Some(buffer),
-            Bound::Volume(_) => None,
+            Bound::Image(_) => None,
         }
     }
 }
@@ -65,9 +65,48 @@ pub struct Commands {
     queries: vk::QueryPool,
     passes: Vec<&'static str>,
     buffers: Vec<Buffer>,
-    volumes: Vec<Volume>,
+    images: Vec<Image3d>,
     pipelines: Vec<Arc<Pipeline>>,
     last_submit: std::sync::atomic::AtomicU64,
+}
+
+/// What a slot of a descriptor set refers to.
+enum Descriptor {
+    Storage(vk::DescriptorBufferInfo),
+    Texel(vk::BufferView),
+    Image(vk::DescriptorImageInfo),
+}
+
+impl Descriptor {
+    fn of(pipeline: &Pipeline, binding: &BindingCode, what: &Bound<'_>) -> Result<Descriptor> {
+        let name = match (binding.kind, what) {
+            (BindingKind::Storage, Bound::Buffer(b)) => {
+                let whole = vk::DescriptorBufferInfo::default().buffer(b.raw()).range(vk::WHOLE_SIZE);
+                return Ok(Descriptor::Storage(whole));
+            }
+            (BindingKind::Texel, Bound::Buffer(b)) => match b.texel_view() {
+                Some(view) => return Ok(Descriptor::Texel(view)),
+                None => b.name(),
+            },
+            (BindingKind::Volume, Bound::Image(image)) => return Ok(Descriptor::Image(image.descriptor())),
+            (_, Bound::Buffer(b)) => b.name(),
+            (_, Bound::Image(_)) => "an image",
+        };
+        let (kernel, slot) = (pipeline.code.name, binding.name);
+        Err(Error::Internal(format!("kernel {kernel}: `{name}` is not {:?}, as `{slot}` must be", binding.kind)))
+    }
+
+    fn write(&self, binding: &BindingCode, set: vk::DescriptorSet) -> vk::WriteDescriptorSet<'_> {
+        let write = vk::WriteDescriptorSet::default()
+            .dst_set(set)
+            .dst_binding(binding.slot)
+            .descriptor_type(descriptor_type(binding));
+        match self {
+            Descriptor::Storage(info) => write.buffer_info(std::slice::from_ref(info)),
+            Descriptor::Texel(view) => write.texel_buffer_view(std::slice::from_ref(view)),
+            Descriptor::Image(info) => write.image_info(std::slice::from_ref(info)),
+        }
+    }
 }
 
 const SETS_PER_POOL: u32 = 64;
@@ -103,32 +142,32 @@ impl Recording {
             queries: vk::QueryPool::null(),
             passes: Vec::new(),
             buffers: Vec::new(),
-            volumes: Vec::new(),
+            images: Vec::new(),
             pipelines: Vec::new(),
             last_submit: std::sync::atomic::AtomicU64::new(0),
         };
         let device = &shared.device;
         let create = vk::CommandPoolCreateInfo::default().queue_family_index(shared.queue_family);
-        // SAFETY: the device is alive; the family is the one it was made with.
+        // SAFETY: the create info lives until the call returns; the family is the one the device's queue is of.
         commands.pool =
             unsafe { device.create_command_pool(&create, None) }.map_err(Error::vulkan("vkCreateCommandPool", name))?;
         let allocate = vk::CommandBufferAllocateInfo::default().command_pool(commands.pool).command_buffer_count(1);
-        // SAFETY: the pool was just made and is used by this thread alone.
+        // SAFETY: the pool was just made, and no other thread knows of it.
         commands.raw = unsafe { device.allocate_command_buffers(&allocate) }
             .map_err(Error::vulkan("vkAllocateCommandBuffers", name))?[0];
         shared.set_name(commands.raw, name);
         // Two submits of the same commands may be in flight.
         let begin = vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::SIMULTANEOUS_USE);
-        // SAFETY: the buffer is in the initial state.
+        // SAFETY: the command buffer was just allocated, so it is in the initial state.
         unsafe { device.begin_command_buffer(commands.raw, &begin) }
             .map_err(Error::vulkan("vkBeginCommandBuffer", name))?;
         if let Some(passes) = timed {
             let create =
                 vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(2 * passes);
-            // SAFETY: the device is alive and its queue has timestamps.
+            // SAFETY: `Recording::timed` asks for timestamps only where the queue has them.
             commands.queries =
                 unsafe { device.create_query_pool(&create, None) }.map_err(Error::vulkan("vkCreateQueryPool", name))?;
-            // SAFETY: the command buffer is recording.
+            // SAFETY: the command buffer was begun above; the pool was just made with this many queries.
             unsafe { device.cmd_reset_query_pool(commands.raw, commands.queries, 0, 2 * passes) };
         }
         let mut recording = Recording { commands, read: HashSet::new(), written: HashSet::new(), timed };
@@ -146,7 +185,7 @@ impl Recording {
             .src_access_mask(vk::AccessFlags::SHADER_WRITE | vk::AccessFlags::TRANSFER_WRITE)
             .dst_access_mask(access | vk::AccessFlags::INDIRECT_COMMAND_READ)];
         let work = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
-        // SAFETY: the command buffer is recording.
+        // SAFETY: a `Recording` has begun its command buffer and not ended it; the barrier lives until the call returns.
         unsafe {
             self.commands.gpu.device.cmd_pipeline_barrier(
                 self.commands.raw,
@@ -227,7 +266,8 @@ impl Recording {
             pushed[*offset as usize..][..8].copy_from_slice(&buffer.address().to_le_bytes());
         }
         self.begin_pass(code.name)?;
-        // SAFETY: the command buffer is recording; pipeline, layout, set and buffers are kept alive by `commands`.
+        // SAFETY: the command buffer is being recorded; `commands` keeps buffers, images and the set's pool alive, and the
+        // pipeline once it is pushed below; the push constants have the size of the layout's range.
         unsafe {
             device.cmd_bind_pipeline(raw, vk::PipelineBindPoint::COMPUTE, pipeline.raw);
             device.cmd_bind_descriptor_sets(raw, vk::PipelineBindPoint::COMPUTE, pipeline.layout, 0, &[set], &[]);
@@ -245,10 +285,10 @@ impl Recording {
     }
 
     fn begin_pass(&mut self, name: &'static str) -> Result<()> {
-        if let Some(debug) = &self.commands.gpu.debug_names {
+        if let Some(debug) = &self.commands.gpu.device.debug_names {
             let label = CString::new(name).unwrap_or_default();
             let label = vk::DebugUtilsLabelEXT::default().label_name(&label);
-            // SAFETY: the command buffer is recording.
+            // SAFETY: the command buffer is being recorded; `label` and its text live until the call returns.
             unsafe { debug.cmd_begin_debug_utils_label(self.commands.raw, &label) };
         }
         if let Some(max) = self.timed {
@@ -258,7 +298,7 @@ impl Recording {
             }
             // A barrier after each pass keeps passes from overlapping, so that times are theirs alone.
             self.barrier();
-            // SAFETY: the query was reset at the start of this recording.
+            // SAFETY: the start of this recording reset all queries, of which there are two for each of `max` passes.
             unsafe {
                 self.commands.gpu.device.cmd_write_timestamp(
                     self.commands.raw,
@@ -274,7 +314,7 @@ impl Recording {
     fn end_pass(&mut self, name: &'static str) {
         if self.timed.is_some() {
             let pass = self.commands.passes.len() as u32;
-            // SAFETY: as in `begin_pass`.
+            // SAFETY: `begin_pass` checked that this pass has its two queries; this is the second.
             unsafe {
                 self.commands.gpu.device.cmd_write_timestamp(
                     self.commands.raw,
@@ -286,8 +326,8 @@ impl Recording {
             self.commands.passes.push(name);
             self.barrier();
         }
-        if let Some(debug) = &self.commands.gpu.debug_names {
-            // SAFETY: a label was opened in `begin_pass`.
+        if let Some(debug) = &self.commands.gpu.device.debug_names {
+            // SAFETY: the command buffer is being recorded, and `begin_pass` opened the label.
             unsafe { debug.cmd_end_debug_utils_label(self.commands.raw) };
         }
     }
@@ -295,79 +335,51 @@ impl Recording {
     fn descriptor_set(
         &mut self,
         pipeline: &Pipeline,
-        bound: &[(&super::pipeline::BindingCode, Bound<'_>)],
+        bound: &[(&BindingCode, Bound<'_>)],
     ) -> Result<vk::DescriptorSet> {
-        let device = &self.commands.gpu.device.clone();
+        let set = self.empty_set(pipeline)?;
+        let mut descriptors = Vec::with_capacity(bound.len());
+        for (binding, what) in bound {
+            if let Bound::Image(image) = what {
+                self.commands.images.push((*image).clone());
+            }
+            descriptors.push((*binding, Descriptor::of(pipeline, binding, what)?));
+        }
+        let writes: Vec<_> = descriptors.iter().map(|(binding, d)| d.write(binding, set)).collect();
+        // SAFETY: the set was just allocated, so nothing uses it; `descriptors` lives until the call returns; each was
+        // checked to be of the kind that the set's layout has in its slot.
+        unsafe { self.commands.gpu.device.update_descriptor_sets(&writes, &[]) };
+        Ok(set)
+    }
+
+    /// A set from the last pool, or from a new one when that is full.
+    fn empty_set(&mut self, pipeline: &Pipeline) -> Result<vk::DescriptorSet> {
         let layouts = [pipeline.set_layout];
+        let gpu = self.commands.gpu.clone();
         let from = |pool| {
             let allocate = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
-            // SAFETY: pool and layout are alive.
-            unsafe { device.allocate_descriptor_sets(&allocate) }.map(|sets| sets[0])
+            // SAFETY: the pool belongs to this recording, which one thread at a time uses; the layout to the pipeline.
+            unsafe { gpu.device.allocate_descriptor_sets(&allocate) }.map(|sets| sets[0])
         };
-        let set = match self.commands.descriptor_pools.last().map(|pool| from(*pool)) {
-            Some(Ok(set)) => set,
-            // No pool yet, or the last is full.
-            _ => {
-                let sizes = [
-                    vk::DescriptorType::STORAGE_BUFFER,
-                    vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
-                    vk::DescriptorType::COMBINED_IMAGE_SAMPLER,
-                ]
-                .map(|ty| vk::DescriptorPoolSize::default().ty(ty).descriptor_count(SETS_PER_POOL * MAX_BINDINGS));
-                let create = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_PER_POOL).pool_sizes(&sizes);
-                // SAFETY: the device is alive.
-                let pool = unsafe { device.create_descriptor_pool(&create, None) }
-                    .map_err(Error::vulkan("vkCreateDescriptorPool", &self.commands.name))?;
-                self.commands.descriptor_pools.push(pool);
-                from(pool).map_err(Error::vulkan("vkAllocateDescriptorSets", pipeline.code.name))?
+        let failed = || Error::vulkan("vkAllocateDescriptorSets", pipeline.code.name);
+        if let Some(pool) = self.commands.descriptor_pools.last() {
+            match from(*pool) {
+                Err(vk::Result::ERROR_OUT_OF_POOL_MEMORY | vk::Result::ERROR_FRAGMENTED_POOL) => {}
+                outcome => return outcome.map_err(failed()),
             }
-        };
-        let mut buffers = Vec::with_capacity(bound.len());
-        let mut views = Vec::with_capacity(bound.len());
-        let mut images = Vec::with_capacity(bound.len());
-        for (binding, what) in bound {
-            let unfit = |name: &str| {
-                let kernel = pipeline.code.name;
-                Error::Internal(format!(
-                    "kernel {kernel}: `{name}` is not {:?}, as `{}` must be",
-                    binding.kind, binding.name
-                ))
-            };
-            let (mut buffer, mut view, mut image) = Default::default();
-            match (binding.kind, what) {
-                (BindingKind::Storage, Bound::Buffer(b)) => {
-                    buffer = vk::DescriptorBufferInfo::default().buffer(b.raw()).range(vk::WHOLE_SIZE);
-                }
-                (BindingKind::Texel, Bound::Buffer(b)) => view = b.texel_view().ok_or_else(|| unfit(b.name()))?,
-                (BindingKind::Volume, Bound::Volume(v)) => image = v.descriptor(),
-                (_, Bound::Buffer(b)) => return Err(unfit(b.name())),
-                (_, Bound::Volume(_)) => return Err(unfit("a volume")),
-            }
-            if let Bound::Volume(v) = what {
-                self.commands.volumes.push((*v).clone());
-            }
-            buffers.push([buffer]);
-            views.push([view]);
-            images.push([image]);
         }
-        let writes: Vec<_> = bound
-            .iter()
-            .enumerate()
-            .map(|(i, (binding, _))| {
-                let write = vk::WriteDescriptorSet::default()
-                    .dst_set(set)
-                    .dst_binding(binding.slot)
-                    .descriptor_type(descriptor_type(binding));
-                match binding.kind {
-                    BindingKind::Storage => write.buffer_info(&buffers[i]),
-                    BindingKind::Texel => write.texel_buffer_view(&views[i]),
-                    BindingKind::Volume => write.image_info(&images[i]),
-                }
-            })
-            .collect();
-        // SAFETY: the set is not in use; infos and views live until the call returns.
-        unsafe { device.update_descriptor_sets(&writes, &[]) };
-        Ok(set)
+        let sizes = [
+            vk::DescriptorType::STORAGE_BUFFER,
+            vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
+            vk::DescriptorType::COMBINED_IMAGE_SAMPLER,
+        ]
+        .map(|ty| vk::DescriptorPoolSize::default().ty(ty).descriptor_count(SETS_PER_POOL * MAX_BINDINGS));
+        let create = vk::DescriptorPoolCreateInfo::default().max_sets(SETS_PER_POOL).pool_sizes(&sizes);
+        // SAFETY: the create info and `sizes` live until the call returns.
+        let pool = unsafe { gpu.device.create_descriptor_pool(&create, None) }
+            .map_err(Error::vulkan("vkCreateDescriptorPool", &self.commands.name))?;
+        self.commands.descriptor_pools.push(pool);
+        from(pool).map_err(failed())
     }
 
     /// Records a copy of `bytes` bytes.
@@ -379,21 +391,22 @@ impl Recording {
         to.check_range(to_at, bytes)?;
         self.depend(&[from], &[to]);
         let region = [vk::BufferCopy::default().src_offset(from_at).dst_offset(to_at).size(bytes)];
-        // SAFETY: ranges were checked; the command buffer is recording.
+        // SAFETY: both ranges were checked; the command buffer is being recorded, and keeps both buffers.
         unsafe { self.commands.gpu.device.cmd_copy_buffer(self.commands.raw, from.raw(), to.raw(), &region) };
         Ok(())
     }
 
-    /// Records filling a whole volume from a buffer; afterwards it may be sampled.
-    pub(super) fn fill_volume(&mut self, from: &Buffer, to: &Volume, [width, height, depth]: [u32; 3]) -> Result<()> {
-        from.check_range(0, u64::from(width) * u64::from(height) * u64::from(depth) * 2)?;
+    /// Records filling a whole image from a buffer; afterwards it may be sampled.
+    pub(super) fn fill_image(&mut self, from: &Buffer, to: &Image3d) -> Result<()> {
+        from.check_range(0, to.bytes())?;
         self.depend(&[from], &[]);
-        self.commands.volumes.push(to.clone());
+        self.commands.images.push(to.clone());
+        let [width, height, depth] = to.size();
         let (device, raw) = (&self.commands.gpu.device, self.commands.raw);
         let barrier = |old, new, before, after| {
             [vk::ImageMemoryBarrier::default()
                 .image(to.raw())
-                .subresource_range(Volume::RANGE)
+                .subresource_range(Image3d::RANGE)
                 .old_layout(old)
                 .new_layout(new)
                 .src_access_mask(before)
@@ -416,7 +429,7 @@ impl Recording {
         let (transfer, compute) = (vk::PipelineStageFlags::TRANSFER, vk::PipelineStageFlags::COMPUTE_SHADER);
         let top = vk::PipelineStageFlags::TOP_OF_PIPE;
         let by_region = vk::DependencyFlags::empty();
-        // SAFETY: the command buffer is recording; the range was checked; buffer and volume are kept by `commands`.
+        // SAFETY: the command buffer is being recorded; the buffer holds all cells, as checked; `commands` keeps both.
         unsafe {
             // Frames submitted earlier may still read what is replaced.
             device.cmd_pipeline_barrier(raw, top | compute, transfer, by_region, &[], &[], &before);
@@ -429,10 +442,9 @@ impl Recording {
     /// Records filling a whole buffer with a 32-bit pattern.
     pub fn fill(&mut self, buffer: &Buffer, pattern: u32) {
         self.depend(&[], &[buffer]);
-        // SAFETY: the command buffer is recording; sizes are multiples of 16.
-        unsafe {
-            self.commands.gpu.device.cmd_fill_buffer(self.commands.raw, buffer.raw(), 0, vk::WHOLE_SIZE, pattern);
-        }
+        let (device, raw) = (&self.commands.gpu.device, self.commands.raw);
+        // SAFETY: the command buffer is being recorded, and keeps the buffer, whose size is a multiple of 16.
+        unsafe { device.cmd_fill_buffer(raw, buffer.raw(), 0, buffer.bytes(), pattern) };
     }
 
     /// Ends the recording.
@@ -445,7 +457,7 @@ impl Recording {
             .src_access_mask(vk::AccessFlags::SHADER_WRITE | vk::AccessFlags::TRANSFER_WRITE)
             .dst_access_mask(vk::AccessFlags::HOST_READ)];
         let commands = &mut self.commands;
-        // SAFETY: the command buffer is recording.
+        // SAFETY: `Recording::new` began the command buffer, and only this function, which takes the recording, ends it.
         unsafe {
             commands.gpu.device.cmd_pipeline_barrier(
                 commands.raw,
@@ -482,7 +494,8 @@ impl Commands {
             .command_buffers(&buffers)
             .signal_semaphores(&semaphores)
             .push_next(&mut timeline)];
-        // SAFETY: the queue is locked; the commands allow simultaneous use and outlive the submit (see Drop).
+        // SAFETY: the queue is locked for us; the commands were ended, allow simultaneous use, and wait in their drop for
+        // this submit; the chain lives until the call returns.
         unsafe { shared.device.queue_submit(*queue, &submit, vk::Fence::null()) }
             .map_err(Error::vulkan("vkQueueSubmit", &self.name))?;
         shared.last_submitted.store(value, Ordering::Release);
@@ -500,7 +513,7 @@ impl Commands {
         }
         let mut ticks = vec![0u64; 2 * self.passes.len()];
         let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
-        // SAFETY: the pool has at least this many queries, all written by the submit.
+        // SAFETY: the pool has two queries for each pass, which every submit writes.
         unsafe { self.gpu.device.get_query_pool_results(self.queries, 0, &mut ticks, flags) }
             .map_err(Error::vulkan("vkGetQueryPoolResults", &self.name))?;
         let period_ms = f64::from(self.gpu.info.timestamp_period_ns) * 1e-6;
@@ -523,15 +536,6 @@ impl Gpu {
     }
 }
 
-impl Shared {
-    pub(super) fn wait(&self, value: u64) -> Result<()> {
-        let (semaphores, values) = ([self.timeline], [value]);
-        let wait = vk::SemaphoreWaitInfo::default().semaphores(&semaphores).values(&values);
-        // SAFETY: the semaphore is a timeline semaphore of this device.
-        unsafe { self.device.wait_semaphores(&wait, u64::MAX) }.map_err(Error::vulkan("vkWaitSemaphores", "timeline"))
-    }
-}
-
 impl Drop for Commands {
     fn drop(&mut self) {
         let submitted = self.last_submit.load(Ordering::Acquire);
@@ -539,7 +543,7 @@ impl Drop for Commands {
             // After a lost device nothing runs any more, so destroying is allowed all the same.
             let _ = self.gpu.wait(submitted);
         }
-        // SAFETY: the last submit is complete; null handles are ignored.
+        // SAFETY: the last submit is complete, and each pool is destroyed once, here; null handles are ignored.
         unsafe {
             for pool in &self.descriptor_pools {
                 self.gpu.device.destroy_descriptor_pool(*pool, None);

@@ -1,9 +1,9 @@
 //! Dispatches whose buffers are found by the names the shaders give them.
 
 use crate::error::{Error, Result};
-use crate::gpu::memory::Buffer;
+use crate::gpu::buffer::Buffer;
+use crate::gpu::image::Image3d;
 use crate::gpu::record::{Bound, Groups, Recording};
-use crate::gpu::volume::Volume;
 use crate::kernels::push::PushConstants;
 use crate::kernels::stages::Stage;
 
@@ -20,10 +20,10 @@ macro_rules! buffer_set {
     ($(#[$about:meta])* $visibility:vis struct $name:ident { $($(#[$doc:meta])* $field:ident,)* }) => {
         $(#[$about])*
         #[derive(Clone)]
-        $visibility struct $name { $($(#[$doc])* pub $field: $crate::gpu::memory::Buffer,)* }
+        $visibility struct $name { $($(#[$doc])* pub $field: $crate::gpu::buffer::Buffer,)* }
 
         impl $crate::kernels::dispatch::BufferSet for $name {
-            fn find(&self, name: $crate::kernels::dispatch::Binding) -> Option<&$crate::gpu::memory::Buffer> {
+            fn find(&self, name: $crate::kernels::dispatch::Binding) -> Option<&$crate::gpu::buffer::Buffer> {
                 match name {
                     $($crate::kernels::dispatch::Binding::$field => Some(&self.$field),)*
                     _ => None,
@@ -40,9 +40,9 @@ impl<'a> From<&'a Buffer> for Bound<'a> {
     }
 }
 
-impl<'a> From<&'a Volume> for Bound<'a> {
-    fn from(volume: &'a Volume) -> Bound<'a> {
-        Bound::Volume(volume)
+impl<'a> From<&'a Image3d> for Bound<'a> {
+    fn from(volume: &'a Image3d) -> Bound<'a> {
+        Bound::Image(volume)
     }
 }
 

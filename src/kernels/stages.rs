@@ -2,8 +2,8 @@
 //! debug label and bench row. Buffers are found by the names the shaders give them.
 
 use crate::error::{Error, Result};
+use crate::gpu::buffer::Operands;
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::Operands;
 use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
 use crate::gpu::record::Groups;
 use crate::kernels::push::{self, PushConstants};
@@ -17,8 +17,11 @@ include!(concat!(env!("OUT_DIR"), "/table.rs"));
 pub const MARCH_LANES: u32 = push::MarchCount::LOCAL_SIZE;
 const _: () = assert!(push::MarchEmit::LOCAL_SIZE == MARCH_LANES);
 
-/// Finds a compiled kernel by its name.
-fn kernel_code(name: &str) -> Result<&'static KernelCode> {
+/// Finds a compiled kernel by its name, variants included.
+///
+/// # Errors
+/// [`Error::Internal`] for a name that no kernel has.
+pub fn kernel_code(name: &str) -> Result<&'static KernelCode> {
     KERNEL_TABLE.iter().find(|k| k.name == name).ok_or_else(|| Error::Internal(format!("no kernel is called `{name}`")))
 }
 

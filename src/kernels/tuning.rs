@@ -1,8 +1,8 @@
 //! Sizes and variants of the kernels, chosen for a device, with the reasons.
 
 use crate::choice::Choice;
+use crate::gpu::buffer::Operands;
 use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
-use crate::gpu::memory::Operands;
 use crate::kernels::constants;
 use serde::Serialize;
 

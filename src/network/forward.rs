@@ -1,8 +1,8 @@
 //! The forward pass of a batch: live samples, network, integrals. What training and rendering share.
 
 use crate::error::{Error, Result};
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::Groups;
 use crate::kernels::constants::OCCUPANCY_EPOCHS;
 use crate::kernels::dispatch::{Binding, buffer_set};

@@ -8,9 +8,9 @@
 //! A sum that is not finite skips the update and halves the scale; many good ones double it (`report`).
 
 use crate::error::{Error, Result};
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::capabilities::{DeviceInfo, MatrixShape};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::Groups;
 use crate::kernels::constants::{NOWHERE, PHASE_BIAS};
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};

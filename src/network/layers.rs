@@ -1,8 +1,8 @@
 //! The network in f32, one pass per layer: runs on every device, and is the yardstick for [`super::fused`].
 
 use crate::error::Result;
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::Groups;
 use crate::kernels::constants::NOWHERE;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};

@@ -1,7 +1,7 @@
 //! What the stages of one recording share.
 
 use crate::error::Result;
-use crate::gpu::memory::Buffer;
+use crate::gpu::buffer::Buffer;
 use crate::gpu::record::{Bound, Groups, Recording};
 use crate::kernels::dispatch::{Binding, BufferSet, dispatch_finding};
 use crate::kernels::layout::Setup;

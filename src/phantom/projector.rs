@@ -3,8 +3,8 @@
 use crate::error::Result;
 use crate::formats::volume::Volume;
 use crate::geometry::{MM_PER_UNIT, ViewRays};
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::layout::View;

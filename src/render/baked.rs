@@ -2,9 +2,9 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, ViewRays};
-use crate::gpu::memory::{Buffer, Memory};
+use crate::gpu::buffer::{Buffer, Memory};
+use crate::gpu::image::Image3d;
 use crate::gpu::record::{Commands, Recording};
-use crate::gpu::volume::Volume;
 use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::layout::View;
 use crate::kernels::push;
@@ -28,7 +28,7 @@ pub struct Baked {
     still: Grid,
     moving: Grid,
     /// The static field, then each phase.
-    volumes: Mutex<Vec<Option<Volume>>>,
+    volumes: Mutex<Vec<Option<Image3d>>>,
     /// Recorded once per size, phase and quantity: a frame is a view written, a submit and a picture read.
     shots: Mutex<HashMap<ShotKey, Arc<Shot>>>,
 }
@@ -114,7 +114,7 @@ impl Baked {
         match &mut volumes[slot(field, phase)] {
             Some(volume) => volume.fill(&cells),
             none => {
-                let volume = self.renderer.gpu.volume("baked", grid.size)?;
+                let volume = self.renderer.gpu.image_3d("baked", grid.size)?;
                 let filling = volume.fill(&cells)?;
                 *none = Some(volume);
                 Ok(filling)
@@ -127,11 +127,11 @@ impl Baked {
         component.fields().iter().all(|field| self.volume(*field, phase).is_some())
     }
 
-    fn volume(&self, field: Component, phase: u32) -> Option<Volume> {
+    fn volume(&self, field: Component, phase: u32) -> Option<Image3d> {
         self.volumes.lock().unwrap_or_else(PoisonError::into_inner)[slot(field, phase)].clone()
     }
 
-    fn volume_or_bake(&self, field: Component, phase: u32) -> Result<Volume> {
+    fn volume_or_bake(&self, field: Component, phase: u32) -> Result<Image3d> {
         if !self.has(field, phase) {
             self.bake(field, phase)?;
         }

@@ -3,8 +3,8 @@
 use crate::config::Config;
 use crate::error::Result;
 use crate::geometry::ViewRays;
+use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::Buffer;
 use crate::gpu::record::Commands;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;

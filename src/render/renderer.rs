@@ -2,8 +2,8 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::ViewRays;
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, Recording};
 use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::layout::{DeviceState, RayOut, Schedule, Setup, View};

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
-use crate::gpu::memory::{Buffer, Memory};
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::View;

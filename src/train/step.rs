@@ -6,8 +6,8 @@
 //! Nothing here waits for the host: counters, schedules and random numbers live on the device.
 
 use crate::error::Result;
+use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::Memory;
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::constants::OCCUPANCY_EPOCH;
 use crate::kernels::dispatch::{Binding, buffer_set};

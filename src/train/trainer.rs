@@ -3,8 +3,8 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::memory::{Buffer, Memory};
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::layout::{DeviceState, StepReport};
 use crate::kernels::stages::Kernels;

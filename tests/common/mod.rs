@@ -11,7 +11,7 @@ use std::path::PathBuf;
 
 /// A device with validation on. A missing driver or layer fails the test: it is never skipped.
 pub fn gpu() -> Gpu {
-    Gpu::open(&DeviceOptions { select: None, validation: true, cache_dir: None, memory_limit: None })
+    Gpu::open(&DeviceOptions { validation: true, ..DeviceOptions::default() })
         .expect("tests need a Vulkan driver (Debian: mesa-vulkan-drivers) and vulkan-validationlayers")
 }
 

@@ -1,0 +1,193 @@
+//! The Vulkan loader, an instance of it, and what its validation layer says.
+
+use super::capabilities::{DeviceInfo, describe};
+use super::lock::lock;
+use crate::error::{Error, Result};
+use ash::{ext, vk};
+use std::ffi::{CStr, c_void};
+use std::sync::Mutex;
+
+const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
+
+/// A Vulkan loader that an application brings along, in place of the system's.
+#[derive(Debug, Clone, Copy)]
+pub struct Loader(vk::PFN_vkGetInstanceProcAddr);
+
+impl Loader {
+    /// Takes a loader by its `vkGetInstanceProcAddr`.
+    ///
+    /// # Safety
+    /// The function must be that of a working Vulkan loader, and stay loaded as long as anything opened with it.
+    pub unsafe fn new(get_instance_proc_addr: vk::PFN_vkGetInstanceProcAddr) -> Loader {
+        Loader(get_instance_proc_addr)
+    }
+
+    fn entry(self) -> ash::Entry {
+        let functions = ash::StaticFn { get_instance_proc_addr: self.0 };
+        // SAFETY: whoever made this loader vouched for the function in `Loader::new`.
+        unsafe { ash::Entry::from_static_fn(functions) }
+    }
+}
+
+/// An instance, destroyed on drop if it was made here.
+pub(super) struct Instance {
+    raw: ash::Instance,
+    ours: bool,
+    messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
+    /// The messenger knows the address, which a box keeps.
+    messages: Box<Mutex<Vec<String>>>,
+    /// Keeps the loader's library in memory.
+    entry: ash::Entry,
+}
+
+impl std::ops::Deref for Instance {
+    type Target = ash::Instance;
+
+    fn deref(&self) -> &ash::Instance {
+        &self.raw
+    }
+}
+
+fn load(loader: Option<Loader>) -> Result<ash::Entry> {
+    if let Some(loader) = loader {
+        return Ok(loader.entry());
+    }
+    // SAFETY: loads the system's Vulkan loader, whose initialisers are trusted as any shared library's are.
+    unsafe { ash::Entry::load() }.map_err(|e| {
+        Error::NoDevice(format!(
+            "the Vulkan loader could not be opened ({e}). Install it (Debian: libvulkan1) together with a driver \
+             (GPU vendor's, or mesa-vulkan-drivers for a CPU driver)"
+        ))
+    })
+}
+
+fn require_validation_layer(entry: &ash::Entry) -> Result<()> {
+    // SAFETY: needs nothing but a loader, which `entry` keeps loaded.
+    let found = unsafe { entry.enumerate_instance_layer_properties() }
+        .map_err(Error::vulkan("vkEnumerateInstanceLayerProperties", "loader"))?;
+    if found.iter().any(|l| l.layer_name_as_c_str().is_ok_and(|n| n == VALIDATION_LAYER)) {
+        return Ok(());
+    }
+    Err(Error::NoDevice(
+        "validation was asked for, but VK_LAYER_KHRONOS_validation is not installed \
+         (Debian: vulkan-validationlayers)"
+            .into(),
+    ))
+}
+
+impl Instance {
+    /// An instance of Vulkan 1.2 of a loader (`None`: the system's), with the validation layer listening if asked for.
+    pub fn create(loader: Option<Loader>, validation: bool) -> Result<Instance> {
+        let entry = load(loader)?;
+        let app = vk::ApplicationInfo::default()
+            .application_name(c"nertca-vk")
+            .engine_name(c"nertca-vk")
+            .api_version(vk::API_VERSION_1_2);
+        let mut layers = Vec::new();
+        let mut extensions = Vec::new();
+        if validation {
+            require_validation_layer(&entry)?;
+            layers.push(VALIDATION_LAYER.as_ptr());
+            extensions.push(ext::debug_utils::NAME.as_ptr());
+        }
+        let enabled = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
+        let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&enabled);
+        let mut create = vk::InstanceCreateInfo::default()
+            .application_info(&app)
+            .enabled_layer_names(&layers)
+            .enabled_extension_names(&extensions);
+        if validation {
+            create = create.push_next(&mut features);
+        }
+        // SAFETY: `create` and all it points to are locals of this function, alive until the call returns.
+        let raw = unsafe { entry.create_instance(&create, None) }
+            .map_err(|code| Error::NoDevice(format!("vkCreateInstance failed: {code}")))?;
+        let mut instance = Instance { raw, ours: true, messenger: None, messages: Box::default(), entry };
+        if validation {
+            instance.listen()?;
+        }
+        Ok(instance)
+    }
+
+    /// Someone else's instance, left as it is.
+    ///
+    /// # Safety
+    /// The handle must be valid, come from the loader, and outlive the result.
+    pub unsafe fn adopt(loader: Option<Loader>, raw: vk::Instance) -> Result<Instance> {
+        let entry = load(loader)?;
+        // SAFETY: the caller vouches for the handle and that it is this loader's.
+        let raw = unsafe { ash::Instance::load(entry.static_fn(), raw) };
+        Ok(Instance { raw, ours: false, messenger: None, messages: Box::default(), entry })
+    }
+
+    fn listen(&mut self) -> Result<()> {
+        let debug = ext::debug_utils::Instance::new(&self.entry, &self.raw);
+        let create = vk::DebugUtilsMessengerCreateInfoEXT::default()
+            .message_severity(
+                vk::DebugUtilsMessageSeverityFlagsEXT::ERROR | vk::DebugUtilsMessageSeverityFlagsEXT::WARNING,
+            )
+            .message_type(
+                vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION | vk::DebugUtilsMessageTypeFlagsEXT::PERFORMANCE,
+            )
+            .pfn_user_callback(Some(on_message))
+            .user_data(std::ptr::from_ref::<Mutex<Vec<String>>>(&self.messages).cast_mut().cast());
+        // SAFETY: the instance has the extension; the callback's data is boxed in `self`, whose drop destroys the
+        // messenger before it goes.
+        let messenger = unsafe { debug.create_debug_utils_messenger(&create, None) }
+            .map_err(Error::vulkan("vkCreateDebugUtilsMessengerEXT", "messenger"))?;
+        self.messenger = Some((debug, messenger));
+        Ok(())
+    }
+
+    /// Whether objects can be given names that the validation layer uses.
+    pub fn has_debug_names(&self) -> bool {
+        self.messenger.is_some()
+    }
+
+    /// Errors and warnings of the validation layer so far.
+    pub fn messages(&self) -> Vec<String> {
+        lock(&self.messages).clone()
+    }
+
+    /// What a device of this instance is and can do.
+    pub fn describe(&self, index: usize, physical: vk::PhysicalDevice) -> DeviceInfo {
+        describe(&self.entry, &self.raw, index, physical)
+    }
+
+    /// Every device, usable or not.
+    pub fn devices(&self) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)>> {
+        // SAFETY: asks about the instance alone, which `self` keeps alive.
+        let physical = unsafe { self.raw.enumerate_physical_devices() }
+            .map_err(|code| Error::NoDevice(format!("vkEnumeratePhysicalDevices failed: {code}")))?;
+        Ok(physical.into_iter().enumerate().map(|(i, p)| (p, self.describe(i, p))).collect())
+    }
+}
+
+impl Drop for Instance {
+    fn drop(&mut self) {
+        if let Some((debug, messenger)) = self.messenger.take() {
+            // SAFETY: the messenger was made from this instance, which is alive, and is taken out exactly once.
+            unsafe { debug.destroy_debug_utils_messenger(messenger, None) };
+        }
+        if self.ours {
+            // SAFETY: a device owns the instance it was made from, so by now there is none; nothing else was made.
+            unsafe { self.raw.destroy_instance(None) };
+        }
+    }
+}
+
+unsafe extern "system" fn on_message(
+    _severity: vk::DebugUtilsMessageSeverityFlagsEXT,
+    _kind: vk::DebugUtilsMessageTypeFlagsEXT,
+    data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
+    user: *mut c_void,
+) -> vk::Bool32 {
+    // SAFETY: the layer passes data that is valid during the call; `user` is the box of an `Instance`, which destroys
+    // the messenger first.
+    let (data, sink) = unsafe { (&*data, &*user.cast::<Mutex<Vec<String>>>()) };
+    // SAFETY: the message is null or, as Vulkan demands of the layer, a text that ends with a zero.
+    let text = unsafe { data.message_as_c_str() }.map_or(String::new(), |t| t.to_string_lossy().into_owned());
+    tracing::error!(target: "vulkan", "{text}");
+    lock(sink).push(text);
+    vk::FALSE
+}
