@@ -6,6 +6,7 @@ use std::ffi::{CString, c_char, c_void};
 use std::fmt::Write as _;
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
+use tracing::subscriber::Interest;
 use tracing::{Dispatch, Event, Level, Metadata, Subscriber};
 
 /// Severity of a log message: an error.
@@ -27,7 +28,7 @@ struct Callback {
 
 // SAFETY: the header asks for a callback and a pointer that may be used on any thread.
 unsafe impl Send for Callback {}
-// SAFETY: as above.
+// SAFETY: the header also says that messages may come on several threads at once.
 unsafe impl Sync for Callback {}
 
 /// Where a context's messages go.
@@ -62,6 +63,11 @@ impl Visit for Text {
 }
 
 impl Subscriber for Callback {
+    /// Asked each time, since other contexts' logs answer for themselves; see [`crate::capi::callsites`].
+    fn register_callsite(&self, _: &'static Metadata<'static>) -> Interest {
+        Interest::sometimes()
+    }
+
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
         metadata.is_event()
             && metadata.target().starts_with("nertca") | (metadata.target() == "vulkan")
@@ -81,7 +87,8 @@ impl Subscriber for Callback {
         event.record(&mut text);
         // A text with a zero inside would end there.
         let text = CString::new(text.0.replace('\0', "?")).unwrap_or_default();
-        // SAFETY: the caller gave a callback for exactly this.
+        // SAFETY: the caller gave function and pointer for this, good for as long as the context; the text lives until the
+        // call returns.
         unsafe { (self.call)(severity(*event.metadata().level()), text.as_ptr(), self.user) };
     }
 

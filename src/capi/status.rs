@@ -1,6 +1,6 @@
 //! Status codes, error texts, and the boundary that no panic crosses.
 
-use crate::capi::handles;
+use crate::capi::{callsites, handles};
 use crate::error::Error;
 use crate::session::TRAINING_THREAD;
 use std::cell::{Cell, RefCell};
@@ -126,6 +126,7 @@ struct Inside;
 impl Inside {
     fn enter() -> Inside {
         catch_reports();
+        callsites::keep_open();
         let _ = DEPTH.try_with(|depth| depth.set(depth.get() + 1));
         Inside
     }

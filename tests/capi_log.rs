@@ -1,0 +1,75 @@
+//! Every context of a process gets its own messages, whoever came by first. One test, alone in its process: what a process
+//! remembers of its log statements is what it is about.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+#![allow(clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
+
+mod capi;
+
+use capi::scene::ok;
+use nertca_vk::capi::context::*;
+use nertca_vk::capi::log::NERTCA_LOG_WARNING;
+use nertca_vk::capi::types::*;
+use std::ffi::{CStr, c_char, c_void};
+use std::ptr::null_mut;
+use std::sync::{Barrier, Mutex};
+
+/// Messages of one context.
+type Heard = Mutex<Vec<String>>;
+
+unsafe extern "C" fn hear(_: u32, text: *const c_char, user: *mut c_void) {
+    let heard = unsafe { &*user.cast::<Heard>() };
+    heard.lock().unwrap().push(unsafe { CStr::from_ptr(text) }.to_string_lossy().into_owned());
+}
+
+/// A context whose end is told of: its pipelines cannot be kept in a directory that cannot be.
+fn open(log: Option<&Heard>) -> *mut nertca_context {
+    let log = log.map(|heard| nertca_log {
+        size: size_of::<nertca_log>(),
+        callback: Some(hear),
+        user: std::ptr::from_ref(heard).cast_mut().cast(),
+        level: NERTCA_LOG_WARNING,
+    });
+    let log = log.as_ref().map_or(std::ptr::null(), std::ptr::from_ref);
+    let mut context = null_mut();
+    let options = c"cache_dir = /dev/null/nowhere";
+    ok(unsafe { nertca_context_create(options.as_ptr(), log, &mut context) }, std::ptr::null::<c_void>());
+    context
+}
+
+#[track_caller]
+fn close(context: *mut nertca_context) {
+    ok(unsafe { nertca_context_destroy(context) }, context);
+}
+
+#[track_caller]
+fn expect_one(heard: &Heard) {
+    let heard = heard.lock().unwrap();
+    assert!(heard.len() == 1 && heard[0].contains("/dev/null/nowhere"), "{heard:?}");
+}
+
+#[test]
+fn a_context_without_a_log_silences_no_other() {
+    // The only log there is, when a thread without one is the first to have something to say.
+    let first = Heard::default();
+    let listening = open(Some(&first));
+    std::thread::scope(|scope| scope.spawn(|| close(open(None))).join().unwrap());
+    close(listening);
+    expect_one(&first);
+
+    // In whatever order threads with and without a log come by.
+    for _ in 0..6 {
+        let heard: [Heard; 2] = Default::default();
+        let together = Barrier::new(4);
+        std::thread::scope(|scope| {
+            for log in [Some(&heard[0]), None, Some(&heard[1]), None] {
+                let together = &together;
+                scope.spawn(move || {
+                    let context = open(log);
+                    together.wait();
+                    close(context);
+                });
+            }
+        });
+        heard.iter().for_each(expect_one);
+    }
+}
