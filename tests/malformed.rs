@@ -1,4 +1,5 @@
-//! Parsers of ours on damaged files: an error or a value, never a panic, a hang or a huge allocation.
+//! Parsers of ours on damaged files: an error or a value, never a panic or a huge allocation; a parser that never ends is
+//! one that this never returns from.
 //! `NERTCA_MALFORMED_INPUTS` sets how many inputs each parser gets; a failure names its seed, and
 //! `NERTCA_MALFORMED_SEED` repeats it.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
@@ -20,7 +21,6 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
 
 /// Refuses what no damaged file of a few kilobytes may ask for.
 struct Bounded;
@@ -150,14 +150,13 @@ fn feed(name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
         let bytes = damage(&seeds[which], &mut random);
         std::fs::write(&path, &bytes).unwrap();
         LARGEST.store(0, Ordering::Relaxed);
-        let begin = Instant::now();
         match std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| parse(&path))) {
             Ok(fine) => accepted += u64::from(fine),
             Err(_) => panic!("{name}: input {input} made it panic: {}", keep(name, &bytes)),
         }
-        let (largest, took) = (LARGEST.load(Ordering::Relaxed), begin.elapsed());
-        if largest >= 512 << 20 || took >= Duration::from_secs(20) {
-            panic!("{name}: input {input} asked for {largest} bytes and took {took:?}: {}", keep(name, &bytes));
+        let largest = LARGEST.load(Ordering::Relaxed);
+        if largest >= 512 << 20 {
+            panic!("{name}: input {input} asked for {largest} bytes: {}", keep(name, &bytes));
         }
     }
     println!("{name}: {count} inputs, {accepted} of them still good");

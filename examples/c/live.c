@@ -1,8 +1,9 @@
 /* Frames arrive phase by phase while training goes on in the background and a render loop draws the moving vessels:
- * prints how long drawing took, and how much it slowed training down.
+ * prints how long drawing took, and how much it slowed training down. Pictures and iterations are counted, not seconds:
+ * a busy machine takes longer, and does the same.
  *
  *   cc live.c -o live $(pkg-config --cflags --libs nertca_vk) -lm -lpthread
- *   ./live [SECONDS] [FRAMES PER SECOND] [CONTEXT OPTIONS]
+ *   ./live [PICTURES] [FRAMES PER SECOND] [CONTEXT OPTIONS]
  */
 #define _POSIX_C_SOURCE 200809L
 #include "nertca_vk.h"
@@ -15,6 +16,11 @@
 #define SIZE 100u
 #define SHOWN 200u
 #define MOST 100000
+/* In turn: iterations without drawing, and pictures drawn. */
+#define ALONE_STEPS 20u
+#define TURN 20
+/* Whoever waits longer than this for one thing waits in vain. */
+#define PATIENCE_S 900.0
 
 static void check(nertca_status status, const void *handle, const char *call) {
   char text[512] = "";
@@ -38,6 +44,13 @@ static void sleep_s(double seconds) {
   nanosleep(&t, NULL);
 }
 
+/* Ends the program when something that was begun at `begin` will not come any more. */
+static void be_patient(double begin, const char *what) {
+  if (now_s() - begin < PATIENCE_S) return;
+  fprintf(stderr, "%s: not within %.0f s\n", what, PATIENCE_S);
+  exit(1);
+}
+
 static int by_size(const void *a, const void *b) {
   double x = *(const double *)a, y = *(const double *)b;
   return (x > y) - (x < y);
@@ -57,15 +70,32 @@ static nertca_progress look(nertca_reconstruction *reconstruction) {
   return progress;
 }
 
+/* Waits for iterations; how many there were. */
+static double train_alone(nertca_reconstruction *reconstruction) {
+  uint32_t first = look(reconstruction).step, step = first;
+  double begin = now_s();
+  while (step < first + ALONE_STEPS) {
+    be_patient(begin, "iterations without drawing");
+    sleep_s(0.01);
+    step = look(reconstruction).step;
+  }
+  return step - first;
+}
+
 int main(int argc, char **argv) {
-  double seconds = argc > 1 ? atof(argv[1]) : 20, rate = argc > 2 ? atof(argv[2]) : 10;
+  int pictures = argc > 1 ? atoi(argv[1]) : 200;
+  double rate = argc > 2 ? atof(argv[2]) : 10;
   nertca_context *context;
   nertca_reconstruction *reconstruction;
   char options[256];
-  static float pixels[SIZE * SIZE], shown[SHOWN * SHOWN];
+  static float pixels[SIZE * SIZE], shown[SHOWN * SHOWN], first_shown[SHOWN * SHOWN];
   static double took[MOST];
-  int drawn = 0, early = 0;
+  int drawn = 0;
 
+  if (pictures < 1 || pictures > MOST || !(rate > 0)) {
+    fprintf(stderr, "1 to %d pictures at a positive rate are drawn\n", MOST);
+    return 2;
+  }
   check(nertca_context_create(argc > 3 ? argv[3] : NULL, NULL, &context), NULL, "nertca_context_create");
   sprintf(options, "phases = %d\ntrain.iterations = 100000\nvessel_attenuation_per_mm = 0.05", PHANTOM_PHASES);
   check(nertca_reconstruction_create(context, options, &reconstruction), context, "nertca_reconstruction_create");
@@ -81,7 +111,11 @@ int main(int argc, char **argv) {
     }
     sleep_s(0.2);
   }
-  while (look(reconstruction).frames < PHANTOM_PHASES * PHANTOM_VIEWS) sleep_s(0.05);
+  double begin = now_s();
+  while (look(reconstruction).frames < PHANTOM_PHASES * PHANTOM_VIEWS) {
+    be_patient(begin, "frames taken in");
+    sleep_s(0.05);
+  }
 
   nertca_view view;
   memset(&view, 0, sizeof view);
@@ -96,30 +130,41 @@ int main(int argc, char **argv) {
   image.pixels_bytes = sizeof shown;
   image.format = NERTCA_PIXELS_F32;
 
-  /* In turn: a stretch of training alone, and one with the render loop, so that both see the same machine. */
-  double alone_s = 0, beside_s = 0, alone_steps = 0, beside_steps = 0, begin = now_s();
-  while (now_s() - begin < seconds) {
-    uint32_t first = look(reconstruction).step;
+  /* The first picture of each phase also builds its volume. */
+  for (uint32_t phase = 0; phase < PHANTOM_PHASES; phase++) {
+    view.phase = phase;
+    check(nertca_reconstruction_render(reconstruction, &view, &image), reconstruction, "nertca_reconstruction_render");
+    if (phase == 0) memcpy(first_shown, shown, sizeof shown);
+  }
+
+  /* Training alone and with the render loop, in turn, so that both see the same machine. */
+  double alone_s = 0, beside_s = 0, alone_steps = 0, beside_steps = 0;
+  while (drawn < pictures) {
     double from = now_s();
-    sleep_s(2);
-    alone_steps += look(reconstruction).step - first;
+    alone_steps += train_alone(reconstruction);
     alone_s += now_s() - from;
-    first = look(reconstruction).step;
+    uint32_t first = look(reconstruction).step;
     from = now_s();
-    while (now_s() - from < 2 && drawn < MOST) {
+    for (int i = 0; i < TURN && drawn < pictures; i++) {
       double start = now_s();
-      view.phase = (uint32_t)(early + drawn) % PHANTOM_PHASES;
+      view.phase = (uint32_t)drawn % PHANTOM_PHASES;
       check(nertca_reconstruction_render(reconstruction, &view, &image), reconstruction, "nertca_reconstruction_render");
-      /* The first picture of each phase also builds its volume. */
-      if (early < PHANTOM_PHASES) early++; else took[drawn++] = now_s() - start;
+      took[drawn++] = now_s() - start;
       sleep_s(1 / rate - (now_s() - start));
     }
     beside_steps += look(reconstruction).step - first;
     beside_s += now_s() - from;
   }
+
+  /* What is drawn follows training. */
+  view.phase = 0;
+  begin = now_s();
+  do {
+    be_patient(begin, "a picture that differs from the first of its phase");
+    check(nertca_reconstruction_render(reconstruction, &view, &image), reconstruction, "nertca_reconstruction_render");
+  } while (memcmp(first_shown, shown, sizeof shown) == 0);
   check(nertca_reconstruction_stop(reconstruction), reconstruction, "nertca_reconstruction_stop");
 
-  if (drawn == 0) return 1;
   qsort(took, (size_t)drawn, sizeof *took, by_size);
   printf("%d pictures of %u x %u while training: median %.1f ms, p90 %.1f ms, p99 %.1f ms, most %.1f ms\n", drawn, SHOWN,
          SHOWN, 1e3 * took[drawn / 2], 1e3 * took[drawn * 9 / 10], 1e3 * took[drawn * 99 / 100], 1e3 * took[drawn - 1]);
