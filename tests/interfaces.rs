@@ -1,12 +1,16 @@
 //! The command line from outside: a whole life on a tiny phantom, exit codes, and input nobody should send.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+#[path = "common/program.rs"]
+mod program;
+
+use program::program;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 fn nertca(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nertca-vk")).args(args).output().unwrap()
+    program().args(args).output().unwrap()
 }
 
 fn text(path: &Path) -> &str {
@@ -334,7 +338,7 @@ fn ctrl_c_saves_and_exits_130() {
     let data = phantom(directory.path(), &[]);
     let run = directory.path().join("run");
     let settings = [SHORT, &["--set", "train.iterations=100000", "--set", "train.validate_every=0"]].concat();
-    let mut child = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
+    let mut child = program()
         .args([&["train", text(&data), "-o", text(&run), "--json"][..], &settings].concat())
         .stdout(std::process::Stdio::piped())
         .spawn()

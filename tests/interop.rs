@@ -4,6 +4,8 @@
 
 #[path = "common/dicom.rs"]
 mod dicom;
+#[path = "common/program.rs"]
+mod program;
 #[path = "common/python.rs"]
 mod python;
 
@@ -11,6 +13,7 @@ use dicom::angiogram;
 use dicom_core::{DataElement, PrimitiveValue, VR};
 use dicom_dictionary_std::tags;
 use dicom_object::InMemDicomObject;
+use program::program;
 use python::python;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -19,7 +22,7 @@ use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
 
 fn nertca(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nertca-vk")).args(args).output().unwrap()
+    program().args(args).output().unwrap()
 }
 
 fn text(path: &Path) -> &str {
@@ -166,12 +169,7 @@ fn ask(port: u16, path: &str, headers: &str) -> (u16, Vec<u8>) {
 #[test]
 fn the_viewer_answers_its_own_page_alone() {
     let (dir, _, run) = trained();
-    let mut server = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
-        .args(["view", text(run)])
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+    let mut server = program().args(["view", text(run)]).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     let mut url = String::new();
     BufReader::new(server.stdout.take().unwrap()).read_line(&mut url).unwrap();
     let url = url.trim();
