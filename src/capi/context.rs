@@ -127,7 +127,7 @@ fn tuning(gpu: &Gpu, layers: Option<Layers>) -> Tuning {
 }
 
 /// # Safety
-/// As the functions that call it.
+/// `options` must be null or end with a zero, `log` be null or as long as it says, `out` be null or writable.
 unsafe fn create(
     options: *const c_char,
     log: *const nertca_log,
@@ -137,11 +137,11 @@ unsafe fn create(
     if out.is_null() {
         return Err(Failure::argument("context", "is null"));
     }
-    // SAFETY: the caller vouches for it.
+    // SAFETY: `out` is not null, and this function asks its callers that it can be written.
     unsafe { out.write_unaligned(std::ptr::null_mut()) };
-    // SAFETY: as above.
+    // SAFETY: `log` is not null here, and this function asks its callers that it is as long as its size says.
     let log = log::dispatch(if log.is_null() { None } else { Some(unsafe { read(log) }?) })?;
-    // SAFETY: as above.
+    // SAFETY: this function asks its callers that `options` is null or ends with a zero.
     let parsed = parse(Options::parse(unsafe { text("options", options) }?.unwrap_or_default())?)?;
     tracing::dispatcher::with_default(&log, || {
         let gpu = open(&parsed)?;
@@ -158,7 +158,7 @@ unsafe fn create(
             process: std::process::id(),
         });
         let handle = handles::insert(context)?;
-        // SAFETY: as above.
+        // SAFETY: checked and written above; nothing gave the caller's memory back in between.
         unsafe { out.write_unaligned(std::ptr::without_provenance_mut(handle)) };
         Ok(())
     })
@@ -186,7 +186,7 @@ pub unsafe extern "C" fn nertca_context_create(
     context: *mut *mut nertca_context,
 ) -> nertca_status {
     call(std::ptr::null::<c_void>(), || {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks the same of these pointers as `create` does.
         unsafe {
             create(options, log, context, |parsed| {
                 if parsed.without_device { Ok(None) } else { Ok(Some(Gpu::open(&parsed.device)?)) }
@@ -203,17 +203,19 @@ struct CallerLock {
 
 // SAFETY: the header asks for functions and a pointer that may be used on any thread.
 unsafe impl Send for CallerLock {}
-// SAFETY: as above.
+// SAFETY: as for `Send`: the header asks for functions that any thread may call, and `QueueLock` gives them nothing but
+// `user`.
 unsafe impl Sync for CallerLock {}
 
 impl QueueLock for CallerLock {
     fn lock(&self) {
-        // SAFETY: the caller gave the function for exactly this.
+        // SAFETY: the header asks for a function that takes `user`, good for as long as the context.
         unsafe { (self.lock)(self.user) }
     }
 
     fn unlock(&self) {
-        // SAFETY: as above.
+        // SAFETY: the header asks for a function that takes `user`, good for as long as the context; `lock` was called
+        // before.
         unsafe { (self.unlock)(self.user) }
     }
 }
@@ -232,7 +234,7 @@ pub unsafe extern "C" fn nertca_context_adopt(
     context: *mut *mut nertca_context,
 ) -> nertca_status {
     call(std::ptr::null::<c_void>(), || {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `vulkan` is null or as long as its size says.
         let theirs = unsafe { read(vulkan) }?;
         for (name, handle) in [
             ("vulkan.instance", theirs.instance),
@@ -266,7 +268,8 @@ pub unsafe extern "C" fn nertca_context_adopt(
             external_memory_fd: theirs.external_memory_fd != 0,
             queue_lock,
         };
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks for valid handles that were made as the fields of `vulkan` say, and the same of the
+        // other pointers as `create` does.
         unsafe { create(options, log, context, |parsed| Ok(Some(Gpu::adopt(adoption, &parsed.device)?))) }
     })
 }
@@ -290,7 +293,7 @@ pub unsafe extern "C" fn nertca_context_describe(
             "validation_messages": context.gpu.as_ref().map(Gpu::validation_messages),
             "deterministic": context.deterministic,
         });
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&described.to_string(), text, size, length) }
     })
 }
@@ -304,7 +307,7 @@ pub unsafe extern "C" fn nertca_context_describe(
 pub unsafe extern "C" fn nertca_devices(text: *mut c_char, size: usize, length: *mut usize) -> nertca_status {
     call(std::ptr::null::<c_void>(), || {
         let devices = serde_json::json!(list_devices()?);
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&devices.to_string(), text, size, length) }
     })
 }

@@ -17,7 +17,7 @@ pub(super) unsafe fn text<'a>(name: &str, text: *const c_char) -> Outcome<Option
     if text.is_null() {
         return Ok(None);
     }
-    // SAFETY: the caller vouches for it.
+    // SAFETY: not null, and this function asks its callers for a text that ends with a zero.
     let text = unsafe { CStr::from_ptr(text) };
     text.to_str().map(Some).map_err(|e| Failure::argument(name, format!("is not UTF-8: {e}")))
 }

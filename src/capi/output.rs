@@ -66,9 +66,9 @@ fn component_of(component: u32) -> Outcome<Component> {
 }
 
 /// # Safety
-/// As the functions that call it.
+/// `view` must be null or as long as it says, with a geometry whose matrix is null or has 12 numbers.
 unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
-    // SAFETY: as the caller vouches.
+    // SAFETY: this function asks its callers that `view` is null or as long as its size says.
     let view = unsafe { read(view) }?;
     let size = sides(view.width, view.height)?;
     let component = component_of(view.component)?;
@@ -82,7 +82,7 @@ unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
         NERTCA_QUALITY_EXACT => true,
         other => return Err(Failure::argument("quality", format!("{other} is none of NERTCA_QUALITY_*"))),
     };
-    // SAFETY: as the caller vouches.
+    // SAFETY: this function asks its callers for a matrix that is null or has 12 numbers.
     let geometry = unsafe { view.geometry.geometry() }?;
     let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Failure::argument(&field, problem))?;
     let quantity = Quantity { component, projection };
@@ -118,9 +118,9 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
     image: *const nertca_image,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks of `view` what `shot` does.
         let shot = unsafe { shot(view) }?;
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `image` is null or as long as its size says.
         let image = unsafe { read(image) }?;
         let (width, height) = shot.size;
         if ![NERTCA_PIXELS_F32, NERTCA_PIXELS_U8].contains(&image.format) {
@@ -171,7 +171,7 @@ pub unsafe extern "C" fn nertca_reconstruction_render_buffer(
     buffer: *mut nertca_buffer,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks of `view` what `shot` does.
         let shot = unsafe { shot(view) }?;
         let target = handles::get::<SharedBuffer, _>(buffer)?;
         check_target(reconstruction, &target, shot.size.0 * shot.size.1)?;
@@ -197,9 +197,9 @@ fn check_target(reconstruction: &Reconstruction, target: &SharedBuffer, floats: 
 }
 
 /// # Safety
-/// As the functions that call it.
+/// `grid` must be null or as long as it says.
 unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Component, u32)> {
-    // SAFETY: as the caller vouches.
+    // SAFETY: this function asks its callers that `grid` is null or as long as its size says.
     let grid = unsafe { read(grid) }?;
     let component = component_of(grid.component)?;
     let patient = PatientGrid {
@@ -227,7 +227,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
     count: usize,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks of `grid` what `grid_of` does.
         let (grid, component, phase) = unsafe { grid_of(grid) }?;
         if values.is_null() {
             return Err(Failure::argument("values", "is null"));
@@ -237,7 +237,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
             return Err(Failure::argument("count", format!("{count} where {needed} are needed")));
         }
         let cells = reconstruction.session.sample(component, phase, &grid)?;
-        // SAFETY: as the caller vouches, and checked.
+        // SAFETY: the caller has room for `count` numbers, which was checked to be enough; bytes need no alignment.
         unsafe { std::ptr::copy_nonoverlapping(cells.as_ptr().cast::<u8>(), values.cast::<u8>(), 4 * cells.len()) };
         Ok(())
     })
@@ -254,7 +254,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
     buffer: *mut nertca_buffer,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks of `grid` what `grid_of` does.
         let (grid, component, phase) = unsafe { grid_of(grid) }?;
         let target = handles::get::<SharedBuffer, _>(buffer)?;
         check_target(reconstruction, &target, grid.size.iter().map(|n| *n as usize).product())?;
@@ -283,7 +283,7 @@ pub unsafe extern "C" fn nertca_reconstruction_evaluate(
             return Err(Failure::argument("scores", "is null"));
         }
         let found = reconstruction.session.evaluate((threshold_per_mm > 0.0).then_some(threshold_per_mm))?;
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `scores` is as long as its size says; it is not null.
         unsafe {
             write(scores, |size| nertca_scores {
                 size,
@@ -317,7 +317,7 @@ pub unsafe extern "C" fn nertca_buffer_create(
         if buffer.is_null() {
             return Err(Failure::argument("buffer", "is null"));
         }
-        // SAFETY: as the caller vouches.
+        // SAFETY: `buffer` is not null, and the header asks that it can be written.
         unsafe { buffer.write_unaligned(std::ptr::null_mut()) };
         if bytes == 0 || bytes > 1 << 40 {
             return Err(Failure::argument("bytes", format!("{bytes} is no size of a buffer")));
@@ -325,7 +325,7 @@ pub unsafe extern "C" fn nertca_buffer_create(
         let (made, fd) = context.device()?.exported_buffer("shared buffer", bytes)?;
         let shared = SharedBuffer { buffer: made, fd, claim: Claim::new(context), process: std::process::id() };
         let handle = handles::insert(Arc::new(shared))?;
-        // SAFETY: as above.
+        // SAFETY: checked and written above; nothing gave the caller's memory back in between.
         unsafe { buffer.write_unaligned(std::ptr::without_provenance_mut(handle)) };
         Ok(())
     })
@@ -349,7 +349,7 @@ pub unsafe extern "C" fn nertca_buffer_export_fd(
         }
         let copy = shared.fd.as_fd().try_clone_to_owned();
         let copy = copy.map_err(crate::error::Error::io("duplicate the descriptor of", "a shared buffer"))?;
-        // SAFETY: as the caller vouches.
+        // SAFETY: `fd` is not null, and the header asks that both can be written unless null.
         unsafe {
             if !bytes.is_null() {
                 bytes.write_unaligned(shared.buffer.bytes());

@@ -103,9 +103,9 @@ pub unsafe extern "C" fn nertca_reconstruction_create(
         if reconstruction.is_null() {
             return Err(Failure::argument("reconstruction", "is null"));
         }
-        // SAFETY: the caller vouches for it.
+        // SAFETY: `reconstruction` is not null, and the header asks that it can be written.
         unsafe { reconstruction.write_unaligned(std::ptr::null_mut()) };
-        // SAFETY: as above.
+        // SAFETY: the header asks that `options` is null or ends with a zero.
         let options = Options::parse(unsafe { text("options", options) }?.unwrap_or_default())?;
         let made = Arc::new(Reconstruction {
             session: session(context, options)?,
@@ -114,7 +114,7 @@ pub unsafe extern "C" fn nertca_reconstruction_create(
             process: std::process::id(),
         });
         let handle = handles::insert(made)?;
-        // SAFETY: as above.
+        // SAFETY: checked and written above; nothing gave the caller's memory back in between.
         unsafe { reconstruction.write_unaligned(std::ptr::without_provenance_mut(handle)) };
         Ok(())
     })
@@ -160,7 +160,8 @@ pub unsafe extern "C" fn nertca_reconstruction_add_frame(
     frame: *const nertca_frame,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `frame` is null or as long as its size says, and its pointers good as far as its
+        // fields say.
         let frame = unsafe { read(frame)?.new_frame() }?;
         Ok(reconstruction.session.add_frame(frame)?)
     })
@@ -184,7 +185,7 @@ pub unsafe extern "C" fn nertca_reconstruction_set_r_peaks(
         if count > 1 << 20 {
             return Err(Failure::argument("count", format!("{count}; at most 2^20 are accepted")));
         }
-        // SAFETY: as the caller vouches.
+        // SAFETY: not null, and the header asks for `count` numbers, which need no alignment.
         let times = (0..count).map(|i| unsafe { times_s.add(i).read_unaligned() }).collect::<Vec<_>>();
         reconstruction.session.set_r_peaks(RPeaks::new(&times)?);
         Ok(())
@@ -207,7 +208,7 @@ pub unsafe extern "C" fn nertca_reconstruction_progress(
         let latest = *reconstruction.latest.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let state = state_code(reconstruction.session.state());
         let step = reconstruction.session.step();
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `progress` is null or as long as its size says.
         unsafe {
             write(progress, |size| nertca_progress {
                 size,
@@ -237,7 +238,7 @@ pub unsafe extern "C" fn nertca_reconstruction_failure(
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
         let failure = reconstruction.session.failure().unwrap_or_default();
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&failure, text, size, length) }
     })
 }
@@ -254,7 +255,7 @@ pub unsafe extern "C" fn nertca_reconstruction_save(
     path: *const c_char,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `path` is null or ends with a zero.
         let path = unsafe { text("path", path) }?.filter(|p| !p.is_empty());
         let path = path.ok_or_else(|| Failure::argument("path", "is null or empty"))?;
         Ok(reconstruction.session.checkpoint()?.write(Path::new(path))?)
@@ -284,7 +285,7 @@ pub unsafe extern "C" fn nertca_reconstruction_save_memory(
             return Err(Failure::argument("bytes", "is null"));
         }
         let content = reconstruction.session.checkpoint()?.to_bytes()?;
-        // SAFETY: as the caller vouches.
+        // SAFETY: `length` is not null, and the header asks that it can be written.
         unsafe { length.write_unaligned(content.len()) };
         if bytes.is_null() {
             return Ok(());
@@ -292,7 +293,8 @@ pub unsafe extern "C" fn nertca_reconstruction_save_memory(
         if content.len() > size {
             return Err(Failure::new(NERTCA_ERROR_BUFFER, format!("{} bytes are needed", content.len())));
         }
-        // SAFETY: as the caller vouches, and checked.
+        // SAFETY: not null, with room for `size` bytes, which was checked to be enough; the content is ours, so they do
+        // not overlap.
         unsafe { std::ptr::copy_nonoverlapping(content.as_ptr(), bytes.cast(), content.len()) };
         Ok(())
     })
@@ -311,7 +313,7 @@ pub unsafe extern "C" fn nertca_reconstruction_load(
     path: *const c_char,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: as the caller vouches.
+        // SAFETY: the header asks that `path` is null or ends with a zero.
         let path = unsafe { text("path", path) }?.filter(|p| !p.is_empty());
         let path = path.ok_or_else(|| Failure::argument("path", "is null or empty"))?;
         Ok(reconstruction.session.load(Checkpoint::read(Path::new(path))?)?)
@@ -335,7 +337,7 @@ pub unsafe extern "C" fn nertca_reconstruction_load_memory(
         if size > 4 << 30 {
             return Err(Failure::argument("size", format!("{size}; at most 4 GiB are accepted")));
         }
-        // SAFETY: as the caller vouches.
+        // SAFETY: not null, and the header asks for `size` bytes, which nobody changes during the call.
         let content = unsafe { std::slice::from_raw_parts(bytes.cast::<u8>(), size) };
         Ok(reconstruction.session.load(Checkpoint::from_bytes(content, Path::new("memory"))?)?)
     })

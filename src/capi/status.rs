@@ -163,7 +163,7 @@ pub(super) fn call<H>(handle: *const H, body: impl FnOnce() -> Outcome<()>) -> n
 /// `buffer` must hold `size` bytes, unless null; `length` must be writable, unless null.
 pub(super) unsafe fn copy_text(text: &str, buffer: *mut c_char, size: usize, length: *mut usize) -> Outcome<()> {
     if !length.is_null() {
-        // SAFETY: the caller vouches for it.
+        // SAFETY: not null, and this function asks its callers that it can be written.
         unsafe { length.write_unaligned(text.len()) };
     }
     if buffer.is_null() {
@@ -204,7 +204,7 @@ pub unsafe extern "C" fn nertca_last_error(
 ) -> nertca_status {
     let inside = Inside::enter();
     let last = LAST.try_with(|last| last.borrow().get(&handle.addr()).cloned()).ok().flatten().unwrap_or_default();
-    // SAFETY: as the caller vouches.
+    // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
     let outcome = catch_unwind(AssertUnwindSafe(|| unsafe { copy_text(&last, text, size, length) }));
     drop(inside);
     // A failure here leaves the text that was asked for as it is.

@@ -49,7 +49,8 @@ impl Callback {
             psnr_db: p.psnr_db,
             iterations_per_s: p.iterations_per_s,
         };
-        // SAFETY: the caller gave the callback for exactly this.
+        // SAFETY: the header asks for a function that takes `user`; the progress it points to lives until the call
+        // returns.
         unsafe { call(&raw const progress, self.user) == 0 }
     }
 }
@@ -83,7 +84,7 @@ pub unsafe extern "C" fn nertca_reconstruction_train(
             !cancelled
         })?;
         if !done.is_null() {
-            // SAFETY: as the caller vouches.
+            // SAFETY: not null, and the header asks that it can be written.
             unsafe { done.write_unaligned(trained) };
         }
         if cancelled { Err(crate::error::Error::Interrupted.into()) } else { Ok(()) }
@@ -150,7 +151,7 @@ pub unsafe extern "C" fn nertca_reconstruction_wait(
     on_reconstruction(reconstruction, |reconstruction| {
         let over = reconstruction.session.wait(Duration::from_millis(limit_ms.into()));
         if !ended.is_null() {
-            // SAFETY: as the caller vouches.
+            // SAFETY: not null, and the header asks that it can be written.
             unsafe { ended.write_unaligned(over.into()) };
         }
         Ok(())

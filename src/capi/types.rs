@@ -325,7 +325,8 @@ pub(super) unsafe fn read<T: Versioned>(from: *const T) -> Outcome<T> {
     if rest.iter().any(|byte| *byte != 0) {
         return Err(Failure::argument(T::NAME, "asks for what this version of the library does not know"));
     }
-    // SAFETY: as above; every bit pattern is a value.
+    // SAFETY: a struct as long as its size says has at least our fields, as `check_size` saw, and every bit pattern of
+    // them is a value.
     Ok(unsafe { from.read_unaligned() })
 }
 
@@ -450,14 +451,14 @@ impl nertca_frame {
             let apart = stride("mask", width, height, self.mask_stride_bytes, self.mask_bytes)?;
             let mut mask = Vec::with_capacity(width * height);
             for row in 0..height {
-                // SAFETY: as above.
+                // SAFETY: `stride` checked that every row lies within the bytes the caller gave for the mask.
                 let row = unsafe { std::slice::from_raw_parts(self.mask.add(row * apart), width) };
                 mask.extend(row.iter().map(|m| *m != 0));
             }
             Some(mask)
         };
         Ok(NewFrame {
-            // SAFETY: as the caller vouches.
+            // SAFETY: the header asks that the geometry's matrix is null or has 12 numbers.
             geometry: unsafe { self.geometry.geometry() }?,
             moment: u32::try_from(self.phase).map_or(Moment::TimeS(self.time_s), Moment::Phase),
             split: match self.split {
