@@ -1,8 +1,12 @@
 //! Output files appear whole or not at all: written beside their target, then renamed.
 
 use crate::error::{Error, Result};
-use std::io::Write;
+use std::fs::File;
+use std::io::{BufWriter, Write};
 use std::path::Path;
+
+/// How the names of files begin that are still being written.
+const PARTIAL: &str = ".partial-";
 
 /// Writes `bytes` to `path` through a temporary file in the same directory; makes missing directories.
 ///
@@ -18,19 +22,28 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<()> {
 /// As [`write_atomic`].
 pub fn write_atomic_with(
     path: &Path,
-    produce: impl FnOnce(&mut std::io::BufWriter<&std::fs::File>) -> std::io::Result<()>,
+    produce: impl FnOnce(&mut BufWriter<&File>) -> std::io::Result<()>,
 ) -> Result<()> {
+    write_atomic_by(path, |file| produce(file).map_err(Error::io("write", path)))
+}
+
+/// Like [`write_atomic`], for content whose making may fail by itself.
+///
+/// # Errors
+/// As [`write_atomic`]; errors of `produce`.
+pub fn write_atomic_by(path: &Path, produce: impl FnOnce(&mut BufWriter<&File>) -> Result<()>) -> Result<()> {
     let directory = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
         _ => Path::new("."),
     };
     create_directory(directory)?;
     let temporary = tempfile::Builder::new()
-        .prefix(".partial-")
+        .prefix(PARTIAL)
         .tempfile_in(directory)
         .map_err(Error::io("create a temporary file in", directory))?;
-    let mut writer = std::io::BufWriter::new(temporary.as_file());
-    produce(&mut writer).and_then(|()| writer.flush()).map_err(Error::io("write", path))?;
+    let mut writer = BufWriter::new(temporary.as_file());
+    produce(&mut writer)?;
+    writer.flush().map_err(Error::io("write", path))?;
     drop(writer);
     #[cfg(unix)]
     {

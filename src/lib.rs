@@ -72,8 +72,17 @@ pub mod geometry;
 
 /// Files that other tools read and write.
 pub mod formats {
+    pub mod gltf;
     pub mod images;
+    pub mod mesh;
+    pub mod metaimage;
+    pub mod nifti;
+    pub mod npy;
+    pub mod nrrd;
+    pub mod png;
+    pub mod raw;
     pub mod volume;
+    pub mod vtk;
 }
 
 /// Angiograms with their geometry and phase.

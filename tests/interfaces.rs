@@ -5,6 +5,7 @@
 mod program;
 
 use program::program;
+use nertca_vk::formats::npy;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -92,8 +93,8 @@ fn a_whole_life() {
         ok(&[&["render", text(&run), "--primary", "-20", "--secondary", "12.5", "-o", text(&out)], extra].concat());
         assert!(out.metadata().unwrap().len() > 100);
     }
-    let npy = nertca_vk::formats::images::read_npy(&directory.path().join("a.npy")).unwrap();
-    assert_eq!(npy.0, [3, 24, 24]);
+    let array = npy::read(&directory.path().join("a.npy"), 1 << 20).unwrap();
+    assert_eq!(array.shape, [3, 24, 24]);
     assert!(ok(&["info", text(&run)]).contains("step: 30"));
     assert!(ok(&["info", text(&data)]).contains("phases: 3"));
     let hull = directory.path().join("hull.nrrd");
@@ -179,11 +180,12 @@ fn volumes_are_projected_in_every_format() {
     let directory = tempfile::tempdir().unwrap();
     let values: Vec<f32> = (0..16 * 16 * 16).map(|i| if (i % 16) > 8 { 0.02 } else { 0.001 }).collect();
     let npy = directory.path().join("v.npy");
-    nertca_vk::formats::images::write_npy(&npy, &[16, 16, 16], &values).unwrap();
+    npy::write(&npy, &[16, 16, 16], &values).unwrap();
     let raw = directory.path().join("v.bin");
     std::fs::write(&raw, values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>()).unwrap();
     let nrrd = directory.path().join("v.nrrd");
-    nertca_vk::formats::volume::Volume::centred([16; 3], 4.0, glam::DVec3::ZERO, values).write_nrrd(&nrrd).unwrap();
+    let volume = nertca_vk::formats::volume::Volume::centred([16; 3], 4.0, glam::DVec3::ZERO, values);
+    nertca_vk::formats::nrrd::write(&nrrd, &volume, "attenuation per mm").unwrap();
     let common = ["--size", "16", "--views", "3", "--fov", "80", "--vessel", "0.015"];
     let mut images = Vec::new();
     for (name, file, extra) in [
@@ -216,7 +218,7 @@ fn spoiled(directory: &Path, name: &str, spoil: impl FnOnce(&Path, &mut Value)) 
         })
     };
     for phase in 0..2 {
-        nertca_vk::formats::images::write_npy(&data.join(format!("{phase}.npy")), &[4, 5], &[0.5; 20]).unwrap();
+        npy::write(&data.join(format!("{phase}.npy")), &[4, 5], &[0.5; 20]).unwrap();
     }
     let mut manifest = json!({
         "format": "nertca-dataset", "version": 1, "phases": 2, "depth_half_extent_mm": 100.0, "frames": [frame(0), frame(1)],
@@ -241,17 +243,17 @@ fn malformed_datasets_are_named_file_and_field() {
         ("empty image", |d, _| std::fs::write(d.join("1.npy"), b"").unwrap(), &["1.npy"]),
         (
             "wrong shape",
-            |d, _| nertca_vk::formats::images::write_npy(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(),
+            |d, _| npy::write(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(),
             &["1.npy", "shape"],
         ),
         (
             "three axes",
-            |d, _| nertca_vk::formats::images::write_npy(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(),
+            |d, _| npy::write(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(),
             &["1.npy", "two axes"],
         ),
         (
             "not a number",
-            |d, _| nertca_vk::formats::images::write_npy(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(),
+            |d, _| npy::write(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(),
             &["1.npy", "row 0"],
         ),
         ("phase", |_, m| m["frames"][1]["phase"] = json!(2), &["dataset.json", "frames[1].phase"]),
@@ -283,7 +285,7 @@ fn malformed_datasets_are_named_file_and_field() {
         (
             "mask size",
             |d, m| {
-                nertca_vk::formats::images::write_npy(&d.join("m.npy"), &[2, 2], &[1.0; 4]).unwrap();
+                npy::write(&d.join("m.npy"), &[2, 2], &[1.0; 4]).unwrap();
                 m["frames"][0]["mask"] = json!("m.npy")
             },
             &["m.npy", "shape"],

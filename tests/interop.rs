@@ -101,6 +101,44 @@ fn exports_open_in_the_tools_people_use() {
 }
 
 #[test]
+fn compressed_exports_hold_the_same() {
+    let (dir, _, run) = trained();
+    let out = dir.path().join("compressed");
+    let export = |name: &str, extra: &[&str]| {
+        ok(&[&["export", text(run), "--spacing", "1.5", "-o", text(&out.join(name))], extra].concat());
+    };
+    for name in ["all.nii", "all.nii.gz", "all.seq.nrrd"] {
+        export(name, &[]);
+    }
+    export("one.nrrd", &["--phase", "1"]);
+    export("named.nii.gz", &["--format", "nifti"]);
+    export("zipped.seq.nrrd", &["--compress"]);
+    export("zipped.nrrd", &["--compress", "--phase", "1"]);
+    // What others read, we read.
+    let volume = |name: &str| {
+        let hints = nertca_vk::formats::volume::VolumeHints::default();
+        nertca_vk::formats::volume::Volume::read(&out.join(name), &hints).unwrap()
+    };
+    assert_eq!(volume("one.nrrd").values, volume("zipped.nrrd").values);
+    for (name, extra) in [
+        ("x.nii", &["--compress"][..]),
+        ("x.mha", &["--compress"]),
+        ("x.nrrd.gz", &["--format", "nrrd"]),
+        ("x.nrrd.gz", &[]),
+    ] {
+        fails(&[&["export", text(run), "-o", text(&out.join(name))], extra].concat(), 2, &[name]);
+        assert!(!out.join(name).exists(), "{name}");
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let outcome = Command::new(root.join(".cache/python/bin/python3"))
+        .arg(root.join("tests/python/check_compressed.py"))
+        .arg(&out)
+        .output()
+        .expect("tools/setup makes .cache/python");
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+}
+
+#[test]
 fn exports_refuse_what_makes_no_sense() {
     let (dir, _, run) = trained();
     let out = dir.path().join("x.nrrd");

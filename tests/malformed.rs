@@ -10,6 +10,7 @@ mod dicom;
 
 use glam::DVec3;
 use nertca_vk::formats::images;
+use nertca_vk::formats::npy;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::import::ecg;
@@ -187,7 +188,8 @@ fn nrrd() {
                  space directions: (1,0,0) (0,2,0) (0,0,3)\nendian: little\nencoding: raw\nspace origin: (1,2,3)\n\n";
     let dir = scratch();
     let zipped = dir.path().join("z.nrrd");
-    Volume::centred([3, 4, 5], 1.0, DVec3::ZERO, vec![0.5; 60]).write_nrrd(&zipped).unwrap();
+    let half = Volume::centred([3, 4, 5], 1.0, DVec3::ZERO, vec![0.5; 60]);
+    nertca_vk::formats::nrrd::write(&zipped, &half, "halves").unwrap();
     feed("v.nrrd", &[volume_file(plain), std::fs::read(&zipped).unwrap()], reads_volume);
 }
 
@@ -203,8 +205,8 @@ fn metaimage() {
 fn npy_volumes_and_images() {
     let dir = scratch();
     let (cube, square) = (dir.path().join("c.npy"), dir.path().join("s.npy"));
-    images::write_npy(&cube, &[3, 4, 5], &[0.5; 60]).unwrap();
-    images::write_npy(&square, &[6, 10], &[0.5; 60]).unwrap();
+    npy::write(&cube, &[3, 4, 5], &[0.5; 60]).unwrap();
+    npy::write(&square, &[6, 10], &[0.5; 60]).unwrap();
     feed("v.npy", &[std::fs::read(&cube).unwrap()], reads_volume);
     feed("i.npy", &[std::fs::read(&square).unwrap()], |p| images::read_image(p).is_ok());
 }

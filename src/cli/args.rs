@@ -398,13 +398,16 @@ pub struct ExportArgs {
     /// Format; by the end of --out otherwise.
     #[arg(long, value_parser = choice::<Format>())]
     pub format: Option<Format>,
+    /// Compress the values of an .nrrd (a .nii.gz is compressed by its name).
+    #[arg(long, conflicts_with = "mesh")]
+    pub compress: bool,
     /// Surfaces of the vessels instead of volumes: --out ends in .stl, .ply, .obj (a file per phase) or .glb (animated).
     #[arg(long, conflicts_with = "format")]
     pub mesh: bool,
     /// Attenuation of the surface, 1/mm; the Dice threshold otherwise.
     #[arg(long, requires = "mesh", value_name = "PER_MM")]
     pub iso: Option<f64>,
-    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .mha, .npy or .vtk.
+    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }

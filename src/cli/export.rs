@@ -4,7 +4,7 @@ use super::args::{Cli, ConvertArgs, ExportArgs};
 use super::data::bar;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
-use nertca_vk::export::volumes::{Format, VolumeExport, grid_over};
+use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
@@ -47,14 +47,17 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
         };
         write_meshes(&renderer, &grid, &phases, iso, format, &args.out, |n, of| progress("surfaces", n, of))?
     } else {
-        let named = args.format.or_else(|| Format::of(&args.out));
+        let of_name = Format::of(&args.out);
+        let format = args.format.or(of_name.map(|(format, _)| format));
+        let compressed = args.compress || args.out.extension().is_some_and(|end| end.eq_ignore_ascii_case("gz"));
         let export = VolumeExport {
             grid,
             component: args.component,
             // The still background is the same at every phase.
             sequence: all && args.component.has_dynamic(),
             phases: if args.component.has_dynamic() { phases } else { vec![0] },
-            format: named.ok_or_else(|| unknown(".nrrd .nii .mha .npy .vtk; say which with --format"))?,
+            format: format.ok_or_else(|| unknown(".nrrd .nii .nii.gz .mha .npy .vtk; say which with --format"))?,
+            compression: if compressed { Compression::Gzip } else { Compression::None },
         };
         export.write(&renderer, &args.out, |n, of| progress("volume", n, of))?
     };

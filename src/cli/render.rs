@@ -3,7 +3,8 @@
 use super::args::{Cli, RenderArgs};
 use super::frame_rates::print_measured;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::formats::images;
+use nertca_vk::formats::images::MAX_SIDE;
+use nertca_vk::formats::npy;
 use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
@@ -60,8 +61,8 @@ impl Renders {
 pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let size = args.size.map_or(model.image_size, |n| [n, n]);
-    if !(1..=images::MAX_SIDE).contains(&size[0]) {
-        return Err(Error::config("--size", size[0], format!("1 to {} is accepted", images::MAX_SIDE)));
+    if !(1..=MAX_SIDE).contains(&size[0]) {
+        return Err(Error::config("--size", size[0], format!("1 to {} is accepted", MAX_SIDE)));
     }
     let Some(out) = &args.out else { return print_measured(cli, args, &model) };
     let extension = out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
@@ -87,7 +88,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     match extension.as_str() {
         "npy" => {
             let shape = if args.phase == "all" { vec![frames.len(), height, width] } else { vec![height, width] };
-            images::write_npy(out, &shape, &frames.concat())?;
+            npy::write(out, &shape, &frames.concat())?;
         }
         "gif" => pictures::write_gif(out, &frames, width, window, 90)?,
         _ => pictures::write_grey(out, &frames[0], width, window)?,

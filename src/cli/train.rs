@@ -6,6 +6,7 @@ use super::report::write_page;
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::formats::nrrd;
 use nertca_vk::model::checkpoint::{self, newest_model};
 use nertca_vk::plan::Plan;
 use nertca_vk::run::events::Event;
@@ -98,7 +99,7 @@ fn export_hull(config: &Config, dataset: &Dataset, file: &Path) -> Result<()> {
     let plan = Plan::new(config, dataset)?;
     plan.notes.iter().for_each(|note| eprintln!("{note}"));
     let hull = plan.hull.ok_or_else(|| Error::config("hull", "", "this configuration and dataset give no hull"))?;
-    hull.to_volume().write_nrrd(file)
+    nrrd::write(file, &hull.to_volume(), "phases at which a cell may move")
 }
 
 fn print_json(event: &Event) {

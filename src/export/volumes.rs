@@ -4,13 +4,19 @@
 use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::formats::nrrd::Encoding;
+use crate::formats::raw::{self, ByteOrder};
+use crate::formats::volume::VolumeHeader;
+use crate::formats::{metaimage, nifti, npy, nrrd, vtk};
 use crate::geometry::MM_PER_UNIT;
 use crate::model::component::Component;
 use crate::model::scene::Scene;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
+use flate2::write::GzEncoder;
 use glam::DVec3;
 use std::io::Write;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// File format of a volume.
@@ -43,18 +49,48 @@ impl Choice for Format {
 }
 
 impl Format {
-    /// Format by the end of a file name.
-    pub fn of(path: &Path) -> Option<Format> {
+    /// Format and compression by the end of a file name.
+    pub fn of(path: &Path) -> Option<(Format, Compression)> {
         let name = path.file_name()?.to_str()?.to_lowercase();
-        Some(match name.rsplit('.').next()? {
+        if name.ends_with(".nii.gz") {
+            return Some((Format::Nifti, Compression::Gzip));
+        }
+        let format = match name.rsplit('.').next()? {
             "nrrd" => Format::Nrrd,
             "nii" => Format::Nifti,
             "mha" => Format::Mha,
             "npy" => Format::Npy,
             "vtk" => Format::Vtk,
             _ => return None,
-        })
+        };
+        Some((format, Compression::None))
     }
+
+    /// Refuses a compression a format does not have, and a name that promises another one.
+    ///
+    /// # Errors
+    /// [`Error::Config`].
+    fn check(self, compression: Compression, path: &Path) -> Result<()> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+        let problem = match (self, compression, name.ends_with(".gz")) {
+            (Format::Nifti, Compression::Gzip, false) => "compressed NIfTI is called .nii.gz",
+            (Format::Nifti, Compression::None, true) => "what is called .nii.gz is compressed",
+            (Format::Nifti | Format::Nrrd, _, false) | (Format::Nifti, Compression::Gzip, true) => return Ok(()),
+            (_, _, true) => "only NIfTI is called .gz when it is compressed",
+            (_, Compression::None, false) => return Ok(()),
+            (_, Compression::Gzip, false) => "only NIfTI and NRRD can be compressed",
+        };
+        Err(Error::config("compression", path.display(), problem))
+    }
+}
+
+/// Whether the values of a volume are compressed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Compression {
+    /// They are not.
+    None,
+    /// As one gzip stream: all of a NIfTI file, the values of an NRRD file.
+    Gzip,
 }
 
 /// What to export.
@@ -70,8 +106,12 @@ pub struct VolumeExport {
     pub sequence: bool,
     /// Format.
     pub format: Format,
+    /// Compression, for NIfTI and NRRD.
+    pub compression: Compression,
 }
 
+/// What the values are.
+const QUANTITY: &str = "attenuation per mm";
 /// Cells of a slab.
 const SLAB_CELLS: usize = 1 << 22;
 
@@ -106,7 +146,7 @@ pub fn grid_over(scene: &Scene, component: Component, spacing_mm: f64) -> Result
 
 impl VolumeExport {
     /// Slices of each slab.
-    fn slabs(&self) -> impl Iterator<Item = std::ops::Range<u32>> + use<> {
+    fn slabs(&self) -> impl Iterator<Item = Range<u32>> + use<> {
         let [nx, ny, nz] = self.grid.size;
         let thick = (SLAB_CELLS / (nx as usize * ny as usize)).clamp(1, nz as usize) as u32;
         (0..nz.div_ceil(thick)).map(move |i| i * thick..((i + 1) * thick).min(nz))
@@ -115,13 +155,15 @@ impl VolumeExport {
     /// Samples and writes; returns the files made. `progress` hears of cells done and cells in all.
     ///
     /// # Errors
-    /// [`Error::Config`] for a phase the model does not have; [`Error::Io`]; device errors.
+    /// [`Error::Config`] for a phase the model does not have, and for a compression that does not fit the format or the
+    /// name; [`Error::Io`]; device errors.
     pub fn write(&self, renderer: &Renderer, path: &Path, mut progress: impl FnMut(u64, u64)) -> Result<Vec<PathBuf>> {
+        self.format.check(self.compression, path)?;
         self.grid.check()?;
         self.phases.iter().try_for_each(|phase| renderer.check_phase(*phase))?;
         let all = self.grid.size.iter().map(|n| u64::from(*n)).product::<u64>() * self.phases.len() as u64;
         let mut done = 0;
-        let mut sample = |phase: u32, slices: std::ops::Range<u32>| -> Result<Vec<f32>> {
+        let mut sample = |phase: u32, slices: Range<u32>| -> Result<Vec<f32>> {
             let cells = renderer.sample_patient(self.component, phase, &self.grid.slices(slices))?;
             done += cells.len() as u64;
             progress(done, all);
@@ -130,174 +172,124 @@ impl VolumeExport {
         if self.format == Format::Vtk {
             return self.write_vtk(path, &mut sample);
         }
-        // Errors of the device travel past the writer, which knows those of files only.
-        let mut failed = None;
-        let written = files::write_atomic_with(path, |file| {
-            file.write_all(&self.header())?;
-            let mut put = |cells: Result<Vec<f32>>| match cells {
-                Ok(cells) => write_floats(file, &cells, f32::to_le_bytes),
-                Err(error) => {
-                    failed = Some(error);
-                    Err(std::io::Error::other("sampling failed"))
-                }
-            };
-            if self.format == Format::Nrrd && self.sequence {
-                // The list axis comes first: all phases of a voxel follow each other.
-                for slices in self.slabs() {
-                    let phases: Result<Vec<_>> = self.phases.iter().map(|p| sample(*p, slices.clone())).collect();
-                    put(phases.map(|phases| {
-                        (0..phases[0].len()).flat_map(|i| phases.iter().map(move |cells| cells[i])).collect()
-                    }))?;
-                }
-                return Ok(());
-            }
-            for phase in &self.phases {
-                for slices in self.slabs() {
-                    put(sample(*phase, slices))?;
-                }
-            }
-            Ok(())
-        });
-        match failed {
-            Some(error) => Err(error),
-            None => written.map(|()| vec![path.to_path_buf()]),
+        files::write_atomic_by(path, |file| self.write_file(path, file, &mut sample))?;
+        Ok(vec![path.to_path_buf()])
+    }
+
+    fn header(&self) -> VolumeHeader {
+        VolumeHeader {
+            origin_mm: self.grid.origin_mm,
+            spacing_mm: self.grid.spacing_mm,
+            size: self.grid.size,
+            phases: self.sequence.then(|| self.phases.clone()),
+            quantity: QUANTITY,
         }
     }
 
-    fn header(&self) -> Vec<u8> {
-        let PatientGrid { origin_mm: o, spacing_mm: s, size: [nx, ny, nz] } = self.grid;
-        let nt = self.phases.len();
-        match self.format {
-            Format::Nrrd => {
-                let (dimension, sizes, none, list, names) = if self.sequence {
-                    let names = "axis 0 index type:=numeric\naxis 0 index values:=";
-                    let phases: Vec<_> = self.phases.iter().map(u32::to_string).collect();
-                    (4, format!("{nt} "), "none ", "list ", format!("{names}{}\n", phases.join(" ")))
-                } else {
-                    (3, String::new(), "", "", String::new())
+    /// Everything of a file that holds all phases.
+    fn write_file(&self, path: &Path, file: &mut impl Write, sample: Sampler<'_>) -> Result<()> {
+        let header = self.header();
+        let failed = |e| Error::io("write", path)(e);
+        let floats = |out: &mut dyn Write, cells: &[f32]| raw::write_floats(out, cells, ByteOrder::Little);
+        match (self.format, self.compression) {
+            (Format::Npy, _) => {
+                let [nx, ny, nz] = self.grid.size.map(|n| n as usize);
+                let shape = if self.sequence { vec![self.phases.len(), nz, ny, nx] } else { vec![nz, ny, nx] };
+                let mut npy = npy::begin(file, &shape).map_err(failed)?;
+                self.each_slab(sample, |cells| npy.extend(cells.iter().copied()).map_err(failed))?;
+                npy.finish().map_err(failed)
+            }
+            (Format::Nifti, Compression::Gzip) => {
+                let mut gzip = GzEncoder::new(file, flate2::Compression::default());
+                gzip.write_all(&nifti::header_of(&header)).map_err(failed)?;
+                self.each_slab(sample, |cells| floats(&mut gzip, cells).map_err(failed))?;
+                gzip.finish().map(drop).map_err(failed)
+            }
+            (Format::Nrrd, Compression::Gzip) => {
+                file.write_all(&nrrd::header_of(&header, Encoding::Gzip)).map_err(failed)?;
+                let mut gzip = GzEncoder::new(file, flate2::Compression::default());
+                self.each_slab(sample, |cells| floats(&mut gzip, cells).map_err(failed))?;
+                gzip.finish().map(drop).map_err(failed)
+            }
+            (format, Compression::None | Compression::Gzip) => {
+                let header = match format {
+                    Format::Nrrd => nrrd::header_of(&header, Encoding::Raw),
+                    Format::Nifti => nifti::header_of(&header),
+                    _ => metaimage::header_of(&header),
                 };
-                format!(
-                    "NRRD0004\ntype: float\ndimension: {dimension}\nspace: left-posterior-superior\n\
-                     sizes: {sizes}{nx} {ny} {nz}\nspace directions: {none}({},0,0) (0,{},0) (0,0,{})\n\
-                     kinds: {list}domain domain domain\nendian: little\nencoding: raw\nspace origin: ({},{},{})\n\
-                     space units: \"mm\" \"mm\" \"mm\"\nquantity:=attenuation per mm\n{names}\n",
-                    s.x, s.y, s.z, o.x, o.y, o.z
-                )
-                .into_bytes()
+                file.write_all(&header).map_err(failed)?;
+                self.each_slab(sample, |cells| floats(file, cells).map_err(failed))
             }
-            Format::Mha => {
-                let (dimensions, axis, point, step, turn) = if self.sequence {
-                    (4, format!(" {nt}"), " 0", " 1", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
-                } else {
-                    (3, String::new(), "", "", "1 0 0 0 1 0 0 0 1")
-                };
-                // MetaImage speaks LPS.
-                format!(
-                    "ObjectType = Image\nNDims = {dimensions}\nBinaryData = True\nBinaryDataByteOrderMSB = False\n\
-                     CompressedData = False\nTransformMatrix = {turn}\nOffset = {} {} {}{point}\n\
-                     ElementSpacing = {} {} {}{step}\nDimSize = {nx} {ny} {nz}{axis}\nElementType = MET_FLOAT\n\
-                     ElementDataFile = LOCAL\n",
-                    o.x, o.y, o.z, s.x, s.y, s.z
-                )
-                .into_bytes()
-            }
-            Format::Npy => {
-                let time = if self.sequence { format!("{nt}, ") } else { String::new() };
-                let text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({time}{nz}, {ny}, {nx}), }}");
-                // Magic, version and header together are a multiple of 64 bytes long, the last a line's end.
-                let padded = (10 + text.len() + 1).next_multiple_of(64) - 10;
-                let mut header = b"\x93NUMPY\x01\x00".to_vec();
-                header.extend((padded as u16).to_le_bytes());
-                header.extend(format!("{text:<width$}\n", width = padded - 1).bytes());
-                header
-            }
-            Format::Nifti => self.nifti_header(),
-            Format::Vtk => Vec::new(),
         }
     }
 
-    fn nifti_header(&self) -> Vec<u8> {
-        let PatientGrid { origin_mm: o, spacing_mm: s, size } = self.grid;
-        let nt = self.phases.len();
-        let mut h = vec![0u8; 352];
-        let mut i16s = |at: usize, values: &[i16]| {
-            values.iter().enumerate().for_each(|(i, v)| h[at + 2 * i..][..2].copy_from_slice(&v.to_le_bytes()));
-        };
-        let time = if self.sequence { (4, nt as i16) } else { (3, 1) };
-        i16s(40, &[time.0, size[0] as i16, size[1] as i16, size[2] as i16, time.1, 1, 1, 1]);
-        i16s(70, &[16, 32]); // float, of 32 bits
-        i16s(252, &[1, 1]); // both transforms in scanner coordinates
-        let mut f32s = |at: usize, values: &[f64]| {
-            values
-                .iter()
-                .enumerate()
-                .for_each(|(i, v)| h[at + 4 * i..][..4].copy_from_slice(&(*v as f32).to_le_bytes()));
-        };
-        f32s(76, &[1.0, s.x, s.y, s.z, 1.0]);
-        f32s(108, &[352.0, 1.0, 0.0]);
-        // NIfTI speaks RAS: left and posterior change sign. As a quaternion, half a turn about superior.
-        f32s(256, &[0.0, 0.0, 1.0, -o.x, -o.y, o.z]);
-        f32s(280, &[-s.x, 0.0, 0.0, -o.x, 0.0, -s.y, 0.0, -o.y, 0.0, 0.0, s.z, o.z]);
-        h[..4].copy_from_slice(&348i32.to_le_bytes());
-        h[123] = 2 | 8; // mm, seconds
-        let about = b"attenuation per mm";
-        h[148..][..about.len()].copy_from_slice(about);
-        h[344..348].copy_from_slice(b"n+1\0");
-        h
+    /// Hands all values on, slab by slab, in the order of the file.
+    fn each_slab(&self, sample: Sampler<'_>, mut put: impl FnMut(&[f32]) -> Result<()>) -> Result<()> {
+        if self.format == Format::Nrrd && self.sequence {
+            // The list axis comes first: all phases of a voxel follow each other.
+            for slices in self.slabs() {
+                let phases = self.phases.iter().map(|p| sample(*p, slices.clone())).collect::<Result<Vec<_>>>()?;
+                let voxels = 0..phases[0].len();
+                put(&voxels.flat_map(|i| phases.iter().map(move |cells| cells[i])).collect::<Vec<_>>())?;
+            }
+            return Ok(());
+        }
+        for phase in &self.phases {
+            for slices in self.slabs() {
+                put(&sample(*phase, slices)?)?;
+            }
+        }
+        Ok(())
     }
 
     /// One file per phase: `name.vtk`, or `name_0000.vtk` and so on.
-    fn write_vtk(
-        &self,
-        path: &Path,
-        sample: &mut dyn FnMut(u32, std::ops::Range<u32>) -> Result<Vec<f32>>,
-    ) -> Result<Vec<PathBuf>> {
-        let PatientGrid { origin_mm: o, spacing_mm: s, size: [nx, ny, nz] } = self.grid;
+    fn write_vtk(&self, path: &Path, sample: Sampler<'_>) -> Result<Vec<PathBuf>> {
         let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut made = Vec::new();
         for phase in &self.phases {
             let file =
                 if self.sequence { path.with_file_name(format!("{stem}_{phase:04}.vtk")) } else { path.to_path_buf() };
-            let mut failed = None;
-            let written = files::write_atomic_with(&file, |out| {
-                write!(
-                    out,
-                    "# vtk DataFile Version 3.0\nattenuation per mm, LPS mm, phase {phase}\nBINARY\n\
-                     DATASET STRUCTURED_POINTS\nDIMENSIONS {nx} {ny} {nz}\nORIGIN {} {} {}\nSPACING {} {} {}\n\
-                     POINT_DATA {}\nSCALARS attenuation float 1\nLOOKUP_TABLE default\n",
-                    o.x,
-                    o.y,
-                    o.z,
-                    s.x,
-                    s.y,
-                    s.z,
-                    nx as usize * ny as usize * nz as usize
-                )?;
-                for slices in self.slabs() {
-                    match sample(*phase, slices) {
-                        Ok(cells) => write_floats(out, &cells, f32::to_be_bytes)?,
-                        Err(error) => {
-                            failed = Some(error);
-                            return Err(std::io::Error::other("sampling failed"));
-                        }
-                    }
-                }
-                Ok(())
-            });
-            if let Some(error) = failed {
-                return Err(error);
-            }
-            written?;
+            files::write_atomic_by(&file, |out| {
+                let failed = |e| Error::io("write", &file)(e);
+                out.write_all(&vtk::header_of(&self.header(), *phase)).map_err(failed)?;
+                self.slabs().try_for_each(|slices| {
+                    raw::write_floats(&mut *out, &sample(*phase, slices)?, ByteOrder::Big).map_err(failed)
+                })
+            })?;
             made.push(file);
         }
         Ok(made)
     }
 }
 
-fn write_floats(out: &mut impl Write, cells: &[f32], bytes: fn(f32) -> [u8; 4]) -> std::io::Result<()> {
-    for block in cells.chunks(1 << 16) {
-        let block: Vec<u8> = block.iter().flat_map(|v| bytes(*v)).collect();
-        out.write_all(&block)?;
+/// Values of some slices at a phase.
+type Sampler<'a> = &'a mut dyn FnMut(u32, Range<u32>) -> Result<Vec<f32>>;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_tell_format_and_compression() {
+        let of = |name: &str| Format::of(Path::new(name));
+        assert_eq!(of("x.nii.gz"), Some((Format::Nifti, Compression::Gzip)));
+        assert_eq!(of("x.NII"), Some((Format::Nifti, Compression::None)));
+        assert_eq!(of("x.seq.nrrd"), Some((Format::Nrrd, Compression::None)));
+        assert_eq!((of("x.gz"), of("x.nrrd.gz"), of("x")), (None, None, None));
+        let fits = |format: Format, compression, name: &str| format.check(compression, Path::new(name)).is_ok();
+        for (format, name, raw, gzip) in [
+            (Format::Nifti, "x.nii", true, false),
+            (Format::Nifti, "x.nii.gz", false, true),
+            (Format::Nrrd, "x.nrrd", true, true),
+            (Format::Nrrd, "x.nrrd.gz", false, false),
+            (Format::Mha, "x.mha", true, false),
+            (Format::Npy, "x.npy.gz", false, false),
+        ] {
+            assert_eq!(
+                (fits(format, Compression::None, name), fits(format, Compression::Gzip, name)),
+                (raw, gzip),
+                "{name}"
+            );
+        }
     }
-    Ok(())
 }

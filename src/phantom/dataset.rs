@@ -2,6 +2,7 @@
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
+use crate::formats::nrrd;
 use crate::formats::volume::{Volume, VolumeHints};
 use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::gpu::device::Gpu;
@@ -16,6 +17,8 @@ use glam::DVec3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
+/// What the values of volumes are.
+const QUANTITY: &str = "attenuation per mm";
 /// A vessel-only line integral above this share of a 1 mm vessel's marks a vessel pixel.
 const MASK_SHARE: f64 = 0.05;
 
@@ -466,11 +469,11 @@ fn from_files(projector: &Projector, options: &PhantomOptions, anatomy: &Anatomy
 
 fn write_volumes(out: &Path, phase: u32, vessels: &Volume, background: Option<(&Volume, &Volume)>) -> Result<()> {
     let directory = out.join("volumes");
-    vessels.write_nrrd(&directory.join(format!("vessels-{phase:02}.nrrd")))?;
+    nrrd::write(&directory.join(format!("vessels-{phase:02}.nrrd")), vessels, QUANTITY)?;
     if let Some((still, moving)) = background {
         let sum =
             Volume { values: still.values.iter().zip(&moving.values).map(|(a, b)| a + b).collect(), ..still.clone() };
-        sum.write_nrrd(&directory.join(format!("background-{phase:02}.nrrd")))?;
+        nrrd::write(&directory.join(format!("background-{phase:02}.nrrd")), &sum, QUANTITY)?;
     }
     Ok(())
 }

@@ -6,7 +6,8 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::formats::images;
+use crate::formats::images::{MAX_FILE_BYTES, MAX_SIDE};
+use crate::formats::npy;
 use crate::geometry::{CArm, Geometry};
 use crate::raster::Image;
 use crate::scan::dataset::{Builder, Dataset, Layout, NewFrame, Split};
@@ -76,7 +77,7 @@ pub fn open(path: &Path) -> Result<Dataset> {
         }
     };
     let [columns, rows] = pair("nDetector", &general.nDetector)?;
-    if !(columns >= 1.0 && rows >= 1.0 && columns <= images::MAX_SIDE as f64 && rows <= images::MAX_SIDE as f64) {
+    if !(columns >= 1.0 && rows >= 1.0 && columns <= MAX_SIDE as f64 && rows <= MAX_SIDE as f64) {
         return Err(Error::data(&general_file, "nDetector", format!("{columns} x {rows} is not an image size")));
     }
     let (width, height) = (columns as usize, rows as usize);
@@ -214,7 +215,7 @@ fn phase_index(entries: &[(PathBuf, Split, FrameEntry)]) -> Result<HashMap<u64, 
 
 /// Array of W x H values in the authors' order: `reshape(W, H)` transposed is rows x columns.
 fn read_picture(path: &Path, width: usize, height: usize) -> Result<Image> {
-    let (shape, values) = images::read_npy(path)?;
+    let npy::Array { shape, values } = npy::read(path, MAX_FILE_BYTES)?;
     if values.len() != width * height {
         return Err(Error::data(path, "shape", format!("{shape:?} does not hold {width} x {height} pixels")));
     }

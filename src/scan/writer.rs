@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::formats::images;
+use crate::formats::{npy, png};
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
 use crate::scan::dataset::{Dataset, Intensity, Layout, MANIFEST, Manifest, ManifestFrame, Split};
 use crate::scan::nerfca;
@@ -106,10 +106,10 @@ impl<'a> Writer<'a> {
             Layout::Native => {
                 let image = PathBuf::from(format!("images/{name}.npy"));
                 let mask_file = PathBuf::from(format!("masks/{name}.png"));
-                images::write_npy(&self.out.join(&image), &[height, width], integrals)?;
+                npy::write(&self.out.join(&image), &[height, width], integrals)?;
                 if let Some(mask) = mask {
                     let codes = mask.iter().map(|m| if *m { u16::MAX } else { 0 }).collect();
-                    images::write_png16(&self.out.join(&mask_file), width, height, codes)?;
+                    png::write_grey16(&self.out.join(&mask_file), width, height, codes)?;
                 }
                 self.manifest.frames.push(ManifestFrame {
                     image,
@@ -128,12 +128,12 @@ impl<'a> Writer<'a> {
                     values.iter().map(|v| ((f64::from(*v) - f64::from(low)) / range.max(1e-12)) as f32).collect();
                 let (image, mask_file) = (format!("{name}.npy"), format!("{name}-mask.npy"));
                 let shape = [width, height];
-                images::write_npy(&self.out.join(&image), &shape, &nerfca::transpose(&unit, height, width))?;
+                npy::write(&self.out.join(&image), &shape, &nerfca::transpose(&unit, height, width))?;
                 if let Some(mask) = mask {
                     let masked: Vec<f32> =
                         values.iter().zip(mask).map(|(v, m)| if *m { *v } else { I0_LOG as f32 }).collect();
                     let stored = nerfca::transpose(&masked, height, width);
-                    images::write_npy(&self.out.join(&mask_file), &shape, &stored)?;
+                    npy::write(&self.out.join(&mask_file), &shape, &stored)?;
                 }
                 let (theta, phi) = self.authors_angles(geometry)?;
                 self.lists[usize::from(split == Split::Validation)].push(nerfca::FrameEntry {

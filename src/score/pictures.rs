@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::formats::images::write_png;
+use crate::formats::png;
 use crate::render::renderer::Rendering;
 use crate::scan::dataset::Frame;
 use image::{DynamicImage, Rgb, RgbImage};
@@ -94,7 +94,7 @@ pub fn write_comparison(path: &Path, frame: &Frame, seen: &Rendering, threshold:
         grey(&seen.dynamic_integral, Window { low: 0.0, ..Window::of(&seen.dynamic_integral) }),
         overlay,
     ]);
-    write_png(path, &DynamicImage::ImageRgb8(picture))
+    png::write(path, &DynamicImage::ImageRgb8(picture))
 }
 
 /// A looping animation of grey images, `width` columns each, `ms` milliseconds apart.
@@ -125,5 +125,5 @@ pub fn write_gif(path: &Path, frames: &[Vec<f32>], width: usize, window: Window,
 /// [`Error::Io`].
 pub fn write_grey(path: &Path, values: &[f32], width: usize, window: Window) -> Result<()> {
     let codes = window.codes(values);
-    write_png(path, &DynamicImage::ImageRgb8(panel(width, |i| Rgb([codes[i]; 3]), values.len())))
+    png::write(path, &DynamicImage::ImageRgb8(panel(width, |i| Rgb([codes[i]; 3]), values.len())))
 }

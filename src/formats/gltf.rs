@@ -1,0 +1,163 @@
+//! Binary glTF (`.glb`): meshes of a beat as one animation. By hand: gltf-json is well kept, but its types want every field
+//! of the standard spelled out, which is longer than the few kinds of object needed here.
+
+use crate::error::{Error, Result};
+use crate::formats::mesh::Mesh;
+use serde_json::{Value, json};
+
+/// Codes of the standard.
+mod code {
+    pub(super) const FLOAT: u32 = 5126;
+    pub(super) const UNSIGNED_INT: u32 = 5125;
+    pub(super) const ARRAY_BUFFER: u32 = 34962;
+    pub(super) const ELEMENT_ARRAY_BUFFER: u32 = 34963;
+    pub(super) const VERSION: u32 = 2;
+}
+
+/// Length of a beat in the animation, seconds.
+const BEAT_S: f32 = 1.0;
+const METRES_PER_MM: f32 = 1e-3;
+/// Chunks begin at multiples of this.
+const ALIGNMENT: usize = 4;
+
+/// glTF has y up: x = left, y = superior, z = anterior.
+fn to_gltf_axes(v: &[f32; 3]) -> [f32; 3] {
+    [v[0], v[2], -v[1]]
+}
+
+/// All phases as one binary glTF, in metres, whose animation shows each for its share of a beat.
+///
+/// # Errors
+/// [`Error::Internal`] for what JSON cannot hold.
+pub fn to_glb(meshes: &[(u32, Mesh)]) -> Result<Vec<u8>> {
+    let mut scene = Scene::default();
+    meshes.iter().enumerate().for_each(|(index, (phase, mesh))| scene.add_node(*phase, mesh, index == 0));
+    if meshes.len() > 1 {
+        scene.animate();
+    }
+    scene.into_container()
+}
+
+/// Objects of a glTF document and the binary data they speak of.
+#[derive(Default)]
+struct Scene {
+    data: Vec<u8>,
+    buffer_views: Vec<Value>,
+    accessors: Vec<Value>,
+    meshes: Vec<Value>,
+    nodes: Vec<Value>,
+    animations: Vec<Value>,
+}
+
+impl Scene {
+    /// Keeps an array; the index of its accessor.
+    fn add_array(&mut self, bytes: impl Iterator<Item = u8>, target: Option<u32>, mut accessor: Value) -> usize {
+        let start = self.data.len();
+        self.data.extend(bytes);
+        let mut view = json!({ "buffer": 0, "byteOffset": start, "byteLength": self.data.len() - start });
+        if let Some(target) = target {
+            view["target"] = json!(target);
+        }
+        self.data.resize(self.data.len().next_multiple_of(ALIGNMENT), 0);
+        accessor["bufferView"] = json!(self.buffer_views.len());
+        self.buffer_views.push(view);
+        self.accessors.push(accessor);
+        self.accessors.len() - 1
+    }
+
+    fn add_floats(&mut self, values: &[f32], target: Option<u32>, accessor: Value) -> usize {
+        self.add_array(values.iter().flat_map(|v| v.to_le_bytes()), target, accessor)
+    }
+
+    /// Keeps vectors, one per vertex.
+    fn add_vectors(&mut self, vectors: &[[f32; 3]], bounds: Option<[[f32; 3]; 2]>) -> usize {
+        let mut accessor = json!({ "componentType": code::FLOAT, "count": vectors.len(), "type": "VEC3" });
+        if let Some([low, high]) = bounds {
+            (accessor["min"], accessor["max"]) = (json!(low), json!(high));
+        }
+        self.add_floats(vectors.as_flattened(), Some(code::ARRAY_BUFFER), accessor)
+    }
+
+    /// A node that shows a mesh, if there is any of it.
+    fn add_node(&mut self, phase: u32, mesh: &Mesh, shown: bool) {
+        let scale = f32::from(u8::from(shown));
+        let mut node = json!({ "name": format!("phase {phase}"), "scale": [scale, scale, scale] });
+        if !mesh.triangles.is_empty() {
+            node["mesh"] = json!(self.add_mesh(mesh));
+        }
+        self.nodes.push(node);
+    }
+
+    fn add_mesh(&mut self, mesh: &Mesh) -> usize {
+        let points: Vec<[f32; 3]> = mesh.vertices.iter().map(|v| to_gltf_axes(&v.map(|x| x * METRES_PER_MM))).collect();
+        let bound = |pick: fn(f32, f32) -> f32| {
+            std::array::from_fn(|axis| points.iter().map(|p| p[axis]).fold(points[0][axis], pick))
+        };
+        let position = self.add_vectors(&points, Some([bound(f32::min), bound(f32::max)]));
+        let normals: Vec<[f32; 3]> = mesh.normals.iter().map(to_gltf_axes).collect();
+        let normal = self.add_vectors(&normals, None);
+        let corners = mesh.triangles.as_flattened();
+        let indices = self.add_array(
+            corners.iter().flat_map(|i| i.to_le_bytes()),
+            Some(code::ELEMENT_ARRAY_BUFFER),
+            json!({ "componentType": code::UNSIGNED_INT, "count": corners.len(), "type": "SCALAR" }),
+        );
+        self.meshes.push(json!({ "primitives": [{
+            "attributes": { "POSITION": position, "NORMAL": normal }, "indices": indices, "material": 0 }] }));
+        self.meshes.len() - 1
+    }
+
+    /// Shows each node while its phase lasts: steps of its scale between 0 and 1.
+    fn animate(&mut self) {
+        let n = self.nodes.len();
+        let times: Vec<f32> = (0..=n).map(|i| BEAT_S * i as f32 / n as f32).collect();
+        let time = self.add_floats(
+            &times,
+            None,
+            json!({ "componentType": code::FLOAT, "count": n + 1, "type": "SCALAR", "min": [0.0], "max": [BEAT_S] }),
+        );
+        let (mut samplers, mut channels) = (Vec::new(), Vec::new());
+        for node in 0..n {
+            let scales: Vec<f32> = (0..=n).flat_map(|i| [f32::from(u8::from(i % n == node)); 3]).collect();
+            let accessor = json!({ "componentType": code::FLOAT, "count": n + 1, "type": "VEC3" });
+            let scale = self.add_floats(&scales, None, accessor);
+            channels.push(json!({ "sampler": samplers.len(), "target": { "node": node, "path": "scale" } }));
+            samplers.push(json!({ "input": time, "output": scale, "interpolation": "STEP" }));
+        }
+        self.animations.push(json!({ "name": "beat", "samplers": samplers, "channels": channels }));
+    }
+
+    /// The JSON of the document. Lists must not be empty.
+    fn document(&self) -> Value {
+        let mut document = json!({
+            "asset": { "version": "2.0", "generator": concat!("nertca-vk ", env!("CARGO_PKG_VERSION")) },
+            "scene": 0,
+            "scenes": [{ "nodes": (0..self.nodes.len()).collect::<Vec<_>>() }],
+            "nodes": self.nodes,
+            "materials": [{ "name": "vessel", "pbrMetallicRoughness": {
+                "baseColorFactor": [0.75, 0.1, 0.08, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.5 } }],
+            "buffers": [{ "byteLength": self.data.len() }],
+        });
+        let lists = [
+            ("bufferViews", &self.buffer_views),
+            ("accessors", &self.accessors),
+            ("animations", &self.animations),
+            ("meshes", &self.meshes),
+        ];
+        for (name, list) in lists.into_iter().filter(|(_, list)| !list.is_empty()) {
+            document[name] = json!(list);
+        }
+        document
+    }
+
+    /// The file: a header, the document and the data.
+    fn into_container(self) -> Result<Vec<u8>> {
+        let mut text = serde_json::to_vec(&self.document()).map_err(|e| Error::Internal(e.to_string()))?;
+        text.resize(text.len().next_multiple_of(ALIGNMENT), b' ');
+        let chunk =
+            |kind: &[u8; 4], bytes: Vec<u8>| [&(bytes.len() as u32).to_le_bytes()[..], &kind[..], &bytes[..]].concat();
+        let chunks = [chunk(b"JSON", text), chunk(b"BIN\0", self.data)].concat();
+        let (magic, length) = (b"glTF", 12 + chunks.len() as u32);
+        Ok([&magic[..], &code::VERSION.to_le_bytes(), &length.to_le_bytes(), &chunks].concat())
+    }
+}

@@ -1,0 +1,139 @@
+//! `.npy` arrays of numbers (npyz).
+
+use crate::error::{Error, Result};
+use crate::files;
+use std::io::Write;
+use std::path::Path;
+
+/// A numeric array of any shape, in C order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Array {
+    /// Length of each axis, the slowest first.
+    pub shape: Vec<usize>,
+    /// Values, the last axis fastest.
+    pub values: Vec<f32>,
+}
+
+/// Reads a numeric `.npy` of any shape (C or Fortran order) and at most `limit` bytes.
+///
+/// # Errors
+/// [`Error::Io`] or [`Error::Data`] naming the file.
+pub fn read(path: &Path, limit: u64) -> Result<Array> {
+    let bytes = files::read_limited(path, limit)?;
+    let bad = |problem: String| Error::data(path, "npy", problem);
+    check_shape(&bytes).map_err(|shape| bad(format!("absurd shape ({shape})")))?;
+    let npy = npyz::NpyFile::new(&bytes[..]).map_err(|e| bad(format!("header: {e}")))?;
+    let mut shape = Vec::new();
+    let mut elements: u64 = 1;
+    for &axis in npy.shape() {
+        elements = elements.checked_mul(axis).ok_or_else(|| bad(format!("absurd shape {:?}", npy.shape())))?;
+        shape.push(axis as usize);
+    }
+    if elements > bytes.len() as u64 {
+        return Err(bad(format!("shape {shape:?} needs more than the file's {} bytes: truncated?", bytes.len())));
+    }
+    let fortran = npy.order() == npyz::Order::Fortran && shape.len() > 1;
+    let npyz::DType::Plain(dtype) = npy.dtype() else {
+        return Err(bad("a structured array; numbers are needed".into()));
+    };
+    let name = dtype.to_string();
+    macro_rules! read_as {
+        ($ty:ty) => {
+            npy.into_vec::<$ty>().map(|v| v.into_iter().map(|x| x as f32).collect())
+        };
+    }
+    let values: std::io::Result<Vec<f32>> = match name.trim_start_matches(['<', '>', '|', '=']) {
+        "f4" => npy.into_vec::<f32>(),
+        "f8" => read_as!(f64),
+        "u1" => read_as!(u8),
+        "u2" => read_as!(u16),
+        "u4" => read_as!(u32),
+        "i1" => read_as!(i8),
+        "i2" => read_as!(i16),
+        "i4" => read_as!(i32),
+        "b1" => npy.into_vec::<bool>().map(|v| v.into_iter().map(|b| f32::from(u8::from(b))).collect()),
+        other => {
+            return Err(bad(format!("element type {other}; floats, integers up to 32 bit and booleans are read")));
+        }
+    };
+    let values = values.map_err(|e| bad(format!("{e}: truncated?")))?;
+    if values.len() as u64 != elements {
+        return Err(bad(format!("{} elements for shape {shape:?}", values.len())));
+    }
+    let values = if fortran { fortran_to_c(&shape, &values) } else { values };
+    Ok(Array { shape, values })
+}
+
+/// The library multiplies the axes of a header's shape without a look at their size.
+fn check_shape(bytes: &[u8]) -> std::result::Result<(), String> {
+    let header = String::from_utf8_lossy(&bytes[..bytes.len().min(1 << 16)]);
+    let Some((_, rest)) = header.split_once("'shape'") else { return Ok(()) };
+    let shape = rest.split_once('(').and_then(|(_, r)| r.split_once(')')).map_or("", |(s, _)| s);
+    let axes = shape.split(',').map(str::trim).filter(|axis| !axis.is_empty());
+    let elements = axes.map(|axis| axis.parse::<u64>().ok()).try_fold(1u64, |n, axis| n.checked_mul(axis?));
+    elements.map(drop).ok_or_else(|| shape.to_owned())
+}
+
+fn fortran_to_c(shape: &[usize], values: &[f32]) -> Vec<f32> {
+    let mut strides = vec![1; shape.len()];
+    for axis in 1..shape.len() {
+        strides[axis] = strides[axis - 1] * shape[axis - 1];
+    }
+    (0..values.len())
+        .map(|mut flat| {
+            let mut at = 0;
+            for axis in (0..shape.len()).rev() {
+                at += flat % shape[axis] * strides[axis];
+                flat /= shape[axis];
+            }
+            values[at]
+        })
+        .collect()
+}
+
+/// Writes a `.npy` of `f32` in C order.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn write(path: &Path, shape: &[usize], values: &[f32]) -> Result<()> {
+    files::write_atomic_with(path, |file| {
+        let mut writer = begin(file, shape)?;
+        writer.extend(values.iter().copied())?;
+        writer.finish()
+    })
+}
+
+/// Begins a `.npy` of `f32` in C order whose values follow piece by piece.
+///
+/// # Errors
+/// Those of `out`.
+pub fn begin<W: Write>(out: W, shape: &[usize]) -> std::io::Result<npyz::NpyWriter<f32, W>> {
+    use npyz::WriterBuilder;
+    let shape: Vec<u64> = shape.iter().map(|&n| n as u64).collect();
+    npyz::WriteOptions::new().default_dtype().shape(&shape).writer(out).begin_nd()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn round_trip_and_truncation() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.npy");
+        let array = Array { shape: vec![2, 3], values: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.5] };
+        write(&path, &array.shape, &array.values).unwrap();
+        assert_eq!(read(&path, 1 << 20).unwrap(), array);
+        let bytes = std::fs::read(&path).unwrap();
+        for keep in [0, 5, 60, bytes.len() - 1] {
+            std::fs::write(&path, &bytes[..keep]).unwrap();
+            let message = read(&path, 1 << 20).unwrap_err().to_string();
+            assert!(message.contains("a.npy"), "{keep}: {message}");
+        }
+    }
+
+    #[test]
+    fn fortran_order_is_read_in_c_order() {
+        assert_eq!(fortran_to_c(&[2, 3], &[0.0, 3.0, 1.0, 4.0, 2.0, 5.0]), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
+    }
+}

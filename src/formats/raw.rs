@@ -1,0 +1,131 @@
+//! Bare numbers: element types, their decoding, and raw binary volumes.
+
+use crate::choice::Choice;
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::volume::{MAX_BYTES, Volume, VolumeHints};
+use std::io::{Read, Write};
+use std::path::Path;
+
+/// Type of the numbers in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[allow(missing_docs, reason = "named after the types they stand for")]
+pub enum Element {
+    F32,
+    F64,
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+}
+
+impl Choice for Element {
+    const ALL: &'static [Element] =
+        &[Element::F32, Element::F64, Element::I8, Element::U8, Element::I16, Element::U16, Element::I32, Element::U32];
+
+    fn name(self) -> &'static str {
+        match self {
+            Element::F32 => "f32",
+            Element::F64 => "f64",
+            Element::I8 => "i8",
+            Element::U8 => "u8",
+            Element::I16 => "i16",
+            Element::U16 => "u16",
+            Element::I32 => "i32",
+            Element::U32 => "u32",
+        }
+    }
+}
+
+/// Order of the bytes of a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ByteOrder {
+    /// Lowest byte first.
+    Little,
+    /// Highest byte first.
+    Big,
+}
+
+impl Element {
+    /// Bytes of one number.
+    pub fn bytes(self) -> usize {
+        match self {
+            Element::F64 => 8,
+            Element::F32 | Element::I32 | Element::U32 => 4,
+            Element::I16 | Element::U16 => 2,
+            Element::I8 | Element::U8 => 1,
+        }
+    }
+
+    /// The first `n` numbers of `bytes`.
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming `path`, when there are fewer.
+    pub fn decode(self, path: &Path, order: ByteOrder, bytes: &[u8], n: usize) -> Result<Vec<f32>> {
+        let wanted = n * self.bytes();
+        let Some(bytes) = bytes.get(..wanted) else {
+            let kind = self.name();
+            let problem = format!("{} bytes where {n} voxels of {kind} need {wanted}: truncated?", bytes.len());
+            return Err(Error::data(path, "data", problem));
+        };
+        macro_rules! numbers {
+            ($ty:ty) => {{
+                let from = match order {
+                    ByteOrder::Little => <$ty>::from_le_bytes,
+                    ByteOrder::Big => <$ty>::from_be_bytes,
+                };
+                bytes.as_chunks::<{ size_of::<$ty>() }>().0.iter().map(|word| from(*word) as f32).collect()
+            }};
+        }
+        Ok(match self {
+            Element::F32 => numbers!(f32),
+            Element::F64 => numbers!(f64),
+            Element::I8 => numbers!(i8),
+            Element::U8 => numbers!(u8),
+            Element::I16 => numbers!(i16),
+            Element::U16 => numbers!(u16),
+            Element::I32 => numbers!(i32),
+            Element::U32 => numbers!(u32),
+        })
+    }
+}
+
+/// Reads a raw binary volume, x fastest, little endian; all else comes from `hints`.
+///
+/// # Errors
+/// [`Error::Data`] or [`Error::Io`] naming file and field.
+pub fn read(path: &Path, hints: &VolumeHints) -> Result<Volume> {
+    let stated = hints.size.unwrap_or_default();
+    let size = Volume::check_size(path, "size", &stated.map(|n| n as u64))?;
+    let kind = hints.raw_type.as_deref().unwrap_or(Element::F32.name());
+    let element = Element::named(kind)
+        .ok_or_else(|| Error::data(path, "type", format!("`{kind}`; {} are read", Element::names())))?;
+    let bytes = files::read_limited(path, MAX_BYTES)?;
+    let values = element.decode(path, ByteOrder::Little, &bytes, size.iter().product())?;
+    Ok(Volume { size, values, index_to_lps: Volume::axis_aligned(size, hints.spacing(path)?) })
+}
+
+/// Reads at most `n` bytes of `compressed`: never more than a header promises, so that a bomb stops there.
+pub(super) fn read_at_most(compressed: impl Read, n: usize) -> std::io::Result<Vec<u8>> {
+    let mut out = Vec::new();
+    compressed.take(n as u64).read_to_end(&mut out)?;
+    Ok(out)
+}
+
+/// Writes floats in a byte order, without a copy of them all.
+///
+/// # Errors
+/// Those of `out`.
+pub fn write_floats(mut out: impl Write, values: &[f32], order: ByteOrder) -> std::io::Result<()> {
+    let bytes = match order {
+        ByteOrder::Little => f32::to_le_bytes,
+        ByteOrder::Big => f32::to_be_bytes,
+    };
+    for block in values.chunks(1 << 16) {
+        let block: Vec<u8> = block.iter().flat_map(|v| bytes(*v)).collect();
+        out.write_all(&block)?;
+    }
+    Ok(())
+}
