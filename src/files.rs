@@ -41,6 +41,7 @@ pub fn write_atomic_by(path: &Path, produce: impl FnOnce(&mut BufWriter<&File>) 
         .prefix(PARTIAL)
         .tempfile_in(directory)
         .map_err(Error::io("create a temporary file in", directory))?;
+    hold(temporary.as_file());
     let mut writer = BufWriter::new(temporary.as_file());
     produce(&mut writer)?;
     writer.flush().map_err(Error::io("write", path))?;
@@ -54,6 +55,40 @@ pub fn write_atomic_by(path: &Path, produce: impl FnOnce(&mut BufWriter<&File>) 
     temporary.as_file().sync_all().map_err(Error::io("flush", path))?;
     temporary.persist(path).map_err(|e| e.error).map_err(Error::io("rename into place", path))?;
     Ok(())
+}
+
+/// Holds a file that is being written, for as long as it is open: [`remove_partial`] leaves it alone.
+#[cfg(unix)]
+fn hold(file: &File) {
+    // Where a file system has no locks, a second process in the same directory goes without protection.
+    let _ = rustix::fs::flock(file, rustix::fs::FlockOperation::LockExclusive);
+}
+
+#[cfg(not(unix))]
+fn hold(_: &File) {}
+
+/// Whether some process still writes a file.
+#[cfg(unix)]
+fn is_held(file: &File) -> bool {
+    rustix::fs::flock(file, rustix::fs::FlockOperation::NonBlockingLockExclusive).is_err()
+}
+
+/// Elsewhere, open files cannot be removed anyway.
+#[cfg(not(unix))]
+fn is_held(_: &File) -> bool {
+    false
+}
+
+/// Removes what a process that was killed has left half written in a directory; how many files. What other processes are
+/// writing stays, and so does a directory that cannot be listed.
+pub fn remove_partial(directory: &Path) -> usize {
+    let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
+    let ours = entries.filter(|entry| {
+        let regular = entry.file_type().is_ok_and(|kind| kind.is_file());
+        regular && entry.file_name().to_str().is_some_and(|name| name.starts_with(PARTIAL))
+    });
+    let left_over = ours.filter(|entry| File::open(entry.path()).is_ok_and(|file| !is_held(&file)));
+    left_over.filter(|entry| std::fs::remove_file(entry.path()).is_ok()).count()
 }
 
 /// A value as indented JSON.
@@ -85,4 +120,30 @@ pub fn read_limited(path: &Path, limit: u64) -> Result<Vec<u8>> {
         return Err(Error::data(path, "size", format!("{} bytes; at most {limit} are accepted", meta.len())));
     }
     std::fs::read(path).map_err(Error::io("read", path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_nobody_writes_any_more_is_removed() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        for name in [".partial-left", "checkpoint", ".other"] {
+            std::fs::write(at(name), b"x").unwrap();
+        }
+        std::fs::create_dir(at(".partial-directory")).unwrap();
+        #[cfg(unix)]
+        std::os::unix::fs::symlink(at("checkpoint"), at(".partial-link")).unwrap();
+        write_atomic_by(&at("written"), |file| {
+            assert_eq!(remove_partial(dir.path()), if cfg!(unix) { 1 } else { 2 });
+            file.write_all(b"whole").map_err(Error::io("write", dir.path()))
+        })
+        .unwrap();
+        assert_eq!(std::fs::read(at("written")).unwrap(), b"whole");
+        assert!(!at(".partial-left").exists() && at("checkpoint").exists() && at(".other").exists());
+        assert!(at(".partial-directory").is_dir());
+        assert_eq!(remove_partial(&at("absent")), 0);
+    }
 }

@@ -51,6 +51,10 @@ pub fn reconstruct(
     options: &RunOptions<'_>,
     observe: &mut dyn FnMut(&Event),
 ) -> Result<()> {
+    // What an earlier process on this run was writing when it was killed.
+    for directory in [options.run, &options.run.join("report")] {
+        files::remove_partial(directory);
+    }
     let trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
         let plan = Plan::new(&saved.model.config, dataset)?.in_scene(saved.model.scene.clone());
