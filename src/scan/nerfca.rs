@@ -1,7 +1,7 @@
 //! The layout of the NeRF-CA / NerT-CA authors, read (and written) as it is.
 //!
 //! `general.json` plus `train-*.json` / `test-*.json`. Images are `.npy` arrays normalised to [0, 1] by
-//! `img_min_max`, stored so that `reshape(W, H)` transposed is the picture; pixel = I0 - line integral.
+//! `img_min_max`, ordinary pictures: [row = v][column = u] (method, section 6); pixel = I0 - line integral.
 //! Masks hold image values inside vessels and I0 elsewhere. Paths may be absolute and stale.
 
 use crate::error::{Error, Result};
@@ -213,20 +213,15 @@ fn phase_index(entries: &[(PathBuf, Split, FrameEntry)]) -> Result<HashMap<u64, 
     Ok(values.iter().enumerate().map(|(i, v)| (v.to_bits(), i as u32)).collect())
 }
 
-/// Array of W x H values in the authors' order: `reshape(W, H)` transposed is rows x columns.
+/// An ordinary picture, rows first; axes of one entry, as stacks of one projection have, count for nothing.
 fn read_picture(path: &Path, width: usize, height: usize) -> Result<Image> {
     let npy::Array { shape, values } = npy::read(path, MAX_FILE_BYTES)?;
-    if values.len() != width * height {
-        return Err(Error::data(path, "shape", format!("{shape:?} does not hold {width} x {height} pixels")));
+    let long: Vec<usize> = shape.iter().copied().filter(|n| *n != 1).collect();
+    let wanted: Vec<usize> = [height, width].into_iter().filter(|n| *n != 1).collect();
+    // A flat list of pixels has its rows one after the other.
+    if long != wanted && shape[..] != [height * width] {
+        let problem = format!("{shape:?}; a picture of {height} rows and {width} columns is [{height}, {width}]");
+        return Err(Error::data(path, "shape", problem));
     }
-    Ok(Image { width, height, values: transpose(&values, width, height) })
-}
-
-/// `[column][row]` <-> `[row][column]` for an array with `outer` leading entries of `inner` values.
-pub(crate) fn transpose(values: &[f32], outer: usize, inner: usize) -> Vec<f32> {
-    let mut out = Vec::with_capacity(values.len());
-    for i in 0..inner {
-        out.extend((0..outer).map(|o| values[o * inner + i]));
-    }
-    out
+    Ok(Image { width, height, values })
 }

@@ -127,13 +127,11 @@ impl<'a> Writer<'a> {
                 let unit: Vec<f32> =
                     values.iter().map(|v| ((f64::from(*v) - f64::from(low)) / range.max(1e-12)) as f32).collect();
                 let (image, mask_file) = (format!("{name}.npy"), format!("{name}-mask.npy"));
-                let shape = [width, height];
-                npy::write(&self.out.join(&image), &shape, &nerfca::transpose(&unit, height, width))?;
+                npy::write(&self.out.join(&image), &[height, width], &unit)?;
                 if let Some(mask) = mask {
                     let masked: Vec<f32> =
                         values.iter().zip(mask).map(|(v, m)| if *m { *v } else { I0_LOG as f32 }).collect();
-                    let stored = nerfca::transpose(&masked, height, width);
-                    npy::write(&self.out.join(&mask_file), &shape, &stored)?;
+                    npy::write(&self.out.join(&mask_file), &[height, width], &masked)?;
                 }
                 let (theta, phi) = self.authors_angles(geometry)?;
                 self.lists[usize::from(split == Split::Validation)].push(nerfca::FrameEntry {

@@ -1,0 +1,102 @@
+//! The authors' layout against files that numpy wrote, following their loader (`tests/python/make_nerfca_golden.py`):
+//! exact line integrals of a few balls on a detector that is wider than high.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
+use glam::DVec3;
+use nertca_vk::formats::npy;
+use nertca_vk::geometry::ViewRays;
+use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::scan::writer::convert;
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+
+fn golden() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/nerfca")
+}
+
+fn read(path: &Path) -> npy::Array {
+    npy::read(path, 1 << 20).unwrap()
+}
+
+/// Centre and radius in world units, attenuation per world unit.
+#[derive(Deserialize)]
+struct Ball(DVec3, f64, f64);
+
+impl Ball {
+    fn integral(&self, rays: &ViewRays, column: usize, row: usize) -> f64 {
+        let direction = rays.pixel(column as f64, row as f64).1.normalize();
+        let away = self.0 - rays.source();
+        let across2 = away.length_squared() - away.dot(direction).powi(2);
+        self.2 * 2.0 * (self.1.powi(2) - across2).max(0.0).sqrt()
+    }
+}
+
+#[derive(Deserialize)]
+struct Balls {
+    still: Vec<Ball>,
+    /// One per phase.
+    vessel: Vec<Ball>,
+}
+
+#[test]
+fn pictures_are_read_the_right_way_round() {
+    let dataset = Dataset::open(&golden()).unwrap();
+    let balls: Balls = serde_json::from_slice(&std::fs::read(golden().join("balls.json")).unwrap()).unwrap();
+    assert_eq!((dataset.layout, dataset.width, dataset.height), (Layout::Nerfca, 14, 10));
+    assert_eq!((dataset.n_phases, dataset.training().len(), dataset.validation().len()), (2, 2, 2));
+    for frame in &dataset.frames {
+        let rays = &dataset.views[frame.view].rays;
+        let vessel = &balls.vessel[frame.phase as usize];
+        for pixel in 0..dataset.n_pixels() {
+            let (column, row) = (pixel % dataset.width, pixel / dataset.width);
+            let through = vessel.integral(rays, column, row);
+            let want = through + balls.still.iter().map(|ball| ball.integral(rays, column, row)).sum::<f64>();
+            let got = f64::from(frame.integrals[pixel]);
+            assert!((got - want).abs() < 2e-6, "{}: column {column}, row {row}: {got}, not {want}", frame.name);
+            assert_eq!(frame.mask.as_ref().unwrap()[pixel], through > 0.0, "{}: {column}, {row}", frame.name);
+        }
+    }
+}
+
+#[test]
+fn what_is_written_is_what_the_authors_write() {
+    let dir = tempfile::tempdir().unwrap();
+    let dataset = Dataset::open(&golden()).unwrap();
+    convert(&dataset, Layout::Nerfca, dir.path()).unwrap();
+    for frame in &dataset.frames {
+        let kind = if frame.name.contains("angles=50") { "test-view0" } else { "train-view1" };
+        let name = format!("{kind}-phase{:02}", frame.phase);
+        for end in [".npy", "-mask.npy"] {
+            let got = read(&dir.path().join(format!("{name}{end}")));
+            let want = read(&golden().join(format!("{}{end}", frame.name)));
+            assert_eq!(got.shape, want.shape, "{name}{end}");
+            for (got, want) in got.values.iter().zip(&want.values) {
+                assert!((got - want).abs() < 2e-6, "{name}{end}: {got}, not {want}");
+            }
+        }
+    }
+}
+
+/// A copy of the golden dataset, to change.
+fn copied() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    for entry in std::fs::read_dir(golden()).unwrap() {
+        let file = entry.unwrap().path();
+        std::fs::copy(&file, dir.path().join(file.file_name().unwrap())).unwrap();
+    }
+    dir
+}
+
+#[test]
+fn arrays_of_another_shape_are_refused() {
+    let dir = copied();
+    let image = dir.path().join("image-hrt=0-resp=0-angles=-30.0-25.0.npy");
+    let values = read(&image).values;
+    for same in [&[140][..], &[1, 10, 14], &[10, 14, 1]] {
+        npy::write(&image, same, &values).unwrap();
+        Dataset::open(dir.path()).unwrap();
+    }
+    npy::write(&image, &[14, 10], &values).unwrap();
+    let message = Dataset::open(dir.path()).unwrap_err().to_string();
+    assert!(message.contains("[14, 10]") && message.contains("is [10, 14]"), "{message}");
+}
