@@ -84,6 +84,7 @@ impl Golden {
             n_phases: phases,
             depth_range: (-self.number("depth"), self.number("depth")),
             vessel_attenuation: None,
+            notes: Vec::new(),
         }
     }
 

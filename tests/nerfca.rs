@@ -100,3 +100,38 @@ fn arrays_of_another_shape_are_refused() {
     let message = Dataset::open(dir.path()).unwrap_err().to_string();
     assert!(message.contains("[14, 10]") && message.contains("is [10, 14]"), "{message}");
 }
+
+/// Opens the golden dataset with other heart phases in its training and test frames.
+fn with_phases(train: [f64; 2], test: [f64; 2]) -> nertca_vk::error::Result<Dataset> {
+    let dir = copied();
+    for (file, phases) in [("train-golden.json", train), ("test-golden.json", test)] {
+        let file = dir.path().join(file);
+        let mut list: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        phases.iter().enumerate().for_each(|(i, phase)| list["frames"][i]["heart_phase"] = (*phase).into());
+        std::fs::write(&file, list.to_string()).unwrap();
+    }
+    Dataset::open(dir.path())
+}
+
+#[test]
+fn phases_no_table_has_are_refused_by_frame_and_value() {
+    for (value, said) in [(-3.0, "-3"), (0.5, "0.5"), (4096.0, "4096")] {
+        let message = with_phases([0.0, value], [0.0, 0.0]).unwrap_err().to_string();
+        for part in ["train-golden.json", "frames[1].heart_phase", said, "whole numbers"] {
+            assert!(message.contains(part), "{value}: {part}: {message}");
+        }
+    }
+    let message = with_phases([0.0, 1.0], [-1.0, 0.0]).unwrap_err().to_string();
+    assert!(message.contains("test-golden.json: frames[0].heart_phase"), "{message}");
+}
+
+#[test]
+fn gaps_between_phases_are_reported() {
+    assert_eq!(with_phases([0.0, 1.0], [0.0, 1.0]).unwrap().notes, Vec::<String>::new());
+    let dataset = with_phases([2.0, 7.0], [3.0, 7.0]).unwrap();
+    let numbers: Vec<u32> = dataset.frames.iter().map(|f| f.phase).collect();
+    assert_eq!((dataset.n_phases, numbers), (3, vec![0, 2, 1, 2]));
+    let [gap, guess] = &dataset.notes[..] else { panic!("{:?}", dataset.notes) };
+    assert!(gap.contains("heart_phase 0-1, 4-6") && gap.contains("2-3, 7, are numbered 0-2"), "{gap}");
+    assert!(guess.contains("no training frame shows phase 1"), "{guess}");
+}

@@ -67,6 +67,7 @@ fn describe_dataset(path: &Path) -> Result<serde_json::Value> {
         "line_integrals": [range.low, range.high],
         "vessel_attenuation_per_mm": dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
         "masks": dataset.frames.iter().filter(|f| f.mask.is_some()).count(),
+        "notes": dataset.notes,
         "views": views,
     }))
 }

@@ -71,7 +71,8 @@ pub fn reconstruct(
         observe(&event);
         Ok(())
     };
-    let mut notes = trainer.plan().notes.clone();
+    let mut notes = dataset.notes.clone();
+    notes.extend(trainer.plan().notes.iter().cloned());
     notes.extend(trainer.tuning().reasons.iter().cloned());
     tell(Event::Started {
         device: gpu.info().name.clone(),

@@ -14,6 +14,8 @@ use std::path::{Path, PathBuf};
 pub const MANIFEST: &str = "dataset.json";
 const MAX_MANIFEST_BYTES: u64 = 256 << 20;
 const MAX_FRAMES: usize = 100_000;
+/// Most cardiac phases of a dataset.
+pub(super) const MAX_PHASES: u32 = 4096;
 
 /// What pixel values mean.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -190,6 +192,8 @@ pub struct Dataset {
     pub depth_range: (f64, f64),
     /// Vessel attenuation per world unit, where stated.
     pub vessel_attenuation: Option<f64>,
+    /// What was found on reading that is no error but may not be meant.
+    pub notes: Vec<String>,
 }
 
 impl Dataset {
@@ -321,6 +325,7 @@ pub(super) struct Builder {
     size: Option<(usize, usize)>,
     views: Vec<View>,
     frames: Vec<Frame>,
+    pub(super) notes: Vec<String>,
 }
 
 pub(super) struct NewFrame<'a, F: Fn(f32) -> f32> {
@@ -341,8 +346,8 @@ impl Builder {
         depth_range: (f64, f64),
         vessel_attenuation: Option<f64>,
     ) -> Result<Builder> {
-        if n_phases == 0 || n_phases > 4096 {
-            return Err(Error::data(file, "phases", format!("{n_phases}; 1 to 4096 are accepted")));
+        if n_phases == 0 || n_phases > MAX_PHASES {
+            return Err(Error::data(file, "phases", format!("{n_phases}; 1 to {MAX_PHASES} are accepted")));
         }
         if vessel_attenuation.is_some_and(|a| !(a.is_finite() && a > 0.0)) {
             return Err(Error::data(file, "vessel_attenuation_per_mm", "is not a positive number"));
@@ -355,6 +360,7 @@ impl Builder {
             size: None,
             views: Vec::new(),
             frames: Vec::new(),
+            notes: Vec::new(),
         })
     }
 
@@ -432,6 +438,7 @@ impl Builder {
             return Err(Error::data(&self.file, "frames", "none is for training"));
         }
         self.frames.sort_by_key(|f| f.split);
+        self.notes.extend(untrained_phases(&self.frames, self.n_phases));
         Ok(Dataset {
             path: path.to_path_buf(),
             layout,
@@ -442,8 +449,28 @@ impl Builder {
             n_phases: self.n_phases,
             depth_range: self.depth_range,
             vessel_attenuation: self.vessel_attenuation,
+            notes: self.notes,
         })
     }
+}
+
+/// Says which phases no training frame shows.
+fn untrained_phases(frames: &[Frame], n_phases: u32) -> Option<String> {
+    let mut seen = vec![false; n_phases as usize];
+    frames.iter().filter(|f| f.split == Split::Train).for_each(|f| seen[f.phase as usize] = true);
+    let unseen: Vec<u32> = (0..n_phases).filter(|p| !seen[*p as usize]).collect();
+    (!unseen.is_empty())
+        .then(|| format!("no training frame shows phase {}: the moving field is a guess there", list_of(&unseen)))
+}
+
+/// Numbers as a person lists them, runs of them as first-last.
+pub(super) fn list_of(numbers: &[u32]) -> String {
+    let runs = numbers.chunk_by(|a, b| a + 1 == *b).map(|run| match run {
+        [first, .., last] => format!("{first}-{last}"),
+        [one] => one.to_string(),
+        [] => String::new(),
+    });
+    runs.collect::<Vec<_>>().join(", ")
 }
 
 /// JSON schema of the manifest.

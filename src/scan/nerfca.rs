@@ -10,7 +10,7 @@ use crate::formats::images::{MAX_FILE_BYTES, MAX_SIDE};
 use crate::formats::npy;
 use crate::geometry::{CArm, Geometry};
 use crate::raster::Image;
-use crate::scan::dataset::{Builder, Dataset, Layout, NewFrame, Split};
+use crate::scan::dataset::{Builder, Dataset, Layout, MAX_PHASES, NewFrame, Split, list_of};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -58,6 +58,20 @@ pub(crate) struct FrameEntry {
     pub larm: f64,
 }
 
+/// A frame, and where it is named.
+struct Entry {
+    file: PathBuf,
+    index: usize,
+    split: Split,
+    frame: FrameEntry,
+}
+
+impl Entry {
+    fn bad(&self, field: &str, problem: String) -> Error {
+        Error::data(&self.file, format!("frames[{}].{field}", self.index), problem)
+    }
+}
+
 fn read_json<T: serde::de::DeserializeOwned>(file: &Path) -> Result<T> {
     let text = files::read_limited(file, MAX_JSON_BYTES)?;
     serde_json::from_slice(&text).map_err(|e| Error::data(file, format!("line {}", e.line()), e.to_string()))
@@ -99,28 +113,27 @@ pub fn open(path: &Path) -> Result<Dataset> {
     let mut entries = Vec::new();
     for (file, split) in lists {
         let list: FrameList = read_json(&file)?;
-        entries.extend(list.frames.into_iter().map(|frame| (file.clone(), split, frame)));
+        let numbered = list.frames.into_iter().enumerate();
+        entries.extend(numbered.map(|(index, frame)| Entry { file: file.clone(), index, split, frame }));
     }
-    let phases = phase_index(&entries)?;
-    let mut builder = Builder::new(&general_file, phases.len().max(1) as u32, depth_range, None)?;
-    for (index, (file, split, entry)) in entries.iter().enumerate() {
+    let phases = heart_phases(&entries)?;
+    let (numbered, note) = number_phases(&phases);
+    let mut builder = Builder::new(&general_file, numbered.len().max(1) as u32, depth_range, None)?;
+    builder.notes.extend(note);
+    for (entry, phase) in entries.iter().zip(&phases) {
+        let frame = &entry.frame;
         let read = |field: &str, name: &str| -> Result<(PathBuf, Image)> {
-            let found = resolve(path, &by_name, name).ok_or_else(|| {
-                Error::data(file, format!("frames[{index}].{field}"), format!("{name} is not below {}", path.display()))
-            })?;
+            let found = resolve(path, &by_name, name)
+                .ok_or_else(|| entry.bad(field, format!("{name} is not below {}", path.display())))?;
             let image = read_picture(&found, width, height)?;
             Ok((found, image))
         };
-        let (source, image) = read("file_path", &entry.file_path)?;
-        let [low, high] = entry.img_min_max;
+        let (source, image) = read("file_path", &frame.file_path)?;
+        let [low, high] = frame.img_min_max;
         if !(low.is_finite() && high.is_finite() && high > low) {
-            return Err(Error::data(
-                file,
-                format!("frames[{index}].img_min_max"),
-                format!("[{low}, {high}] is not a range"),
-            ));
+            return Err(entry.bad("img_min_max", format!("[{low}, {high}] is not a range")));
         }
-        let mask = match &entry.mask_file_path {
+        let mask = match &frame.mask_file_path {
             None => None,
             Some(name) => {
                 let (_, mask) = read("mask_file_path", name)?;
@@ -129,19 +142,19 @@ pub fn open(path: &Path) -> Result<Dataset> {
             }
         };
         builder.add(NewFrame {
-            index,
+            index: entry.index,
             source: &source,
             geometry: Geometry::CArm(CArm {
-                primary_deg: entry.theta,
-                secondary_deg: entry.phi,
+                primary_deg: frame.theta,
+                secondary_deg: frame.phi,
                 sid_mm: general.DSD * to_mm,
                 sod_mm: general.DSO * to_mm,
                 pixel_mm: pixel.map(|p| p * to_mm),
                 offset_mm: offset.map(|p| p * to_mm),
                 table_mm: [0.0; 3],
             }),
-            phase: phases[&entry.heart_phase.to_bits()],
-            split: *split,
+            phase: numbered.partition_point(|p| p < phase) as u32,
+            split: entry.split,
             image,
             to_integral: |v| (i0 - (f64::from(v) * (high - low) + low)) as f32,
             mask,
@@ -200,17 +213,35 @@ fn resolve(root: &Path, by_name: &HashMap<String, PathBuf>, stated: &str) -> Opt
     by_name.get(stated.rsplit(['/', '\\']).next()?).cloned()
 }
 
-fn phase_index(entries: &[(PathBuf, Split, FrameEntry)]) -> Result<HashMap<u64, u32>> {
-    let mut values = Vec::new();
-    for (index, (file, _, entry)) in entries.iter().enumerate() {
-        if !entry.heart_phase.is_finite() {
-            return Err(Error::data(file, format!("frames[{index}].heart_phase"), "is not finite"));
+/// The `heart_phase` of each entry: it picks a row of the authors' table of latents, so it counts from 0 in whole numbers.
+fn heart_phases(entries: &[Entry]) -> Result<Vec<u32>> {
+    let check = |entry: &Entry| {
+        let phase = entry.frame.heart_phase;
+        if phase.fract() == 0.0 && (0.0..f64::from(MAX_PHASES)).contains(&phase) {
+            return Ok(phase as u32);
         }
-        values.push(entry.heart_phase);
-    }
-    values.sort_by(f64::total_cmp);
-    values.dedup();
-    Ok(values.iter().enumerate().map(|(i, v)| (v.to_bits(), i as u32)).collect())
+        let problem = format!("{phase}; phases count from 0 in whole numbers, up to {}", MAX_PHASES - 1);
+        Err(entry.bad("heart_phase", problem))
+    };
+    entries.iter().map(check).collect()
+}
+
+/// Phases that occur, in order, and a note about those between them that do not.
+fn number_phases(phases: &[u32]) -> (Vec<u32>, Option<String>) {
+    let mut found = phases.to_vec();
+    found.sort_unstable();
+    found.dedup();
+    let last = found.last().copied().unwrap_or(0);
+    let missing: Vec<u32> = (0..last).filter(|p| found.binary_search(p).is_err()).collect();
+    let note = (!missing.is_empty()).then(|| {
+        format!(
+            "no frame has heart_phase {}: those that occur, {}, are numbered 0-{}",
+            list_of(&missing),
+            list_of(&found),
+            found.len() - 1
+        )
+    });
+    (found, note)
 }
 
 /// An ordinary picture, rows first; axes of one entry, as stacks of one projection have, count for nothing.

@@ -144,6 +144,7 @@ impl Inbox {
             n_phases: self.options.phases,
             depth_range: (-half, half),
             vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
+            notes: Vec::new(),
         })
     }
 

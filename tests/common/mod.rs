@@ -75,6 +75,7 @@ pub fn small_dataset(width: usize, height: usize) -> Dataset {
         n_phases: phases,
         depth_range: (-0.9, 0.9),
         vessel_attenuation: Some(1.0),
+        notes: Vec::new(),
     }
 }
 
