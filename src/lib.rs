@@ -171,6 +171,7 @@ pub mod phantom {
     pub mod dataset;
     pub mod projector;
     pub mod tree;
+    pub mod views;
     pub mod voxels;
 }
 

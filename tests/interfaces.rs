@@ -199,7 +199,7 @@ fn volumes_are_projected_in_every_format() {
     }
     assert_eq!(images[0], images[1]);
     assert_eq!(images[0], images[2]);
-    fails(&["project", text(&npy), "--out", "nowhere"], 1, &["v.npy", "--spacing"]);
+    fails(&["project", text(&npy), "--out", "nowhere"], 1, &["v.npy", "spacing", "must be given"]);
     fails(
         &["project", text(&raw), "--out", "nowhere", "--raw-size", "99,99,99", "--spacing", "1,1,1"],
         1,
@@ -318,8 +318,8 @@ fn usage_errors_have_their_exit_codes() {
     fails(&["train", "x", "-o", "y", "--set", "train.rayz=1"], 2, &["train.rayz"]);
     fails(&["train", "x", "-o", "y", "--config", "absent.toml"], 1, &["absent.toml"]);
     fails(&["--device", "no such device", "phantom", "never-made"], 3, &["no such device"]);
-    fails(&["phantom", "never-made", "--views", "5"], 2, &["--views"]);
-    fails(&["phantom", "never-made", "--size", "1"], 2, &["--size"]);
+    fails(&["phantom", "never-made", "--views", "5"], 2, &["views = 5", "angles"]);
+    fails(&["phantom", "never-made", "--size", "1"], 2, &["size = 1"]);
     assert!(!Path::new("never-made").exists(), "a refused command must leave nothing behind");
     assert!(ok(&["train", "--print-config", "--preset", "paper"]).contains("iterations = 30000"));
     assert!(ok(&["completions", "bash"]).contains("nertca-vk"));
@@ -409,4 +409,72 @@ fn matrices_are_refused_where_there_are_none() {
     let run = directory.path().join("run");
     let asked = [&["--layers", "matrices", "train", text(&data), "-o", text(&run)], SHORT];
     fails(&asked.concat(), 2, &["cooperative matrices", "f32"]);
+}
+
+#[test]
+fn views_and_detectors_are_the_user_s() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("v.npy");
+    npy::write(&file, &[16, 16, 16], &[0.01; 4096]).unwrap();
+    let out = directory.path().join("data");
+    let project = ["project", text(&file), "--spacing", "4,4,4", "--size", "16", "--out", text(&out)];
+    ok(&[
+        &project[..],
+        &["--angles", "-30,25.5;60,-20", "--test-angles", "0,0", "--sod", "700,710,720", "--sid", "1100"],
+        &["--pixel", "6,7", "--offset", "1,2;-3,4;0,0"],
+    ]
+    .concat());
+    let dataset = nertca_vk::scan::dataset::Dataset::open(&out).unwrap();
+    let arms: Vec<_> = dataset
+        .views
+        .iter()
+        .map(|view| match &view.geometry {
+            nertca_vk::geometry::Geometry::CArm(c) => {
+                (c.primary_deg, c.secondary_deg, c.sod_mm, c.pixel_mm, c.offset_mm)
+            }
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    let pixel = [6.0, 7.0];
+    assert_eq!(
+        arms,
+        [
+            (-30.0, 25.5, 700.0, pixel, [1.0, 2.0]),
+            (60.0, -20.0, 710.0, pixel, [-3.0, 4.0]),
+            (0.0, 0.0, 720.0, pixel, [0.0, 0.0]),
+        ]
+    );
+    assert_eq!((dataset.training().len(), dataset.validation().len()), (2, 1));
+    // The cube is 64 mm wide: a detector shifted by two pixels sees it two pixels further on the other side.
+    let centre = |frame: &nertca_vk::scan::dataset::Frame| {
+        let mass: f32 = frame.integrals.iter().sum();
+        frame.integrals.iter().enumerate().map(|(i, v)| (i % 16) as f32 * v).sum::<f32>() / mass
+    };
+    let shifted = directory.path().join("shifted");
+    let project = ["project", text(&file), "--spacing", "4,4,4", "--size", "16", "--out", text(&shifted)];
+    ok(&[&project[..], &["--angles", "0,0;30,0", "--test-angles", "none", "--pixel", "20", "--offset", "40,0;0,0"]]
+        .concat());
+    let dataset = nertca_vk::scan::dataset::Dataset::open(&shifted).unwrap();
+    assert!(dataset.validation().is_empty());
+    let [moved, middle] = [0, 1].map(|i| centre(&dataset.frames[i]));
+    assert!((middle - 7.5).abs() < 0.05 && (moved - 5.5).abs() < 0.05, "{moved} and {middle}");
+    // Refused before anything is written.
+    let nowhere = directory.path().join("nowhere");
+    let refuse = |extra: &[&str], part: &str| {
+        let project = ["project", text(&file), "--spacing", "4,4,4", "--out", text(&nowhere)];
+        fails(&[&project[..], extra].concat(), 2, &[part]);
+        assert!(!nowhere.exists());
+    };
+    refuse(&["--angles", "30"], "P,S");
+    refuse(&["--angles", "0,0", "--views", "3"], "--views");
+    refuse(&["--angles", "0,0;1000,0"], "1000");
+    refuse(&["--angles", "0,0", "--test-angles", "none", "--sod", "700,800"], "one or 1");
+    refuse(&["--sod", "1200"], "sod_mm");
+    refuse(&["--pixel=-1"], "--pixel");
+    refuse(&["--pixel", "1", "--fov", "100"], "--fov");
+    fails(&["phantom", text(&nowhere), "--sod", "700"], 2, &["--tree"]);
+    let own = directory.path().join("own");
+    ok(&["phantom", text(&own), "--size", "16", "--phases", "1", "--no-volumes", "--angles", "88,3;0,0"]);
+    let dataset = nertca_vk::scan::dataset::Dataset::open(&own).unwrap();
+    assert_eq!((dataset.training().len(), dataset.validation().len()), (2, 3), "the paper's view at 90, 0 is too near");
 }

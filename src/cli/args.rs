@@ -10,6 +10,7 @@ use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::model::component::Component;
 use nertca_vk::phantom::dataset::Setting;
+use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::render::quantity::Projection;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::train::calibrate;
@@ -90,9 +91,9 @@ pub struct PhantomArgs {
     /// Cardiac phases.
     #[arg(long, default_value_t = 10)]
     pub phases: u32,
-    /// Training views: 3, 4 or 9.
-    #[arg(long, default_value_t = 4)]
-    pub views: u32,
+    /// From where it is seen.
+    #[command(flatten)]
+    pub views: ViewAngleArgs,
     /// Seed of shape and noise.
     #[arg(long, default_value_t = 1)]
     pub seed: u32,
@@ -111,15 +112,9 @@ pub struct PhantomArgs {
     /// Chest CT in Hounsfield units behind the tree.
     #[arg(long, value_name = "CT", requires = "tree")]
     pub background: Option<PathBuf>,
-    /// Source to isocentre with --tree, mm.
-    #[arg(long, default_value_t = 750.0, value_name = "MM")]
-    pub sod: f64,
-    /// Source to detector with --tree, mm.
-    #[arg(long, default_value_t = 1100.0, value_name = "MM")]
-    pub sid: f64,
-    /// Field of view at the isocentre with --tree, mm.
-    #[arg(long, default_value_t = 160.0, value_name = "MM")]
-    pub fov: f64,
+    /// C-arm with --tree.
+    #[command(flatten)]
+    pub c_arm: CArmArgs,
     /// Attenuation of filled vessels with --tree, 1/mm.
     #[arg(long, default_value_t = 0.10, value_name = "PER_MM")]
     pub iodine: f64,
@@ -140,18 +135,12 @@ pub struct ProjectArgs {
     /// Columns and rows of the images.
     #[arg(long, default_value_t = 200)]
     pub size: usize,
-    /// Training views: 3, 4 or 9.
-    #[arg(long, default_value_t = 4)]
-    pub views: u32,
-    /// Source to isocentre, mm.
-    #[arg(long, default_value_t = 750.0, value_name = "MM")]
-    pub sod: f64,
-    /// Source to detector, mm.
-    #[arg(long, default_value_t = 1100.0, value_name = "MM")]
-    pub sid: f64,
-    /// Field of view at the isocentre, mm.
-    #[arg(long, default_value_t = 160.0, value_name = "MM")]
-    pub fov: f64,
+    /// From where it is seen.
+    #[command(flatten)]
+    pub views: ViewAngleArgs,
+    /// C-arm.
+    #[command(flatten)]
+    pub c_arm: CArmArgs,
     /// Values are Hounsfield units, not attenuation per mm.
     #[arg(long)]
     pub hounsfield: bool,
@@ -176,6 +165,78 @@ pub struct ProjectArgs {
     /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
     pub layout: Layout,
+}
+
+/// Views of synthetic data.
+#[derive(Debug, Args)]
+pub struct ViewAngleArgs {
+    /// Training views: the paper's 3, 4 or 9.
+    #[arg(long, default_value_t = 4, conflicts_with = "angles")]
+    pub views: u32,
+    /// Training views by primary and secondary angle, degrees (LAO and cranial positive), instead of the paper's.
+    #[arg(long, value_name = "P,S[;P,S...]", allow_hyphen_values = true, value_parser = view_angles)]
+    pub angles: Option<AngleList>,
+    /// Validation views, or `none`, instead of the paper's (of which those within 15 degrees of --angles are left out).
+    #[arg(long, value_name = "P,S[;P,S...]", allow_hyphen_values = true, value_parser = test_angles)]
+    pub test_angles: Option<AngleList>,
+}
+
+/// Angles of several views.
+#[derive(Debug, Clone)]
+pub struct AngleList(pub Vec<Angles>);
+
+impl ViewAngleArgs {
+    /// The views asked for.
+    pub fn views(&self) -> Result<ViewAngles> {
+        let validation = self.test_angles.as_ref().map(|list| list.0.as_slice());
+        let mut views = match &self.angles {
+            Some(list) => ViewAngles::given(&list.0, validation)?,
+            None => ViewAngles::published(self.views)?,
+        };
+        if let Some(validation) = validation {
+            views.validation = validation.to_vec();
+        }
+        Ok(views)
+    }
+}
+
+/// C-arms of synthetic data: one value for all views, or one for each, those of training first.
+#[derive(Debug, Args)]
+pub struct CArmArgs {
+    /// Source to isocentre, mm: one for all views, or one for each (training first, then validation).
+    #[arg(long, default_value = "750", value_name = "MM[,MM...]", value_delimiter = ',')]
+    pub sod: Vec<f64>,
+    /// Source to detector, mm: one for all views, or one for each.
+    #[arg(long, default_value = "1100", value_name = "MM[,MM...]", value_delimiter = ',')]
+    pub sid: Vec<f64>,
+    /// Field of view at the isocentre, mm.
+    #[arg(long, default_value_t = 160.0, value_name = "MM")]
+    pub fov: f64,
+    /// Pixel pitch on the detector along columns and rows, mm, instead of --fov: one number or two.
+    #[arg(long, value_name = "MM[,MM]", value_parser = pitch, conflicts_with = "fov")]
+    pub pixel: Option<[f64; 2]>,
+    /// Offset of the detector's centre along columns and rows, mm: one for all views, or one for each.
+    #[arg(long, default_value = "0,0", value_name = "U,V[;U,V...]", allow_hyphen_values = true, value_delimiter = ';',
+        value_parser = offset)]
+    pub offset: Vec<[f64; 2]>,
+}
+
+impl CArmArgs {
+    /// Whether nothing was asked for.
+    pub fn is_default(&self) -> bool {
+        let at_rest = self.offset == [[0.0; 2]] && self.pixel.is_none();
+        self.sod == [750.0] && self.sid == [1100.0] && self.fov == 160.0 && at_rest
+    }
+
+    /// The C-arms asked for.
+    pub fn options(&self) -> CArmOptions {
+        CArmOptions {
+            sod_mm: self.sod.clone(),
+            sid_mm: self.sid.clone(),
+            pixel: self.pixel.map_or(PixelPitch::FieldOfView(self.fov), PixelPitch::Detector),
+            offset_mm: self.offset.clone(),
+        }
+    }
 }
 
 /// `import`.
@@ -244,6 +305,31 @@ fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize
         (Ok(first), Ok(last)) if first <= last => Ok(first..=last),
         _ => Err("write it as FIRST-LAST, as in 5-12".into()),
     }
+}
+
+/// Parses `A,B`.
+fn pair(text: &str) -> Option<[f64; 2]> {
+    let (a, b) = text.split_once(',')?;
+    Some([a.trim().parse().ok()?, b.trim().parse().ok()?])
+}
+
+/// Parses a detector offset, `U,V`.
+fn offset(text: &str) -> std::result::Result<[f64; 2], String> {
+    pair(text).ok_or_else(|| "two lengths in mm are needed, as U,V".to_owned())
+}
+
+/// Parses `P,S[;P,S...]`.
+fn view_angles(text: &str) -> std::result::Result<AngleList, String> {
+    let view = |view: &str| match pair(view) {
+        Some([primary_deg, secondary_deg]) => Ok(Angles { primary_deg, secondary_deg }),
+        None => Err(format!("`{view}`: write primary and secondary angle as P,S and views as P,S;P,S")),
+    };
+    text.split(';').map(view).collect::<std::result::Result<_, _>>().map(AngleList)
+}
+
+/// Parses the same, or `none`.
+fn test_angles(text: &str) -> std::result::Result<AngleList, String> {
+    if text == "none" { Ok(AngleList(Vec::new())) } else { view_angles(text) }
 }
 
 /// Parses one length for both directions, or two.

@@ -11,6 +11,7 @@ use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::network::cost::NetworkCost;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
@@ -105,7 +106,7 @@ fn default_phantom(gpu: &Gpu, scratch: &Path) -> Result<Dataset> {
         setting: Setting::Xcat,
         size: 100,
         phases: 10,
-        views: 4,
+        views: ViewAngles::published(4)?,
         seed: 1,
         photons: None,
         respiration_mm: 0.0,

@@ -6,7 +6,7 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
-use nertca_vk::phantom::dataset::{Anatomy, CArmOptions, PhantomOptions, VolumeOptions, make, project_volumes};
+use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
 use nertca_vk::scan::gating::RPeaks;
 use std::path::Path;
 
@@ -25,12 +25,16 @@ pub fn bar() -> impl FnMut(&str, u64, u64) {
 
 /// Makes a phantom.
 pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
+    if args.tree.is_none() && !args.c_arm.is_default() {
+        let problem = "--sod, --sid, --fov, --pixel and --offset are for --tree; a published set-up has its own C-arm";
+        return Err(Error::config("--tree", "none", problem));
+    }
     let gpu = cli.open_device()?;
     let options = PhantomOptions {
         setting: args.geometry,
         size: args.size,
         phases: args.phases,
-        views: args.views,
+        views: args.views.views()?,
         seed: args.seed,
         photons: args.photons,
         respiration_mm: args.respiration,
@@ -38,7 +42,7 @@ pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
         anatomy: args.tree.as_ref().map(|tree| Anatomy {
             tree: tree.clone(),
             background: args.background.clone(),
-            c_arm: CArmOptions { sod_mm: args.sod, sid_mm: args.sid, field_mm: args.fov },
+            c_arms: args.c_arm.options(),
             iodine_per_mm: args.iodine,
         }),
         volumes: !args.no_volumes,
@@ -62,9 +66,9 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
         hounsfield: args.hounsfield,
         scale: args.scale,
         vessel_per_mm: args.vessel,
-        c_arm: CArmOptions { sod_mm: args.sod, sid_mm: args.sid, field_mm: args.fov },
+        c_arms: args.c_arm.options(),
         size: args.size,
-        views: args.views,
+        views: args.views.views()?,
         layout: args.layout,
     };
     project_volumes(&gpu, &options, &args.out, bar())?;

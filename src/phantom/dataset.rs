@@ -8,6 +8,7 @@ use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::gpu::device::Gpu;
 use crate::phantom::projector::{LoadedVolume, Projector};
 use crate::phantom::tree::{Heart, Tree, contraction};
+use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use crate::phantom::voxels::{self, Tissues};
 use crate::random::{STREAM_PHOTON, normal, uniform01};
 use crate::scan::dataset::{Layout, MANIFEST, Split};
@@ -51,8 +52,8 @@ pub struct PhantomOptions {
     pub size: usize,
     /// Cardiac phases.
     pub phases: u32,
-    /// Training views: 3, 4 or 9.
-    pub views: u32,
+    /// Views.
+    pub views: ViewAngles,
     /// Seed of shape and noise.
     pub seed: u32,
     /// Photons per unattenuated pixel; `None` = no noise.
@@ -74,21 +75,10 @@ pub struct Anatomy {
     pub tree: PathBuf,
     /// CT in Hounsfield units.
     pub background: Option<PathBuf>,
-    /// C-arm.
-    pub c_arm: CArmOptions,
+    /// C-arms.
+    pub c_arms: CArmOptions,
     /// Vessel attenuation, 1/mm.
     pub iodine_per_mm: f64,
-}
-
-/// A C-arm given by what a user knows of it.
-#[derive(Debug, Clone, Copy)]
-pub struct CArmOptions {
-    /// Source to isocentre, mm.
-    pub sod_mm: f64,
-    /// Source to detector, mm.
-    pub sid_mm: f64,
-    /// Field of view at the isocentre, mm.
-    pub field_mm: f64,
 }
 
 /// A user's own volumes.
@@ -104,41 +94,21 @@ pub struct VolumeOptions {
     pub scale: f32,
     /// Attenuation from which a voxel is vessel, 1/mm.
     pub vessel_per_mm: Option<f64>,
-    /// C-arm.
-    pub c_arm: CArmOptions,
+    /// C-arms.
+    pub c_arms: CArmOptions,
     /// Columns and rows of the images.
     pub size: usize,
-    /// Training views: 3, 4 or 9.
-    pub views: u32,
+    /// Views.
+    pub views: ViewAngles,
     /// Layout to write.
     pub layout: Layout,
 }
 
-/// Primary and secondary angle of the training views, degrees (method, section 1).
-pub fn training_angles(views: u32) -> Result<Vec<(f64, f64)>> {
-    let four = [(-30.0, 30.0), (-30.0, -30.0), (60.0, -30.0), (60.0, 30.0)];
-    match views {
-        3 => Ok(four[1..].to_vec()),
-        4 => Ok(four.to_vec()),
-        9 => {
-            let grid = [-60.0, 0.0, 60.0];
-            let all = grid.iter().flat_map(|a| grid.iter().map(move |b| (*a, *b)));
-            // A view next to a validation view would give the answer away.
-            Ok(all
-                .filter(|(a, b)| VALIDATION_ANGLES.iter().all(|(c, d)| (a - c).abs() + (b - d).abs() > 15.0))
-                .collect())
-        }
-        other => Err(Error::config("views", other, "3, 4 or 9 is accepted")),
-    }
-}
-
-/// Primary and secondary angle of the validation views, degrees.
-pub const VALIDATION_ANGLES: [(f64, f64); 4] = [(-5.0, 40.0), (-5.0, -40.0), (90.0, 0.0), (-30.0, 0.0)];
-
 /// What a phantom dataset is shot from.
 pub(super) struct Stage {
     pub(super) description: String,
-    pub(super) c_arm: CArm,
+    /// One per view.
+    pub(super) c_arms: Vec<CArm>,
     pub(super) depth_half_extent_mm: f64,
     pub(super) vessel_attenuation: Option<f64>,
     pub(super) still: Option<LoadedVolume>,
@@ -147,9 +117,9 @@ pub(super) struct Stage {
 }
 
 /// How a stage is shot.
-struct Shooting {
+struct Shooting<'a> {
     size: usize,
-    views: u32,
+    views: &'a ViewAngles,
     seed: u32,
     photons: Option<f64>,
     respiration_mm: f64,
@@ -174,7 +144,7 @@ pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl 
     }
     let shooting = Shooting {
         size: options.size,
-        views: options.views,
+        views: &options.views,
         seed: options.seed,
         photons: options.photons,
         respiration_mm: options.respiration_mm,
@@ -203,7 +173,7 @@ pub fn project_volumes(
 ) -> Result<()> {
     let shooting = Shooting {
         size: options.size,
-        views: options.views,
+        views: &options.views,
         seed: 0,
         photons: None,
         respiration_mm: 0.0,
@@ -214,6 +184,7 @@ pub fn project_volumes(
     if options.vessel_per_mm.is_some_and(|v| !(v.is_finite() && v > 0.0)) {
         return Err(Error::config("vessel_per_mm", options.vessel_per_mm.unwrap_or_default(), "must be positive"));
     }
+    let c_arms = options.c_arms.c_arms(&options.views, options.size)?;
     let projector = Projector::new(gpu, options.size, options.size)?;
     let total = options.volumes.len() as u64;
     let (mut moving, mut radius) = (Vec::new(), 0f64);
@@ -234,8 +205,8 @@ pub fn project_volumes(
     }
     let stage = Stage {
         description: format!("projected from {} volumes", options.volumes.len()),
-        c_arm: options.c_arm.c_arm(options.size)?,
-        depth_half_extent_mm: radius.min(0.9 * options.c_arm.sod_mm),
+        depth_half_extent_mm: radius.min(largest_depth_mm(&c_arms)),
+        c_arms,
         vessel_attenuation: options.vessel_per_mm,
         still: None,
         moving,
@@ -243,32 +214,22 @@ pub fn project_volumes(
     shoot(&projector, &stage, &shooting, out, progress)
 }
 
-impl CArmOptions {
-    fn c_arm(&self, size: usize) -> Result<CArm> {
-        for (field, value) in [("sod_mm", self.sod_mm), ("sid_mm", self.sid_mm), ("field_mm", self.field_mm)] {
-            if !(value.is_finite() && value > 0.0) {
-                return Err(Error::config(field, value, "must be a positive length in mm"));
-            }
-        }
-        let pixel = self.field_mm / size as f64 * self.sid_mm / self.sod_mm;
-        Ok(CArm {
-            primary_deg: 0.0,
-            secondary_deg: 0.0,
-            sid_mm: self.sid_mm,
-            sod_mm: self.sod_mm,
-            pixel_mm: [pixel; 2],
-            offset_mm: [0.0; 2],
-            table_mm: [0.0; 3],
-        })
-    }
+/// How far from the isocentre attenuation may lie: short of the nearest source.
+fn largest_depth_mm(c_arms: &[CArm]) -> f64 {
+    0.9 * c_arms.iter().map(|c_arm| c_arm.sod_mm).fold(f64::INFINITY, f64::min)
+}
+
+/// The widest field of view at the isocentre.
+fn widest_field_mm(c_arms: &[CArm], size: usize) -> f64 {
+    let fields = c_arms.iter().map(|c_arm| c_arm.pixel_mm[0] * size as f64 * c_arm.sod_mm / c_arm.sid_mm);
+    fields.fold(0.0, f64::max)
 }
 
 /// Refuses impossible images and directories that already hold a dataset, before any work is done.
-fn check_output(shooting: &Shooting, out: &Path) -> Result<()> {
+fn check_output(shooting: &Shooting<'_>, out: &Path) -> Result<()> {
     if !(16..=2048).contains(&shooting.size) {
         return Err(Error::config("size", shooting.size, "16 to 2048 is accepted"));
     }
-    training_angles(shooting.views)?;
     for name in [MANIFEST, nerfca::GENERAL] {
         if out.join(name).exists() {
             return Err(Error::config("OUT", out.display(), "already holds a dataset; choose another directory"));
@@ -281,22 +242,13 @@ fn check_output(shooting: &Shooting, out: &Path) -> Result<()> {
 fn shoot(
     projector: &Projector,
     stage: &Stage,
-    shooting: &Shooting,
+    shooting: &Shooting<'_>,
     out: &Path,
     mut progress: impl FnMut(&str, u64, u64),
 ) -> Result<()> {
     let size = shooting.size;
-    let views: Vec<_> = training_angles(shooting.views)?
-        .into_iter()
-        .map(|a| (a, Split::Train))
-        .chain(VALIDATION_ANGLES.map(|a| (a, Split::Validation)))
-        .collect();
-    let geometries: Vec<Geometry> = views
-        .iter()
-        .map(|((primary_deg, secondary_deg), _)| {
-            Geometry::CArm(CArm { primary_deg: *primary_deg, secondary_deg: *secondary_deg, ..stage.c_arm.clone() })
-        })
-        .collect();
+    let splits: Vec<Split> = shooting.views.all().map(|(_, split)| split).collect();
+    let geometries: Vec<Geometry> = stage.c_arms.iter().cloned().map(Geometry::CArm).collect();
     let rays = geometries
         .iter()
         .map(|g| g.rays(size, size).map_err(|(field, problem)| Error::config(field, "", problem)))
@@ -307,22 +259,24 @@ fn shoot(
         depth_half_extent_mm: stage.depth_half_extent_mm,
         vessel_attenuation_per_mm: stage.vessel_attenuation,
         size: [size, size],
-        c_arm: stage.c_arm.clone(),
+        c_arm: stage.c_arms[0].clone(),
     };
     let mut writer = Writer::new(out, shooting.layout, about)?;
     let still = match &stage.still {
         Some(volume) => projector.project(volume, &rays, DVec3::ZERO)?,
         None => vec![vec![0.0; size * size]; rays.len()],
     };
-    let pixel_at_isocentre = stage.c_arm.pixel_mm[0] * stage.c_arm.sod_mm / stage.c_arm.sid_mm;
-    let mask_threshold = (MASK_SHARE * stage.vessel_attenuation.unwrap_or(0.0) * pixel_at_isocentre) as f32;
+    let mask_threshold = |c_arm: &CArm| {
+        let pixel_at_isocentre = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
+        (MASK_SHARE * stage.vessel_attenuation.unwrap_or(0.0) * pixel_at_isocentre) as f32
+    };
     let total = stage.moving.len() as u64;
     for (phase, (background, vessels)) in stage.moving.iter().enumerate() {
         progress("projections", phase as u64, total);
         let phase = phase as u32;
         for (view, geometry) in geometries.iter().enumerate() {
             // Breathing differs between runs, so each view has its own course of displacement.
-            let shift = DVec3::Z * breath(shooting, view, phase, views[view].1, total);
+            let shift = DVec3::Z * breath(shooting, view, phase, splits[view], total);
             let project = |volume: &LoadedVolume| -> Result<Vec<f32>> {
                 Ok(projector.project(volume, std::slice::from_ref(&rays[view]), shift)?.swap_remove(0))
             };
@@ -336,19 +290,20 @@ fn shoot(
                 if !shooting.vessels_in_background {
                     add(&mut image, &vessel_image);
                 }
-                mask = Some(vessel_image.iter().map(|v| *v > mask_threshold).collect::<Vec<_>>());
+                let threshold = mask_threshold(&stage.c_arms[view]);
+                mask = Some(vessel_image.iter().map(|v| *v > threshold).collect::<Vec<_>>());
             }
             if let Some(photons) = shooting.photons {
                 add_noise(&mut image, photons, shooting.seed, (view as u32) << 16 | phase);
             }
-            writer.frame(geometry, views[view].1, view, phase, &image, mask.as_deref())?;
+            writer.frame(geometry, splits[view], view, phase, &image, mask.as_deref())?;
         }
     }
     progress("projections", total, total);
     writer.finish()
 }
 
-fn breath(options: &Shooting, view: usize, phase: u32, split: Split, phases: u64) -> f64 {
+fn breath(options: &Shooting<'_>, view: usize, phase: u32, split: Split, phases: u64) -> f64 {
     if split == Split::Validation {
         return 0.0;
     }
@@ -416,18 +371,17 @@ fn procedural(projector: &Projector, options: &PhantomOptions, out: &Path) -> Re
         moving.push((Some(projector.load(background)?), Some(projector.load(vessels)?)));
     }
     let radius = half_mm + centre_mm.x.abs().max(centre_mm.y.abs());
+    let c_arms = CArmOptions {
+        sod_mm: vec![sod_mm],
+        sid_mm: vec![sid_mm],
+        pixel: PixelPitch::Detector([scale_pixels; 2]),
+        offset_mm: vec![[0.0; 2]],
+    }
+    .c_arms(&options.views, options.size)?;
     Ok(Stage {
         description: format!("procedural phantom, {:?} set-up, seed {}", options.setting, options.seed),
-        c_arm: CArm {
-            primary_deg: 0.0,
-            secondary_deg: 0.0,
-            sid_mm,
-            sod_mm,
-            pixel_mm: [scale_pixels; 2],
-            offset_mm: [0.0; 2],
-            table_mm: [0.0; 3],
-        },
-        depth_half_extent_mm: (radius * std::f64::consts::SQRT_2).min(0.9 * sod_mm),
+        depth_half_extent_mm: (radius * std::f64::consts::SQRT_2).min(largest_depth_mm(&c_arms)),
+        c_arms,
         vessel_attenuation: Some(tissues.vessel),
         still: Some(projector.load(still)?),
         moving,
@@ -455,12 +409,12 @@ fn from_files(projector: &Projector, options: &PhantomOptions, anatomy: &Anatomy
         }
         moving.push((None, Some(projector.load(vessels)?)));
     }
-    let c_arm = anatomy.c_arm;
-    let radius = still.as_ref().map_or(c_arm.field_mm, Volume::axial_radius_mm);
+    let c_arms = anatomy.c_arms.c_arms(&options.views, options.size)?;
+    let radius = still.as_ref().map_or_else(|| widest_field_mm(&c_arms, options.size), Volume::axial_radius_mm);
     Ok(Stage {
         description: format!("anatomy from {}", anatomy.tree.file_name().unwrap_or_default().to_string_lossy()),
-        c_arm: c_arm.c_arm(options.size)?,
-        depth_half_extent_mm: radius.min(0.9 * c_arm.sod_mm),
+        depth_half_extent_mm: radius.min(largest_depth_mm(&c_arms)),
+        c_arms,
         vessel_attenuation: Some(anatomy.iodine_per_mm),
         still: still.map(|v| projector.load(v)).transpose()?,
         moving,
@@ -481,14 +435,6 @@ fn write_volumes(out: &Path, phase: u32, vessels: &Volume, background: Option<(&
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn nine_views_leave_validation_unseen() {
-        let nine = training_angles(9).unwrap();
-        assert_eq!(nine.len(), 9);
-        assert_eq!(training_angles(3).unwrap()[0], (-30.0, -30.0));
-        assert!(training_angles(5).is_err());
-    }
 
     #[test]
     fn noise_has_the_variance_of_its_counts() {
