@@ -12,7 +12,7 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::metrics::otsu;
+use nertca_vk::score::metrics::vessel_threshold;
 
 /// The phases `--phase` names, and whether it names all.
 pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
@@ -79,7 +79,7 @@ fn dice_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid)
     }
     let values = renderer.sample_patient(Component::Dynamic, 0, grid)?;
     let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();
-    Ok(f64::from(otsu(&inside)))
+    Ok(f64::from(vessel_threshold(&inside)))
 }
 
 /// Converts a dataset between layouts.

@@ -1,5 +1,12 @@
 //! Image metrics as plain functions.
 
+use crate::raster::percentile;
+
+/// Values above this percentile are as good as at it when a threshold is sought.
+const HOT: f64 = 0.995;
+/// Steps in which the best threshold is sought.
+const CANDIDATES: u32 = 200;
+
 /// Dice overlap of two masks; 1 when both are empty.
 pub fn dice(a: &[bool], b: &[bool]) -> f64 {
     let both = a.iter().zip(b).filter(|(x, y)| **x && **y).count();
@@ -93,6 +100,47 @@ pub fn otsu(values: &[f32]) -> f32 {
     low + (best_at as f32 + 1.0) / BINS as f32 * (high - low)
 }
 
+/// Otsu's threshold for vessels in values that are zero for the most part and have a few hot spots. Values are held at
+/// their [`HOT`] percentile: one pixel in two thousand far above all vessels would otherwise become the upper group.
+/// Zero where fewer values than that are above zero.
+pub fn vessel_threshold(values: &[f32]) -> f32 {
+    let hottest = percentile(values, HOT);
+    otsu(&values.iter().map(|v| v.min(hottest)).collect::<Vec<_>>())
+}
+
+/// The threshold with the best mean Dice of several images, and that Dice: values above it against a mask. `used` is
+/// tried too. None of no images.
+pub fn best_dice(images: &[(&[f32], &[bool])], used: f32) -> Option<(f64, f32)> {
+    let sorted = |values: &mut dyn Iterator<Item = f32>| {
+        let mut values: Vec<f32> = values.collect();
+        values.sort_unstable_by(f32::total_cmp);
+        values
+    };
+    let above = |sorted: &[f32], threshold: f32| sorted.len() - sorted.partition_point(|v| *v <= threshold);
+    let images: Vec<(Vec<f32>, Vec<f32>)> = images
+        .iter()
+        .map(|(values, mask)| {
+            let in_mask = values.iter().zip(*mask).filter(|(_, inside)| **inside).map(|(v, _)| *v);
+            (sorted(&mut values.iter().copied()), sorted(&mut { in_mask }))
+        })
+        .collect();
+    let pooled = sorted(&mut images.iter().flat_map(|(all, _)| all.iter().copied()));
+    // Shares of the pixels above the threshold, from half of them to a few, evenly on a logarithmic scale.
+    let candidates = (0..=CANDIDATES).map(|i| {
+        let share = 0.5 * (2.0 / pooled.len().max(2) as f64).powf(f64::from(i) / f64::from(CANDIDATES));
+        pooled.get(((1.0 - share) * (pooled.len().max(1) - 1) as f64) as usize).copied().unwrap_or(used)
+    });
+    let mean_dice = |threshold: f32| {
+        let each = images.iter().map(|(all, in_mask)| {
+            let sum = above(all, threshold) + in_mask.len();
+            if sum == 0 { 1.0 } else { 2.0 * above(in_mask, threshold) as f64 / sum as f64 }
+        });
+        each.sum::<f64>() / images.len() as f64
+    };
+    let tried = candidates.chain([used]).map(|threshold| (mean_dice(threshold), threshold));
+    tried.filter(|(dice, _)| dice.is_finite()).max_by(|a, b| a.0.total_cmp(&b.0))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -118,11 +166,58 @@ mod tests {
         assert!(ssim(&truth, &noisy, 20) < 0.8);
     }
 
+    /// The pair of images of `tests/python/ssim_reference.py`, and what scikit-image 0.26 says of them.
     #[test]
-    fn otsu_splits_two_groups() {
-        let mut values = vec![0.1f32; 90];
-        values.extend([0.9f32; 10]);
-        let t = otsu(&values);
-        assert!(t > 0.1 && t < 0.9, "{t}");
+    fn ssim_is_that_of_scikit_image() {
+        const WIDTH: usize = 37;
+        let pixels = (0..23 * WIDTH).map(|i| ((i % WIDTH) as f64, (i / WIDTH) as f64));
+        let (truth, prediction): (Vec<f64>, Vec<f64>) = pixels
+            .map(|(x, y)| {
+                let truth = (x * x + 3.0 * x * y + 40.0 * y) % 97.0 / 97.0 * 0.5 + 0.5 * x / WIDTH as f64;
+                (truth, 0.8 * truth + (7.0 * x + 11.0 * y) % 13.0 / 13.0 * 0.2)
+            })
+            .unzip();
+        let value = ssim(&truth, &prediction, WIDTH);
+        assert!((value - 0.878_587_503_954_006_5).abs() < 1e-9, "{value}");
+    }
+
+    /// Values spread evenly about two levels.
+    fn two_levels(low: f32, n_low: usize, high: f32, n_high: usize) -> Vec<f32> {
+        let spread = |level: f32, n: usize| (0..n).map(move |i| level * (0.6 + 0.8 * i as f32 / n as f32));
+        spread(low, n_low).chain(spread(high, n_high)).collect()
+    }
+
+    #[test]
+    fn otsu_splits_two_groups_where_they_part() {
+        // The lower group ends at 0.14, the upper one begins at 0.6; a histogram's bin is 0.005 wide.
+        let t = otsu(&two_levels(0.1, 900, 1.0, 100));
+        assert!((0.14..0.146).contains(&t), "{t}");
+        // Groups that meet: one bin after the lower one ends, many of the upper one are below.
+        let t = otsu(&two_levels(0.1, 500, 0.4, 500));
+        assert!((0.255..0.265).contains(&t), "{t}");
+    }
+
+    #[test]
+    fn a_few_hot_spots_do_not_move_the_threshold() {
+        let mut values = two_levels(0.1, 900, 1.0, 100);
+        values.extend([0.0; 5000]);
+        let cool = vessel_threshold(&values);
+        values.extend([40.0, 55.0, 60.0, 70.0]);
+        let hot = vessel_threshold(&values);
+        assert!((cool - hot).abs() < 0.02 && (0.13..0.6).contains(&hot), "{cool} without, {hot} with hot spots");
+        assert!(otsu(&values) > 1.4, "Otsu alone sees the hot spots only: {}", otsu(&values));
+    }
+
+    #[test]
+    fn the_best_threshold_is_found() {
+        let values = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8];
+        let mask = values.map(|v| v > 0.55);
+        let (dice, threshold) = best_dice(&[(&values, &mask)], 0.0).unwrap();
+        assert!(dice == 1.0 && (0.5..0.6).contains(&threshold), "{dice} at {threshold}");
+        // An image that wants another threshold is outvoted by two: the mean decides, 1, 1 and 1/2.
+        let few = values.map(|v| v > 0.75);
+        let (dice, threshold) = best_dice(&[(&values, &mask), (&values, &mask), (&values, &few)], 0.0).unwrap();
+        assert!((dice - 2.5 / 3.0).abs() < 1e-12 && (0.5..0.6).contains(&threshold), "{dice} at {threshold}");
+        assert_eq!(best_dice(&[], 0.0), None);
     }
 }
