@@ -19,6 +19,7 @@ mod cli {
     pub mod frame_rates;
     pub mod info;
     pub mod page;
+    pub mod progress;
     pub mod render;
     pub mod report;
     pub mod train;

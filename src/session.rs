@@ -369,9 +369,8 @@ impl Session {
         let dataset = lock(&self.shared.inbox).dataset(|_, _| true)?;
         let frames: Vec<_> = dataset.validation().iter().collect();
         let threshold = threshold_per_mm.map(|t| t * MM_PER_UNIT);
-        self.shared.with_viewer(|live, step| {
-            evaluate(live.renderer(step)?, &dataset, &frames, step, threshold, |_, _, _| Ok(()))
-        })
+        self.shared
+            .with_viewer(|live, step| evaluate(live.renderer(step)?, &dataset, &frames, step, threshold, |_| Ok(())))
     }
 
     /// Everything needed to continue, after the iterations under way.

@@ -67,8 +67,14 @@ fn a_whole_life() {
     let lines = ok(&[&["train", text(&data), "-o", text(&run), "--json", "--stop-at", "20"], SHORT].concat());
     let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
     let kinds: Vec<_> = events.iter().map(|e| e["event"].as_str().unwrap()).collect();
-    assert_eq!((kinds[0], *kinds.last().unwrap()), ("started", "finished"));
+    assert_eq!(kinds[0], "started");
     assert!(kinds.contains(&"validation") && kinds.contains(&"saved"));
+    // Training is over before the unseen images are scored, one by one.
+    let finished = kinds.iter().position(|kind| *kind == "finished").unwrap();
+    let scored: Vec<_> = events[finished + 1..].iter().map(|e| (&e["event"], e["images"].as_u64(), &e["of"])).collect();
+    let wanted: Vec<_> = (0..=12).map(|n| (json!("evaluation"), Some(n), json!(12))).collect();
+    assert!(scored.iter().zip(&wanted).all(|(a, b)| (a.0, a.1, a.2) == (&b.0, b.1, &b.2)), "{scored:?}");
+    assert_eq!(scored.len(), 13);
     fails(&["train", text(&data), "-o", text(&run)], 2, &["--resume", "--force"]);
     ok(&["train", text(&data), "-o", text(&run), "--json", "--resume"]);
     assert!(run.join("checkpoint-0000030.safetensors").is_file());
@@ -78,8 +84,11 @@ fn a_whole_life() {
         serde_json::from_str(&ok(&["eval", text(&run), "--json", "--images", text(&pictures)])).unwrap();
     assert_eq!(scores["images"].as_array().unwrap().len(), 12);
     for key in ["dynamic", "total"] {
-        assert!((0.0..=1.0).contains(&scores["dice"][key].as_f64().unwrap()));
+        let dice = scores["dice"][key].as_f64().unwrap();
+        let best = scores["best_dice"][key]["dice"].as_f64().unwrap();
+        assert!((0.0..=best).contains(&dice) && best <= 1.0, "{key}: {dice}, at best {best}");
     }
+    assert!(scores["warnings"].is_array());
     assert!(scores["psnr"].as_f64().unwrap() > 0.0 && scores["ssim"].is_f64());
     assert_eq!(std::fs::read_dir(&pictures).unwrap().count(), 12 + 4 + 1, "pictures, animations and the page");
     assert!(ok(&["eval", text(&run)]).contains("mean of  12 images"));
@@ -477,4 +486,58 @@ fn views_and_detectors_are_the_user_s() {
     ok(&["phantom", text(&own), "--size", "16", "--phases", "1", "--no-volumes", "--angles", "88,3;0,0"]);
     let dataset = nertca_vk::scan::dataset::Dataset::open(&own).unwrap();
     assert_eq!((dataset.training().len(), dataset.validation().len()), (2, 3), "the paper's view at 90, 0 is too near");
+}
+
+/// Starts a training whose lines of JSON are read as they come.
+#[cfg(unix)]
+fn training(data: &Path, run: &Path, extra: &[&str]) -> (std::process::Child, impl Iterator<Item = Value> + use<>) {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
+        .args([&["train", text(data), "-o", text(run), "--json"], extra].concat())
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let lines = std::io::BufRead::lines(std::io::BufReader::new(child.stdout.take().unwrap()));
+    (child, lines.map_while(|line| serde_json::from_str(&line.ok()?).ok()))
+}
+
+#[cfg(unix)]
+fn signal(child: &std::process::Child, name: &str) {
+    assert!(Command::new("kill").args([name, &child.id().to_string()]).status().unwrap().success());
+}
+
+#[test]
+#[cfg(unix)]
+fn scoring_stops_when_told_and_can_be_left_for_later() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = directory.path().join("forty images");
+    ok(&["phantom", text(&data), "--size", "64", "--phases", "10", "--views", "3", "--no-volumes"]);
+    let run = directory.path().join("run");
+    // Forty images that take their time.
+    let slow = [SHORT, &["--set", "train.validate_every=0", "--set", "march.render_samples=2048"]].concat();
+    for name in ["-TERM", "-INT"] {
+        let (mut child, mut lines) = training(&data, &run, &[&slow[..], &["--force"]].concat());
+        assert!(lines.any(|line| line["event"] == "evaluation" && line["images"] == 1), "no image was scored");
+        signal(&child, name);
+        lines.for_each(drop);
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{name}");
+        let saved = nertca_vk::model::checkpoint::newest(&run).unwrap();
+        assert_eq!(nertca_vk::model::checkpoint::Checkpoint::read(&saved).unwrap().model.step, 30);
+        assert!(!run.join("report/evaluation.json").exists(), "what was not scored has no scores");
+    }
+    let unscored = directory.path().join("unscored");
+    let said = ok(&[&["train", text(&data), "-o", text(&unscored), "--json", "--no-eval"], &slow[..]].concat());
+    assert!(said.lines().last().unwrap().contains("\"finished\"") && !unscored.join("report").exists());
+    assert!(std::fs::read_to_string(unscored.join("report.html")).unwrap().contains("Not scored yet"));
+    let mut eval = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
+        .args(["eval", text(&unscored)])
+        .stderr(std::process::Stdio::piped())
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut said = std::io::BufRead::lines(std::io::BufReader::new(eval.stderr.take().unwrap()));
+    assert!(said.any(|line| line.unwrap().contains("4 of 40")), "every tenth is told");
+    signal(&eval, "-TERM");
+    said.for_each(drop);
+    assert_eq!(eval.wait().unwrap().code(), Some(130));
 }

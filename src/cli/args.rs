@@ -392,6 +392,9 @@ pub struct TrainArgs {
     /// One JSON object per line on stdout instead of a progress bar.
     #[arg(long)]
     pub json: bool,
+    /// Leave scores and pictures of the unseen images for `eval`.
+    #[arg(long)]
+    pub no_eval: bool,
     /// Start over in a directory that already holds a run.
     #[arg(short, long)]
     pub force: bool,

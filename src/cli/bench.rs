@@ -16,7 +16,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
-use nertca_vk::run::score::evaluate_model;
+use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::train::timing::{Subject, Timing};
 use nertca_vk::train::trainer::Trainer;
@@ -165,7 +165,10 @@ fn measure(
             })?;
             let score = match dataset.validation().is_empty() {
                 true => None,
-                false => Some(evaluate_model(gpu, &tuning, &newest_model(&directory)?, dataset, None, None)?),
+                false => {
+                    let scoring = ScoreOptions { threshold_per_mm: None, pictures: None, cancel: &never };
+                    Some(evaluate_model(gpu, &tuning, &newest_model(&directory)?, dataset, &scoring, &mut |_| ())?)
+                }
             };
             Some(FullRun {
                 train_s,

@@ -1,14 +1,15 @@
 //! `eval`.
 
 use super::args::{Cli, EvalArgs};
-use super::report::write_page;
+use super::progress::{show_evaluation, stop_flag};
+use super::report::Report;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::run::info::RunInfo;
-use nertca_vk::run::score::evaluate_model;
+use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::eval::Evaluation;
+use nertca_vk::score::eval::{BestDice, BestDices, Evaluation};
 use std::path::Path;
 
 /// Scores a run.
@@ -24,18 +25,31 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     let gpu = cli.open_device()?;
     let model = newest_model(&args.run)?;
     let tuning = cli.tuning(&gpu, &model.config);
-    let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, args.threshold, args.images.as_deref())?;
+    let cancel = stop_flag()?;
+    let scoring = ScoreOptions { threshold_per_mm: args.threshold, pictures: args.images.as_deref(), cancel: &cancel };
+    let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut show_evaluation())?;
     let run = if args.run.is_dir() { args.run.as_path() } else { args.run.parent().unwrap_or(Path::new("")) };
     let (pictures, page) = match &args.images {
         Some(images) => (images.as_path(), images.join("report.html")),
         None => (Path::new(""), run.join("eval.html")),
     };
-    write_page(&gpu, &tuning, &model, &dataset, Some(&evaluation), (run, pictures), &page)?;
+    Report {
+        gpu: &gpu,
+        tuning: &tuning,
+        model: &model,
+        dataset: &dataset,
+        evaluation: Some(&evaluation),
+        warnings: &evaluation.warnings,
+        run,
+        pictures,
+    }
+    .write(&page)?;
     if args.json {
         out!("{}", pretty_json(&evaluation)?);
     } else {
         print_table(&evaluation);
     }
+    evaluation.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     cli.close_device(&gpu)
 }
 
@@ -70,4 +84,10 @@ pub fn print_table(evaluation: &Evaluation) {
         evaluation.threshold.total_per_mm,
         evaluation.threshold.rule
     );
+    let best = |best: Option<BestDice>| match best {
+        Some(best) => format!("{:.3} at {:.4e} per mm", best.dice, best.threshold_per_mm),
+        None => "-".into(),
+    };
+    let BestDices { dynamic, total } = evaluation.best_dice;
+    out!("best Dice over thresholds, found with the masks: {} / {}", best(dynamic), best(total));
 }

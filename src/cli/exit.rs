@@ -9,7 +9,7 @@ const NO_DEVICE: u8 = 3;
 /// What failed may succeed when it is tried again (`EX_TEMPFAIL`): for schedulers.
 const TRY_AGAIN: u8 = 75;
 /// Stopped by Ctrl-C or SIGTERM; what was done is saved.
-const INTERRUPTED: u8 = 130;
+pub const INTERRUPTED: u8 = 130;
 
 /// Exit code of an error; 1 for all that has none of its own.
 pub fn code(error: &Error) -> u8 {

@@ -199,7 +199,12 @@ impl Page<'_> {
                 div { b { (format!("{:.3}", e.ssim)) } "SSIM" }
             }
             h2 { "Scores of " (e.images.len()) " unseen images" }
-            p.lead { "Vessel where attenuation exceeds " (format!("{:.3e}", e.threshold.dynamic_per_mm)) " per mm (" (e.threshold.rule) ")" }
+            p.lead { "Vessel where attenuation exceeds " (format!("{:.3e}", e.threshold.dynamic_per_mm)) " per mm (" (e.threshold.rule) ")."
+                @if let Some(best) = e.best_dice.dynamic {
+                    " No threshold gives the dynamic field more than Dice " (format!("{:.3}", best.dice)) " (at "
+                    (format!("{:.3e}", best.threshold_per_mm)) " per mm, found with the masks)."
+                }
+            }
             div.scroll { table {
                 tr { th { "image" } th { "primary" } th { "secondary" } th { "phase" } th { "Dice dynamic" } th { "Dice total" } th { "PSNR dB" } th { "SSIM" } }
                 @for i in &e.images {

@@ -10,60 +10,104 @@ use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use std::path::Path;
 
-/// Writes `report.html` for a model: its scores with the pictures [`evaluate_model`] left in `pictures`, and, where `run`
-/// is a run directory, how it came about.
-///
-/// # Errors
-/// [`Error::Io`].
-pub fn write_page(
-    gpu: &Gpu,
-    tuning: &Tuning,
-    model: &Model,
-    dataset: &Dataset,
-    evaluation: Option<&Evaluation>,
-    (run, pictures): (&Path, &Path),
-    path: &Path,
-) -> Result<()> {
-    let log = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
-    let metrics: Vec<serde_json::Value> = log.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
-    let latest = |event: &str| metrics.iter().rev().find(|line| line["event"] == event);
-    let mut facts = vec![
-        ("dataset".to_owned(), dataset.path.display().to_string()),
-        ("images".to_owned(), images_of(dataset)),
-        ("iterations".to_owned(), format!("{} of {}", model.step, model.config.train.iterations)),
-        ("parameters".to_owned(), model.layout.len.to_string()),
-        ("preset".to_owned(), model.config.preset.name().to_owned()),
-        (
-            "hull".to_owned(),
-            model.hull.as_ref().map_or("none".into(), |h| format!("{:.3} % of the box", 100.0 * h.share())),
-        ),
-        ("scored on".to_owned(), gpu.info().name.clone()),
-        ("commit".to_owned(), env!("NERTCA_COMMIT").to_owned()),
-    ];
-    if let Some(started) = latest("started") {
-        facts.push(("trained on".into(), started["device"].as_str().unwrap_or_default().to_owned()));
-        let notes = started["notes"].as_array().into_iter().flatten().filter_map(|n| n.as_str());
-        facts.extend(notes.map(|note| ("note".to_owned(), note.to_owned())));
-    } else {
-        facts.extend(tuning.reasons.iter().map(|reason| ("note".to_owned(), reason.clone())));
+/// What `report.html` is made of.
+pub struct Report<'a> {
+    /// Device the model was scored on.
+    pub gpu: &'a Gpu,
+    /// Paths through the kernels.
+    pub tuning: &'a Tuning,
+    /// The fields.
+    pub model: &'a Model,
+    /// Data they were scored with.
+    pub dataset: &'a Dataset,
+    /// Scores, where there are any.
+    pub evaluation: Option<&'a Evaluation>,
+    /// What makes the fields or the scores worth less than they seem.
+    pub warnings: &'a [String],
+    /// Where it may be told how the model came about: a run directory.
+    pub run: &'a Path,
+    /// Where comparison pictures were left.
+    pub pictures: &'a Path,
+}
+
+impl Report<'_> {
+    /// Writes the page.
+    ///
+    /// # Errors
+    /// [`nertca_vk::error::Error::Io`].
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let Report { gpu, tuning, model, dataset, evaluation, run, pictures, .. } = *self;
+        let log = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+        let metrics: Vec<serde_json::Value> = log.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let latest = |event: &str| metrics.iter().rev().find(|line| line["event"] == event);
+        let mut facts = vec![
+            ("dataset".to_owned(), dataset.path.display().to_string()),
+            ("images".to_owned(), images_of(dataset)),
+            ("iterations".to_owned(), format!("{} of {}", model.step, model.config.train.iterations)),
+            ("parameters".to_owned(), model.layout.len.to_string()),
+            ("preset".to_owned(), model.config.preset.name().to_owned()),
+            (
+                "hull".to_owned(),
+                model.hull.as_ref().map_or("none".into(), |h| format!("{:.3} % of the box", 100.0 * h.share())),
+            ),
+            ("scored on".to_owned(), gpu.info().name.clone()),
+            ("commit".to_owned(), env!("NERTCA_COMMIT").to_owned()),
+        ];
+        if let Some(started) = latest("started") {
+            facts.push(("trained on".into(), started["device"].as_str().unwrap_or_default().to_owned()));
+            let notes = started["notes"].as_array().into_iter().flatten().filter_map(|n| n.as_str());
+            facts.extend(notes.map(|note| ("note".to_owned(), note.to_owned())));
+        } else {
+            facts.extend(tuning.reasons.iter().map(|reason| ("note".to_owned(), reason.clone())));
+        }
+        if let Some(s) = latest("finished").and_then(|line| line["train_s"].as_f64()) {
+            facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s of an RTX A5000")));
+        }
+        let frames = dataset.validation().iter();
+        let page = Page {
+            title: run.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned()),
+            facts,
+            warnings: self.all_warnings(),
+            metrics,
+            evaluation,
+            pictures: frames
+                .map(|f| (f.view, f.phase, pictures.join(format!("{}.png", f.name))))
+                .filter(|(_, _, file)| file.is_file())
+                .collect(),
+            config: model.config.to_toml()?,
+        };
+        page.write(path)
     }
-    if let Some(s) = latest("finished").and_then(|line| line["train_s"].as_f64()) {
-        facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s of an RTX A5000")));
+
+    fn all_warnings(&self) -> Vec<String> {
+        let (model, dataset) = (self.model, self.dataset);
+
+        let mut warnings = Vec::new();
+        if model.step < model.config.train.iterations {
+            warnings.push(format!("Not finished: {} of {} iterations.", model.step, model.config.train.iterations));
+        }
+        if model.config.hull.enabled && model.hull.is_none() {
+            warnings.push("No motion hull was used: views may not agree, or too much moves.".to_owned());
+        }
+        if let Some(hull) = model.hull.as_ref().filter(|h| h.share() < 5e-5) {
+            warnings.push(format!(
+                "The motion hull keeps {:.4} % of the box: views hardly agree. Check geometry and phases, or raise \
+             hull.dilate_pixels.",
+                100.0 * hull.share()
+            ));
+        }
+        if self.evaluation.is_none() {
+            warnings.push(match dataset.validation().is_empty() {
+                true => "The dataset has no validation frames: nothing was scored.".to_owned(),
+                false => "Not scored yet: `nertca-vk eval` does it.".to_owned(),
+            });
+        }
+        if !dataset.validation().is_empty() && dataset.validation().iter().all(|f| f.mask.is_none()) {
+            warnings.push("The validation frames have no vessel masks: there is no Dice.".to_owned());
+        }
+        warnings.extend(self.warnings.iter().cloned());
+        warnings
     }
-    let frames = dataset.validation().iter();
-    let page = Page {
-        title: run.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned()),
-        facts,
-        warnings: warnings(model, dataset, evaluation),
-        metrics,
-        evaluation,
-        pictures: frames
-            .map(|f| (f.view, f.phase, pictures.join(format!("{}.png", f.name))))
-            .filter(|(_, _, file)| file.is_file())
-            .collect(),
-        config: model.config.to_toml()?,
-    };
-    page.write(path)
 }
 
 fn images_of(dataset: &Dataset) -> String {
@@ -76,27 +120,4 @@ fn images_of(dataset: &Dataset) -> String {
         dataset.validation().len(),
         dataset.n_phases
     )
-}
-
-fn warnings(model: &Model, dataset: &Dataset, evaluation: Option<&Evaluation>) -> Vec<String> {
-    let mut warnings = Vec::new();
-    if model.step < model.config.train.iterations {
-        warnings.push(format!("Not finished: {} of {} iterations.", model.step, model.config.train.iterations));
-    }
-    if model.config.hull.enabled && model.hull.is_none() {
-        warnings.push("No motion hull was used: views may not agree, or too much moves.".to_owned());
-    }
-    if let Some(hull) = model.hull.as_ref().filter(|h| h.share() < 5e-5) {
-        warnings.push(format!(
-            "The motion hull keeps {:.4} % of the box: views hardly agree. Check geometry and phases, or raise \
-             hull.dilate_pixels.",
-            100.0 * hull.share()
-        ));
-    }
-    if evaluation.is_none() {
-        warnings.push("The dataset has no validation frames: nothing was scored.".to_owned());
-    } else if dataset.validation().iter().all(|f| f.mask.is_none()) {
-        warnings.push("The validation frames have no vessel masks: there is no Dice.".to_owned());
-    }
-    warnings
 }

@@ -1,23 +1,23 @@
-//! `train`: progress, Ctrl-C, report.
+//! `train`: a run and its report.
 
 use super::args::{Cli, TrainArgs};
 use super::eval::print_table;
-use super::report::write_page;
-use indicatif::{ProgressBar, ProgressStyle};
+use super::progress::{print_json, show_progress, stop_flag};
+use super::report::Report;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::files;
 use nertca_vk::formats::nrrd;
 use nertca_vk::model::checkpoint::{self, newest_model};
 use nertca_vk::plan::Plan;
+use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
-use nertca_vk::run::score::evaluate_model;
+use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
-use std::io::IsTerminal;
+use nertca_vk::score::eval::moving_field_warning;
 use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 fn config(args: &TrainArgs) -> Result<Config> {
     let iterations = args.iterations.map(|n| format!("train.iterations={n}"));
@@ -39,14 +39,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
         return export_hull(&config, &dataset, file);
     }
     prepare_directory(run, args)?;
-    let cancel = Arc::new(AtomicBool::new(false));
-    let seen = cancel.clone();
-    ctrlc::set_handler(move || {
-        if seen.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
-        }
-    })
-    .map_err(|e| Error::Internal(format!("Ctrl-C handler: {e}")))?;
+    let cancel = stop_flag()?;
     let gpu = cli.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
     // A resumed run keeps its own configuration, so that is what paths are chosen for.
@@ -54,23 +47,42 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     let tuning = cli.training_tuning(&gpu, &config, &dataset)?;
     let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
     let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
-    let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut observer);
-    drop(observer);
-    outcome?;
+    reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
     let report = run.join("report");
     let (model, page) = (newest_model(run)?, run.join("report.html"));
-    if dataset.validation().is_empty() {
-        write_page(&gpu, &tuning, &model, &dataset, None, (run, &report), &page)?;
-    } else {
-        let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, None, Some(&report))?;
-        write_page(&gpu, &tuning, &model, &dataset, Some(&evaluation), (run, &report), &page)?;
-        let text = nertca_vk::files::pretty_json(&evaluation)?;
-        nertca_vk::files::write_atomic(&report.join("evaluation.json"), text.as_bytes())?;
-        if !args.json {
-            print_table(&evaluation);
-            out!("report: {}, pictures: {}", page.display(), report.display());
+    let mut warnings = Vec::new();
+    let mut evaluation = None;
+    if !args.no_eval && dataset.validation().is_empty() {
+        warnings.extend(moving_field_warning(&Renderer::new(&gpu, &model, tuning.clone())?, &dataset)?);
+    } else if !args.no_eval {
+        let scoring = ScoreOptions { threshold_per_mm: None, pictures: Some(&report), cancel: &cancel };
+        let outcome = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut observer);
+        if let Err(Error::Interrupted) = outcome {
+            let (run, report) = (run.display(), report.display());
+            eprintln!("the run is complete; to score it: nertca-vk eval \"{run}\" --images \"{report}\"");
         }
+        let scores = outcome?;
+        files::write_atomic(&report.join("evaluation.json"), files::pretty_json(&scores)?.as_bytes())?;
+        warnings.clone_from(&scores.warnings);
+        evaluation = Some(scores);
     }
+    drop(observer);
+    Report {
+        gpu: &gpu,
+        tuning: &tuning,
+        model: &model,
+        dataset: &dataset,
+        evaluation: evaluation.as_ref(),
+        warnings: &warnings,
+        run,
+        pictures: &report,
+    }
+    .write(&page)?;
+    if let Some(evaluation) = evaluation.as_ref().filter(|_| !args.json) {
+        print_table(evaluation);
+        out!("report: {}, pictures: {}", page.display(), report.display());
+    }
+    warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     cli.close_device(&gpu)
 }
 
@@ -100,46 +112,4 @@ fn export_hull(config: &Config, dataset: &Dataset, file: &Path) -> Result<()> {
     plan.notes.iter().for_each(|note| eprintln!("{note}"));
     let hull = plan.hull.ok_or_else(|| Error::config("hull", "", "this configuration and dataset give no hull"))?;
     nrrd::write(file, &hull.to_volume(), "phases at which a cell may move")
-}
-
-fn print_json(event: &Event) {
-    if let Ok(line) = serde_json::to_string(event) {
-        out!("{line}");
-    }
-}
-
-fn show_progress() -> impl FnMut(&Event) {
-    let terminal = std::io::stderr().is_terminal();
-    let bar = ProgressBar::new(1);
-    if let Ok(style) = ProgressStyle::with_template("[{bar:30}] {pos}/{len} {msg}") {
-        bar.set_style(style);
-    }
-    let say = move |bar: &ProgressBar, text: String| {
-        if terminal { bar.println(text) } else { eprintln!("{text}") }
-    };
-    move |event| match event {
-        Event::Started { device, step, iterations, parameters, notes } => {
-            bar.set_length(u64::from(*iterations));
-            bar.set_position(u64::from(*step));
-            say(&bar, format!("{device}: {parameters} parameters"));
-            notes.iter().for_each(|n| say(&bar, format!("- {n}")));
-        }
-        Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
-            bar.set_position(u64::from(loss.step));
-            bar.set_message(format!(
-                "loss {:.3e}  PSNR {psnr:.1} dB  {iterations_per_s:.1} it/s  {left_s:.0} s left",
-                loss.total()
-            ));
-        }
-        Event::Validation { step, train_s, dice_dynamic, psnr, ssim, .. } => {
-            let dice = dice_dynamic.map_or("-".into(), |d| format!("{d:.3}"));
-            say(&bar, format!("{step:6} iterations, {train_s:6.1} s: Dice {dice}  PSNR {psnr:.2} dB  SSIM {ssim:.3}"));
-        }
-        Event::Profile { .. } => (),
-        Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
-        Event::Finished { step, train_s, .. } => {
-            bar.finish_and_clear();
-            say(&bar, format!("{step} iterations in {train_s:.1} s of training"));
-        }
-    }
 }

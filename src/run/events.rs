@@ -58,6 +58,17 @@ pub enum Event {
         /// File.
         path: PathBuf,
     },
+    /// Images of the evaluation after training, one by one; not a line of `metrics.jsonl`.
+    Evaluation {
+        /// Images rendered so far.
+        images: usize,
+        /// Images in all.
+        of: usize,
+        /// Seconds of evaluation so far.
+        elapsed_s: f64,
+        /// Estimated seconds to the end; none before the first image.
+        left_s: Option<f64>,
+    },
     /// Device time of each pass of one more iteration, whose result is not kept.
     Profile {
         /// Iterations done before.

@@ -12,7 +12,7 @@ use crate::model::checkpoint::{self, Checkpoint};
 use crate::plan::Plan;
 use crate::run::events::Event;
 use crate::run::log::MetricsLog;
-use crate::run::snapshots::{Job, Keeper, News};
+use crate::run::snapshots::{Answer, Job, SnapshotWorker};
 use crate::scan::dataset::Dataset;
 use crate::score::eval;
 use crate::train::trainer::Trainer;
@@ -83,24 +83,25 @@ pub fn reconstruct(
     })?;
     let mut training = Training::new(trainer);
     let begin = Instant::now();
-    let keeper = Keeper {
+    let worker = SnapshotWorker {
         gpu,
         tuning: options.tuning,
         run: options.run,
         dataset,
         validation: eval::spread_validation(dataset, config.train.validate_images as usize),
         begin,
+        cancel: options.cancel,
     };
     std::thread::scope(|scope| {
-        // At most two snapshots wait: beyond that training waits for the keeper.
+        // At most two snapshots wait: beyond that training waits for the worker.
         let (jobs, to_do) = sync_channel::<Job>(2);
-        let (done, news) = channel::<News>();
-        scope.spawn(move || keeper.work(&to_do, &done));
-        Loop::new(&mut training, &config, options, &mut tell).run(jobs, &news)
+        let (done, answers) = channel::<Answer>();
+        scope.spawn(move || worker.work(&to_do, &done));
+        Loop::new(&mut training, &config, options, &mut tell).run(jobs, &answers)
     })
 }
 
-/// Runs the iterations. Snapshots go to the keeper, which works beside training where `tuning.overlap` says so, and
+/// Runs the iterations. Snapshots go to the worker, which works beside training where `tuning.overlap` says so, and
 /// while training waits otherwise.
 struct Loop<'a> {
     training: &'a mut Training,
@@ -109,7 +110,7 @@ struct Loop<'a> {
     tell: &'a mut dyn FnMut(Event) -> Result<()>,
     first_step: u32,
     end: u32,
-    /// Jobs the keeper has not finished.
+    /// Jobs the worker has not finished.
     waiting: u32,
 }
 
@@ -131,7 +132,7 @@ impl<'a> Loop<'a> {
         }
     }
 
-    fn run(mut self, jobs: SyncSender<Job>, news: &Receiver<News>) -> Result<()> {
+    fn run(mut self, jobs: SyncSender<Job>, answers: &Receiver<Answer>) -> Result<()> {
         let overlap = self.options.tuning.overlap;
         loop {
             let cancelled = self.cancelled();
@@ -142,11 +143,11 @@ impl<'a> Loop<'a> {
                 let job = Job { snapshot: self.training.trainer().snapshot()?, save, validate, train_s };
                 self.waiting += 1;
                 if jobs.send(job).is_err() {
-                    break; // the keeper failed, and says why below
+                    break; // the worker failed, and says why below
                 }
             }
             if !overlap {
-                self.hear_all(news)?;
+                self.await_answers(answers)?;
             }
             if cancelled || step >= self.end {
                 break;
@@ -155,7 +156,7 @@ impl<'a> Loop<'a> {
             while self.training.trainer().submitted() < stop && !self.cancelled() {
                 let progress = self.training.advance(stop)?;
                 self.report(progress)?;
-                news.try_iter().try_for_each(|item| self.hear(item))?;
+                answers.try_iter().try_for_each(|answer| self.take(answer))?;
             }
             if !overlap || stop == self.end || self.cancelled() {
                 let progress = self.training.drain()?;
@@ -163,7 +164,7 @@ impl<'a> Loop<'a> {
             }
         }
         drop(jobs);
-        self.hear_all(news)?;
+        self.await_answers(answers)?;
         if self.training.trainer().step() < self.end {
             return Err(Error::Interrupted);
         }
@@ -201,8 +202,8 @@ impl<'a> Loop<'a> {
         Ok(())
     }
 
-    fn hear(&mut self, item: News) -> Result<()> {
-        match item? {
+    fn take(&mut self, answer: Answer) -> Result<()> {
+        match answer? {
             Some(event) => (self.tell)(event),
             None => {
                 self.waiting -= 1;
@@ -211,10 +212,10 @@ impl<'a> Loop<'a> {
         }
     }
 
-    fn hear_all(&mut self, news: &Receiver<News>) -> Result<()> {
+    fn await_answers(&mut self, answers: &Receiver<Answer>) -> Result<()> {
         while self.waiting > 0 {
-            let item = news.recv().map_err(|_| Error::Internal("the keeper of snapshots is gone".into()))?;
-            self.hear(item)?;
+            let gone = |_| Error::Internal("the worker that saves snapshots is gone".into());
+            self.take(answers.recv().map_err(gone)?)?;
         }
         Ok(())
     }

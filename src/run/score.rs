@@ -1,27 +1,41 @@
 //! Scores of a model on every unseen image, and pictures of them.
 
 use crate::error::{Error, Result};
+use crate::geometry::MM_PER_UNIT;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::render::renderer::Renderer;
+use crate::run::events::Event;
 use crate::scan::dataset::Dataset;
-use crate::score::eval::{Evaluation, evaluate};
+use crate::score::eval::{Evaluation, Scoring, evaluate, moving_field_warning};
 use crate::score::pictures::{self, Window};
+use std::collections::HashMap;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
-/// Evaluates a model on all validation frames and leaves pictures in `directory`, if given: one comparison per
-/// frame and one animation per view.
+/// How to score.
+pub struct ScoreOptions<'a> {
+    /// Dice threshold on attenuation, 1/mm, instead of the rule.
+    pub threshold_per_mm: Option<f64>,
+    /// Directory for pictures: one comparison per image and one animation per view.
+    pub pictures: Option<&'a Path>,
+    /// Set to true to stop after the image under way.
+    pub cancel: &'a AtomicBool,
+}
+
+/// Evaluates a model on all validation frames. `observe` hears of [`Event::Evaluation`] after every image.
 ///
 /// # Errors
-/// Errors of data, device and files.
+/// [`Error::Interrupted`] after a cancel; errors of data, device and files.
 pub fn evaluate_model(
     gpu: &Gpu,
     tuning: &Tuning,
     model: &Model,
     dataset: &Dataset,
-    threshold_per_mm: Option<f64>,
-    directory: Option<&Path>,
+    options: &ScoreOptions<'_>,
+    observe: &mut dyn FnMut(&Event),
 ) -> Result<Evaluation> {
     if model.layout.phases != dataset.n_phases as usize {
         return Err(Error::config(
@@ -32,38 +46,99 @@ pub fn evaluate_model(
     }
     let renderer = Renderer::new(gpu, model, tuning.clone())?;
     let frames: Vec<_> = dataset.validation().iter().collect();
-    let threshold = threshold_per_mm.map(|t| t * crate::geometry::MM_PER_UNIT);
-    let evaluation = evaluate(&renderer, dataset, &frames, model.step, threshold, |frame, seen, threshold| {
-        let Some(directory) = directory else { return Ok(()) };
-        pictures::write_comparison(
-            &directory.join(format!("{}.png", frame.name)),
-            frame,
-            seen,
-            threshold,
-            dataset.width,
-        )
-    })?;
-    if let Some(directory) = directory {
-        write_beats(&renderer, dataset, directory)?;
+    let mut beats = options.pictures.map(|directory| Beats::new(dataset, directory));
+    let missing = beats.as_ref().map_or(0, |beats| beats.missing(dataset).len());
+    let mut pace = Pace::new(frames.len() + missing, options.cancel, observe);
+    let threshold = options.threshold_per_mm.map(|t| t * MM_PER_UNIT);
+    let mut evaluation =
+        evaluate(&renderer, dataset, &frames, model.step, threshold, |scoring| match (scoring, &mut beats) {
+            (Scoring::Rendered, _) => pace.one_more(),
+            (Scoring::Scored { .. }, None) => pace.check(),
+            (Scoring::Scored { frame, rendering, threshold }, Some(beats)) => {
+                pace.check()?;
+                beats.images.insert((frame.view, frame.phase), rendering.dynamic_integral.clone());
+                let path = beats.directory.join(format!("{}.png", frame.name));
+                pictures::write_comparison(&path, frame, rendering, threshold, dataset.width)
+            }
+        })?;
+    if let Some(beats) = beats {
+        beats.write(&renderer, dataset, &mut pace)?;
     }
+    evaluation.warnings.extend(moving_field_warning(&renderer, dataset)?);
     Ok(evaluation)
 }
 
-/// One animation of the dynamic field per validation view.
-fn write_beats(renderer: &Renderer, dataset: &Dataset, directory: &Path) -> Result<()> {
-    let mut views: Vec<usize> = dataset.validation().iter().map(|f| f.view).collect();
-    views.sort_unstable();
-    views.dedup();
-    for (index, view) in views.into_iter().enumerate() {
-        let beat = (0..dataset.n_phases)
-            .map(|phase| {
-                let rays = &dataset.views[view].rays;
-                Ok(renderer.render(rays, dataset.width, dataset.height, phase)?.dynamic_integral)
-            })
-            .collect::<Result<Vec<_>>>()?;
-        let high = beat.iter().flatten().copied().fold(f32::MIN_POSITIVE, f32::max);
-        let path = directory.join(format!("beat-view{index}.gif"));
-        pictures::write_gif(&path, &beat, dataset.width, Window { low: 0.0, high: 0.8 * high }, 90)?;
+/// Counts images, tells of them, and ends the work where that was asked for.
+struct Pace<'a> {
+    done: usize,
+    of: usize,
+    begin: Instant,
+    cancel: &'a AtomicBool,
+    observe: &'a mut dyn FnMut(&Event),
+}
+
+impl<'a> Pace<'a> {
+    fn new(of: usize, cancel: &'a AtomicBool, observe: &'a mut dyn FnMut(&Event)) -> Pace<'a> {
+        let mut pace = Pace { done: 0, of, begin: Instant::now(), cancel, observe };
+        pace.tell();
+        pace
     }
-    Ok(())
+
+    fn tell(&mut self) {
+        let elapsed_s = self.begin.elapsed().as_secs_f64();
+        let each_s = elapsed_s / self.done.max(1) as f64;
+        let left_s = (self.done > 0).then(|| each_s * (self.of - self.done) as f64);
+        (self.observe)(&Event::Evaluation { images: self.done, of: self.of, elapsed_s, left_s });
+    }
+
+    fn one_more(&mut self) -> Result<()> {
+        self.done += 1;
+        self.tell();
+        self.check()
+    }
+
+    fn check(&self) -> Result<()> {
+        if self.cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) }
+    }
+}
+
+/// Animations of the dynamic field, one per validation view.
+struct Beats<'a> {
+    directory: &'a Path,
+    views: Vec<usize>,
+    /// Line integrals of a view at a phase, as far as they are rendered.
+    images: HashMap<(usize, u32), Vec<f32>>,
+}
+
+impl<'a> Beats<'a> {
+    fn new(dataset: &Dataset, directory: &'a Path) -> Beats<'a> {
+        let mut views: Vec<usize> = dataset.validation().iter().map(|f| f.view).collect();
+        views.sort_unstable();
+        views.dedup();
+        Beats { directory, views, images: HashMap::new() }
+    }
+
+    /// Views and phases that no validation frame shows.
+    fn missing(&self, dataset: &Dataset) -> Vec<(usize, u32)> {
+        let every = self.views.iter().flat_map(|view| (0..dataset.n_phases).map(move |phase| (*view, phase)));
+        let seen = |at: &(usize, u32)| dataset.validation().iter().any(|f| (f.view, f.phase) == *at);
+        every.filter(|at| !seen(at)).collect()
+    }
+
+    fn write(mut self, renderer: &Renderer, dataset: &Dataset, pace: &mut Pace<'_>) -> Result<()> {
+        for (view, phase) in self.missing(dataset) {
+            let rays = &dataset.views[view].rays;
+            let seen = renderer.render(rays, dataset.width, dataset.height, phase)?;
+            self.images.insert((view, phase), seen.dynamic_integral);
+            pace.one_more()?;
+        }
+        for (index, view) in self.views.iter().enumerate() {
+            let beat: Vec<Vec<f32>> = (0..dataset.n_phases).filter_map(|p| self.images.remove(&(*view, p))).collect();
+            let high = beat.iter().flatten().copied().fold(f32::MIN_POSITIVE, f32::max);
+            let path = self.directory.join(format!("beat-view{index}.gif"));
+            pictures::write_gif(&path, &beat, dataset.width, Window { low: 0.0, high: 0.8 * high }, 90)?;
+            pace.check()?;
+        }
+        Ok(())
+    }
 }

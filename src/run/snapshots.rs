@@ -1,19 +1,20 @@
 //! Saving and validating snapshots of a run, beside training or between its iterations.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::render::renderer::Renderer;
 use crate::run::events::Event;
 use crate::scan::dataset::{Dataset, Frame};
-use crate::score::eval::evaluate;
+use crate::score::eval::{Scoring, evaluate};
 use crate::train::trainer::Snapshot;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
 use std::time::Instant;
 
-/// What the keeper says: an event, or nothing more about a job.
-pub(super) type News = Result<Option<Event>>;
+/// What the worker answers: an event of a job, or that the job is done.
+pub(super) type Answer = Result<Option<Event>>;
 
 /// A snapshot and what to do with it.
 pub(super) struct Job {
@@ -25,17 +26,19 @@ pub(super) struct Job {
 }
 
 /// Saves and validates snapshots.
-pub(super) struct Keeper<'a> {
+pub(super) struct SnapshotWorker<'a> {
     pub(super) gpu: &'a Gpu,
     pub(super) tuning: &'a Tuning,
     pub(super) run: &'a Path,
     pub(super) dataset: &'a Dataset,
     pub(super) validation: Vec<&'a Frame>,
     pub(super) begin: Instant,
+    /// Ends a validation under way once it is true.
+    pub(super) cancel: &'a AtomicBool,
 }
 
-impl Keeper<'_> {
-    pub(super) fn work(&self, jobs: &Receiver<Job>, done: &Sender<News>) {
+impl SnapshotWorker<'_> {
+    pub(super) fn work(&self, jobs: &Receiver<Job>, done: &Sender<Answer>) {
         let mut renderer = None;
         for job in jobs {
             let mut events = Vec::new();
@@ -63,7 +66,15 @@ impl Keeper<'_> {
                 none => none.insert(Renderer::new(self.gpu, &saved.model, self.tuning.clone())?),
             };
             renderer.set_model(&saved.model)?;
-            let score = evaluate(renderer, self.dataset, &self.validation, step, None, |_, _, _| Ok(()))?;
+            let go_on = |_: Scoring<'_>| match self.cancel.load(Ordering::Relaxed) {
+                true => Err(Error::Interrupted),
+                false => Ok(()),
+            };
+            let score = match evaluate(renderer, self.dataset, &self.validation, step, None, go_on) {
+                // The run ends; what is left to do is to save, not to score.
+                Err(Error::Interrupted) => return Ok(()),
+                score => score?,
+            };
             events.push(Event::Validation {
                 step,
                 train_s,

@@ -1,10 +1,19 @@
 //! Evaluation on views the reconstruction has not seen (method, section 5).
 
 use crate::error::{Error, Result};
+use crate::geometry::MM_PER_UNIT;
+use crate::raster::percentile;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::metrics;
 use serde::Serialize;
+
+/// How a Dice threshold is chosen where nothing else tells.
+const VESSEL_RULE: &str = "Otsu on the predicted maximum projections, held at their 99.5th percentile";
+/// Share of an image's pixels that may change more than what counts as its strongest change.
+const STRONGEST: f64 = 0.005;
+/// A moving field that attenuates less than this share of the strongest change in the data is dead.
+const DEAD_SHARE: f64 = 0.1;
 
 /// Metrics of one image.
 #[derive(Debug, Clone, Serialize)]
@@ -47,6 +56,25 @@ pub struct Thresholds {
     pub rule: &'static str,
 }
 
+/// The best mean Dice that any threshold gives, to tell a bad field from a bad threshold. It is found with the masks of
+/// the scored images themselves, so it is no score.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct BestDice {
+    /// Mean over images with a mask.
+    pub dice: f64,
+    /// The threshold that gives it, per mm.
+    pub threshold_per_mm: f64,
+}
+
+/// Best Dice over thresholds; none without masks.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct BestDices {
+    /// Of the dynamic field.
+    pub dynamic: Option<BestDice>,
+    /// Of both fields.
+    pub total: Option<BestDice>,
+}
+
 /// The outcome.
 #[derive(Debug, Clone, Serialize)]
 pub struct Evaluation {
@@ -54,15 +82,40 @@ pub struct Evaluation {
     pub step: u32,
     /// Mean Dice.
     pub dice: DiceMeans,
+    /// What Dice would be with the best threshold.
+    pub best_dice: BestDices,
     /// Mean PSNR, dB.
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
     /// Thresholds used.
     pub threshold: Thresholds,
+    /// What makes these scores worth less than they seem.
+    pub warnings: Vec<String>,
     /// One row per image.
     pub images: Vec<ImageScore>,
 }
+
+/// What scoring shows of itself as it goes on.
+pub enum Scoring<'a> {
+    /// An image has been rendered.
+    Rendered,
+    /// An image is scored.
+    Scored {
+        /// The image.
+        frame: &'a Frame,
+        /// What the model makes of it.
+        rendering: &'a Rendering,
+        /// Threshold on the dynamic field, per world unit.
+        threshold: f64,
+    },
+}
+
+/// Which quantity of a rendering is compared with the mask.
+type Maxima = fn(&Rendering) -> &[f32];
+
+const DYNAMIC: Maxima = |r| &r.dynamic_max;
+const TOTAL: Maxima = |r| &r.total_max;
 
 /// Threshold on attenuation per world unit for a set of maximum projections.
 fn choose_thresholds(seen: &[Rendering], stated: Option<f64>, given: Option<f64>) -> (f64, f64, &'static str) {
@@ -70,38 +123,41 @@ fn choose_thresholds(seen: &[Rendering], stated: Option<f64>, given: Option<f64>
         (Some(t), _) => (t, t, "given"),
         (None, Some(vessel)) => (vessel / 3.0, vessel / 3.0, "a third of the stated vessel attenuation"),
         (None, None) => {
-            let all = |pick: fn(&Rendering) -> &Vec<f32>| {
-                f64::from(metrics::otsu(&seen.iter().flat_map(|r| pick(r).iter().copied()).collect::<Vec<_>>()))
+            let all = |maxima: Maxima| {
+                let values: Vec<f32> = seen.iter().flat_map(|r| maxima(r).iter().copied()).collect();
+                f64::from(metrics::vessel_threshold(&values))
             };
-            (all(|r| &r.dynamic_max), all(|r| &r.total_max), "Otsu on the predicted maximum projections")
+            (all(DYNAMIC), all(TOTAL), VESSEL_RULE)
         }
     }
 }
 
-/// Scores frames of a dataset. `threshold` (per world unit) overrides the rule; `look` gets every frame
-/// with its rendering and the dynamic threshold.
+/// Scores frames of a dataset. `threshold` (per world unit) overrides the rule. `observe` hears of every image; its
+/// error ends the work.
 ///
 /// # Errors
-/// [`Error::Data`] without frames; device errors; errors of `look`.
+/// [`Error::Data`] without frames; device errors; errors of `observe`.
 pub fn evaluate(
     renderer: &Renderer,
     dataset: &Dataset,
     frames: &[&Frame],
     step: u32,
     threshold: Option<f64>,
-    mut look: impl FnMut(&Frame, &Rendering, f64) -> Result<()>,
+    mut observe: impl FnMut(Scoring<'_>) -> Result<()>,
 ) -> Result<Evaluation> {
     if frames.is_empty() {
         return Err(Error::data(&dataset.path, "frames", "none is for validation"));
     }
-    let seen = frames
-        .iter()
-        .map(|f| renderer.render(&dataset.views[f.view].rays, dataset.width, dataset.height, f.phase))
-        .collect::<Result<Vec<_>>>()?;
+    let mut seen = Vec::new();
+    for frame in frames {
+        let rays = &dataset.views[frame.view].rays;
+        seen.push(renderer.render(rays, dataset.width, dataset.height, frame.phase)?);
+        observe(Scoring::Rendered)?;
+    }
     let (dynamic_threshold, total_threshold, rule) = choose_thresholds(&seen, dataset.vessel_attenuation, threshold);
     let mut images = Vec::new();
     for (frame, rendering) in frames.iter().zip(&seen) {
-        look(frame, rendering, dynamic_threshold)?;
+        observe(Scoring::Scored { frame, rendering, threshold: dynamic_threshold })?;
         let overlap = |values: &[f32], threshold: f64| {
             let mask = frame.mask.as_ref()?;
             let predicted: Vec<bool> = values.iter().map(|v| f64::from(*v) > threshold).collect();
@@ -124,10 +180,16 @@ pub fn evaluate(
         let values: Vec<f64> = images.iter().filter_map(pick).collect();
         (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
     };
-    let per_mm = |t: f64| t / crate::geometry::MM_PER_UNIT;
+    let per_mm = |t: f64| t / MM_PER_UNIT;
+    let best = |maxima: Maxima, used: f64| {
+        let masked = frames.iter().zip(&seen).filter_map(|(f, r)| Some((maxima(r), f.mask.as_deref()?)));
+        let (dice, threshold) = metrics::best_dice(&masked.collect::<Vec<_>>(), used as f32)?;
+        Some(BestDice { dice, threshold_per_mm: per_mm(f64::from(threshold)) })
+    };
     Ok(Evaluation {
         step,
         dice: DiceMeans { dynamic: mean(&|i| i.dice_dynamic), total: mean(&|i| i.dice_total) },
+        best_dice: BestDices { dynamic: best(DYNAMIC, dynamic_threshold), total: best(TOTAL, total_threshold) },
         psnr: mean(&|i| Some(i.psnr)).unwrap_or(f64::NAN),
         ssim: mean(&|i| Some(i.ssim)).unwrap_or(f64::NAN),
         threshold: Thresholds {
@@ -135,8 +197,44 @@ pub fn evaluate(
             total_per_mm: per_mm(total_threshold),
             rule,
         },
+        warnings: Vec::new(),
         images,
     })
+}
+
+/// The training image that changed most over time, and by how much: above the smallest value of each pixel over the
+/// phases of its view, at all but the strongest [`STRONGEST`] of its pixels. None where nothing changes.
+fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
+    let changes = dataset.training_views().into_iter().flat_map(|view| {
+        let frames: Vec<&Frame> = dataset.training().iter().filter(|f| f.view == view).collect();
+        let still: Vec<f32> = (0..dataset.n_pixels())
+            .map(|p| frames.iter().map(|f| f.integrals[p]).fold(f32::INFINITY, f32::min))
+            .collect();
+        frames.into_iter().map(move |frame| {
+            let above: Vec<f32> = frame.integrals.iter().zip(&still).map(|(v, s)| v - s).collect();
+            (frame, f64::from(percentile(&above, 1.0 - STRONGEST)))
+        })
+    });
+    changes.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, change)| *change > 0.0)
+}
+
+/// Says so when the moving field has died: when it attenuates less than [`DEAD_SHARE`] of the strongest change over time
+/// in the data, where that change was seen.
+///
+/// # Errors
+/// Device errors.
+pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Option<String>> {
+    let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
+    let rays = &dataset.views[frame.view].rays;
+    let seen = renderer.render(rays, dataset.width, dataset.height, frame.phase)?;
+    let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
+    Ok((strongest < DEAD_SHARE * change).then(|| {
+        format!(
+            "The moving field has died: its line integrals reach {strongest:.2e} where the images change by {change:.2e}. \
+             Dice says nothing here. Views may disagree by more than the motion hull allows: check geometry and phases; \
+             a smaller hull.dilate_pixels, a lower dynamic.lr or another seed may help."
+        )
+    }))
 }
 
 /// `n` of the dataset's validation frames, evenly spread.

@@ -1,0 +1,98 @@
+//! What a person or a program sees of a run while it goes on, and how it is told to stop.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use nertca_vk::error::{Error, Result};
+use nertca_vk::run::events::Event;
+use std::io::IsTerminal;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A flag that Ctrl-C and SIGTERM set; another of them ends the program at once.
+pub fn stop_flag() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let seen = stop.clone();
+    ctrlc::set_handler(move || {
+        if seen.swap(true, Ordering::Relaxed) {
+            std::process::exit(i32::from(super::exit::INTERRUPTED));
+        }
+        eprintln!("nertca-vk: stopping after the work under way; once more to stop at once");
+    })
+    .map_err(|e| Error::Internal(format!("Ctrl-C handler: {e}")))?;
+    Ok(stop)
+}
+
+/// One JSON object per line on stdout.
+pub fn print_json(event: &Event) {
+    if let Ok(line) = serde_json::to_string(event) {
+        out!("{line}");
+    }
+}
+
+fn bar(template: &str) -> ProgressBar {
+    let bar = ProgressBar::new(1);
+    if let Ok(style) = ProgressStyle::with_template(template) {
+        bar.set_style(style);
+    }
+    bar
+}
+
+/// A bar and lines on stderr.
+pub fn show_progress() -> impl FnMut(&Event) {
+    let terminal = std::io::stderr().is_terminal();
+    let bar = bar("[{bar:30}] {pos}/{len} {msg}");
+    let say = move |bar: &ProgressBar, text: String| {
+        if terminal { bar.println(text) } else { eprintln!("{text}") }
+    };
+    let mut evaluation = show_evaluation();
+    move |event| match event {
+        Event::Started { device, step, iterations, parameters, notes } => {
+            bar.set_length(u64::from(*iterations));
+            bar.set_position(u64::from(*step));
+            say(&bar, format!("{device}: {parameters} parameters"));
+            notes.iter().for_each(|n| say(&bar, format!("- {n}")));
+        }
+        Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
+            bar.set_position(u64::from(loss.step));
+            bar.set_message(format!(
+                "loss {:.3e}  PSNR {psnr:.1} dB  {iterations_per_s:.1} it/s  {left_s:.0} s left",
+                loss.total()
+            ));
+        }
+        Event::Validation { step, train_s, dice_dynamic, psnr, ssim, .. } => {
+            let dice = dice_dynamic.map_or("-".into(), |d| format!("{d:.3}"));
+            say(&bar, format!("{step:6} iterations, {train_s:6.1} s: Dice {dice}  PSNR {psnr:.2} dB  SSIM {ssim:.3}"));
+        }
+        Event::Evaluation { .. } => evaluation(event),
+        Event::Profile { .. } => (),
+        Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
+        Event::Finished { step, train_s, .. } => {
+            bar.finish_and_clear();
+            say(&bar, format!("{step} iterations in {train_s:.1} s of training"));
+        }
+    }
+}
+
+/// A bar for an evaluation; where stderr is no terminal, a line for every tenth of it.
+pub fn show_evaluation() -> impl FnMut(&Event) {
+    let terminal = std::io::stderr().is_terminal();
+    let mut shown = None;
+    move |event| {
+        let Event::Evaluation { images, of, left_s, .. } = event else { return };
+        let left = left_s.map_or(String::new(), |s| format!(", {s:.0} s left"));
+        if !terminal {
+            let tenth = images * 10 / (*of).max(1);
+            if shown.as_ref().is_none_or(|(_, last)| *last != tenth) {
+                eprintln!("unseen images: {images} of {of}{left}");
+                shown = Some((ProgressBar::hidden(), tenth));
+            }
+            return;
+        }
+        let (bar, _) = shown.get_or_insert_with(|| (bar("[{bar:30}] {pos}/{len} unseen images{msg}"), 0));
+        bar.set_length(*of as u64);
+        bar.set_position(*images as u64);
+        bar.set_message(left);
+        if images == of {
+            bar.finish_and_clear();
+        }
+    }
+}
