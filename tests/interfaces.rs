@@ -5,6 +5,9 @@
 mod program;
 
 use program::program;
+#[path = "common/shared.rs"]
+mod shared;
+
 use nertca_vk::formats::npy;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -93,17 +96,7 @@ fn a_whole_life() {
     assert_eq!(std::fs::read_dir(&pictures).unwrap().count(), 12 + 4 + 1, "pictures, animations and the page");
     assert!(ok(&["eval", text(&run)]).contains("mean of  12 images"));
 
-    for (file, extra) in [
-        ("a.png", &["--component", "static"][..]),
-        ("a.npy", &["--phase", "all", "--projection", "mip", "--component", "dynamic"]),
-        ("a.gif", &["--phase", "all", "--size", "31"]),
-    ] {
-        let out = directory.path().join(file);
-        ok(&[&["render", text(&run), "--primary", "-20", "--secondary", "12.5", "-o", text(&out)], extra].concat());
-        assert!(out.metadata().unwrap().len() > 100);
-    }
-    let array = npy::read(&directory.path().join("a.npy"), 1 << 20).unwrap();
-    assert_eq!(array.shape, [3, 24, 24]);
+    renders_show_the_fields(directory.path(), &run);
     assert!(ok(&["info", text(&run)]).contains("step: 30"));
     assert!(ok(&["info", text(&data)]).contains("phases: 3"));
     let hull = directory.path().join("hull.nrrd");
@@ -126,6 +119,43 @@ fn a_whole_life() {
         2,
         &["--phase", "2"],
     );
+}
+
+/// Renders a run in every format: pictures, numbers and animations say the same.
+fn renders_show_the_fields(directory: &Path, run: &Path) {
+    let render = |file: &str, extra: &[&str]| {
+        let out = directory.join(file);
+        ok(&[&["render", text(run), "--primary", "-20", "--secondary", "12.5", "-o", text(&out)], extra].concat());
+        out
+    };
+    let read = |file: &str, extra: &[&str]| npy::read(&render(file, extra), 1 << 20).unwrap();
+    let still = read("still.npy", &["--component", "static"]);
+    assert_eq!(still.shape, [24, 24]);
+    let (low, high) = still.values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+    assert!(low >= 0.0 && high > low, "{low} to {high}");
+    // Dark is much: the picture is the numbers, enlarged nine times.
+    let picture = image::open(render("a.png", &["--component", "static"])).unwrap().to_luma8();
+    assert_eq!(picture.dimensions(), (216, 216));
+    for (i, value) in still.values.iter().enumerate() {
+        let code = picture.get_pixel(9 * (i as u32 % 24) + 4, 9 * (i as u32 / 24) + 4).0[0];
+        let wanted = 255.0 * (1.0 - (value - low) / (high - low));
+        assert!((f32::from(code) - wanted).abs() <= 1.0, "pixel {i}: {code}, not {wanted}");
+    }
+    // All phases, and one of them alone.
+    let every = read("every.npy", &["--phase", "all", "--projection", "mip", "--component", "dynamic"]);
+    let one = read("one.npy", &["--phase", "2", "--projection", "mip", "--component", "dynamic"]);
+    assert_eq!(every.shape, [3, 24, 24]);
+    assert!(every.values[2 * 576..] == one.values[..] && every.values.iter().any(|v| *v > 0.0));
+    let gif =
+        std::io::BufReader::new(std::fs::File::open(render("a.gif", &["--phase", "all", "--size", "31"])).unwrap());
+    let frames = image::codecs::gif::GifDecoder::new(gif).unwrap();
+    let frames = image::AnimationDecoder::into_frames(frames).collect_frames().unwrap();
+    assert_eq!(frames.len(), 3);
+    for frame in &frames {
+        assert_eq!(frame.buffer().dimensions(), (217, 217));
+        let grey: Vec<u8> = frame.buffer().pixels().map(|p| p.0[0]).collect();
+        assert!(grey.iter().max().unwrap() - grey.iter().min().unwrap() > 100, "a frame shows nothing");
+    }
 }
 
 #[test]
@@ -155,11 +185,7 @@ fn both_layouts_hold_the_same_data() {
 
 #[test]
 fn real_anatomy_makes_a_dataset() {
-    let anatomy = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/anatomy");
-    if !anatomy.is_dir() {
-        eprintln!("SKIPPED: {} is absent", anatomy.display());
-        return;
-    }
+    let Some(anatomy) = shared::shared("anatomy") else { return };
     let directory = tempfile::tempdir().unwrap();
     let out = directory.path().join("real");
     let (tree, ct) = (anatomy.join("coronary_tree_hra.json"), anatomy.join("thorax_ct.nii.gz"));
@@ -250,21 +276,9 @@ fn malformed_datasets_are_named_file_and_field() {
             &["1.npy", "truncated"],
         ),
         ("empty image", |d, _| std::fs::write(d.join("1.npy"), b"").unwrap(), &["1.npy"]),
-        (
-            "wrong shape",
-            |d, _| npy::write(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(),
-            &["1.npy", "shape"],
-        ),
-        (
-            "three axes",
-            |d, _| npy::write(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(),
-            &["1.npy", "two axes"],
-        ),
-        (
-            "not a number",
-            |d, _| npy::write(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(),
-            &["1.npy", "row 0"],
-        ),
+        ("wrong shape", |d, _| npy::write(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(), &["1.npy", "shape"]),
+        ("three axes", |d, _| npy::write(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(), &["1.npy", "two axes"]),
+        ("not a number", |d, _| npy::write(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(), &["1.npy", "row 0"]),
         ("phase", |_, m| m["frames"][1]["phase"] = json!(2), &["dataset.json", "frames[1].phase"]),
         ("negative phase", |_, m| m["frames"][1]["phase"] = json!(-1), &["dataset.json", "line"]),
         ("no frames", |_, m| m["frames"] = json!([]), &["dataset.json", "frames"]),
@@ -401,7 +415,13 @@ fn measurements_and_baked_views() {
     let picture = directory.path().join("baked.npy");
     let pose = ["render", text(&run), "--primary", "10", "--component", "dynamic", "--phase", "1"];
     ok(&[&pose[..], &["--baked", "--out", text(&picture)]].concat());
-    assert!(std::fs::metadata(&picture).unwrap().len() >= 24 * 24 * 4);
+    let fields = directory.path().join("fields.npy");
+    ok(&[&pose[..], &["--out", text(&fields)]].concat());
+    let [baked, fields] = [&picture, &fields].map(|file| npy::read(file, 1 << 20).unwrap());
+    assert_eq!((&baked.shape[..], &fields.shape[..]), (&[24, 24][..], &[24, 24][..]));
+    let largest = fields.values.iter().copied().fold(0.0, f32::max);
+    let apart = baked.values.iter().zip(&fields.values).map(|(a, b)| (a - b).abs()).sum::<f32>() / 576.0;
+    assert!(largest > 0.0 && apart < 0.05 * largest, "{apart} apart on average, of {largest}");
     let said = ok(&["render", text(&run), "--fps", "--size", "16"]);
     assert_eq!(said.lines().filter(|l| l.contains("frames/s")).count(), 6, "{said}");
 }
@@ -418,6 +438,100 @@ fn matrices_are_refused_where_there_are_none() {
     let run = directory.path().join("run");
     let asked = [&["--layers", "matrices", "train", text(&data), "-o", text(&run)], SHORT];
     fails(&asked.concat(), 2, &["cooperative matrices", "f32"]);
+}
+
+/// Starts a training whose lines of JSON are read as they come.
+#[cfg(unix)]
+fn training(data: &Path, run: &Path, extra: &[&str]) -> (std::process::Child, impl Iterator<Item = Value> + use<>) {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
+        .args([&["train", text(data), "-o", text(run), "--json"], extra].concat())
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let lines = std::io::BufRead::lines(std::io::BufReader::new(child.stdout.take().unwrap()));
+    (child, lines.map_while(|line| serde_json::from_str(&line.ok()?).ok()))
+}
+
+#[cfg(unix)]
+fn signal(child: &std::process::Child, name: &str) {
+    assert!(Command::new("kill").args([name, &child.id().to_string()]).status().unwrap().success());
+}
+
+#[test]
+#[cfg(unix)]
+fn scoring_stops_when_told_and_can_be_left_for_later() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = directory.path().join("forty images");
+    ok(&["phantom", text(&data), "--size", "64", "--phases", "10", "--views", "3", "--no-volumes"]);
+    let run = directory.path().join("run");
+    // Forty images that take their time.
+    let slow = [SHORT, &["--set", "train.validate_every=0", "--set", "march.render_samples=2048"]].concat();
+    for name in ["-TERM", "-INT"] {
+        let (mut child, mut lines) = training(&data, &run, &[&slow[..], &["--force"]].concat());
+        assert!(lines.any(|line| line["event"] == "evaluation" && line["images"] == 1), "no image was scored");
+        signal(&child, name);
+        lines.for_each(drop);
+        assert_eq!(child.wait().unwrap().code(), Some(130), "{name}");
+        let saved = nertca_vk::model::checkpoint::newest(&run).unwrap();
+        assert_eq!(nertca_vk::model::checkpoint::Checkpoint::read(&saved).unwrap().model.step, 30);
+        assert!(!run.join("report/evaluation.json").exists(), "what was not scored has no scores");
+    }
+    let unscored = directory.path().join("unscored");
+    let said = ok(&[&["train", text(&data), "-o", text(&unscored), "--json", "--no-eval"], &slow[..]].concat());
+    assert!(said.lines().last().unwrap().contains("\"finished\"") && !unscored.join("report").exists());
+    assert!(std::fs::read_to_string(unscored.join("report.html")).unwrap().contains("Not scored yet"));
+    let mut eval = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
+        .args(["eval", text(&unscored)])
+        .stderr(std::process::Stdio::piped())
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut said = std::io::BufRead::lines(std::io::BufReader::new(eval.stderr.take().unwrap()));
+    assert!(said.any(|line| line.unwrap().contains("4 of 40")), "every tenth is told");
+    signal(&eval, "-TERM");
+    said.for_each(drop);
+    assert_eq!(eval.wait().unwrap().code(), Some(130));
+}
+
+#[test]
+#[cfg(unix)]
+fn a_run_killed_at_random_ends_in_the_same_file() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = phantom(directory.path(), &[]);
+    let settings = [SHORT, &["--set", "train.checkpoint_every=3", "--set", "train.validate_every=0"]].concat();
+    let settings =
+        [&settings[..], &["--set", "train.iterations_per_submit=1", "--set", "dynamic.delay=5", "--no-eval"]].concat();
+    let (whole, killed) = (directory.path().join("whole"), directory.path().join("killed"));
+    ok(&[&["train", text(&data), "-o", text(&whole)], &settings[..]].concat());
+    // Killed after so many lines, again and again, until it is through; the moments come from a fixed seed.
+    let mut random = 0x2545_f491_4f6c_dd1du64;
+    let mut kills = 0;
+    let last = killed.join("checkpoint-0000030.safetensors");
+    for _ in 0..40 {
+        let saved = nertca_vk::model::checkpoint::list(&killed).is_ok_and(|found| !found.is_empty());
+        let begin = if saved { vec!["--resume", "--no-eval"] } else { [&settings[..], &["--force"]].concat() };
+        let (mut child, mut lines) = training(&data, &killed, &begin);
+        random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        let through = lines.nth(1 + (random >> 33) as usize % 5).is_none();
+        if !through {
+            child.kill().unwrap();
+            kills += 1;
+        }
+        lines.for_each(drop);
+        let _ = child.wait().unwrap();
+        if last.is_file() {
+            break;
+        }
+        // As a kill in the middle of a checkpoint leaves it.
+        std::fs::write(killed.join(".partial-abcdef"), b"half").unwrap();
+    }
+    ok(&["train", text(&data), "-o", text(&killed), "--resume", "--no-eval"]);
+    assert!(kills >= 3, "{kills} kills");
+    let [a, b] = [&whole, &killed].map(|run| std::fs::read(run.join("checkpoint-0000030.safetensors")).unwrap());
+    assert!(a == b, "the files differ after {kills} kills");
+    let hidden = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with(".partial");
+    assert!(!std::fs::read_dir(&killed).unwrap().any(|entry| hidden(&entry.unwrap())), "half a file is left");
 }
 
 #[test]
@@ -486,58 +600,4 @@ fn views_and_detectors_are_the_user_s() {
     ok(&["phantom", text(&own), "--size", "16", "--phases", "1", "--no-volumes", "--angles", "88,3;0,0"]);
     let dataset = nertca_vk::scan::dataset::Dataset::open(&own).unwrap();
     assert_eq!((dataset.training().len(), dataset.validation().len()), (2, 3), "the paper's view at 90, 0 is too near");
-}
-
-/// Starts a training whose lines of JSON are read as they come.
-#[cfg(unix)]
-fn training(data: &Path, run: &Path, extra: &[&str]) -> (std::process::Child, impl Iterator<Item = Value> + use<>) {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
-        .args([&["train", text(data), "-o", text(run), "--json"], extra].concat())
-        .stdout(std::process::Stdio::piped())
-        .stderr(std::process::Stdio::null())
-        .spawn()
-        .unwrap();
-    let lines = std::io::BufRead::lines(std::io::BufReader::new(child.stdout.take().unwrap()));
-    (child, lines.map_while(|line| serde_json::from_str(&line.ok()?).ok()))
-}
-
-#[cfg(unix)]
-fn signal(child: &std::process::Child, name: &str) {
-    assert!(Command::new("kill").args([name, &child.id().to_string()]).status().unwrap().success());
-}
-
-#[test]
-#[cfg(unix)]
-fn scoring_stops_when_told_and_can_be_left_for_later() {
-    let directory = tempfile::tempdir().unwrap();
-    let data = directory.path().join("forty images");
-    ok(&["phantom", text(&data), "--size", "64", "--phases", "10", "--views", "3", "--no-volumes"]);
-    let run = directory.path().join("run");
-    // Forty images that take their time.
-    let slow = [SHORT, &["--set", "train.validate_every=0", "--set", "march.render_samples=2048"]].concat();
-    for name in ["-TERM", "-INT"] {
-        let (mut child, mut lines) = training(&data, &run, &[&slow[..], &["--force"]].concat());
-        assert!(lines.any(|line| line["event"] == "evaluation" && line["images"] == 1), "no image was scored");
-        signal(&child, name);
-        lines.for_each(drop);
-        assert_eq!(child.wait().unwrap().code(), Some(130), "{name}");
-        let saved = nertca_vk::model::checkpoint::newest(&run).unwrap();
-        assert_eq!(nertca_vk::model::checkpoint::Checkpoint::read(&saved).unwrap().model.step, 30);
-        assert!(!run.join("report/evaluation.json").exists(), "what was not scored has no scores");
-    }
-    let unscored = directory.path().join("unscored");
-    let said = ok(&[&["train", text(&data), "-o", text(&unscored), "--json", "--no-eval"], &slow[..]].concat());
-    assert!(said.lines().last().unwrap().contains("\"finished\"") && !unscored.join("report").exists());
-    assert!(std::fs::read_to_string(unscored.join("report.html")).unwrap().contains("Not scored yet"));
-    let mut eval = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
-        .args(["eval", text(&unscored)])
-        .stderr(std::process::Stdio::piped())
-        .stdout(std::process::Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut said = std::io::BufRead::lines(std::io::BufReader::new(eval.stderr.take().unwrap()));
-    assert!(said.any(|line| line.unwrap().contains("4 of 40")), "every tenth is told");
-    signal(&eval, "-TERM");
-    said.for_each(drop);
-    assert_eq!(eval.wait().unwrap().code(), Some(130));
 }

@@ -2,6 +2,9 @@
 //! beside the project): imported, reconstructed, and laid over themselves.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
+#[path = "common/shared.rs"]
+mod shared;
+
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
@@ -9,19 +12,14 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::metrics::otsu;
+use nertca_vk::score::metrics::vessel_threshold;
 use nertca_vk::train::trainer::Trainer;
+use shared::shared;
 use std::path::PathBuf;
 
 fn runs() -> Option<Vec<PathBuf>> {
-    let beside = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let data = std::env::var_os("NERTCA_DATA").map_or(beside, PathBuf::from).join("xa");
-    let files: Vec<_> = (1..=4).map(|i| data.join(format!("IM{i}.dcm"))).collect();
-    if files.iter().all(|f| f.is_file()) {
-        return Some(files);
-    }
-    eprintln!("SKIPPED: the angiography runs are not at {}", data.display());
-    None
+    let folder = shared("xa")?;
+    Some((1..=4).map(|i| folder.join(format!("IM{i}.dcm"))).collect())
 }
 
 fn options() -> ImportOptions {
@@ -120,7 +118,7 @@ fn the_reconstruction_lies_on_the_vessels_it_was_made_from() {
             renderer.render(&dataset.views[view].rays, dataset.width, dataset.height, 0).unwrap().dynamic_integral;
         let line = |values: &[f32]| {
             let positive: Vec<f32> = values.iter().copied().filter(|v| *v > 0.0).collect();
-            let limit = otsu(&positive);
+            let limit = vessel_threshold(&positive);
             centreline(&values.iter().map(|v| *v > limit).collect::<Vec<_>>(), dataset.width)
         };
         let (real, seen) = (line(&real), line(&seen));
