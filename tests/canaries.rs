@@ -1,0 +1,95 @@
+//! Nothing is read that was not written, and nothing is written beside its buffer: every buffer of a training run and of
+//! renderings starts out with a loud pattern and has canaries behind it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+mod shim;
+
+use common::{expect_silence, run, small_config, small_dataset};
+use nertca_vk::gpu::buffer::Operands;
+use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::kernels::tuning::{Layers, Tuning};
+use nertca_vk::model::component::Component;
+use nertca_vk::plan::Plan;
+use nertca_vk::render::baked::Baked;
+use nertca_vk::render::quantity::{Projection, Quantity};
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::train::trainer::Trainer;
+use std::sync::Arc;
+
+/// NaN as f32, as either f16 half, and far out of range as an index.
+const NOT_A_NUMBER: u32 = 0xffc1_ffc1;
+/// Large but finite as f32 and f16, since a maximum with NaN may hide it.
+const LARGE: u32 = 0x7bff_7bff;
+
+/// A CPU driver, whose memory the host can reach.
+fn gpu() -> Gpu {
+    let select = Some("llvmpipe".to_owned());
+    Gpu::open(&DeviceOptions { select, validation: true, loader: Some(shim::loader()), ..DeviceOptions::default() })
+        .expect("this test needs Mesa's CPU driver (Debian: mesa-vulkan-drivers) and vulkan-validationlayers")
+}
+
+/// Trains a little and draws, in memory that starts out as `word`; everything that came of it, as bits.
+fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning) -> Tuning) -> Vec<u32> {
+    shim::begin_poison(word);
+    let gpu = gpu();
+    let tuning = choose(Tuning::for_device(gpu.info()));
+    let dataset = small_dataset(13, 11);
+    let plan = Plan::new(&small_config(preset, settings), &dataset).unwrap();
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning.clone()).unwrap();
+    let losses = run(&mut trainer, 9);
+    let checkpoint = trainer.checkpoint().unwrap();
+    let renderer = Renderer::new(&gpu, &checkpoint.model, tuning).unwrap();
+    let rays = &dataset.views[1].rays;
+    let exact = renderer.render(rays, 13, 11, 2).unwrap();
+    let baked = Baked::for_display(Arc::new(renderer), &checkpoint.model, 4.0);
+    let total = Quantity { component: Component::Total, projection: Projection::Drr };
+    let quick = baked.render(rays, 13, 11, 2, total).unwrap();
+    drop((trainer, baked));
+    expect_silence(gpu);
+    let (filled, unreachable, broken) = shim::end_poison();
+    assert!(filled > 60 && unreachable == 0, "{filled} buffers were filled, {unreachable} could not be");
+    assert_eq!(broken, Vec::<String>::new());
+    let numbers = checkpoint.model.params.iter().chain(checkpoint.moments.as_flattened());
+    let pictures = exact.static_integral.iter().chain(&exact.dynamic_integral).chain(&quick);
+    let numbers: Vec<f32> = numbers.chain(pictures).copied().chain(losses.iter().map(|l| *l as f32)).collect();
+    assert!(numbers.iter().all(|v| v.is_finite()), "something that was never written was read");
+    numbers.iter().map(|v| v.to_bits()).chain(checkpoint.occupancy).collect()
+}
+
+#[track_caller]
+fn expect_the_same(preset: &str, settings: &[&str], choose: &dyn Fn(Tuning) -> Tuning) {
+    let one = everything(NOT_A_NUMBER, preset, settings, choose);
+    let other = everything(LARGE, preset, settings, choose);
+    assert!(one == other, "results depend on what memory held before");
+}
+
+/// Several chunks, a hull, empty cells that are learned.
+const FULL: &[&str] = &[
+    "train.chunk_samples=1024",
+    "train.rays=90",
+    "hull.enabled=true",
+    "hull.max_share=1",
+    "hull.resolution=24",
+    "occupancy.start=2",
+];
+
+#[test]
+fn f32_layers_mind_their_buffers() {
+    for operands in [Operands::Texel, Operands::Storage, Operands::Address] {
+        let choose = move |tuning| Tuning { layers: Layers::F32, operands, ..tuning };
+        expect_the_same("fast", FULL, &choose);
+    }
+    let choose = |tuning| Tuning { layers: Layers::F32, ..tuning };
+    expect_the_same("paper", &["dynamic.occlusion=1e-3"], &choose);
+}
+
+#[test]
+fn matrix_layers_mind_their_buffers() {
+    if gpu().info().matrices.is_empty() {
+        assert!(std::env::var("NERTCA_MATRICES").is_err(), "this driver has no cooperative matrices");
+        println!("skipped: this driver has no cooperative matrices");
+        return;
+    }
+    expect_the_same("fast", FULL, &|tuning| tuning.with_layers(Layers::Matrices, String::new()));
+}
