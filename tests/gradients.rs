@@ -112,20 +112,38 @@ fn lookup_and_scatter_are_adjoint() {
     }
 }
 
-/// <A sigma, r> = <sigma, A' r> for the ray sum: the integral is linear in attenuation.
+/// <J p, r> = <p, J' r> for the line integrals of both fields and their backward pass, along directions in which features
+/// are linear: planes with fixed lines, and the output neuron with fixed layers.
 #[test]
-fn ray_sum_and_its_adjoint_agree() {
-    let plan = plan("paper", &["loss.normalise=true"]);
+fn line_integrals_and_their_backward_pass_are_adjoint() {
+    let plan = plan("paper", &["loss.normalise=true", "dynamic.occlusion=0"]);
+    let (s, p) = (&plan.setup, &plan.params);
     let params = start(&plan);
     let rays = march::batch(&plan, 1);
-    let (mut left, mut right) = (0.0, 0.0);
+    let random = |a: u32, b: usize| random::uniform01(11, 78, a, b as u32) - 0.5;
+    let planes = 0..p.line(0, 0, 0);
+    let out_neuron = (p.out_weights..p.out_weights + p.width).chain([p.out_bias]);
+    let mut direction = vec![0.0; p.len];
+    planes.chain(out_neuron).for_each(|i| direction[i] = random(0, i));
+    let moved: Vec<f64> = params.iter().zip(&direction).map(|(p, d)| p + d).collect();
+    let (mut left, mut gradient) = ([0.0; 2], vec![0.0; p.len]);
     for (index, ray) in rays.iter().enumerate() {
         let seen = march::fwd(&plan, &params, 1, ray, true, Precision::Exact);
-        let r = 0.3 + index as f64;
-        left += r * seen.static_integral;
-        for sample in &seen.statics {
-            right += field::static_attenuation(&plan.setup, &plan.params, &params, sample.x) * (r * sample.dl);
+        let then = march::fwd(&plan, &moved, 1, ray, true, Precision::Exact);
+        let r = [random(1, index), random(2, index)];
+        for (a, b) in seen.statics.iter().zip(&then.statics) {
+            let slope = f64::from(s.static_gain) * field::sigmoid(a.feature + f64::from(s.static_shift));
+            left[0] += r[0] * a.dl * slope * (b.feature - a.feature);
         }
+        for (a, b) in seen.dynamics.iter().zip(&then.dynamics) {
+            let slope = f64::from(s.dynamic_gain) * field::sigmoid(a.trace.feature + f64::from(s.dynamic_shift));
+            left[1] += r[1] * a.dl * slope * (b.trace.feature - a.trace.feature);
+        }
+        march::bwd(&plan, &params, ray, &seen, r, Precision::Exact, &mut gradient);
     }
-    assert!((left - right).abs() < 1e-10 * left.abs() && left > 0.0, "{left} against {right}");
+    let dot = |range: std::ops::Range<usize>| -> f64 { range.map(|i| direction[i] * gradient[i]).sum() };
+    for (left, right) in left.into_iter().zip([dot(0..p.static_len), dot(p.static_len..p.len)]) {
+        assert!((left - right).abs() < 1e-10 * left.abs(), "{left} against {right}");
+        assert!(left.abs() > 1e-3, "the identity must not be trivial");
+    }
 }

@@ -14,7 +14,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::reference::field::Precision;
 use nertca_vk::reference::{march, step};
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::train::calibrate;
+use nertca_vk::train::calibrate::{self, Verdict};
 use nertca_vk::train::trainer::Trainer;
 
 /// The twin rounds where the kernels round.
@@ -173,10 +173,14 @@ fn both_paths_are_timed_and_the_verdict_is_kept() {
     let config = small_config("fast", &[]);
     let verdict = calibrate::measure(&gpu, &config, &small_dataset(13, 11), &tuning).unwrap();
     assert!(verdict.f32_ms > 0.0 && verdict.matrices_ms > 0.0);
-    let faster = if verdict.matrices_ms < verdict.f32_ms { Layers::Matrices } else { Layers::F32 };
-    let applied = verdict.apply(tuning);
-    assert_eq!(applied.layers, faster);
-    assert!(applied.reasons.iter().any(|r| r.contains("timed once")), "{:?}", applied.reasons);
+    for (f32_ms, matrices_ms, faster) in
+        [(2.0, 1.0, Layers::Matrices), (1.0, 2.0, Layers::F32), (1.0, 1.0, Layers::F32)]
+    {
+        let applied = Verdict { f32_ms, matrices_ms }.apply(tuning.clone());
+        assert_eq!(applied.layers, faster);
+        let told = format!("{f32_ms:.3} ms per iteration in f32, {matrices_ms:.3} ms on matrices");
+        assert!(applied.reasons.iter().any(|r| r.contains(&told)), "{:?}", applied.reasons);
+    }
     let cache = tempfile::tempdir().unwrap();
     assert_eq!(calibrate::recall(cache.path(), gpu.info(), &config), None);
     calibrate::remember(cache.path(), gpu.info(), &config, verdict).unwrap();

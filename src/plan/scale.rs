@@ -159,18 +159,111 @@ pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
         field_of_view(dataset).min(half_depth(dataset))
     }
 }
+
 /// Depth of the dynamic field, in vessels, from which a run starts nearer to zero. Tight hulls of 3 and 4 views reach 2.4.
 const DEEP: f64 = 2.5;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Preset;
+    use crate::geometry::Geometry;
+    use crate::scan::dataset::{Frame, Layout, Split, View};
+
+    const SIZE: usize = 8;
+
+    /// Two views of two phases of pixels that are `still`, but for the middle ones, which gain `change` at the second.
+    fn dataset(still: f32, change: f32) -> Dataset {
+        let views: Vec<View> = [-30.0, 60.0]
+            .map(|primary_deg| {
+                let geometry = Geometry::CArm(crate::geometry::CArm {
+                    primary_deg,
+                    secondary_deg: 0.0,
+                    sid_mm: 1000.0,
+                    sod_mm: 600.0,
+                    pixel_mm: [15.0; 2],
+                    offset_mm: [0.0; 2],
+                    table_mm: [0.0; 3],
+                });
+                View { rays: geometry.rays(SIZE, SIZE).unwrap(), geometry }
+            })
+            .into();
+        let middle = |p: usize| (2..6).contains(&(p % SIZE)) && (2..6).contains(&(p / SIZE));
+        let frame = |view, phase| Frame {
+            name: format!("v{view}p{phase}"),
+            view,
+            phase,
+            split: Split::Train,
+            integrals: (0..SIZE * SIZE).map(|p| if phase == 1 && middle(p) { still + change } else { still }).collect(),
+            mask: None,
+        };
+        Dataset {
+            path: "test".into(),
+            layout: Layout::Native,
+            frames: vec![frame(0, 0), frame(0, 1), frame(1, 0), frame(1, 1)],
+            views,
+            width: SIZE,
+            height: SIZE,
+            n_phases: 2,
+            depth_range: (-0.9, 0.9),
+            vessel_attenuation: None,
+        }
+    }
+
+    fn normalised(dataset: &Dataset, settings: &[&str]) -> Result<Scene> {
+        let settings: Vec<String> = ["loss.normalise=true"].iter().chain(settings).map(|s| (*s).to_owned()).collect();
+        let config = Config::load(Some(Preset::Paper), None, &settings).unwrap();
+        let motion = crate::plan::motion::analyse(dataset, &config.hull);
+        Scene::new(&config, dataset, &motion, None)
+    }
+
+    fn softplus(x: f64) -> f64 {
+        x.exp().ln_1p()
+    }
+
+    #[test]
+    fn a_feature_of_zero_is_the_mean_integral_of_the_images() {
+        // A quarter of the pixels gains 0.4 in half the frames.
+        let scene = normalised(&dataset(2.0, 0.4), &[]).unwrap();
+        let mean = 2.0 + 0.4 / 8.0;
+        let across = scene.static_gain * softplus(scene.static_shift) * (scene.static_max[0] - scene.static_min[0]);
+        assert!((across - mean).abs() < 1e-6, "{across}");
+        assert!((scene.static_weight * mean * mean - 1.0).abs() < 1e-6, "a residual as large as the mean costs 1");
+    }
+
+    #[test]
+    fn a_vessel_explains_the_largest_change_over_the_beat() {
+        let temporal = ["loss.dynamic_target=temporal", "loss.robust=0.3"];
+        let data = dataset(2.0, 0.4);
+        let scene = normalised(&data, &temporal).unwrap();
+        let vessel = 0.05 * field_of_view(&data);
+        assert!((scene.dynamic_gain * vessel - 0.4).abs() < 1e-5, "{}", scene.dynamic_gain * vessel);
+        assert!((scene.dynamic_weight * 0.4 * 0.4 - 1.0).abs() < 1e-4);
+        assert!((scene.robust_scale - 0.3 * 0.4).abs() < 1e-5);
+        // Twice the change: twice the gain, and residuals weigh a quarter.
+        let strong = normalised(&dataset(2.0, 0.8), &temporal).unwrap();
+        assert!((strong.dynamic_gain / scene.dynamic_gain - 2.0).abs() < 1e-4);
+        assert!((strong.dynamic_weight / scene.dynamic_weight - 0.25).abs() < 1e-4);
+        // Fields that share one residual share its weight, and there is nothing to be robust against.
+        let absolute = normalised(&data, &["loss.dynamic_target=absolute", "loss.robust=0.3"]).unwrap();
+        assert_eq!((absolute.dynamic_weight, absolute.robust_scale), (absolute.static_weight, 0.0));
+    }
+
+    #[test]
+    fn images_without_attenuation_are_refused() {
+        for still in [0.0, -1.0] {
+            let error = normalised(&dataset(still, 0.0), &[]).unwrap_err().to_string();
+            assert!(error.contains("images") && error.contains("must be positive"), "{error}");
+        }
+        // Nothing moves: the dynamic field is scaled to the images themselves.
+        let still = normalised(&dataset(2.0, 0.0), &[]).unwrap();
+        assert!(still.dynamic_gain.is_finite() && still.dynamic_gain > 0.0);
+    }
 
     #[test]
     fn deep_fields_start_nearer_to_zero() {
         assert_eq!(first_shift(-2.0, 2.4), -2.0);
         // Twice as deep as a run bears: a quarter of the attenuation.
-        let softplus = |x: f64| x.exp().ln_1p();
         assert!((softplus(first_shift(-2.0, 2.0 * DEEP)) - softplus(-2.0) / 4.0).abs() < 1e-12);
         assert_eq!(first_shift(-2.0, 1e6), -5.0);
         assert_eq!(first_shift(-10.0, 1e6), -10.0, "a shift that was asked for is never raised");

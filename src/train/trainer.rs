@@ -438,3 +438,74 @@ impl Snapshot {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Geometry;
+    use crate::scan::dataset::{Frame, Layout, Split, View};
+
+    fn dataset() -> Dataset {
+        let geometry = Geometry::CArm(CArm {
+            primary_deg: 30.0,
+            secondary_deg: -10.0,
+            sid_mm: 1000.0,
+            sod_mm: 600.0,
+            pixel_mm: [1.0; 2],
+            offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
+        });
+        let frame = |phase, split, value: f32| Frame {
+            name: format!("p{phase}"),
+            view: 0,
+            phase,
+            split,
+            integrals: vec![value, 1.0, 2.0, 3.0],
+            mask: None,
+        };
+        Dataset {
+            path: "test".into(),
+            layout: Layout::Native,
+            views: vec![View { rays: geometry.rays(2, 2).unwrap(), geometry }],
+            frames: vec![frame(0, Split::Train, 0.0), frame(1, Split::Validation, 4.0)],
+            width: 2,
+            height: 2,
+            n_phases: 2,
+            depth_range: (-1.0, 1.0),
+            vessel_attenuation: None,
+        }
+    }
+
+    #[test]
+    fn a_fingerprint_is_of_what_is_trained_on_and_nothing_else() {
+        let before = data_fingerprint(&dataset());
+        let of = |change: &dyn Fn(&mut Dataset)| {
+            let mut changed = dataset();
+            change(&mut changed);
+            data_fingerprint(&changed)
+        };
+        assert_eq!(of(&|d| d.path = "elsewhere".into()), before);
+        assert_eq!(of(&|d| d.frames[0].name = "renamed".into()), before);
+        assert_eq!(of(&|d| d.frames[1].integrals[0] = 9.0), before, "validation images are not trained on");
+        assert_ne!(of(&|d| d.frames[0].integrals[0] = -0.0), before, "every bit counts");
+        assert_ne!(of(&|d| d.frames[0].integrals.swap(0, 1)), before);
+        assert_ne!(of(&|d| d.frames[0].phase = 1), before);
+        assert_ne!(of(&|d| d.views[0].rays.anchor[1].x += 1e-3), before);
+    }
+
+    #[test]
+    fn the_objective_counts_each_term_once() {
+        let loss = StepLoss {
+            step: 1,
+            data: 1.0,
+            // Part of `data`, and an error that is not weighted.
+            dynamic: 0.25,
+            tv: 0.125,
+            occlusion: 0.5,
+            squared_error: 7.0,
+            live_samples: 3,
+            loss_scale: 1.0,
+        };
+        assert_eq!(loss.total(), 1.625);
+    }
+}

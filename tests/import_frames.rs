@@ -1,0 +1,74 @@
+//! Which frames of a clinical run are taken: the longest stretch in which vessels are filled with contrast.
+#![cfg(feature = "dicom")]
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "common/dicom.rs"]
+mod dicom;
+
+use dicom_core::{DataElement, PrimitiveValue, VR};
+use dicom_dictionary_std::tags;
+use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
+use nertca_vk::scan::dataset::Dataset;
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+/// A run with a frame for each share of full contrast: a bar, by so much darker than what is around it.
+fn run(path: &Path, contrast: &[f64]) {
+    let pixels: Vec<u8> = contrast
+        .iter()
+        .flat_map(|share| {
+            (0..64u32 * 64).map(move |p| {
+                let (x, y) = (p % 64, p / 64);
+                let bar = (30..33).contains(&x) && (10..54).contains(&y);
+                190 + (y / 8) as u8 - if bar { (100.0 * share) as u8 } else { 0 }
+            })
+        })
+        .collect();
+    dicom::angiogram(path, |o| {
+        let frames = contrast.len().to_string();
+        o.put(DataElement::new(tags::NUMBER_OF_FRAMES, VR::IS, PrimitiveValue::from(frames.as_str())));
+        o.put(DataElement::new(tags::PIXEL_DATA, VR::OB, PrimitiveValue::from(pixels.clone())));
+    });
+}
+
+/// Imports frames, each as a phase of its own; what the user is told, and how many there are.
+fn import(contrast: &[f64], phases: u32, frames: Option<RangeInclusive<usize>>) -> (String, usize) {
+    let directory = tempfile::tempdir().unwrap();
+    let (file, out) = (directory.path().join("run.dcm"), directory.path().join("data"));
+    run(&file, contrast);
+    let options = ImportOptions {
+        phases,
+        gating: Gating::Phases((0..phases).collect()),
+        frames,
+        pixel_mm: None,
+        size: None,
+        depth_half_extent_mm: 90.0,
+    };
+    let notes = import_dicom(&[file], &options, &out).unwrap();
+    (notes.join("\n"), Dataset::open(&out).unwrap().frames.len())
+}
+
+#[test]
+fn the_longest_filled_stretch_is_taken() {
+    // Contrast flows in and out, comes back for a moment, and is gone.
+    let (told, frames) = import(&[0.0, 0.3, 0.8, 1.0, 1.0, 0.9, 0.3, 1.0, 0.0], 4, None);
+    assert!(told.contains("frames 3 to 6 of 9 are filled with contrast"), "{told}");
+    assert_eq!(frames, 4);
+}
+
+#[test]
+fn a_stretch_may_begin_with_the_run_and_last_to_its_end() {
+    let (told, frames) = import(&[0.0, 0.1, 1.0, 0.9, 1.0], 3, None);
+    assert!(told.contains("frames 3 to 5 of 5"), "{told}");
+    assert_eq!(frames, 3);
+    let (told, frames) = import(&[1.0, 0.9, 0.2, 0.0, 0.1], 2, None);
+    assert!(told.contains("frames 1 to 2 of 5"), "{told}");
+    assert_eq!(frames, 2);
+}
+
+#[test]
+fn frames_that_are_asked_for_are_taken_as_they_are() {
+    let (told, frames) = import(&[0.0, 0.1, 1.0, 0.9, 1.0], 3, Some(1..=3));
+    assert!(!told.contains("filled"), "{told}");
+    assert_eq!(frames, 3);
+}
