@@ -8,7 +8,7 @@ use common::small_dataset;
 use criterion::{Criterion, criterion_group, criterion_main};
 use glam::DVec3;
 use nertca_vk::config::{Config, Preset};
-use nertca_vk::export::surfaces::Mesh;
+use nertca_vk::export::surfaces::surface as surface_of;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::{Plan, carve::carve, motion};
@@ -42,7 +42,7 @@ fn surface(c: &mut Criterion) {
         .map(|i| DVec3::new((i % 96) as f64, (i / 96 % 96) as f64, (i / (96 * 96)) as f64))
         .map(|p| (40.0 - p.distance(centre)) as f32)
         .collect();
-    c.bench_function("surface_nets", |b| b.iter(|| Mesh::of(&ball, &grid, 5.0)));
+    c.bench_function("surface_nets", |b| b.iter(|| surface_of(&ball, &grid, 5.0)));
 }
 
 fn step(c: &mut Criterion) {

@@ -50,9 +50,12 @@ pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
     Ok(kernels)
 }
 
+/// Name of a further build of a shader, and what it defines.
+type Variant = (String, Vec<Define>);
+
 /// `variants.txt`: `shader name [DEFINE[=VALUE]]...` per line; `#` starts a comment.
-fn read_variants(path: &Path) -> Result<BTreeMap<String, Vec<(String, Vec<Define>)>>, Failure> {
-    let mut variants: BTreeMap<String, Vec<_>> = BTreeMap::new();
+fn read_variants(path: &Path) -> Result<BTreeMap<String, Vec<Variant>>, Failure> {
+    let mut variants: BTreeMap<String, Vec<Variant>> = BTreeMap::new();
     for line in fs::read_to_string(path)?.lines() {
         let mut words = line.split('#').next().unwrap_or("").split_whitespace();
         let (Some(shader), Some(name)) = (words.next(), words.next()) else {

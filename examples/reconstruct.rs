@@ -7,7 +7,7 @@
 
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::{Error, Result};
-use nertca_vk::export::volumes::{Format, VolumeExport, grid_over};
+use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
 use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::Tuning;
@@ -62,6 +62,7 @@ fn main() -> Result<()> {
         phases: (0..dataset.n_phases).collect(),
         sequence: true,
         format: Format::Nrrd,
+        compression: Compression::None,
     };
     let files = export.write(&renderer, &out.join("beat.seq.nrrd"), |_, _| {})?;
     files.iter().for_each(|file| println!("{}", file.display()));
@@ -73,7 +74,7 @@ fn score(renderer: &Renderer, dataset: &Dataset, step: u32) -> Result<()> {
     if frames.is_empty() {
         return Ok(());
     }
-    let evaluation = evaluate(renderer, dataset, &frames, step, None, |_, _, _| Ok(()))?;
+    let evaluation = evaluate(renderer, dataset, &frames, step, None, |_| Ok(()))?;
     match evaluation.dice.dynamic {
         Some(dice) => println!("Dice {dice:.3} on {} unseen images", frames.len()),
         None => println!("PSNR {:.2} dB on {} unseen images", evaluation.psnr, frames.len()),

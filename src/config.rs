@@ -121,7 +121,7 @@ impl Config {
         }
         let config: Config = table
             .try_into()
-            .map_err(|e: toml::de::Error| Error::config("configuration", "", format!("{}", e.message())))?;
+            .map_err(|e: toml::de::Error| Error::config("configuration", "", e.message().to_owned()))?;
         config.check()?;
         Ok(config)
     }

@@ -12,6 +12,7 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::hull::Hull;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk::phantom::projector::Projector;
+use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::plan::carve::carve;
 use nertca_vk::plan::motion;
 use nertca_vk::plan::scale::dynamic_half;
@@ -34,7 +35,7 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
         setting: Setting::Xcat,
         size: 100,
         phases: PHASES,
-        views,
+        views: ViewAngles::published(views).unwrap(),
         seed: 1,
         photons: None,
         respiration_mm: 0.0,

@@ -3,12 +3,11 @@
 
 #[path = "common/program.rs"]
 mod program;
-
-use program::program;
 #[path = "common/shared.rs"]
 mod shared;
 
 use nertca_vk::formats::npy;
+use program::program;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -205,6 +205,7 @@ mod tests {
             width: SIZE,
             height: SIZE,
             n_phases: 2,
+            notes: Vec::new(),
             depth_range: (-0.9, 0.9),
             vessel_attenuation: None,
         }

@@ -471,6 +471,7 @@ mod tests {
             width: 2,
             height: 2,
             n_phases: 2,
+            notes: Vec::new(),
             depth_range: (-1.0, 1.0),
             vessel_attenuation: None,
         }
