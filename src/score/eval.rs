@@ -218,8 +218,8 @@ fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
     changes.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, change)| *change > 0.0)
 }
 
-/// Says so when the moving field has died: when it attenuates less than [`DEAD_SHARE`] of the strongest change over time
-/// in the data, where that change was seen.
+/// Says so when the moving field has died: when its line integrals reach less than a tenth of the strongest change over
+/// time in the data, where that change was seen.
 ///
 /// # Errors
 /// Device errors.

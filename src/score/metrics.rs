@@ -101,7 +101,7 @@ pub fn otsu(values: &[f32]) -> f32 {
 }
 
 /// Otsu's threshold for vessels in values that are zero for the most part and have a few hot spots. Values are held at
-/// their [`HOT`] percentile: one pixel in two thousand far above all vessels would otherwise become the upper group.
+/// their 99.5th percentile: one pixel in two thousand far above all vessels would otherwise become the upper group.
 /// Zero where fewer values than that are above zero.
 pub fn vessel_threshold(values: &[f32]) -> f32 {
     let hottest = percentile(values, HOT);
