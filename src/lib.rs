@@ -11,7 +11,7 @@
 //! 7. [`score`] compares them with what was seen, [`export`] hands them to other tools
 //!
 //! [`run`] ties these to a run directory, [`session`] is a reconstruction in memory that grows with its frames, and
-//! [`capi`] the same for C. [`mod@bench`] times the engine, [`phantom`] makes data to try it on, and [`reference`] holds an
+//! [`capi`] the same for C. [`mod@bench`] times the engine, [`phantom`] makes data to try it on, and [`mod@reference`] holds an
 //! f64 twin of every compute stage, for tests. Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
 //! without any knowledge of angiography. Modules use only what stands above them in this file.
 //!
@@ -57,6 +57,7 @@ pub mod gpu {
 }
 
 pub mod config;
+pub mod geometry;
 
 /// The compute stages.
 pub mod kernels {
@@ -67,8 +68,6 @@ pub mod kernels {
     pub mod stages;
     pub mod tuning;
 }
-
-pub mod geometry;
 
 /// Files that other tools read and write.
 pub mod formats {

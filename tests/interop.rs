@@ -143,14 +143,14 @@ fn exports_refuse_what_makes_no_sense() {
     let (dir, _, run) = trained();
     let out = dir.path().join("x.nrrd");
     let refuse = |extra: &[&str], parts: &[&str]| fails(&[&["export", text(run)], extra].concat(), 2, parts);
-    refuse(&["--spacing", "0", "-o", text(&out)], &["--spacing", "positive"]);
-    refuse(&["--spacing", "1e-9", "-o", text(&out)], &["--spacing", "too many"]);
-    refuse(&["--spacing", "nan", "-o", text(&out)], &["--spacing"]);
+    refuse(&["--spacing", "0", "-o", text(&out)], &["spacing_mm", "positive"]);
+    refuse(&["--spacing", "1e-9", "-o", text(&out)], &["spacing_mm", "too many"]);
+    refuse(&["--spacing", "nan", "-o", text(&out)], &["spacing_mm"]);
     refuse(&["--phase", "3", "-o", text(&out)], &["--phase", "0 to 2"]);
     refuse(&["-o", "volume.tiff"], &["--out", ".nrrd"]);
     refuse(&["--mesh", "-o", text(&out)], &[".stl"]);
-    refuse(&["--mesh", "--iso=-1", "-o", "x.stl"], &["--iso"]);
-    refuse(&["--mesh", "--iso", "1e6", "-o", "x.stl"], &["--iso", "no vessel"]);
+    refuse(&["--mesh", "--iso=-1", "-o", "x.stl"], &["iso_per_mm"]);
+    refuse(&["--mesh", "--iso", "1e6", "-o", "x.stl"], &["iso_per_mm", "no vessel"]);
     refuse(&["--mesh", "--component", "total", "-o", "x.stl"], &["--component"]);
     fails(&["export", text(run), "-o", "/dev/null/x.nrrd"], 1, &["/dev/null"]);
     assert!(!out.exists(), "nothing is left half written");
@@ -316,7 +316,7 @@ fn dicom_runs_get_phases_and_lose_their_patient() {
     assert!(!manifest.contains("SECRET"));
     // Without an ECG or a choice, it says what to give.
     let none = run(&import(&["--phases", "6"]));
-    assert!(String::from_utf8_lossy(&none.stderr).contains("--heart-rate"));
+    assert!(String::from_utf8_lossy(&none.stderr).contains("a heart rate"));
 }
 
 #[test]
@@ -346,7 +346,7 @@ fn dicom_nobody_should_send_is_refused_by_name() {
         ("sod.dcm", "(0018,1111)", Box::new(set(tags::DISTANCE_SOURCE_TO_PATIENT, VR::DS, "2000"))),
         ("no sid.dcm", "(0018,1110)", remove(tags::DISTANCE_SOURCE_TO_DETECTOR)),
         ("spacing.dcm", "(0018,1164)", Box::new(set(tags::IMAGER_PIXEL_SPACING, VR::DS, "0\\0"))),
-        ("no spacing.dcm", "--pixel-spacing", remove(tags::IMAGER_PIXEL_SPACING)),
+        ("no spacing.dcm", "pixel spacing", remove(tags::IMAGER_PIXEL_SPACING)),
         ("frames.dcm", "(0028,0008)", Box::new(set(tags::NUMBER_OF_FRAMES, VR::IS, "0"))),
         ("many.dcm", "(0028,0008)", Box::new(set(tags::NUMBER_OF_FRAMES, VR::IS, "100000"))),
         ("too few pixels.dcm", "(7FE0,0010) PixelData", Box::new(set(tags::NUMBER_OF_FRAMES, VR::IS, "50"))),
@@ -374,7 +374,7 @@ fn dicom_nobody_should_send_is_refused_by_name() {
         refuse(name, name, &[]);
     }
     refuse("not there.dcm", "not there.dcm", &[]);
-    refuse("good.dcm", "--frames", &["--frames", "3-9"]);
-    refuse("good.dcm", "--size", &["--size", "2"]);
+    refuse("good.dcm", "frames", &["--frames", "3-9"]);
+    refuse("good.dcm", "size", &["--size", "2"]);
     fails(&["import", "dicom", text(dir.path()), "-o", text(&out), "--still"], 1, &["size"]);
 }

@@ -85,7 +85,7 @@ pub fn recall(cache: &Path, info: &DeviceInfo, config: &Config) -> Option<Verdic
 /// Keeps a verdict.
 ///
 /// # Errors
-/// [`Error::Io`] when the directory cannot be written.
+/// [`crate::error::Error::Io`] when the directory cannot be written.
 pub fn remember(cache: &Path, info: &DeviceInfo, config: &Config, verdict: Verdict) -> Result<()> {
     let mut all = read(cache);
     all.insert(key(info, config), verdict);
