@@ -37,3 +37,18 @@ pub fn hint(error: &Error) -> Option<&'static str> {
         _ => None,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn schedulers_can_tell_what_to_try_again() {
+        let memory = |may_pass| Error::OutOfMemory { object: "rays".into(), bytes: 1, detail: String::new(), may_pass };
+        let lost = Error::DeviceLost { pass: "training".into() };
+        assert_eq!((code(&lost), code(&memory(true))), (TRY_AGAIN, 75));
+        assert_eq!(code(&memory(false)), 1, "a limit of the device stays where it is");
+        assert_eq!(code(&Error::config("phase", 77, "")), USAGE);
+        assert!(hint(&lost).is_some_and(|hint| hint.contains("--resume")));
+    }
+}
