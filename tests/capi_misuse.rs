@@ -34,6 +34,7 @@ impl Bench {
         let text = last_error(null::<c_void>());
         assert_eq!(got, wanted, "{function} ({part}): {text}");
         assert!(text.contains(part), "{function}: `{text}` does not name `{part}`");
+        assert!(!text.contains("--"), "{function}: `{text}` speaks of a command line");
     }
 
     /// Null, stale, wild and foreign handles.

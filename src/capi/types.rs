@@ -481,7 +481,7 @@ pub const NERTCA_ABI_VERSION: u32 = 0;
 /// Version this header was made with.
 pub const NERTCA_VERSION_MAJOR: u32 = 0;
 /// See `NERTCA_VERSION_MAJOR`.
-pub const NERTCA_VERSION_MINOR: u32 = 1;
+pub const NERTCA_VERSION_MINOR: u32 = 2;
 /// See `NERTCA_VERSION_MAJOR`.
 pub const NERTCA_VERSION_PATCH: u32 = 0;
 
