@@ -53,6 +53,14 @@ pub mod data {
     pub mod writer;
 }
 
+/// The soft motion hull: which cells may hold a moving vessel, by likelihood instead of certainty.
+pub mod soft_hull {
+    pub mod background;
+    pub mod carve;
+    pub mod evidence;
+    mod filters;
+}
+
 /// The fields: their parameters, and the scene they live in.
 pub mod model {
     pub mod field;

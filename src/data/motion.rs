@@ -48,7 +48,7 @@ pub struct Hull {
 }
 
 /// How far the smallest of `n` standard normal draws lies below the mean, on average.
-fn expected_minimum(n: usize) -> f64 {
+pub(crate) fn expected_minimum(n: usize) -> f64 {
     // Blom's approximation of the first normal order statistic.
     if n < 2 {
         return 0.0;
@@ -71,7 +71,7 @@ fn upper_tail(z: f64) -> f64 {
     (-0.5 * z * z).exp() / std::f64::consts::TAU.sqrt() * poly
 }
 
-fn median(values: &mut [f32]) -> f32 {
+pub(crate) fn median(values: &mut [f32]) -> f32 {
     if values.is_empty() {
         return 0.0;
     }
@@ -83,7 +83,7 @@ fn median(values: &mut [f32]) -> f32 {
 /// intensity; so pixels are grouped by intensity and each group's median temporal deviation is its noise. A group that
 /// consists of moving vessels, as the darkest of an image with a plain background does, would pass them off as noise;
 /// so none is noisier than a few times the image as a whole.
-fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
+pub(crate) fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
     const GROUPS: usize = 24;
     const NOISIEST: f32 = 6.0;
     let most = NOISIEST * median(&mut deviation.to_vec());
@@ -181,12 +181,12 @@ fn filter(image: &Image, radius: usize, pick: impl Fn(f32, f32) -> f32 + Sync) -
 }
 
 /// Grey dilation by a square of `2 radius + 1` pixels.
-pub(super) fn dilate(image: &Image, radius: usize) -> Image {
+pub(crate) fn dilate(image: &Image, radius: usize) -> Image {
     filter(image, radius, f32::max)
 }
 
 /// Grey opening: what is narrower than `2 radius + 1` pixels is cut down to its surroundings.
-pub(super) fn opening(image: &Image, radius: usize) -> Image {
+pub(crate) fn opening(image: &Image, radius: usize) -> Image {
     dilate(&filter(image, radius, f32::min), radius)
 }
 
@@ -291,7 +291,7 @@ impl Hull {
 }
 
 /// World point to pixel.
-struct Projector {
+pub(crate) struct Projector {
     source: DVec3,
     inverse: DMat3,
     width: i64,
@@ -299,13 +299,13 @@ struct Projector {
 }
 
 impl Projector {
-    fn new(rays: &ViewRays, width: usize, height: usize) -> Self {
+    pub(crate) fn new(rays: &ViewRays, width: usize, height: usize) -> Self {
         let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
         Projector { source: rays.source(), inverse: basis.inverse(), width: width as i64, height: height as i64 }
     }
 
     /// Index of the pixel a point falls on; `None` when the view does not see it.
-    fn pixel(&self, point: DVec3) -> Option<usize> {
+    pub(crate) fn pixel(&self, point: DVec3) -> Option<usize> {
         let h = self.inverse * (point - self.source);
         if h.z <= 0.0 {
             return None;

@@ -2,10 +2,13 @@
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 
 use nertca_vk::config::Config;
+use nertca_vk::cpu::random::{STREAM_PHOTON, normal};
 use nertca_vk::data::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::data::geometry::{CArm, Geometry};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::Tuning;
+use nertca_vk::phantom;
+use nertca_vk::phantom::dataset::{PhantomOptions, Setting};
 use nertca_vk::train::trainer::Trainer;
 use std::path::PathBuf;
 
@@ -114,4 +117,31 @@ pub fn relative_error(got: &[f32], want: &[f64]) -> (f64, usize) {
         }
     }
     worst
+}
+
+/// The default phantom, procedural, without photon noise, with its vessel volumes beside it.
+pub fn phantom(gpu: &Gpu, directory: &std::path::Path, size: usize, views: u32) -> Dataset {
+    let options = PhantomOptions {
+        setting: Setting::Xcat,
+        size,
+        phases: 10,
+        views,
+        seed: 1,
+        photons: None,
+        respiration_mm: 0.0,
+        layout: Layout::Native,
+        anatomy: None,
+        volumes: true,
+    };
+    phantom::dataset::make(gpu, &options, directory, |_, _, _| ()).unwrap();
+    Dataset::open(directory).unwrap()
+}
+
+/// Adds white noise of a standard deviation to the training images.
+pub fn whiten(dataset: &mut Dataset, deviation: f64) {
+    for (index, frame) in dataset.frames.iter_mut().enumerate().filter(|(_, f)| f.split == Split::Train) {
+        for (pixel, value) in frame.integrals.iter_mut().enumerate() {
+            *value += (deviation * normal(7, STREAM_PHOTON, index as u32, pixel as u32)) as f32;
+        }
+    }
 }
