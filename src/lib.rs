@@ -61,6 +61,30 @@ pub mod soft_hull {
     mod filters;
 }
 
+/// Gaussians as the moving field.
+pub mod gaussians {
+    pub mod layout;
+    pub mod maxima;
+    pub mod model;
+    pub mod reference;
+    pub mod scene;
+    pub mod seed;
+    pub mod settings;
+    pub mod stages;
+    pub mod trainer;
+    pub mod view;
+
+    /// One set for the whole beat.
+    pub mod tree {
+        pub mod layout;
+        pub mod model;
+        pub mod reference;
+        pub mod settings;
+        pub mod stages;
+        pub mod trainer;
+    }
+}
+
 /// The fields: their parameters, and the scene they live in.
 pub mod model {
     pub mod field;
