@@ -63,7 +63,7 @@ fn along<'a>(
         t = (t + step).max(parts[first].0);
         let here = parts[first..].iter().take_while(|p| p.0 <= t).filter(|p| p.1 >= t);
         best = best.max(here.map(|p| p.3.at(t - p.2)).sum());
-        while first < parts.len() && !(parts[first].1 >= t + step) {
+        while first < parts.len() && parts[first].1 < t + step {
             first += 1;
         }
     }

@@ -64,7 +64,7 @@ impl Scene {
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
-        if !(strongest > 0.0) || motion.hull.share() == 0.0 {
+        if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
             let problem = "nothing moves that several views agree on: check geometry, phases and noise";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }

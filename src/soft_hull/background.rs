@@ -17,14 +17,13 @@ const STRONGEST_BLUR: f32 = 0.7;
 /// Share of pixels whose change is below the strongest.
 const STRONGEST_PERCENTILE: f64 = 0.995;
 
-/// Radius of the openings that tell vessels from what is wider, as a share of the image's smaller side: a field that shows
-/// a heart is some twenty times as wide as its widest vessel.
+/// Radius of the opening that takes vessels out of the background, as a share of the image's smaller side: a field that
+/// shows a heart is some twenty times as wide as its widest vessel.
 const OPENING_SHARE: f64 = 0.03;
+/// Radius of the opening that tells a heart or a diaphragm that moves from vessels, junctions and crossings.
+const WIDE_SHARE: f64 = 0.06;
 /// And at least, pixels.
 const LEAST_OPENING_RADIUS: usize = 2;
-
-/// Phases from which noise is told by the line through neighbours.
-const LEAST_PHASES_FOR_LINES: usize = 6;
 
 /// Line integrals of one training view over the beat.
 #[derive(Debug, Clone)]
@@ -75,8 +74,7 @@ pub struct Background {
     pub strongest: f32,
 }
 
-/// Noise of each pixel from the differences between successive phases, or, where there are enough of them, from how far
-/// each lies off the line through its neighbours: a background that moves smoothly adds little to that.
+/// Noise of each pixel from the differences between successive phases.
 fn noise(series: &Series) -> Vec<f32> {
     // 1 / the deviation of a median of absolute values of normal draws.
     const MEDIAN_TO_DEVIATION: f32 = 1.4826;
@@ -86,15 +84,8 @@ fn noise(series: &Series) -> Vec<f32> {
     let mean: Vec<f32> = (0..pixels).map(|p| images.iter().map(|i| i.values[p]).sum::<f32>() / n).collect();
     let deviation: Vec<f32> = (0..pixels)
         .map(|p| {
-            let at = |i: usize| images[i].values[p];
-            // The variance of a sum of independent values is that of one times the squares of their factors.
-            let (mut steps, squares): (Vec<f32>, f32) = if images.len() >= LEAST_PHASES_FOR_LINES {
-                let off_line = |i: usize| (at(i - 1) - 2.0 * at(i) + at(i + 1)).abs();
-                ((1..images.len() - 1).map(off_line).collect(), 6.0)
-            } else {
-                ((1..images.len()).map(|i| (at(i) - at(i - 1)).abs()).collect(), 2.0)
-            };
-            median(&mut steps) * MEDIAN_TO_DEVIATION / squares.sqrt()
+            let mut steps: Vec<f32> = images.windows(2).map(|w| (w[1].values[p] - w[0].values[p]).abs()).collect();
+            median(&mut steps) * (MEDIAN_TO_DEVIATION / std::f32::consts::SQRT_2)
         })
         .collect();
     noise_by_intensity(&mean, &deviation)
@@ -130,9 +121,9 @@ impl Background {
             .map(|p| lower_mode(&images.iter().map(|i| i.values[p]).collect::<Vec<_>>(), noise[p].max(least), bias))
             .collect();
         let level = image(level);
-        let radius = opening_radius(width, height);
+        let wide = opening_radius(WIDE_SHARE, width, height);
         let changes: Vec<Option<Image>> =
-            series.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, radius))).collect();
+            series.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, wide))).collect();
         let smooth: Vec<Image> = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR)).collect();
         let most = |p: usize| smooth.iter().map(|c| c.values[p]).fold(f32::MIN, f32::max);
         let largest: Vec<f32> = (0..width * height).map(most).collect();
@@ -140,17 +131,17 @@ impl Background {
         let floor = (LEAST_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
         noise.iter_mut().for_each(|s| *s = s.max(floor));
         // An opening of noise is biased low, one of the smoothed background much less.
-        let mut low = opening(&blur(&level, STRONGEST_BLUR), radius);
+        let mut low = opening(&blur(&level, STRONGEST_BLUR), opening_radius(OPENING_SHARE, width, height));
         low.values.iter_mut().zip(&level.values).for_each(|(low, b)| *low = low.min(*b));
         Background { level, low, changes, noise: image(noise), strongest }
     }
 }
 
-fn opening_radius(width: usize, height: usize) -> usize {
-    ((OPENING_SHARE * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
+fn opening_radius(share: f64, width: usize, height: usize) -> usize {
+    ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
 }
 
-/// What exceeds the level, less what remains of it when all that is as thin as vessels is taken away.
+/// What exceeds the level, less what remains of it when all that is thinner than the opening is taken away.
 fn narrow_change(seen: &Image, level: &Image, radius: usize) -> Image {
     let change = map2(seen, level, |y, b| y - b);
     let wide = opening(&blur(&change, STRONGEST_BLUR), radius);
