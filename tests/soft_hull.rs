@@ -72,6 +72,7 @@ fn thick(full: &[bool], size: [usize; 3]) -> Vec<bool> {
 }
 
 #[derive(Debug)]
+#[allow(dead_code, reason = "all of it is printed")]
 struct Score {
     recall: f64,
     thin: f64,
