@@ -20,7 +20,7 @@ fn expect_file(path: &str, wanted: &str) {
         let line = found.lines().zip(wanted.lines()).position(|(a, b)| a != b).unwrap_or(0);
         panic!(
             "{path} is not what the sources say, from line {}: `{}` where `{}` is expected. If the change is meant, run \
-             NERTCA_BLESS=1 cargo test --test capi_header, and raise NERTCA_ABI_VERSION when callers would break",
+             tools/bless, and raise NERTCA_ABI_VERSION when callers would break",
             line + 1,
             found.lines().nth(line).unwrap_or_default(),
             wanted.lines().nth(line).unwrap_or_default()
