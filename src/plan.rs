@@ -4,6 +4,7 @@
 pub mod carve;
 pub mod motion;
 pub mod scale;
+pub mod soft_hull;
 
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};

@@ -53,7 +53,7 @@ pub fn carve(dataset: &Dataset, motion: &[ViewMotion], half: f64, resolution: us
 }
 
 /// World point to pixel.
-struct Projector {
+pub(super) struct Projector {
     source: DVec3,
     inverse: DMat3,
     width: i64,
@@ -61,13 +61,13 @@ struct Projector {
 }
 
 impl Projector {
-    fn new(rays: &ViewRays, width: usize, height: usize) -> Self {
+    pub(super) fn new(rays: &ViewRays, width: usize, height: usize) -> Self {
         let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
         Projector { source: rays.source(), inverse: basis.inverse(), width: width as i64, height: height as i64 }
     }
 
     /// Index of the pixel a point falls on; `None` when the view does not see it.
-    fn pixel(&self, point: DVec3) -> Option<usize> {
+    pub(super) fn pixel(&self, point: DVec3) -> Option<usize> {
         let h = self.inverse * (point - self.source);
         if h.z <= 0.0 {
             return None;

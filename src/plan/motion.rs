@@ -30,7 +30,7 @@ pub struct ViewMotion {
 }
 
 /// How far the smallest of `n` standard normal draws lies below the mean, on average.
-fn expected_minimum(n: usize) -> f64 {
+pub(super) fn expected_minimum(n: usize) -> f64 {
     // Blom's approximation of the first normal order statistic.
     if n < 2 {
         return 0.0;
@@ -57,7 +57,7 @@ fn upper_tail(z: f64) -> f64 {
 /// intensity; so pixels are grouped by intensity and each group's median temporal deviation is its noise. A group that
 /// consists of moving vessels, as the darkest of an image with a plain background does, would pass them off as noise;
 /// so none is noisier than a few times the image as a whole.
-fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
+pub(super) fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
     const GROUPS: usize = 24;
     const NOISIEST: f32 = 6.0;
     let most = NOISIEST * median(&mut deviation.to_vec());

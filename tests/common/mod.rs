@@ -5,9 +5,12 @@ use nertca_vk::config::Config;
 use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk::phantom::views::ViewAngles;
+use nertca_vk::random::{STREAM_PHOTON, normal};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::train::trainer::Trainer;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A device with validation on. A missing driver or layer fails the test: it is never skipped.
 pub fn gpu() -> Gpu {
@@ -115,4 +118,37 @@ pub fn relative_error(got: &[f32], want: &[f64]) -> (f64, usize) {
         }
     }
     worst
+}
+
+/// The default phantom, procedural, without photon noise, with its vessel volumes beside it.
+pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset {
+    let options = PhantomOptions {
+        setting: Setting::Xcat,
+        size,
+        phases: 10,
+        views: ViewAngles::published(views).unwrap(),
+        seed: 1,
+        photons: None,
+        respiration_mm: 0.0,
+        layout: Layout::Native,
+        anatomy: None,
+        volumes: true,
+    };
+    make(gpu, &options, directory, |_, _, _| ()).unwrap();
+    Dataset::open(directory).unwrap()
+}
+
+/// Adds white noise of a standard deviation to the training images.
+pub fn whiten(dataset: &mut Dataset, deviation: f64) {
+    for (index, frame) in dataset.frames.iter_mut().enumerate().filter(|(_, f)| f.split == Split::Train) {
+        for (pixel, value) in frame.integrals.iter_mut().enumerate() {
+            *value += (deviation * normal(7, STREAM_PHOTON, index as u32, pixel as u32)) as f32;
+        }
+    }
+}
+
+/// Leaves the first training view's images to validation alone.
+pub fn drop_first_view(dataset: &mut Dataset) {
+    let first = dataset.training_views()[0];
+    dataset.frames.retain(|f| f.split == Split::Validation || f.view != first);
 }

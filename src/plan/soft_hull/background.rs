@@ -1,0 +1,159 @@
+//! What a still view looks like without its vessels, and how noisy it is.
+
+use crate::plan::motion::{expected_minimum, noise_by_intensity};
+use crate::plan::soft_hull::filters::{gaussian, map2, separable};
+use crate::raster::{Image, dilate, median, opening, percentile};
+use crate::scan::dataset::Dataset;
+use rayon::prelude::*;
+
+/// Phases within so many standard deviations of the background belong to it.
+const BACKGROUND_SIGMAS: f32 = 2.0;
+/// Times the set of phases that belong to the background is drawn up anew.
+const BACKGROUND_ROUNDS: usize = 4;
+/// Noise is never taken for less than this share of the strongest change: models are not exact either.
+const LEAST_NOISE_SHARE: f32 = 0.01;
+/// Pixels of blur before the strongest change is read off.
+const STRONGEST_BLUR: f32 = 0.7;
+/// Share of pixels whose change is below the strongest.
+const STRONGEST_PERCENTILE: f64 = 0.995;
+
+/// Radius of the opening that takes vessels out of the background, as a share of the image's smaller side: a field that
+/// shows a heart is some twenty times as wide as its widest vessel.
+const OPENING_SHARE: f64 = 0.03;
+/// Radius of the opening that tells a heart or a diaphragm that moves from vessels, junctions and crossings.
+const WIDE_SHARE: f64 = 0.06;
+/// And at least, pixels.
+const LEAST_OPENING_RADIUS: usize = 2;
+
+/// Line integrals of one training view over the beat.
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// Index into [`Dataset::views`].
+    pub view: usize,
+    /// An image per phase of the dataset, rows first; `None` where the view has none.
+    pub images: Vec<Option<Image>>,
+}
+
+impl Series {
+    /// The training images of each view that has at least two phases; several images of one phase are averaged.
+    pub fn of(dataset: &Dataset) -> Vec<Series> {
+        let series = dataset.training_views().into_iter().map(|view| Series {
+            view,
+            images: (0..dataset.n_phases).map(|phase| mean_image(dataset, view, phase)).collect(),
+        });
+        series.filter(|s| s.seen().count() > 1).collect()
+    }
+
+    /// Images of the phases the view has.
+    pub fn seen(&self) -> impl Iterator<Item = &Image> {
+        self.images.iter().flatten()
+    }
+}
+
+fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
+    let frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view && f.phase == phase).collect();
+    let scale = 1.0 / frames.len() as f32;
+    let value = |p: usize| frames.iter().map(|f| f.integrals[p]).sum::<f32>() * scale;
+    let values = (0..dataset.n_pixels()).map(value).collect();
+    (!frames.is_empty()).then_some(Image { width: dataset.width, height: dataset.height, values })
+}
+
+/// The still background of a view, and what stands out of it.
+#[derive(Debug, Clone)]
+pub struct Background {
+    /// Mean of the phases at which no vessel covers the pixel.
+    pub level: Image,
+    /// The same where a vessel covers the pixel at every phase: what remains without structures as thin as vessels.
+    pub low: Image,
+    /// What exceeds the level at each phase and is no wider than a vessel: a heart, a lung or a diaphragm that moves changes
+    /// wide areas. `None` where the view has no image.
+    pub changes: Vec<Option<Image>>,
+    /// Standard deviation of a pixel's noise; never zero.
+    pub noise: Image,
+    /// The strongest change of the view, a line integral: what the thickest vessel adds.
+    pub strongest: f32,
+}
+
+/// Noise of each pixel from the differences between successive phases.
+fn noise(series: &Series) -> Vec<f32> {
+    // 1 / the deviation of a median of absolute values of normal draws.
+    const MEDIAN_TO_DEVIATION: f32 = 1.4826;
+    let images: Vec<&Image> = series.seen().collect();
+    let pixels = images[0].values.len();
+    let n = images.len() as f32;
+    let mean: Vec<f32> = (0..pixels).map(|p| images.iter().map(|i| i.values[p]).sum::<f32>() / n).collect();
+    let deviation: Vec<f32> = (0..pixels)
+        .map(|p| {
+            let mut steps: Vec<f32> = images.windows(2).map(|w| (w[1].values[p] - w[0].values[p]).abs()).collect();
+            median(&mut steps) * (MEDIAN_TO_DEVIATION / std::f32::consts::SQRT_2)
+        })
+        .collect();
+    noise_by_intensity(&mean, &deviation)
+}
+
+/// Lower mode of a pixel over the phases: starting from the smallest value, corrected for the bias that taking a
+/// minimum of noisy values has, the mean of what lies no more than noise above it.
+fn lower_mode(values: &[f32], noise: f32, bias: f32) -> f32 {
+    let mut level = values.iter().copied().fold(f32::INFINITY, f32::min) + bias * noise;
+    for _ in 0..BACKGROUND_ROUNDS {
+        let inside = values.iter().filter(|v| **v < level + BACKGROUND_SIGMAS * noise);
+        let (sum, count) = inside.fold((0.0, 0u32), |(sum, count), v| (sum + v, count + 1));
+        if count > 0 {
+            level = sum / count as f32;
+        }
+    }
+    level
+}
+
+impl Background {
+    /// Analyses a view.
+    pub fn new(series: &Series) -> Background {
+        let images: Vec<&Image> = series.seen().collect();
+        let (width, height) = (images[0].width, images[0].height);
+        let image = |values: Vec<f32>| Image { width, height, values };
+        let mut noise = noise(series);
+        let bias = expected_minimum(images.len()) as f32;
+        // A pixel without noise at all still rounds.
+        let span = images.iter().flat_map(|i| &i.values).fold([f32::MAX, f32::MIN], |[l, h], v| [l.min(*v), h.max(*v)]);
+        let least = 1e-6 * (span[1] - span[0]);
+        let level: Vec<f32> = (0..width * height)
+            .into_par_iter()
+            .map(|p| lower_mode(&images.iter().map(|i| i.values[p]).collect::<Vec<_>>(), noise[p].max(least), bias))
+            .collect();
+        let level = image(level);
+        let wide = opening_radius(WIDE_SHARE, width, height);
+        let changes: Vec<Option<Image>> =
+            series.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, wide))).collect();
+        let smooth: Vec<Image> = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR)).collect();
+        let most = |p: usize| smooth.iter().map(|c| c.values[p]).fold(f32::MIN, f32::max);
+        let largest: Vec<f32> = (0..width * height).map(most).collect();
+        let strongest = percentile(&largest, STRONGEST_PERCENTILE);
+        let floor = (LEAST_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
+        noise.iter_mut().for_each(|s| *s = s.max(floor));
+        // An opening of noise is biased low, one of the smoothed background much less.
+        let mut low = opening(&blur(&level, STRONGEST_BLUR), opening_radius(OPENING_SHARE, width, height));
+        low.values.iter_mut().zip(&level.values).for_each(|(low, b)| *low = low.min(*b));
+        Background { level, low, changes, noise: image(noise), strongest }
+    }
+}
+
+fn opening_radius(share: f64, width: usize, height: usize) -> usize {
+    ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
+}
+
+/// What exceeds the level, less what remains of it when all that is thinner than the opening is taken away.
+fn narrow_change(seen: &Image, level: &Image, radius: usize) -> Image {
+    let change = map2(seen, level, |y, b| y - b);
+    let wide = opening(&blur(&change, STRONGEST_BLUR), radius);
+    map2(&change, &wide, |d, wide| d - wide.max(0.0))
+}
+
+/// Largest value within `radius` pixels along both axes.
+pub(super) fn largest_within(image: &Image, radius: usize) -> Image {
+    dilate(image, radius)
+}
+
+/// Gaussian blur; the border's pixels go on outside.
+pub fn blur(image: &Image, sigma: f32) -> Image {
+    separable(image, &gaussian(sigma))
+}
