@@ -17,6 +17,8 @@ use std::{env, fs};
 
 type Failure = Box<dyn std::error::Error>;
 
+/// Includes whose structures the host uses, too.
+const SHARED_STRUCTURES: [&str; 2] = ["layout", "gaussian_layout"];
 /// Includes whose integer constants the host uses, too.
 const SHARED_CONSTANTS: [&str; 5] = ["layout", "occupancy", "positions", "random", "sample_rays"];
 
@@ -45,7 +47,11 @@ fn write_shaders(glsl: &Path, out: &Path) -> Result<(), Failure> {
     }
     let include = |name: &str| fs::read_to_string(glsl.join(format!("inc/{name}.glsl")));
     fs::write(out.join("table.rs"), generate::table(&kernels, out))?;
-    fs::write(out.join("layout.rs"), generate::layout(&kernels, &source::comments(&include("layout")?))?)?;
+    let mut comments = source::Comments::new();
+    for name in SHARED_STRUCTURES {
+        comments.extend(source::comments(&include(name)?));
+    }
+    fs::write(out.join("layout.rs"), generate::layout(&kernels, &comments)?)?;
     fs::write(out.join("push.rs"), generate::push(&kernels)?)?;
     fs::write(out.join("bindings.rs"), generate::bindings(&kernels))?;
     fs::write(out.join("numbers.rs"), generate::numbers(&numbers))?;

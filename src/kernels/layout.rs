@@ -1,4 +1,5 @@
-//! Structures shared with the shaders: made by build.rs from `glsl/inc/layout.glsl` and what the compiler made of it.
+//! Structures shared with the shaders: made by build.rs from `glsl/inc/layout.glsl`, `glsl/inc/gaussian_layout.glsl` and
+//! what the compiler made of them.
 
 use crate::geometry::ViewRays;
 use crate::kernels::constants::CELLS_PER_WORD;
@@ -25,5 +26,12 @@ impl Setup {
     /// Words of one epoch of occupancy: two bits per phase and cell.
     pub fn occupancy_words(&self) -> usize {
         (self.n_phases as usize * (self.occupancy_cells as usize).pow(3)).div_ceil(CELLS_PER_WORD as usize)
+    }
+}
+
+impl TreeSetup {
+    /// Nodes of the grid of a phase.
+    pub fn nodes(&self) -> usize {
+        (self.n_nodes as usize).pow(3)
     }
 }

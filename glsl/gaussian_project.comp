@@ -1,0 +1,23 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// How every view sees every Gaussian of a set per phase. One invocation per Gaussian (x) and view (y).
+#include "inc/gaussian.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint n_gaussians; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { GaussianView gaussian_views[]; };
+layout(binding = 2) readonly buffer B2 { Gaussian gaussians[]; };
+// [phase][view] -> image, or -1.
+layout(binding = 3) readonly buffer B3 { int image_of_view[]; };
+// [view][Gaussian]
+layout(binding = 4) writeonly buffer B4 { Splat splats[]; };
+// Image each belongs to.
+layout(binding = 5) writeonly buffer B5 { int image_of_splat[]; };
+
+void main() {
+    uint i = gl_GlobalInvocationID.x, view = gl_WorkGroupID.y;
+    if (i >= push.n_gaussians) return;
+    Gaussian g = gaussians[i];
+    splats[view * push.n_gaussians + i] = project(g, g.position, gaussian_views[view], gaussian_setup).splat;
+    image_of_splat[view * push.n_gaussians + i] = image_of_view[g.phase * gaussian_setup.n_views + view];
+}

@@ -1,0 +1,39 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Residuals of images that follow each other, four pixels per invocation. The image D of the field is free where the
+// still background y - D lies between its bounds; outside, r = D - bound counts, weighted by the pixel's noise,
+// Charbonnier-shaped:
+//   loss = sqrt((w r)^2 + bend^2) - bend
+// Reads the fixed-point sums and clears them for the next iteration.
+#include "inc/gaussian.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/reduce.glsl"
+layout(push_constant) uniform Push { uint first_quad; uint n_quads; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) buffer B1 { ivec4 splat_images[]; };
+// Bounds of D, as images.
+layout(binding = 2) readonly buffer B2 { vec4 bound_low[]; };
+layout(binding = 3) readonly buffer B3 { vec4 bound_high[]; };
+// Weight of each pixel, as images.
+layout(binding = 4) readonly buffer B4 { vec4 pixel_weight[]; };
+// dL/dD.
+layout(binding = 5) writeonly buffer B5 { vec4 splat_image_gradient[]; };
+// One per workgroup.
+layout(binding = 6) writeonly buffer B6 { float gaussian_loss_parts[]; };
+
+void main() {
+    float loss = 0.0;
+    if (gl_GlobalInvocationID.x < push.n_quads) {
+        uint i = push.first_quad + gl_GlobalInvocationID.x;
+        vec4 d = vec4(splat_images[i]) / gaussian_setup.fixed_point;
+        splat_images[i] = ivec4(0);
+        vec4 w = pixel_weight[i];
+        vec4 r = w * (d - clamp(d, bound_low[i], bound_high[i]));
+        vec4 root = sqrt(r * r + gaussian_setup.bend * gaussian_setup.bend);
+        splat_image_gradient[i] = gaussian_setup.loss_weight * w * r / root;
+        // root - bend without cancellation.
+        loss = gaussian_setup.loss_weight * dot(r * r / (root + gaussian_setup.bend), vec4(1.0));
+    }
+    float total = workgroup_sum(loss);
+    if (gl_LocalInvocationID.x == 0u) gaussian_loss_parts[gl_WorkGroupID.x] = total;
+}

@@ -1,0 +1,18 @@
+// One set of Gaussians for the whole beat: each moves by the displacement of a grid, free per phase, and harmonics of
+// its own. Twin: src/reference/tree.rs.
+
+// Position on the grid, in steps from its first node.
+vec3 on_grid(vec3 position, TreeSetup tree) {
+    float last = float(tree.n_nodes) - 1.001;
+    return clamp((position + tree.half_side) * tree.inverse_step, vec3(0.0), vec3(last));
+}
+
+// Share of a node's displacement at a place on the grid.
+float node_share(vec3 place, uvec3 node) {
+    vec3 w = max(vec3(0.0), 1.0 - abs(place - vec3(node)));
+    return w.x * w.y * w.z;
+}
+
+uint node_index(uvec3 node, TreeSetup tree) {
+    return (node.z * tree.n_nodes + node.y) * tree.n_nodes + node.x;
+}

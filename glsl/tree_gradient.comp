@@ -1,0 +1,48 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Gradient of each Gaussian of the tree from its moments in the views of some phases, in their order: of its shape and
+// place at rest, and of its place at each phase. One invocation per Gaussian.
+#include "inc/gaussian.glsl"
+#include "inc/gaussian_gradient.glsl"
+#include "inc/gaussian_tree.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; uint n_phases; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { TreeSetup tree_setup; };
+layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
+layout(binding = 3) readonly buffer B3 { Gaussian gaussians[]; };
+layout(binding = 4) readonly buffer B4 { vec4 motion_grid[]; };
+layout(binding = 5) readonly buffer B5 { vec4 own_motion[]; };
+layout(binding = 6) readonly buffer B6 { float motion_basis[]; };
+layout(binding = 7) readonly buffer B7 { int image_of_splat[]; };
+layout(binding = 8) readonly buffer B8 { vec4 splat_moments[]; };
+// [Gaussian]: position and log-density, log-scale, rotation.
+layout(binding = 9) writeonly buffer B9 { vec4 gaussian_gradient[]; };
+// [phase][Gaussian]
+layout(binding = 10) writeonly buffer B10 { vec4 place_gradient[]; };
+#include "inc/gaussian_motion.glsl"
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= push.n_gaussians) return;
+    Gaussian g = gaussians[i];
+    GaussianGradient sum = no_gradient();
+    for (uint t = 0u; t < push.n_phases; t++) {
+        uint phase = push.first_phase + t;
+        vec3 x = position_at(i, g.position, phase), before = sum.position;
+        sum.position = vec3(0.0);
+        for (uint view = 0u; view < gaussian_setup.n_views; view++) {
+            uint at = (t * gaussian_setup.n_views + view) * push.n_gaussians + i;
+            if (image_of_splat[at] < 0) continue;
+            Projection p = project(g, x, gaussian_views[view], gaussian_setup);
+            if (!(p.depth > 0.0)) continue;
+            vec3 linear = splat_moments[2u * at].xyz, square = splat_moments[2u * at + 1u].xyz;
+            add_gradient(g, p, gaussian_views[view], gaussian_setup, linear, square, sum);
+        }
+        place_gradient[phase * push.n_gaussians + i] = vec4(sum.position, 0.0);
+        sum.position += before;
+    }
+    gaussian_gradient[3u * i] = vec4(sum.position, sum.log_density);
+    gaussian_gradient[3u * i + 1u] = vec4(sum.log_scale, 0.0);
+    gaussian_gradient[3u * i + 2u] = sum.rotation;
+}

@@ -1,0 +1,27 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Adam on the grid's displacements. One invocation per node (x) and phase (y).
+#include "inc/gaussian.glsl"
+#include "inc/gaussian_tree.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint first_phase; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { TreeSetup tree_setup; };
+layout(binding = 2) readonly buffer B2 { GaussianSchedule gaussian_schedule[]; };
+layout(binding = 3) readonly buffer B3 { uint gaussian_step; };
+layout(binding = 4) readonly buffer B4 { vec4 motion_grid_gradient[]; };
+layout(binding = 5) buffer B5 { vec4 motion_grid[]; };
+layout(binding = 6) buffer B6 { vec4 motion_grid_first[]; };
+layout(binding = 7) buffer B7 { vec4 motion_grid_second[]; };
+#include "inc/gaussian_adam.glsl"
+
+void main() {
+    uint n_nodes = tree_setup.n_nodes * tree_setup.n_nodes * tree_setup.n_nodes;
+    if (gl_GlobalInvocationID.x >= n_nodes) return;
+    uint at = (push.first_phase + gl_WorkGroupID.y) * n_nodes + gl_GlobalInvocationID.x;
+    vec4 first = motion_grid_first[at], second = motion_grid_second[at];
+    GaussianSchedule now = gaussian_schedule[gaussian_step];
+    motion_grid[at] -= adam(motion_grid_gradient[at], vec4(tree_setup.grid_rate), now, first, second);
+    motion_grid_first[at] = first;
+    motion_grid_second[at] = second;
+}

@@ -1,0 +1,35 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// How every view sees every Gaussian of the tree at each of some phases. One invocation per Gaussian (x), phase and
+// view (y).
+#include "inc/gaussian.glsl"
+#include "inc/gaussian_tree.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { TreeSetup tree_setup; };
+layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
+layout(binding = 3) readonly buffer B3 { Gaussian gaussians[]; };
+// [phase][node]: displacement; none at phase 0.
+layout(binding = 4) readonly buffer B4 { vec4 motion_grid[]; };
+// [Gaussian][basis function]
+layout(binding = 5) readonly buffer B5 { vec4 own_motion[]; };
+// [phase][basis function]
+layout(binding = 6) readonly buffer B6 { float motion_basis[]; };
+// [phase][view] -> image, or -1.
+layout(binding = 7) readonly buffer B7 { int image_of_view[]; };
+// [phase][view][Gaussian], from the first of the phases.
+layout(binding = 8) writeonly buffer B8 { Splat splats[]; };
+layout(binding = 9) writeonly buffer B9 { int image_of_splat[]; };
+#include "inc/gaussian_motion.glsl"
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= push.n_gaussians) return;
+    uint phase = push.first_phase + gl_WorkGroupID.y / gaussian_setup.n_views;
+    uint view = gl_WorkGroupID.y % gaussian_setup.n_views;
+    Gaussian g = gaussians[i];
+    uint at = gl_WorkGroupID.y * push.n_gaussians + i;
+    splats[at] = project(g, position_at(i, g.position, phase), gaussian_views[view], gaussian_setup).splat;
+    image_of_splat[at] = image_of_view[phase * gaussian_setup.n_views + view];
+}
