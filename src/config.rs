@@ -7,7 +7,7 @@ pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
-use sections::{Adam, DynamicField, Hull, Loss, March, Occupancy, StaticField, Train, check_range};
+use sections::{Adam, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree, check_range};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -81,6 +81,12 @@ pub struct Config {
     pub occupancy: Occupancy,
     /// The optimiser.
     pub adam: Adam,
+    /// Gaussians as the moving field; checkpoints of before have none.
+    #[serde(default = "presets::gaussians")]
+    pub gaussians: Gaussians,
+    /// One set of Gaussians that moves; checkpoints of before have none.
+    #[serde(default = "presets::tree")]
+    pub tree: Tree,
 }
 
 impl Config {
@@ -145,6 +151,12 @@ impl Config {
         self.hull.check_ranges()?;
         self.occupancy.check_ranges()?;
         self.adam.check_ranges()?;
+        self.gaussians.check_ranges()?;
+        self.tree.check_ranges()?;
+        if self.gaussians.least_scale > self.gaussians.greatest_scale {
+            let problem = format!("exceeds gaussians.greatest_scale = {}", self.gaussians.greatest_scale);
+            return Err(Error::config("gaussians.least_scale", self.gaussians.least_scale, problem));
+        }
         check_range("dynamic.skip_layer", d.skip_layer.into(), 0.0, d.layers.into())?;
         check_range("dynamic.window_start", d.window_start, 0.0, d.bands.into())?;
         if d.width % 16 != 0 {
@@ -234,6 +246,10 @@ mod tests {
             ("train.rays=0", "train.rays"),
             ("dynamic.width=20", "dynamic.width"),
             ("dynamic.lr=nan", "dynamic.lr"),
+            ("gaussians.least_scale=4", "gaussians.least_scale"),
+            ("gaussians.bend=nan", "gaussians.bend"),
+            ("gaussians.count=0", "gaussians.count"),
+            ("tree.track_blur=0", "tree.track_blur"),
             ("train", "setting"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
@@ -248,5 +264,13 @@ mod tests {
             config.check().unwrap();
             assert_eq!(toml::from_str::<Config>(&config.to_toml().unwrap()).unwrap(), config);
         }
+    }
+
+    #[test]
+    fn a_configuration_without_gaussians_has_the_defaults() {
+        let config = Config::preset(Preset::Fast);
+        let mut table = toml::Table::try_from(&config).unwrap();
+        assert!(table.remove("gaussians").is_some() && table.remove("tree").is_some());
+        assert_eq!(table.try_into::<Config>().unwrap(), config);
     }
 }

@@ -1,6 +1,6 @@
 //! The presets.
 
-use crate::config::sections::{Adam, DynamicField, Hull, Loss, March, Occupancy, StaticField, Train};
+use crate::config::sections::{Adam, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree};
 use crate::config::{Config, Decay, DynamicTarget, Preset};
 
 impl Config {
@@ -80,6 +80,49 @@ fn paper() -> Config {
         },
         occupancy: Occupancy { enabled: false, cells: 64, start: 15_000, threshold: 0.01 },
         adam: Adam { beta1: 0.9, beta2: 0.99, epsilon: 1e-8 },
+        gaussians: gaussians(),
+        tree: tree(),
+    }
+}
+
+/// Gaussians are none of the paper's: one set of defaults for all presets.
+pub(super) fn gaussians() -> Gaussians {
+    Gaussians {
+        iterations: 100,
+        count: 500,
+        first_scale: 0.8,
+        least_scale: 0.4,
+        greatest_scale: 3.0,
+        position_rate: 0.05,
+        scale_rate: 0.03,
+        rotation_rate: 0.03,
+        density_rate: 0.08,
+        fall_share: 0.3,
+        last_rate: 0.05,
+        bend: 0.05,
+        noise_scale: 0.05,
+        cut: 3.2,
+        grow_at: 50,
+        grow_share: 0.15,
+        weakest: 0.01,
+        missing: 0.03,
+    }
+}
+
+/// As [`gaussians`].
+pub(super) fn tree() -> Tree {
+    Tree {
+        warm_iterations: 60,
+        take: 0.03,
+        node: 18.0,
+        grid_rate: 0.03,
+        smoothness: 0.002,
+        harmonics: 4,
+        own_rate: 0.02,
+        own_penalty: 0.3,
+        track_blur: 1.5,
+        track_rate: 0.25,
+        track_iterations: 25,
     }
 }
 

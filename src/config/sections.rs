@@ -200,3 +200,74 @@ section! {
         epsilon: f64 in 1e-30 to 1.0,
     }
 }
+
+section! {
+    /// Gaussians as the moving field. Lengths are pixels at the isocentre, line integrals shares of the views' strongest
+    /// change.
+    Gaussians, "gaussians" {
+        /// Iterations, each over all images.
+        iterations: u32 in 1.0 to 1e6,
+        /// Gaussians seeded per phase.
+        count: u32 in 1.0 to 1_048_576.0,
+        /// First scale.
+        first_scale: f64 in 0.01 to 100.0,
+        /// Least scale.
+        least_scale: f64 in 0.01 to 100.0,
+        /// Greatest scale.
+        greatest_scale: f64 in 0.01 to 100.0,
+        /// Adam's rate of positions.
+        position_rate: f64 in 0.0 to 100.0,
+        /// Adam's rate of log-scales.
+        scale_rate: f64 in 0.0 to 100.0,
+        /// Adam's rate of quaternions.
+        rotation_rate: f64 in 0.0 to 100.0,
+        /// Adam's rate of log-densities.
+        density_rate: f64 in 0.0 to 100.0,
+        /// Share of the iterations, at the end, over which rates fall.
+        fall_share: f64 in 0.001 to 1.0,
+        /// What rates fall to, as a share of themselves.
+        last_rate: f64 in 0.0 to 1.0,
+        /// Where the loss bends from square to linear.
+        bend: f64 in 1e-6 to 1e3,
+        /// Noise at which a pixel counts 0.7 times; 0 = all pixels count alike.
+        noise_scale: f64 in 0.0 to 1e3,
+        /// Standard deviations at which a Gaussian ends.
+        cut: f64 in 1.0 to 10.0,
+        /// Iteration at which weak Gaussians are dropped and new ones placed where data are missing; 0 = never.
+        grow_at: u32 in 0.0 to 1e6,
+        /// New Gaussians per phase, as a share of `count`.
+        grow_share: f64 in 0.0 to 10.0,
+        /// Amplitude below which a Gaussian is dropped.
+        weakest: f64 in 0.0 to 1e3,
+        /// Missing line integral from which a Gaussian is placed; also its first density.
+        missing: f64 in 1e-6 to 1e3,
+    }
+}
+
+section! {
+    /// One set of Gaussians that moves over the beat. Lengths are pixels at the isocentre.
+    Tree, "tree" {
+        /// Iterations of phase 0 alone, before anything moves.
+        warm_iterations: u32 in 1.0 to 1e6,
+        /// Amplitude from which a Gaussian of phase 0 is taken into the tree, share of the views' strongest change.
+        take: f64 in 0.0 to 1e3,
+        /// Distance of the grid's nodes.
+        node: f64 in 1.0 to 1e4,
+        /// Adam's rate of displacements.
+        grid_rate: f64 in 0.0 to 100.0,
+        /// Penalty on squared differences of neighbouring nodes.
+        smoothness: f64 in 0.0 to 1e6,
+        /// Harmonics of a Gaussian's own motion.
+        harmonics: u32 in 0.0 to 64.0,
+        /// Adam's rate of own motion.
+        own_rate: f64 in 0.0 to 100.0,
+        /// Penalty on squared own motion.
+        own_penalty: f64 in 0.0 to 1e6,
+        /// Blur of images and Gaussians while the grid is tracked.
+        track_blur: f64 in 0.1 to 100.0,
+        /// Adam's rate of displacements while they are tracked.
+        track_rate: f64 in 0.0 to 100.0,
+        /// Iterations per tracked phase.
+        track_iterations: u32 in 0.0 to 1e6,
+    }
+}
