@@ -5,7 +5,9 @@
 //! 1. [`scan`]: angiograms with geometry and phase, validated -> line integrals (`import`, of the feature `dicom`, brings them in)
 //! 2. [`plan`]: what moves -> still backgrounds, the motion hull, scales and boxes: everything a run needs
 //! 3. [`train::step`]: one iteration, top to bottom: rays -> samples -> [`network`] -> loss -> gradients -> Adam
-//! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses
+//! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses. Beside it, [`train::gaussians`] and
+//!    [`train::tree`] fit [`gaussians`] as the moving field to [`plan::targets`], from [`plan::seeds`] in a
+//!    [`plan::soft_hull`]
 //! 5. [`model`]: parameters, scales, hull and configuration; [`model::checkpoint`] keeps them in one safetensors file
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
 //! 7. [`score`] compares them with what was seen, [`export`] hands them to other tools
@@ -103,6 +105,15 @@ pub mod import {
 
 pub mod model;
 pub mod network;
+
+/// Gaussians on the device: how views see them, and one iteration.
+pub mod gaussians {
+    pub mod particles;
+    pub mod stages;
+    pub mod tree;
+    pub mod view;
+}
+
 pub mod plan;
 
 /// Drawing a model, for any pose and phase.
@@ -118,10 +129,13 @@ pub mod render {
 /// From a plan to a checkpoint.
 pub mod train {
     pub mod calibrate;
+    pub mod gaussians;
     pub mod step;
+    mod targets;
     pub mod timing;
     pub mod trainer;
     pub mod training;
+    pub mod tree;
 }
 
 /// What a reconstruction is worth.

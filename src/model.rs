@@ -2,6 +2,7 @@
 
 pub mod checkpoint;
 pub mod component;
+pub mod gaussians;
 pub mod hull;
 pub mod params;
 pub mod scene;

@@ -2,9 +2,12 @@
 //! hull, backgrounds, ray lists, schedule. Pure host code; both the engine and its CPU twin start here.
 
 pub mod carve;
+pub mod fit;
 pub mod motion;
 pub mod scale;
+pub mod seeds;
 pub mod soft_hull;
+pub mod targets;
 
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};

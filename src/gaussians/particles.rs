@@ -1,0 +1,101 @@
+//! Gaussians with the optimiser's moments, on the host and on the device: what grows and shrinks together.
+
+use crate::error::Result;
+use crate::gpu::buffer::Memory;
+use crate::gpu::device::Gpu;
+use crate::kernels::dispatch::{Binding, buffer_set};
+use crate::kernels::layout::{Gaussian, Splat};
+
+/// Gaussians with Adam's moments.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Particles {
+    /// Parameters.
+    pub rows: Vec<Gaussian>,
+    /// First moments: position and log-density, log-scale, rotation.
+    pub first: Vec<[f32; 12]>,
+    /// Second moments, laid out alike.
+    pub second: Vec<[f32; 12]>,
+}
+
+buffer_set! {
+    /// Gaussians on the device, and what an iteration computes of each.
+    pub struct ParticleBuffers {
+        /// [`Gaussian`]s.
+        gaussians,
+        /// First moments of Adam, three vec4 per Gaussian: position and log-density, log-scale, rotation.
+        gaussian_adam_first,
+        /// Second moments of Adam, laid out alike.
+        gaussian_adam_second,
+        /// Gradient, laid out alike.
+        gaussian_gradient,
+        /// [`Splat`]s, view by view.
+        splats,
+        /// Image that each splat belongs to, or -1.
+        image_of_splat,
+        /// What the gradient needs of each splat's pixels, two vec4.
+        splat_moments,
+    }
+}
+
+impl Particles {
+    /// Gaussians that were never updated.
+    pub fn fresh(rows: Vec<Gaussian>) -> Particles {
+        let zeros = vec![[0.0; 12]; rows.len()];
+        Particles { rows, first: zeros.clone(), second: zeros }
+    }
+
+    /// Keeps those marked in `keep`, one mark per Gaussian.
+    pub fn retain(&mut self, keep: &[bool]) {
+        retain_marked(&mut self.rows, keep);
+        retain_marked(&mut self.first, keep);
+        retain_marked(&mut self.second, keep);
+    }
+
+    /// Adds Gaussians that were never updated.
+    pub fn append(&mut self, rows: Vec<Gaussian>) {
+        let fresh = Particles::fresh(rows);
+        self.rows.extend(fresh.rows);
+        self.first.extend(fresh.first);
+        self.second.extend(fresh.second);
+    }
+
+    /// Puts them on the device, with room for splats in `n_views` views.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::OutOfMemory`] naming the buffer.
+    pub fn upload(&self, gpu: &Gpu, n_views: u32) -> Result<ParticleBuffers> {
+        let n = self.rows.len() as u64;
+        let n_splats = n * u64::from(n_views);
+        let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
+        Ok(ParticleBuffers {
+            gaussians: gpu.buffer_with("gaussians", &self.rows)?,
+            gaussian_adam_first: gpu.buffer_with("gaussian_adam_first", &self.first)?,
+            gaussian_adam_second: gpu.buffer_with("gaussian_adam_second", &self.second)?,
+            gaussian_gradient: new(Binding::gaussian_gradient, 48 * n)?,
+            splats: new(Binding::splats, size_of::<Splat>() as u64 * n_splats)?,
+            image_of_splat: new(Binding::image_of_splat, 4 * n_splats)?,
+            splat_moments: new(Binding::splat_moments, 32 * n_splats)?,
+        })
+    }
+}
+
+impl ParticleBuffers {
+    /// Reads the first `n` Gaussians back.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn download(&self, gpu: &Gpu, n: usize) -> Result<Particles> {
+        Ok(Particles {
+            rows: gpu.download(&self.gaussians, 0, n)?,
+            first: gpu.download(&self.gaussian_adam_first, 0, n)?,
+            second: gpu.download(&self.gaussian_adam_second, 0, n)?,
+        })
+    }
+}
+
+/// Keeps the values whose Gaussians are marked; each Gaussian has equally many.
+pub(super) fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
+    let each = values.len() / keep.len().max(1);
+    let mut at = 0..;
+    values.retain(|_| at.next().is_some_and(|i| keep[i / each]));
+}

@@ -1,0 +1,160 @@
+//! The stages of a fit of Gaussians, what they bind, and one iteration on a set per phase, top to bottom:
+//!
+//! gaussian_project -> gaussian_splat -> gaussian_residual -> gaussian_moments -> gaussian_update -> gaussian_report
+
+use crate::error::Result;
+use crate::gaussians::particles::ParticleBuffers;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{Groups, Recording};
+use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
+use crate::kernels::layout::GaussianSetup;
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::stages::{Build, Stage};
+use std::ops::Range;
+
+/// Losses kept on the device.
+pub const RING_LENGTH: u32 = 1024;
+
+/// Pipelines of a fit.
+pub struct GaussianKernels {
+    /// How every view sees every Gaussian of a set per phase.
+    pub project: Stage<push::GaussianProject>,
+    /// Images.
+    pub splat: Stage<push::GaussianSplat>,
+    /// Residuals, their gradients and losses.
+    pub residual: Stage<push::GaussianResidual>,
+    /// What gradients need of the images.
+    pub moments: Stage<push::GaussianMoments>,
+    /// Gradients and the optimiser.
+    pub update: Stage<push::GaussianUpdate>,
+    /// Loss and step count.
+    pub report: Stage<push::GaussianReport>,
+}
+
+impl GaussianKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<GaussianKernels> {
+        let plain = Build::default();
+        Ok(GaussianKernels {
+            project: plain.stage(gpu)?,
+            splat: plain.stage(gpu)?,
+            residual: plain.stage(gpu)?,
+            moments: plain.stage(gpu)?,
+            update: plain.stage(gpu)?,
+            report: plain.stage(gpu)?,
+        })
+    }
+}
+
+buffer_set! {
+    /// What Gaussians are fitted to, and what a fit counts.
+    pub struct TargetBuffers {
+        /// [`GaussianSetup`].
+        gaussian_setup,
+        /// [`crate::kernels::layout::GaussianView`]s.
+        gaussian_views,
+        /// `[phase][view]`: index of the image, or -1.
+        image_of_view,
+        /// `[image][pixel]`: least line integral of the moving field.
+        bound_low,
+        /// `[image][pixel]`: greatest.
+        bound_high,
+        /// `[image][pixel]`: factor on the residual.
+        pixel_weight,
+        /// [`crate::kernels::layout::GaussianSchedule`]s.
+        gaussian_schedule,
+        /// `[image][pixel]`: images of the Gaussians in fixed point; clear between iterations.
+        splat_images,
+        /// `[image][pixel]`: gradient of the loss.
+        splat_image_gradient,
+        /// Partial sums of the loss.
+        gaussian_loss_parts,
+        /// Iterations done.
+        gaussian_step,
+        /// Losses of the last iterations.
+        gaussian_ring,
+    }
+}
+
+/// Partial sums of the loss of so many groups of four pixels.
+pub fn loss_parts(n_quads: u32) -> u32 {
+    n_quads.div_ceil(push::GaussianResidual::LOCAL_SIZE)
+}
+
+/// A recording of stages on `n` Gaussians.
+pub struct GaussianPass<'a> {
+    /// Where stages go.
+    pub recording: &'a mut Recording,
+    /// The stages.
+    pub kernels: &'a GaussianKernels,
+    /// What is fitted to.
+    pub targets: &'a TargetBuffers,
+    /// The Gaussians.
+    pub particles: &'a ParticleBuffers,
+    /// Constants on the host.
+    pub setup: &'a GaussianSetup,
+    /// Their number.
+    pub n: u32,
+}
+
+impl GaussianPass<'_> {
+    /// Records a stage that finds its buffers here or in `more`.
+    pub(super) fn run<P: PushConstants>(
+        &mut self,
+        stage: &Stage<P>,
+        groups: Groups<'_>,
+        more: &[&dyn BufferSet],
+        push: P,
+    ) -> Result<()> {
+        let (targets, particles) = (self.targets, self.particles);
+        let others = |name| more.iter().find_map(|set| set.find(name));
+        let find = |name| targets.find(name).or_else(|| particles.find(name)).or_else(|| others(name));
+        dispatch_finding(self.recording, stage, groups, &[], find, push)
+    }
+
+    /// Records the images of splats that are projected already.
+    pub(super) fn splats(&mut self, n_splats: u32) -> Result<()> {
+        let splat = &self.kernels.splat;
+        self.run(splat, splat.groups_for(n_splats), &[], push::GaussianSplat { n_splats })
+    }
+
+    /// Records the residuals of some images, and the moments of all splats.
+    pub(super) fn residual(&mut self, images: Range<u32>, n_splats: u32) -> Result<()> {
+        let [first_quad, n_quads] = [images.start, images.len() as u32].map(|n| n * self.setup.image_stride / 4);
+        let GaussianKernels { residual, moments, .. } = self.kernels;
+        let push = push::GaussianResidual { first_quad, n_quads };
+        self.run(residual, residual.groups_for(n_quads), &[], push)?;
+        self.run(moments, moments.groups_for(n_splats), &[], push::GaussianMoments { n_splats })
+    }
+
+    /// Records the end of an iteration: its loss, and the count.
+    pub(super) fn report(&mut self) -> Result<()> {
+        self.run(&self.kernels.report, Groups::Direct([1, 1, 1]), &[], push::GaussianReport {})
+    }
+}
+
+/// Records the images of Gaussians, each of one phase; the images must be clear.
+///
+/// # Errors
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_images(pass: &mut GaussianPass<'_>) -> Result<()> {
+    let (project, n) = (&pass.kernels.project, pass.n);
+    let groups = Groups::Direct([n.div_ceil(project.local_size()), pass.setup.n_views, 1]);
+    pass.run(project, groups, &[], push::GaussianProject { n_gaussians: n })?;
+    pass.splats(n * pass.setup.n_views)
+}
+
+/// Records one iteration on Gaussians, each of one phase.
+///
+/// # Errors
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_step(pass: &mut GaussianPass<'_>) -> Result<()> {
+    let (update, setup, n) = (&pass.kernels.update, pass.setup, pass.n);
+    record_images(pass)?;
+    pass.residual(0..setup.n_images, n * setup.n_views)?;
+    pass.run(update, update.groups_for(n), &[], push::GaussianUpdate { n_gaussians: n })?;
+    pass.report()
+}

@@ -1,0 +1,278 @@
+//! The stages of a moving tree: an iteration over all phases, and one that tracks the grid at a single phase.
+
+use crate::error::Result;
+use crate::gaussians::particles::retain_marked;
+use crate::gaussians::stages::GaussianPass;
+use crate::gpu::buffer::Memory;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::Groups;
+use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
+use crate::kernels::layout::TreeSetup;
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::stages::{Build, Stage};
+use crate::model::gaussians::basis;
+use std::ops::Range;
+
+/// Pipelines of the tree, beside those of [`crate::gaussians::stages::GaussianKernels`].
+pub struct TreeKernels {
+    /// How every view sees every Gaussian at some phases.
+    pub project: Stage<push::TreeProject>,
+    /// Gradients of shapes and places.
+    pub gradient: Stage<push::TreeGradient>,
+    /// The optimiser on Gaussians and their own motion.
+    pub update: Stage<push::TreeUpdate>,
+    /// Gradient of the grid.
+    pub grid_gradient: Stage<push::TreeGridGradient>,
+    /// The optimiser on the grid.
+    pub grid_update: Stage<push::TreeGridUpdate>,
+    /// Where tracking begins.
+    pub guess: Stage<push::TreeGuess>,
+}
+
+impl TreeKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<TreeKernels> {
+        let plain = Build::default();
+        Ok(TreeKernels {
+            project: plain.stage(gpu)?,
+            gradient: plain.stage(gpu)?,
+            update: plain.stage(gpu)?,
+            grid_gradient: plain.stage(gpu)?,
+            grid_update: plain.stage(gpu)?,
+            guess: plain.stage(gpu)?,
+        })
+    }
+}
+
+buffer_set! {
+    /// Motion that all Gaussians share: displacements of a grid.
+    pub struct GridBuffers {
+        /// [`TreeSetup`].
+        tree_setup,
+        /// `[phase][basis function]`.
+        motion_basis,
+        /// `[phase][node]`: displacement.
+        motion_grid,
+        /// First moments of Adam, laid out alike.
+        motion_grid_first,
+        /// Second moments of Adam, laid out alike.
+        motion_grid_second,
+        /// Gradient, laid out alike.
+        motion_grid_gradient,
+    }
+}
+
+impl GridBuffers {
+    /// A grid at rest.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::OutOfMemory`] naming the buffer.
+    pub fn new(gpu: &Gpu, tree: &TreeSetup, n_phases: usize) -> Result<GridBuffers> {
+        let basis_at = |phase: usize| basis(tree.n_basis as usize, phase as f64 / n_phases as f64);
+        let basis: Vec<f32> = (0..n_phases).flat_map(basis_at).map(|v| v as f32).collect();
+        let at_rest = vec![[0f32; 4]; n_phases * tree.nodes()];
+        let grid = |name: Binding| gpu.buffer_with(name.name(), &at_rest);
+        Ok(GridBuffers {
+            tree_setup: gpu.buffer_with("tree_setup", &[*tree])?,
+            motion_basis: gpu.buffer_with("motion_basis", &basis)?,
+            motion_grid: grid(Binding::motion_grid)?,
+            motion_grid_first: grid(Binding::motion_grid_first)?,
+            motion_grid_second: grid(Binding::motion_grid_second)?,
+            motion_grid_gradient: grid(Binding::motion_grid_gradient)?,
+        })
+    }
+
+    /// The same grid under other constants.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::OutOfMemory`] naming the buffer.
+    pub fn under(&self, gpu: &Gpu, tree: &TreeSetup) -> Result<GridBuffers> {
+        Ok(GridBuffers { tree_setup: gpu.buffer_with("tree_setup", &[*tree])?, ..self.clone() })
+    }
+}
+
+/// Own motion with Adam's moments: `[Gaussian][basis function]`.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct OwnMotion {
+    /// Amplitudes.
+    pub amplitudes: Vec<[f32; 4]>,
+    /// First moments.
+    pub first: Vec<[f32; 4]>,
+    /// Second moments.
+    pub second: Vec<[f32; 4]>,
+}
+
+buffer_set! {
+    /// Own motion of Gaussians on the device.
+    pub struct OwnMotionBuffers {
+        /// `[Gaussian][basis function]`: amplitudes.
+        own_motion,
+        /// First moments of Adam, laid out alike.
+        own_motion_first,
+        /// Second moments of Adam, laid out alike.
+        own_motion_second,
+        /// `[phase][Gaussian]`: gradient of the place.
+        place_gradient,
+    }
+}
+
+impl OwnMotion {
+    /// Motion of these amplitudes that was never updated.
+    pub fn fresh(amplitudes: Vec<[f32; 4]>) -> OwnMotion {
+        let zeros = vec![[0.0; 4]; amplitudes.len()];
+        OwnMotion { amplitudes, first: zeros.clone(), second: zeros }
+    }
+
+    /// Keeps the motion of Gaussians marked in `keep`, one mark per Gaussian.
+    pub fn retain(&mut self, keep: &[bool]) {
+        retain_marked(&mut self.amplitudes, keep);
+        retain_marked(&mut self.first, keep);
+        retain_marked(&mut self.second, keep);
+    }
+
+    /// Adds motion that was never updated.
+    pub fn append(&mut self, amplitudes: Vec<[f32; 4]>) {
+        let fresh = OwnMotion::fresh(amplitudes);
+        self.amplitudes.extend(fresh.amplitudes);
+        self.first.extend(fresh.first);
+        self.second.extend(fresh.second);
+    }
+
+    /// Puts it on the device, with room for `n_places` places of Gaussians: one per Gaussian and phase.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::OutOfMemory`] naming the buffer.
+    pub fn upload(&self, gpu: &Gpu, n_places: u64) -> Result<OwnMotionBuffers> {
+        Ok(OwnMotionBuffers {
+            own_motion: gpu.buffer_with("own_motion", &self.amplitudes)?,
+            own_motion_first: gpu.buffer_with("own_motion_first", &self.first)?,
+            own_motion_second: gpu.buffer_with("own_motion_second", &self.second)?,
+            place_gradient: gpu.buffer("place_gradient", 16 * n_places, Memory::Device)?,
+        })
+    }
+}
+
+impl OwnMotionBuffers {
+    /// Reads the first `n` vectors back.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn download(&self, gpu: &Gpu, n: usize) -> Result<OwnMotion> {
+        Ok(OwnMotion {
+            amplitudes: gpu.download(&self.own_motion, 0, n)?,
+            first: gpu.download(&self.own_motion_first, 0, n)?,
+            second: gpu.download(&self.own_motion_second, 0, n)?,
+        })
+    }
+}
+
+/// A recording of stages on a tree.
+pub struct TreePass<'a> {
+    /// Its Gaussians at rest, and what they are fitted to.
+    pub gaussians: GaussianPass<'a>,
+    /// The tree's own stages.
+    pub kernels: &'a TreeKernels,
+    /// The grid.
+    pub grid: &'a GridBuffers,
+    /// Own motion.
+    pub own: &'a OwnMotionBuffers,
+    /// Constants on the host.
+    pub setup: &'a TreeSetup,
+}
+
+impl TreePass<'_> {
+    fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
+        let more: [&dyn BufferSet; 2] = [self.grid, self.own];
+        self.gaussians.run(stage, groups, &more, push)
+    }
+
+    /// Workgroups of a stage on the nodes of some phases.
+    fn nodes<P: PushConstants>(&self, stage: &Stage<P>, n_phases: usize) -> Groups<'static> {
+        Groups::Direct([(self.setup.nodes() as u32).div_ceil(stage.local_size()), n_phases as u32, 1])
+    }
+
+    /// Splats of some phases.
+    fn n_splats(&self, phases: &Range<u32>) -> u32 {
+        self.gaussians.n * phases.len() as u32 * self.gaussians.setup.n_views
+    }
+
+    /// Records the gradient at some phases, whose images are `images`.
+    fn gradient(&mut self, phases: Range<u32>, images: Range<u32>) -> Result<()> {
+        let n_gaussians = self.gaussians.n;
+        record_images(self, phases.clone())?;
+        let n_splats = self.n_splats(&phases);
+        self.gaussians.residual(images, n_splats)?;
+        let TreeKernels { gradient, grid_gradient, .. } = self.kernels;
+        let (first_phase, n_phases) = (phases.start, phases.len() as u32);
+        let push = push::TreeGradient { n_gaussians, first_phase, n_phases };
+        self.run(gradient, gradient.groups_for(n_gaussians), push)?;
+        // The grid rests at phase 0.
+        let moving = phases.start.max(1)..phases.end;
+        let push = push::TreeGridGradient { n_gaussians, first_phase: moving.start };
+        self.run(grid_gradient, self.nodes(grid_gradient, moving.len()), push)
+    }
+
+    fn grid_update(&mut self, phases: Range<u32>) -> Result<()> {
+        let update = &self.kernels.grid_update;
+        let push = push::TreeGridUpdate { first_phase: phases.start };
+        self.run(update, self.nodes(update, phases.len()), push)
+    }
+}
+
+/// Records the images of some phases; the images must be clear.
+///
+/// # Errors
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_images(pass: &mut TreePass<'_>, phases: Range<u32>) -> Result<()> {
+    let (project, n_gaussians) = (&pass.kernels.project, pass.gaussians.n);
+    let n_seen = phases.len() as u32 * pass.gaussians.setup.n_views;
+    let groups = Groups::Direct([n_gaussians.div_ceil(project.local_size()), n_seen, 1]);
+    pass.run(project, groups, push::TreeProject { n_gaussians, first_phase: phases.start })?;
+    pass.gaussians.splats(pass.n_splats(&phases))
+}
+
+/// Records one iteration over all phases.
+///
+/// # Errors
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_step(pass: &mut TreePass<'_>) -> Result<()> {
+    let (update, setup, n_gaussians) = (&pass.kernels.update, pass.gaussians.setup, pass.gaussians.n);
+    pass.gradient(0..setup.n_phases, 0..setup.n_images)?;
+    pass.run(update, update.groups_for(n_gaussians), push::TreeUpdate { n_gaussians })?;
+    pass.grid_update(1..setup.n_phases)?;
+    pass.gaussians.report()
+}
+
+/// A phase to be tracked, and what is known.
+#[derive(Debug, Clone)]
+pub struct Track {
+    /// The phase.
+    pub phase: u32,
+    /// The one it follows.
+    pub before: u32,
+    /// The one that follows.
+    pub before_that: u32,
+    /// Its images, which follow each other.
+    pub images: Range<u32>,
+}
+
+/// Records the tracking of a phase from those before, over its images; the pass has constants of tracking.
+///
+/// # Errors
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_track(pass: &mut TreePass<'_>, track: &Track, iterations: u32) -> Result<()> {
+    let Track { phase, before, before_that, .. } = *track;
+    let guess = &pass.kernels.guess;
+    let groups = guess.groups_for(pass.setup.nodes() as u32);
+    pass.run(guess, groups, push::TreeGuess { phase, before, before_that })?;
+    pass.gaussians.recording.fill(&pass.gaussians.targets.gaussian_step, 0);
+    for _ in 0..iterations {
+        pass.gradient(phase..phase + 1, track.images.clone())?;
+        pass.grid_update(phase..phase + 1)?;
+        pass.gaussians.report()?;
+    }
+    Ok(())
+}

@@ -1,0 +1,177 @@
+//! Gaussians as the moving field, plain data: a set per phase, or one set that moves.
+
+use crate::error::{Error, Result};
+use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use glam::DVec3;
+
+/// What turns world units and line integrals into the Gaussians' own, and back.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Units {
+    /// World units (100 mm) of a pixel at the isocentre.
+    pub pixel: f64,
+    /// Line integral that counts as 1: the views' strongest change.
+    pub strongest: f64,
+}
+
+impl Units {
+    /// Attenuation per world unit of a density of 1.
+    pub fn attenuation(&self) -> f64 {
+        self.strongest / self.pixel
+    }
+}
+
+/// The quaternion of axes along the world's.
+pub fn rotation_none() -> [f32; 4] {
+    [1.0, 0.0, 0.0, 0.0]
+}
+
+/// A moving field as a set of Gaussians per phase.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Gaussians {
+    /// Their units.
+    pub units: Units,
+    /// Cardiac phases.
+    pub n_phases: usize,
+    /// Bounds of the scales, and where Gaussians end.
+    pub setup: GaussianSetup,
+    /// All phases', in the order of training.
+    pub rows: Vec<Gaussian>,
+    /// Iterations done.
+    pub step: u32,
+}
+
+impl Gaussians {
+    /// Gaussians of a phase.
+    pub fn at(&self, phase: usize) -> impl Iterator<Item = &Gaussian> {
+        self.rows.iter().filter(move |g| g.phase as usize == phase)
+    }
+
+    /// Refuses parameters that are not finite.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] with the first of them.
+    pub fn check(&self) -> Result<()> {
+        let numbers = |g: &Gaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.log_density]);
+        match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
+            Some(bad) => {
+                let step = u64::from(self.step);
+                Err(Error::Diverged { step, quantity: "parameter of a Gaussian", value: f64::from(bad) })
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// About the largest line integral through a Gaussian, whatever the direction: through its thinnest axis.
+pub fn amplitude(g: &Gaussian, setup: &GaussianSetup) -> f64 {
+    let thinnest = g.log_scale.iter().copied().fold(f32::INFINITY, f32::min).exp();
+    let scale = f64::from(thinnest.clamp(setup.least_scale, setup.greatest_scale));
+    f64::from(g.log_density).exp() * std::f64::consts::TAU.sqrt() * scale
+}
+
+/// One set of Gaussians for the whole beat.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MovingTree {
+    /// Gaussians as they are at phase 0.
+    pub rest: Gaussians,
+    /// The grid.
+    pub setup: TreeSetup,
+    /// `[phase][node]`: displacement (x, y, z, 0), pixels at the isocentre; none at phase 0.
+    pub grid: Vec<[f32; 4]>,
+    /// `[Gaussian][basis function]`: own motion (x, y, z, 0), pixels at the isocentre.
+    pub own: Vec<[f32; 4]>,
+}
+
+/// Values of the basis functions of own motion at a fraction of the beat: harmonics that vanish at its start.
+pub fn basis(n_basis: usize, fraction: f64) -> Vec<f64> {
+    let angle = |k: usize| std::f64::consts::TAU * fraction * k as f64;
+    let harmonics = n_basis / 2;
+    (1..=harmonics).map(|k| angle(k).cos() - 1.0).chain((1..=harmonics).map(|k| angle(k).sin())).collect()
+}
+
+/// Nodes around a point with their shares of its displacement.
+pub fn shares(setup: &TreeSetup, x: DVec3) -> [(usize, f64); 8] {
+    let n = setup.n_nodes as usize;
+    let last = DVec3::splat(f64::from(setup.n_nodes) - 1.001);
+    let place = (x + f64::from(setup.half_side)) * f64::from(setup.inverse_step);
+    let place = place.clamp(DVec3::ZERO, last);
+    let first = place.floor();
+    let part = place - first;
+    std::array::from_fn(|corner| {
+        let [dx, dy, dz] = [corner & 1, corner >> 1 & 1, corner >> 2];
+        let along = |d: usize, part: f64| if d == 1 { part } else { 1.0 - part };
+        let node = ((first.z as usize + dz) * n + first.y as usize + dy) * n + first.x as usize + dx;
+        (node, along(dx, part.x) * along(dy, part.y) * along(dz, part.z))
+    })
+}
+
+fn vector(v: &[f32; 4]) -> DVec3 {
+    DVec3::new(v[0].into(), v[1].into(), v[2].into())
+}
+
+impl MovingTree {
+    /// Where the grid carries a point of phase 0 at a phase, which may lie between two; the beat closes.
+    pub fn carried(&self, x: DVec3, phase: f64) -> DVec3 {
+        let n_phases = self.rest.n_phases;
+        let phase = phase.rem_euclid(n_phases as f64);
+        let (before, share) = (phase.floor() as usize % n_phases, phase.fract());
+        let all = shares(&self.setup, x);
+        let at = |t: usize| -> DVec3 {
+            let nodes = &self.grid[t * self.setup.nodes()..][..self.setup.nodes()];
+            all.iter().map(|(node, share)| *share * vector(&nodes[*node])).sum()
+        };
+        x + at(before).lerp(at((before + 1) % n_phases), share)
+    }
+
+    /// Where Gaussian `index` is at a phase, which may lie between two; the beat closes.
+    pub fn position(&self, index: usize, phase: f64) -> DVec3 {
+        let n_basis = self.setup.n_basis as usize;
+        let own = &self.own[index * n_basis..][..n_basis];
+        let basis = basis(n_basis, phase / self.rest.n_phases as f64);
+        self.carried(self.at_rest(index), phase) + own.iter().zip(basis).map(|(a, b)| b * vector(a)).sum::<DVec3>()
+    }
+
+    fn at_rest(&self, index: usize) -> DVec3 {
+        DVec3::from_array(self.rest.rows[index].position.map(f64::from))
+    }
+
+    /// The Gaussian nearest to a point of phase 0.
+    pub fn nearest(&self, x: DVec3) -> usize {
+        let distance = |i: usize| self.at_rest(i).distance_squared(x);
+        (0..self.rest.rows.len()).min_by(|a, b| distance(*a).total_cmp(&distance(*b))).unwrap_or(0)
+    }
+
+    /// The set as it is at every phase: what phases are drawn and scored by.
+    pub fn expand(&self) -> Gaussians {
+        let at = |phase: usize| {
+            self.rest.rows.iter().enumerate().map(move |(i, g)| Gaussian {
+                position: self.position(i, phase as f64).as_vec3().to_array(),
+                phase: phase as u32,
+                ..*g
+            })
+        };
+        Gaussians { rows: (0..self.rest.n_phases).flat_map(at).collect(), ..self.rest.clone() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shares_are_trilinear() {
+        let setup = TreeSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, ..TreeSetup::default() };
+        let x = DVec3::new(-17.0, 3.0, 22.0);
+        let all = shares(&setup, x);
+        assert!((all.iter().map(|s| s.1).sum::<f64>() - 1.0).abs() < 1e-12);
+        let node = |i: usize| DVec3::new((i % 4) as f64, (i / 4 % 4) as f64, (i / 16) as f64) * 20.0 - 30.0;
+        let mean: DVec3 = all.iter().map(|(i, share)| *share * node(*i)).sum();
+        assert!((mean - x).length() < 1e-6, "a linear field is reproduced: {mean}");
+    }
+
+    #[test]
+    fn own_motion_begins_and_ends_at_rest() {
+        assert!(basis(8, 0.0).iter().chain(&basis(8, 1.0)).all(|v| v.abs() < 1e-12));
+        assert!(basis(8, 0.3).iter().any(|v| v.abs() > 0.5));
+    }
+}

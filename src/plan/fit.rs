@@ -1,0 +1,114 @@
+//! Constants and schedule of a fit of Gaussians.
+
+use crate::config::sections;
+use crate::gaussians::stages::{RING_LENGTH, loss_parts};
+use crate::kernels::layout::{GaussianSchedule, GaussianSetup, TreeSetup};
+use crate::plan::targets::Targets;
+
+/// Bits behind the point of the integer sums: images hold up to 2048 times the strongest change, in steps of 1e-6.
+const FIXED_POINT_BITS: i32 = 20;
+/// Decay of Adam's first and second moments, and its smallest denominator.
+const BETAS: [f32; 2] = [0.9, 0.98];
+const EPSILON: f32 = 1e-12;
+/// The same while a phase is tracked: little memory, for few iterations.
+const TRACK_BETAS: [f32; 2] = [0.8, 0.95];
+/// What the rate falls to, linearly, over the iterations of a tracked phase.
+const TRACK_LAST_RATE: f64 = 0.2;
+/// The grid reaches this far beyond the hull, pixels.
+const MARGIN: f64 = 2.0;
+
+/// Constants of a fit.
+pub fn gaussian_setup(targets: &Targets, settings: &sections::Gaussians) -> GaussianSetup {
+    let image_stride = (targets.n_pixels() as u32).next_multiple_of(4);
+    GaussianSetup {
+        n_views: targets.views.len() as u32,
+        n_phases: targets.n_phases as u32,
+        width: targets.width as u32,
+        height: targets.height as u32,
+        cut: settings.cut as f32,
+        least_scale: settings.least_scale as f32,
+        greatest_scale: settings.greatest_scale as f32,
+        fixed_point: 2f32.powi(FIXED_POINT_BITS),
+        bend: settings.bend as f32,
+        loss_weight: 1.0 / targets.phases_seen().max(1) as f32,
+        beta1: BETAS[0],
+        beta2: BETAS[1],
+        epsilon: EPSILON,
+        position_rate: settings.position_rate as f32,
+        scale_rate: settings.scale_rate as f32,
+        rotation_rate: settings.rotation_rate as f32,
+        density_rate: settings.density_rate as f32,
+        ring_length: RING_LENGTH,
+        n_images: targets.n_images as u32,
+        image_stride,
+        n_loss_parts: loss_parts(targets.n_images as u32 * image_stride / 4),
+        blur: 0.0,
+    }
+}
+
+/// Constants while the motion of a tree is tracked, a phase at a time.
+pub fn track_setup(setup: &GaussianSetup, settings: &sections::Tree) -> GaussianSetup {
+    GaussianSetup {
+        blur: settings.track_blur as f32,
+        loss_weight: 1.0,
+        beta1: TRACK_BETAS[0],
+        beta2: TRACK_BETAS[1],
+        n_loss_parts: loss_parts(setup.n_views * setup.image_stride / 4),
+        ..*setup
+    }
+}
+
+/// A tree's grid, around the hull.
+pub fn tree_setup(targets: &Targets, settings: &sections::Tree) -> TreeSetup {
+    let reach = targets.places.iter().flatten().map(|p| p.position.abs().max_element()).fold(0.0, f64::max);
+    let half_side = reach + MARGIN;
+    let n_nodes = (2.0 * half_side / settings.node).ceil() as u32 + 1;
+    // More harmonics than half the phases cannot be told apart.
+    let harmonics = settings.harmonics.min((targets.n_phases as u32).saturating_sub(1) / 2);
+    TreeSetup {
+        n_nodes,
+        half_side: half_side as f32,
+        inverse_step: (f64::from(n_nodes - 1) / (2.0 * half_side)) as f32,
+        n_basis: 2 * harmonics,
+        smoothness: (settings.smoothness / targets.n_phases as f64) as f32,
+        own_penalty: settings.own_penalty as f32,
+        grid_rate: settings.grid_rate as f32,
+        own_rate: settings.own_rate as f32,
+    }
+}
+
+/// One row per iteration.
+pub fn schedule(settings: &sections::Gaussians) -> Vec<GaussianSchedule> {
+    (0..settings.iterations.max(1)).map(|step| row(step, rate(settings, step), BETAS)).collect()
+}
+
+/// One row per iteration of a tracked phase.
+pub fn track_schedule(settings: &sections::Tree) -> Vec<GaussianSchedule> {
+    let n = settings.track_iterations.max(1);
+    let rate = |step: u32| 1.0 - (1.0 - TRACK_LAST_RATE) * f64::from(step) / f64::from(n);
+    (0..n).map(|step| row(step, rate(step), TRACK_BETAS)).collect()
+}
+
+fn row(step: u32, rate: f64, betas: [f32; 2]) -> GaussianSchedule {
+    let bias = |beta: f32| (1.0 - f64::from(beta).powi(step as i32 + 1)) as f32;
+    GaussianSchedule { rate: rate as f32, bias1: bias(betas[0]), bias2: bias(betas[1]) }
+}
+
+/// Factor on all rates at an iteration: 1, falling linearly at the end.
+fn rate(settings: &sections::Gaussians, step: u32) -> f64 {
+    let left = f64::from(settings.iterations.saturating_sub(step));
+    (left / (settings.fall_share * f64::from(settings.iterations.max(1)))).clamp(settings.last_rate, 1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Preset};
+
+    #[test]
+    fn rates_fall_over_the_last_third() {
+        let rate = |step| rate(&Config::preset(Preset::Fast).gaussians, step);
+        assert_eq!((rate(0), rate(70)), (1.0, 1.0));
+        assert!((rate(85) - 0.5).abs() < 1e-12 && (rate(99) - 0.05).abs() < 1e-12);
+    }
+}

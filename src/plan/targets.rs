@@ -1,0 +1,162 @@
+//! What Gaussians are fitted to: views, bounds of the moving field's images, weights, and where vessels may be.
+
+use crate::config::sections;
+use crate::error::{Error, Result};
+use crate::gaussians::view::SplatView;
+use crate::model::gaussians::Units;
+use crate::plan::soft_hull::background::Series;
+use crate::plan::soft_hull::carve::{HullCell, SoftMotion};
+use crate::plan::soft_hull::evidence::ViewEvidence;
+use crate::scan::dataset::Dataset;
+use glam::DVec3;
+
+/// A place where a vessel may be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Place {
+    /// Centre of a hull cell, pixels at the isocentre.
+    pub position: DVec3,
+    /// What all views say for it: a log-likelihood ratio.
+    pub evidence: f64,
+}
+
+/// The data in the Gaussians' units.
+#[derive(Debug, Clone)]
+pub struct Targets {
+    /// Their units.
+    pub units: Units,
+    /// Columns of an image.
+    pub width: usize,
+    /// Rows of an image.
+    pub height: usize,
+    /// Cardiac phases.
+    pub n_phases: usize,
+    /// Training views with at least two phases.
+    pub views: Vec<SplatView>,
+    /// `[phase][view]`: index of the image, where there is one.
+    pub image_of: Vec<Option<usize>>,
+    /// Images.
+    pub n_images: usize,
+    /// `[image][pixel]`: least line integral of the moving field that explains the pixel.
+    pub low: Vec<f32>,
+    /// `[image][pixel]`: greatest.
+    pub high: Vec<f32>,
+    /// `[image][pixel]`: factor on the residual, from the pixel's noise.
+    pub weight: Vec<f32>,
+    /// Cells of the hull, per phase.
+    pub places: Vec<Vec<Place>>,
+    /// Side of a cell, pixels at the isocentre.
+    pub cell: f64,
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let n = values.len();
+    0.5 * (values[(n - 1) / 2] + values[n / 2])
+}
+
+impl Targets {
+    /// Brings a dataset and what moves in it into the Gaussians' units.
+    ///
+    /// # Errors
+    /// [`Error::Config`] when nothing moves, or too little is known to tell.
+    pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
+        if motion.views.is_empty() {
+            let problem = "no training view has two phases, so nothing is known of motion";
+            return Err(Error::config("dataset", dataset.path.display(), problem));
+        }
+        let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
+        if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
+            let problem = "nothing moves that several views agree on: check geometry, phases and noise";
+            return Err(Error::config("dataset", dataset.path.display(), problem));
+        }
+        let pixel = |v: usize| {
+            let rays = &dataset.views[v].rays;
+            0.5 * (rays.direction[1].length() + rays.direction[2].length()) * rays.sod
+        };
+        let units = Units { pixel: median(motion.views.iter().map(|v| pixel(v.view)).collect()), strongest };
+        let n_phases = dataset.n_phases as usize;
+        let mut targets = Targets {
+            units,
+            width: dataset.width,
+            height: dataset.height,
+            n_phases,
+            views: motion.views.iter().map(|v| SplatView::new(&dataset.views[v.view].rays, units)).collect(),
+            image_of: vec![None; n_phases * motion.views.len()],
+            n_images: 0,
+            low: Vec::new(),
+            high: Vec::new(),
+            weight: Vec::new(),
+            places: Vec::new(),
+            cell: motion.hull.cell / units.pixel,
+        };
+        let series = Series::of(dataset);
+        let weights: Vec<Vec<f32>> = motion.views.iter().map(|v| weights(v, strongest, settings.noise_scale)).collect();
+        // Images of a phase follow each other.
+        for phase in 0..n_phases {
+            for (slot, (series, view)) in series.iter().zip(&motion.views).enumerate() {
+                let (Some(image), Some(change)) = (&series.images[phase], &view.background.changes[phase]) else {
+                    continue;
+                };
+                let above = image.values.iter().zip(&view.background.low.values).map(|(y, b)| y - b);
+                let share = |change: f32| (f64::from(change) / strongest) as f32;
+                targets.image_of[phase * motion.views.len() + slot] = Some(targets.n_images);
+                targets.n_images += 1;
+                targets.low.extend(change.values.iter().map(|d| share(*d)));
+                targets.high.extend(above.map(share));
+                targets.weight.extend(&weights[slot]);
+            }
+        }
+        let place = |c: &HullCell| Place {
+            position: motion.hull.centre(c.index) / units.pixel,
+            evidence: f64::from(c.evidence),
+        };
+        targets.places = motion.hull.cells.iter().map(|cells| cells.iter().map(place).collect()).collect();
+        Ok(targets)
+    }
+
+    /// Phases that some view has.
+    pub fn phases_seen(&self) -> usize {
+        self.image_of.chunks(self.views.len()).filter(|row| row.iter().any(Option::is_some)).count()
+    }
+
+    /// The images of one phase alone, and its places.
+    pub fn only(&self, phase: usize) -> Targets {
+        let n = self.n_pixels();
+        let kept: Vec<usize> = self.views_at(phase).map(|(image, _)| image).collect();
+        let pick = |values: &[f32]| kept.iter().flat_map(|i| &values[i * n..(i + 1) * n]).copied().collect();
+        let mut targets = Targets {
+            image_of: vec![None; self.image_of.len()],
+            n_images: kept.len(),
+            low: pick(&self.low),
+            high: pick(&self.high),
+            weight: pick(&self.weight),
+            places: vec![Vec::new(); self.n_phases],
+            views: self.views.clone(),
+            ..*self
+        };
+        let row = phase * self.views.len();
+        let images = (row..row + self.views.len()).filter(|i| self.image_of[*i].is_some()).enumerate();
+        for (image, at) in images {
+            targets.image_of[at] = Some(image);
+        }
+        targets.places[phase].clone_from(&self.places[phase]);
+        targets
+    }
+
+    /// Pixels of an image.
+    pub fn n_pixels(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// Views that have a phase, with their images' indices.
+    pub fn views_at(&self, phase: usize) -> impl Iterator<Item = (usize, &SplatView)> {
+        let row = &self.image_of[phase * self.views.len()..][..self.views.len()];
+        row.iter().zip(&self.views).filter_map(|(image, view)| Some(((*image)?, view)))
+    }
+}
+
+/// Residuals count less where pixels are noisy, so that the loss bends later there.
+fn weights(view: &ViewEvidence, strongest: f64, scale: f64) -> Vec<f32> {
+    let weight = |noise: f64| if scale > 0.0 { 1.0 / (1.0 + (noise / scale).powi(2)).sqrt() } else { 1.0 };
+    view.background.noise.values.iter().map(|s| weight(f64::from(*s) / strongest) as f32).collect()
+}

@@ -1,0 +1,212 @@
+//! Fits a set of Gaussians per phase: many iterations per submit, and a step on the host where their number changes.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::gaussians::particles::{ParticleBuffers, Particles};
+use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers, record_images, record_step};
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{Commands, Recording};
+use crate::kernels::layout::{Gaussian, GaussianSetup};
+use crate::model::gaussians::{Gaussians, amplitude};
+use crate::plan::targets::Targets;
+use crate::plan::{fit, seeds};
+use crate::train::targets::{losses, take_images, target_buffers};
+
+/// Iterations that go into one submit: a CPU driver runs that many without waiting for the host.
+pub(super) const ITERATIONS_PER_SUBMIT: u32 = 10;
+
+/// A run on a device.
+pub struct GaussianTrainer {
+    gpu: Gpu,
+    targets: Targets,
+    config: Config,
+    setup: GaussianSetup,
+    kernels: GaussianKernels,
+    buffers: TargetBuffers,
+    particles: ParticleBuffers,
+    n: u32,
+    iterations: Iterations,
+    step: u32,
+}
+
+/// Recorded iterations.
+pub(super) struct Iterations {
+    several: Commands,
+    single: Commands,
+}
+
+impl Iterations {
+    /// Records them by a function that records so many.
+    pub(super) fn record(make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
+        Ok(Iterations { several: make(ITERATIONS_PER_SUBMIT)?, single: make(1)? })
+    }
+
+    /// Runs some, at most up to `stop`; how many.
+    pub(super) fn run(&self, gpu: &Gpu, step: u32, stop: u32) -> Result<u32> {
+        let several = stop - step >= ITERATIONS_PER_SUBMIT;
+        let (commands, n) = if several { (&self.several, ITERATIONS_PER_SUBMIT) } else { (&self.single, 1) };
+        gpu.wait(commands.submit()?)?;
+        Ok(n)
+    }
+}
+
+impl GaussianTrainer {
+    /// Seeds Gaussians in the hull of the targets.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for impossible settings or when there is no place for a Gaussian; device errors.
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianTrainer> {
+        let mut rows = seeds::seeds(&targets, &config.gaussians, config.seed);
+        let trainer = Self::with(gpu, targets, config, &Particles::fresh(rows.clone()))?;
+        let density = seeds::first_density(&trainer.targets, &trainer.images()?);
+        rows.iter_mut().for_each(|g| g.log_density = density.ln() as f32);
+        gpu.upload(&trainer.particles.gaussians, 0, &rows)?;
+        Ok(trainer)
+    }
+
+    /// Starts from given Gaussians.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::new`].
+    pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<GaussianTrainer> {
+        config.check()?;
+        let n = check_count(particles)?;
+        let setup = fit::gaussian_setup(&targets, &config.gaussians);
+        let kernels = GaussianKernels::new(gpu)?;
+        let buffers = target_buffers(gpu, &targets, &setup, &fit::schedule(&config.gaussians))?;
+        let particles = particles.upload(gpu, setup.n_views)?;
+        let iterations = record(gpu, &kernels, &buffers, &particles, &setup, n)?;
+        let (gpu, config) = (gpu.clone(), config.clone());
+        Ok(GaussianTrainer { gpu, targets, config, setup, kernels, buffers, particles, n, iterations, step: 0 })
+    }
+
+    /// Iterations done.
+    pub fn step(&self) -> u32 {
+        self.step
+    }
+
+    /// Gaussians of all phases.
+    pub fn count(&self) -> u32 {
+        self.n
+    }
+
+    /// What the run is fitted to.
+    pub fn targets(&self) -> &Targets {
+        &self.targets
+    }
+
+    /// Constants of the run.
+    pub fn setup(&self) -> &GaussianSetup {
+        &self.setup
+    }
+
+    /// The Gaussians on the device, for rendering while training and for tests.
+    pub fn particles(&self) -> &ParticleBuffers {
+        &self.particles
+    }
+
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the losses
+    /// of the iterations done. An empty list means the target was reached before.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] on a loss that is not finite; device errors.
+    pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        let until = until.min(self.config.gaussians.iterations);
+        if self.step >= until {
+            return Ok(Vec::new());
+        }
+        let grow_at = self.config.gaussians.grow_at;
+        if grow_at > 0 && self.step == grow_at {
+            self.grow()?;
+        }
+        let stop = if grow_at > self.step { until.min(grow_at) } else { until };
+        let first = self.step;
+        self.step += self.iterations.run(&self.gpu, first, stop)?;
+        losses(&self.buffers, first..self.step)
+    }
+
+    /// Drops weak Gaussians and places new ones where data are missing. Once in a run, so it is the host's work: it needs
+    /// the hull's cells and a weighted draw, a few megabytes each way.
+    fn grow(&mut self) -> Result<()> {
+        let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
+        particles.retain(&strong(&particles.rows, &self.setup, self.config.gaussians.weakest));
+        self.replace(&particles)?;
+        let (settings, seed) = (&self.config.gaussians, self.config.seed);
+        particles.append(seeds::additions(&self.targets, settings, seed, &self.images()?));
+        self.replace(&particles)
+    }
+
+    fn replace(&mut self, particles: &Particles) -> Result<()> {
+        self.n = check_count(particles)?;
+        self.particles = particles.upload(&self.gpu, self.setup.n_views)?;
+        self.iterations = record(&self.gpu, &self.kernels, &self.buffers, &self.particles, &self.setup, self.n)?;
+        Ok(())
+    }
+
+    /// Images of the present field, `[image][pixel]`, shares of the strongest change.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn images(&self) -> Result<Vec<f32>> {
+        let mut recording = Recording::new(&self.gpu, "images of Gaussians")?;
+        record_images(&mut GaussianPass {
+            recording: &mut recording,
+            kernels: &self.kernels,
+            targets: &self.buffers,
+            particles: &self.particles,
+            setup: &self.setup,
+            n: self.n,
+        })?;
+        self.gpu.wait(recording.finish()?.submit()?)?;
+        take_images(&self.gpu, &self.buffers, &self.targets, &self.setup)
+    }
+
+    /// The field after the iterations done.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when a parameter is not finite; device errors.
+    pub fn model(&self) -> Result<Gaussians> {
+        let model = Gaussians {
+            units: self.targets.units,
+            n_phases: self.targets.n_phases,
+            setup: self.setup,
+            rows: self.gpu.download(&self.particles.gaussians, 0, self.n as usize)?,
+            step: self.step,
+        };
+        model.check()?;
+        Ok(model)
+    }
+}
+
+/// Which Gaussians show more than the weakest that is kept.
+pub(super) fn strong(rows: &[Gaussian], setup: &GaussianSetup, weakest: f64) -> Vec<bool> {
+    rows.iter().map(|g| amplitude(g, setup) > weakest).collect()
+}
+
+/// Their number; none, or too many, cannot be fitted.
+pub(super) fn check_count(particles: &Particles) -> Result<u32> {
+    let n = particles.rows.len();
+    if n == 0 {
+        let problem = "no Gaussian is left: nothing in the images moves, or gaussians.weakest is too high";
+        return Err(Error::config("gaussians.count", n, problem));
+    }
+    u32::try_from(n).map_err(|_| Error::config("gaussians.count", n, "too many Gaussians"))
+}
+
+fn record(
+    gpu: &Gpu,
+    kernels: &GaussianKernels,
+    targets: &TargetBuffers,
+    particles: &ParticleBuffers,
+    setup: &GaussianSetup,
+    n: u32,
+) -> Result<Iterations> {
+    Iterations::record(|iterations| {
+        let mut recording = Recording::new(gpu, &format!("{iterations} iterations of Gaussians"))?;
+        let mut pass = GaussianPass { recording: &mut recording, kernels, targets, particles, setup, n };
+        for _ in 0..iterations {
+            record_step(&mut pass)?;
+        }
+        recording.finish()
+    })
+}

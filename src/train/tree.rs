@@ -1,0 +1,321 @@
+//! Fits a moving tree: phase 0 alone, then the grid tracked from phase to phase, then everything together.
+
+use crate::config::{Config, sections};
+use crate::error::{Error, Result};
+use crate::gaussians::particles::{ParticleBuffers, Particles};
+use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
+use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
+use crate::gaussians::tree::{record_images, record_step, record_track};
+use crate::gpu::buffer::Memory;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::Recording;
+use crate::kernels::layout::{GaussianSetup, TreeSetup};
+use crate::model::gaussians::{Gaussians, MovingTree};
+use crate::plan::soft_hull::background::blur;
+use crate::plan::targets::Targets;
+use crate::plan::{fit, seeds};
+use crate::raster::Image;
+use crate::train::gaussians::{GaussianTrainer, Iterations, check_count, strong};
+use crate::train::targets::{losses, padded, take_images, target_buffers};
+use glam::DVec3;
+
+/// A run on a device.
+pub struct TreeTrainer {
+    gpu: Gpu,
+    targets: Targets,
+    config: Config,
+    kernels: (GaussianKernels, TreeKernels),
+    joint: Fit,
+    particles: ParticleBuffers,
+    own: OwnMotionBuffers,
+    n: u32,
+    iterations: Iterations,
+    step: u32,
+}
+
+/// What iterations of one kind go by: the joint fit of everything, or the tracking of a phase.
+struct Fit {
+    setup: GaussianSetup,
+    tree: TreeSetup,
+    targets: TargetBuffers,
+    grid: GridBuffers,
+}
+
+impl Fit {
+    /// A fit of everything, with a grid at rest.
+    fn joint(gpu: &Gpu, targets: &Targets, config: &Config) -> Result<Fit> {
+        let setup = fit::gaussian_setup(targets, &config.gaussians);
+        let tree = fit::tree_setup(targets, &config.tree);
+        let buffers = target_buffers(gpu, targets, &setup, &fit::schedule(&config.gaussians))?;
+        Ok(Fit { setup, tree, targets: buffers, grid: GridBuffers::new(gpu, &tree, targets.n_phases)? })
+    }
+
+    /// A fit of the same grid to the same images, blurred, a phase at a time.
+    fn tracking(&self, gpu: &Gpu, targets: &Targets, settings: &sections::Tree) -> Result<Fit> {
+        let setup = fit::track_setup(&self.setup, settings);
+        let tree = TreeSetup { grid_rate: settings.track_rate as f32, ..self.tree };
+        let blurred = |values: &[f32]| {
+            let images = values.chunks(targets.n_pixels()).flat_map(|image| {
+                let image = Image { width: targets.width, height: targets.height, values: image.to_vec() };
+                blur(&image, settings.track_blur as f32).values
+            });
+            padded(&images.collect::<Vec<_>>(), targets, &setup)
+        };
+        let buffers = TargetBuffers {
+            gaussian_setup: gpu.buffer_with("gaussian_setup of tracking", &[setup])?,
+            bound_low: gpu.buffer_with("bound_low of tracking", &blurred(&targets.low))?,
+            bound_high: gpu.buffer_with("bound_high of tracking", &blurred(&targets.high))?,
+            gaussian_schedule: gpu.buffer_with("gaussian_schedule of tracking", &fit::track_schedule(settings))?,
+            gaussian_step: gpu.buffer_with("gaussian_step of tracking", &[0u32])?,
+            gaussian_ring: gpu.buffer(
+                "gaussian_ring of tracking",
+                self.targets.gaussian_ring.bytes(),
+                Memory::Readback,
+            )?,
+            ..self.targets.clone()
+        };
+        Ok(Fit { setup, tree, targets: buffers, grid: self.grid.under(gpu, &tree)? })
+    }
+}
+
+impl TreeTrainer {
+    /// Fits phase 0 alone, makes a tree of what it shows, and tracks it through the beat.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for impossible settings or when phase 0 shows nothing; device errors.
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<TreeTrainer> {
+        let iterations = config.tree.warm_iterations;
+        let warm = sections::Gaussians { iterations, ..config.gaussians.clone() };
+        let warm = Config { gaussians: warm, ..config.clone() };
+        let mut first = GaussianTrainer::new(gpu, targets.only(0), &warm)?;
+        while first.step() < iterations {
+            first.advance(iterations)?;
+        }
+        let mut found = Particles::fresh(first.model()?.rows);
+        found.retain(&strong(&found.rows, first.setup(), config.tree.take));
+        drop(first);
+        let trainer = Self::with(gpu, targets, config, &found)?;
+        trainer.track()?;
+        Ok(trainer)
+    }
+
+    /// Starts from given Gaussians of phase 0 at rest.
+    ///
+    /// # Errors
+    /// As [`TreeTrainer::new`].
+    pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<TreeTrainer> {
+        config.check()?;
+        let n = check_count(particles)?;
+        let kernels = (GaussianKernels::new(gpu)?, TreeKernels::new(gpu)?);
+        let joint = Fit::joint(gpu, &targets, config)?;
+        let own = OwnMotion::fresh(vec![[0.0; 4]; n as usize * joint.tree.n_basis as usize]);
+        let (particles, own) = upload(gpu, &joint.setup, particles, &own)?;
+        let iterations = record(gpu, &kernels, &joint, (&particles, &own), n)?;
+        let (gpu, config) = (gpu.clone(), config.clone());
+        Ok(TreeTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
+    }
+
+    /// Tracks the grid forward and backward from phase 0 to the middle of the beat, on blurred images.
+    fn track(&self) -> Result<()> {
+        let settings = &self.config.tree;
+        let tracking = self.joint.tracking(&self.gpu, &self.targets, settings)?;
+        for track in tracks(&self.targets) {
+            let iterations = if track.images.is_empty() { 0 } else { settings.track_iterations };
+            let mut recording = Recording::new(&self.gpu, "tracking")?;
+            let bound = (&self.particles, &self.own);
+            record_track(&mut pass(&mut recording, &self.kernels, &tracking, bound, self.n), &track, iterations)?;
+            self.gpu.wait(recording.finish()?.submit()?)?;
+        }
+        // What follows begins without momentum.
+        let mut recording = Recording::new(&self.gpu, "clear momentum")?;
+        recording.fill(&self.joint.grid.motion_grid_first, 0);
+        recording.fill(&self.joint.grid.motion_grid_second, 0);
+        self.gpu.wait(recording.finish()?.submit()?)
+    }
+
+    /// Iterations done, those of phase 0 and of tracking not counted.
+    pub fn step(&self) -> u32 {
+        self.step
+    }
+
+    /// Gaussians of the tree.
+    pub fn count(&self) -> u32 {
+        self.n
+    }
+
+    /// What the run is fitted to.
+    pub fn targets(&self) -> &Targets {
+        &self.targets
+    }
+
+    /// Constants of the run.
+    pub fn setup(&self) -> &GaussianSetup {
+        &self.joint.setup
+    }
+
+    /// Constants of the grid.
+    pub fn tree_setup(&self) -> &TreeSetup {
+        &self.joint.tree
+    }
+
+    /// The Gaussians on the device, for rendering while training and for tests.
+    pub fn particles(&self) -> &ParticleBuffers {
+        &self.particles
+    }
+
+    /// The grid on the device, as [`TreeTrainer::particles`].
+    pub fn grid(&self) -> &GridBuffers {
+        &self.joint.grid
+    }
+
+    /// Own motion on the device, as [`TreeTrainer::particles`].
+    pub fn own_motion(&self) -> &OwnMotionBuffers {
+        &self.own
+    }
+
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the losses
+    /// of the iterations done, penalties not included. An empty list means the target was reached before.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] on a loss that is not finite; device errors.
+    pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        let until = until.min(self.config.gaussians.iterations);
+        if self.step >= until {
+            return Ok(Vec::new());
+        }
+        let grow_at = self.config.gaussians.grow_at;
+        if grow_at > 0 && self.step == grow_at {
+            self.grow()?;
+        }
+        let stop = if grow_at > self.step { until.min(grow_at) } else { until };
+        let first = self.step;
+        self.step += self.iterations.run(&self.gpu, first, stop)?;
+        losses(&self.joint.targets, first..self.step)
+    }
+
+    /// Drops weak Gaussians and places new ones where data are missing at half the phases. Once in a run, on the host, as
+    /// with a set per phase.
+    fn grow(&mut self) -> Result<()> {
+        let (n, n_basis) = (self.n as usize, self.joint.tree.n_basis as usize);
+        let mut particles = self.particles.download(&self.gpu, n)?;
+        let mut own = self.own.download(&self.gpu, n * n_basis)?;
+        let keep = strong(&particles.rows, &self.joint.setup, self.config.gaussians.weakest);
+        particles.retain(&keep);
+        own.retain(&keep);
+        self.replace(&particles, &own)?;
+        let tree = self.tree()?;
+        let carried = |x: DVec3, phase: usize| tree.carried(x, phase as f64);
+        let (settings, seed) = (&self.config.gaussians, self.config.seed);
+        let additions = seeds::tree_additions(&self.targets, settings, seed, &self.images()?, carried);
+        // They move as their nearest neighbour does.
+        for g in &additions {
+            let nearest = tree.nearest(DVec3::from_array(g.position.map(f64::from)));
+            own.append(tree.own[nearest * n_basis..][..n_basis].to_vec());
+        }
+        particles.append(additions);
+        self.replace(&particles, &own)
+    }
+
+    fn replace(&mut self, particles: &Particles, own: &OwnMotion) -> Result<()> {
+        self.n = check_count(particles)?;
+        (self.particles, self.own) = upload(&self.gpu, &self.joint.setup, particles, own)?;
+        self.iterations = record(&self.gpu, &self.kernels, &self.joint, (&self.particles, &self.own), self.n)?;
+        Ok(())
+    }
+
+    /// Images of the present field, `[image][pixel]`, shares of the strongest change.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn images(&self) -> Result<Vec<f32>> {
+        let mut recording = Recording::new(&self.gpu, "images of a tree")?;
+        let mut pass = pass(&mut recording, &self.kernels, &self.joint, (&self.particles, &self.own), self.n);
+        record_images(&mut pass, 0..self.joint.setup.n_phases)?;
+        self.gpu.wait(recording.finish()?.submit()?)?;
+        take_images(&self.gpu, &self.joint.targets, &self.targets, &self.joint.setup)
+    }
+
+    /// The tree after the iterations done.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when a parameter is not finite; device errors.
+    pub fn tree(&self) -> Result<MovingTree> {
+        let (n, tree) = (self.n as usize, self.joint.tree);
+        let grid: Vec<[f32; 4]> =
+            self.gpu.download(&self.joint.grid.motion_grid, 0, self.targets.n_phases * tree.nodes())?;
+        let own: Vec<[f32; 4]> = self.gpu.download(&self.own.own_motion, 0, n * tree.n_basis as usize)?;
+        if let Some(bad) = grid.iter().chain(&own).flatten().find(|v| !v.is_finite()) {
+            let step = u64::from(self.step);
+            return Err(Error::Diverged { step, quantity: "motion of the tree", value: f64::from(*bad) });
+        }
+        let rest = Gaussians {
+            units: self.targets.units,
+            n_phases: self.targets.n_phases,
+            setup: self.joint.setup,
+            rows: self.gpu.download(&self.particles.gaussians, 0, n)?,
+            step: self.step,
+        };
+        rest.check()?;
+        Ok(MovingTree { rest, setup: tree, grid, own })
+    }
+}
+
+/// In which order phases are tracked, each from the two before it.
+fn tracks(targets: &Targets) -> Vec<Track> {
+    let n = targets.n_phases as u32;
+    let forward = (1..=n / 2).map(|t| [t, t - 1, t.saturating_sub(2)]);
+    let backward = (n / 2 + 1..n).rev().map(|t| [t, (t + 1) % n, if t + 2 < n { t + 2 } else { 0 }]);
+    let images = |phase: u32| {
+        let images: Vec<u32> = targets.views_at(phase as usize).map(|(image, _)| image as u32).collect();
+        images.first().map_or(0..0, |first| *first..first + images.len() as u32)
+    };
+    let track = |[phase, before, before_that]: [u32; 3]| Track { phase, before, before_that, images: images(phase) };
+    forward.chain(backward).map(track).collect()
+}
+
+/// Gaussians and their own motion on the device.
+type Bound<'a> = (&'a ParticleBuffers, &'a OwnMotionBuffers);
+
+fn upload(
+    gpu: &Gpu,
+    setup: &GaussianSetup,
+    particles: &Particles,
+    own: &OwnMotion,
+) -> Result<(ParticleBuffers, OwnMotionBuffers)> {
+    let n_places = particles.rows.len() as u64 * u64::from(setup.n_phases);
+    Ok((particles.upload(gpu, setup.n_views * setup.n_phases)?, own.upload(gpu, n_places)?))
+}
+
+fn pass<'a>(
+    recording: &'a mut Recording,
+    kernels: &'a (GaussianKernels, TreeKernels),
+    fit: &'a Fit,
+    (particles, own): Bound<'a>,
+    n: u32,
+) -> TreePass<'a> {
+    let (common, kernels) = kernels;
+    TreePass {
+        gaussians: GaussianPass { recording, kernels: common, targets: &fit.targets, particles, setup: &fit.setup, n },
+        kernels,
+        grid: &fit.grid,
+        own,
+        setup: &fit.tree,
+    }
+}
+
+fn record(
+    gpu: &Gpu,
+    kernels: &(GaussianKernels, TreeKernels),
+    fit: &Fit,
+    bound: Bound<'_>,
+    n: u32,
+) -> Result<Iterations> {
+    Iterations::record(|iterations| {
+        let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a tree"))?;
+        let mut pass = pass(&mut recording, kernels, fit, bound, n);
+        for _ in 0..iterations {
+            record_step(&mut pass)?;
+        }
+        recording.finish()
+    })
+}
