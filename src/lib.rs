@@ -193,8 +193,11 @@ pub mod bench;
 /// f64 twins of the compute stages: plain loops, no device. For tests; nothing else uses them.
 pub mod reference {
     pub mod field;
+    pub mod gaussians;
     pub mod march;
+    pub mod maxima;
     pub mod occupancy;
     pub mod projector;
     pub mod step;
+    pub mod tree;
 }

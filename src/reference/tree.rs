@@ -1,0 +1,124 @@
+//! f64 twin of the tree: where Gaussians are, the loss with its penalties, and its gradient.
+
+use crate::kernels::layout::{GaussianSetup, TreeSetup};
+use crate::model::gaussians::{basis, shares};
+use crate::plan::targets::Targets;
+use crate::reference::gaussians::{self, N_PARAMS, Params};
+use glam::DVec3;
+
+/// Everything that is fitted, or its gradient.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TreeParams {
+    /// Gaussians at rest.
+    pub rows: Vec<Params>,
+    /// `[Gaussian][basis function]`.
+    pub own: Vec<DVec3>,
+    /// `[phase][node]`; phase 0 stays at rest.
+    pub grid: Vec<DVec3>,
+}
+
+impl TreeParams {
+    /// Zeros of the same sizes.
+    pub fn zeros(&self) -> TreeParams {
+        TreeParams {
+            rows: vec![[0.0; N_PARAMS]; self.rows.len()],
+            own: vec![DVec3::ZERO; self.own.len()],
+            grid: vec![DVec3::ZERO; self.grid.len()],
+        }
+    }
+}
+
+/// What a Gaussian's place at a phase is made of.
+struct Motion {
+    nodes: [(usize, f64); 8],
+    basis: Vec<f64>,
+}
+
+fn motion(tree: &TreeSetup, rest: &Params, phase: usize, n_phases: usize) -> Motion {
+    let nodes = shares(tree, DVec3::new(rest[0], rest[1], rest[2])).map(|(n, share)| (phase * tree.nodes() + n, share));
+    Motion { nodes, basis: basis(tree.n_basis as usize, phase as f64 / n_phases as f64) }
+}
+
+fn displaced(p: &TreeParams, i: usize, motion: &Motion) -> Params {
+    let grid: DVec3 = motion.nodes.iter().map(|(node, share)| *share * p.grid[*node]).sum();
+    let n_basis = motion.basis.len();
+    let own: DVec3 = motion.basis.iter().zip(&p.own[i * n_basis..]).map(|(b, a)| *b * *a).sum();
+    let mut out = p.rows[i];
+    (grid + own).to_array().iter().zip(&mut out).for_each(|(d, x)| *x += d);
+    out
+}
+
+/// Loss without and with penalties, and the gradient of the latter. A Gaussian's share of the nodes is taken as given.
+pub fn loss_and_gradient(
+    targets: &Targets,
+    setup: &GaussianSetup,
+    tree: &TreeSetup,
+    p: &TreeParams,
+) -> (f64, f64, TreeParams) {
+    let n = targets.n_pixels();
+    let mut images = vec![0.0; targets.n_images * n];
+    let everywhere: Vec<(usize, usize)> =
+        (0..targets.n_phases).flat_map(|phase| (0..p.rows.len()).map(move |i| (phase, i))).collect();
+    let place = |phase: usize, i: usize| motion(tree, &p.rows[i], phase, targets.n_phases);
+    for &(phase, i) in &everywhere {
+        let moved = displaced(p, i, &place(phase, i));
+        for (image, view) in targets.views_at(phase) {
+            if let Some(seen) = gaussians::project(&moved, view, setup) {
+                seen.splat(setup, &mut images[image * n..][..n]);
+            }
+        }
+    }
+    let (mut loss, mut residuals) = (0.0, Vec::new());
+    for (image, seen) in images.chunks(n).enumerate() {
+        let range = image * n..(image + 1) * n;
+        let [low, high, weight] = [&targets.low, &targets.high, &targets.weight].map(|v| &v[range.clone()]);
+        let (value, residual) = gaussians::residual(setup, seen, low, high, weight);
+        loss += value;
+        residuals.push(residual);
+    }
+    let mut gradient = p.zeros();
+    for &(phase, i) in &everywhere {
+        let motion = place(phase, i);
+        let moved = displaced(p, i, &motion);
+        for (image, view) in targets.views_at(phase) {
+            let Some(seen) = gaussians::project(&moved, view, setup) else { continue };
+            let g = gaussians::gradient(&moved, view, setup, seen.moments(setup, &residuals[image]));
+            gradient.rows[i].iter_mut().zip(g).for_each(|(sum, g)| *sum += g);
+            let x = DVec3::new(g[0], g[1], g[2]);
+            for (k, b) in motion.basis.iter().enumerate() {
+                gradient.own[i * motion.basis.len() + k] += *b * x;
+            }
+            for (node, share) in motion.nodes.iter().filter(|_| phase > 0) {
+                gradient.grid[*node] += *share * x;
+            }
+        }
+    }
+    let penalty = add_penalties(tree, p, targets.n_phases, &mut gradient);
+    (loss, loss + penalty, gradient)
+}
+
+/// Squared own motion, and squared differences of neighbouring nodes.
+fn add_penalties(tree: &TreeSetup, p: &TreeParams, n_phases: usize, gradient: &mut TreeParams) -> f64 {
+    let (own, smooth) = (f64::from(tree.own_penalty), f64::from(tree.smoothness));
+    let mut penalty = 0.0;
+    for (g, a) in gradient.own.iter_mut().zip(&p.own) {
+        *g += 2.0 * own * *a;
+        penalty += own * a.length_squared();
+    }
+    let n = tree.n_nodes as usize;
+    for phase in 1..n_phases {
+        for node in 0..tree.nodes() {
+            for stride in [1, n, n * n] {
+                if node / stride % n + 1 == n {
+                    continue;
+                }
+                let (a, b) = (phase * tree.nodes() + node, phase * tree.nodes() + node + stride);
+                let step = p.grid[b] - p.grid[a];
+                penalty += smooth * step.length_squared();
+                gradient.grid[b] += 2.0 * smooth * step;
+                gradient.grid[a] -= 2.0 * smooth * step;
+            }
+        }
+    }
+    penalty
+}
