@@ -15,9 +15,11 @@ use std::path::Path;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Preset {
-    /// Normalised, hull-gated, tuned; the default.
+    /// Gaussians move in front of a still tensor field; the default.
     #[default]
     Fast,
+    /// The paper's two fields, normalised, hull-gated, tuned.
+    FastMlp,
     /// As the paper states it.
     Paper,
     /// As the authors' public code does it.
@@ -25,11 +27,12 @@ pub enum Preset {
 }
 
 impl Choice for Preset {
-    const ALL: &'static [Preset] = &[Preset::Fast, Preset::Paper, Preset::PublicCode];
+    const ALL: &'static [Preset] = &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode];
 
     fn name(self) -> &'static str {
         match self {
             Preset::Fast => "fast",
+            Preset::FastMlp => "fast-mlp",
             Preset::Paper => "paper",
             Preset::PublicCode => "public-code",
         }
@@ -44,6 +47,20 @@ pub enum Decay {
     Linear,
     /// A constant factor per step.
     Exponential,
+}
+
+/// What the moving field is made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum GaussianForm {
+    /// The network: no Gaussians.
+    None,
+    /// A set of Gaussians per phase, nothing shared.
+    Phase,
+    /// One set of Gaussians that moves over the beat.
+    Tree,
+    /// A tree where the data allow it, a set per phase else.
+    Auto,
 }
 
 /// What drives the dynamic field.
@@ -130,6 +147,16 @@ impl Config {
             .map_err(|e: toml::de::Error| Error::config("configuration", "", e.message().to_owned()))?;
         config.check()?;
         Ok(config)
+    }
+
+    /// Whether Gaussians are the moving field, and not the network.
+    pub fn gaussians_move(&self) -> bool {
+        self.gaussians.form != GaussianForm::None
+    }
+
+    /// Iterations, the first of the run, that go to Gaussians; the still field has the others.
+    pub fn gaussian_iterations(&self) -> u32 {
+        if self.gaussians_move() { self.gaussians.iterations.min(self.train.iterations) } else { 0 }
     }
 
     /// The configuration as TOML.
@@ -259,7 +286,7 @@ mod tests {
 
     #[test]
     fn a_printed_configuration_reads_back() {
-        for preset in [Preset::Fast, Preset::Paper, Preset::PublicCode] {
+        for preset in Preset::ALL.iter().copied() {
             let config = Config::preset(preset);
             config.check().unwrap();
             assert_eq!(toml::from_str::<Config>(&config.to_toml().unwrap()).unwrap(), config);

@@ -108,6 +108,7 @@ pub mod network;
 
 /// Gaussians on the device: how views see them, and one iteration.
 pub mod gaussians {
+    pub mod blobs;
     pub mod particles;
     pub mod stages;
     pub mod tree;
@@ -130,6 +131,7 @@ pub mod render {
 pub mod train {
     pub mod calibrate;
     pub mod gaussians;
+    pub mod moving;
     pub mod step;
     mod targets;
     pub mod timing;

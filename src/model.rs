@@ -2,6 +2,7 @@
 
 pub mod checkpoint;
 pub mod component;
+mod gaussian_tensors;
 pub mod gaussians;
 pub mod hull;
 pub mod params;
@@ -11,6 +12,7 @@ pub mod setup;
 
 use crate::config::Config;
 use crate::geometry::CArm;
+use crate::model::gaussians::MovingGaussians;
 use crate::model::hull::Hull;
 use crate::model::params::ParamLayout;
 use crate::model::scene::Scene;
@@ -26,6 +28,8 @@ pub struct Model {
     pub layout: ParamLayout,
     /// Motion hull, when the run uses one.
     pub hull: Option<Hull>,
+    /// Gaussians, where they are the moving field; else the network is.
+    pub moving: Option<MovingGaussians>,
     /// Parameters, padded as [`ParamLayout`] says.
     pub params: Vec<f32>,
     /// Iterations done.

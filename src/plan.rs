@@ -9,7 +9,7 @@ pub mod seeds;
 pub mod soft_hull;
 pub mod targets;
 
-use crate::config::{Config, DynamicTarget};
+use crate::config::{Config, DynamicTarget, GaussianForm};
 use crate::error::{Error, Result};
 use crate::kernels::layout::{self, Setup};
 use crate::model::hull::Hull;
@@ -17,6 +17,8 @@ use crate::model::params::ParamLayout;
 use crate::model::scene::Scene;
 use crate::plan::motion::ViewMotion;
 use crate::plan::scale::dynamic_half;
+use crate::plan::soft_hull::carve::SoftMotion;
+use crate::plan::targets::Targets;
 use crate::scan::dataset::Dataset;
 
 /// A run, ready to start.
@@ -43,6 +45,8 @@ pub struct Plan {
     pub motion_rays: Vec<u32>,
     /// The hull, when it is used.
     pub hull: Option<Hull>,
+    /// What Gaussians are fitted to, when they are the moving field.
+    pub targets: Option<Targets>,
     /// Decisions worth telling the user.
     pub notes: Vec<String>,
 }
@@ -55,7 +59,12 @@ impl Plan {
     pub fn new(config: &Config, dataset: &Dataset) -> Result<Plan> {
         let mut notes = Vec::new();
         let motion = motion::analyse(dataset, &config.hull);
-        let hull = choose_hull(config, dataset, &motion, &mut notes);
+        let (hull, targets) = if config.gaussians_move() {
+            let (hull, targets) = plan_gaussians(config, dataset, &mut notes)?;
+            (Some(hull), Some(targets))
+        } else {
+            (choose_hull(config, dataset, &motion, &mut notes), None)
+        };
         let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
         let pixels = dataset.n_pixels();
         let training = dataset.training();
@@ -121,6 +130,7 @@ impl Plan {
             backgrounds,
             motion_rays,
             hull,
+            targets,
             notes,
         })
     }
@@ -137,6 +147,21 @@ impl Plan {
         };
         Plan { scene, setup, ..self }
     }
+}
+
+/// Cells along each axis of the soft hull that Gaussians are seeded in.
+const SOFT_HULL_CELLS: usize = 112;
+
+/// Where vessels may be, and what Gaussians are fitted to.
+fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {
+    let soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
+    let targets = Targets::new(dataset, &soft, &config.gaussians)?;
+    notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
+    notes.push(match targets.form(config.gaussians.form) {
+        GaussianForm::Tree => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
+        _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
+    });
+    Ok((soft.hull.to_hull(), targets))
 }
 
 fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes: &mut Vec<String>) -> Option<Hull> {

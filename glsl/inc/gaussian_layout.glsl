@@ -73,3 +73,13 @@ struct Splat {
     vec3 conic;                 // a, b and c: the inverse variance
     float amplitude;            // line integral at the centre
 };
+
+// A Gaussian of the moving field as it is at a phase, in world units (100 mm): what is drawn.
+struct Blob {
+    vec3 centre;                // in world units
+    float density;              // attenuation at the centre, per world unit
+    vec3 diagonal;              // of the inverse variance: xx, yy, zz
+    float reach;                // no point further away belongs to it
+    vec3 mixed;                 // of the inverse variance: xy, xz, yz
+    float cut;                  // squared standard deviations at which it ends
+};

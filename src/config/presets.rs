@@ -1,13 +1,14 @@
 //! The presets.
 
 use crate::config::sections::{Adam, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree};
-use crate::config::{Config, Decay, DynamicTarget, Preset};
+use crate::config::{Config, Decay, DynamicTarget, GaussianForm, Preset};
 
 impl Config {
     /// Defaults of a preset.
     pub fn preset(preset: Preset) -> Config {
         match preset {
-            Preset::Fast => fast(paper()),
+            Preset::Fast => fast(fast_mlp(paper())),
+            Preset::FastMlp => fast_mlp(paper()),
             Preset::Paper => paper(),
             Preset::PublicCode => public_code(paper()),
         }
@@ -88,6 +89,7 @@ fn paper() -> Config {
 /// Gaussians are none of the paper's: one set of defaults for all presets.
 pub(super) fn gaussians() -> Gaussians {
     Gaussians {
+        form: GaussianForm::None,
         iterations: 100,
         count: 500,
         first_scale: 0.8,
@@ -137,10 +139,23 @@ fn public_code(paper: Config) -> Config {
     }
 }
 
-/// Normalised, hull-gated, tuned.
-fn fast(paper: Config) -> Config {
+/// Gaussians in front of the still field of [`fast_mlp`].
+fn fast(mlp: Config) -> Config {
     Config {
         preset: Preset::Fast,
+        train: Train { iterations: 500, motion_share: 0.0, checkpoint_every: 250, validate_every: 0, ..mlp.train },
+        // The network is never asked; the smallest one takes no memory.
+        dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, window_start: 0.0, ..mlp.dynamic },
+        occupancy: Occupancy { enabled: false, ..mlp.occupancy },
+        gaussians: Gaussians { form: GaussianForm::Auto, ..mlp.gaussians },
+        ..mlp
+    }
+}
+
+/// The paper's two fields, normalised, hull-gated, tuned.
+fn fast_mlp(paper: Config) -> Config {
+    Config {
+        preset: Preset::FastMlp,
         train: Train {
             iterations: 1200,
             rays: 1024,

@@ -1,6 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{Decay, DynamicTarget};
+use crate::config::{Decay, DynamicTarget, GaussianForm};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -205,6 +205,8 @@ section! {
     /// Gaussians as the moving field. Lengths are pixels at the isocentre, line integrals shares of the views' strongest
     /// change.
     Gaussians, "gaussians" {
+        /// What the moving field is made of: "none" (the network), "phase", "tree" or "auto".
+        form: GaussianForm,
         /// Iterations, each over all images.
         iterations: u32 in 1.0 to 1e6,
         /// Gaussians seeded per phase.

@@ -218,7 +218,7 @@ impl LayerKernels {
 }
 
 /// Variant of the shaders that read arrays of vec4; only the layers' time depends on doing so through addresses.
-fn vec4_variant(tuning: &Tuning) -> &'static str {
+pub(crate) fn vec4_variant(tuning: &Tuning) -> &'static str {
     if tuning.operands == Operands::Texel { "_texel" } else { "" }
 }
 

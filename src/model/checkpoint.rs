@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::geometry::CArm;
 use crate::model::Model;
+use crate::model::gaussian_tensors::{self, FileTensor, GaussianHeader};
 use crate::model::hull::Hull;
 use crate::model::params::ParamLayout;
 use crate::model::scene::Scene;
@@ -17,6 +18,10 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 const FORMAT: &str = "nertca-checkpoint-2";
+/// Of checkpoints whose moving field is made of Gaussians: they have no network.
+const GAUSSIAN_FORMAT: &str = "nertca-checkpoint-3";
+/// What names of the network's tensors begin with.
+const NETWORK: &str = "dynamic.";
 const MAX_BYTES: u64 = 4 << 30;
 /// Checkpoints kept besides the newest.
 const KEEP_OLDER: usize = 2;
@@ -60,6 +65,8 @@ struct Header {
     #[serde(default)]
     loss_scale: Option<LossScale>,
     hull: Option<HullHeader>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    gaussians: Option<GaussianHeader>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -152,8 +159,14 @@ impl Checkpoint {
     /// [`Error::Internal`].
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
         let model = &self.model;
-        let mut tensors: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = Vec::new();
+        let mut tensors: Vec<FileTensor> = Vec::new();
+        if let Some(field) = &model.moving {
+            tensors.extend(gaussian_tensors::tensors(field));
+        }
         for tensor in model.layout.tensors() {
+            if model.moving.is_some() && tensor.name.starts_with(NETWORK) {
+                continue;
+            }
             let gather = |value: &dyn Fn(usize) -> f32| -> Vec<u8> {
                 tensor.positions.iter().flat_map(|at| value(*at as usize).to_le_bytes()).collect()
             };
@@ -174,7 +187,8 @@ impl Checkpoint {
             tensors.push(("occupancy.bits".into(), Dtype::U32, vec![self.occupancy.len()], bytes));
         }
         let header = Header {
-            format: FORMAT.into(),
+            format: if model.moving.is_some() { GAUSSIAN_FORMAT } else { FORMAT }.into(),
+            gaussians: model.moving.as_ref().map(gaussian_tensors::header),
             config: model.config.clone(),
             scene: model.scene.clone(),
             phases: model.layout.phases,
@@ -223,8 +237,10 @@ impl Checkpoint {
         let text = metadata.metadata().as_ref().and_then(|m| m.get("nertca")).cloned();
         let text = text.ok_or_else(|| bad("metadata", "is not a checkpoint of this program".into()))?;
         let header: Header = serde_json::from_str(&text).map_err(|e| bad("metadata", e.to_string()))?;
-        if header.format != FORMAT {
-            return Err(bad("format", format!("`{}`; this version reads `{FORMAT}`", header.format)));
+        let wanted = if header.gaussians.is_some() { GAUSSIAN_FORMAT } else { FORMAT };
+        if header.format != wanted {
+            let problem = format!("`{}`; this version reads `{FORMAT}` and `{GAUSSIAN_FORMAT}`", header.format);
+            return Err(bad("format", problem));
         }
         header.config.check()?;
         if let Some(LossScale { scale, .. }) = header.loss_scale.filter(|s| !(s.scale.is_finite() && s.scale >= 1.0)) {
@@ -245,6 +261,9 @@ impl Checkpoint {
         let mut params = vec![0f32; layout.len];
         let mut moments = vec![[0f32; 2]; layout.len];
         for tensor in layout.tensors() {
+            if header.gaussians.is_some() && tensor.name.starts_with(NETWORK) {
+                continue;
+            }
             for prefix in ["", "adam.m.", "adam.v."] {
                 let name = format!("{prefix}{}", tensor.name);
                 let view = tensors.tensor(&name).map_err(|e| bad(&name, e.to_string()))?;
@@ -289,6 +308,10 @@ impl Checkpoint {
                 Some(Hull { size: h.size, min: DVec3::from_array(h.min), cell: h.cell, n_phases: h.n_phases, bits })
             }
         };
+        let moving = match &header.gaussians {
+            Some(about) => Some(gaussian_tensors::read(about, &tensors, header.phases, path)?),
+            None => None,
+        };
         let occupancy = match tensors.tensor("occupancy.bits") {
             Ok(view) if view.dtype() == Dtype::U32 => to_words(view.data()),
             _ => Vec::new(),
@@ -300,6 +323,7 @@ impl Checkpoint {
                 scene: header.scene,
                 layout,
                 hull,
+                moving,
                 params,
                 step: header.step,
                 vessel_attenuation: header.vessel_attenuation,

@@ -3,6 +3,7 @@
 use crate::error::{Error, Result};
 use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
 use glam::DVec3;
+use std::sync::{Arc, Mutex};
 
 /// What turns world units and line integrals into the Gaussians' own, and back.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -82,6 +83,44 @@ pub struct MovingTree {
     pub own: Vec<[f32; 4]>,
 }
 
+/// Gaussians as the moving field of a model.
+#[derive(Debug, Clone, PartialEq)]
+pub enum MovingGaussians {
+    /// A set per phase, nothing shared.
+    PerPhase(Gaussians),
+    /// One set for the beat.
+    Tree(MovingTree),
+}
+
+/// Gaussians of a run in training as they are now, and how often they have changed.
+pub type MovingFeed = Arc<Mutex<(u64, MovingGaussians)>>;
+
+impl MovingGaussians {
+    /// The set, for a tree as it is at phase 0.
+    pub fn rows(&self) -> &Gaussians {
+        match self {
+            MovingGaussians::PerPhase(sets) => sets,
+            MovingGaussians::Tree(tree) => &tree.rest,
+        }
+    }
+
+    /// Gaussians at a phase, from 0.
+    pub fn at(&self, phase: usize) -> Vec<Gaussian> {
+        match self {
+            MovingGaussians::PerPhase(sets) => sets.at(phase).copied().collect(),
+            MovingGaussians::Tree(tree) => tree.at(phase as f64),
+        }
+    }
+
+    /// Lower and upper corner of a box around the centres at all phases, world units; `None` without Gaussians.
+    pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
+        let phases = 0..self.rows().n_phases;
+        let centres = phases.flat_map(|phase| self.at(phase)).map(|g| DVec3::from_array(g.position.map(f64::from)));
+        let pixel = self.rows().units.pixel;
+        centres.map(|x| (x * pixel, x * pixel)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+    }
+}
+
 /// Values of the basis functions of own motion at a fraction of the beat: harmonics that vanish at its start.
 pub fn basis(n_basis: usize, fraction: f64) -> Vec<f64> {
     let angle = |k: usize| std::f64::consts::TAU * fraction * k as f64;
@@ -141,16 +180,20 @@ impl MovingTree {
         (0..self.rest.rows.len()).min_by(|a, b| distance(*a).total_cmp(&distance(*b))).unwrap_or(0)
     }
 
-    /// The set as it is at every phase: what phases are drawn and scored by.
-    pub fn expand(&self) -> Gaussians {
-        let at = |phase: usize| {
-            self.rest.rows.iter().enumerate().map(move |(i, g)| Gaussian {
-                position: self.position(i, phase as f64).as_vec3().to_array(),
-                phase: phase as u32,
-                ..*g
-            })
+    /// The set as it is at a phase, which may lie between two.
+    pub fn at(&self, phase: f64) -> Vec<Gaussian> {
+        let moved = |(i, g): (usize, &Gaussian)| Gaussian {
+            position: self.position(i, phase).as_vec3().to_array(),
+            phase: phase as u32,
+            ..*g
         };
-        Gaussians { rows: (0..self.rest.n_phases).flat_map(at).collect(), ..self.rest.clone() }
+        self.rest.rows.iter().enumerate().map(moved).collect()
+    }
+
+    /// The set as it is at every phase: what phases are scored by.
+    pub fn expand(&self) -> Gaussians {
+        let rows = (0..self.rest.n_phases).flat_map(|phase| self.at(phase as f64)).collect();
+        Gaussians { rows, ..self.rest.clone() }
     }
 }
 

@@ -13,10 +13,12 @@ impl Config {
     pub fn schedule(&self, step: u32) -> layout::Schedule {
         let d = &self.dynamic;
         let progress = f64::from(step) / f64::from(self.train.iterations);
-        let active = step >= d.delay;
+        let active = step >= d.delay && !self.gaussians_move();
         let since_delay = step.saturating_sub(d.delay);
         let restarted = active && d.delay > 0;
-        let updates = if restarted { since_delay } else { step } + 1;
+        // The still field begins where Gaussians end.
+        let since_begin = step.saturating_sub(self.gaussian_iterations());
+        let updates = if restarted { since_delay } else { since_begin } + 1;
         let opened = f64::from(since_delay) / f64::from(d.window_iterations.max(1));
         let bands = f64::from(d.bands);
         layout::Schedule {

@@ -3,12 +3,12 @@
 use crate::error::{Error, Result};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::record::Groups;
+use crate::gpu::record::{Groups, Recording};
 use crate::kernels::constants::OCCUPANCY_EPOCHS;
-use crate::kernels::dispatch::{Binding, buffer_set};
+use crate::kernels::dispatch::{Binding, buffer_set, dispatch};
 use crate::kernels::layout::{DeviceState, DispatchSize, IndirectArguments, LiveSamples, Ray, RayOut, Setup};
 use crate::kernels::push;
-use crate::kernels::stages::MARCH_LANES;
+use crate::kernels::stages::{Kernels, MARCH_LANES};
 use crate::kernels::tuning::Tuning;
 use crate::model::hull::Hull;
 use crate::model::params::ParamLayout;
@@ -100,6 +100,22 @@ impl ForwardBuffers {
             sample_sigma: new(Binding::sample_sigma, capacity * 8)?,
             occupancy: new(Binding::occupancy, occupancy_bytes(setup))?,
         })
+    }
+
+    /// Records the rays of `push.n_rays` pixels of a view.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when stage and buffers do not fit.
+    pub fn record_pose(
+        &self,
+        recording: &mut Recording,
+        kernels: &Kernels,
+        views: &Buffer,
+        push: push::PoseRays,
+    ) -> Result<()> {
+        let stage = &kernels.pose_rays;
+        let bound = [(Binding::views, views.into()), (Binding::rays, (&self.rays).into())];
+        dispatch(recording, stage, stage.groups_for(push.n_rays), &bound, push)
     }
 
     /// One invocation per padded sample.

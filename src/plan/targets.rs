@@ -1,6 +1,6 @@
 //! What Gaussians are fitted to: views, bounds of the moving field's images, weights, and where vessels may be.
 
-use crate::config::sections;
+use crate::config::{GaussianForm, sections};
 use crate::error::{Error, Result};
 use crate::gaussians::view::SplatView;
 use crate::model::gaussians::Units;
@@ -112,6 +112,17 @@ impl Targets {
         };
         targets.places = motion.hull.cells.iter().map(|cells| cells.iter().map(place).collect()).collect();
         Ok(targets)
+    }
+
+    /// The form of moving field that suits the data where `asked` leaves it open: a tree shares one set of Gaussians over
+    /// the beat, which takes phases enough to follow it from one to the next and a first phase that two views show.
+    pub fn form(&self, asked: GaussianForm) -> GaussianForm {
+        const LEAST_PHASES: usize = 4;
+        match asked {
+            GaussianForm::Auto if self.n_phases >= LEAST_PHASES && self.views_at(0).count() >= 2 => GaussianForm::Tree,
+            GaussianForm::Auto => GaussianForm::Phase,
+            asked => asked,
+        }
     }
 
     /// Phases that some view has.

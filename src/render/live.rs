@@ -9,10 +9,12 @@ use crate::gpu::record::Commands;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
+use crate::model::gaussians::MovingFeed;
 use crate::render::baked::Baked;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
-use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, PoisonError};
 use std::time::Instant;
 
 /// Side of a cell of the moving field: finer than a thin vessel, coarse enough to be baked again and again.
@@ -27,6 +29,15 @@ pub struct Source {
     pub outline: Model,
     /// Its parameters on the device.
     pub params: Option<Buffer>,
+    /// Its Gaussians, where they are the moving field.
+    pub moving: Option<MovingFeed>,
+}
+
+impl Source {
+    /// A model that does not change.
+    pub fn of(model: &Model) -> Source {
+        Source { outline: model.clone(), params: None, moving: None }
+    }
 }
 
 /// Draws the present state of a source.
@@ -34,6 +45,9 @@ pub struct Live {
     baked: Baked,
     config: Config,
     params: Option<Buffer>,
+    moving: Option<MovingFeed>,
+    /// Change of the feed that is drawn.
+    moving_at: AtomicU64,
     /// Iteration the static field and each phase were baked at.
     baked_at: Vec<u32>,
     rest_until: Instant,
@@ -51,6 +65,8 @@ impl Live {
             baked: Baked::for_display(renderer, model, CELL_MM),
             config: model.config.clone(),
             params: source.params.clone(),
+            moving: source.moving.clone(),
+            moving_at: AtomicU64::new(u64::MAX),
             baked_at: vec![0; 1 + model.layout.phases],
             rest_until: Instant::now(),
         })
@@ -128,7 +144,23 @@ impl Live {
     }
 
     fn follow(&self, step: u32) -> Result<Option<Commands>> {
+        self.follow_gaussians()?;
         let Some(params) = &self.params else { return Ok(None) };
         self.baked.renderer().follow(params, self.config.schedule(step)).map(Some)
+    }
+
+    /// Takes the source's Gaussians if they have changed.
+    fn follow_gaussians(&self) -> Result<()> {
+        let Some(feed) = &self.moving else { return Ok(()) };
+        let (change, field) = {
+            let now = feed.lock().unwrap_or_else(PoisonError::into_inner);
+            if now.0 == self.moving_at.load(Ordering::Relaxed) {
+                return Ok(());
+            }
+            now.clone()
+        };
+        self.baked.renderer().set_gaussians(&field)?;
+        self.moving_at.store(change, Ordering::Relaxed);
+        Ok(())
     }
 }

@@ -1,17 +1,18 @@
 //! Projections of a reconstruction for any pose and phase, through the kernels that train it.
 
 use crate::error::{Error, Result};
+use crate::gaussians::blobs::Blobs;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, Recording};
-use crate::kernels::dispatch::{Binding, dispatch};
 use crate::kernels::layout::{DeviceState, RayOut, Schedule, Setup, View};
 use crate::kernels::push;
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
+use crate::model::gaussians::MovingGaussians;
 use crate::model::params::ParamLayout;
 use crate::model::setup::sample_capacity;
 use crate::network::forward::ForwardBuffers;
@@ -74,6 +75,8 @@ pub struct Renderer {
     pub(super) buffers: ForwardBuffers,
     pub(super) setup: Setup,
     model_layout: ParamLayout,
+    /// Where Gaussians are the moving field.
+    pub(super) moving: Option<Blobs>,
 }
 
 impl Renderer {
@@ -96,20 +99,39 @@ impl Renderer {
         let buffers = ForwardBuffers::new(gpu, tuning, &setup, layout, RAYS_PER_SUBMIT, schedule, hull)?;
         // The schedule has a single row, that of the model's step.
         gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
-        let renderer =
-            Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout: model.layout.clone() };
-        renderer.set_model(model)?;
+        let moving = model.moving.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
+        let model_layout = model.layout.clone();
+        let renderer = Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout, moving };
+        renderer.set_params(model)?;
         Ok(renderer)
     }
 
-    /// Replaces parameters and window by those of `model`, which must have the same layout.
+    /// Replaces parameters, window and Gaussians by those of `model`, which must have the same layout.
     ///
     /// # Errors
     /// [`Error::Internal`] for another layout; device errors.
     pub fn set_model(&self, model: &Model) -> Result<()> {
-        if model.layout != self.model_layout {
+        if model.layout != self.model_layout || model.moving.is_some() != self.moving.is_some() {
             return Err(Error::Internal("the model has another layout than the renderer".into()));
         }
+        if let Some(field) = &model.moving {
+            self.set_gaussians(field)?;
+        }
+        self.set_params(model)
+    }
+
+    /// Replaces the moving field of a model that has Gaussians.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] where the network moves; device errors.
+    pub fn set_gaussians(&self, field: &MovingGaussians) -> Result<()> {
+        match &self.moving {
+            Some(blobs) => blobs.replace(field),
+            None => Err(Error::Internal("the network is the moving field of this model".into())),
+        }
+    }
+
+    fn set_params(&self, model: &Model) -> Result<()> {
         self.gpu.upload(&self.buffers.params, 0, &model.params)?;
         self.buffers.schedule.write(&[model.config.schedule(model.step)])
     }
@@ -156,19 +178,6 @@ impl Renderer {
         Pass { recording, kernels, network, buffers, training: None, params, setup }
     }
 
-    /// Records the rays of `push.n_rays` pixels of a view.
-    pub(super) fn record_rays(
-        &self,
-        recording: &mut Recording,
-        buffers: &ForwardBuffers,
-        views: &Buffer,
-        push: push::PoseRays,
-    ) -> Result<()> {
-        let stage = &self.kernels.pose_rays;
-        let bound = [(Binding::views, views.into()), (Binding::rays, (&buffers.rays).into())];
-        dispatch(recording, stage, stage.groups_for(push.n_rays), &bound, push)
-    }
-
     /// Renders a `width` x `height` view at a phase.
     ///
     /// # Errors
@@ -177,13 +186,19 @@ impl Renderer {
         self.check_phase(phase)?;
         let views = self.gpu.buffer_with("views", &[View::of(rays)])?;
         let pixels = (width * height) as u32;
+        let image_width = width as u32;
+        // Whole rows, which tiles of pixels are made of.
+        let at_once = (RAYS_PER_SUBMIT / image_width * image_width).max(RAYS_PER_SUBMIT.min(image_width));
         let mut out = Rendering::default();
-        for first_pixel in (0..pixels).step_by(RAYS_PER_SUBMIT as usize) {
-            let n_rays = RAYS_PER_SUBMIT.min(pixels - first_pixel);
+        for first_pixel in (0..pixels).step_by(at_once as usize) {
+            let n_rays = at_once.min(pixels - first_pixel);
             let mut recording = Recording::new(&self.gpu, "render")?;
-            let push = push::PoseRays { first_pixel, n_rays, phase, image_width: width as u32, view: 0 };
-            self.record_rays(&mut recording, &self.buffers, &views, push)?;
+            let push = push::PoseRays { first_pixel, n_rays, phase, image_width, view: 0 };
+            self.buffers.record_pose(&mut recording, &self.kernels, &views, push)?;
             self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
+            if let Some(blobs) = &self.moving {
+                blobs.record_rays(&mut recording, &self.buffers, phase, n_rays, image_width.min(n_rays))?;
+            }
             self.gpu.wait(recording.finish()?.submit()?)?;
             let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
             out.extend(&seen);

@@ -67,17 +67,18 @@ impl Renderer {
             let setup_buffer = self.constants(&mut r, "setup", bytemuck::bytes_of(&setup))?;
             let buffers = ForwardBuffers { setup: setup_buffer, ..self.buffers.clone() };
             let push = push::PoseRays { first_pixel: first, n_rays: n, phase, image_width: ny, view: 0 };
-            self.record_rays(&mut r, &buffers, &views, push)?;
-            let mut pass = self.pass(&mut r, &buffers, &setup);
-            match field {
-                Component::Static => {
+            buffers.record_pose(&mut r, &self.kernels, &views, push)?;
+            match (field, &self.moving) {
+                (Component::Static, _) => {
                     let stage = &self.kernels.volume_static;
                     let bound = [(Binding::volume, (&cells).into())];
-                    pass.run_with(stage, stage.groups_for(n * nx), &bound, push::VolumeStatic { n_rays: n })?;
+                    let push = push::VolumeStatic { n_rays: n };
+                    self.pass(&mut r, &buffers, &setup).run_with(stage, stage.groups_for(n * nx), &bound, push)?;
                 }
-                _ => {
-                    pass.recording.fill(&cells, 0);
-                    pass.volume(n, &cells)?;
+                (_, Some(blobs)) => blobs.record_points(&mut r, &buffers, phase, n, nx, &cells)?,
+                (_, None) => {
+                    r.fill(&cells, 0);
+                    self.pass(&mut r, &buffers, &setup).volume(n, &cells)?;
                 }
             }
             r.copy(&cells, 0, &read, 0, u64::from(n) * u64::from(nx) * 4)?;

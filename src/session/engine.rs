@@ -173,7 +173,7 @@ impl Shared {
         engine.settled = Some(Instant::now() + begin.elapsed() * SETTLE);
         self.step.store(trainer.step(), Ordering::Release);
         let params = Some(trainer.forward().params.clone());
-        self.publish(Source { outline: trainer.outline(), params });
+        self.publish(Source { outline: trainer.outline(), params, moving: trainer.moving_feed() });
         engine.training = Some(Training::new(trainer));
         Ok(())
     }
@@ -221,7 +221,7 @@ impl Shared {
     fn fall_back(&self, engine: &mut Engine) {
         engine.training = None;
         engine.version = 0;
-        let source = engine.saved.as_ref().map(|saved| Source { outline: saved.model.clone(), params: None });
+        let source = engine.saved.as_ref().map(|saved| Source::of(&saved.model));
         self.step.store(engine.saved.as_ref().map_or(0, |s| s.model.step), Ordering::Release);
         let mut published = lock(&self.published);
         published.generation += 1;

@@ -11,12 +11,14 @@ use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
+use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::model::setup::{RING_LENGTH, sample_capacity};
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::pass::Pass;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
+use crate::train::moving::Moving;
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use serde::Serialize;
 use std::collections::VecDeque;
@@ -43,7 +45,7 @@ pub struct StepLoss {
     pub tv: f64,
     /// Occlusion, weighted.
     pub occlusion: f64,
-    /// Mean squared residual of the total line integral.
+    /// Mean squared residual of the total line integral; not a number while Gaussians are fitted.
     pub squared_error: f64,
     /// Live dynamic samples of the batch.
     pub live_samples: u64,
@@ -52,6 +54,21 @@ pub struct StepLoss {
 }
 
 impl StepLoss {
+    /// An iteration of Gaussians, which are fitted to bounds and not to line integrals.
+    fn of_gaussians(step: u32, loss: f64) -> StepLoss {
+        let none = StepLoss {
+            step,
+            data: 0.0,
+            dynamic: 0.0,
+            tv: 0.0,
+            occlusion: 0.0,
+            squared_error: f64::NAN,
+            live_samples: 0,
+            loss_scale: 1.0,
+        };
+        StepLoss { data: loss, dynamic: loss, ..none }
+    }
+
     /// The objective.
     pub fn total(&self) -> f64 {
         self.data + self.tv + self.occlusion
@@ -66,6 +83,8 @@ pub struct Trainer {
     network: Network,
     forward: ForwardBuffers,
     training: TrainingBuffers,
+    /// Gaussians, where they are the moving field.
+    moving: Option<Moving>,
     /// Iterations of `several`.
     per_submit: u32,
     several: Commands,
@@ -79,6 +98,14 @@ pub struct Trainer {
     c_arm: CArm,
     image_size: [usize; 2],
     data_fingerprint: String,
+}
+
+/// Refuses to continue with fields of another shape.
+fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
+    if checkpoint.model.layout == plan.params && checkpoint.model.moving.is_some() == plan.targets.is_some() {
+        return Ok(());
+    }
+    Err(Error::config("checkpoint", checkpoint.model.layout.len, "its fields have another shape"))
 }
 
 /// Fingerprint of the training images (FNV-1a over their bits and geometry).
@@ -103,8 +130,7 @@ impl Trainer {
     /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
-        let params = plan.params.initial(&plan.config);
-        Self::start(gpu, plan, dataset, tuning, &params, None)
+        Self::start(gpu, plan, dataset, tuning, None, None)
     }
 
     /// Continues a run: the result is the same as without interruption.
@@ -125,10 +151,14 @@ impl Trainer {
                 "the checkpoint was trained on other images or geometry",
             ));
         }
-        Self::carry_on(gpu, plan, dataset, tuning, checkpoint)
+        // What was begun and not finished is fitted anew: that takes seconds and comes to the same bits.
+        let fitted = checkpoint.model.step >= plan.config.gaussian_iterations();
+        let moving = checkpoint.model.moving.as_ref().filter(|_| fitted);
+        check_shape(&plan, checkpoint)?;
+        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), moving)
     }
 
-    /// Continues a run on other images than it was begun on, as when more of them arrived.
+    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians are fitted anew.
     ///
     /// # Errors
     /// [`Error::Config`] when parameters and plan do not fit; device errors.
@@ -139,10 +169,8 @@ impl Trainer {
         tuning: Tuning,
         checkpoint: &Checkpoint,
     ) -> Result<Trainer> {
-        if checkpoint.model.layout != plan.params {
-            return Err(Error::config("checkpoint", checkpoint.model.layout.len, "its fields have another shape"));
-        }
-        Self::start(gpu, plan, dataset, tuning, &checkpoint.model.params, Some(checkpoint))
+        check_shape(&plan, checkpoint)?;
+        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), None)
     }
 
     fn start(
@@ -150,8 +178,8 @@ impl Trainer {
         mut plan: Plan,
         dataset: &Dataset,
         tuning: Tuning,
-        params: &[f32],
         saved: Option<&Checkpoint>,
+        moving: Option<&MovingGaussians>,
     ) -> Result<Trainer> {
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params));
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
@@ -159,7 +187,10 @@ impl Trainer {
         let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32)?;
         let (forward, training) = (forward_buffers(gpu, &kernels.tuning, &plan)?, TrainingBuffers::new(gpu, &plan)?);
         clear(gpu, &network, &forward, &training)?;
-        gpu.upload(&forward.params, 0, params)?;
+        match saved {
+            Some(saved) => gpu.upload(&forward.params, 0, &saved.model.params)?,
+            None => gpu.upload(&forward.params, 0, &plan.params.initial(&plan.config))?,
+        }
         let mut now = DeviceState { step: 0, loss_scale: network.first_loss_scale(), overflowed: 0, good_updates: 0 };
         if let Some(saved) = saved {
             gpu.upload(&training.moments, 0, &saved.moments)?;
@@ -173,8 +204,11 @@ impl Trainer {
                 (now.loss_scale, now.good_updates) = (scale, good_updates);
             }
         }
+        let moving = Moving::begin(gpu, &mut plan, dataset, moving)?;
+        let step = if moving.as_ref().is_some_and(Moving::is_fitting) { 0 } else { now.step };
+        // The still field's iterations follow those of Gaussians.
+        now.step = now.step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
-        let step = now.step;
         let record = |n: u32| -> Result<Commands> {
             let mut recording = Recording::new(gpu, &format!("{n} training iterations"))?;
             let mut pass = Pass {
@@ -193,7 +227,7 @@ impl Trainer {
         };
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
         let (several, single) = (record(per_submit)?, record(1)?);
-        Ok(Trainer {
+        let trainer = Trainer {
             gpu: gpu.clone(),
             kernels,
             network,
@@ -207,12 +241,18 @@ impl Trainer {
             completed: step,
             reported: step,
             first_loss: None,
+            moving,
             vessel_attenuation: dataset.vessel_attenuation,
             c_arm: dataset.reference_c_arm(),
             image_size: [dataset.width, dataset.height],
             data_fingerprint: data_fingerprint(dataset),
             plan,
-        })
+        };
+        // A field that was fitted before has left its images already.
+        if trainer.moving.as_ref().is_some_and(|m| !m.is_fitting()) {
+            trainer.leave_to_still_field()?;
+        }
+        Ok(trainer)
     }
 
     /// Iterations done.
@@ -246,6 +286,9 @@ impl Trainer {
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite or exploded; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+        if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
+            return self.advance_gaussians(until);
+        }
         while self.submitted < until && self.in_flight.len() < submits_in_flight(&self.gpu) {
             let (commands, n) = if until - self.submitted >= self.per_submit {
                 (&self.several, self.per_submit)
@@ -259,6 +302,33 @@ impl Trainer {
         self.gpu.wait(ticket)?;
         self.completed += n;
         self.read_losses()
+    }
+
+    /// The moving field as it is now, for those who draw it; none where the network moves.
+    pub fn moving_feed(&self) -> Option<MovingFeed> {
+        self.moving.as_ref().map(Moving::feed)
+    }
+
+    /// Some iterations of the Gaussians' fit; after its last, the still field begins with what they leave.
+    fn advance_gaussians(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+        let Some(moving) = &mut self.moving else { return Ok(Vec::new()) };
+        let losses = moving.advance(until, self.plan.config.gaussian_iterations())?;
+        if !moving.is_fitting() {
+            self.leave_to_still_field()?;
+        }
+        let first = self.completed;
+        for done in [&mut self.submitted, &mut self.completed, &mut self.reported] {
+            *done = first + losses.len() as u32;
+        }
+        Ok(losses.into_iter().zip(first + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
+    }
+
+    /// The still field is trained on the images less the moving field.
+    fn leave_to_still_field(&self) -> Result<()> {
+        let Some(moving) = &self.moving else { return Ok(()) };
+        let n_rays = self.plan.setup.n_rays;
+        let remains = moving.what_remains(&self.gpu, &self.kernels, &self.forward, n_rays, &self.plan)?;
+        self.gpu.upload(&self.training.images, 0, &remains)
     }
 
     fn read_losses(&mut self) -> Result<Vec<StepLoss>> {
@@ -317,7 +387,9 @@ impl Trainer {
             config: self.plan.config.clone(),
             scene: self.plan.scene.clone(),
             layout: self.plan.params.clone(),
-            hull: self.plan.hull.clone(),
+            // Gaussians need no hull once they are seeded.
+            hull: self.plan.hull.clone().filter(|_| self.moving.is_none()),
+            moving: self.moving.as_ref().map(Moving::field),
             params: Vec::new(),
             step: self.submitted,
             vessel_attenuation: self.vessel_attenuation,

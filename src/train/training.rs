@@ -100,7 +100,8 @@ impl Training {
     fn progress(&mut self, loss: StepLoss) -> Progress {
         let newest = loss.squared_error;
         let smoothed = self.smoothed_mse.map_or(newest, |mse| (1.0 - SMOOTHING) * mse + SMOOTHING * newest);
-        self.smoothed_mse = Some(smoothed);
+        // Gaussians have none.
+        self.smoothed_mse = Some(smoothed).filter(|mse| mse.is_finite());
         let elapsed_s = self.elapsed_s();
         Progress {
             loss,

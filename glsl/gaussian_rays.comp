@@ -1,0 +1,125 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Exact line integrals of the moving field's Gaussians, and the largest attenuation along each ray: a sum of Gaussians
+// is one along any ray, in closed form. One workgroup per tile of 8 x 8 pixels of an image, one invocation per ray.
+//   ray_out[ray].dynamic_integral, dynamic_max, total_max
+// Reads what march_fwd left of the static field. Twin: reference::blobs.
+#include "inc/operands.glsl"
+#include "inc/layout.glsl"
+#include "inc/gaussian_layout.glsl"
+#include "inc/softplus.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/reduce.glsl"
+layout(push_constant) uniform Push { uint n_rays; uint image_width; uint first_blob; uint n_blobs; } push;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { Ray rays[]; };
+layout(binding = 2) readonly buffer B2 { Blob blobs[]; };
+READ_VEC4(3, B3, static_params);
+layout(binding = 4) buffer B4 { RayOut ray_out[]; };
+#include "inc/tensor_vm.glsl"
+#include "inc/blobs.glsl"
+
+// Most Gaussians of a ray that its maximum is sought among; the strongest are kept.
+const uint MOST_PEAKS = 32u;
+// Steps from a Gaussian's peak towards the peak of the sum.
+const uint CLIMBS = 4u;
+const float TWO_PI = 6.28318530718;
+
+// Along the ray: peak exp(-steepness (depth - at)^2 / 2).
+float peak_at[MOST_PEAKS];
+float peak_steepness[MOST_PEAKS];
+float peak_height[MOST_PEAKS];
+uint n_peaks = 0u;
+
+void keep_peak(float at, float steepness, float height) {
+    uint slot = n_peaks;
+    if (slot == MOST_PEAKS) {
+        slot = 0u;
+        for (uint i = 1u; i < MOST_PEAKS; i++)
+            if (peak_height[i] < peak_height[slot]) slot = i;
+        if (height <= peak_height[slot]) return;
+    } else {
+        n_peaks++;
+    }
+    peak_at[slot] = at;
+    peak_steepness[slot] = steepness;
+    peak_height[slot] = height;
+}
+
+// Attenuation of the kept Gaussians at a depth, and where the next step of a climb leads.
+float sum_at(float depth, out float next) {
+    float sum = 0.0, pull = 0.0, weight = 0.0;
+    for (uint i = 0u; i < n_peaks; i++) {
+        float d = depth - peak_at[i];
+        float value = peak_height[i] * exp(-0.5 * peak_steepness[i] * d * d);
+        sum += value;
+        pull += value * peak_steepness[i] * peak_at[i];
+        weight += value * peak_steepness[i];
+    }
+    next = weight > 0.0 ? pull / weight : depth;
+    return sum;
+}
+
+void main() {
+    uint lane = gl_LocalInvocationID.x;
+    uint tiles = (push.image_width + 7u) / 8u;
+    uvec2 corner = 8u * uvec2(gl_WorkGroupID.x % tiles, gl_WorkGroupID.x / tiles);
+    uvec2 pixel = corner + uvec2(lane % 8u, lane / 8u);
+    uint r = pixel.y * push.image_width + pixel.x;
+    bool wanted = pixel.x < push.image_width && r < push.n_rays;
+    Ray first = rays[corner.y * push.image_width + corner.x];
+    Ray ray = first;
+    if (wanted) ray = rays[r];
+    // No ray of the tile strays further from its first one.
+    float spread = workgroup_max(distance(ray.anchor, first.anchor));
+    float spread_per_depth = workgroup_max(distance(ray.direction, first.direction));
+    float first_squared = dot(first.direction, first.direction);
+    float squared = dot(ray.direction, ray.direction);
+    float integral = 0.0;
+    for (uint begin = 0u; begin < push.n_blobs; begin += 64u) {
+        bool near = false;
+        if (begin + lane < push.n_blobs) {
+            Blob b = blobs[push.first_blob + begin + lane];
+            vec3 w = b.centre - first.anchor;
+            float depth = dot(w, first.direction) / first_squared;
+            float away = length(w - depth * first.direction);
+            // A ray's closest point is not at the first ray's depth: a tenth more covers that.
+            near = away <= b.reach + 1.1 * (spread + (abs(depth) + b.reach) * spread_per_depth);
+        }
+        mark_near(near);
+        for (uint word = 0u; word < 2u; word++) {
+            for (uint bits = near_blobs[word]; bits != 0u; bits &= bits - 1u) {
+                Blob b = blobs[push.first_blob + begin + 32u * word + uint(findLSB(bits))];
+                vec3 w = b.centre - ray.anchor;
+                // From the ray's point nearest to the centre: numbers stay small.
+                float depth = dot(w, ray.direction) / squared;
+                w -= depth * ray.direction;
+                vec3 along = blob_times(b, ray.direction);
+                float steepness = dot(ray.direction, along);
+                float offset = dot(w, along) / steepness;
+                float q = max(dot(w, blob_times(b, w)) - offset * offset * steepness, 0.0);
+                if (q >= b.cut) continue;
+                float height = b.density * exp(-0.5 * q);
+                integral += height * sqrt(TWO_PI / steepness) * ray.norm;
+                keep_peak(depth + offset, steepness, height);
+            }
+        }
+    }
+    if (!wanted) return;
+    float dynamic_max = 0.0;
+    float total_max = ray_out[r].static_max;
+    for (uint i = 0u; i < n_peaks; i++) {
+        float depth = peak_at[i], next;
+        for (uint k = 0u; k < CLIMBS; k++) {
+            sum_at(depth, next);
+            depth = next;
+        }
+        float value = sum_at(depth, next);
+        dynamic_max = max(dynamic_max, value);
+        vec3 x = ray.anchor + depth * ray.direction;
+        total_max = max(total_max, value + (static_inside(x) ? static_attenuation(x) : 0.0));
+    }
+    ray_out[r].dynamic_integral = integral;
+    ray_out[r].dynamic_max = dynamic_max;
+    ray_out[r].total_max = total_max;
+}

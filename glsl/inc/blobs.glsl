@@ -1,0 +1,20 @@
+// Which Gaussians a workgroup's points or rays can meet, 64 at a time. Needs `blobs`.
+
+// A bit for each of 64 Gaussians; read in order, so that sums repeat bit by bit.
+shared uint near_blobs[2];
+
+vec3 blob_times(Blob b, vec3 v) {
+    return vec3(b.diagonal.x * v.x + b.mixed.x * v.y + b.mixed.y * v.z,
+                b.mixed.x * v.x + b.diagonal.y * v.y + b.mixed.z * v.z,
+                b.mixed.y * v.x + b.mixed.z * v.y + b.diagonal.z * v.z);
+}
+
+// Says for the Gaussian of this lane whether it is near; then `near_blobs` holds for all lanes.
+void mark_near(bool near) {
+    uint lane = gl_LocalInvocationID.x;
+    barrier();
+    if (lane < 2u) near_blobs[lane] = 0u;
+    barrier();
+    if (near) atomicOr(near_blobs[lane >> 5], 1u << (lane & 31u));
+    barrier();
+}

@@ -1,0 +1,172 @@
+//! Gaussians as they are drawn: along rays, and at the cells of volumes.
+
+use crate::error::{Error, Result};
+use crate::gpu::buffer::Buffer;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{Groups, Recording};
+use crate::kernels::dispatch::{Binding, BufferSet, dispatch_finding};
+use crate::kernels::layout::{Blob, Gaussian, GaussianSetup};
+use crate::kernels::push;
+use crate::kernels::stages::{Build, Stage, vec4_variant};
+use crate::kernels::tuning::Tuning;
+use crate::model::gaussians::{MovingGaussians, Units};
+use glam::{DMat3, DQuat, DVec3};
+use std::ops::Range;
+use std::sync::{Mutex, PoisonError};
+
+/// Sides of the tile of pixels that a workgroup draws.
+const TILE: u32 = 8;
+
+/// Pipelines.
+pub struct BlobKernels {
+    /// Line integrals and maxima.
+    pub rays: Stage<push::GaussianRays>,
+    /// Attenuation at the cells of rows.
+    pub points: Stage<push::GaussianPoints>,
+}
+
+impl BlobKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu, tuning: &Tuning) -> Result<BlobKernels> {
+        let plain = Build::default();
+        Ok(BlobKernels {
+            rays: Build { variant: vec4_variant(tuning), ..plain }.stage(gpu)?,
+            points: plain.stage(gpu)?,
+        })
+    }
+}
+
+impl Blob {
+    /// A Gaussian in world units.
+    pub fn of(g: &Gaussian, units: Units, setup: &GaussianSetup) -> Blob {
+        let bound = |log: f32| f64::from(log.exp().clamp(setup.least_scale, setup.greatest_scale)) * units.pixel;
+        let scale = DVec3::from_array(g.log_scale.map(bound));
+        let [w, x, y, z] = g.rotation.map(f64::from);
+        let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+        let inverse = axes * DMat3::from_diagonal(1.0 / (scale * scale)) * axes.transpose();
+        let cut = f64::from(setup.cut);
+        let f32s = |v: DVec3| v.as_vec3().to_array();
+        Blob {
+            centre: f32s(DVec3::from_array(g.position.map(f64::from)) * units.pixel),
+            density: (f64::from(g.log_density).exp() * units.attenuation()) as f32,
+            diagonal: f32s(DVec3::new(inverse.x_axis.x, inverse.y_axis.y, inverse.z_axis.z)),
+            reach: (cut * scale.max_element()) as f32,
+            mixed: f32s(DVec3::new(inverse.y_axis.x, inverse.z_axis.x, inverse.z_axis.y)),
+            cut: (cut * cut) as f32,
+        }
+    }
+}
+
+/// Gaussians of all phases on the device.
+struct BlobSet {
+    blobs: Buffer,
+    /// Those of each phase.
+    phases: Vec<Range<u32>>,
+}
+
+impl BlobSet {
+    fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<BlobSet> {
+        let (sets, mut all, mut phases) = (field.rows(), Vec::new(), Vec::new());
+        for phase in 0..sets.n_phases {
+            let first = all.len() as u32;
+            all.extend(field.at(phase).iter().map(|g| Blob::of(g, sets.units, &sets.setup)));
+            phases.push(first..all.len() as u32);
+        }
+        // A buffer is never empty.
+        let blobs = if all.is_empty() { vec![Blob::default()] } else { all };
+        Ok(BlobSet { blobs: gpu.buffer_with("blobs", &blobs)?, phases })
+    }
+}
+
+/// Draws a moving field that is made of Gaussians.
+pub struct Blobs {
+    gpu: Gpu,
+    kernels: BlobKernels,
+    set: Mutex<BlobSet>,
+}
+
+impl Blobs {
+    /// Puts a field on the device.
+    ///
+    /// # Errors
+    /// [`Error::OutOfMemory`]; other device errors.
+    pub fn new(gpu: &Gpu, tuning: &Tuning, field: &MovingGaussians) -> Result<Blobs> {
+        let set = Mutex::new(BlobSet::new(gpu, field)?);
+        Ok(Blobs { gpu: gpu.clone(), kernels: BlobKernels::new(gpu, tuning)?, set })
+    }
+
+    /// Draws another field from now on. What was recorded before draws the old one.
+    ///
+    /// # Errors
+    /// As [`Blobs::new`].
+    pub fn replace(&self, field: &MovingGaussians) -> Result<()> {
+        let new = BlobSet::new(&self.gpu, field)?;
+        *self.set.lock().unwrap_or_else(PoisonError::into_inner) = new;
+        Ok(())
+    }
+
+    /// Gaussians of a phase, and their buffer.
+    fn at(&self, phase: u32) -> Result<(Buffer, Range<u32>)> {
+        let set = self.set.lock().unwrap_or_else(PoisonError::into_inner);
+        let missing = || Error::Internal(format!("no Gaussians of phase {phase}"));
+        Ok((set.blobs.clone(), set.phases.get(phase as usize).ok_or_else(missing)?.clone()))
+    }
+
+    /// Records integrals and maxima of the `n_rays` rays in `buffers`, rows of an image of `image_width` columns. What
+    /// `ray_out` says of the static field must be there already.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when stage and buffers do not fit.
+    pub fn record_rays(
+        &self,
+        recording: &mut Recording,
+        buffers: &dyn BufferSet,
+        phase: u32,
+        n_rays: u32,
+        image_width: u32,
+    ) -> Result<()> {
+        let (blobs, at) = self.at(phase)?;
+        let rows = n_rays.div_ceil(image_width);
+        let tiles = image_width.div_ceil(TILE) * rows.div_ceil(TILE);
+        let push = push::GaussianRays { n_rays, image_width, first_blob: at.start, n_blobs: at.len() as u32 };
+        let bound = [(Binding::blobs, (&blobs).into())];
+        dispatch_finding(
+            recording,
+            &self.kernels.rays,
+            Groups::Direct([tiles, 1, 1]),
+            &bound,
+            |name| buffers.find(name),
+            push,
+        )
+    }
+
+    /// Records the field at the cells of `volume`: rows of `row_cells` along the rays `rows` in `buffers`.
+    ///
+    /// # Errors
+    /// As [`Blobs::record_rays`].
+    pub fn record_points(
+        &self,
+        recording: &mut Recording,
+        buffers: &dyn BufferSet,
+        phase: u32,
+        n_rows: u32,
+        row_cells: u32,
+        volume: &Buffer,
+    ) -> Result<()> {
+        // Groups along y are limited to 65535 on every device.
+        const MOST_ROWS: u32 = 65_535;
+        let (blobs, at) = self.at(phase)?;
+        let bound = [(Binding::blobs, (&blobs).into()), (Binding::volume, volume.into())];
+        let points = &self.kernels.points;
+        for first_row in (0..n_rows).step_by(MOST_ROWS as usize) {
+            let rows = MOST_ROWS.min(n_rows - first_row);
+            let push = push::GaussianPoints { first_row, first_blob: at.start, n_blobs: at.len() as u32 };
+            let groups = Groups::Direct([row_cells.div_ceil(points.local_size()), rows, 1]);
+            dispatch_finding(recording, points, groups, &bound, |name| buffers.find(name), push)?;
+        }
+        Ok(())
+    }
+}

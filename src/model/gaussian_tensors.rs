@@ -1,0 +1,200 @@
+//! Gaussians in a checkpoint: tensors under documented names, and what the header says of them.
+
+use crate::error::{Error, Result};
+use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units};
+use safetensors::tensor::{Dtype, SafeTensors};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Most nodes along an axis of a tree's grid, and most numbers per axis of own motion: no run comes near.
+const MOST_NODES: u32 = 512;
+const MOST_BASIS: u32 = 256;
+
+/// A tensor on its way into a file: name, type, shape, bytes.
+pub(super) type FileTensor = (String, Dtype, Vec<usize>, Vec<u8>);
+
+/// What tensors do not tell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct GaussianHeader {
+    /// World units (100 mm) of a pixel at the isocentre, the unit of all lengths.
+    pixel: f64,
+    /// Line integral that counts as 1.
+    strongest: f64,
+    /// Standard deviations at which a Gaussian ends.
+    cut: f32,
+    /// Bounds of the scales, pixels.
+    least_scale: f32,
+    greatest_scale: f32,
+    /// Iterations of the fit.
+    step: u32,
+    /// The grid that moves a tree; none for a set per phase.
+    grid: Option<GridHeader>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct GridHeader {
+    /// Nodes along each axis of a cube around the isocentre.
+    nodes: u32,
+    /// Half its side, pixels.
+    half_side: f32,
+    /// Numbers per axis of a Gaussian's own motion.
+    basis: u32,
+}
+
+pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
+    let sets = field.rows();
+    GaussianHeader {
+        pixel: sets.units.pixel,
+        strongest: sets.units.strongest,
+        cut: sets.setup.cut,
+        least_scale: sets.setup.least_scale,
+        greatest_scale: sets.setup.greatest_scale,
+        step: sets.step,
+        grid: match field {
+            MovingGaussians::PerPhase(_) => None,
+            MovingGaussians::Tree(tree) => Some(GridHeader {
+                nodes: tree.setup.n_nodes,
+                half_side: tree.setup.half_side,
+                basis: tree.setup.n_basis,
+            }),
+        },
+    }
+}
+
+pub(super) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
+    let rows = &field.rows().rows;
+    let floats = |name: &str, width: usize, of: &dyn Fn(&Gaussian) -> Vec<f32>| -> FileTensor {
+        let bytes = rows.iter().flat_map(of).flat_map(f32::to_le_bytes).collect();
+        let shape = if width == 1 { vec![rows.len()] } else { vec![rows.len(), width] };
+        (format!("gaussians.{name}"), Dtype::F32, shape, bytes)
+    };
+    let mut all = vec![
+        floats("position", 3, &|g| g.position.to_vec()),
+        floats("log_scale", 3, &|g| g.log_scale.to_vec()),
+        floats("rotation", 4, &|g| g.rotation.to_vec()),
+        floats("log_density", 1, &|g| vec![g.log_density]),
+    ];
+    match field {
+        MovingGaussians::PerPhase(_) => {
+            let phases = rows.iter().flat_map(|g| g.phase.to_le_bytes()).collect();
+            all.push(("gaussians.phase".into(), Dtype::U32, vec![rows.len()], phases));
+        }
+        MovingGaussians::Tree(tree) => {
+            let vectors = |name: &str, shape: Vec<usize>, values: &[[f32; 4]]| -> FileTensor {
+                let bytes = values.iter().flat_map(|v| v[..3].to_vec()).flat_map(f32::to_le_bytes).collect();
+                (format!("gaussians.{name}"), Dtype::F32, shape, bytes)
+            };
+            let (n, basis) = (tree.setup.n_nodes as usize, tree.setup.n_basis as usize);
+            all.push(vectors("motion.grid", vec![tree.rest.n_phases, n, n, n, 3], &tree.grid));
+            all.push(vectors("motion.own", vec![rows.len(), basis, 3], &tree.own));
+        }
+    }
+    all
+}
+
+/// Reads what [`header`] and [`tensors`] describe.
+pub(super) fn read(
+    header: &GaussianHeader,
+    tensors: &SafeTensors<'_>,
+    n_phases: usize,
+    path: &Path,
+) -> Result<MovingGaussians> {
+    let file = File { tensors, path };
+    let positive = [header.pixel, header.strongest, header.cut.into(), header.least_scale.into()];
+    if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || header.greatest_scale < header.least_scale {
+        return Err(Error::data(path, "gaussians", "units, cut and scales must be positive and finite"));
+    }
+    let position = file.floats("gaussians.position", &[None, Some(3)])?;
+    let n = position.len() / 3;
+    let log_scale = file.floats("gaussians.log_scale", &[Some(n), Some(3)])?;
+    let rotation = file.floats("gaussians.rotation", &[Some(n), Some(4)])?;
+    let log_density = file.floats("gaussians.log_density", &[Some(n)])?;
+    let phase = match &header.grid {
+        None => file.words("gaussians.phase", n)?,
+        Some(_) => vec![0; n],
+    };
+    if let Some(bad) = phase.iter().find(|p| **p as usize >= n_phases) {
+        return Err(Error::data(path, "gaussians.phase", format!("{bad} of {n_phases} phases")));
+    }
+    let row = |i: usize| Gaussian {
+        position: [0, 1, 2].map(|k| position[3 * i + k]),
+        log_density: log_density[i],
+        log_scale: [0, 1, 2].map(|k| log_scale[3 * i + k]),
+        phase: phase[i],
+        rotation: [0, 1, 2, 3].map(|k| rotation[4 * i + k]),
+    };
+    let sets = Gaussians {
+        units: Units { pixel: header.pixel, strongest: header.strongest },
+        n_phases,
+        setup: GaussianSetup {
+            n_phases: n_phases as u32,
+            cut: header.cut,
+            least_scale: header.least_scale,
+            greatest_scale: header.greatest_scale,
+            ..GaussianSetup::default()
+        },
+        rows: (0..n).map(row).collect(),
+        step: header.step,
+    };
+    let Some(grid) = &header.grid else { return Ok(MovingGaussians::PerPhase(sets)) };
+    if !(2..=MOST_NODES).contains(&grid.nodes)
+        || grid.basis > MOST_BASIS
+        || grid.half_side.is_nan()
+        || grid.half_side <= 0.0
+    {
+        let problem = format!("{} nodes, half side {}, basis {}", grid.nodes, grid.half_side, grid.basis);
+        return Err(Error::data(path, "gaussians.grid", problem));
+    }
+    let nodes = Some(grid.nodes as usize);
+    let vectors = |name: &str, shape: &[Option<usize>]| -> Result<Vec<[f32; 4]>> {
+        let values = file.floats(name, shape)?;
+        Ok(values.chunks_exact(3).map(|v| [v[0], v[1], v[2], 0.0]).collect())
+    };
+    Ok(MovingGaussians::Tree(MovingTree {
+        setup: TreeSetup {
+            n_nodes: grid.nodes,
+            half_side: grid.half_side,
+            inverse_step: (f64::from(grid.nodes - 1) / (2.0 * f64::from(grid.half_side))) as f32,
+            n_basis: grid.basis,
+            ..TreeSetup::default()
+        },
+        grid: vectors("gaussians.motion.grid", &[Some(n_phases), nodes, nodes, nodes, Some(3)])?,
+        own: vectors("gaussians.motion.own", &[Some(n), Some(grid.basis as usize), Some(3)])?,
+        rest: sets,
+    }))
+}
+
+/// Where tensors are read from.
+struct File<'a> {
+    tensors: &'a SafeTensors<'a>,
+    path: &'a Path,
+}
+
+impl File<'_> {
+    /// The bytes of a tensor of a type and shape; `None` stands for any length.
+    fn bytes(&self, name: &str, dtype: Dtype, shape: &[Option<usize>]) -> Result<&[u8]> {
+        let bad = |problem: String| Error::data(self.path, name, problem);
+        let view = self.tensors.tensor(name).map_err(|e| bad(e.to_string()))?;
+        let fits = view.shape().len() == shape.len()
+            && view.shape().iter().zip(shape).all(|(is, wanted)| wanted.is_none_or(|wanted| *is == wanted));
+        if view.dtype() != dtype || !fits {
+            return Err(bad(format!("{:?} {:?} where {dtype:?} {shape:?} is needed", view.dtype(), view.shape())));
+        }
+        Ok(view.data())
+    }
+
+    fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
+        let bytes = self.bytes(name, Dtype::F32, shape)?.chunks_exact(4);
+        let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
+        match values.iter().all(|v| v.is_finite()) {
+            true => Ok(values),
+            false => Err(Error::data(self.path, name, "holds a value that is not finite")),
+        }
+    }
+
+    fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
+        let bytes = self.bytes(name, Dtype::U32, &[Some(n)])?.chunks_exact(4);
+        Ok(bytes.map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect())
+    }
+}

@@ -1,0 +1,170 @@
+//! Gaussians of a run: their fit, and what they leave of the images to the still field.
+
+use crate::config::{Config, GaussianForm};
+use crate::error::Result;
+use crate::gaussians::blobs::Blobs;
+use crate::geometry::ViewRays;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::Recording;
+use crate::kernels::layout::{RayOut, View};
+use crate::kernels::push;
+use crate::kernels::stages::Kernels;
+use crate::model::gaussians::{MovingFeed, MovingGaussians};
+use crate::network::forward::ForwardBuffers;
+use crate::plan::Plan;
+use crate::plan::targets::Targets;
+use crate::scan::dataset::{Dataset, Frame};
+use crate::train::gaussians::GaussianTrainer;
+use crate::train::tree::TreeTrainer;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// A fit under way.
+pub(super) enum MovingFit {
+    /// A set per phase.
+    PerPhase(Box<GaussianTrainer>),
+    /// One set for the beat.
+    Tree(Box<TreeTrainer>),
+}
+
+impl MovingFit {
+    /// Begins a fit of the form that configuration and data ask for.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::new`] and [`TreeTrainer::new`].
+    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<MovingFit> {
+        Ok(match targets.form(config.gaussians.form) {
+            GaussianForm::Tree => MovingFit::Tree(Box::new(TreeTrainer::new(gpu, targets, config)?)),
+            _ => MovingFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
+        })
+    }
+
+    /// Iterations done.
+    pub(super) fn step(&self) -> u32 {
+        match self {
+            MovingFit::PerPhase(fit) => fit.step(),
+            MovingFit::Tree(fit) => fit.step(),
+        }
+    }
+
+    /// Runs some iterations towards `until`; their losses.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::advance`].
+    pub(super) fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        match self {
+            MovingFit::PerPhase(fit) => fit.advance(until),
+            MovingFit::Tree(fit) => fit.advance(until),
+        }
+    }
+
+    /// The field after the iterations done.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::model`].
+    pub(super) fn field(&self) -> Result<MovingGaussians> {
+        Ok(match self {
+            MovingFit::PerPhase(fit) => MovingGaussians::PerPhase(fit.model()?),
+            MovingFit::Tree(fit) => MovingGaussians::Tree(fit.tree()?),
+        })
+    }
+}
+
+/// The moving field of a run, where it is made of Gaussians.
+pub(super) struct Moving {
+    /// Until its iterations are done; the still field begins then.
+    fit: Option<MovingFit>,
+    feed: MovingFeed,
+    /// Where each training image was taken, and its phase.
+    shots: Vec<(ViewRays, u32)>,
+}
+
+impl Moving {
+    /// Begins a fit to the plan's targets, or takes over `fitted`; none where the network moves.
+    ///
+    /// # Errors
+    /// As [`MovingFit::new`].
+    pub(super) fn begin(
+        gpu: &Gpu,
+        plan: &mut Plan,
+        dataset: &Dataset,
+        fitted: Option<&MovingGaussians>,
+    ) -> Result<Option<Moving>> {
+        let Some(targets) = plan.targets.take() else { return Ok(None) };
+        let shot = |frame: &Frame| (dataset.views[frame.view].rays.clone(), frame.phase);
+        let (fit, field) = match fitted {
+            Some(field) => (None, field.clone()),
+            None => {
+                let fit = MovingFit::new(gpu, targets, &plan.config)?;
+                let field = fit.field()?;
+                (Some(fit), field)
+            }
+        };
+        let shots = dataset.training().iter().map(shot).collect();
+        Ok(Some(Moving { fit, feed: Arc::new(Mutex::new((0, field))), shots }))
+    }
+
+    /// Whether iterations of the fit are left.
+    pub(super) fn is_fitting(&self) -> bool {
+        self.fit.is_some()
+    }
+
+    /// For those who draw the field.
+    pub(super) fn feed(&self) -> MovingFeed {
+        self.feed.clone()
+    }
+
+    /// The field as it is now.
+    pub(super) fn field(&self) -> MovingGaussians {
+        self.feed.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
+    }
+
+    /// Runs some iterations towards `until`, and ends the fit after `end` of them; their losses.
+    ///
+    /// # Errors
+    /// As [`MovingFit::advance`].
+    pub(super) fn advance(&mut self, until: u32, end: u32) -> Result<Vec<f64>> {
+        let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
+        let losses = fit.advance(until.min(end))?;
+        let field = fit.field()?;
+        if fit.step() >= end {
+            self.fit = None;
+        }
+        let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);
+        *feed = (feed.0 + 1, field);
+        Ok(losses)
+    }
+
+    /// Line integrals of the plan's images less those of the field: `[frame][pixel]`. Uses `forward`, whose buffers hold
+    /// `n_rays`; what its `ray_out` holds is lost.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub(super) fn what_remains(
+        &self,
+        gpu: &Gpu,
+        kernels: &Kernels,
+        forward: &ForwardBuffers,
+        n_rays: u32,
+        plan: &Plan,
+    ) -> Result<Vec<f32>> {
+        let blobs = Blobs::new(gpu, &kernels.tuning, &self.field())?;
+        let (image_width, pixels) = (plan.setup.image_width, plan.setup.n_pixels);
+        // Whole rows, which tiles of pixels are made of.
+        let at_once = (n_rays / image_width * image_width).max(n_rays.min(image_width));
+        let mut remains = plan.images.clone();
+        for ((rays, phase), image) in self.shots.iter().zip(remains.chunks_mut(pixels as usize)) {
+            let views = gpu.buffer_with("views", &[View::of(rays)])?;
+            for (part, values) in (0..).zip(image.chunks_mut(at_once as usize)) {
+                let n_rays = values.len() as u32;
+                let mut recording = Recording::new(gpu, "moving field of an image")?;
+                let push = push::PoseRays { first_pixel: part * at_once, n_rays, phase: *phase, image_width, view: 0 };
+                forward.record_pose(&mut recording, kernels, &views, push)?;
+                blobs.record_rays(&mut recording, forward, *phase, n_rays, image_width.min(n_rays))?;
+                gpu.wait(recording.finish()?.submit()?)?;
+                let seen: Vec<RayOut> = gpu.download(&forward.ray_out, 0, values.len())?;
+                values.iter_mut().zip(&seen).for_each(|(y, seen)| *y -= seen.dynamic_integral);
+            }
+        }
+        Ok(remains)
+    }
+}
