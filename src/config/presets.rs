@@ -143,7 +143,14 @@ fn public_code(paper: Config) -> Config {
 fn fast(mlp: Config) -> Config {
     Config {
         preset: Preset::Fast,
-        train: Train { iterations: 500, motion_share: 0.0, checkpoint_every: 250, validate_every: 0, ..mlp.train },
+        train: Train {
+            iterations: 300,
+            rays: 256,
+            motion_share: 0.0,
+            checkpoint_every: 100,
+            validate_every: 0,
+            ..mlp.train
+        },
         // The network is never asked; the smallest one takes no memory.
         dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, window_start: 0.0, ..mlp.dynamic },
         occupancy: Occupancy { enabled: false, ..mlp.occupancy },

@@ -13,7 +13,7 @@ const SMOOTHING: f64 = 0.05;
 pub struct Progress {
     /// Losses of the iteration.
     pub loss: StepLoss,
-    /// PSNR of the iteration's rays, dB.
+    /// PSNR of the iteration's rays, dB; not a number while Gaussians are fitted, which have no rays.
     pub psnr_db: f64,
     /// The same, smoothed over iterations.
     pub smoothed_psnr_db: f64,
@@ -113,6 +113,9 @@ impl Training {
     }
 
     fn psnr_db(&self, squared_error: f64) -> f64 {
+        if squared_error.is_nan() {
+            return f64::NAN;
+        }
         -10.0 * (squared_error / (self.image_range * self.image_range)).max(1e-20).log10()
     }
 }
