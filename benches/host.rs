@@ -21,7 +21,7 @@ use nertca_vk::train::trainer::Trainer;
 const SIDE: usize = 100;
 
 fn hull(c: &mut Criterion) {
-    let (dataset, config) = (small_dataset(SIDE, SIDE), Config::preset(Preset::Fast));
+    let (dataset, config) = (small_dataset(SIDE, SIDE), Config::preset(Preset::FastMlp));
     c.bench_function("motion_analysis", |b| b.iter(|| motion::analyse(&dataset, &config.hull)));
     let moving = motion::analyse(&dataset, &config.hull);
     c.bench_function("hull_carving", |b| b.iter(|| carve(&dataset, &moving, 0.6, 128, true)));
@@ -48,7 +48,7 @@ fn surface(c: &mut Criterion) {
 fn step(c: &mut Criterion) {
     let gpu = Gpu::open(&DeviceOptions::default()).unwrap();
     let dataset = small_dataset(SIDE, SIDE);
-    let mut config = Config::preset(Preset::Fast);
+    let mut config = Config::preset(Preset::FastMlp);
     config.train.iterations = 1_000_000;
     config.train.iterations_per_submit = 1;
     let plan = Plan::new(&config, &dataset).unwrap();

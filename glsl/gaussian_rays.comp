@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 // Exact line integrals of the moving field's Gaussians, and the largest attenuation along each ray: a sum of Gaussians
 // is one along any ray, in closed form. One workgroup per tile of 8 x 8 pixels of an image, one invocation per ray.
-//   ray_out[ray].dynamic_integral, dynamic_max, total_max
+//   ray_out[ray].dynamic_integral; with_maxima: also dynamic_max and total_max
 // Reads what march_fwd left of the static field. Twin: reference::blobs.
 #include "inc/operands.glsl"
 #include "inc/layout.glsl"
@@ -10,6 +10,7 @@
 #include "inc/softplus.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
+layout(constant_id = 1) const uint with_maxima = 0u;
 layout(push_constant) uniform Push { uint n_rays; uint image_width; uint first_blob; uint n_blobs; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
@@ -101,11 +102,13 @@ void main() {
                 if (q >= b.cut) continue;
                 float height = b.density * exp(-0.5 * q);
                 integral += height * sqrt(TWO_PI / steepness) * ray.norm;
-                keep_peak(depth + offset, steepness, height);
+                if (with_maxima != 0u) keep_peak(depth + offset, steepness, height);
             }
         }
     }
     if (!wanted) return;
+    ray_out[r].dynamic_integral = integral;
+    if (with_maxima == 0u) return;
     float dynamic_max = 0.0;
     float total_max = ray_out[r].static_max;
     for (uint i = 0u; i < n_peaks; i++) {
@@ -119,7 +122,6 @@ void main() {
         vec3 x = ray.anchor + depth * ray.direction;
         total_max = max(total_max, value + (static_inside(x) ? static_attenuation(x) : 0.0));
     }
-    ray_out[r].dynamic_integral = integral;
     ray_out[r].dynamic_max = dynamic_max;
     ray_out[r].total_max = total_max;
 }

@@ -294,8 +294,8 @@ mod tests {
     }
 
     #[test]
-    fn a_configuration_without_gaussians_has_the_defaults() {
-        let config = Config::preset(Preset::Fast);
+    fn a_configuration_of_before_gaussians_has_none() {
+        let config = Config::preset(Preset::FastMlp);
         let mut table = toml::Table::try_from(&config).unwrap();
         assert!(table.remove("gaussians").is_some() && table.remove("tree").is_some());
         assert_eq!(table.try_into::<Config>().unwrap(), config);

@@ -194,6 +194,7 @@ pub mod bench;
 
 /// f64 twins of the compute stages: plain loops, no device. For tests; nothing else uses them.
 pub mod reference {
+    pub mod blobs;
     pub mod field;
     pub mod gaussians;
     pub mod march;

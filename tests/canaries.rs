@@ -78,7 +78,7 @@ const FULL: &[&str] = &[
 fn f32_layers_mind_their_buffers() {
     for operands in [Operands::Texel, Operands::Storage, Operands::Address] {
         let choose = move |tuning| Tuning { layers: Layers::F32, operands, ..tuning };
-        expect_the_same("fast", FULL, &choose);
+        expect_the_same("fast-mlp", FULL, &choose);
     }
     let choose = |tuning| Tuning { layers: Layers::F32, ..tuning };
     expect_the_same("paper", &["dynamic.occlusion=1e-3"], &choose);
@@ -91,5 +91,5 @@ fn matrix_layers_mind_their_buffers() {
         println!("skipped: this driver has no cooperative matrices");
         return;
     }
-    expect_the_same("fast", FULL, &|tuning| tuning.with_layers(Layers::Matrices, String::new()));
+    expect_the_same("fast-mlp", FULL, &|tuning| tuning.with_layers(Layers::Matrices, String::new()));
 }

@@ -237,6 +237,6 @@ fn public_code() {
 }
 
 #[test]
-fn fast() {
-    check(Preset::Fast, "fast");
+fn fast_mlp() {
+    check(Preset::FastMlp, "fast");
 }

@@ -26,9 +26,9 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     for (preset, settings) in [
         ("paper", &["dynamic.occlusion=1e-3", "loss.normalise=true"][..]),
         ("public-code", &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
-        ("fast", &["loss.dynamic_target=absolute"]),
-        ("fast", &["loss.robust=0"]),
-        ("fast", &["loss.robust=0.3"]),
+        ("fast-mlp", &["loss.dynamic_target=absolute"]),
+        ("fast-mlp", &["loss.robust=0"]),
+        ("fast-mlp", &["loss.robust=0.3"]),
     ] {
         let plan = plan(preset, settings);
         let params = start(&plan);
@@ -68,7 +68,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
 
 #[test]
 fn temporal_residual_is_flat_between_its_bounds() {
-    let plan = plan("fast", &["loss.robust=0"]);
+    let plan = plan("fast-mlp", &["loss.robust=0"]);
     let params = start(&plan);
     let mut ray = march::ray(&plan, 40);
     let seen = march::fwd(&plan, &params, 0, &ray, true, Precision::Exact).dynamic_integral;

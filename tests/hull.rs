@@ -148,7 +148,7 @@ fn no_vessel_that_moves_is_carved_away() {
         let phantom = phantom(&gpu, views);
         let dataset = &phantom.dataset;
         let changes = changes(&gpu, &phantom);
-        let config = Config::load(Some(Preset::Fast), None, &[]).unwrap();
+        let config = Config::load(Some(Preset::FastMlp), None, &[]).unwrap();
         let motion = motion::analyse(dataset, &config.hull);
         let half = dynamic_half(&config, dataset);
         for (per_phase, visible) in [(true, VISIBLE_AT_A_PHASE), (false, VISIBLE_OVER_THE_BEAT)] {
@@ -171,7 +171,7 @@ fn carving_by_exact_shadows_loses_nothing() {
     let gpu = gpu();
     let phantom = phantom(&gpu, 3);
     let dataset = &phantom.dataset;
-    let config = Config::load(Some(Preset::Fast), None, &[]).unwrap();
+    let config = Config::load(Some(Preset::FastMlp), None, &[]).unwrap();
     let half = dynamic_half(&config, dataset);
     let mut motion = motion::analyse(dataset, &config.hull);
     for m in &mut motion {

@@ -17,11 +17,11 @@ use nertca_vk::train::trainer::Trainer;
 const CASES: &[(&str, &[&str])] = &[
     ("paper", &["dynamic.occlusion=1e-3"]),
     ("public-code", &["dynamic.occlusion=1e-3"]),
-    ("fast", &[]),
+    ("fast-mlp", &[]),
     // odd bands, five ranks (two vec4), no power of two anywhere, batch of one ray
-    ("fast", &["dynamic.bands=5", "static.ranks=5", "static.grid=7", "train.rays=4", "march.dynamic_samples=33"]),
+    ("fast-mlp", &["dynamic.bands=5", "static.ranks=5", "static.grid=7", "train.rays=4", "march.dynamic_samples=33"]),
     // more than 32 depths a lane
-    ("fast", &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
+    ("fast-mlp", &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
     // a single hidden layer, skip in a deep net, wide layers
     ("paper", &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
     ("public-code", &["dynamic.layers=6", "dynamic.skip_layer=3", "dynamic.width=48", "dynamic.latent=12"]),
@@ -31,9 +31,11 @@ const CASES: &[(&str, &[&str])] = &[
 fn rays_and_depths_match() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let plan =
-        Plan::new(&small_config("fast", &["hull.enabled=true", "hull.max_share=1", "hull.resolution=24"]), &dataset)
-            .unwrap();
+    let plan = Plan::new(
+        &small_config("fast-mlp", &["hull.enabled=true", "hull.max_share=1", "hull.resolution=24"]),
+        &dataset,
+    )
+    .unwrap();
     assert!(plan.hull.is_some(), "this case is about the hull");
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let losses = trainer.advance(1).unwrap();
@@ -141,7 +143,7 @@ fn occupancy_is_learned_and_heeded() {
     // A field that stays as it starts, and a threshold that most of its values are below, so that both kinds of cells occur.
     let settings =
         ["occupancy.start=100", "occupancy.cells=9", "dynamic.lr=0", "dynamic.lr_end=0", "train.iterations=200"];
-    let mut plan = Plan::new(&small_config("fast", &settings), &dataset).unwrap();
+    let mut plan = Plan::new(&small_config("fast-mlp", &settings), &dataset).unwrap();
     let mut first = Trainer::new(&gpu, Plan::new(&plan.config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let live = first.advance(1).unwrap()[0].live_samples as usize;
     let mut sigma: Vec<[f32; 2]> = gpu.download(&first.forward().sample_sigma, 0, live).unwrap();
@@ -208,7 +210,7 @@ fn occupancy_is_learned_and_heeded() {
 fn ten_updates_across_the_delay_match() {
     let gpu = gpu();
     let dataset = small_dataset(9, 8);
-    for preset in ["paper", "public-code", "fast"] {
+    for preset in ["paper", "public-code", "fast-mlp"] {
         // Starts at the sixth iteration; the optimiser is re-created there. A softer shift than -10 lets
         // the network move, so that the comparison sees it.
         let settings =

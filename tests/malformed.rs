@@ -247,7 +247,7 @@ fn the_authors_frames() {
 fn checkpoints() {
     let data = common::small_dataset(8, 8);
     let config = common::small_config(
-        "fast",
+        "fast-mlp",
         &["static.grid=3", "dynamic.width=16", "dynamic.layers=2", "occupancy.enabled=false"],
     );
     let gpu = Gpu::open(&DeviceOptions::default()).unwrap();

@@ -35,13 +35,13 @@ fn matrices() -> Option<(Gpu, Tuning)> {
 /// Each covers what the others do not: no skip and a skip layer; the skip layer last; one layer; odd bands; several
 /// chunks; more tiles than workgroups; fewer samples than a tile; loops unrolled as on a GPU, with large tiles.
 const CASES: &[(&str, &[&str], MatrixTuning)] = &[
-    ("fast", &["dynamic.width=48", "dynamic.bands=5"], CPU),
+    ("fast-mlp", &["dynamic.width=48", "dynamic.bands=5"], CPU),
     ("public-code", &["dynamic.occlusion=1e-3", "loss.normalise=true"], CPU),
-    ("fast", &["dynamic.layers=3", "dynamic.skip_layer=3", "dynamic.width=64", "train.rays=100"], CPU),
+    ("fast-mlp", &["dynamic.layers=3", "dynamic.skip_layer=3", "dynamic.width=64", "train.rays=100"], CPU),
     ("paper", &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true", "dynamic.latent=12"], CPU),
-    ("fast", &["train.rays=1", "march.dynamic_samples=7"], CPU),
+    ("fast-mlp", &["train.rays=1", "march.dynamic_samples=7"], CPU),
     (
-        "fast",
+        "fast-mlp",
         &["dynamic.width=32", "dynamic.layers=3", "dynamic.bands=4", "train.rays=60"],
         MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true },
     ),
@@ -90,7 +90,7 @@ fn losses_and_gradients_match() {
 fn training_repeats_bit_by_bit_resumes_and_follows_f32() {
     let Some((gpu, tuning)) = matrices() else { return };
     let dataset = small_dataset(13, 11);
-    let config = small_config("fast", &["dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
+    let config = small_config("fast-mlp", &["dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
     let start = |layers| {
         let tuning = tuning.clone().with_layers(layers, String::new());
         Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning).unwrap()
@@ -119,7 +119,7 @@ fn training_repeats_bit_by_bit_resumes_and_follows_f32() {
 fn an_overflow_skips_the_update_and_halves_the_scale() {
     let Some((gpu, tuning)) = matrices() else { return };
     let dataset = small_dataset(13, 11);
-    let plan = Plan::new(&small_config("fast", &[]), &dataset).unwrap();
+    let plan = Plan::new(&small_config("fast-mlp", &[]), &dataset).unwrap();
     let (before, first) = (plan.params.initial(&plan.config), plan.params.static_len);
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning).unwrap();
     let huge = DeviceState { step: 0, loss_scale: 2f32.powi(60), overflowed: 0, good_updates: 7 };
@@ -170,7 +170,7 @@ fn renderings_equal_the_twin() {
 #[test]
 fn both_paths_are_timed_and_the_verdict_is_kept() {
     let Some((gpu, tuning)) = matrices() else { return };
-    let config = small_config("fast", &[]);
+    let config = small_config("fast-mlp", &[]);
     let verdict = calibrate::measure(&gpu, &config, &small_dataset(13, 11), &tuning).unwrap();
     assert!(verdict.f32_ms > 0.0 && verdict.matrices_ms > 0.0);
     for (f32_ms, matrices_ms, faster) in
@@ -186,7 +186,7 @@ fn both_paths_are_timed_and_the_verdict_is_kept() {
     calibrate::remember(cache.path(), gpu.info(), &config, verdict).unwrap();
     let recalled = calibrate::recall(cache.path(), gpu.info(), &config).unwrap();
     assert!((recalled.f32_ms - verdict.f32_ms).abs() < 1e-9);
-    let wider = small_config("fast", &["dynamic.width=64"]);
+    let wider = small_config("fast-mlp", &["dynamic.width=64"]);
     assert_eq!(calibrate::recall(cache.path(), gpu.info(), &wider), None, "another network, another verdict");
     std::fs::write(cache.path().join("paths.json"), "{").unwrap();
     assert_eq!(calibrate::recall(cache.path(), gpu.info(), &config), None);

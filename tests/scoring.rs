@@ -26,7 +26,7 @@ fn dataset() -> Dataset {
 
 /// An untrained model whose moving field attenuates by softplus(`bias`) in its own units.
 fn model(gpu: &nertca_vk::gpu::device::Gpu, dataset: &Dataset, bias: f32) -> Model {
-    let plan = Plan::new(&small_config("fast", &[]), dataset).unwrap();
+    let plan = Plan::new(&small_config("fast-mlp", &[]), dataset).unwrap();
     let mut model = Trainer::new(gpu, plan, dataset, tuning(gpu)).unwrap().model().unwrap();
     let bias_at = model.layout.out_bias;
     model.params[bias_at] = bias;

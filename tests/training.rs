@@ -26,7 +26,7 @@ use std::sync::atomic::AtomicBool;
 fn the_loss_falls_and_runs_repeat_bit_by_bit() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    for preset in ["fast", "paper"] {
+    for preset in ["fast-mlp", "paper"] {
         let config =
             small_config(preset, &["loss.normalise=true", "dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
         let train = || {
@@ -48,7 +48,8 @@ fn the_loss_falls_and_runs_repeat_bit_by_bit() {
 fn resume_equals_no_interruption() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let config = small_config("fast", &["dynamic.delay=7", "train.checkpoint_every=1000", "train.validate_every=16"]);
+    let config =
+        small_config("fast-mlp", &["dynamic.delay=7", "train.checkpoint_every=1000", "train.validate_every=16"]);
     let directory = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
     let go = |name: &str, resume: bool, stop_at: Option<u32>| {
@@ -82,7 +83,7 @@ fn resume_equals_no_interruption() {
 fn resuming_on_other_images_is_refused() {
     let gpu = gpu();
     let mut dataset = small_dataset(13, 11);
-    let config = small_config("fast", &[]);
+    let config = small_config("fast-mlp", &[]);
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 4);
     let saved = trainer.checkpoint().unwrap();
@@ -105,7 +106,7 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
             cancel.store(true, std::sync::atomic::Ordering::Relaxed);
         }
     };
-    let config = small_config("fast", &["train.iterations=1000"]);
+    let config = small_config("fast-mlp", &["train.iterations=1000"]);
     let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut stop_at_ten);
     assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
     assert!(Checkpoint::read(&checkpoint::newest(directory.path()).unwrap()).unwrap().model.step >= 10);
@@ -115,7 +116,7 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
     let options =
         RunOptions { tuning: &tuning(&gpu), run: directory.path(), resume: false, stop_at: None, cancel: &never };
     let config = small_config(
-        "fast",
+        "fast-mlp",
         &[
             "train.iterations=400",
             "train.checkpoint_every=1",
@@ -134,7 +135,7 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
 fn renderings_equal_the_twin() {
     let gpu = gpu();
     let dataset = small_dataset(12, 10);
-    for preset in ["paper", "fast"] {
+    for preset in ["paper", "fast-mlp"] {
         let config = small_config(preset, &["loss.normalise=true", "train.chunk_samples=1500"]);
         let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
         run(&mut trainer, 20);
@@ -180,7 +181,7 @@ fn damaged_checkpoints_are_refused() {
     let dataset = small_dataset(13, 11);
     let mut trainer = Trainer::new(
         &gpu,
-        Plan::new(&small_config("fast", &["occupancy.enabled=false"]), &dataset).unwrap(),
+        Plan::new(&small_config("fast-mlp", &["occupancy.enabled=false"]), &dataset).unwrap(),
         &dataset,
         tuning(&gpu),
     )
@@ -208,7 +209,8 @@ fn older_checkpoints_follow_the_stated_rule() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
     let mut trainer =
-        Trainer::new(&gpu, Plan::new(&small_config("fast", &[]), &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+        Trainer::new(&gpu, Plan::new(&small_config("fast-mlp", &[]), &dataset).unwrap(), &dataset, tuning(&gpu))
+            .unwrap();
     let directory = tempfile::tempdir().unwrap();
     for step in 1..=5 {
         run(&mut trainer, step);
@@ -222,7 +224,7 @@ fn older_checkpoints_follow_the_stated_rule() {
 fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
     let gpu = gpu();
     let dataset = small_dataset(24, 20);
-    let config = small_config("fast", &["train.rays=64", "train.chunk_samples=2000", "march.render_samples=200"]);
+    let config = small_config("fast-mlp", &["train.rays=64", "train.chunk_samples=2000", "march.render_samples=200"]);
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     run(&mut trainer, 5);
     let model = trainer.model().unwrap();
@@ -289,7 +291,7 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
 fn keeping_snapshots_beside_training_changes_nothing() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    let config = small_config("fast", &["train.checkpoint_every=12", "train.validate_every=8"]);
+    let config = small_config("fast-mlp", &["train.checkpoint_every=12", "train.validate_every=8"]);
     let directory = tempfile::tempdir().unwrap();
     let never = AtomicBool::new(false);
     let go = |name: &str, overlap: bool| {

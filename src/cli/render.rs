@@ -47,7 +47,7 @@ impl Renders {
     /// Line integrals, or maxima per mm.
     pub fn render(&self, shot: &Shot, phase: u32, quantity: Quantity) -> Result<Vec<f32>> {
         let image = match self {
-            Renders::Fields(renderer) => renderer.render(&shot.rays, shot.width, shot.height, phase)?.show(quantity),
+            Renders::Fields(renderer) => renderer.show(&shot.rays, (shot.width, shot.height), phase, quantity)?,
             Renders::Baked(baked) => baked.render(&shot.rays, shot.width, shot.height, phase, quantity)?,
         };
         Ok(match quantity.projection {

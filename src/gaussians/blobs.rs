@@ -19,8 +19,10 @@ const TILE: u32 = 8;
 
 /// Pipelines.
 pub struct BlobKernels {
-    /// Line integrals and maxima.
+    /// Line integrals.
     pub rays: Stage<push::GaussianRays>,
+    /// Line integrals and maxima.
+    pub rays_maxima: Stage<push::GaussianRays>,
     /// Attenuation at the cells of rows.
     pub points: Stage<push::GaussianPoints>,
 }
@@ -34,6 +36,8 @@ impl BlobKernels {
         let plain = Build::default();
         Ok(BlobKernels {
             rays: Build { variant: vec4_variant(tuning), ..plain }.stage(gpu)?,
+            rays_maxima: Build { variant: vec4_variant(tuning), constants: &[("with_maxima", 1)], ..plain }
+                .stage(gpu)?,
             points: plain.stage(gpu)?,
         })
     }
@@ -115,8 +119,8 @@ impl Blobs {
         Ok((set.blobs.clone(), set.phases.get(phase as usize).ok_or_else(missing)?.clone()))
     }
 
-    /// Records integrals and maxima of the `n_rays` rays in `buffers`, rows of an image of `image_width` columns. What
-    /// `ray_out` says of the static field must be there already.
+    /// Records integrals, and maxima where asked for, of the `n_rays` rays in `buffers`, rows of an image of `image_width`
+    /// columns. For the sum's largest value, what `ray_out` says of the static field must be there already.
     ///
     /// # Errors
     /// [`Error::Internal`] when stage and buffers do not fit.
@@ -127,20 +131,16 @@ impl Blobs {
         phase: u32,
         n_rays: u32,
         image_width: u32,
+        maxima: bool,
     ) -> Result<()> {
         let (blobs, at) = self.at(phase)?;
         let rows = n_rays.div_ceil(image_width);
         let tiles = image_width.div_ceil(TILE) * rows.div_ceil(TILE);
         let push = push::GaussianRays { n_rays, image_width, first_blob: at.start, n_blobs: at.len() as u32 };
         let bound = [(Binding::blobs, (&blobs).into())];
-        dispatch_finding(
-            recording,
-            &self.kernels.rays,
-            Groups::Direct([tiles, 1, 1]),
-            &bound,
-            |name| buffers.find(name),
-            push,
-        )
+        let stage = if maxima { &self.kernels.rays_maxima } else { &self.kernels.rays };
+        let groups = Groups::Direct([tiles, 1, 1]);
+        dispatch_finding(recording, stage, groups, &bound, |name| buffers.find(name), push)
     }
 
     /// Records the field at the cells of `volume`: rows of `row_cells` along the rays `rows` in `buffers`.

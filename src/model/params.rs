@@ -225,7 +225,7 @@ mod tests {
 
     #[test]
     fn slices_are_aligned_disjoint_and_named() {
-        for preset in [Preset::Fast, Preset::Paper, Preset::PublicCode] {
+        for preset in [Preset::FastMlp, Preset::Paper, Preset::PublicCode] {
             let config = Config::preset(preset);
             let layout = ParamLayout::new(&config, 10);
             let mut seen = vec![false; layout.len];

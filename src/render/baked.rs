@@ -22,7 +22,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 pub const BAKED_CELLS: u32 = 192;
 
 /// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates;
-/// finer detail than a cell is lost. Volumes are baked when first needed, or when asked for.
+/// finer detail than a cell is lost, but for Gaussians, which are drawn as they are in front of the baked static field.
+/// Volumes are baked when first needed, or when asked for.
 pub struct Baked {
     renderer: Arc<Renderer>,
     still: Grid,
@@ -53,14 +54,15 @@ fn slot(field: Component, phase: u32) -> usize {
 }
 
 impl Baked {
-    /// Bakes all phases with `cells` cells along the longest side of each box.
+    /// Bakes the static field and, where the network moves, all phases, with `cells` cells along the longest side of each box.
     ///
     /// # Errors
     /// Device errors, [`Error::OutOfMemory`] first of all.
     pub fn new(renderer: Arc<Renderer>, cells: u32) -> Result<Baked> {
         let baked = Self::empty(renderer, cells, cells);
         baked.bake(Component::Static, 0)?;
-        for phase in 0..baked.renderer.setup.n_phases {
+        let moving = if baked.renderer.moving.is_some() { 0 } else { baked.renderer.setup.n_phases };
+        for phase in 0..moving {
             baked.bake(Component::Dynamic, phase)?;
         }
         Ok(baked)
@@ -151,12 +153,32 @@ impl Baked {
         quantity: Quantity,
     ) -> Result<Vec<f32>> {
         self.renderer.check_phase(phase)?;
+        if self.renderer.draws_gaussians(quantity) {
+            return self.render_gaussians(rays, (width, height), phase, quantity);
+        }
         let shot = self.shot(width, height, phase, quantity)?;
         let _alone = shot.in_use.lock().unwrap_or_else(PoisonError::into_inner);
         shot.view.write(&[View::of(rays)])?;
         self.renderer.gpu.wait(shot.commands.submit()?)?;
         let mut image = vec![0f32; width * height];
         shot.image.read(&mut image)?;
+        Ok(image)
+    }
+
+    /// Gaussians as they are, in front of the baked static field.
+    fn render_gaussians(
+        &self,
+        rays: &ViewRays,
+        (width, height): (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>> {
+        let of = |component| Quantity { component, ..quantity };
+        let mut image = self.renderer.show(rays, (width, height), phase, of(Component::Dynamic))?;
+        if quantity.component.has_static() {
+            let still = self.render(rays, width, height, phase, of(Component::Static))?;
+            image.iter_mut().zip(&still).for_each(|(sum, still)| *sum += still);
+        }
         Ok(image)
     }
 
@@ -174,6 +196,11 @@ impl Baked {
     ) -> Result<()> {
         self.renderer.check_phase(phase)?;
         target.check_range(0, (width * height * 4) as u64)?;
+        if self.renderer.draws_gaussians(quantity) {
+            // Their kernels leave a picture among other things, so it goes through the host.
+            let image = self.render_gaussians(rays, (width, height), phase, quantity)?;
+            return self.renderer.gpu.upload(target, 0, &image);
+        }
         let view = self.renderer.gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
         view.write(&[View::of(rays)])?;
         let commands = self.record(&view, target, (width, height), phase, quantity)?;

@@ -72,7 +72,7 @@ impl Live {
         })
     }
 
-    /// Through baked volumes. A volume older than `step`, the source's present iteration, is baked anew unless the last
+    /// As [`Baked::render`]. A volume older than `step`, the source's present iteration, is baked anew unless the last
     /// refresh was too recent: refreshing takes at most a fifth of the time.
     ///
     /// # Errors
@@ -85,6 +85,7 @@ impl Live {
         phase: u32,
         quantity: Quantity,
     ) -> Result<Vec<f32>> {
+        self.follow_gaussians()?;
         let _under_way = self.refresh(step, phase, quantity)?;
         self.baked.render(rays, size.0, size.1, phase, quantity)
     }
@@ -102,6 +103,7 @@ impl Live {
         phase: u32,
         quantity: Quantity,
     ) -> Result<()> {
+        self.follow_gaussians()?;
         let _under_way = self.refresh(step, phase, quantity)?;
         self.baked.render_into(target, rays, size, phase, quantity)
     }
@@ -111,7 +113,8 @@ impl Live {
         self.baked.renderer().check_phase(phase)?;
         let component = quantity.component;
         let still = (component.has_static(), Component::Static, 0);
-        let moving = (component.has_dynamic(), Component::Dynamic, 1 + phase as usize);
+        let baked = component.has_dynamic() && !self.baked.renderer().draws_gaussians(quantity);
+        let moving = (baked, Component::Dynamic, 1 + phase as usize);
         for (wanted, field, slot) in [still, moving] {
             let old = || self.baked_at[slot] != step && Instant::now() >= self.rest_until;
             if wanted && (!self.baked.has(field, phase) || old()) {

@@ -183,6 +183,40 @@ impl Renderer {
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have; device errors.
     pub fn render(&self, rays: &ViewRays, width: usize, height: usize, phase: u32) -> Result<Rendering> {
+        self.render_parts(rays, (width, height), phase, Parts { still: true, maxima: true })
+    }
+
+    /// What a `width` x `height` view at a phase shows, rows first; maxima per world unit. Where Gaussians move, nothing
+    /// else is computed: the moving field alone comes at display rates.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn show(
+        &self,
+        rays: &ViewRays,
+        (width, height): (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<Vec<f32>> {
+        let still = self.moving.is_none() || quantity.component.has_static();
+        let parts = Parts { still, maxima: quantity.projection == Projection::Mip };
+        Ok(self.render_parts(rays, (width, height), phase, parts)?.show(quantity))
+    }
+
+    /// Whether a view of the moving field is drawn from Gaussians as they are, at display rates. The largest value of their
+    /// sum with the still field is not the sum of the largest values: that one takes the rays' samples, or volumes.
+    pub fn draws_gaussians(&self, quantity: Quantity) -> bool {
+        let summed = quantity.projection == Projection::Drr || quantity.component == Component::Dynamic;
+        self.moving.is_some() && quantity.component.has_dynamic() && summed
+    }
+
+    fn render_parts(
+        &self,
+        rays: &ViewRays,
+        (width, height): (usize, usize),
+        phase: u32,
+        parts: Parts,
+    ) -> Result<Rendering> {
         self.check_phase(phase)?;
         let views = self.gpu.buffer_with("views", &[View::of(rays)])?;
         let pixels = (width * height) as u32;
@@ -195,9 +229,12 @@ impl Renderer {
             let mut recording = Recording::new(&self.gpu, "render")?;
             let push = push::PoseRays { first_pixel, n_rays, phase, image_width, view: 0 };
             self.buffers.record_pose(&mut recording, &self.kernels, &views, push)?;
-            self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
+            if parts.still {
+                self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
+            }
             if let Some(blobs) = &self.moving {
-                blobs.record_rays(&mut recording, &self.buffers, phase, n_rays, image_width.min(n_rays))?;
+                let row = image_width.min(n_rays);
+                blobs.record_rays(&mut recording, &self.buffers, phase, n_rays, row, parts.maxima)?;
             }
             self.gpu.wait(recording.finish()?.submit()?)?;
             let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
@@ -205,4 +242,13 @@ impl Renderer {
         }
         Ok(out)
     }
+}
+
+/// What of a rendering is wanted; the rest is undefined.
+#[derive(Debug, Clone, Copy)]
+struct Parts {
+    /// The still field.
+    still: bool,
+    /// Maxima of Gaussians.
+    maxima: bool,
 }

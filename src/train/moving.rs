@@ -9,6 +9,7 @@ use crate::gpu::record::Recording;
 use crate::kernels::layout::{RayOut, View};
 use crate::kernels::push;
 use crate::kernels::stages::Kernels;
+use crate::model::Model;
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::network::forward::ForwardBuffers;
 use crate::plan::Plan;
@@ -79,7 +80,8 @@ pub(super) struct Moving {
 }
 
 impl Moving {
-    /// Begins a fit to the plan's targets, or takes over `fitted`; none where the network moves.
+    /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where the network
+    /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits.
     ///
     /// # Errors
     /// As [`MovingFit::new`].
@@ -87,20 +89,29 @@ impl Moving {
         gpu: &Gpu,
         plan: &mut Plan,
         dataset: &Dataset,
-        fitted: Option<&MovingGaussians>,
+        saved: Option<&Model>,
     ) -> Result<Option<Moving>> {
         let Some(targets) = plan.targets.take() else { return Ok(None) };
         let shot = |frame: &Frame| (dataset.views[frame.view].rays.clone(), frame.phase);
-        let (fit, field) = match fitted {
+        let (done, end) = (saved.map_or(0, |model| model.step), plan.config.gaussian_iterations());
+        let (fit, field) = match saved.and_then(|model| model.moving.as_ref()).filter(|_| done >= end) {
             Some(field) => (None, field.clone()),
             None => {
-                let fit = MovingFit::new(gpu, targets, &plan.config)?;
+                let mut fit = MovingFit::new(gpu, targets, &plan.config)?;
+                while fit.step() < done {
+                    fit.advance(done)?;
+                }
                 let field = fit.field()?;
                 (Some(fit), field)
             }
         };
         let shots = dataset.training().iter().map(shot).collect();
         Ok(Some(Moving { fit, feed: Arc::new(Mutex::new((0, field))), shots }))
+    }
+
+    /// Iterations done of a fit that is not finished.
+    pub(super) fn step(&self) -> Option<u32> {
+        self.fit.as_ref().map(MovingFit::step)
     }
 
     /// Whether iterations of the fit are left.
@@ -159,7 +170,7 @@ impl Moving {
                 let mut recording = Recording::new(gpu, "moving field of an image")?;
                 let push = push::PoseRays { first_pixel: part * at_once, n_rays, phase: *phase, image_width, view: 0 };
                 forward.record_pose(&mut recording, kernels, &views, push)?;
-                blobs.record_rays(&mut recording, forward, *phase, n_rays, image_width.min(n_rays))?;
+                blobs.record_rays(&mut recording, forward, *phase, n_rays, image_width.min(n_rays), false)?;
                 gpu.wait(recording.finish()?.submit()?)?;
                 let seen: Vec<RayOut> = gpu.download(&forward.ray_out, 0, values.len())?;
                 values.iter_mut().zip(&seen).for_each(|(y, seen)| *y -= seen.dynamic_integral);

@@ -11,7 +11,7 @@ use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
-use crate::model::gaussians::{MovingFeed, MovingGaussians};
+use crate::model::gaussians::MovingFeed;
 use crate::model::setup::{RING_LENGTH, sample_capacity};
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::pass::Pass;
@@ -130,7 +130,7 @@ impl Trainer {
     /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, None, None)
+        Self::start(gpu, plan, dataset, tuning, None)
     }
 
     /// Continues a run: the result is the same as without interruption.
@@ -151,14 +151,11 @@ impl Trainer {
                 "the checkpoint was trained on other images or geometry",
             ));
         }
-        // What was begun and not finished is fitted anew: that takes seconds and comes to the same bits.
-        let fitted = checkpoint.model.step >= plan.config.gaussian_iterations();
-        let moving = checkpoint.model.moving.as_ref().filter(|_| fitted);
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), moving)
+        Self::start(gpu, plan, dataset, tuning, Some(checkpoint))
     }
 
-    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians are fitted anew.
+    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians are then fitted anew.
     ///
     /// # Errors
     /// [`Error::Config`] when parameters and plan do not fit; device errors.
@@ -170,7 +167,7 @@ impl Trainer {
         checkpoint: &Checkpoint,
     ) -> Result<Trainer> {
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), None)
+        Self::start(gpu, plan, dataset, tuning, Some(checkpoint))
     }
 
     fn start(
@@ -179,7 +176,6 @@ impl Trainer {
         dataset: &Dataset,
         tuning: Tuning,
         saved: Option<&Checkpoint>,
-        moving: Option<&MovingGaussians>,
     ) -> Result<Trainer> {
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params));
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
@@ -204,8 +200,10 @@ impl Trainer {
                 (now.loss_scale, now.good_updates) = (scale, good_updates);
             }
         }
-        let moving = Moving::begin(gpu, &mut plan, dataset, moving)?;
-        let step = if moving.as_ref().is_some_and(Moving::is_fitting) { 0 } else { now.step };
+        let data_fingerprint = data_fingerprint(dataset);
+        let of_these_data = saved.filter(|saved| saved.data_fingerprint == data_fingerprint);
+        let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data.map(|saved| &saved.model))?;
+        let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
         // The still field's iterations follow those of Gaussians.
         now.step = now.step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
@@ -245,7 +243,7 @@ impl Trainer {
             vessel_attenuation: dataset.vessel_attenuation,
             c_arm: dataset.reference_c_arm(),
             image_size: [dataset.width, dataset.height],
-            data_fingerprint: data_fingerprint(dataset),
+            data_fingerprint,
             plan,
         };
         // A field that was fitted before has left its images already.

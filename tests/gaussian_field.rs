@@ -1,0 +1,251 @@
+//! Gaussians as a model's moving field: drawing against f64, checkpoints, whole runs.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+
+use common::{expect_silence, gpu, phantom, relative_error, run, tuning};
+use glam::DVec3;
+use nertca_vk::choice::Choice;
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::error::Error;
+use nertca_vk::geometry::ViewRays;
+use nertca_vk::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use nertca_vk::model::Model;
+use nertca_vk::model::checkpoint::{self, Checkpoint};
+use nertca_vk::model::component::Component;
+use nertca_vk::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units};
+use nertca_vk::plan::Plan;
+use nertca_vk::random::normal;
+use nertca_vk::reference::blobs;
+use nertca_vk::render::grid::Grid;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::run::events::Event;
+use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::train::trainer::Trainer;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Pixel at the isocentre and strongest change of the field under test, world units.
+const UNITS: Units = Units { pixel: 0.006, strongest: 0.3 };
+
+fn random_set(n: usize, n_phases: u32) -> Gaussians {
+    let value = |i: usize, k: u32| normal(5, 0, i as u32, k);
+    let rows = (0..n).map(|i| Gaussian {
+        position: [0, 1, 2].map(|k| (11.0 * value(i, k)) as f32),
+        log_density: (-1.5 + 0.4 * value(i, 3)) as f32,
+        log_scale: [4, 5, 6].map(|k| (0.2 + 0.4 * value(i, k)) as f32),
+        phase: i as u32 % n_phases,
+        rotation: [7, 8, 9, 10].map(|k| value(i, k) as f32),
+    });
+    let setup = GaussianSetup { n_phases, cut: 3.2, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() };
+    Gaussians { units: UNITS, n_phases: n_phases as usize, setup, rows: rows.collect(), step: 7 }
+}
+
+fn random_tree(n: usize, n_phases: u32) -> MovingTree {
+    let setup = TreeSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, n_basis: 4, ..TreeSetup::default() };
+    let wave = |i: usize| [0.7, 1.1, 1.9].map(|k| (1.5 * (k * i as f64).sin()) as f32);
+    let vector = |i: usize| [wave(i)[0], wave(i)[1], wave(i)[2], 0.0];
+    let grid = (0..n_phases as usize * 64).map(|i| if i < 64 { [0.0; 4] } else { vector(i) }).collect();
+    let mut rest = random_set(n, 1);
+    (rest.n_phases, rest.setup.n_phases) = (n_phases as usize, n_phases);
+    MovingTree { rest, setup, grid, own: (0..n * 4).map(vector).collect() }
+}
+
+fn forms() -> [MovingGaussians; 2] {
+    [MovingGaussians::PerPhase(random_set(231, 3)), MovingGaussians::Tree(random_tree(77, 3))]
+}
+
+/// A model of a dataset whose moving field is `field`; its still field is untrained.
+fn model(gpu: &nertca_vk::gpu::device::Gpu, dataset: &Dataset, field: MovingGaussians) -> Model {
+    let config = Config::load(Some(Preset::FastMlp), None, &["hull.enabled=false".into()]).unwrap();
+    let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset).unwrap(), dataset, tuning(gpu)).unwrap();
+    let of_network = trainer.model().unwrap();
+    let config = Config::preset(Preset::Fast);
+    let layout = nertca_vk::model::params::ParamLayout::new(&config, dataset.n_phases as usize);
+    Model { params: layout.initial(&config), layout, config, moving: Some(field), hull: None, ..of_network }
+}
+
+/// Rays of a pixel in f64.
+fn ray(rays: &ViewRays, pixel: usize, width: usize) -> (DVec3, DVec3) {
+    rays.pixel((pixel % width) as f64, (pixel / width) as f64)
+}
+
+#[test]
+fn integrals_and_maxima_match_their_twin() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(37, 29);
+    for field in forms() {
+        let model = model(&gpu, &dataset, field.clone());
+        let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
+        let (rays, phase) = (&dataset.views[1].rays, 2);
+        let seen = renderer.render(rays, 37, 29, phase).unwrap();
+        let set = blobs::field(&field, phase as usize);
+        let want: Vec<blobs::Along> = (0..37 * 29).map(|p| blobs::along(&set, ray(rays, p, 37))).collect();
+        let integrals: Vec<f64> = want.iter().map(|w| w.integral).collect();
+        let (error, at) = relative_error(&seen.dynamic_integral, &integrals);
+        println!("integrals {error:.1e}");
+        assert!(error < 1e-4, "pixel {at}: {} against {}", seen.dynamic_integral[at], integrals[at]);
+        let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
+        let (error, at) = relative_error(&seen.dynamic_max, &maxima);
+        println!("maxima {error:.1e}");
+        // The twin steps along the ray, so it may miss a peak by the square of its step; the device may end a climb early.
+        assert!(error < 3e-3, "pixel {at}: {} against {}", seen.dynamic_max[at], maxima[at]);
+        assert!(maxima.iter().filter(|m| **m > 0.0).count() > 150, "the case must show something");
+        // The still field is nearly flat, so the sum's largest value is nearly the sum of largest values.
+        for ((total, still), moving) in seen.total_max.iter().zip(&seen.static_max).zip(&seen.dynamic_max) {
+            assert!(*total >= still.max(*moving) * 0.999 && *total <= (still + moving) * 1.001);
+        }
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn cells_match_their_twin() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(13, 11);
+    let grid = Grid::over(DVec3::new(-0.17, -0.15, -0.16), DVec3::new(0.15, 0.16, 0.12), 75);
+    for field in forms() {
+        let model = model(&gpu, &dataset, field.clone());
+        let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
+        let cells = renderer.sample(Component::Dynamic, 1, &grid).unwrap();
+        let set = blobs::field(&field, 1);
+        let [nx, ny, _] = grid.size.map(|n| n as usize);
+        let point = |i: usize| {
+            grid.origin + grid.spacing * DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64)
+        };
+        let some: Vec<usize> = (0..grid.len()).step_by(17).collect();
+        let want: Vec<f64> = some.iter().map(|i| blobs::at(&set, point(*i))).collect();
+        let got: Vec<f32> = some.iter().map(|i| cells[*i]).collect();
+        let (error, at) = relative_error(&got, &want);
+        println!("cells {error:.1e}");
+        assert!(error < 1e-3, "cell {at}: {} against {}", got[at], want[at]);
+        assert!(want.iter().filter(|v| **v > 0.0).count() > want.len() / 10, "the case must show something");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn checkpoints_keep_every_bit() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(13, 11);
+    for field in forms() {
+        let model = model(&gpu, &dataset, field);
+        let moments = vec![[0.25, 0.5]; model.layout.len];
+        let saved =
+            Checkpoint { model, moments, occupancy: Vec::new(), loss_scale: None, data_fingerprint: "x".into() };
+        let bytes = saved.to_bytes().unwrap();
+        let read = Checkpoint::from_bytes(&bytes, Path::new("test")).unwrap();
+        assert_eq!(read.to_bytes().unwrap(), bytes);
+        for phase in 0..3 {
+            let at = |c: &Checkpoint| c.model.moving.as_ref().unwrap().at(phase);
+            assert_eq!(at(&read), at(&saved));
+        }
+        let statics = saved.model.layout.static_len;
+        assert_eq!(read.model.params[..statics], saved.model.params[..statics]);
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn damaged_gaussians_are_refused_by_name() {
+    let gpu = gpu();
+    let model = model(&gpu, &common::small_dataset(13, 11), forms()[0].clone());
+    let moments = vec![[0.0; 2]; model.layout.len];
+    let refused = |change: &dyn Fn(&mut Gaussians)| {
+        let mut model = model.clone();
+        if let Some(MovingGaussians::PerPhase(sets)) = &mut model.moving {
+            change(sets);
+        }
+        let saved = Checkpoint {
+            model,
+            moments: moments.clone(),
+            occupancy: Vec::new(),
+            loss_scale: None,
+            data_fingerprint: String::new(),
+        };
+        Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()
+    };
+    assert!(refused(&|s| s.rows[3].log_density = f32::NAN).contains("gaussians.log_density"));
+    assert!(refused(&|s| s.rows[3].phase = 3).contains("gaussians.phase"));
+    assert!(refused(&|s| s.units.pixel = 0.0).contains("gaussians"));
+    expect_silence(gpu);
+}
+
+/// A run short enough for tests: 20 iterations of Gaussians, 12 of the still field.
+fn short_run(form: &str) -> Config {
+    let settings = [
+        "train.iterations=32",
+        "train.checkpoint_every=1000",
+        "gaussians.iterations=20",
+        "gaussians.grow_at=10",
+        "gaussians.count=120",
+        "tree.warm_iterations=12",
+        "tree.track_iterations=4",
+    ];
+    let mut all: Vec<String> = settings.map(String::from).to_vec();
+    all.push(format!("gaussians.form={form}"));
+    Config::load(Preset::named("fast"), None, &all).unwrap()
+}
+
+#[test]
+fn resume_equals_no_interruption() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    for form in ["phase", "tree"] {
+        let config = short_run(form);
+        let go = |name: &str, resume: bool, stop_after: Option<u32>| {
+            let path = directory.path().join(format!("{form}-{name}"));
+            let cancel = AtomicBool::new(false);
+            let options = RunOptions { tuning: &tuning(&gpu), run: &path, resume, stop_at: None, cancel: &cancel };
+            let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |event| {
+                if let (Event::Progress { loss, .. }, Some(stop)) = (event, stop_after) {
+                    cancel.store(loss.step >= stop, Ordering::Relaxed);
+                }
+            });
+            match (outcome, stop_after) {
+                (Ok(()), None) | (Err(Error::Interrupted), Some(_)) => {}
+                (outcome, _) => panic!("{outcome:?}"),
+            }
+            std::fs::read(checkpoint::newest(&path).unwrap()).unwrap()
+        };
+        let whole = go("whole", false, None);
+        // While Gaussians are fitted, and while the still field is.
+        for stop in [10, 25] {
+            let name = format!("stopped-{stop}");
+            assert_ne!(go(&name, false, Some(stop)), whole);
+            assert_eq!(go(&name, true, None), whole, "{form}, stopped after {stop}");
+        }
+        let read = Checkpoint::from_bytes(&whole, Path::new("whole")).unwrap();
+        assert_eq!(read.model.step, 32);
+        assert_eq!(matches!(read.model.moving, Some(MovingGaussians::Tree(_))), form == "tree");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn the_still_field_learns_what_gaussians_leave() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let config = Config {
+        train: nertca_vk::config::sections::Train { iterations: 120, ..short_run("phase").train },
+        ..short_run("phase")
+    };
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let losses = run(&mut trainer, 120);
+    assert_eq!(losses.len(), 120);
+    assert!(losses[19] < 0.7 * losses[0], "Gaussians: {} to {}", losses[0], losses[19]);
+    assert!(losses[119] < 0.5 * losses[20], "still field: {} to {}", losses[20], losses[119]);
+    let model = trainer.model().unwrap();
+    let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
+    let frame = dataset.training()[0].clone();
+    let seen = renderer.render(&dataset.views[frame.view].rays, dataset.width, dataset.height, frame.phase).unwrap();
+    let mean = |v: &[f32]| v.iter().map(|v| f64::from(*v)).sum::<f64>() / v.len() as f64;
+    let (measured, total) = (mean(&frame.integrals), mean(&seen.total_integral()));
+    assert!((total / measured - 1.0).abs() < 0.05, "{total} against {measured}");
+    assert!(mean(&seen.dynamic_integral) > 0.0);
+    drop((renderer, trainer));
+    expect_silence(gpu);
+}
