@@ -110,6 +110,7 @@ pub mod network;
 pub mod gaussians {
     pub mod blobs;
     pub mod particles;
+    pub mod pictures;
     pub mod stages;
     pub mod tree;
     pub mod view;

@@ -18,6 +18,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::random::normal;
 use nertca_vk::reference::blobs;
 use nertca_vk::render::grid::Grid;
+use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
@@ -86,12 +87,18 @@ fn integrals_and_maxima_match_their_twin() {
         let (error, at) = relative_error(&seen.dynamic_integral, &integrals);
         println!("integrals {error:.1e}");
         assert!(error < 1e-4, "pixel {at}: {} against {}", seen.dynamic_integral[at], integrals[at]);
+        // The same at display rates: affine, and cut in the image instead of in space.
+        let line = Quantity { component: Component::Dynamic, projection: Projection::Drr };
+        let quick = renderer.show(rays, (37, 29), phase, line).unwrap();
+        let (error, at) = relative_error(&quick, &integrals);
+        println!("pictures {error:.1e}");
+        assert!(error < 0.01, "pixel {at}: {} against {}", quick[at], integrals[at]);
         let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
         let (error, at) = relative_error(&seen.dynamic_max, &maxima);
         println!("maxima {error:.1e}");
         // The twin steps along the ray, so it may miss a peak by the square of its step; the device may end a climb early.
         assert!(error < 3e-3, "pixel {at}: {} against {}", seen.dynamic_max[at], maxima[at]);
-        assert!(maxima.iter().filter(|m| **m > 0.0).count() > 150, "the case must show something");
+        assert!(maxima.iter().filter(|m| **m > 0.0).count() > 60, "the case must show something");
         // The still field is nearly flat, so the sum's largest value is nearly the sum of largest values.
         for ((total, still), moving) in seen.total_max.iter().zip(&seen.static_max).zip(&seen.dynamic_max) {
             assert!(*total >= still.max(*moving) * 0.999 && *total <= (still + moving) * 1.001);

@@ -2,16 +2,11 @@
 
 use crate::config::{Config, GaussianForm};
 use crate::error::Result;
-use crate::gaussians::blobs::Blobs;
+use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
 use crate::gpu::device::Gpu;
-use crate::gpu::record::Recording;
-use crate::kernels::layout::{RayOut, View};
-use crate::kernels::push;
-use crate::kernels::stages::Kernels;
 use crate::model::Model;
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
-use crate::network::forward::ForwardBuffers;
 use crate::plan::Plan;
 use crate::plan::targets::Targets;
 use crate::scan::dataset::{Dataset, Frame};
@@ -145,36 +140,17 @@ impl Moving {
         Ok(losses)
     }
 
-    /// Line integrals of the plan's images less those of the field: `[frame][pixel]`. Uses `forward`, whose buffers hold
-    /// `n_rays`; what its `ray_out` holds is lost.
+    /// Line integrals of the plan's images less those of the field: `[frame][pixel]`.
     ///
     /// # Errors
     /// Device errors.
-    pub(super) fn what_remains(
-        &self,
-        gpu: &Gpu,
-        kernels: &Kernels,
-        forward: &ForwardBuffers,
-        n_rays: u32,
-        plan: &Plan,
-    ) -> Result<Vec<f32>> {
-        let blobs = Blobs::new(gpu, &kernels.tuning, &self.field())?;
-        let (image_width, pixels) = (plan.setup.image_width, plan.setup.n_pixels);
-        // Whole rows, which tiles of pixels are made of.
-        let at_once = (n_rays / image_width * image_width).max(n_rays.min(image_width));
+    pub(super) fn what_remains(&self, gpu: &Gpu, plan: &Plan) -> Result<Vec<f32>> {
+        let pictures = Pictures::new(gpu, &self.field())?;
+        let (width, pixels) = (plan.setup.image_width as usize, plan.setup.n_pixels as usize);
         let mut remains = plan.images.clone();
-        for ((rays, phase), image) in self.shots.iter().zip(remains.chunks_mut(pixels as usize)) {
-            let views = gpu.buffer_with("views", &[View::of(rays)])?;
-            for (part, values) in (0..).zip(image.chunks_mut(at_once as usize)) {
-                let n_rays = values.len() as u32;
-                let mut recording = Recording::new(gpu, "moving field of an image")?;
-                let push = push::PoseRays { first_pixel: part * at_once, n_rays, phase: *phase, image_width, view: 0 };
-                forward.record_pose(&mut recording, kernels, &views, push)?;
-                blobs.record_rays(&mut recording, forward, *phase, n_rays, image_width.min(n_rays), false)?;
-                gpu.wait(recording.finish()?.submit()?)?;
-                let seen: Vec<RayOut> = gpu.download(&forward.ray_out, 0, values.len())?;
-                values.iter_mut().zip(&seen).for_each(|(y, seen)| *y -= seen.dynamic_integral);
-            }
+        for ((rays, phase), image) in self.shots.iter().zip(remains.chunks_mut(pixels)) {
+            let seen = pictures.draw(rays, (width, pixels / width), *phase)?;
+            image.iter_mut().zip(seen).for_each(|(y, seen)| *y -= seen);
         }
         Ok(remains)
     }

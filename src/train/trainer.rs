@@ -324,8 +324,7 @@ impl Trainer {
     /// The still field is trained on the images less the moving field.
     fn leave_to_still_field(&self) -> Result<()> {
         let Some(moving) = &self.moving else { return Ok(()) };
-        let n_rays = self.plan.setup.n_rays;
-        let remains = moving.what_remains(&self.gpu, &self.kernels, &self.forward, n_rays, &self.plan)?;
+        let remains = moving.what_remains(&self.gpu, &self.plan)?;
         self.gpu.upload(&self.training.images, 0, &remains)
     }
 

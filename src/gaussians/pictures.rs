@@ -1,0 +1,161 @@
+//! Pictures of Gaussians at display rates: line integrals by the kernels that fit them, a few thousand pixels' worth of work.
+//! Affine around each centre: the error is below that of the cut.
+
+use crate::error::Result;
+use crate::gaussians::view::SplatView;
+use crate::geometry::ViewRays;
+use crate::gpu::buffer::Memory;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{Commands, Groups, Recording};
+use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
+use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, Splat};
+use crate::kernels::push;
+use crate::kernels::stages::{Build, Stage};
+use crate::model::gaussians::{MovingGaussians, Units};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Pictures kept recorded; a display in use has far fewer.
+const MOST_RECORDED: usize = 256;
+/// Bits behind the point of the integer sums, as in a fit.
+const FIXED_POINT_BITS: i32 = 20;
+
+/// Columns, rows, phase.
+type Key = (usize, usize, u32);
+
+/// Draws line integrals of a moving field that is made of Gaussians.
+pub struct Pictures {
+    gpu: Gpu,
+    project: Stage<push::GaussianProject>,
+    splat: Stage<push::GaussianSplat>,
+    state: Mutex<State>,
+}
+
+/// The field, and pictures recorded of it.
+struct State {
+    field: MovingGaussians,
+    recorded: HashMap<Key, Arc<Picture>>,
+}
+
+buffer_set! {
+    /// What the stages bind.
+    struct PictureBuffers {
+        /// [`GaussianSetup`].
+        gaussian_setup,
+        /// One [`GaussianView`].
+        gaussian_views,
+        /// The picture is image 0 at every phase.
+        image_of_view,
+        /// Gaussians of the phase.
+        gaussians,
+        /// [`Splat`]s.
+        splats,
+        /// Image of each.
+        image_of_splat,
+        /// The picture in fixed point.
+        splat_images,
+    }
+}
+
+struct Picture {
+    commands: Commands,
+    buffers: PictureBuffers,
+    /// Of a picture under way.
+    in_use: Mutex<()>,
+}
+
+impl Pictures {
+    /// Prepares to draw a field.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<Pictures> {
+        let state = Mutex::new(State { field: field.clone(), recorded: HashMap::new() });
+        Ok(Pictures {
+            gpu: gpu.clone(),
+            project: Build::default().stage(gpu)?,
+            splat: Build::default().stage(gpu)?,
+            state,
+        })
+    }
+
+    /// Draws another field from now on.
+    pub fn replace(&self, field: &MovingGaussians) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        *state = State { field: field.clone(), recorded: HashMap::new() };
+    }
+
+    /// Line integrals of a `width` x `height` view at a phase, rows first.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn draw(&self, rays: &ViewRays, (width, height): (usize, usize), phase: u32) -> Result<Vec<f32>> {
+        let (units, picture) = self.picture((width, height, phase))?;
+        let _alone = picture.in_use.lock().unwrap_or_else(PoisonError::into_inner);
+        picture.buffers.gaussian_views.write(&[SplatView::new(rays, units).to_device()])?;
+        self.gpu.wait(picture.commands.submit()?)?;
+        let mut sums = vec![0i32; width * height];
+        picture.buffers.splat_images.read(&mut sums)?;
+        let unit = units.strongest / 2f64.powi(FIXED_POINT_BITS);
+        Ok(sums.iter().map(|v| (f64::from(*v) * unit) as f32).collect())
+    }
+
+    fn picture(&self, key: Key) -> Result<(Units, Arc<Picture>)> {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let units = state.field.rows().units;
+        if let Some(picture) = state.recorded.get(&key) {
+            return Ok((units, picture.clone()));
+        }
+        if state.recorded.len() >= MOST_RECORDED {
+            state.recorded.clear();
+        }
+        let picture = Arc::new(self.record(&state.field, key)?);
+        state.recorded.insert(key, picture.clone());
+        Ok((units, picture))
+    }
+
+    fn record(&self, field: &MovingGaussians, (width, height, phase): Key) -> Result<Picture> {
+        let (gpu, sets) = (&self.gpu, field.rows());
+        let rows = field.at(phase as usize);
+        let n = rows.len() as u32;
+        let pixels = (width * height) as u32;
+        let setup = GaussianSetup {
+            n_views: 1,
+            n_phases: sets.n_phases as u32,
+            width: width as u32,
+            height: height as u32,
+            fixed_point: 2f32.powi(FIXED_POINT_BITS),
+            n_images: 1,
+            image_stride: pixels,
+            blur: 0.0,
+            ..sets.setup
+        };
+        // Buffers are never empty.
+        let least = u64::from(n.max(1));
+        let rows = if rows.is_empty() { vec![Gaussian::default()] } else { rows };
+        let buffers = PictureBuffers {
+            gaussian_setup: gpu.buffer_with("gaussian_setup of a picture", &[setup])?,
+            gaussian_views: gpu.buffer(
+                "gaussian_views of a picture",
+                size_of::<GaussianView>() as u64,
+                Memory::Upload,
+            )?,
+            image_of_view: gpu.buffer_with("image_of_view of a picture", &vec![0i32; sets.n_phases])?,
+            gaussians: gpu.buffer_with("gaussians of a picture", &rows)?,
+            splats: gpu.buffer("splats of a picture", size_of::<Splat>() as u64 * least, Memory::Device)?,
+            image_of_splat: gpu.buffer("image_of_splat of a picture", 4 * least, Memory::Device)?,
+            splat_images: gpu.buffer("splat_images of a picture", 4 * u64::from(pixels), Memory::Readback)?,
+        };
+        let mut recording = Recording::new(gpu, "picture of Gaussians")?;
+        recording.fill(&buffers.splat_images, 0);
+        if n > 0 {
+            let find = |name| buffers.find(name);
+            let push = push::GaussianProject { n_gaussians: n };
+            let groups = Groups::Direct([n.div_ceil(self.project.local_size()), 1, 1]);
+            dispatch_finding(&mut recording, &self.project, groups, &[], find, push)?;
+            let push = push::GaussianSplat { n_splats: n };
+            dispatch_finding(&mut recording, &self.splat, self.splat.groups_for(n), &[], find, push)?;
+        }
+        Ok(Picture { commands: recording.finish()?, buffers, in_use: Mutex::default() })
+    }
+}
