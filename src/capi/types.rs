@@ -244,7 +244,7 @@ pub struct nertca_progress {
     pub frames: u32,
     /// Loss of the last iteration.
     pub loss: f64,
-    /// PSNR of the last iteration's rays, dB.
+    /// PSNR of the last iteration's rays, dB; NaN while Gaussians are fitted, which have no rays.
     pub psnr_db: f64,
     /// Iterations per second since training was last begun.
     pub iterations_per_s: f64,

@@ -53,8 +53,10 @@ pub fn show_progress() -> impl FnMut(&Event) {
         }
         Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
             bar.set_position(u64::from(loss.step));
+            // Gaussians are fitted to bounds, which have no PSNR.
+            let psnr = if psnr.is_nan() { "Gaussians".into() } else { format!("PSNR {psnr:.1} dB") };
             bar.set_message(format!(
-                "loss {:.3e}  PSNR {psnr:.1} dB  {iterations_per_s:.1} it/s  {left_s:.0} s left",
+                "loss {:.3e}  {psnr}  {iterations_per_s:.1} it/s  {left_s:.0} s left",
                 loss.total()
             ));
         }
