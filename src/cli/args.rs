@@ -436,9 +436,12 @@ pub struct RenderArgs {
     /// Secondary angle, degrees, cranial positive.
     #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
     pub secondary: f64,
-    /// Phase from 0, or `all`.
-    #[arg(long, default_value = "0")]
+    /// Phase from 0, or `all`; between two, as 3.4, where one set of Gaussians moves (preset fast, gaussians.form = "tree").
+    #[arg(long, default_value = "0", allow_negative_numbers = true)]
     pub phase: String,
+    /// Pictures between neighbouring phases, for smooth animations with --phase all.
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=32))]
+    pub between: u32,
     /// Field to show: both, the still background or the moving vessels.
     #[arg(long, value_parser = choice::<Component>(), default_value = Component::Total.name())]
     pub component: Component,
