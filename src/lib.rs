@@ -147,8 +147,9 @@ pub mod score {
     pub mod pictures;
 }
 
-/// A model for other tools: volumes and surfaces.
+/// A model for other tools: volumes, surfaces and motion.
 pub mod export {
+    pub mod motion;
     pub mod surfaces;
     pub mod volumes;
 }

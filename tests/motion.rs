@@ -4,6 +4,8 @@
 mod common;
 #[path = "common/program.rs"]
 mod program;
+#[path = "common/python.rs"]
+mod python;
 
 use common::{expect_silence, gpu, small_config, small_dataset, tuning};
 use glam::{DMat3, DVec3};
@@ -17,6 +19,8 @@ use nertca_vk::plan::Plan;
 use nertca_vk::reference::gaussians::{Params, exact_integral, params};
 use nertca_vk::render::renderer::Renderer;
 use program::program;
+use python::python;
+use serde_json::json;
 use std::path::Path;
 use std::process::Output;
 
@@ -239,4 +243,75 @@ fn the_program_renders_between_phases() {
         refuses(&["render", run, "--out", "x.npy", "--phase", "0.5"], &["between two phases", "whole", "tree"]);
         refuses(&["render", run, "--out", "x.npy", "--phase", "3"], &["--phase", "0 to 2"]);
     }
+}
+
+/// LPS mm of what is along (posterior, left, superior) in pixels.
+fn lps_mm(x: DVec3) -> [f64; 3] {
+    [x.y, x.x, x.z].map(|v| v * UNITS.pixel * 100.0)
+}
+
+#[test]
+fn motion_opens_in_other_tools() {
+    let dir = tempfile::tempdir().unwrap();
+    let to = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    let run = saved(moving_model(), &dir.path().join("tree.safetensors"));
+    let export = |name: &str, extra: &[&str]| ok(&[&["export", &run, "--motion", "--out", &to(name)], extra].concat());
+    export("field.nrrd", &[]);
+    export("zipped.nrrd", &["--compress"]);
+    export("one.nrrd", &["--phase", "1"]);
+    assert_eq!(export("field.vtk", &[]).lines().count(), PHASES);
+    export("one.vtk", &["--phase", "1"]);
+    export("lines.vtk", &["--trajectories"]);
+    // What the files must say is asked of the tree, at places that are no nodes.
+    let tree = tree();
+    let places: Vec<DVec3> = (0..7).map(|i| 3.5 * rest(i)).collect();
+    assert!(places.iter().all(|x| x.abs().max_element() < HALF_SIDE));
+    let expected = json!({
+        "phases": PHASES,
+        "size": NODES,
+        "places_mm": places.iter().map(|x| lps_mm(*x)).collect::<Vec<_>>(),
+        "displacements_mm": (0..PHASES)
+            .map(|t| places.iter().map(|x| lps_mm(tree.carried(*x, t as f64) - *x)).collect::<Vec<_>>())
+            .collect::<Vec<_>>(),
+        "trajectories_mm": (0..6)
+            .map(|i| (0..PHASES).map(|t| lps_mm(place(i, t as f64))).collect::<Vec<_>>())
+            .collect::<Vec<_>>(),
+        "scales_mm": (0..6)
+            .map(|i| {
+                let mut mm = [0.1 * f64::from(i), 0.4, -0.2].map(|log| f64::exp(log) * UNITS.pixel * 100.0);
+                mm.sort_by(f64::total_cmp);
+                mm
+            })
+            .collect::<Vec<_>>(),
+        "attenuation_per_mm": (0..6)
+            .map(|i| (-1.0 + 0.1 * f64::from(i)).exp() * UNITS.strongest / (UNITS.pixel * 100.0))
+            .collect::<Vec<_>>(),
+    });
+    std::fs::write(to("expected.json"), expected.to_string()).unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/check_motion.py");
+    let outcome = python().arg(script).arg(dir.path()).output().unwrap();
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+}
+
+#[test]
+fn motion_that_is_not_known_is_not_exported() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("x.nrrd");
+    let sets =
+        saved(model("fast", Some(MovingGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
+    let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
+    let moves = saved(moving_model(), &dir.path().join("tree.safetensors"));
+    let export = |run: &str, extra: &[&str], parts: &[&str]| {
+        refuses(&[&["export", run, "--motion", "--out", out.to_str().unwrap()], extra].concat(), parts);
+        assert!(!out.exists());
+    };
+    export(&sets, &[], &["gaussians.form", "per phase", "\"tree\""]);
+    export(&network, &[], &["gaussians.form", "network", "\"tree\""]);
+    export(&moves, &["--phase", "3"], &["--phase", "0 to 2"]);
+    export(&moves, &["--trajectories"], &["--out", ".vtk"]);
+    export(&moves, &["--mesh"], &["--mesh"]);
+    let to = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    refuses(&["export", &moves, "--motion", "--out", &to("x.mha")], &["x.mha", ".nrrd .vtk"]);
+    refuses(&["export", &moves, "--motion", "--compress", "--out", &to("x.vtk")], &["x.vtk", "NRRD"]);
+    refuses(&["export", &moves, "--trajectories", "--out", &to("x.vtk")], &["--motion"]);
 }

@@ -499,6 +499,14 @@ pub struct ExportArgs {
     /// Attenuation of the surface, 1/mm; the Dice threshold otherwise.
     #[arg(long, requires = "mesh", value_name = "PER_MM")]
     pub iso: Option<f64>,
+    /// Motion instead of volumes: displacements from phase 0 at the nodes of the grid that moves the Gaussians, mm, where
+    /// one set moves (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion along a vessel is not observed in
+    /// projections: displacements along vessels come from smoothness alone, and no strain can be read from them.
+    #[arg(long, conflicts_with_all = ["mesh", "format", "component", "spacing"])]
+    pub motion: bool,
+    /// With --motion: the way of each Gaussian over the beat, its own motion included, as lines in a .vtk.
+    #[arg(long, requires = "motion", conflicts_with_all = ["compress", "phase"])]
+    pub trajectories: bool,
     /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
