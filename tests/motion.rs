@@ -20,7 +20,7 @@ use nertca_vk::reference::gaussians::{Params, exact_integral, params};
 use nertca_vk::render::renderer::Renderer;
 use program::program;
 use python::python;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::Path;
 use std::process::Output;
 
@@ -314,4 +314,27 @@ fn motion_that_is_not_known_is_not_exported() {
     refuses(&["export", &moves, "--motion", "--out", &to("x.mha")], &["x.mha", ".nrrd .vtk"]);
     refuses(&["export", &moves, "--motion", "--compress", "--out", &to("x.vtk")], &["x.vtk", "NRRD"]);
     refuses(&["export", &moves, "--trajectories", "--out", &to("x.vtk")], &["--motion"]);
+}
+
+#[test]
+fn a_run_of_gaussians_is_described() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = saved(moving_model(), &dir.path().join("tree.safetensors"));
+    let info: Value = serde_json::from_str(&ok(&["info", &run, "--json"])).unwrap();
+    let told = &info["gaussians"];
+    assert_eq!((&told["form"], &told["count"]), (&json!("tree"), &json!(6)));
+    // 11 numbers a Gaussian, two vectors of own motion, and the grid.
+    assert_eq!(told["bytes"], 4 * (6 * 11 + 6 * 2 * 3 + PHASES * 125 * 3));
+    for phase in 0..PHASES {
+        let mm: Vec<f64> = (0..6).map(|i| 100.0 * UNITS.pixel * place(i, phase as f64).distance(rest(i))).collect();
+        let of = &told["displacement_from_phase_0"][phase];
+        let (mean, largest) = (mm.iter().sum::<f64>() / 6.0, mm.iter().copied().fold(0.0, f64::max));
+        assert!((of["mean_mm"].as_f64().unwrap() - mean).abs() < 1e-4, "{of} at phase {phase}, not {mean}");
+        assert!((of["largest_mm"].as_f64().unwrap() - largest).abs() < 1e-4, "{of} at phase {phase}, not {largest}");
+    }
+    let text = ok(&["info", &run]);
+    assert!(text.contains("form: \"tree\"") && text.contains("count: 6") && !text.contains("hull_share"), "{text}");
+    let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
+    let info: Value = serde_json::from_str(&ok(&["info", &network, "--json"])).unwrap();
+    assert_eq!(info["gaussians"], Value::Null);
 }
