@@ -113,6 +113,7 @@ pub mod gaussians {
     pub mod stages;
     pub mod tree;
     pub mod view;
+    pub mod work;
 }
 
 pub mod plan;
