@@ -63,6 +63,20 @@ pub enum GaussianForm {
     Auto,
 }
 
+impl Choice for GaussianForm {
+    const ALL: &'static [GaussianForm] =
+        &[GaussianForm::None, GaussianForm::Phase, GaussianForm::Tree, GaussianForm::Auto];
+
+    fn name(self) -> &'static str {
+        match self {
+            GaussianForm::None => "none",
+            GaussianForm::Phase => "phase",
+            GaussianForm::Tree => "tree",
+            GaussianForm::Auto => "auto",
+        }
+    }
+}
+
 /// What drives the dynamic field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

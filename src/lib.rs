@@ -114,6 +114,7 @@ pub mod gaussians {
     pub mod stages;
     pub mod tree;
     pub mod view;
+    pub mod work;
 }
 
 pub mod plan;
@@ -148,8 +149,9 @@ pub mod score {
     pub mod pictures;
 }
 
-/// A model for other tools: volumes and surfaces.
+/// A model for other tools: volumes, surfaces and motion.
 pub mod export {
+    pub mod motion;
     pub mod surfaces;
     pub mod volumes;
 }

@@ -383,7 +383,8 @@ fn measurements_and_baked_views() {
     let data = phantom(directory.path(), &[]);
     let run = directory.path().join("run");
     ok(&[&["train", text(&data), "-o", text(&run)], SHORT].concat());
-    let (file, quick) = (directory.path().join("bench.json"), ["--iterations", "2", "--repeats", "3"]);
+    let file = directory.path().join("bench.json");
+    let quick = ["--preset", "fast-mlp", "--iterations", "2", "--repeats", "3"];
     let full = [&["bench", text(&data), "--full", "--json", text(&file), "--set", "dynamic.delay=5"], SHORT, &quick];
     let said = ok(&full.concat());
     for part in ["before the network starts", "peaks: f32", "37:00", "really run", "network passes alone"] {

@@ -436,9 +436,12 @@ pub struct RenderArgs {
     /// Secondary angle, degrees, cranial positive.
     #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
     pub secondary: f64,
-    /// Phase from 0, or `all`.
-    #[arg(long, default_value = "0")]
+    /// Phase from 0, or `all`; between two, as 3.4, where one set of Gaussians moves (preset fast, gaussians.form = "tree").
+    #[arg(long, default_value = "0", allow_negative_numbers = true)]
     pub phase: String,
+    /// Pictures between neighbouring phases, for smooth animations with --phase all.
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=32))]
+    pub between: u32,
     /// Field to show: both, the still background or the moving vessels.
     #[arg(long, value_parser = choice::<Component>(), default_value = Component::Total.name())]
     pub component: Component,
@@ -496,6 +499,14 @@ pub struct ExportArgs {
     /// Attenuation of the surface, 1/mm; the Dice threshold otherwise.
     #[arg(long, requires = "mesh", value_name = "PER_MM")]
     pub iso: Option<f64>,
+    /// Motion instead of volumes: displacements from phase 0 at the nodes of the grid that moves the Gaussians, mm, where
+    /// one set moves (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion along a vessel is not observed in
+    /// projections: displacements along vessels come from smoothness alone, and no strain can be read from them.
+    #[arg(long, conflicts_with_all = ["mesh", "format", "component", "spacing"])]
+    pub motion: bool,
+    /// With --motion: the way of each Gaussian over the beat, its own motion included, as lines in a .vtk.
+    #[arg(long, requires = "motion", conflicts_with_all = ["compress", "phase"])]
+    pub trajectories: bool,
     /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,

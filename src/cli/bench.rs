@@ -7,6 +7,7 @@ use nertca_vk::choice::Choice;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::network::cost::NetworkCost;
@@ -18,7 +19,7 @@ use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::{Dataset, Layout};
-use nertca_vk::train::timing::{Subject, Timing};
+use nertca_vk::train::timing::{GaussianSubject, GaussianTiming, Subject, Timing};
 use nertca_vk::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -42,13 +43,16 @@ struct Report {
     config: serde_json::Value,
     rays: u32,
     peaks: Peaks,
-    /// Operations of the network per live sample.
-    network_cost: NetworkCost,
-    /// Iterations before the network starts; none without a delay.
+    /// Operations of the network per live sample; none where Gaussians move.
+    network_cost: Option<NetworkCost>,
+    /// Iterations of Gaussians; none where the network moves, and in reports of versions that had none.
+    #[serde(default)]
+    gaussians: Option<GaussianTiming>,
+    /// Iterations of the still field alone: those before the network starts, none without a delay; or those after Gaussians.
     before: Option<Timing>,
-    /// Iterations with the network.
-    after: Timing,
-    /// Iterations of the whole run times the medians.
+    /// Iterations with the network; none where Gaussians move.
+    after: Option<Timing>,
+    /// Iterations of the whole run times the medians, and what Gaussians need before their first.
     whole_run_s: f64,
     /// Milliseconds of each pass, kept apart.
     passes_ms: BTreeMap<String, f64>,
@@ -128,24 +132,19 @@ fn measure(
 ) -> Result<Report> {
     let tuning = cli.training_tuning(gpu, config, dataset)?;
     let peaks = bench::peaks(gpu)?;
-    let delay = config.dynamic.delay.min(config.train.iterations);
-    let before = match delay {
-        0 => None,
-        _ => Some(Subject::new(gpu, config, dataset, &tuning, false)?.time(args.iterations, args.repeats)?),
+    let timings = match config.gaussians_move() {
+        true => time_gaussians(args, gpu, config, dataset, &tuning)?,
+        false => time_network(args, gpu, config, dataset, &tuning)?,
     };
-    let mut subject = Subject::new(gpu, config, dataset, &tuning, true)?;
-    let after = subject.time(args.iterations, args.repeats)?;
-    let passes_ms = subject.passes(PROFILED.min(args.iterations))?;
-    let whole_run_s = 1e-3
-        * (before.as_ref().map_or(0.0, Timing::median) * f64::from(delay)
-            + after.median() * f64::from(config.train.iterations - delay));
-    let (paths, rays, network_cost) = (subject.notes(), subject.rays(), subject.cost());
-    drop(subject);
     let frame_rates = match args.render {
         false => Vec::new(),
         true => {
             // Any parameters cost the same, so untrained ones serve.
             let mut trainer = Trainer::new(gpu, Plan::new(config, dataset)?, dataset, tuning.clone())?;
+            // But for Gaussians, which cost the more the larger they are.
+            while trainer.step() < config.gaussian_iterations() {
+                trainer.advance(config.gaussian_iterations())?;
+            }
             let model = trainer.model()?;
             let renderer = Arc::new(Renderer::new(gpu, &model, tuning.clone())?);
             measure_frame_rates(&renderer, &model, Component::Total, &[200, 512], 2.0)?
@@ -184,19 +183,86 @@ fn measure(
         commit: env!("NERTCA_COMMIT").into(),
         device: gpu.info().name.clone(),
         driver: gpu.info().driver.clone(),
-        paths,
+        paths: timings.paths,
         preset: config.preset.name().into(),
         config: serde_json::to_value(config).map_err(|e| Error::Internal(e.to_string()))?,
-        rays,
+        rays: timings.rays,
         peaks,
-        network_cost,
-        before,
-        after,
-        whole_run_s,
-        passes_ms,
+        network_cost: timings.network_cost,
+        gaussians: timings.gaussians,
+        before: timings.before,
+        after: timings.after,
+        whole_run_s: timings.whole_run_s,
+        passes_ms: timings.passes_ms,
         frame_rates,
         full,
     })
+}
+
+/// What was timed of a run.
+struct Timings {
+    paths: Vec<String>,
+    rays: u32,
+    network_cost: Option<NetworkCost>,
+    gaussians: Option<GaussianTiming>,
+    before: Option<Timing>,
+    after: Option<Timing>,
+    whole_run_s: f64,
+    passes_ms: BTreeMap<String, f64>,
+}
+
+/// Times a run whose moving field is the network.
+fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
+    let delay = config.dynamic.delay.min(config.train.iterations);
+    let before = match delay {
+        0 => None,
+        _ => Some(Subject::new(gpu, config, dataset, tuning, false)?.time(args.iterations, args.repeats)?),
+    };
+    let mut subject = Subject::new(gpu, config, dataset, tuning, true)?;
+    let after = subject.time(args.iterations, args.repeats)?;
+    let whole_run_s = 1e-3
+        * (before.as_ref().map_or(0.0, Timing::median) * f64::from(delay)
+            + after.median() * f64::from(config.train.iterations - delay));
+    Ok(Timings {
+        paths: subject.notes(),
+        rays: subject.rays(),
+        network_cost: Some(subject.cost()),
+        gaussians: None,
+        before,
+        after: Some(after),
+        whole_run_s,
+        passes_ms: subject.passes(PROFILED.min(args.iterations))?,
+    })
+}
+
+/// Times a run whose moving field is made of Gaussians: their iterations, then those of the still field.
+fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
+    let profiled = PROFILED.min(args.iterations);
+    let mut fit = GaussianSubject::new(gpu, config, dataset, args.iterations * args.repeats + profiled)?;
+    let gaussians = fit.time(args.iterations, args.repeats)?;
+    let mut passes_ms = fit.passes(profiled)?;
+    drop(fit);
+    let mut still = Subject::new(gpu, config, dataset, tuning, false)?;
+    let before = still.time(args.iterations, args.repeats)?;
+    passes_ms.extend(still.passes(profiled)?);
+    let first = config.gaussian_iterations();
+    let whole_run_s = gaussians.preparation_s
+        + 1e-3 * (gaussians.median() * f64::from(first) + before.median() * f64::from(config.train.iterations - first));
+    Ok(Timings {
+        paths: still.notes(),
+        rays: still.rays(),
+        network_cost: None,
+        gaussians: Some(gaussians),
+        before: Some(before),
+        after: None,
+        whole_run_s,
+        passes_ms,
+    })
+}
+
+/// Whether a pass is one over pairs of a Gaussian and a pixel, whose operations are counted.
+fn is_over_pairs(pass: &str) -> bool {
+    ["gaussian_splat", "gaussian_moments"].contains(&pass)
 }
 
 /// Whether a pass belongs to the network whose operations are counted.
@@ -214,28 +280,16 @@ fn print(report: &Report, kernels: bool) {
     let p = &report.peaks;
     let matrix = p.matrix_tflops.map_or("none".to_owned(), |t| format!("{t:.3} TFLOP/s"));
     out!("peaks: f32 {:.3} TFLOP/s, f16 matrices {matrix}, copy {:.1} GB/s", p.f32_tflops, p.copy_gb_per_s);
-    let line = |name: &str, t: &Timing| {
-        let (low, high) = t.ms.iter().fold((f64::INFINITY, 0f64), |(l, h), ms| (l.min(*ms), h.max(*ms)));
-        let cpu = t.host_cpu_share.map_or(String::new(), |s| format!(", process uses {s:.2} CPUs"));
-        out!("{name}: {:.3} ms per iteration (median of {}; {low:.3} to {high:.3}){cpu}", t.median(), t.ms.len());
-    };
     out!("preset {}, {} rays per iteration", report.preset, report.rays);
-    if let Some(before) = &report.before {
-        line("before the network starts", before);
+    if let Some(gaussians) = &report.gaussians {
+        print_gaussians(report, gaussians);
     }
-    line("with the network         ", &report.after);
-    let (ms, live) = (report.after.median(), report.after.live_samples);
-    out!(
-        "  {live} live samples: {:.3e} samples/s, {:.4} TFLOP/s over whole iterations",
-        live as f64 / ms * 1e3,
-        report.after.network_gflop / ms
-    );
-    let network_ms: f64 = report.passes_ms.iter().filter(|(name, _)| is_network(name)).map(|(_, ms)| ms).sum();
-    if network_ms > 0.0 {
-        let tflops = report.after.network_gflop / network_ms;
-        let of = |peak: f64| 100.0 * tflops / peak;
-        let share = p.matrix_tflops.map_or(String::new(), |m| format!(", {:.0} % of the matrix peak", of(m)));
-        out!("  network passes alone: {tflops:.4} TFLOP/s: {:.0} % of the f32 peak{share}", of(p.f32_tflops));
+    if let Some(before) = &report.before {
+        let name = if report.gaussians.is_some() { "still field after them" } else { "before the network starts" };
+        print_times(name, &before.ms, before.median(), before.host_cpu_share);
+    }
+    if let Some(after) = &report.after {
+        print_network(report, after);
     }
     let speedup = PAPER_SECONDS / report.whole_run_s;
     out!("whole run: {} against 37:00 of the paper, extrapolated: {speedup:.3} x as fast", clock(report.whole_run_s));
@@ -260,6 +314,60 @@ fn print(report: &Report, kernels: bool) {
     }
 }
 
+/// Times of an iteration, in a line.
+fn print_times(name: &str, ms: &[f64], median: f64, host_cpu_share: Option<f64>) {
+    let (low, high) = ms.iter().fold((f64::INFINITY, 0f64), |(l, h), ms| (l.min(*ms), h.max(*ms)));
+    let cpu = host_cpu_share.map_or(String::new(), |s| format!(", process uses {s:.2} CPUs"));
+    out!("{name:25}: {median:.3} ms per iteration (median of {}; {low:.3} to {high:.3}){cpu}", ms.len());
+}
+
+/// Milliseconds of some passes together.
+fn ms_of(report: &Report, belongs: impl Fn(&str) -> bool) -> f64 {
+    report.passes_ms.iter().filter(|(name, _)| belongs(name)).map(|(_, ms)| ms).sum()
+}
+
+fn print_gaussians(report: &Report, gaussians: &GaussianTiming) {
+    let GaussianTiming { form, count, work, .. } = gaussians;
+    out!("{count} Gaussians, form {form}; {:.2} s before their first iteration", gaussians.preparation_s);
+    let ms = gaussians.median();
+    print_times("Gaussians", &gaussians.ms, ms, gaussians.host_cpu_share);
+    out!(
+        "  {} pairs of a Gaussian and a pixel: {:.3e} pairs/s, {:.4} TFLOP/s and {:.2} GB/s over whole iterations",
+        work.pairs,
+        work.pairs as f64 / ms * 1e3,
+        work.gflop / ms,
+        work.megabytes / ms
+    );
+    let pairs_ms = ms_of(report, is_over_pairs);
+    if pairs_ms > 0.0 {
+        let tflops = work.gflop / pairs_ms;
+        let share = 100.0 * tflops / report.peaks.f32_tflops;
+        out!("  passes over pairs alone: {tflops:.4} TFLOP/s: {share:.0} % of the f32 peak");
+    }
+}
+
+fn print_network(report: &Report, after: &Timing) {
+    let ms = after.median();
+    print_times("with the network", &after.ms, ms, after.host_cpu_share);
+    let live = after.live_samples;
+    out!(
+        "  {live} live samples: {:.3e} samples/s, {:.4} TFLOP/s over whole iterations",
+        live as f64 / ms * 1e3,
+        after.network_gflop / ms
+    );
+    let network_ms = ms_of(report, is_network);
+    if network_ms > 0.0 {
+        let tflops = after.network_gflop / network_ms;
+        let of = |peak: f64| 100.0 * tflops / peak;
+        let matrices = report.peaks.matrix_tflops;
+        let share = matrices.map_or(String::new(), |m| format!(", {:.0} % of the matrix peak", of(m)));
+        out!(
+            "  network passes alone: {tflops:.4} TFLOP/s: {:.0} % of the f32 peak{share}",
+            of(report.peaks.f32_tflops)
+        );
+    }
+}
+
 fn compare(this: &Report, other: &Report) {
     out!("compared with {} on {} (ratios: this / other):", other.commit, other.device);
     if (&this.device, &this.driver) != (&other.device, &other.driver) {
@@ -269,10 +377,17 @@ fn compare(this: &Report, other: &Report) {
         out!("  another configuration: see both files");
     }
     let ratio = |name: &str, a: f64, b: f64| out!("  {name:32} {:6.3}  ({a:.3} / {b:.3})", a / b);
-    if let (Some(a), Some(b)) = (&this.before, &other.before) {
-        ratio("before the network, ms", a.median(), b.median());
+    if let (Some(a), Some(b)) = (&this.gaussians, &other.gaussians) {
+        ratio("Gaussians, ms", a.median(), b.median());
+        ratio("before the first of them, s", a.preparation_s, b.preparation_s);
     }
-    ratio("with the network, ms", this.after.median(), other.after.median());
+    if let (Some(a), Some(b)) = (&this.before, &other.before) {
+        ratio("without the network, ms", a.median(), b.median());
+    }
+    if let (Some(a), Some(b)) = (&this.after, &other.after) {
+        ratio("with the network, ms", a.median(), b.median());
+    }
+    ratio("whole run, extrapolated, s", this.whole_run_s, other.whole_run_s);
     for (name, ms) in &this.passes_ms {
         if let Some(theirs) = other.passes_ms.get(name) {
             ratio(name, *ms, *theirs);

@@ -3,8 +3,10 @@
 use super::args::{Cli, ConvertArgs, ExportArgs};
 use super::data::bar;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::export::motion::{MotionExport, MotionFormat, moving_tree, write_trajectories};
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
 use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
+use nertca_vk::formats::nrrd::Encoding;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
@@ -31,6 +33,9 @@ pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
 pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, model.layout.phases as u32)?;
+    if args.motion {
+        return export_motion(args, &model, phases, all);
+    }
     if args.mesh && args.component.has_static() {
         return Err(Error::config("--component", "", "surfaces are those of the moving vessels: --component dynamic"));
     }
@@ -70,6 +75,29 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
     );
     drop(renderer);
     cli.close_device(&gpu)
+}
+
+/// Exports displacements, or the Gaussians' ways; no device is needed.
+fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: bool) -> Result<()> {
+    let tree = moving_tree(model)?;
+    let format = MotionFormat::of(&args.out);
+    let unknown = |known: &str| Error::config("--out", args.out.display(), format!("ends in none of {known}"));
+    let made = if args.trajectories {
+        if format != Some(MotionFormat::Vtk) {
+            return Err(unknown(".vtk"));
+        }
+        write_trajectories(tree, &args.out)?;
+        vec![args.out.clone()]
+    } else {
+        let encoding = if args.compress { Encoding::Gzip } else { Encoding::Raw };
+        let format = format.ok_or_else(|| unknown(".nrrd .vtk"))?;
+        MotionExport { tree, phases, sequence, format, encoding }.write(&args.out)?
+    };
+    made.iter().for_each(|path| out!("{}", path.display()));
+    eprintln!(
+        "motion along a vessel is not observed in projections: displacements along vessels come from smoothness alone"
+    );
+    Ok(())
 }
 
 /// The attenuation from which the dynamic field counts as vessel: a third of the stated one, or Otsu's.

@@ -38,7 +38,7 @@ pub fn measure_frame_rates(
         for &size in sizes {
             let frame = |i: u32| {
                 let shot = shot(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
-                renders.render(&shot, i % model.layout.phases as u32, quantity)
+                renders.render(&shot, f64::from(i % model.layout.phases as u32), quantity)
             };
             frame(0)?;
             let (begin, mut frames) = (std::time::Instant::now(), 0);

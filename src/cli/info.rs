@@ -1,10 +1,12 @@
 //! `info`.
 
 use super::args::InfoArgs;
+use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
 use nertca_vk::files::pretty_json;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
+use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
 use nertca_vk::score::pictures::Window;
 use std::path::Path;
@@ -37,9 +39,20 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
         "parameters": model.layout.len,
         "phases": model.layout.phases,
         "hull_share": model.hull.as_ref().map(|h| h.share()),
+        "gaussians": model.moving.as_ref().map(describe_gaussians),
         "scene": model.scene,
         "config": model.config,
     }))
+}
+
+fn describe_gaussians(field: &MovingGaussians) -> serde_json::Value {
+    let phases = 0..field.rows().n_phases;
+    serde_json::json!({
+        "form": field.form().name(),
+        "count": field.rows().rows.len(),
+        "bytes": field.bytes(),
+        "displacement_from_phase_0": field.tree().map(|tree| phases.map(|p| tree.displacement(p as f64)).collect::<Vec<_>>()),
+    })
 }
 
 fn describe_dataset(path: &Path) -> Result<serde_json::Value> {
@@ -76,6 +89,8 @@ fn print_tree(value: &serde_json::Value, depth: usize) {
     let Some(map) = value.as_object() else { return };
     for (key, value) in map {
         match value {
+            // What a run does not have.
+            serde_json::Value::Null => {}
             serde_json::Value::Object(_) => {
                 out!("{:indent$}{key}:", "", indent = 2 * depth);
                 print_tree(value, depth + 1);

@@ -5,6 +5,7 @@ use base64::Engine;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
+use nertca_vk::model::gaussians::Displacement;
 use nertca_vk::score::eval::Evaluation;
 use plotters::prelude::*;
 use serde_json::Value;
@@ -28,6 +29,8 @@ pub struct Page<'a> {
     pub metrics: Vec<Value>,
     /// Scores, where there were views to score.
     pub evaluation: Option<&'a Evaluation>,
+    /// How far Gaussians that move have come at each phase; empty for other fields.
+    pub motion: Vec<Displacement>,
     /// Comparison picture of each scored frame: view, phase, file.
     pub pictures: Vec<(usize, u32, PathBuf)>,
     /// The whole configuration.
@@ -270,6 +273,23 @@ impl Page<'_> {
         })
     }
 
+    fn motion(&self) -> Markup {
+        let largest = self.motion.iter().map(|d| d.largest_mm).fold(0.0, f64::max);
+        html! {
+            @if largest > 0.0 {
+                h2 { "Motion of the Gaussians" }
+                p.lead { "Distance from phase 0. Motion along a vessel is not observed in projections." }
+                table.bars {
+                    tr { th { "phase" } th { "mean, mm" } th { "largest, mm" } th {} }
+                    @for (phase, d) in self.motion.iter().enumerate() {
+                        tr { td { (phase) } td { (format!("{:.2}", d.mean_mm)) } td { (format!("{:.2}", d.largest_mm)) }
+                            td style="width:20rem" { div style=(format!("width:{:.1}%", 100.0 * d.mean_mm / largest)) {} } }
+                    }
+                }
+            }
+        }
+    }
+
     /// Writes the page.
     ///
     /// # Errors
@@ -291,6 +311,7 @@ impl Page<'_> {
                     (self.scores())
                     (self.plots()?)
                     (self.views()?)
+                    (self.motion())
                     (self.kernels())
                     h2 { "What ran on what" }
                     table.facts { @for (name, value) in &self.facts { tr { td { (name) } td { (value) } } } }

@@ -45,15 +45,44 @@ pub enum Renders {
 
 impl Renders {
     /// Line integrals, or maxima per mm.
-    pub fn render(&self, shot: &Shot, phase: u32, quantity: Quantity) -> Result<Vec<f32>> {
+    pub fn render(&self, shot: &Shot, phase: f64, quantity: Quantity) -> Result<Vec<f32>> {
+        let (rays, width, height) = (&shot.rays, shot.width, shot.height);
         let image = match self {
-            Renders::Fields(renderer) => renderer.show(&shot.rays, (shot.width, shot.height), phase, quantity)?,
-            Renders::Baked(baked) => baked.render(&shot.rays, shot.width, shot.height, phase, quantity)?,
+            Renders::Fields(renderer) if phase.fract() == 0.0 && phase < f64::from(renderer.n_phases()) => {
+                renderer.show(rays, (width, height), phase as u32, quantity)?
+            }
+            Renders::Fields(renderer) => renderer.render_at(rays, width, height, phase)?.show(quantity),
+            Renders::Baked(_) if phase.fract() != 0.0 => {
+                return Err(Error::config("--baked", phase, "volumes are baked at whole phases: leave --baked away"));
+            }
+            Renders::Baked(baked) => baked.render(rays, width, height, phase as u32, quantity)?,
         };
         Ok(match quantity.projection {
             Projection::Drr => image,
             Projection::Mip => image.into_iter().map(|x| x / MM_PER_UNIT as f32).collect(),
         })
+    }
+}
+
+/// Milliseconds between the phases of an animation, and the least that viewers keep to.
+const PHASE_MS: u32 = 90;
+const LEAST_MS: u32 = 20;
+
+/// The moments of the beat that `--phase` and `--between` name.
+fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
+    let n_phases = model.layout.phases as u32;
+    let between = args.between + 1;
+    if args.phase == "all" {
+        return Ok((0..n_phases * between).map(|i| f64::from(i) / f64::from(between)).collect());
+    }
+    if args.between > 0 {
+        return Err(Error::config("--between", args.between, "pictures between phases need --phase all"));
+    }
+    // The beat of Gaussians that move closes: it ends where it begins.
+    let last = if model.moving.as_ref().is_some_and(|field| field.tree().is_some()) { n_phases } else { n_phases - 1 };
+    match args.phase.parse::<f64>() {
+        Ok(phase) if (0.0..=f64::from(last)).contains(&phase) => Ok(vec![phase]),
+        _ => Err(Error::config("--phase", &args.phase, format!("`all` or a phase from 0 to {last} is accepted"))),
     }
 }
 
@@ -69,7 +98,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     if !["png", "npy", "gif"].contains(&extension.as_str()) {
         return Err(Error::config("--out", out.display(), "ends in none of .png .npy .gif"));
     }
-    let (phases, _) = super::export::phases(&args.phase, model.layout.phases as u32)?;
+    let phases = moments(args, &model)?;
     if extension == "png" && phases.len() > 1 {
         return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
     }
@@ -90,7 +119,10 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
             let shape = if args.phase == "all" { vec![frames.len(), height, width] } else { vec![height, width] };
             npy::write(out, &shape, &frames.concat())?;
         }
-        "gif" => pictures::write_gif(out, &frames, width, window, 90)?,
+        "gif" => {
+            let ms = (PHASE_MS / (args.between + 1)).max(LEAST_MS);
+            pictures::write_gif(out, &frames, width, window, ms)?;
+        }
         _ => pictures::write_grey(out, &frames[0], width, window)?,
     }
     drop(renders);

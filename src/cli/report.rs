@@ -6,6 +6,7 @@ use nertca_vk::error::Result;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
+use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use std::path::Path;
@@ -46,13 +47,15 @@ impl Report<'_> {
             ("iterations".to_owned(), format!("{} of {}", model.step, model.config.train.iterations)),
             ("parameters".to_owned(), model.layout.len.to_string()),
             ("preset".to_owned(), model.config.preset.name().to_owned()),
-            (
-                "hull".to_owned(),
-                model.hull.as_ref().map_or("none".into(), |h| format!("{:.3} % of the box", 100.0 * h.share())),
-            ),
             ("scored on".to_owned(), gpu.info().name.clone()),
             ("commit".to_owned(), env!("NERTCA_COMMIT").to_owned()),
         ];
+        if let Some(hull) = &model.hull {
+            facts.push(("hull".into(), format!("{:.3} % of the box", 100.0 * hull.share())));
+        }
+        if let Some(field) = &model.moving {
+            facts.push(("Gaussians".into(), gaussians_of(field)));
+        }
         if let Some(started) = latest("started") {
             facts.push(("trained on".into(), started["device"].as_str().unwrap_or_default().to_owned()));
             let notes = started["notes"].as_array().into_iter().flatten().filter_map(|n| n.as_str());
@@ -64,12 +67,14 @@ impl Report<'_> {
             facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s of an RTX A5000")));
         }
         let frames = dataset.validation().iter();
+        let tree = model.moving.as_ref().and_then(MovingGaussians::tree);
         let page = Page {
             title: run.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned()),
             facts,
             warnings: self.all_warnings(),
             metrics,
             evaluation,
+            motion: tree.map_or(Vec::new(), |t| (0..t.rest.n_phases).map(|p| t.displacement(p as f64)).collect()),
             pictures: frames
                 .map(|f| (f.view, f.phase, pictures.join(format!("{}.png", f.name))))
                 .filter(|(_, _, file)| file.is_file())
@@ -86,7 +91,7 @@ impl Report<'_> {
         if model.step < model.config.train.iterations {
             warnings.push(format!("Not finished: {} of {} iterations.", model.step, model.config.train.iterations));
         }
-        if model.config.hull.enabled && model.hull.is_none() {
+        if model.config.hull.enabled && model.hull.is_none() && model.moving.is_none() {
             warnings.push("No motion hull was used: views may not agree, or too much moves.".to_owned());
         }
         if let Some(hull) = model.hull.as_ref().filter(|h| h.share() < 5e-5) {
@@ -108,6 +113,15 @@ impl Report<'_> {
         warnings.extend(self.warnings.iter().cloned());
         warnings
     }
+}
+
+fn gaussians_of(field: &MovingGaussians) -> String {
+    let form = match field {
+        MovingGaussians::PerPhase(_) => "each phase has its own",
+        MovingGaussians::Tree(_) => "one set that moves",
+    };
+    let kib = field.bytes() as f64 / 1024.0;
+    format!("{}, {form} (gaussians.form = \"{}\"), {kib:.0} KiB", field.rows().rows.len(), field.form().name())
 }
 
 fn images_of(dataset: &Dataset) -> String {

@@ -17,40 +17,116 @@ pub enum Encoding {
     Gzip,
 }
 
-/// The header of a volume of floats, its end included.
-fn header(size: &str, index_to_lps: &DAffine3, sequence: Option<&[u32]>, encoding: Encoding, quantity: &str) -> String {
+/// What a file has beside its three axes of space.
+#[derive(Clone, Copy)]
+enum Beside<'a> {
+    /// Nothing: a single volume.
+    Nothing,
+    /// An axis of phases, first.
+    Phases(&'a [u32]),
+    /// An axis of three components, first, and one of phases, if there are several, last.
+    Vectors(Option<&'a [u32]>),
+}
+
+/// Entries of the axes beside those of space: those in front of them, and those behind.
+struct MoreAxes {
+    sizes: [String; 2],
+    directions: [&'static str; 2],
+    kinds: [&'static str; 2],
+    /// Lines that name the phases.
+    names: String,
+    dimension: usize,
+}
+
+impl MoreAxes {
+    fn of(beside: Beside<'_>) -> MoreAxes {
+        let names = |axis: usize, phases: &[u32]| {
+            let values: Vec<_> = phases.iter().map(u32::to_string).collect();
+            format!("axis {axis} index type:=numeric\naxis {axis} index values:={}\n", values.join(" "))
+        };
+        let none = String::new;
+        match beside {
+            Beside::Nothing => {
+                MoreAxes { sizes: [none(), none()], directions: ["", ""], kinds: ["", ""], names: none(), dimension: 3 }
+            }
+            Beside::Phases(phases) => MoreAxes {
+                sizes: [format!("{} ", phases.len()), none()],
+                directions: ["none ", ""],
+                kinds: ["list ", ""],
+                names: names(0, phases),
+                dimension: 4,
+            },
+            Beside::Vectors(None) => MoreAxes {
+                sizes: ["3 ".into(), none()],
+                directions: ["none ", ""],
+                kinds: ["vector ", ""],
+                names: none(),
+                dimension: 4,
+            },
+            Beside::Vectors(Some(phases)) => MoreAxes {
+                sizes: ["3 ".into(), format!(" {}", phases.len())],
+                directions: ["none ", " none"],
+                kinds: ["vector ", " list"],
+                names: names(4, phases),
+                dimension: 5,
+            },
+        }
+    }
+}
+
+/// The header of a file of floats, its end included.
+fn header(
+    size: &str,
+    index_to_lps: &DAffine3,
+    beside: Beside<'_>,
+    encoding: Encoding,
+    quantity: &str,
+    comments: &[&str],
+) -> String {
     let v = |p: DVec3| format!("({},{},{})", p.x, p.y, p.z);
     let m = index_to_lps.matrix3;
     let encoding = match encoding {
         Encoding::Raw => "raw",
         Encoding::Gzip => "gzip",
     };
-    let (dimension, count, none, list, names) = match sequence {
-        None => (3, String::new(), "", "", String::new()),
-        Some(phases) => {
-            let values: Vec<_> = phases.iter().map(u32::to_string).collect();
-            let names = format!("axis 0 index type:=numeric\naxis 0 index values:={}\n", values.join(" "));
-            (4, format!("{} ", phases.len()), "none ", "list ", names)
-        }
-    };
+    let comments: String = comments.iter().map(|comment| format!("# {comment}\n")).collect();
+    let MoreAxes { sizes, directions, kinds, names, dimension } = MoreAxes::of(beside);
     format!(
-        "NRRD0004\ntype: float\ndimension: {dimension}\nspace: left-posterior-superior\nsizes: {count}{size}\n\
-         space directions: {none}{} {} {}\nkinds: {list}domain domain domain\nendian: little\nencoding: {encoding}\n\
-         space origin: {}\nspace units: \"mm\" \"mm\" \"mm\"\nquantity:={quantity}\n{names}\n",
+        "NRRD0004\n{comments}type: float\ndimension: {dimension}\nspace: left-posterior-superior\n\
+         sizes: {}{size}{}\nspace directions: {}{} {} {}{}\nkinds: {}domain domain domain{}\n\
+         endian: little\nencoding: {encoding}\nspace origin: {}\nspace units: \"mm\" \"mm\" \"mm\"\n\
+         quantity:={quantity}\n{names}\n",
+        sizes[0],
+        sizes[1],
+        directions[0],
         v(m.x_axis),
         v(m.y_axis),
         v(m.z_axis),
+        directions[1],
+        kinds[0],
+        kinds[1],
         v(index_to_lps.translation)
     )
+}
+
+/// The header of a grid along the patient's axes.
+fn header_on_grid(h: &VolumeHeader, beside: Beside<'_>, encoding: Encoding, comments: &[&str]) -> Vec<u8> {
+    let [nx, ny, nz] = h.size;
+    let axes = DMat3::from_diagonal(h.spacing_mm);
+    let index_to_lps = DAffine3::from_mat3_translation(axes, h.origin_mm);
+    header(&format!("{nx} {ny} {nz}"), &index_to_lps, beside, encoding, h.quantity, comments).into_bytes()
 }
 
 /// The header of a file that is written piece by piece. The values of a sequence follow with all phases of a voxel
 /// behind each other.
 pub fn header_of(h: &VolumeHeader, encoding: Encoding) -> Vec<u8> {
-    let [nx, ny, nz] = h.size;
-    let axes = DMat3::from_diagonal(h.spacing_mm);
-    let index_to_lps = DAffine3::from_mat3_translation(axes, h.origin_mm);
-    header(&format!("{nx} {ny} {nz}"), &index_to_lps, h.phases.as_deref(), encoding, h.quantity).into_bytes()
+    header_on_grid(h, h.phases.as_deref().map_or(Beside::Nothing, Beside::Phases), encoding, &[])
+}
+
+/// The header of a file of vectors with `comments`, written piece by piece. Values follow phase by phase, with the
+/// components of a vector behind each other: a list axis that comes last is what 3D Slicer itself writes.
+pub fn vector_header_of(h: &VolumeHeader, encoding: Encoding, comments: &[&str]) -> Vec<u8> {
+    header_on_grid(h, Beside::Vectors(h.phases.as_deref()), encoding, comments)
 }
 
 /// Writes a gzip-compressed volume in LPS mm; `quantity` says what its values are.
@@ -59,7 +135,8 @@ pub fn header_of(h: &VolumeHeader, encoding: Encoding) -> Vec<u8> {
 /// [`Error::Io`].
 pub fn write(path: &Path, volume: &Volume, quantity: &str) -> Result<()> {
     let [nx, ny, nz] = volume.size;
-    let header = header(&format!("{nx} {ny} {nz}"), &volume.index_to_lps, None, Encoding::Gzip, quantity);
+    let size = format!("{nx} {ny} {nz}");
+    let header = header(&size, &volume.index_to_lps, Beside::Nothing, Encoding::Gzip, quantity, &[]);
     files::write_atomic_with(path, |file| {
         file.write_all(header.as_bytes())?;
         let mut gzip = flate2::write::GzEncoder::new(file, flate2::Compression::fast());

@@ -1,16 +1,80 @@
-//! Legacy `.vtk` structured points, which ParaView groups by the numbers in their names.
+//! Legacy `.vtk`: structured points, which ParaView groups by the numbers in their names, and lines. Floats are big-endian.
 
+use crate::formats::raw::{self, ByteOrder};
 use crate::formats::volume::VolumeHeader;
+use std::io::{Result, Write};
+
+/// The header of a grid with `title`, up to what its points have.
+fn grid_of(h: &VolumeHeader, title: &str) -> String {
+    let VolumeHeader { origin_mm: o, spacing_mm: s, size: [nx, ny, nz], .. } = h;
+    let points: usize = h.size.iter().map(|n| *n as usize).product();
+    format!(
+        "# vtk DataFile Version 3.0\n{title}\nBINARY\n\
+         DATASET STRUCTURED_POINTS\nDIMENSIONS {nx} {ny} {nz}\nORIGIN {} {} {}\nSPACING {} {} {}\n\
+         POINT_DATA {points}\n",
+        o.x, o.y, o.z, s.x, s.y, s.z
+    )
+}
 
 /// The header of a file of big-endian floats, one phase, that is written piece by piece.
 pub fn header_of(h: &VolumeHeader, phase: u32) -> Vec<u8> {
-    let VolumeHeader { origin_mm: o, spacing_mm: s, size: [nx, ny, nz], quantity, .. } = h;
-    let points: usize = h.size.iter().map(|n| *n as usize).product();
-    format!(
-        "# vtk DataFile Version 3.0\n{quantity}, LPS mm, phase {phase}\nBINARY\n\
-         DATASET STRUCTURED_POINTS\nDIMENSIONS {nx} {ny} {nz}\nORIGIN {} {} {}\nSPACING {} {} {}\n\
-         POINT_DATA {points}\nSCALARS attenuation float 1\nLOOKUP_TABLE default\n",
-        o.x, o.y, o.z, s.x, s.y, s.z
-    )
-    .into_bytes()
+    let grid = grid_of(h, &format!("{}, LPS mm, phase {phase}", h.quantity));
+    format!("{grid}SCALARS attenuation float 1\nLOOKUP_TABLE default\n").into_bytes()
+}
+
+/// The header of a file of vectors called `name`, three big-endian floats per point, one phase, that is written piece by
+/// piece. `title` has a line to itself.
+pub fn vector_header_of(h: &VolumeHeader, name: &str, title: &str) -> Vec<u8> {
+    format!("{}VECTORS {name} float\n", grid_of(h, title)).into_bytes()
+}
+
+/// Values of every point of [`Lines`].
+pub struct PointValues {
+    /// Name, without blanks.
+    pub name: &'static str,
+    /// Numbers per point, 1 to 4.
+    pub width: usize,
+    /// Point by point.
+    pub values: Vec<f32>,
+}
+
+/// Closed lines of equally many points each.
+pub struct Lines {
+    /// What they are, in a line.
+    pub title: String,
+    /// Points of a line.
+    pub points_per_line: usize,
+    /// Points of all lines in order, LPS mm.
+    pub points: Vec<[f32; 3]>,
+    /// What points have.
+    pub values: Vec<PointValues>,
+}
+
+impl Lines {
+    /// Writes them as poly data.
+    ///
+    /// # Errors
+    /// Errors of `out`.
+    pub fn write(&self, out: &mut impl Write) -> Result<()> {
+        let (n, each) = (self.points.len(), self.points_per_line.max(1));
+        let n_lines = n / each;
+        let title = &self.title;
+        write!(out, "# vtk DataFile Version 3.0\n{title}\nBINARY\nDATASET POLYDATA\nPOINTS {n} float\n")?;
+        raw::write_floats(&mut *out, self.points.as_flattened(), ByteOrder::Big)?;
+        // A line is its number of points and their places; it ends where it begins.
+        write!(out, "\nLINES {n_lines} {}\n", n_lines * (each + 2))?;
+        for first in (0..n).step_by(each) {
+            let places = (first..first + each).chain([first]);
+            for word in [each + 1].into_iter().chain(places) {
+                out.write_all(&(word as u32).to_be_bytes())?;
+            }
+        }
+        write!(out, "\nPOINT_DATA {n}\n")?;
+        for PointValues { name, width, values } in &self.values {
+            write!(out, "SCALARS {name} float {width}\nLOOKUP_TABLE default\n")?;
+            raw::write_floats(&mut *out, values, ByteOrder::Big)?;
+            writeln!(out)?;
+        }
+        Ok(())
+    }
 }

@@ -9,7 +9,7 @@ use crate::kernels::layout::{Blob, Gaussian, GaussianSetup};
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage, vec4_variant};
 use crate::kernels::tuning::Tuning;
-use crate::model::gaussians::{MovingGaussians, Units};
+use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units, scales};
 use glam::{DMat3, DQuat, DVec3};
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
@@ -46,8 +46,7 @@ impl BlobKernels {
 impl Blob {
     /// A Gaussian in world units.
     pub fn of(g: &Gaussian, units: Units, setup: &GaussianSetup) -> Blob {
-        let bound = |log: f32| f64::from(log.exp().clamp(setup.least_scale, setup.greatest_scale)) * units.pixel;
-        let scale = DVec3::from_array(g.log_scale.map(bound));
+        let scale = scales(g, setup) * units.pixel;
         let [w, x, y, z] = g.rotation.map(f64::from);
         let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
         let inverse = axes * DMat3::from_diagonal(1.0 / (scale * scale)) * axes.transpose();
@@ -64,11 +63,20 @@ impl Blob {
     }
 }
 
+/// Gaussians on the device as they are at one moment of the beat: some of a buffer.
+#[derive(Clone)]
+pub struct BlobList {
+    blobs: Buffer,
+    range: Range<u32>,
+}
+
 /// Gaussians of all phases on the device.
 struct BlobSet {
     blobs: Buffer,
     /// Those of each phase.
     phases: Vec<Range<u32>>,
+    /// What moves between phases, if anything does.
+    tree: Option<MovingTree>,
 }
 
 impl BlobSet {
@@ -79,10 +87,14 @@ impl BlobSet {
             all.extend(field.at(phase).iter().map(|g| Blob::of(g, sets.units, &sets.setup)));
             phases.push(first..all.len() as u32);
         }
-        // A buffer is never empty.
-        let blobs = if all.is_empty() { vec![Blob::default()] } else { all };
-        Ok(BlobSet { blobs: gpu.buffer_with("blobs", &blobs)?, phases })
+        Ok(BlobSet { blobs: upload(gpu, all)?, phases, tree: field.tree().cloned() })
     }
+}
+
+/// A buffer of Gaussians; it is never empty.
+fn upload(gpu: &Gpu, blobs: Vec<Blob>) -> Result<Buffer> {
+    let blobs = if blobs.is_empty() { vec![Blob::default()] } else { blobs };
+    gpu.buffer_with("blobs", &blobs)
 }
 
 /// Draws a moving field that is made of Gaussians.
@@ -112,15 +124,40 @@ impl Blobs {
         Ok(())
     }
 
-    /// Gaussians of a phase, and their buffer.
-    fn at(&self, phase: u32) -> Result<(Buffer, Range<u32>)> {
+    /// Gaussians as they are at a phase.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for a phase the field does not have.
+    pub fn at(&self, phase: u32) -> Result<BlobList> {
         let set = self.set.lock().unwrap_or_else(PoisonError::into_inner);
         let missing = || Error::Internal(format!("no Gaussians of phase {phase}"));
-        Ok((set.blobs.clone(), set.phases.get(phase as usize).ok_or_else(missing)?.clone()))
+        Ok(BlobList { blobs: set.blobs.clone(), range: set.phases.get(phase as usize).ok_or_else(missing)?.clone() })
+    }
+
+    /// Whether the field is known between phases.
+    pub fn move_between_phases(&self) -> bool {
+        self.set.lock().unwrap_or_else(PoisonError::into_inner).tree.is_some()
+    }
+
+    /// Gaussians of a tree as they are at a phase, which may lie between two; none of another field, which is known at
+    /// whole phases alone.
+    ///
+    /// # Errors
+    /// [`Error::OutOfMemory`]; other device errors.
+    pub fn between(&self, phase: f64) -> Result<Option<BlobList>> {
+        let blobs: Vec<Blob> = {
+            let set = self.set.lock().unwrap_or_else(PoisonError::into_inner);
+            let Some(tree) = &set.tree else { return Ok(None) };
+            let Gaussians { units, setup, .. } = &tree.rest;
+            tree.at(phase).iter().map(|g| Blob::of(g, *units, setup)).collect()
+        };
+        let range = 0..blobs.len() as u32;
+        Ok(Some(BlobList { blobs: upload(&self.gpu, blobs)?, range }))
     }
 
     /// Records integrals, and maxima where asked for, of the `n_rays` rays in `buffers`, rows of an image of `image_width`
-    /// columns. For the sum's largest value, what `ray_out` says of the static field must be there already.
+    /// columns, of Gaussians as they are at some moment. For the sum's largest value, what `ray_out` says of the static field
+    /// must be there already.
     ///
     /// # Errors
     /// [`Error::Internal`] when stage and buffers do not fit.
@@ -128,16 +165,15 @@ impl Blobs {
         &self,
         recording: &mut Recording,
         buffers: &dyn BufferSet,
-        phase: u32,
+        BlobList { blobs, range }: &BlobList,
         n_rays: u32,
         image_width: u32,
         maxima: bool,
     ) -> Result<()> {
-        let (blobs, at) = self.at(phase)?;
         let rows = n_rays.div_ceil(image_width);
         let tiles = image_width.div_ceil(TILE) * rows.div_ceil(TILE);
-        let push = push::GaussianRays { n_rays, image_width, first_blob: at.start, n_blobs: at.len() as u32 };
-        let bound = [(Binding::blobs, (&blobs).into())];
+        let push = push::GaussianRays { n_rays, image_width, first_blob: range.start, n_blobs: range.len() as u32 };
+        let bound = [(Binding::blobs, blobs.into())];
         let stage = if maxima { &self.kernels.rays_maxima } else { &self.kernels.rays };
         let groups = Groups::Direct([tiles, 1, 1]);
         dispatch_finding(recording, stage, groups, &bound, |name| buffers.find(name), push)
@@ -158,12 +194,12 @@ impl Blobs {
     ) -> Result<()> {
         // Groups along y are limited to 65535 on every device.
         const MOST_ROWS: u32 = 65_535;
-        let (blobs, at) = self.at(phase)?;
+        let BlobList { blobs, range } = self.at(phase)?;
         let bound = [(Binding::blobs, (&blobs).into()), (Binding::volume, volume.into())];
         let points = &self.kernels.points;
         for first_row in (0..n_rows).step_by(MOST_ROWS as usize) {
             let rows = MOST_ROWS.min(n_rows - first_row);
-            let push = push::GaussianPoints { first_row, first_blob: at.start, n_blobs: at.len() as u32 };
+            let push = push::GaussianPoints { first_row, first_blob: range.start, n_blobs: range.len() as u32 };
             let groups = Groups::Direct([row_cells.div_ceil(points.local_size()), rows, 1]);
             dispatch_finding(recording, points, groups, &bound, |name| buffers.find(name), push)?;
         }

@@ -93,6 +93,13 @@ pub(super) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
     all
 }
 
+impl MovingGaussians {
+    /// Bytes that the field takes in a checkpoint.
+    pub fn bytes(&self) -> usize {
+        tensors(self).iter().map(|(.., bytes)| bytes.len()).sum()
+    }
+}
+
 /// Reads what [`header`] and [`tensors`] describe.
 pub(super) fn read(
     header: &GaussianHeader,

@@ -1,8 +1,11 @@
 //! Gaussians as the moving field, plain data: a set per phase, or one set that moves.
 
+use crate::config::GaussianForm;
 use crate::error::{Error, Result};
+use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
 use glam::DVec3;
+use serde::Serialize;
 use std::sync::{Arc, Mutex};
 
 /// What turns world units and line integrals into the Gaussians' own, and back.
@@ -63,6 +66,11 @@ impl Gaussians {
     }
 }
 
+/// Standard deviations of a Gaussian along its own axes, within its bounds, pixels.
+pub fn scales(g: &Gaussian, setup: &GaussianSetup) -> DVec3 {
+    DVec3::from_array(g.log_scale.map(|log| f64::from(log.exp().clamp(setup.least_scale, setup.greatest_scale))))
+}
+
 /// About the largest line integral through a Gaussian, whatever the direction: through its thinnest axis.
 pub fn amplitude(g: &Gaussian, setup: &GaussianSetup) -> f64 {
     let thinnest = g.log_scale.iter().copied().fold(f32::INFINITY, f32::min).exp();
@@ -101,6 +109,22 @@ impl MovingGaussians {
         match self {
             MovingGaussians::PerPhase(sets) => sets,
             MovingGaussians::Tree(tree) => &tree.rest,
+        }
+    }
+
+    /// The tree, if the field is one.
+    pub fn tree(&self) -> Option<&MovingTree> {
+        match self {
+            MovingGaussians::PerPhase(_) => None,
+            MovingGaussians::Tree(tree) => Some(tree),
+        }
+    }
+
+    /// Its form.
+    pub fn form(&self) -> GaussianForm {
+        match self {
+            MovingGaussians::PerPhase(_) => GaussianForm::Phase,
+            MovingGaussians::Tree(_) => GaussianForm::Tree,
         }
     }
 
@@ -144,6 +168,15 @@ pub fn shares(setup: &TreeSetup, x: DVec3) -> [(usize, f64); 8] {
     })
 }
 
+/// How far Gaussians are at a phase from where they are at phase 0.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Displacement {
+    /// Mean over the Gaussians, mm; 0 without any.
+    pub mean_mm: f64,
+    /// Largest, mm.
+    pub largest_mm: f64,
+}
+
 fn vector(v: &[f32; 4]) -> DVec3 {
     DVec3::new(v[0].into(), v[1].into(), v[2].into())
 }
@@ -172,6 +205,17 @@ impl MovingTree {
 
     fn at_rest(&self, index: usize) -> DVec3 {
         DVec3::from_array(self.rest.rows[index].position.map(f64::from))
+    }
+
+    /// How far Gaussians are at a phase from where they are at phase 0, own motion included.
+    pub fn displacement(&self, phase: f64) -> Displacement {
+        let mm = self.rest.units.pixel * MM_PER_UNIT;
+        let n = self.rest.rows.len();
+        let lengths: Vec<f64> = (0..n).map(|i| mm * self.position(i, phase).distance(self.at_rest(i))).collect();
+        Displacement {
+            mean_mm: lengths.iter().sum::<f64>() / n.max(1) as f64,
+            largest_mm: lengths.into_iter().fold(0.0, f64::max),
+        }
     }
 
     /// The Gaussian nearest to a point of phase 0.

@@ -1,7 +1,7 @@
 //! Projections of a reconstruction for any pose and phase, through the kernels that train it.
 
 use crate::error::{Error, Result};
-use crate::gaussians::blobs::Blobs;
+use crate::gaussians::blobs::{BlobList, Blobs};
 use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -157,6 +157,11 @@ impl Renderer {
         Ok(commands)
     }
 
+    /// Cardiac phases of the model.
+    pub fn n_phases(&self) -> u32 {
+        self.setup.n_phases
+    }
+
     /// Refuses a phase the model does not have.
     ///
     /// # Errors
@@ -166,6 +171,19 @@ impl Renderer {
             return Ok(());
         }
         Err(Error::config("phase", phase, format!("phases go from 0 to {}", self.setup.n_phases - 1)))
+    }
+
+    /// Gaussians as they are between two phases.
+    fn between(&self, phase: f64) -> Result<BlobList> {
+        match self.moving.as_ref().map(|blobs| blobs.between(phase)).transpose()?.flatten() {
+            Some(list) => Ok(list),
+            None => Err(Error::config(
+                "phase",
+                phase,
+                "lies between two phases, and the moving field of this model knows whole ones alone: ask for a whole \
+                 phase, or train one set of Gaussians that moves (preset fast with gaussians.form = \"tree\")",
+            )),
+        }
     }
 
     /// Most samples a ray may have.
@@ -230,6 +248,46 @@ impl Renderer {
         parts: Parts,
     ) -> Result<Rendering> {
         self.check_phase(phase)?;
+        let blobs = self.moving.as_ref().map(|blobs| blobs.at(phase)).transpose()?;
+        self.draw(rays, (width, height), phase, blobs.as_ref(), parts)
+    }
+
+    /// Renders a `width` x `height` view at a phase that may lie between two, such as 3.4, of a model whose moving field
+    /// is one set of Gaussians that moves; its beat closes, so that the number of phases is phase 0 again. Whole phases are
+    /// those of [`Renderer::render`].
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a phase below 0 or beyond the beat, and for one between two where the moving field is a set
+    /// of Gaussians per phase or a network; device errors.
+    pub fn render_at(&self, rays: &ViewRays, width: usize, height: usize, phase: f64) -> Result<Rendering> {
+        let last = self.last_moment();
+        if !(0.0..=f64::from(self.setup.n_phases)).contains(&phase) {
+            return Err(Error::config("phase", phase, format!("phases go from 0 to {last}")));
+        }
+        if phase.fract() != 0.0 {
+            // The static field is the same at every phase.
+            let all = Parts { still: true, maxima: true };
+            return self.draw(rays, (width, height), 0, Some(&self.between(phase)?), all);
+        }
+        let closes = last == self.setup.n_phases && phase == f64::from(last);
+        self.render(rays, width, height, if closes { 0 } else { phase as u32 })
+    }
+
+    /// The last phase that can be asked for: that of a set of Gaussians that moves is the first of the next beat.
+    fn last_moment(&self) -> u32 {
+        let moves = self.moving.as_ref().is_some_and(Blobs::move_between_phases);
+        if moves { self.setup.n_phases } else { self.setup.n_phases - 1 }
+    }
+
+    /// Renders a view at a phase, with `blobs` where Gaussians are the moving field.
+    fn draw(
+        &self,
+        rays: &ViewRays,
+        (width, height): (usize, usize),
+        phase: u32,
+        blobs: Option<&BlobList>,
+        parts: Parts,
+    ) -> Result<Rendering> {
         let views = self.gpu.buffer_with("views", &[View::of(rays)])?;
         let pixels = (width * height) as u32;
         let image_width = width as u32;
@@ -244,9 +302,9 @@ impl Renderer {
             if parts.still {
                 self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
             }
-            if let Some(blobs) = &self.moving {
+            if let (Some(kernels), Some(list)) = (&self.moving, blobs) {
                 let row = image_width.min(n_rays);
-                blobs.record_rays(&mut recording, &self.buffers, phase, n_rays, row, parts.maxima)?;
+                kernels.record_rays(&mut recording, &self.buffers, list, n_rays, row, parts.maxima)?;
             }
             self.gpu.wait(recording.finish()?.submit()?)?;
             let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;

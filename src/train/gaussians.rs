@@ -4,8 +4,9 @@ use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers, record_images, record_step};
+use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
-use crate::gpu::record::{Commands, Recording};
+use crate::gpu::record::{Commands, PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{Gaussians, amplitude};
 use crate::plan::targets::Targets;
@@ -176,6 +177,42 @@ impl GaussianTrainer {
         model.check()?;
         Ok(model)
     }
+
+    /// Runs one iteration with a timestamp around each pass.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        let mut recording = Recording::timed(&self.gpu, "profiled iteration of Gaussians", MAX_PASSES)?;
+        record_step(&mut GaussianPass {
+            recording: &mut recording,
+            kernels: &self.kernels,
+            targets: &self.buffers,
+            particles: &self.particles,
+            setup: &self.setup,
+            n: self.n,
+        })?;
+        self.step += 1;
+        pass_times(&self.gpu, recording)
+    }
+
+    /// What the last iteration cost.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn work(&self) -> Result<GaussianWork> {
+        GaussianWork::of(&self.gpu, &self.setup, &self.particles, self.n * self.setup.n_views)
+    }
+}
+
+/// Most passes of an iteration that is timed.
+pub(super) const MAX_PASSES: u32 = 64;
+
+/// Runs a recording and tells the time of its passes.
+pub(super) fn pass_times(gpu: &Gpu, recording: Recording) -> Result<Vec<PassTime>> {
+    let commands = recording.finish()?;
+    gpu.wait(commands.submit()?)?;
+    commands.pass_times()
 }
 
 /// Which Gaussians show more than the weakest that is kept.

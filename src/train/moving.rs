@@ -3,8 +3,10 @@
 use crate::config::{Config, GaussianForm};
 use crate::error::Result;
 use crate::gaussians::pictures::Pictures;
+use crate::gaussians::work::GaussianWork;
 use crate::geometry::ViewRays;
 use crate::gpu::device::Gpu;
+use crate::gpu::record::PassTime;
 use crate::model::Model;
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::plan::Plan;
@@ -62,6 +64,44 @@ impl MovingFit {
             MovingFit::PerPhase(fit) => MovingGaussians::PerPhase(fit.model()?),
             MovingFit::Tree(fit) => MovingGaussians::Tree(fit.tree()?),
         })
+    }
+
+    /// Gaussians that there are.
+    pub(super) fn count(&self) -> u32 {
+        match self {
+            MovingFit::PerPhase(fit) => fit.count(),
+            MovingFit::Tree(fit) => fit.count(),
+        }
+    }
+
+    /// What it fits.
+    pub(super) fn form(&self) -> GaussianForm {
+        match self {
+            MovingFit::PerPhase(_) => GaussianForm::Phase,
+            MovingFit::Tree(_) => GaussianForm::Tree,
+        }
+    }
+
+    /// Runs one iteration with a timestamp around each pass.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub(super) fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        match self {
+            MovingFit::PerPhase(fit) => fit.profile_step(),
+            MovingFit::Tree(fit) => fit.profile_step(),
+        }
+    }
+
+    /// What the last iteration cost.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub(super) fn work(&self) -> Result<GaussianWork> {
+        match self {
+            MovingFit::PerPhase(fit) => fit.work(),
+            MovingFit::Tree(fit) => fit.work(),
+        }
     }
 }
 

@@ -1,12 +1,17 @@
 //! Timing of training iterations.
 
+use crate::choice::Choice;
 use crate::config::Config;
-use crate::error::Result;
+use crate::config::sections::Tree;
+use crate::error::{Error, Result};
+use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
+use crate::gpu::record::PassTime;
 use crate::kernels::tuning::Tuning;
 use crate::network::cost::NetworkCost;
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
+use crate::train::moving::MovingFit;
 use crate::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -28,10 +33,38 @@ pub struct Timing {
 impl Timing {
     /// Median of the repeats.
     pub fn median(&self) -> f64 {
-        let mut sorted = self.ms.clone();
-        sorted.sort_by(f64::total_cmp);
-        sorted[sorted.len() / 2]
+        median(&self.ms)
     }
+}
+
+/// Times and work of a fit of Gaussians.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct GaussianTiming {
+    /// Form of the field: "phase" or "tree".
+    pub form: String,
+    /// Gaussians after the timed iterations.
+    pub count: u32,
+    /// Seconds from targets to the first iteration: seeds, and of a tree the fit of phase 0 and the tracking of its grid.
+    pub preparation_s: f64,
+    /// Milliseconds per iteration of each repeat; the fit goes on from one to the next.
+    pub ms: Vec<f64>,
+    /// Host CPU seconds per second of the fit, all threads of the process; a CPU driver's work is among them.
+    pub host_cpu_share: Option<f64>,
+    /// Work of the last timed iteration.
+    pub work: GaussianWork,
+}
+
+impl GaussianTiming {
+    /// Median of the repeats.
+    pub fn median(&self) -> f64 {
+        median(&self.ms)
+    }
+}
+
+fn median(ms: &[f64]) -> f64 {
+    let mut sorted = ms.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted[sorted.len() / 2]
 }
 
 /// CPU time this process has used, where the system tells (Linux).
@@ -41,6 +74,25 @@ fn cpu_time() -> Option<Duration> {
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks: u64 = fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?;
     Some(Duration::from_millis(10 * ticks))
+}
+
+/// Milliseconds per iteration of `repeats` times `iterations` iterations that `run` runs, and CPU seconds per second.
+fn time_repeats(iterations: u32, repeats: u32, mut run: impl FnMut() -> Result<()>) -> Result<(Vec<f64>, Option<f64>)> {
+    let (cpu, all, mut ms) = (cpu_time(), Instant::now(), Vec::new());
+    for _ in 0..repeats {
+        let begin = Instant::now();
+        run()?;
+        ms.push(begin.elapsed().as_secs_f64() * 1e3 / f64::from(iterations));
+    }
+    let share = cpu.zip(cpu_time()).map(|(before, after)| (after - before).as_secs_f64() / all.elapsed().as_secs_f64());
+    Ok((ms, share))
+}
+
+/// Adds the passes of an iteration to means over `iterations`.
+fn add_passes(means: &mut BTreeMap<String, f64>, passes: Vec<PassTime>, iterations: u32) {
+    for pass in passes {
+        *means.entry(pass.name.to_owned()).or_default() += pass.ms / f64::from(iterations);
+    }
 }
 
 /// A run to time: nothing is learned, so that a schedule's high learning rates cannot make it diverge; work does not
@@ -55,7 +107,8 @@ pub struct Subject {
 const WARM_UP: u32 = 4;
 
 impl Subject {
-    /// Prepares a run of a configuration, with the network on or off throughout.
+    /// Prepares a run of a configuration, with the network on or off throughout; where Gaussians move, it is off, and the
+    /// run is that of the still field after them.
     ///
     /// # Errors
     /// Errors of the configuration, the data and the device.
@@ -70,11 +123,14 @@ impl Subject {
         ] {
             *rate = 0.0;
         }
+        // As few Gaussians' iterations as can be, which leave the still field the same work.
+        config.gaussians.iterations = 1;
+        config.tree = Tree { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.tree };
         config.dynamic.delay = if with_network { 0 } else { config.train.iterations };
         let plan = Plan::new(&config, dataset)?;
         let (cost, n_rays) = (NetworkCost::of(&plan.params), plan.setup.n_rays);
         let mut subject = Subject { trainer: Trainer::new(gpu, plan, dataset, tuning.clone())?, cost, n_rays };
-        subject.run(WARM_UP)?;
+        subject.run(config.gaussian_iterations() + WARM_UP)?;
         Ok(subject)
     }
 
@@ -107,17 +163,13 @@ impl Subject {
     /// # Errors
     /// Device errors.
     pub fn time(&mut self, iterations: u32, repeats: u32) -> Result<Timing> {
-        let mut timing = Timing { ms: Vec::new(), live_samples: 0, network_gflop: 0.0, host_cpu_share: None };
-        let (cpu, all) = (cpu_time(), Instant::now());
-        for _ in 0..repeats {
-            let begin = Instant::now();
-            timing.live_samples = self.run(iterations)?;
-            timing.ms.push(begin.elapsed().as_secs_f64() * 1e3 / f64::from(iterations));
-        }
-        timing.host_cpu_share =
-            cpu.zip(cpu_time()).map(|(before, after)| (after - before).as_secs_f64() / all.elapsed().as_secs_f64());
-        timing.network_gflop = timing.live_samples as f64 * self.cost.total() as f64 * 1e-9;
-        Ok(timing)
+        let mut live_samples = 0;
+        let (ms, host_cpu_share) = time_repeats(iterations, repeats, || {
+            live_samples = self.run(iterations)?;
+            Ok(())
+        })?;
+        let network_gflop = live_samples as f64 * self.cost.total() as f64 * 1e-9;
+        Ok(Timing { ms, live_samples, network_gflop, host_cpu_share })
     }
 
     /// Milliseconds of each pass, kept apart, averaged over `iterations`.
@@ -127,9 +179,75 @@ impl Subject {
     pub fn passes(&mut self, iterations: u32) -> Result<BTreeMap<String, f64>> {
         let mut passes = BTreeMap::new();
         for _ in 0..iterations {
-            for pass in self.trainer.profile_step()? {
-                *passes.entry(pass.name.to_owned()).or_default() += pass.ms / f64::from(iterations);
+            add_passes(&mut passes, self.trainer.profile_step()?, iterations);
+        }
+        Ok(passes)
+    }
+}
+
+/// A fit of Gaussians to time. It is a real one from its seeds on: its work depends on how large Gaussians become.
+pub struct GaussianSubject {
+    fit: MovingFit,
+    preparation_s: f64,
+}
+
+impl GaussianSubject {
+    /// Prepares the fit of a configuration whose moving field is made of Gaussians, with `most` iterations to time and to
+    /// profile, or as many as the configuration has if these are more.
+    ///
+    /// # Errors
+    /// [`Error::Config`] where the network moves; errors of the configuration, the data and the device.
+    pub fn new(gpu: &Gpu, config: &Config, dataset: &Dataset, most: u32) -> Result<GaussianSubject> {
+        let mut config = config.clone();
+        config.gaussians.iterations = config.gaussians.iterations.max(most + WARM_UP);
+        let Some(targets) = Plan::new(&config, dataset)?.targets else {
+            return Err(Error::config(
+                "gaussians.form",
+                config.gaussians.form.name(),
+                "there are no Gaussians to time",
+            ));
+        };
+        let begin = Instant::now();
+        let mut subject = GaussianSubject { fit: MovingFit::new(gpu, targets, &config)?, preparation_s: 0.0 };
+        subject.preparation_s = begin.elapsed().as_secs_f64();
+        subject.run(WARM_UP)?;
+        Ok(subject)
+    }
+
+    fn run(&mut self, n: u32) -> Result<()> {
+        let target = self.fit.step() + n;
+        while self.fit.step() < target {
+            if self.fit.advance(target)?.is_empty() {
+                return Err(Error::Internal("the timed fit is over".into()));
             }
+        }
+        Ok(())
+    }
+
+    /// Times `repeats` times `iterations` iterations.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] beyond the iterations prepared for; device errors.
+    pub fn time(&mut self, iterations: u32, repeats: u32) -> Result<GaussianTiming> {
+        let (ms, host_cpu_share) = time_repeats(iterations, repeats, || self.run(iterations))?;
+        Ok(GaussianTiming {
+            form: self.fit.form().name().into(),
+            count: self.fit.count(),
+            preparation_s: self.preparation_s,
+            ms,
+            host_cpu_share,
+            work: self.fit.work()?,
+        })
+    }
+
+    /// Milliseconds of each pass, kept apart, averaged over `iterations`.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn passes(&mut self, iterations: u32) -> Result<BTreeMap<String, f64>> {
+        let mut passes = BTreeMap::new();
+        for _ in 0..iterations {
+            add_passes(&mut passes, self.fit.profile_step()?, iterations);
         }
         Ok(passes)
     }

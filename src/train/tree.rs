@@ -6,16 +6,17 @@ use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
 use crate::gaussians::tree::{record_images, record_step, record_track};
+use crate::gaussians::work::GaussianWork;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
-use crate::gpu::record::Recording;
+use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{GaussianSetup, TreeSetup};
 use crate::model::gaussians::{Gaussians, MovingTree};
 use crate::plan::soft_hull::background::blur;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
-use crate::train::gaussians::{GaussianTrainer, Iterations, check_count, strong};
+use crate::train::gaussians::{GaussianTrainer, Iterations, MAX_PASSES, check_count, pass_times, strong};
 use crate::train::targets::{losses, padded, take_images, target_buffers};
 use glam::DVec3;
 
@@ -257,6 +258,27 @@ impl TreeTrainer {
         };
         rest.check()?;
         Ok(MovingTree { rest, setup: tree, grid, own })
+    }
+
+    /// Runs one iteration with a timestamp around each pass.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        let mut recording = Recording::timed(&self.gpu, "profiled iteration of a tree", MAX_PASSES)?;
+        let bound = (&self.particles, &self.own);
+        record_step(&mut pass(&mut recording, &self.kernels, &self.joint, bound, self.n))?;
+        self.step += 1;
+        pass_times(&self.gpu, recording)
+    }
+
+    /// What the last iteration cost.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn work(&self) -> Result<GaussianWork> {
+        let setup = &self.joint.setup;
+        GaussianWork::of(&self.gpu, setup, &self.particles, self.n * setup.n_views * setup.n_phases)
     }
 }
 

@@ -1,0 +1,206 @@
+//! Motion of a reconstruction for the tools people use: displacements of the grid that moves the Gaussians as NRRD or VTK,
+//! and the way of each Gaussian as lines. Patient coordinates, mm.
+//!
+//! Projections do not show motion along a vessel: what is exported there comes from the smoothness of the grid alone. So no
+//! strain is exported, and none should be derived.
+
+use crate::choice::Choice;
+use crate::config::GaussianForm;
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::nrrd::{self, Encoding};
+use crate::formats::raw::{self, ByteOrder};
+use crate::formats::volume::VolumeHeader;
+use crate::formats::vtk::{self, Lines, PointValues};
+use crate::geometry::MM_PER_UNIT;
+use crate::kernels::layout::Gaussian;
+use crate::model::Model;
+use crate::model::gaussians::{MovingGaussians, MovingTree, scales};
+use flate2::write::GzEncoder;
+use glam::DVec3;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// What the vectors are.
+const QUANTITY: &str = "displacement from phase 0, mm";
+/// What every file says of them.
+const CAVEAT: &str = "motion along a vessel is not observed in projections";
+
+/// File format of displacements.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MotionFormat {
+    /// NRRD: a vector axis, first, and a list axis of phases, last.
+    Nrrd,
+    /// Legacy VTK structured points with a vector array; a file per phase, which ParaView groups.
+    Vtk,
+}
+
+impl MotionFormat {
+    /// Format by the end of a file name.
+    pub fn of(path: &Path) -> Option<MotionFormat> {
+        match path.extension()?.to_str()?.to_lowercase().as_str() {
+            "nrrd" => Some(MotionFormat::Nrrd),
+            "vtk" => Some(MotionFormat::Vtk),
+            _ => None,
+        }
+    }
+}
+
+/// The one set of Gaussians whose motion a model knows.
+///
+/// # Errors
+/// [`Error::Config`] where the moving field is a set of Gaussians per phase or a network: neither says what becomes of a
+/// point.
+pub fn moving_tree(model: &Model) -> Result<&MovingTree> {
+    let form = model.moving.as_ref().map_or(GaussianForm::None, MovingGaussians::form);
+    model.moving.as_ref().and_then(MovingGaussians::tree).ok_or_else(|| {
+        let made_of = match form {
+            GaussianForm::None => "a network",
+            _ => "a set of Gaussians per phase",
+        };
+        Error::config(
+            "gaussians.form",
+            form.name(),
+            format!(
+                "the moving field is {made_of}, which shows every phase and carries no point from one to the next: train \
+                 one set of Gaussians that moves (preset fast with gaussians.form = \"tree\")"
+            ),
+        )
+    })
+}
+
+/// A length or place along (posterior, left, superior) in the Gaussians' pixels, as LPS mm.
+fn lps_mm(tree: &MovingTree, x: DVec3) -> DVec3 {
+    DVec3::new(x.y, x.x, x.z) * tree.rest.units.pixel * MM_PER_UNIT
+}
+
+/// Displacements on a tree's grid, to export.
+pub struct MotionExport<'a> {
+    /// What moves.
+    pub tree: &'a MovingTree,
+    /// Phases to export, from 0.
+    pub phases: Vec<u32>,
+    /// Write an axis of phases, or a number into each name, even for one phase.
+    pub sequence: bool,
+    /// Format.
+    pub format: MotionFormat,
+    /// How NRRD stores them.
+    pub encoding: Encoding,
+}
+
+impl MotionExport<'_> {
+    /// Writes the displacement of every node of the grid from phase 0 to each phase, mm along (left, posterior, superior);
+    /// left is fastest in the files. Returns the files made. Gaussians' own motion is not part of it.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a phase the model does not have, and for gzip in VTK; [`Error::Io`].
+    pub fn write(&self, path: &Path) -> Result<Vec<PathBuf>> {
+        let n_phases = self.tree.rest.n_phases;
+        if let Some(bad) = self.phases.iter().find(|phase| **phase as usize >= n_phases) {
+            return Err(Error::config("phase", bad, format!("phases go from 0 to {}", n_phases - 1)));
+        }
+        match (self.format, self.encoding) {
+            (MotionFormat::Nrrd, _) => self.write_nrrd(path).map(|()| vec![path.to_path_buf()]),
+            (MotionFormat::Vtk, Encoding::Raw) => self.write_vtk(path),
+            (MotionFormat::Vtk, Encoding::Gzip) => {
+                Err(Error::config("compression", path.display(), "of motion, only NRRD can be compressed"))
+            }
+        }
+    }
+
+    /// The grid and what is on it.
+    fn header(&self) -> VolumeHeader {
+        let setup = &self.tree.setup;
+        let (first, step) = (-f64::from(setup.half_side), 1.0 / f64::from(setup.inverse_step));
+        VolumeHeader {
+            origin_mm: lps_mm(self.tree, DVec3::splat(first)),
+            spacing_mm: lps_mm(self.tree, DVec3::splat(step)),
+            size: [setup.n_nodes; 3],
+            phases: self.sequence.then(|| self.phases.clone()),
+            quantity: QUANTITY,
+        }
+    }
+
+    /// Displacements of a phase in the order of the files.
+    fn vectors(&self, phase: u32) -> Vec<f32> {
+        let n = self.tree.setup.n_nodes as usize;
+        let nodes = &self.tree.grid[phase as usize * n.pow(3)..][..n.pow(3)];
+        // The grid's axes are (posterior, left, superior), the first fastest.
+        let node = |i: usize| nodes[(i / (n * n) * n + i % n) * n + i / n % n];
+        let vector = |[x, y, z, _]: [f32; 4]| lps_mm(self.tree, DVec3::new(x.into(), y.into(), z.into()));
+        (0..n.pow(3)).flat_map(|i| vector(node(i)).as_vec3().to_array()).collect()
+    }
+
+    fn write_nrrd(&self, path: &Path) -> Result<()> {
+        files::write_atomic_with(path, |file| {
+            file.write_all(&nrrd::vector_header_of(&self.header(), self.encoding, &[CAVEAT]))?;
+            match self.encoding {
+                Encoding::Raw => self.write_phases(file),
+                Encoding::Gzip => {
+                    let mut gzip = GzEncoder::new(file, flate2::Compression::default());
+                    self.write_phases(&mut gzip)?;
+                    gzip.finish().map(drop)
+                }
+            }
+        })
+    }
+
+    fn write_phases(&self, out: &mut dyn Write) -> std::io::Result<()> {
+        self.phases.iter().try_for_each(|p| raw::write_floats(&mut *out, &self.vectors(*p), ByteOrder::Little))
+    }
+
+    /// One file per phase: `name.vtk`, or `name_0000.vtk` and so on.
+    fn write_vtk(&self, path: &Path) -> Result<Vec<PathBuf>> {
+        let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let one = |phase: &u32| {
+            let file =
+                if self.sequence { path.with_file_name(format!("{stem}_{phase:04}.vtk")) } else { path.to_path_buf() };
+            let title = format!("{QUANTITY}, LPS, phase {phase}; {CAVEAT}");
+            files::write_atomic_with(&file, |out| {
+                out.write_all(&vtk::vector_header_of(&self.header(), "displacement_mm", &title))?;
+                raw::write_floats(out, &self.vectors(*phase), ByteOrder::Big)
+            })?;
+            Ok(file)
+        };
+        self.phases.iter().map(one).collect()
+    }
+}
+
+/// Writes the way of each Gaussian over the beat, own motion included, as a closed line in a legacy VTK file: a point per
+/// phase with its `phase`, the Gaussian's standard deviations from the least to the greatest (`scale_mm`), and its
+/// attenuation at the centre (`attenuation_per_mm`).
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn write_trajectories(tree: &MovingTree, path: &Path) -> Result<()> {
+    let n_phases = tree.rest.n_phases;
+    let units = tree.rest.units;
+    let mut lines = Lines {
+        title: format!("trajectories of Gaussians over a closed beat, LPS mm; {CAVEAT}"),
+        points_per_line: n_phases,
+        points: Vec::new(),
+        values: Vec::new(),
+    };
+    let (mut phases, mut scale_mm, mut attenuation) = (Vec::new(), Vec::new(), Vec::new());
+    let deviations_mm = |g: &Gaussian| {
+        let mut sorted = (scales(g, &tree.rest.setup) * units.pixel * MM_PER_UNIT).to_array();
+        sorted.sort_by(f64::total_cmp);
+        sorted.map(|v| v as f32)
+    };
+    for (index, g) in tree.rest.rows.iter().enumerate() {
+        let scale = deviations_mm(g);
+        let per_mm = f64::from(g.log_density).exp() * units.attenuation() / MM_PER_UNIT;
+        for phase in 0..n_phases {
+            lines.points.push(lps_mm(tree, tree.position(index, phase as f64)).as_vec3().to_array());
+            phases.push(phase as f32);
+            scale_mm.extend(scale);
+            attenuation.push(per_mm as f32);
+        }
+    }
+    lines.values = vec![
+        PointValues { name: "phase", width: 1, values: phases },
+        PointValues { name: "scale_mm", width: 3, values: scale_mm },
+        PointValues { name: "attenuation_per_mm", width: 1, values: attenuation },
+    ];
+    files::write_atomic_with(path, |out| lines.write(out))
+}
