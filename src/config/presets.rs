@@ -88,7 +88,7 @@ fn paper() -> Config {
 /// Gaussians are none of the paper's: one set of defaults for all presets.
 pub(super) fn gaussians() -> Gaussians {
     Gaussians {
-        iterations: 100,
+        iterations: 120,
         count: 500,
         first_scale: 0.8,
         least_scale: 0.4,
@@ -106,6 +106,7 @@ pub(super) fn gaussians() -> Gaussians {
         grow_share: 0.15,
         weakest: 0.01,
         missing: 0.03,
+        background_every: 40,
     }
 }
 
