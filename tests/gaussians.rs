@@ -457,6 +457,56 @@ fn impossible_runs_are_refused_in_words() {
     expect_silence(gpu);
 }
 
+/// Everything of a fit, by the settings.
+fn fit_of(gpu: &Gpu, dataset: &Dataset, config: &Config, form: Train) -> Result<Gaussians> {
+    let targets = Targets::new(dataset, &SoftMotion::new(dataset, 0.3, 32), &config.gaussians)?;
+    form(gpu, targets, config)
+}
+
+fn check_finite(model: &Gaussians, what: &str) {
+    let finite = |g: &Gaussian| params(g).iter().all(|v| v.is_finite());
+    assert!(!model.rows.is_empty() && model.rows.iter().all(finite), "{what}");
+}
+
+#[test]
+fn degenerate_data_are_fitted_or_refused_in_words() {
+    let gpu = gpu();
+    let config = with_settings(sections::Gaussians { iterations: 60, count: 40, ..config().gaussians });
+    let all = common::small_dataset(32, 32);
+    for (name, form) in FORMS {
+        let refused = |dataset: &Dataset, config: &Config, part: &str| {
+            let fault =
+                fit_of(&gpu, dataset, config, form).err().unwrap_or_else(|| panic!("{name}: {part}")).to_string();
+            assert!(fault.contains(part), "{name}: {fault}");
+        };
+        let fitted = |dataset: &Dataset, what: &str| {
+            check_finite(&fit_of(&gpu, dataset, &config, form).unwrap_or_else(|e| panic!("{name}, {what}: {e}")), what);
+        };
+        fitted(&all, "all");
+        let kept = |keep: &dyn Fn(&Frame) -> bool| {
+            let mut dataset = all.clone();
+            dataset.frames.retain(|f| keep(f));
+            dataset
+        };
+        let first = all.training_views()[0];
+        refused(&kept(&|f| f.view == first), &config, "a single training view");
+        refused(&kept(&|f| f.phase == 0), &config, "no training view has two phases");
+        let (one, other) = (all.frames[0].phase, all.frames.iter().map(|f| f.phase).max().unwrap());
+        // Two phases of this scene differ too little in too few places.
+        refused(&kept(&|f| f.phase == one || f.phase == other), &config, "nothing moves");
+        let mut still = all.clone();
+        still.frames.iter_mut().for_each(|f| f.integrals.fill(1.0));
+        refused(&still, &config, "nothing moves");
+        let mut broken = all.clone();
+        broken.frames[0].integrals[5] = f32::NAN;
+        let view = broken.frames[0].view;
+        refused(&broken, &config, &format!("view {view}"));
+        let none = with_settings(sections::Gaussians { weakest: 1e3, ..config.gaussians.clone() });
+        refused(&all, &none, "gaussians.weakest");
+    }
+    expect_silence(gpu);
+}
+
 /// Half side of the default phantom's box, world units.
 const HALF: f64 = 0.2546;
 

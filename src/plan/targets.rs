@@ -57,6 +57,20 @@ pub struct Targets {
     pub cell: f64,
 }
 
+/// Refuses a line integral that is not a number, naming its image.
+fn check_finite(dataset: &Dataset, series: &Series) -> Result<()> {
+    for (phase, image) in series.images.iter().enumerate() {
+        let Some(pixel) = image.as_ref().and_then(|i| i.values.iter().position(|v| !v.is_finite())) else { continue };
+        let (column, row) = (pixel % dataset.width, pixel / dataset.width);
+        let at = format!("{}, view {}, phase {phase}", dataset.path.display(), series.view);
+        let problem = format!(
+            "the line integral at column {column}, row {row} is not finite: leave the image out, or correct it"
+        );
+        return Err(Error::config("dataset", at, problem));
+    }
+    Ok(())
+}
+
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let n = values.len();
@@ -67,13 +81,18 @@ impl Targets {
     /// Brings a dataset and what moves in it into the Gaussians' units.
     ///
     /// # Errors
-    /// [`Error::Config`] when nothing moves, or too little is known to tell.
+    /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
     pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
         if motion.views.is_empty() {
             let problem = "no training view has two phases, so nothing is known of motion";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
+        if motion.views.len() == 1 {
+            let problem = "a single training view has two phases: two are needed to tell where along a ray a vessel is";
+            return Err(Error::config("dataset", dataset.path.display(), problem));
+        }
         let series = Series::of(dataset);
+        series.iter().try_for_each(|s| check_finite(dataset, s))?;
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
         if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
             let problem = "nothing moves that several views agree on: check geometry, phases and noise";
