@@ -3,7 +3,9 @@
 
 pub mod carve;
 pub mod fit;
+pub mod lengths;
 pub mod motion;
+pub mod remainder;
 pub mod scale;
 pub mod seeds;
 pub mod soft_hull;

@@ -56,6 +56,30 @@ pub fn opening(image: &Image, radius: usize) -> Image {
     dilate(&filter(image, radius, f32::min), radius)
 }
 
+/// Median of each row's `2 radius + 1` pixels, then of each column's: in one or two directions what is narrower than half
+/// that goes.
+pub fn median_filter(image: &Image, radius: usize) -> Image {
+    let (w, h) = (image.width, image.height);
+    let window = |centre: usize, end: usize| centre.saturating_sub(radius)..(centre + radius + 1).min(end);
+    let mut values = Vec::with_capacity(2 * radius + 1);
+    let mut middle = |all: &mut dyn Iterator<Item = f32>| {
+        values.clear();
+        values.extend(all);
+        median(&mut values)
+    };
+    let mut rows = Image::zeros(w, h);
+    for (source, row) in image.values.chunks(w).zip(rows.values.chunks_mut(w)) {
+        for (x, out) in row.iter_mut().enumerate() {
+            *out = middle(&mut source[window(x, w)].iter().copied());
+        }
+    }
+    let mut out = Image::zeros(w, h);
+    for (p, out) in out.values.iter_mut().enumerate() {
+        *out = middle(&mut window(p / w, h).map(|y| rows.values[y * w + p % w]));
+    }
+    out
+}
+
 /// The middle value; 0 of none. Reorders.
 pub fn median(values: &mut [f32]) -> f32 {
     if values.is_empty() {

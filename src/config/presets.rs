@@ -90,7 +90,7 @@ fn paper() -> Config {
 pub(super) fn gaussians() -> Gaussians {
     Gaussians {
         form: GaussianForm::None,
-        iterations: 100,
+        iterations: 120,
         count: 500,
         first_scale: 0.8,
         least_scale: 0.4,
@@ -108,6 +108,7 @@ pub(super) fn gaussians() -> Gaussians {
         grow_share: 0.15,
         weakest: 0.01,
         missing: 0.03,
+        background_every: 40,
     }
 }
 

@@ -202,8 +202,8 @@ section! {
 }
 
 section! {
-    /// Gaussians as the moving field. Lengths are pixels at the isocentre, line integrals shares of the views' strongest
-    /// change.
+    /// Gaussians as the moving field. Lengths are pixels at the isocentre of images whose smaller side has 100, and grow with
+    /// the images; line integrals are shares of the views' strongest change.
     Gaussians, "gaussians" {
         /// What the moving field is made of: "none" (the network), "phase", "tree" or "auto".
         form: GaussianForm,
@@ -213,7 +213,7 @@ section! {
         count: u32 in 1.0 to 1_048_576.0,
         /// First scale.
         first_scale: f64 in 0.01 to 100.0,
-        /// Least scale.
+        /// Least scale; noise raises it by up to half, where vessels are wide enough.
         least_scale: f64 in 0.01 to 100.0,
         /// Greatest scale.
         greatest_scale: f64 in 0.01 to 100.0,
@@ -243,13 +243,16 @@ section! {
         weakest: f64 in 0.0 to 1e3,
         /// Missing line integral from which a Gaussian is placed; also its first density.
         missing: f64 in 1e-6 to 1e3,
+        /// Iterations after which the still background is estimated anew from what the Gaussians leave of the images, and
+        /// again after as many; not while rates fall; 0 = never.
+        background_every: u32 in 0.0 to 1e6,
     }
 }
 
 section! {
-    /// One set of Gaussians that moves over the beat. Lengths are pixels at the isocentre.
+    /// One set of Gaussians that moves over the beat. Lengths are those of `gaussians`.
     Tree, "tree" {
-        /// Iterations of phase 0 alone, before anything moves.
+        /// Iterations of a set per phase, before the tree is made of phase 0's.
         warm_iterations: u32 in 1.0 to 1e6,
         /// Amplitude from which a Gaussian of phase 0 is taken into the tree, share of the views' strongest change.
         take: f64 in 0.0 to 1e3,

@@ -34,6 +34,8 @@ pub struct DeviceInfo {
     pub max_workgroup_count: u32,
     /// Range of one storage buffer binding, bytes.
     pub max_storage_buffer_range: u32,
+    /// Storage buffers that a kernel may bind: of a stage, or of a set where those are fewer.
+    pub max_storage_buffers: u32,
     /// Elements of one texel buffer.
     pub max_texel_buffer_elements: u32,
     /// Bytes of push constants.
@@ -242,6 +244,9 @@ pub(super) fn describe(
         max_workgroup_invocations: limits.max_compute_work_group_invocations,
         max_workgroup_count: limits.max_compute_work_group_count[0],
         max_storage_buffer_range: limits.max_storage_buffer_range,
+        max_storage_buffers: limits
+            .max_per_stage_descriptor_storage_buffers
+            .min(limits.max_descriptor_set_storage_buffers),
         max_texel_buffer_elements: limits.max_texel_buffer_elements,
         max_push_constants: limits.max_push_constants_size,
         timestamp_period_ns: if limits.timestamp_compute_and_graphics == vk::TRUE {

@@ -70,7 +70,7 @@ impl Gpu {
     /// Builds a pipeline. `spec` gives values by name; constants not named keep the shader's default.
     ///
     /// # Errors
-    /// [`Error::Internal`] for an unknown constant, [`Error::Config`] beyond device limits,
+    /// [`Error::Internal`] for an unknown constant, [`Error::NoDevice`] when the kernel binds more than the device allows,
     /// [`Error::Vulkan`] when the driver refuses the shader.
     pub fn pipeline(&self, code: &'static KernelCode, local_size: u32, spec: &[(&str, u32)]) -> Result<Pipeline> {
         self.make_pipeline(code, local_size, spec, false)
@@ -114,6 +114,13 @@ impl Gpu {
         }
         if !code.addresses.is_empty() && !info.buffer_device_address {
             return Err(Error::Internal(format!("kernel {}: {} has no buffer addresses", code.name, info.name)));
+        }
+        let buffers = code.bindings.iter().filter(|b| descriptor_type(b) == vk::DescriptorType::STORAGE_BUFFER).count();
+        if buffers > info.max_storage_buffers as usize {
+            return Err(Error::NoDevice(format!(
+                "{}: kernel {} binds {buffers} storage buffers, the device allows {}",
+                info.name, code.name, info.max_storage_buffers
+            )));
         }
         let mut entries = Vec::new();
         let mut values: Vec<u32> = Vec::new();

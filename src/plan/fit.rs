@@ -94,6 +94,22 @@ fn row(step: u32, rate: f64, betas: [f32; 2]) -> GaussianSchedule {
     GaussianSchedule { rate: rate as f32, bias1: bias(betas[0]), bias2: bias(betas[1]) }
 }
 
+/// Whether Gaussians are dropped and placed before an iteration.
+pub fn grows(settings: &sections::Gaussians, step: u32) -> bool {
+    settings.grow_at > 0 && step == settings.grow_at
+}
+
+/// Whether the still background is estimated anew before an iteration: not while rates fall, when little could follow.
+pub fn renews_background(settings: &sections::Gaussians, step: u32) -> bool {
+    let every = settings.background_every;
+    every > 0 && step > 0 && step.is_multiple_of(every) && rate(settings, step) == 1.0
+}
+
+/// Where iterations from `step` on towards `until` must stop, as something is to be done before the next.
+pub fn next_stop(settings: &sections::Gaussians, step: u32, until: u32) -> u32 {
+    (step + 1..until).find(|s| grows(settings, *s) || renews_background(settings, *s)).unwrap_or(until)
+}
+
 /// Factor on all rates at an iteration: 1, falling linearly at the end.
 fn rate(settings: &sections::Gaussians, step: u32) -> f64 {
     let left = f64::from(settings.iterations.saturating_sub(step));
@@ -108,7 +124,16 @@ mod tests {
     #[test]
     fn rates_fall_over_the_last_third() {
         let rate = |step| rate(&Config::preset(Preset::Fast).gaussians, step);
-        assert_eq!((rate(0), rate(70)), (1.0, 1.0));
-        assert!((rate(85) - 0.5).abs() < 1e-12 && (rate(99) - 0.05).abs() < 1e-12);
+        assert_eq!((rate(0), rate(84)), (1.0, 1.0));
+        assert!((rate(102) - 0.5).abs() < 1e-12 && (rate(119) - 0.05).abs() < 1e-12);
+    }
+    #[test]
+    fn iterations_stop_where_something_is_to_be_done() {
+        let settings = Config::preset(Preset::Fast).gaussians;
+        let stops = std::iter::successors(Some(0), |s| (*s < 120).then(|| next_stop(&settings, *s, 120)));
+        assert_eq!(stops.collect::<Vec<_>>(), [0, 40, 50, 80, 120]);
+        assert!(renews_background(&settings, 40) && !renews_background(&settings, 0) && grows(&settings, 50));
+        let never = sections::Gaussians { background_every: 0, grow_at: 0, ..settings };
+        assert_eq!((next_stop(&never, 3, 70), renews_background(&never, 40)), (70, false));
     }
 }

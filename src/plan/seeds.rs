@@ -91,7 +91,7 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
         let weights: Vec<f64> =
             places.iter().map(|p| enough(settings, lacking(targets, &missing, phase, p.position))).collect();
         let draw = Draw { targets, settings, seed, round: (targets.n_phases + phase) as u32 };
-        all.extend(draw.gaussians(&weights, count, phase, settings.missing));
+        all.extend(draw.gaussians(&weights, count, phase, added_density(targets, settings)));
     }
     all
 }
@@ -116,7 +116,12 @@ pub fn tree_additions(
     };
     let weights: Vec<f64> = places.iter().map(weight).collect();
     let draw = Draw { targets, settings, seed, round: targets.n_phases as u32 };
-    draw.gaussians(&weights, count, 0, settings.missing).collect()
+    draw.gaussians(&weights, count, 0, added_density(targets, settings)).collect()
+}
+
+/// Density of a new Gaussian: the same line integral whatever a pixel is.
+fn added_density(targets: &Targets, settings: &sections::Gaussians) -> f64 {
+    settings.missing / targets.lengths.factor
 }
 
 /// Least line integral that the views of a phase lack at a point.

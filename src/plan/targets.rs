@@ -4,6 +4,7 @@ use crate::config::{GaussianForm, sections};
 use crate::error::{Error, Result};
 use crate::gaussians::view::SplatView;
 use crate::model::gaussians::Units;
+use crate::plan::lengths::{Lengths, vessel_width};
 use crate::plan::soft_hull::background::Series;
 use crate::plan::soft_hull::carve::{HullCell, SoftMotion};
 use crate::plan::soft_hull::evidence::ViewEvidence;
@@ -36,16 +37,38 @@ pub struct Targets {
     pub image_of: Vec<Option<usize>>,
     /// Images.
     pub n_images: usize,
+    /// `[image][pixel]`: line integrals of the images, shares of the strongest change.
+    pub images: Vec<f32>,
+    /// `[image][pixel]`: greatest line integral of the moving field by what is known before it is fitted.
+    pub most: Vec<f32>,
     /// `[image][pixel]`: least line integral of the moving field that explains the pixel.
     pub low: Vec<f32>,
     /// `[image][pixel]`: greatest.
     pub high: Vec<f32>,
     /// `[image][pixel]`: factor on the residual, from the pixel's noise.
     pub weight: Vec<f32>,
+    /// `[image][pixel]`: standard deviation of the noise, share of the strongest change.
+    pub noise: Vec<f32>,
+    /// What lengths in the settings mean here.
+    pub lengths: Lengths,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<Place>>,
     /// Side of a cell, pixels at the isocentre.
     pub cell: f64,
+}
+
+/// Refuses a line integral that is not a number, naming its image.
+fn check_finite(dataset: &Dataset, series: &Series) -> Result<()> {
+    for (phase, image) in series.images.iter().enumerate() {
+        let Some(pixel) = image.as_ref().and_then(|i| i.values.iter().position(|v| !v.is_finite())) else { continue };
+        let (column, row) = (pixel % dataset.width, pixel / dataset.width);
+        let at = format!("{}, view {}, phase {phase}", dataset.path.display(), series.view);
+        let problem = format!(
+            "the line integral at column {column}, row {row} is not finite: leave the image out, or correct it"
+        );
+        return Err(Error::config("dataset", at, problem));
+    }
+    Ok(())
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
@@ -58,12 +81,18 @@ impl Targets {
     /// Brings a dataset and what moves in it into the Gaussians' units.
     ///
     /// # Errors
-    /// [`Error::Config`] when nothing moves, or too little is known to tell.
+    /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
     pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
         if motion.views.is_empty() {
             let problem = "no training view has two phases, so nothing is known of motion";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
+        if motion.views.len() == 1 {
+            let problem = "a single training view has two phases: two are needed to tell where along a ray a vessel is";
+            return Err(Error::config("dataset", dataset.path.display(), problem));
+        }
+        let series = Series::of(dataset);
+        series.iter().try_for_each(|s| check_finite(dataset, s))?;
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
         if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
             let problem = "nothing moves that several views agree on: check geometry, phases and noise";
@@ -83,13 +112,16 @@ impl Targets {
             views: motion.views.iter().map(|v| SplatView::new(&dataset.views[v.view].rays, units)).collect(),
             image_of: vec![None; n_phases * motion.views.len()],
             n_images: 0,
+            images: Vec::new(),
+            most: Vec::new(),
             low: Vec::new(),
             high: Vec::new(),
             weight: Vec::new(),
+            noise: Vec::new(),
+            lengths: Lengths { factor: 1.0, smoothing: 1.0 },
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };
-        let series = Series::of(dataset);
         let weights: Vec<Vec<f32>> = motion.views.iter().map(|v| weights(v, strongest, settings.noise_scale)).collect();
         // Images of a phase follow each other.
         for phase in 0..n_phases {
@@ -101,11 +133,18 @@ impl Targets {
                 let share = |change: f32| (f64::from(change) / strongest) as f32;
                 targets.image_of[phase * motion.views.len() + slot] = Some(targets.n_images);
                 targets.n_images += 1;
+                targets.images.extend(image.values.iter().map(|y| share(*y)));
                 targets.low.extend(change.values.iter().map(|d| share(*d)));
                 targets.high.extend(above.map(share));
                 targets.weight.extend(&weights[slot]);
+                targets.noise.extend(view.background.noise.values.iter().map(|s| share(*s)));
             }
         }
+        targets.most.clone_from(&targets.high);
+        let changes = motion.views.iter().flat_map(|v| v.background.changes.iter().flatten());
+        let width = vessel_width(changes, strongest as f32);
+        let size = [dataset.width, dataset.height];
+        targets.lengths = Lengths::new(size, width, &targets.noise, settings.least_scale);
         let place = |c: &HullCell| Place {
             position: motion.hull.centre(c.index) / units.pixel,
             evidence: f64::from(c.evidence),
@@ -128,30 +167,6 @@ impl Targets {
     /// Phases that some view has.
     pub fn phases_seen(&self) -> usize {
         self.image_of.chunks(self.views.len()).filter(|row| row.iter().any(Option::is_some)).count()
-    }
-
-    /// The images of one phase alone, and its places.
-    pub fn only(&self, phase: usize) -> Targets {
-        let n = self.n_pixels();
-        let kept: Vec<usize> = self.views_at(phase).map(|(image, _)| image).collect();
-        let pick = |values: &[f32]| kept.iter().flat_map(|i| &values[i * n..(i + 1) * n]).copied().collect();
-        let mut targets = Targets {
-            image_of: vec![None; self.image_of.len()],
-            n_images: kept.len(),
-            low: pick(&self.low),
-            high: pick(&self.high),
-            weight: pick(&self.weight),
-            places: vec![Vec::new(); self.n_phases],
-            views: self.views.clone(),
-            ..*self
-        };
-        let row = phase * self.views.len();
-        let images = (row..row + self.views.len()).filter(|i| self.image_of[*i].is_some()).enumerate();
-        for (image, at) in images {
-            targets.image_of[at] = Some(image);
-        }
-        targets.places[phase].clone_from(&self.places[phase]);
-        targets
     }
 
     /// Pixels of an image.

@@ -1,6 +1,6 @@
 //! Fits a set of Gaussians per phase: many iterations per submit, and a step on the host where their number changes.
 
-use crate::config::Config;
+use crate::config::{Config, sections};
 use crate::error::{Error, Result};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers, record_images, record_step};
@@ -11,7 +11,7 @@ use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{Gaussians, amplitude};
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
-use crate::train::targets::{losses, take_images, target_buffers};
+use crate::train::targets::{losses, renew_bounds, take_images, target_buffers};
 
 /// Iterations that go into one submit: a CPU driver runs that many without waiting for the host.
 pub(super) const ITERATIONS_PER_SUBMIT: u32 = 10;
@@ -20,7 +20,8 @@ pub(super) const ITERATIONS_PER_SUBMIT: u32 = 10;
 pub struct GaussianTrainer {
     gpu: Gpu,
     targets: Targets,
-    config: Config,
+    settings: sections::Gaussians,
+    seed: u32,
     setup: GaussianSetup,
     kernels: GaussianKernels,
     buffers: TargetBuffers,
@@ -57,7 +58,7 @@ impl GaussianTrainer {
     /// # Errors
     /// [`Error::Config`] for impossible settings or when there is no place for a Gaussian; device errors.
     pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianTrainer> {
-        let mut rows = seeds::seeds(&targets, &config.gaussians, config.seed);
+        let mut rows = seeds::seeds(&targets, &targets.lengths.gaussians(&config.gaussians), config.seed);
         let trainer = Self::with(gpu, targets, config, &Particles::fresh(rows.clone()))?;
         let density = seeds::first_density(&trainer.targets, &trainer.images()?);
         rows.iter_mut().for_each(|g| g.log_density = density.ln() as f32);
@@ -72,13 +73,14 @@ impl GaussianTrainer {
     pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<GaussianTrainer> {
         config.check()?;
         let n = check_count(particles)?;
-        let setup = fit::gaussian_setup(&targets, &config.gaussians);
+        let settings = targets.lengths.gaussians(&config.gaussians);
+        let setup = fit::gaussian_setup(&targets, &settings);
         let kernels = GaussianKernels::new(gpu)?;
-        let buffers = target_buffers(gpu, &targets, &setup, &fit::schedule(&config.gaussians))?;
+        let buffers = target_buffers(gpu, &targets, &setup, &fit::schedule(&settings))?;
         let particles = particles.upload(gpu, setup.n_views)?;
         let iterations = record(gpu, &kernels, &buffers, &particles, &setup, n)?;
-        let (gpu, config) = (gpu.clone(), config.clone());
-        Ok(GaussianTrainer { gpu, targets, config, setup, kernels, buffers, particles, n, iterations, step: 0 })
+        let (gpu, seed) = (gpu.clone(), config.seed);
+        Ok(GaussianTrainer { gpu, targets, settings, seed, setup, kernels, buffers, particles, n, iterations, step: 0 })
     }
 
     /// Iterations done.
@@ -94,6 +96,11 @@ impl GaussianTrainer {
     /// What the run is fitted to.
     pub fn targets(&self) -> &Targets {
         &self.targets
+    }
+
+    /// The same, when the run is over.
+    pub(super) fn into_targets(self) -> Targets {
+        self.targets
     }
 
     /// Constants of the run.
@@ -112,28 +119,39 @@ impl GaussianTrainer {
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
-        let until = until.min(self.config.gaussians.iterations);
+        let until = until.min(self.settings.iterations);
         if self.step >= until {
             return Ok(Vec::new());
         }
-        let grow_at = self.config.gaussians.grow_at;
-        if grow_at > 0 && self.step == grow_at {
+        let settings = &self.settings;
+        let (renew, grow) = (fit::renews_background(settings, self.step), fit::grows(settings, self.step));
+        let stop = fit::next_stop(settings, self.step, until);
+        if renew {
+            self.renew_background()?;
+        }
+        if grow {
             self.grow()?;
         }
-        let stop = if grow_at > self.step { until.min(grow_at) } else { until };
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, stop)?;
         losses(&self.buffers, first..self.step)
+    }
+
+    /// Estimates the still background anew from what the Gaussians leave of the images, and with it the bounds of the
+    /// fit's targets.
+    pub(super) fn renew_background(&mut self) -> Result<()> {
+        let images = self.images()?;
+        renew_bounds(&self.gpu, &mut self.targets, &self.buffers, &self.setup, &images)
     }
 
     /// Drops weak Gaussians and places new ones where data are missing. Once in a run, so it is the host's work: it needs
     /// the hull's cells and a weighted draw, a few megabytes each way.
     fn grow(&mut self) -> Result<()> {
         let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
-        particles.retain(&strong(&particles.rows, &self.setup, self.config.gaussians.weakest));
+        particles.retain(&strong(&particles.rows, &self.setup, self.settings.weakest));
         self.replace(&particles)?;
-        let (settings, seed) = (&self.config.gaussians, self.config.seed);
-        particles.append(seeds::additions(&self.targets, settings, seed, &self.images()?));
+        let images = self.images()?;
+        particles.append(seeds::additions(&self.targets, &self.settings, self.seed, &images));
         self.replace(&particles)
     }
 

@@ -7,6 +7,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{GaussianSchedule, GaussianSetup, GaussianView};
+use crate::plan::remainder::{self, Bounds};
 use crate::plan::targets::Targets;
 use std::ops::Range;
 
@@ -38,6 +39,21 @@ pub(super) fn target_buffers(
     };
     clear_images(gpu, &buffers)?;
     Ok(buffers)
+}
+
+/// Bounds by the background that `images` of the field leave, on the host and on the device.
+pub(super) fn renew_bounds(
+    gpu: &Gpu,
+    targets: &mut Targets,
+    buffers: &TargetBuffers,
+    setup: &GaussianSetup,
+    images: &[f32],
+) -> Result<()> {
+    let Bounds { low, high } = remainder::bounds(targets, images);
+    gpu.upload(&buffers.bound_low, 0, &padded(&low, targets, setup))?;
+    gpu.upload(&buffers.bound_high, 0, &padded(&high, targets, setup))?;
+    (targets.low, targets.high) = (low, high);
+    Ok(())
 }
 
 /// Images, each filled up to the stride with zeros, which residuals of nothing are.

@@ -1,4 +1,4 @@
-//! Fits a moving tree: phase 0 alone, then the grid tracked from phase to phase, then everything together.
+//! Fits a moving tree: a set per phase, of which phase 0's becomes the tree; then the grid tracked from phase to phase, then everything together.
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
@@ -17,7 +17,7 @@ use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
 use crate::train::gaussians::{GaussianTrainer, Iterations, MAX_PASSES, check_count, pass_times, strong};
-use crate::train::targets::{losses, padded, take_images, target_buffers};
+use crate::train::targets::{losses, padded, renew_bounds, take_images, target_buffers};
 use glam::DVec3;
 
 /// A run on a device.
@@ -45,9 +45,10 @@ struct Fit {
 impl Fit {
     /// A fit of everything, with a grid at rest.
     fn joint(gpu: &Gpu, targets: &Targets, config: &Config) -> Result<Fit> {
-        let setup = fit::gaussian_setup(targets, &config.gaussians);
-        let tree = fit::tree_setup(targets, &config.tree);
-        let buffers = target_buffers(gpu, targets, &setup, &fit::schedule(&config.gaussians))?;
+        let settings = targets.lengths.gaussians(&config.gaussians);
+        let setup = fit::gaussian_setup(targets, &settings);
+        let tree = fit::tree_setup(targets, &targets.lengths.tree(&config.tree));
+        let buffers = target_buffers(gpu, targets, &setup, &fit::schedule(&settings))?;
         Ok(Fit { setup, tree, targets: buffers, grid: GridBuffers::new(gpu, &tree, targets.n_phases)? })
     }
 
@@ -80,7 +81,7 @@ impl Fit {
 }
 
 impl TreeTrainer {
-    /// Fits phase 0 alone, makes a tree of what it shows, and tracks it through the beat.
+    /// Fits a set per phase, which tells the background; makes a tree of what phase 0 shows, and tracks it through the beat.
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings or when phase 0 shows nothing; device errors.
@@ -88,13 +89,18 @@ impl TreeTrainer {
         let iterations = config.tree.warm_iterations;
         let warm = sections::Gaussians { iterations, ..config.gaussians.clone() };
         let warm = Config { gaussians: warm, ..config.clone() };
-        let mut first = GaussianTrainer::new(gpu, targets.only(0), &warm)?;
+        let mut first = GaussianTrainer::new(gpu, targets, &warm)?;
         while first.step() < iterations {
             first.advance(iterations)?;
         }
+        if config.gaussians.background_every > 0 {
+            first.renew_background()?;
+        }
         let mut found = Particles::fresh(first.model()?.rows);
-        found.retain(&strong(&found.rows, first.setup(), config.tree.take));
-        drop(first);
+        let strong = strong(&found.rows, first.setup(), config.tree.take);
+        let keep: Vec<bool> = found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == 0).collect();
+        found.retain(&keep);
+        let targets = first.into_targets();
         let trainer = Self::with(gpu, targets, config, &found)?;
         trainer.track()?;
         Ok(trainer)
@@ -118,8 +124,8 @@ impl TreeTrainer {
 
     /// Tracks the grid forward and backward from phase 0 to the middle of the beat, on blurred images.
     fn track(&self) -> Result<()> {
-        let settings = &self.config.tree;
-        let tracking = self.joint.tracking(&self.gpu, &self.targets, settings)?;
+        let settings = self.targets.lengths.tree(&self.config.tree);
+        let tracking = self.joint.tracking(&self.gpu, &self.targets, &settings)?;
         for track in tracks(&self.targets) {
             let iterations = if track.images.is_empty() { 0 } else { settings.track_iterations };
             let mut recording = Recording::new(&self.gpu, "tracking")?;
@@ -184,11 +190,16 @@ impl TreeTrainer {
         if self.step >= until {
             return Ok(Vec::new());
         }
-        let grow_at = self.config.gaussians.grow_at;
-        if grow_at > 0 && self.step == grow_at {
+        let settings = &self.config.gaussians;
+        let (renew, grow) = (fit::renews_background(settings, self.step), fit::grows(settings, self.step));
+        let stop = fit::next_stop(settings, self.step, until);
+        if renew {
+            let images = self.images()?;
+            renew_bounds(&self.gpu, &mut self.targets, &self.joint.targets, &self.joint.setup, &images)?;
+        }
+        if grow {
             self.grow()?;
         }
-        let stop = if grow_at > self.step { until.min(grow_at) } else { until };
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, stop)?;
         losses(&self.joint.targets, first..self.step)
@@ -206,8 +217,8 @@ impl TreeTrainer {
         self.replace(&particles, &own)?;
         let tree = self.tree()?;
         let carried = |x: DVec3, phase: usize| tree.carried(x, phase as f64);
-        let (settings, seed) = (&self.config.gaussians, self.config.seed);
-        let additions = seeds::tree_additions(&self.targets, settings, seed, &self.images()?, carried);
+        let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
+        let additions = seeds::tree_additions(&self.targets, &settings, seed, &self.images()?, carried);
         // They move as their nearest neighbour does.
         for g in &additions {
             let nearest = tree.nearest(DVec3::from_array(g.position.map(f64::from)));

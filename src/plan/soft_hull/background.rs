@@ -137,7 +137,8 @@ impl Background {
     }
 }
 
-fn opening_radius(share: f64, width: usize, height: usize) -> usize {
+/// Radius of a window, from its share of an image's smaller side.
+pub(in crate::plan) fn opening_radius(share: f64, width: usize, height: usize) -> usize {
     ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
 }
 
