@@ -185,6 +185,7 @@ fn short_run(form: &str) -> Config {
         "train.iterations=32",
         "train.checkpoint_every=1000",
         "gaussians.iterations=20",
+        "gaussians.background_every=8",
         "gaussians.grow_at=10",
         "gaussians.count=120",
         "tree.warm_iterations=12",
