@@ -217,6 +217,8 @@ fn the_program_renders_between_phases() {
         assert_eq!(smooth.values[2 * phase * n..][..n], all.values[phase * n..][..n], "phase {phase}");
     }
     assert_eq!(between.shape, [15, 19]);
+    let neighbours = [&all.values[2 * n..], &all.values[..n]];
+    assert!(neighbours.iter().all(|whole| **whole != between.values[..]), "what moves is at neither phase");
     assert_eq!(
         smooth.values[5 * n..],
         between.values[..],
