@@ -405,7 +405,7 @@ impl Session {
         inbox.options.config = model.config.clone();
         engine.training = None;
         engine.version = 0;
-        self.shared.publish(Source::of(&model));
+        self.shared.publish(Source::of(model));
         self.shared.step.store(model.step, Ordering::Release);
         lock(&self.shared.control).state = State::Idle;
         engine.saved = Some(checkpoint);

@@ -152,6 +152,7 @@ fn fast(mlp: Config) -> Config {
             validate_every: 0,
             ..mlp.train
         },
+        march: March { dynamic_samples: 2, ..mlp.march },
         // The network is never asked; the smallest one takes no memory.
         dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, window_start: 0.0, ..mlp.dynamic },
         occupancy: Occupancy { enabled: false, ..mlp.occupancy },

@@ -152,6 +152,15 @@ impl Tuning {
         self
     }
 
+    /// The plainest path where the network is never asked.
+    pub fn for_network(self, asked: bool) -> Tuning {
+        if asked {
+            self
+        } else {
+            self.with_layers(Layers::F32, "no layers: Gaussians move instead of the network".into())
+        }
+    }
+
     /// Samples one workgroup of the layer kernels covers.
     pub fn tile_samples(&self) -> u32 {
         self.layer_lanes * self.tile().samples

@@ -87,11 +87,14 @@ impl Renderer {
     /// # Errors
     /// Device errors.
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
+        let tuning = tuning.for_network(model.moving.is_none());
         let mut setup = model.scene.setup(&model.config, &model.layout, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;
         setup.n_static_samples = model.config.march.render_samples;
-        setup.n_dynamic_samples = model.config.march.render_samples;
+        if model.moving.is_none() {
+            setup.n_dynamic_samples = model.config.march.render_samples;
+        }
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.layout));
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
         let network = Network::new(gpu, &tuning, &setup, &model.layout, Purpose::Render)?;

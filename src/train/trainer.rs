@@ -177,6 +177,7 @@ impl Trainer {
         tuning: Tuning,
         saved: Option<&Checkpoint>,
     ) -> Result<Trainer> {
+        let tuning = tuning.for_network(!plan.config.gaussians_move());
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params));
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
         let network = Network::new(gpu, &tuning, &plan.setup, &plan.params, Purpose::Train)?;
