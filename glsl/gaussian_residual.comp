@@ -1,11 +1,15 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Residuals of images that follow each other, four pixels per invocation. The image D of the field is free where the
+// Residuals of images that follow each other, in groups of four pixels. The image D of the field is free where the
 // still background y - D lies between its bounds; outside, r = D - bound counts, weighted by the pixel's noise,
 // Charbonnier-shaped:
 //   loss = sqrt((w r)^2 + bend^2) - bend
 // Reads the fixed-point sums and clears them for the next iteration.
 #include "inc/gaussian.glsl"
+// Groups of four pixels per invocation: few enough sums over workgroups.
+#ifndef QUADS
+#define QUADS 8u
+#endif
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
 layout(push_constant) uniform Push { uint first_quad; uint n_quads; } push;
@@ -23,8 +27,11 @@ layout(binding = 6) writeonly buffer B6 { float gaussian_loss_parts[]; };
 
 void main() {
     float loss = 0.0;
-    if (gl_GlobalInvocationID.x < push.n_quads) {
-        uint i = push.first_quad + gl_GlobalInvocationID.x;
+    uint first = gl_WorkGroupID.x * QUADS * gl_WorkGroupSize.x + gl_LocalInvocationID.x;
+    for (uint k = 0u; k < QUADS; k++) {
+        uint quad = first + k * gl_WorkGroupSize.x;
+        if (quad >= push.n_quads) break;
+        uint i = push.first_quad + quad;
         vec4 d = vec4(splat_images[i]) / gaussian_setup.fixed_point;
         splat_images[i] = ivec4(0);
         vec4 w = pixel_weight[i];
@@ -32,7 +39,7 @@ void main() {
         vec4 root = sqrt(r * r + gaussian_setup.bend * gaussian_setup.bend);
         splat_image_gradient[i] = gaussian_setup.loss_weight * w * r / root;
         // root - bend without cancellation.
-        loss = gaussian_setup.loss_weight * dot(r * r / (root + gaussian_setup.bend), vec4(1.0));
+        loss += gaussian_setup.loss_weight * dot(r * r / (root + gaussian_setup.bend), vec4(1.0));
     }
     float total = workgroup_sum(loss);
     if (gl_LocalInvocationID.x == 0u) gaussian_loss_parts[gl_WorkGroupID.x] = total;

@@ -1,11 +1,15 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Gradient of the grid's displacements: of the Gaussians around each node, in their order, and of the smoothness
-// penalty on squared differences of neighbouring nodes. One invocation per node (x) and phase (y).
+// penalty on squared differences of neighbouring nodes. One invocation per node (x) and PHASES phases (y):
+// a Gaussian's share of a node is the same at all of them.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_tree.glsl"
+#ifndef PHASES
+#define PHASES 5u
+#endif
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; } push;
+layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; uint n_phases; } push;
 layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { TreeSetup tree_setup; };
 layout(binding = 2) readonly buffer B2 { Gaussian gaussians[]; };
@@ -16,19 +20,25 @@ layout(binding = 5) writeonly buffer B5 { vec4 motion_grid_gradient[]; };
 void main() {
     uint n = tree_setup.n_nodes, index = gl_GlobalInvocationID.x, n_nodes = n * n * n;
     if (index >= n_nodes) return;
-    uint phase = push.first_phase + gl_WorkGroupID.y;
+    uint begin = gl_WorkGroupID.y * PHASES, end = min(begin + PHASES, push.n_phases);
     uvec3 node = uvec3(index % n, index / n % n, index / (n * n));
-    vec4 sum = vec4(0.0);
+    vec4 sums[PHASES];
+    for (uint t = 0u; t < PHASES; t++) sums[t] = vec4(0.0);
     for (uint i = 0u; i < push.n_gaussians; i++) {
         float share = node_share(on_grid(gaussians[i].position, tree_setup), node);
-        if (share > 0.0) sum += share * place_gradient[phase * push.n_gaussians + i];
+        if (share == 0.0) continue;
+        for (uint t = begin; t < end; t++)
+            sums[t - begin] += share * place_gradient[(push.first_phase + t) * push.n_gaussians + i];
     }
-    vec4 here = motion_grid[phase * n_nodes + index], bend = vec4(0.0);
-    uint stride = 1u;
-    for (uint axis = 0u; axis < 3u; axis++) {
-        if (node[axis] > 0u) bend += here - motion_grid[phase * n_nodes + index - stride];
-        if (node[axis] + 1u < n) bend += here - motion_grid[phase * n_nodes + index + stride];
-        stride *= n;
+    for (uint t = begin; t < end; t++) {
+        uint at = (push.first_phase + t) * n_nodes + index;
+        vec4 here = motion_grid[at], bend = vec4(0.0);
+        uint stride = 1u;
+        for (uint axis = 0u; axis < 3u; axis++) {
+            if (node[axis] > 0u) bend += here - motion_grid[at - stride];
+            if (node[axis] + 1u < n) bend += here - motion_grid[at + stride];
+            stride *= n;
+        }
+        motion_grid_gradient[at] = sums[t - begin] + 2.0 * tree_setup.smoothness * bend;
     }
-    motion_grid_gradient[phase * n_nodes + index] = sum + 2.0 * tree_setup.smoothness * bend;
 }

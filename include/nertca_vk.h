@@ -413,7 +413,7 @@ typedef struct {
    */
   double loss;
   /**
-   * PSNR of the last iteration's rays, dB.
+   * PSNR of the last iteration's rays, dB; NaN while Gaussians are fitted, which have no rays.
    */
   double psnr_db;
   /**
@@ -744,7 +744,7 @@ nertca_status nertca_context_destroy(nertca_context *context);
  *
  * `options` are lines of `key = value` or a JSON object: `phases` (cardiac phases; needed), `depth_half_extent_mm`
  * (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (of filled
- * vessels, where known: sets the Dice threshold), `preset` (fast, paper or public-code) and every key that
+ * vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper or public-code) and every key that
  * `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
  *
  * `*reconstruction` is null on failure. Any thread.

@@ -1,7 +1,7 @@
 //! Frames per second of renderings.
 
 use super::args::{Cli, RenderArgs};
-use super::render::{Renders, shot};
+use super::render::shot;
 use nertca_vk::error::Result;
 use nertca_vk::model::Model;
 use nertca_vk::model::component::Component;
@@ -31,14 +31,18 @@ pub fn measure_frame_rates(
     sizes: &[usize],
     seconds: f64,
 ) -> Result<Vec<FrameRate>> {
-    let baked = Renders::Baked(Box::new(Baked::new(renderer.clone(), BAKED_CELLS)?));
+    let baked = Baked::new(renderer.clone(), BAKED_CELLS)?;
     let quantity = Quantity { component, projection: Projection::Drr };
     let mut rates = Vec::new();
-    for (way, renders) in [("fields", &Renders::Fields(renderer.clone())), ("baked", &baked)] {
+    for way in ["fields", "baked"] {
         for &size in sizes {
             let frame = |i: u32| {
                 let shot = shot(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
-                renders.render(&shot, f64::from(i % model.layout.phases as u32), quantity)
+                let phase = i % model.layout.phases as u32;
+                match way {
+                    "fields" => renderer.show(&shot.rays, (size, size), phase, quantity),
+                    _ => baked.render(&shot.rays, size, size, phase, quantity),
+                }
             };
             frame(0)?;
             let (begin, mut frames) = (std::time::Instant::now(), 0);

@@ -48,9 +48,6 @@ impl Renders {
     pub fn render(&self, shot: &Shot, phase: f64, quantity: Quantity) -> Result<Vec<f32>> {
         let (rays, width, height) = (&shot.rays, shot.width, shot.height);
         let image = match self {
-            Renders::Fields(renderer) if phase.fract() == 0.0 && phase < f64::from(renderer.n_phases()) => {
-                renderer.show(rays, (width, height), phase as u32, quantity)?
-            }
             Renders::Fields(renderer) => renderer.render_at(rays, width, height, phase)?.show(quantity),
             Renders::Baked(_) if phase.fract() != 0.0 => {
                 return Err(Error::config("--baked", phase, "volumes are baked at whole phases: leave --baked away"));

@@ -6,6 +6,7 @@ use crate::error::Result;
 use crate::gaussians::particles::ParticleBuffers;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants;
 use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
 use crate::kernels::layout::GaussianSetup;
 use crate::kernels::push::{self, PushConstants};
@@ -81,7 +82,7 @@ buffer_set! {
 
 /// Partial sums of the loss of so many groups of four pixels.
 pub fn loss_parts(n_quads: u32) -> u32 {
-    n_quads.div_ceil(push::GaussianResidual::LOCAL_SIZE)
+    n_quads.div_ceil(constants::gaussian_residual::QUADS * push::GaussianResidual::LOCAL_SIZE)
 }
 
 /// A recording of stages on `n` Gaussians.
@@ -126,7 +127,8 @@ impl GaussianPass<'_> {
         let [first_quad, n_quads] = [images.start, images.len() as u32].map(|n| n * self.setup.image_stride / 4);
         let GaussianKernels { residual, moments, .. } = self.kernels;
         let push = push::GaussianResidual { first_quad, n_quads };
-        self.run(residual, residual.groups_for(n_quads), &[], push)?;
+        let groups = Groups::Direct([loss_parts(n_quads).max(1), 1, 1]);
+        self.run(residual, groups, &[], push)?;
         self.run(moments, moments.groups_for(n_splats), &[], push::GaussianMoments { n_splats })
     }
 

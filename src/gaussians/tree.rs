@@ -6,6 +6,7 @@ use crate::gaussians::stages::GaussianPass;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
+use crate::kernels::constants;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::TreeSetup;
 use crate::kernels::push::{self, PushConstants};
@@ -211,8 +212,9 @@ impl TreePass<'_> {
         self.run(gradient, gradient.groups_for(n_gaussians), push)?;
         // The grid rests at phase 0.
         let moving = phases.start.max(1)..phases.end;
-        let push = push::TreeGridGradient { n_gaussians, first_phase: moving.start };
-        self.run(grid_gradient, self.nodes(grid_gradient, moving.len()), push)
+        let push = push::TreeGridGradient { n_gaussians, first_phase: moving.start, n_phases: moving.len() as u32 };
+        let groups = moving.len().div_ceil(constants::tree_grid_gradient::PHASES as usize);
+        self.run(grid_gradient, self.nodes(grid_gradient, groups), push)
     }
 
     fn grid_update(&mut self, phases: Range<u32>) -> Result<()> {

@@ -160,11 +160,6 @@ impl Renderer {
         Ok(commands)
     }
 
-    /// Cardiac phases of the model.
-    pub fn n_phases(&self) -> u32 {
-        self.setup.n_phases
-    }
-
     /// Refuses a phase the model does not have.
     ///
     /// # Errors
