@@ -436,7 +436,7 @@ fn matrices_are_refused_where_there_are_none() {
     }
     let data = phantom(directory.path(), &[]);
     let run = directory.path().join("run");
-    let asked = [&["--layers", "matrices", "train", text(&data), "-o", text(&run)], SHORT];
+    let asked = [&["--layers", "matrices", "train", "--preset", "fast-mlp", text(&data), "-o", text(&run)], SHORT];
     fails(&asked.concat(), 2, &["cooperative matrices", "f32"]);
 }
 
