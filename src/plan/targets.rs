@@ -84,7 +84,8 @@ impl Targets {
     /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
     pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
         if motion.views.is_empty() {
-            let problem = "no training view has two phases, so nothing is known of motion";
+            let problem = "no training view has two phases, so nothing is known of motion; \
+                           for a still object take the preset fast-mlp with loss.dynamic_target = absolute";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
         if motion.views.len() == 1 {
