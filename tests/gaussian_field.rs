@@ -9,7 +9,7 @@ use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::geometry::ViewRays;
-use nertca_vk::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use nertca_vk::kernels::layout::{DeviceState, Gaussian, GaussianSetup, TreeSetup};
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::model::component::Component;
@@ -255,5 +255,29 @@ fn the_still_field_learns_what_gaussians_leave() {
     assert!((total / measured - 1.0).abs() < 0.05, "{total} against {measured}");
     assert!(mean(&seen.dynamic_integral) > 0.0);
     drop((renderer, trainer));
+    expect_silence(gpu);
+}
+
+#[test]
+fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
+    let gpu = gpu();
+    let directory = tempfile::tempdir().unwrap();
+    let mut dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let config = short_run("phase");
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    run(&mut trainer, 32);
+    let saved = trainer.checkpoint().unwrap();
+    drop(trainer);
+    dataset.frames.remove(3);
+    let plan = Plan::new(&config, &dataset).unwrap().in_scene(saved.model.scene.clone());
+    let mut trainer = Trainer::carry_on(&gpu, plan, &dataset, tuning(&gpu), &saved).unwrap();
+    assert_eq!(trainer.step(), 0);
+    let losses = run(&mut trainer, 32);
+    assert_eq!(losses.len(), 32);
+    assert!(losses.iter().all(|l| l.is_finite() && *l > 0.0), "{losses:?}");
+    // Schedules and losses are found by the device's count.
+    let state: Vec<DeviceState> = gpu.download(&trainer.forward().state, 0, 1).unwrap();
+    assert_eq!(state[0].step, 32);
+    drop(trainer);
     expect_silence(gpu);
 }

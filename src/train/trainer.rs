@@ -205,8 +205,8 @@ impl Trainer {
         let of_these_data = saved.filter(|saved| saved.data_fingerprint == data_fingerprint);
         let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data.map(|saved| &saved.model))?;
         let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
-        // The still field's iterations follow those of Gaussians.
-        now.step = now.step.max(plan.config.gaussian_iterations());
+        // The still field's iterations follow those of Gaussians, which may have begun anew.
+        now.step = step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
         let record = |n: u32| -> Result<Commands> {
             let mut recording = Recording::new(gpu, &format!("{n} training iterations"))?;
