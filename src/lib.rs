@@ -140,6 +140,7 @@ pub mod train {
     pub mod trainer;
     pub mod training;
     pub mod tree;
+    pub mod tree_start;
 }
 
 /// What a reconstruction is worth.

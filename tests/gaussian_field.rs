@@ -203,27 +203,34 @@ fn resume_equals_no_interruption() {
     let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
     for form in ["phase", "tree"] {
         let config = short_run(form);
-        let go = |name: &str, resume: bool, stop_after: Option<u32>| {
+        let go = |name: &str, resume: bool, stop: Option<&dyn Fn(&Event) -> bool>| {
             let path = directory.path().join(format!("{form}-{name}"));
             let cancel = AtomicBool::new(false);
             let options = RunOptions { tuning: &tuning(&gpu), run: &path, resume, stop_at: None, cancel: &cancel };
             let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |event| {
-                if let (Event::Progress { loss, .. }, Some(stop)) = (event, stop_after) {
-                    cancel.store(loss.step >= stop, Ordering::Relaxed);
+                if stop.is_some_and(|stop| stop(event)) {
+                    cancel.store(true, Ordering::Relaxed);
                 }
             });
-            match (outcome, stop_after) {
+            match (outcome, stop) {
                 (Ok(()), None) | (Err(Error::Interrupted), Some(_)) => {}
                 (outcome, _) => panic!("{outcome:?}"),
             }
             std::fs::read(checkpoint::newest(&path).unwrap()).unwrap()
         };
         let whole = go("whole", false, None);
-        // While Gaussians are fitted, and while the still field is.
-        for stop in [10, 25] {
-            let name = format!("stopped-{stop}");
-            assert_ne!(go(&name, false, Some(stop)), whole);
-            assert_eq!(go(&name, true, None), whole, "{form}, stopped after {stop}");
+        let after = |n: u32| move |e: &Event| matches!(e, Event::Progress { loss, .. } if loss.step >= n);
+        let (first, second) = (after(10), after(25));
+        let preparing = |share: f64| move |e: &Event| matches!(e, Event::Preparing { share: done } if *done >= share);
+        let (warming, tracking) = (preparing(0.2), preparing(0.6));
+        let mut stops: Vec<(&str, &dyn Fn(&Event) -> bool)> =
+            vec![("while Gaussians are fitted", &first), ("while the still field is trained", &second)];
+        if form == "tree" {
+            stops.extend([("among the phases' own", &warming as &dyn Fn(&Event) -> bool), ("on the way", &tracking)]);
+        }
+        for (name, stop) in stops {
+            assert_ne!(go(name, false, Some(stop)), whole);
+            assert_eq!(go(name, true, None), whole, "{form}, stopped {name}");
         }
         let read = Checkpoint::from_bytes(&whole, Path::new("whole")).unwrap();
         assert_eq!(read.model.step, 32);

@@ -51,6 +51,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
             say(&bar, format!("{device}: {parameters} parameters"));
             notes.iter().for_each(|n| say(&bar, format!("- {n}")));
         }
+        Event::Preparing { share } => bar.set_message(format!("seeking Gaussians, {:.0} %", 100.0 * share)),
         Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
             bar.set_position(u64::from(loss.step));
             // Gaussians are fitted to bounds, which have no PSNR.

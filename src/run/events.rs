@@ -22,6 +22,12 @@ pub enum Event {
         /// Decisions about data and device.
         notes: Vec<String>,
     },
+    /// What comes before the first iteration: Gaussians that are sought and followed through the beat; not a line of
+    /// `metrics.jsonl`.
+    Preparing {
+        /// Share of it that is done, 0 to 1.
+        share: f64,
+    },
     /// Losses, every few iterations.
     Progress {
         /// Losses of the last iteration.

@@ -29,6 +29,9 @@ impl MetricsLog {
     }
 
     pub(super) fn write(&mut self, event: &Event) -> Result<()> {
+        if matches!(event, Event::Preparing { .. }) {
+            return Ok(());
+        }
         let line = serde_json::to_string(event).map_err(|e| Error::Internal(e.to_string()))? + "\n";
         self.file.write_all(line.as_bytes()).map_err(Error::io("append to", &self.path))
     }

@@ -154,6 +154,9 @@ impl<'a> Loop<'a> {
             }
             let stop = (step + 1..self.end).find(|s| self.saves_at(*s) || self.validates_at(*s)).unwrap_or(self.end);
             while self.training.trainer().submitted() < stop && !self.cancelled() {
+                if let Some(share) = self.training.trainer().preparation() {
+                    (self.tell)(Event::Preparing { share })?;
+                }
                 let progress = self.training.advance(stop)?;
                 self.report(progress)?;
                 answers.try_iter().try_for_each(|answer| self.take(answer))?;

@@ -1,7 +1,7 @@
 //! Gaussians of a run: their fit, and what they leave of the images to the still field.
 
 use crate::config::{Config, GaussianForm};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gaussians::pictures::Pictures;
 use crate::gaussians::work::GaussianWork;
 use crate::geometry::ViewRays;
@@ -14,12 +14,15 @@ use crate::plan::targets::Targets;
 use crate::scan::dataset::{Dataset, Frame};
 use crate::train::gaussians::GaussianTrainer;
 use crate::train::tree::TreeTrainer;
+use crate::train::tree_start::TreeStart;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// A fit under way.
 pub(super) enum MovingFit {
     /// A set per phase.
     PerPhase(Box<GaussianTrainer>),
+    /// One set for the beat, on its way.
+    Start(Box<TreeStart>),
     /// One set for the beat.
     Tree(Box<TreeTrainer>),
 }
@@ -28,10 +31,10 @@ impl MovingFit {
     /// Begins a fit of the form that configuration and data ask for.
     ///
     /// # Errors
-    /// As [`GaussianTrainer::new`] and [`TreeTrainer::new`].
+    /// As [`GaussianTrainer::new`] and [`TreeStart::new`].
     pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<MovingFit> {
         Ok(match targets.form(config.gaussians.form) {
-            GaussianForm::Tree => MovingFit::Tree(Box::new(TreeTrainer::new(gpu, targets, config)?)),
+            GaussianForm::Tree => MovingFit::Start(Box::new(TreeStart::new(gpu, targets, config)?)),
             _ => MovingFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
         })
     }
@@ -40,17 +43,32 @@ impl MovingFit {
     pub(super) fn step(&self) -> u32 {
         match self {
             MovingFit::PerPhase(fit) => fit.step(),
+            MovingFit::Start(_) => 0,
             MovingFit::Tree(fit) => fit.step(),
         }
     }
 
-    /// Runs some iterations towards `until`; their losses.
+    /// Share done of what comes before the first iteration; none when that has begun.
+    pub(super) fn preparation(&self) -> Option<f64> {
+        match self {
+            MovingFit::Start(start) => Some(start.share()),
+            MovingFit::PerPhase(_) | MovingFit::Tree(_) => None,
+        }
+    }
+
+    /// Runs some iterations towards `until`; their losses. None while a tree is on its way.
     ///
     /// # Errors
-    /// As [`GaussianTrainer::advance`].
+    /// As [`GaussianTrainer::advance`] and [`TreeStart::advance`].
     pub(super) fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
         match self {
             MovingFit::PerPhase(fit) => fit.advance(until),
+            MovingFit::Start(start) => {
+                if let Some(tree) = start.advance()? {
+                    *self = MovingFit::Tree(Box::new(tree));
+                }
+                Ok(Vec::new())
+            }
             MovingFit::Tree(fit) => fit.advance(until),
         }
     }
@@ -62,6 +80,7 @@ impl MovingFit {
     pub(super) fn field(&self) -> Result<MovingGaussians> {
         Ok(match self {
             MovingFit::PerPhase(fit) => MovingGaussians::PerPhase(fit.model()?),
+            MovingFit::Start(start) => MovingGaussians::PerPhase(start.field()?),
             MovingFit::Tree(fit) => MovingGaussians::Tree(fit.tree()?),
         })
     }
@@ -70,6 +89,7 @@ impl MovingFit {
     pub(super) fn count(&self) -> u32 {
         match self {
             MovingFit::PerPhase(fit) => fit.count(),
+            MovingFit::Start(start) => start.count(),
             MovingFit::Tree(fit) => fit.count(),
         }
     }
@@ -78,7 +98,7 @@ impl MovingFit {
     pub(super) fn form(&self) -> GaussianForm {
         match self {
             MovingFit::PerPhase(_) => GaussianForm::Phase,
-            MovingFit::Tree(_) => GaussianForm::Tree,
+            MovingFit::Start(_) | MovingFit::Tree(_) => GaussianForm::Tree,
         }
     }
 
@@ -89,6 +109,7 @@ impl MovingFit {
     pub(super) fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         match self {
             MovingFit::PerPhase(fit) => fit.profile_step(),
+            MovingFit::Start(_) => Err(not_begun()),
             MovingFit::Tree(fit) => fit.profile_step(),
         }
     }
@@ -100,9 +121,14 @@ impl MovingFit {
     pub(super) fn work(&self) -> Result<GaussianWork> {
         match self {
             MovingFit::PerPhase(fit) => fit.work(),
+            MovingFit::Start(_) => Err(not_begun()),
             MovingFit::Tree(fit) => fit.work(),
         }
     }
+}
+
+fn not_begun() -> Error {
+    Error::Internal("the tree's iterations have not begun".into())
 }
 
 /// The moving field of a run, where it is made of Gaussians.
@@ -119,7 +145,7 @@ impl Moving {
     /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits.
     ///
     /// # Errors
-    /// As [`MovingFit::new`].
+    /// As [`MovingFit::new`], and as [`TreeStart::advance`] for what is done again.
     pub(super) fn begin(
         gpu: &Gpu,
         plan: &mut Plan,
@@ -147,6 +173,11 @@ impl Moving {
     /// Iterations done of a fit that is not finished.
     pub(super) fn step(&self) -> Option<u32> {
         self.fit.as_ref().map(MovingFit::step)
+    }
+
+    /// Share done of what comes before the first iteration; none when that has begun.
+    pub(super) fn preparation(&self) -> Option<f64> {
+        self.fit.as_ref().and_then(MovingFit::preparation)
     }
 
     /// Whether iterations of the fit are left.

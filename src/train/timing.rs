@@ -209,6 +209,9 @@ impl GaussianSubject {
         };
         let begin = Instant::now();
         let mut subject = GaussianSubject { fit: MovingFit::new(gpu, targets, &config)?, preparation_s: 0.0 };
+        while subject.fit.preparation().is_some() {
+            subject.fit.advance(0)?;
+        }
         subject.preparation_s = begin.elapsed().as_secs_f64();
         subject.run(WARM_UP)?;
         Ok(subject)

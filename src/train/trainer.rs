@@ -280,7 +280,8 @@ impl Trainer {
     }
 
     /// Keeps the device busy towards `until` and returns the losses that became known. Returns with work
-    /// in flight unless `until` is reached; an empty list means the target was reached before.
+    /// in flight unless `until` is reached; an empty list means the target was reached before, or that the first iteration
+    /// is still being prepared.
     ///
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite or exploded; device errors.
@@ -301,6 +302,11 @@ impl Trainer {
         self.gpu.wait(ticket)?;
         self.completed += n;
         self.read_losses()
+    }
+
+    /// Share done of what comes before the first iteration; none when that has begun.
+    pub fn preparation(&self) -> Option<f64> {
+        self.moving.as_ref().and_then(Moving::preparation)
     }
 
     /// The moving field as it is now, for those who draw it; none where the network moves.

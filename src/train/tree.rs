@@ -1,4 +1,5 @@
-//! Fits a moving tree: a set per phase, of which phase 0's becomes the tree; then the grid tracked from phase to phase, then everything together.
+//! Fits a moving tree: Gaussians of phase 0, carried through the beat by a grid, all of it together. [`TreeStart`] brings
+//! it about.
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
@@ -16,8 +17,9 @@ use crate::plan::soft_hull::background::blur;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
-use crate::train::gaussians::{GaussianTrainer, Iterations, MAX_PASSES, check_count, pass_times, strong};
+use crate::train::gaussians::{Iterations, MAX_PASSES, check_count, pass_times, strong};
 use crate::train::targets::{losses, padded, renew_bounds, take_images, target_buffers};
+use crate::train::tree_start::TreeStart;
 use glam::DVec3;
 
 /// A run on a device.
@@ -35,7 +37,7 @@ pub struct TreeTrainer {
 }
 
 /// What iterations of one kind go by: the joint fit of everything, or the tracking of a phase.
-struct Fit {
+pub(super) struct Fit {
     setup: GaussianSetup,
     tree: TreeSetup,
     targets: TargetBuffers,
@@ -81,29 +83,17 @@ impl Fit {
 }
 
 impl TreeTrainer {
-    /// Fits a set per phase, which tells the background; makes a tree of what phase 0 shows, and tracks it through the beat.
+    /// Starts from targets alone, all of [`TreeStart`] at once.
     ///
     /// # Errors
-    /// [`Error::Config`] for impossible settings or when phase 0 shows nothing; device errors.
+    /// As [`TreeStart::new`] and [`TreeStart::advance`].
     pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<TreeTrainer> {
-        let iterations = config.tree.warm_iterations;
-        let warm = sections::Gaussians { iterations, ..config.gaussians.clone() };
-        let warm = Config { gaussians: warm, ..config.clone() };
-        let mut first = GaussianTrainer::new(gpu, targets, &warm)?;
-        while first.step() < iterations {
-            first.advance(iterations)?;
+        let mut start = TreeStart::new(gpu, targets, config)?;
+        loop {
+            if let Some(trainer) = start.advance()? {
+                return Ok(trainer);
+            }
         }
-        if config.gaussians.background_every > 0 {
-            first.renew_background()?;
-        }
-        let mut found = Particles::fresh(first.model()?.rows);
-        let strong = strong(&found.rows, first.setup(), config.tree.take);
-        let keep: Vec<bool> = found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == 0).collect();
-        found.retain(&keep);
-        let targets = first.into_targets();
-        let trainer = Self::with(gpu, targets, config, &found)?;
-        trainer.track()?;
-        Ok(trainer)
     }
 
     /// Starts from given Gaussians of phase 0 at rest.
@@ -122,18 +112,22 @@ impl TreeTrainer {
         Ok(TreeTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
     }
 
-    /// Tracks the grid forward and backward from phase 0 to the middle of the beat, on blurred images.
-    fn track(&self) -> Result<()> {
-        let settings = self.targets.lengths.tree(&self.config.tree);
-        let tracking = self.joint.tracking(&self.gpu, &self.targets, &settings)?;
-        for track in tracks(&self.targets) {
-            let iterations = if track.images.is_empty() { 0 } else { settings.track_iterations };
-            let mut recording = Recording::new(&self.gpu, "tracking")?;
-            let bound = (&self.particles, &self.own);
-            record_track(&mut pass(&mut recording, &self.kernels, &tracking, bound, self.n), &track, iterations)?;
-            self.gpu.wait(recording.finish()?.submit()?)?;
-        }
-        // What follows begins without momentum.
+    /// What the grid is tracked by.
+    pub(super) fn tracking(&self) -> Result<Fit> {
+        self.joint.tracking(&self.gpu, &self.targets, &self.targets.lengths.tree(&self.config.tree))
+    }
+
+    /// Tracks the grid to a phase from those before it, on blurred images.
+    pub(super) fn track(&self, tracking: &Fit, track: &Track) -> Result<()> {
+        let iterations = if track.images.is_empty() { 0 } else { self.config.tree.track_iterations };
+        let mut recording = Recording::new(&self.gpu, "tracking")?;
+        let bound = (&self.particles, &self.own);
+        record_track(&mut pass(&mut recording, &self.kernels, tracking, bound, self.n), track, iterations)?;
+        self.gpu.wait(recording.finish()?.submit()?)
+    }
+
+    /// What follows tracking begins without momentum.
+    pub(super) fn forget_momentum(&self) -> Result<()> {
         let mut recording = Recording::new(&self.gpu, "clear momentum")?;
         recording.fill(&self.joint.grid.motion_grid_first, 0);
         recording.fill(&self.joint.grid.motion_grid_second, 0);
@@ -291,19 +285,6 @@ impl TreeTrainer {
         let setup = &self.joint.setup;
         GaussianWork::of(&self.gpu, setup, &self.particles, self.n * setup.n_views * setup.n_phases)
     }
-}
-
-/// In which order phases are tracked, each from the two before it.
-fn tracks(targets: &Targets) -> Vec<Track> {
-    let n = targets.n_phases as u32;
-    let forward = (1..=n / 2).map(|t| [t, t - 1, t.saturating_sub(2)]);
-    let backward = (n / 2 + 1..n).rev().map(|t| [t, (t + 1) % n, if t + 2 < n { t + 2 } else { 0 }]);
-    let images = |phase: u32| {
-        let images: Vec<u32> = targets.views_at(phase as usize).map(|(image, _)| image as u32).collect();
-        images.first().map_or(0..0, |first| *first..first + images.len() as u32)
-    };
-    let track = |[phase, before, before_that]: [u32; 3]| Track { phase, before, before_that, images: images(phase) };
-    forward.chain(backward).map(track).collect()
 }
 
 /// Gaussians and their own motion on the device.

@@ -1,0 +1,138 @@
+//! How a moving tree begins: a set of Gaussians per phase, of which phase 0's becomes the tree; then the grid tracked from
+//! phase to phase.
+
+use crate::config::{Config, sections};
+use crate::error::{Error, Result};
+use crate::gaussians::particles::Particles;
+use crate::gaussians::tree::Track;
+use crate::gpu::device::Gpu;
+use crate::model::gaussians::Gaussians;
+use crate::plan::targets::Targets;
+use crate::train::gaussians::{GaussianTrainer, strong};
+use crate::train::tree::{Fit, TreeTrainer};
+
+/// A tree on its way.
+pub struct TreeStart {
+    gpu: Gpu,
+    config: Config,
+    stage: Stage,
+}
+
+enum Stage {
+    /// A set per phase, which tells the background as well.
+    Warming(Box<GaussianTrainer>),
+    /// The grid from phase to phase.
+    Tracking(Box<Tracking>),
+    /// The tree has been handed over, or lost to an error.
+    Over,
+}
+
+struct Tracking {
+    trainer: TreeTrainer,
+    fit: Fit,
+    /// Last first.
+    left: Vec<Track>,
+    /// What is shown until every phase has been reached.
+    meanwhile: Gaussians,
+}
+
+impl TreeStart {
+    /// Seeds a set of Gaussians per phase.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::new`].
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<TreeStart> {
+        let warm = sections::Gaussians { iterations: config.tree.warm_iterations, ..config.gaussians.clone() };
+        let warm = Config { gaussians: warm, ..config.clone() };
+        let warming = GaussianTrainer::new(gpu, targets, &warm)?;
+        Ok(TreeStart { gpu: gpu.clone(), config: config.clone(), stage: Stage::Warming(Box::new(warming)) })
+    }
+
+    /// Does some of the work, a submit or two; the tree when it is ready to be fitted as a whole.
+    ///
+    /// # Errors
+    /// [`Error::Config`] when phase 0 shows nothing; [`Error::Diverged`]; device errors.
+    pub fn advance(&mut self) -> Result<Option<TreeTrainer>> {
+        let warm_iterations = self.config.tree.warm_iterations;
+        match std::mem::replace(&mut self.stage, Stage::Over) {
+            Stage::Warming(mut first) if first.step() < warm_iterations => {
+                first.advance(warm_iterations)?;
+                self.stage = Stage::Warming(first);
+            }
+            Stage::Warming(first) => self.stage = Stage::Tracking(Box::new(self.plant(*first)?)),
+            Stage::Tracking(mut under_way) => {
+                let Some(track) = under_way.left.pop() else {
+                    under_way.trainer.forget_momentum()?;
+                    return Ok(Some(under_way.trainer));
+                };
+                under_way.trainer.track(&under_way.fit, &track)?;
+                self.stage = Stage::Tracking(under_way);
+            }
+            Stage::Over => return Err(Error::Internal("a tree that has begun cannot begin again".into())),
+        }
+        Ok(None)
+    }
+
+    /// Makes a tree of what phase 0 shows.
+    fn plant(&self, mut first: GaussianTrainer) -> Result<Tracking> {
+        if self.config.gaussians.background_every > 0 {
+            first.renew_background()?;
+        }
+        let meanwhile = first.model()?;
+        let mut found = Particles::fresh(meanwhile.rows.clone());
+        let strong = strong(&found.rows, first.setup(), self.config.tree.take);
+        let keep: Vec<bool> = found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == 0).collect();
+        found.retain(&keep);
+        let trainer = TreeTrainer::with(&self.gpu, first.into_targets(), &self.config, &found)?;
+        let (fit, mut left) = (trainer.tracking()?, tracks(trainer.targets()));
+        left.reverse();
+        Ok(Tracking { trainer, fit, left, meanwhile })
+    }
+
+    /// Share that is done, 0 to 1: half of it the sets per phase, half of it following them.
+    pub fn share(&self) -> f64 {
+        match &self.stage {
+            Stage::Warming(first) => 0.5 * f64::from(first.step()) / f64::from(self.config.tree.warm_iterations.max(1)),
+            Stage::Tracking(under_way) => {
+                let all = under_way.trainer.targets().n_phases.max(1) as f64;
+                1.0 - 0.5 * under_way.left.len() as f64 / all
+            }
+            Stage::Over => 1.0,
+        }
+    }
+
+    /// A set per phase, as far as the field is known.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::model`].
+    pub fn field(&self) -> Result<Gaussians> {
+        match &self.stage {
+            Stage::Warming(first) => first.model(),
+            Stage::Tracking(under_way) => Ok(under_way.meanwhile.clone()),
+            Stage::Over => Err(Error::Internal("the tree has been handed over".into())),
+        }
+    }
+
+    /// Gaussians that there are.
+    pub fn count(&self) -> u32 {
+        match &self.stage {
+            Stage::Warming(first) => first.count(),
+            Stage::Tracking(under_way) => under_way.trainer.count(),
+            Stage::Over => 0,
+        }
+    }
+}
+
+/// In which order phases are tracked, each from the two before it: forward and backward from phase 0 to the middle of the
+/// beat.
+fn tracks(targets: &Targets) -> Vec<Track> {
+    let n = targets.n_phases as u32;
+    let forward = (1..=n / 2).map(|t| [t, t - 1, t.saturating_sub(2)]);
+    let backward = (n / 2 + 1..n).rev().map(|t| [t, (t + 1) % n, if t + 2 < n { t + 2 } else { 0 }]);
+    let images = |phase: u32| {
+        let images: Vec<u32> = targets.views_at(phase as usize).map(|(image, _)| image as u32).collect();
+        images.first().map_or(0..0, |first| *first..first + images.len() as u32)
+    };
+    let track = |[phase, before, before_that]: [u32; 3]| Track { phase, before, before_that, images: images(phase) };
+    forward.chain(backward).map(track).collect()
+}
