@@ -111,7 +111,7 @@ impl Session {
                 published: Mutex::default(),
                 step: AtomicU32::new(0),
                 viewer: Mutex::new(None),
-                control: Mutex::new(Control { state: State::Idle, failure: None, worker: None }),
+                control: Mutex::new(Control { state: State::Idle, failure: None, worker: None, news: Instant::now() }),
                 changed: Condvar::new(),
                 stop: AtomicBool::new(false),
                 pause: AtomicBool::new(false),
@@ -146,7 +146,7 @@ impl Session {
     fn announce(&self) {
         self.shared.version.fetch_add(1, Ordering::AcqRel);
         // The lock keeps the news from falling between a worker's look and its wait.
-        drop(lock(&self.shared.control));
+        lock(&self.shared.control).news = Instant::now();
         self.shared.changed.notify_all();
     }
 

@@ -148,6 +148,8 @@ fn fast(mlp: Config) -> Config {
             iterations: 300,
             rays: 256,
             motion_share: 0.0,
+            // Divides what lies between changes of the Gaussians' number and background.
+            iterations_per_submit: 10,
             checkpoint_every: 100,
             validate_every: 0,
             ..mlp.train

@@ -261,16 +261,25 @@ pub struct Track {
     pub images: Range<u32>,
 }
 
-/// Records the tracking of a phase from those before, over its images; the pass has constants of tracking.
+/// Records the first guess of a phase's grid, from those before; the pass has constants of tracking.
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_track(pass: &mut TreePass<'_>, track: &Track, iterations: u32) -> Result<()> {
+pub fn record_guess(pass: &mut TreePass<'_>, track: &Track) -> Result<()> {
     let Track { phase, before, before_that, .. } = *track;
     let guess = &pass.kernels.guess;
     let groups = guess.groups_for(pass.setup.nodes() as u32);
     pass.run(guess, groups, push::TreeGuess { phase, before, before_that })?;
     pass.gaussians.recording.fill(&pass.gaussians.targets.gaussian_step, 0);
+    Ok(())
+}
+
+/// Records iterations of a phase's tracking over its images, after its guess.
+///
+/// # Errors
+/// As [`record_guess`].
+pub fn record_track(pass: &mut TreePass<'_>, track: &Track, iterations: u32) -> Result<()> {
+    let phase = track.phase;
     for _ in 0..iterations {
         pass.gradient(phase..phase + 1, track.images.clone())?;
         pass.grid_update(phase..phase + 1)?;

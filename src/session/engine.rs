@@ -17,6 +17,8 @@ use std::time::{Duration, Instant};
 
 /// After taking in new frames, this many times as long passes before the next ones are taken in.
 const SETTLE: u32 = 4;
+/// Unless no frame has come for so long, or for as long as taking them in took last.
+const QUIET: Duration = Duration::from_millis(300);
 /// While others wait for the engine, training looks again after this long.
 const GIVE_WAY: Duration = Duration::from_micros(200);
 
@@ -49,8 +51,17 @@ pub(super) struct Engine {
     /// Of the inbox the trainer was built from.
     pub(super) version: u64,
     pub(super) frames: u32,
-    /// New frames are left waiting until then.
-    pub(super) settled: Option<Instant>,
+    /// When new frames are taken in.
+    pub(super) settling: Option<Settling>,
+}
+
+/// Frames that come one after the other are taken in together: training would do nothing else.
+#[derive(Clone, Copy)]
+pub(super) struct Settling {
+    /// They wait until then.
+    until: Instant,
+    /// Unless none has come for so long.
+    quiet: Duration,
 }
 
 /// What is drawn.
@@ -65,6 +76,8 @@ pub(super) struct Control {
     pub(super) state: State,
     pub(super) failure: Option<String>,
     pub(super) worker: Option<ThreadId>,
+    /// When frames or R-peaks came last.
+    pub(super) news: Instant,
 }
 
 pub(super) fn nothing_yet() -> Error {
@@ -170,7 +183,8 @@ impl Shared {
         trainer.plan().notes.iter().for_each(|note| tracing::info!("{note}"));
         engine.frames = dataset.training().len() as u32;
         engine.version = version;
-        engine.settled = Some(Instant::now() + begin.elapsed() * SETTLE);
+        let took = begin.elapsed();
+        engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.step.store(trainer.step(), Ordering::Release);
         let params = Some(trainer.forward().params.clone());
         self.publish(Source { outline: trainer.outline(), params, moving: trainer.moving_feed() });
@@ -230,6 +244,11 @@ impl Shared {
         *lock(&self.viewer) = None;
     }
 
+    fn has_settled(&self, engine: &Engine) -> bool {
+        let Some(Settling { until, quiet }) = engine.settling else { return true };
+        Instant::now() >= until || lock(&self.control).news.elapsed() >= quiet
+    }
+
     pub(super) fn set_state(&self, state: State) {
         lock(&self.control).state = state;
         self.changed.notify_all();
@@ -263,7 +282,7 @@ impl Shared {
             }
             let mut engine = lock(&self.engine);
             let version = self.version.load(Ordering::Acquire);
-            if engine.version != version && engine.settled.is_none_or(|until| Instant::now() >= until) {
+            if engine.version != version && self.has_settled(&engine) {
                 match self.take_in_frames(&mut engine) {
                     Ok(()) => (),
                     Err(Error::NotReady(why)) if engine.training.is_none() => {

@@ -13,9 +13,6 @@ use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::train::targets::{losses, renew_bounds, take_images, target_buffers};
 
-/// Iterations that go into one submit: a CPU driver runs that many without waiting for the host.
-pub(super) const ITERATIONS_PER_SUBMIT: u32 = 10;
-
 /// A run on a device.
 pub struct GaussianTrainer {
     gpu: Gpu,
@@ -23,6 +20,7 @@ pub struct GaussianTrainer {
     settings: sections::Gaussians,
     seed: u32,
     setup: GaussianSetup,
+    per_submit: u32,
     kernels: GaussianKernels,
     buffers: TargetBuffers,
     particles: ParticleBuffers,
@@ -34,19 +32,20 @@ pub struct GaussianTrainer {
 /// Recorded iterations.
 pub(super) struct Iterations {
     several: Commands,
+    n_several: u32,
     single: Commands,
 }
 
 impl Iterations {
-    /// Records them by a function that records so many.
-    pub(super) fn record(make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
-        Ok(Iterations { several: make(ITERATIONS_PER_SUBMIT)?, single: make(1)? })
+    /// Records them, as many to a submit and one by one, by a function that records so many.
+    pub(super) fn record(per_submit: u32, make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
+        Ok(Iterations { several: make(per_submit)?, n_several: per_submit, single: make(1)? })
     }
 
     /// Runs some, at most up to `stop`; how many.
     pub(super) fn run(&self, gpu: &Gpu, step: u32, stop: u32) -> Result<u32> {
-        let several = stop - step >= ITERATIONS_PER_SUBMIT;
-        let (commands, n) = if several { (&self.several, ITERATIONS_PER_SUBMIT) } else { (&self.single, 1) };
+        let several = stop - step >= self.n_several;
+        let (commands, n) = if several { (&self.several, self.n_several) } else { (&self.single, 1) };
         gpu.wait(commands.submit()?)?;
         Ok(n)
     }
@@ -78,9 +77,22 @@ impl GaussianTrainer {
         let kernels = GaussianKernels::new(gpu)?;
         let buffers = target_buffers(gpu, &targets, &setup, &fit::schedule(&settings))?;
         let particles = particles.upload(gpu, setup.n_views)?;
-        let iterations = record(gpu, &kernels, &buffers, &particles, &setup, n)?;
-        let (gpu, seed) = (gpu.clone(), config.seed);
-        Ok(GaussianTrainer { gpu, targets, settings, seed, setup, kernels, buffers, particles, n, iterations, step: 0 })
+        let per_submit = config.train.iterations_per_submit;
+        let iterations = record(gpu, &kernels, &buffers, &particles, &setup, n, per_submit)?;
+        Ok(GaussianTrainer {
+            gpu: gpu.clone(),
+            targets,
+            settings,
+            seed: config.seed,
+            setup,
+            per_submit,
+            kernels,
+            buffers,
+            particles,
+            n,
+            iterations,
+            step: 0,
+        })
     }
 
     /// Iterations done.
@@ -158,8 +170,14 @@ impl GaussianTrainer {
     fn replace(&mut self, particles: &Particles) -> Result<()> {
         self.n = check_count(particles)?;
         self.particles = particles.upload(&self.gpu, self.setup.n_views)?;
-        self.iterations = record(&self.gpu, &self.kernels, &self.buffers, &self.particles, &self.setup, self.n)?;
+        let (setup, n) = (&self.setup, self.n);
+        self.iterations = record(&self.gpu, &self.kernels, &self.buffers, &self.particles, setup, n, self.per_submit)?;
         Ok(())
+    }
+
+    fn pass<'a>(&'a self, recording: &'a mut Recording) -> GaussianPass<'a> {
+        let (kernels, targets, particles) = (&self.kernels, &self.buffers, &self.particles);
+        GaussianPass { recording, kernels, targets, particles, setup: &self.setup, n: self.n }
     }
 
     /// Images of the present field, `[image][pixel]`, shares of the strongest change.
@@ -168,14 +186,7 @@ impl GaussianTrainer {
     /// Device errors.
     pub fn images(&self) -> Result<Vec<f32>> {
         let mut recording = Recording::new(&self.gpu, "images of Gaussians")?;
-        record_images(&mut GaussianPass {
-            recording: &mut recording,
-            kernels: &self.kernels,
-            targets: &self.buffers,
-            particles: &self.particles,
-            setup: &self.setup,
-            n: self.n,
-        })?;
+        record_images(&mut self.pass(&mut recording))?;
         self.gpu.wait(recording.finish()?.submit()?)?;
         take_images(&self.gpu, &self.buffers, &self.targets, &self.setup)
     }
@@ -202,14 +213,7 @@ impl GaussianTrainer {
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of Gaussians", MAX_PASSES)?;
-        record_step(&mut GaussianPass {
-            recording: &mut recording,
-            kernels: &self.kernels,
-            targets: &self.buffers,
-            particles: &self.particles,
-            setup: &self.setup,
-            n: self.n,
-        })?;
+        record_step(&mut self.pass(&mut recording))?;
         self.step += 1;
         pass_times(&self.gpu, recording)
     }
@@ -255,8 +259,9 @@ fn record(
     particles: &ParticleBuffers,
     setup: &GaussianSetup,
     n: u32,
+    per_submit: u32,
 ) -> Result<Iterations> {
-    Iterations::record(|iterations| {
+    Iterations::record(per_submit, |iterations| {
         let mut recording = Recording::new(gpu, &format!("{iterations} iterations of Gaussians"))?;
         let mut pass = GaussianPass { recording: &mut recording, kernels, targets, particles, setup, n };
         for _ in 0..iterations {

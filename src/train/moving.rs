@@ -142,7 +142,8 @@ pub(super) struct Moving {
 
 impl Moving {
     /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where the network
-    /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits.
+    /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits, however
+    /// many iterations go into a submit.
     ///
     /// # Errors
     /// As [`MovingFit::new`], and as [`TreeStart::advance`] for what is done again.
@@ -151,6 +152,7 @@ impl Moving {
         plan: &mut Plan,
         dataset: &Dataset,
         saved: Option<&Model>,
+        per_submit: u32,
     ) -> Result<Option<Moving>> {
         let Some(targets) = plan.targets.take() else { return Ok(None) };
         let shot = |frame: &Frame| (dataset.views[frame.view].rays.clone(), frame.phase);
@@ -158,7 +160,9 @@ impl Moving {
         let (fit, field) = match saved.and_then(|model| model.moving.as_ref()).filter(|_| done >= end) {
             Some(field) => (None, field.clone()),
             None => {
-                let mut fit = MovingFit::new(gpu, targets, &plan.config)?;
+                let mut config = plan.config.clone();
+                config.train.iterations_per_submit = per_submit;
+                let mut fit = MovingFit::new(gpu, targets, &config)?;
                 while fit.step() < done {
                     fit.advance(done)?;
                 }

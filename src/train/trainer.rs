@@ -203,7 +203,8 @@ impl Trainer {
         }
         let data_fingerprint = data_fingerprint(dataset);
         let of_these_data = saved.filter(|saved| saved.data_fingerprint == data_fingerprint);
-        let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data.map(|saved| &saved.model))?;
+        let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
+        let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data.map(|saved| &saved.model), per_submit)?;
         let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
         // The still field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
@@ -224,7 +225,6 @@ impl Trainer {
             }
             recording.finish()
         };
-        let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
         let (several, single) = (record(per_submit)?, record(1)?);
         let trainer = Trainer {
             gpu: gpu.clone(),

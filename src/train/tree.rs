@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
-use crate::gaussians::tree::{record_images, record_step, record_track};
+use crate::gaussians::tree::{record_guess, record_images, record_step, record_track};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
@@ -107,7 +107,7 @@ impl TreeTrainer {
         let joint = Fit::joint(gpu, &targets, config)?;
         let own = OwnMotion::fresh(vec![[0.0; 4]; n as usize * joint.tree.n_basis as usize]);
         let (particles, own) = upload(gpu, &joint.setup, particles, &own)?;
-        let iterations = record(gpu, &kernels, &joint, (&particles, &own), n)?;
+        let iterations = record(gpu, &kernels, &joint, (&particles, &own), n, config.train.iterations_per_submit)?;
         let (gpu, config) = (gpu.clone(), config.clone());
         Ok(TreeTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
     }
@@ -117,13 +117,22 @@ impl TreeTrainer {
         self.joint.tracking(&self.gpu, &self.targets, &self.targets.lengths.tree(&self.config.tree))
     }
 
-    /// Tracks the grid to a phase from those before it, on blurred images.
+    /// Tracks the grid to a phase from those before it, on blurred images, in submits as long as those of the fit.
     pub(super) fn track(&self, tracking: &Fit, track: &Track) -> Result<()> {
-        let iterations = if track.images.is_empty() { 0 } else { self.config.tree.track_iterations };
-        let mut recording = Recording::new(&self.gpu, "tracking")?;
-        let bound = (&self.particles, &self.own);
-        record_track(&mut pass(&mut recording, &self.kernels, tracking, bound, self.n), track, iterations)?;
-        self.gpu.wait(recording.finish()?.submit()?)
+        let submit = |record: &dyn Fn(&mut TreePass<'_>) -> Result<()>| {
+            let mut recording = Recording::new(&self.gpu, "tracking")?;
+            let bound = (&self.particles, &self.own);
+            record(&mut pass(&mut recording, &self.kernels, tracking, bound, self.n))?;
+            self.gpu.wait(recording.finish()?.submit()?)
+        };
+        submit(&|pass| record_guess(pass, track))?;
+        let mut left = if track.images.is_empty() { 0 } else { self.config.tree.track_iterations };
+        while left > 0 {
+            let n = left.min(self.config.train.iterations_per_submit);
+            submit(&|pass| record_track(pass, track, n))?;
+            left -= n;
+        }
+        Ok(())
     }
 
     /// What follows tracking begins without momentum.
@@ -225,7 +234,8 @@ impl TreeTrainer {
     fn replace(&mut self, particles: &Particles, own: &OwnMotion) -> Result<()> {
         self.n = check_count(particles)?;
         (self.particles, self.own) = upload(&self.gpu, &self.joint.setup, particles, own)?;
-        self.iterations = record(&self.gpu, &self.kernels, &self.joint, (&self.particles, &self.own), self.n)?;
+        let (bound, per_submit) = ((&self.particles, &self.own), self.config.train.iterations_per_submit);
+        self.iterations = record(&self.gpu, &self.kernels, &self.joint, bound, self.n, per_submit)?;
         Ok(())
     }
 
@@ -323,8 +333,9 @@ fn record(
     fit: &Fit,
     bound: Bound<'_>,
     n: u32,
+    per_submit: u32,
 ) -> Result<Iterations> {
-    Iterations::record(|iterations| {
+    Iterations::record(per_submit, |iterations| {
         let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a tree"))?;
         let mut pass = pass(&mut recording, kernels, fit, bound, n);
         for _ in 0..iterations {
