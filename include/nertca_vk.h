@@ -968,7 +968,7 @@ nertca_status nertca_reconstruction_sample_buffer(nertca_reconstruction *reconst
 
 /**
  * Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`. `threshold_per_mm` is the attenuation from which
- * the moving field counts as vessel; 0 for a third of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
+ * the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
  * Any thread, also while training.
  *
  * # Safety

@@ -160,6 +160,7 @@ pub mod export {
 /// One run, from a dataset to a run directory.
 pub mod run {
     pub mod events;
+    pub mod hull_pictures;
     pub mod info;
     mod log;
     pub mod reconstruct;

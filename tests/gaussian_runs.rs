@@ -73,6 +73,7 @@ fn the_page_tells_of_gaussians_and_their_motion() {
         let row = format!("<td>{phase}</td><td>{:.2}</td><td>{:.2}</td>", of("mean_mm"), of("largest_mm"));
         assert!(page.contains(&row), "`{row}` is missing");
     }
+    assert_eq!(page.matches("alt=\"hull in view").count() as u64, VIEWS);
     assert!(page.contains("Motion along a vessel is not observed"));
     assert!(
         !page.contains("<td>hull</td>") && !page.contains("No motion hull was used"),

@@ -25,6 +25,7 @@ use nertca_vk::reference::gaussians::{self as reference, AdamState, N_PARAMS, Pa
 use nertca_vk::reference::maxima::maxima;
 use nertca_vk::reference::tree::{TreeParams, loss_and_gradient};
 use nertca_vk::scan::dataset::{Dataset, Frame};
+use nertca_vk::score::eval::VESSEL_SHARE;
 use nertca_vk::score::metrics;
 use nertca_vk::train::gaussians::GaussianTrainer;
 use nertca_vk::train::tree::TreeTrainer;
@@ -532,9 +533,9 @@ fn train_tree(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussians>
     Ok(trainer.tree()?.expand())
 }
 
-/// Mean Dice over the validation images: largest attenuation along the ray, at least a third of the vessel's.
+/// Mean Dice over the validation images: largest attenuation along the ray, at least a fifth of the vessel's.
 fn dice(model: &Gaussians, dataset: &Dataset) -> f64 {
-    let level = dataset.vessel_attenuation.unwrap() / 3.0;
+    let level = VESSEL_SHARE * dataset.vessel_attenuation.unwrap();
     let of = |frame: &Frame| {
         let view = SplatView::new(&dataset.views[frame.view].rays, model.units);
         let seen = maxima(model, &view, dataset.width, dataset.height, frame.phase as usize);

@@ -171,6 +171,17 @@ fn the_hull_as_bits_is_the_same_hull() {
     for (phase, cells) in soft.cells.iter().enumerate() {
         assert!(cells.iter().all(|c| hull.contains_point(soft.centre(c.index), phase)));
     }
+    // Its silhouette covers the pixel each cell's centre is seen in, and leaves pixels no cell is near.
+    let view = &dataset.views[dataset.training()[0].view];
+    let covered = hull.silhouette(&view.rays, (dataset.width, dataset.height), 1);
+    let cells: Vec<_> = soft.cells[1].iter().filter_map(|c| view.rays.project(soft.centre(c.index))).collect();
+    let seen = |(column, row): (f64, f64)| covered[row.round() as usize * dataset.width + column.round() as usize];
+    assert!(!cells.is_empty() && cells.iter().all(|at| seen(*at)));
+    for (i, covered) in covered.iter().enumerate().filter(|(_, covered)| **covered) {
+        let (column, row) = ((i % dataset.width) as f64, (i / dataset.width) as f64);
+        let near = cells.iter().any(|at| (at.0 - column).abs().max((at.1 - row).abs()) < 6.0);
+        assert!(*covered && near, "column {column}, row {row}");
+    }
     let volume = hull.to_volume();
     let most = volume.values.iter().copied().fold(0f32, f32::max);
     assert!(most >= 1.0 && most <= soft.cells.len() as f32);

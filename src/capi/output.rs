@@ -264,7 +264,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
 }
 
 /// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`. `threshold_per_mm` is the attenuation from which
-/// the moving field counts as vessel; 0 for a third of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
+/// the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
 /// Any thread, also while training.
 ///
 /// # Safety

@@ -14,6 +14,7 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::eval::VESSEL_SHARE;
 use nertca_vk::score::metrics::vessel_threshold;
 
 /// The phases `--phase` names, and whether it names all.
@@ -100,10 +101,10 @@ fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: b
     Ok(())
 }
 
-/// The attenuation from which the dynamic field counts as vessel: a third of the stated one, or Otsu's.
+/// The attenuation from which the dynamic field counts as vessel: a fifth of the stated one, or Otsu's.
 fn dice_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid) -> Result<f64> {
     if let Some(attenuation) = model.vessel_attenuation {
-        return Ok(attenuation / 3.0 / MM_PER_UNIT);
+        return Ok(VESSEL_SHARE * attenuation / MM_PER_UNIT);
     }
     let values = renderer.sample_patient(Component::Dynamic, 0, grid)?;
     let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();

@@ -33,6 +33,8 @@ pub struct Page<'a> {
     pub motion: Vec<Displacement>,
     /// Comparison picture of each scored frame: view, phase, file.
     pub pictures: Vec<(usize, u32, PathBuf)>,
+    /// Picture of the motion hull in front of each training view: view, file.
+    pub hull: Vec<(usize, PathBuf)>,
     /// The whole configuration.
     pub config: String,
 }
@@ -51,6 +53,7 @@ fieldset{border:0;padding:0;margin:0 0 1.5rem}legend{padding:0;color:var(--soft)
 label.p{display:inline-block;min-width:1.6rem;text-align:center;padding:.1rem .4rem;border:1px solid var(--line);cursor:pointer}
 input.p:focus-visible+label.p{outline:2px solid}.shot{display:none}.shot img{width:100%;image-rendering:pixelated}
 .bars div{background:var(--soft);height:.7rem}pre{overflow:auto;border:1px solid var(--line);padding:.6rem;font-size:.85rem}
+.hulls{display:flex;flex-wrap:wrap;gap:1rem}.hulls figure{margin:0;flex:1 1 24rem}.hulls img{width:100%;image-rendering:pixelated}
 .scroll{overflow-x:auto;max-height:26rem}";
 
 /// Series of a plot.
@@ -128,6 +131,12 @@ fn plot(title: &str, lines: &[Line], log_y: bool) -> Result<String> {
         area.present().map_err(|e| fault(&e))?;
     }
     Ok(svg)
+}
+
+/// A picture as an address that holds it.
+fn embedded(path: &Path) -> Result<String> {
+    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+    Ok(format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes)))
 }
 
 impl Page<'_> {
@@ -236,11 +245,10 @@ impl Page<'_> {
             frames.sort();
             let mut shots = Vec::new();
             for (slot, (phase, path)) in frames.into_iter().enumerate() {
-                let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
                 rules += &format!(
                     "#v{index}s{slot}:checked~.v{index}s{slot}{{display:block}}#v{index}s{slot}:checked+label{{background:var(--ink);color:var(--paper)}}"
                 );
-                shots.push((slot, phase, base64::engine::general_purpose::STANDARD.encode(bytes)));
+                shots.push((slot, phase, embedded(path)?));
             }
             views.push((index, view, shots));
         }
@@ -264,9 +272,24 @@ impl Page<'_> {
                         }
                         @for (slot, phase, data) in shots {
                             div class=(format!("shot v{index}s{slot}")) {
-                                img alt=(format!("view {view} at phase {phase}")) src=(format!("data:image/png;base64,{data}"));
+                                img alt=(format!("view {view} at phase {phase}")) src=(data);
                             }
                         }
+                    }
+                }
+            }
+        })
+    }
+
+    fn hull(&self) -> Result<Markup> {
+        let pictures = self.hull.iter().map(|(view, path)| Ok((view, embedded(path)?))).collect::<Result<Vec<_>>>()?;
+        Ok(html! {
+            @if !pictures.is_empty() {
+                h2 { "Where vessels may be" }
+                p.lead { "Training views at their first phase, and in orange what the motion hull covers of them: a vessel outside was lost before training." }
+                div.hulls {
+                    @for (view, data) in &pictures {
+                        figure { img alt=(format!("hull in view {view}")) src=(data); figcaption { "View " (view) } }
                     }
                 }
             }
@@ -311,6 +334,7 @@ impl Page<'_> {
                     (self.scores())
                     (self.plots()?)
                     (self.views()?)
+                    (self.hull()?)
                     (self.motion())
                     (self.kernels())
                     h2 { "What ran on what" }

@@ -7,6 +7,7 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
 use nertca_vk::model::gaussians::MovingGaussians;
+use nertca_vk::run::hull_pictures;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use std::path::Path;
@@ -78,6 +79,12 @@ impl Report<'_> {
             pictures: frames
                 .map(|f| (f.view, f.phase, pictures.join(format!("{}.png", f.name))))
                 .filter(|(_, _, file)| file.is_file())
+                .collect(),
+            hull: dataset
+                .training_views()
+                .into_iter()
+                .map(|view| (view, hull_pictures::file(&run.join("report"), view)))
+                .filter(|(_, file)| file.is_file())
                 .collect(),
             config: model.config.to_toml()?,
         };

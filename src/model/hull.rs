@@ -1,7 +1,7 @@
 //! The motion hull: where the dynamic field may exist.
 
 use crate::formats::volume::Volume;
-use crate::geometry::MM_PER_UNIT;
+use crate::geometry::{MM_PER_UNIT, ViewRays};
 use glam::{DAffine3, DMat3, DVec3};
 
 /// Binary volumes on a regular grid, one for all phases or one per phase; world units, x fastest.
@@ -60,16 +60,42 @@ impl Hull {
     /// Lower and upper corner of the cells kept at any phase; `None` when nothing is kept.
     pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
         let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-        let [nx, ny, _] = self.size;
-        for (word, bits) in self.bits.iter().enumerate().filter(|(_, bits)| **bits != 0) {
-            for bit in (0..32).filter(|bit| bits >> bit & 1 == 1) {
-                let index = word % self.words() * 32 + bit;
-                let cell = DVec3::new((index % nx) as f64, (index / nx % ny) as f64, (index / (nx * ny)) as f64);
-                let corner = self.min + cell * self.cell;
-                low = low.min(corner);
-                high = high.max(corner + self.cell);
-            }
+        for corner in (0..self.n_phases).flat_map(|phase| self.corners(phase)) {
+            low = low.min(corner);
+            high = high.max(corner + self.cell);
         }
         low.is_finite().then_some((low, high))
+    }
+
+    /// Lower corners of the cells kept at a phase.
+    fn corners(&self, phase: usize) -> impl Iterator<Item = DVec3> {
+        let [nx, ny, _] = self.size;
+        let corner = move |index: usize| {
+            self.min + self.cell * DVec3::new((index % nx) as f64, (index / nx % ny) as f64, (index / (nx * ny)) as f64)
+        };
+        let start = if self.n_phases > 1 { phase * self.words() } else { 0 };
+        let words = self.bits[start..start + self.words()].iter().enumerate().filter(|(_, bits)| **bits != 0);
+        words.flat_map(move |(word, bits)| {
+            (0..32).filter(move |bit| bits >> bit & 1 == 1).map(move |bit| corner(word * 32 + bit))
+        })
+    }
+
+    /// Pixels of a `width` x `height` view, rows first, behind which a cell is kept at a phase: what the hull lets the moving
+    /// field explain. A cell covers the square that holds it.
+    pub fn silhouette(&self, rays: &ViewRays, (width, height): (usize, usize), phase: usize) -> Vec<bool> {
+        let mut covered = vec![false; width * height];
+        let pixel = rays.direction[1].length().min(rays.direction[2].length()) * rays.sod;
+        let reach = 0.5 * 3f64.sqrt() * self.cell / pixel;
+        let span = |centre: f64, n: usize| {
+            (centre - reach).round().clamp(0.0, n as f64) as usize
+                ..((centre + reach).round() + 1.0).clamp(0.0, n as f64) as usize
+        };
+        for corner in self.corners(phase) {
+            let Some((column, row)) = rays.project(corner + 0.5 * self.cell) else { continue };
+            for row in span(row, height) {
+                covered[row * width..][span(column, width)].fill(true);
+            }
+        }
+        covered
     }
 }

@@ -11,6 +11,7 @@ use crate::kernels::tuning::Tuning;
 use crate::model::checkpoint::{self, Checkpoint};
 use crate::plan::Plan;
 use crate::run::events::Event;
+use crate::run::hull_pictures;
 use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
 use crate::scan::dataset::Dataset;
@@ -61,7 +62,11 @@ pub fn reconstruct(
         Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
         files::create_directory(options.run)?;
-        Trainer::new(gpu, Plan::new(config, dataset)?, dataset, options.tuning.clone())?
+        let plan = Plan::new(config, dataset)?;
+        if let Some(hull) = &plan.hull {
+            hull_pictures::write(&options.run.join("report"), dataset, hull)?;
+        }
+        Trainer::new(gpu, plan, dataset, options.tuning.clone())?
     };
     let config = trainer.plan().config.clone();
     files::write_atomic(&options.run.join("config.toml"), config.to_toml()?.as_bytes())?;

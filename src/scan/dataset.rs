@@ -97,7 +97,7 @@ pub struct Manifest {
     pub phases: u32,
     /// Attenuation is searched within this distance before and behind the isocentre plane, mm.
     pub depth_half_extent_mm: f64,
-    /// Attenuation of contrast-filled vessels, 1/mm, where known; a third of it is the Dice threshold.
+    /// Attenuation of contrast-filled vessels, 1/mm, where known; a fifth of it is the Dice threshold.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub vessel_attenuation_per_mm: Option<f64>,
     /// All images.

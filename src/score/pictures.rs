@@ -97,6 +97,17 @@ pub fn write_comparison(path: &Path, frame: &Frame, seen: &Rendering, threshold:
     png::write(path, &DynamicImage::ImageRgb8(picture))
 }
 
+/// An image, and the same with what the hull covers in orange: where vessels may be. A vessel outside was lost.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn write_hull(path: &Path, integrals: &[f32], covered: &[bool], width: usize) -> Result<()> {
+    let codes = Window::of(integrals).codes(integrals);
+    let plain = panel(width, |i| Rgb([codes[i]; 3]), codes.len());
+    let tinted = |i: usize| if covered[i] { Rgb([240, codes[i] / 2 + 100, codes[i] / 3]) } else { Rgb([codes[i]; 3]) };
+    png::write(path, &DynamicImage::ImageRgb8(beside(&[plain, panel(width, tinted, codes.len())])))
+}
+
 /// A looping animation of grey images, `width` columns each, `ms` milliseconds apart.
 ///
 /// # Errors

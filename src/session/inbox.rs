@@ -16,7 +16,7 @@ pub struct SessionOptions {
     pub phases: u32,
     /// Attenuation is searched within this distance before and behind the isocentre plane, mm.
     pub depth_half_extent_mm: f64,
-    /// Attenuation of contrast-filled vessels, 1/mm, where known; a third of it is the Dice threshold.
+    /// Attenuation of contrast-filled vessels, 1/mm, where known; a fifth of it is the Dice threshold.
     pub vessel_attenuation_per_mm: Option<f64>,
     /// Refuse frames while training in the background, so that results never depend on timing.
     pub deterministic: bool,

@@ -1,0 +1,30 @@
+//! The motion hull in front of the images it was carved from.
+
+use crate::error::Result;
+use crate::files;
+use crate::model::hull::Hull;
+use crate::scan::dataset::Dataset;
+use crate::score::pictures;
+use std::path::{Path, PathBuf};
+
+/// Where the picture of a view is kept, beside a run's other pictures.
+pub fn file(pictures: &Path, view: usize) -> PathBuf {
+    pictures.join(format!("hull-view{view}.png"))
+}
+
+/// Writes one picture per training view, of its first phase.
+///
+/// # Errors
+/// [`crate::error::Error::Io`].
+pub(super) fn write(directory: &Path, dataset: &Dataset, hull: &Hull) -> Result<()> {
+    files::create_directory(directory)?;
+    let training = dataset.training();
+    for view in dataset.training_views() {
+        let frames = training.iter().filter(|frame| frame.view == view);
+        let Some(frame) = frames.min_by_key(|frame| frame.phase) else { continue };
+        let size = (dataset.width, dataset.height);
+        let covered = hull.silhouette(&dataset.views[view].rays, size, frame.phase as usize);
+        pictures::write_hull(&file(directory, view), &frame.integrals, &covered, dataset.width)?;
+    }
+    Ok(())
+}
