@@ -2,9 +2,12 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
+#[path = "common/golden_file.rs"]
+mod golden_file;
 
 use common::{drop_first_view, expect_silence, gpu, phantom, relative_error, whiten};
 use glam::DVec3;
+use golden_file::Golden;
 use nertca_vk::config::sections::{self, Tree};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
@@ -29,8 +32,6 @@ use nertca_vk::score::eval::VESSEL_SHARE;
 use nertca_vk::score::metrics;
 use nertca_vk::train::gaussians::GaussianTrainer;
 use nertca_vk::train::tree::TreeTrainer;
-use safetensors::SafeTensors;
-use serde_json::Value;
 use std::time::Instant;
 
 /// The defaults.
@@ -322,26 +323,7 @@ fn runs_repeat_bit_by_bit() {
     expect_silence(gpu);
 }
 
-struct Golden {
-    bytes: Vec<u8>,
-    case: Value,
-}
-
 impl Golden {
-    fn open() -> Golden {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/gaussians.safetensors");
-        let bytes = std::fs::read(path).unwrap_or_else(|e| panic!("{path}: {e}; run tools/reference_gaussians.py"));
-        let (_, metadata) = SafeTensors::read_metadata(&bytes).unwrap();
-        let case = serde_json::from_str(&metadata.metadata().as_ref().unwrap()["case"]).unwrap();
-        Golden { bytes, case }
-    }
-
-    fn get(&self, name: &str) -> Vec<f64> {
-        let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
-        let data = tensors.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}")).data().to_vec();
-        data.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect()
-    }
-
     fn size(&self, key: &str) -> usize {
         self.case[key].as_u64().unwrap() as usize
     }
@@ -391,7 +373,7 @@ impl Golden {
 #[test]
 fn golden_values_of_pytorch() {
     let gpu = gpu();
-    let golden = Golden::open();
+    let golden = Golden::open("gaussians", "tools/reference_gaussians.py");
     let (targets, rows) = (golden.targets(), golden.gaussians("start"));
     let iterations = golden.size("iterations") as u32;
     let config = with_settings(sections::Gaussians { iterations, grow_at: 0, ..config().gaussians });

@@ -3,8 +3,11 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
+#[path = "common/golden_file.rs"]
+mod golden_file;
 
 use common::{expect_silence, gpu, relative_error, tuning};
+use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::model::scene::Scene;
@@ -13,29 +16,8 @@ use nertca_vk::reference::field::Precision;
 use nertca_vk::reference::{march, step};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::train::trainer::Trainer;
-use safetensors::SafeTensors;
-use serde_json::Value;
-
-struct Golden {
-    bytes: Vec<u8>,
-    case: Value,
-}
 
 impl Golden {
-    fn open(preset: &str) -> Golden {
-        let path = format!("{}/tests/golden/{preset}.safetensors", env!("CARGO_MANIFEST_DIR"));
-        let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{path}: {e}; run tools/reference.py"));
-        let (_, metadata) = SafeTensors::read_metadata(&bytes).unwrap();
-        let case = serde_json::from_str(&metadata.metadata().as_ref().unwrap()["case"]).unwrap();
-        Golden { bytes, case }
-    }
-
-    fn get(&self, name: &str) -> Vec<f64> {
-        let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
-        let data = tensors.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}")).data().to_vec();
-        data.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect()
-    }
-
     fn number(&self, key: &str) -> f64 {
         self.case[key].as_f64().unwrap_or_else(|| panic!("{key}"))
     }
@@ -158,7 +140,7 @@ fn gather(golden: &Golden, plan: &Plan, prefix: &str) -> Vec<f64> {
 }
 
 fn check(preset: Preset, name: &str) {
-    let golden = Golden::open(name);
+    let golden = Golden::open(name, "tools/reference.py");
     let (config, dataset) = (golden.config(preset), golden.dataset());
     let mut plan = Plan::new(&config, &dataset).unwrap().in_scene(golden.scene());
     plan.backgrounds = (0..dataset.views.len())

@@ -2,6 +2,7 @@
 //! Affine around each centre: the error is below that of the cut.
 
 use crate::error::Result;
+use crate::gaussians::stages::FIXED_POINT_BITS;
 use crate::gaussians::view::SplatView;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::Memory;
@@ -17,8 +18,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Pictures kept recorded; a display in use has far fewer.
 const MOST_RECORDED: usize = 256;
-/// Bits behind the point of the integer sums, as in a fit.
-const FIXED_POINT_BITS: i32 = 20;
 
 /// Columns, rows, phase.
 type Key = (usize, usize, u32);

@@ -15,6 +15,8 @@ use std::ops::Range;
 
 /// Losses kept on the device.
 pub const RING_LENGTH: u32 = 1024;
+/// Bits behind the point of the integer sums: images hold up to 2048 times the strongest change, in steps of 1e-6.
+pub const FIXED_POINT_BITS: i32 = 20;
 
 /// Pipelines of a fit.
 pub struct GaussianKernels {

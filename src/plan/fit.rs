@@ -1,12 +1,10 @@
 //! Constants and schedule of a fit of Gaussians.
 
 use crate::config::sections;
-use crate::gaussians::stages::{RING_LENGTH, loss_parts};
+use crate::gaussians::stages::{FIXED_POINT_BITS, RING_LENGTH, loss_parts};
 use crate::kernels::layout::{GaussianSchedule, GaussianSetup, TreeSetup};
 use crate::plan::targets::Targets;
 
-/// Bits behind the point of the integer sums: images hold up to 2048 times the strongest change, in steps of 1e-6.
-const FIXED_POINT_BITS: i32 = 20;
 /// Decay of Adam's first and second moments, and its smallest denominator.
 const BETAS: [f32; 2] = [0.9, 0.98];
 const EPSILON: f32 = 1e-12;

@@ -1,0 +1,29 @@
+//! Golden values of an independent script: float64 tensors with a description of the case.
+
+use safetensors::SafeTensors;
+use serde_json::Value;
+
+/// A file of `tests/golden`.
+pub struct Golden {
+    bytes: Vec<u8>,
+    /// What the script was asked.
+    pub case: Value,
+}
+
+impl Golden {
+    /// Reads `name`, which `script` made.
+    pub fn open(name: &str, script: &str) -> Golden {
+        let path = format!("{}/tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
+        let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{path}: {e}; run {script}"));
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).unwrap();
+        let case = serde_json::from_str(&metadata.metadata().as_ref().unwrap()["case"]).unwrap();
+        Golden { bytes, case }
+    }
+
+    /// The values of a tensor.
+    pub fn get(&self, name: &str) -> Vec<f64> {
+        let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
+        let data = tensors.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}")).data().to_vec();
+        data.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().unwrap())).collect()
+    }
+}
