@@ -1,6 +1,59 @@
 //! Cardiac phases from time stamps and R-peaks.
 
+use crate::choice::Choice;
 use crate::error::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+/// From the R-peak to the end of systole, seconds. Coronary arteries stand still 280 to 340 ms after R at heart rates of 60
+/// to 80 per minute.
+pub const SYSTOLE_S: f64 = 0.31;
+/// Share of the phases before the end of systole: phases are fractions of a beat of [`SYSTOLE_S`] / 0.35, 68 per minute.
+pub const SYSTOLE_SHARE: f64 = 0.35;
+/// Fast hearts shorten systole, too: it takes this share of a beat at most.
+const LONGEST_SYSTOLE: f64 = 0.6;
+
+/// How time since the R-peak becomes a fraction of the beat, where hearts beat at different rates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BeatScaling {
+    /// All of the beat stretches alike.
+    Linear,
+    /// Systole keeps its length ([`SYSTOLE_S`]), diastole takes the rest.
+    TwoSegment,
+}
+
+impl Choice for BeatScaling {
+    const ALL: &'static [BeatScaling] = &[BeatScaling::Linear, BeatScaling::TwoSegment];
+
+    fn name(self) -> &'static str {
+        match self {
+            BeatScaling::Linear => "linear",
+            BeatScaling::TwoSegment => "two-segment",
+        }
+    }
+}
+
+impl BeatScaling {
+    /// Fraction of the beat (0 to 1) at a time after the R-peak in a beat of a length, both in seconds.
+    pub fn fraction(self, since_r_s: f64, beat_s: f64) -> f64 {
+        match self {
+            BeatScaling::Linear => (since_r_s / beat_s).clamp(0.0, 1.0),
+            BeatScaling::TwoSegment => two_segment_fraction(since_r_s, beat_s, SYSTOLE_S),
+        }
+    }
+}
+
+/// Fraction of the beat (0 to 1) at a time after the R-peak, seconds, in a beat whose systole ends after `systole_s`: systole
+/// fills the first [`SYSTOLE_SHARE`] evenly, diastole the rest.
+pub fn two_segment_fraction(since_r_s: f64, beat_s: f64, systole_s: f64) -> f64 {
+    let systole_s = systole_s.min(LONGEST_SYSTOLE * beat_s);
+    let fraction = if since_r_s < systole_s {
+        SYSTOLE_SHARE * since_r_s / systole_s
+    } else {
+        SYSTOLE_SHARE + (1.0 - SYSTOLE_SHARE) * (since_r_s - systole_s) / (beat_s - systole_s)
+    };
+    fraction.clamp(0.0, 1.0)
+}
 
 /// Beats longer than this many of the usual ones are gaps in the ECG, not beats.
 const LONGEST_BEAT: f64 = 1.8;
@@ -87,6 +140,23 @@ mod tests {
         let peaks = RPeaks::new(&[0.0, 1.0, 2.0, 5.0, 6.0]).unwrap();
         assert_eq!(peaks.phase(3.0, 10), None);
         assert_eq!(peaks.phase(5.5, 10), Some(5));
+    }
+
+    #[test]
+    fn systole_keeps_its_length_and_diastole_takes_the_rest() {
+        let at = |since_r_s, beat_s| BeatScaling::TwoSegment.fraction(since_r_s, beat_s);
+        for beat_s in [0.75, 1.0, 1.3] {
+            assert!((at(SYSTOLE_S, beat_s) - SYSTOLE_SHARE).abs() < 1e-12, "end of systole in a beat of {beat_s} s");
+            assert!((at(0.5 * (SYSTOLE_S + beat_s), beat_s) - 0.675).abs() < 1e-12, "middle of diastole");
+            assert!(at(0.0, beat_s) == 0.0 && (at(beat_s, beat_s) - 1.0).abs() < 1e-12, "both ends of the beat");
+        }
+        assert!((at(0.18, 0.3) - SYSTOLE_SHARE).abs() < 1e-12, "systole leaves room for diastole");
+        assert_eq!(BeatScaling::Linear.fraction(0.25, 1.0), 0.25);
+        let usual = SYSTOLE_S / SYSTOLE_SHARE;
+        assert!(
+            (at(0.6, usual) - BeatScaling::Linear.fraction(0.6, usual)).abs() < 1e-12,
+            "both agree at 68 per minute"
+        );
     }
 
     #[test]
