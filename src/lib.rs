@@ -188,9 +188,16 @@ pub mod capi {
 
 /// Synthetic data with exact truth.
 pub mod phantom {
+    mod blades;
+    mod catheter;
     pub mod dataset;
+    pub mod degradations;
+    pub mod noise;
     pub mod projector;
+    mod runs;
+    mod subjects;
     pub mod tree;
+    pub mod truth;
     pub mod views;
     pub mod voxels;
 }

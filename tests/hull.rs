@@ -11,6 +11,7 @@ use nertca_vk::geometry::world_from_lps_mm;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::hull::Hull;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::projector::Projector;
 use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::plan::carve::carve;
@@ -37,8 +38,7 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
         phases: PHASES,
         views: ViewAngles::published(views).unwrap(),
         seed: 1,
-        photons: None,
-        respiration_mm: 0.0,
+        degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,
         volumes: true,

@@ -64,7 +64,7 @@ const SHORT: &[&str] = &[
 #[test]
 fn a_whole_life() {
     let directory = tempfile::tempdir().unwrap();
-    let data = phantom(directory.path(), &["--photons", "1e9", "--respiration", "0.2"]);
+    let data = phantom(directory.path(), &["--photons", "1e9", "--breathing", "0.2"]);
     let run = directory.path().join("run");
     let lines = ok(&[&["train", text(&data), "-o", text(&run), "--json", "--stop-at", "20"], SHORT].concat());
     let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();

@@ -24,6 +24,7 @@ const uint STREAM_SHAPE = 6u;         // shape variation of phantoms
 const uint STREAM_OCCUPANCY = 7u;     // which empty cells are looked at again
 const uint STREAM_PLACE = 8u;         // which cells of the hull Gaussians begin in
 const uint STREAM_JITTER = 9u;        // where in a cell a Gaussian begins
+const uint STREAM_ACQUISITION = 10u;  // how runs of phantoms are taken
 
 // Uniform in [0, 1), 24 bits.
 float uniform01(uint seed, uint stream, uint a, uint b) {

@@ -10,9 +10,12 @@ use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::model::component::Component;
 use nertca_vk::phantom::dataset::Setting;
+use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm, USUAL_BREATH_S};
+use nertca_vk::phantom::noise::Photons;
 use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::render::quantity::Projection;
 use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::scan::gating::BeatScaling;
 use nertca_vk::train::calibrate;
 use std::path::PathBuf;
 
@@ -94,15 +97,9 @@ pub struct PhantomArgs {
     /// From where it is seen.
     #[command(flatten)]
     pub views: ViewAngleArgs,
-    /// Seed of shape and noise.
+    /// Seed of shape, noise and degradations.
     #[arg(long, default_value_t = 1)]
     pub seed: u32,
-    /// Photons per unattenuated pixel; no noise without.
-    #[arg(long)]
-    pub photons: Option<f64>,
-    /// Breathing along the body, peak to peak, mm; each training view breathes on its own.
-    #[arg(long, default_value_t = 0.0, value_name = "MM")]
-    pub respiration: f64,
     /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
     pub layout: Layout,
@@ -121,6 +118,13 @@ pub struct PhantomArgs {
     /// Do not write the voxel volumes (`volumes/*.nrrd`).
     #[arg(long)]
     pub no_volumes: bool,
+    /// A catheter of 2 mm (6F) in the aorta of the training views: its tip, in the ostium, goes with the heart, its other
+    /// end is still; not part of the masks.
+    #[arg(long, help_heading = DEGRADATIONS)]
+    pub catheter: bool,
+    /// What a cath lab's angiograms have.
+    #[command(flatten)]
+    pub degradations: DegradationArgs,
 }
 
 /// `project`.
@@ -162,9 +166,83 @@ pub struct ProjectArgs {
     /// Put the centre of each volume at the isocentre.
     #[arg(long)]
     pub centre: bool,
+    /// Seed of noise and degradations.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u32,
     /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
     pub layout: Layout,
+    /// What a cath lab's angiograms have.
+    #[command(flatten)]
+    pub degradations: DegradationArgs,
+}
+
+/// Heading of [`DegradationArgs`] in the help.
+const DEGRADATIONS: &str = "Degradations (of the training views; true values in truth.json)";
+
+/// What makes synthetic data worse, as a cath lab's are.
+#[derive(Debug, Args)]
+#[command(next_help_heading = DEGRADATIONS)]
+pub struct DegradationArgs {
+    /// Standard deviations of the stated geometry's errors: of both angles, degrees, and of the patient's position along each
+    /// axis, mm. Images are made with the true geometry.
+    #[arg(long, value_name = "DEG,MM", allow_hyphen_values = true, value_parser = geometry_error)]
+    pub geometry_error: Option<GeometryError>,
+    /// The heart breathes: its way along the body, peak to peak, mm, and the length of a breath, seconds (4 by default). Each
+    /// run begins anywhere in the breath; the background stays.
+    #[arg(long, value_name = "MM[,PERIOD_S]", allow_hyphen_values = true, value_parser = breathing)]
+    pub breathing: Option<Breathing>,
+    /// The diaphragm breathes, too, and with a CT or with volumes the lower front of the chest.
+    #[arg(long, requires = "breathing")]
+    pub breathing_background: bool,
+    /// Photon noise, of all views: photons per pixel of the open beam, before the patient.
+    #[arg(long, value_name = "N", allow_hyphen_values = true, conflicts_with = "detector_photons")]
+    pub photons: Option<f64>,
+    /// Photon noise, of all views: photons per pixel at the detector, behind the patient, as the mean over each image.
+    #[arg(long, value_name = "N", allow_hyphen_values = true)]
+    pub detector_photons: Option<f64>,
+    /// Contrast density differs between runs: its standard deviation, percent. Within a run it drifts half as much.
+    #[arg(long, value_name = "PERCENT", default_value_t = 0.0, allow_hyphen_values = true)]
+    pub contrast_variation: f64,
+    /// Beats per minute, one for all training views or one for each: images are taken at --fps from anywhere in the beat, and
+    /// each phase gets the nearest image by --gating, where one is nearer than half a phase. Regular phases without.
+    #[arg(long, value_name = "BPM[,BPM...]", value_delimiter = ',', allow_hyphen_values = true)]
+    pub heart_rate: Vec<f64>,
+    /// Images per second, as 7.5, 15 or 30.
+    #[arg(long, default_value_t = 15.0, requires = "heart_rate", allow_hyphen_values = true)]
+    pub fps: f64,
+    /// Length of each run, beats: contrast fills the vessels for about three.
+    #[arg(long, default_value_t = 3, requires = "heart_rate")]
+    pub beats: u32,
+    /// How time becomes phase: `two-segment` (systole keeps its length, diastole takes the rest) or `linear`.
+    #[arg(long, value_parser = choice::<BeatScaling>(), default_value = BeatScaling::TwoSegment.name(),
+        requires = "heart_rate")]
+    pub gating: BeatScaling,
+    /// A blade on one side hides about this share (0 to 0.9) of the moving vessels of each view.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, allow_hyphen_values = true)]
+    pub collimate: f64,
+}
+
+impl DegradationArgs {
+    /// The degradations asked for.
+    pub fn degradations(&self, catheter: bool) -> Degradations {
+        let background = self.breathing_background;
+        let open = self.photons.map(Photons::Unattenuated);
+        Degradations {
+            geometry_error: self.geometry_error,
+            breathing: self.breathing.map(|breathing| Breathing { background, ..breathing }),
+            photons: open.or(self.detector_photons.map(Photons::Detector)),
+            contrast_variation: self.contrast_variation / 100.0,
+            rhythm: (!self.heart_rate.is_empty()).then(|| Rhythm {
+                beats_per_min: self.heart_rate.clone(),
+                frames_per_s: self.fps,
+                beats: self.beats,
+                gating: self.gating,
+            }),
+            collimated_share: self.collimate,
+            catheter,
+        }
+    }
 }
 
 /// Views of synthetic data.
@@ -311,6 +389,19 @@ fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize
 fn pair(text: &str) -> Option<[f64; 2]> {
     let (a, b) = text.split_once(',')?;
     Some([a.trim().parse().ok()?, b.trim().parse().ok()?])
+}
+
+/// Parses `DEG,MM`.
+fn geometry_error(text: &str) -> std::result::Result<GeometryError, String> {
+    let [angle_deg, position_mm] = pair(text).ok_or("degrees and mm are needed, as DEG,MM")?;
+    Ok(GeometryError { angle_deg, position_mm })
+}
+
+/// Parses `MM` or `MM,PERIOD_S`.
+fn breathing(text: &str) -> std::result::Result<Breathing, String> {
+    let both = pair(text).or_else(|| Some([text.trim().parse().ok()?, USUAL_BREATH_S]));
+    let [peak_to_peak_mm, period_s] = both.ok_or("mm are needed, or mm and seconds as MM,PERIOD_S")?;
+    Ok(Breathing { peak_to_peak_mm, period_s, background: false })
 }
 
 /// Parses a detector offset, `U,V`.

@@ -12,6 +12,7 @@ use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::network::cost::NetworkCost;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
@@ -112,8 +113,7 @@ fn default_phantom(gpu: &Gpu, scratch: &Path) -> Result<Dataset> {
         phases: 10,
         views: ViewAngles::published(4)?,
         seed: 1,
-        photons: None,
-        respiration_mm: 0.0,
+        degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,
         volumes: false,

@@ -36,8 +36,7 @@ pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
         phases: args.phases,
         views: args.views.views()?,
         seed: args.seed,
-        photons: args.photons,
-        respiration_mm: args.respiration,
+        degradations: args.degradations.degradations(args.catheter),
         layout: args.layout,
         anatomy: args.tree.as_ref().map(|tree| Anatomy {
             tree: tree.clone(),
@@ -69,6 +68,8 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
         c_arms: args.c_arm.options(),
         size: args.size,
         views: args.views.views()?,
+        seed: args.seed,
+        degradations: args.degradations.degradations(false),
         layout: args.layout,
     };
     project_volumes(&gpu, &options, &args.out, bar())?;

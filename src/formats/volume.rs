@@ -63,6 +63,23 @@ impl Volume {
         m.x_axis.length().min(m.y_axis.length()).min(m.z_axis.length())
     }
 
+    /// Value at a voxel index, trilinear between voxel centres; beyond the border the nearest value.
+    pub fn interpolated(&self, index: DVec3) -> f32 {
+        let [nx, ny, _] = self.size;
+        let last = DVec3::from_array(self.size.map(|n| n as f64 - 1.0));
+        let index = index.clamp(DVec3::ZERO, last);
+        let (low, share) = (index.floor().as_usizevec3(), index.fract().as_vec3());
+        let at = |x: usize, y: usize, z: usize| {
+            let [x, y, z] =
+                [(low.x + x, 0), (low.y + y, 1), (low.z + z, 2)].map(|(i, axis)| i.min(self.size[axis] - 1));
+            self.values[(z * ny + y) * nx + x]
+        };
+        let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+        let row = |y, z| mix(at(0, y, z), at(1, y, z), share.x);
+        let plane = |z| mix(row(0, z), row(1, z), share.y);
+        mix(plane(0), plane(1), share.z)
+    }
+
     /// Largest distance of a corner from the isocentre in the axial plane, mm.
     pub fn axial_radius_mm(&self) -> f64 {
         let mut radius = 0f64;

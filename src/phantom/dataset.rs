@@ -1,16 +1,19 @@
-//! Phantom datasets: volumes and motion -> projections, exact masks, noise -> a dataset on disk.
+//! Phantom datasets: volumes and motion -> projections, exact masks, degradations -> a dataset on disk.
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
-use crate::formats::nrrd;
-use crate::formats::volume::{Volume, VolumeHints};
+use crate::formats::volume::VolumeHints;
 use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::gpu::device::Gpu;
-use crate::phantom::projector::{LoadedVolume, Projector};
-use crate::phantom::tree::{Heart, Tree, contraction};
+use crate::phantom::blades::Blade;
+use crate::phantom::degradations::{Chance, Degradations};
+use crate::phantom::noise::add_noise;
+use crate::phantom::projector::Projector;
+use crate::phantom::runs::{Shot, shots};
+use crate::phantom::subjects::{Moving, Patient, Placed, Pose, Reading, Subject, Thorax, Volumes};
+use crate::phantom::truth::{TrueFrame, Truth};
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
-use crate::phantom::voxels::{self, Tissues};
-use crate::random::{STREAM_PHOTON, normal, uniform01};
+use crate::phantom::voxels::Tissues;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
 use crate::scan::nerfca;
 use crate::scan::writer::{About, Writer};
@@ -18,10 +21,10 @@ use glam::DVec3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-/// What the values of volumes are.
-const QUANTITY: &str = "attenuation per mm";
 /// A vessel-only line integral above this share of a 1 mm vessel's marks a vessel pixel.
 const MASK_SHARE: f64 = 0.05;
+/// A blade attenuates so many times as much as the densest part of its view.
+const BLADE_DENSITY: f32 = 2.0;
 
 /// A published set-up of C-arm and volume.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -54,12 +57,10 @@ pub struct PhantomOptions {
     pub phases: u32,
     /// Views.
     pub views: ViewAngles,
-    /// Seed of shape and noise.
+    /// Seed of shape, noise and degradations.
     pub seed: u32,
-    /// Photons per unattenuated pixel; `None` = no noise.
-    pub photons: Option<f64>,
-    /// Amplitude of breathing along the body, mm; 0 = held breath.
-    pub respiration_mm: f64,
+    /// What is done to the training views.
+    pub degradations: Degradations,
     /// Layout to write.
     pub layout: Layout,
     /// Real anatomy instead of the procedural one.
@@ -100,20 +101,25 @@ pub struct VolumeOptions {
     pub size: usize,
     /// Views.
     pub views: ViewAngles,
+    /// Seed of noise and degradations.
+    pub seed: u32,
+    /// What is done to the training views.
+    pub degradations: Degradations,
     /// Layout to write.
     pub layout: Layout,
 }
 
 /// What a phantom dataset is shot from.
-pub(super) struct Stage {
-    pub(super) description: String,
+struct Stage {
+    description: String,
     /// One per view.
-    pub(super) c_arms: Vec<CArm>,
-    pub(super) depth_half_extent_mm: f64,
-    pub(super) vessel_attenuation: Option<f64>,
-    pub(super) still: Option<LoadedVolume>,
-    /// Per phase: what moves besides the vessels, and the vessels (for image and mask).
-    pub(super) moving: Vec<(Option<LoadedVolume>, Option<LoadedVolume>)>,
+    c_arms: Vec<CArm>,
+    depth_half_extent_mm: f64,
+    vessel_attenuation: Option<f64>,
+    phases: u32,
+    subject: Box<dyn Subject>,
+    /// The vessels are part of the moving background already.
+    vessels_in_background: bool,
 }
 
 /// How a stage is shot.
@@ -121,11 +127,10 @@ struct Shooting<'a> {
     size: usize,
     views: &'a ViewAngles,
     seed: u32,
-    photons: Option<f64>,
-    respiration_mm: f64,
+    degradations: &'a Degradations,
     layout: Layout,
-    /// The vessels are part of the moving volume already; project them for the mask alone.
-    vessels_in_background: bool,
+    /// Also write the voxel volumes.
+    volumes: bool,
 }
 
 /// Makes a phantom dataset in `out`.
@@ -136,35 +141,29 @@ pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl 
     if !(1..=200).contains(&options.phases) {
         return Err(Error::config("phases", options.phases, "1 to 200 is accepted"));
     }
-    if let Some(photons) = options.photons.filter(|n| !(n.is_finite() && *n >= 1.0)) {
-        return Err(Error::config("photons", photons, "at least 1 is needed"));
-    }
-    if !(options.respiration_mm.is_finite() && options.respiration_mm.abs() <= 100.0) {
-        return Err(Error::config("respiration_mm", options.respiration_mm, "at most 100 mm is accepted"));
-    }
     let shooting = Shooting {
         size: options.size,
         views: &options.views,
         seed: options.seed,
-        photons: options.photons,
-        respiration_mm: options.respiration_mm,
+        degradations: &options.degradations,
         layout: options.layout,
-        vessels_in_background: false,
+        volumes: options.volumes,
     };
-    check_output(&shooting, out)?;
+    shooting.check(out)?;
     let projector = Projector::new(gpu, options.size, options.size)?;
     progress("volumes", 0, 1);
     let stage = match &options.anatomy {
-        None => procedural(&projector, options, out)?,
-        Some(anatomy) => from_files(&projector, options, anatomy, out)?,
+        None => procedural(options)?,
+        Some(anatomy) => from_files(options, anatomy)?,
     };
     shoot(&projector, &stage, &shooting, out, progress)
 }
 
-/// Projects a user's volumes, one per phase, into a dataset in `out`.
+/// Projects a user's volumes, one per phase, into a dataset in `out`. Between phases the nearest volume is shown; where the
+/// patient breathes, what all volumes have in common stands still.
 ///
 /// # Errors
-/// As [`make`].
+/// As [`make`]; also for degradations that need vessels where none are told apart.
 pub fn project_volumes(
     gpu: &Gpu,
     options: &VolumeOptions,
@@ -174,44 +173,51 @@ pub fn project_volumes(
     let shooting = Shooting {
         size: options.size,
         views: &options.views,
-        seed: 0,
-        photons: None,
-        respiration_mm: 0.0,
+        seed: options.seed,
+        degradations: &options.degradations,
         layout: options.layout,
-        vessels_in_background: true,
+        volumes: false,
     };
-    check_output(&shooting, out)?;
+    shooting.check(out)?;
     if options.vessel_per_mm.is_some_and(|v| !(v.is_finite() && v > 0.0)) {
         return Err(Error::config("vessel_per_mm", options.vessel_per_mm.unwrap_or_default(), "must be positive"));
     }
+    check_vessels(&options.degradations, options.vessel_per_mm)?;
     let c_arms = options.c_arms.c_arms(&options.views, options.size)?;
     let projector = Projector::new(gpu, options.size, options.size)?;
     let total = options.volumes.len() as u64;
-    let (mut moving, mut radius) = (Vec::new(), 0f64);
-    for (index, path) in options.volumes.iter().enumerate() {
-        progress("volumes", index as u64, total);
-        let mut volume = Volume::read(path, &options.hints)?;
-        volume.values.iter_mut().for_each(|v| *v *= options.scale);
-        if options.hounsfield {
-            voxels::attenuation_from_hounsfield(&mut volume);
-        }
-        radius = radius.max(volume.axial_radius_mm());
-        let vessels = options.vessel_per_mm.map(|threshold| Volume {
-            values: volume.values.iter().map(|v| if f64::from(*v) >= threshold { *v } else { 0.0 }).collect(),
-            ..volume.clone()
-        });
-        let vessels = vessels.map(|v| projector.load(v)).transpose()?;
-        moving.push((Some(projector.load(volume)?), vessels));
-    }
+    let reading = Reading {
+        paths: &options.volumes,
+        hints: &options.hints,
+        hounsfield: options.hounsfield,
+        scale: options.scale,
+        vessel_per_mm: options.vessel_per_mm,
+    };
+    let breathing = options.degradations.breathing.is_some();
+    let volumes = Volumes::read(&projector, &reading, breathing, |done| progress("volumes", done, total))?;
     let stage = Stage {
         description: format!("projected from {} volumes", options.volumes.len()),
-        depth_half_extent_mm: radius.min(largest_depth_mm(&c_arms)),
+        depth_half_extent_mm: volumes.axial_radius_mm().min(largest_depth_mm(&c_arms)),
         c_arms,
         vessel_attenuation: options.vessel_per_mm,
-        still: None,
-        moving,
+        phases: total as u32,
+        subject: Box::new(volumes),
+        vessels_in_background: true,
     };
     shoot(&projector, &stage, &shooting, out, progress)
+}
+
+/// Refuses degradations of volumes that lack what they are done to.
+fn check_vessels(degradations: &Degradations, vessel_per_mm: Option<f64>) -> Result<()> {
+    if degradations.catheter {
+        return Err(Error::config("catheter", true, "volumes do not say where the ostium is; phantoms do"));
+    }
+    let of_vessels =
+        [("contrast_variation", degradations.contrast_variation), ("collimated_share", degradations.collimated_share)];
+    match of_vessels.into_iter().find(|(_, value)| *value > 0.0 && vessel_per_mm.is_none()) {
+        Some((field, value)) => Err(Error::config(field, value, "needs vessel_per_mm, to tell vessels from the rest")),
+        None => Ok(()),
+    }
 }
 
 /// How far from the isocentre attenuation may lie: short of the nearest source.
@@ -225,20 +231,124 @@ fn widest_field_mm(c_arms: &[CArm], size: usize) -> f64 {
     fields.fold(0.0, f64::max)
 }
 
-/// Refuses impossible images and directories that already hold a dataset, before any work is done.
-fn check_output(shooting: &Shooting<'_>, out: &Path) -> Result<()> {
-    if !(16..=2048).contains(&shooting.size) {
-        return Err(Error::config("size", shooting.size, "16 to 2048 is accepted"));
+impl Shooting<'_> {
+    /// Refuses impossible images and directories that already hold a dataset, before any work is done.
+    fn check(&self, out: &Path) -> Result<()> {
+        if !(16..=2048).contains(&self.size) {
+            return Err(Error::config("size", self.size, "16 to 2048 is accepted"));
+        }
+        for name in [MANIFEST, nerfca::GENERAL] {
+            if out.join(name).exists() {
+                return Err(Error::config("OUT", out.display(), "already holds a dataset; choose another directory"));
+            }
+        }
+        self.degradations.check(self.views.training.len(), self.layout)
     }
-    for name in [MANIFEST, nerfca::GENERAL] {
-        if out.join(name).exists() {
-            return Err(Error::config("OUT", out.display(), "already holds a dataset; choose another directory"));
+
+    fn chance(&self, view: usize) -> Chance {
+        Chance { seed: self.seed, view: view as u32 }
+    }
+
+    /// What the dataset says of a C-arm.
+    fn stated(&self, c_arm: &CArm, view: usize, split: Split) -> CArm {
+        match self.degradations.geometry_error {
+            Some(error) if split == Split::Train => error.stated(c_arm, self.chance(view)),
+            _ => c_arm.clone(),
         }
     }
-    Ok(())
 }
 
-/// Projects every view and phase of a stage and writes the dataset.
+/// Takes images of a stage.
+struct Camera<'a> {
+    projector: &'a Projector,
+    stage: &'a Stage,
+    rays: Vec<ViewRays>,
+    /// Line integrals of what stands still, per view.
+    still: Vec<Vec<f32>>,
+    /// What moves, as it was drawn last.
+    drawn: Option<(Pose, Moving)>,
+}
+
+/// Line integrals of an image, and of its vessels alone.
+struct Exposure {
+    image: Vec<f32>,
+    vessels: Option<Vec<f32>>,
+}
+
+impl<'a> Camera<'a> {
+    fn new(projector: &'a Projector, stage: &'a Stage, size: usize) -> Result<Camera<'a>> {
+        let rays = |c_arm: &CArm| {
+            let rays = Geometry::CArm(c_arm.clone()).rays(size, size);
+            rays.map_err(|(field, problem)| Error::config(field, "", problem))
+        };
+        let rays = stage.c_arms.iter().map(rays).collect::<Result<Vec<ViewRays>>>()?;
+        let still = match stage.subject.still(projector, DVec3::ZERO)? {
+            Some(volume) => projector.project(&volume, &rays, DVec3::ZERO)?,
+            None => vec![vec![0.0; size * size]; rays.len()],
+        };
+        Ok(Camera { projector, stage, rays, still, drawn: None })
+    }
+
+    fn expose(&mut self, view: usize, shot: &Shot, catheter: bool) -> Result<Exposure> {
+        let pose = Pose { fraction: shot.fraction, breath: shot.breath, catheter };
+        let moving = match self.drawn.take() {
+            Some((drawn, moving)) if drawn == pose => moving,
+            _ => self.stage.subject.moving(self.projector, &pose)?,
+        };
+        let mut image = match shot.breath.chest_mm {
+            DVec3::ZERO => self.still[view].clone(),
+            chest_mm => match self.stage.subject.still(self.projector, chest_mm)? {
+                Some(volume) => self.project(view, &Placed::at_rest(volume))?,
+                None => self.still[view].clone(),
+            },
+        };
+        for placed in moving.background.iter().chain(&moving.catheter) {
+            add(&mut image, &self.project(view, placed)?, 1.0);
+        }
+        let vessels = moving.vessels.as_ref().map(|placed| self.project(view, placed)).transpose()?;
+        if let Some(vessels) = &vessels {
+            let there = if self.stage.vessels_in_background { 1.0 } else { 0.0 };
+            add(&mut image, vessels, shot.contrast_gain as f32 - there);
+        }
+        self.drawn = Some((pose, moving));
+        Ok(Exposure { image, vessels })
+    }
+
+    fn project(&self, view: usize, placed: &Placed) -> Result<Vec<f32>> {
+        let rays = std::slice::from_ref(&self.rays[view]);
+        Ok(self.projector.project(&placed.volume, rays, placed.shift_mm)?.swap_remove(0))
+    }
+
+    /// Vessel pixels, from the line integrals of vessels alone.
+    fn mask(&self, view: usize, vessels: &[f32]) -> Vec<bool> {
+        let c_arm = &self.stage.c_arms[view];
+        let pixel_at_isocentre = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
+        let threshold = (MASK_SHARE * self.stage.vessel_attenuation.unwrap_or(0.0) * pixel_at_isocentre) as f32;
+        vessels.iter().map(|v| *v > threshold).collect()
+    }
+
+    /// The blade that hides a share of what moves of a view's vessels.
+    fn blade(&mut self, view: usize, shots: &[Option<Shot>], shooting: &Shooting<'_>) -> Result<Blade> {
+        let pixels = shooting.size * shooting.size;
+        let (mut sum, mut least, mut densest, mut images) = (vec![0f64; pixels], vec![f32::MAX; pixels], 0f32, 0);
+        for shot in shots.iter().flatten() {
+            let exposure = self.expose(view, shot, shooting.degradations.catheter)?;
+            densest = exposure.image.iter().copied().fold(densest, f32::max);
+            for (pixel, value) in exposure.vessels.iter().flatten().enumerate() {
+                sum[pixel] += f64::from(*value);
+                least[pixel] = least[pixel].min(*value);
+            }
+            images += 1;
+        }
+        // Of a single image all vessels count: nothing tells which of them move.
+        let still = |pixel: usize| if images > 1 { f64::from(images) * f64::from(least[pixel]) } else { 0.0 };
+        let moving: Vec<f64> = sum.iter().enumerate().map(|(pixel, sum)| sum - still(pixel)).collect();
+        let share = shooting.degradations.collimated_share;
+        Ok(Blade::hiding(share, &moving, shooting.size, BLADE_DENSITY * densest, shooting.chance(view)))
+    }
+}
+
+/// Takes the images of every view and writes the dataset.
 fn shoot(
     projector: &Projector,
     stage: &Stage,
@@ -246,130 +356,83 @@ fn shoot(
     out: &Path,
     mut progress: impl FnMut(&str, u64, u64),
 ) -> Result<()> {
-    let size = shooting.size;
+    let (size, degradations) = (shooting.size, shooting.degradations);
     let splits: Vec<Split> = shooting.views.all().map(|(_, split)| split).collect();
-    let geometries: Vec<Geometry> = stage.c_arms.iter().cloned().map(Geometry::CArm).collect();
-    let rays = geometries
-        .iter()
-        .map(|g| g.rays(size, size).map_err(|(field, problem)| Error::config(field, "", problem)))
-        .collect::<Result<Vec<ViewRays>>>()?;
     let about = About {
         description: stage.description.clone(),
-        phases: stage.moving.len() as u32,
+        phases: stage.phases,
         depth_half_extent_mm: stage.depth_half_extent_mm,
         vessel_attenuation_per_mm: stage.vessel_attenuation,
         size: [size, size],
         c_arm: stage.c_arms[0].clone(),
     };
     let mut writer = Writer::new(out, shooting.layout, about)?;
-    let still = match &stage.still {
-        Some(volume) => projector.project(volume, &rays, DVec3::ZERO)?,
-        None => vec![vec![0.0; size * size]; rays.len()],
-    };
-    let mask_threshold = |c_arm: &CArm| {
-        let pixel_at_isocentre = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
-        (MASK_SHARE * stage.vessel_attenuation.unwrap_or(0.0) * pixel_at_isocentre) as f32
-    };
-    let total = stage.moving.len() as u64;
-    for (phase, (background, vessels)) in stage.moving.iter().enumerate() {
-        progress("projections", phase as u64, total);
-        let phase = phase as u32;
-        for (view, geometry) in geometries.iter().enumerate() {
-            // Breathing differs between runs, so each view has its own course of displacement.
-            let shift = DVec3::Z * breath(shooting, view, phase, splits[view], total);
-            let project = |volume: &LoadedVolume| -> Result<Vec<f32>> {
-                Ok(projector.project(volume, std::slice::from_ref(&rays[view]), shift)?.swap_remove(0))
-            };
-            let mut image = still[view].clone();
-            if let Some(volume) = background {
-                add(&mut image, &project(volume)?);
-            }
-            let mut mask = None;
-            if let Some(volume) = vessels {
-                let vessel_image = project(volume)?;
-                if !shooting.vessels_in_background {
-                    add(&mut image, &vessel_image);
-                }
-                let threshold = mask_threshold(&stage.c_arms[view]);
-                mask = Some(vessel_image.iter().map(|v| *v > threshold).collect::<Vec<_>>());
-            }
-            if let Some(photons) = shooting.photons {
+    let mut truth = Truth::new(shooting.seed, stage.phases);
+    let mut camera = Camera::new(projector, stage, size)?;
+    let mut plan = Vec::new();
+    for (view, split) in splits.iter().enumerate() {
+        let mut shots = shots(degradations, shooting.seed, view, *split, stage.phases);
+        for shot in shots.iter_mut().flatten() {
+            shot.fraction = stage.subject.nearest_fraction(shot.fraction);
+        }
+        let collimated = *split == Split::Train && degradations.collimated_share > 0.0;
+        let blade = if collimated { Some(camera.blade(view, &shots, shooting)?) } else { None };
+        plan.push((shots, blade));
+    }
+    for phase in 0..stage.phases {
+        progress("projections", u64::from(phase), u64::from(stage.phases));
+        if shooting.volumes {
+            let fraction = Shot::at_phase(phase, stage.phases).fraction;
+            stage.subject.write_volumes(&out.join("volumes"), phase, fraction)?;
+        }
+        for (view, (shots, blade)) in plan.iter().enumerate() {
+            let Some(shot) = &shots[phase as usize] else { continue };
+            let (split, c_arm) = (splits[view], &stage.c_arms[view]);
+            let Exposure { mut image, vessels } =
+                camera.expose(view, shot, degradations.catheter && split == Split::Train)?;
+            let mut mask = vessels.map(|vessels| camera.mask(view, &vessels));
+            if let Some(photons) = degradations.photons {
                 add_noise(&mut image, photons, shooting.seed, (view as u32) << 16 | phase);
             }
-            writer.frame(geometry, splits[view], view, phase, &image, mask.as_deref())?;
+            if let Some(blade) = blade {
+                blade.close(&mut image, mask.as_mut(), size);
+            }
+            let stated = Geometry::CArm(shooting.stated(c_arm, view, split));
+            let file = writer.frame(&stated, split, view, phase, &image, mask.as_deref())?;
+            let DVec3 { x: left, y: posterior, z: superior } = shot.breath.heart_mm;
+            truth.frames.push(TrueFrame {
+                image: file,
+                view,
+                split,
+                phase,
+                geometry: c_arm.clone(),
+                heart_shift_mm: [posterior, left, superior],
+                beat_phase: shot.fraction * f64::from(stage.phases),
+                time_s: shot.time_s,
+                contrast_gain: shot.contrast_gain,
+                cut_share: blade.as_ref().map_or(0.0, |blade| blade.cut_share),
+            });
         }
     }
-    progress("projections", total, total);
+    progress("projections", u64::from(stage.phases), u64::from(stage.phases));
+    truth.write(out)?;
     writer.finish()
 }
 
-fn breath(options: &Shooting<'_>, view: usize, phase: u32, split: Split, phases: u64) -> f64 {
-    if split == Split::Validation {
-        return 0.0;
-    }
-    let start = uniform01(options.seed, STREAM_PHOTON, u32::MAX, view as u32);
-    let course = start + 0.25 * f64::from(phase) / phases as f64;
-    0.5 * options.respiration_mm * (std::f64::consts::TAU * course).sin()
-}
-
-fn add(image: &mut [f32], other: &[f32]) {
+fn add(image: &mut [f32], other: &[f32], factor: f32) {
     for (a, b) in image.iter_mut().zip(other) {
-        *a += b;
+        *a += factor * b;
     }
 }
 
-/// Counts are Poisson; beyond a few hundred photons a normal is indistinguishable from it.
-fn add_noise(image: &mut [f32], photons: f64, seed: u32, stream: u32) {
-    for (pixel, value) in image.iter_mut().enumerate() {
-        let expected = photons * (-f64::from(*value)).exp();
-        let counts = if expected > 200.0 {
-            (expected + expected.sqrt() * normal(seed, STREAM_PHOTON, stream, pixel as u32)).round()
-        } else {
-            poisson(expected, seed, stream, pixel as u32)
-        };
-        *value = -(counts.max(0.5) / photons).ln() as f32;
-    }
-}
-
-/// Knuth's product method; `expected` is at most 200.
-fn poisson(expected: f64, seed: u32, stream: u32, pixel: u32) -> f64 {
-    let mut log_product = 0.0;
-    let mut count = 0u32;
-    loop {
-        log_product += uniform01(seed ^ count.wrapping_mul(0x9e37_79b9), STREAM_PHOTON, stream, pixel).max(1e-9).ln();
-        if log_product < -expected {
-            return f64::from(count);
-        }
-        count += 1;
-    }
-}
-
-fn procedural(projector: &Projector, options: &PhantomOptions, out: &Path) -> Result<Stage> {
+fn procedural(options: &PhantomOptions) -> Result<Stage> {
     let scale_pixels = 200.0 / options.size as f64;
     // Volume offsets are in the world's axes (posterior, left, superior); LPS swaps the first two.
     let (tissues, sid_mm, sod_mm, anatomy_scale, centre_mm, half_mm) = match options.setting {
         Setting::Xcat => (Tissues::XCAT, 2500.0, 450.0, 0.37, DVec3::new(-25.0, 10.0, 25.0), 64.0),
         Setting::Magix => (Tissues::MAGIX, 2000.0, 600.0, 0.62, DVec3::ZERO, 230.0),
     };
-    let heart = Heart::new(DVec3::ZERO, anatomy_scale);
-    let tree = Tree::procedural(&heart, anatomy_scale, options.phases, options.seed);
-    let (low, high) = tree.bounds_mm();
-    // The tree's middle is the isocentre, as on a real table.
-    let shift = -0.5 * (low + high);
-    let heart = Heart::new(shift, anatomy_scale);
-    let tree = Tree::procedural(&heart, anatomy_scale, options.phases, options.seed);
-    let still = voxels::thorax(tissues, shift, anatomy_scale, centre_mm, half_mm);
-    let spacing = 0.4 * anatomy_scale;
-    let mut moving = Vec::new();
-    for phase in 0..options.phases {
-        let squeeze = contraction(f64::from(phase) / f64::from(options.phases));
-        let background = voxels::heart_and_diaphragm(tissues, &heart, squeeze, shift, anatomy_scale, &still);
-        let vessels = voxels::vessels(&tree, phase as usize, tissues.vessel, spacing);
-        if options.volumes {
-            write_volumes(out, phase, &vessels, Some((&still, &background)))?;
-        }
-        moving.push((Some(projector.load(background)?), Some(projector.load(vessels)?)));
-    }
+    let thorax = Thorax::new(tissues, anatomy_scale, options.seed, options.phases, (centre_mm, half_mm));
     let radius = half_mm + centre_mm.x.abs().max(centre_mm.y.abs());
     let c_arms = CArmOptions {
         sod_mm: vec![sod_mm],
@@ -383,69 +446,27 @@ fn procedural(projector: &Projector, options: &PhantomOptions, out: &Path) -> Re
         depth_half_extent_mm: (radius * std::f64::consts::SQRT_2).min(largest_depth_mm(&c_arms)),
         c_arms,
         vessel_attenuation: Some(tissues.vessel),
-        still: Some(projector.load(still)?),
-        moving,
+        phases: options.phases,
+        subject: Box::new(thorax),
+        vessels_in_background: false,
     })
 }
 
-fn from_files(projector: &Projector, options: &PhantomOptions, anatomy: &Anatomy, out: &Path) -> Result<Stage> {
-    if !(anatomy.iodine_per_mm.is_finite() && anatomy.iodine_per_mm > 0.0) {
-        return Err(Error::config("iodine_per_mm", anatomy.iodine_per_mm, "must be positive"));
+fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<Stage> {
+    let vessel_per_mm = anatomy.iodine_per_mm;
+    if !(vessel_per_mm.is_finite() && vessel_per_mm > 0.0) {
+        return Err(Error::config("iodine_per_mm", vessel_per_mm, "must be positive"));
     }
-    let tree = Tree::read(&anatomy.tree, options.phases)?;
-    let still = match &anatomy.background {
-        None => None,
-        Some(path) => {
-            let mut volume = Volume::read(path, &VolumeHints::default())?;
-            voxels::attenuation_from_hounsfield(&mut volume);
-            Some(volume)
-        }
-    };
-    let mut moving = Vec::new();
-    for phase in 0..options.phases {
-        let vessels = voxels::vessels(&tree, phase as usize, anatomy.iodine_per_mm, 0.5);
-        if options.volumes {
-            write_volumes(out, phase, &vessels, None)?;
-        }
-        moving.push((None, Some(projector.load(vessels)?)));
-    }
+    let patient = Patient::read(&anatomy.tree, anatomy.background.as_deref(), vessel_per_mm, options.phases)?;
     let c_arms = anatomy.c_arms.c_arms(&options.views, options.size)?;
-    let radius = still.as_ref().map_or_else(|| widest_field_mm(&c_arms, options.size), Volume::axial_radius_mm);
+    let radius = patient.axial_radius_mm().unwrap_or_else(|| widest_field_mm(&c_arms, options.size));
     Ok(Stage {
         description: format!("anatomy from {}", anatomy.tree.file_name().unwrap_or_default().to_string_lossy()),
         depth_half_extent_mm: radius.min(largest_depth_mm(&c_arms)),
         c_arms,
-        vessel_attenuation: Some(anatomy.iodine_per_mm),
-        still: still.map(|v| projector.load(v)).transpose()?,
-        moving,
+        vessel_attenuation: Some(vessel_per_mm),
+        phases: options.phases,
+        subject: Box::new(patient),
+        vessels_in_background: false,
     })
-}
-
-fn write_volumes(out: &Path, phase: u32, vessels: &Volume, background: Option<(&Volume, &Volume)>) -> Result<()> {
-    let directory = out.join("volumes");
-    nrrd::write(&directory.join(format!("vessels-{phase:02}.nrrd")), vessels, QUANTITY)?;
-    if let Some((still, moving)) = background {
-        let sum =
-            Volume { values: still.values.iter().zip(&moving.values).map(|(a, b)| a + b).collect(), ..still.clone() };
-        nrrd::write(&directory.join(format!("background-{phase:02}.nrrd")), &sum, QUANTITY)?;
-    }
-    Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn noise_has_the_variance_of_its_counts() {
-        for (photons, integral) in [(1e6f64, 2.0f32), (500.0, 3.0)] {
-            let mut image = vec![integral; 20_000];
-            add_noise(&mut image, photons, 1, 0);
-            let mean = image.iter().map(|v| f64::from(*v)).sum::<f64>() / 20_000.0;
-            let var = image.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / 20_000.0;
-            let expected = photons * f64::from(-integral).exp();
-            let relative = var * expected;
-            assert!((0.9..1.25).contains(&relative), "{photons}: {relative}");
-        }
-    }
 }

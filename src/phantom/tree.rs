@@ -8,24 +8,25 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::random::{STREAM_SHAPE, uniform01};
+use crate::scan::gating::SYSTOLE_SHARE;
 use glam::DVec3;
 use serde::Deserialize;
 use std::path::Path;
 
-/// One vessel: a polyline that moves.
+/// One vessel: a polyline.
 #[derive(Debug, Clone)]
 pub struct Branch {
     /// Anatomical name.
     pub name: String,
-    /// Points per phase, LPS mm.
-    pub points: Vec<Vec<DVec3>>,
+    /// Points, LPS mm.
+    pub points: Vec<DVec3>,
     /// Lumen radius at each point, mm.
     pub radius_mm: Vec<f64>,
     /// Contrast filling at each point, 0 to 1.
     pub filling: Vec<f64>,
 }
 
-/// A tree over the phases of one beat.
+/// A tree at one moment of the beat.
 #[derive(Debug, Clone)]
 pub struct Tree {
     /// All vessels.
@@ -33,10 +34,12 @@ pub struct Tree {
 }
 
 /// How far the ventricle has contracted at a fraction of the beat: 0 at end-diastole, 1 at end-systole
-/// (35 % of the beat), back to 0 at 75 %, then rest.
+/// ([`SYSTOLE_SHARE`] of the beat), back to 0 at 75 %, then rest.
 pub fn contraction(fraction: f64) -> f64 {
     let x = fraction.rem_euclid(1.0);
-    let half_wave = if x < 0.35 { 0.5 * x / 0.35 } else { (0.5 + 0.5 * (x - 0.35) / 0.4).min(1.0) };
+    let since_systole = x - SYSTOLE_SHARE;
+    let half_wave =
+        if since_systole < 0.0 { 0.5 * x / SYSTOLE_SHARE } else { (0.5 + 0.5 * since_systole / 0.4).min(1.0) };
     (std::f64::consts::PI * half_wave).sin().powi(2)
 }
 
@@ -174,9 +177,10 @@ const COURSES: &[Course] = &[
 ];
 
 impl Tree {
-    /// A left coronary tree on a beating heart. `scale` shrinks anatomy; `seed` varies its course by a few
-    /// degrees and the contrast along it.
-    pub fn procedural(heart: &Heart, scale: f64, n_phases: u32, seed: u32) -> Tree {
+    /// A left coronary tree on a beating heart, at a fraction of the beat. `scale` shrinks anatomy; `seed` varies its
+    /// course by a few degrees and the contrast along it.
+    pub fn procedural(heart: &Heart, scale: f64, fraction: f64, seed: u32) -> Tree {
+        let squeeze = contraction(fraction);
         let branches = COURSES
             .iter()
             .enumerate()
@@ -193,22 +197,15 @@ impl Tree {
                     let sway = amplitude * (s * 4.0).min(1.0) * (std::f64::consts::TAU * wave * s + phase).sin();
                     (along, around.to_radians() + sway, depth)
                 };
-                let points = (0..n_phases)
-                    .map(|p| {
-                        let squeeze = contraction(f64::from(p) / f64::from(n_phases));
-                        (0..=steps)
-                            .map(|i| {
-                                let (along, around, depth) = at(i);
-                                heart.point(along, around, depth, squeeze)
-                            })
-                            .collect()
-                    })
-                    .collect();
+                let point = |i: usize| {
+                    let (along, around, depth) = at(i);
+                    heart.point(along, around, depth, squeeze)
+                };
                 let share = |i: usize| i as f64 / steps as f64;
                 let (d0, d1) = course.diameter_mm;
                 Branch {
                     name: course.name.to_owned(),
-                    points,
+                    points: (0..=steps).map(point).collect(),
                     radius_mm: (0..=steps).map(|i| 0.5 * scale * (d0 + (d1 - d0) * share(i))).collect(),
                     // Contrast thins towards the periphery and comes in slow waves.
                     filling: (0..=steps)
@@ -220,55 +217,45 @@ impl Tree {
         Tree { branches }
     }
 
-    /// Reads a tree (see `docs/formats.md`) and interpolates its beat to `n_phases`, closing in time.
-    ///
-    /// # Errors
-    /// [`Error::Data`] naming file and field.
-    pub fn read(path: &Path, n_phases: u32) -> Result<Tree> {
-        let bytes = files::read_limited(path, 1 << 30)?;
-        let file: TreeFile = serde_json::from_slice(&bytes)
-            .map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))?;
-        file.check(path)?;
-        let stored = file.points_mm.len();
-        let at = |phase: u32, i: usize| {
-            let x = f64::from(phase) / f64::from(n_phases) * stored as f64;
-            let (a, b) = (x as usize % stored, (x as usize + 1) % stored);
-            let ras = DVec3::from_array(file.points_mm[a][i]).lerp(DVec3::from_array(file.points_mm[b][i]), x.fract());
-            DVec3::new(-ras.x, -ras.y, ras.z)
-        };
-        let branches = file
-            .branches
-            .iter()
-            .map(|b| {
-                let range = b.first..b.first + b.count;
-                Branch {
-                    name: b.name.clone(),
-                    points: (0..n_phases).map(|p| range.clone().map(|i| at(p, i)).collect()).collect(),
-                    radius_mm: file.radius_mm[range.clone()].to_vec(),
-                    filling: vec![1.0; b.count],
-                }
-            })
-            .collect();
-        Ok(Tree { branches })
+    /// The box of the tree, radii included.
+    pub fn bounds(&self) -> Bounds {
+        let points = self.branches.iter().flat_map(|b| b.points.iter().zip(&b.radius_mm));
+        let boxes = points.map(|(p, r)| Bounds { low_mm: *p - *r, high_mm: *p + *r });
+        boxes.fold(Bounds::EMPTY, Bounds::joined)
     }
 
-    /// Lower and upper corner of all phases, radii included, LPS mm.
-    pub fn bounds_mm(&self) -> (DVec3, DVec3) {
-        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-        for branch in &self.branches {
-            for points in &branch.points {
-                for (p, r) in points.iter().zip(&branch.radius_mm) {
-                    low = low.min(*p - *r);
-                    high = high.max(*p + *r);
-                }
-            }
-        }
-        (low, high)
+    /// Where the first branch begins, LPS mm.
+    pub fn ostium_mm(&self) -> Option<DVec3> {
+        self.branches.first()?.points.first().copied()
+    }
+}
+
+/// A box along patient axes, LPS mm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds {
+    /// Lower corner.
+    pub low_mm: DVec3,
+    /// Upper corner.
+    pub high_mm: DVec3,
+}
+
+impl Bounds {
+    const EMPTY: Bounds = Bounds { low_mm: DVec3::INFINITY, high_mm: DVec3::NEG_INFINITY };
+
+    /// The box around both.
+    pub fn joined(self, other: Bounds) -> Bounds {
+        Bounds { low_mm: self.low_mm.min(other.low_mm), high_mm: self.high_mm.max(other.high_mm) }
+    }
+
+    /// The box of a tree over the phases of its beat; `at` draws it at a fraction.
+    pub fn over_the_beat(n_phases: u32, at: impl Fn(f64) -> Tree) -> Bounds {
+        let boxes = (0..n_phases).map(|p| at(f64::from(p) / f64::from(n_phases)).bounds());
+        boxes.fold(Bounds::EMPTY, Bounds::joined)
     }
 }
 
 /// Catmull-Rom through the control points, `s` in [0, 1].
-fn spline(controls: &[[f64; 3]], s: f64) -> [f64; 3] {
+pub(super) fn spline(controls: &[[f64; 3]], s: f64) -> [f64; 3] {
     let last = controls.len() - 1;
     let x = s * last as f64;
     let i = (x as usize).min(last - 1);
@@ -282,14 +269,15 @@ fn spline(controls: &[[f64; 3]], s: f64) -> [f64; 3] {
     })
 }
 
-#[derive(Deserialize)]
-struct TreeFile {
+/// A tree and its beat, as read from a file.
+#[derive(Debug, Deserialize)]
+pub struct TreeFile {
     branches: Vec<TreeBranch>,
     radius_mm: Vec<f64>,
     points_mm: Vec<Vec<[f64; 3]>>,
 }
 
-#[derive(Deserialize)]
+#[derive(Debug, Deserialize)]
 struct TreeBranch {
     name: String,
     first: usize,
@@ -297,6 +285,40 @@ struct TreeBranch {
 }
 
 impl TreeFile {
+    /// Reads a tree (see `docs/formats.md`).
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming file and field.
+    pub fn read(path: &Path) -> Result<TreeFile> {
+        let bytes = files::read_limited(path, 1 << 30)?;
+        let file: TreeFile = serde_json::from_slice(&bytes)
+            .map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))?;
+        file.check(path)?;
+        Ok(file)
+    }
+
+    /// The tree at a fraction (0 to 1) of its beat, between the stored phases on straight lines; the beat closes.
+    pub fn at(&self, fraction: f64) -> Tree {
+        let stored = self.points_mm.len();
+        let x = fraction * stored as f64;
+        let (a, b) = (x as usize % stored, (x as usize + 1) % stored);
+        let point = |i: usize| {
+            let (from, to) = (DVec3::from_array(self.points_mm[a][i]), DVec3::from_array(self.points_mm[b][i]));
+            let ras = from.lerp(to, x.fract());
+            DVec3::new(-ras.x, -ras.y, ras.z)
+        };
+        let branch = |b: &TreeBranch| {
+            let range = b.first..b.first + b.count;
+            Branch {
+                name: b.name.clone(),
+                points: range.clone().map(point).collect(),
+                radius_mm: self.radius_mm[range].to_vec(),
+                filling: vec![1.0; b.count],
+            }
+        };
+        Tree { branches: self.branches.iter().map(branch).collect() }
+    }
+
     fn check(&self, path: &Path) -> Result<()> {
         let n = self.radius_mm.len();
         if self.points_mm.is_empty() || self.branches.is_empty() {
@@ -337,11 +359,12 @@ mod tests {
     #[test]
     fn the_beat_closes_and_moves() {
         assert!(contraction(0.0) < 1e-12 && (contraction(0.35) - 1.0).abs() < 1e-12 && contraction(0.8) < 1e-12);
-        let tree = Tree::procedural(&Heart::new(DVec3::ZERO, 1.0), 1.0, 10, 1);
+        let at = |fraction| Tree::procedural(&Heart::new(DVec3::ZERO, 1.0), 1.0, fraction, 1);
+        let (begin, systole) = (at(0.0), at(0.3));
         // Measured coronary motion: a few mm at the apex to 15 mm at the base.
-        for branch in &tree.branches {
-            let moved = branch.points[0].iter().zip(&branch.points[3]).map(|(a, b)| a.distance(*b));
-            let mean = moved.sum::<f64>() / branch.points[0].len() as f64;
+        for (branch, later) in begin.branches.iter().zip(&systole.branches) {
+            let moved = branch.points.iter().zip(&later.points).map(|(a, b)| a.distance(*b));
+            let mean = moved.sum::<f64>() / branch.points.len() as f64;
             println!("{} {mean:.1} mm", branch.name);
             assert!((3.0..16.0).contains(&mean), "{} moves {mean} mm", branch.name);
         }
@@ -349,15 +372,21 @@ mod tests {
 
     #[test]
     fn branches_are_attached() {
-        let tree = Tree::procedural(&Heart::new(DVec3::ZERO, 1.0), 1.0, 4, 3);
-        let by_name = |n: &str| tree.branches.iter().find(|b| b.name == n).unwrap();
-        for (child, parent) in
-            [("LAD", "LM"), ("LCx", "LM"), ("D1", "LAD"), ("D2", "LAD"), ("OM1", "LCx"), ("OM2", "LCx"), ("S1", "LAD")]
-        {
-            for phase in 0..4 {
-                let start = by_name(child).points[phase][0];
-                let gap = by_name(parent).points[phase].iter().map(|p| p.distance(start)).fold(f64::MAX, f64::min);
-                assert!(gap < 3.5, "{child} starts {gap} mm from {parent} at phase {phase}");
+        for fraction in [0.0, 0.25, 0.5, 0.75] {
+            let tree = Tree::procedural(&Heart::new(DVec3::ZERO, 1.0), 1.0, fraction, 3);
+            let by_name = |n: &str| tree.branches.iter().find(|b| b.name == n).unwrap();
+            for (child, parent) in [
+                ("LAD", "LM"),
+                ("LCx", "LM"),
+                ("D1", "LAD"),
+                ("D2", "LAD"),
+                ("OM1", "LCx"),
+                ("OM2", "LCx"),
+                ("S1", "LAD"),
+            ] {
+                let start = by_name(child).points[0];
+                let gap = by_name(parent).points.iter().map(|p| p.distance(start)).fold(f64::MAX, f64::min);
+                assert!(gap < 3.5, "{child} starts {gap} mm from {parent} at {fraction} of the beat");
             }
         }
     }

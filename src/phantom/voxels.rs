@@ -1,7 +1,7 @@
 //! Attenuation volumes: the procedural thorax, a real CT, and vessels drawn into voxels.
 
 use crate::formats::volume::Volume;
-use crate::phantom::tree::{Heart, Tree};
+use crate::phantom::tree::{Bounds, Heart, Tree};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -82,11 +82,21 @@ pub fn thorax(tissues: Tissues, heart_mm: DVec3, scale: f64, centre_mm: DVec3, h
     })
 }
 
+/// Where breathing has carried parts of the chest, LPS mm.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Breath {
+    /// The heart, its vessels included.
+    pub heart_mm: DVec3,
+    /// The diaphragm and what lies on it.
+    pub chest_mm: DVec3,
+}
+
 /// What moves against [`thorax`]: heart and diaphragm displace lung. `squeeze` is the heart's contraction.
 pub fn heart_and_diaphragm(
     tissues: Tissues,
     heart: &Heart,
     squeeze: f64,
+    breath: Breath,
     heart_mm: DVec3,
     scale: f64,
     still: &Volume,
@@ -98,11 +108,44 @@ pub fn heart_and_diaphragm(
         for (x, v) in values.iter_mut().enumerate() {
             let here = f64::from(still.values[row * nx + x]);
             let lps = to_lps.transform_point3(DVec3::new(x as f64, y as f64, z as f64));
-            let p = (lps - heart_mm) / scale + DVec3::new(25.0, -25.0, 0.0);
+            let p = (lps - breath.chest_mm - heart_mm) / scale + DVec3::new(25.0, -25.0, 0.0);
             let dome = p.z + 62.0 + 0.0022 * (p.x.abs() - 70.0).powi(2);
-            let solid = heart.contains(lps, squeeze) || dome < 0.0;
+            let solid = heart.contains(lps - breath.heart_mm, squeeze) || dome < 0.0;
             if solid && here > 0.0 && here < tissues.soft {
                 *v = (tissues.soft - here) as f32;
+            }
+        }
+    });
+    volume
+}
+
+/// Height over which the movement of breathing fades, from the diaphragm (below) to the upper chest, mm above the isocentre.
+const BREATHING_HEIGHT_MM: std::ops::Range<f64> = -40.0..40.0;
+/// Depth over which it fades, from the heart to the spine and the back, mm behind the isocentre.
+const BREATHING_DEPTH_MM: std::ops::Range<f64> = 20.0..60.0;
+
+/// Smooth step from 1 below a range to 0 above it.
+fn fading(x: f64, range: &std::ops::Range<f64>) -> f64 {
+    let t = ((x - range.start) / (range.end - range.start)).clamp(0.0, 1.0);
+    1.0 - t * t * (3.0 - 2.0 * t)
+}
+
+/// A chest around the isocentre whose lower part breathing has carried by `chest_mm` (LPS): all of it from 40 mm below the
+/// isocentre, nothing from 40 mm above, and nothing of what lies 60 mm behind, smoothly in between.
+pub fn breathing_chest(chest: &Volume, chest_mm: DVec3) -> Volume {
+    if chest_mm == DVec3::ZERO {
+        return chest.clone();
+    }
+    let to_index = chest.index_to_lps.inverse();
+    let [nx, ny, _] = chest.size;
+    let mut volume = chest.clone();
+    volume.values.par_chunks_mut(nx).enumerate().for_each(|(row, values)| {
+        let (y, z) = (row % ny, row / ny);
+        for (x, v) in values.iter_mut().enumerate() {
+            let lps = chest.index_to_lps.transform_point3(DVec3::new(x as f64, y as f64, z as f64));
+            let carried = fading(lps.z, &BREATHING_HEIGHT_MM) * fading(lps.y, &BREATHING_DEPTH_MM);
+            if carried > 0.0 {
+                *v = chest.interpolated(to_index.transform_point3(lps - chest_mm * carried));
             }
         }
     });
@@ -116,14 +159,13 @@ pub fn attenuation_from_hounsfield(volume: &mut Volume) {
     }
 }
 
-/// Draws one phase of a tree into voxels: attenuation times filling inside, antialiased at the wall.
-pub fn vessels(tree: &Tree, phase: usize, attenuation: f64, spacing_mm: f64) -> Volume {
-    let (low, high) = tree.bounds_mm();
-    let (low, high) = (low - 2.0 * spacing_mm, high + 2.0 * spacing_mm);
+/// Draws a tree into voxels of a box: attenuation times filling inside, antialiased at the wall.
+pub fn vessels(tree: &Tree, bounds: Bounds, attenuation: f64, spacing_mm: f64) -> Volume {
+    let (low, high) = (bounds.low_mm - 2.0 * spacing_mm, bounds.high_mm + 2.0 * spacing_mm);
     let size = ((high - low) / spacing_mm).ceil().as_usizevec3().to_array().map(|n| n + 1);
     let mut values = vec![0f32; size.iter().product()];
     for branch in &tree.branches {
-        let points = &branch.points[phase];
+        let points = &branch.points;
         for i in 0..points.len().saturating_sub(1) {
             let ends = [(points[i] - low) / spacing_mm, (points[i + 1] - low) / spacing_mm];
             let radii = [branch.radius_mm[i] / spacing_mm, branch.radius_mm[i + 1] / spacing_mm];
@@ -177,14 +219,34 @@ mod tests {
     use super::*;
 
     #[test]
+    fn breathing_carries_the_lower_chest_and_leaves_the_rest() {
+        let n = 40;
+        let flat = Volume::centred([n; 3], 5.0, DVec3::ZERO, vec![0.0; n * n * n]);
+        // Values tell where they come from: the height.
+        let height = |i: usize| flat.index_to_lps.transform_point3(DVec3::new(0.0, 0.0, (i / (n * n)) as f64)).z;
+        let chest = Volume { values: (0..n * n * n).map(|i| height(i) as f32).collect(), ..flat.clone() };
+        let breathed = breathing_chest(&chest, DVec3::new(0.0, 0.0, 3.0));
+        let moved = |lps: DVec3| {
+            let at = flat.index_to_lps.inverse().transform_point3(lps);
+            chest.interpolated(at) - breathed.interpolated(at)
+        };
+        assert!((moved(DVec3::new(10.0, -20.0, -60.0)) - 3.0).abs() < 1e-4, "the diaphragm goes along");
+        let half = moved(DVec3::new(10.0, -20.0, 0.0));
+        assert!((half - 1.5).abs() < 0.1, "the middle goes half the way: {half}");
+        assert_eq!(moved(DVec3::new(10.0, -20.0, 60.0)), 0.0, "the upper chest stays");
+        assert_eq!(moved(DVec3::new(10.0, 80.0, -60.0)), 0.0, "the spine stays");
+    }
+
+    #[test]
     fn a_straight_vessel_has_the_right_amount_of_contrast() {
         let branch = super::super::tree::Branch {
             name: "v".into(),
-            points: vec![vec![DVec3::new(-10.0, 0.3, 0.1), DVec3::new(10.0, -0.2, 0.4)]],
+            points: vec![DVec3::new(-10.0, 0.3, 0.1), DVec3::new(10.0, -0.2, 0.4)],
             radius_mm: vec![1.5, 1.5],
             filling: vec![1.0, 1.0],
         };
-        let volume = vessels(&Tree { branches: vec![branch] }, 0, 0.1, 0.25);
+        let tree = Tree { branches: vec![branch] };
+        let volume = vessels(&tree, tree.bounds(), 0.1, 0.25);
         let total: f64 = volume.values.iter().map(|v| f64::from(*v)).sum::<f64>() * 0.25f64.powi(3);
         let length = DVec3::new(20.0, -0.5, 0.3).length();
         let exact =

@@ -83,7 +83,7 @@ impl<'a> Writer<'a> {
         })
     }
 
-    /// Writes a frame's image and mask.
+    /// Writes a frame's image and mask; the image's file, relative to the dataset.
     ///
     /// # Errors
     /// [`Error::Config`] for a geometry the authors' layout cannot state; [`Error::Io`].
@@ -95,7 +95,7 @@ impl<'a> Writer<'a> {
         phase: u32,
         integrals: &[f32],
         mask: Option<&[bool]>,
-    ) -> Result<()> {
+    ) -> Result<PathBuf> {
         let kind = if split == Split::Train { "train" } else { "test" };
         let name = format!("{kind}-view{view}-phase{phase:02}");
         let seen = self.names.entry(name.clone()).or_default();
@@ -112,13 +112,14 @@ impl<'a> Writer<'a> {
                     png::write_grey16(&self.out.join(&mask_file), width, height, codes)?;
                 }
                 self.manifest.frames.push(ManifestFrame {
-                    image,
+                    image: image.clone(),
                     phase,
                     split,
                     geometry: geometry.clone(),
                     intensity: Intensity::Integral { scale: 1.0, offset: 0.0 },
                     mask: mask.map(|_| mask_file),
                 });
+                Ok(image)
             }
             Layout::Nerfca => {
                 let values: Vec<f32> = integrals.iter().map(|y| (I0_LOG - f64::from(*y)) as f32).collect();
@@ -135,7 +136,7 @@ impl<'a> Writer<'a> {
                 }
                 let (theta, phi) = self.authors_angles(geometry)?;
                 self.lists[usize::from(split == Split::Validation)].push(nerfca::FrameEntry {
-                    file_path: image,
+                    file_path: image.clone(),
                     img_min_max: [f64::from(low), f64::from(high).max(f64::from(low) + 1e-12)],
                     mask_file_path: mask.map(|_| mask_file),
                     weighted_file_path: None,
@@ -144,9 +145,9 @@ impl<'a> Writer<'a> {
                     phi,
                     larm: 0.0,
                 });
+                Ok(PathBuf::from(image))
             }
         }
-        Ok(())
     }
 
     /// Angles of a geometry that differs from the common one by nothing else.

@@ -6,6 +6,7 @@ use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
+use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::random::{STREAM_PHOTON, normal};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
@@ -128,8 +129,7 @@ pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset 
         phases: 10,
         views: ViewAngles::published(views).unwrap(),
         seed: 1,
-        photons: None,
-        respiration_mm: 0.0,
+        degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,
         volumes: true,

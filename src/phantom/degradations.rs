@@ -1,0 +1,241 @@
+//! What a cath lab's angiograms have and a perfect phantom's lack: options, and the numbers drawn for them.
+//!
+//! Training views alone are degraded; validation views show the heart where the others have it on average, from where the
+//! dataset says.
+
+use crate::error::{Error, Result};
+use crate::geometry::CArm;
+use crate::phantom::noise::Photons;
+use crate::random::{STREAM_ACQUISITION, normal, uniform01};
+use crate::scan::dataset::Layout;
+use crate::scan::gating::BeatScaling;
+
+/// Length of a breath at rest, seconds.
+pub const USUAL_BREATH_S: f64 = 4.0;
+/// Largest share of the vessels that may be cut off.
+const LARGEST_CUT: f64 = 0.9;
+
+/// What is done to the training views; nothing by default.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Degradations {
+    /// Errors of the geometry that the dataset states; images are made with the true one.
+    pub geometry_error: Option<GeometryError>,
+    /// Breathing during and between runs.
+    pub breathing: Option<Breathing>,
+    /// Photon noise, of validation views too; none without.
+    pub photons: Option<Photons>,
+    /// Standard deviation of a run's contrast density as a share of it; within a run it drifts half as much.
+    pub contrast_variation: f64,
+    /// Hearts that beat at rates of their own, seen at a frame rate.
+    pub rhythm: Option<Rhythm>,
+    /// Share of the moving vessels that blades hide in each view, 0 to 0.9.
+    pub collimated_share: f64,
+    /// A catheter in the aorta, its tip in the ostium.
+    pub catheter: bool,
+}
+
+/// Standard deviations of the errors of a stated geometry.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GeometryError {
+    /// Of primary and secondary angle, degrees.
+    pub angle_deg: f64,
+    /// Of the patient's position along each axis, mm.
+    pub position_mm: f64,
+}
+
+/// A breathing patient.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Breathing {
+    /// The heart's way along the body, peak to peak, mm.
+    pub peak_to_peak_mm: f64,
+    /// Length of a breath, seconds.
+    pub period_s: f64,
+    /// Diaphragm and lower chest breathe, too.
+    pub background: bool,
+}
+
+/// When images are taken, and how they get their phases.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rhythm {
+    /// Beats per minute: one for all training views, or one for each.
+    pub beats_per_min: Vec<f64>,
+    /// Images per second.
+    pub frames_per_s: f64,
+    /// Length of a run, beats.
+    pub beats: u32,
+    /// How time becomes phase.
+    pub gating: BeatScaling,
+}
+
+fn within(field: &str, value: f64, accepted: std::ops::RangeInclusive<f64>, unit: &str) -> Result<()> {
+    match accepted.contains(&value) {
+        true => Ok(()),
+        false => {
+            let problem = format!("{} to {}{unit} is accepted", accepted.start(), accepted.end());
+            Err(Error::config(field, value, problem))
+        }
+    }
+}
+
+impl Degradations {
+    /// Refuses what cannot be done to so many training views in a layout.
+    ///
+    /// # Errors
+    /// [`Error::Config`] naming the field.
+    pub fn check(&self, training_views: usize, layout: Layout) -> Result<()> {
+        if let Some(GeometryError { angle_deg, position_mm }) = self.geometry_error {
+            within("geometry_error.angle_deg", angle_deg, 0.0..=45.0, " degrees")?;
+            within("geometry_error.position_mm", position_mm, 0.0..=100.0, " mm")?;
+            if layout == Layout::Nerfca && position_mm > 0.0 {
+                let problem = "the layout `nerfca` cannot state where the patient lies; 0, or the native layout";
+                return Err(Error::config("geometry_error.position_mm", position_mm, problem));
+            }
+        }
+        if let Some(breathing) = self.breathing {
+            within("breathing.peak_to_peak_mm", breathing.peak_to_peak_mm, 0.0..=100.0, " mm")?;
+            within("breathing.period_s", breathing.period_s, 0.5..=60.0, " s")?;
+        }
+        if let Some(photons) = self.photons {
+            let (field, value) = match photons {
+                Photons::Unattenuated(value) => ("photons", value),
+                Photons::Detector(value) => ("detector_photons", value),
+            };
+            within(field, value, 1.0..=1e15, "")?;
+        }
+        within("contrast_variation", self.contrast_variation, 0.0..=1.0, "")?;
+        within("collimated_share", self.collimated_share, 0.0..=LARGEST_CUT, "")?;
+        self.rhythm.as_ref().map_or(Ok(()), |rhythm| rhythm.check(training_views))
+    }
+}
+
+impl Rhythm {
+    fn check(&self, training_views: usize) -> Result<()> {
+        let rates = self.beats_per_min.len();
+        if rates != 1 && rates != training_views {
+            let problem = format!("rates for {training_views} training views: one or {training_views} are needed");
+            return Err(Error::config("heart_rate", rates, problem));
+        }
+        for rate in &self.beats_per_min {
+            within("heart_rate", *rate, 20.0..=300.0, " beats per minute")?;
+        }
+        within("frames_per_s", self.frames_per_s, 0.1..=1000.0, " per second")?;
+        within("beats", f64::from(self.beats), 1.0..=100.0, "")
+    }
+}
+
+/// What is drawn at random for a run.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Draw {
+    Geometry,
+    Breath,
+    RunStart,
+    Systole,
+    Contrast,
+    ContrastCourse,
+    Blade,
+}
+
+/// The random numbers of one training view; each [`Draw`] has its own, so that one degradation changes no other.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Chance {
+    pub(super) seed: u32,
+    pub(super) view: u32,
+}
+
+impl Chance {
+    /// Uniform in [0, 1).
+    pub(super) fn uniform(self, draw: Draw) -> f64 {
+        uniform01(self.seed, STREAM_ACQUISITION, draw as u32, self.view)
+    }
+
+    /// Standard normal; number `index` of a draw.
+    fn normal_at(self, draw: Draw, index: u32) -> f64 {
+        normal(self.seed, STREAM_ACQUISITION, index << 16 | draw as u32, self.view)
+    }
+
+    /// Standard normal.
+    pub(super) fn normal(self, draw: Draw) -> f64 {
+        self.normal_at(draw, 0)
+    }
+}
+
+impl GeometryError {
+    /// What the dataset states of a C-arm.
+    pub(super) fn stated(self, truth: &CArm, chance: Chance) -> CArm {
+        let error = |index| chance.normal_at(Draw::Geometry, index);
+        CArm {
+            primary_deg: truth.primary_deg + self.angle_deg * error(0),
+            secondary_deg: truth.secondary_deg + self.angle_deg * error(1),
+            table_mm: std::array::from_fn(|axis| truth.table_mm[axis] + self.position_mm * error(2 + axis as u32)),
+            ..truth.clone()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_done_is_named() {
+        let none = Degradations::default();
+        assert!(none.check(4, Layout::Native).is_ok());
+        let rhythm = |beats_per_min: &[f64], frames_per_s| {
+            let gating = BeatScaling::Linear;
+            Some(Rhythm { beats_per_min: beats_per_min.to_vec(), frames_per_s, beats: 3, gating })
+        };
+        let error = |angle_deg, position_mm| Some(GeometryError { angle_deg, position_mm });
+        let breathing = |peak_to_peak_mm, period_s| Some(Breathing { peak_to_peak_mm, period_s, background: false });
+        let refused = [
+            (Degradations { geometry_error: error(-0.1, 0.0), ..none.clone() }, "angle_deg = -0.1"),
+            (Degradations { geometry_error: error(0.0, f64::NAN), ..none.clone() }, "position_mm = NaN"),
+            (Degradations { breathing: breathing(-1.0, 4.0), ..none.clone() }, "peak_to_peak_mm = -1"),
+            (Degradations { breathing: breathing(1.0, 0.0), ..none.clone() }, "period_s = 0"),
+            (Degradations { photons: Some(Photons::Unattenuated(0.0)), ..none.clone() }, "photons = 0"),
+            (Degradations { photons: Some(Photons::Detector(f64::NAN)), ..none.clone() }, "detector_photons = NaN"),
+            (Degradations { contrast_variation: f64::INFINITY, ..none.clone() }, "contrast_variation = inf"),
+            (Degradations { collimated_share: 1.0, ..none.clone() }, "collimated_share = 1"),
+            (Degradations { rhythm: rhythm(&[60.0, 70.0], 15.0), ..none.clone() }, "one or 4"),
+            (Degradations { rhythm: rhythm(&[], 15.0), ..none.clone() }, "one or 4"),
+            (Degradations { rhythm: rhythm(&[10.0], 15.0), ..none.clone() }, "heart_rate = 10"),
+            (Degradations { rhythm: rhythm(&[60.0], 0.0), ..none.clone() }, "frames_per_s = 0"),
+        ];
+        for (degradations, part) in refused {
+            let message = degradations.check(4, Layout::Native).unwrap_err().to_string();
+            assert!(message.contains(part), "`{message}` does not say `{part}`");
+        }
+        let shifted = Degradations { geometry_error: error(0.5, 1.0), ..none };
+        assert!(shifted.check(4, Layout::Native).is_ok());
+        assert!(shifted.check(4, Layout::Nerfca).unwrap_err().to_string().contains("native"));
+    }
+
+    #[test]
+    fn errors_of_geometry_have_the_deviation_asked_for() {
+        let truth = CArm {
+            primary_deg: -30.0,
+            secondary_deg: 30.0,
+            sid_mm: 1100.0,
+            sod_mm: 750.0,
+            pixel_mm: [1.0; 2],
+            offset_mm: [0.0; 2],
+            table_mm: [1.0, 2.0, 3.0],
+        };
+        let error = GeometryError { angle_deg: 0.5, position_mm: 2.0 };
+        let stated: Vec<CArm> = (0..2000).map(|view| error.stated(&truth, Chance { seed: 3, view })).collect();
+        let spread = |of: &dyn Fn(&CArm) -> f64| {
+            let n = stated.len() as f64;
+            let mean = stated.iter().map(of).sum::<f64>() / n;
+            (mean, (stated.iter().map(|c| (of(c) - mean).powi(2)).sum::<f64>() / n).sqrt())
+        };
+        let near = |(mean, sd): (f64, f64), true_mean: f64, true_sd: f64| {
+            assert!((mean - true_mean).abs() < 0.1 * true_sd && (sd / true_sd - 1.0).abs() < 0.05, "{mean} +- {sd}");
+        };
+        near(spread(&|c| c.primary_deg), -30.0, 0.5);
+        near(spread(&|c| c.secondary_deg), 30.0, 0.5);
+        for axis in 0..3 {
+            near(spread(&move |c| c.table_mm[axis]), truth.table_mm[axis], 2.0);
+        }
+        let both = stated.iter().map(|c| (c.primary_deg + 30.0) * (c.table_mm[0] - 1.0)).sum::<f64>();
+        assert!(both.abs() < 0.1 * 0.5 * 2.0 * 2000.0, "errors depend on each other: {both}");
+    }
+}

@@ -1,0 +1,169 @@
+//! When the images of each view are taken, and what heart, breath and contrast do at that time.
+
+use crate::phantom::degradations::{Breathing, Chance, Degradations, Draw, Rhythm};
+use crate::phantom::voxels::Breath;
+use crate::scan::dataset::Split;
+use crate::scan::gating::two_segment_fraction;
+use glam::DVec3;
+
+/// Length of a beat where no heart rate is asked for, seconds: phases are its equal parts.
+const USUAL_BEAT_S: f64 = 1.0;
+/// The heart's way while the patient breathes out, per mm along the body, LPS: up and back. Shechter et al., "Respiratory
+/// motion of the heart from free breathing coronary angiograms", IEEE Trans. Med. Imaging 23:1046 (2004): 4.9 mm down and
+/// 1.3 mm to the front while breathing in.
+const BREATH: DVec3 = DVec3::new(0.0, 1.3 / 4.9, 1.0);
+/// End of systole after the R-peak, seconds, between runs: the still point that Shechter and others find.
+const SYSTOLE_S: std::ops::Range<f64> = 0.28..0.34;
+/// Contrast comes and goes within so many seconds.
+const CONTRAST_WAVE_S: f64 = 3.0;
+/// Contrast within a run varies by this share of what it varies between runs.
+const CONTRAST_WITHIN: f64 = 0.5;
+/// Vessels never lose more contrast than down to this share.
+const LEAST_CONTRAST: f64 = 0.1;
+
+/// One image to be taken.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Shot {
+    /// Since the first image of the run.
+    pub(super) time_s: f64,
+    /// Of the beat, 0 to 1: what the heart does.
+    pub(super) fraction: f64,
+    pub(super) breath: Breath,
+    /// Factor on the vessels' contrast.
+    pub(super) contrast_gain: f64,
+}
+
+impl Shot {
+    /// A phase of a heart that keeps to the phases, in held breath.
+    pub(super) fn at_phase(phase: u32, phases: u32) -> Shot {
+        let fraction = f64::from(phase) / f64::from(phases);
+        Shot { time_s: USUAL_BEAT_S * fraction, fraction, breath: Breath::default(), contrast_gain: 1.0 }
+    }
+}
+
+/// The images of a view by phase; `None` where its run has no image near enough.
+pub(super) fn shots(options: &Degradations, seed: u32, view: usize, split: Split, phases: u32) -> Vec<Option<Shot>> {
+    let regular = (0..phases).map(|phase| Some(Shot::at_phase(phase, phases))).collect();
+    if split == Split::Validation {
+        return regular;
+    }
+    let chance = Chance { seed, view: view as u32 };
+    let mut shots = match &options.rhythm {
+        Some(rhythm) => gated(rhythm, chance, phases),
+        None => regular,
+    };
+    for shot in shots.iter_mut().flatten() {
+        shot.breath = options.breathing.map_or_else(Breath::default, |breathing| breathing.at(shot.time_s, chance));
+        if options.contrast_variation > 0.0 {
+            shot.contrast_gain = contrast_gain(options.contrast_variation, shot.time_s, chance);
+        }
+    }
+    shots
+}
+
+/// Of all images of a run, the one nearest to each phase: no farther than half a phase.
+fn gated(rhythm: &Rhythm, chance: Chance, phases: u32) -> Vec<Option<Shot>> {
+    let rates = &rhythm.beats_per_min;
+    let beat_s = 60.0 / rates[chance.view as usize % rates.len()];
+    let systole_s = SYSTOLE_S.start + (SYSTOLE_S.end - SYSTOLE_S.start) * chance.uniform(Draw::Systole);
+    let start_s = beat_s * chance.uniform(Draw::RunStart);
+    let images = (f64::from(rhythm.beats) * beat_s * rhythm.frames_per_s).ceil() as u32;
+    let mut nearest: Vec<Option<(f64, Shot)>> = vec![None; phases as usize];
+    for image in 0..images {
+        let time_s = f64::from(image) / rhythm.frames_per_s;
+        let since_r_s = (start_s + time_s).rem_euclid(beat_s);
+        let stated = f64::from(phases) * rhythm.gating.fraction(since_r_s, beat_s);
+        let distance = (stated - stated.round()).abs();
+        let slot = &mut nearest[stated.round() as usize % phases as usize];
+        if slot.is_none_or(|(best, _)| distance < best) {
+            let fraction = two_segment_fraction(since_r_s, beat_s, systole_s).rem_euclid(1.0);
+            *slot = Some((distance, Shot { time_s, fraction, breath: Breath::default(), contrast_gain: 1.0 }));
+        }
+    }
+    nearest.into_iter().map(|found| found.map(|(_, shot)| shot)).collect()
+}
+
+impl Breathing {
+    /// Where the breath is at a time of a run; each run begins anywhere in it.
+    fn at(self, time_s: f64, chance: Chance) -> Breath {
+        let course = chance.uniform(Draw::Breath) + time_s / self.period_s;
+        let heart_mm = BREATH * (0.5 * self.peak_to_peak_mm * (std::f64::consts::TAU * course).sin());
+        Breath { heart_mm, chest_mm: if self.background { heart_mm } else { DVec3::ZERO } }
+    }
+}
+
+/// Contrast of a run, and its slow wave.
+fn contrast_gain(variation: f64, time_s: f64, chance: Chance) -> f64 {
+    let course = chance.uniform(Draw::ContrastCourse) + time_s / CONTRAST_WAVE_S;
+    let wave = std::f64::consts::SQRT_2 * (std::f64::consts::TAU * course).sin();
+    let gain = 1.0 + variation * (chance.normal(Draw::Contrast) + CONTRAST_WITHIN * wave);
+    gain.max(LEAST_CONTRAST)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scan::gating::BeatScaling;
+
+    const PHASES: u32 = 10;
+
+    fn rhythm(rate: f64, frames_per_s: f64, beats: u32, gating: BeatScaling) -> Rhythm {
+        Rhythm { beats_per_min: vec![rate], frames_per_s, beats, gating }
+    }
+
+    /// How far the true phase of images lies from the one they are given, phases; and how many phases have an image.
+    fn phase_errors(rhythm: &Rhythm) -> (f64, usize) {
+        let (mut worst, mut seen) = (0f64, 0);
+        for view in 0..20 {
+            for (phase, shot) in gated(rhythm, Chance { seed: 1, view }, PHASES).iter().enumerate() {
+                let Some(shot) = shot else { continue };
+                let off = shot.fraction * f64::from(PHASES) - phase as f64;
+                let around = off - f64::from(PHASES) * (off / f64::from(PHASES)).round();
+                worst = worst.max(around.abs());
+                seen += 1;
+            }
+        }
+        (worst, seen)
+    }
+
+    #[test]
+    fn gating_finds_the_phases() {
+        use BeatScaling::{Linear, TwoSegment};
+        // Half a phase of sampling, and what 30 ms of systole are: 30 / 310 of 3.5 phases.
+        for rate in [50.0, 68.0, 100.0] {
+            let (worst, seen) = phase_errors(&rhythm(rate, 30.0, 1, TwoSegment));
+            assert!(worst < 0.9, "{rate} per minute: {worst} phases");
+            assert_eq!(seen, 200, "{rate} per minute");
+        }
+        let slow = |gating| phase_errors(&rhythm(45.0, 1000.0, 1, gating)).0;
+        assert!(slow(TwoSegment) < 0.45 && slow(Linear) > 1.0, "{} {}", slow(TwoSegment), slow(Linear));
+    }
+
+    #[test]
+    fn few_images_leave_phases_out() {
+        let one_beat = phase_errors(&rhythm(80.0, 7.5, 1, BeatScaling::TwoSegment)).1;
+        assert!((100..=120).contains(&one_beat), "6 images a beat: {one_beat} of 200");
+        assert!(phase_errors(&rhythm(80.0, 7.5, 3, BeatScaling::TwoSegment)).1 > 130);
+    }
+
+    #[test]
+    fn breath_and_contrast_have_the_size_asked_for() {
+        let breathing = Breathing { peak_to_peak_mm: 4.0, period_s: 5.0, background: false };
+        let course: Vec<Breath> =
+            (0..500).map(|i| breathing.at(0.01 * f64::from(i), Chance { seed: 1, view: 2 })).collect();
+        let along: Vec<f64> = course.iter().map(|b| b.heart_mm.z).collect();
+        let (low, high) = along.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+        assert!((high - low - 4.0).abs() < 0.01 && (high + low).abs() < 0.01, "{low} to {high}");
+        assert!(course.iter().all(|b| b.chest_mm == DVec3::ZERO));
+        let (mut between, mut within) = (0.0, 0.0);
+        for view in 0..1000 {
+            let gains: Vec<f64> =
+                (0..30).map(|i| contrast_gain(0.1, 0.1 * f64::from(i), Chance { seed: 1, view })).collect();
+            let mean = gains.iter().sum::<f64>() / 30.0;
+            between += (mean - 1.0).powi(2) / 1000.0;
+            within += gains.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / 30e3;
+        }
+        let (between, within) = (between.sqrt(), within.sqrt());
+        assert!((between - 0.1).abs() < 0.01 && (within - 0.05).abs() < 0.005, "{between}, {within}");
+    }
+}

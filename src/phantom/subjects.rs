@@ -1,0 +1,308 @@
+//! What stands before the C-arm: a procedural thorax, a tree in a CT, or a user's volumes.
+
+use crate::error::{Error, Result};
+use crate::formats::nrrd;
+use crate::formats::volume::{Volume, VolumeHints};
+use crate::phantom::catheter;
+use crate::phantom::projector::{LoadedVolume, Projector};
+use crate::phantom::tree::{Bounds, Heart, Tree, TreeFile, contraction};
+use crate::phantom::voxels::{self, Breath, Tissues};
+use glam::DVec3;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// What the values of volumes are.
+const QUANTITY: &str = "attenuation per mm";
+/// Voxels of vessels from a file, mm.
+const VESSEL_VOXEL_MM: f64 = 0.5;
+
+/// What the subject does while an image is taken.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Pose {
+    /// Of the beat, 0 to 1.
+    pub(super) fraction: f64,
+    pub(super) breath: Breath,
+    pub(super) catheter: bool,
+}
+
+impl Pose {
+    /// Where a catheter's tip lay when it took its course, in the resting tree, and where it is now.
+    fn catheter_between(&self, rest: &Tree, now: &Tree) -> Option<[DVec3; 2]> {
+        let tips = self.catheter.then(|| Some([rest.ostium_mm()?, now.ostium_mm()? + self.breath.heart_mm]));
+        tips.flatten()
+    }
+}
+
+/// A volume that breathing has carried away from where it was loaded.
+#[derive(Clone)]
+pub(super) struct Placed {
+    pub(super) volume: Arc<LoadedVolume>,
+    pub(super) shift_mm: DVec3,
+}
+
+impl Placed {
+    pub(super) fn at_rest(volume: LoadedVolume) -> Placed {
+        Placed { volume: Arc::new(volume), shift_mm: DVec3::ZERO }
+    }
+}
+
+/// What moves, at a pose.
+pub(super) struct Moving {
+    pub(super) background: Option<Placed>,
+    pub(super) vessels: Option<Placed>,
+    pub(super) catheter: Option<Placed>,
+}
+
+/// Something to take angiograms of.
+pub(super) trait Subject {
+    /// What does not beat, with the chest where breathing has carried it.
+    fn still(&self, projector: &Projector, chest_mm: DVec3) -> Result<Option<LoadedVolume>>;
+
+    /// What beats.
+    fn moving(&self, projector: &Projector, pose: &Pose) -> Result<Moving>;
+
+    /// The fraction of the beat nearest to another that can be shown.
+    fn nearest_fraction(&self, fraction: f64) -> f64 {
+        fraction
+    }
+
+    /// Writes the voxels of a phase into a directory.
+    fn write_volumes(&self, _directory: &Path, _phase: u32, _fraction: f64) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// A procedural heart in a procedural thorax.
+pub(super) struct Thorax {
+    tissues: Tissues,
+    scale: f64,
+    seed: u32,
+    heart_mm: DVec3,
+    heart: Heart,
+    bounds: Bounds,
+    still: Volume,
+}
+
+impl Thorax {
+    /// A thorax in a cube, its tree's middle at the isocentre, as on a real table.
+    pub(super) fn new(
+        tissues: Tissues,
+        scale: f64,
+        seed: u32,
+        phases: u32,
+        (centre_mm, half_mm): (DVec3, f64),
+    ) -> Thorax {
+        let heart = Heart::new(DVec3::ZERO, scale);
+        let bounds = Bounds::over_the_beat(phases, |fraction| Tree::procedural(&heart, scale, fraction, seed));
+        let heart_mm = -0.5 * (bounds.low_mm + bounds.high_mm);
+        let heart = Heart::new(heart_mm, scale);
+        let bounds = Bounds::over_the_beat(phases, |fraction| Tree::procedural(&heart, scale, fraction, seed));
+        let still = voxels::thorax(tissues, heart_mm, scale, centre_mm, half_mm);
+        Thorax { tissues, scale, seed, heart_mm, heart, bounds, still }
+    }
+
+    fn tree(&self, fraction: f64) -> Tree {
+        Tree::procedural(&self.heart, self.scale, fraction, self.seed)
+    }
+
+    fn vessels(&self, tree: &Tree) -> Volume {
+        voxels::vessels(tree, self.bounds.joined(tree.bounds()), self.tissues.vessel, self.vessel_voxel_mm())
+    }
+
+    fn vessel_voxel_mm(&self) -> f64 {
+        0.4 * self.scale
+    }
+
+    fn background(&self, fraction: f64, breath: Breath) -> Volume {
+        let squeeze = contraction(fraction);
+        voxels::heart_and_diaphragm(self.tissues, &self.heart, squeeze, breath, self.heart_mm, self.scale, &self.still)
+    }
+}
+
+impl Subject for Thorax {
+    fn still(&self, projector: &Projector, _chest_mm: DVec3) -> Result<Option<LoadedVolume>> {
+        projector.load(self.still.clone()).map(Some)
+    }
+
+    fn moving(&self, projector: &Projector, pose: &Pose) -> Result<Moving> {
+        let tree = self.tree(pose.fraction);
+        let catheter = pose
+            .catheter_between(&self.tree(0.0), &tree)
+            .map(|[rest, tip]| catheter::volume(tip, rest, self.scale, self.tissues.vessel, self.vessel_voxel_mm()));
+        Ok(Moving {
+            background: Some(Placed::at_rest(projector.load(self.background(pose.fraction, pose.breath))?)),
+            vessels: Some(Placed {
+                volume: Arc::new(projector.load(self.vessels(&tree))?),
+                shift_mm: pose.breath.heart_mm,
+            }),
+            catheter: catheter.map(|volume| projector.load(volume)).transpose()?.map(Placed::at_rest),
+        })
+    }
+
+    fn write_volumes(&self, directory: &Path, phase: u32, fraction: f64) -> Result<()> {
+        write_vessels(directory, phase, &self.vessels(&self.tree(fraction)))?;
+        let moving = self.background(fraction, Breath::default());
+        let values = self.still.values.iter().zip(&moving.values).map(|(a, b)| a + b).collect();
+        let sum = Volume { values, ..moving };
+        nrrd::write(&directory.join(format!("background-{phase:02}.nrrd")), &sum, QUANTITY)
+    }
+}
+
+fn write_vessels(directory: &Path, phase: u32, vessels: &Volume) -> Result<()> {
+    nrrd::write(&directory.join(format!("vessels-{phase:02}.nrrd")), vessels, QUANTITY)
+}
+
+/// A tree from a file, in a CT where there is one.
+pub(super) struct Patient {
+    tree: TreeFile,
+    bounds: Bounds,
+    vessel_per_mm: f64,
+    still: Option<Volume>,
+}
+
+impl Patient {
+    pub(super) fn read(tree: &Path, background: Option<&Path>, vessel_per_mm: f64, phases: u32) -> Result<Patient> {
+        let tree = TreeFile::read(tree)?;
+        let bounds = Bounds::over_the_beat(phases, |fraction| tree.at(fraction));
+        let still = background.map(|path| Volume::read(path, &VolumeHints::default())).transpose()?;
+        let still = still.map(|mut volume| {
+            voxels::attenuation_from_hounsfield(&mut volume);
+            volume
+        });
+        Ok(Patient { tree, bounds, vessel_per_mm, still })
+    }
+
+    /// Largest distance from the isocentre that attenuates, where there is a CT.
+    pub(super) fn axial_radius_mm(&self) -> Option<f64> {
+        self.still.as_ref().map(Volume::axial_radius_mm)
+    }
+
+    fn vessels(&self, tree: &Tree) -> Volume {
+        voxels::vessels(tree, self.bounds.joined(tree.bounds()), self.vessel_per_mm, VESSEL_VOXEL_MM)
+    }
+}
+
+impl Subject for Patient {
+    fn still(&self, projector: &Projector, chest_mm: DVec3) -> Result<Option<LoadedVolume>> {
+        self.still.as_ref().map(|volume| projector.load(voxels::breathing_chest(volume, chest_mm))).transpose()
+    }
+
+    fn moving(&self, projector: &Projector, pose: &Pose) -> Result<Moving> {
+        let tree = self.tree.at(pose.fraction);
+        let catheter = pose
+            .catheter_between(&self.tree.at(0.0), &tree)
+            .map(|[rest, tip]| catheter::volume(tip, rest, 1.0, self.vessel_per_mm, VESSEL_VOXEL_MM));
+        Ok(Moving {
+            background: None,
+            vessels: Some(Placed {
+                volume: Arc::new(projector.load(self.vessels(&tree))?),
+                shift_mm: pose.breath.heart_mm,
+            }),
+            catheter: catheter.map(|volume| projector.load(volume)).transpose()?.map(Placed::at_rest),
+        })
+    }
+
+    fn write_volumes(&self, directory: &Path, phase: u32, fraction: f64) -> Result<()> {
+        write_vessels(directory, phase, &self.vessels(&self.tree.at(fraction)))
+    }
+}
+
+/// How the volumes of a user are read.
+pub(super) struct Reading<'a> {
+    pub(super) paths: &'a [PathBuf],
+    pub(super) hints: &'a VolumeHints,
+    pub(super) hounsfield: bool,
+    pub(super) scale: f32,
+    /// Attenuation from which a voxel is vessel.
+    pub(super) vessel_per_mm: Option<f64>,
+}
+
+impl Reading<'_> {
+    fn volume(&self, path: &Path) -> Result<Volume> {
+        let mut volume = Volume::read(path, self.hints)?;
+        volume.values.iter_mut().for_each(|v| *v *= self.scale);
+        if self.hounsfield {
+            voxels::attenuation_from_hounsfield(&mut volume);
+        }
+        Ok(volume)
+    }
+
+    /// What never changes over the volumes: each voxel's smallest attenuation.
+    fn minimum(&self) -> Result<Option<Volume>> {
+        let mut paths = self.paths.iter();
+        let (Some(first), 2..) = (paths.next(), self.paths.len()) else {
+            return Ok(None);
+        };
+        let mut least = self.volume(first)?;
+        for path in paths {
+            let volume = self.volume(path)?;
+            if volume.size != least.size || volume.index_to_lps != least.index_to_lps {
+                let problem = "differs from the first volume's; breathing needs volumes of one grid, to tell the heart \
+                               from what stands still";
+                return Err(Error::data(path, "grid", problem));
+            }
+            least.values.iter_mut().zip(&volume.values).for_each(|(a, b)| *a = a.min(*b));
+        }
+        Ok(Some(least))
+    }
+}
+
+/// A user's volumes, one per phase.
+pub(super) struct Volumes {
+    /// What all volumes have in common, where it is told apart from what beats.
+    still: Option<Volume>,
+    moving: Vec<(Arc<LoadedVolume>, Option<Arc<LoadedVolume>>)>,
+    radius_mm: f64,
+}
+
+impl Volumes {
+    /// Reads all volumes. `breathing` tells what beats from what stands still.
+    pub(super) fn read(
+        projector: &Projector,
+        reading: &Reading<'_>,
+        breathing: bool,
+        mut progress: impl FnMut(u64),
+    ) -> Result<Volumes> {
+        let still = if breathing { reading.minimum()? } else { None };
+        let (mut moving, mut radius_mm) = (Vec::new(), 0f64);
+        for (index, path) in reading.paths.iter().enumerate() {
+            progress(index as u64);
+            let mut volume = reading.volume(path)?;
+            radius_mm = radius_mm.max(volume.axial_radius_mm());
+            let vessels = reading.vessel_per_mm.map(|threshold| Volume {
+                values: volume.values.iter().map(|v| if f64::from(*v) >= threshold { *v } else { 0.0 }).collect(),
+                ..volume.clone()
+            });
+            let vessels = vessels.map(|v| projector.load(v)).transpose()?.map(Arc::new);
+            if let Some(still) = &still {
+                volume.values.iter_mut().zip(&still.values).for_each(|(v, least)| *v -= least);
+            }
+            moving.push((Arc::new(projector.load(volume)?), vessels));
+        }
+        Ok(Volumes { still, moving, radius_mm })
+    }
+
+    pub(super) fn axial_radius_mm(&self) -> f64 {
+        self.radius_mm
+    }
+
+    fn index(&self, fraction: f64) -> usize {
+        (fraction * self.moving.len() as f64).round() as usize % self.moving.len()
+    }
+}
+
+impl Subject for Volumes {
+    fn still(&self, projector: &Projector, chest_mm: DVec3) -> Result<Option<LoadedVolume>> {
+        self.still.as_ref().map(|volume| projector.load(voxels::breathing_chest(volume, chest_mm))).transpose()
+    }
+
+    fn moving(&self, _projector: &Projector, pose: &Pose) -> Result<Moving> {
+        let (volume, vessels) = &self.moving[self.index(pose.fraction)];
+        let placed = |volume: &Arc<LoadedVolume>| Placed { volume: volume.clone(), shift_mm: pose.breath.heart_mm };
+        Ok(Moving { background: Some(placed(volume)), vessels: vessels.as_ref().map(placed), catheter: None })
+    }
+
+    fn nearest_fraction(&self, fraction: f64) -> f64 {
+        self.index(fraction) as f64 / self.moving.len() as f64
+    }
+}

@@ -1,0 +1,99 @@
+//! `truth.json` beside a synthetic dataset: how each image was really taken (see `docs/formats.md`).
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::geometry::CArm;
+use crate::scan::dataset::Split;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Name of the file inside a dataset.
+pub const TRUTH: &str = "truth.json";
+const FORMAT: &str = "nertca-truth";
+const VERSION: u32 = 1;
+const MAX_BYTES: u64 = 256 << 20;
+
+/// How the images of a synthetic dataset were really taken.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Truth {
+    /// Always `nertca-truth`.
+    format: String,
+    /// Version of this layout: 1.
+    version: u32,
+    /// Seed that all random numbers come from.
+    pub seed: u32,
+    /// Number of cardiac phases T.
+    pub phases: u32,
+    /// One per image, in the order of the dataset's.
+    pub frames: Vec<TrueFrame>,
+}
+
+/// How one image was really taken.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrueFrame {
+    /// Image file, as the dataset names it.
+    pub image: PathBuf,
+    /// View, from 0: those of training first.
+    pub view: usize,
+    /// Training or validation.
+    pub split: Split,
+    /// Phase that the dataset states, from 0.
+    pub phase: u32,
+    /// C-arm that the image was made with; the dataset may state another.
+    pub geometry: CArm,
+    /// Where breathing had carried the heart from its mean position, mm along (posterior, left, superior): a point of
+    /// the heart at x is seen as if it were at x plus this.
+    pub heart_shift_mm: [f64; 3],
+    /// What the heart really did, 0 to T: a stated phase without its errors.
+    pub beat_phase: f64,
+    /// Time since the first image of the run, seconds.
+    pub time_s: f64,
+    /// Factor on the contrast of the vessels.
+    pub contrast_gain: f64,
+    /// Share of the view's moving vessels that a blade hides, all phases taken together.
+    pub cut_share: f64,
+}
+
+impl Truth {
+    pub(super) fn new(seed: u32, phases: u32) -> Truth {
+        Truth { format: FORMAT.to_owned(), version: VERSION, seed, phases, frames: Vec::new() }
+    }
+
+    /// Reads the truth beside a dataset in a directory.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where there is none, [`Error::Data`] for a file of another kind.
+    pub fn load(dataset: &Path) -> Result<Truth> {
+        let file = dataset.join(TRUTH);
+        let truth: Truth = serde_json::from_slice(&files::read_limited(&file, MAX_BYTES)?)
+            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
+        if truth.format != FORMAT || truth.version != VERSION {
+            let found = format!("`{}` version {}; expected `{FORMAT}` version {VERSION}", truth.format, truth.version);
+            return Err(Error::data(&file, "format", found));
+        }
+        Ok(truth)
+    }
+
+    pub(super) fn write(&self, dataset: &Path) -> Result<()> {
+        files::write_atomic(&dataset.join(TRUTH), files::pretty_json(self)?.as_bytes())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn other_files_are_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        assert!(matches!(Truth::load(directory.path()), Err(Error::Io { .. })));
+        let mut truth = Truth::new(7, 10);
+        truth.write(directory.path()).unwrap();
+        assert_eq!(Truth::load(directory.path()).unwrap(), truth);
+        truth.version = 2;
+        truth.write(directory.path()).unwrap();
+        assert!(Truth::load(directory.path()).unwrap_err().to_string().contains("version 2"));
+    }
+}
