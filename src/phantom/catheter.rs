@@ -27,7 +27,7 @@ const STEPS: usize = 120;
 pub(super) fn volume(tip_mm: DVec3, rest_mm: DVec3, scale: f64, vessel_per_mm: f64, spacing_mm: f64) -> Volume {
     let point = |step: usize| {
         let along = step as f64 / STEPS as f64;
-        let carried = (tip_mm - rest_mm) * (1.0 - along).powi(2);
+        let carried = (tip_mm - rest_mm) * (1.0 - along).powi(3);
         rest_mm + DVec3::from_array(spline(COURSE, along)) * scale + carried
     };
     let branch = Branch {

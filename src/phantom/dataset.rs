@@ -183,6 +183,9 @@ pub fn project_volumes(
         return Err(Error::config("vessel_per_mm", options.vessel_per_mm.unwrap_or_default(), "must be positive"));
     }
     check_vessels(&options.degradations, options.vessel_per_mm)?;
+    if options.volumes.is_empty() {
+        return Err(Error::config("volumes", 0, "at least one is needed, for one phase"));
+    }
     let c_arms = options.c_arms.c_arms(&options.views, options.size)?;
     let projector = Projector::new(gpu, options.size, options.size)?;
     let total = options.volumes.len() as u64;
