@@ -64,7 +64,7 @@ const SHORT: &[&str] = &[
 #[test]
 fn a_whole_life() {
     let directory = tempfile::tempdir().unwrap();
-    let data = phantom(directory.path(), &["--photons", "1e9", "--breathing", "0.2"]);
+    let data = phantom(directory.path(), &["--photons", "1e9", "--breathing", "0.2", "--geometry-error", "0.01,0.01"]);
     let run = directory.path().join("run");
     let lines = ok(&[&["train", text(&data), "-o", text(&run), "--json", "--stop-at", "20"], SHORT].concat());
     let events: Vec<Value> = lines.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
@@ -155,6 +155,34 @@ fn renders_show_the_fields(directory: &Path, run: &Path) {
         let grey: Vec<u8> = frame.buffer().pixels().map(|p| p.0[0]).collect();
         assert!(grey.iter().max().unwrap() - grey.iter().min().unwrap() > 100, "a frame shows nothing");
     }
+}
+
+#[test]
+fn degradations_that_cannot_be_are_named() {
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("none");
+    let refused = |extra: &[&str], parts: &[&str]| {
+        fails(&[&["phantom", text(&out), "--size", "24", "--views", "3"], extra].concat(), 2, parts);
+        assert!(!out.exists(), "{extra:?} leaves something behind");
+    };
+    refused(&["--geometry-error", "0.5"], &["--geometry-error", "DEG,MM"]);
+    refused(&["--geometry-error", "-0.5,1"], &["angle_deg = -0.5"]);
+    refused(&["--geometry-error", "0.5,NaN"], &["position_mm = NaN"]);
+    refused(&["--geometry-error", "0.5,1", "--layout", "nerfca"], &["position_mm = 1", "nerfca"]);
+    refused(&["--breathing", "deep"], &["--breathing", "MM,PERIOD_S"]);
+    refused(&["--breathing", "-3"], &["peak_to_peak_mm = -3"]);
+    refused(&["--breathing", "3,0"], &["period_s = 0"]);
+    refused(&["--breathing-background"], &["--breathing <MM"]);
+    refused(&["--photons", "1e5", "--detector-photons", "1e4"], &["--photons", "--detector-photons"]);
+    refused(&["--detector-photons", "0"], &["detector_photons = 0"]);
+    refused(&["--contrast-variation", "-20"], &["contrast_variation = -0.2"]);
+    refused(&["--heart-rate", "60,70"], &["heart_rate = 2", "3 training views"]);
+    refused(&["--heart-rate", "6"], &["heart_rate = 6", "20 to 300"]);
+    refused(&["--heart-rate", "60", "--fps", "0"], &["frames_per_s = 0"]);
+    refused(&["--heart-rate", "60", "--beats", "0"], &["beats = 0"]);
+    refused(&["--fps", "30"], &["--heart-rate"]);
+    refused(&["--heart-rate", "60", "--gating", "cubic"], &["cubic", "two-segment"]);
+    refused(&["--collimate", "0.95"], &["collimated_share = 0.95"]);
 }
 
 #[test]
