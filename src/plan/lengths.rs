@@ -1,7 +1,7 @@
 //! What settings in pixels mean on the images at hand: larger images show the same field, and noise asks for smoother vessels.
 
 use crate::config::sections::{Gaussians, Tree};
-use crate::plan::soft_hull::background::blur;
+use crate::evidence::background::blur;
 use crate::raster::{Image, percentile};
 
 /// Smaller side of the images, pixels, whose pixels the settings' lengths are.

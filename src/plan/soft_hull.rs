@@ -1,7 +1,4 @@
-//! The soft hull: each view says for and against a vessel at each pixel and phase, and cells are kept by what all views
-//! say together, so that no view alone can veto one.
+//! The soft hull: each view says for and against a vessel at each pixel and phase ([`crate::evidence`]), and cells are kept by
+//! what all views say together, so that no view alone can veto one.
 
-pub mod background;
 pub mod carve;
-pub mod evidence;
-mod filters;

@@ -3,6 +3,7 @@
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
+use crate::evidence::background::blur;
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
@@ -13,7 +14,6 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{GaussianSetup, TreeSetup};
 use crate::model::gaussians::{Gaussians, MovingTree};
-use crate::plan::soft_hull::background::blur;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;

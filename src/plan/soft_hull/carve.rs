@@ -1,9 +1,10 @@
 //! From what the views say of pixels to what they say of cells: sums over views, support from the phases beside.
 
+use crate::evidence::background::Series;
+use crate::evidence::ratios::{LEAST, MOST, ViewEvidence};
+use crate::geometry::ViewRays;
 use crate::model::hull::Hull;
 use crate::plan::carve::Projector;
-use crate::plan::soft_hull::background::Series;
-use crate::plan::soft_hull::evidence::{LEAST, MOST, ViewEvidence};
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -66,7 +67,8 @@ fn threshold(n_views: usize) -> f32 {
 
 /// The views' pixels under points, and what they add up to.
 struct Votes<'a> {
-    projectors: Vec<Projector>,
+    /// Of each view, or of each view at each phase where the heart's displacement differs from frame to frame.
+    projectors: Vec<Vec<Projector>>,
     views: &'a [ViewEvidence],
     /// Largest ratio of each pixel over the phases, per view.
     largest: Vec<Vec<f32>>,
@@ -76,7 +78,13 @@ struct Votes<'a> {
 
 impl<'a> Votes<'a> {
     fn new(dataset: &Dataset, views: &'a [ViewEvidence]) -> Votes<'a> {
-        let projector = |v: &ViewEvidence| Projector::new(&dataset.views[v.view].rays, dataset.width, dataset.height);
+        let projector = |rays: &ViewRays| Projector::new(rays, dataset.width, dataset.height);
+        let projectors = |v: &ViewEvidence| -> Vec<Projector> {
+            if !dataset.heart_shifts() {
+                return vec![projector(&dataset.views[v.view].rays)];
+            }
+            (0..dataset.n_phases).map(|phase| projector(&dataset.heart_rays_at(v.view, phase))).collect()
+        };
         let largest = |v: &ViewEvidence| {
             let mut most = vec![LEAST; dataset.n_pixels()];
             for ratio in v.ratios.iter().flatten() {
@@ -85,7 +93,7 @@ impl<'a> Votes<'a> {
             most
         };
         Votes {
-            projectors: views.iter().map(projector).collect(),
+            projectors: views.iter().map(projectors).collect(),
             views,
             largest: views.iter().map(largest).collect(),
             needed: views.len().min(2),
@@ -97,9 +105,14 @@ impl<'a> Votes<'a> {
         self.views.iter().filter(|v| v.ratios[phase].is_some()).count()
     }
 
-    fn pixels(&self, point: DVec3, pixels: &mut [Option<usize>]) {
-        for (pixel, projector) in pixels.iter_mut().zip(&self.projectors) {
-            *pixel = projector.pixel(point);
+    /// Pixels differ from phase to phase.
+    fn moves(&self) -> bool {
+        self.projectors.iter().any(|of_view| of_view.len() > 1)
+    }
+
+    fn pixels(&self, point: DVec3, phase: usize, pixels: &mut [Option<usize>]) {
+        for (pixel, of_view) in pixels.iter_mut().zip(&self.projectors) {
+            *pixel = of_view[if of_view.len() > 1 { phase } else { 0 }].pixel(point);
         }
     }
 
@@ -135,8 +148,11 @@ fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) 
             let mut slab = vec![least; n_phases * n * n];
             let mut pixels = vec![None; votes.views.len()];
             for at in 0..n * n {
-                votes.pixels(centre(min, cell, n, z * n * n + at), &mut pixels);
+                let point = centre(min, cell, n, z * n * n + at);
                 for phase in 0..n_phases {
+                    if phase == 0 || votes.moves() {
+                        votes.pixels(point, phase, &mut pixels);
+                    }
                     slab[phase * n * n + at] = votes.at(phase, &pixels).unwrap_or(least).max(least);
                 }
             }
@@ -211,11 +227,16 @@ impl SoftHull {
                     if MOST * views.len() as f32 + most_support[beside] < least {
                         continue;
                     }
-                    votes.pixels(centre(min, cell, n, index), &mut pixels);
-                    if votes.at_most(&pixels).is_none_or(|most| most + most_support[beside] < least) {
+                    let point = centre(min, cell, n, index);
+                    votes.pixels(point, 0, &mut pixels);
+                    let hopeless = || votes.at_most(&pixels).is_none_or(|most| most + most_support[beside] < least);
+                    if !votes.moves() && hopeless() {
                         continue;
                     }
                     for (phase, kept) in kept.iter_mut().enumerate() {
+                        if votes.moves() {
+                            votes.pixels(point, phase, &mut pixels);
+                        }
                         let Some(sum) = votes.at(phase, &pixels) else { continue };
                         let evidence = sum + support[phase][beside];
                         if evidence >= thresholds[phase] {

@@ -3,8 +3,8 @@
 //! Background -> change above it -> the smallest filter that is quiet enough for the weakest vessel -> ratio, clipped,
 //! so that no view alone can veto a cell or prove it.
 
-use crate::plan::soft_hull::background::{Background, Series, largest_within};
-use crate::plan::soft_hull::filters::{Estimate, LineFilter, blob, map2};
+use crate::evidence::background::{Background, Series, largest_within};
+use crate::evidence::filters::{Estimate, LineFilter, blob, map2};
 use crate::raster::Image;
 use rayon::prelude::*;
 

@@ -1,7 +1,7 @@
 //! What a still view looks like without its vessels, and how noisy it is.
 
-use crate::plan::motion::{expected_minimum, noise_by_intensity};
-use crate::plan::soft_hull::filters::{gaussian, map2, separable};
+use crate::evidence::filters::{gaussian, map2, separable};
+use crate::evidence::noise::{expected_minimum, noise_by_intensity};
 use crate::raster::{Image, dilate, median, opening, percentile};
 use crate::scan::dataset::Dataset;
 use rayon::prelude::*;
@@ -138,7 +138,7 @@ impl Background {
 }
 
 /// Radius of a window, from its share of an image's smaller side.
-pub(in crate::plan) fn opening_radius(share: f64, width: usize, height: usize) -> usize {
+pub fn opening_radius(share: f64, width: usize, height: usize) -> usize {
     ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
 }
 
@@ -150,7 +150,7 @@ fn narrow_change(seen: &Image, level: &Image, radius: usize) -> Image {
 }
 
 /// Largest value within `radius` pixels along both axes.
-pub(super) fn largest_within(image: &Image, radius: usize) -> Image {
+pub fn largest_within(image: &Image, radius: usize) -> Image {
     dilate(image, radius)
 }
 
