@@ -7,7 +7,9 @@ pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
-use sections::{Adam, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree, check_range};
+use sections::{
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree, check_range,
+};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -77,6 +79,34 @@ impl Choice for GaussianForm {
     }
 }
 
+/// What is corrected of the views' stated geometry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CalibrateMode {
+    /// Whatever predicts phases best that it has not seen: nothing, positions of views, or breathing too.
+    Auto,
+    /// Nothing.
+    Off,
+    /// Angles and position of each view, where that helps.
+    Static,
+    /// The same and a displacement of the heart in each frame, where that helps.
+    Breathing,
+}
+
+impl Choice for CalibrateMode {
+    const ALL: &'static [CalibrateMode] =
+        &[CalibrateMode::Auto, CalibrateMode::Off, CalibrateMode::Static, CalibrateMode::Breathing];
+
+    fn name(self) -> &'static str {
+        match self {
+            CalibrateMode::Auto => "auto",
+            CalibrateMode::Off => "off",
+            CalibrateMode::Static => "static",
+            CalibrateMode::Breathing => "breathing",
+        }
+    }
+}
+
 /// What drives the dynamic field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -97,6 +127,9 @@ pub struct Config {
     pub seed: u32,
     /// The loop.
     pub train: Train,
+    /// Self-calibration of the views; checkpoints of before have none.
+    #[serde(default = "presets::uncalibrated")]
+    pub calibrate: Calibrate,
     /// Sampling along rays.
     pub march: March,
     /// The still background.
@@ -185,6 +218,7 @@ impl Config {
     pub fn check(&self) -> Result<()> {
         let (t, m, d) = (&self.train, &self.march, &self.dynamic);
         self.train.check_ranges()?;
+        self.calibrate.check_ranges()?;
         self.march.check_ranges()?;
         self.static_field.check_ranges()?;
         self.dynamic.check_ranges()?;

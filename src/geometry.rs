@@ -17,6 +17,11 @@ pub fn world_from_lps_mm(lps: DVec3) -> DVec3 {
     DVec3::new(lps.y, lps.x, lps.z) / MM_PER_UNIT
 }
 
+/// Patient vector in mm (left, posterior, superior) of a world vector.
+pub fn lps_mm_from_world(world: DVec3) -> DVec3 {
+    DVec3::new(world.y, world.x, world.z) * MM_PER_UNIT
+}
+
 /// How an image was taken.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -52,8 +57,9 @@ pub struct CArm {
     pub table_mm: [f64; 3],
 }
 
-fn is_at_rest(table_mm: &[f64; 3]) -> bool {
-    *table_mm == [0.0; 3]
+/// Whether a way is none.
+pub(crate) fn is_at_rest(way_mm: &[f64; 3]) -> bool {
+    *way_mm == [0.0; 3]
 }
 
 /// A 3 x 4 projection from patient mm (LPS, origin at the isocentre) to homogeneous pixels
@@ -104,6 +110,28 @@ impl Geometry {
             Geometry::Matrix(_) => None,
         }
     }
+
+    /// The same, turned by angles (primary and secondary, degrees) about the isocentre, and its patient carried a further
+    /// `shift` (world units). A matrix turns like the C-arm that looks where it looks.
+    pub fn corrected(&self, angles_deg: [f64; 2], shift: DVec3) -> Geometry {
+        match self {
+            Geometry::CArm(c) => {
+                let shift_mm = lps_mm_from_world(shift);
+                Geometry::CArm(CArm {
+                    primary_deg: c.primary_deg + angles_deg[0],
+                    secondary_deg: c.secondary_deg + angles_deg[1],
+                    table_mm: [0, 1, 2].map(|k| c.table_mm[k] + shift_mm[k]),
+                    ..c.clone()
+                })
+            }
+            Geometry::Matrix(matrix) => Geometry::Matrix(matrix.corrected(angles_deg, shift)),
+        }
+    }
+}
+
+/// Angles in degrees, primary and secondary, of the C-arm that looks along `axis`, from the source to the detector.
+pub fn angles_deg_of(axis: DVec3) -> [f64; 2] {
+    [axis.y.atan2(-axis.x).to_degrees(), axis.z.clamp(-1.0, 1.0).asin().to_degrees()]
 }
 
 impl CArm {
@@ -147,7 +175,7 @@ impl CArm {
         let table = world_from_lps_mm(DVec3::from_array(self.table_mm));
         let sod = self.sod_mm / MM_PER_UNIT + table.dot(r * DVec3::Z);
         let source = r * DVec3::new(0.0, 0.0, -self.sod_mm / MM_PER_UNIT) - table;
-        Ok(ViewRays { anchor: [source + direction[0] * sod, du * sod, dv * sod], direction, sod })
+        Ok(ViewRays::at_depth(source, direction, sod))
     }
 }
 
@@ -175,12 +203,64 @@ impl Matrix {
         // A matrix is defined up to sign: look from the source towards the isocentre.
         let scale = rows[2].length() * depth_of_origin.signum();
         let direction = [DVec3::Z, DVec3::X, DVec3::Y].map(|p| inverse * p * scale);
-        let sod = depth_of_origin.abs();
-        Ok(ViewRays { anchor: [source + direction[0] * sod, direction[1] * sod, direction[2] * sod], direction, sod })
+        Ok(ViewRays::at_depth(source, direction, depth_of_origin.abs()))
+    }
+
+    /// See [`Geometry::corrected`]: the corrected view sees a point where this one sees it moved and turned back.
+    fn corrected(&self, angles_deg: [f64; 2], shift: DVec3) -> Matrix {
+        let Ok(rays) = self.rays() else { return self.clone() };
+        let [primary, secondary] = angles_deg_of(rays.axis());
+        let turn =
+            rotation(primary + angles_deg[0], secondary + angles_deg[1]) * rotation(primary, secondary).transpose();
+        // The turn in the patient's axes (left, posterior, superior): first and second are exchanged.
+        let back = |row: usize, column: usize| {
+            let world = |axis: usize| [1, 0, 2][axis];
+            turn.col(world(row))[world(column)]
+        };
+        let shift_mm = lps_mm_from_world(shift);
+        let matrix = self.matrix.map(|m| {
+            let row = [0, 1, 2].map(|column| (0..3).map(|k| m[k] * back(k, column)).sum::<f64>());
+            [row[0], row[1], row[2], m[3] + row[0] * shift_mm.x + row[1] * shift_mm.y + row[2] * shift_mm.z]
+        });
+        Matrix { matrix }
     }
 }
 
 impl ViewRays {
+    fn at_depth(source: DVec3, direction: [DVec3; 3], sod: f64) -> ViewRays {
+        let [d0, du, dv] = direction;
+        ViewRays { anchor: [source + d0 * sod, du * sod, dv * sod], direction, sod }
+    }
+
+    /// Unit vector across the detector, from the source to it.
+    pub fn axis(&self) -> DVec3 {
+        let axis = self.direction[1].cross(self.direction[2]).normalize();
+        if axis.dot(self.direction[0]) < 0.0 { -axis } else { axis }
+    }
+
+    /// The rays that see the patient carried by `way` (world units).
+    pub fn moved(&self, way: DVec3) -> ViewRays {
+        if way == DVec3::ZERO {
+            return self.clone();
+        }
+        ViewRays::at_depth(self.source() - way, self.direction, self.sod + way.dot(self.axis()))
+    }
+
+    /// The rays of the C-arm turned about the isocentre, which the table has carried the patient's origin away from by
+    /// `table` (world units).
+    pub fn turned(&self, turn: DMat3, table: DVec3) -> ViewRays {
+        let source = turn * (self.source() + table) - table;
+        let direction = self.direction.map(|d| turn * d);
+        ViewRays::at_depth(source, direction, -source.dot(turn * self.axis()))
+    }
+
+    /// The rays of an image whose pixels are `factor` x `factor` of this one's.
+    pub fn binned(&self, factor: usize) -> ViewRays {
+        let (middle, f) = (0.5 * (factor as f64 - 1.0), factor as f64);
+        let (_, first) = self.pixel(middle, middle);
+        ViewRays::at_depth(self.source(), [first, self.direction[1] * f, self.direction[2] * f], self.sod)
+    }
+
     /// Anchor and direction of pixel `(i, j)`.
     pub fn pixel(&self, i: f64, j: f64) -> (DVec3, DVec3) {
         let at = |p: &[DVec3; 3]| p[0] + i * p[1] + j * p[2];
@@ -201,8 +281,20 @@ impl ViewRays {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+
+    /// A projection matrix with these rays; its sign is free.
+    pub(crate) fn matrix_of(rays: &ViewRays) -> Geometry {
+        // P = [B^-1 | -B^-1 s] in world units, brought to LPS mm.
+        let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]).inverse();
+        let shift = -(basis * rays.source()) * MM_PER_UNIT;
+        let matrix = [0, 1, 2].map(|r| {
+            let row = basis.row(r);
+            [-3.0 * row.y, -3.0 * row.x, -3.0 * row.z, -3.0 * shift[r]]
+        });
+        Geometry::Matrix(Matrix { matrix })
+    }
 
     fn carm(primary_deg: f64, secondary_deg: f64) -> CArm {
         CArm {
@@ -257,19 +349,20 @@ mod tests {
     #[test]
     fn a_matrix_gives_the_rays_of_its_c_arm() {
         let want = carm(40.0, -20.0).rays(64, 48).unwrap();
-        // P = [B^-1 | -B^-1 s] in world units, brought to LPS mm; the sign is free.
-        let basis = DMat3::from_cols(want.direction[1], want.direction[2], want.direction[0]).inverse();
-        let shift = -(basis * want.source()) * MM_PER_UNIT;
-        let rows = [0, 1, 2].map(|r| {
-            let row = basis.row(r);
-            [-3.0 * row.y, -3.0 * row.x, -3.0 * row.z, -3.0 * shift[r]]
-        });
-        let got = Matrix { matrix: rows }.rays().unwrap();
+        let got = matrix_of(&want).rays(64, 48).unwrap();
         assert!((got.sod - want.sod).abs() < 1e-9);
         for (a, b) in got.direction.iter().zip(&want.direction) {
             assert!((*a - *b).length() < 1e-9, "{a} {b}");
         }
         assert!((got.anchor[0] - want.anchor[0]).length() < 1e-9);
+    }
+
+    #[test]
+    fn binned_pixels_look_through_the_middle_of_theirs() {
+        let (fine, coarse) =
+            (carm(40.0, -20.0).rays(64, 48).unwrap(), carm(40.0, -20.0).rays(64, 48).unwrap().binned(4));
+        let ((a, b), (c, d)) = (fine.pixel(9.5, 5.5), coarse.pixel(2.0, 1.0));
+        assert!((a - c).length() < 1e-12 && (b - d).length() < 1e-12);
     }
 
     #[test]

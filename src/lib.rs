@@ -3,7 +3,8 @@
 //! The way of the data, and where to read it:
 //!
 //! 1. [`scan`]: angiograms with geometry and phase, validated -> line integrals (`import`, of the feature `dicom`, brings them in)
-//! 2. [`plan`]: what moves -> still backgrounds, the motion hull, scales and boxes: everything a run needs
+//! 2. [`evidence`]: what each view shows by itself; [`calibrate`] brings views that disagree together by it;
+//!    [`plan`]: what moves -> still backgrounds, the motion hull, scales and boxes: everything a run needs
 //! 3. [`train::step`]: one iteration, top to bottom: rays -> samples -> [`network`] -> loss -> gradients -> Adam
 //! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses. Beside it, [`train::gaussians`] and
 //!    [`train::tree`] fit [`gaussians`] as the moving field to [`plan::targets`], from [`plan::seeds`] in a
@@ -103,6 +104,16 @@ pub mod import {
     mod lengths;
 }
 
+/// What each view shows by itself: its still background, its noise, and where vessels may be.
+pub mod evidence {
+    pub mod background;
+    mod filters;
+    pub mod noise;
+    pub mod ratios;
+}
+
+pub mod calibrate;
+
 pub mod model;
 pub mod network;
 
@@ -145,6 +156,7 @@ pub mod train {
 
 /// What a reconstruction is worth.
 pub mod score {
+    pub mod calibrated;
     pub mod eval;
     pub mod metrics;
     pub mod pictures;

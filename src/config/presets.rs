@@ -1,7 +1,9 @@
 //! The presets.
 
-use crate::config::sections::{Adam, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree};
-use crate::config::{Config, Decay, DynamicTarget, GaussianForm, Preset};
+use crate::config::sections::{
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree,
+};
+use crate::config::{CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset};
 
 impl Config {
     /// Defaults of a preset.
@@ -30,6 +32,7 @@ fn paper() -> Config {
             validate_every: 1000,
             validate_images: 8,
         },
+        calibrate: uncalibrated(),
         march: March {
             static_samples: 256,
             dynamic_samples: 256,
@@ -84,6 +87,11 @@ fn paper() -> Config {
         gaussians: gaussians(),
         tree: tree(),
     }
+}
+
+/// Geometry is what the dataset says, as in the paper.
+pub(super) fn uncalibrated() -> Calibrate {
+    Calibrate { mode: CalibrateMode::Off }
 }
 
 /// Gaussians are none of the paper's: one set of defaults for all presets.
@@ -175,6 +183,7 @@ fn fast_mlp(paper: Config) -> Config {
             checkpoint_every: 400,
             ..paper.train
         },
+        calibrate: Calibrate { mode: CalibrateMode::Auto },
         march: March {
             static_samples: 32,
             dynamic_samples: 128,

@@ -1,6 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{Decay, DynamicTarget, GaussianForm};
+use crate::config::{CalibrateMode, Decay, DynamicTarget, GaussianForm};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -53,6 +53,14 @@ section! {
         validate_every: u32,
         /// Validation images used during training; evenly spread over all of them.
         validate_images: u32,
+    }
+}
+
+section! {
+    /// Self-calibration: corrections of the views' stated geometry, found in the angiograms before anything else.
+    Calibrate, "calibrate" {
+        /// What is corrected.
+        mode: CalibrateMode,
     }
 }
 

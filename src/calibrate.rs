@@ -1,0 +1,364 @@
+//! Self-calibration: brings views that disagree together, from the angiograms alone (method, robustness of geometry).
+//!
+//! What moves in one view must add up, plane by plane through both sources, to what moves in another ([`profiles`]). A
+//! correction of two angles and a translation per view, and of a displacement of the heart per frame where it breathes, is
+//! found by Gauss-Newton on that ([`solve`]), less what no image tells ([`gauge`]), and kept where it predicts phases it has
+//! not seen ([`choose`]).
+
+pub mod choose;
+pub mod correction;
+pub mod gauge;
+mod linear;
+pub mod observed;
+pub mod pose;
+pub mod profiles;
+pub mod silhouettes;
+pub mod solve;
+
+use crate::config::{CalibrateMode, Config};
+use crate::error::{Error, Result};
+use crate::geometry::{MM_PER_UNIT, lps_mm_from_world};
+use crate::scan::dataset::Dataset;
+use choose::{Correction, Validated, best, fit, misfit, validate};
+use correction::{Calibration, FrameCorrection, ViewCorrection};
+use gauge::{FrameRays, RigidMotion, common_motion};
+use glam::DVec3;
+use observed::Observed;
+use pose::Poses;
+use solve::{ANGLE_DEG, BREATHING_MM, DEPTH_MM, IN_PLANE_MM};
+
+/// Corrections beyond so many standard deviations of what is expected are not believed.
+const BOUND: f64 = 4.0;
+/// Views with more than this share of their change at the border have vessels that the image cuts off.
+const CUT_OFF: f64 = 0.02;
+/// Half side of the cube that stands for the heart where corrections are compared, as a share of the field of view's half.
+const HEART_SHARE: f64 = 0.5;
+
+/// Calibrates the training views of a dataset as the configuration asks.
+///
+/// # Errors
+/// [`Error::Config`] when breathing is asked for where the network moves, which takes corrections per view only.
+pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
+    let mode = config.calibrate.mode;
+    if mode == CalibrateMode::Off {
+        return Ok(Calibration::none(None));
+    }
+    if mode == CalibrateMode::Breathing && !config.gaussians_move() {
+        let problem = "the network takes corrections per view only: choose static, or Gaussians as the moving field";
+        return Err(Error::config("calibrate.mode", "breathing", problem));
+    }
+    let observed = Observed::new(dataset);
+    if let Some(why) = nothing_to_tell(&observed) {
+        return Ok(Calibration::none(Some(format!("views not calibrated: {why}"))));
+    }
+    let mut notes = Vec::new();
+    let cut = cut_off(&observed);
+    if !cut.is_empty() {
+        notes.push(format!(
+            "vessels are cut off at the border of views {cut:?}: what other views show of them has no counterpart there, so \
+             corrections are less sure, and breathing is assumed only where it explains much"
+        ));
+    }
+    let candidates = candidates(mode, config.gaussians_move(), &mut notes);
+    Ok(Calibrator { dataset, observed: &observed, notes }.choose(&candidates))
+}
+
+/// What a view shows of vessels at a phase, and what of it the other views explain before and after a correction.
+pub struct Silhouettes {
+    /// Index into the dataset's views.
+    pub view: usize,
+    /// Cardiac phase.
+    pub phase: u32,
+    /// Columns of the images.
+    pub width: usize,
+    /// Above the still background.
+    pub seen: Vec<f32>,
+    /// Pixels that show vessels.
+    pub shown: Vec<bool>,
+    /// Those that the other views explain, before and after.
+    pub explained: [Vec<bool>; 2],
+}
+
+/// Silhouettes of each training view at the phase that shows most of the vessels.
+pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
+    let before = Observed::new(dataset);
+    let after = before.by_geometry_of(corrected);
+    let stated = Poses::stated(before.views.len(), before.n_phases());
+    let of_view = |slot: usize| {
+        let count = |t: &usize| before.shown[slot][*t].iter().flatten().filter(|s| **s).count();
+        let phase = (0..before.n_phases()).max_by_key(count)?;
+        let moved = Poses { heart: after.1.clone(), ..stated.clone() };
+        Some(Silhouettes {
+            view: before.views[slot],
+            phase: phase as u32,
+            width: before.fine.views[slot].size[0],
+            seen: before.seen[slot][phase].clone()?,
+            shown: before.shown[slot][phase].clone()?,
+            explained: [
+                silhouettes::explained_pixels(&before, &stated, slot, phase)?,
+                silhouettes::explained_pixels(&after.0, &moved, slot, phase)?,
+            ],
+        })
+    };
+    (0..before.views.len()).filter_map(of_view).collect()
+}
+
+/// Why nothing can be told of how the views agree.
+fn nothing_to_tell(observed: &Observed) -> Option<String> {
+    let n = observed.views.len();
+    if n < 2 {
+        return Some(format!("{n} training views show two phases, and it takes two to compare"));
+    }
+    if observed.fine.pairs.is_empty() {
+        return Some("all pairs of views look along one line, where they have no planes in common to compare".into());
+    }
+    let all: Vec<usize> = (0..observed.n_phases()).collect();
+    let power = misfit(observed, &Poses::stated(n, observed.n_phases()), &all).power;
+    (power == 0.0).then(|| "nothing moves in the images: their phases are all alike".into())
+}
+
+/// What to try, the least first.
+fn candidates(mode: CalibrateMode, frames: bool, notes: &mut Vec<String>) -> Vec<Correction> {
+    match mode {
+        CalibrateMode::Off => vec![Correction::Stated],
+        CalibrateMode::Static => vec![Correction::Stated, Correction::Static],
+        CalibrateMode::Breathing => vec![Correction::Stated, Correction::Breathing],
+        CalibrateMode::Auto if frames => vec![Correction::Stated, Correction::Static, Correction::Breathing],
+        CalibrateMode::Auto => {
+            notes.push("the network takes corrections per view only: breathing is not looked for".into());
+            vec![Correction::Stated, Correction::Static]
+        }
+    }
+}
+
+/// Views whose vessels the image cuts off.
+fn cut_off(observed: &Observed) -> Vec<usize> {
+    let views = observed.views.iter().zip(&observed.at_border);
+    views.filter(|(_, share)| **share > CUT_OFF).map(|(view, _)| *view).collect()
+}
+
+struct Calibrator<'a> {
+    dataset: &'a Dataset,
+    observed: &'a Observed,
+    notes: Vec<String>,
+}
+
+impl Calibrator<'_> {
+    fn choose(mut self, candidates: &[Correction]) -> Calibration {
+        if self.observed.n_phases() < choose::LEAST_PHASES {
+            return self.without_validation(candidates);
+        }
+        let tried: Vec<Validated> = candidates.iter().map(|c| validate(self.observed, *c)).collect();
+        let residuals: Vec<f64> = tried.iter().map(|t| t.residual).collect();
+        // Displacements of frames take up what is cut off more than positions of views do.
+        let breathing_gain = if cut_off(self.observed).is_empty() { choose::LEAST_GAIN } else { choose::LARGE_GAIN };
+        let gain = |k: usize| if candidates[k] == Correction::Breathing { breathing_gain } else { choose::LEAST_GAIN };
+        let chosen = best(&residuals, gain);
+        let shares = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();
+        if candidates[chosen] == Correction::Stated {
+            self.notes.push(format!(
+                "views agree as stated: a correction does not bring phases it was not fitted to closer ({})",
+                in_words(&shares)
+            ));
+            return Calibration { tried: shares, notes: self.notes, ..Calibration::none(None) };
+        }
+        let all: Vec<usize> = (0..self.observed.n_phases()).collect();
+        let poses = fit(self.observed, candidates[chosen], &all);
+        let [even, odd] = &tried[chosen].halves;
+        let repeatability = 0.5 * self.distance_px(even, odd);
+        self.accept(candidates[chosen], &poses, Some(repeatability), shares)
+    }
+
+    /// Too few phases to keep some back: what helps those there are must help a lot.
+    fn without_validation(mut self, candidates: &[Correction]) -> Calibration {
+        const LARGE: f64 = 0.5;
+        self.notes.push(format!(
+            "{} phases are too few to test a correction on some it has not seen: only one that halves the residual is kept",
+            self.observed.n_phases()
+        ));
+        let all: Vec<usize> = (0..self.observed.n_phases()).collect();
+        let share = |poses: &Poses| misfit(self.observed, poses, &all).share();
+        let stated = share(&Poses::stated(self.observed.views.len(), all.len()));
+        let tried = candidates[1.min(candidates.len() - 1)];
+        let poses = fit(self.observed, tried, &all);
+        let shares = vec![(Correction::Stated, stated), (tried, share(&poses))];
+        if tried == Correction::Stated || shares[1].1 > LARGE * stated {
+            self.notes.push(format!("views are left as stated ({})", in_words(&shares)));
+            return Calibration { tried: shares, notes: self.notes, ..Calibration::none(None) };
+        }
+        self.accept(tried, &poses, None, shares)
+    }
+
+    fn accept(
+        mut self,
+        correction: Correction,
+        poses: &Poses,
+        repeatability_px: Option<f64>,
+        tried: Vec<(Correction, f64)>,
+    ) -> Calibration {
+        if let Some(what) = out_of_bounds(self.observed, poses) {
+            self.notes.push(format!(
+                "views disagree, but the correction found is not to be believed ({what}): the stated geometry is kept. Check \
+                 the images' orientation, the signs of the angles and the phases"
+            ));
+            return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
+        }
+        let stated = Poses::stated(self.observed.views.len(), self.observed.n_phases());
+        let moved = self.motion(&stated, poses);
+        let disagreement_px = self.distance_px(&stated, poses);
+        let view = |slot: usize| self.view(slot, poses, &moved);
+        let views: Vec<ViewCorrection> = (0..self.observed.views.len()).map(view).collect();
+        let frames = if correction == Correction::Breathing { self.frames(poses) } else { Vec::new() };
+        let explained = [&stated, poses].map(|poses| silhouettes::explained(self.observed, poses));
+        let mut calibration = Calibration {
+            correction,
+            views,
+            frames,
+            disagreement_px,
+            repeatability_px,
+            tried,
+            explained,
+            notes: self.notes,
+        };
+        calibration.describe();
+        calibration
+    }
+
+    fn view(&self, slot: usize, poses: &Poses, moved: &RigidMotion) -> ViewCorrection {
+        let view = self.observed.views[slot];
+        let pose = &poses.views[slot];
+        let stated = self.dataset.views[view].geometry.clone();
+        let residual = |poses: &Poses| {
+            let mut views = self.observed.fine.clone();
+            views.pairs.retain(|p| p.views.contains(&slot));
+            let all: Vec<usize> = (0..views.n_phases).collect();
+            solve::misfit(&views, poses, 3.0, &all).share()
+        };
+        let before = Poses::stated(poses.views.len(), self.observed.n_phases());
+        let frames: Vec<FrameRays> = self.frame_rays(&before, poses, Some(slot));
+        ViewCorrection {
+            view,
+            primary_deg: pose.angles_deg[0],
+            secondary_deg: pose.angles_deg[1],
+            table_mm: lps_mm_from_world(pose.shift).to_array(),
+            moved_px: moved.remainder_px(&frames, &self.points()),
+            residual_before: residual(&before),
+            residual_after: residual(poses),
+            corrected: stated.corrected(pose.angles_deg, pose.shift),
+            stated,
+        }
+    }
+
+    fn frames(&self, poses: &Poses) -> Vec<FrameCorrection> {
+        let of_view = |slot: usize| {
+            let phases = &self.observed.fine.views[slot].phases;
+            let seen = (0..phases.len()).filter(|t| phases[*t].is_some());
+            seen.map(move |t| FrameCorrection {
+                view: self.observed.views[slot],
+                phase: t as u32,
+                heart_shift_mm: (poses.heart[slot][t] * MM_PER_UNIT).to_array(),
+            })
+        };
+        (0..self.observed.views.len()).flat_map(of_view).collect()
+    }
+
+    /// Points that stand for the heart: the corners and the middle of a cube.
+    fn points(&self) -> Vec<DVec3> {
+        let rays = &self.observed.stands[0].rays;
+        let [width, height] = self.observed.fine.views[0].size.map(|n| n as f64);
+        let half = HEART_SHARE * 0.5 * rays.anchor[1].length().min(rays.anchor[2].length()) * width.min(height);
+        let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { half } else { -half };
+        let corners = (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2)));
+        corners.chain([DVec3::ZERO]).collect()
+    }
+
+    /// Frames by two sets of poses, in the dataset's pixels; of one view, or of all.
+    fn frame_rays(&self, a: &Poses, b: &Poses, of: Option<usize>) -> Vec<FrameRays> {
+        let mut frames = Vec::new();
+        for (slot, stand) in self.observed.stands.iter().enumerate().filter(|(slot, _)| of.is_none_or(|o| o == *slot)) {
+            for t in 0..self.observed.n_phases() {
+                let rays = |p: &Poses| stand.corrected_rays(&p.views[slot], p.heart[slot][t]);
+                frames.push(FrameRays { phase: t, truth: rays(a), corrected: rays(b) });
+            }
+        }
+        frames
+    }
+
+    /// What moves all views alike from one set of poses to another.
+    fn motion(&self, a: &Poses, b: &Poses) -> RigidMotion {
+        let breathes = [a, b].iter().any(|p| p.heart.iter().flatten().any(|s| *s != DVec3::ZERO));
+        common_motion(&self.frame_rays(a, b, None), &self.points(), self.observed.n_phases(), breathes)
+    }
+
+    /// Root mean square of how far images of the heart by two sets of poses are apart, less what moves all views alike, in
+    /// the dataset's pixels.
+    fn distance_px(&self, a: &Poses, b: &Poses) -> f64 {
+        let frames = self.frame_rays(a, b, None);
+        self.motion(a, b).remainder_px(&frames, &self.points()) * self.observed.factor as f64
+    }
+}
+
+/// Which correction exceeds what is to be believed.
+fn out_of_bounds(observed: &Observed, poses: &Poses) -> Option<String> {
+    for (slot, pose) in poses.views.iter().enumerate() {
+        let view = observed.views[slot];
+        let axes = observed.stands[slot].axes();
+        let along = |k: usize| (pose.shift.dot(axes.col(k)) * MM_PER_UNIT).abs();
+        let angle = pose.angles_deg[0].abs().max(pose.angles_deg[1].abs());
+        if angle.is_nan() || angle > BOUND * ANGLE_DEG {
+            return Some(format!("view {view} by {angle:.1} deg"));
+        }
+        let (across, depth) = (along(0).max(along(1)), along(2));
+        if across.is_nan() || across > BOUND * IN_PLANE_MM || depth.is_nan() || depth > BOUND * DEPTH_MM {
+            return Some(format!("view {view} by {:.1} mm", across.max(depth)));
+        }
+        for (phase, shift) in poses.heart[slot].iter().enumerate() {
+            let far = |k: usize| (shift[k] * MM_PER_UNIT).abs() > BOUND * BREATHING_MM[k];
+            if (0..3).any(far) || !shift.is_finite() {
+                return Some(format!(
+                    "the heart by {:.1} mm in view {view}, phase {phase}",
+                    shift.length() * MM_PER_UNIT
+                ));
+            }
+        }
+    }
+    None
+}
+
+fn in_words(tried: &Vec<(Correction, f64)>) -> String {
+    let name = |c: &Correction| match c {
+        Correction::Stated => "as stated",
+        Correction::Static => "static",
+        Correction::Breathing => "breathing",
+    };
+    let each: Vec<String> = tried.iter().map(|(c, r)| format!("{} {:.1} %", name(c), 100.0 * r)).collect();
+    format!("residual: {}", each.join(", "))
+}
+
+impl Calibration {
+    /// Says what was done, view by view.
+    fn describe(&mut self) {
+        let known = self.repeatability_px.map_or(String::new(), |px| format!(", repeatable to {px:.2} px"));
+        let kind = match self.correction {
+            Correction::Breathing => "positions of views and breathing of each frame",
+            _ => "positions of views",
+        };
+        let lengths = self.frames.iter().map(|f| DVec3::from_array(f.heart_shift_mm).length());
+        let breath = lengths.fold(0.0, f64::max);
+        let breath =
+            if breath > 0.0 { format!(", the heart up to {breath:.1} mm from its mean") } else { String::new() };
+        self.notes.push(format!(
+            "views disagree by {:.2} px; corrected: {kind}{known}{breath} ({})",
+            self.disagreement_px,
+            in_words(&self.tried)
+        ));
+        for v in &self.views {
+            let [l, p, s] = v.table_mm;
+            self.notes.push(format!(
+                "view {}: {:+.2} deg primary, {:+.2} deg secondary, patient {l:+.2} {p:+.2} {s:+.2} mm (left, posterior, \
+                 superior)",
+                v.view, v.primary_deg, v.secondary_deg
+            ));
+        }
+    }
+}

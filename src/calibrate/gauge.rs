@@ -1,0 +1,190 @@
+//! What no image tells (method, robustness of geometry, section 3): a common motion of all views. Least corrections are
+//! chosen; with truth, the motion can be found.
+
+use crate::calibrate::linear::Symmetric;
+use crate::calibrate::pose::{Poses, Stand};
+use crate::geometry::ViewRays;
+use glam::{DMat3, DVec3};
+
+/// What a shift of each view does across its axis, and the inverse of the sum over views.
+struct Across {
+    of_view: Vec<DMat3>,
+    inverse: DMat3,
+}
+
+impl Across {
+    fn of(axes: impl Iterator<Item = DVec3>) -> Option<Across> {
+        let of_view: Vec<DMat3> = axes.map(|z| DMat3::IDENTITY - DMat3::from_cols(z * z.x, z * z.y, z * z.z)).collect();
+        let sum = of_view.iter().fold(DMat3::ZERO, |sum, q| sum + *q);
+        (sum.determinant() > 1e-9).then(|| Across { of_view, inverse: sum.inverse() })
+    }
+
+    /// The translation closest to all of `shifts` across their views.
+    fn common(&self, shifts: impl Iterator<Item = DVec3>) -> DVec3 {
+        self.inverse * self.of_view.iter().zip(shifts).map(|(q, s)| *q * s).sum::<DVec3>()
+    }
+}
+
+/// Takes the common motion out of corrections, so that they are the least that make the views agree: the mean primary
+/// angle, the translation common to all views, and with `breathing` that of each phase. Images stay as consistent as
+/// they are.
+pub fn fix(stands: &[Stand], poses: &mut Poses, breathing: bool) {
+    let n = stands.len() as f64;
+    let mean = poses.views.iter().map(|p| p.angles_deg[0]).sum::<f64>() / n;
+    // The primary angle turns about -z.
+    let turn = DMat3::from_rotation_z(mean.to_radians());
+    for (v, pose) in poses.views.iter_mut().enumerate() {
+        let table = stands[v].table();
+        pose.angles_deg[0] -= mean;
+        pose.shift = turn * (pose.shift + table) - table;
+        poses.heart[v].iter_mut().for_each(|s| *s = turn * *s);
+    }
+    let Some(across) = Across::of(stands.iter().map(|s| s.axes().z_axis)) else { return };
+    if breathing {
+        for t in 0..poses.heart[0].len() {
+            let common = across.common(poses.heart.iter().map(|of_view| of_view[t]));
+            poses.heart.iter_mut().for_each(|of_view| of_view[t] -= common);
+        }
+    }
+    let common = across.common(poses.views.iter().map(|p| p.shift));
+    poses.views.iter_mut().for_each(|p| p.shift -= common);
+}
+
+/// A training frame as it truly was, and by corrected geometry: the rays by which the heart was seen.
+#[derive(Debug, Clone)]
+pub struct FrameRays {
+    /// Cardiac phase.
+    pub phase: usize,
+    /// What the heart truly was seen by.
+    pub truth: ViewRays,
+    /// What it is seen by after the correction.
+    pub corrected: ViewRays,
+}
+
+/// A rotation about the isocentre and a translation, the same for all phases or one for each.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RigidMotion {
+    /// Axis times angle, radians.
+    pub rotation: DVec3,
+    /// Of each phase, world units.
+    pub translations: Vec<DVec3>,
+}
+
+impl RigidMotion {
+    /// No motion.
+    pub fn none(n_phases: usize) -> RigidMotion {
+        RigidMotion { rotation: DVec3::ZERO, translations: vec![DVec3::ZERO; n_phases] }
+    }
+
+    fn turn(&self) -> DMat3 {
+        let angle = self.rotation.length();
+        if angle == 0.0 { DMat3::IDENTITY } else { DMat3::from_axis_angle(self.rotation / angle, angle) }
+    }
+
+    /// Where a point (world units) goes at a phase.
+    pub fn carry(&self, point: DVec3, phase: usize) -> DVec3 {
+        self.turn() * point + self.translations[phase]
+    }
+
+    /// The rays that see a carried object as these see it at rest.
+    pub fn carry_rays(&self, rays: &ViewRays, phase: usize) -> ViewRays {
+        rays.turned(self.turn(), DVec3::ZERO).moved(-self.translations[phase])
+    }
+
+    /// Root of the mean square of the image distances, pixels, that remain between truth and correction over `points`
+    /// (world units).
+    pub fn remainder_px(&self, frames: &[FrameRays], points: &[DVec3]) -> f64 {
+        let squares = frames.iter().flat_map(|f| points.iter().map(|p| self.distance(f, *p).map_or(0.0, squared)));
+        (squares.sum::<f64>() / (frames.len() * points.len()).max(1) as f64).sqrt()
+    }
+
+    /// Columns and rows from where a point truly is seen to where it is seen carried; none behind a source.
+    fn distance(&self, frame: &FrameRays, point: DVec3) -> Option<[f64; 2]> {
+        let (truth, seen) = (frame.truth.project(point)?, frame.corrected.project(self.carry(point, frame.phase))?);
+        Some([seen.0 - truth.0, seen.1 - truth.1])
+    }
+
+    /// The motion after a small step of one of its numbers: 0 to 2 turn, the others translate, phase by phase or all.
+    fn stepped(&self, number: usize, step: f64, each_phase: bool) -> RigidMotion {
+        let mut next = self.clone();
+        match number.checked_sub(3) {
+            None => next.rotation[number] += step,
+            Some(k) if each_phase => next.translations[k / 3][k % 3] += step,
+            Some(k) => next.translations.iter_mut().for_each(|t| t[k] += step),
+        }
+        next
+    }
+}
+
+fn squared(distance: [f64; 2]) -> f64 {
+    distance[0] * distance[0] + distance[1] * distance[1]
+}
+
+/// The common motion between true and corrected geometry: what the reconstruction of the corrected views is moved by
+/// against the truth. It is the motion that brings `points` (world units, spread over the heart) closest to where they
+/// truly were seen; with `each_phase`, every phase has a translation of its own, as when the heart breathes.
+pub fn common_motion(frames: &[FrameRays], points: &[DVec3], n_phases: usize, each_phase: bool) -> RigidMotion {
+    const STEPS: usize = 5;
+    const DIFFERENCE: f64 = 1e-5;
+    // Phases that no frame shows, and what no view tells, stay where they are.
+    const DAMPING: f64 = 1e-9;
+    let n = if each_phase { 3 + 3 * n_phases } else { 6 };
+    let mut motion = RigidMotion::none(n_phases);
+    for _ in 0..STEPS {
+        let (mut matrix, mut gradient) = (Symmetric::zeros(n), vec![0.0; n]);
+        for frame in frames {
+            let of_phase = if each_phase { 3 + 3 * frame.phase } else { 3 };
+            let numbers: Vec<usize> = (0..3).chain(of_phase..of_phase + 3).collect();
+            let moved: Vec<RigidMotion> =
+                numbers.iter().map(|number| motion.stepped(*number, DIFFERENCE, each_phase)).collect();
+            for point in points {
+                let Some(here) = motion.distance(frame, *point) else { continue };
+                let slope = |m: &RigidMotion| {
+                    let there = m.distance(frame, *point).unwrap_or(here);
+                    [0, 1].map(|k| (there[k] - here[k]) / DIFFERENCE)
+                };
+                let slopes: Vec<[f64; 2]> = moved.iter().map(slope).collect();
+                let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
+                for (k, i) in numbers.iter().enumerate() {
+                    gradient[*i] += dot(slopes[k], here);
+                    numbers[..=k].iter().enumerate().for_each(|(l, j)| matrix.add(*i, *j, dot(slopes[k], slopes[l])));
+                }
+            }
+        }
+        let size = gradient.len() as f64;
+        (0..n).for_each(|i| matrix.add(i, i, DAMPING * size));
+        let Some(step) = matrix.solve(&gradient) else { break };
+        for (number, step) in step.into_iter().enumerate() {
+            motion = motion.stepped(number, -step, each_phase);
+        }
+    }
+    motion
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::calibrate::solve::tests::{ANGLES, SIZE, views};
+
+    #[test]
+    fn a_common_motion_is_found() {
+        let views = views(&ANGLES);
+        let motion = RigidMotion {
+            rotation: DVec3::new(0.01, -0.02, 0.015),
+            translations: vec![DVec3::new(0.01, 0.0, -0.02), DVec3::new(0.0, 0.01, 0.0), DVec3::ZERO],
+        };
+        let points = [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X, DVec3::ONE].map(|p| p * 0.1);
+        let frame = |(v, phase): (usize, usize)| {
+            let truth = views.views[v].stand.rays.clone();
+            FrameRays { phase, corrected: motion.carry_rays(&truth, phase), truth }
+        };
+        let frames: Vec<FrameRays> = (0..9).map(|k| frame((k / 3, k % 3))).collect();
+        let found = common_motion(&frames, &points, 3, true);
+        assert!((found.rotation - motion.rotation).length() < 1e-6, "{found:?}");
+        for (a, b) in found.translations.iter().zip(&motion.translations) {
+            assert!((*a - *b).length() < 1e-6, "{found:?}");
+        }
+        assert!(found.remainder_px(&frames, &points) < 1e-4);
+        assert!(RigidMotion::none(3).remainder_px(&frames, &points) > 0.02 * SIZE[0] as f64);
+    }
+}

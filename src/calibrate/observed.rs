@@ -1,0 +1,175 @@
+//! What the angiograms show of the moving vessels, as far as it takes to make the views consistent.
+
+use crate::calibrate::pose::Stand;
+use crate::calibrate::profiles::{Moving, Views};
+use crate::evidence::background::Series;
+use crate::evidence::ratios::ViewEvidence;
+use crate::raster::{Image, dilate};
+use crate::scan::dataset::{Dataset, Frame};
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// Longer sides are brought to about so many pixels.
+const SIDE: usize = 128;
+/// Log-likelihood ratio of "a vessel is here" from which a pixel takes part, at any phase: next to the most a view says.
+const LIKELY: f32 = 2.0;
+/// Pixels that take part are so many more around: tight masks bias noisy data.
+const MASK_MARGIN: usize = 2;
+/// The border, pixels.
+const BORDER: usize = 2;
+/// Standard deviations of noise that are no vessel at the border.
+const CLEAR: f32 = 4.0;
+
+/// The training views that show at least two phases.
+#[derive(Debug, Clone)]
+pub struct Observed {
+    /// Indices into [`Dataset::views`].
+    pub views: Vec<usize>,
+    /// Where they stand.
+    pub stands: Vec<Stand>,
+    /// Pixels of the dataset along one of these.
+    pub factor: usize,
+    /// What exceeds the still background: tells the rough way.
+    pub coarse: Views,
+    /// Differences from the still background, of either sign: tell the rest.
+    pub fine: Views,
+    /// `[view][phase]`: images above the still background.
+    pub seen: Vec<Vec<Option<Vec<f32>>>>,
+    /// `[view][phase]`: pixels that show vessels.
+    pub shown: Vec<Vec<Option<Vec<bool>>>>,
+    /// Share of each view's change that lies at the border of its images.
+    pub at_border: Vec<f64>,
+}
+
+/// Means of `factor` x `factor` pixels.
+fn binned(values: &[f32], width: usize, factor: usize) -> Vec<f32> {
+    let (w, h) = (width / factor, values.len() / width / factor);
+    let scale = 1.0 / (factor * factor) as f32;
+    let mut out = vec![0.0; w * h];
+    for y in 0..h * factor {
+        for x in 0..w * factor {
+            out[y / factor * w + x / factor] += values[y * width + x] * scale;
+        }
+    }
+    out
+}
+
+/// The training frames on larger pixels.
+fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
+    let frame = |f: &Frame| Frame { integrals: binned(&f.integrals, dataset.width, factor), mask: None, ..f.clone() };
+    let mut coarse = Dataset {
+        frames: dataset.training().par_iter().map(frame).collect(),
+        width: dataset.width / factor,
+        height: dataset.height / factor,
+        views: dataset.views.clone(),
+        path: dataset.path.clone(),
+        notes: Vec::new(),
+        ..*dataset
+    };
+    coarse.views.iter_mut().for_each(|view| view.rays = view.rays.binned(factor));
+    coarse
+}
+
+/// One view's part of it.
+struct Seen {
+    stand: Stand,
+    /// Pixels that change.
+    mask: Vec<bool>,
+    /// `[phase]`: above the still background.
+    above: Vec<Option<Vec<f32>>>,
+    /// `[phase]`: pixels that show vessels.
+    shown: Vec<Option<Vec<bool>>>,
+    noise: Vec<f32>,
+    at_border: f64,
+}
+
+impl Seen {
+    fn new(data: &Dataset, series: &Series) -> Seen {
+        let evidence = ViewEvidence::new(series);
+        let level = &evidence.background.level.values;
+        let likely = |p: usize| evidence.ratios.iter().flatten().any(|r| r.values[p] > LIKELY);
+        let mask: Vec<bool> = (0..data.n_pixels()).map(likely).collect();
+        let above = series.images.iter().map(|image| {
+            let values = &image.as_ref()?.values;
+            Some(values.iter().zip(level).map(|(y, b)| y - b).collect::<Vec<f32>>())
+        });
+        let above: Vec<_> = above.collect();
+        let view = &data.views[series.view];
+        let ratios = evidence.ratios.iter();
+        let shown = ratios.map(|r| Some(r.as_ref()?.values.iter().map(|r| *r > LIKELY).collect())).collect();
+        let stand = Stand::new(&view.geometry, &view.rays);
+        let noise = evidence.background.noise.values;
+        let mut seen = Seen { stand, mask, above, shown, noise, at_border: 0.0 };
+        seen.at_border = seen.share_at_border(data.width, data.height);
+        seen
+    }
+
+    fn share_at_border(&self, width: usize, height: usize) -> f64 {
+        let clear = |p: usize| CLEAR * self.noise[p];
+        let change = |p: usize| -> f64 {
+            self.above.iter().flatten().map(|y| y[p]).filter(|y| *y > clear(p)).map(f64::from).sum()
+        };
+        let (mut all, mut border) = (f64::MIN_POSITIVE, 0.0);
+        for p in (0..self.mask.len()).filter(|p| self.mask[*p]) {
+            let (x, y) = (p % width, p / width);
+            all += change(p);
+            if x.min(y).min(width - 1 - x).min(height - 1 - y) < BORDER {
+                border += change(p);
+            }
+        }
+        border / all
+    }
+}
+
+fn widened(mask: &[bool], [width, height]: [usize; 2]) -> Vec<bool> {
+    let values = mask.iter().map(|m| f32::from(u8::from(*m))).collect();
+    dilate(&Image { width, height, values }, MASK_MARGIN).values.iter().map(|v| *v > 0.0).collect()
+}
+
+impl Observed {
+    /// Analyses a dataset.
+    pub fn new(dataset: &Dataset) -> Observed {
+        let factor = ((dataset.width.max(dataset.height) as f64 / SIDE as f64).round() as usize).max(1);
+        let data = coarsened(dataset, factor);
+        let size = [data.width, data.height];
+        let n_phases = data.n_phases as usize;
+        let series = Series::of(&data);
+        let seen: Vec<Seen> = series.par_iter().map(|s| Seen::new(&data, s)).collect();
+        let positive = |s: &Seen| {
+            let above = s.above.iter().map(|y| Some(y.as_ref()?.iter().map(|v| v.max(0.0)).collect()));
+            Moving::new(s.stand.clone(), size, &s.mask, &above.collect::<Vec<_>>())
+        };
+        let signed = |s: &Seen| Moving::new(s.stand.clone(), size, &widened(&s.mask, size), &s.above);
+        Observed {
+            views: series.iter().map(|s| s.view).collect(),
+            coarse: Views::new(seen.iter().map(positive).collect(), n_phases),
+            fine: Views::new(seen.iter().map(signed).collect(), n_phases),
+            at_border: seen.iter().map(|s| s.at_border).collect(),
+            stands: seen.iter().map(|s| s.stand.clone()).collect(),
+            seen: seen.iter().map(|s| s.above.clone()).collect(),
+            shown: seen.into_iter().map(|s| s.shown).collect(),
+            factor,
+        }
+    }
+
+    /// The same images by another geometry, and by its displacements of the heart, `[view][phase]` in world units.
+    pub fn by_geometry_of(&self, dataset: &Dataset) -> (Observed, Vec<Vec<DVec3>>) {
+        let mut other = self.clone();
+        for (stand, view) in other.stands.iter_mut().zip(&self.views) {
+            let view = &dataset.views[*view];
+            *stand = Stand::new(&view.geometry, &view.rays.binned(self.factor));
+        }
+        let shift = |view: usize, t: usize| {
+            let frame = dataset.training().iter().find(|f| f.view == view && f.phase as usize == t);
+            frame.map_or(DVec3::ZERO, Frame::heart_shift)
+        };
+        let shifts = |view: &usize| (0..self.n_phases()).map(|t| shift(*view, t)).collect();
+        let heart = self.views.iter().map(shifts).collect();
+        (other, heart)
+    }
+
+    /// Cardiac phases.
+    pub fn n_phases(&self) -> usize {
+        self.fine.n_phases
+    }
+}
