@@ -18,6 +18,7 @@ void main() {
     uint i = gl_GlobalInvocationID.x, view = gl_WorkGroupID.y;
     if (i >= push.n_gaussians) return;
     Gaussian g = gaussians[i];
-    splats[view * push.n_gaussians + i] = project(g, g.position, gaussian_views[view], gaussian_setup).splat;
-    image_of_splat[view * push.n_gaussians + i] = image_of_view[g.phase * gaussian_setup.n_views + view];
+    int image = image_of_view[g.phase * gaussian_setup.n_views + view];
+    splats[view * push.n_gaussians + i] = project(g, g.position, gaussian_views[max(image, 0)], gaussian_setup).splat;
+    image_of_splat[view * push.n_gaussians + i] = image;
 }

@@ -36,12 +36,13 @@ void main() {
     Gaussian g = gaussians[i];
     GaussianGradient sum = no_gradient();
     for (uint view = 0u; view < gaussian_setup.n_views; view++) {
-        if (image_of_view[g.phase * gaussian_setup.n_views + view] < 0) continue;
-        Projection p = project(g, g.position, gaussian_views[view], gaussian_setup);
+        int image = image_of_view[g.phase * gaussian_setup.n_views + view];
+        if (image < 0) continue;
+        Projection p = project(g, g.position, gaussian_views[image], gaussian_setup);
         if (!(p.depth > 0.0)) continue;
         uint at = 2u * (view * push.n_gaussians + i);
         vec3 linear = splat_moments[at].xyz, square = splat_moments[at + 1u].xyz;
-        add_gradient(g, p, gaussian_views[view], gaussian_setup, linear, square, sum);
+        add_gradient(g, p, gaussian_views[image], gaussian_setup, linear, square, sum);
     }
     vec4 place_rate = vec4(vec3(gaussian_setup.position_rate), gaussian_setup.density_rate);
     vec4 place = step_of(3u * i, vec4(sum.position, sum.log_density), place_rate, now);

@@ -33,11 +33,12 @@ void main() {
         sum.position = vec3(0.0);
         for (uint view = 0u; view < gaussian_setup.n_views; view++) {
             uint at = (t * gaussian_setup.n_views + view) * push.n_gaussians + i;
-            if (image_of_splat[at] < 0) continue;
-            Projection p = project(g, x, gaussian_views[view], gaussian_setup);
+            int image = image_of_splat[at];
+            if (image < 0) continue;
+            Projection p = project(g, x, gaussian_views[image], gaussian_setup);
             if (!(p.depth > 0.0)) continue;
             vec3 linear = splat_moments[2u * at].xyz, square = splat_moments[2u * at + 1u].xyz;
-            add_gradient(g, p, gaussian_views[view], gaussian_setup, linear, square, sum);
+            add_gradient(g, p, gaussian_views[image], gaussian_setup, linear, square, sum);
         }
         place_gradient[phase * push.n_gaussians + i] = vec4(sum.position, 0.0);
         sum.position += before;

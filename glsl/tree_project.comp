@@ -30,6 +30,7 @@ void main() {
     uint view = gl_WorkGroupID.y % gaussian_setup.n_views;
     Gaussian g = gaussians[i];
     uint at = gl_WorkGroupID.y * push.n_gaussians + i;
-    splats[at] = project(g, position_at(i, g.position, phase), gaussian_views[view], gaussian_setup).splat;
-    image_of_splat[at] = image_of_view[phase * gaussian_setup.n_views + view];
+    int image = image_of_view[phase * gaussian_setup.n_views + view];
+    splats[at] = project(g, position_at(i, g.position, phase), gaussian_views[max(image, 0)], gaussian_setup).splat;
+    image_of_splat[at] = image;
 }

@@ -82,6 +82,8 @@ fn targets(width: usize, height: usize, n_phases: usize) -> Targets {
     let views: Vec<SplatView> =
         ANGLES.iter().map(|a| SplatView::new(&c_arm(*a).rays(width, height).unwrap(), units())).collect();
     let n_images = n_phases * views.len() - 1;
+    let n_views = views.len();
+    let views: Vec<SplatView> = views.iter().cycle().take(n_images).cloned().collect();
     let image_of = (0..n_images).map(Some).chain([None]).collect();
     let wave = |i: usize, k: f64| (0.5 + 0.5 * (k * i as f64).sin()) as f32;
     let all = 0..n_images * width * height;
@@ -90,6 +92,7 @@ fn targets(width: usize, height: usize, n_phases: usize) -> Targets {
         width,
         height,
         n_phases,
+        n_views,
         views,
         image_of,
         n_images,

@@ -19,7 +19,7 @@ const MARGIN: f64 = 2.0;
 pub fn gaussian_setup(targets: &Targets, settings: &sections::Gaussians) -> GaussianSetup {
     let image_stride = (targets.n_pixels() as u32).next_multiple_of(4);
     GaussianSetup {
-        n_views: targets.views.len() as u32,
+        n_views: targets.n_views as u32,
         n_phases: targets.n_phases as u32,
         width: targets.width as u32,
         height: targets.height as u32,

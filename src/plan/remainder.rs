@@ -1,7 +1,7 @@
 //! The still background anew, from what a moving field leaves of the images: where a vessel covers a pixel at most phases,
 //! the lowest phases do not show the background, but the images less the vessels do.
 
-use crate::plan::soft_hull::background::{blur, opening_radius};
+use crate::evidence::background::{blur, opening_radius};
 use crate::plan::targets::Targets;
 use crate::raster::{Image, median_filter};
 use rayon::prelude::*;
@@ -29,9 +29,9 @@ pub struct Bounds {
 pub fn bounds(targets: &Targets, images: &[f32]) -> Bounds {
     let mut bounds = Bounds { low: targets.low.clone(), high: targets.high.clone() };
     let n = targets.n_pixels();
-    for view in 0..targets.views.len() {
+    for view in 0..targets.n_views {
         let of_view: Vec<usize> =
-            targets.image_of.iter().skip(view).step_by(targets.views.len()).flatten().copied().collect();
+            targets.image_of.iter().skip(view).step_by(targets.n_views).flatten().copied().collect();
         if of_view.len() < 3 {
             continue;
         }
@@ -124,7 +124,8 @@ mod tests {
             width: SIDE,
             height: SIDE,
             n_phases: PHASES,
-            views: vec![SplatView::new(&Geometry::CArm(geometry).rays(SIDE, SIDE).unwrap(), units)],
+            n_views: 1,
+            views: vec![SplatView::new(&Geometry::CArm(geometry).rays(SIDE, SIDE).unwrap(), units); PHASES],
             image_of: (0..PHASES).map(Some).collect(),
             n_images: PHASES,
             images: images.to_vec(),

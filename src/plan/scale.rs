@@ -196,6 +196,7 @@ mod tests {
             split: Split::Train,
             integrals: (0..SIZE * SIZE).map(|p| if phase == 1 && middle(p) { still + change } else { still }).collect(),
             mask: None,
+            heart_shift_mm: [0.0; 3],
         };
         Dataset {
             path: "test".into(),

@@ -2,12 +2,12 @@
 
 use crate::config::{GaussianForm, sections};
 use crate::error::{Error, Result};
+use crate::evidence::background::Series;
+use crate::evidence::ratios::ViewEvidence;
 use crate::gaussians::view::SplatView;
 use crate::model::gaussians::Units;
 use crate::plan::lengths::{Lengths, vessel_width};
-use crate::plan::soft_hull::background::Series;
 use crate::plan::soft_hull::carve::{HullCell, SoftMotion};
-use crate::plan::soft_hull::evidence::ViewEvidence;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
@@ -32,6 +32,8 @@ pub struct Targets {
     /// Cardiac phases.
     pub n_phases: usize,
     /// Training views with at least two phases.
+    pub n_views: usize,
+    /// What each image sees the heart by: its view, moved against the heart's displacement in that frame.
     pub views: Vec<SplatView>,
     /// `[phase][view]`: index of the image, where there is one.
     pub image_of: Vec<Option<usize>>,
@@ -110,7 +112,8 @@ impl Targets {
             width: dataset.width,
             height: dataset.height,
             n_phases,
-            views: motion.views.iter().map(|v| SplatView::new(&dataset.views[v.view].rays, units)).collect(),
+            n_views: motion.views.len(),
+            views: Vec::new(),
             image_of: vec![None; n_phases * motion.views.len()],
             n_images: 0,
             images: Vec::new(),
@@ -134,6 +137,7 @@ impl Targets {
                 let share = |change: f32| (f64::from(change) / strongest) as f32;
                 targets.image_of[phase * motion.views.len() + slot] = Some(targets.n_images);
                 targets.n_images += 1;
+                targets.views.push(SplatView::new(&dataset.heart_rays_at(view.view, phase as u32), units));
                 targets.images.extend(image.values.iter().map(|y| share(*y)));
                 targets.low.extend(change.values.iter().map(|d| share(*d)));
                 targets.high.extend(above.map(share));
@@ -167,7 +171,7 @@ impl Targets {
 
     /// Phases that some view has.
     pub fn phases_seen(&self) -> usize {
-        self.image_of.chunks(self.views.len()).filter(|row| row.iter().any(Option::is_some)).count()
+        self.image_of.chunks(self.n_views).filter(|row| row.iter().any(Option::is_some)).count()
     }
 
     /// Pixels of an image.
@@ -175,10 +179,10 @@ impl Targets {
         self.width * self.height
     }
 
-    /// Views that have a phase, with their images' indices.
+    /// Images of a phase, and what they see the heart by.
     pub fn views_at(&self, phase: usize) -> impl Iterator<Item = (usize, &SplatView)> {
-        let row = &self.image_of[phase * self.views.len()..][..self.views.len()];
-        row.iter().zip(&self.views).filter_map(|(image, view)| Some(((*image)?, view)))
+        let row = &self.image_of[phase * self.n_views..][..self.n_views];
+        row.iter().flatten().map(|image| (*image, &self.views[*image]))
     }
 }
 

@@ -4,9 +4,10 @@ use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::images;
-use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
+use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, is_at_rest};
 use crate::raster::Image;
 use crate::scan::nerfca;
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -122,6 +123,13 @@ pub struct ManifestFrame {
     /// Vessel mask of the same size: non-zero inside vessels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<PathBuf>,
+    /// How far breathing has carried the heart from its mean along (posterior, left, superior) in this frame, mm. It moves
+    /// what beats, not the still background.
+    #[serde(default, skip_serializing_if = "is_at_rest")]
+    pub heart_shift_mm: [f64; 3],
+    /// The geometry as it was stated before it was corrected; kept for the record, not used.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stated_geometry: Option<Geometry>,
 }
 
 /// One image, ready for use.
@@ -139,6 +147,15 @@ pub struct Frame {
     pub integrals: Vec<f32>,
     /// Vessel mask, where known.
     pub mask: Option<Vec<bool>>,
+    /// How far breathing has carried the heart from its mean along (posterior, left, superior), mm.
+    pub heart_shift_mm: [f64; 3],
+}
+
+impl Frame {
+    /// How far breathing has carried the heart from its mean, world units.
+    pub fn heart_shift(&self) -> DVec3 {
+        DVec3::from_array(self.heart_shift_mm) / MM_PER_UNIT
+    }
 }
 
 /// A geometry shared by frames.
@@ -197,6 +214,22 @@ pub struct Dataset {
 }
 
 impl Dataset {
+    /// Rays by which the heart is seen in a frame: the view's, moved against the heart's displacement.
+    pub fn heart_rays(&self, frame: &Frame) -> ViewRays {
+        self.views[frame.view].rays.moved(frame.heart_shift())
+    }
+
+    /// Rays by which the heart is seen in a view's training frames at a phase; those of the view where it has none.
+    pub fn heart_rays_at(&self, view: usize, phase: u32) -> ViewRays {
+        let frame = self.training().iter().find(|f| (f.view, f.phase) == (view, phase));
+        frame.map_or_else(|| self.views[view].rays.clone(), |f| self.heart_rays(f))
+    }
+
+    /// Whether some training frame has a displacement of the heart.
+    pub fn heart_shifts(&self) -> bool {
+        self.training().iter().any(|f| f.heart_shift_mm != [0.0; 3])
+    }
+
     /// Reads a dataset, detecting its layout.
     ///
     /// # Errors
@@ -262,6 +295,7 @@ impl Dataset {
                 image,
                 to_integral: |v| frame.intensity.integral(v),
                 mask,
+                heart_shift_mm: frame.heart_shift_mm,
             })?;
         }
         builder.finish(path, Layout::Native)
@@ -337,6 +371,7 @@ pub(super) struct NewFrame<'a, F: Fn(f32) -> f32> {
     pub image: Image,
     pub to_integral: F,
     pub mask: Option<Vec<bool>>,
+    pub heart_shift_mm: [f64; 3],
 }
 
 impl Builder {
@@ -368,6 +403,9 @@ impl Builder {
         let field = |name: &str| format!("frames[{}].{name}", new.index);
         if self.frames.len() >= MAX_FRAMES {
             return Err(Error::data(&self.file, "frames", format!("more than {MAX_FRAMES}")));
+        }
+        if !new.heart_shift_mm.iter().all(|s| s.is_finite() && s.abs() < 1e3) {
+            return Err(Error::data(&self.file, field("heart_shift_mm"), "is not a displacement in mm"));
         }
         if new.phase >= self.n_phases {
             return Err(Error::data(
@@ -426,6 +464,7 @@ impl Builder {
             split: new.split,
             integrals: new.image.values.iter().map(|v| (new.to_integral)(*v)).collect(),
             mask: new.mask,
+            heart_shift_mm: new.heart_shift_mm,
         });
         Ok(())
     }

@@ -158,6 +158,7 @@ pub fn open(path: &Path) -> Result<Dataset> {
             image,
             to_integral: |v| (i0 - (f64::from(v) * (high - low) + low)) as f32,
             mask,
+            heart_shift_mm: [0.0; 3],
         })?;
     }
     builder.finish(path, Layout::Nerfca)

@@ -118,6 +118,8 @@ impl<'a> Writer<'a> {
                     geometry: geometry.clone(),
                     intensity: Intensity::Integral { scale: 1.0, offset: 0.0 },
                     mask: mask.map(|_| mask_file),
+                    heart_shift_mm: [0.0; 3],
+                    stated_geometry: None,
                 });
                 Ok(image)
             }
@@ -148,6 +150,25 @@ impl<'a> Writer<'a> {
                 Ok(PathBuf::from(image))
             }
         }
+    }
+
+    /// Says of the frame written last how far the heart was displaced, along (posterior, left, superior), mm, and what
+    /// its geometry was stated to be before it was corrected.
+    ///
+    /// # Errors
+    /// [`Error::Config`] where the layout cannot state a displacement.
+    pub fn corrected(&mut self, heart_shift_mm: [f64; 3], stated: Option<&Geometry>) -> Result<()> {
+        if self.layout == Layout::Nerfca && heart_shift_mm != [0.0; 3] {
+            return Err(Error::config(
+                "layout",
+                "nerfca",
+                "has no displacements of the heart, as breathing makes them",
+            ));
+        }
+        if let Some(frame) = self.manifest.frames.last_mut() {
+            (frame.heart_shift_mm, frame.stated_geometry) = (heart_shift_mm, stated.cloned());
+        }
+        Ok(())
     }
 
     /// Angles of a geometry that differs from the common one by nothing else.
@@ -192,6 +213,21 @@ impl<'a> Writer<'a> {
 /// # Errors
 /// [`Error::Config`] for what the layout cannot state; [`Error::Io`].
 pub fn convert(dataset: &Dataset, layout: Layout, out: &Path) -> Result<()> {
+    let description = format!("converted from {:?}", dataset.layout).to_lowercase();
+    write(dataset, layout, out, description, &|_| None)
+}
+
+/// Writes a dataset of line integrals; `stated` gives what the geometry of a view was before it was corrected.
+///
+/// # Errors
+/// As [`convert`].
+pub fn write(
+    dataset: &Dataset,
+    layout: Layout,
+    out: &Path,
+    description: String,
+    stated: &dyn Fn(usize) -> Option<Geometry>,
+) -> Result<()> {
     let (low, high) = dataset.depth_range;
     if layout == Layout::Nerfca && (low + high).abs() > 1e-9 {
         return Err(Error::config("layout", "nerfca", "the depth range is not centred"));
@@ -200,7 +236,7 @@ pub fn convert(dataset: &Dataset, layout: Layout, out: &Path) -> Result<()> {
         out,
         layout,
         About {
-            description: format!("converted from {:?}", dataset.layout).to_lowercase(),
+            description,
             phases: dataset.n_phases,
             depth_half_extent_mm: low.abs().max(high.abs()) * MM_PER_UNIT,
             vessel_attenuation_per_mm: dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
@@ -211,6 +247,7 @@ pub fn convert(dataset: &Dataset, layout: Layout, out: &Path) -> Result<()> {
     for frame in &dataset.frames {
         let geometry = &dataset.views[frame.view].geometry;
         writer.frame(geometry, frame.split, frame.view, frame.phase, &frame.integrals, frame.mask.as_deref())?;
+        writer.corrected(frame.heart_shift_mm, stated(frame.view).as_ref())?;
     }
     writer.finish()
 }

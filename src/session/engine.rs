@@ -1,5 +1,6 @@
 //! What trains a session and what is drawn of it, shared by the threads that do so.
 
+use crate::calibrate::calibrate;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -162,6 +163,9 @@ impl Shared {
             // Views wait for what was submitted before them.
             tuning.iterations_per_submit = Some(1);
         }
+        let calibration = calibrate(&dataset, &config)?;
+        calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
+        let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;
         if let Some(training) = &mut engine.training {
             let state = training.trainer_mut().checkpoint()?;

@@ -108,6 +108,7 @@ impl Inbox {
             split: new.split,
             integrals: new.integrals,
             mask: new.mask,
+            heart_shift_mm: [0.0; 3],
         };
         self.frames.push((frame, new.moment));
         Ok(())

@@ -155,7 +155,7 @@ impl Moving {
         per_submit: u32,
     ) -> Result<Option<Moving>> {
         let Some(targets) = plan.targets.take() else { return Ok(None) };
-        let shot = |frame: &Frame| (dataset.views[frame.view].rays.clone(), frame.phase);
+        let shot = |frame: &Frame| (dataset.heart_rays(frame), frame.phase);
         let (done, end) = (saved.map_or(0, |model| model.step), plan.config.gaussian_iterations());
         let (fit, field) = match saved.and_then(|model| model.moving.as_ref()).filter(|_| done >= end) {
             Some(field) => (None, field.clone()),

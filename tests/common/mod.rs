@@ -65,7 +65,15 @@ pub fn small_dataset(width: usize, height: usize) -> Dataset {
                 })
                 .collect();
             let split = if v == 2 && phase == 2 { Split::Validation } else { Split::Train };
-            frames.push(Frame { name: format!("v{v}p{phase}"), view: v, phase, split, integrals, mask: None });
+            frames.push(Frame {
+                name: format!("v{v}p{phase}"),
+                view: v,
+                phase,
+                split,
+                integrals,
+                mask: None,
+                heart_shift_mm: [0.0; 3],
+            });
         }
     }
     frames.sort_by_key(|f| f.split);
