@@ -48,7 +48,7 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
         return Err(Error::config("calibrate.mode", "breathing", problem));
     }
     let observed = Observed::new(dataset);
-    if let Some(why) = nothing_to_tell(&observed) {
+    if let Some(why) = nothing_to_tell(dataset, &observed) {
         return Ok(Calibration::none(Some(format!("views not calibrated: {why}"))));
     }
     let mut notes = Vec::new();
@@ -82,12 +82,12 @@ pub struct Silhouettes {
 /// Silhouettes of each training view at the phase that shows most of the vessels.
 pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
     let before = Observed::new(dataset);
-    let after = before.by_geometry_of(corrected);
+    let (after, heart) = before.by_geometry_of(corrected);
     let stated = Poses::stated(before.views.len(), before.n_phases());
+    let displaced = Poses { heart, ..stated.clone() };
     let of_view = |slot: usize| {
         let count = |t: &usize| before.shown[slot][*t].iter().flatten().filter(|s| **s).count();
         let phase = (0..before.n_phases()).max_by_key(count)?;
-        let moved = Poses { heart: after.1.clone(), ..stated.clone() };
         Some(Silhouettes {
             view: before.views[slot],
             phase: phase as u32,
@@ -96,7 +96,7 @@ pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
             shown: before.shown[slot][phase].clone()?,
             explained: [
                 silhouettes::explained_pixels(&before, &stated, slot, phase)?,
-                silhouettes::explained_pixels(&after.0, &moved, slot, phase)?,
+                silhouettes::explained_pixels(&after, &displaced, slot, phase)?,
             ],
         })
     };
@@ -104,7 +104,10 @@ pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
 }
 
 /// Why nothing can be told of how the views agree.
-fn nothing_to_tell(observed: &Observed) -> Option<String> {
+fn nothing_to_tell(dataset: &Dataset, observed: &Observed) -> Option<String> {
+    if dataset.heart_shifts() {
+        return Some("frames state displacements of the heart already".into());
+    }
     let n = observed.views.len();
     if n < 2 {
         return Some(format!("{n} training views show two phases, and it takes two to compare"));
@@ -113,7 +116,7 @@ fn nothing_to_tell(observed: &Observed) -> Option<String> {
         return Some("all pairs of views look along one line, where they have no planes in common to compare".into());
     }
     let all: Vec<usize> = (0..observed.n_phases()).collect();
-    let power = misfit(observed, &Poses::stated(n, observed.n_phases()), &all).power;
+    let power = misfit(&observed.fine, &Poses::stated(n, observed.n_phases()), &all).power;
     (power == 0.0).then(|| "nothing moves in the images: their phases are all alike".into())
 }
 
@@ -177,7 +180,7 @@ impl Calibrator<'_> {
             self.observed.n_phases()
         ));
         let all: Vec<usize> = (0..self.observed.n_phases()).collect();
-        let share = |poses: &Poses| misfit(self.observed, poses, &all).share();
+        let share = |poses: &Poses| misfit(&self.observed.fine, poses, &all).share();
         let stated = share(&Poses::stated(self.observed.views.len(), all.len()));
         let tried = candidates[1.min(candidates.len() - 1)];
         let poses = fit(self.observed, tried, &all);
@@ -232,7 +235,7 @@ impl Calibrator<'_> {
             let mut views = self.observed.fine.clone();
             views.pairs.retain(|p| p.views.contains(&slot));
             let all: Vec<usize> = (0..views.n_phases).collect();
-            solve::misfit(&views, poses, 3.0, &all).share()
+            choose::misfit(&views, poses, &all).share()
         };
         let before = Poses::stated(poses.views.len(), self.observed.n_phases());
         let frames: Vec<FrameRays> = self.frame_rays(&before, poses, Some(slot));

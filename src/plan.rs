@@ -65,6 +65,11 @@ impl Plan {
             let (hull, targets) = plan_gaussians(config, dataset, &mut notes)?;
             (Some(hull), Some(targets))
         } else {
+            if dataset.heart_shifts() {
+                notes.push(
+                    "the network sees all frames of a view alike: displacements of the heart are left out".into(),
+                );
+            }
             (choose_hull(config, dataset, &motion, &mut notes), None)
         };
         let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;

@@ -4,6 +4,7 @@
 use crate::calibrate::gauge;
 use crate::calibrate::observed::Observed;
 use crate::calibrate::pose::Poses;
+use crate::calibrate::profiles::Views;
 use crate::calibrate::solve::{self, Misfit, Stage};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -61,8 +62,8 @@ pub fn fit(observed: &Observed, correction: Correction, phases: &[usize]) -> Pos
 }
 
 /// How far the views are from agreeing at the wanted phases.
-pub fn misfit(observed: &Observed, poses: &Poses, phases: &[usize]) -> Misfit {
-    solve::misfit(&observed.fine, poses, FINE[1], phases)
+pub fn misfit(views: &Views, poses: &Poses, phases: &[usize]) -> Misfit {
+    solve::misfit(views, poses, FINE[1], phases)
 }
 
 /// Displacements at phases that were not fitted: on a straight line between those beside, the nearest at the ends. Breath
@@ -96,7 +97,7 @@ pub fn validate(observed: &Observed, correction: Correction) -> Validated {
         let (fitted, tested) = (parity(odd), parity(1 - odd));
         let mut poses = fit(observed, correction, &fitted);
         poses.heart.iter_mut().for_each(|of_view| between(of_view, &fitted));
-        let misfit = misfit(observed, &poses, &tested);
+        let misfit = misfit(&observed.fine, &poses, &tested);
         squares += misfit.squares;
         power += misfit.power;
         poses

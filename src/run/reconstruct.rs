@@ -1,8 +1,10 @@
 //! One reconstruction, from a dataset to a run directory: trains, validates, saves, and can be stopped.
 //!
-//! A run directory holds `config.toml`, `metrics.jsonl` (one object per line), the newest checkpoints and,
-//! when finished, `report/` with the evaluation and pictures.
+//! A run directory holds `config.toml`, `metrics.jsonl` (one object per line), the newest checkpoints, `calibration.json`
+//! with what was corrected of the views' geometry and, when finished, `report/` with the evaluation and pictures.
 
+use crate::calibrate::calibrate;
+use crate::calibrate::correction::Calibration;
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
@@ -15,6 +17,7 @@ use crate::run::hull_pictures;
 use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
 use crate::scan::dataset::Dataset;
+use crate::score::calibrated::in_calibrated_frame;
 use crate::score::eval;
 use crate::train::trainer::Trainer;
 use crate::train::training::{Progress, Training};
@@ -56,12 +59,13 @@ pub fn reconstruct(
     for directory in [options.run, &options.run.join("report")] {
         files::remove_partial(directory);
     }
+    let (dataset, calibration) = calibrated(config, dataset, options)?;
+    let dataset = &dataset;
     let trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
         let plan = Plan::new(&saved.model.config, dataset)?.in_scene(saved.model.scene.clone());
         Trainer::resume(gpu, plan, dataset, options.tuning.clone(), &saved)?
     } else {
-        files::create_directory(options.run)?;
         let plan = Plan::new(config, dataset)?;
         if let Some(hull) = &plan.hull {
             hull_pictures::write(&options.run.join("report"), dataset, hull)?;
@@ -77,6 +81,7 @@ pub fn reconstruct(
         Ok(())
     };
     let mut notes = dataset.notes.clone();
+    notes.extend(calibration.notes);
     notes.extend(trainer.plan().notes.iter().cloned());
     notes.extend(trainer.tuning().reasons.iter().cloned());
     tell(Event::Started {
@@ -104,6 +109,20 @@ pub fn reconstruct(
         scope.spawn(move || worker.work(&to_do, &done));
         Loop::new(&mut training, &config, options, &mut tell).run(jobs, &answers)
     })
+}
+
+/// The dataset by the geometry that the run goes by: found now, or when the run was begun.
+fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> Result<(Dataset, Calibration)> {
+    let calibration = if options.resume {
+        Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
+    } else {
+        files::create_directory(options.run)?;
+        let calibration = calibrate(dataset, config)?;
+        calibration.write(options.run)?;
+        calibration
+    };
+    let corrected = dataset.corrected(&calibration)?;
+    Ok((in_calibrated_frame(&corrected)?.unwrap_or(corrected), calibration))
 }
 
 /// Runs the iterations. Snapshots go to the worker, which works beside training where `tuning.overlap` says so, and
