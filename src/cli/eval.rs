@@ -3,6 +3,7 @@
 use super::args::{Cli, EvalArgs};
 use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
+use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
 use nertca_vk::model::checkpoint::newest_model;
@@ -21,7 +22,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     if args.threshold.is_some_and(|t| !(t.is_finite() && t >= 0.0)) {
         return Err(Error::config("--threshold", args.threshold.unwrap_or_default(), "must not be negative"));
     }
-    let dataset = Dataset::open(&data)?;
+    let dataset = as_trained(Dataset::open(&data)?, &args.run)?;
     let gpu = cli.open_device()?;
     let model = newest_model(&args.run)?;
     let tuning = cli.tuning(&gpu, &model.config);
@@ -53,6 +54,14 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     cli.close_device(&gpu)
 }
 
+/// A dataset by the geometry that a run went by.
+pub fn as_trained(dataset: Dataset, run: &Path) -> Result<Dataset> {
+    match Calibration::read(run)? {
+        Some(calibration) => dataset.corrected(&calibration),
+        None => Ok(dataset),
+    }
+}
+
 /// Prints scores as a table with means.
 pub fn print_table(evaluation: &Evaluation) {
     let dice = |d: Option<f64>| d.map_or("    -".into(), |d| format!("{d:.3}"));
@@ -78,6 +87,13 @@ pub fn print_table(evaluation: &Evaluation) {
         evaluation.psnr,
         evaluation.ssim
     );
+    if let Some(stated) = &evaluation.dice_as_stated {
+        out!(
+            "unseen views from where the calibrated reconstruction has them; as stated, Dice is {} / {}",
+            dice(stated.dynamic),
+            dice(stated.total)
+        );
+    }
     out!(
         "Dice threshold {:.4e} / {:.4e} per mm (dynamic / total): {}",
         evaluation.threshold.dynamic_per_mm,

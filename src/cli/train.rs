@@ -1,7 +1,7 @@
 //! `train`: a run and its report.
 
 use super::args::{Cli, TrainArgs};
-use super::eval::print_table;
+use super::eval::{as_trained, print_table};
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
 use nertca_vk::config::Config;
@@ -48,6 +48,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
     let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
+    let dataset = as_trained(dataset, run)?;
     let report = run.join("report");
     let (model, page) = (newest_model(run)?, run.join("report.html"));
     let mut warnings = Vec::new();

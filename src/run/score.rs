@@ -8,6 +8,7 @@ use crate::model::Model;
 use crate::render::renderer::Renderer;
 use crate::run::events::Event;
 use crate::scan::dataset::Dataset;
+use crate::score::calibrated::in_calibrated_frame;
 use crate::score::eval::{Evaluation, Scoring, evaluate, moving_field_warning};
 use crate::score::pictures::{self, Window};
 use std::collections::HashMap;
@@ -25,7 +26,9 @@ pub struct ScoreOptions<'a> {
     pub cancel: &'a AtomicBool,
 }
 
-/// Evaluates a model on all validation frames. `observe` hears of [`Event::Evaluation`] after every image.
+/// Evaluates a model on all validation frames of a dataset whose training views are those the run went by. Where the truth of
+/// synthetic data tells, unseen views are seen from where the reconstruction has them, and Dice as stated is told beside it.
+/// `observe` hears of [`Event::Evaluation`] after every image.
 ///
 /// # Errors
 /// [`Error::Interrupted`] after a cancel; errors of data, device and files.
@@ -45,6 +48,9 @@ pub fn evaluate_model(
         ));
     }
     let renderer = Renderer::new(gpu, model, tuning.clone())?;
+    let stated = dataset;
+    let carried = in_calibrated_frame(dataset)?;
+    let dataset = carried.as_ref().unwrap_or(dataset);
     let frames: Vec<_> = dataset.validation().iter().collect();
     let mut beats = options.pictures.map(|directory| Beats::new(dataset, directory));
     let missing = beats.as_ref().map_or(0, |beats| beats.missing(dataset).len());
@@ -63,6 +69,12 @@ pub fn evaluate_model(
         })?;
     if let Some(beats) = beats {
         beats.write(&renderer, dataset, &mut pace)?;
+    }
+    if carried.is_some() {
+        let frames: Vec<_> = stated.validation().iter().collect();
+        let go_on =
+            |_: Scoring<'_>| if options.cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) };
+        evaluation.dice_as_stated = Some(evaluate(&renderer, stated, &frames, model.step, threshold, go_on)?.dice);
     }
     evaluation.warnings.extend(moving_field_warning(&renderer, dataset)?);
     Ok(evaluation)

@@ -86,6 +86,10 @@ pub struct Evaluation {
     pub step: u32,
     /// Mean Dice.
     pub dice: DiceMeans,
+    /// Where unseen views of synthetic data were carried to the frame of the calibrated reconstruction: Dice where they were
+    /// left as stated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dice_as_stated: Option<DiceMeans>,
     /// What Dice would be with the best threshold.
     pub best_dice: BestDices,
     /// Mean PSNR, dB.
@@ -156,8 +160,8 @@ pub fn evaluate(
     }
     let mut seen = Vec::new();
     for frame in frames {
-        let rays = &dataset.views[frame.view].rays;
-        seen.push(renderer.render(rays, dataset.width, dataset.height, frame.phase)?);
+        let rays = dataset.heart_rays(frame);
+        seen.push(renderer.render(&rays, dataset.width, dataset.height, frame.phase)?);
         observe(Scoring::Rendered)?;
     }
     let (dynamic_threshold, total_threshold, rule) = choose_thresholds(&seen, dataset.vessel_attenuation, threshold);
@@ -195,6 +199,7 @@ pub fn evaluate(
     Ok(Evaluation {
         step,
         dice: DiceMeans { dynamic: mean(&|i| i.dice_dynamic), total: mean(&|i| i.dice_total) },
+        dice_as_stated: None,
         best_dice: BestDices { dynamic: best(DYNAMIC, dynamic_threshold), total: best(TOTAL, total_threshold) },
         psnr: mean(&|i| Some(i.psnr)).unwrap_or(f64::NAN),
         ssim: mean(&|i| Some(i.ssim)).unwrap_or(f64::NAN),
@@ -231,8 +236,7 @@ fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
 /// Device errors.
 pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Option<String>> {
     let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
-    let rays = &dataset.views[frame.view].rays;
-    let seen = renderer.render(rays, dataset.width, dataset.height, frame.phase)?;
+    let seen = renderer.render(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.phase)?;
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
     Ok((strongest < DEAD_SHARE * change).then(|| {
         format!(

@@ -130,6 +130,31 @@ pub fn write_gif(path: &Path, frames: &[Vec<f32>], width: usize, window: Window,
     files::write_atomic(path, &bytes)
 }
 
+/// Writes what a view shows of vessels before and after a correction, side by side: green where the other views show vessels
+/// on the ray, too, red where they do not.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn write_silhouettes(
+    path: &Path,
+    seen: &[f32],
+    shown: &[bool],
+    explained: [&[bool]; 2],
+    width: usize,
+) -> Result<()> {
+    let window = Window::of(seen);
+    let codes = window.codes(seen);
+    let side = |explained: &[bool]| {
+        let colour = |i: usize| match (shown[i], explained[i]) {
+            (false, _) => Rgb([codes[i]; 3]),
+            (true, true) => Rgb([30, 150, 60]),
+            (true, false) => Rgb([220, 40, 30]),
+        };
+        panel(width, colour, seen.len())
+    };
+    png::write(path, &DynamicImage::ImageRgb8(beside(&explained.map(side))))
+}
+
 /// One grey image.
 ///
 /// # Errors
