@@ -11,6 +11,7 @@ macro_rules! out {
 mod cli {
     pub mod args;
     pub mod bench;
+    pub mod calibrate;
     pub mod data;
     pub mod devices;
     pub mod eval;
@@ -47,6 +48,7 @@ fn main() -> ExitCode {
         Command::Render(args) => cli::render::render(&cli, args),
         Command::View(args) => cli::view::view(&cli, args),
         Command::Export(args) => cli::export::export(&cli, args),
+        Command::Calibrate(args) => cli::calibrate::run(args),
         Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),
         Command::Info(args) => cli::info::info(args),

@@ -3,7 +3,7 @@
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 use nertca_vk::choice::Choice;
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::{CalibrateMode, Config, Preset};
 use nertca_vk::error::Result;
 use nertca_vk::export::volumes::Format;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
@@ -62,6 +62,8 @@ pub enum Command {
     View(ViewArgs),
     /// Export volumes or vessel surfaces of a run for other tools.
     Export(ExportArgs),
+    /// Correct views that disagree, from the angiograms alone.
+    Calibrate(CalibrateArgs),
     /// Convert a dataset between the native and the authors' layout.
     Convert(ConvertArgs),
     /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
@@ -601,6 +603,22 @@ pub struct ExportArgs {
     /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
+}
+
+/// `calibrate`.
+#[derive(Debug, Args)]
+pub struct CalibrateArgs {
+    /// Dataset directory in either layout.
+    pub data: PathBuf,
+    /// What is corrected.
+    #[arg(long, value_parser = choice::<CalibrateMode>(), default_value = "auto")]
+    pub mode: CalibrateMode,
+    /// Dataset directory to make: the same images with corrected geometry, and pictures of what changed in `calibration`.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `convert`.

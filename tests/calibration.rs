@@ -1,0 +1,159 @@
+//! Views that disagree are brought together from the angiograms alone.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+#[path = "common/disagreeing.rs"]
+mod disagreeing;
+
+use common::{gpu, run, small_dataset, tuning};
+use disagreeing::{PHASES, Shot, Studio, Wrong};
+use nertca_vk::calibrate::calibrate;
+use nertca_vk::calibrate::choose::{Correction, fit};
+use nertca_vk::calibrate::correction::Calibration;
+use nertca_vk::calibrate::observed::Observed;
+use nertca_vk::config::Config;
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::plan::Plan;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::scan::writer;
+use nertca_vk::score::calibrated::in_calibrated_frame;
+use nertca_vk::score::eval::evaluate;
+use nertca_vk::train::trainer::Trainer;
+use std::time::Instant;
+
+fn config(mode: &str) -> Config {
+    Config::load(None, None, &[format!("calibrate.mode={mode}")]).unwrap()
+}
+
+/// Error of a dataset's geometry against the truth, pixels.
+fn error_px(shot: &Shot, dataset: &Dataset) -> f64 {
+    shot.error_px(&|view, phase| dataset.heart_rays_at(view, phase as u32))
+}
+
+/// What automatic calibration makes of a shot, and the error that remains, pixels.
+fn calibrated(shot: &Shot, mode: &str) -> (Calibration, f64) {
+    let begin = Instant::now();
+    let calibration = calibrate(&shot.dataset, &config(mode)).unwrap();
+    let seconds = begin.elapsed().as_secs_f64();
+    let error = error_px(shot, &shot.dataset.corrected(&calibration).unwrap());
+    let before = error_px(shot, &shot.dataset);
+    println!("{before:.2} px -> {error:.3} px, {seconds:.2} s; {}", calibration.notes.join("; "));
+    (calibration, error)
+}
+
+#[test]
+fn views_are_brought_together() {
+    let gpu = gpu();
+    let studio = Studio::new(&gpu, 100, 1);
+    let none = Wrong { seed: 11, ..Wrong::default() };
+    let moved = Wrong { angle_deg: 0.5, shift_mm: 1.0, ..none };
+    let breathing = Wrong { breathing_mm: 3.0, ..none };
+    let cases = [
+        (4, none, Correction::Stated, 0.05),
+        (3, none, Correction::Stated, 0.05),
+        (4, Wrong { noise: 0.1, ..none }, Correction::Stated, 0.05),
+        (4, moved, Correction::Static, 0.15),
+        (3, moved, Correction::Static, 0.15),
+        (4, Wrong { noise: 0.1, ..moved }, Correction::Static, 0.3),
+        (4, breathing, Correction::Breathing, 0.2),
+        (3, breathing, Correction::Breathing, 0.2),
+        (4, Wrong { breathing_mm: 3.0, angle_deg: 0.25, shift_mm: 0.5, ..none }, Correction::Breathing, 0.3),
+    ];
+    let mut failures = Vec::new();
+    for (n_views, wrong, correction, most) in cases {
+        let shot = studio.shoot(n_views, false, wrong);
+        let (calibration, error) = calibrated(&shot, "auto");
+        if calibration.correction != correction || error.is_nan() || error > most {
+            failures.push(format!("{n_views} views, {wrong:?}: {:?}, {error:.3} px", calibration.correction));
+        }
+        let all: Vec<usize> = (0..PHASES as usize).collect();
+        let observed = Observed::new(&shot.dataset);
+        let poses = fit(&observed, Correction::Breathing, &all);
+        for t in all {
+            let mean = poses.gains.iter().map(|g| g[t]).sum::<f64>() / f64::from(n_views);
+            assert!(mean.abs() < 1e-3, "mean contrast of phase {t}: {mean}");
+        }
+    }
+    assert_eq!(failures, Vec::<String>::new());
+}
+
+/// Dice of the moving field at unseen views, by the default preset.
+fn dice(gpu: &Gpu, dataset: &Dataset) -> f64 {
+    let config = config("off");
+    let iterations = config.gaussian_iterations();
+    let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset).unwrap(), dataset, tuning(gpu)).unwrap();
+    run(&mut trainer, iterations);
+    let renderer = Renderer::new(gpu, &trainer.model().unwrap(), tuning(gpu)).unwrap();
+    let frames: Vec<_> = dataset.validation().iter().collect();
+    evaluate(&renderer, dataset, &frames, iterations, None, |_| Ok(())).unwrap().dice.dynamic.unwrap()
+}
+
+#[test]
+fn a_calibrated_run_is_as_good_as_one_with_true_geometry() {
+    let gpu = gpu();
+    let studio = Studio::new(&gpu, 100, 1);
+    let none = Wrong { seed: 11, ..Wrong::default() };
+    let truth = dice(&gpu, &studio.shoot(4, true, none).dataset);
+    let moved = Wrong { angle_deg: 0.5, shift_mm: 1.0, ..none };
+    let breathing = Wrong { angle_deg: 0.25, shift_mm: 0.5, breathing_mm: 3.0, ..none };
+    for (wrong, least) in [(moved, truth - 0.03), (breathing, truth - 0.06)] {
+        let mut shot = studio.shoot(4, true, wrong);
+        let directory = tempfile::tempdir().unwrap();
+        shot.write_truth(directory.path());
+        shot.dataset.path = directory.path().into();
+        let (calibration, error) = calibrated(&shot, "auto");
+        let corrected = shot.dataset.corrected(&calibration).unwrap();
+        let carried = in_calibrated_frame(&corrected).unwrap().expect("unseen views are elsewhere than stated");
+        let (got, stated) = (dice(&gpu, &carried), dice(&gpu, &shot.dataset));
+        println!("true geometry {truth:.3}, calibrated {got:.3} ({error:.2} px), stated {stated:.3}");
+        assert!(got >= least && got > stated + 0.1, "{wrong:?}: {got:.3}, stated {stated:.3}, true {truth:.3}");
+    }
+}
+
+#[test]
+fn what_tells_nothing_is_left_as_stated() {
+    let phases_alike = {
+        let mut dataset = small_dataset(40, 40);
+        let first: Vec<_> = dataset.frames.clone();
+        for f in &mut dataset.frames {
+            let same = first.iter().find(|g| g.view == f.view).unwrap();
+            f.integrals.clone_from(&same.integrals);
+        }
+        dataset
+    };
+    let mut one_view = small_dataset(40, 40);
+    one_view.frames.retain(|f| f.view == 0);
+    for (dataset, why) in [(phases_alike, "phases are all alike"), (one_view, "it takes two")] {
+        let calibration = calibrate(&dataset, &config("auto")).unwrap();
+        assert_eq!(calibration.correction, Correction::Stated);
+        assert!(calibration.notes.join(" ").contains(why), "{:?}", calibration.notes);
+        assert_eq!(dataset.corrected(&calibration).unwrap().views[0].geometry, dataset.views[0].geometry);
+    }
+    assert_eq!(calibrate(&small_dataset(40, 40), &config("off")).unwrap(), Calibration::none(None));
+    let network = Config::load(None, None, &["gaussians.form=none".into(), "calibrate.mode=breathing".into()]).unwrap();
+    let refused = calibrate(&small_dataset(40, 40), &network).unwrap_err().to_string();
+    assert!(refused.contains("calibrate.mode") && refused.contains("per view only"), "{refused}");
+}
+
+#[test]
+fn corrections_are_written_and_read() {
+    let dataset = small_dataset(24, 20);
+    let stated = dataset.views[1].geometry.clone();
+    let mut corrected = dataset.clone();
+    corrected.views[1].geometry = stated.corrected([0.3, -0.2], glam::DVec3::new(0.01, 0.0, -0.02));
+    corrected.views[1].rays = corrected.views[1].geometry.rays(24, 20).unwrap();
+    corrected.frames[0].heart_shift_mm = [1.0, -0.5, 2.0];
+    let directory = tempfile::tempdir().unwrap();
+    let of_view = |view: usize| (view == 1).then(|| stated.clone());
+    writer::write(&corrected, Layout::Native, directory.path(), "test".into(), &of_view).unwrap();
+    let read = Dataset::open(directory.path()).unwrap();
+    assert_eq!(read.views[1].geometry, corrected.views[1].geometry);
+    assert_eq!(read.frames[0].heart_shift_mm, [1.0, -0.5, 2.0]);
+    let source = read.heart_rays(&read.frames[0]).source() - read.views[read.frames[0].view].rays.source();
+    assert!((source - glam::DVec3::new(-0.01, 0.005, -0.02)).length() < 1e-12, "{source}");
+    let text = std::fs::read_to_string(directory.path().join("dataset.json")).unwrap();
+    assert!(text.contains("stated_geometry"));
+    let refused = writer::convert(&read, Layout::Nerfca, &directory.path().join("x")).unwrap_err().to_string();
+    assert!(refused.contains("nerfca"), "{refused}");
+}

@@ -1,0 +1,205 @@
+//! Phantoms whose views disagree by known errors, and how well a correction does against the truth.
+
+use glam::DVec3;
+use nertca_vk::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
+use nertca_vk::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::phantom::projector::{LoadedVolume, Projector};
+use nertca_vk::phantom::tree::{Heart, Tree, contraction};
+use nertca_vk::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
+use nertca_vk::phantom::voxels::{self, Tissues};
+use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
+use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use std::path::Path;
+
+pub const PHASES: u32 = 10;
+const SCALE: f64 = 0.37;
+
+/// A beating tree in a thorax, ready to be shot.
+pub struct Studio {
+    projector: Projector,
+    still: LoadedVolume,
+    heart: Vec<LoadedVolume>,
+    vessels: Vec<LoadedVolume>,
+    tree: Tree,
+    pub size: usize,
+}
+
+/// What is wrong with the stated geometry, standard deviations or amplitudes.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Wrong {
+    pub angle_deg: f64,
+    pub shift_mm: f64,
+    pub breathing_mm: f64,
+    /// Share of the strongest vessel's line integral.
+    pub noise: f64,
+    pub seed: u32,
+}
+
+/// A dataset with stated geometry, and what truly was.
+pub struct Shot {
+    pub dataset: Dataset,
+    /// Per view.
+    pub truth: Vec<Geometry>,
+    /// `[view][phase]`, world units.
+    pub heart: Vec<Vec<DVec3>>,
+    pub breathes: bool,
+    points: Vec<Vec<DVec3>>,
+}
+
+impl Studio {
+    pub fn new(gpu: &Gpu, size: usize, seed: u32) -> Studio {
+        let heart = Heart::new(DVec3::ZERO, SCALE);
+        let (low, high) = Tree::procedural(&heart, SCALE, PHASES, seed).bounds_mm();
+        let shift = -0.5 * (low + high);
+        let heart = Heart::new(shift, SCALE);
+        let tree = Tree::procedural(&heart, SCALE, PHASES, seed);
+        let still = voxels::thorax(Tissues::XCAT, shift, SCALE, DVec3::new(-25.0, 10.0, 25.0), 64.0);
+        let projector = Projector::new(gpu, size, size).unwrap();
+        let load = |volume| projector.load(volume).unwrap();
+        let beat = |t: u32| {
+            let squeeze = contraction(f64::from(t) / f64::from(PHASES));
+            load(voxels::heart_and_diaphragm(Tissues::XCAT, &heart, squeeze, shift, SCALE, &still))
+        };
+        let vessel = |t: u32| load(voxels::vessels(&tree, t as usize, Tissues::XCAT.vessel, 0.4 * SCALE));
+        let (hearts, vessels) = ((0..PHASES).map(beat).collect(), (0..PHASES).map(vessel).collect());
+        let still = projector.load(still).unwrap();
+        Studio { heart: hearts, vessels, still, tree, projector, size }
+    }
+
+    /// Shoots the published training views, and those unseen if wanted, with errors that the stated geometry does not know of.
+    pub fn shoot(&self, n_views: u32, unseen: bool, wrong: Wrong) -> Shot {
+        let mut views = ViewAngles::published(n_views).unwrap();
+        views.validation.truncate(if unseen { 2 } else { 0 });
+        let c_arms = CArmOptions {
+            sod_mm: vec![450.0],
+            sid_mm: vec![2500.0],
+            pixel: PixelPitch::Detector([200.0 / self.size as f64; 2]),
+            offset_mm: vec![[0.0; 2]],
+        };
+        let splits: Vec<Split> = views.all().map(|(_, split)| split).collect();
+        let stated: Vec<CArm> = c_arms.c_arms(&views, self.size).unwrap();
+        let draw = |v: usize, k: u32| normal(wrong.seed, STREAM_PHOTON, 1000 + v as u32, k);
+        let mut shot = Shot {
+            dataset: self.empty(&stated),
+            truth: Vec::new(),
+            heart: Vec::new(),
+            breathes: wrong.breathing_mm > 0.0,
+            points: self.points(),
+        };
+        for (v, (c_arm, split)) in stated.iter().zip(&splits).enumerate() {
+            let seen = *split == Split::Train;
+            let error = |k: u32, size: f64| if seen { size * draw(v, k) } else { 0.0 };
+            let mut truth = c_arm.clone();
+            truth.primary_deg += error(0, wrong.angle_deg);
+            truth.secondary_deg += error(1, wrong.angle_deg);
+            truth.table_mm = [2, 3, 4].map(|k| error(k, wrong.shift_mm));
+            let truth = Geometry::CArm(truth);
+            let rays = [truth.rays(self.size, self.size).unwrap()];
+            let start = uniform01(wrong.seed, STREAM_PHOTON, 2000, v as u32);
+            let still = &self.projector.project(&self.still, &rays, DVec3::ZERO).unwrap()[0];
+            let mut breath = Vec::new();
+            for t in 0..PHASES {
+                // A quarter of a breath per beat.
+                let course = (std::f64::consts::TAU * (start + 0.25 * f64::from(t) / f64::from(PHASES))).sin();
+                let amplitude = if seen { wrong.breathing_mm } else { 0.0 };
+                let lps = course * amplitude * DVec3::new(0.0, 0.3, 1.0);
+                let moving = [&self.heart[t as usize], &self.vessels[t as usize]];
+                let moving = moving.map(|m| self.projector.project(m, &rays, lps).unwrap().swap_remove(0));
+                let mut integrals: Vec<f32> = still.clone();
+                moving.iter().for_each(|m| integrals.iter_mut().zip(m).for_each(|(i, m)| *i += m));
+                let strongest = moving[1].iter().copied().fold(0f32, f32::max);
+                for (p, value) in integrals.iter_mut().enumerate() {
+                    let noise = normal(wrong.seed, STREAM_PHOTON, 3000 + (v as u32) * 100 + t, p as u32);
+                    *value += strongest * (wrong.noise * noise) as f32;
+                }
+                let mask = (!seen).then(|| moving[1].iter().map(|m| *m > 0.05 * strongest).collect());
+                let name = format!("view{v}-phase{t:02}");
+                shot.dataset.frames.push(Frame {
+                    name,
+                    view: v,
+                    phase: t,
+                    split: *split,
+                    integrals,
+                    mask,
+                    heart_shift_mm: [0.0; 3],
+                });
+                breath.push(world_from_lps_mm(lps));
+            }
+            shot.truth.push(truth);
+            shot.heart.push(breath);
+        }
+        shot
+    }
+
+    fn empty(&self, stated: &[CArm]) -> Dataset {
+        let view = |c_arm: &CArm| {
+            let geometry = Geometry::CArm(c_arm.clone());
+            View { rays: geometry.rays(self.size, self.size).unwrap(), geometry }
+        };
+        Dataset {
+            path: "phantom".into(),
+            layout: Layout::Native,
+            views: stated.iter().map(view).collect(),
+            frames: Vec::new(),
+            width: self.size,
+            height: self.size,
+            n_phases: PHASES,
+            depth_range: (-1.26, 1.26),
+            vessel_attenuation: Some(Tissues::XCAT.vessel * 100.0),
+            notes: Vec::new(),
+        }
+    }
+
+    fn points(&self) -> Vec<Vec<DVec3>> {
+        let at = |t: usize| {
+            let all = self.tree.branches.iter().flat_map(move |b| b.points[t].iter().step_by(4));
+            all.map(|p| world_from_lps_mm(*p)).collect()
+        };
+        (0..PHASES as usize).map(at).collect()
+    }
+}
+
+impl Shot {
+    /// Writes `truth.json` into a directory.
+    pub fn write_truth(&self, directory: &Path) {
+        let frame = |f: &Frame| {
+            serde_json::json!({
+                "image": format!("{}.npy", f.name),
+                "view": f.view,
+                "split": f.split,
+                "phase": f.phase,
+                "geometry": self.truth[f.view],
+                "heart_shift_mm": (self.heart[f.view][f.phase as usize] * 100.0).to_array(),
+            })
+        };
+        let frames: Vec<_> = self.dataset.frames.iter().map(frame).collect();
+        let truth = serde_json::json!({ "format": "nertca-truth", "version": 1, "frames": frames });
+        std::fs::write(directory.join("truth.json"), truth.to_string()).unwrap();
+    }
+
+    /// Frames of the training views as they truly were and by the rays that `corrected` says of (view, phase).
+    pub fn frames(&self, corrected: &dyn Fn(usize, usize) -> ViewRays) -> Vec<FrameRays> {
+        let size = self.dataset.width;
+        let frame = |f: &Frame| {
+            let phase = f.phase as usize;
+            let truth = self.truth[f.view].rays(size, size).unwrap().moved(self.heart[f.view][phase]);
+            FrameRays { phase, truth, corrected: corrected(f.view, phase) }
+        };
+        self.dataset.training().iter().map(frame).collect()
+    }
+
+    /// Root mean square image distance of vessel points after removing the gauge, pixels.
+    pub fn error_px(&self, corrected: &dyn Fn(usize, usize) -> ViewRays) -> f64 {
+        let frames = self.frames(corrected);
+        let some: Vec<DVec3> = self.points.iter().flatten().step_by(37).copied().collect();
+        let motion = common_motion(&frames, &some, PHASES as usize, self.breathes);
+        let squares: f64 = (0..PHASES as usize)
+            .map(|t| {
+                let here: Vec<FrameRays> = frames.iter().filter(|f| f.phase == t).cloned().collect();
+                RigidMotion::remainder_px(&motion, &here, &self.points[t]).powi(2)
+            })
+            .sum();
+        (squares / f64::from(PHASES)).sqrt()
+    }
+}
