@@ -5,9 +5,9 @@ use nertca_vk::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
 use nertca_vk::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::phantom::projector::{LoadedVolume, Projector};
-use nertca_vk::phantom::tree::{Heart, Tree, contraction};
+use nertca_vk::phantom::tree::{Bounds, Heart, Tree, contraction};
 use nertca_vk::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
-use nertca_vk::phantom::voxels::{self, Tissues};
+use nertca_vk::phantom::voxels::{self, Breath, Tissues};
 use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use std::path::Path;
@@ -21,7 +21,7 @@ pub struct Studio {
     still: LoadedVolume,
     heart: Vec<LoadedVolume>,
     vessels: Vec<LoadedVolume>,
-    tree: Tree,
+    trees: Vec<Tree>,
     pub size: usize,
 }
 
@@ -50,21 +50,23 @@ pub struct Shot {
 impl Studio {
     pub fn new(gpu: &Gpu, size: usize, seed: u32) -> Studio {
         let heart = Heart::new(DVec3::ZERO, SCALE);
-        let (low, high) = Tree::procedural(&heart, SCALE, PHASES, seed).bounds_mm();
-        let shift = -0.5 * (low + high);
+        let bounds = Bounds::over_the_beat(PHASES, |fraction| Tree::procedural(&heart, SCALE, fraction, seed));
+        let shift = -0.5 * (bounds.low_mm + bounds.high_mm);
         let heart = Heart::new(shift, SCALE);
-        let tree = Tree::procedural(&heart, SCALE, PHASES, seed);
+        let fraction = |t: u32| f64::from(t) / f64::from(PHASES);
+        let trees: Vec<Tree> = (0..PHASES).map(|t| Tree::procedural(&heart, SCALE, fraction(t), seed)).collect();
+        let bounds = trees[1..].iter().map(Tree::bounds).fold(trees[0].bounds(), Bounds::joined);
         let still = voxels::thorax(Tissues::XCAT, shift, SCALE, DVec3::new(-25.0, 10.0, 25.0), 64.0);
         let projector = Projector::new(gpu, size, size).unwrap();
         let load = |volume| projector.load(volume).unwrap();
         let beat = |t: u32| {
-            let squeeze = contraction(f64::from(t) / f64::from(PHASES));
-            load(voxels::heart_and_diaphragm(Tissues::XCAT, &heart, squeeze, shift, SCALE, &still))
+            let (squeeze, breath) = (contraction(fraction(t)), Breath::default());
+            load(voxels::heart_and_diaphragm(Tissues::XCAT, &heart, squeeze, breath, shift, SCALE, &still))
         };
-        let vessel = |t: u32| load(voxels::vessels(&tree, t as usize, Tissues::XCAT.vessel, 0.4 * SCALE));
-        let (hearts, vessels) = ((0..PHASES).map(beat).collect(), (0..PHASES).map(vessel).collect());
+        let vessel = |tree: &Tree| load(voxels::vessels(tree, bounds, Tissues::XCAT.vessel, 0.4 * SCALE));
+        let (hearts, vessels) = ((0..PHASES).map(beat).collect(), trees.iter().map(vessel).collect());
         let still = projector.load(still).unwrap();
-        Studio { heart: hearts, vessels, still, tree, projector, size }
+        Studio { heart: hearts, vessels, still, trees, projector, size }
     }
 
     /// Shoots the published training views, and those unseen if wanted, with errors that the stated geometry does not know of.
@@ -153,7 +155,7 @@ impl Studio {
 
     fn points(&self) -> Vec<Vec<DVec3>> {
         let at = |t: usize| {
-            let all = self.tree.branches.iter().flat_map(move |b| b.points[t].iter().step_by(4));
+            let all = self.trees[t].branches.iter().flat_map(|b| b.points.iter().step_by(4));
             all.map(|p| world_from_lps_mm(*p)).collect()
         };
         (0..PHASES as usize).map(at).collect()
