@@ -15,6 +15,8 @@ const SIDE: usize = 128;
 const LIKELY: f32 = 2.0;
 /// Pixels that take part are so many more around: tight masks bias noisy data.
 const MASK_MARGIN: usize = 2;
+/// Least change of a pixel that shows a vessel to a person, as a share of the strongest.
+const SHOWN_SHARE: f32 = 0.15;
 /// The border, pixels.
 const BORDER: usize = 2;
 /// Standard deviations of noise that are no vessel at the border.
@@ -37,6 +39,8 @@ pub struct Observed {
     pub seen: Vec<Vec<Option<Vec<f32>>>>,
     /// `[view][phase]`: pixels that show vessels.
     pub shown: Vec<Vec<Option<Vec<bool>>>>,
+    /// Strongest change over the beat of any view, as a share of the range of its line integrals.
+    pub change: f64,
     /// Share of each view's change that lies at the border of its images.
     pub at_border: Vec<f64>,
 }
@@ -80,7 +84,18 @@ struct Seen {
     /// `[phase]`: pixels that show vessels.
     shown: Vec<Option<Vec<bool>>>,
     noise: Vec<f32>,
+    change: f64,
     at_border: f64,
+}
+
+/// `[phase]`: pixels that are likely to show a vessel, and clearly one: a heart or a diaphragm that moves is wider.
+fn shown(evidence: &ViewEvidence) -> Vec<Option<Vec<bool>>> {
+    let least = SHOWN_SHARE * evidence.background.strongest;
+    let phases = evidence.ratios.iter().zip(&evidence.background.changes).map(|(ratio, change)| {
+        let pixels = ratio.as_ref()?.values.iter().zip(&change.as_ref()?.values);
+        Some(pixels.map(|(ratio, change)| *ratio > LIKELY && *change > least).collect())
+    });
+    phases.collect()
 }
 
 impl Seen {
@@ -95,11 +110,13 @@ impl Seen {
         });
         let above: Vec<_> = above.collect();
         let view = &data.views[series.view];
-        let ratios = evidence.ratios.iter();
-        let shown = ratios.map(|r| Some(r.as_ref()?.values.iter().map(|r| *r > LIKELY).collect())).collect();
+        let shown = shown(&evidence);
         let stand = Stand::new(&view.geometry, &view.rays);
+        let values = series.seen().flat_map(|image| &image.values);
+        let [least, most] = values.fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
+        let change = f64::from(evidence.background.strongest) / f64::from(most - least).max(f64::MIN_POSITIVE);
         let noise = evidence.background.noise.values;
-        let mut seen = Seen { stand, mask, above, shown, noise, at_border: 0.0 };
+        let mut seen = Seen { stand, mask, above, shown, noise, change, at_border: 0.0 };
         seen.at_border = seen.share_at_border(data.width, data.height);
         seen
     }
@@ -144,6 +161,7 @@ impl Observed {
             views: series.iter().map(|s| s.view).collect(),
             coarse: Views::new(seen.iter().map(positive).collect(), n_phases),
             fine: Views::new(seen.iter().map(signed).collect(), n_phases),
+            change: seen.iter().map(|s| s.change).fold(0.0, f64::max),
             at_border: seen.iter().map(|s| s.at_border).collect(),
             stands: seen.iter().map(|s| s.stand.clone()).collect(),
             seen: seen.iter().map(|s| s.above.clone()).collect(),

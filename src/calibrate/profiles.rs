@@ -8,6 +8,7 @@
 
 use crate::calibrate::pose::{Poses, Stand};
 use glam::{DMat3, DVec3};
+use rayon::prelude::*;
 use std::ops::Range;
 
 /// Shortest baseline, as a share of the distance from source to isocentre.
@@ -236,7 +237,7 @@ impl Views {
             };
             PairAtPhase { phase, pencil, profiles: [profile(0), profile(1)] }
         };
-        phases.into_iter().map(at).collect()
+        phases.into_par_iter().map(at).collect()
     }
 }
 
@@ -262,7 +263,7 @@ impl Sums {
         let n = (range.end - range.start) as usize;
         let mut sums = [(); 3].map(|()| vec![0.0; n]);
         let bins = 1.0 / bin;
-        for (pixel, value) in view.pixels.iter().zip(values) {
+        for (pixel, value) in view.pixels.iter().zip(values).filter(|(_, value)| **value != 0.0) {
             let at = |p: &[f64; 3]| p[0] + pixel.column * p[1] + pixel.row * p[2];
             let (s, a, b) = (at(&along_s), at(&along_a), at(&along_b));
             let across = a * a + b * b;
