@@ -157,7 +157,7 @@ impl Calibrator<'_> {
         let breathing_gain = if cut_off(self.observed).is_empty() { choose::LEAST_GAIN } else { choose::LARGE_GAIN };
         let gain = |k: usize| if candidates[k] == Correction::Breathing { breathing_gain } else { choose::LEAST_GAIN };
         let chosen = best(&residuals, gain);
-        let shares = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();
+        let shares: Vec<_> = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();
         if candidates[chosen] == Correction::Stated {
             self.notes.push(format!(
                 "views agree as stated: a correction does not bring phases it was not fitted to closer ({})",
@@ -328,7 +328,7 @@ fn out_of_bounds(observed: &Observed, poses: &Poses) -> Option<String> {
     None
 }
 
-fn in_words(tried: &Vec<(Correction, f64)>) -> String {
+fn in_words(tried: &[(Correction, f64)]) -> String {
     let name = |c: &Correction| match c {
         Correction::Stated => "as stated",
         Correction::Static => "static",

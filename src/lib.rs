@@ -3,7 +3,8 @@
 //! The way of the data, and where to read it:
 //!
 //! 1. [`scan`]: angiograms with geometry and phase, validated -> line integrals (`import`, of the feature `dicom`, brings them in)
-//! 2. [`evidence`]: what each view shows by itself; [`calibrate`] brings views that disagree together by it;
+//! 2. [`evidence`]: what each view shows by itself; [`calibrate`] brings views that disagree together by it, and
+//!    [`mod@check`] names the mistake where that cannot be;
 //!    [`plan`]: what moves -> still backgrounds, the motion hull, scales and boxes: everything a run needs
 //! 3. [`train::step`]: one iteration, top to bottom: rays -> samples -> [`network`] -> loss -> gradients -> Adam
 //! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses. Beside it, [`train::gaussians`] and
@@ -113,6 +114,7 @@ pub mod evidence {
 }
 
 pub mod calibrate;
+pub mod check;
 
 pub mod model;
 pub mod network;

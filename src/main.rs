@@ -12,6 +12,7 @@ mod cli {
     pub mod args;
     pub mod bench;
     pub mod calibrate;
+    pub mod check;
     pub mod data;
     pub mod devices;
     pub mod eval;
@@ -51,6 +52,7 @@ fn main() -> ExitCode {
         Command::Calibrate(args) => cli::calibrate::run(args),
         Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),
+        Command::Check(args) => cli::check::run(args),
         Command::Info(args) => cli::info::info(args),
         Command::Completions(args) => cli::devices::completions(args),
     };

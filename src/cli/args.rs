@@ -68,6 +68,8 @@ pub enum Command {
     Convert(ConvertArgs),
     /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
     Bench(BenchArgs),
+    /// Tell whether a dataset makes sense, and which of the usual mistakes it has.
+    Check(CheckArgs),
     /// Describe a dataset or a run.
     Info(InfoArgs),
     /// Print shell completions.
@@ -663,6 +665,19 @@ pub struct BenchArgs {
     /// Compare with a file of an earlier --json.
     #[arg(long, value_name = "FILE")]
     pub compare: Option<PathBuf>,
+}
+
+/// `check`.
+#[derive(Debug, Args)]
+pub struct CheckArgs {
+    /// Dataset directory.
+    pub data: PathBuf,
+    /// JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
+    /// Leave a picture of each training view here, with what all views agree on in orange.
+    #[arg(long, value_name = "DIR")]
+    pub pictures: Option<PathBuf>,
 }
 
 /// `info`.

@@ -163,6 +163,8 @@ fn fast(mlp: Config) -> Config {
             ..mlp.train
         },
         march: March { dynamic_samples: 2, ..mlp.march },
+        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does not.
+        static_field: StaticField { tv: 100.0, ..mlp.static_field },
         // The network is never asked; the smallest one takes no memory.
         dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, window_start: 0.0, ..mlp.dynamic },
         occupancy: Occupancy { enabled: false, ..mlp.occupancy },

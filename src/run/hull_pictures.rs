@@ -16,7 +16,7 @@ pub fn file(pictures: &Path, view: usize) -> PathBuf {
 ///
 /// # Errors
 /// [`crate::error::Error::Io`].
-pub(super) fn write(directory: &Path, dataset: &Dataset, hull: &Hull) -> Result<()> {
+pub fn write(directory: &Path, dataset: &Dataset, hull: &Hull) -> Result<()> {
     files::create_directory(directory)?;
     let training = dataset.training();
     for view in dataset.training_views() {

@@ -1,0 +1,225 @@
+//! Tells whether a dataset makes sense before anything is trained on it: do its views show one object, and if not, which of
+//! the usual mistakes makes them?
+//!
+//! Views are judged by what moves in them ([`agreement`]), which takes neither labels nor a reconstruction. When they
+//! disagree, the data are tried without each of the usual [`mistakes`]; the one without which they agree is named. What no
+//! set of views tells is which of a patient and the mirrored patient it shows.
+
+pub mod agreement;
+pub mod mistakes;
+
+use crate::calibrate::observed::Observed;
+use crate::calibrate::profiles::Views;
+use crate::error::{Error, Result};
+use crate::evidence::background::{Background, Series};
+use crate::scan::dataset::Dataset;
+use agreement::{Agreement, Comparison, Look, agreement};
+use mistakes::{MISTAKES, Mistake, PhaseMistake, exchanged};
+use serde::Serialize;
+
+/// Without the mistake, views must disagree less than this share of what they do with it.
+const CLEARLY_BETTER: f64 = 0.6;
+/// And less than this altogether: half of it is what unrelated views have.
+const AGREES: f64 = 0.3;
+/// Explanations that are no worse than so many times the best are named, too.
+const AS_GOOD: f64 = 1.25;
+/// Views that disagree more than this, with the coarsest look, show different things.
+const DISAGREES: f64 = 0.3;
+/// Share of a view's changes next to its edges from which vessels are likely to be cut off.
+const CUT_OFF: f64 = 0.05;
+/// Noise, as a share of the strongest change, from which thin vessels are lost.
+const NOISY: f64 = 0.2;
+
+/// What is seen of one view.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CheckedView {
+    /// Index into [`Dataset::views`].
+    pub view: usize,
+    /// Primary and secondary angle, degrees, where stated.
+    pub angles_deg: Option<(f64, f64)>,
+    /// Phases it has.
+    pub phases: usize,
+    /// Noise of a pixel, as a share of the strongest change.
+    pub noise: f64,
+    /// Share of all change that is next to the edges of the image.
+    pub at_edges: f64,
+}
+
+/// What is to be said of a dataset.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Check {
+    /// Training views with at least two phases.
+    pub views: Vec<CheckedView>,
+    /// How well they agree; none where no two of them can be compared.
+    pub agreement: Option<Agreement>,
+    /// Mistakes without which they agree, likeliest first, and how to undo them: one of them was made. Empty when the data
+    /// are sound, or wrong in a way that is not among the usual ones.
+    pub mistakes: Vec<String>,
+    /// What else to look at.
+    pub warnings: Vec<String>,
+}
+
+impl Check {
+    /// Whether views agree and no mistake was found.
+    pub fn sound(&self) -> bool {
+        self.mistakes.is_empty() && self.agreement.as_ref().is_some_and(|a| a.coarse <= DISAGREES)
+    }
+}
+
+/// A mistake, and what the views show without it.
+struct Explanation {
+    advice: String,
+    views: Views,
+    /// What the fine look leaves.
+    fine: f64,
+}
+
+/// Looks at a dataset.
+///
+/// # Errors
+/// [`Error::Config`] when fewer than two training views have two phases, since nothing is known of motion then.
+pub fn check(dataset: &Dataset) -> Result<Check> {
+    let observed = Observed::new(dataset);
+    if observed.views.len() < 2 {
+        let problem = format!(
+            "{} of its training views show two phases: two views are needed to compare what moves in them",
+            observed.views.len()
+        );
+        return Err(Error::config("dataset", dataset.path.display(), problem));
+    }
+    let (series, stated) = (Series::of(dataset), agreement(&observed.fine));
+    let views: Vec<CheckedView> =
+        (0..observed.views.len()).map(|v| checked_view(dataset, &observed, v, &series[v])).collect();
+    let mistakes = stated.as_ref().map_or(Vec::new(), |stated| {
+        let inverted = darkens(&observed.fine) < 0.0;
+        named(stated, &explanations(dataset, &observed, inverted), inverted)
+    });
+    let mut warnings = view_warnings(&views);
+    match &stated {
+        None => warnings.push(
+            "no two views can be compared: they look from the same side, or from opposite ones".into(),
+        ),
+        Some(stated) if mistakes.is_empty() && stated.coarse > DISAGREES => warnings.push(format!(
+            "views disagree ({:.0} % of what moves is not the same in two views) and none of the usual mistakes explains it: \
+             compare geometry, phases and order of the images with their source",
+            100.0 * stated.coarse
+        )),
+        _ => (),
+    }
+    Ok(Check { views, agreement: stated, mistakes, warnings })
+}
+
+fn checked_view(dataset: &Dataset, observed: &Observed, v: usize, series: &Series) -> CheckedView {
+    let background = Background::new(series);
+    CheckedView {
+        view: observed.views[v],
+        angles_deg: dataset.views[observed.views[v]].geometry.angles_deg(),
+        phases: series.seen().count(),
+        noise: median(&background.noise.values) / f64::from(background.strongest).max(f64::MIN_POSITIVE),
+        at_edges: observed.at_border[v],
+    }
+}
+
+fn median(values: &[f32]) -> f64 {
+    f64::from(crate::raster::percentile(values, 0.5))
+}
+
+fn view_warnings(views: &[CheckedView]) -> Vec<String> {
+    let mut warnings = Vec::new();
+    for v in views {
+        if v.at_edges > CUT_OFF {
+            let share = 100.0 * v.at_edges;
+            warnings.push(format!("view {}: {share:.0} % of what moves is at the edge: vessels are cut off", v.view));
+        }
+        if v.noise > NOISY {
+            let share = 100.0 * v.noise;
+            warnings.push(format!(
+                "view {}: noise is {share:.0} % of the strongest vessel: thin ones will be lost",
+                v.view
+            ));
+        }
+    }
+    let (least, most) = (views.iter().map(|v| v.phases).min(), views.iter().map(|v| v.phases).max());
+    if least != most {
+        warnings.push("views have different numbers of phases: phases that one lacks are told by fewer views".into());
+    }
+    warnings
+}
+
+/// Third moment of the changes over time: vessels darken few pixels by much at a time, so it is positive.
+fn darkens(views: &Views) -> f64 {
+    let mut moment = 0.0;
+    for view in &views.views {
+        let seen: Vec<&Vec<f32>> = view.phases.iter().flatten().collect();
+        for pixel in 0..view.pixels.len() {
+            let mean = seen.iter().map(|p| f64::from(p[pixel])).sum::<f64>() / seen.len() as f64;
+            moment += seen.iter().map(|p| (f64::from(p[pixel]) - mean).powi(3)).sum::<f64>();
+        }
+    }
+    moment
+}
+
+/// Ways in which vessels come to brighten instead of to darken.
+const INVERTING: [Mistake; 2] = [Mistake::LogTwice, Mistake::LogMissing];
+
+fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<Explanation> {
+    let mut all = Vec::new();
+    let mut consider = |advice: String, views: Views| {
+        if !views.pairs.is_empty() {
+            let fine = Comparison::of(&views, Look::Fine).residual();
+            all.push(Explanation { advice, views, fine });
+        }
+    };
+    for mistake in MISTAKES.into_iter().filter(|m| inverted == INVERTING.contains(m)) {
+        if let Some(undone) = mistake.undone(dataset) {
+            consider(mistake.advice().into(), Observed::new(&undone).fine);
+        }
+    }
+    if inverted {
+        return all;
+    }
+    for b in 0..observed.views.len() {
+        for pair in (0..b).map(|a| [observed.views[a], observed.views[b]]) {
+            let advice = format!("views {} and {} are exchanged: each has the images of the other", pair[0], pair[1]);
+            consider(advice, Observed::new(&exchanged(dataset, pair)).fine);
+        }
+    }
+    let stated = Comparison::of(&observed.fine, Look::Fine);
+    all.extend(PhaseMistake::all(observed.views.len(), observed.fine.n_phases).map(|mistake| {
+        let views = mistake.undone(&observed.fine);
+        let fine = stated.after_change(&views, mistake.view).residual();
+        Explanation { advice: advice_on_phases(mistake, observed.views[mistake.view]), views, fine }
+    }));
+    all
+}
+
+fn advice_on_phases(mistake: PhaseMistake, view: usize) -> String {
+    if mistake.reversed {
+        return format!("the phases of view {view} run backwards");
+    }
+    format!("view {view} is late by {} phases: subtract them from its phases, cyclically", mistake.late)
+}
+
+/// Those that explain why views disagree, best first; by the coarse look where the fine one finds none. Where vessels
+/// brighten, the best is one whatever else agrees.
+fn named(stated: &Agreement, explanations: &[Explanation], inverted: bool) -> Vec<String> {
+    let fine: Vec<f64> = explanations.iter().map(|e| e.fine).collect();
+    let by_fine = best_of(explanations, &fine, if inverted { f64::INFINITY } else { stated.fine });
+    if !by_fine.is_empty() || stated.coarse <= DISAGREES {
+        return by_fine;
+    }
+    let coarse: Vec<f64> = explanations.iter().map(|e| Comparison::of(&e.views, Look::Coarse).residual()).collect();
+    best_of(explanations, &coarse, stated.coarse)
+}
+
+/// Explanations with the least residuals, if these are clearly less than as stated.
+fn best_of(explanations: &[Explanation], residuals: &[f64], stated: f64) -> Vec<String> {
+    let mut order: Vec<usize> = (0..residuals.len()).collect();
+    order.sort_by(|a, b| residuals[*a].total_cmp(&residuals[*b]));
+    let Some(best) = order.first().map(|i| residuals[*i]) else { return Vec::new() };
+    if best >= CLEARLY_BETTER * stated || best >= AGREES {
+        return Vec::new();
+    }
+    let as_good = order.into_iter().take_while(|i| residuals[*i] <= AS_GOOD * best);
+    as_good.map(|i| explanations[i].advice.clone()).collect()
+}

@@ -1,0 +1,117 @@
+//! How well the views of a dataset agree, whatever the still background: what moves in one must add up, plane by plane
+//! through both sources, to what moves in the other (see [`crate::calibrate::profiles`]).
+
+use crate::calibrate::pose::Poses;
+use crate::calibrate::profiles::{Blur, Pair, PairAtPhase, Views};
+use rayon::prelude::*;
+use serde::Serialize;
+
+/// How sharp the look is: blur of the profiles, bins of half a pixel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Look {
+    /// Sharp enough to tell a turned image from an upright one.
+    Fine,
+    /// So blurred that an error of geometry hardly matters.
+    Coarse,
+}
+
+impl Look {
+    fn blur(self) -> Blur {
+        Blur::gaussian(match self {
+            Look::Fine => 6.0,
+            Look::Coarse => 24.0,
+        })
+    }
+}
+
+/// How well two views agree.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct PairAgreement {
+    /// The views, by their place among those that show motion.
+    pub views: [usize; 2],
+    /// Squared difference of their profiles, as a share of their squares: 0 for the same object, about 1 for two that have
+    /// nothing to do with each other.
+    pub residual: f64,
+}
+
+/// How well all views agree.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Agreement {
+    /// As of a pair, over all pairs, with fine profiles.
+    pub fine: f64,
+    /// The same with profiles blurred so far that an error of geometry hardly matters.
+    pub coarse: f64,
+    /// Fine, pair by pair.
+    pub pairs: Vec<PairAgreement>,
+}
+
+/// Squared difference and squares of profiles.
+type Parts = (f64, f64);
+
+/// Of a pair at all phases. What is the same at all of them is left out: it is an error of the still background.
+fn parts(phases: &[PairAtPhase]) -> Parts {
+    let Some(first) = phases.first() else { return (0.0, 0.0) };
+    let mean = |side: usize, bin: usize| {
+        phases.iter().map(|at| at.profiles[side].value[bin]).sum::<f64>() / phases.len() as f64
+    };
+    let mut sum = (0.0, 0.0);
+    for bin in 0..first.profiles[0].value.len() {
+        let means = [mean(0, bin), mean(1, bin)];
+        for at in phases {
+            let [a, b] = [0, 1].map(|side| at.profiles[side].value[bin] - means[side]);
+            sum = (sum.0 + (a - b) * (a - b), sum.1 + a * a + b * b);
+        }
+    }
+    sum
+}
+
+fn share(parts: impl Iterator<Item = Parts>) -> f64 {
+    let (difference, squares) = parts.fold((0.0, 0.0), |sum, p| (sum.0 + p.0, sum.1 + p.1));
+    if squares > 0.0 { difference / squares } else { 0.0 }
+}
+
+/// What a look at all pairs of views shows.
+#[derive(Debug, Clone)]
+pub struct Comparison {
+    look: Look,
+    by_pair: Vec<Parts>,
+}
+
+impl Comparison {
+    /// Compares all pairs at all phases both views have.
+    pub fn of(views: &Views, look: Look) -> Comparison {
+        let by_pair = views.pairs.par_iter().map(|pair| compare(views, *pair, look)).collect();
+        Comparison { look, by_pair }
+    }
+
+    /// The same after a change of one view: only its pairs are looked at again.
+    pub fn after_change(&self, views: &Views, changed: usize) -> Comparison {
+        let again = |(pair, before): (&Pair, &Parts)| {
+            if pair.views.contains(&changed) { compare(views, *pair, self.look) } else { *before }
+        };
+        Comparison { look: self.look, by_pair: views.pairs.par_iter().zip(&self.by_pair).map(again).collect() }
+    }
+
+    /// Squared difference of all profiles, as a share of their squares.
+    pub fn residual(&self) -> f64 {
+        share(self.by_pair.iter().copied())
+    }
+}
+
+fn compare(views: &Views, pair: Pair, look: Look) -> Parts {
+    let poses = Poses::stated(views.views.len(), views.n_phases);
+    let phases: Vec<usize> = (0..views.n_phases).collect();
+    parts(&views.profiles(pair, &poses, &phases, &look.blur()))
+}
+
+/// The agreement of views, over pairs that say something about each other; none when there is no such pair.
+pub fn agreement(views: &Views) -> Option<Agreement> {
+    let fine = Comparison::of(views, Look::Fine);
+    let pair =
+        |(pair, parts): (&Pair, &Parts)| PairAgreement { views: pair.views, residual: share(std::iter::once(*parts)) };
+    (!views.pairs.is_empty()).then(|| Agreement {
+        fine: fine.residual(),
+        coarse: Comparison::of(views, Look::Coarse).residual(),
+        pairs: views.pairs.iter().zip(&fine.by_pair).map(pair).collect(),
+    })
+}

@@ -1,0 +1,168 @@
+//! The usual mistakes in a dataset, and what it would be without them.
+
+use crate::calibrate::profiles::Views;
+use crate::geometry::{CArm, Geometry};
+use crate::scan::dataset::{Dataset, View};
+
+/// Something that is wrong with all images or all geometries alike.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Mistake {
+    /// Rows are columns.
+    Transposed,
+    /// Columns run the wrong way; the mirrored patient, with the sign of the primary angle turned, shows the same.
+    Mirrored,
+    /// Rows run the wrong way; with the sign of the secondary angle turned, the mirrored patient shows the same.
+    UpsideDown,
+    /// Both: images are turned by half a turn, or both angles have the wrong sign.
+    Turned,
+    /// Primary and secondary angle are exchanged.
+    AnglesExchanged,
+    /// The pixel pitch is that at the isocentre, where the detector's is wanted.
+    PitchAtIsocentre,
+    /// The logarithm was taken of line integrals.
+    LogTwice,
+    /// Intensities were taken for line integrals.
+    LogMissing,
+}
+
+/// All of them.
+pub const MISTAKES: [Mistake; 8] = [
+    Mistake::Transposed,
+    Mistake::Mirrored,
+    Mistake::UpsideDown,
+    Mistake::Turned,
+    Mistake::AnglesExchanged,
+    Mistake::PitchAtIsocentre,
+    Mistake::LogTwice,
+    Mistake::LogMissing,
+];
+
+/// Smallest intensity whose logarithm is taken, as a share of the largest.
+const DARKEST: f32 = 1e-6;
+
+impl Mistake {
+    /// What it is, and how to undo it.
+    pub fn advice(self) -> &'static str {
+        match self {
+            Mistake::Transposed => "the images are transposed: exchange rows and columns of every image",
+            Mistake::Mirrored => {
+                "the images are mirrored left to right, or the primary angle has the wrong sign (LAO is positive): both \
+                 explain the data; the patient's anatomy tells which"
+            }
+            Mistake::UpsideDown => {
+                "the images are upside down, or the secondary angle has the wrong sign (cranial is positive): both explain \
+                 the data; the patient's anatomy tells which"
+            }
+            Mistake::Turned => {
+                "the images are turned by half a turn, or both angles have the wrong sign (LAO and cranial are positive)"
+            }
+            Mistake::AnglesExchanged => "primary and secondary angle are exchanged",
+            Mistake::PitchAtIsocentre => {
+                "pixel_mm is the pitch at the isocentre: the detector's is wanted, which is sid_mm / sod_mm times as large"
+            }
+            Mistake::LogTwice => {
+                "the logarithm was taken twice: the images were line integrals already (intensity kind `integral`)"
+            }
+            Mistake::LogMissing => {
+                "the images are intensities, not line integrals: take their negative logarithm (intensity kind `linear`)"
+            }
+        }
+    }
+
+    /// The data without the mistake; none where it cannot have been made.
+    pub fn undone(self, dataset: &Dataset) -> Option<Dataset> {
+        let (w, h) = (dataset.width, dataset.height);
+        match self {
+            Mistake::Transposed => images(dataset, (h, w), |values, i| values[i % h * w + i / h]),
+            Mistake::Mirrored => images(dataset, (w, h), |values, i| values[i / w * w + (w - 1 - i % w)]),
+            Mistake::UpsideDown => images(dataset, (w, h), |values, i| values[(h - 1 - i / w) * w + i % w]),
+            Mistake::Turned => images(dataset, (w, h), |values, i| values[w * h - 1 - i]),
+            Mistake::AnglesExchanged => geometries(dataset, |c| CArm {
+                primary_deg: c.secondary_deg,
+                secondary_deg: c.primary_deg,
+                ..c.clone()
+            }),
+            Mistake::PitchAtIsocentre => {
+                geometries(dataset, |c| CArm { pixel_mm: c.pixel_mm.map(|p| p * c.sid_mm / c.sod_mm), ..c.clone() })
+            }
+            Mistake::LogTwice => images(dataset, (w, h), |values, i| (-values[i]).exp()),
+            Mistake::LogMissing => {
+                let brightest = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(0f32, f32::max);
+                let least = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(f32::INFINITY, f32::min);
+                // Intensities are never negative.
+                (brightest > 0.0 && least >= 0.0)
+                    .then(|| images(dataset, (w, h), |values, i| -(values[i] / brightest).max(DARKEST).ln()))
+                    .flatten()
+            }
+        }
+    }
+}
+
+/// The dataset with its training images resampled, each from itself.
+fn images(dataset: &Dataset, (width, height): (usize, usize), at: impl Fn(&[f32], usize) -> f32) -> Option<Dataset> {
+    let mut changed = dataset.clone();
+    (changed.width, changed.height) = (width, height);
+    changed.frames = dataset.training().to_vec();
+    for frame in &mut changed.frames {
+        let values = std::mem::take(&mut frame.integrals);
+        frame.integrals = (0..values.len()).map(|i| at(&values, i)).collect();
+        frame.mask = None;
+    }
+    if (width, height) != (dataset.width, dataset.height) {
+        for view in &mut changed.views {
+            view.rays = view.geometry.rays(width, height).ok()?;
+        }
+    }
+    Some(changed)
+}
+
+/// The dataset with other C-arms; none where a geometry is a matrix, or would be impossible.
+fn geometries(dataset: &Dataset, change: impl Fn(&CArm) -> CArm) -> Option<Dataset> {
+    let mut changed = dataset.clone();
+    for view in &mut changed.views {
+        let Geometry::CArm(c_arm) = &view.geometry else { return None };
+        let geometry = Geometry::CArm(change(c_arm));
+        let rays = geometry.rays(dataset.width, dataset.height).ok()?;
+        *view = View { geometry, rays };
+    }
+    Some(changed)
+}
+
+/// Something wrong with the phases of one view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PhaseMistake {
+    /// The view, by its place among those that show motion.
+    pub view: usize,
+    /// Its phases run backwards.
+    pub reversed: bool,
+    /// Phases by which it is late.
+    pub late: usize,
+}
+
+impl PhaseMistake {
+    /// All that one view can have.
+    pub fn all(n_views: usize, n_phases: usize) -> impl Iterator<Item = PhaseMistake> {
+        let of_view = move |view| {
+            let late = (1..n_phases).map(move |late| PhaseMistake { view, reversed: false, late });
+            late.chain((0..n_phases).map(move |late| PhaseMistake { view, reversed: true, late }))
+        };
+        (0..n_views).flat_map(of_view)
+    }
+
+    /// What the views show without it.
+    pub fn undone(self, views: &Views) -> Views {
+        let n = views.n_phases;
+        let taken = |t: usize| if self.reversed { (2 * n - 1 - t + self.late) % n } else { (t + self.late) % n };
+        let mut changed = views.clone();
+        let phases = &views.views[self.view].phases;
+        changed.views[self.view].phases = (0..n).map(|t| phases[taken(t)].clone()).collect();
+        changed
+    }
+}
+
+/// Two views whose images, or geometries, are exchanged.
+pub fn exchanged(dataset: &Dataset, [a, b]: [usize; 2]) -> Dataset {
+    let mut changed = dataset.clone();
+    changed.views.swap(a, b);
+    changed
+}

@@ -1,0 +1,68 @@
+//! `check`.
+
+use super::args::CheckArgs;
+use nertca_vk::calibrate::calibrate;
+use nertca_vk::check::{Check, check};
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::error::{Error, Result};
+use nertca_vk::files;
+use nertca_vk::plan::Plan;
+use nertca_vk::run::hull_pictures;
+use nertca_vk::scan::dataset::Dataset;
+
+/// Tells whether a dataset makes sense.
+pub fn run(args: &CheckArgs) -> Result<()> {
+    let dataset = Dataset::open(&args.data)?;
+    let found = check(&dataset)?;
+    if args.json {
+        out!("{}", files::pretty_json(&found)?);
+    } else {
+        print(&dataset, &found)?;
+    }
+    if let Some(directory) = &args.pictures {
+        match Plan::new(&Config::preset(Preset::Fast), &dataset)?.hull {
+            Some(hull) => hull_pictures::write(directory, &dataset, &hull)?,
+            None => eprintln!("no pictures: views agree on nothing that moves"),
+        }
+    }
+    if found.sound() {
+        return Ok(());
+    }
+    let problem = match found.mistakes.first() {
+        Some(mistake) => format!("its views agree without one mistake: {mistake}"),
+        None => "its views do not show the same object".to_owned(),
+    };
+    Err(Error::data(&dataset.path, "dataset", problem))
+}
+
+fn print(dataset: &Dataset, found: &Check) -> Result<()> {
+    out!("view primary secondary phases    noise  at the edge");
+    for v in &found.views {
+        let angle = |deg: Option<f64>| deg.map_or("-".into(), |deg| format!("{deg:.1}"));
+        let (primary, secondary) = (angle(v.angles_deg.map(|a| a.0)), angle(v.angles_deg.map(|a| a.1)));
+        let (noise, edge) = (100.0 * v.noise, 100.0 * v.at_edges);
+        out!("{:4} {primary:>7} {secondary:>9} {:6} {noise:7.1}% {edge:11.1}%", v.view, v.phases);
+    }
+    if let Some(agreement) = &found.agreement {
+        out!("disagreement of views (0: one object, 100: unrelated): {:.1}", 100.0 * agreement.fine);
+        for pair in &agreement.pairs {
+            let [a, b] = pair.views.map(|v| found.views[v].view);
+            out!("  views {a} and {b}: {:.1}", 100.0 * pair.residual);
+        }
+    }
+    match found.mistakes.as_slice() {
+        [] => (),
+        [one] => out!("mistake: {one}"),
+        several => {
+            out!("one of these mistakes:");
+            several.iter().for_each(|m| out!("  - {m}"));
+        }
+    }
+    found.warnings.iter().for_each(|w| out!("warning: {w}"));
+    if found.sound() {
+        let config = Config::preset(Preset::Fast);
+        calibrate(dataset, &config)?.notes.iter().for_each(|note| out!("{note}"));
+        out!("the views show one object");
+    }
+    Ok(())
+}
