@@ -223,7 +223,8 @@ fn resume_equals_no_interruption() {
         let (first, second) = (after(10), after(25));
         let preparing = |share: f64| move |e: &Event| matches!(e, Event::Preparing { share: done } if *done >= share);
         let (warming, tracking) = (preparing(0.2), preparing(0.6));
-        let mut stops: Vec<(&str, &dyn Fn(&Event) -> bool)> =
+        type Stop<'a> = (&'a str, &'a dyn Fn(&Event) -> bool);
+        let mut stops: Vec<Stop<'_>> =
             vec![("while Gaussians are fitted", &first), ("while the still field is trained", &second)];
         if form == "tree" {
             stops.extend([("among the phases' own", &warming as &dyn Fn(&Event) -> bool), ("on the way", &tracking)]);
