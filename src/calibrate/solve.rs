@@ -413,23 +413,23 @@ pub(super) mod tests {
     pub(in crate::calibrate) const SIZE: [usize; 2] = [40, 36];
     pub(in crate::calibrate) const PHASES: usize = 3;
 
-    /// Blobs that move over three phases, as exact integrals, seen by views at these angles and from tables beside the middle;
+    /// Blobs that move over three phases, as exact integrals, seen from nearby by views at these angles and tables off the middle;
     /// the last view has other pixels.
     pub(in crate::calibrate) fn views(angles: &[(f64, f64)]) -> Views {
         let blob = |k: usize, t: usize| {
             let (a, b) = (1.3 * k as f64 + 0.4 * t as f64, 2.1 * k as f64 - 0.3 * t as f64);
-            DVec3::new(0.08 * a.sin(), 0.09 * b.cos(), 0.08 * (a + b).sin())
+            DVec3::new(0.05 * a.sin(), 0.05 * b.cos(), 0.05 * (a + b).sin())
         };
         let view = |(v, (primary_deg, secondary_deg)): (usize, &(f64, f64))| {
             let last = v + 1 == angles.len();
             let geometry = Geometry::CArm(CArm {
                 primary_deg: *primary_deg,
                 secondary_deg: *secondary_deg,
-                sid_mm: if last { 1100.0 } else { 1000.0 },
-                sod_mm: 700.0,
+                sid_mm: if last { 350.0 } else { 320.0 },
+                sod_mm: 200.0,
                 pixel_mm: if last { [1.1, 1.2] } else { [1.0; 2] },
-                offset_mm: [1.0, -2.0],
-                table_mm: [2.0, -1.0, 0.5 * v as f64],
+                offset_mm: [1.0, -1.0],
+                table_mm: [1.0, -1.0, 0.5 * v as f64],
             });
             let rays = geometry.rays(SIZE[0], SIZE[1]).unwrap();
             let image = |t: usize| {
@@ -485,9 +485,9 @@ pub(super) mod tests {
         let views = views(&ANGLES);
         assert_eq!(views.pairs.len(), 3);
         let at_truth = misfit(&views, &Poses::stated(3, PHASES), 4.0, &[0, 1, 2]).share();
-        assert!(at_truth < 0.01, "{at_truth}");
+        assert!(at_truth < 0.002, "{at_truth}");
         let apart = misfit(&views, &off(3), 4.0, &[0, 1, 2]).share();
-        assert!(apart > 0.1, "{apart}");
+        assert!(apart > 0.02, "{apart}");
     }
 
     #[test]
@@ -511,7 +511,7 @@ pub(super) mod tests {
                     let apart = norm(&mut want.iter().zip(column).map(|(a, b)| a - b));
                     let size = norm(&mut want.iter().copied());
                     // Pixels are shared between two bins, which no kernel's slope knows of.
-                    assert!(apart < 0.06 * size + 1e-9, "{pair:?}, phase {t}, {unknown:?}: {apart:.2e} of {size:.2e}");
+                    assert!(apart < 0.1 * size + 1e-9, "{pair:?}, phase {t}, {unknown:?}: {apart:.2e} of {size:.2e}");
                 }
             }
         }
