@@ -12,7 +12,7 @@
 //!    [`plan::soft_hull`]
 //! 5. [`model`]: parameters, scales, hull and configuration; [`model::checkpoint`] keeps them in one safetensors file
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
-//! 7. [`score`] compares them with what was seen, [`export`] hands them to other tools
+//! 7. [`export`] hands them to other tools, [`score`] compares them with what was seen
 //!
 //! [`run`] ties these to a run directory, [`session`] is a reconstruction in memory that grows with its frames, and
 //! [`capi`] the same for C. [`mod@bench`] times the engine, [`phantom`] makes data to try it on, and [`mod@reference`] holds an
@@ -156,19 +156,24 @@ pub mod train {
     pub mod tree_start;
 }
 
-/// What a reconstruction is worth.
-pub mod score {
-    pub mod calibrated;
-    pub mod eval;
-    pub mod metrics;
-    pub mod pictures;
-}
-
 /// A model for other tools: volumes, surfaces and motion.
 pub mod export {
     pub mod motion;
     pub mod surfaces;
     pub mod volumes;
+}
+
+/// What a reconstruction is worth.
+pub mod score {
+    pub mod calibrated;
+    pub mod centreline;
+    pub mod distances;
+    pub mod eval;
+    pub mod mask;
+    pub mod metrics;
+    pub mod pictures;
+    pub mod shapes;
+    pub mod volume;
 }
 
 /// One run, from a dataset to a run directory.

@@ -26,6 +26,7 @@ mod cli {
     pub mod report;
     pub mod train;
     pub mod view;
+    pub mod volume_table;
 }
 
 use clap::Parser;

@@ -3,6 +3,7 @@
 use super::args::{Cli, EvalArgs};
 use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
+use super::volume_table;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
@@ -106,4 +107,7 @@ pub fn print_table(evaluation: &Evaluation) {
     };
     let BestDices { dynamic, total } = evaluation.best_dice;
     out!("best Dice over thresholds, found with the masks: {} / {}", best(dynamic), best(total));
+    if let Some(volume) = &evaluation.volume {
+        volume_table::print(volume);
+    }
 }

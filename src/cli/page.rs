@@ -1,6 +1,7 @@
 //! `report.html`: one page that needs nothing but itself. Plots are SVG, pictures are embedded, and phases are chosen by
 //! radio buttons, so that no script is needed.
 
+use super::volume_table::{self, COLUMNS};
 use base64::Engine;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use nertca_vk::error::{Error, Result};
@@ -232,6 +233,20 @@ impl Page<'_> {
         }
     }
 
+    fn volume(&self) -> Markup {
+        let Some(volume) = self.evaluation.and_then(|e| e.volume.as_ref()) else { return html! {} };
+        html! {
+            h2 { "Scores in 3D" }
+            p.lead { (volume_table::legend(volume)) }
+            div.scroll { table {
+                tr { th { "phase" } @for column in &COLUMNS { th { (column.heading.join(" ").trim()) } } }
+                @for (name, cells) in volume_table::rows(volume) {
+                    tr { td { (name) } @for cell in cells { td { (cell) } } }
+                }
+            } }
+        }
+    }
+
     fn views(&self) -> Result<Markup> {
         let mut by_view: BTreeMap<usize, Vec<(u32, &PathBuf)>> = BTreeMap::new();
         // Evenly thinned out where there are too many.
@@ -332,6 +347,7 @@ impl Page<'_> {
                     p.lead { "4D reconstruction of the coronary arteries, nertca-vk " (env!("CARGO_PKG_VERSION")) }
                     @for warning in &self.warnings { p.warn { (warning) } }
                     (self.scores())
+                    (self.volume())
                     (self.plots()?)
                     (self.views()?)
                     (self.hull()?)

@@ -17,6 +17,7 @@ use crate::phantom::voxels::Tissues;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
 use crate::scan::nerfca;
 use crate::scan::writer::{About, Writer};
+use crate::score::volume::VOLUMES;
 use glam::DVec3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -386,7 +387,7 @@ fn shoot(
         progress("projections", u64::from(phase), u64::from(stage.phases));
         if shooting.volumes {
             let fraction = Shot::at_phase(phase, stage.phases).fraction;
-            stage.subject.write_volumes(&out.join("volumes"), phase, fraction)?;
+            stage.subject.write_volumes(&out.join(VOLUMES), phase, fraction)?;
         }
         for (view, (shots, blade)) in plan.iter().enumerate() {
             let Some(shot) = &shots[phase as usize] else { continue };

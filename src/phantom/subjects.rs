@@ -7,6 +7,7 @@ use crate::phantom::catheter;
 use crate::phantom::projector::{LoadedVolume, Projector};
 use crate::phantom::tree::{Bounds, Heart, Tree, TreeFile, contraction};
 use crate::phantom::voxels::{self, Breath, Tissues};
+use crate::score::volume::truth_file;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -149,7 +150,7 @@ impl Subject for Thorax {
 }
 
 fn write_vessels(directory: &Path, phase: u32, vessels: &Volume) -> Result<()> {
-    nrrd::write(&directory.join(format!("vessels-{phase:02}.nrrd")), vessels, QUANTITY)
+    nrrd::write(&truth_file(directory, phase), vessels, QUANTITY)
 }
 
 /// A tree from a file, in a CT where there is one.

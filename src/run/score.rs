@@ -11,6 +11,7 @@ use crate::scan::dataset::Dataset;
 use crate::score::calibrated::in_calibrated_frame;
 use crate::score::eval::{Evaluation, Scoring, evaluate, moving_field_warning};
 use crate::score::pictures::{self, Window};
+use crate::score::volume;
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -75,6 +76,18 @@ pub fn evaluate_model(
         let go_on =
             |_: Scoring<'_>| if options.cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) };
         evaluation.dice_as_stated = Some(evaluate(&renderer, stated, &frames, model.step, threshold, go_on)?.dice);
+    }
+    let threshold_per_mm = evaluation.threshold.dynamic_per_mm;
+    match volume::score(&renderer, &model.scene, dataset, threshold_per_mm, || pace.check()) {
+        // The truth is at fault: images are scored all the same.
+        Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
+            evaluation.warnings.push(format!("There are no scores in 3D: {error}."));
+        }
+        scores => evaluation.volume = scores?,
+    }
+    if carried.is_some() && evaluation.volume.is_some() {
+        let warning = "Distances in 3D hold the common motion of all calibrated views, which no image tells.";
+        evaluation.warnings.push(warning.into());
     }
     evaluation.warnings.extend(moving_field_warning(&renderer, dataset)?);
     Ok(evaluation)

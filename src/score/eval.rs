@@ -6,6 +6,7 @@ use crate::raster::percentile;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::metrics;
+use crate::score::volume::VolumeScores;
 use serde::Serialize;
 
 /// Share of the vessels' stated attenuation from which a field counts as vessel. Fields are smoother than vessels, so half
@@ -98,6 +99,9 @@ pub struct Evaluation {
     pub ssim: f64,
     /// Thresholds used.
     pub threshold: Thresholds,
+    /// Scores in 3D, where the dataset carries its vessels as volumes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub volume: Option<VolumeScores>,
     /// What makes these scores worth less than they seem.
     pub warnings: Vec<String>,
     /// One row per image.
@@ -208,6 +212,7 @@ pub fn evaluate(
             total_per_mm: per_mm(total_threshold),
             rule,
         },
+        volume: None,
         warnings: Vec::new(),
         images,
     })
