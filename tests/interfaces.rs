@@ -507,7 +507,7 @@ fn scoring_stops_when_told_and_can_be_left_for_later() {
     }
     let unscored = directory.path().join("unscored");
     let said = ok(&[&["train", text(&data), "-o", text(&unscored), "--json", "--no-eval"], &slow[..]].concat());
-    assert!(said.lines().last().unwrap().contains("\"finished\"") && !unscored.join("report").exists());
+    assert!(said.lines().last().unwrap().contains("\"finished\"") && !unscored.join("report/evaluation.json").exists());
     assert!(std::fs::read_to_string(unscored.join("report.html")).unwrap().contains("Not scored yet"));
     let mut eval = Command::new(env!("CARGO_BIN_EXE_nertca-vk"))
         .args(["eval", text(&unscored)])
