@@ -1,7 +1,7 @@
 //! Tells whether a dataset makes sense before anything is trained on it: do its views show one object, and if not, which of
 //! the usual mistakes makes them?
 //!
-//! Views are judged by what moves in them ([`agreement`]), which takes neither labels nor a reconstruction. When they
+//! Views are judged by what moves in them ([`mod@agreement`]), which takes neither labels nor a reconstruction. When they
 //! disagree, the data are tried without each of the usual [`mistakes`]; the one without which they agree is named. What no
 //! set of views tells is which of a patient and the mirrored patient it shows.
 

@@ -150,7 +150,7 @@ struct PencilMotion {
 }
 
 impl PencilMotion {
-    /// Factors on [`Profile`]'s slopes `turned`, `towards_first` and `towards_second` of each view.
+    /// Factors on [`crate::calibrate::profiles::Profile`]'s slopes `turned`, `towards_first` and `towards_second` of each view.
     fn factors(&self, pencil: &Pencil, axes: [DVec3; 2]) -> [[f64; 3]; 2] {
         let Pencil { baseline, first, second, length, middle: [across, along] } = *pencil;
         let tilt = [first.dot(self.way) / length, second.dot(self.way) / length];
