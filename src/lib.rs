@@ -93,6 +93,7 @@ pub mod scan {
     pub mod dataset;
     pub mod gating;
     pub mod nerfca;
+    pub mod truth;
     pub mod writer;
 }
 
@@ -216,7 +217,6 @@ pub mod phantom {
     mod runs;
     mod subjects;
     pub mod tree;
-    pub mod truth;
     pub mod views;
     pub mod voxels;
 }

@@ -15,7 +15,7 @@ use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, R
 use nertca_vk::phantom::noise::Photons;
 use nertca_vk::phantom::projector::Projector;
 use nertca_vk::phantom::tree::{Bounds, Heart, Tree, TreeFile, contraction};
-use nertca_vk::phantom::truth::{TrueFrame, Truth};
+use nertca_vk::scan::truth::{TrueFrame, Truth};
 use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::phantom::voxels::{self, Breath, Tissues};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};
@@ -81,10 +81,8 @@ fn views() -> ViewAngles {
     ViewAngles::given(&training, Some(&[at(90.0, 0.0)])).unwrap()
 }
 
-/// The procedural phantom.
-fn thorax(gpu: &Gpu, degradations: Degradations) -> Set {
-    let directory = tempfile::tempdir().unwrap();
-    let options = PhantomOptions {
+fn options(degradations: Degradations, anatomy: Option<Anatomy>) -> PhantomOptions {
+    PhantomOptions {
         setting: Setting::Xcat,
         size: SIZE,
         phases: PHASES,
@@ -92,9 +90,15 @@ fn thorax(gpu: &Gpu, degradations: Degradations) -> Set {
         seed: 5,
         degradations,
         layout: Layout::Native,
-        anatomy: None,
+        anatomy,
         volumes: false,
-    };
+    }
+}
+
+/// The procedural phantom.
+fn thorax(gpu: &Gpu, degradations: Degradations) -> Set {
+    let directory = tempfile::tempdir().unwrap();
+    let options = options(degradations, None);
     make(gpu, &options, directory.path(), |_, _, _| ()).unwrap();
     Set::read(directory)
 }
@@ -144,22 +148,13 @@ impl Files {
     /// A tree from a file, with or without the CT around it.
     fn patient(&self, gpu: &Gpu, ct: bool, degradations: Degradations) -> Set {
         let directory = tempfile::tempdir().unwrap();
-        let options = PhantomOptions {
-            setting: Setting::Xcat,
-            size: SIZE,
-            phases: PHASES,
-            views: views(),
-            seed: 5,
-            degradations,
-            layout: Layout::Native,
-            anatomy: Some(Anatomy {
-                tree: self.tree(),
-                background: ct.then(|| self.directory.path().join("ct.nrrd")),
-                c_arms: c_arms(),
-                iodine_per_mm: IODINE,
-            }),
-            volumes: false,
+        let anatomy = Anatomy {
+            tree: self.tree(),
+            background: ct.then(|| self.directory.path().join("ct.nrrd")),
+            c_arms: c_arms(),
+            iodine_per_mm: IODINE,
         };
+        let options = options(degradations, Some(anatomy));
         make(gpu, &options, directory.path(), |_, _, _| ()).unwrap();
         Set::read(directory)
     }

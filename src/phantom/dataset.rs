@@ -11,7 +11,7 @@ use crate::phantom::noise::add_noise;
 use crate::phantom::projector::Projector;
 use crate::phantom::runs::{Shot, shots};
 use crate::phantom::subjects::{Moving, Patient, Placed, Pose, Reading, Subject, Thorax, Volumes};
-use crate::phantom::truth::{TrueFrame, Truth};
+use crate::scan::truth::{TrueFrame, Truth};
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use crate::phantom::voxels::Tissues;
 use crate::scan::dataset::{Layout, MANIFEST, Split};

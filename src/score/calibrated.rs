@@ -4,48 +4,13 @@
 
 use crate::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
 use crate::error::{Error, Result};
-use crate::files;
-use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
+use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
 use crate::scan::dataset::{Dataset, Frame, Split};
+use crate::scan::truth::{TRUTH, TrueFrame, Truth};
 use glam::DVec3;
-use serde::Deserialize;
-use std::path::Path;
 
-/// Name of the file beside a synthetic dataset.
-const TRUTH: &str = "truth.json";
-const MAX_BYTES: u64 = 256 << 20;
 /// Half side of the cube of points that stand for the heart, as a share of the field of view's half.
 const HEART_SHARE: f64 = 0.5;
-
-/// How images were really taken; what else the file says does not matter here.
-#[derive(Debug, Deserialize)]
-struct Truth {
-    frames: Vec<TrueFrame>,
-}
-
-/// One image.
-#[derive(Debug, Deserialize)]
-struct TrueFrame {
-    /// View, from 0: those of training first.
-    view: usize,
-    split: Split,
-    phase: u32,
-    geometry: CArm,
-    heart_shift_mm: [f64; 3],
-}
-
-impl Truth {
-    fn read(dataset: &Path) -> Result<Option<Truth>> {
-        let file = dataset.join(TRUTH);
-        if !file.is_file() {
-            return Ok(None);
-        }
-        let text = files::read_limited(&file, MAX_BYTES)?;
-        serde_json::from_slice(&text)
-            .map(Some)
-            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))
-    }
-}
 
 fn true_rays(frame: &TrueFrame, dataset: &Dataset) -> Result<ViewRays> {
     let rays = Geometry::CArm(frame.geometry.clone()).rays(dataset.width, dataset.height);
@@ -72,9 +37,12 @@ const NEGLIGIBLE_PX: f64 = 0.01;
 /// `truth.json`, where that is of other frames, or where nothing moves by it.
 ///
 /// # Errors
-/// [`Error::Data`] for a truth that cannot be read.
+/// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read.
 pub fn in_calibrated_frame(dataset: &Dataset) -> Result<Option<Dataset>> {
-    let Some(truth) = Truth::read(&dataset.path)? else { return Ok(None) };
+    if !dataset.path.join(TRUTH).is_file() {
+        return Ok(None);
+    }
+    let truth = Truth::load(&dataset.path)?;
     let found = TrueFrames::new(&truth, dataset);
     if dataset.frames.iter().any(|f| found.of(f).is_none()) {
         return Ok(None);

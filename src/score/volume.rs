@@ -28,12 +28,12 @@ const FAR_MM: f64 = 2.0;
 /// Side of the smallest cube that counts as a component, pixels.
 const COMPONENT_PIXELS: f64 = 1.0;
 /// The whole field is looked at in points so many pixels apart.
-const COARSE_PIXELS: f64 = 1.0;
+const COARSE_PIXELS: f64 = 0.75;
 /// Such points at most along its longest side.
 const COARSE_POINTS: f64 = 192.0;
 /// Around points below this share of the threshold nothing is vessel: a Gaussian of 0.4 pixels, the least, has as much of its
 /// peak left where it is farthest from such points.
-const FAINT: f64 = 0.1;
+const FAINT: f64 = 0.25;
 /// Voxels of a block that is sampled at once, along left, posterior (a group of the device) and superior.
 const BLOCK: [u32; 3] = [8, 64, 8];
 /// Voxels at most that are compared.
@@ -382,8 +382,8 @@ mod tests {
         let (size, spacing_mm) = ([60, 20, 20], DVec3::new(0.25, 0.5, 0.5));
         let box_at = |x: f64| move |p: DVec3| (x..=x + 1.0).contains(&p.x) && (4.0..=6.0).contains(&p.y) && p.z == 5.0;
         let truth = drawn(size, spacing_mm, box_at(2.0));
-        let (near, far) = (drawn(size, spacing_mm, box_at(4.0)), drawn(size, spacing_mm, box_at(8.0)));
-        // Three parts where the vessel is, two 1 to 2 mm away from it, one 5 to 6 mm away.
+        let (near, far) = (drawn(size, spacing_mm, box_at(4.0)), drawn(size, spacing_mm, box_at(6.0)));
+        // Three parts where the vessel is, two 1 to 2 mm away from it, one 3 to 4 mm away.
         let weight = |i: usize| 3 * u8::from(truth.inside[i]) + 2 * u8::from(near.inside[i]) + u8::from(far.inside[i]);
         let grid = PatientGrid { origin_mm: DVec3::splat(-5.0), spacing_mm, size: size.map(|n| n as u32) };
         let field = CoarseField { grid, values: (0..truth.inside.len()).map(|i| f32::from(weight(i))).collect() };
@@ -396,7 +396,7 @@ mod tests {
         };
         let close = |[a, b]: [f64; 2], [c, d]: [f64; 2]| (a - c).abs() < 1e-9 && (b - d).abs() < 1e-9;
         assert!(close(shares(0.4), [0.5, 1.0 / 6.0]), "{:?}", shares(0.4));
-        assert!(close(shares(2.0), [1.0 / 6.0, 1.0 / 6.0]), "{:?}", shares(2.0));
+        assert!(close(shares(1.4), [1.0 / 6.0, 1.0 / 6.0]), "{:?}", shares(1.4));
         assert!(close(shares(3.0), [0.0, 1.0 / 6.0]), "{:?}", shares(3.0));
         assert_eq!(Mass::default().share(0.0), None);
     }

@@ -57,7 +57,8 @@ pub struct TrueFrame {
 }
 
 impl Truth {
-    pub(super) fn new(seed: u32, phases: u32) -> Truth {
+    /// The truth of a dataset of `phases` phases, without frames yet.
+    pub fn new(seed: u32, phases: u32) -> Truth {
         Truth { format: FORMAT.to_owned(), version: VERSION, seed, phases, frames: Vec::new() }
     }
 
@@ -76,7 +77,11 @@ impl Truth {
         Ok(truth)
     }
 
-    pub(super) fn write(&self, dataset: &Path) -> Result<()> {
+    /// Writes the truth beside a dataset in a directory.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where it cannot be written.
+    pub fn write(&self, dataset: &Path) -> Result<()> {
         files::write_atomic(&dataset.join(TRUTH), files::pretty_json(self)?.as_bytes())
     }
 }
