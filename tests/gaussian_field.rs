@@ -6,7 +6,7 @@ mod common;
 use common::{expect_silence, gpu, phantom, relative_error, run, tuning};
 use glam::DVec3;
 use nertca_vk::choice::Choice;
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::{Config, Preset, sections};
 use nertca_vk::error::Error;
 use nertca_vk::geometry::ViewRays;
 use nertca_vk::kernels::layout::{DeviceState, Gaussian, GaussianSetup, TreeSetup};
@@ -187,6 +187,7 @@ fn short_run(form: &str) -> Config {
         "gaussians.iterations=20",
         "gaussians.background_every=8",
         "gaussians.grow_at=10",
+        "gaussians.clear_at=14",
         "gaussians.count=120",
         "tree.warm_iterations=12",
         "tree.track_iterations=4",
@@ -247,9 +248,12 @@ fn the_still_field_learns_what_gaussians_leave() {
     let gpu = gpu();
     let directory = tempfile::tempdir().unwrap();
     let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
+    let config = short_run("phase");
     let config = Config {
-        train: nertca_vk::config::sections::Train { iterations: 120, ..short_run("phase").train },
-        ..short_run("phase")
+        train: sections::Train { iterations: 120, ..config.train },
+        // After so few iterations, vessels are not dense yet.
+        gaussians: sections::Gaussians { clear_at: 0, ..config.gaussians },
+        ..config
     };
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let losses = run(&mut trainer, 120);

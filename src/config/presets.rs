@@ -115,6 +115,8 @@ pub(super) fn gaussians() -> Gaussians {
         grow_at: 50,
         grow_share: 0.15,
         weakest: 0.01,
+        clear_at: 65,
+        faint: 0.2,
         missing: 0.03,
         background_every: 40,
     }

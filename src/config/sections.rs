@@ -249,6 +249,10 @@ section! {
         grow_share: f64 in 0.0 to 10.0,
         /// Amplitude below which a Gaussian is dropped.
         weakest: f64 in 0.0 to 1e3,
+        /// Iteration at which Gaussians too faint for vessels are dropped: they stand for what else moves; 0 = never.
+        clear_at: u32 in 0.0 to 1e6,
+        /// Density below which a Gaussian is too faint, as a share of the vessels'.
+        faint: f64 in 0.0 to 1.0,
         /// Missing line integral from which a Gaussian is placed; also its first density.
         missing: f64 in 1e-6 to 1e3,
         /// Iterations after which the still background is estimated anew from what the Gaussians leave of the images, and

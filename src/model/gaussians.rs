@@ -78,6 +78,40 @@ pub fn amplitude(g: &Gaussian, setup: &GaussianSetup) -> f64 {
     f64::from(g.log_density).exp() * std::f64::consts::TAU.sqrt() * scale
 }
 
+/// Share of all attenuation that is in Gaussians less dense than vessels are said to be.
+const BELOW_VESSELS: f64 = 0.75;
+
+/// Density of the vessels that Gaussians stand for: three quarters of what attenuates is less dense, as the ends, the walls
+/// and the thin branches of vessels are, and what moves beside them.
+fn vessel_density(rows: &[Gaussian], setup: &GaussianSetup) -> f64 {
+    let mut by_density: Vec<(f64, f64)> = rows.iter().map(|g| (density(g), mass(g, setup))).collect();
+    by_density.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let all: f64 = by_density.iter().map(|(_, mass)| mass).sum();
+    let mut below = 0.0;
+    for (density, mass) in &by_density {
+        below += mass;
+        if below >= BELOW_VESSELS * all {
+            return *density;
+        }
+    }
+    0.0
+}
+
+fn density(g: &Gaussian) -> f64 {
+    f64::from(g.log_density).exp()
+}
+
+/// What a Gaussian attenuates in all, but for a factor that all share.
+fn mass(g: &Gaussian, setup: &GaussianSetup) -> f64 {
+    density(g) * scales(g, setup).element_product()
+}
+
+/// Which Gaussians are at least so dense, as a share of the vessels' density.
+pub fn dense(rows: &[Gaussian], setup: &GaussianSetup, share: f64) -> Vec<bool> {
+    let least = share * vessel_density(rows, setup);
+    rows.iter().map(|g| density(g) >= least).collect()
+}
+
 /// One set of Gaussians for the whole beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MovingTree {
@@ -254,6 +288,27 @@ mod tests {
         let node = |i: usize| DVec3::new((i % 4) as f64, (i / 4 % 4) as f64, (i / 16) as f64) * 20.0 - 30.0;
         let mean: DVec3 = all.iter().map(|(i, share)| *share * node(*i)).sum();
         assert!((mean - x).length() < 1e-6, "a linear field is reproduced: {mean}");
+    }
+
+    #[test]
+    fn broad_and_faint_is_no_vessel() {
+        let setup = GaussianSetup { least_scale: 0.5, greatest_scale: 4.0, ..GaussianSetup::default() };
+        let gaussian = |density: f32, scale: f32| Gaussian {
+            log_density: density.ln(),
+            log_scale: [scale.ln(); 3],
+            ..Gaussian::default()
+        };
+        // A quarter of the attenuation is in what is broad, hardly any in a hot spot.
+        let mut rows = vec![gaussian(0.01, 4.0)];
+        rows.extend(vec![gaussian(0.2, 1.0); 10]);
+        rows.push(gaussian(0.6, 0.5));
+        assert!((vessel_density(&rows, &setup) - 0.2).abs() < 1e-6);
+        // Scales beyond the bounds are taken as the bounds, as images take them.
+        rows[0].log_scale = [100f32.ln(); 3];
+        assert!((vessel_density(&rows, &setup) - 0.2).abs() < 1e-6);
+        let kept = |share: f64| dense(&rows, &setup, share).iter().filter(|kept| **kept).count();
+        assert_eq!((kept(0.04), kept(0.06), kept(1.1)), (12, 11, 1));
+        assert_eq!(dense(&[], &setup, 0.5), [false; 0]);
     }
 
     #[test]

@@ -97,6 +97,11 @@ pub fn grows(settings: &sections::Gaussians, step: u32) -> bool {
     settings.grow_at > 0 && step == settings.grow_at
 }
 
+/// Whether Gaussians too faint for vessels are dropped before an iteration.
+pub fn clears(settings: &sections::Gaussians, step: u32) -> bool {
+    settings.clear_at > 0 && step == settings.clear_at
+}
+
 /// Whether the still background is estimated anew before an iteration: not while rates fall, when little could follow.
 pub fn renews_background(settings: &sections::Gaussians, step: u32) -> bool {
     let every = settings.background_every;
@@ -105,7 +110,9 @@ pub fn renews_background(settings: &sections::Gaussians, step: u32) -> bool {
 
 /// Where iterations from `step` on towards `until` must stop, as something is to be done before the next.
 pub fn next_stop(settings: &sections::Gaussians, step: u32, until: u32) -> u32 {
-    (step + 1..until).find(|s| grows(settings, *s) || renews_background(settings, *s)).unwrap_or(until)
+    (step + 1..until)
+        .find(|s| grows(settings, *s) || clears(settings, *s) || renews_background(settings, *s))
+        .unwrap_or(until)
 }
 
 /// Factor on all rates at an iteration: 1, falling linearly at the end.
@@ -129,9 +136,9 @@ mod tests {
     fn iterations_stop_where_something_is_to_be_done() {
         let settings = Config::preset(Preset::Fast).gaussians;
         let stops = std::iter::successors(Some(0), |s| (*s < 120).then(|| next_stop(&settings, *s, 120)));
-        assert_eq!(stops.collect::<Vec<_>>(), [0, 40, 50, 80, 120]);
+        assert_eq!(stops.collect::<Vec<_>>(), [0, 40, 50, 65, 80, 120]);
         assert!(renews_background(&settings, 40) && !renews_background(&settings, 0) && grows(&settings, 50));
-        let never = sections::Gaussians { background_every: 0, grow_at: 0, ..settings };
+        let never = sections::Gaussians { background_every: 0, grow_at: 0, clear_at: 0, ..settings };
         assert_eq!((next_stop(&never, 3, 70), renews_background(&never, 40)), (70, false));
     }
 }

@@ -8,7 +8,7 @@ use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
-use crate::model::gaussians::{Gaussians, amplitude};
+use crate::model::gaussians::{Gaussians, amplitude, dense};
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::train::targets::{losses, renew_bounds, take_images, target_buffers};
@@ -137,12 +137,16 @@ impl GaussianTrainer {
         }
         let settings = &self.settings;
         let (renew, grow) = (fit::renews_background(settings, self.step), fit::grows(settings, self.step));
+        let clear = fit::clears(settings, self.step);
         let stop = fit::next_stop(settings, self.step, until);
         if renew {
             self.renew_background()?;
         }
         if grow {
             self.grow()?;
+        }
+        if clear {
+            self.clear()?;
         }
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, stop)?;
@@ -164,6 +168,13 @@ impl GaussianTrainer {
         self.replace(&particles)?;
         let images = self.images()?;
         particles.append(seeds::additions(&self.targets, &self.settings, self.seed, &images));
+        self.replace(&particles)
+    }
+
+    /// Drops what is too faint for vessels: it stands for what else moves.
+    fn clear(&mut self) -> Result<()> {
+        let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
+        particles.retain(&dense(&particles.rows, &self.setup, self.settings.faint));
         self.replace(&particles)
     }
 

@@ -12,8 +12,8 @@ use crate::gaussians::work::GaussianWork;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
-use crate::kernels::layout::{GaussianSetup, TreeSetup};
-use crate::model::gaussians::{Gaussians, MovingTree};
+use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::model::gaussians::{Gaussians, MovingTree, dense};
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
@@ -195,6 +195,7 @@ impl TreeTrainer {
         }
         let settings = &self.config.gaussians;
         let (renew, grow) = (fit::renews_background(settings, self.step), fit::grows(settings, self.step));
+        let clear = fit::clears(settings, self.step);
         let stop = fit::next_stop(settings, self.step, until);
         if renew {
             let images = self.images()?;
@@ -202,6 +203,9 @@ impl TreeTrainer {
         }
         if grow {
             self.grow()?;
+        }
+        if clear {
+            self.clear()?;
         }
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, stop)?;
@@ -211,24 +215,38 @@ impl TreeTrainer {
     /// Drops weak Gaussians and places new ones where data are missing at half the phases. Once in a run, on the host, as
     /// with a set per phase.
     fn grow(&mut self) -> Result<()> {
-        let (n, n_basis) = (self.n as usize, self.joint.tree.n_basis as usize);
-        let mut particles = self.particles.download(&self.gpu, n)?;
-        let mut own = self.own.download(&self.gpu, n * n_basis)?;
-        let keep = strong(&particles.rows, &self.joint.setup, self.config.gaussians.weakest);
-        particles.retain(&keep);
-        own.retain(&keep);
-        self.replace(&particles, &own)?;
+        let (weakest, setup) = (self.config.gaussians.weakest, self.joint.setup);
+        let (mut particles, mut own) = self.retain(|rows| strong(rows, &setup, weakest))?;
         let tree = self.tree()?;
         let carried = |x: DVec3, phase: usize| tree.carried(x, phase as f64);
         let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
         let additions = seeds::tree_additions(&self.targets, &settings, seed, &self.images()?, carried);
         // They move as their nearest neighbour does.
+        let n_basis = self.joint.tree.n_basis as usize;
         for g in &additions {
             let nearest = tree.nearest(DVec3::from_array(g.position.map(f64::from)));
             own.append(tree.own[nearest * n_basis..][..n_basis].to_vec());
         }
         particles.append(additions);
         self.replace(&particles, &own)
+    }
+
+    /// Drops what is too faint for vessels: it stands for what else moves.
+    fn clear(&mut self) -> Result<()> {
+        let (faint, setup) = (self.config.gaussians.faint, self.joint.setup);
+        self.retain(|rows| dense(rows, &setup, faint)).map(|_| ())
+    }
+
+    /// Keeps some of the Gaussians, on the device and as returned.
+    fn retain(&mut self, kept: impl Fn(&[Gaussian]) -> Vec<bool>) -> Result<(Particles, OwnMotion)> {
+        let n = self.n as usize;
+        let mut particles = self.particles.download(&self.gpu, n)?;
+        let mut own = self.own.download(&self.gpu, n * self.joint.tree.n_basis as usize)?;
+        let keep = kept(&particles.rows);
+        particles.retain(&keep);
+        own.retain(&keep);
+        self.replace(&particles, &own)?;
+        Ok((particles, own))
     }
 
     fn replace(&mut self, particles: &Particles, own: &OwnMotion) -> Result<()> {
