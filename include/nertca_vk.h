@@ -162,6 +162,21 @@
 #define NERTCA_LOG_INFO 3
 
 /**
+ * A frame's geometry is taken as stated.
+ */
+#define NERTCA_CORRECTION_STATED 0
+
+/**
+ * Angles and position of the frame's view are corrected.
+ */
+#define NERTCA_CORRECTION_STATIC 1
+
+/**
+ * The same, and a displacement of the heart in this frame.
+ */
+#define NERTCA_CORRECTION_BREATHING 2
+
+/**
  * Memory on the device that other APIs and processes can import.
  */
 typedef struct nertca_buffer nertca_buffer;
@@ -421,6 +436,54 @@ typedef struct {
    */
   double iterations_per_s;
 } nertca_progress;
+
+/**
+ * How calibration sees a frame.
+ */
+typedef struct {
+  /**
+   * `sizeof(nertca_correction)`.
+   */
+  size_t size;
+  /**
+   * One of `NERTCA_CORRECTION_*`.
+   */
+  uint32_t kind;
+  /**
+   * Added to the stated primary angle, degrees.
+   */
+  double primary_deg;
+  /**
+   * Added to the stated secondary angle, degrees.
+   */
+  double secondary_deg;
+  /**
+   * How much further than stated the table has carried the patient (LPS), mm.
+   */
+  double table_mm[3];
+  /**
+   * Where breathing has carried the heart in this frame (LPS), mm.
+   */
+  double heart_shift_mm[3];
+  /**
+   * Root mean square of how far the correction moves the heart's image in this view, pixels, less what moves all views
+   * alike.
+   */
+  double moved_px;
+  /**
+   * What does not agree with the other views, as a share of what moves, before.
+   */
+  double residual_before;
+  /**
+   * And after.
+   */
+  double residual_after;
+  /**
+   * All of it, displacement of the heart included, as a row-major 3 x 4 projection from patient mm to homogeneous pixels
+   * (column, row; integers are pixel centres): what `nertca_geometry.matrix` takes.
+   */
+  double matrix[3][4];
+} nertca_correction;
 
 /**
  * Told now and then how far training is; a non-zero result ends it. `progress` is valid during the call. Called on the
@@ -857,6 +920,38 @@ nertca_status nertca_reconstruction_load(nertca_reconstruction *reconstruction, 
  * `bytes` must be readable for `size` bytes.
  */
 nertca_status nertca_reconstruction_load_memory(nertca_reconstruction *reconstruction, const void *bytes, size_t size);
+
+/**
+ * How the reconstruction sees a frame since training last took frames in: as stated, or as calibration (`calibrate.mode`)
+ * corrected it. Frames count from 0 in the order in which they were added. To draw the vessels over a frame, render with
+ * its `matrix`. Any thread, at any time.
+ *
+ * A motion that all views share is not seen by any of them and is no part of the correction; and what a checkpoint was
+ * corrected by is not known after loading it.
+ *
+ * @return NERTCA_ERROR_ARGUMENT for a frame that was not added.
+ *
+ * # Safety
+ * `correction` must be writable, with its size set.
+ */
+nertca_status nertca_reconstruction_correction(nertca_reconstruction *reconstruction,
+                                               uint32_t frame,
+                                               nertca_correction *correction);
+
+/**
+ * States another geometry for a frame that was added: what the C-arm, or a calibration elsewhere, knows better by now.
+ * Training takes it in as it does a new frame. Calibration begins from what is stated; with `calibrate.mode = off` that
+ * is what the reconstruction goes by. Any thread.
+ *
+ * @return NERTCA_ERROR_ARGUMENT naming the field that is wrong, or for a frame that was not added; NERTCA_ERROR_BUSY
+ * while training in the background in a deterministic context.
+ *
+ * # Safety
+ * `geometry` must be as long as it says, and its matrix null or readable for 12 numbers.
+ */
+nertca_status nertca_reconstruction_set_geometry(nertca_reconstruction *reconstruction,
+                                                 uint32_t frame,
+                                                 const nertca_geometry *geometry);
 
 /**
  * Trains up to `iterations` more in the calling thread, with the frames there are. `progress` may be null; a non-zero

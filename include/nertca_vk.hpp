@@ -97,6 +97,15 @@ class Reconstruction : public detail::Owner<nertca_reconstruction, nertca_recons
     detail::check(nertca_reconstruction_create(context.get(), options.c_str(), &handle_), context.get());
   }
   void add_frame(const nertca_frame &frame) { check(nertca_reconstruction_add_frame(handle_, &frame)); }
+  // Frames count from 0 in the order in which they were added.
+  nertca_correction correction(std::uint32_t frame) const {
+    nertca_correction correction = make<nertca_correction>();
+    check(nertca_reconstruction_correction(handle_, frame, &correction));
+    return correction;
+  }
+  void set_geometry(std::uint32_t frame, const nertca_geometry &geometry) {
+    check(nertca_reconstruction_set_geometry(handle_, frame, &geometry));
+  }
   void set_r_peaks(const std::vector<double> &times_s) {
     check(nertca_reconstruction_set_r_peaks(handle_, times_s.data(), times_s.size()));
   }

@@ -272,6 +272,17 @@ impl ViewRays {
         self.anchor[0] - self.direction[0] * self.sod
     }
 
+    /// The projection from patient mm (left, posterior, superior) to homogeneous pixels (column, row), rows first.
+    pub fn projection(&self) -> [[f64; 4]; 3] {
+        // [B^-1 | -B^-1 s] in world units, whose axes are posterior, left, superior.
+        let basis = DMat3::from_cols(self.direction[1], self.direction[2], self.direction[0]).inverse();
+        let shift = -(basis * self.source()) * MM_PER_UNIT;
+        [0, 1, 2].map(|r| {
+            let row = basis.row(r);
+            [row.y, row.x, row.z, shift[r]]
+        })
+    }
+
     /// Column and row (pixel centres at integers) a world point projects to; `None` behind the source.
     pub fn project(&self, point: DVec3) -> Option<(f64, f64)> {
         let basis = DMat3::from_cols(self.direction[1], self.direction[2], self.direction[0]);
@@ -286,13 +297,7 @@ pub(crate) mod tests {
 
     /// A projection matrix with these rays; its sign is free.
     pub(crate) fn matrix_of(rays: &ViewRays) -> Geometry {
-        // P = [B^-1 | -B^-1 s] in world units, brought to LPS mm.
-        let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]).inverse();
-        let shift = -(basis * rays.source()) * MM_PER_UNIT;
-        let matrix = [0, 1, 2].map(|r| {
-            let row = basis.row(r);
-            [-3.0 * row.y, -3.0 * row.x, -3.0 * row.z, -3.0 * shift[r]]
-        });
+        let matrix = rays.projection().map(|row| row.map(|value| -3.0 * value));
         Geometry::Matrix(Matrix { matrix })
     }
 

@@ -185,6 +185,7 @@ pub mod run {
     mod log;
     pub mod reconstruct;
     pub mod score;
+    pub mod silhouette_pictures;
     mod snapshots;
 }
 
@@ -194,6 +195,7 @@ pub mod session;
 #[allow(non_camel_case_types, reason = "types have the names they have in C")]
 #[allow(unreachable_pub, reason = "what the modules share among themselves")]
 pub mod capi {
+    pub mod calibration;
     mod callsites;
     pub mod context;
     pub mod handles;

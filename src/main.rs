@@ -12,6 +12,7 @@ mod cli {
     pub mod args;
     pub mod bench;
     pub mod calibrate;
+    pub mod calibration_table;
     pub mod check;
     pub mod data;
     pub mod devices;

@@ -4,11 +4,13 @@
 //! Threads: every function may be called from any thread at any time. Training holds the engine for a few iterations
 //! at a time; drawing never waits for more than those.
 
+mod corrected;
 mod engine;
 mod inbox;
 
+use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
-use crate::geometry::{MM_PER_UNIT, ViewRays};
+use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -21,6 +23,7 @@ use crate::render::renderer::Rendering;
 use crate::scan::gating::RPeaks;
 use crate::score::eval::{Evaluation, evaluate};
 use crate::train::trainer::StepLoss;
+pub use corrected::CorrectedFrame;
 use engine::{Control, Shared, nothing_yet};
 use inbox::Inbox;
 pub use inbox::{Moment, NewFrame, SessionOptions};
@@ -109,6 +112,7 @@ impl Session {
                 engine: Mutex::default(),
                 visitors: AtomicU32::new(0),
                 published: Mutex::default(),
+                calibration: Mutex::default(),
                 step: AtomicU32::new(0),
                 viewer: Mutex::new(None),
                 control: Mutex::new(Control { state: State::Idle, failure: None, worker: None, news: Instant::now() }),
@@ -121,20 +125,45 @@ impl Session {
         })
     }
 
-    /// Adds a frame. Training in the background takes it in by itself, soon; training that starts later, at once.
+    /// Adds a frame, which counts from 0 on. Training in the background takes it in by itself, soon; training that starts later, at once.
     ///
     /// # Errors
     /// [`Error::Config`] naming what is wrong with it; [`Error::Busy`] while a deterministic session is training.
     pub fn add_frame(&self, new: NewFrame) -> Result<()> {
-        let shared = &self.shared;
-        let mut inbox = lock(&shared.inbox);
+        self.change_frames(|inbox| inbox.add(new))
+    }
+
+    /// States another geometry for a frame that was added: what the C-arm or a calibration elsewhere knows better by now.
+    /// Training takes it in as it does a new frame.
+    ///
+    /// # Errors
+    /// As [`Session::add_frame`]; [`Error::Config`] for a frame that was not added.
+    pub fn set_geometry(&self, frame: usize, geometry: Geometry) -> Result<()> {
+        self.change_frames(|inbox| inbox.set_geometry(frame, geometry))
+    }
+
+    fn change_frames(&self, change: impl FnOnce(&mut Inbox) -> Result<()>) -> Result<()> {
+        let mut inbox = lock(&self.shared.inbox);
         if inbox.options.deterministic && matches!(self.state(), State::Running | State::Waiting) {
             return Err(Error::Busy("a deterministic session takes no frames while it trains".into()));
         }
-        inbox.add(new)?;
+        change(&mut inbox)?;
         drop(inbox);
         self.announce();
         Ok(())
+    }
+
+    /// How the reconstruction sees a frame, counted from 0 as they were added: as stated, or as calibration corrected it
+    /// when training last took frames in. A checkpoint that was loaded says nothing of it.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a frame that was not added.
+    pub fn corrected_frame(&self, frame: usize) -> Result<CorrectedFrame> {
+        let calibration = lock(&self.shared.calibration).clone().unwrap_or_else(|| Calibration::none(None));
+        let inbox = lock(&self.shared.inbox);
+        let (frame, moment) = inbox.frame(frame)?;
+        let size = inbox.size.ok_or_else(nothing_yet)?;
+        CorrectedFrame::new(&inbox.views[frame.view], frame, inbox.phase(*moment), size, &calibration)
     }
 
     /// Gives the R-peaks by which frames with time stamps get their phase; replaces earlier ones.

@@ -7,11 +7,13 @@ mod disagreeing;
 
 use common::{gpu, run, small_dataset, tuning};
 use disagreeing::{PHASES, Shot, Studio, Wrong};
+use glam::DVec3;
 use nertca_vk::calibrate::calibrate;
 use nertca_vk::calibrate::choose::{Correction, fit};
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::calibrate::observed::Observed;
 use nertca_vk::config::Config;
+use nertca_vk::geometry::{MM_PER_UNIT, ViewRays, lps_mm_from_world};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
@@ -19,6 +21,7 @@ use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer;
 use nertca_vk::score::calibrated::in_calibrated_frame;
 use nertca_vk::score::eval::evaluate;
+use nertca_vk::session::{Moment, NewFrame, Session, SessionOptions};
 use nertca_vk::train::trainer::Trainer;
 use std::time::Instant;
 
@@ -156,4 +159,66 @@ fn corrections_are_written_and_read() {
     assert!(text.contains("stated_geometry"));
     let refused = writer::convert(&read, Layout::Nerfca, &directory.path().join("x")).unwrap_err().to_string();
     assert!(refused.contains("nerfca"), "{refused}");
+}
+
+#[test]
+fn a_session_tells_how_it_sees_its_frames() {
+    let gpu = gpu();
+    let wrong = Wrong { seed: 11, angle_deg: 0.5, shift_mm: 1.0, breathing_mm: 3.0, ..Wrong::default() };
+    let shot = Studio::new(&gpu, 100, 1).shoot(3, false, wrong);
+    let options = SessionOptions {
+        config: config("auto"),
+        phases: PHASES,
+        depth_half_extent_mm: shot.dataset.depth_range.1 * MM_PER_UNIT,
+        vessel_attenuation_per_mm: shot.dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
+        deterministic: true,
+    };
+    let session = Session::new(Some(gpu.clone()), Some(tuning(&gpu)), options).unwrap();
+    let training = shot.dataset.training();
+    for f in training {
+        let new = NewFrame {
+            geometry: shot.dataset.views[f.view].geometry.clone(),
+            moment: Moment::Phase(f.phase),
+            split: f.split,
+            width: shot.dataset.width,
+            height: shot.dataset.height,
+            integrals: f.integrals.clone(),
+            mask: None,
+        };
+        session.add_frame(new).unwrap();
+    }
+    // Corners of the heart, as pixels of a frame.
+    let corners = (0..8).map(|k| DVec3::new((k & 1) as f64, (k >> 1 & 1) as f64, (k >> 2) as f64) * 0.1 - 0.05);
+    let corners: Vec<DVec3> = corners.collect();
+    let farthest = |frame: usize, rays: &ViewRays| {
+        let seen = session.corrected_frame(frame).unwrap();
+        let away = corners.iter().map(|corner| {
+            let x = lps_mm_from_world(*corner);
+            let [i, j, w] = seen.projection.map(|[a, b, c, d]| a * x.x + b * x.y + c * x.z + d);
+            let (u, v) = rays.project(*corner).unwrap();
+            (i / w - u).hypot(j / w - v)
+        });
+        (seen.correction, away.fold(0.0, f64::max))
+    };
+    for (index, f) in training.iter().enumerate() {
+        let (correction, away) = farthest(index, &shot.dataset.views[f.view].rays);
+        assert_eq!(correction, Correction::Stated, "nothing was trained");
+        assert!(away < 1e-9, "frame {index} as stated: {away} px");
+    }
+    session.train(1, &mut |_| true).unwrap();
+    let corrected = shot.dataset.corrected(&calibrate(&shot.dataset, &config("auto")).unwrap()).unwrap();
+    for (index, f) in corrected.training().iter().enumerate() {
+        let (correction, away) = farthest(index, &corrected.heart_rays(f));
+        assert_eq!(correction, Correction::Breathing);
+        assert!(away < 1e-9, "frame {index} as corrected: {away} px");
+        assert!(farthest(index, &shot.dataset.views[f.view].rays).1 > 0.5, "frame {index} was moved");
+    }
+    // What is stated anew is what counts, until training takes it in.
+    let other = shot.dataset.views[training[0].view].geometry.corrected([1.0, 0.0], DVec3::ZERO);
+    session.set_geometry(0, other.clone()).unwrap();
+    let (correction, away) = farthest(0, &other.rays(shot.dataset.width, shot.dataset.height).unwrap());
+    assert!(correction == Correction::Stated && away < 1e-9, "{correction:?}, {away} px");
+    assert_eq!(farthest(1, &corrected.heart_rays(&corrected.training()[1])).0, Correction::Breathing);
+    let none = session.corrected_frame(training.len()).unwrap_err().to_string();
+    assert!(none.contains(&format!("{} were added", training.len())), "{none}");
 }

@@ -5,6 +5,7 @@ mod capi;
 
 use ash::vk::{self, Handle};
 use capi::scene::*;
+use nertca_vk::capi::calibration::*;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
@@ -271,6 +272,45 @@ fn progress(reconstruction: *mut nertca_reconstruction) -> nertca_progress {
     let mut progress = nertca_progress { size: size_of::<nertca_progress>(), ..zeroed() };
     ok(unsafe { nertca_reconstruction_progress(reconstruction, &mut progress) }, reconstruction);
     progress
+}
+
+fn correction(reconstruction: *mut nertca_reconstruction, frame: u32) -> nertca_correction {
+    let mut correction = nertca_correction { size: size_of::<nertca_correction>(), ..zeroed() };
+    ok(unsafe { nertca_reconstruction_correction(reconstruction, frame, &mut correction) }, reconstruction);
+    correction
+}
+
+#[test]
+fn geometry_is_told_and_can_be_known_better_later() {
+    let context = context("validation = true\ndeterministic = true");
+    let (corrected, given) = (reconstruction(context, SMALL), reconstruction(context, SMALL));
+    for view in 0..3 {
+        for phase in 0..PHASES {
+            let pixels = pixels(view, phase);
+            let wrong = nertca_geometry { primary_deg: 10.0 * f64::from(phase), ..geometry(view) };
+            let frame = nertca_frame { geometry: wrong, ..frame(view, phase, &pixels) };
+            ok(unsafe { nertca_reconstruction_add_frame(corrected, &frame) }, corrected);
+        }
+    }
+    for index in 0..9 {
+        let geometry = geometry(index as usize / 3);
+        ok(unsafe { nertca_reconstruction_set_geometry(corrected, index, &geometry) }, corrected);
+    }
+    add_frames(given, 0..3);
+    train(corrected, 3);
+    train(given, 3);
+    let (a, b) = (drawn(corrected, &exact(1, NERTCA_COMPONENT_TOTAL)), drawn(given, &exact(1, NERTCA_COMPONENT_TOTAL)));
+    assert_eq!(a, b, "frames whose geometry was stated anew");
+    // The matrix is the geometry: a C-arm drawn by one is drawn as by the other.
+    let seen = correction(corrected, 4);
+    assert_eq!((seen.kind, seen.heart_shift_mm), (NERTCA_CORRECTION_STATED, [0.0; 3]));
+    let by_angles = nertca_view { geometry: geometry(1), ..exact(1, NERTCA_COMPONENT_TOTAL) };
+    let matrix = nertca_geometry { size: by_angles.geometry.size, matrix: seen.matrix.as_ptr().cast(), ..zeroed() };
+    let by_matrix = nertca_view { geometry: matrix, ..by_angles };
+    let away = far(&drawn(corrected, &by_matrix), &drawn(corrected, &by_angles));
+    assert!(away < 1e-4, "drawn by its matrix, a view differs by {away}");
+    assert!(far(&drawn(corrected, &by_matrix), &a) > 0.01, "two views differ");
+    close(context, &[corrected, given]);
 }
 
 #[test]

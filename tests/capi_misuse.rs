@@ -5,6 +5,7 @@ mod capi;
 
 use capi::root;
 use capi::scene::*;
+use nertca_vk::capi::calibration::*;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
@@ -67,6 +68,7 @@ fn every_function_refuses_what_it_cannot_use() {
     contexts(&b);
     reconstructions(&b);
     frames(&b);
+    calibration(&b);
     checkpoints(&b);
     training(&b);
     views(&b);
@@ -238,6 +240,23 @@ fn reconstructions(b: &Bench) {
     b.handles(progress, stale(b), b.context.cast(), |h| unsafe {
         nertca_reconstruction_progress(h, &mut nertca_progress { size: size_of::<nertca_progress>(), ..zeroed() })
     });
+}
+
+fn calibration(b: &Bench) {
+    let correction = "nertca_reconstruction_correction";
+    let mut room = nertca_correction { size: size_of::<nertca_correction>(), ..zeroed() };
+    b.refuses(correction, NERTCA_ERROR_ARGUMENT, "0 were added", unsafe {
+        nertca_reconstruction_correction(b.bare, 0, &mut room)
+    });
+    b.handles(correction, stale(b), b.context.cast(), |h| unsafe {
+        nertca_reconstruction_correction(h, 0, &mut nertca_correction { size: room.size, ..zeroed() })
+    });
+    let set = "nertca_reconstruction_set_geometry";
+    b.refuses(set, NERTCA_ERROR_ARGUMENT, "is null", unsafe { nertca_reconstruction_set_geometry(b.bare, 0, null()) });
+    b.refuses(set, NERTCA_ERROR_ARGUMENT, "0 were added", unsafe {
+        nertca_reconstruction_set_geometry(b.bare, 0, &geometry(0))
+    });
+    b.handles(set, stale(b), b.context.cast(), |h| unsafe { nertca_reconstruction_set_geometry(h, 0, &geometry(0)) });
 }
 
 fn frames(b: &Bench) {

@@ -6,6 +6,7 @@
 mod capi;
 
 use capi::scene::*;
+use nertca_vk::capi::calibration::*;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
@@ -97,7 +98,7 @@ impl Pool {
     }
 
     fn step(&mut self) -> nertca_status {
-        let n = self.random.below(28);
+        let n = self.random.below(30);
         match n {
             0 => {
                 let options = if self.device {
@@ -268,6 +269,16 @@ impl Pool {
                 1 => nertca_buffer_destroy(self.buffer()),
                 _ => unsafe { nertca_context_destroy(self.context()) },
             },
+            27 => {
+                let mut correction = nertca_correction { size: self.random.below(300), ..zeroed() };
+                correction.size = correction.size.min(size_of::<nertca_correction>());
+                let (r, frame) = (self.reconstruction(), self.random.below(12) as u32);
+                unsafe { nertca_reconstruction_correction(r, frame, &mut correction) }
+            }
+            28 => {
+                let (r, frame, geometry) = (self.reconstruction(), self.random.below(12) as u32, self.geometry());
+                unsafe { nertca_reconstruction_set_geometry(r, frame, &geometry) }
+            }
             _ => {
                 let mut text = [0; 64];
                 let size = self.random.below(65);

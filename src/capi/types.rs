@@ -250,6 +250,34 @@ pub struct nertca_progress {
     pub iterations_per_s: f64,
 }
 
+/// How calibration sees a frame.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_correction {
+    /// `sizeof(nertca_correction)`.
+    pub size: usize,
+    /// One of `NERTCA_CORRECTION_*`.
+    pub kind: u32,
+    /// Added to the stated primary angle, degrees.
+    pub primary_deg: f64,
+    /// Added to the stated secondary angle, degrees.
+    pub secondary_deg: f64,
+    /// How much further than stated the table has carried the patient (LPS), mm.
+    pub table_mm: [f64; 3],
+    /// Where breathing has carried the heart in this frame (LPS), mm.
+    pub heart_shift_mm: [f64; 3],
+    /// Root mean square of how far the correction moves the heart's image in this view, pixels, less what moves all views
+    /// alike.
+    pub moved_px: f64,
+    /// What does not agree with the other views, as a share of what moves, before.
+    pub residual_before: f64,
+    /// And after.
+    pub residual_after: f64,
+    /// All of it, displacement of the heart included, as a row-major 3 x 4 projection from patient mm to homogeneous pixels
+    /// (column, row; integers are pixel centres): what `nertca_geometry.matrix` takes.
+    pub matrix: [[f64; 4]; 3],
+}
+
 /// Scores on the frames added for validation.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -295,7 +323,7 @@ macro_rules! versioned {
     )* };
 }
 versioned!(nertca_log nertca_vulkan nertca_geometry nertca_frame nertca_view nertca_image nertca_grid nertca_progress
-       nertca_scores);
+       nertca_correction nertca_scores);
 
 fn check_size<T: Versioned>(size: usize) -> Outcome<()> {
     if size < size_of::<T>() || size > 4096 {

@@ -1,9 +1,10 @@
 //! `report.html`: one page that needs nothing but itself. Plots are SVG, pictures are embedded, and phases are chosen by
 //! radio buttons, so that no script is needed.
 
-use super::volume_table::{self, COLUMNS};
+use super::{calibration_table, volume_table};
 use base64::Engine;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::model::gaussians::Displacement;
@@ -36,6 +37,10 @@ pub struct Page<'a> {
     pub pictures: Vec<(usize, u32, PathBuf)>,
     /// Picture of the motion hull in front of each training view: view, file.
     pub hull: Vec<(usize, PathBuf)>,
+    /// How views were corrected, where that is known.
+    pub calibration: Option<Calibration>,
+    /// Picture of what each training view shows of vessels, before and after correction: view, file.
+    pub silhouettes: Vec<(usize, PathBuf)>,
     /// The whole configuration.
     pub config: String,
 }
@@ -54,7 +59,7 @@ fieldset{border:0;padding:0;margin:0 0 1.5rem}legend{padding:0;color:var(--soft)
 label.p{display:inline-block;min-width:1.6rem;text-align:center;padding:.1rem .4rem;border:1px solid var(--line);cursor:pointer}
 input.p:focus-visible+label.p{outline:2px solid}.shot{display:none}.shot img{width:100%;image-rendering:pixelated}
 .bars div{background:var(--soft);height:.7rem}pre{overflow:auto;border:1px solid var(--line);padding:.6rem;font-size:.85rem}
-.hulls{display:flex;flex-wrap:wrap;gap:1rem}.hulls figure{margin:0;flex:1 1 24rem}.hulls img{width:100%;image-rendering:pixelated}
+.by-view{display:flex;flex-wrap:wrap;gap:1rem}.by-view figure{margin:0;flex:1 1 24rem}.by-view img{width:100%;image-rendering:pixelated}
 .scroll{overflow-x:auto;max-height:26rem}";
 
 /// Series of a plot.
@@ -138,6 +143,18 @@ fn plot(title: &str, lines: &[Line], log_y: bool) -> Result<String> {
 fn embedded(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
     Ok(format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes)))
+}
+
+/// Pictures side by side, a view each.
+fn by_view(what: &str, pictures: &[(usize, PathBuf)]) -> Result<Markup> {
+    let pictures = pictures.iter().map(|(view, path)| Ok((view, embedded(path)?))).collect::<Result<Vec<_>>>()?;
+    Ok(html! {
+        div.by-view {
+            @for (view, data) in &pictures {
+                figure { img alt=(format!("{what} in view {view}")) src=(data); figcaption { "View " (view) } }
+            }
+        }
+    })
 }
 
 impl Page<'_> {
@@ -239,7 +256,7 @@ impl Page<'_> {
             h2 { "Scores in 3D" }
             p.lead { (volume_table::legend(volume)) }
             div.scroll { table {
-                tr { th { "phase" } @for column in &COLUMNS { th { (column.heading.join(" ").trim()) } } }
+                tr { th { "phase" } @for column in &volume_table::COLUMNS { th { (column.heading.join(" ").trim()) } } }
                 @for (name, cells) in volume_table::rows(volume) {
                     tr { td { (name) } @for cell in cells { td { (cell) } } }
                 }
@@ -297,16 +314,29 @@ impl Page<'_> {
     }
 
     fn hull(&self) -> Result<Markup> {
-        let pictures = self.hull.iter().map(|(view, path)| Ok((view, embedded(path)?))).collect::<Result<Vec<_>>>()?;
+        let pictures = by_view("hull", &self.hull)?;
         Ok(html! {
-            @if !pictures.is_empty() {
+            @if !self.hull.is_empty() {
                 h2 { "Where vessels may be" }
                 p.lead { "Training views at their first phase, and in orange what the motion hull covers of them: a vessel outside was lost before training." }
-                div.hulls {
-                    @for (view, data) in &pictures {
-                        figure { img alt=(format!("hull in view {view}")) src=(data); figcaption { "View " (view) } }
-                    }
-                }
+                (pictures)
+            }
+        })
+    }
+
+    fn calibration(&self) -> Result<Markup> {
+        let Some(calibration) = self.calibration.as_ref().filter(|c| !c.views.is_empty()) else { return Ok(html! {}) };
+        Ok(html! {
+            h2 { "How views were corrected" }
+            @for note in &calibration.notes { p.lead { (note) } }
+            p.lead { "Added to what the dataset states; in all, " (calibration_table::legend(calibration)) "." }
+            div.scroll { table {
+                tr { @for column in &calibration_table::COLUMNS { th { (column.heading.join(" ").trim()) } } }
+                @for cells in calibration_table::rows(calibration) { tr { @for cell in cells { td { (cell) } } } }
+            } }
+            @if !self.silhouettes.is_empty() {
+                p.lead { "What each training view shows of vessels, as stated (left) and corrected (right): green where all other views show vessels on the ray, too, red where they do not." }
+                (by_view("silhouettes", &self.silhouettes)?)
             }
         })
     }
@@ -350,6 +380,7 @@ impl Page<'_> {
                     (self.volume())
                     (self.plots()?)
                     (self.views()?)
+                    (self.calibration()?)
                     (self.hull()?)
                     (self.motion())
                     (self.kernels())

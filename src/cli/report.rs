@@ -1,16 +1,17 @@
 //! What a finished run is worth: scores on every unseen image, pictures of them, and a page to look at.
 
 use super::page::Page;
+use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
 use nertca_vk::model::gaussians::MovingGaussians;
-use nertca_vk::run::hull_pictures;
+use nertca_vk::run::{hull_pictures, silhouette_pictures};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What `report.html` is made of.
 pub struct Report<'a> {
@@ -36,7 +37,7 @@ impl Report<'_> {
     /// Writes the page.
     ///
     /// # Errors
-    /// [`nertca_vk::error::Error::Io`].
+    /// [`nertca_vk::error::Error::Io`]; [`nertca_vk::error::Error::Data`] for a run's calibration that cannot be read.
     pub fn write(&self, path: &Path) -> Result<()> {
         let Report { gpu, tuning, model, dataset, evaluation, run, pictures, .. } = *self;
         let log = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
@@ -69,6 +70,10 @@ impl Report<'_> {
         }
         let frames = dataset.validation().iter();
         let tree = model.moving.as_ref().and_then(MovingGaussians::tree);
+        let of_views = |file: fn(&Path, usize) -> PathBuf| {
+            let files = dataset.training_views().into_iter().map(|view| (view, file(&run.join("report"), view)));
+            files.filter(|(_, file)| file.is_file()).collect()
+        };
         let page = Page {
             title: run.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned()),
             facts,
@@ -80,12 +85,9 @@ impl Report<'_> {
                 .map(|f| (f.view, f.phase, pictures.join(format!("{}.png", f.name))))
                 .filter(|(_, _, file)| file.is_file())
                 .collect(),
-            hull: dataset
-                .training_views()
-                .into_iter()
-                .map(|view| (view, hull_pictures::file(&run.join("report"), view)))
-                .filter(|(_, file)| file.is_file())
-                .collect(),
+            hull: of_views(hull_pictures::file),
+            calibration: Calibration::read(run)?,
+            silhouettes: of_views(silhouette_pictures::file),
             config: model.config.to_toml()?,
         };
         page.write(path)

@@ -4,6 +4,7 @@
 //! with what was corrected of the views' geometry and, when finished, `report/` with the evaluation and pictures.
 
 use crate::calibrate::calibrate;
+use crate::calibrate::choose::Correction;
 use crate::calibrate::correction::Calibration;
 use crate::config::Config;
 use crate::error::{Error, Result};
@@ -13,9 +14,9 @@ use crate::kernels::tuning::Tuning;
 use crate::model::checkpoint::{self, Checkpoint};
 use crate::plan::Plan;
 use crate::run::events::Event;
-use crate::run::hull_pictures;
 use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
+use crate::run::{hull_pictures, silhouette_pictures};
 use crate::scan::dataset::Dataset;
 use crate::score::calibrated::in_calibrated_frame;
 use crate::score::eval;
@@ -122,6 +123,9 @@ fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> R
         calibration
     };
     let corrected = dataset.corrected(&calibration)?;
+    if !options.resume && calibration.correction != Correction::Stated {
+        silhouette_pictures::write(&options.run.join("report"), dataset, &corrected)?;
+    }
     Ok((in_calibrated_frame(&corrected)?.unwrap_or(corrected), calibration))
 }
 

@@ -1,6 +1,7 @@
 //! What trains a session and what is drawn of it, shared by the threads that do so.
 
 use crate::calibrate::calibrate;
+use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -34,6 +35,8 @@ pub(super) struct Shared {
     /// Who waits for the engine, other than training in the background.
     pub(super) visitors: AtomicU32,
     pub(super) published: Mutex<Published>,
+    /// Of the frames that training goes by; none before it begins.
+    pub(super) calibration: Mutex<Option<Calibration>>,
     /// Iterations handed to the device.
     pub(super) step: AtomicU32,
     pub(super) viewer: Mutex<Option<(u64, Live)>>,
@@ -166,6 +169,7 @@ impl Shared {
         let calibration = calibrate(&dataset, &config)?;
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         let dataset = dataset.corrected(&calibration)?;
+        *lock(&self.calibration) = Some(calibration);
         let fresh = Plan::new(&config, &dataset)?;
         if let Some(training) = &mut engine.training {
             let state = training.trainer_mut().checkpoint()?;

@@ -2,7 +2,7 @@
 
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
-use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::gating::RPeaks;
 use std::path::PathBuf;
@@ -50,6 +50,10 @@ pub struct NewFrame {
     pub mask: Option<Vec<bool>>,
 }
 
+fn bad(field: &str, value: String, problem: String) -> Error {
+    Error::config(format!("frame: {field}"), value, problem)
+}
+
 /// Checked frames, and how they are to be used.
 pub(super) struct Inbox {
     pub(super) options: SessionOptions,
@@ -61,8 +65,6 @@ pub(super) struct Inbox {
 
 impl Inbox {
     pub(super) fn add(&mut self, new: NewFrame) -> Result<()> {
-        let bad =
-            |field: &str, value: String, problem: String| Error::config(format!("frame: {field}"), value, problem);
         let pixels = new.width.checked_mul(new.height).filter(|n| *n > 0);
         if pixels != Some(new.integrals.len()) || new.mask.as_ref().is_some_and(|m| Some(m.len()) != pixels) {
             let size = format!("{} x {}", new.width, new.height);
@@ -86,21 +88,9 @@ impl Inbox {
             }
             _ => (),
         }
-        let rays =
-            new.geometry.rays(new.width, new.height).map_err(|(field, problem)| bad(&field, String::new(), problem))?;
-        let depth = self.options.depth_half_extent_mm / MM_PER_UNIT;
-        if rays.sod <= depth {
-            let problem = format!("the source stands inside the depth range of {} mm", depth * MM_PER_UNIT);
-            return Err(bad("sod_mm", format!("{:.0}", rays.sod * MM_PER_UNIT), problem));
-        }
+        let rays = self.rays(&new.geometry, (new.width, new.height))?;
         self.size = Some((new.width, new.height));
-        let view = match self.views.iter().position(|v| v.geometry == new.geometry) {
-            Some(view) => view,
-            None => {
-                self.views.push(View { geometry: new.geometry, rays });
-                self.views.len() - 1
-            }
-        };
+        let view = self.view(View { geometry: new.geometry, rays });
         let frame = Frame {
             name: format!("frame-{}", self.frames.len()),
             view,
@@ -114,17 +104,56 @@ impl Inbox {
         Ok(())
     }
 
-    /// The frames whose phase is known and that `keep` wants.
-    pub(super) fn dataset(&self, keep: impl Fn(&Frame, &[Frame]) -> bool) -> Result<Dataset> {
-        let phase = |moment: Moment| match (moment, &self.r_peaks) {
+    /// States another geometry for a frame, counted from 0 as they were added.
+    pub(super) fn set_geometry(&mut self, index: usize, geometry: Geometry) -> Result<()> {
+        self.frame(index)?;
+        let Some(size) = self.size else { return Ok(()) };
+        let rays = self.rays(&geometry, size)?;
+        self.frames[index].0.view = self.view(View { geometry, rays });
+        Ok(())
+    }
+
+    /// A frame, counted from 0 as they were added.
+    pub(super) fn frame(&self, index: usize) -> Result<&(Frame, Moment)> {
+        let none = || Error::config("frame", index, format!("{} were added; they count from 0", self.frames.len()));
+        self.frames.get(index).ok_or_else(none)
+    }
+
+    /// Rays of a geometry that frames of a size can have.
+    fn rays(&self, geometry: &Geometry, (width, height): (usize, usize)) -> Result<ViewRays> {
+        let rays = geometry.rays(width, height).map_err(|(field, problem)| bad(&field, String::new(), problem))?;
+        let depth = self.options.depth_half_extent_mm / MM_PER_UNIT;
+        if rays.sod <= depth {
+            let problem = format!("the source stands inside the depth range of {} mm", depth * MM_PER_UNIT);
+            return Err(bad("sod_mm", format!("{:.0}", rays.sod * MM_PER_UNIT), problem));
+        }
+        Ok(rays)
+    }
+
+    /// Index of a view, which is new unless an earlier frame was taken from there.
+    fn view(&mut self, view: View) -> usize {
+        let known = self.views.iter().position(|v| v.geometry == view.geometry);
+        known.unwrap_or_else(|| {
+            self.views.push(view);
+            self.views.len() - 1
+        })
+    }
+
+    /// Cardiac phase of a moment, where it is known.
+    pub(super) fn phase(&self, moment: Moment) -> Option<u32> {
+        match (moment, &self.r_peaks) {
             (Moment::Phase(phase), _) => Some(phase),
             (Moment::TimeS(time), Some(peaks)) => peaks.phase(time, self.options.phases),
             (Moment::TimeS(_), None) => None,
-        };
+        }
+    }
+
+    /// The frames whose phase is known and that `keep` wants.
+    pub(super) fn dataset(&self, keep: impl Fn(&Frame, &[Frame]) -> bool) -> Result<Dataset> {
         let known: Vec<Frame> = self
             .frames
             .iter()
-            .filter_map(|(frame, moment)| phase(*moment).map(|phase| Frame { phase, ..frame.clone() }))
+            .filter_map(|(frame, moment)| self.phase(*moment).map(|phase| Frame { phase, ..frame.clone() }))
             .collect();
         let mut frames: Vec<Frame> = known.iter().filter(|f| keep(f, &known)).cloned().collect();
         frames.sort_by_key(|f| f.split);

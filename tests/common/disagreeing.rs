@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use nertca_vk::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
-use nertca_vk::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
+use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::phantom::projector::{LoadedVolume, Projector};
 use nertca_vk::phantom::tree::{Bounds, Heart, Tree, contraction};
@@ -10,6 +10,7 @@ use nertca_vk::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::phantom::voxels::{self, Breath, Tissues};
 use nertca_vk::random::{STREAM_PHOTON, normal, uniform01};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use nertca_vk::scan::truth::{TrueFrame, Truth};
 use std::path::Path;
 
 pub const PHASES: u32 = 10;
@@ -165,19 +166,24 @@ impl Studio {
 impl Shot {
     /// Writes `truth.json` into a directory.
     pub fn write_truth(&self, directory: &Path) {
-        let frame = |f: &Frame| {
-            serde_json::json!({
-                "image": format!("{}.npy", f.name),
-                "view": f.view,
-                "split": f.split,
-                "phase": f.phase,
-                "geometry": self.truth[f.view],
-                "heart_shift_mm": (self.heart[f.view][f.phase as usize] * 100.0).to_array(),
-            })
+        let frame = |f: &Frame| TrueFrame {
+            image: format!("{}.npy", f.name).into(),
+            view: f.view,
+            split: f.split,
+            phase: f.phase,
+            geometry: match &self.truth[f.view] {
+                Geometry::CArm(c_arm) => c_arm.clone(),
+                Geometry::Matrix(_) => panic!("a C-arm took these images"),
+            },
+            heart_shift_mm: (self.heart[f.view][f.phase as usize] * MM_PER_UNIT).to_array(),
+            beat_phase: f.phase.into(),
+            time_s: 0.0,
+            contrast_gain: 1.0,
+            cut_share: 0.0,
         };
-        let frames: Vec<_> = self.dataset.frames.iter().map(frame).collect();
-        let truth = serde_json::json!({ "format": "nertca-truth", "version": 1, "frames": frames });
-        std::fs::write(directory.join("truth.json"), truth.to_string()).unwrap();
+        let mut truth = Truth::new(0, PHASES);
+        truth.frames = self.dataset.frames.iter().map(frame).collect();
+        truth.write(directory).unwrap();
     }
 
     /// Frames of the training views as they truly were and by the rays that `corrected` says of (view, phase).

@@ -1,0 +1,47 @@
+//! A calibration as a table: the same columns on the terminal and on the page.
+
+use nertca_vk::calibrate::correction::{Calibration, ViewCorrection};
+
+/// A column: what it shows, in two lines, and how.
+pub struct Column {
+    /// First and second line of its heading.
+    pub heading: [&'static str; 2],
+    text: fn(&ViewCorrection) -> String,
+}
+
+/// All columns, a row per view.
+pub const COLUMNS: [Column; 9] = [
+    Column { heading: ["", "view"], text: |v| v.view.to_string() },
+    Column { heading: ["primary", "deg"], text: |v| format!("{:+.2}", v.primary_deg) },
+    Column { heading: ["secondary", "deg"], text: |v| format!("{:+.2}", v.secondary_deg) },
+    Column { heading: ["left", "mm"], text: |v| format!("{:+.2}", v.table_mm[0]) },
+    Column { heading: ["posterior", "mm"], text: |v| format!("{:+.2}", v.table_mm[1]) },
+    Column { heading: ["superior", "mm"], text: |v| format!("{:+.2}", v.table_mm[2]) },
+    Column { heading: ["moved", "px"], text: |v| format!("{:.2}", v.moved_px) },
+    Column { heading: ["residual", "before"], text: |v| format!("{:.1} %", 100.0 * v.residual_before) },
+    Column { heading: ["residual", "after"], text: |v| format!("{:.1} %", 100.0 * v.residual_after) },
+];
+
+/// Rows of the table.
+pub fn rows(calibration: &Calibration) -> Vec<Vec<String>> {
+    let row = |view| COLUMNS.iter().map(|column| (column.text)(view)).collect();
+    calibration.views.iter().map(row).collect()
+}
+
+/// How far the views agree before and after.
+pub fn legend(calibration: &Calibration) -> String {
+    let [before, after] = calibration.explained.map(|share| 100.0 * share);
+    format!("vessel pixels that all other views explain: {before:.0} % before, {after:.0} % after")
+}
+
+/// Prints the table where something was corrected, and what there is to say.
+pub fn print(calibration: &Calibration) {
+    if !calibration.views.is_empty() {
+        let line = |cells: Vec<&str>| out!("{}", cells.iter().map(|cell| format!("{cell:>11}")).collect::<String>());
+        line(COLUMNS.iter().map(|c| c.heading[0]).collect());
+        line(COLUMNS.iter().map(|c| c.heading[1]).collect());
+        rows(calibration).iter().for_each(|cells| line(cells.iter().map(String::as_str).collect()));
+        out!("{}", legend(calibration));
+    }
+    calibration.notes.iter().for_each(|note| out!("{note}"));
+}

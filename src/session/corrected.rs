@@ -1,0 +1,57 @@
+//! How a session's reconstruction sees its frames.
+
+use crate::calibrate::choose::Correction;
+use crate::calibrate::correction::{Calibration, ViewCorrection};
+use crate::error::{Error, Result};
+use crate::geometry::world_from_lps_mm;
+use crate::scan::dataset::{Frame, View};
+use glam::DVec3;
+
+/// A frame as calibration sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CorrectedFrame {
+    /// How this frame is corrected.
+    pub correction: Correction,
+    /// Its view's part; none where the view is taken as stated.
+    pub view: Option<ViewCorrection>,
+    /// Where breathing has carried the heart along (left, posterior, superior), mm.
+    pub heart_shift_mm: [f64; 3],
+    /// From patient mm (left, posterior, superior) to homogeneous pixels (column, row; integers are pixel centres), rows
+    /// first: draws the vessels where this frame shows them.
+    pub projection: [[f64; 4]; 3],
+}
+
+impl CorrectedFrame {
+    /// `phase` and `size` (columns, rows) are those of the frame, which is of `view`.
+    pub(super) fn new(
+        view: &View,
+        frame: &Frame,
+        phase: Option<u32>,
+        size: (usize, usize),
+        calibration: &Calibration,
+    ) -> Result<CorrectedFrame> {
+        // What was stated may have been changed since.
+        let corrected = calibration.views.iter().find(|c| c.view == frame.view && c.stated == view.geometry);
+        let rays = match corrected {
+            Some(c) => c.corrected.rays(size.0, size.1).map_err(|(field, problem)| {
+                Error::config("frame", &frame.name, format!("corrected geometry: {field}: {problem}"))
+            })?,
+            None => view.rays.clone(),
+        };
+        let shift =
+            calibration.frames.iter().find(|c| corrected.is_some() && c.view == frame.view && Some(c.phase) == phase);
+        let [posterior, left, superior] = shift.map_or([0.0; 3], |c| c.heart_shift_mm);
+        let heart_shift_mm = [left, posterior, superior];
+        let way = world_from_lps_mm(DVec3::from_array(heart_shift_mm));
+        Ok(CorrectedFrame {
+            correction: match (corrected, shift) {
+                (None, _) => Correction::Stated,
+                (Some(_), None) => Correction::Static,
+                (Some(_), Some(_)) => Correction::Breathing,
+            },
+            view: corrected.cloned(),
+            heart_shift_mm,
+            projection: rays.moved(way).projection(),
+        })
+    }
+}
