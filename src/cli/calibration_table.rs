@@ -31,7 +31,11 @@ pub fn rows(calibration: &Calibration) -> Vec<Vec<String>> {
 /// How far the views agree before and after.
 pub fn legend(calibration: &Calibration) -> String {
     let [before, after] = calibration.explained.map(|share| 100.0 * share);
-    format!("vessel pixels that all other views explain: {before:.0} % before, {after:.0} % after")
+    format!(
+        "Views disagreed by {:.2} pixels. All other views explain {before:.0} % of a view's vessel pixels before, and \
+         {after:.0} % after.",
+        calibration.disagreement_px
+    )
 }
 
 /// Prints the table where something was corrected, and what there is to say.

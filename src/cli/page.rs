@@ -328,8 +328,7 @@ impl Page<'_> {
         let Some(calibration) = self.calibration.as_ref().filter(|c| !c.views.is_empty()) else { return Ok(html! {}) };
         Ok(html! {
             h2 { "How views were corrected" }
-            @for note in &calibration.notes { p.lead { (note) } }
-            p.lead { "Added to what the dataset states; in all, " (calibration_table::legend(calibration)) "." }
+            p.lead { "Added to what the dataset states. " (calibration_table::legend(calibration)) }
             div.scroll { table {
                 tr { @for column in &calibration_table::COLUMNS { th { (column.heading.join(" ").trim()) } } }
                 @for cells in calibration_table::rows(calibration) { tr { @for cell in cells { td { (cell) } } } }
