@@ -164,13 +164,18 @@ pub mod export {
     pub mod volumes;
 }
 
+/// Where the moving field is vessel, as sets of voxels.
+pub mod vessels {
+    pub mod centreline;
+    pub mod distances;
+    pub(crate) mod field;
+    pub mod mask;
+}
+
 /// What a reconstruction is worth.
 pub mod score {
     pub mod calibrated;
-    pub mod centreline;
-    pub mod distances;
     pub mod eval;
-    pub mod mask;
     pub mod metrics;
     pub mod pictures;
     pub mod shapes;

@@ -2,10 +2,10 @@
 
 use crate::error::{Error, Result};
 use crate::raster::percentile;
-use crate::score::centreline::centreline;
-use crate::score::distances::DistanceMap;
-use crate::score::mask::{Mask, component_sizes};
 use crate::score::metrics;
+use crate::vessels::centreline::centreline;
+use crate::vessels::distances::DistanceMap;
+use crate::vessels::mask::{Mask, component_sizes};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -130,7 +130,7 @@ pub fn compare(truth: &Mask, ours: &Mask, smallest_component_mm3: f64) -> Result
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::score::mask::tests::drawn;
+    use crate::vessels::mask::tests::drawn;
     use glam::DVec3;
 
     const SPACING_MM: DVec3 = DVec3::new(0.5, 0.25, 1.0);

@@ -1,20 +1,18 @@
 //! Scores in 3D, where a dataset carries its vessels as volumes (see `docs/formats.md`).
 
 use crate::error::{Error, Result};
-use crate::export::volumes::grid_over;
 use crate::formats::volume::{Volume, VolumeHints};
 use crate::geometry::MM_PER_UNIT;
-use crate::model::component::Component;
 use crate::model::scene::Scene;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
-use crate::score::distances::DistanceMap;
-use crate::score::mask::Mask;
 use crate::score::shapes::{Agreement, WITHIN_MM, compare};
+use crate::vessels::distances::DistanceMap;
+use crate::vessels::field::{CoarseField, Corners, MovingField};
+use crate::vessels::mask::Mask;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Directory of the volumes inside a dataset.
@@ -27,15 +25,6 @@ const FAR_PIXELS: f64 = 2.0;
 const FAR_MM: f64 = 2.0;
 /// Side of the smallest cube that counts as a component, pixels.
 const COMPONENT_PIXELS: f64 = 1.0;
-/// The whole field is looked at in points so many pixels apart.
-const COARSE_PIXELS: f64 = 0.75;
-/// Such points at most along its longest side.
-const COARSE_POINTS: f64 = 192.0;
-/// Around points below this share of the threshold nothing is vessel: a Gaussian of 0.4 pixels, the least, has as much of its
-/// peak left where it is farthest from such points.
-const FAINT: f64 = 0.25;
-/// Voxels of a block that is sampled at once, along left, posterior (a group of the device) and superior.
-const BLOCK: [u32; 3] = [8, 64, 8];
 /// Voxels at most that are compared.
 const MOST_VOXELS: u64 = 1 << 26;
 
@@ -109,7 +98,7 @@ pub fn score(
         proceed()?;
         let truth = Truth::read(&file, dataset.vessel_attenuation.map(|v| v / MM_PER_UNIT))?;
         let moving = MovingField { renderer, scene, phase, pixel_mm, threshold_per_mm };
-        phases.push(PhaseScores { phase, scores: moving.scores(&truth, &file, smallest_component_mm3)? });
+        phases.push(PhaseScores { phase, scores: scores(&moving, &truth, &file, smallest_component_mm3)? });
     }
     Ok((!phases.is_empty()).then(|| VolumeScores {
         threshold_per_mm,
@@ -199,28 +188,6 @@ impl Truth {
     }
 }
 
-/// The first and the last point of a box, patient mm.
-#[derive(Clone, Copy)]
-struct Corners {
-    low_mm: DVec3,
-    high_mm: DVec3,
-}
-
-impl Corners {
-    fn of(grid: &PatientGrid) -> Corners {
-        let steps = DVec3::from_array(grid.size.map(|n| f64::from(n) - 1.0));
-        Corners { low_mm: grid.origin_mm, high_mm: grid.origin_mm + steps * grid.spacing_mm }
-    }
-
-    fn grown(self, by_mm: f64) -> Corners {
-        Corners { low_mm: self.low_mm - by_mm, high_mm: self.high_mm + by_mm }
-    }
-
-    fn joined(self, other: Corners) -> Corners {
-        Corners { low_mm: self.low_mm.min(other.low_mm), high_mm: self.high_mm.max(other.high_mm) }
-    }
-}
-
 /// Attenuation summed over volumes, mm² (per mm, times mm³).
 #[derive(Clone, Copy, Default)]
 struct Mass {
@@ -230,132 +197,12 @@ struct Mass {
 }
 
 impl Mass {
-    /// A share of all of it; none of nothing.
-    fn share(&self, part: f64) -> Option<f64> {
-        (self.all > 0.0).then(|| part / self.all)
-    }
-}
-
-/// The moving field at a phase.
-struct MovingField<'a> {
-    renderer: &'a Renderer,
-    scene: &'a Scene,
-    phase: u32,
-    pixel_mm: f64,
-    threshold_per_mm: f64,
-}
-
-impl MovingField<'_> {
-    /// Scores against the truth, on a grid of its voxels that holds the truth and what of the field is vessel.
-    fn scores(&self, truth: &Truth, file: &Path, smallest_component_mm3: f64) -> Result<Scores> {
-        let coarse = self.coarse()?;
-        let own = Corners::of(&truth.grid).grown(FAR_MM.max(FAR_PIXELS * self.pixel_mm));
-        let reach = coarse.reach(self.threshold_per_mm).map_or(own, |reach| own.joined(reach));
-        let (grid, true_vessels) = truth.reaching(reach, file)?;
-        let ours = self.vessels(&coarse, &grid)?;
-        let mass = DistanceMap::to(&true_vessels).map(|to_truth| coarse.mass(&grid, &to_truth, self.pixel_mm));
-        Ok(Scores {
-            agreement: compare(&true_vessels, &ours, smallest_component_mm3)?,
-            mass_beyond_2_pixels: mass.and_then(|m| m.share(m.far_pixels)),
-            mass_beyond_2_mm: mass.and_then(|m| m.share(m.far_mm)),
-        })
-    }
-
-    /// The whole field at points a pixel apart; of large fields, farther apart.
-    fn coarse(&self) -> Result<CoarseField> {
-        let size = DVec3::from_array(self.scene.dynamic_max) - DVec3::from_array(self.scene.dynamic_min);
-        let longest_mm = size.max_element() * MM_PER_UNIT;
-        let spacing_mm = (COARSE_PIXELS * self.pixel_mm).max(longest_mm / COARSE_POINTS);
-        let grid = grid_over(self.scene, Component::Dynamic, spacing_mm)?;
-        Ok(CoarseField { grid, values: self.renderer.sample_patient(Component::Dynamic, self.phase, &grid)? })
-    }
-
-    /// Points of a grid at which the field is vessel. Where it is faint around, it is not looked at.
-    fn vessels(&self, coarse: &CoarseField, grid: &PatientGrid) -> Result<Mask> {
-        let [nx, ny, nz] = grid.size.map(|n| n as usize);
-        let mut inside = vec![false; nx * ny * nz];
-        for block in coarse.blocks(grid, FAINT * self.threshold_per_mm) {
-            let [x, y, z] = block.first.map(|i| i as usize);
-            let [columns, rows, _] = block.grid.size.map(|n| n as usize);
-            let values = self.renderer.sample_patient(Component::Dynamic, self.phase, &block.grid)?;
-            for (row, values) in values.chunks(columns).enumerate() {
-                let first = ((z + row / rows) * ny + y + row % rows) * nx + x;
-                let inside = inside[first..].iter_mut().zip(values);
-                inside.for_each(|(inside, value)| *inside = f64::from(*value) > self.threshold_per_mm);
-            }
-        }
-        Ok(Mask { size: [nx, ny, nz], spacing_mm: grid.spacing_mm, inside })
-    }
-}
-
-/// Part of a grid.
-struct Block {
-    /// Its first point in the whole grid.
-    first: [u32; 3],
-    grid: PatientGrid,
-}
-
-/// The field at few points.
-struct CoarseField {
-    grid: PatientGrid,
-    values: Vec<f32>,
-}
-
-impl CoarseField {
-    /// Points that attenuate, patient mm, and how much, per mm.
-    fn points(&self) -> impl Iterator<Item = (DVec3, f64)> {
-        let [nx, ny, _] = self.grid.size.map(|n| n as usize);
-        let attenuating = self.values.iter().enumerate().filter(|(_, value)| **value > 0.0);
-        attenuating.map(move |(i, value)| {
-            let index = DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64);
-            (self.grid.origin_mm + index * self.grid.spacing_mm, f64::from(*value))
-        })
-    }
-
-    /// A box for each point above a threshold, which holds all that is nearer to it than the next point.
-    fn boxes(&self, threshold_per_mm: f64) -> impl Iterator<Item = Corners> {
-        let around_mm = self.grid.spacing_mm.max_element();
-        let above = self.points().filter(move |(_, value)| *value > threshold_per_mm);
-        above.map(move |(point, _)| Corners { low_mm: point, high_mm: point }.grown(around_mm))
-    }
-
-    /// What a box must hold to hold all that is above a threshold.
-    fn reach(&self, threshold_per_mm: f64) -> Option<Corners> {
-        self.boxes(threshold_per_mm).reduce(Corners::joined)
-    }
-
-    /// Blocks of a grid around points above a threshold.
-    fn blocks(&self, grid: &PatientGrid, threshold_per_mm: f64) -> Vec<Block> {
-        let in_blocks = |point_mm: DVec3| {
-            let voxel = (point_mm - grid.origin_mm) / grid.spacing_mm;
-            let last = DVec3::from_array(grid.size.map(|n| f64::from(n - 1)));
-            let voxel = voxel.clamp(DVec3::ZERO, last).as_uvec3().to_array();
-            [voxel[0] / BLOCK[0], voxel[1] / BLOCK[1], voxel[2] / BLOCK[2]]
-        };
-        let mut wanted = BTreeSet::new();
-        for Corners { low_mm, high_mm } in self.boxes(threshold_per_mm) {
-            let (low, high) = (in_blocks(low_mm), in_blocks(high_mm));
-            for z in low[2]..=high[2] {
-                for y in low[1]..=high[1] {
-                    wanted.extend((low[0]..=high[0]).map(|x| [z, y, x]));
-                }
-            }
-        }
-        let block = |[z, y, x]: [u32; 3]| {
-            let first = [x * BLOCK[0], y * BLOCK[1], z * BLOCK[2]];
-            let steps = DVec3::from_array(first.map(f64::from));
-            let size = std::array::from_fn(|axis| BLOCK[axis].min(grid.size[axis] - first[axis]));
-            Block { first, grid: PatientGrid { origin_mm: grid.origin_mm + steps * grid.spacing_mm, size, ..*grid } }
-        };
-        wanted.into_iter().map(block).collect()
-    }
-
-    /// Attenuation by its distance to the truth, which is known on a grid; beyond that grid all of it is far.
-    fn mass(&self, grid: &PatientGrid, to_truth: &DistanceMap, pixel_mm: f64) -> Mass {
+    /// That of a field by its distance to the truth, which is known on a grid; beyond that grid all of it is far.
+    fn of(coarse: &CoarseField, grid: &PatientGrid, to_truth: &DistanceMap, pixel_mm: f64) -> Mass {
         let [nx, ny, _] = grid.size.map(|n| n as usize);
         let end = DVec3::from_array(grid.size.map(f64::from));
         let mut mass = Mass::default();
-        for (point_mm, value) in self.points() {
+        for (point_mm, value) in coarse.points() {
             let voxel = ((point_mm - grid.origin_mm) / grid.spacing_mm).round();
             let away_mm = if voxel.cmpge(DVec3::ZERO).all() && voxel.cmplt(end).all() {
                 let [x, y, z] = voxel.as_usizevec3().to_array();
@@ -363,19 +210,50 @@ impl CoarseField {
             } else {
                 f64::INFINITY
             };
-            let here = value * self.grid.spacing_mm.element_product();
+            let here = value * coarse.grid.spacing_mm.element_product();
             mass.all += here;
             mass.far_pixels += if away_mm > FAR_PIXELS * pixel_mm { here } else { 0.0 };
             mass.far_mm += if away_mm > FAR_MM { here } else { 0.0 };
         }
         mass
     }
+
+    /// A share of all of it; none of nothing.
+    fn share(&self, part: f64) -> Option<f64> {
+        (self.all > 0.0).then(|| part / self.all)
+    }
+}
+
+/// Scores of a field against the truth, on a grid of its voxels that holds the truth and what of the field is vessel.
+fn scores(field: &MovingField<'_>, truth: &Truth, file: &Path, smallest_component_mm3: f64) -> Result<Scores> {
+    let coarse = field.coarse()?;
+    let own = Corners::of(&truth.grid).grown(FAR_MM.max(FAR_PIXELS * field.pixel_mm));
+    let reach = coarse.reach(field.threshold_per_mm).map_or(own, |reach| own.joined(reach));
+    let (grid, true_vessels) = truth.reaching(reach, file)?;
+    let ours = vessels(field, &coarse, &grid)?;
+    let mass = DistanceMap::to(&true_vessels).map(|to_truth| Mass::of(&coarse, &grid, &to_truth, field.pixel_mm));
+    Ok(Scores {
+        agreement: compare(&true_vessels, &ours, smallest_component_mm3)?,
+        mass_beyond_2_pixels: mass.and_then(|m| m.share(m.far_pixels)),
+        mass_beyond_2_mm: mass.and_then(|m| m.share(m.far_mm)),
+    })
+}
+
+/// Points of a grid at which a field is vessel.
+fn vessels(field: &MovingField<'_>, coarse: &CoarseField, grid: &PatientGrid) -> Result<Mask> {
+    let size = grid.size.map(|n| n as usize);
+    let mut inside = vec![false; size.iter().product()];
+    field.rows(coarse, grid, |first, values| {
+        let inside = inside[first..].iter_mut().zip(values);
+        inside.for_each(|(inside, value)| *inside = f64::from(*value) > field.threshold_per_mm);
+    })?;
+    Ok(Mask { size, spacing_mm: grid.spacing_mm, inside })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::score::mask::tests::drawn;
+    use crate::vessels::mask::tests::drawn;
 
     #[test]
     fn what_floats_is_its_share_of_the_mass() {
@@ -389,7 +267,7 @@ mod tests {
         let field = CoarseField { grid, values: (0..truth.inside.len()).map(|i| f32::from(weight(i))).collect() };
         let to_truth = DistanceMap::to(&truth).unwrap();
         let shares = |pixel_mm: f64| {
-            let mass = field.mass(&grid, &to_truth, pixel_mm);
+            let mass = Mass::of(&field, &grid, &to_truth, pixel_mm);
             let expected = 6.0 * truth.voxels().count() as f64 * 0.0625;
             assert!((mass.all - expected).abs() < 1e-9, "{} mm² for {expected}", mass.all);
             [mass.share(mass.far_pixels).unwrap(), mass.share(mass.far_mm).unwrap()]
@@ -425,33 +303,13 @@ mod tests {
     }
 
     #[test]
-    fn few_points_tell_where_to_look() {
+    fn what_lies_beyond_the_grid_is_far_from_everything_in_it() {
         let coarse = PatientGrid { origin_mm: DVec3::splat(-2.0), spacing_mm: DVec3::splat(2.0), size: [3, 3, 3] };
         let mut coarse = CoarseField { grid: coarse, values: vec![0.0; 27] };
-        coarse.values[13] = 5.0;
-        coarse.values[14] = 3.0;
-        let reach = coarse.reach(4.0).unwrap();
-        assert_eq!((reach.low_mm, reach.high_mm), (DVec3::splat(-2.0), DVec3::splat(2.0)));
-        assert_eq!(coarse.reach(1.0).unwrap().high_mm, DVec3::new(4.0, 2.0, 2.0));
-        assert!(coarse.reach(6.0).is_none());
-        // Voxels of a quarter of a millimetre from the middle on: the box of the middle ends at 2 mm, the other's at 4.
+        (coarse.values[0], coarse.values[13], coarse.values[14]) = (2.0, 5.0, 3.0);
         let grid = PatientGrid { origin_mm: DVec3::ZERO, spacing_mm: DVec3::splat(0.25), size: [20, 70, 20] };
-        let blocks = |threshold| {
-            let blocks = coarse.blocks(&grid, threshold);
-            blocks.iter().map(|b| (b.first, b.grid.origin_mm.to_array(), b.grid.size)).collect::<Vec<_>>()
-        };
-        // A block has 2 mm, 16 mm and 2 mm; the last one of a row is what is left of it.
-        let of_the_middle = blocks(4.0);
-        assert!(
-            of_the_middle.contains(&([0; 3], [0.0; 3], [8, 64, 8])) && of_the_middle.len() == 4,
-            "{of_the_middle:?}"
-        );
-        let of_both = blocks(1.0);
-        assert!(of_both.contains(&([16, 0, 8], [4.0, 0.0, 2.0], [4, 64, 8])) && of_both.len() == 6, "{of_both:?}");
-        // What lies beyond the grid is far from everything in it.
         let truth = Mask { size: [20, 70, 20], spacing_mm: grid.spacing_mm, inside: vec![true; 20 * 70 * 20] };
-        coarse.values[0] = 2.0;
-        let mass = coarse.mass(&grid, &DistanceMap::to(&truth).unwrap(), 0.3);
+        let mass = Mass::of(&coarse, &grid, &DistanceMap::to(&truth).unwrap(), 0.3);
         assert_eq!((mass.all, mass.far_pixels, mass.far_mm), (80.0, 16.0, 16.0));
     }
 }

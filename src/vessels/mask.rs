@@ -100,11 +100,11 @@ pub fn component_sizes(mask: &Mask) -> Vec<usize> {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use super::*;
 
     /// Voxels of a grid where `inside` says so of a position in mm from the first voxel.
-    pub(in crate::score) fn drawn(size: [usize; 3], spacing_mm: DVec3, inside: impl Fn(DVec3) -> bool) -> Mask {
+    pub(crate) fn drawn(size: [usize; 3], spacing_mm: DVec3, inside: impl Fn(DVec3) -> bool) -> Mask {
         let [nx, ny, nz] = size;
         let at = |i: usize| DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64) * spacing_mm;
         Mask { size, spacing_mm, inside: (0..nx * ny * nz).map(|i| inside(at(i))).collect() }

@@ -5,7 +5,7 @@
 //! where its neighbours in the set are one component (26 neighbours) and so are those outside it that share faces and
 //! edges with it (6 neighbours; Bertrand and Malandain, Pattern Recognition Letters 1994).
 
-use crate::score::mask::{CELLS, CENTRE, Framed, Mask, steps_to};
+use crate::vessels::mask::{CELLS, CENTRE, Framed, Mask, steps_to};
 
 /// A set of the cells of a neighbourhood, a bit each.
 type Cells = u32;
@@ -159,9 +159,9 @@ impl Thinning {
 mod tests {
     use super::*;
     use crate::random::pcg4d;
-    use crate::score::distances::DistanceMap;
-    use crate::score::mask::component_sizes;
-    use crate::score::mask::tests::drawn;
+    use crate::vessels::distances::DistanceMap;
+    use crate::vessels::mask::component_sizes;
+    use crate::vessels::mask::tests::drawn;
     use glam::DVec3;
 
     /// Vertices less edges plus faces less cubes of a set's cells: components less tunnels plus cavities.

@@ -1,6 +1,6 @@
 //! Exact Euclidean distances to a set of voxels (Felzenszwalb and Huttenlocher, Theory of Computing 2012).
 
-use crate::score::mask::Mask;
+use crate::vessels::mask::Mask;
 use rayon::prelude::*;
 
 /// How far each voxel of a grid is from the nearest voxel of a set, centre to centre.
@@ -112,7 +112,7 @@ impl Envelope {
 mod tests {
     use super::*;
     use crate::random::pcg4d;
-    use crate::score::mask::tests::drawn;
+    use crate::vessels::mask::tests::drawn;
     use glam::DVec3;
 
     #[test]

@@ -1,0 +1,184 @@
+//! The moving field where it is not faint: the whole of it at few points, and blocks of a finer grid around those that count.
+
+use crate::error::Result;
+use crate::export::volumes::grid_over;
+use crate::geometry::MM_PER_UNIT;
+use crate::model::component::Component;
+use crate::model::scene::Scene;
+use crate::render::grid::PatientGrid;
+use crate::render::renderer::Renderer;
+use glam::DVec3;
+use std::collections::BTreeSet;
+
+/// The whole field is looked at in points so many pixels apart.
+const COARSE_PIXELS: f64 = 0.75;
+/// Such points at most along its longest side.
+const COARSE_POINTS: f64 = 192.0;
+/// Around points below this share of the threshold nothing is vessel: a Gaussian of 0.4 pixels, the least, has as much of its
+/// peak left where it is farthest from such points.
+const FAINT: f64 = 0.25;
+/// Voxels of a block that is sampled at once, along left, posterior (a group of the device) and superior.
+const BLOCK: [u32; 3] = [8, 64, 8];
+
+/// The first and the last point of a box, patient mm.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Corners {
+    pub(crate) low_mm: DVec3,
+    pub(crate) high_mm: DVec3,
+}
+
+impl Corners {
+    /// Those of a grid's points.
+    pub(crate) fn of(grid: &PatientGrid) -> Corners {
+        let steps = DVec3::from_array(grid.size.map(|n| f64::from(n) - 1.0));
+        Corners { low_mm: grid.origin_mm, high_mm: grid.origin_mm + steps * grid.spacing_mm }
+    }
+
+    pub(crate) fn grown(self, by_mm: f64) -> Corners {
+        Corners { low_mm: self.low_mm - by_mm, high_mm: self.high_mm + by_mm }
+    }
+
+    pub(crate) fn joined(self, other: Corners) -> Corners {
+        Corners { low_mm: self.low_mm.min(other.low_mm), high_mm: self.high_mm.max(other.high_mm) }
+    }
+}
+
+/// The moving field at a phase.
+pub(crate) struct MovingField<'a> {
+    pub(crate) renderer: &'a Renderer,
+    pub(crate) scene: &'a Scene,
+    pub(crate) phase: u32,
+    pub(crate) pixel_mm: f64,
+    /// It is vessel above this.
+    pub(crate) threshold_per_mm: f64,
+}
+
+impl MovingField<'_> {
+    /// The whole field at points a pixel apart; of large fields, farther apart.
+    pub(crate) fn coarse(&self) -> Result<CoarseField> {
+        let size = DVec3::from_array(self.scene.dynamic_max) - DVec3::from_array(self.scene.dynamic_min);
+        let longest_mm = size.max_element() * MM_PER_UNIT;
+        let spacing_mm = (COARSE_PIXELS * self.pixel_mm).max(longest_mm / COARSE_POINTS);
+        let grid = grid_over(self.scene, Component::Dynamic, spacing_mm)?;
+        Ok(CoarseField { grid, values: self.renderer.sample_patient(Component::Dynamic, self.phase, &grid)? })
+    }
+
+    /// What a box must hold to hold all that is not faint.
+    pub(crate) fn reach(&self, coarse: &CoarseField) -> Option<Corners> {
+        coarse.reach(FAINT * self.threshold_per_mm)
+    }
+
+    /// Hands on the field at the points of a grid, per mm, a row along left at a time with the index of its first point.
+    /// Where the field is faint around, it is not looked at.
+    pub(crate) fn rows(
+        &self,
+        coarse: &CoarseField,
+        grid: &PatientGrid,
+        mut put: impl FnMut(usize, &[f32]),
+    ) -> Result<()> {
+        let [nx, ny, _] = grid.size.map(|n| n as usize);
+        for block in coarse.blocks(grid, FAINT * self.threshold_per_mm) {
+            let [x, y, z] = block.first.map(|i| i as usize);
+            let [columns, rows, _] = block.grid.size.map(|n| n as usize);
+            let values = self.renderer.sample_patient(Component::Dynamic, self.phase, &block.grid)?;
+            for (row, values) in values.chunks(columns).enumerate() {
+                put(((z + row / rows) * ny + y + row % rows) * nx + x, values);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Part of a grid.
+struct Block {
+    /// Its first point in the whole grid.
+    first: [u32; 3],
+    grid: PatientGrid,
+}
+
+/// The field at few points.
+pub(crate) struct CoarseField {
+    pub(crate) grid: PatientGrid,
+    pub(crate) values: Vec<f32>,
+}
+
+impl CoarseField {
+    /// Points that attenuate, patient mm, and how much, per mm.
+    pub(crate) fn points(&self) -> impl Iterator<Item = (DVec3, f64)> {
+        let [nx, ny, _] = self.grid.size.map(|n| n as usize);
+        let attenuating = self.values.iter().enumerate().filter(|(_, value)| **value > 0.0);
+        attenuating.map(move |(i, value)| {
+            let index = DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64);
+            (self.grid.origin_mm + index * self.grid.spacing_mm, f64::from(*value))
+        })
+    }
+
+    /// A box for each point above a threshold, which holds all that is nearer to it than the next point.
+    fn boxes(&self, threshold_per_mm: f64) -> impl Iterator<Item = Corners> {
+        let around_mm = self.grid.spacing_mm.max_element();
+        let above = self.points().filter(move |(_, value)| *value > threshold_per_mm);
+        above.map(move |(point, _)| Corners { low_mm: point, high_mm: point }.grown(around_mm))
+    }
+
+    /// What a box must hold to hold all that is above a threshold.
+    pub(crate) fn reach(&self, threshold_per_mm: f64) -> Option<Corners> {
+        self.boxes(threshold_per_mm).reduce(Corners::joined)
+    }
+
+    /// Blocks of a grid around points above a threshold.
+    fn blocks(&self, grid: &PatientGrid, threshold_per_mm: f64) -> Vec<Block> {
+        let in_blocks = |point_mm: DVec3| {
+            let voxel = (point_mm - grid.origin_mm) / grid.spacing_mm;
+            let last = DVec3::from_array(grid.size.map(|n| f64::from(n - 1)));
+            let voxel = voxel.clamp(DVec3::ZERO, last).as_uvec3().to_array();
+            [voxel[0] / BLOCK[0], voxel[1] / BLOCK[1], voxel[2] / BLOCK[2]]
+        };
+        let mut wanted = BTreeSet::new();
+        for Corners { low_mm, high_mm } in self.boxes(threshold_per_mm) {
+            let (low, high) = (in_blocks(low_mm), in_blocks(high_mm));
+            for z in low[2]..=high[2] {
+                for y in low[1]..=high[1] {
+                    wanted.extend((low[0]..=high[0]).map(|x| [z, y, x]));
+                }
+            }
+        }
+        let block = |[z, y, x]: [u32; 3]| {
+            let first = [x * BLOCK[0], y * BLOCK[1], z * BLOCK[2]];
+            let steps = DVec3::from_array(first.map(f64::from));
+            let size = std::array::from_fn(|axis| BLOCK[axis].min(grid.size[axis] - first[axis]));
+            Block { first, grid: PatientGrid { origin_mm: grid.origin_mm + steps * grid.spacing_mm, size, ..*grid } }
+        };
+        wanted.into_iter().map(block).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn few_points_tell_where_to_look() {
+        let coarse = PatientGrid { origin_mm: DVec3::splat(-2.0), spacing_mm: DVec3::splat(2.0), size: [3, 3, 3] };
+        let mut coarse = CoarseField { grid: coarse, values: vec![0.0; 27] };
+        coarse.values[13] = 5.0;
+        coarse.values[14] = 3.0;
+        let reach = coarse.reach(4.0).unwrap();
+        assert_eq!((reach.low_mm, reach.high_mm), (DVec3::splat(-2.0), DVec3::splat(2.0)));
+        assert_eq!(coarse.reach(1.0).unwrap().high_mm, DVec3::new(4.0, 2.0, 2.0));
+        assert!(coarse.reach(6.0).is_none());
+        // Voxels of a quarter of a millimetre from the middle on: the box of the middle ends at 2 mm, the other's at 4.
+        let grid = PatientGrid { origin_mm: DVec3::ZERO, spacing_mm: DVec3::splat(0.25), size: [20, 70, 20] };
+        let blocks = |threshold| {
+            let blocks = coarse.blocks(&grid, threshold);
+            blocks.iter().map(|b| (b.first, b.grid.origin_mm.to_array(), b.grid.size)).collect::<Vec<_>>()
+        };
+        // A block has 2 mm, 16 mm and 2 mm; the last one of a row is what is left of it.
+        let of_the_middle = blocks(4.0);
+        assert!(
+            of_the_middle.contains(&([0; 3], [0.0; 3], [8, 64, 8])) && of_the_middle.len() == 4,
+            "{of_the_middle:?}"
+        );
+        let of_both = blocks(1.0);
+        assert!(of_both.contains(&([16, 0, 8], [4.0, 0.0, 2.0], [4, 64, 8])) && of_both.len() == 6, "{of_both:?}");
+    }
+}
