@@ -7,15 +7,11 @@ use nertca_vk::export::motion::{MotionExport, MotionFormat, moving_tree, write_t
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
 use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
 use nertca_vk::formats::nrrd::Encoding;
-use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
-use nertca_vk::model::component::Component;
-use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::eval::VESSEL_SHARE;
-use nertca_vk::score::metrics::vessel_threshold;
+use nertca_vk::score::eval::vessel_threshold_per_mm;
 
 /// The phases `--phase` names, and whether it names all.
 pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
@@ -49,7 +45,7 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
         let format = MeshFormat::of(&args.out).ok_or_else(|| unknown(".stl .ply .obj .glb"))?;
         let iso = match args.iso {
             Some(iso) => iso,
-            None => dice_threshold_per_mm(&renderer, &model, &grid)?,
+            None => vessel_threshold_per_mm(&renderer, &model, &grid)?,
         };
         write_meshes(&renderer, &grid, &phases, iso, format, &args.out, |n, of| progress("surfaces", n, of))?
     } else {
@@ -99,16 +95,6 @@ fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: b
         "motion along a vessel is not observed in projections: displacements along vessels come from smoothness alone"
     );
     Ok(())
-}
-
-/// The attenuation from which the dynamic field counts as vessel: a fifth of the stated one, or Otsu's.
-fn dice_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid) -> Result<f64> {
-    if let Some(attenuation) = model.vessel_attenuation {
-        return Ok(VESSEL_SHARE * attenuation / MM_PER_UNIT);
-    }
-    let values = renderer.sample_patient(Component::Dynamic, 0, grid)?;
-    let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();
-    Ok(f64::from(vessel_threshold(&inside)))
 }
 
 /// Converts a dataset between layouts.

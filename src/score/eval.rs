@@ -2,7 +2,10 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
+use crate::model::Model;
+use crate::model::component::Component;
 use crate::raster::percentile;
+use crate::render::grid::PatientGrid;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::metrics;
@@ -144,6 +147,20 @@ fn choose_thresholds(seen: &[Rendering], stated: Option<f64>, given: Option<f64>
             (all(DYNAMIC), all(TOTAL), VESSEL_RULE)
         }
     }
+}
+
+/// Attenuation per mm from which the moving field of a model counts as vessel: [`VESSEL_SHARE`] of the stated one, or
+/// Otsu's threshold of what the field has at phase 0 at the points of a grid.
+///
+/// # Errors
+/// Those of [`Renderer::sample_patient`].
+pub fn vessel_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid) -> Result<f64> {
+    if let Some(attenuation) = model.vessel_attenuation {
+        return Ok(VESSEL_SHARE * attenuation / MM_PER_UNIT);
+    }
+    let values = renderer.sample_patient(Component::Dynamic, 0, grid)?;
+    let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();
+    Ok(f64::from(metrics::vessel_threshold(&inside)))
 }
 
 /// Scores frames of a dataset. `threshold` (per world unit) overrides the rule. `observe` hears of every image; its
