@@ -12,7 +12,7 @@
 //!    [`plan::soft_hull`]
 //! 5. [`model`]: parameters, scales, hull and configuration; [`model::checkpoint`] keeps them in one safetensors file
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
-//! 7. [`export`] hands them to other tools, [`score`] compares them with what was seen
+//! 7. [`export`] hands them to other tools, [`score`] compares them with what was seen, [`trees`] turns them into centrelines
 //!
 //! [`run`] ties these to a run directory, [`session`] is a reconstruction in memory that grows with its frames, and
 //! [`capi`] the same for C. [`mod@bench`] times the engine, [`phantom`] makes data to try it on, and [`mod@reference`] holds an
@@ -84,8 +84,10 @@ pub mod formats {
     pub mod nrrd;
     pub mod png;
     pub mod raw;
+    pub mod swc;
     pub mod volume;
     pub mod vtk;
+    pub mod vtp;
 }
 
 /// Angiograms with their geometry and phase.
@@ -180,6 +182,20 @@ pub mod score {
     pub mod pictures;
     pub mod shapes;
     pub mod volume;
+}
+
+/// Vessels as trees of centrelines with radii, followed over the beat.
+pub mod trees {
+    mod branches;
+    pub mod extract;
+    pub mod files;
+    mod follow;
+    mod graph;
+    mod radii;
+    mod refine;
+    mod sampled;
+    mod tidy;
+    pub mod tree;
 }
 
 /// One run, from a dataset to a run directory.

@@ -26,6 +26,7 @@ mod cli {
     pub mod render;
     pub mod report;
     pub mod train;
+    pub mod tree;
     pub mod view;
     pub mod volume_table;
 }
@@ -51,6 +52,7 @@ fn main() -> ExitCode {
         Command::Render(args) => cli::render::render(&cli, args),
         Command::View(args) => cli::view::view(&cli, args),
         Command::Export(args) => cli::export::export(&cli, args),
+        Command::Tree(args) => cli::tree::run(&cli, args),
         Command::Calibrate(args) => cli::calibrate::run(args),
         Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),

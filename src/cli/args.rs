@@ -62,6 +62,8 @@ pub enum Command {
     View(ViewArgs),
     /// Export volumes or vessel surfaces of a run for other tools.
     Export(ExportArgs),
+    /// Vessels of a run as trees: centrelines with radii in mm, followed over the beat.
+    Tree(TreeArgs),
     /// Correct views that disagree, from the angiograms alone.
     Calibrate(CalibrateArgs),
     /// Convert a dataset between the native and the authors' layout.
@@ -603,6 +605,28 @@ pub struct ExportArgs {
     #[arg(long, requires = "motion", conflicts_with_all = ["compress", "phase"])]
     pub trajectories: bool,
     /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
+    #[arg(short, long, value_name = "FILE")]
+    pub out: PathBuf,
+}
+
+/// `tree`.
+#[derive(Debug, Args)]
+pub struct TreeArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Phase from 0, or `all`. Where one set of Gaussians moves (gaussians.form = "tree"), point i of branch b is the same
+    /// material point at every phase; elsewhere each phase has a tree of its own, and program and file say "not tracked".
+    #[arg(long, default_value = "all")]
+    pub phase: String,
+    /// Attenuation from which the moving field is vessel, 1/mm; the Dice threshold otherwise.
+    #[arg(long, value_name = "PER_MM")]
+    pub threshold: Option<f64>,
+    /// Branches that end without reaching so far beyond the vessel they leave are spurs and left out, mm; three times what
+    /// the field resolves otherwise.
+    #[arg(long, value_name = "MM")]
+    pub min_branch: Option<f64>,
+    /// Output: .json (all phases), .vtp (a file per phase and a .pvd of them all, for ParaView, 3D Slicer and VMTK) or .swc
+    /// (a file per phase). Millimetres along (left, posterior, superior).
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }

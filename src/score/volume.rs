@@ -243,7 +243,7 @@ fn scores(field: &MovingField<'_>, truth: &Truth, file: &Path, smallest_componen
 fn vessels(field: &MovingField<'_>, coarse: &CoarseField, grid: &PatientGrid) -> Result<Mask> {
     let size = grid.size.map(|n| n as usize);
     let mut inside = vec![false; size.iter().product()];
-    field.rows(coarse, grid, |first, values| {
+    field.rows(&field.boxes(coarse), grid, |first, values| {
         let inside = inside[first..].iter_mut().zip(values);
         inside.for_each(|(inside, value)| *inside = f64::from(*value) > field.threshold_per_mm);
     })?;

@@ -34,6 +34,11 @@ impl Corners {
         Corners { low_mm: grid.origin_mm, high_mm: grid.origin_mm + steps * grid.spacing_mm }
     }
 
+    /// A box around a point.
+    pub(crate) fn around(point_mm: DVec3, reach_mm: f64) -> Corners {
+        Corners { low_mm: point_mm, high_mm: point_mm }.grown(reach_mm)
+    }
+
     pub(crate) fn grown(self, by_mm: f64) -> Corners {
         Corners { low_mm: self.low_mm - by_mm, high_mm: self.high_mm + by_mm }
     }
@@ -63,21 +68,16 @@ impl MovingField<'_> {
         Ok(CoarseField { grid, values: self.renderer.sample_patient(Component::Dynamic, self.phase, &grid)? })
     }
 
-    /// What a box must hold to hold all that is not faint.
-    pub(crate) fn reach(&self, coarse: &CoarseField) -> Option<Corners> {
-        coarse.reach(FAINT * self.threshold_per_mm)
+    /// Boxes that hold all that is not faint.
+    pub(crate) fn boxes(&self, coarse: &CoarseField) -> Vec<Corners> {
+        coarse.boxes(FAINT * self.threshold_per_mm).collect()
     }
 
-    /// Hands on the field at the points of a grid, per mm, a row along left at a time with the index of its first point.
-    /// Where the field is faint around, it is not looked at.
-    pub(crate) fn rows(
-        &self,
-        coarse: &CoarseField,
-        grid: &PatientGrid,
-        mut put: impl FnMut(usize, &[f32]),
-    ) -> Result<()> {
+    /// Hands on the field at the points of a grid that are in some boxes, per mm, a row along left at a time with the index of
+    /// its first point. Elsewhere it is not looked at.
+    pub(crate) fn rows(&self, boxes: &[Corners], grid: &PatientGrid, mut put: impl FnMut(usize, &[f32])) -> Result<()> {
         let [nx, ny, _] = grid.size.map(|n| n as usize);
-        for block in coarse.blocks(grid, FAINT * self.threshold_per_mm) {
+        for block in blocks(boxes, grid) {
             let [x, y, z] = block.first.map(|i| i as usize);
             let [columns, rows, _] = block.grid.size.map(|n| n as usize);
             let values = self.renderer.sample_patient(Component::Dynamic, self.phase, &block.grid)?;
@@ -117,39 +117,39 @@ impl CoarseField {
     fn boxes(&self, threshold_per_mm: f64) -> impl Iterator<Item = Corners> {
         let around_mm = self.grid.spacing_mm.max_element();
         let above = self.points().filter(move |(_, value)| *value > threshold_per_mm);
-        above.map(move |(point, _)| Corners { low_mm: point, high_mm: point }.grown(around_mm))
+        above.map(move |(point, _)| Corners::around(point, around_mm))
     }
 
     /// What a box must hold to hold all that is above a threshold.
     pub(crate) fn reach(&self, threshold_per_mm: f64) -> Option<Corners> {
         self.boxes(threshold_per_mm).reduce(Corners::joined)
     }
+}
 
-    /// Blocks of a grid around points above a threshold.
-    fn blocks(&self, grid: &PatientGrid, threshold_per_mm: f64) -> Vec<Block> {
-        let in_blocks = |point_mm: DVec3| {
-            let voxel = (point_mm - grid.origin_mm) / grid.spacing_mm;
-            let last = DVec3::from_array(grid.size.map(|n| f64::from(n - 1)));
-            let voxel = voxel.clamp(DVec3::ZERO, last).as_uvec3().to_array();
-            [voxel[0] / BLOCK[0], voxel[1] / BLOCK[1], voxel[2] / BLOCK[2]]
-        };
-        let mut wanted = BTreeSet::new();
-        for Corners { low_mm, high_mm } in self.boxes(threshold_per_mm) {
-            let (low, high) = (in_blocks(low_mm), in_blocks(high_mm));
-            for z in low[2]..=high[2] {
-                for y in low[1]..=high[1] {
-                    wanted.extend((low[0]..=high[0]).map(|x| [z, y, x]));
-                }
+/// Blocks of a grid that some boxes reach into.
+fn blocks(boxes: &[Corners], grid: &PatientGrid) -> Vec<Block> {
+    let in_blocks = |point_mm: DVec3| {
+        let voxel = (point_mm - grid.origin_mm) / grid.spacing_mm;
+        let last = DVec3::from_array(grid.size.map(|n| f64::from(n - 1)));
+        let voxel = voxel.clamp(DVec3::ZERO, last).as_uvec3().to_array();
+        [voxel[0] / BLOCK[0], voxel[1] / BLOCK[1], voxel[2] / BLOCK[2]]
+    };
+    let mut wanted = BTreeSet::new();
+    for Corners { low_mm, high_mm } in boxes {
+        let (low, high) = (in_blocks(*low_mm), in_blocks(*high_mm));
+        for z in low[2]..=high[2] {
+            for y in low[1]..=high[1] {
+                wanted.extend((low[0]..=high[0]).map(|x| [z, y, x]));
             }
         }
-        let block = |[z, y, x]: [u32; 3]| {
-            let first = [x * BLOCK[0], y * BLOCK[1], z * BLOCK[2]];
-            let steps = DVec3::from_array(first.map(f64::from));
-            let size = std::array::from_fn(|axis| BLOCK[axis].min(grid.size[axis] - first[axis]));
-            Block { first, grid: PatientGrid { origin_mm: grid.origin_mm + steps * grid.spacing_mm, size, ..*grid } }
-        };
-        wanted.into_iter().map(block).collect()
     }
+    let block = |[z, y, x]: [u32; 3]| {
+        let first = [x * BLOCK[0], y * BLOCK[1], z * BLOCK[2]];
+        let steps = DVec3::from_array(first.map(f64::from));
+        let size = std::array::from_fn(|axis| BLOCK[axis].min(grid.size[axis] - first[axis]));
+        Block { first, grid: PatientGrid { origin_mm: grid.origin_mm + steps * grid.spacing_mm, size, ..*grid } }
+    };
+    wanted.into_iter().map(block).collect()
 }
 
 #[cfg(test)]
@@ -169,7 +169,8 @@ mod tests {
         // Voxels of a quarter of a millimetre from the middle on: the box of the middle ends at 2 mm, the other's at 4.
         let grid = PatientGrid { origin_mm: DVec3::ZERO, spacing_mm: DVec3::splat(0.25), size: [20, 70, 20] };
         let blocks = |threshold| {
-            let blocks = coarse.blocks(&grid, threshold);
+            let boxes: Vec<Corners> = coarse.boxes(threshold).collect();
+            let blocks = blocks(&boxes, &grid);
             blocks.iter().map(|b| (b.first, b.grid.origin_mm.to_array(), b.grid.size)).collect::<Vec<_>>()
         };
         // A block has 2 mm, 16 mm and 2 mm; the last one of a row is what is left of it.

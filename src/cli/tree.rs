@@ -1,0 +1,43 @@
+//! `tree`.
+
+use super::args::{Cli, TreeArgs};
+use super::data::bar;
+use super::export::phases;
+use nertca_vk::error::{Error, Result};
+use nertca_vk::model::checkpoint::newest_model;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
+use nertca_vk::trees::files::{TreeFormat, note, write};
+
+/// Writes the vessels of a run as trees.
+pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
+    let unknown = || Error::config("--out", args.out.display(), "ends in none of .json .vtp .swc");
+    let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
+    let model = newest_model(&args.run)?;
+    let (phases, all) = phases(&args.phase, model.layout.phases as u32)?;
+    let gpu = cli.open_device()?;
+    let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?;
+    let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
+    let mut progress = bar();
+    let beat = vessel_trees(&renderer, &model, &options, |n, of| progress("trees", n, of))?;
+    let made = write(&beat, &args.out, format, all)?;
+    made.iter().for_each(|path| out!("{}", path.display()));
+    for tree in &beat.phases {
+        eprintln!(
+            "phase {}: {} branches, {:.1} mm, connected in {}",
+            tree.phase,
+            tree.branches.len(),
+            tree.length_mm(),
+            tree.components()
+        );
+    }
+    eprintln!(
+        "vessel above {:.4e} per mm; the field resolves {:.2} mm and was looked at every {:.2} mm; {}",
+        beat.threshold_per_mm,
+        beat.resolution_mm,
+        beat.spacing_mm,
+        note(&beat)
+    );
+    drop(renderer);
+    cli.close_device(&gpu)
+}

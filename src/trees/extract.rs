@@ -1,0 +1,326 @@
+//! A model's vessels as trees.
+
+use crate::error::{Error, Result};
+use crate::export::volumes::grid_over;
+use crate::geometry::MM_PER_UNIT;
+use crate::model::Model;
+use crate::model::component::Component;
+use crate::model::gaussians::MovingGaussians;
+use crate::render::grid::PatientGrid;
+use crate::render::renderer::Renderer;
+use crate::score::eval::vessel_threshold_per_mm;
+use crate::trees::branches::chains;
+use crate::trees::follow::Carrier;
+use crate::trees::graph::Forest;
+use crate::trees::radii::Lumen;
+use crate::trees::refine::{Centring, STEP, evenly, from_voxels};
+use crate::trees::sampled::SampledField;
+use crate::trees::tidy::{bridge_gaps, drop_specks, prune_spurs};
+use crate::trees::tree::{BeatTree, Branch, PhaseTree};
+use crate::vessels::centreline::centreline;
+use crate::vessels::distances::DistanceMap;
+use crate::vessels::field::{Corners, MovingField};
+use crate::vessels::mask::Mask;
+use glam::DVec3;
+
+/// The phase whose points are followed: Gaussians rest there, and of a beat that begins with the R peak it is the end of
+/// diastole, when the vessels are longest and lie apart.
+const REFERENCE_PHASE: u32 = 0;
+/// Distance between points of the grid that a field is sampled on, in units of what it resolves.
+const GRID_STEP: f64 = 0.5;
+/// Points of that grid at most; vessels that need more are looked at more coarsely.
+const MOST_POINTS: f64 = (1u64 << 26) as f64;
+/// The least standard deviation of Gaussians counts as this share of what the field resolves.
+const RESOLVED_DEVIATIONS: f64 = 2.5;
+/// The least length of a branch that is kept, in units of what the field resolves.
+const LEAST_BRANCH: f64 = 3.0;
+/// How often lines are brought to the ridge.
+const CENTRINGS: usize = 2;
+
+/// Which trees are wanted.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TreeOptions {
+    /// Phases, from 0.
+    pub phases: Vec<u32>,
+    /// The field is vessel above this, per mm; by the rule of scoring otherwise ([`vessel_threshold_per_mm`]).
+    pub threshold_per_mm: Option<f64>,
+    /// Branches that end without reaching so far beyond the lumen of the vessel they leave are spurs, mm; three times what
+    /// the field resolves otherwise.
+    pub least_branch_mm: Option<f64>,
+}
+
+/// The vessels of a model as trees of centrelines with radii. Where one set of Gaussians moves, the tree of phase 0 is
+/// followed: point i of branch b is the same material point in all phases, with one radius, and motion along vessels, which projections do
+/// not show, is what the Gaussians' grid makes of it. Elsewhere each phase has a tree of its own. `progress` hears of
+/// phases done and phases in all.
+///
+/// # Errors
+/// [`Error::Config`] for a phase the model does not have, for lengths and thresholds that are not positive, and for a phase
+/// without vessels above the threshold; device errors.
+pub fn vessel_trees(
+    renderer: &Renderer,
+    model: &Model,
+    options: &TreeOptions,
+    mut progress: impl FnMut(u64, u64),
+) -> Result<BeatTree> {
+    options.phases.iter().try_for_each(|phase| renderer.check_phase(*phase))?;
+    let mut finder = Finder::new(renderer, model, options)?;
+    let all = options.phases.len() as u64;
+    let moving = model.moving.as_ref().and_then(MovingGaussians::tree);
+    let mut phases = Vec::new();
+    if let Some(tree) = moving {
+        let reference = finder.tree(REFERENCE_PHASE)?;
+        let carrier = Carrier::new(tree);
+        for phase in &options.phases {
+            phases.push(finder.followed(&reference, &carrier, *phase)?);
+            progress(phases.len() as u64, all);
+        }
+    } else {
+        for phase in &options.phases {
+            phases.push(finder.tree(*phase)?);
+            progress(phases.len() as u64, all);
+        }
+    }
+    Ok(BeatTree {
+        reference_phase: moving.map(|_| REFERENCE_PHASE),
+        threshold_per_mm: finder.threshold_per_mm,
+        resolution_mm: finder.resolution_mm,
+        spacing_mm: finder.spacing_mm,
+        phases,
+    })
+}
+
+/// A positive number, or what is wrong with it.
+fn positive(name: &str, value: f64) -> Result<f64> {
+    if value.is_finite() && value > 0.0 {
+        return Ok(value);
+    }
+    Err(Error::config(name, value, "is not a positive number"))
+}
+
+/// Finds the vessels of a model.
+struct Finder<'a> {
+    renderer: &'a Renderer,
+    model: &'a Model,
+    pixel_mm: f64,
+    resolution_mm: f64,
+    threshold_per_mm: f64,
+    least_branch_mm: f64,
+    /// The largest distance so far between points of fields that were looked at.
+    spacing_mm: f64,
+}
+
+impl Finder<'_> {
+    fn new<'a>(renderer: &'a Renderer, model: &'a Model, options: &TreeOptions) -> Result<Finder<'a>> {
+        let c_arm = &model.c_arm;
+        let pixel_mm = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
+        let least_deviation_mm = model.moving.as_ref().map_or(0.0, |moving| {
+            let rows = moving.rows();
+            f64::from(rows.setup.least_scale) * rows.units.pixel * MM_PER_UNIT
+        });
+        let resolution_mm = pixel_mm.max(RESOLVED_DEVIATIONS * least_deviation_mm);
+        let threshold_per_mm = match options.threshold_per_mm {
+            Some(threshold) => positive("threshold_per_mm", threshold)?,
+            None => {
+                let grid = grid_over(&model.scene, Component::Dynamic, resolution_mm)?;
+                vessel_threshold_per_mm(renderer, model, &grid)?
+            }
+        };
+        let least_branch_mm =
+            options.least_branch_mm.map_or(Ok(LEAST_BRANCH * resolution_mm), |mm| positive("least_branch_mm", mm))?;
+        Ok(Finder { renderer, model, pixel_mm, resolution_mm, threshold_per_mm, least_branch_mm, spacing_mm: 0.0 })
+    }
+
+    fn no_vessels(&self, phase: u32) -> Error {
+        let problem = format!(
+            "at phase {phase} the moving field has no vessel above it: try a lower one, or see in the run's report \
+             whether the moving field shows vessels at all"
+        );
+        Error::config("threshold_per_mm", format!("{:.3e}", self.threshold_per_mm), problem)
+    }
+
+    /// The field at a phase, of which one can ask where it is not faint.
+    fn moving(&self, phase: u32) -> MovingField<'_> {
+        let Finder { renderer, model, pixel_mm, threshold_per_mm, .. } = *self;
+        MovingField { renderer, scene: &model.scene, phase, pixel_mm, threshold_per_mm }
+    }
+
+    /// The field of a phase inside boxes; none without boxes.
+    fn field(&mut self, phase: u32, boxes: &[Corners]) -> Result<Option<SampledField>> {
+        let Some(reach) = boxes.iter().copied().reduce(Corners::joined) else { return Ok(None) };
+        let extent_mm = reach.high_mm - reach.low_mm;
+        let fitting_mm = (extent_mm.element_product() / MOST_POINTS).cbrt();
+        let spacing_mm = fitting_mm.max(GRID_STEP * self.resolution_mm);
+        self.spacing_mm = self.spacing_mm.max(spacing_mm);
+        let size = ((extent_mm / spacing_mm).ceil().as_uvec3() + 1).to_array();
+        let grid = PatientGrid { origin_mm: reach.low_mm, spacing_mm: DVec3::splat(spacing_mm), size };
+        let mut values = vec![0f32; size.iter().map(|n| *n as usize).product()];
+        self.moving(phase).rows(boxes, &grid, |first, row| values[first..][..row.len()].copy_from_slice(row))?;
+        Ok(Some(SampledField { grid, values }))
+    }
+
+    /// The tree of a phase by itself.
+    fn tree(&mut self, phase: u32) -> Result<PhaseTree> {
+        let moving = self.moving(phase);
+        let boxes = moving.boxes(&moving.coarse()?);
+        let field = self.field(phase, &boxes)?.ok_or_else(|| self.no_vessels(phase))?;
+        let lines = centrelines(&field, self.threshold_per_mm, self.resolution_mm, self.least_branch_mm);
+        if lines.is_empty() {
+            return Err(self.no_vessels(phase));
+        }
+        Ok(PhaseTree { phase, branches: self.measured(&field, lines) })
+    }
+
+    /// The tree of the reference phase as it is at another. A material point keeps its radius.
+    fn followed(&mut self, reference: &PhaseTree, carrier: &Carrier<'_>, phase: u32) -> Result<PhaseTree> {
+        if phase == reference.phase {
+            return Ok(reference.clone());
+        }
+        let carried: Vec<Vec<DVec3>> =
+            reference.branches.iter().map(|branch| carrier.carried_mm(&branch.points_mm, phase)).collect();
+        let reach_mm = Centring::REACH * self.resolution_mm;
+        let boxes: Vec<Corners> = carried.iter().flatten().map(|point| Corners::around(*point, reach_mm)).collect();
+        let field = self.field(phase, &boxes)?.ok_or_else(|| self.no_vessels(phase))?;
+        let centring = Centring { field: &field, resolution_mm: self.resolution_mm };
+        let mut branches: Vec<Branch> = Vec::new();
+        for (branch, mut points_mm) in reference.branches.iter().zip(carried) {
+            let start = branch.parent.and_then(|parent| branches[parent].points_mm.last().copied());
+            points_mm[0] = start.unwrap_or(points_mm[0]);
+            let points_mm = centring.line(&points_mm, start.is_some());
+            branches.push(Branch { points_mm, ..branch.clone() });
+        }
+        Ok(PhaseTree { phase, branches })
+    }
+
+    /// Lines with the radii of their vessels.
+    fn measured(&self, field: &SampledField, lines: Vec<Line>) -> Vec<Branch> {
+        let vessel_per_mm = self.model.vessel_attenuation.map(|attenuation| attenuation / MM_PER_UNIT);
+        let lumen = Lumen { field, resolution_mm: self.resolution_mm, vessel_per_mm };
+        let branch = |Line { parent, points_mm }: Line| {
+            let radius_mm = lumen.radii_mm(&points_mm);
+            Branch { parent, points_mm, radius_mm }
+        };
+        lines.into_iter().map(branch).collect()
+    }
+}
+
+/// A centreline and the one it leaves.
+struct Line {
+    parent: Option<usize>,
+    points_mm: Vec<DVec3>,
+}
+
+/// The centrelines of a field where it exceeds a threshold, each behind the one it leaves.
+fn centrelines(field: &SampledField, threshold_per_mm: f64, resolution_mm: f64, least_branch_mm: f64) -> Vec<Line> {
+    let mut forest = thinned(field, threshold_per_mm);
+    bridge_gaps(&mut forest, resolution_mm);
+    prune_spurs(&mut forest, least_branch_mm);
+    drop_specks(&mut forest, least_branch_mm);
+    let centring = Centring { field, resolution_mm };
+    let mut lines: Vec<Line> = Vec::new();
+    for chain in chains(&forest) {
+        let mut points_mm = forest.places_mm(&chain.nodes);
+        let start = chain.parent.and_then(|parent| lines[parent].points_mm.last().copied());
+        points_mm[0] = start.unwrap_or(points_mm[0]);
+        let mut points_mm = from_voxels(&points_mm, resolution_mm);
+        for _ in 0..CENTRINGS {
+            points_mm = evenly(&centring.line(&points_mm, start.is_some()), STEP * resolution_mm);
+        }
+        lines.push(Line { parent: chain.parent, points_mm });
+    }
+    lines
+}
+
+/// The forest of lines one voxel wide that a field is thinned to where it exceeds a threshold.
+fn thinned(field: &SampledField, threshold_per_mm: f64) -> Forest {
+    let inside: Vec<bool> = field.values.iter().map(|v| f64::from(*v) > threshold_per_mm).collect();
+    let (size, spacing_mm) = (field.grid.size.map(|n| n as usize), field.grid.spacing_mm);
+    let outside = Mask { size, spacing_mm, inside: inside.iter().map(|inside| !inside).collect() };
+    let to_outside = DistanceMap::to(&outside);
+    let line = centreline(&Mask { inside, ..outside });
+    Forest::of(&line, field, |voxel| to_outside.as_ref().map_or(0.0, |map| f64::from(map.at_mm(voxel))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::trees::sampled::tests::{RESOLUTION_MM, Tube, VESSEL_PER_MM, distance_mm, points, vessels};
+    use std::f64::consts::TAU;
+
+    fn found(tubes: &[Tube]) -> Vec<Line> {
+        centrelines(&vessels(tubes), 0.2 * VESSEL_PER_MM, RESOLUTION_MM, LEAST_BRANCH * RESOLUTION_MM)
+    }
+
+    /// The largest distance of a line's points from the nearest of the true ones, mm.
+    fn farthest_mm(line: &[DVec3], truth: &[DVec3]) -> f64 {
+        line.iter().map(|point| distance_mm(truth, *point)).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn a_helix_is_its_middle() {
+        let helix = points(2000, |along| {
+            let (sine, cosine) = (2.0 * TAU * along).sin_cos();
+            DVec3::new(10.0 * cosine, 10.0 * sine, 30.0 * along - 15.0)
+        });
+        let lines = found(&[(helix.clone(), 1.2)]);
+        assert_eq!(lines.len(), 1);
+        let line = &lines[0].points_mm;
+        assert!(farthest_mm(line, &helix) < 0.15, "{} mm off", farthest_mm(line, &helix));
+        // Ends recede by the radius.
+        assert!(farthest_mm(&helix, line) < 2.0, "{} mm missing", farthest_mm(&helix, line));
+        let steps: Vec<f64> = line.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
+        assert!(steps.iter().all(|step| (step / steps[0] - 1.0).abs() < 0.02), "points are even");
+    }
+
+    #[test]
+    fn a_fork_has_three_branches_that_meet() {
+        let fork = DVec3::new(0.0, 0.0, -2.0);
+        let arm = |to: DVec3| points(400, |along| fork.lerp(to, along));
+        let stem = arm(DVec3::new(0.0, 0.0, -16.0));
+        let (left, right) = (arm(DVec3::new(-12.0, 0.0, 13.0)), arm(DVec3::new(12.0, 2.0, 13.0)));
+        let lines = found(&[(stem.clone(), 2.0), (left.clone(), 1.3), (right.clone(), 1.3)]);
+        let parents: Vec<Option<usize>> = lines.iter().map(|line| line.parent).collect();
+        assert_eq!(parents, [None, Some(0), Some(0)], "the widest end is the root");
+        assert!(lines[0].points_mm[0].z < -12.0, "the root is the stem's end");
+        let end = lines[0].points_mm[lines[0].points_mm.len() - 1];
+        assert!(lines[1..].iter().all(|line| line.points_mm[0] == end));
+        assert!(end.distance(fork) < 1.5, "they meet at {end}, not {fork}");
+        let all = [stem, left, right].concat();
+        for line in lines {
+            assert!(farthest_mm(&line.points_mm, &all) < 0.4, "{} mm off", farthest_mm(&line.points_mm, &all));
+        }
+    }
+
+    #[test]
+    fn a_ring_is_cut_where_it_is_thinnest() {
+        let ring = |from: f64, to: f64| {
+            points(800, |along| {
+                let (sine, cosine) = (TAU * (from + (to - from) * along)).sin_cos();
+                DVec3::new(12.0 * cosine, 12.0 * sine, 0.0)
+            })
+        };
+        // Thin around a quarter of the way round.
+        let lines = found(&[(ring(0.3, 1.2), 1.5), (ring(0.2, 0.3), 0.6)]);
+        let lengths: f64 = lines.iter().map(|line| crate::trees::tree::length_mm(&line.points_mm)).sum();
+        assert_eq!(lines.len(), 1, "one open line");
+        assert!((0.9..1.0).contains(&(lengths / (TAU * 12.0))), "{lengths} mm");
+        let ends = [lines[0].points_mm[0], lines[0].points_mm[lines[0].points_mm.len() - 1]];
+        assert!(ends.iter().all(|end| end.x.abs() < 5.0 && end.y > 10.0), "cut in the thin part: {ends:?}");
+    }
+
+    #[test]
+    fn a_bump_is_no_branch_and_a_side_branch_is_one() {
+        let stem = (points(400, |along| DVec3::X * (34.0 * along - 17.0)), 2.0);
+        let side = |length: f64| (points(100, |along| DVec3::Y * length * along), 0.8);
+        assert_eq!(found(&[stem.clone(), side(3.5)]).len(), 1);
+        assert_eq!(found(&[stem.clone(), side(9.0)]).len(), 3);
+    }
+
+    #[test]
+    fn a_gap_is_closed_and_nothing_has_no_lines() {
+        let part = |from: f64, to: f64| (points(200, |along| DVec3::Z * (from + (to - from) * along)), 1.0);
+        assert_eq!(found(&[part(-17.0, -1.5), part(1.5, 17.0)]).len(), 1);
+        assert_eq!(found(&[part(-17.0, -5.0), part(5.0, 17.0)]).len(), 2);
+        assert!(found(&[]).is_empty());
+    }
+}

@@ -1,0 +1,258 @@
+//! Trees as files (see `docs/formats.md`): JSON, VTK and SWC.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::swc;
+use crate::formats::vtp::{self, Values};
+use crate::trees::tree::{BeatTree, Branch, PhaseTree};
+use glam::DVec3;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+const FORMAT: &str = "nertca-tree";
+const VERSION: u32 = 1;
+const AXES: &str = "left, posterior, superior";
+/// Digits kept: a tenth of a micrometre.
+const PER_MM: f64 = 1e4;
+
+/// File format of trees.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TreeFormat {
+    /// JSON: all phases in one file.
+    Json,
+    /// VTK poly data, a file per phase with a `.pvd` of them all.
+    Vtp,
+    /// SWC, a file per phase.
+    Swc,
+}
+
+impl TreeFormat {
+    /// Format by the end of a file name.
+    pub fn of(path: &Path) -> Option<TreeFormat> {
+        match path.extension()?.to_str()?.to_lowercase().as_str() {
+            "json" => Some(TreeFormat::Json),
+            "vtp" => Some(TreeFormat::Vtp),
+            "swc" => Some(TreeFormat::Swc),
+            _ => None,
+        }
+    }
+}
+
+/// `tree.json`.
+#[derive(Serialize)]
+struct TreeFile {
+    format: &'static str,
+    version: u32,
+    axes: &'static str,
+    tracked: bool,
+    reference_phase: Option<u32>,
+    note: &'static str,
+    threshold_per_mm: f64,
+    resolution_mm: f64,
+    spacing_mm: f64,
+    phases: Vec<PhaseRow>,
+}
+
+#[derive(Serialize)]
+struct PhaseRow {
+    phase: u32,
+    length_mm: f64,
+    branches: Vec<BranchRow>,
+}
+
+#[derive(Serialize)]
+struct BranchRow {
+    parent: Option<usize>,
+    length_mm: f64,
+    points_mm: Vec<[f64; 3]>,
+    radius_mm: Vec<f64>,
+}
+
+fn rounded(mm: f64) -> f64 {
+    (mm * PER_MM).round() / PER_MM
+}
+
+fn rounded_point(point_mm: &DVec3) -> [f64; 3] {
+    point_mm.to_array().map(rounded)
+}
+
+impl BranchRow {
+    fn of(branch: &Branch) -> BranchRow {
+        BranchRow {
+            parent: branch.parent,
+            length_mm: rounded(branch.length_mm()),
+            points_mm: branch.points_mm.iter().map(rounded_point).collect(),
+            radius_mm: branch.radius_mm.iter().copied().map(rounded).collect(),
+        }
+    }
+}
+
+/// What every file says of how its phases belong together.
+pub fn note(beat: &BeatTree) -> &'static str {
+    match beat.reference_phase {
+        Some(_) => {
+            "tracked: a point of a branch is the same material point at every phase; motion along a vessel is not \
+             observed in projections"
+        }
+        None => "not tracked: each phase has a tree of its own, whose branches and points belong to no other phase's",
+    }
+}
+
+/// Writes a tree; returns the files made. `sequence` writes a number into each name of a format with a file per phase, and
+/// for VTK a collection, even for one phase.
+///
+/// # Errors
+/// [`Error::Io`].
+pub fn write(beat: &BeatTree, path: &Path, format: TreeFormat, sequence: bool) -> Result<Vec<PathBuf>> {
+    match format {
+        TreeFormat::Json => {
+            files::write_atomic(path, to_json(beat)?.as_bytes())?;
+            Ok(vec![path.to_path_buf()])
+        }
+        TreeFormat::Vtp => {
+            let mut made = write_phases(beat, path, sequence, to_vtp)?;
+            if sequence {
+                // Last, so that all it names is there.
+                let collection = path.with_extension("pvd");
+                files::write_atomic(&collection, to_collection(beat, &made).as_bytes())?;
+                made.push(collection);
+            }
+            Ok(made)
+        }
+        TreeFormat::Swc => write_phases(beat, path, sequence, to_swc),
+    }
+}
+
+/// One file per phase: `name.vtp`, or `name_0000.vtp` and so on.
+fn write_phases(
+    beat: &BeatTree,
+    path: &Path,
+    sequence: bool,
+    content: fn(&BeatTree, &PhaseTree) -> String,
+) -> Result<Vec<PathBuf>> {
+    let part = |part: Option<&std::ffi::OsStr>| part.unwrap_or_default().to_string_lossy().into_owned();
+    let (stem, extension) = (part(path.file_stem()), part(path.extension()));
+    let write = |tree: &PhaseTree| {
+        let file = match sequence {
+            true => path.with_file_name(format!("{stem}_{:04}.{extension}", tree.phase)),
+            false => path.to_path_buf(),
+        };
+        files::write_atomic(&file, content(beat, tree).as_bytes()).map(|()| file)
+    };
+    beat.phases.iter().map(write).collect()
+}
+
+fn to_json(beat: &BeatTree) -> Result<String> {
+    let phases = beat.phases.iter().map(|tree| PhaseRow {
+        phase: tree.phase,
+        length_mm: rounded(tree.length_mm()),
+        branches: tree.branches.iter().map(BranchRow::of).collect(),
+    });
+    let file = TreeFile {
+        format: FORMAT,
+        version: VERSION,
+        axes: AXES,
+        tracked: beat.reference_phase.is_some(),
+        reference_phase: beat.reference_phase,
+        note: note(beat),
+        threshold_per_mm: beat.threshold_per_mm,
+        resolution_mm: beat.resolution_mm,
+        spacing_mm: beat.spacing_mm,
+        phases: phases.collect(),
+    };
+    serde_json::to_string(&file).map_err(|e| Error::Internal(e.to_string()))
+}
+
+fn title(beat: &BeatTree, tree: &PhaseTree) -> String {
+    format!("centrelines of vessels, LPS mm, phase {}; {}", tree.phase, note(beat))
+}
+
+fn to_vtp(beat: &BeatTree, tree: &PhaseTree) -> String {
+    let branches = || tree.branches.iter();
+    let radii: Vec<f64> = branches().flat_map(|b| b.radius_mm.iter().copied().map(rounded)).collect();
+    let lines = vtp::Lines {
+        title: title(beat, tree),
+        time: f64::from(tree.phase),
+        points: branches().flat_map(|b| b.points_mm.iter().map(rounded_point)).collect(),
+        counts: branches().map(|b| b.points_mm.len()).collect(),
+        of_points: vec![
+            Values::Float("Radius", radii.clone()),
+            // What VMTK and 3D Slicer's extension of it look for.
+            Values::Float("MaximumInscribedSphereRadius", radii),
+            Values::Int("PointId", branches().flat_map(|b| 0..b.points_mm.len() as i64).collect()),
+        ],
+        of_lines: vec![
+            Values::Int("BranchId", (0..tree.branches.len() as i64).collect()),
+            Values::Int("ParentId", branches().map(|b| b.parent.map_or(-1, |parent| parent as i64)).collect()),
+            Values::Int("Tracked", branches().map(|_| i64::from(beat.reference_phase.is_some())).collect()),
+        ],
+    };
+    lines.to_vtp()
+}
+
+fn to_collection(beat: &BeatTree, files: &[PathBuf]) -> String {
+    let name = |file: &PathBuf| file.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let entries = beat.phases.iter().zip(files).map(|(tree, file)| (f64::from(tree.phase), name(file)));
+    vtp::collection(&entries.collect::<Vec<_>>())
+}
+
+fn to_swc(beat: &BeatTree, tree: &PhaseTree) -> String {
+    let mut points: Vec<swc::Point> = Vec::new();
+    // Where the last point of each branch is among all points.
+    let mut ends = Vec::new();
+    for branch in &tree.branches {
+        let mut before = branch.parent.map(|parent| ends[parent]);
+        // The first point of a branch is the last of its parent, which is there already.
+        let first = usize::from(before.is_some());
+        for (point, radius) in branch.points_mm.iter().zip(&branch.radius_mm).skip(first) {
+            points.push(swc::Point { position: rounded_point(point), radius: rounded(*radius), parent: before });
+            before = Some(points.len() - 1);
+        }
+        ends.push(points.len() - 1);
+    }
+    swc::to_swc(&title(beat, tree), &points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn beat(reference_phase: Option<u32>) -> BeatTree {
+        let line = |points: &[f64]| points.iter().map(|x| DVec3::new(*x, 0.0, 1.0)).collect();
+        let branches = vec![
+            Branch { parent: None, points_mm: line(&[0.0, 1.0]), radius_mm: vec![2.0, 1.5] },
+            Branch { parent: Some(0), points_mm: line(&[1.0, 2.0, 3.0]), radius_mm: vec![1.5, 1.0, 0.5] },
+            Branch { parent: Some(0), points_mm: line(&[1.0, 5.0]), radius_mm: vec![1.5, 0.7] },
+        ];
+        let phases = vec![PhaseTree { phase: 3, branches }];
+        BeatTree { reference_phase, threshold_per_mm: 0.02, resolution_mm: 0.5, spacing_mm: 0.25, phases }
+    }
+
+    #[test]
+    fn points_of_swc_come_from_the_parents_end() {
+        let beat = beat(Some(0));
+        let text = to_swc(&beat, &beat.phases[0]);
+        let rows: Vec<&str> = text.lines().filter(|line| !line.starts_with('#')).collect();
+        let expected = ["1 0 0 0 1 2 -1", "2 0 1 0 1 1.5 1", "3 0 2 0 1 1 2", "4 0 3 0 1 0.5 3", "5 0 5 0 1 0.7 2"];
+        assert_eq!(rows, expected);
+    }
+
+    #[test]
+    fn all_files_say_whether_points_are_followed() {
+        for (reference, said) in [(Some(0), "tracked: a point"), (None, "not tracked: each phase")] {
+            let beat = beat(reference);
+            let tree = &beat.phases[0];
+            for text in [to_json(&beat).unwrap(), to_vtp(&beat, tree), to_swc(&beat, tree)] {
+                assert_eq!(text.matches(said).count(), 1, "{text}");
+            }
+        }
+    }
+
+    #[test]
+    fn names_tell_the_format() {
+        let of = |name: &str| TreeFormat::of(Path::new(name));
+        assert_eq!(of("beat.VTP"), Some(TreeFormat::Vtp));
+        assert_eq!((of("a.json"), of("a.swc")), (Some(TreeFormat::Json), Some(TreeFormat::Swc)));
+        assert_eq!((of("a.vtk"), of("json"), of("a.json.gz")), (None, None, None));
+    }
+}

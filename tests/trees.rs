@@ -1,0 +1,177 @@
+//! Vessels as trees, through the program: a tree that is known is taken angiograms of, reconstructed and found again. VTK opens
+//! the files, SciPy compares.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "common/program.rs"]
+mod program;
+#[path = "common/python.rs"]
+mod python;
+
+use program::program;
+use python::python;
+use serde_json::{Value, json};
+use std::f64::consts::PI;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+use std::sync::OnceLock;
+
+const PHASES: usize = 4;
+/// Points of the trunk and of each branch.
+const POINTS: [usize; 3] = [40, 50, 50];
+
+/// The true vessels at rest: a trunk and two branches, RAS mm.
+fn rest() -> Vec<[f64; 3]> {
+    let trunk = |a: f64| [4.0 * (3.0 * a).sin() * (1.0 - a), 6.0 * (2.0 * a).sin() * (1.0 - a), 35.0 * (1.0 - a)];
+    let left = |a: f64| [-28.0 * a, (10.0 + 6.0 * (3.0 * a).sin()) * a, -(38.0 * a + 4.0) * a];
+    let right = |a: f64| [(26.0 + 4.0 * (4.0 * a).sin()) * a, -8.0 * a, -34.0 * a];
+    let courses: [&dyn Fn(f64) -> [f64; 3]; 3] = [&trunk, &left, &right];
+    let along = |(n, course): (usize, &dyn Fn(f64) -> [f64; 3])| {
+        (0..n).map(|i| course(i as f64 / (n - 1) as f64)).collect::<Vec<_>>()
+    };
+    POINTS.into_iter().zip(courses).flat_map(along).collect()
+}
+
+/// The true vessels over the beat, as `phantom --tree` reads them.
+fn truth() -> Value {
+    let squeezed = |phase: usize| {
+        let squeeze = (PI * phase as f64 / PHASES as f64).sin().powi(2);
+        let (across, along) = (1.0 - 0.12 * squeeze, 1.0 - 0.08 * squeeze);
+        let moved =
+            |[x, y, z]: [f64; 3]| [x * across + 3.0 * squeeze, y * across - 4.0 * squeeze, z * along + 6.0 * squeeze];
+        rest().into_iter().map(moved).collect::<Vec<_>>()
+    };
+    let radius = |first: f64, last: f64, n: usize| {
+        (0..n).map(move |i| first + (last - first) * i as f64 / (n - 1) as f64).collect::<Vec<_>>()
+    };
+    let [trunk, left, right] = POINTS;
+    let radii = [radius(2.0, 1.8, trunk), radius(1.6, 1.0, left), radius(1.5, 0.9, right)].concat();
+    json!({
+        "branches": [
+            { "name": "trunk", "first": 0, "count": trunk },
+            { "name": "left", "first": trunk, "count": left },
+            { "name": "right", "first": trunk + left, "count": right },
+        ],
+        "radius_mm": radii,
+        "points_mm": (0..PHASES).map(squeezed).collect::<Vec<_>>(),
+    })
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn nertca(args: &[&str]) -> Output {
+    program().arg("--validate").args(args).output().unwrap()
+}
+
+/// What the program says on stdout and stderr.
+#[track_caller]
+fn ok(args: &[&str]) -> (String, String) {
+    let out = nertca(args);
+    let said = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    assert!(out.status.success(), "{args:?}: {}", said(&out.stderr));
+    (said(&out.stdout), said(&out.stderr))
+}
+
+struct Trained {
+    directory: tempfile::TempDir,
+    data: PathBuf,
+    run: PathBuf,
+}
+
+/// A short run on the true vessels, made once.
+fn trained() -> &'static Trained {
+    static RUN: OnceLock<Trained> = OnceLock::new();
+    RUN.get_or_init(|| {
+        let directory = tempfile::tempdir().unwrap();
+        let (tree, data, run) =
+            (directory.path().join("truth.json"), directory.path().join("data"), directory.path().join("run"));
+        std::fs::write(&tree, truth().to_string()).unwrap();
+        let phases = PHASES.to_string();
+        ok(&["phantom", text(&data), "--tree", text(&tree), "--size", "64", "--phases", &phases]);
+        train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60"]);
+        Trained { directory, data, run }
+    })
+}
+
+fn train(data: &Path, run: &Path, more: &[&str]) {
+    ok(&[&["train", text(data), "-o", text(run), "--no-eval"], more].concat());
+}
+
+#[test]
+fn the_tree_is_the_true_one_in_every_format() {
+    let Trained { directory, run, .. } = trained();
+    let to = |name: &str| directory.path().join(name);
+    for (name, files) in [("beat.json", 1), ("beat.vtp", PHASES + 1), ("beat.swc", PHASES)] {
+        let (made, said) = ok(&["tree", text(run), "-o", text(&to(name))]);
+        assert_eq!(made.lines().count(), files, "{made}");
+        assert!(made.lines().all(|file| Path::new(file).is_file()));
+        assert!(said.contains("\ntracked") || said.contains("; tracked"), "{said}");
+    }
+    let (one, _) = ok(&["tree", text(run), "-o", text(&to("one.vtp")), "--phase", "2"]);
+    assert_eq!(one.trim(), text(&to("one.vtp")), "one phase is one file, under its own name");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/check_trees.py");
+    let outcome = python().arg(script).arg(directory.path()).output().unwrap();
+    print!("{}", String::from_utf8_lossy(&outcome.stdout));
+    assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
+}
+
+fn tree_of(run: &Path, file: &Path, more: &[&str]) -> Value {
+    ok(&[&["tree", text(run), "-o", text(file)], more].concat());
+    serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap()
+}
+
+#[test]
+fn fields_that_carry_no_points_are_not_tracked() {
+    let Trained { directory, data, .. } = trained();
+    let run = directory.path().join("sets");
+    train(data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60", "--set", "gaussians.form=phase"]);
+    let file = directory.path().join("sets.json");
+    let (_, said) = ok(&["tree", text(&run), "-o", text(&file)]);
+    assert!(said.contains("not tracked"), "{said}");
+    let tree = tree_of(&run, &file, &["--phase", "1"]);
+    assert_eq!((&tree["tracked"], &tree["reference_phase"]), (&json!(false), &Value::Null));
+    assert!(tree["note"].as_str().unwrap().starts_with("not tracked"));
+    assert_eq!(tree["phases"].as_array().unwrap().len(), 1);
+    assert!(tree["phases"][0]["length_mm"].as_f64().unwrap() > 80.0, "{}", tree["phases"][0]["length_mm"]);
+}
+
+#[test]
+fn options_change_what_is_found() {
+    let Trained { directory, run, .. } = trained();
+    let file = |name: &str| directory.path().join(name);
+    let branches = |tree: &Value| tree["phases"][0]["branches"].as_array().unwrap().len();
+    let usual = tree_of(run, &file("usual.json"), &["--phase", "0"]);
+    assert_eq!(branches(&usual), POINTS.len());
+    // Both branches are shorter than that.
+    let stem = tree_of(run, &file("stem.json"), &["--phase", "0", "--min-branch", "100"]);
+    assert_eq!(branches(&stem), 1);
+    let threshold = usual["threshold_per_mm"].as_f64().unwrap();
+    let high = tree_of(run, &file("high.json"), &["--phase", "0", "--threshold", &(1.5 * threshold).to_string()]);
+    assert!((high["threshold_per_mm"].as_f64().unwrap() / threshold - 1.5).abs() < 1e-9);
+}
+
+#[test]
+fn what_has_no_tree_is_refused() {
+    let Trained { directory, data, run } = trained();
+    let out = directory.path().join("x.json");
+    let refuses = |run: &Path, out: &Path, more: &[&str], parts: &[&str]| {
+        let args = [&["tree", text(run), "-o", text(out)], more].concat();
+        let answer = nertca(&args);
+        let stderr = String::from_utf8_lossy(&answer.stderr);
+        assert_eq!(answer.status.code(), Some(2), "{args:?}: {stderr}");
+        parts.iter().for_each(|part| assert!(stderr.contains(part), "{args:?} does not name `{part}`: {stderr}"));
+        assert!(!out.exists());
+    };
+    refuses(run, &directory.path().join("x.vtk"), &[], &["--out", "x.vtk", ".json .vtp .swc"]);
+    refuses(run, &directory.path().join("tree"), &[], &["--out", ".json .vtp .swc"]);
+    refuses(run, &out, &["--threshold", "1e3"], &["threshold_per_mm", "no vessel", "lower"]);
+    refuses(run, &out, &["--threshold", "0"], &["threshold_per_mm = 0", "positive"]);
+    refuses(run, &out, &["--threshold", "nan"], &["threshold_per_mm", "positive"]);
+    refuses(run, &out, &["--min-branch=-1"], &["least_branch_mm = -1", "positive"]);
+    refuses(run, &out, &["--phase", "4"], &["--phase", "0 to 3"]);
+    // A network that has not been trained yet has no vessels.
+    let young = directory.path().join("young");
+    train(data, &young, &["--preset", "fast-mlp", "--iterations", "1"]);
+    refuses(&young, &out, &[], &["phase 0", "no vessel", "report"]);
+}
