@@ -11,6 +11,7 @@ use crate::phantom::noise::add_noise;
 use crate::phantom::projector::Projector;
 use crate::phantom::runs::{Shot, shots};
 use crate::phantom::subjects::{Moving, Patient, Placed, Pose, Reading, Subject, Thorax, Volumes};
+use crate::phantom::tree::{Tree, TreeFile};
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use crate::phantom::voxels::Tissues;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
@@ -22,6 +23,8 @@ use glam::DVec3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
+/// File of the true vessels as a tree, among the volumes.
+const TREE: &str = "tree.json";
 /// A vessel-only line integral above this share of a 1 mm vessel's marks a vessel pixel.
 const MASK_SHARE: f64 = 0.05;
 /// A blade attenuates so many times as much as the densest part of its view.
@@ -420,6 +423,13 @@ fn shoot(
     }
     progress("projections", u64::from(stage.phases), u64::from(stage.phases));
     truth.write(out)?;
+    if shooting.volumes {
+        let at = |phase| stage.subject.vessel_tree(Shot::at_phase(phase, stage.phases).fraction);
+        let trees: Vec<Tree> = (0..stage.phases).filter_map(at).collect();
+        if let Some(file) = TreeFile::of(&trees) {
+            file.write(&out.join(VOLUMES).join(TREE))?;
+        }
+    }
     writer.finish()
 }
 

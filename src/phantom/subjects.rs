@@ -67,6 +67,11 @@ pub(super) trait Subject {
         fraction
     }
 
+    /// Its vessels at a fraction of the beat, where they are known as a tree.
+    fn vessel_tree(&self, _fraction: f64) -> Option<Tree> {
+        None
+    }
+
     /// Writes the voxels of a phase into a directory.
     fn write_volumes(&self, _directory: &Path, _phase: u32, _fraction: f64) -> Result<()> {
         Ok(())
@@ -140,6 +145,10 @@ impl Subject for Thorax {
         })
     }
 
+    fn vessel_tree(&self, fraction: f64) -> Option<Tree> {
+        Some(self.tree(fraction))
+    }
+
     fn write_volumes(&self, directory: &Path, phase: u32, fraction: f64) -> Result<()> {
         write_vessels(directory, phase, &self.vessels(&self.tree(fraction)))?;
         let moving = self.background(fraction, Breath::default());
@@ -201,6 +210,10 @@ impl Subject for Patient {
             }),
             catheter: catheter.map(|volume| projector.load(volume)).transpose()?.map(Placed::at_rest),
         })
+    }
+
+    fn vessel_tree(&self, fraction: f64) -> Option<Tree> {
+        Some(self.tree.at(fraction))
     }
 
     fn write_volumes(&self, directory: &Path, phase: u32, fraction: f64) -> Result<()> {

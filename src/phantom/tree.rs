@@ -10,7 +10,7 @@ use crate::files;
 use crate::random::{STREAM_SHAPE, uniform01};
 use crate::scan::gating::SYSTOLE_SHARE;
 use glam::DVec3;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// One vessel: a polyline.
@@ -270,14 +270,14 @@ pub(super) fn spline(controls: &[[f64; 3]], s: f64) -> [f64; 3] {
 }
 
 /// A tree and its beat, as read from a file.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct TreeFile {
     branches: Vec<TreeBranch>,
     radius_mm: Vec<f64>,
     points_mm: Vec<Vec<[f64; 3]>>,
 }
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 struct TreeBranch {
     name: String,
     first: usize,
@@ -295,6 +295,37 @@ impl TreeFile {
             .map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))?;
         file.check(path)?;
         Ok(file)
+    }
+
+    /// The tree that has these shapes at equal fractions of its beat; none without any. All must have the same branches.
+    pub fn of(shapes: &[Tree]) -> Option<TreeFile> {
+        let rest = shapes.first()?;
+        let firsts = rest.branches.iter().scan(0, |end, branch| {
+            let first = *end;
+            *end += branch.points.len();
+            Some(first)
+        });
+        let branch = |(branch, first): (&Branch, usize)| TreeBranch {
+            name: branch.name.clone(),
+            first,
+            count: branch.points.len(),
+        };
+        let ras = |p: &DVec3| [-p.x, -p.y, p.z];
+        let points = |tree: &Tree| tree.branches.iter().flat_map(|b| b.points.iter().map(ras)).collect();
+        Some(TreeFile {
+            branches: rest.branches.iter().zip(firsts).map(branch).collect(),
+            radius_mm: rest.branches.iter().flat_map(|b| b.radius_mm.iter().copied()).collect(),
+            points_mm: shapes.iter().map(points).collect(),
+        })
+    }
+
+    /// Writes the tree, as [`TreeFile::read`] reads it.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let json = serde_json::to_string(self).map_err(|e| Error::Internal(e.to_string()))?;
+        files::write_atomic(path, json.as_bytes())
     }
 
     /// The tree at a fraction (0 to 1) of its beat, between the stored phases on straight lines; the beat closes.
