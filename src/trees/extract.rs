@@ -30,7 +30,7 @@ const REFERENCE_PHASE: u32 = 0;
 const GRID_STEP: f64 = 0.5;
 /// Points of that grid at most; vessels that need more are looked at more coarsely.
 const MOST_POINTS: f64 = (1u64 << 26) as f64;
-/// The least standard deviation of Gaussians counts as this share of what the field resolves.
+/// What a field of Gaussians resolves, in units of the least standard deviation that they may have.
 const RESOLVED_DEVIATIONS: f64 = 2.5;
 /// The least length of a branch that is kept, in units of what the field resolves.
 const LEAST_BRANCH: f64 = 3.0;
@@ -50,9 +50,9 @@ pub struct TreeOptions {
 }
 
 /// The vessels of a model as trees of centrelines with radii. Where one set of Gaussians moves, the tree of phase 0 is
-/// followed: point i of branch b is the same material point in all phases, with one radius, and motion along vessels, which projections do
-/// not show, is what the Gaussians' grid makes of it. Elsewhere each phase has a tree of its own. `progress` hears of
-/// phases done and phases in all.
+/// followed: point i of branch b is the same material point in all phases, with one radius, and motion along vessels, which
+/// projections do not show, is what the Gaussians' grid makes of it. Elsewhere each phase has a tree of its own. `progress`
+/// hears of phases done and phases in all.
 ///
 /// # Errors
 /// [`Error::Config`] for a phase the model does not have, for lengths and thresholds that are not positive, and for a phase
@@ -128,13 +128,17 @@ impl Finder<'_> {
         };
         let least_branch_mm =
             options.least_branch_mm.map_or(Ok(LEAST_BRANCH * resolution_mm), |mm| positive("least_branch_mm", mm))?;
-        Ok(Finder { renderer, model, pixel_mm, resolution_mm, threshold_per_mm, least_branch_mm, spacing_mm: 0.0 })
+        let finder =
+            Finder { renderer, model, pixel_mm, resolution_mm, threshold_per_mm, least_branch_mm, spacing_mm: 0.0 };
+        // The rule gives nothing where the field is nothing at the first phase.
+        if threshold_per_mm > 0.0 { Ok(finder) } else { Err(finder.no_vessels(REFERENCE_PHASE)) }
     }
 
     fn no_vessels(&self, phase: u32) -> Error {
         let problem = format!(
-            "at phase {phase} the moving field has no vessel above it: try a lower one, or see in the run's report \
-             whether the moving field shows vessels at all"
+            "at phase {phase} the moving field has no vessel above it that is longer than {:.2} mm: try a lower one, or \
+             see in the run's report whether the moving field shows vessels at all",
+            self.least_branch_mm
         );
         Error::config("threshold_per_mm", format!("{:.3e}", self.threshold_per_mm), problem)
     }

@@ -111,6 +111,14 @@ mod tests {
                 assert!((beside / found - 1.0).abs() < 0.05, "{beside} mm beside another vessel, {found} mm alone");
             }
         }
+        // One between four others ends in the valleys around it.
+        let at = |y: f64, z: f64| points(400, |along| DVec3::new(36.0 * along - 18.0, y, z));
+        let around = [(3.4, 0.0), (-3.4, 0.0), (0.0, 3.4), (0.0, -3.4)].map(|(y, z)| (at(y, z), 2.0));
+        let among = [vec![(at(0.0, 0.0), 0.8)], around.to_vec()].concat();
+        for vessel_per_mm in [Some(VESSEL_PER_MM), None] {
+            let found = radius_mm(&among, vessel_per_mm);
+            assert!((found / 0.8 - 1.0).abs() < 0.15, "{found} mm among others, {vessel_per_mm:?}");
+        }
         // A wrong attenuation shows in the area.
         let tube = [(points(400, |along| DVec3::X * (36.0 * along - 18.0)), 1.3)];
         let (right, half) = (radius_mm(&tube, Some(VESSEL_PER_MM)), radius_mm(&tube, Some(0.5 * VESSEL_PER_MM)));

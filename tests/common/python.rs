@@ -7,5 +7,8 @@ use std::process::Command;
 pub fn python() -> Command {
     let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".cache/python/bin/python3");
     assert!(python.is_file(), "{} is missing: NERTCA_SETUP_TESTS=1 tools/setup makes it", python.display());
-    Command::new(python)
+    let mut command = Command::new(python);
+    // Scripts that use each other leave nothing beside them.
+    command.env("PYTHONDONTWRITEBYTECODE", "1");
+    command
 }

@@ -8,31 +8,17 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
+from compare_trees import compare, read_truth, show
 from scipy.spatial import cKDTree
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
 directory = Path(sys.argv[1])
-RAS_TO_LPS = np.array([-1, -1, 1])
 NEAR_MM = 1.0
-STEP_MM = 0.1
 
-truth = json.loads((directory / "truth.json").read_text())
-true_points = np.array(truth["points_mm"]) * RAS_TO_LPS
-true_branches = [slice(b["first"], b["first"] + b["count"]) for b in truth["branches"]]
+truth = read_truth(directory / "truth.json")
+true_points, _, true_branches = truth
 beat = json.loads((directory / "beat.json").read_text())
-
-
-def finely(points, *values):
-    """Points of a line at most STEP_MM apart, with values between those of its own points."""
-    share = [np.zeros(1)]
-    for i, length in enumerate(np.linalg.norm(np.diff(points, axis=0), axis=1)):
-        n = int(np.ceil(length / STEP_MM)) or 1
-        share.append(i + np.arange(1, n + 1) / n)
-    share = np.concatenate(share)
-    index = np.arange(len(points))
-    columns = np.column_stack([points, *values])
-    return np.column_stack([np.interp(share, index, column) for column in columns.T])
 
 
 def length(points):
@@ -58,21 +44,19 @@ def check_json():
 
 def check_against_truth():
     """Of each phase: where the lines are, how wide they are and how many."""
-    for phase, row in enumerate(beat["phases"]):
-        ours = np.concatenate([finely(np.array(b["points_mm"]), b["radius_mm"]) for b in row["branches"]])
-        radii = np.array(truth["radius_mm"])
-        true = np.concatenate([finely(true_points[phase][b], radii[b]) for b in true_branches])
-        to_true, nearest = cKDTree(true[:, :3]).query(ours[:, :3])
-        to_ours, _ = cKDTree(ours[:, :3]).query(true[:, :3])
-        right, found = (to_true <= NEAR_MM).mean(), (to_ours <= NEAR_MM).mean()
-        errors = ours[:, 3] - true[nearest, 3]
-        rmse = np.sqrt((errors**2).mean())
-        roots = sum(b["parent"] is None for b in row["branches"])
-        print(f"phase {phase}: {right:.3f} of ours and {found:.3f} of the truth within {NEAR_MM} mm, {to_true.mean():.2f}"
-              f" and {to_ours.mean():.2f} mm on average, radius RMSE {rmse:.3f} mm, {roots} component(s)")
-        assert roots == 1 and len(row["branches"]) == 3, (phase, roots, len(row["branches"]))
-        assert right > 0.97 and found > 0.95 and to_true.mean() < 0.4, (phase, right, found, to_true.mean())
-        assert rmse < 0.2, (phase, rmse)
+    for row in beat["phases"]:
+        scores = compare(truth, row["phase"], row["branches"], NEAR_MM)
+        show(f"phase {row['phase']}", scores)
+        assert scores["components"] == 1 and len(row["branches"]) == 3, (row["phase"], scores)
+        assert scores["ours_near"] > 0.97 and scores["true_near"] > 0.95, (row["phase"], scores)
+        assert scores["ours_to_true_mm"] < 0.4 and scores["radius_rmse_mm"] < 0.2, (row["phase"], scores)
+
+
+def check_phantom():
+    """The phantom leaves the tree it was made of."""
+    points, radii, branches = read_truth(directory / "data/volumes/tree.json")
+    assert branches == true_branches
+    assert np.allclose(points, true_points, atol=1e-9) and np.allclose(radii, truth[1], atol=1e-9)
 
 
 def check_tracking():
@@ -151,6 +135,7 @@ def check_swc(file, row):
 
 
 check_json()
+check_phantom()
 check_against_truth()
 check_tracking()
 check_collection()
