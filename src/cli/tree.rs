@@ -24,10 +24,10 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
         eprintln!(
-            "phase {}: {} branches, {:.1} mm, connected in {}",
+            "phase {}: {:.1} mm in {} branches, components: {}",
             tree.phase,
-            tree.branches.len(),
             tree.length_mm(),
+            tree.branches.len(),
             tree.components()
         );
     }
