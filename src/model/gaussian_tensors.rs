@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
-use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units};
+use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units, inverse_step};
 use safetensors::tensor::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -162,7 +162,7 @@ pub(super) fn read(
         setup: TreeSetup {
             n_nodes: grid.nodes,
             half_side: grid.half_side,
-            inverse_step: (f64::from(grid.nodes - 1) / (2.0 * f64::from(grid.half_side))) as f32,
+            inverse_step: inverse_step(grid.nodes, grid.half_side),
             n_basis: grid.basis,
             ..TreeSetup::default()
         },

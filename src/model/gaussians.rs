@@ -112,6 +112,12 @@ pub fn dense(rows: &[Gaussian], setup: &GaussianSetup, share: f64) -> Vec<bool> 
     rows.iter().map(|g| density(g) >= least).collect()
 }
 
+/// Nodes per pixel of a tree's grid of so many nodes along each axis, which reaches `half_side` pixels to either side. From
+/// what checkpoints keep, to the last bit: a field that was loaded must draw the pictures of the one that was saved.
+pub fn inverse_step(n_nodes: u32, half_side: f32) -> f32 {
+    (f64::from(n_nodes - 1) / (2.0 * f64::from(half_side))) as f32
+}
+
 /// One set of Gaussians for the whole beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MovingTree {

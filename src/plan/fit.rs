@@ -3,6 +3,7 @@
 use crate::config::sections;
 use crate::gaussians::stages::{FIXED_POINT_BITS, RING_LENGTH, loss_parts};
 use crate::kernels::layout::{GaussianSchedule, GaussianSetup, TreeSetup};
+use crate::model::gaussians::inverse_step;
 use crate::plan::targets::Targets;
 
 /// Decay of Adam's first and second moments, and its smallest denominator.
@@ -66,7 +67,7 @@ pub fn tree_setup(targets: &Targets, settings: &sections::Tree) -> TreeSetup {
     TreeSetup {
         n_nodes,
         half_side: half_side as f32,
-        inverse_step: (f64::from(n_nodes - 1) / (2.0 * half_side)) as f32,
+        inverse_step: inverse_step(n_nodes, half_side as f32),
         n_basis: 2 * harmonics,
         smoothness: (settings.smoothness / targets.n_phases as f64) as f32,
         own_penalty: settings.own_penalty as f32,
