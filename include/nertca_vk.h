@@ -633,6 +633,61 @@ typedef struct {
 } nertca_scores;
 
 /**
+ * Vessels as trees of centrelines with radii: what is asked for, and room for the answer.
+ */
+typedef struct {
+  /**
+   * `sizeof(nertca_tree)`.
+   */
+  size_t size;
+  /**
+   * The moving field is vessel above this, 1/mm; 0 for the threshold that scores take. Set to what was taken.
+   */
+  double threshold_per_mm;
+  /**
+   * Branches that end without reaching so far beyond the vessel they leave are left out, mm; 0 for three times what the
+   * field resolves.
+   */
+  double least_branch_mm;
+  /**
+   * Set to 1 where all phases have the same material points, to 0 where each has branches of its own.
+   */
+  uint32_t followed;
+  /**
+   * Elements that each of `branch_*` has room for; set to how many branches there are, over all phases.
+   */
+  size_t branches;
+  /**
+   * Points that `points_mm` and `radius_mm` have room for; set to how many there are, over all phases.
+   */
+  size_t points;
+  /**
+   * Cardiac phase of each branch, from 0.
+   */
+  uint32_t *branch_phase;
+  /**
+   * The branch that each leaves, by its place in these arrays; -1 for one that begins at a root.
+   */
+  int32_t *branch_parent;
+  /**
+   * First point of each branch, from 0.
+   */
+  uint32_t *branch_first;
+  /**
+   * How many points each branch has; the first is the last of its parent.
+   */
+  uint32_t *branch_points;
+  /**
+   * Points of the centrelines (LPS), mm: three numbers each.
+   */
+  double *points_mm;
+  /**
+   * Radius of the vessel at each point, mm.
+   */
+  double *radius_mm;
+} nertca_tree;
+
+/**
  * Done.
  */
 #define NERTCA_OK 0
@@ -1099,6 +1154,25 @@ nertca_status nertca_buffer_export_fd(nertca_buffer *buffer, int32_t *fd, uint64
  * threads.
  */
 nertca_status nertca_buffer_destroy(nertca_buffer *buffer);
+
+/**
+ * Finds the vessels at all phases as trees of centrelines with radii, and tells how much room they need: with all arrays of
+ * `tree` null. Called again with arrays, it copies what it found, whatever training has done since. Takes seconds.
+ *
+ * Branches come phase by phase, each behind its parent. Where `followed` is 1, all phases have the same branches with the
+ * same number of points, and point i of a branch is the same material point at every phase; elsewhere each phase has
+ * branches of its own. Motion along a vessel is not observed in projections: what there is of it comes from smoothness
+ * alone. Any thread, also while training.
+ *
+ * @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a threshold or length
+ * that is negative, for a moving field without vessels above the threshold, and where only some arrays are given;
+ * NERTCA_ERROR_BUFFER when they are too short: the counts then tell what is needed.
+ *
+ * # Safety
+ * `tree` must be as long as it says, and its arrays null or writable for `branches` and `points` elements.
+ */
+nertca_status nertca_reconstruction_tree(nertca_reconstruction *reconstruction,
+                                         nertca_tree *tree);
 
 #ifdef __cplusplus
 }  // extern "C"

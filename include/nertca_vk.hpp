@@ -132,6 +132,35 @@ class Reconstruction : public detail::Owner<nertca_reconstruction, nertca_recons
     check(nertca_reconstruction_progress(handle_, &progress));
     return progress;
   }
+  // The vessels at all phases as trees of centrelines with radii.
+  struct Tree {
+    bool followed = false;  // all phases have the same material points
+    std::vector<std::uint32_t> branch_phase, branch_first, branch_points;
+    std::vector<std::int32_t> branch_parent;
+    std::vector<double> points_mm;  // three numbers a point, LPS
+    std::vector<double> radius_mm;
+  };
+  Tree tree(double threshold_per_mm = 0.0, double least_branch_mm = 0.0) {
+    nertca_tree room = make<nertca_tree>();
+    room.threshold_per_mm = threshold_per_mm;
+    room.least_branch_mm = least_branch_mm;
+    check(nertca_reconstruction_tree(handle_, &room));
+    Tree tree;
+    tree.followed = room.followed != 0;
+    for (std::vector<std::uint32_t> *words : {&tree.branch_phase, &tree.branch_first, &tree.branch_points})
+      words->resize(room.branches);
+    tree.branch_parent.resize(room.branches);
+    tree.points_mm.resize(3 * room.points);
+    tree.radius_mm.resize(room.points);
+    room.branch_phase = tree.branch_phase.data();
+    room.branch_first = tree.branch_first.data();
+    room.branch_points = tree.branch_points.data();
+    room.branch_parent = tree.branch_parent.data();
+    room.points_mm = tree.points_mm.data();
+    room.radius_mm = tree.radius_mm.data();
+    check(nertca_reconstruction_tree(handle_, &room));
+    return tree;
+  }
   // Line integrals (or attenuation per mm for maximum projections), rows first.
   std::vector<float> render(const nertca_view &view) {
     std::vector<float> pixels(static_cast<std::size_t>(view.width) * view.height);

@@ -226,6 +226,7 @@ pub mod capi {
     pub mod reconstruction;
     pub mod status;
     pub mod training;
+    pub mod tree;
     pub mod types;
 }
 

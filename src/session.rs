@@ -19,10 +19,12 @@ use crate::model::component::Component;
 use crate::render::grid::PatientGrid;
 use crate::render::live::Source;
 use crate::render::quantity::Quantity;
-use crate::render::renderer::Rendering;
+use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::gating::RPeaks;
 use crate::score::eval::{Evaluation, evaluate};
 use crate::train::trainer::StepLoss;
+use crate::trees::extract::{TreeOptions, vessel_trees};
+use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;
 use engine::{Control, Shared, nothing_yet};
 use inbox::Inbox;
@@ -400,6 +402,19 @@ impl Session {
         let threshold = threshold_per_mm.map(|t| t * MM_PER_UNIT);
         self.shared
             .with_viewer(|live, step| evaluate(live.renderer(step)?, &dataset, &frames, step, threshold, |_| Ok(())))
+    }
+
+    /// The vessels at all phases as trees of centrelines with radii, from the fields as they are after the iterations under
+    /// way; see [`vessel_trees`] for the threshold and the least length.
+    ///
+    /// # Errors
+    /// [`Error::NotReady`] before anything was trained or loaded; those of [`vessel_trees`].
+    pub fn trees(&self, threshold_per_mm: Option<f64>, least_branch_mm: Option<f64>) -> Result<BeatTree> {
+        let (gpu, tuning) = self.shared.device()?;
+        let model = self.checkpoint()?.model;
+        let renderer = Renderer::new(gpu, &model, tuning.clone())?;
+        let phases = (0..model.layout.phases as u32).collect();
+        vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| ())
     }
 
     /// Everything needed to continue, after the iterations under way.

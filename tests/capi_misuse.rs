@@ -11,6 +11,7 @@ use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
+use nertca_vk::capi::tree::*;
 use nertca_vk::capi::types::*;
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -69,6 +70,7 @@ fn every_function_refuses_what_it_cannot_use() {
     reconstructions(&b);
     frames(&b);
     calibration(&b);
+    tree(&b);
     checkpoints(&b);
     training(&b);
     views(&b);
@@ -257,6 +259,27 @@ fn calibration(b: &Bench) {
         nertca_reconstruction_set_geometry(b.bare, 0, &geometry(0))
     });
     b.handles(set, stale(b), b.context.cast(), |h| unsafe { nertca_reconstruction_set_geometry(h, 0, &geometry(0)) });
+}
+
+fn tree(b: &Bench) {
+    let tree = "nertca_reconstruction_tree";
+    let size = size_of::<nertca_tree>();
+    let ask = |h, asked: nertca_tree| unsafe { nertca_reconstruction_tree(h, &mut { asked }) };
+    b.refuses(tree, NERTCA_ERROR_ARGUMENT, "is null", unsafe { nertca_reconstruction_tree(b.bare, null_mut()) });
+    b.refuses(tree, NERTCA_ERROR_ARGUMENT, "nertca_tree.size", ask(b.bare, zeroed()));
+    b.refuses(tree, NERTCA_ERROR_NOT_READY, "", ask(b.bare, nertca_tree { size, ..zeroed() }));
+    let mut radius_mm = 0.0;
+    let partly = nertca_tree { size, radius_mm: &mut radius_mm, ..zeroed() };
+    b.refuses(tree, NERTCA_ERROR_ARGUMENT, "branch_phase", ask(b.trained, partly));
+    for bad in [-1.0, f64::NAN, f64::INFINITY] {
+        let asked = nertca_tree { size, threshold_per_mm: bad, ..zeroed() };
+        b.refuses(tree, NERTCA_ERROR_ARGUMENT, "threshold_per_mm", ask(b.trained, asked));
+        let asked = nertca_tree { size, threshold_per_mm: 1e-4, least_branch_mm: bad, ..zeroed() };
+        b.refuses(tree, NERTCA_ERROR_ARGUMENT, "least_branch_mm", ask(b.trained, asked));
+    }
+    let nothing = nertca_tree { size, threshold_per_mm: 1e6, ..zeroed() };
+    b.refuses(tree, NERTCA_ERROR_ARGUMENT, "no vessel", ask(b.trained, nothing));
+    b.handles(tree, stale(b), b.context.cast(), |h| ask(h, nertca_tree { size, ..zeroed() }));
 }
 
 fn frames(b: &Bench) {

@@ -1,18 +1,26 @@
 //! Vessels as trees, through the program: a tree that is known is taken angiograms of, reconstructed and found again. VTK opens
 //! the files, SciPy compares.
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests")]
 
 #[path = "common/program.rs"]
 mod program;
 #[path = "common/python.rs"]
 mod python;
 
+use nertca_vk::capi::context::*;
+use nertca_vk::capi::reconstruction::*;
+use nertca_vk::capi::status::{NERTCA_ERROR_BUFFER, NERTCA_OK};
+use nertca_vk::capi::tree::nertca_reconstruction_tree;
+use nertca_vk::capi::types::{nertca_log, nertca_tree};
+use nertca_vk::model::checkpoint;
 use program::program;
 use python::python;
 use serde_json::{Value, json};
 use std::f64::consts::PI;
+use std::ffi::CString;
 use std::path::{Path, PathBuf};
 use std::process::Output;
+use std::ptr::{null, null_mut};
 use std::sync::OnceLock;
 
 const PHASES: usize = 4;
@@ -174,4 +182,64 @@ fn what_has_no_tree_is_refused() {
     let young = directory.path().join("young");
     train(data, &young, &["--preset", "fast-mlp", "--iterations", "1"]);
     refuses(&young, &out, &[], &["phase 0", "no vessel", "report"]);
+}
+
+#[test]
+fn c_callers_get_the_same_tree() {
+    let Trained { directory, run, .. } = trained();
+    let written = tree_of(run, &directory.path().join("all.json"), &[]);
+    let none: *const nertca_log = null();
+    let (mut context, mut reconstruction) = (null_mut(), null_mut());
+    assert_eq!(unsafe { nertca_context_create(null(), none, &mut context) }, NERTCA_OK);
+    let options = CString::new(format!("phases = {PHASES}")).unwrap();
+    let made = unsafe { nertca_reconstruction_create(context, options.as_ptr(), &mut reconstruction) };
+    assert_eq!(made, NERTCA_OK);
+    let newest = checkpoint::newest(run).unwrap();
+    let path = CString::new(text(&newest)).unwrap();
+    assert_eq!(unsafe { nertca_reconstruction_load(reconstruction, path.as_ptr()) }, NERTCA_OK);
+
+    let mut room: nertca_tree = unsafe { std::mem::zeroed() };
+    room.size = size_of::<nertca_tree>();
+    assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_OK);
+    assert_eq!((room.followed, room.branches), (1, PHASES * POINTS.len()));
+    assert!((room.threshold_per_mm / written["threshold_per_mm"].as_f64().unwrap() - 1.0).abs() < 1e-9);
+    let (n, points) = (room.branches, room.points);
+    let (mut phase, mut parent, mut first, mut count) = (vec![9; n], vec![9; n], vec![9; n], vec![9; n]);
+    let (mut points_mm, mut radius_mm) = (vec![f64::NAN; 3 * points], vec![f64::NAN; points]);
+    room.branch_phase = phase.as_mut_ptr();
+    room.branch_parent = parent.as_mut_ptr();
+    room.branch_first = first.as_mut_ptr();
+    room.branch_points = count.as_mut_ptr();
+    room.points_mm = points_mm.as_mut_ptr();
+    room.radius_mm = radius_mm.as_mut_ptr();
+    // Too little room is refused, and nothing is written.
+    room.points -= 1;
+    assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_ERROR_BUFFER);
+    assert!(room.points == points && radius_mm[0].is_nan() && phase[0] == 9);
+    assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_OK);
+
+    let numbers = |value: &Value| value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<_>>();
+    let mut branch = 0;
+    for (tree, of_phase) in written["phases"].as_array().unwrap().iter().enumerate() {
+        let root = branch as i64;
+        for wanted in of_phase["branches"].as_array().unwrap() {
+            let found_parent = i64::from(parent[branch]);
+            assert_eq!(wanted["parent"].as_i64().map_or(-1, |p| root + p), found_parent, "branch {branch}");
+            assert_eq!(phase[branch] as usize, tree);
+            let range = first[branch] as usize..(first[branch] + count[branch]) as usize;
+            let wanted_mm: Vec<f64> = wanted["points_mm"].as_array().unwrap().iter().flat_map(numbers).collect();
+            let found_mm = &points_mm[3 * range.start..3 * range.end];
+            assert_eq!(wanted_mm.len(), found_mm.len());
+            // The file keeps a tenth of a micrometre.
+            assert!(wanted_mm.iter().zip(found_mm).all(|(a, b)| (a - b).abs() < 1e-4), "branch {branch}");
+            let radii = numbers(&wanted["radius_mm"]);
+            assert!(
+                radii.len() == range.len() && radii.iter().zip(&radius_mm[range]).all(|(a, b)| (a - b).abs() < 1e-4)
+            );
+            branch += 1;
+        }
+    }
+    assert_eq!(branch, n);
+    assert_eq!(unsafe { nertca_reconstruction_destroy(reconstruction) }, NERTCA_OK);
+    assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_OK);
 }

@@ -13,6 +13,7 @@ use crate::config::{Config, Preset};
 use crate::model::checkpoint::Checkpoint;
 use crate::scan::gating::RPeaks;
 use crate::session::{Progress, Session, SessionOptions};
+use crate::trees::tree::BeatTree;
 use std::ffi::{c_char, c_void};
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -27,6 +28,8 @@ pub(super) struct Reconstruction {
     // Dropped in this order: the session's memory belongs to the context's device.
     pub session: Session,
     pub latest: Arc<Mutex<Option<Progress>>>,
+    /// The vessels as they were last found.
+    pub tree: Mutex<Option<BeatTree>>,
     pub claim: Claim,
     process: u32,
 }
@@ -110,6 +113,7 @@ pub unsafe extern "C" fn nertca_reconstruction_create(
         let made = Arc::new(Reconstruction {
             session: session(context, options)?,
             latest: Arc::default(),
+            tree: Mutex::default(),
             claim: Claim::new(context),
             process: std::process::id(),
         });

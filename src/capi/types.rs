@@ -278,6 +278,37 @@ pub struct nertca_correction {
     pub matrix: [[f64; 4]; 3],
 }
 
+/// Vessels as trees of centrelines with radii: what is asked for, and room for the answer.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct nertca_tree {
+    /// `sizeof(nertca_tree)`.
+    pub size: usize,
+    /// The moving field is vessel above this, 1/mm; 0 for the threshold that scores take. Set to what was taken.
+    pub threshold_per_mm: f64,
+    /// Branches that end without reaching so far beyond the vessel they leave are left out, mm; 0 for three times what the
+    /// field resolves.
+    pub least_branch_mm: f64,
+    /// Set to 1 where all phases have the same material points, to 0 where each has branches of its own.
+    pub followed: u32,
+    /// Elements that each of `branch_*` has room for; set to how many branches there are, over all phases.
+    pub branches: usize,
+    /// Points that `points_mm` and `radius_mm` have room for; set to how many there are, over all phases.
+    pub points: usize,
+    /// Cardiac phase of each branch, from 0.
+    pub branch_phase: *mut u32,
+    /// The branch that each leaves, by its place in these arrays; -1 for one that begins at a root.
+    pub branch_parent: *mut i32,
+    /// First point of each branch, from 0.
+    pub branch_first: *mut u32,
+    /// How many points each branch has; the first is the last of its parent.
+    pub branch_points: *mut u32,
+    /// Points of the centrelines (LPS), mm: three numbers each.
+    pub points_mm: *mut f64,
+    /// Radius of the vessel at each point, mm.
+    pub radius_mm: *mut f64,
+}
+
 /// Scores on the frames added for validation.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -323,7 +354,7 @@ macro_rules! versioned {
     )* };
 }
 versioned!(nertca_log nertca_vulkan nertca_geometry nertca_frame nertca_view nertca_image nertca_grid nertca_progress
-       nertca_correction nertca_scores);
+       nertca_correction nertca_tree nertca_scores);
 
 fn check_size<T: Versioned>(size: usize) -> Outcome<()> {
     if size < size_of::<T>() || size > 4096 {

@@ -1,0 +1,131 @@
+//! Vessels as trees of centrelines with radii.
+
+use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
+use crate::capi::status::{Failure, NERTCA_ERROR_BUFFER, Outcome, nertca_status};
+use crate::capi::types::{nertca_tree, read, write};
+use crate::trees::tree::{BeatTree, Branch};
+use std::sync::PoisonError;
+
+/// Finds the vessels at all phases as trees of centrelines with radii, and tells how much room they need: with all arrays of
+/// `tree` null. Called again with arrays, it copies what it found, whatever training has done since. Takes seconds.
+///
+/// Branches come phase by phase, each behind its parent. Where `followed` is 1, all phases have the same branches with the
+/// same number of points, and point i of a branch is the same material point at every phase; elsewhere each phase has
+/// branches of its own. Motion along a vessel is not observed in projections: what there is of it comes from smoothness
+/// alone. Any thread, also while training.
+///
+/// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a threshold or length
+/// that is negative, for a moving field without vessels above the threshold, and where only some arrays are given;
+/// NERTCA_ERROR_BUFFER when they are too short: the counts then tell what is needed.
+///
+/// # Safety
+/// `tree` must be as long as it says, and its arrays null or writable for `branches` and `points` elements.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_tree(
+    reconstruction: *mut nertca_reconstruction,
+    tree: *mut nertca_tree,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: the header asks that `tree` is null or as long as its size says.
+        let asked = unsafe { read(tree) }?;
+        let copies = wants_copies(&asked)?;
+        let mut kept = reconstruction.tree.lock().unwrap_or_else(PoisonError::into_inner);
+        if !copies {
+            *kept = None;
+        }
+        let found = match kept.take() {
+            Some(found) => found,
+            None => find(reconstruction, &asked)?,
+        };
+        let flat = FlatTree::of(&found);
+        let told = nertca_tree {
+            threshold_per_mm: found.threshold_per_mm,
+            followed: u32::from(found.reference_phase.is_some()),
+            branches: flat.branch_phase.len(),
+            points: flat.radius_mm.len(),
+            ..asked
+        };
+        *kept = Some(found);
+        // SAFETY: as above.
+        unsafe { write(tree, |size| nertca_tree { size, ..told }) }?;
+        if !copies {
+            return Ok(());
+        }
+        if asked.branches < told.branches || asked.points < told.points {
+            let needed = format!("room for {} branches and {} points is needed", told.branches, told.points);
+            return Err(Failure::new(NERTCA_ERROR_BUFFER, needed));
+        }
+        // SAFETY: no array is null, as was checked, and the header asks for as many elements as were compared above.
+        unsafe {
+            copy(&flat.branch_phase, asked.branch_phase);
+            copy(&flat.branch_parent, asked.branch_parent);
+            copy(&flat.branch_first, asked.branch_first);
+            copy(&flat.branch_points, asked.branch_points);
+            copy(&flat.points_mm, asked.points_mm);
+            copy(&flat.radius_mm, asked.radius_mm);
+        }
+        Ok(())
+    })
+}
+
+/// Whether the caller has arrays; all of them, or none.
+fn wants_copies(asked: &nertca_tree) -> Outcome<bool> {
+    let missing = [
+        ("branch_phase", asked.branch_phase.is_null()),
+        ("branch_parent", asked.branch_parent.is_null()),
+        ("branch_first", asked.branch_first.is_null()),
+        ("branch_points", asked.branch_points.is_null()),
+        ("points_mm", asked.points_mm.is_null()),
+        ("radius_mm", asked.radius_mm.is_null()),
+    ];
+    if missing.iter().all(|(_, null)| *null) {
+        return Ok(false);
+    }
+    match missing.iter().find(|(_, null)| *null) {
+        Some((name, _)) => Err(Failure::argument(name, "is null, and other arrays are not")),
+        None => Ok(true),
+    }
+}
+
+fn find(reconstruction: &Reconstruction, asked: &nertca_tree) -> Outcome<BeatTree> {
+    let given = |value: f64| (value != 0.0).then_some(value);
+    Ok(reconstruction.session.trees(given(asked.threshold_per_mm), given(asked.least_branch_mm))?)
+}
+
+/// # Safety
+/// `to` must be writable for as many elements as `from` has.
+unsafe fn copy<T: Copy>(from: &[T], to: *mut T) {
+    for (i, value) in from.iter().enumerate() {
+        // SAFETY: this function asks its callers for as many elements, which need no alignment.
+        unsafe { to.add(i).write_unaligned(*value) };
+    }
+}
+
+/// All phases one behind the other, an array for each quantity.
+#[derive(Default)]
+struct FlatTree {
+    branch_phase: Vec<u32>,
+    branch_parent: Vec<i32>,
+    branch_first: Vec<u32>,
+    branch_points: Vec<u32>,
+    points_mm: Vec<f64>,
+    radius_mm: Vec<f64>,
+}
+
+impl FlatTree {
+    fn of(found: &BeatTree) -> FlatTree {
+        let mut flat = FlatTree::default();
+        for tree in &found.phases {
+            let first = flat.branch_phase.len();
+            for Branch { parent, points_mm, radius_mm } in &tree.branches {
+                flat.branch_phase.push(tree.phase);
+                flat.branch_parent.push(parent.map_or(-1, |parent| (first + parent) as i32));
+                flat.branch_first.push(flat.radius_mm.len() as u32);
+                flat.branch_points.push(points_mm.len() as u32);
+                flat.points_mm.extend(points_mm.iter().flat_map(|point| point.to_array()));
+                flat.radius_mm.extend(radius_mm);
+            }
+        }
+        flat
+    }
+}
