@@ -192,7 +192,7 @@ fn short_run(form: &str) -> Config {
         "tree.warm_iterations=12",
         "tree.track_iterations=4",
         // As smooth as the preset asks for, the still field learns too little in so few iterations to be seen.
-        "static.tv=10",
+        "static.tv=1",
     ];
     let mut all: Vec<String> = settings.map(String::from).to_vec();
     all.push(format!("gaussians.form={form}"));
@@ -250,16 +250,17 @@ fn the_still_field_learns_what_gaussians_leave() {
     let dataset = phantom(&gpu, &directory.path().join("phantom"), 40, 4);
     let config = short_run("phase");
     let config = Config {
-        train: sections::Train { iterations: 120, ..config.train },
+        train: sections::Train { iterations: 160, ..config.train },
         // After so few iterations, vessels are not dense yet.
         gaussians: sections::Gaussians { clear_at: 0, ..config.gaussians },
         ..config
     };
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
-    let losses = run(&mut trainer, 120);
-    assert_eq!(losses.len(), 120);
+    let losses = run(&mut trainer, 160);
+    assert_eq!(losses.len(), 160);
     assert!(losses[19] < 0.7 * losses[0], "Gaussians: {} to {}", losses[0], losses[19]);
-    assert!(losses[119] < 0.5 * losses[20], "still field: {} to {}", losses[20], losses[119]);
+    println!("Gaussians: {} to {}, still field: {} to {}", losses[0], losses[19], losses[20], losses[159]);
+    assert!(losses[159] < 0.5 * losses[20], "still field: {} to {}", losses[20], losses[159]);
     let model = trainer.model().unwrap();
     let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
     let frame = dataset.training()[0].clone();
