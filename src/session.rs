@@ -449,6 +449,7 @@ impl Session {
         inbox.options.config = model.config.clone();
         engine.training = None;
         engine.version = 0;
+        *lock(&self.shared.calibration) = None;
         self.shared.publish(Source::of(model));
         self.shared.step.store(model.step, Ordering::Release);
         lock(&self.shared.control).state = State::Idle;

@@ -219,6 +219,9 @@ fn a_session_tells_how_it_sees_its_frames() {
     let (correction, away) = farthest(0, &other.rays(shot.dataset.width, shot.dataset.height).unwrap());
     assert!(correction == Correction::Stated && away < 1e-9, "{correction:?}, {away} px");
     assert_eq!(farthest(1, &corrected.heart_rays(&corrected.training()[1])).0, Correction::Breathing);
+    // What a checkpoint was corrected by is not known.
+    session.load(session.checkpoint().unwrap()).unwrap();
+    assert_eq!(farthest(1, &shot.dataset.views[training[1].view].rays).0, Correction::Stated);
     let none = session.corrected_frame(training.len()).unwrap_err().to_string();
     assert!(none.contains(&format!("{} were added", training.len())), "{none}");
 }
