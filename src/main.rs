@@ -15,6 +15,7 @@ mod cli {
     pub mod calibration_table;
     pub mod check;
     pub mod data;
+    pub mod device;
     pub mod devices;
     pub mod eval;
     pub mod exit;
@@ -25,6 +26,7 @@ mod cli {
     pub mod progress;
     pub mod render;
     pub mod report;
+    pub mod synthetic_args;
     pub mod train;
     pub mod tree;
     pub mod view;

@@ -1,7 +1,8 @@
 //! `bench`: iterations, passes and renderings against the device's own limits and the paper's 37 minutes.
 
-use super::args::{BenchArgs, Cli};
+use super::args::{Cli, ConfigArgs};
 use super::frame_rates::{FrameRate, measure_frame_rates, print_frame_rates};
+use clap::Args;
 use nertca_vk::bench::{self, PAPER_SECONDS, Peaks};
 use nertca_vk::choice::Choice;
 use nertca_vk::config::Config;
@@ -24,9 +25,40 @@ use nertca_vk::train::timing::{GaussianSubject, GaussianTiming, Subject, Timing}
 use nertca_vk::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+
+/// `bench`.
+#[derive(Debug, Args)]
+pub struct BenchArgs {
+    /// Dataset directory; the default phantom, made on the fly, without.
+    pub data: Option<PathBuf>,
+    /// Hyper-parameters.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// Iterations of each timed repeat.
+    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=2000))]
+    pub iterations: u32,
+    /// Timed repeats.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=10))]
+    pub repeats: u32,
+    /// Also run the whole reconstruction, with time-to-Dice.
+    #[arg(long)]
+    pub full: bool,
+    /// List the time of each pass.
+    #[arg(long)]
+    pub kernels: bool,
+    /// Also measure frames per second of renderings.
+    #[arg(long)]
+    pub render: bool,
+    /// Write everything, with raw samples, configuration and commit, as JSON.
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Compare with a file of an earlier --json.
+    #[arg(long, value_name = "FILE")]
+    pub compare: Option<PathBuf>,
+}
 
 /// Iterations timed pass by pass.
 const PROFILED: u32 = 8;

@@ -1,14 +1,32 @@
 //! `calibrate`: a dataset whose views agree.
 
-use super::args::CalibrateArgs;
+use super::args::choice;
 use super::calibration_table;
+use clap::Args;
 use nertca_vk::calibrate::calibrate;
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::{CalibrateMode, Config, Preset};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::run::silhouette_pictures;
 use nertca_vk::scan::dataset::{Dataset, Layout, MANIFEST};
 use nertca_vk::scan::writer;
+use std::path::PathBuf;
+
+/// `calibrate`.
+#[derive(Debug, Args)]
+pub struct CalibrateArgs {
+    /// Dataset directory in either layout.
+    pub data: PathBuf,
+    /// What is corrected.
+    #[arg(long, value_parser = choice::<CalibrateMode>(), default_value = "auto")]
+    pub mode: CalibrateMode,
+    /// Dataset directory to make: the same images with corrected geometry, and pictures of what changed in `calibration`.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+}
 
 /// Folder of what belongs to the correction, in the dataset.
 const FOLDER: &str = "calibration";

@@ -1,6 +1,6 @@
 //! `check`.
 
-use super::args::CheckArgs;
+use clap::Args;
 use nertca_vk::calibrate::calibrate;
 use nertca_vk::check::{Check, check};
 use nertca_vk::config::{Config, Preset};
@@ -9,6 +9,20 @@ use nertca_vk::files;
 use nertca_vk::plan::Plan;
 use nertca_vk::run::hull_pictures;
 use nertca_vk::scan::dataset::Dataset;
+use std::path::PathBuf;
+
+/// `check`.
+#[derive(Debug, Args)]
+pub struct CheckArgs {
+    /// Dataset directory.
+    pub data: PathBuf,
+    /// JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
+    /// Leave a picture of each training view here, with what all views agree on in orange.
+    #[arg(long, value_name = "DIR")]
+    pub pictures: Option<PathBuf>,
+}
 
 /// Tells whether a dataset makes sense.
 pub fn run(args: &CheckArgs) -> Result<()> {

@@ -1,6 +1,8 @@
 //! `phantom`, `project` and `import`.
 
-use super::args::{Cli, ImportArgs, ImportDicomArgs, ImportSource, PhantomArgs, ProjectArgs};
+use super::args::Cli;
+use super::synthetic_args::{PhantomArgs, ProjectArgs, pitch};
+use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
@@ -8,7 +10,69 @@ use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
 use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
 use nertca_vk::scan::gating::RPeaks;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+/// `import`.
+#[derive(Debug, Args)]
+pub struct ImportArgs {
+    /// What to import.
+    #[command(subcommand)]
+    pub source: ImportSource,
+}
+
+/// What can be imported.
+#[derive(Debug, Subcommand)]
+pub enum ImportSource {
+    /// X-ray angiography runs (DICOM XA or RF, multi-frame), one file per view.
+    Dicom(ImportDicomArgs),
+}
+
+/// `import dicom`.
+#[derive(Debug, Args)]
+pub struct ImportDicomArgs {
+    /// One file per view.
+    #[arg(required = true, value_name = "FILE")]
+    pub files: Vec<PathBuf>,
+    /// Directory to make.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Cardiac phases.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    pub phases: u32,
+    /// Nothing moves: average each run. Phase 0 is the object, phase 1 what it looks like without vessels.
+    #[arg(long, conflicts_with_all = ["r_peaks", "heart_rate", "phase_list"])]
+    pub still: bool,
+    /// R-peaks in seconds from the first frame, one per line, instead of the files' ECG.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["heart_rate", "phase_list"])]
+    pub r_peaks: Option<PathBuf>,
+    /// Beats per minute of a steady heart with an R-peak at the first frame.
+    #[arg(long, value_name = "PER_MIN", conflicts_with = "phase_list")]
+    pub heart_rate: Option<f64>,
+    /// A phase from 0 for each selected frame, one per line, the same for all runs.
+    #[arg(long, value_name = "FILE")]
+    pub phase_list: Option<PathBuf>,
+    /// Frames of each run, from 1; those filled with contrast by default.
+    #[arg(long, value_name = "FIRST-LAST", value_parser = frame_range)]
+    pub frames: Option<std::ops::RangeInclusive<usize>>,
+    /// Pixel pitch on the detector along columns and rows, mm: one number or two.
+    #[arg(long, value_name = "MM[,MM]", value_parser = pitch)]
+    pub pixel_spacing: Option<[f64; 2]>,
+    /// Longest side of the images, pixels: larger ones are averaged down.
+    #[arg(long)]
+    pub size: Option<usize>,
+    /// Depth searched before and behind the isocentre, mm.
+    #[arg(long, default_value_t = 100.0, value_name = "MM")]
+    pub depth: f64,
+}
+
+/// Parses `FIRST-LAST`.
+fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize>, String> {
+    let (first, last) = text.split_once('-').unwrap_or((text, text));
+    match (first.trim().parse(), last.trim().parse()) {
+        (Ok(first), Ok(last)) if first <= last => Ok(first..=last),
+        _ => Err("write it as FIRST-LAST, as in 5-12".into()),
+    }
+}
 
 /// A progress bar for work whose length is known as it goes.
 pub fn bar() -> impl FnMut(&str, u64, u64) {

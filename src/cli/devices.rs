@@ -1,12 +1,27 @@
 //! `devices` and `completions`.
 
-use super::args::{Cli, CompletionsArgs, DevicesArgs};
-use clap::CommandFactory;
+use super::args::Cli;
+use clap::{Args, CommandFactory};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
 use nertca_vk::gpu::device::list_devices;
 use nertca_vk::kernels::tuning::Tuning;
 use serde::Serialize;
+
+/// `devices`.
+#[derive(Debug, Args)]
+pub struct DevicesArgs {
+    /// JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `completions`.
+#[derive(Debug, Args)]
+pub struct CompletionsArgs {
+    /// Shell to print for.
+    pub shell: clap_complete::Shell,
+}
 
 #[derive(Serialize)]
 struct Row {

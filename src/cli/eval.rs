@@ -1,9 +1,10 @@
 //! `eval`.
 
-use super::args::{Cli, EvalArgs};
+use super::args::Cli;
 use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
 use super::volume_table;
+use clap::Args;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
@@ -12,7 +13,26 @@ use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::{BestDice, BestDices, Evaluation};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+/// `eval`.
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Dataset with validation frames; the one the run was trained on by default.
+    #[arg(long, value_name = "DATA")]
+    pub data: Option<PathBuf>,
+    /// JSON instead of a table.
+    #[arg(long)]
+    pub json: bool,
+    /// Leave comparison pictures and `report.html` here; without, a page without pictures is left in RUN as `eval.html`.
+    #[arg(long, value_name = "DIR")]
+    pub images: Option<PathBuf>,
+    /// Dice threshold on attenuation, 1/mm, instead of the rule.
+    #[arg(long, value_name = "PER_MM")]
+    pub threshold: Option<f64>,
+}
 
 /// Scores a run.
 pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {

@@ -1,7 +1,9 @@
 //! `export` and `convert`.
 
-use super::args::{Cli, ConvertArgs, ExportArgs};
+use super::args::{Cli, choice};
 use super::data::bar;
+use clap::Args;
+use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::motion::{MotionExport, MotionFormat, moving_tree, write_trajectories};
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
@@ -9,9 +11,63 @@ use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
 use nertca_vk::formats::nrrd::Encoding;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
+use nertca_vk::model::component::Component;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::score::eval::vessel_threshold_per_mm;
+use std::path::PathBuf;
+
+/// `export`.
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Field to export: both, the still background or the moving vessels.
+    #[arg(long, value_parser = choice::<Component>(), default_value = Component::Dynamic.name())]
+    pub component: Component,
+    /// Phase from 0, or `all`: a fourth axis, or a file per phase.
+    #[arg(long, default_value = "all")]
+    pub phase: String,
+    /// Distance between points, mm.
+    #[arg(long, default_value_t = 0.5, value_name = "MM")]
+    pub spacing: f64,
+    /// Format; by the end of --out otherwise.
+    #[arg(long, value_parser = choice::<Format>())]
+    pub format: Option<Format>,
+    /// Compress the values of an .nrrd (a .nii.gz is compressed by its name).
+    #[arg(long, conflicts_with = "mesh")]
+    pub compress: bool,
+    /// Surfaces of the vessels instead of volumes: --out ends in .stl, .ply, .obj (a file per phase) or .glb (animated).
+    #[arg(long, conflicts_with = "format")]
+    pub mesh: bool,
+    /// Attenuation of the surface, 1/mm; the Dice threshold otherwise.
+    #[arg(long, requires = "mesh", value_name = "PER_MM")]
+    pub iso: Option<f64>,
+    /// Motion instead of volumes: displacements from phase 0 at the nodes of the grid that moves the Gaussians, mm, where
+    /// one set moves (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion along a vessel is not observed in
+    /// projections: displacements along vessels come from smoothness alone, and no strain can be read from them.
+    #[arg(long, conflicts_with_all = ["mesh", "format", "component", "spacing"])]
+    pub motion: bool,
+    /// With --motion: the way of each Gaussian over the beat, its own motion included, as lines in a .vtk.
+    #[arg(long, requires = "motion", conflicts_with_all = ["compress", "phase"])]
+    pub trajectories: bool,
+    /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
+    #[arg(short, long, value_name = "FILE")]
+    pub out: PathBuf,
+}
+
+/// `convert`.
+#[derive(Debug, Args)]
+pub struct ConvertArgs {
+    /// Dataset directory in either layout.
+    pub data: PathBuf,
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    #[arg(long, value_parser = choice::<Layout>())]
+    pub layout: Layout,
+    /// Directory to make.
+    #[arg(short, long)]
+    pub out: PathBuf,
+}
 
 /// The phases `--phase` names, and whether it names all.
 pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {

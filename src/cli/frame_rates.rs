@@ -1,7 +1,7 @@
 //! Frames per second of renderings.
 
-use super::args::{Cli, RenderArgs};
-use super::render::shot;
+use super::args::Cli;
+use super::render::{RenderArgs, shot};
 use nertca_vk::error::Result;
 use nertca_vk::model::Model;
 use nertca_vk::model::component::Component;

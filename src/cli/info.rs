@@ -1,6 +1,6 @@
 //! `info`.
 
-use super::args::InfoArgs;
+use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
 use nertca_vk::files::pretty_json;
@@ -9,7 +9,21 @@ use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
 use nertca_vk::score::pictures::Window;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+/// `info`.
+#[derive(Debug, Args)]
+pub struct InfoArgs {
+    /// Dataset directory, run directory or checkpoint.
+    #[arg(required_unless_present = "schema")]
+    pub path: Option<PathBuf>,
+    /// JSON instead of text.
+    #[arg(long)]
+    pub json: bool,
+    /// Print the JSON schema of `dataset.json` and exit.
+    #[arg(long)]
+    pub schema: bool,
+}
 
 /// Describes a dataset or a run.
 pub fn info(args: &InfoArgs) -> Result<()> {

@@ -1,18 +1,60 @@
 //! `render`.
 
-use super::args::{Cli, RenderArgs};
+use super::args::{Cli, choice};
 use super::frame_rates::print_measured;
+use clap::Args;
+use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::images::MAX_SIDE;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
+use nertca_vk::model::component::Component;
 use nertca_vk::render::baked::{BAKED_CELLS, Baked};
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::score::pictures::{self, Window};
+use std::path::PathBuf;
 use std::sync::Arc;
+
+/// `render`.
+#[derive(Debug, Args)]
+pub struct RenderArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Primary angle, degrees, LAO positive.
+    #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
+    pub primary: f64,
+    /// Secondary angle, degrees, cranial positive.
+    #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
+    pub secondary: f64,
+    /// Phase from 0, or `all`; between two, as 3.4, where one set of Gaussians moves (preset fast, gaussians.form = "tree").
+    #[arg(long, default_value = "0", allow_negative_numbers = true)]
+    pub phase: String,
+    /// Pictures between neighbouring phases, for smooth animations with --phase all.
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=32))]
+    pub between: u32,
+    /// Field to show: both, the still background or the moving vessels.
+    #[arg(long, value_parser = choice::<Component>(), default_value = Component::Total.name())]
+    pub component: Component,
+    /// Line integral (`drr`) or largest attenuation along the ray (`mip`).
+    #[arg(long, value_parser = choice::<Projection>(), default_value = Projection::Drr.name())]
+    pub projection: Projection,
+    /// Columns and rows; those of the dataset by default.
+    #[arg(long)]
+    pub size: Option<usize>,
+    /// Through volumes baked from the fields: faster, and as fine as their cells.
+    #[arg(long)]
+    pub baked: bool,
+    /// Measure frames per second, read back to the host, of the chosen component turning about the patient: both ways, at
+    /// 200 x 200, 512 x 512, and --size.
+    #[arg(long)]
+    pub fps: bool,
+    /// Output: .png, .npy (floats; all phases stacked) or .gif (all phases).
+    #[arg(short, long, value_name = "FILE", required_unless_present = "fps")]
+    pub out: Option<PathBuf>,
+}
 
 /// Where and what to render.
 pub struct Shot {

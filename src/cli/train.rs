@@ -1,9 +1,10 @@
 //! `train`: a run and its report.
 
-use super::args::{Cli, TrainArgs};
+use super::args::{Cli, ConfigArgs};
 use super::eval::{as_trained, print_table};
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
+use clap::Args;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
@@ -17,7 +18,48 @@ use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::moving_field_warning;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+/// `train`.
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Dataset directory (native or authors' layout).
+    #[arg(required_unless_present = "print_config")]
+    pub data: Option<PathBuf>,
+    /// Run directory.
+    #[arg(short, long, value_name = "RUN", required_unless_present = "print_config")]
+    pub out: Option<PathBuf>,
+    /// Hyper-parameters.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// Length of the run (same as --set train.iterations=N).
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<u32>,
+    /// Seed (same as --set seed=S).
+    #[arg(long, value_name = "S")]
+    pub seed: Option<u32>,
+    /// Continue from the newest checkpoint in RUN, with its configuration.
+    #[arg(long, conflicts_with_all = ["preset", "config", "set", "iterations", "seed"])]
+    pub resume: bool,
+    /// Save and stop after N iterations; schedules keep the full length.
+    #[arg(long, value_name = "N")]
+    pub stop_at: Option<u32>,
+    /// One JSON object per line on stdout instead of a progress bar.
+    #[arg(long)]
+    pub json: bool,
+    /// Leave scores and pictures of the unseen images for `eval`.
+    #[arg(long)]
+    pub no_eval: bool,
+    /// Start over in a directory that already holds a run.
+    #[arg(short, long)]
+    pub force: bool,
+    /// Print the configuration as TOML and exit.
+    #[arg(long)]
+    pub print_config: bool,
+    /// Export the motion hull as NRRD and exit without training.
+    #[arg(long, value_name = "FILE.nrrd")]
+    pub export_hull: Option<PathBuf>,
+}
 
 fn config(args: &TrainArgs) -> Result<Config> {
     let iterations = args.iterations.map(|n| format!("train.iterations={n}"));

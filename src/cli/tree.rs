@@ -1,13 +1,37 @@
 //! `tree`.
 
-use super::args::{Cli, TreeArgs};
+use super::args::Cli;
 use super::data::bar;
 use super::export::phases;
+use clap::Args;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
+use std::path::PathBuf;
+
+/// `tree`.
+#[derive(Debug, Args)]
+pub struct TreeArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Phase from 0, or `all`. Where one set of Gaussians moves (gaussians.form = "tree"), point i of branch b is the same
+    /// material point at every phase; elsewhere each phase has a tree of its own, and program and file say "not tracked".
+    #[arg(long, default_value = "all")]
+    pub phase: String,
+    /// Attenuation from which the moving field is vessel, 1/mm; the Dice threshold otherwise.
+    #[arg(long, value_name = "PER_MM")]
+    pub threshold: Option<f64>,
+    /// Branches that end without reaching so far beyond the vessel they leave are spurs and left out, mm; three times what
+    /// the field resolves otherwise.
+    #[arg(long, value_name = "MM")]
+    pub min_branch: Option<f64>,
+    /// Output: .json (all phases), .vtp (a file per phase and a .pvd of them all, for ParaView, 3D Slicer and VMTK) or .swc
+    /// (a file per phase). Millimetres along (left, posterior, superior).
+    #[arg(short, long, value_name = "FILE")]
+    pub out: PathBuf,
+}
 
 /// Writes the vessels of a run as trees.
 pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {

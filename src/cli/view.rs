@@ -3,13 +3,14 @@
 //! Listens on 127.0.0.1 alone. Every request needs the token of the printed address, a host name that is this machine's,
 //! and, where a browser says so, to come from the page itself.
 
-use super::args::{Cli, ViewArgs};
+use super::args::Cli;
 use axum::Router;
 use axum::extract::{Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
+use clap::Args;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use nertca_vk::choice::Choice;
@@ -24,7 +25,18 @@ use nertca_vk::render::renderer::Renderer;
 use serde::Deserialize;
 use std::collections::HashMap;
 use std::net::{Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
+
+/// `view`.
+#[derive(Debug, Args)]
+pub struct ViewArgs {
+    /// Run directory or checkpoint file.
+    pub run: PathBuf,
+    /// Port on 127.0.0.1; a free one by default.
+    #[arg(long, default_value_t = 0)]
+    pub port: u16,
+}
 
 const PAGE: &str = include_str!("view.html");
 /// Side of a picture, pixels.

@@ -1,0 +1,292 @@
+//! What can be typed of synthetic data: views, C-arms, degradations.
+
+use super::args::{choice, pair, triple};
+use clap::Args;
+use nertca_vk::choice::Choice;
+use nertca_vk::error::Result;
+use nertca_vk::phantom::dataset::Setting;
+use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm, USUAL_BREATH_S};
+use nertca_vk::phantom::noise::Photons;
+use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
+use nertca_vk::scan::dataset::Layout;
+use nertca_vk::scan::gating::BeatScaling;
+use std::path::PathBuf;
+
+/// `phantom`.
+#[derive(Debug, Args)]
+pub struct PhantomArgs {
+    /// Directory to make.
+    pub out: PathBuf,
+    /// C-arm and volume of a published set-up: `xcat` (DSD 2500, DSO 450) or `magix` (DSD 2000, DSO 600).
+    #[arg(long, value_parser = choice::<Setting>(), default_value = Setting::Xcat.name())]
+    pub geometry: Setting,
+    /// Columns and rows of the images.
+    #[arg(long, default_value_t = 100)]
+    pub size: usize,
+    /// Cardiac phases.
+    #[arg(long, default_value_t = 10)]
+    pub phases: u32,
+    /// From where it is seen.
+    #[command(flatten)]
+    pub views: ViewAngleArgs,
+    /// Seed of shape, noise and degradations.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u32,
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
+    pub layout: Layout,
+    /// Coronary tree as JSON instead of the procedural one.
+    #[arg(long, value_name = "FILE")]
+    pub tree: Option<PathBuf>,
+    /// Chest CT in Hounsfield units behind the tree.
+    #[arg(long, value_name = "CT", requires = "tree")]
+    pub background: Option<PathBuf>,
+    /// C-arm with --tree.
+    #[command(flatten)]
+    pub c_arm: CArmArgs,
+    /// Attenuation of filled vessels with --tree, 1/mm.
+    #[arg(long, default_value_t = 0.10, value_name = "PER_MM")]
+    pub iodine: f64,
+    /// Do not write the voxel volumes (`volumes/*.nrrd`).
+    #[arg(long)]
+    pub no_volumes: bool,
+    /// A catheter of 2 mm (6F) in the aorta of the training views: its tip, in the ostium, goes with the heart, its other
+    /// end is still; not part of the masks.
+    #[arg(long, help_heading = DEGRADATIONS)]
+    pub catheter: bool,
+    /// What a cath lab's angiograms have.
+    #[command(flatten)]
+    pub degradations: DegradationArgs,
+}
+
+/// `project`.
+#[derive(Debug, Args)]
+pub struct ProjectArgs {
+    /// Volumes, one per phase in order: .npy .nii .nii.gz .nrrd .mha or raw binaries.
+    #[arg(required = true, value_name = "VOLUME")]
+    pub volumes: Vec<PathBuf>,
+    /// Directory to make.
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Columns and rows of the images.
+    #[arg(long, default_value_t = 200)]
+    pub size: usize,
+    /// From where it is seen.
+    #[command(flatten)]
+    pub views: ViewAngleArgs,
+    /// C-arm.
+    #[command(flatten)]
+    pub c_arm: CArmArgs,
+    /// Values are Hounsfield units, not attenuation per mm.
+    #[arg(long)]
+    pub hounsfield: bool,
+    /// Multiply values by this after reading.
+    #[arg(long, default_value_t = 1.0)]
+    pub scale: f32,
+    /// Voxels at or above this attenuation per mm are vessel, for the masks and the Dice threshold.
+    #[arg(long, value_name = "PER_MM")]
+    pub vessel: Option<f64>,
+    /// Voxel spacing of .npy and raw volumes, mm.
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple::<f64>)]
+    pub spacing: Option<[f64; 3]>,
+    /// Size of raw volumes, voxels.
+    #[arg(long, value_name = "X,Y,Z", value_parser = triple::<usize>)]
+    pub raw_size: Option<[usize; 3]>,
+    /// Element type of raw volumes: f32, f64, i16, u16 or u8, little endian.
+    #[arg(long, value_name = "TYPE")]
+    pub raw_type: Option<String>,
+    /// Put the centre of each volume at the isocentre.
+    #[arg(long)]
+    pub centre: bool,
+    /// Seed of noise and degradations.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u32,
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
+    pub layout: Layout,
+    /// What a cath lab's angiograms have.
+    #[command(flatten)]
+    pub degradations: DegradationArgs,
+}
+
+/// Heading of [`DegradationArgs`] in the help.
+const DEGRADATIONS: &str = "Degradations (of the training views; true values in truth.json)";
+
+/// What makes synthetic data worse, as a cath lab's are.
+#[derive(Debug, Args)]
+#[command(next_help_heading = DEGRADATIONS)]
+pub struct DegradationArgs {
+    /// Standard deviations of the stated geometry's errors: of both angles, degrees, and of the patient's position along each
+    /// axis, mm. Images are made with the true geometry.
+    #[arg(long, value_name = "DEG,MM", allow_hyphen_values = true, value_parser = geometry_error)]
+    pub geometry_error: Option<GeometryError>,
+    /// The heart breathes: its way along the body, peak to peak, mm, and the length of a breath, seconds (4 by default). Each
+    /// run begins anywhere in the breath; the background stays.
+    #[arg(long, value_name = "MM[,PERIOD_S]", allow_hyphen_values = true, value_parser = breathing)]
+    pub breathing: Option<Breathing>,
+    /// The diaphragm breathes, too, and with a CT or with volumes the lower front of the chest.
+    #[arg(long, requires = "breathing")]
+    pub breathing_background: bool,
+    /// Photon noise, of all views: photons per pixel of the open beam, before the patient.
+    #[arg(long, value_name = "N", allow_hyphen_values = true, conflicts_with = "detector_photons")]
+    pub photons: Option<f64>,
+    /// Photon noise, of all views: photons per pixel at the detector, behind the patient, as the mean over each image.
+    #[arg(long, value_name = "N", allow_hyphen_values = true)]
+    pub detector_photons: Option<f64>,
+    /// Contrast density differs between runs: its standard deviation, percent. Within a run it drifts half as much.
+    #[arg(long, value_name = "PERCENT", default_value_t = 0.0, allow_hyphen_values = true)]
+    pub contrast_variation: f64,
+    /// Beats per minute, one for all training views or one for each: images are taken at --fps from anywhere in the beat, and
+    /// each phase gets the nearest image by --gating, where one is nearer than half a phase. Regular phases without.
+    #[arg(long, value_name = "BPM[,BPM...]", value_delimiter = ',', allow_hyphen_values = true)]
+    pub heart_rate: Vec<f64>,
+    /// Images per second, as 7.5, 15 or 30.
+    #[arg(long, default_value_t = 15.0, requires = "heart_rate", allow_hyphen_values = true)]
+    pub fps: f64,
+    /// Length of each run, beats: contrast fills the vessels for about three.
+    #[arg(long, default_value_t = 3, requires = "heart_rate")]
+    pub beats: u32,
+    /// How time becomes phase: `two-segment` (systole keeps its length, diastole takes the rest) or `linear`.
+    #[arg(long, value_parser = choice::<BeatScaling>(), default_value = BeatScaling::TwoSegment.name(),
+        requires = "heart_rate")]
+    pub gating: BeatScaling,
+    /// A blade on one side hides about this share (0 to 0.9) of the moving vessels of each view.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, allow_hyphen_values = true)]
+    pub collimate: f64,
+}
+
+impl DegradationArgs {
+    /// The degradations asked for.
+    pub fn degradations(&self, catheter: bool) -> Degradations {
+        let background = self.breathing_background;
+        let open = self.photons.map(Photons::Unattenuated);
+        Degradations {
+            geometry_error: self.geometry_error,
+            breathing: self.breathing.map(|breathing| Breathing { background, ..breathing }),
+            photons: open.or(self.detector_photons.map(Photons::Detector)),
+            contrast_variation: self.contrast_variation / 100.0,
+            rhythm: (!self.heart_rate.is_empty()).then(|| Rhythm {
+                beats_per_min: self.heart_rate.clone(),
+                frames_per_s: self.fps,
+                beats: self.beats,
+                gating: self.gating,
+            }),
+            collimated_share: self.collimate,
+            catheter,
+        }
+    }
+}
+
+/// Views of synthetic data.
+#[derive(Debug, Args)]
+pub struct ViewAngleArgs {
+    /// Training views: the paper's 3, 4 or 9.
+    #[arg(long, default_value_t = 4, conflicts_with = "angles")]
+    pub views: u32,
+    /// Training views by primary and secondary angle, degrees (LAO and cranial positive), instead of the paper's.
+    #[arg(long, value_name = "P,S[;P,S...]", allow_hyphen_values = true, value_parser = view_angles)]
+    pub angles: Option<AngleList>,
+    /// Validation views, or `none`, instead of the paper's (of which those within 15 degrees of --angles are left out).
+    #[arg(long, value_name = "P,S[;P,S...]", allow_hyphen_values = true, value_parser = test_angles)]
+    pub test_angles: Option<AngleList>,
+}
+
+/// Angles of several views.
+#[derive(Debug, Clone)]
+pub struct AngleList(pub Vec<Angles>);
+
+impl ViewAngleArgs {
+    /// The views asked for.
+    pub fn views(&self) -> Result<ViewAngles> {
+        let validation = self.test_angles.as_ref().map(|list| list.0.as_slice());
+        let mut views = match &self.angles {
+            Some(list) => ViewAngles::given(&list.0, validation)?,
+            None => ViewAngles::published(self.views)?,
+        };
+        if let Some(validation) = validation {
+            views.validation = validation.to_vec();
+        }
+        Ok(views)
+    }
+}
+
+/// C-arms of synthetic data: one value for all views, or one for each, those of training first.
+#[derive(Debug, Args)]
+pub struct CArmArgs {
+    /// Source to isocentre, mm: one for all views, or one for each (training first, then validation).
+    #[arg(long, default_value = "750", value_name = "MM[,MM...]", value_delimiter = ',')]
+    pub sod: Vec<f64>,
+    /// Source to detector, mm: one for all views, or one for each.
+    #[arg(long, default_value = "1100", value_name = "MM[,MM...]", value_delimiter = ',')]
+    pub sid: Vec<f64>,
+    /// Field of view at the isocentre, mm.
+    #[arg(long, default_value_t = 160.0, value_name = "MM")]
+    pub fov: f64,
+    /// Pixel pitch on the detector along columns and rows, mm, instead of --fov: one number or two.
+    #[arg(long, value_name = "MM[,MM]", value_parser = pitch, conflicts_with = "fov")]
+    pub pixel: Option<[f64; 2]>,
+    /// Offset of the detector's centre along columns and rows, mm: one for all views, or one for each.
+    #[arg(long, default_value = "0,0", value_name = "U,V[;U,V...]", allow_hyphen_values = true, value_delimiter = ';',
+        value_parser = offset)]
+    pub offset: Vec<[f64; 2]>,
+}
+
+impl CArmArgs {
+    /// Whether nothing was asked for.
+    pub fn is_default(&self) -> bool {
+        let at_rest = self.offset == [[0.0; 2]] && self.pixel.is_none();
+        self.sod == [750.0] && self.sid == [1100.0] && self.fov == 160.0 && at_rest
+    }
+
+    /// The C-arms asked for.
+    pub fn options(&self) -> CArmOptions {
+        CArmOptions {
+            sod_mm: self.sod.clone(),
+            sid_mm: self.sid.clone(),
+            pixel: self.pixel.map_or(PixelPitch::FieldOfView(self.fov), PixelPitch::Detector),
+            offset_mm: self.offset.clone(),
+        }
+    }
+}
+
+/// Parses `DEG,MM`.
+fn geometry_error(text: &str) -> std::result::Result<GeometryError, String> {
+    let [angle_deg, position_mm] = pair(text).ok_or("degrees and mm are needed, as DEG,MM")?;
+    Ok(GeometryError { angle_deg, position_mm })
+}
+
+/// Parses `MM` or `MM,PERIOD_S`.
+fn breathing(text: &str) -> std::result::Result<Breathing, String> {
+    let both = pair(text).or_else(|| Some([text.trim().parse().ok()?, USUAL_BREATH_S]));
+    let [peak_to_peak_mm, period_s] = both.ok_or("mm are needed, or mm and seconds as MM,PERIOD_S")?;
+    Ok(Breathing { peak_to_peak_mm, period_s, background: false })
+}
+
+/// Parses a detector offset, `U,V`.
+fn offset(text: &str) -> std::result::Result<[f64; 2], String> {
+    pair(text).ok_or_else(|| "two lengths in mm are needed, as U,V".to_owned())
+}
+
+/// Parses `P,S[;P,S...]`.
+fn view_angles(text: &str) -> std::result::Result<AngleList, String> {
+    let view = |view: &str| match pair(view) {
+        Some([primary_deg, secondary_deg]) => Ok(Angles { primary_deg, secondary_deg }),
+        None => Err(format!("`{view}`: write primary and secondary angle as P,S and views as P,S;P,S")),
+    };
+    text.split(';').map(view).collect::<std::result::Result<_, _>>().map(AngleList)
+}
+
+/// Parses the same, or `none`.
+fn test_angles(text: &str) -> std::result::Result<AngleList, String> {
+    if text == "none" { Ok(AngleList(Vec::new())) } else { view_angles(text) }
+}
+
+/// Parses one length for both directions, or two.
+pub(super) fn pitch(text: &str) -> std::result::Result<[f64; 2], String> {
+    let parts: Vec<f64> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
+    match parts[..] {
+        [x] if x > 0.0 => Ok([x, x]),
+        [x, y] if x > 0.0 && y > 0.0 => Ok([x, y]),
+        _ => Err("one or two positive lengths in mm are needed".into()),
+    }
+}
