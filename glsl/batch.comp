@@ -1,7 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Draws the rays of one iteration. One invocation per ray.
-//   rays[n_rays] <- permutations of motion_rays and of all training rays, without replacement.
+//   rays[n_rays] <- permutations of the rays that meet the hull, and of all training rays or those listed as shown, without
+//   replacement.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/pixel_ray.glsl"
@@ -12,7 +13,7 @@ layout(binding = 2) readonly buffer B2 { View views[]; };
 layout(binding = 3) readonly buffer B3 { Frame frames[]; };
 layout(binding = 4) readonly buffer B4 { float images[]; };
 layout(binding = 5) readonly buffer B5 { vec2 backgrounds[]; };
-layout(binding = 6) readonly buffer B6 { uint motion_rays[]; };
+layout(binding = 6) readonly buffer B6 { uint listed_rays[]; };
 layout(binding = 7) writeonly buffer B7 { Ray rays[]; };
 
 uint draw(uint slot, uint per_step, uint n, uint stream) {
@@ -25,9 +26,12 @@ void main() {
     if (r >= setup.n_rays) return;
     uint id;
     if (r < setup.n_motion_rays) {
-        id = motion_rays[draw(r, setup.n_motion_rays, setup.n_motion_list, STREAM_MOTION_RAY)];
+        id = listed_rays[draw(r, setup.n_motion_rays, setup.n_motion_list, STREAM_MOTION_RAY)];
     } else {
-        id = draw(r - setup.n_motion_rays, setup.n_rays - setup.n_motion_rays, setup.n_all_rays, STREAM_RAY);
+        bool all = setup.n_shown_list == 0u;
+        uint n = all ? setup.n_all_rays : setup.n_shown_list;
+        id = draw(r - setup.n_motion_rays, setup.n_rays - setup.n_motion_rays, n, STREAM_RAY);
+        if (!all) id = listed_rays[setup.n_motion_list + id];
     }
     Frame frame = frames[id / setup.n_pixels];
     View view = views[frame.view];

@@ -58,7 +58,7 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
     if !cut.is_empty() {
         notes.push(format!(
             "vessels are cut off at the border of views {cut:?}: what other views show of them has no counterpart there, so \
-             corrections are less sure, and breathing is assumed only where it explains much"
+             corrections are less sure, and assumed only where they explain much"
         ));
     }
     let candidates = candidates(mode, config.gaussians_move(), &mut notes);
@@ -154,8 +154,11 @@ impl Calibrator<'_> {
         let tried: Vec<Validated> = candidates.iter().map(|c| validate(self.observed, *c)).collect();
         let residuals: Vec<f64> = tried.iter().map(|t| t.residual).collect();
         // Displacements of frames take up what is cut off more than positions of views do.
-        let breathing_gain = if cut_off(self.observed).is_empty() { choose::LEAST_GAIN } else { choose::LARGE_GAIN };
-        let gain = |k: usize| if candidates[k] == Correction::Breathing { breathing_gain } else { choose::LEAST_GAIN };
+        let gain = |k: usize| match candidates[k] {
+            _ if cut_off(self.observed).is_empty() => choose::LEAST_GAIN,
+            Correction::Breathing => choose::LARGE_GAIN,
+            _ => choose::CUT_OFF_GAIN,
+        };
         let chosen = best(&residuals, gain);
         let shares: Vec<_> = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();
         if candidates[chosen] == Correction::Stated {

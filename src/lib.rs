@@ -94,6 +94,7 @@ pub mod formats {
 pub mod scan {
     pub mod dataset;
     pub mod gating;
+    pub(crate) mod hidden;
     pub mod nerfca;
     pub mod truth;
     pub mod writer;

@@ -43,8 +43,8 @@ pub struct Plan {
     pub images: Vec<f32>,
     /// Bounds of the still background of each pixel of each view.
     pub backgrounds: Vec<[f32; 2]>,
-    /// Rays that meet the hull, as frame * pixels + pixel.
-    pub motion_rays: Vec<u32>,
+    /// Rays as frame * pixels + pixel: first those that meet the hull, then, where some pixels are hidden, all that are not.
+    pub listed_rays: Vec<u32>,
     /// The hull, when it is used.
     pub hull: Option<Hull>,
     /// What Gaussians are fitted to, when they are the moving field.
@@ -89,7 +89,7 @@ impl Plan {
         }
         let mut frames = Vec::with_capacity(training.len());
         let mut images = Vec::with_capacity(n_all);
-        let mut motion_rays = Vec::new();
+        let mut listed_rays = Vec::new();
         for (index, frame) in training.iter().enumerate() {
             let slot = slot_of_view[frame.view];
             frames.push(layout::Frame {
@@ -102,8 +102,14 @@ impl Plan {
             if hull.is_some() {
                 let m = &motion[slot as usize];
                 let moving = if config.hull.per_phase { &m.moving_at[frame.phase as usize] } else { &m.moving };
-                motion_rays.extend((0..pixels).filter(|p| moving[*p]).map(|p| (index * pixels + p) as u32));
+                let shown = (0..pixels).filter(|p| moving[*p] && dataset.shows(frame.view, *p));
+                listed_rays.extend(shown.map(|p| (index * pixels + p) as u32));
             }
+        }
+        let n_motion_list = listed_rays.len();
+        if !dataset.hidden.is_empty() {
+            let shown = |id: &usize| dataset.shows(training[id / pixels].view, id % pixels);
+            listed_rays.extend((0..n_all).filter(shown).map(|id| id as u32));
         }
         if config.loss.dynamic_target == DynamicTarget::Temporal && motion.iter().any(|m| m.n_phases < 2) {
             return Err(Error::config(
@@ -113,14 +119,15 @@ impl Plan {
             ));
         }
         let params = ParamLayout::new(config, dataset.n_phases as usize);
-        let n_motion_rays = if motion_rays.is_empty() {
+        let n_motion_rays = if n_motion_list == 0 {
             0
         } else {
             (f64::from(config.train.rays) * config.train.motion_share).round() as u32
         };
         let mut setup = scene.setup(config, &params, hull.as_ref());
         setup.n_motion_rays = n_motion_rays;
-        setup.n_motion_list = motion_rays.len() as u32;
+        setup.n_motion_list = n_motion_list as u32;
+        setup.n_shown_list = (listed_rays.len() - n_motion_list) as u32;
         setup.n_all_rays = n_all as u32;
         setup.n_pixels = pixels as u32;
         setup.image_width = dataset.width as u32;
@@ -135,7 +142,7 @@ impl Plan {
             frames,
             images,
             backgrounds,
-            motion_rays,
+            listed_rays,
             hull,
             targets,
             notes,
@@ -147,6 +154,7 @@ impl Plan {
         let setup = Setup {
             n_motion_rays: self.setup.n_motion_rays,
             n_motion_list: self.setup.n_motion_list,
+            n_shown_list: self.setup.n_shown_list,
             n_all_rays: self.setup.n_all_rays,
             n_pixels: self.setup.n_pixels,
             image_width: self.setup.image_width,

@@ -71,6 +71,7 @@ fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
         height: SIZE,
         n_phases: PHASES,
         depth_range: (-1.0, 1.0),
+        hidden: Default::default(),
         vessel_attenuation: None,
         notes: Vec::new(),
     }

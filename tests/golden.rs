@@ -66,6 +66,7 @@ impl Golden {
             height,
             n_phases: phases,
             depth_range: (-self.number("depth"), self.number("depth")),
+            hidden: Default::default(),
             vessel_attenuation: None,
             notes: Vec::new(),
         }
@@ -150,8 +151,8 @@ fn check(preset: Preset, name: &str) {
             bound("low").into_iter().zip(bound("high")).map(|(l, h)| [l as f32, h as f32]).collect::<Vec<_>>()
         })
         .collect();
-    plan.motion_rays = (0..plan.setup.n_all_rays).step_by(3).collect();
-    plan.setup.n_motion_list = plan.motion_rays.len() as u32;
+    plan.listed_rays = (0..plan.setup.n_all_rays).step_by(3).collect();
+    plan.setup.n_motion_list = plan.listed_rays.len() as u32;
     plan.setup.n_motion_rays = golden.number("n_motion") as u32;
     let gpu = gpu();
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();

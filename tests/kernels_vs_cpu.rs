@@ -242,3 +242,33 @@ fn ten_updates_across_the_delay_match() {
     }
     expect_silence(gpu);
 }
+
+/// Behind a blade nothing is drawn: the twin's rays, and none of them hidden, whether they meet the hull or not.
+#[test]
+fn hidden_pixels_are_never_drawn() {
+    let gpu = gpu();
+    let mut dataset = small_dataset(13, 11);
+    let blade: Vec<bool> = (0..dataset.n_pixels()).map(|p| p % 13 < 7).collect();
+    dataset.hidden.insert(0, blade.clone());
+    let settings = ["hull.enabled=true", "hull.max_share=1", "hull.resolution=24"];
+    let plan = Plan::new(&small_config("fast-mlp", &settings), &dataset).unwrap();
+    assert!(plan.setup.n_motion_list > 0 && plan.setup.n_shown_list > 0, "the case is about both lists");
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
+    let mut of_view = [0, 0];
+    for _ in 0..4 {
+        let step = trainer.advance(1).unwrap().last().unwrap().step - 1;
+        let plan = trainer.plan();
+        let got: Vec<Ray> = gpu.download(&trainer.forward().rays, 0, plan.setup.n_rays as usize).unwrap();
+        let want = march::batch(plan, step);
+        for (got, want) in got.iter().zip(&want) {
+            assert_eq!(got.id, want.id);
+            let (frame, pixel) = (got.id / plan.setup.n_pixels, got.id % plan.setup.n_pixels);
+            let view = dataset.training()[frame as usize].view;
+            assert!(view != 0 || !blade[pixel as usize], "ray {} is hidden", got.id);
+            of_view[usize::from(view != 0)] += 1;
+        }
+    }
+    assert!(of_view.iter().all(|n| *n > 20), "rays of the view behind the blade, and of others: {of_view:?}");
+    drop(trainer);
+    expect_silence(gpu);
+}

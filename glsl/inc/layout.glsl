@@ -23,9 +23,10 @@ struct Setup {
     uint hull_enabled;          // 1: there is a hull
     uint seed;                  // of all random numbers
     uint n_rays;                // rays of a batch
-    uint n_motion_rays;         // first rays of a batch, drawn from motion_rays
+    uint n_motion_rays;         // first rays of a batch, drawn from the first of listed_rays
     uint n_all_rays;            // training rays: frames x pixels
-    uint n_motion_list;         // length of motion_rays
+    uint n_motion_list;         // rays of listed_rays that meet the hull; they come first
+    uint n_shown_list;          // rays of listed_rays behind them, which the others are drawn from; 0: from all training rays
     uint n_pixels;              // pixels of one image
     uint image_width;           // columns of an image
     uint n_phases;              // cardiac phases

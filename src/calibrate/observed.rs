@@ -58,11 +58,18 @@ fn binned(values: &[f32], width: usize, factor: usize) -> Vec<f32> {
     out
 }
 
+/// Pixels of which a part is hidden.
+fn binned_hidden(hidden: &[bool], width: usize, factor: usize) -> Vec<bool> {
+    let values: Vec<f32> = hidden.iter().map(|h| f32::from(u8::from(*h))).collect();
+    binned(&values, width, factor).iter().map(|share| *share > 0.0).collect()
+}
+
 /// The training frames on larger pixels.
 fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
     let frame = |f: &Frame| Frame { integrals: binned(&f.integrals, dataset.width, factor), mask: None, ..f.clone() };
     let mut coarse = Dataset {
         frames: dataset.training().par_iter().map(frame).collect(),
+        hidden: dataset.hidden.iter().map(|(v, h)| (*v, binned_hidden(h, dataset.width, factor))).collect(),
         width: dataset.width / factor,
         height: dataset.height / factor,
         views: dataset.views.clone(),
@@ -79,6 +86,8 @@ struct Seen {
     stand: Stand,
     /// Pixels that change.
     mask: Vec<bool>,
+    /// The same with a margin.
+    wide_mask: Vec<bool>,
     /// `[phase]`: above the still background.
     above: Vec<Option<Vec<f32>>>,
     /// `[phase]`: pixels that show vessels.
@@ -102,45 +111,57 @@ impl Seen {
     fn new(data: &Dataset, series: &Series) -> Seen {
         let evidence = ViewEvidence::new(series);
         let level = &evidence.background.level.values;
-        let likely = |p: usize| evidence.ratios.iter().flatten().any(|r| r.values[p] > LIKELY);
+        let likely =
+            |p: usize| data.shows(series.view, p) && evidence.ratios.iter().flatten().any(|r| r.values[p] > LIKELY);
         let mask: Vec<bool> = (0..data.n_pixels()).map(likely).collect();
+        let mut wide_mask = widened(&mask, [data.width, data.height], MASK_MARGIN);
+        wide_mask.iter_mut().enumerate().for_each(|(p, m)| *m &= data.shows(series.view, p));
         let above = series.images.iter().map(|image| {
             let values = &image.as_ref()?.values;
             Some(values.iter().zip(level).map(|(y, b)| y - b).collect::<Vec<f32>>())
         });
         let above: Vec<_> = above.collect();
         let view = &data.views[series.view];
-        let shown = shown(&evidence);
+        let mut shown = shown(&evidence);
+        for pixels in shown.iter_mut().flatten() {
+            pixels.iter_mut().enumerate().for_each(|(p, s)| *s &= data.shows(series.view, p));
+        }
         let stand = Stand::new(&view.geometry, &view.rays);
         let values = series.seen().flat_map(|image| &image.values);
         let [least, most] = values.fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
         let change = f64::from(evidence.background.strongest) / f64::from(most - least).max(f64::MIN_POSITIVE);
         let noise = evidence.background.noise.values;
-        let mut seen = Seen { stand, mask, above, shown, noise, change, at_border: 0.0 };
-        seen.at_border = seen.share_at_border(data.width, data.height);
+        let mut seen = Seen { stand, mask, wide_mask, above, shown, noise, change, at_border: 0.0 };
+        seen.at_border = seen.share_at_border(&border(data, series.view));
         seen
     }
 
-    fn share_at_border(&self, width: usize, height: usize) -> f64 {
+    fn share_at_border(&self, border: &[bool]) -> f64 {
         let clear = |p: usize| CLEAR * self.noise[p];
         let change = |p: usize| -> f64 {
             self.above.iter().flatten().map(|y| y[p]).filter(|y| *y > clear(p)).map(f64::from).sum()
         };
-        let (mut all, mut border) = (f64::MIN_POSITIVE, 0.0);
+        let (mut all, mut beside) = (f64::MIN_POSITIVE, 0.0);
         for p in (0..self.mask.len()).filter(|p| self.mask[*p]) {
-            let (x, y) = (p % width, p / width);
             all += change(p);
-            if x.min(y).min(width - 1 - x).min(height - 1 - y) < BORDER {
-                border += change(p);
-            }
+            beside += if border[p] { change(p) } else { 0.0 };
         }
-        border / all
+        beside / all
     }
 }
 
-fn widened(mask: &[bool], [width, height]: [usize; 2]) -> Vec<bool> {
+/// Pixels next to what a view does not show: beyond the edges of its images, or hidden.
+fn border(data: &Dataset, view: usize) -> Vec<bool> {
+    let (width, height) = (data.width, data.height);
+    let hidden: Vec<bool> = (0..data.n_pixels()).map(|p| !data.shows(view, p)).collect();
+    let beside = widened(&hidden, [width, height], BORDER);
+    let at_edge = |p: usize| (p % width).min(p / width).min(width - 1 - p % width).min(height - 1 - p / width) < BORDER;
+    (0..data.n_pixels()).map(|p| at_edge(p) || beside[p]).collect()
+}
+
+fn widened(mask: &[bool], [width, height]: [usize; 2], pixels: usize) -> Vec<bool> {
     let values = mask.iter().map(|m| f32::from(u8::from(*m))).collect();
-    dilate(&Image { width, height, values }, MASK_MARGIN).values.iter().map(|v| *v > 0.0).collect()
+    dilate(&Image { width, height, values }, pixels).values.iter().map(|v| *v > 0.0).collect()
 }
 
 impl Observed {
@@ -156,7 +177,7 @@ impl Observed {
             let above = s.above.iter().map(|y| Some(y.as_ref()?.iter().map(|v| v.max(0.0)).collect()));
             Moving::new(s.stand.clone(), size, &s.mask, &above.collect::<Vec<_>>())
         };
-        let signed = |s: &Seen| Moving::new(s.stand.clone(), size, &widened(&s.mask, size), &s.above);
+        let signed = |s: &Seen| Moving::new(s.stand.clone(), size, &s.wide_mask, &s.above);
         Observed {
             views: series.iter().map(|s| s.view).collect(),
             coarse: Views::new(seen.iter().map(positive).collect(), n_phases),

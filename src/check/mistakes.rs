@@ -73,10 +73,10 @@ impl Mistake {
     pub fn undone(self, dataset: &Dataset) -> Option<Dataset> {
         let (w, h) = (dataset.width, dataset.height);
         match self {
-            Mistake::Transposed => images(dataset, (h, w), |values, i| values[i % h * w + i / h]),
-            Mistake::Mirrored => images(dataset, (w, h), |values, i| values[i / w * w + (w - 1 - i % w)]),
-            Mistake::UpsideDown => images(dataset, (w, h), |values, i| values[(h - 1 - i / w) * w + i % w]),
-            Mistake::Turned => images(dataset, (w, h), |values, i| values[w * h - 1 - i]),
+            Mistake::Transposed => moved(dataset, (h, w), |i| i % h * w + i / h),
+            Mistake::Mirrored => moved(dataset, (w, h), |i| i / w * w + (w - 1 - i % w)),
+            Mistake::UpsideDown => moved(dataset, (w, h), |i| (h - 1 - i / w) * w + i % w),
+            Mistake::Turned => moved(dataset, (w, h), |i| w * h - 1 - i),
             Mistake::AnglesExchanged => geometries(dataset, |c| CArm {
                 primary_deg: c.secondary_deg,
                 secondary_deg: c.primary_deg,
@@ -85,28 +85,26 @@ impl Mistake {
             Mistake::PitchAtIsocentre => {
                 geometries(dataset, |c| CArm { pixel_mm: c.pixel_mm.map(|p| p * c.sid_mm / c.sod_mm), ..c.clone() })
             }
-            Mistake::LogTwice => images(dataset, (w, h), |values, i| (-values[i]).exp()),
+            Mistake::LogTwice => Some(revalued(dataset, |v| (-v).exp())),
             Mistake::LogMissing => {
                 let brightest = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(0f32, f32::max);
                 let least = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(f32::INFINITY, f32::min);
                 // Intensities are never negative.
-                (brightest > 0.0 && least >= 0.0)
-                    .then(|| images(dataset, (w, h), |values, i| -(values[i] / brightest).max(DARKEST).ln()))
-                    .flatten()
+                (brightest > 0.0 && least >= 0.0).then(|| revalued(dataset, |v| -(v / brightest).max(DARKEST).ln()))
             }
         }
     }
 }
 
-/// The dataset with its training images resampled, each from itself.
-fn images(dataset: &Dataset, (width, height): (usize, usize), at: impl Fn(&[f32], usize) -> f32) -> Option<Dataset> {
-    let mut changed = dataset.clone();
+/// The dataset with the pixels of its training images elsewhere: `from` says where each was.
+fn moved(dataset: &Dataset, (width, height): (usize, usize), from: impl Fn(usize) -> usize) -> Option<Dataset> {
+    let mut changed = revalued(dataset, |v| v);
     (changed.width, changed.height) = (width, height);
-    changed.frames = dataset.training().to_vec();
     for frame in &mut changed.frames {
-        let values = std::mem::take(&mut frame.integrals);
-        frame.integrals = (0..values.len()).map(|i| at(&values, i)).collect();
-        frame.mask = None;
+        frame.integrals = (0..frame.integrals.len()).map(|i| frame.integrals[from(i)]).collect();
+    }
+    for hidden in changed.hidden.values_mut() {
+        *hidden = (0..hidden.len()).map(|i| hidden[from(i)]).collect();
     }
     if (width, height) != (dataset.width, dataset.height) {
         for view in &mut changed.views {
@@ -114,6 +112,16 @@ fn images(dataset: &Dataset, (width, height): (usize, usize), at: impl Fn(&[f32]
         }
     }
     Some(changed)
+}
+
+/// The dataset with other values in its training images.
+fn revalued(dataset: &Dataset, value: impl Fn(f32) -> f32) -> Dataset {
+    let mut changed = Dataset { frames: dataset.training().to_vec(), ..dataset.clone() };
+    for frame in &mut changed.frames {
+        frame.integrals.iter_mut().for_each(|v| *v = value(*v));
+        frame.mask = None;
+    }
+    changed
 }
 
 /// The dataset with other C-arms; none where a geometry is a matrix, or would be impossible.

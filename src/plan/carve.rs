@@ -16,7 +16,7 @@ pub fn carve(dataset: &Dataset, motion: &[ViewMotion], half: f64, resolution: us
     let cell = 2.0 * half / n as f64;
     let min = DVec3::splat(-half);
     let projectors: Vec<_> =
-        motion.iter().map(|m| Projector::new(&dataset.views[m.view].rays, dataset.width, dataset.height)).collect();
+        motion.iter().map(|m| Projector::new(dataset, m.view, &dataset.views[m.view].rays)).collect();
     let needed = motion.len().min(2);
     // For each kept cell, the pixel it falls on in each view.
     let kept: Vec<(usize, Vec<Option<usize>>)> = (0..cells)
@@ -53,17 +53,21 @@ pub fn carve(dataset: &Dataset, motion: &[ViewMotion], half: f64, resolution: us
 }
 
 /// World point to pixel.
-pub(super) struct Projector {
+pub(super) struct Projector<'a> {
     source: DVec3,
     inverse: DMat3,
     width: i64,
     height: i64,
+    dataset: &'a Dataset,
+    view: usize,
 }
 
-impl Projector {
-    pub(super) fn new(rays: &ViewRays, width: usize, height: usize) -> Self {
+impl<'a> Projector<'a> {
+    /// Of a view, by its rays or by those that frames of it see the heart by.
+    pub(super) fn new(dataset: &'a Dataset, view: usize, rays: &ViewRays) -> Self {
         let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
-        Projector { source: rays.source(), inverse: basis.inverse(), width: width as i64, height: height as i64 }
+        let (width, height) = (dataset.width as i64, dataset.height as i64);
+        Projector { source: rays.source(), inverse: basis.inverse(), width, height, dataset, view }
     }
 
     /// Index of the pixel a point falls on; `None` when the view does not see it.
@@ -73,6 +77,8 @@ impl Projector {
             return None;
         }
         let (i, j) = ((h.x / h.z).round() as i64, (h.y / h.z).round() as i64);
-        (i >= 0 && j >= 0 && i < self.width && j < self.height).then_some((j * self.width + i) as usize)
+        let inside = i >= 0 && j >= 0 && i < self.width && j < self.height;
+        let pixel = inside.then_some((j * self.width + i) as usize)?;
+        self.dataset.shows(self.view, pixel).then_some(pixel)
     }
 }

@@ -208,6 +208,7 @@ mod tests {
             n_phases: 2,
             notes: Vec::new(),
             depth_range: (-0.9, 0.9),
+            hidden: Default::default(),
             vessel_attenuation: None,
         }
     }

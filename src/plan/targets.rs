@@ -126,7 +126,8 @@ impl Targets {
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };
-        let weights: Vec<Vec<f32>> = motion.views.iter().map(|v| weights(v, strongest, settings.noise_scale)).collect();
+        let weights: Vec<Vec<f32>> =
+            motion.views.iter().map(|v| weights(dataset, v, strongest, settings.noise_scale)).collect();
         // Images of a phase follow each other.
         for phase in 0..n_phases {
             for (slot, (series, view)) in series.iter().zip(&motion.views).enumerate() {
@@ -186,8 +187,12 @@ impl Targets {
     }
 }
 
-/// Residuals count less where pixels are noisy, so that the loss bends later there.
-fn weights(view: &ViewEvidence, strongest: f64, scale: f64) -> Vec<f32> {
-    let weight = |noise: f64| if scale > 0.0 { 1.0 / (1.0 + (noise / scale).powi(2)).sqrt() } else { 1.0 };
-    view.background.noise.values.iter().map(|s| weight(f64::from(*s) / strongest) as f32).collect()
+/// Residuals count less where pixels are noisy, so that the loss bends later there, and nothing where pixels are hidden.
+fn weights(dataset: &Dataset, view: &ViewEvidence, strongest: f64, scale: f64) -> Vec<f32> {
+    let weight = |(pixel, noise): (usize, &f32)| match f64::from(*noise) / strongest {
+        _ if !dataset.shows(view.view, pixel) => 0.0,
+        noise if scale > 0.0 => (1.0 / (1.0 + (noise / scale).powi(2)).sqrt()) as f32,
+        _ => 1.0,
+    };
+    view.background.noise.values.iter().enumerate().map(weight).collect()
 }

@@ -34,9 +34,13 @@ pub fn batch(plan: &Plan, step: u32) -> Vec<Ray> {
     (0..s.n_rays)
         .map(|r| {
             let id = if r < s.n_motion_rays {
-                plan.motion_rays[draw(r, s.n_motion_rays, s.n_motion_list, STREAM_MOTION_RAY) as usize]
+                plan.listed_rays[draw(r, s.n_motion_rays, s.n_motion_list, STREAM_MOTION_RAY) as usize]
             } else {
-                draw(r - s.n_motion_rays, s.n_rays - s.n_motion_rays, s.n_all_rays, STREAM_RAY)
+                let drawn = |n: u32| draw(r - s.n_motion_rays, s.n_rays - s.n_motion_rays, n, STREAM_RAY);
+                match s.n_shown_list {
+                    0 => drawn(s.n_all_rays),
+                    n => plan.listed_rays[(s.n_motion_list + drawn(n)) as usize],
+                }
             };
             ray(plan, id)
         })

@@ -9,6 +9,7 @@ use crate::raster::Image;
 use crate::scan::nerfca;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Name of the manifest inside a native dataset.
@@ -199,6 +200,9 @@ pub struct Dataset {
     pub views: Vec<View>,
     /// All images; those of training first.
     pub frames: Vec<Frame>,
+    /// Pixels that show nothing of the patient, such as those behind a collimator's blade, by index into `views`; views without
+    /// such pixels are left out.
+    pub hidden: BTreeMap<usize, Vec<bool>>,
     /// Image columns.
     pub width: usize,
     /// Image rows.
@@ -478,18 +482,21 @@ impl Builder {
         }
         self.frames.sort_by_key(|f| f.split);
         self.notes.extend(untrained_phases(&self.frames, self.n_phases));
-        Ok(Dataset {
+        let mut dataset = Dataset {
             path: path.to_path_buf(),
             layout,
             views: self.views,
             frames: self.frames,
+            hidden: BTreeMap::new(),
             width,
             height,
             n_phases: self.n_phases,
             depth_range: self.depth_range,
             vessel_attenuation: self.vessel_attenuation,
             notes: self.notes,
-        })
+        };
+        dataset.hide();
+        Ok(dataset)
     }
 }
 

@@ -5,6 +5,7 @@ use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::gating::RPeaks;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// What a session is about.
@@ -164,18 +165,21 @@ impl Inbox {
             )));
         };
         let half = self.options.depth_half_extent_mm / MM_PER_UNIT;
-        Ok(Dataset {
+        let mut dataset = Dataset {
             path: PathBuf::from("session"),
             layout: Layout::Native,
             views: self.views.clone(),
             frames,
+            hidden: BTreeMap::new(),
             width,
             height,
             n_phases: self.options.phases,
             depth_range: (-half, half),
             vessel_attenuation: self.options.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT),
             notes: Vec::new(),
-        })
+        };
+        dataset.hide();
+        Ok(dataset)
     }
 
     /// The training frames: with a temporal target, those of views seen at two phases or more.

@@ -31,8 +31,8 @@ buffer_set! {
         images,
         /// Still backgrounds of each view: lower and upper bound per pixel.
         backgrounds,
-        /// Rays that meet the hull.
-        motion_rays,
+        /// Rays that meet the hull, then those that are not hidden, where some are.
+        listed_rays,
         /// [`StepReport`]s of the last iterations.
         ring,
         /// Gradient of each ray's two integrals.
@@ -67,7 +67,7 @@ impl TrainingBuffers {
             frames: gpu.buffer_with("frames", &plan.frames)?,
             images: gpu.buffer_with("images", &plan.images)?,
             backgrounds: gpu.buffer_with("backgrounds", &plan.backgrounds)?,
-            motion_rays: gpu.buffer_with("motion_rays", &plan.motion_rays)?,
+            listed_rays: gpu.buffer_with("listed_rays", &plan.listed_rays)?,
             ring: gpu.buffer("ring", ring_bytes, Memory::Readback)?,
             ray_gradient: new(Binding::ray_gradient, n_rays * 8)?,
             ray_loss: new(Binding::ray_loss, n_rays * 16)?,

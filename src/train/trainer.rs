@@ -551,6 +551,7 @@ mod tests {
             n_phases: 2,
             notes: Vec::new(),
             depth_range: (-1.0, 1.0),
+            hidden: Default::default(),
             vessel_attenuation: None,
         }
     }

@@ -149,6 +149,7 @@ impl Studio {
             height: self.size,
             n_phases: PHASES,
             depth_range: (-1.26, 1.26),
+            hidden: Default::default(),
             vessel_attenuation: Some(Tissues::XCAT.vessel * 100.0),
             notes: Vec::new(),
         }

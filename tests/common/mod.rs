@@ -86,6 +86,7 @@ pub fn small_dataset(width: usize, height: usize) -> Dataset {
         height,
         n_phases: phases,
         depth_range: (-0.9, 0.9),
+        hidden: Default::default(),
         vessel_attenuation: Some(1.0),
         notes: Vec::new(),
     }

@@ -68,7 +68,7 @@ fn threshold(n_views: usize) -> f32 {
 /// The views' pixels under points, and what they add up to.
 struct Votes<'a> {
     /// Of each view, or of each view at each phase where the heart's displacement differs from frame to frame.
-    projectors: Vec<Vec<Projector>>,
+    projectors: Vec<Vec<Projector<'a>>>,
     views: &'a [ViewEvidence],
     /// Largest ratio of each pixel over the phases, per view.
     largest: Vec<Vec<f32>>,
@@ -77,9 +77,9 @@ struct Votes<'a> {
 }
 
 impl<'a> Votes<'a> {
-    fn new(dataset: &Dataset, views: &'a [ViewEvidence]) -> Votes<'a> {
-        let projector = |rays: &ViewRays| Projector::new(rays, dataset.width, dataset.height);
+    fn new(dataset: &'a Dataset, views: &'a [ViewEvidence]) -> Votes<'a> {
         let projectors = |v: &ViewEvidence| -> Vec<Projector> {
+            let projector = |rays: &ViewRays| Projector::new(dataset, v.view, rays);
             if !dataset.heart_shifts() {
                 return vec![projector(&dataset.views[v.view].rays)];
             }

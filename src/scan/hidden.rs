@@ -1,0 +1,170 @@
+//! Pixels that show nothing of the patient: behind a collimator's blade, or outside a round detector.
+
+use crate::scan::dataset::{Dataset, Frame, Split};
+use std::collections::VecDeque;
+
+/// Pixels so little below the darkest, as a share of an image's range, are as dark.
+const AS_DARK: f32 = 1e-4;
+
+impl Dataset {
+    /// Whether an image of a view shows the patient at a pixel.
+    pub fn shows(&self, view: usize, pixel: usize) -> bool {
+        self.hidden.get(&view).is_none_or(|hidden| !hidden[pixel])
+    }
+
+    /// Finds the pixels that hide the patient. What a blade or a rim hides reads the same number in all images of a view,
+    /// the darkest of each, from the border of the image on; the pixels next to it are half hidden. Training images go on
+    /// there as at the edge, so that nothing takes a blade for tissue.
+    pub(crate) fn hide(&mut self) {
+        for view in 0..self.views.len() {
+            let frames: Vec<&Frame> = self.frames.iter().filter(|f| f.view == view).collect();
+            let hidden = hidden(&frames, self.width, self.height);
+            let count = hidden.iter().filter(|h| **h).count();
+            if count == 0 {
+                continue;
+            }
+            self.notes.push(format!(
+                "view {view}: {:.0} % of the pixels are hidden, as behind a collimator's blade: nothing is learned from them",
+                100.0 * count as f64 / self.n_pixels() as f64
+            ));
+            let nearest = nearest_shown(&hidden, self.width);
+            for frame in self.frames.iter_mut().filter(|f| f.view == view && f.split == Split::Train) {
+                frame.integrals = nearest.iter().map(|p| frame.integrals[*p]).collect();
+            }
+            self.hidden.insert(view, hidden);
+        }
+    }
+}
+
+/// Hidden pixels of a view, of which some are shown; none where fewer are as dark than the shorter side of the image has.
+fn hidden(frames: &[&Frame], width: usize, height: usize) -> Vec<bool> {
+    let mut dark = vec![!frames.is_empty(); width * height];
+    for frame in frames {
+        let [least, most] = frame.integrals.iter().fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
+        let limit = most - AS_DARK * (most - least);
+        dark.iter_mut().zip(&frame.integrals).for_each(|(dark, v)| *dark &= least < most && *v >= limit);
+    }
+    let border = (0..dark.len()).filter(|p| dark[*p] && at_border(*p, width, height));
+    let reached = flood(border, width, height, |p| dark[p]);
+    let mut hidden: Vec<bool> = reached.iter().map(Option::is_some).collect();
+    let count = hidden.iter().filter(|h| **h).count();
+    if count < width.min(height) {
+        return vec![false; hidden.len()];
+    }
+    let beside: Vec<usize> =
+        (0..hidden.len()).filter(|p| !hidden[*p] && neighbours(*p, width, height).any(|q| hidden[q])).collect();
+    if count + beside.len() == hidden.len() {
+        return vec![false; hidden.len()];
+    }
+    beside.into_iter().for_each(|p| hidden[p] = true);
+    hidden
+}
+
+/// Of each pixel, the nearest that is shown.
+fn nearest_shown(hidden: &[bool], width: usize) -> Vec<usize> {
+    let shown = (0..hidden.len()).filter(|p| !hidden[*p]);
+    let from = flood(shown, width, hidden.len() / width, |_| true);
+    from.iter().enumerate().map(|(p, from)| from.unwrap_or(p)).collect()
+}
+
+/// From which of the `starts` each pixel is reached first, by steps along rows and columns to pixels that `enters` allows.
+fn flood(
+    starts: impl Iterator<Item = usize>,
+    width: usize,
+    height: usize,
+    enters: impl Fn(usize) -> bool,
+) -> Vec<Option<usize>> {
+    let mut from = vec![None; width * height];
+    let mut queue: VecDeque<usize> = starts.inspect(|p| from[*p] = Some(*p)).collect();
+    while let Some(pixel) = queue.pop_front() {
+        for next in neighbours(pixel, width, height).filter(|p| enters(*p)) {
+            if from[next].is_none() {
+                from[next] = from[pixel];
+                queue.push_back(next);
+            }
+        }
+    }
+    from
+}
+
+fn at_border(pixel: usize, width: usize, height: usize) -> bool {
+    let (x, y) = (pixel % width, pixel / width);
+    x == 0 || y == 0 || x + 1 == width || y + 1 == height
+}
+
+fn neighbours(pixel: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
+    let (x, y) = (pixel % width, pixel / width);
+    let beside = [
+        (x > 0).then(|| pixel - 1),
+        (x + 1 < width).then(|| pixel + 1),
+        (y > 0).then(|| pixel - width),
+        (y + 1 < height).then(|| pixel + width),
+    ];
+    beside.into_iter().flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 30;
+    const HEIGHT: usize = 20;
+
+    fn frame(phase: u32, value: impl Fn(usize, usize) -> f32) -> Frame {
+        Frame {
+            name: String::new(),
+            view: 0,
+            phase,
+            split: Split::Train,
+            integrals: (0..WIDTH * HEIGHT).map(|p| value(p % WIDTH, p / WIDTH)).collect(),
+            mask: None,
+            heart_shift_mm: [0.0; 3],
+        }
+    }
+
+    fn hidden_of(frames: &[Frame]) -> Vec<bool> {
+        hidden(&frames.iter().collect::<Vec<_>>(), WIDTH, HEIGHT)
+    }
+
+    /// A chest, a vessel that moves, and darkness from `first` on.
+    fn chest(phase: u32, dark: f32, first: usize) -> Frame {
+        frame(phase, move |x, y| match x {
+            x if x >= first => dark,
+            x if x + 1 == first => 0.5 * dark,
+            x if x == 5 + phase as usize => 2.0,
+            _ => 1.0 + 0.01 * y as f32,
+        })
+    }
+
+    #[test]
+    fn a_blade_and_the_pixels_it_half_covers_are_hidden() {
+        // Each image on a scale of its own, as when frames state intensities.
+        let frames = [chest(0, 9.0, 24), chest(1, 8.0, 24), chest(2, 9.5, 24)];
+        let hidden = hidden_of(&frames);
+        assert!(hidden.iter().enumerate().all(|(p, h)| *h == (p % WIDTH >= 23)));
+        let nearest = nearest_shown(&hidden, WIDTH);
+        assert!(nearest.iter().enumerate().all(|(p, q)| *q == p / WIDTH * WIDTH + (p % WIDTH).min(22)));
+    }
+
+    #[test]
+    fn the_corners_of_a_round_detector_are_hidden() {
+        let outside = |x: usize, y: usize| (x as f32 - 14.5).powi(2) + (y as f32 - 9.5).powi(2) > 200.0;
+        let frames = [0, 1].map(|t| frame(t, move |x, y| if outside(x, y) { 5.0 } else { 1.0 + t as f32 * 0.1 }));
+        let hidden = hidden_of(&frames);
+        assert!((0..hidden.len()).filter(|p| outside(p % WIDTH, p / WIDTH)).all(|p| hidden[p]));
+        assert!(!hidden[10 * WIDTH + 15] && hidden.iter().filter(|h| **h).count() < WIDTH * HEIGHT / 2);
+    }
+
+    #[test]
+    fn what_shows_the_patient_is_not_hidden() {
+        let none = |frames: &[Frame]| hidden_of(frames).iter().all(|h| !h);
+        assert!(none(&[chest(0, 9.0, usize::MAX), chest(1, 9.0, usize::MAX)]), "nothing is dark");
+        assert!(none(&[frame(0, |_, _| 3.0), frame(1, |_, _| 3.0)]), "images that show nothing anywhere");
+        // A dense spot in the middle, a border that darkens at one phase only, and one whose darkness has structure.
+        assert!(none(&[frame(0, |x, y| if x.abs_diff(15) < 4 && y.abs_diff(10) < 4 { 9.0 } else { 1.0 })]));
+        assert!(none(&[chest(0, 9.0, 24), chest(1, 9.0, usize::MAX)]));
+        assert!(none(&[0, 1].map(|t| frame(t, |x, y| if x > 24 { 8.0 + 0.01 * y as f32 } else { 1.0 }))));
+        assert!(none(&[0, 1].map(|t| frame(t, |x, y| if x + y < 3 { 9.0 } else { 1.0 }))), "a few pixels are no blade");
+        assert!(none(&[]));
+    }
+}
