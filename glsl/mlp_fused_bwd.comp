@@ -60,11 +60,10 @@ float bias_sum[8];
 float out_sum[8];
 float out_bias_sum;
 
+#include "inc/sample_gradient.glsl"
+
 float sample_gradient(uint s) {
-    if (s >= live.count) return 0.0;
-    uint ray = sample_rays[s];
-    float per_integral = ray_gradient[ray_of(ray)].y + (is_near(ray) ? setup.occlusion_weight : 0.0);
-    return state.loss_scale * per_integral * sample_points[s].w * sample_sigma[s].y;
+    return s < live.count ? state.loss_scale * feature_gradient(s) : 0.0;
 }
 
 void stage(uint first) {

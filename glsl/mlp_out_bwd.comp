@@ -17,16 +17,12 @@ READ_VEC4(6, B6, activations);
 READ_VEC4(7, B7, params);
 layout(binding = 8) writeonly buffer B8 { float sample_feature_gradient[]; };
 layout(binding = 9) writeonly buffer B9 { vec4 dz[]; };
+#include "inc/sample_gradient.glsl"
 
 void main() {
     uint s = gl_GlobalInvocationID.x;
     if (s >= live.padded) return;
-    float gradient = 0.0;
-    if (s < live.count) {
-        uint ray = sample_rays[s];
-        float per_integral = ray_gradient[ray_of(ray)].y + (is_near(ray) ? setup.occlusion_weight : 0.0);
-        gradient = per_integral * sample_points[s].w * sample_sigma[s].y;
-    }
+    float gradient = s < live.count ? feature_gradient(s) : 0.0;
     sample_feature_gradient[s] = gradient;
     for (uint q = 0u; q < push.groups; q++) {
         vec4 on = vec4(greaterThan(FETCH(activations, q * push.capacity + s), vec4(0.0)));

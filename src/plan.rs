@@ -9,6 +9,7 @@ pub mod remainder;
 pub mod scale;
 pub mod seeds;
 pub mod soft_hull;
+pub mod start;
 pub mod targets;
 
 use crate::config::{Config, DynamicTarget, GaussianForm};
@@ -49,6 +50,8 @@ pub struct Plan {
     pub hull: Option<Hull>,
     /// What Gaussians are fitted to, when they are the moving field.
     pub targets: Option<Targets>,
+    /// Weighted loss of the moving field when there is none, where a network moves with a temporal target.
+    pub empty_loss: Option<f64>,
     /// Decisions worth telling the user.
     pub notes: Vec<String>,
 }
@@ -73,6 +76,9 @@ impl Plan {
             (choose_hull(config, dataset, &motion, &mut notes), None)
         };
         let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
+        let compared = targets.is_none() && config.loss.dynamic_target == DynamicTarget::Temporal;
+        let empty_loss = compared
+            .then(|| scene.dynamic_weight * scene.start(config, dataset, &motion, hull.as_ref()).empty_loss());
         let pixels = dataset.n_pixels();
         let training = dataset.training();
         let n_all = training.len() * pixels;
@@ -145,6 +151,7 @@ impl Plan {
             listed_rays,
             hull,
             targets,
+            empty_loss,
             notes,
         })
     }

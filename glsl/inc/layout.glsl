@@ -41,6 +41,7 @@ struct Setup {
     float static_gain;          // see `static_shift`
     float dynamic_shift;        // sigma_s = gain * softplus(feature + shift)
     float dynamic_gain;         // see `dynamic_shift`
+    float least_slope;          // of sigma_s by its feature, where a ray asks for more; 0: as the softplus has it
     float static_weight;        // 1 / (mean integral)^2, 1 without normalisation
     float dynamic_weight;       // weight of a squared residual of the dynamic field
     float robust_scale;         // residuals of the dynamic field beyond this count linearly; 0: squared

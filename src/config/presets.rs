@@ -39,6 +39,7 @@ fn paper() -> Config {
             render_samples: 256,
             per_ray_depths: true,
             fit_dynamic_range: false,
+            fit_static_range: false,
         },
         static_field: StaticField {
             grid: 48,
@@ -67,6 +68,8 @@ fn paper() -> Config {
             lr_end: 1e-2,
             decay: Decay::Linear,
             normalised_shift: -2.0,
+            best_start: false,
+            least_slope: 0.0,
             occlusion: 1e-8,
             occlusion_share: 0.2,
         },
@@ -168,7 +171,15 @@ fn fast(mlp: Config) -> Config {
         // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does not.
         static_field: StaticField { tv: 100.0, ..mlp.static_field },
         // The network is never asked; the smallest one takes no memory.
-        dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, window_start: 0.0, ..mlp.dynamic },
+        dynamic: DynamicField {
+            layers: 1,
+            width: 16,
+            latent: 4,
+            bands: 1,
+            window_start: 0.0,
+            best_start: false,
+            ..mlp.dynamic
+        },
         occupancy: Occupancy { enabled: false, ..mlp.occupancy },
         gaussians: Gaussians { form: GaussianForm::Auto, ..mlp.gaussians },
         ..mlp
@@ -194,6 +205,7 @@ fn fast_mlp(paper: Config) -> Config {
             render_samples: 256,
             per_ray_depths: true,
             fit_dynamic_range: true,
+            fit_static_range: true,
         },
         static_field: StaticField { half_extent_mm: 0.0, tv: 1e-3, ..paper.static_field },
         dynamic: DynamicField {
@@ -207,6 +219,8 @@ fn fast_mlp(paper: Config) -> Config {
             delay: 0,
             lr: 1e-2,
             lr_end: 3e-4,
+            best_start: true,
+            least_slope: 1e-3,
             occlusion: 0.0,
             ..paper.dynamic
         },

@@ -77,6 +77,8 @@ section! {
         per_ray_depths: bool,
         /// Spread the dynamic field's depths over its own box instead of the whole depth range.
         fit_dynamic_range: bool,
+        /// Look for the static field only as near and as far as its box reaches.
+        fit_static_range: bool,
     }
 }
 
@@ -87,7 +89,7 @@ section! {
         grid: u32 in 2.0 to 512.0,
         /// Ranks per mode, R.
         ranks: u32 in 1.0 to 64.0,
-        /// Half side of its box, mm; 0 = the dataset's depth range.
+        /// Half side of its box, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is less.
         half_extent_mm: f64 in 0.0 to 1e5,
         /// Standard deviation of the initial planes and lines.
         init_std: f64 in 0.0 to 10.0,
@@ -135,8 +137,12 @@ section! {
         lr_end: f64 in 0.0 to 100.0,
         /// How it decays.
         decay: Decay,
-        /// Shift inside its softplus when the problem is normalised, at most: deep hulls start lower.
+        /// Shift inside its softplus when the problem is normalised.
         normalised_shift: f64 in -20.0 to 20.0,
+        /// Start, with a temporal target, where the best constant field is instead.
+        best_start: bool,
+        /// Least slope of its softplus where a ray asks for more, so that the field cannot die; 0 = none.
+        least_slope: f64 in 0.0 to 1.0,
         /// Weight of occlusion minimisation, lambda_o.
         occlusion: f64 in 0.0 to 1e6,
         /// Share of the depth range, from the source, it covers.

@@ -54,6 +54,7 @@ impl Scene {
         setup.static_weight = self.static_weight as f32;
         setup.dynamic_weight = self.dynamic_weight as f32;
         setup.robust_scale = self.robust_scale as f32;
+        setup.least_slope = (config.dynamic.least_slope * self.dynamic_gain) as f32;
         setup.temporal_target = u32::from(config.loss.dynamic_target == DynamicTarget::Temporal);
         setup.occlusion_weight = config.dynamic.occlusion as f32;
         setup.occlusion_depth = (near + (far - near) * config.dynamic.occlusion_share) as f32;

@@ -6,9 +6,13 @@ use crate::geometry::MM_PER_UNIT;
 use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::plan::motion::ViewMotion;
+use crate::plan::start::Start;
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
+
+/// Half side of the still field's box, radii of the field of view, at most.
+const STATIC_FIELDS_OF_VIEW: f64 = 1.6;
 
 impl Scene {
     /// Chooses scales and boxes for a dataset.
@@ -17,11 +21,8 @@ impl Scene {
     /// [`Error::Data`] when the images cannot be normalised.
     pub fn new(config: &Config, dataset: &Dataset, motion: &[ViewMotion], hull: Option<&Hull>) -> Result<Scene> {
         let (near, far) = dataset.depth_range;
-        let static_half = if config.static_field.half_extent_mm > 0.0 {
-            config.static_field.half_extent_mm / MM_PER_UNIT
-        } else {
-            half_depth(dataset)
-        };
+        let static_half = static_half(config, dataset);
+        let static_reach = static_half * 3f64.sqrt();
         let half = dynamic_half(config, dataset);
         let (dynamic_min, dynamic_max) =
             hull.and_then(Hull::bounds).unwrap_or((DVec3::splat(-half), DVec3::splat(half)));
@@ -39,7 +40,11 @@ impl Scene {
             static_max: [static_half; 3],
             dynamic_min: dynamic_min.to_array(),
             dynamic_max: dynamic_max.to_array(),
-            static_depth: [near, far],
+            static_depth: if config.march.fit_static_range {
+                [near.max(-static_reach), far.min(static_reach)]
+            } else {
+                [near, far]
+            },
             dynamic_depth,
             encode_centre: encode_centre.to_array(),
             encode_scale,
@@ -90,17 +95,27 @@ impl Scene {
         // A vessel fills a few percent of the field of view.
         let vessel = 0.05 * field_of_view(dataset);
         self.dynamic_gain = change / vessel;
-        let depth = hull
-            .map_or((DVec3::from_array(self.dynamic_max) - DVec3::from_array(self.dynamic_min)).max_element(), |h| {
-                mean_depth(h, dataset, motion)
-            });
-        self.dynamic_shift = first_shift(config.dynamic.normalised_shift, depth / vessel);
         (self.dynamic_weight, self.robust_scale) = match config.loss.dynamic_target {
             DynamicTarget::Temporal => (1.0 / (change * change), config.loss.robust * change),
             // Both fields share one squared residual.
             DynamicTarget::Absolute => (self.static_weight, 0.0),
         };
+        let best_start = config.dynamic.best_start && config.loss.dynamic_target == DynamicTarget::Temporal;
+        let shift = best_start.then(|| self.start(config, dataset, motion, hull).best_shift());
+        self.dynamic_shift = shift.unwrap_or(config.dynamic.normalised_shift);
         Ok(())
+    }
+
+    /// What is known before a run of a network starts.
+    pub fn start<'a>(
+        &self,
+        config: &'a Config,
+        dataset: &'a Dataset,
+        motion: &'a [ViewMotion],
+        hull: Option<&'a Hull>,
+    ) -> Start<'a> {
+        let (depth, gain, robust) = (self.dynamic_depth, self.dynamic_gain, self.robust_scale);
+        Start { config, dataset, motion, hull, depth, gain, robust }
     }
 }
 
@@ -116,35 +131,13 @@ fn field_of_view(dataset: &Dataset) -> f64 {
     radius
 }
 
-/// How deep rays that meet the hull run inside it, on average: its volume over the area of the pixels that see it.
-fn mean_depth(hull: &Hull, dataset: &Dataset, motion: &[ViewMotion]) -> f64 {
-    let (mut sum, mut n) = (0.0, 0);
-    for m in motion {
-        let at = |i: f64, j: f64| dataset.views[m.view].rays.pixel(i, j).0;
-        let pixel_area = (at(1.0, 0.0) - at(0.0, 0.0)).cross(at(0.0, 1.0) - at(0.0, 0.0)).length();
-        for phase in 0..hull.n_phases {
-            let seen = if hull.n_phases > 1 { &m.moving_at[phase] } else { &m.moving };
-            let pixels = seen.iter().filter(|moving| **moving).count();
-            if pixels > 0 {
-                let bits = &hull.bits[phase * hull.words()..][..hull.words()];
-                let cells: u32 = bits.iter().map(|w| w.count_ones()).sum();
-                sum += f64::from(cells) * hull.cell.powi(3) / (pixels as f64 * pixel_area);
-                n += 1;
-            }
-        }
+/// Half side of the box of the still field, world units: what is far outside the field of view is seen by one view at a time,
+/// and a box that holds it spends the field on it.
+fn static_half(config: &Config, dataset: &Dataset) -> f64 {
+    if config.static_field.half_extent_mm > 0.0 {
+        return config.static_field.half_extent_mm / MM_PER_UNIT;
     }
-    if n > 0 { sum / f64::from(n) } else { 0.0 }
-}
-
-/// The shift inside the dynamic field's softplus that a run starts with. A field that is `depth_in_vessels` times as deep
-/// as a vessel starts with as many times too large an integral, whose gradients can switch the whole network off: then
-/// it starts nearer to zero.
-fn first_shift(normalised_shift: f64, depth_in_vessels: f64) -> f64 {
-    if depth_in_vessels <= DEEP {
-        return normalised_shift;
-    }
-    let attenuation = normalised_shift.exp().ln_1p() / (depth_in_vessels / DEEP).powi(2);
-    attenuation.exp_m1().ln().max(normalised_shift.min(-5.0))
+    half_depth(dataset).min(STATIC_FIELDS_OF_VIEW * field_of_view(dataset))
 }
 
 fn half_depth(dataset: &Dataset) -> f64 {
@@ -159,9 +152,6 @@ pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
         field_of_view(dataset).min(half_depth(dataset))
     }
 }
-
-/// Depth of the dynamic field, in vessels, from which a run starts nearer to zero. Tight hulls of 3 and 4 views reach 2.4.
-const DEEP: f64 = 2.5;
 
 #[cfg(test)]
 mod tests {
@@ -261,14 +251,5 @@ mod tests {
         // Nothing moves: the dynamic field is scaled to the images themselves.
         let still = normalised(&dataset(2.0, 0.0), &[]).unwrap();
         assert!(still.dynamic_gain.is_finite() && still.dynamic_gain > 0.0);
-    }
-
-    #[test]
-    fn deep_fields_start_nearer_to_zero() {
-        assert_eq!(first_shift(-2.0, 2.4), -2.0);
-        // Twice as deep as a run bears: a quarter of the attenuation.
-        assert!((softplus(first_shift(-2.0, 2.0 * DEEP)) - softplus(-2.0) / 4.0).abs() < 1e-12);
-        assert_eq!(first_shift(-2.0, 1e6), -5.0);
-        assert_eq!(first_shift(-10.0, 1e6), -10.0, "a shift that was asked for is never raised");
     }
 }

@@ -189,6 +189,7 @@ pub fn bwd(
     for sample in &march.dynamics {
         let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
         let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
+        let slope = if per_integral < 0.0 { slope.max(s.least_slope.into()) } else { slope };
         let dl_dfeature = per_integral * sample.dl * slope;
         field::network_bwd(p, params, &sample.trace, ray.phase, dl_dfeature, precision, gradient);
     }

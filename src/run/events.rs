@@ -33,6 +33,9 @@ pub enum Event {
         /// Losses of the last iteration.
         #[serde(flatten)]
         loss: StepLoss,
+        /// Loss of the moving field over that of no field, where a network moves: next to 1, it has died.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        dynamic_share: Option<f64>,
         /// PSNR of the training rays, dB, smoothed.
         psnr: f64,
         /// Iterations per second.

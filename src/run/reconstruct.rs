@@ -221,7 +221,9 @@ impl<'a> Loop<'a> {
     fn report(&mut self, progress: Vec<Progress>) -> Result<()> {
         for p in progress {
             if p.loss.step.is_multiple_of(REPORT_EVERY) || p.loss.step == self.end {
+                let empty = self.training.trainer().plan().empty_loss;
                 (self.tell)(Event::Progress {
+                    dynamic_share: empty.filter(|empty| *empty > 0.0).map(|empty| p.loss.dynamic / empty),
                     loss: p.loss,
                     psnr: p.smoothed_psnr_db,
                     iterations_per_s: p.iterations_per_s,

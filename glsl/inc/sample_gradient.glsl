@@ -1,0 +1,10 @@
+// dL/d feature of a sample of the dynamic field; includes of this file have the buffers of samples and rays.
+// Where the softplus is flat nothing would tell the network that a ray asks for more: there the slope is at least
+// `least_slope`. A ray that asks for less needs no such help.
+float feature_gradient(uint s) {
+    uint ray = sample_rays[s];
+    float per_integral = ray_gradient[ray_of(ray)].y + (is_near(ray) ? setup.occlusion_weight : 0.0);
+    float slope = sample_sigma[s].y;
+    if (per_integral < 0.0) slope = max(slope, setup.least_slope);
+    return per_integral * sample_points[s].w * slope;
+}

@@ -1,0 +1,168 @@
+//! Where the network starts: at the best constant field in the hull. From a field that nearly every ray asks to be fainter, the
+//! first steps throw the network below the softplus, where nothing calls it back (method, robustness of training).
+
+use crate::config::Config;
+use crate::model::hull::Hull;
+use crate::plan::motion::ViewMotion;
+use crate::scan::dataset::{Dataset, Frame};
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// Rays looked at.
+const RAYS: f64 = 4000.0;
+/// Depths of a ray that are looked up in the hull.
+const DEPTHS: usize = 128;
+/// Shifts tried, from the least on.
+const LEAST_SHIFT: f64 = -8.0;
+const SHIFT_STEP: f64 = 0.125;
+const SHIFTS: usize = 73;
+/// A constant field that leaves more than this share of what no field leaves tells nothing, as where there is no hull.
+const TELLS_NOTHING: f64 = 0.99;
+/// The least start then.
+const LEAST_BLIND_SHIFT: f64 = -5.0;
+
+/// What a ray asks of a constant field.
+#[derive(Debug, Clone, Copy)]
+struct StartRay {
+    /// Length inside the hull at the ray's phase, world units.
+    length: f64,
+    /// Bounds of its line integral.
+    bounds: [f64; 2],
+}
+
+/// What is known before a run starts.
+pub struct Start<'a> {
+    /// Settings.
+    pub config: &'a Config,
+    /// Angiograms.
+    pub dataset: &'a Dataset,
+    /// What moves in each view.
+    pub motion: &'a [ViewMotion],
+    /// Where the field may be.
+    pub hull: Option<&'a Hull>,
+    /// First and last depth along rays, world units.
+    pub depth: [f64; 2],
+    /// Attenuation of a softplus of 1, per world unit.
+    pub gain: f64,
+    /// Residual from which the loss grows linearly; 0: it is squared throughout.
+    pub robust: f64,
+}
+
+impl Start<'_> {
+    /// The shift inside the softplus of the constant field with the least loss with a temporal target.
+    pub fn best_shift(&self) -> f64 {
+        best_shift(&self.rays(), self.gain, self.robust)
+    }
+
+    /// Mean loss of no field at all.
+    pub fn empty_loss(&self) -> f64 {
+        let rays = self.rays();
+        rays.iter().map(|ray| ray.loss(0.0, self.robust)).sum::<f64>() / rays.len().max(1) as f64
+    }
+
+    /// Rays spread over the images evenly, those that meet the hull as often as in training.
+    fn rays(&self) -> Vec<StartRay> {
+        let share = if self.hull.is_some() { self.config.train.motion_share } else { 0.0 };
+        let frames: Vec<(&Frame, &ViewMotion)> = self
+            .motion
+            .iter()
+            .flat_map(|m| self.dataset.training().iter().filter(|f| f.view == m.view).map(move |f| (f, m)))
+            .collect();
+        let pixels = |wanted: &(dyn Fn(&Frame, &ViewMotion, usize) -> bool + Sync)| -> Vec<(usize, usize)> {
+            let of = |index: usize| {
+                let (frame, motion) = frames[index];
+                (0..self.dataset.n_pixels()).filter(move |p| wanted(frame, motion, *p)).map(move |p| (index, p))
+            };
+            (0..frames.len()).flat_map(of).collect()
+        };
+        let moving = |frame: &Frame, motion: &ViewMotion, p: usize| {
+            let seen =
+                if self.config.hull.per_phase { &motion.moving_at[frame.phase as usize] } else { &motion.moving };
+            seen[p] && self.dataset.shows(frame.view, p)
+        };
+        let mut chosen = spread(pixels(&moving), share * RAYS);
+        chosen.extend(spread(pixels(&|frame, _, p| self.dataset.shows(frame.view, p)), (1.0 - share) * RAYS));
+        chosen.into_par_iter().map(|(index, p)| self.ray(frames[index].0, frames[index].1, p)).collect()
+    }
+
+    fn ray(&self, frame: &Frame, motion: &ViewMotion, pixel: usize) -> StartRay {
+        let (column, row) = (pixel % self.dataset.width, pixel / self.dataset.width);
+        let (anchor, direction) = self.dataset.views[frame.view].rays.pixel(column as f64, row as f64);
+        let [near, far] = self.depth;
+        let step = (far - near) / DEPTHS as f64;
+        let inside = |point: DVec3| self.hull.is_none_or(|hull| hull.contains_point(point, frame.phase as usize));
+        let met = (0..DEPTHS).filter(|k| inside(anchor + direction * (near + (*k as f64 + 0.5) * step))).count();
+        let target = f64::from(frame.integrals[pixel]);
+        StartRay {
+            length: met as f64 * step * direction.length(),
+            bounds: [motion.background[pixel], motion.background_low[pixel]].map(|b| target - f64::from(b)),
+        }
+    }
+}
+
+/// About `count` of the items, evenly.
+fn spread<T: Copy>(items: Vec<T>, count: f64) -> Vec<T> {
+    let step = (items.len() as f64 / count.max(1.0)).max(1.0);
+    let n = (items.len() as f64 / step) as usize;
+    if count < 1.0 { Vec::new() } else { (0..n).map(|k| items[(k as f64 * step) as usize]).collect() }
+}
+
+fn best_shift(rays: &[StartRay], gain: f64, robust: f64) -> f64 {
+    let loss = |attenuation: f64| -> f64 { rays.iter().map(|ray| ray.loss(attenuation, robust)).sum() };
+    let shifts = (0..SHIFTS).map(|k| LEAST_SHIFT + k as f64 * SHIFT_STEP);
+    let tried = shifts.map(|shift| (shift, loss(gain * shift.exp().ln_1p())));
+    let best = tried.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((LEAST_SHIFT, 0.0));
+    if best.1 < TELLS_NOTHING * loss(0.0) { best.0 } else { best.0.max(LEAST_BLIND_SHIFT) }
+}
+
+impl StartRay {
+    /// As in training: of what is beyond the bounds.
+    fn loss(&self, attenuation: f64, robust: f64) -> f64 {
+        let integral = attenuation * self.length;
+        let residual = integral - integral.clamp(self.bounds[0].min(self.bounds[1]), self.bounds[1]);
+        if robust == 0.0 {
+            return residual * residual;
+        }
+        2.0 * robust * robust * ((1.0 + (residual / robust).powi(2)).sqrt() - 1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ray(length: f64, integral: f64) -> StartRay {
+        StartRay { length, bounds: [integral; 2] }
+    }
+
+    #[test]
+    fn a_constant_field_that_explains_all_rays_is_found() {
+        let attenuation = |shift: f64| 3.0 * shift.exp().ln_1p();
+        for shift in [-4.0, -0.75, 0.5] {
+            let rays: Vec<_> = (1..50).map(|k| 0.1 * f64::from(k)).map(|l| ray(l, l * attenuation(shift))).collect();
+            assert_eq!(best_shift(&rays, 3.0, 0.0), shift);
+            assert_eq!(best_shift(&rays, 3.0, 0.2), shift);
+        }
+    }
+
+    #[test]
+    fn deep_fields_of_which_rays_see_little_start_lower() {
+        let half =
+            |length: f64| -> Vec<_> { (0..100).map(|k| ray(length, if k % 2 == 0 { 1.0 } else { 0.0 })).collect() };
+        assert!(best_shift(&half(4.0), 1.0, 0.0) < best_shift(&half(1.0), 1.0, 0.0));
+    }
+
+    #[test]
+    fn where_no_constant_field_helps_the_start_is_not_nothing() {
+        let rays: Vec<_> = (0..1000).map(|k| ray(4.0, if k == 0 { 1.0 } else { 0.0 })).collect();
+        assert_eq!(best_shift(&rays, 1.0, 0.1), LEAST_BLIND_SHIFT);
+        assert!(best_shift(&[], 1.0, 0.1).is_finite());
+    }
+
+    #[test]
+    fn items_are_taken_evenly() {
+        assert_eq!(spread((0..10).collect(), 5.0), [0, 2, 4, 6, 8]);
+        assert_eq!(spread((0..3).collect(), 5.0), [0, 1, 2]);
+        assert!(spread((0..3).collect::<Vec<_>>(), 0.0).is_empty());
+    }
+}
