@@ -77,8 +77,8 @@ impl Plan {
         };
         let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
         let compared = targets.is_none() && config.loss.dynamic_target == DynamicTarget::Temporal;
-        let empty_loss = compared
-            .then(|| scene.dynamic_weight * scene.start(config, dataset, &motion, hull.as_ref()).empty_loss());
+        let empty_loss =
+            compared.then(|| scene.dynamic_weight * scene.start(config, dataset, &motion, hull.as_ref()).empty_loss());
         let pixels = dataset.n_pixels();
         let training = dataset.training();
         let n_all = training.len() * pixels;

@@ -21,14 +21,38 @@ fn start(plan: &Plan) -> Vec<f64> {
     params
 }
 
+/// A field that has fallen asleep hears those rays that ask for more, and no louder those that ask for less.
+#[test]
+fn a_sleeping_field_is_called_back() {
+    let asleep = ["dynamic.best_start=false", "dynamic.normalised_shift=-14"];
+    let of = |least_slope: &str, more: bool| {
+        let slope = format!("dynamic.least_slope={least_slope}");
+        let mut plan = plan("fast-mlp", &[asleep[0], asleep[1], &slope]);
+        if !more {
+            // No ray asks for more than nothing.
+            plan.images.iter_mut().for_each(|value| *value = -1.0);
+        }
+        let rays = march::batch(&plan, 0);
+        let (_, gradient) = step::loss_and_gradient(&plan, &start(&plan), 0, &rays, Precision::Exact);
+        gradient[plan.params.out_bias]
+    };
+    let (deaf, hears) = (of("0", true), of("1e-3", true));
+    assert!(deaf < 0.0 && hears < 0.0, "rays ask for more: {deaf}, {hears}");
+    // The softplus's own slope at -14 is 8.3e-7.
+    assert!((hears / deaf / 1.2e3 - 1.0).abs() < 0.2, "{deaf}, {hears}");
+    let less = of("1e-3", false);
+    assert!(less > 0.0 && less == of("0", false), "{less}");
+}
+
 #[test]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     for (preset, settings) in [
         ("paper", &["dynamic.occlusion=1e-3", "loss.normalise=true"][..]),
         ("public-code", &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
-        ("fast-mlp", &["loss.dynamic_target=absolute"]),
-        ("fast-mlp", &["loss.robust=0"]),
-        ("fast-mlp", &["loss.robust=0.3"]),
+        // A least slope is not that of the loss.
+        ("fast-mlp", &["dynamic.least_slope=0", "loss.dynamic_target=absolute"]),
+        ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0"]),
+        ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0.3"]),
     ] {
         let plan = plan(preset, settings);
         let params = start(&plan);
