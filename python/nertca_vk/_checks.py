@@ -107,9 +107,9 @@ def target(name: str, out: object, shape: tuple[int, ...]) -> "npt.NDArray[np.fl
 
 def readable(array: "np.ndarray[Any, np.dtype[Any]]") -> Any:
     """A pointer to an array's bytes, which stay where they are while it lives."""
-    return ffi.from_buffer(array.reshape(-1).view(np.uint8))
+    return ffi.from_buffer(array)
 
 
 def writable(array: "np.ndarray[Any, np.dtype[Any]]") -> Any:
     """As `readable`, for the library to write to."""
-    return ffi.from_buffer(array.reshape(-1).view(np.uint8), require_writable=True)
+    return ffi.from_buffer(array, require_writable=True)

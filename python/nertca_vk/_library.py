@@ -1,5 +1,6 @@
 """The shared library of this package, declared by the header that came with it."""
 
+import functools
 import json
 import os
 import re
@@ -43,6 +44,19 @@ lib: Final[Any] = _open(LIBRARY)
 STATUS_NAMES: Final = {
     getattr(lib, name): name.removeprefix("NERTCA_ERROR_") for name in dir(lib) if name.startswith("NERTCA_ERROR_")
 }
+
+
+@functools.cache
+def _layout(name: str) -> tuple[Any, int]:
+    return ffi.typeof(f"{name} *"), ffi.sizeof(name)
+
+
+def new(name: str) -> Any:
+    """A struct of the library with its size set, and zeros in all other fields."""
+    pointer, size = _layout(name)
+    struct = ffi.new(pointer)
+    struct.size = size
+    return struct
 
 
 def version() -> str:

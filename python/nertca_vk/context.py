@@ -5,7 +5,7 @@ import os
 from typing import Any, Optional, Union
 
 from ._callbacks import ON_LOG
-from ._library import as_options, check, ffi, lib, read_text
+from ._library import as_options, check, ffi, lib, new, read_text
 from ._life import Life, claim_process, end_with
 from .results import Device
 
@@ -56,9 +56,8 @@ class Context:
                 "layers": layers,
             }
         )
-        log = ffi.new(
-            "nertca_log *", {"size": ffi.sizeof("nertca_log"), "callback": ON_LOG, "level": lib.NERTCA_LOG_INFO}
-        )
+        log = new("nertca_log")
+        log.callback, log.level = ON_LOG, lib.NERTCA_LOG_INFO
         made = ffi.new("nertca_context **")
         check(lib.nertca_context_create(options, log, made), ffi.NULL)
         self._life = Life("context", made[0], lib.nertca_context_destroy)

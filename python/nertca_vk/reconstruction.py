@@ -24,11 +24,11 @@ from ._checks import (
     writable,
     wrong,
 )
-from ._library import as_options, as_path, check, ffi, lib, read_text
+from ._library import as_options, as_path, check, ffi, lib, new, read_text
 from ._life import Life, end_with
 from .context import Context
 from .errors import BufferTooSmallError, Error
-from .geometry import Geometry, fill
+from .geometry import Geometry, as_struct
 from .intensity import Integral, Intensity
 from .results import Branch, Correction, CorrectionKind, Grid, Progress, Scores, Tree
 
@@ -189,8 +189,11 @@ class Reconstruction:
         if values.dtype == np.float64:
             values = values.astype(np.float32)
         rows, columns = values.shape
-        frame = ffi.new("nertca_frame *", {"size": ffi.sizeof("nertca_frame"), "width": columns, "height": rows})
-        kept = [fill(frame.geometry, geometry), readable(values)]
+        frame = new("nertca_frame")
+        frame.width, frame.height = columns, rows
+        stated, matrix = as_struct(geometry)
+        frame.geometry = stated[0]
+        kept = [matrix, readable(values)]
         frame.pixels, frame.pixels_bytes = kept[1], values.nbytes
         frame.format = PIXEL_FORMATS[values.dtype]
         intensity.fill(frame)
@@ -233,7 +236,7 @@ class Reconstruction:
         loading it. Raises ArgumentError for a frame that was not added.
         """
         handle = self.handle
-        found = ffi.new("nertca_correction *", {"size": ffi.sizeof("nertca_correction")})
+        found = new("nertca_correction")
         check(lib.nertca_reconstruction_correction(handle, whole("frame", frame), found), handle)
         left, posterior, superior = found.heart_shift_mm
         return Correction(
@@ -253,8 +256,7 @@ class Reconstruction:
 
         Raises ArgumentError naming what is wrong; BusyError while training in the background in a deterministic context.
         """
-        stated = ffi.new("nertca_geometry *")
-        kept = fill(stated, geometry)
+        stated, kept = as_struct(geometry)
         handle = self.handle
         check(lib.nertca_reconstruction_set_geometry(handle, whole("frame", frame), stated), handle)
         del kept
@@ -347,7 +349,7 @@ class Reconstruction:
     def progress(self) -> Progress:
         """State and progress, at any time."""
         handle = self.handle
-        found = ffi.new("nertca_progress *", {"size": ffi.sizeof("nertca_progress")})
+        found = new("nertca_progress")
         check(lib.nertca_reconstruction_progress(handle, found), handle)
         return progress_of(found)
 
@@ -390,23 +392,18 @@ class Reconstruction:
         Raises NotReadyError before anything was trained or loaded; ArgumentError naming what is wrong.
         """
         rows, columns = (whole("shape", side, 1, 8192) for side in shape)
-        view = ffi.new("nertca_view *", {"size": ffi.sizeof("nertca_view"), "width": columns, "height": rows})
-        kept = fill(view.geometry, geometry)
+        view = new("nertca_view")
+        view.width, view.height = columns, rows
+        stated, kept = as_struct(geometry)
+        view.geometry = stated[0]
         view.phase = whole("phase", phase)
         view.component = constant("component", component, "NERTCA_COMPONENT_")
         view.projection = constant("projection", projection, "NERTCA_PROJECTION_")
         view.quality = constant("quality", quality, "NERTCA_QUALITY_")
         drawn = target("out", out, (rows, columns))
-        memory = writable(drawn)
-        picture = ffi.new(
-            "nertca_image *",
-            {
-                "size": ffi.sizeof("nertca_image"),
-                "pixels": memory,
-                "pixels_bytes": drawn.nbytes,
-                "format": lib.NERTCA_PIXELS_F32,
-            },
-        )
+        picture = new("nertca_image")
+        picture.pixels, picture.pixels_bytes = writable(drawn), drawn.nbytes
+        picture.format = lib.NERTCA_PIXELS_F32
         handle = self.handle
         check(lib.nertca_reconstruction_render(handle, view, picture), handle)
         del kept
@@ -431,7 +428,7 @@ class Reconstruction:
         left, posterior, superior = (whole("grid.points", n, 1, 4096) for n in asked.points)
         if left * posterior * superior > MOST_POINTS:
             raise wrong("grid.points", f"{left} x {posterior} x {superior}; at most 2^30 in all are accepted")
-        struct = ffi.new("nertca_grid *", {"size": ffi.sizeof("nertca_grid")})
+        struct = new("nertca_grid")
         struct.origin_mm = reals("grid.origin_mm", asked.origin_mm, 3)
         struct.spacing_mm = reals("grid.spacing_mm", asked.spacing_mm, 3)
         struct.points = [left, posterior, superior]
@@ -454,7 +451,7 @@ class Reconstruction:
         NotReadyError before anything was trained or loaded; ArgumentError where there is no vessel above the threshold.
         """
         handle = self.handle
-        struct = ffi.new("nertca_tree *", {"size": ffi.sizeof("nertca_tree")})
+        struct = new("nertca_tree")
         struct.threshold_per_mm = real("threshold_per_mm", threshold_per_mm)
         struct.least_branch_mm = real("least_branch_mm", least_branch_mm)
         with self._finding_tree:
@@ -492,7 +489,7 @@ class Reconstruction:
         Raises DataError without such frames; NotReadyError before anything was trained or loaded.
         """
         handle = self.handle
-        found = ffi.new("nertca_scores *", {"size": ffi.sizeof("nertca_scores")})
+        found = new("nertca_scores")
         threshold = real("threshold_per_mm", threshold_per_mm)
         check(lib.nertca_reconstruction_evaluate(handle, threshold, found), handle)
         return Scores(**{name: getattr(found, name) for name in Scores.__dataclass_fields__})
