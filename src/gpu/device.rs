@@ -74,6 +74,7 @@ pub(super) struct Shared {
     pub(super) last_submitted: AtomicU64,
     pub(super) live_objects: AtomicU64,
     pub(super) info: DeviceInfo,
+    #[cfg_attr(not(unix), allow(dead_code, reason = "memory is shared on Unix only"))]
     pub(super) physical: vk::PhysicalDevice,
     memory: Memory,
     queue_lock: Option<Box<dyn QueueLock>>,
