@@ -225,6 +225,7 @@ pub mod capi {
     pub mod options;
     pub mod output;
     pub mod reconstruction;
+    mod shared_memory;
     pub mod status;
     pub mod training;
     pub mod tree;

@@ -3,6 +3,7 @@
 use crate::capi::context::{Claim, Context, nertca_context, on_context};
 use crate::capi::handles::{self, Kind, Object};
 use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
+use crate::capi::shared_memory;
 use crate::capi::status::{Failure, NERTCA_OK, Outcome, call, nertca_status};
 use crate::capi::types::{
     NERTCA_COMPONENT_DYNAMIC, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_TOTAL, NERTCA_PIXELS_F32, NERTCA_PIXELS_U8,
@@ -15,7 +16,6 @@ use crate::model::component::Component;
 use crate::render::grid::PatientGrid;
 use crate::render::quantity::{Projection, Quantity};
 use glam::DVec3;
-use std::os::fd::{AsFd, IntoRawFd, OwnedFd};
 use std::sync::Arc;
 
 /// Memory on the device that other APIs and processes can import.
@@ -26,7 +26,7 @@ pub struct nertca_buffer {
 /// Behind [`nertca_buffer`].
 pub(super) struct SharedBuffer {
     buffer: Buffer,
-    fd: OwnedFd,
+    memory: shared_memory::Memory,
     claim: Claim,
     process: u32,
 }
@@ -322,8 +322,8 @@ pub unsafe extern "C" fn nertca_buffer_create(
         if bytes == 0 || bytes > 1 << 40 {
             return Err(Failure::argument("bytes", format!("{bytes} is no size of a buffer")));
         }
-        let (made, fd) = context.device()?.exported_buffer("shared buffer", bytes)?;
-        let shared = SharedBuffer { buffer: made, fd, claim: Claim::new(context), process: std::process::id() };
+        let (made, memory) = shared_memory::make(context.device()?, bytes)?;
+        let shared = SharedBuffer { buffer: made, memory, claim: Claim::new(context), process: std::process::id() };
         let handle = handles::insert(Arc::new(shared))?;
         // SAFETY: checked and written above; nothing gave the caller's memory back in between.
         unsafe { buffer.write_unaligned(std::ptr::without_provenance_mut(handle)) };
@@ -347,14 +347,13 @@ pub unsafe extern "C" fn nertca_buffer_export_fd(
         if fd.is_null() {
             return Err(Failure::argument("fd", "is null"));
         }
-        let copy = shared.fd.as_fd().try_clone_to_owned();
-        let copy = copy.map_err(crate::error::Error::io("duplicate the descriptor of", "a shared buffer"))?;
+        let copy = shared.memory.descriptor()?;
         // SAFETY: `fd` is not null, and the header asks that both can be written unless null.
         unsafe {
             if !bytes.is_null() {
                 bytes.write_unaligned(shared.buffer.bytes());
             }
-            fd.write_unaligned(copy.into_raw_fd());
+            fd.write_unaligned(copy);
         }
         Ok(())
     })

@@ -54,6 +54,7 @@ enum Backing {
     /// In a block of the allocator.
     Block(Mutex<Allocation>),
     /// In memory of its own, which may be exported.
+    #[cfg_attr(not(unix), allow(dead_code, reason = "memory is shared on Unix only"))]
     Own(vk::DeviceMemory),
 }
 
@@ -141,6 +142,7 @@ impl Gpu {
 }
 
 /// What memory is exported as.
+#[cfg(unix)]
 const EXPORTED: vk::ExternalMemoryHandleTypeFlags = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
 
 /// Sizes are whole vec4, and never nothing.

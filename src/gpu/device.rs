@@ -2,7 +2,7 @@
 //! timeline, debug names.
 
 use super::capabilities::{DeviceInfo, DeviceKind, MATRIX_EXTENSIONS, compute_family};
-use super::instance::{Instance, Loader};
+use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
 use crate::error::{Error, Result};
 use ash::{ext, khr, vk};
@@ -74,6 +74,7 @@ pub(super) struct Shared {
     pub(super) last_submitted: AtomicU64,
     pub(super) live_objects: AtomicU64,
     pub(super) info: DeviceInfo,
+    #[cfg_attr(not(unix), allow(dead_code, reason = "memory is shared on Unix only"))]
     pub(super) physical: vk::PhysicalDevice,
     memory: Memory,
     queue_lock: Option<Box<dyn QueueLock>>,
@@ -150,7 +151,7 @@ fn choose(
 ) -> Result<(vk::PhysicalDevice, DeviceInfo)> {
     let names = || {
         if all.is_empty() {
-            "the loader offers none: install a driver (Debian: mesa-vulkan-drivers for a CPU driver)".to_owned()
+            format!("the loader offers none: install a driver ({DRIVER_PACKAGES})")
         } else {
             let one = |d: &DeviceInfo| match &d.unusable {
                 None => format!("{} = {}", d.index, d.name),

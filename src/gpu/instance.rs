@@ -8,6 +8,11 @@ use std::ffi::{CStr, c_void};
 use std::sync::Mutex;
 
 const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
+/// What to install where there is no loader.
+const LOADER_PACKAGES: &str = "Debian, Ubuntu: libvulkan1; Fedora: vulkan-loader; Arch: vulkan-icd-loader";
+/// What to install where there is no driver.
+pub(super) const DRIVER_PACKAGES: &str = "the GPU vendor's, or Mesa's, which has one for CPUs as well: Debian, Ubuntu, \
+                                          Fedora: mesa-vulkan-drivers; Arch: vulkan-swrast";
 
 /// A Vulkan loader that an application brings along, in place of the system's.
 #[derive(Debug, Clone, Copy)]
@@ -55,9 +60,19 @@ fn load(loader: Option<Loader>) -> Result<ash::Entry> {
     // SAFETY: loads the system's Vulkan loader, whose initialisers are trusted as any shared library's are.
     unsafe { ash::Entry::load() }.map_err(|e| {
         Error::NoDevice(format!(
-            "the Vulkan loader could not be opened ({e}). Install it (Debian: libvulkan1) together with a driver \
-             (GPU vendor's, or mesa-vulkan-drivers for a CPU driver)"
+            "the Vulkan loader could not be opened ({e}). Install it ({LOADER_PACKAGES}) and a driver \
+             ({DRIVER_PACKAGES})"
         ))
+    })
+}
+
+/// No driver that the loader finds is the commonest reason of all.
+fn no_instance(code: vk::Result) -> Error {
+    Error::NoDevice(match code {
+        vk::Result::ERROR_INCOMPATIBLE_DRIVER => {
+            format!("the Vulkan loader finds no driver. Install one ({DRIVER_PACKAGES})")
+        }
+        code => format!("vkCreateInstance failed: {code}"),
     })
 }
 
@@ -100,8 +115,7 @@ impl Instance {
             create = create.push_next(&mut features);
         }
         // SAFETY: `create` and all it points to are locals of this function, alive until the call returns.
-        let raw = unsafe { entry.create_instance(&create, None) }
-            .map_err(|code| Error::NoDevice(format!("vkCreateInstance failed: {code}")))?;
+        let raw = unsafe { entry.create_instance(&create, None) }.map_err(no_instance)?;
         let mut instance = Instance { raw, ours: true, messenger: None, messages: Box::default(), entry };
         if validation {
             instance.listen()?;

@@ -1,0 +1,1 @@
+../../include/nertca_vk.h

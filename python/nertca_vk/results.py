@@ -1,0 +1,135 @@
+"""What the library answers."""
+
+from dataclasses import dataclass
+from typing import Literal, Optional
+
+import numpy as np
+import numpy.typing as npt
+
+State = Literal["idle", "running", "paused", "waiting", "finished", "cancelled", "failed"]
+CorrectionKind = Literal["stated", "static", "breathing"]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far training is."""
+
+    state: State
+    step: int
+    """Iterations done."""
+    iterations: int
+    """Length of the run."""
+    frames: int
+    """Frames trained on."""
+    loss: float
+    """Loss of the last iteration."""
+    psnr_db: float
+    """PSNR of the last iteration's rays, dB; NaN while Gaussians are fitted, which have no rays."""
+    iterations_per_s: float
+    """Iterations per second since training was last begun."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """How calibration sees a frame."""
+
+    kind: CorrectionKind
+    primary_deg: float
+    """Added to the stated primary angle, degrees."""
+    secondary_deg: float
+    """Added to the stated secondary angle, degrees."""
+    table_mm: tuple[float, float, float]
+    """How much further than stated the table has carried the patient (LPS), mm."""
+    heart_shift_mm: tuple[float, float, float]
+    """Where breathing has carried the heart in this frame (LPS), mm."""
+    moved_px: float
+    """Root mean square of how far the correction moves the heart's image in this view, pixels."""
+    residual_before: float
+    """What does not agree with the other views, as a share of what moves, before."""
+    residual_after: float
+    """And after."""
+    matrix: npt.NDArray[np.float64]
+    """All of it, as a projection of shape (3, 4): a geometry to draw the vessels over the frame with."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores on the frames added for validation."""
+
+    step: int
+    """Iterations of the model."""
+    images: int
+    """Images scored."""
+    dice_dynamic: float
+    """Mean Dice of the moving vessels; NaN without masks."""
+    dice_total: float
+    """Mean Dice of both fields; NaN without masks."""
+    psnr_db: float
+    """Mean PSNR, dB."""
+    ssim: float
+    """Mean structural similarity."""
+    threshold_per_mm: float
+    """Attenuation from which the moving field counts as vessel, 1/mm."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid of points in patient coordinates (left, posterior, superior)."""
+
+    origin_mm: tuple[float, float, float]
+    """First point, mm."""
+    spacing_mm: tuple[float, float, float]
+    """Distance between neighbours along each axis, mm."""
+    points: tuple[int, int, int]
+    """Points along each axis, 1 to 4096."""
+
+    @staticmethod
+    def around_isocentre(half_extent_mm: float = 60.0, spacing_mm: float = 1.0) -> "Grid":
+        """A cube around the isocentre, with a point on it."""
+        beside = int(half_extent_mm / spacing_mm)
+        first = -beside * spacing_mm
+        return Grid((first, first, first), (spacing_mm, spacing_mm, spacing_mm), (2 * beside + 1,) * 3)
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A vessel's centreline between two bifurcations, at one cardiac phase."""
+
+    phase: int
+    """Cardiac phase, from 0."""
+    parent: Optional[int]
+    """The branch that it leaves, by its place among the branches; None for one that begins at a root."""
+    points_mm: npt.NDArray[np.float64]
+    """Points (LPS), mm, of shape (points, 3); the first is the last of its parent."""
+    radius_mm: npt.NDArray[np.float64]
+    """Radius of the vessel at each point, mm, of shape (points,)."""
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Vessels at all phases as trees of centrelines with radii."""
+
+    threshold_per_mm: float
+    """The moving field was taken as vessel above this, 1/mm."""
+    followed: bool
+    """Whether all phases have the same branches, and point i of each is the same material point at every phase."""
+    branches: list[Branch]
+    """Phase by phase, each behind its parent."""
+
+    def at(self, phase: int) -> list[Branch]:
+        """The branches of one cardiac phase."""
+        return [branch for branch in self.branches if branch.phase == phase]
+
+
+@dataclass(frozen=True)
+class Device:
+    """A Vulkan device."""
+
+    index: int
+    name: str
+    uuid: str
+    kind: str
+    """discrete, integrated, virtual, cpu or other."""
+    driver: str
+    unusable: Optional[str]
+    """Why it cannot be used; None where it can."""

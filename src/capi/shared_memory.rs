@@ -1,0 +1,49 @@
+//! Memory that other processes and APIs import, by file descriptors: what Unix has, and other systems refuse.
+
+use crate::error::Result;
+use crate::gpu::buffer::Buffer;
+use crate::gpu::device::Gpu;
+
+#[cfg(unix)]
+mod system {
+    use super::{Buffer, Gpu, Result};
+    use crate::error::Error;
+    use std::os::fd::{AsFd, IntoRawFd, OwnedFd};
+
+    /// A buffer's memory, for others to import.
+    pub struct Memory(OwnedFd);
+
+    pub fn make(gpu: &Gpu, bytes: u64) -> Result<(Buffer, Memory)> {
+        let (buffer, fd) = gpu.exported_buffer("shared buffer", bytes)?;
+        Ok((buffer, Memory(fd)))
+    }
+
+    impl Memory {
+        /// Another descriptor of it, the caller's.
+        pub fn descriptor(&self) -> Result<i32> {
+            let copy = self.0.as_fd().try_clone_to_owned();
+            Ok(copy.map_err(Error::io("duplicate the descriptor of", "a shared buffer"))?.into_raw_fd())
+        }
+    }
+}
+
+#[cfg(not(unix))]
+mod system {
+    use super::{Buffer, Gpu, Result};
+    use crate::error::Error;
+
+    /// There is none.
+    pub enum Memory {}
+
+    pub fn make(_: &Gpu, _: u64) -> Result<(Buffer, Memory)> {
+        Err(Error::NoDevice("memory is shared by file descriptors, which this system does not have".into()))
+    }
+
+    impl Memory {
+        pub fn descriptor(&self) -> Result<i32> {
+            match *self {}
+        }
+    }
+}
+
+pub(super) use system::{Memory, make};
