@@ -82,6 +82,7 @@ fn megabytes(bytes: u64) -> f64 {
 }
 
 #[test]
+#[ignore = "builds everything once more, for any Linux: tools/test --packages"]
 fn the_wheel_is_small_stripped_and_whole() {
     let installed = installed();
     let name = installed.wheel.file_name().unwrap().to_str().unwrap();
@@ -108,6 +109,7 @@ fn the_wheel_is_small_stripped_and_whole() {
 }
 
 #[test]
+#[ignore = "builds everything once more, for any Linux: tools/test --packages"]
 fn licences_of_everything_linked_come_along() {
     let information = installed().packages().join(format!("nertca_vk-{}.dist-info", env!("CARGO_PKG_VERSION")));
     let texts = std::fs::read_to_string(information.join("licenses/THIRD-PARTY-LICENCES.txt")).unwrap();
@@ -128,6 +130,7 @@ fn licences_of_everything_linked_come_along() {
 
 /// The library turns panics into errors: they must find their way through what zig links.
 #[test]
+#[ignore = "builds everything once more, for any Linux: tools/test --packages"]
 fn panics_are_caught_in_what_zig_links() {
     let scratch = tempfile::tempdir().unwrap();
     let source = scratch.path().join("panics.rs");
@@ -156,6 +159,7 @@ fn readme(language: &str) -> String {
 }
 
 #[test]
+#[ignore = "builds everything once more, for any Linux: tools/test --packages"]
 fn readmes_example_runs_with_nothing_but_the_wheel() {
     let installed = installed();
     let scratch = tempfile::tempdir().unwrap();
@@ -181,6 +185,7 @@ print(beat.shape, beat.dtype, beat.std(0).max() > 0.1 * beat.max())";
 }
 
 #[test]
+#[ignore = "builds everything once more, for any Linux: tools/test --packages"]
 fn types_are_strict_inside_and_for_users() {
     let installed = installed();
     let scratch = tempfile::tempdir().unwrap();
@@ -214,6 +219,7 @@ fn types_are_strict_inside_and_for_users() {
 }
 
 #[test]
+#[ignore = "builds everything once more, for any Linux: tools/test --packages"]
 fn the_package_keeps_what_it_promises() {
     let installed = installed();
     installed.add("pytest");
