@@ -6,6 +6,7 @@ mod common;
 
 use common::{expect_silence, gpu};
 use glam::DVec3;
+use nertca_vk::formats::images::read_image;
 use nertca_vk::formats::nrrd;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::geometry::{CArm, Geometry, ViewRays};
@@ -35,14 +36,14 @@ const IODINE: f64 = 0.1;
 struct Set {
     dataset: Dataset,
     truth: Truth,
-    _directory: TempDir,
+    directory: TempDir,
 }
 
 impl Set {
     fn read(directory: TempDir) -> Set {
         let (dataset, truth) = (Dataset::open(directory.path()).unwrap(), Truth::load(directory.path()).unwrap());
         assert_eq!(dataset.frames.len(), truth.frames.len());
-        Set { dataset, truth, _directory: directory }
+        Set { dataset, truth, directory }
     }
 
     /// Each image with its truth.
@@ -431,6 +432,15 @@ fn images_show_the_heart_at_the_time_they_are_taken() {
     expect_silence(gpu);
 }
 
+/// What is hidden is found when a dataset is read, with the pixels beside it and no others.
+fn found_hidden(dataset: &Dataset, view: usize, hidden: &[bool]) {
+    let found: Vec<bool> = (0..PIXELS).map(|p| !dataset.shows(view, p)).collect();
+    assert!(found.iter().zip(hidden).all(|(found, hidden)| *found || !hidden), "all of it");
+    let count = |pixels: &[bool]| pixels.iter().filter(|p| **p).count();
+    let beside = if hidden.contains(&true) { SIZE } else { 0 };
+    assert_eq!(count(&found), count(hidden) + beside);
+}
+
 #[test]
 fn a_blade_hides_the_share_of_the_truth() {
     let gpu = gpu();
@@ -443,8 +453,10 @@ fn a_blade_hides_the_share_of_the_truth() {
     let noisy = files.patient(&gpu, true, Degradations { photons, ..Degradations::default() });
     for view in 0..=TRAINING {
         let frames: Vec<_> = cut.frames().filter(|(_, t)| t.view == view).collect();
-        let hidden: Vec<bool> =
-            (0..PIXELS).map(|p| frames.iter().all(|(f, _)| f.integrals[p] == frames[0].0.integrals[p])).collect();
+        let written: Vec<Vec<f32>> =
+            frames.iter().map(|(_, t)| read_image(&cut.directory.path().join(&t.image)).unwrap().values).collect();
+        let hidden: Vec<bool> = (0..PIXELS).map(|p| written.iter().all(|image| image[p] == written[0][p])).collect();
+        found_hidden(&cut.dataset, frames[0].0.view, &hidden);
         let lowest = |p: usize| frames.iter().map(|(f, _)| vessels.same(f).integrals[p]).fold(f32::MAX, f32::min);
         let moving: Vec<f32> =
             (0..PIXELS).map(|p| frames.iter().map(|(f, _)| vessels.same(f).integrals[p] - lowest(p)).sum()).collect();
@@ -453,10 +465,10 @@ fn a_blade_hides_the_share_of_the_truth() {
         let wanted = if view == TRAINING { 0.0 } else { 0.15 };
         assert!((share - wanted).abs() < 0.04, "view {view}: {share}");
         let densest = frames.iter().flat_map(|(f, _)| &whole.same(f).integrals).fold(0f32, |m, v| m.max(*v));
-        for (frame, truth) in &frames {
+        for ((frame, truth), written) in frames.iter().zip(&written) {
             assert!((truth.cut_share - share).abs() < 1e-3, "view {view}: {} and {share}", truth.cut_share);
             for (p, hidden) in hidden.iter().enumerate() {
-                let (value, mask) = (frame.integrals[p], frame.mask.as_ref().unwrap()[p]);
+                let (value, mask) = (written[p], frame.mask.as_ref().unwrap()[p]);
                 match hidden {
                     true => assert!(value > 1.5 * densest && !mask, "pixel {p} of a blade: {value}"),
                     false => {

@@ -178,9 +178,10 @@ fn what_has_no_tree_is_refused() {
     refuses(run, &out, &["--threshold", "nan"], &["threshold_per_mm", "positive"]);
     refuses(run, &out, &["--min-branch=-1"], &["least_branch_mm = -1", "positive"]);
     refuses(run, &out, &["--phase", "4"], &["--phase", "0 to 3"]);
-    // A network that has not been trained yet has no vessels.
+    // A network that starts at nothing, and has not been trained yet, has no vessels.
     let young = directory.path().join("young");
-    train(data, &young, &["--preset", "fast-mlp", "--iterations", "1"]);
+    let nothing = ["--set", "dynamic.best_start=false", "--set", "dynamic.normalised_shift=-15"];
+    train(data, &young, &[&["--preset", "fast-mlp", "--iterations", "1"], &nothing[..]].concat());
     refuses(&young, &out, &[], &["phase 0", "no vessel", "report"]);
 }
 
