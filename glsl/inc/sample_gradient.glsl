@@ -1,4 +1,4 @@
-// dL/d feature of a sample of the dynamic field; includes of this file have the buffers of samples and rays.
+// dL/d feature of a sample of the dynamic field; what includes this declares the buffers of samples and rays first.
 // Where the softplus is flat nothing would tell the network that a ray asks for more: there the slope is at least
 // `least_slope`. A ray that asks for less needs no such help.
 float feature_gradient(uint s) {

@@ -119,7 +119,8 @@ impl StartRay {
     /// As in training: of what is beyond the bounds.
     fn loss(&self, attenuation: f64, robust: f64) -> f64 {
         let integral = attenuation * self.length;
-        let residual = integral - integral.clamp(self.bounds[0].min(self.bounds[1]), self.bounds[1]);
+        // Not `clamp`, which panics where a bound is no number.
+        let residual = integral - integral.max(self.bounds[0]).min(self.bounds[1]);
         if robust == 0.0 {
             return residual * residual;
         }
