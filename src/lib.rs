@@ -21,21 +21,54 @@
 //!
 //! A dataset becomes a reconstruction, in memory:
 //!
-//! ```no_run
-//! use nertca_vk::{config::*, gpu::device::*, kernels::tuning::Tuning, plan::Plan};
+//! ```
+//! use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
+//! use nertca_vk::{config::*, gpu::device::*, kernels::tuning::Tuning, model::component::Component, plan::Plan};
 //! use nertca_vk::{render::renderer::Renderer, scan::dataset::Dataset, train::trainer::Trainer};
 //!
-//! let dataset = Dataset::open("out/phantom".as_ref())?;
 //! let gpu = Gpu::open(&DeviceOptions::default())?;
-//! let tuning = Tuning::for_device(gpu.info());
+//! # let directory = tempfile::tempdir().unwrap();
+//! # let (data, out) = (directory.path().join("phantom"), directory.path());
+//! # let options = nertca_vk::phantom::dataset::PhantomOptions {
+//! #     setting: nertca_vk::phantom::dataset::Setting::Xcat,
+//! #     size: 32,
+//! #     phases: 4,
+//! #     views: nertca_vk::phantom::views::ViewAngles::published(3)?,
+//! #     seed: 1,
+//! #     degradations: Default::default(),
+//! #     layout: nertca_vk::scan::dataset::Layout::Native,
+//! #     anatomy: None,
+//! #     volumes: false,
+//! # };
+//! # nertca_vk::phantom::dataset::make(&gpu, &options, &data, |_, _, _| ())?;
+//! let dataset = Dataset::open(&data)?;
 //! let config = Config::preset(Preset::Fast);
+//! # let config = Config::load(Some(Preset::Fast), None, &["train.iterations=20".into()])?;
+//!
+//! // Train.
+//! let tuning = Tuning::for_device(gpu.info());
 //! let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
 //! while trainer.step() < config.train.iterations {
 //!     trainer.advance(config.train.iterations)?;
 //! }
-//! let renderer = Renderer::new(&gpu, &trainer.model()?, tuning)?;
+//! let model = trainer.model()?;
+//!
+//! // Draw the first view at the first phase.
+//! let renderer = Renderer::new(&gpu, &model, tuning)?;
 //! let view = renderer.render(&dataset.views[0].rays, dataset.width, dataset.height, 0)?;
 //! println!("the moving vessels' largest line integral: {}", view.dynamic_integral.iter().fold(0.0, |m, v| v.max(m)));
+//!
+//! // Export the vessels of all phases, on cells of 2 mm.
+//! let export = VolumeExport {
+//!     grid: grid_over(&model.scene, Component::Dynamic, 2.0)?,
+//!     component: Component::Dynamic,
+//!     phases: (0..dataset.n_phases).collect(),
+//!     sequence: true,
+//!     format: Format::Nrrd,
+//!     compression: Compression::None,
+//! };
+//! let files = export.write(&renderer, &out.join("beat.seq.nrrd"), |_, _| {})?;
+//! # assert!(view.dynamic_integral.iter().any(|v| *v > 0.0) && files[0].is_file());
 //! # Ok::<(), nertca_vk::error::Error>(())
 //! ```
 //!
@@ -93,6 +126,7 @@ pub mod formats {
 /// Angiograms with their geometry and phase.
 pub mod scan {
     pub mod dataset;
+    pub(crate) mod frame_checks;
     pub mod gating;
     pub(crate) mod hidden;
     pub mod nerfca;
@@ -106,6 +140,7 @@ pub mod import {
     pub mod angiograms;
     pub mod dicom;
     pub mod ecg;
+    pub mod image_beat;
     mod lengths;
 }
 
@@ -146,7 +181,7 @@ pub mod render {
     pub mod sample;
 }
 
-/// From a plan to a checkpoint.
+/// Training: from a plan to a checkpoint.
 pub mod train {
     pub mod calibrate;
     pub mod gaussians;

@@ -9,6 +9,7 @@ use dicom_core::{DataElement, PrimitiveValue, VR};
 use dicom_dictionary_std::tags;
 use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::scan::gating::BeatScaling;
 use std::ops::RangeInclusive;
 use std::path::Path;
 
@@ -39,6 +40,7 @@ fn import(contrast: &[f64], phases: u32, frames: Option<RangeInclusive<usize>>) 
     let options = ImportOptions {
         phases,
         gating: Gating::Phases((0..phases).collect()),
+        scaling: BeatScaling::Linear,
         frames,
         pixel_mm: None,
         size: None,
@@ -71,4 +73,36 @@ fn frames_that_are_asked_for_are_taken_as_they_are() {
     let (told, frames) = import(&[0.0, 0.1, 1.0, 0.9, 1.0], 3, Some(1..=3));
     assert!(!told.contains("filled"), "{told}");
     assert_eq!(frames, 3);
+}
+
+#[test]
+fn a_run_without_ecg_is_gated_by_its_images() {
+    let directory = tempfile::tempdir().unwrap();
+    let (file, out) = (directory.path().join("run.dcm"), directory.path().join("data"));
+    // A bar that swings once in 12 frames of 0.1 s.
+    let frames = 30u32;
+    let swing = |frame: u32| 8.0 * (std::f64::consts::TAU * f64::from(frame) / 12.0).sin();
+    let pixel = |frame: u32, p: u32| {
+        let bar = (f64::from(p % 64) - 32.0 - swing(frame)).abs() < 1.5 && (10..54).contains(&(p / 64));
+        if bar { 90u8 } else { 190 + (p / 64 / 8) as u8 }
+    };
+    let pixels: Vec<u8> = (0..frames).flat_map(|f| (0..64 * 64).map(move |p| pixel(f, p))).collect();
+    dicom::angiogram(&file, |o| {
+        o.put(DataElement::new(tags::NUMBER_OF_FRAMES, VR::IS, PrimitiveValue::from(frames.to_string())));
+        o.put(DataElement::new(tags::PIXEL_DATA, VR::OB, PrimitiveValue::from(pixels.clone())));
+    });
+    let options = |gating| ImportOptions {
+        phases: 6,
+        gating,
+        scaling: BeatScaling::Linear,
+        frames: None,
+        pixel_mm: None,
+        size: None,
+        depth_half_extent_mm: 90.0,
+    };
+    let refused = import_dicom(std::slice::from_ref(&file), &options(Gating::Ecg), &out).unwrap_err().to_string();
+    assert!(refused.contains("have the beat found in the images"), "{refused}");
+    let told = import_dicom(&[file], &options(Gating::Images), &out).unwrap().join("\n");
+    assert!(told.contains("50 beats per minute, by the images"), "{told}");
+    assert_eq!(Dataset::open(&out).unwrap().frames.len(), 6, "{told}");
 }

@@ -12,6 +12,7 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::scan::gating::BeatScaling;
 use nertca_vk::score::metrics::vessel_threshold;
 use nertca_vk::train::trainer::Trainer;
 use shared::shared;
@@ -26,6 +27,7 @@ fn options() -> ImportOptions {
     ImportOptions {
         phases: 1,
         gating: Gating::Still,
+        scaling: BeatScaling::Linear,
         frames: None,
         pixel_mm: None,
         size: Some(256),

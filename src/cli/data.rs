@@ -1,15 +1,16 @@
 //! `phantom`, `project` and `import`.
 
-use super::args::Cli;
+use super::args::{Cli, choice};
 use super::synthetic_args::{PhantomArgs, ProjectArgs, pitch};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
 use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
-use nertca_vk::scan::gating::RPeaks;
+use nertca_vk::scan::gating::{BeatScaling, RPeaks};
 use std::path::{Path, PathBuf};
 
 /// `import`.
@@ -48,6 +49,13 @@ pub struct ImportDicomArgs {
     /// Beats per minute of a steady heart with an R-peak at the first frame.
     #[arg(long, value_name = "PER_MIN", conflicts_with = "phase_list")]
     pub heart_rate: Option<f64>,
+    /// No ECG: find the beat of each run in how its vessels move. The heart is taken to be steady; one and a half beats must be
+    /// filled with contrast.
+    #[arg(long, conflicts_with_all = ["still", "r_peaks", "heart_rate", "phase_list"])]
+    pub gate_by_images: bool,
+    /// How times between R-peaks become phases.
+    #[arg(long, value_parser = choice::<BeatScaling>(), default_value = BeatScaling::default().name())]
+    pub beat_scaling: BeatScaling,
     /// A phase from 0 for each selected frame, one per line, the same for all runs.
     #[arg(long, value_name = "FILE")]
     pub phase_list: Option<PathBuf>,
@@ -163,6 +171,7 @@ fn list<T: std::str::FromStr>(path: &Path) -> Result<Vec<T>> {
 
 fn dicom(args: &ImportDicomArgs) -> Result<()> {
     let gating = match (args.still, &args.r_peaks, args.heart_rate, &args.phase_list) {
+        _ if args.gate_by_images => Gating::Images,
         (true, ..) => Gating::Still,
         (_, Some(file), ..) => Gating::RPeaks(RPeaks::new(&list::<f64>(file)?)?),
         (_, _, Some(rate), _) => Gating::HeartRate(rate),
@@ -172,6 +181,7 @@ fn dicom(args: &ImportDicomArgs) -> Result<()> {
     let options = ImportOptions {
         phases: args.phases,
         gating,
+        scaling: args.beat_scaling,
         frames: args.frames.clone(),
         pixel_mm: args.pixel_spacing,
         size: args.size,

@@ -3,9 +3,10 @@
 use crate::error::{Error, Result};
 use crate::geometry::{CArm, Geometry};
 use crate::import::dicom::{Relationship, Run};
+use crate::import::image_beat;
 use crate::raster::{Image, dilate, opening, percentile};
 use crate::scan::dataset::{Layout, Split};
-use crate::scan::gating::RPeaks;
+use crate::scan::gating::{BeatScaling, RPeaks};
 use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
@@ -29,6 +30,8 @@ pub enum Gating {
     RPeaks(RPeaks),
     /// A steady heart, with an R-peak at the first frame.
     HeartRate(f64),
+    /// How the vessels of each run move: a steady heart (see [`image_beat`]).
+    Images,
     /// A phase for each selected frame of each run, in order.
     Phases(Vec<u32>),
     /// Nothing moves: the frames of a run are averaged. Phase 0 is the object, phase 1 what it looks like without
@@ -41,8 +44,10 @@ pub enum Gating {
 pub struct ImportOptions {
     /// Cardiac phases.
     pub phases: u32,
-    /// Where they come from.
+    /// Where phases come from.
     pub gating: Gating,
+    /// How times between R-peaks become phases.
+    pub scaling: BeatScaling,
     /// Frames of each run, from 1; those filled with contrast without.
     pub frames: Option<RangeInclusive<usize>>,
     /// Pixel pitch on the detector along columns and rows, mm, instead of what the files say.
@@ -280,16 +285,9 @@ fn phases(
         Gating::Phases(list) => {
             return Err(none(&format!("{} are given for {} selected frames", list.len(), selected.len())));
         }
-        Gating::HeartRate(rate) => {
-            let peaks = RPeaks::steady(*rate, 0.0, run.times_s.last().copied().unwrap_or(0.0))?;
-            selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases)).collect()
-        }
-        Gating::RPeaks(peaks) => selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases)).collect(),
-        Gating::Ecg => {
-            let peaks = run.r_peaks.as_ref().ok_or_else(|| {
-                none("the file has no ECG: give R-peaks, a heart rate or a list of phases, or say that the object is at rest")
-            })?;
-            selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases)).collect()
+        timed => {
+            let peaks = r_peaks(timed, run, frames, selected, vessel, notes)?;
+            selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases, options.scaling)).collect()
         }
     };
     let mut images = Vec::new();
@@ -309,6 +307,39 @@ fn phases(
     }
     notes.push(format!("{}: {} of {n_phases} phases from {} frames", run.name(), images.len(), selected.len()));
     Ok(images)
+}
+
+/// The beats of a run, by what is asked for.
+fn r_peaks(
+    gating: &Gating,
+    run: &Run,
+    frames: &[Image],
+    selected: &[usize],
+    vessel: usize,
+    notes: &mut Vec<String>,
+) -> Result<RPeaks> {
+    match gating {
+        Gating::RPeaks(peaks) => Ok(peaks.clone()),
+        Gating::HeartRate(rate) => RPeaks::steady(*rate, 0.0, run.times_s.last().copied().unwrap_or(0.0)),
+        Gating::Images => {
+            let images: Vec<&Image> = selected.iter().map(|i| &frames[*i]).collect();
+            let times_s: Vec<f64> = selected.iter().map(|i| run.times_s[*i]).collect();
+            let found = image_beat::beat(&images, &times_s, vessel)
+                .map_err(|e| Error::data(&run.path, "phases", e.to_string()))?;
+            notes.push(format!(
+                "{}: {:.0} beats per minute, by the images (vessels move like a contracting ventricle with a correlation of {:.2});                  taken to be steady",
+                run.name(),
+                found.beats_per_min,
+                found.likeness
+            ));
+            Ok(found.r_peaks)
+        }
+        _ => run.r_peaks.clone().ok_or_else(|| {
+            let problem = "the file has no ECG: give R-peaks, a heart rate or a list of phases, have the beat found in the images, or \
+                           say that the object is at rest";
+            Error::data(&run.path, "phases", problem)
+        }),
+    }
 }
 
 /// The image without structures as thin as vessels: where something stands out of its surroundings by more than noise

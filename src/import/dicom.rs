@@ -32,7 +32,7 @@ pub enum Relationship {
 /// A run.
 #[derive(Debug, Clone)]
 pub struct Run {
-    /// Where it came from.
+    /// File the run was read from.
     pub path: PathBuf,
     /// Columns.
     pub width: usize,

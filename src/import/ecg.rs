@@ -54,6 +54,7 @@ pub fn r_peaks(trace: &[f64], rate_hz: f64) -> Result<RPeaks> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scan::gating::BeatScaling;
 
     #[test]
     fn peaks_of_a_noisy_trace_are_found() {
@@ -68,8 +69,8 @@ mod tests {
             .collect();
         let found = r_peaks(&trace, rate).unwrap();
         for (index, beat) in beats.iter().enumerate() {
-            assert_eq!(found.phase(beat + 0.02, 20), Some(0), "beat {index}");
-            assert_eq!(found.phase(beat - 0.02, 20), Some(19), "beat {index}");
+            assert_eq!(found.phase(beat + 0.02, 20, BeatScaling::Linear), Some(0), "beat {index}");
+            assert_eq!(found.phase(beat - 0.02, 20, BeatScaling::Linear), Some(19), "beat {index}");
         }
         assert!(r_peaks(&[0.0; 600], rate).is_err(), "a flat line has none");
     }

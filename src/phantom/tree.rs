@@ -8,7 +8,7 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::random::{STREAM_SHAPE, uniform01};
-use crate::scan::gating::SYSTOLE_SHARE;
+use crate::scan::gating::contraction;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -31,16 +31,6 @@ pub struct Branch {
 pub struct Tree {
     /// All vessels.
     pub branches: Vec<Branch>,
-}
-
-/// How far the ventricle has contracted at a fraction of the beat: 0 at end-diastole, 1 at end-systole
-/// ([`SYSTOLE_SHARE`] of the beat), back to 0 at 75 %, then rest.
-pub fn contraction(fraction: f64) -> f64 {
-    let x = fraction.rem_euclid(1.0);
-    let since_systole = x - SYSTOLE_SHARE;
-    let half_wave =
-        if since_systole < 0.0 { 0.5 * x / SYSTOLE_SHARE } else { (0.5 + 0.5 * since_systole / 0.4).min(1.0) };
-    (std::f64::consts::PI * half_wave).sin().powi(2)
 }
 
 /// Direction of the heart's swing in systole: to the front, right and up; LPS.

@@ -6,6 +6,7 @@ use crate::files;
 use crate::formats::images;
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, is_at_rest};
 use crate::raster::Image;
+use crate::scan::frame_checks::{Complaint, check_phase, check_size, check_values, checked_rays};
 use crate::scan::nerfca;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -136,7 +137,7 @@ pub struct ManifestFrame {
 /// One image, ready for use.
 #[derive(Debug, Clone)]
 pub struct Frame {
-    /// For messages and picture names.
+    /// Name of the frame, for messages and pictures.
     pub name: String,
     /// Index into [`Dataset::views`].
     pub view: usize,
@@ -162,7 +163,7 @@ impl Frame {
 /// A geometry shared by frames.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// As stated in the file.
+    /// Geometry as stated in the file.
     pub geometry: Geometry,
     /// Rays in world units.
     pub rays: ViewRays,
@@ -194,7 +195,7 @@ impl Choice for Layout {
 pub struct Dataset {
     /// Directory it came from.
     pub path: PathBuf,
-    /// Its layout.
+    /// Layout of the files it was read from.
     pub layout: Layout,
     /// Distinct geometries.
     pub views: Vec<View>,
@@ -411,49 +412,20 @@ impl Builder {
         if !new.heart_shift_mm.iter().all(|s| s.is_finite() && s.abs() < 1e3) {
             return Err(Error::data(&self.file, field("heart_shift_mm"), "is not a displacement in mm"));
         }
-        if new.phase >= self.n_phases {
-            return Err(Error::data(
-                &self.file,
-                field("phase"),
-                format!("{} with {} phases; phases count from 0", new.phase, self.n_phases),
-            ));
-        }
+        let told = |file: &Path, Complaint { field: name, value, problem }: Complaint| {
+            Error::data(file, field(&name), format!("{value} {problem}").trim_start())
+        };
+        check_phase(new.phase, self.n_phases).map_err(|c| told(&self.file, c))?;
         let size = (new.image.width, new.image.height);
-        match self.size {
-            Some(first) if first != size => {
-                return Err(Error::data(
-                    new.source,
-                    "shape",
-                    format!("{} x {} where earlier images have {} x {}", size.0, size.1, first.0, first.1),
-                ));
-            }
-            _ => self.size = Some(size),
-        }
-        if let Some(at) = new.image.values.iter().position(|v| !v.is_finite()) {
-            return Err(Error::data(
-                new.source,
-                format!("pixel (column {}, row {})", at % size.0, at / size.0),
-                format!("{} is not a finite number", new.image.values[at]),
-            ));
-        }
+        check_size(size, self.size).map_err(|c| told(new.source, c))?;
+        self.size = Some(size);
+        check_values(&new.image.values, size.0).map_err(|c| told(new.source, c))?;
         let view = match self.views.iter().position(|v| v.geometry == new.geometry) {
             Some(view) => view,
             None => {
-                let rays = new
-                    .geometry
-                    .rays(size.0, size.1)
-                    .map_err(|(name, problem)| Error::data(&self.file, field(&format!("geometry.{name}")), problem))?;
-                if rays.sod + self.depth_range.0 <= 0.0 {
-                    return Err(Error::data(
-                        &self.file,
-                        field("geometry"),
-                        format!(
-                            "the source, {:.0} mm before the isocentre, stands inside the depth range ({:.0} mm)",
-                            rays.sod * MM_PER_UNIT,
-                            -self.depth_range.0 * MM_PER_UNIT
-                        ),
-                    ));
-                }
+                let of_geometry = |c: Complaint| Complaint { field: format!("geometry.{}", c.field), ..c };
+                let rays = checked_rays(&new.geometry, size, -self.depth_range.0)
+                    .map_err(|c| told(&self.file, of_geometry(c)))?;
                 self.views.push(View { geometry: new.geometry, rays });
                 self.views.len() - 1
             }

@@ -4,7 +4,7 @@ use crate::choice::Choice;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// From the R-peak to the end of systole, seconds. Coronary arteries stand still 280 to 340 ms after R at heart rates of 60
+/// Time from the R-peak to the end of systole, seconds. Coronary arteries stand still 280 to 340 ms after R at heart rates of 60
 /// to 80 per minute.
 pub const SYSTOLE_S: f64 = 0.31;
 /// Share of the phases before the end of systole: phases are fractions of a beat of [`SYSTOLE_S`] / 0.35, 68 per minute.
@@ -13,12 +13,13 @@ pub const SYSTOLE_SHARE: f64 = 0.35;
 const LONGEST_SYSTOLE: f64 = 0.6;
 
 /// How time since the R-peak becomes a fraction of the beat, where hearts beat at different rates.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum BeatScaling {
     /// All of the beat stretches alike.
     Linear,
     /// Systole keeps its length ([`SYSTOLE_S`]), diastole takes the rest.
+    #[default]
     TwoSegment,
 }
 
@@ -53,6 +54,16 @@ pub fn two_segment_fraction(since_r_s: f64, beat_s: f64, systole_s: f64) -> f64 
         SYSTOLE_SHARE + (1.0 - SYSTOLE_SHARE) * (since_r_s - systole_s) / (beat_s - systole_s)
     };
     fraction.clamp(0.0, 1.0)
+}
+
+/// How far the ventricle has contracted at a fraction of the beat: 0 at end-diastole, 1 at end-systole
+/// ([`SYSTOLE_SHARE`] of the beat), back to 0 at 75 %, then rest.
+pub fn contraction(fraction: f64) -> f64 {
+    let x = fraction.rem_euclid(1.0);
+    let since_systole = x - SYSTOLE_SHARE;
+    let half_wave =
+        if since_systole < 0.0 { 0.5 * x / SYSTOLE_SHARE } else { (0.5 + 0.5 * since_systole / 0.4).min(1.0) };
+    (std::f64::consts::PI * half_wave).sin().powi(2)
 }
 
 /// Beats longer than this many of the usual ones are gaps in the ECG, not beats.
@@ -95,6 +106,11 @@ impl RPeaks {
         Self::new(&(0..n).map(|i| start_s + i as f64 * beat).collect::<Vec<_>>())
     }
 
+    /// Their times, seconds.
+    pub fn times_s(&self) -> &[f64] {
+        &self.times_s
+    }
+
     /// Median length of a beat, seconds.
     pub fn beat_s(&self) -> f64 {
         let mut beats: Vec<f64> = self.times_s.windows(2).map(|w| w[1] - w[0]).collect();
@@ -102,9 +118,9 @@ impl RPeaks {
         beats[beats.len() / 2]
     }
 
-    /// Phase of a time, from 0, of `n_phases` equal parts of its beat. Up to one usual beat before the first and after
-    /// the last R-peak counts; `None` beyond, and within gaps of the ECG.
-    pub fn phase(&self, time_s: f64, n_phases: u32) -> Option<u32> {
+    /// Phase of a time, from 0, of `n_phases` equal parts of its beat as `scaling` counts it. Up to one usual beat before the
+    /// first and after the last R-peak counts; `None` beyond, and within gaps of the ECG.
+    pub fn phase(&self, time_s: f64, n_phases: u32, scaling: BeatScaling) -> Option<u32> {
         let usual = self.beat_s();
         let after = self.times_s.partition_point(|r| *r <= time_s);
         let (start, beat) = match (after, self.times_s.len()) {
@@ -112,10 +128,11 @@ impl RPeaks {
             (i, n) if i == n => (self.times_s[n - 1], usual),
             (i, _) => (self.times_s[i - 1], self.times_s[i] - self.times_s[i - 1]),
         };
-        let share = (time_s - start) / beat;
-        if !(0.0..1.0).contains(&share) || beat > LONGEST_BEAT * usual {
+        let since_r_s = time_s - start;
+        if !(0.0..beat).contains(&since_r_s) || beat > LONGEST_BEAT * usual {
             return None;
         }
+        let share = scaling.fraction(since_r_s, beat);
         Some(((share * f64::from(n_phases)) as u32).min(n_phases - 1))
     }
 }
@@ -123,23 +140,32 @@ impl RPeaks {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use BeatScaling::Linear;
 
     #[test]
     fn phases_are_equal_parts_of_each_beat() {
         let peaks = RPeaks::new(&[1.0, 2.0, 2.8]).unwrap();
-        assert_eq!(peaks.phase(1.0, 10), Some(0));
-        assert_eq!(peaks.phase(1.55, 10), Some(5));
-        assert_eq!(peaks.phase(2.4, 10), Some(5), "a shorter beat has shorter phases");
-        assert_eq!(peaks.phase(0.5, 10), Some(5), "one beat before the first R-peak is known well enough");
-        assert_eq!(peaks.phase(3.5, 10), Some(7), "and one after the last");
-        assert_eq!((peaks.phase(-0.1, 10), peaks.phase(4.0, 10)), (None, None));
+        assert_eq!(peaks.phase(1.0, 10, Linear), Some(0));
+        assert_eq!(peaks.phase(1.55, 10, Linear), Some(5));
+        assert_eq!(peaks.phase(2.4, 10, Linear), Some(5), "a shorter beat has shorter phases");
+        assert_eq!(peaks.phase(0.5, 10, Linear), Some(5), "one beat before the first R-peak is known well enough");
+        assert_eq!(peaks.phase(3.5, 10, Linear), Some(7), "and one after the last");
+        assert_eq!((peaks.phase(-0.1, 10, Linear), peaks.phase(4.0, 10, Linear)), (None, None));
+    }
+
+    #[test]
+    fn a_slow_beat_is_slow_in_diastole() {
+        let peaks = RPeaks::new(&[0.0, 1.5, 3.0]).unwrap();
+        let at = |time_s| (peaks.phase(time_s, 10, Linear), peaks.phase(time_s, 10, BeatScaling::TwoSegment));
+        assert_eq!(at(0.305), (Some(2), Some(3)), "the end of systole");
+        assert_eq!(at(1.49), (Some(9), Some(9)), "the end of the beat");
     }
 
     #[test]
     fn a_gap_in_the_ecg_has_no_phase() {
         let peaks = RPeaks::new(&[0.0, 1.0, 2.0, 5.0, 6.0]).unwrap();
-        assert_eq!(peaks.phase(3.0, 10), None);
-        assert_eq!(peaks.phase(5.5, 10), Some(5));
+        assert_eq!(peaks.phase(3.0, 10, Linear), None);
+        assert_eq!(peaks.phase(5.5, 10, Linear), Some(5));
     }
 
     #[test]
@@ -164,6 +190,6 @@ mod tests {
         assert!(RPeaks::new(&[1.0]).is_err());
         assert!(RPeaks::new(&[1.0, 1.0]).unwrap_err().to_string().contains("must rise"));
         assert!(RPeaks::new(&[1.0, f64::NAN]).is_err());
-        assert_eq!(RPeaks::steady(60.0, 0.5, 3.0).unwrap().phase(1.75, 4), Some(1));
+        assert_eq!(RPeaks::steady(60.0, 0.5, 3.0).unwrap().phase(1.75, 4, Linear), Some(1));
     }
 }

@@ -4,7 +4,8 @@ use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use crate::scan::gating::RPeaks;
+use crate::scan::frame_checks::{Complaint, check_phase, check_size, check_values, checked_rays};
+use crate::scan::gating::{BeatScaling, RPeaks};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -39,7 +40,7 @@ pub struct NewFrame {
     pub geometry: Geometry,
     /// When.
     pub moment: Moment,
-    /// To train on, or to score with.
+    /// Whether to train on it, or to score with it.
     pub split: Split,
     /// Columns.
     pub width: usize,
@@ -53,6 +54,10 @@ pub struct NewFrame {
 
 fn bad(field: &str, value: String, problem: String) -> Error {
     Error::config(format!("frame: {field}"), value, problem)
+}
+
+fn told(complaint: Complaint) -> Error {
+    bad(&complaint.field, complaint.value, complaint.problem)
 }
 
 /// Checked frames, and how they are to be used.
@@ -71,23 +76,14 @@ impl Inbox {
             let size = format!("{} x {}", new.width, new.height);
             return Err(bad("size", size, "does not fit its pixels or mask".into()));
         }
-        if let Some(size) = self.size.filter(|size| *size != (new.width, new.height)) {
-            let problem = format!("earlier frames have {} x {}; all must be of one size", size.0, size.1);
-            return Err(bad("size", format!("{} x {}", new.width, new.height), problem));
-        }
-        if let Some(at) = new.integrals.iter().position(|v| !v.is_finite()) {
-            let pixel = format!("column {}, row {}", at % new.width, at / new.width);
-            return Err(bad("pixels", pixel, format!("{} is no line integral", new.integrals[at])));
-        }
+        check_size((new.width, new.height), self.size).map_err(told)?;
+        check_values(&new.integrals, new.width).map_err(told)?;
         match new.moment {
-            Moment::Phase(phase) if phase >= self.options.phases => {
-                let problem = format!("phases go from 0 to {}", self.options.phases - 1);
-                return Err(bad("phase", phase.to_string(), problem));
-            }
+            Moment::Phase(phase) => check_phase(phase, self.options.phases).map_err(told)?,
             Moment::TimeS(time) if !time.is_finite() => {
                 return Err(bad("time", time.to_string(), "is not a time in seconds".into()));
             }
-            _ => (),
+            Moment::TimeS(_) => (),
         }
         let rays = self.rays(&new.geometry, (new.width, new.height))?;
         self.size = Some((new.width, new.height));
@@ -121,14 +117,8 @@ impl Inbox {
     }
 
     /// Rays of a geometry that frames of a size can have.
-    fn rays(&self, geometry: &Geometry, (width, height): (usize, usize)) -> Result<ViewRays> {
-        let rays = geometry.rays(width, height).map_err(|(field, problem)| bad(&field, String::new(), problem))?;
-        let depth = self.options.depth_half_extent_mm / MM_PER_UNIT;
-        if rays.sod <= depth {
-            let problem = format!("the source stands inside the depth range of {} mm", depth * MM_PER_UNIT);
-            return Err(bad("sod_mm", format!("{:.0}", rays.sod * MM_PER_UNIT), problem));
-        }
-        Ok(rays)
+    fn rays(&self, geometry: &Geometry, size: (usize, usize)) -> Result<ViewRays> {
+        checked_rays(geometry, size, self.options.depth_half_extent_mm / MM_PER_UNIT).map_err(told)
     }
 
     /// Index of a view, which is new unless an earlier frame was taken from there.
@@ -144,7 +134,7 @@ impl Inbox {
     pub(super) fn phase(&self, moment: Moment) -> Option<u32> {
         match (moment, &self.r_peaks) {
             (Moment::Phase(phase), _) => Some(phase),
-            (Moment::TimeS(time), Some(peaks)) => peaks.phase(time, self.options.phases),
+            (Moment::TimeS(time), Some(peaks)) => peaks.phase(time, self.options.phases, BeatScaling::default()),
             (Moment::TimeS(_), None) => None,
         }
     }

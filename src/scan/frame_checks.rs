@@ -1,0 +1,63 @@
+//! What every frame must satisfy, whether it comes from a file or from a caller.
+
+use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
+
+/// What is wrong with a frame.
+pub(crate) struct Complaint {
+    /// Part of the frame.
+    pub(crate) field: String,
+    /// What it is.
+    pub(crate) value: String,
+    /// Why that cannot be.
+    pub(crate) problem: String,
+}
+
+impl Complaint {
+    fn new(field: &str, value: impl ToString, problem: impl ToString) -> Complaint {
+        Complaint { field: field.into(), value: value.to_string(), problem: problem.to_string() }
+    }
+}
+
+/// Refuses a size (columns, rows) that earlier frames do not have.
+pub(crate) fn check_size(size: (usize, usize), earlier: Option<(usize, usize)>) -> Result<(), Complaint> {
+    match earlier {
+        Some(earlier) if earlier != size => {
+            let problem = format!("earlier frames have {} x {}; all must be of one size", earlier.0, earlier.1);
+            Err(Complaint::new("size", format!("{} x {}", size.0, size.1), problem))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Refuses a value that is no number, naming its pixel.
+pub(crate) fn check_values(values: &[f32], width: usize) -> Result<(), Complaint> {
+    match values.iter().position(|v| !v.is_finite()) {
+        Some(at) => {
+            let pixel = format!("column {}, row {}", at % width, at / width);
+            Err(Complaint::new("pixels", pixel, format!("{} is not a finite number", values[at])))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Refuses a phase that there is not.
+pub(crate) fn check_phase(phase: u32, n_phases: u32) -> Result<(), Complaint> {
+    if phase < n_phases {
+        return Ok(());
+    }
+    Err(Complaint::new("phase", phase, format!("phases go from 0 to {}", n_phases.saturating_sub(1))))
+}
+
+/// Rays of a geometry whose source stands before what is searched, `depth_before` world units from the isocentre on.
+pub(crate) fn checked_rays(
+    geometry: &Geometry,
+    size: (usize, usize),
+    depth_before: f64,
+) -> Result<ViewRays, Complaint> {
+    let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Complaint::new(&field, "", problem))?;
+    if rays.sod <= depth_before {
+        let problem = format!("the source stands inside the depth range of {:.0} mm", depth_before * MM_PER_UNIT);
+        return Err(Complaint::new("sod_mm", format!("{:.0}", rays.sod * MM_PER_UNIT), problem));
+    }
+    Ok(rays)
+}
