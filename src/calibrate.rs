@@ -12,6 +12,7 @@ mod linear;
 pub mod observed;
 pub mod pose;
 pub mod profiles;
+mod sight;
 pub mod silhouettes;
 pub mod solve;
 
@@ -29,8 +30,11 @@ use solve::{ANGLE_DEG, BREATHING_MM, DEPTH_MM, IN_PLANE_MM};
 
 /// Corrections beyond so many standard deviations of what is expected are not believed.
 const BOUND: f64 = 4.0;
-/// Views with more than this share of their change at the border have vessels that the image cuts off.
-const CUT_OFF: f64 = 0.02;
+/// Where vessels are cut off, profiles differ whatever the geometry, and the same way at all phases: there, a correction must leave at
+/// most this share of the squared residual, ...
+const LARGE_GAIN_LEAVES: f64 = 0.5;
+/// ... or of the vessel pixels that the other views do not explain as stated.
+const LEFT_UNEXPLAINED: f64 = 0.75;
 /// Changes over the beat below this share of the images' range are rounding.
 const LEAST_CHANGE: f64 = 1e-5;
 /// Half side of the cube that stands for the heart where corrections are compared, as a share of the field of view's half.
@@ -54,11 +58,11 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
         return Ok(Calibration::none(Some(format!("views not calibrated: {why}"))));
     }
     let mut notes = Vec::new();
-    let cut = cut_off(&observed);
+    let cut: Vec<usize> = observed.cut_off().into_iter().map(|slot| observed.views[slot]).collect();
     if !cut.is_empty() {
         notes.push(format!(
-            "vessels are cut off at the border of views {cut:?}: what other views show of them has no counterpart there, so \
-             corrections are less sure, and assumed only where they explain much"
+            "vessels are cut off at the border of views {cut:?}: what other views show of them has no counterpart there, so a \
+             correction is assumed only where views then agree clearly better"
         ));
     }
     let candidates = candidates(mode, config.gaussians_move(), &mut notes);
@@ -77,7 +81,7 @@ pub struct Silhouettes {
     pub seen: Vec<f32>,
     /// Pixels that show vessels.
     pub shown: Vec<bool>,
-    /// Those that the other views explain, before and after.
+    /// Vessel pixels that the other views explain, before and after the correction.
     pub explained: [Vec<bool>; 2],
 }
 
@@ -134,12 +138,6 @@ fn candidates(mode: CalibrateMode, frames: bool, notes: &mut Vec<String>) -> Vec
     }
 }
 
-/// Views whose vessels the image cuts off.
-fn cut_off(observed: &Observed) -> Vec<usize> {
-    let views = observed.views.iter().zip(&observed.at_border);
-    views.filter(|(_, share)| **share > CUT_OFF).map(|(view, _)| *view).collect()
-}
-
 struct Calibrator<'a> {
     dataset: &'a Dataset,
     observed: &'a Observed,
@@ -155,9 +153,8 @@ impl Calibrator<'_> {
         let residuals: Vec<f64> = tried.iter().map(|t| t.residual).collect();
         // Displacements of frames take up what is cut off more than positions of views do.
         let gain = |k: usize| match candidates[k] {
-            _ if cut_off(self.observed).is_empty() => choose::LEAST_GAIN,
-            Correction::Breathing => choose::LARGE_GAIN,
-            _ => choose::CUT_OFF_GAIN,
+            Correction::Breathing if !self.observed.cut_off().is_empty() => choose::LARGE_GAIN,
+            _ => choose::LEAST_GAIN,
         };
         let chosen = best(&residuals, gain);
         let shares: Vec<_> = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();
@@ -210,12 +207,22 @@ impl Calibrator<'_> {
             return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
         }
         let stated = Poses::stated(self.observed.views.len(), self.observed.n_phases());
+        let explained = [&stated, poses].map(|poses| silhouettes::explained(self.observed, poses));
+        if !self.observed.cut_off().is_empty() && !helps_clearly(correction, &tried, explained) {
+            self.notes.push(format!(
+                "views are left as stated: a correction brings what moves closer ({}), but the other views explain {:.0} % of a \
+                 view's vessel pixels with it and {:.0} % without",
+                in_words(&tried),
+                100.0 * explained[1],
+                100.0 * explained[0]
+            ));
+            return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
+        }
         let moved = self.motion(&stated, poses);
         let disagreement_px = self.distance_px(&stated, poses);
         let view = |slot: usize| self.view(slot, poses, &moved);
         let views: Vec<ViewCorrection> = (0..self.observed.views.len()).map(view).collect();
         let frames = if correction == Correction::Breathing { self.frames(poses) } else { Vec::new() };
-        let explained = [&stated, poses].map(|poses| silhouettes::explained(self.observed, poses));
         let mut calibration = Calibration {
             correction,
             views,
@@ -302,6 +309,14 @@ impl Calibrator<'_> {
         let frames = self.frame_rays(a, b, None);
         self.motion(a, b).remainder_px(&frames, &self.points()) * self.observed.factor as f64
     }
+}
+
+/// Whether a correction takes away what vessels that are cut off cannot have caused, by the residuals (shares of the profiles)
+/// or the explained pixels before and after it.
+fn helps_clearly(correction: Correction, tried: &[(Correction, f64)], explained: [f64; 2]) -> bool {
+    let residual = |of: Correction| tried.iter().find(|(c, _)| *c == of).map_or(f64::NAN, |(_, share)| share * share);
+    residual(correction) <= LARGE_GAIN_LEAVES * residual(Correction::Stated)
+        || 1.0 - explained[1] <= LEFT_UNEXPLAINED * (1.0 - explained[0])
 }
 
 /// Which correction exceeds what is to be believed.

@@ -51,6 +51,12 @@ pub fn dilate(image: &Image, radius: usize) -> Image {
     filter(image, radius, f32::max)
 }
 
+/// A mask with a margin of so many pixels, as [`dilate`] has it.
+pub fn widened(mask: &[bool], [width, height]: [usize; 2], pixels: usize) -> Vec<bool> {
+    let values = mask.iter().map(|m| f32::from(u8::from(*m))).collect();
+    dilate(&Image { width, height, values }, pixels).values.iter().map(|v| *v > 0.0).collect()
+}
+
 /// Grey opening: what is narrower than `2 radius + 1` pixels is cut down to its surroundings.
 pub fn opening(image: &Image, radius: usize) -> Image {
     dilate(&filter(image, radius, f32::min), radius)

@@ -81,6 +81,50 @@ fn views_are_brought_together() {
     assert_eq!(failures, Vec::<String>::new());
 }
 
+/// Puts blades before the images of the first views, each on another side, which hide about `share` of the columns or rows.
+fn with_blades(shot: &mut Shot, views: usize, share: f64) {
+    let (width, height) = (shot.dataset.width, shot.dataset.height);
+    let depth = (share * width as f64) as usize;
+    for view in 0..views {
+        let shown = |p: usize| match view % 4 {
+            0 => p % width >= depth,
+            1 => p / width >= depth,
+            2 => p % width < width - depth,
+            _ => p / width < height - depth,
+        };
+        for frame in shot.dataset.frames.iter_mut().filter(|f| f.view == view) {
+            let dark = frame.integrals.iter().copied().fold(f32::MIN, f32::max) + 1.0;
+            frame.integrals.iter_mut().enumerate().filter(|(p, _)| !shown(*p)).for_each(|(_, v)| *v = dark);
+        }
+        shot.dataset.hidden.insert(view, (0..width * height).map(|p| !shown(p)).collect());
+    }
+}
+
+#[test]
+fn blades_do_not_pull_views_apart() {
+    let gpu = gpu();
+    let studio = Studio::new(&gpu, 100, 1);
+    let none = Wrong { seed: 11, ..Wrong::default() };
+    let moved = Wrong { angle_deg: 0.5, shift_mm: 1.0, ..none };
+    let mut failures = Vec::new();
+    for (n_views, blades, share, wrong, most) in [
+        (3, 3, 0.35, none, 0.05),
+        (4, 4, 0.35, none, 0.05),
+        (3, 3, 0.2, none, 0.05),
+        (3, 2, 0.15, moved, 1.0),
+        (4, 4, 0.15, moved, 0.5),
+    ] {
+        let mut shot = studio.shoot(n_views, false, wrong);
+        with_blades(&mut shot, blades, share);
+        let (calibration, error) = calibrated(&shot, "auto");
+        if error.is_nan() || error > most {
+            let chosen = calibration.correction;
+            failures.push(format!("{n_views} views, {blades} blades of {share}, {wrong:?}: {chosen:?}, {error:.3} px"));
+        }
+    }
+    assert_eq!(failures, Vec::<String>::new());
+}
+
 /// Dice of the moving field at unseen views, by the default preset.
 fn dice(gpu: &Gpu, dataset: &Dataset) -> f64 {
     let config = config("off");

@@ -19,9 +19,8 @@ const STEPS: [usize; 2] = [2, 3];
 const TEMPER: f64 = 10.0;
 /// A correction must take this share of the squared residual away at phases it has not seen: chance takes less.
 pub const LEAST_GAIN: f64 = 0.02;
-/// Where vessels are cut off, so that profiles differ whatever the geometry, positions of views must take this share away.
-pub const CUT_OFF_GAIN: f64 = 0.15;
-/// And breathing this share.
+/// Where vessels are cut off, which displacements of frames take up more than positions of views do, breathing must take this
+/// share away.
 pub const LARGE_GAIN: f64 = 0.3;
 /// Fewer phases cannot be split.
 pub const LEAST_PHASES: usize = 4;

@@ -12,7 +12,7 @@ use std::path::Path;
 pub const FILE: &str = "calibration.json";
 const MAX_BYTES: u64 = 64 << 20;
 
-/// Of one view.
+/// Correction of one view.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ViewCorrection {
     /// Index into the dataset's views.
@@ -25,17 +25,17 @@ pub struct ViewCorrection {
     pub table_mm: [f64; 3],
     /// Root mean square of how far the correction moves the heart's image, pixels, less what moves all views alike.
     pub moved_px: f64,
-    /// What does not agree with the other views, as a share of the profiles, before.
+    /// Difference of this view's profiles from those of the others before the correction, as a share of the profiles.
     pub residual_before: f64,
-    /// And after.
+    /// Difference of this view's profiles from those of the others after the correction, as a share of the profiles.
     pub residual_after: f64,
-    /// As stated.
+    /// Geometry of the view as stated.
     pub stated: Geometry,
-    /// As corrected.
+    /// Geometry of the view as corrected.
     pub corrected: Geometry,
 }
 
-/// Of one frame: where breathing has carried the heart.
+/// Correction of one frame: where breathing has carried the heart.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FrameCorrection {
     /// Index into the dataset's views.
@@ -64,7 +64,7 @@ pub struct Calibration {
     pub tried: Vec<(Correction, f64)>,
     /// Share of the pixels that show vessels for which all other views show some on the ray, to a pixel: before and after.
     pub explained: [f64; 2],
-    /// In words.
+    /// What was done and why, in words.
     pub notes: Vec<String>,
 }
 

@@ -57,7 +57,7 @@ pub struct FrameRays {
     pub phase: usize,
     /// What the heart truly was seen by.
     pub truth: ViewRays,
-    /// What it is seen by after the correction.
+    /// Rays of the frame after the correction.
     pub corrected: ViewRays,
 }
 
@@ -66,7 +66,7 @@ pub struct FrameRays {
 pub struct RigidMotion {
     /// Axis times angle, radians.
     pub rotation: DVec3,
-    /// Of each phase, world units.
+    /// Translation of each phase, world units.
     pub translations: Vec<DVec3>,
 }
 

@@ -4,7 +4,7 @@ use crate::calibrate::pose::Stand;
 use crate::calibrate::profiles::{Moving, Views};
 use crate::evidence::background::Series;
 use crate::evidence::ratios::ViewEvidence;
-use crate::raster::{Image, dilate};
+use crate::raster::widened;
 use crate::scan::dataset::{Dataset, Frame};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -19,6 +19,8 @@ const MASK_MARGIN: usize = 2;
 const SHOWN_SHARE: f32 = 0.15;
 /// The border, pixels.
 const BORDER: usize = 2;
+/// Views with more than this share of their change at the border have vessels that the image cuts off.
+const CUT_OFF: f64 = 0.02;
 /// Standard deviations of noise that are no vessel at the border.
 const CLEAR: f32 = 4.0;
 
@@ -27,7 +29,7 @@ const CLEAR: f32 = 4.0;
 pub struct Observed {
     /// Indices into [`Dataset::views`].
     pub views: Vec<usize>,
-    /// Where they stand.
+    /// Where each of the views stands.
     pub stands: Vec<Stand>,
     /// Pixels of the dataset along one of these.
     pub factor: usize,
@@ -39,6 +41,8 @@ pub struct Observed {
     pub seen: Vec<Vec<Option<Vec<f32>>>>,
     /// `[view][phase]`: pixels that show vessels.
     pub shown: Vec<Vec<Option<Vec<bool>>>>,
+    /// `[view]`: pixels that show the patient.
+    pub visible: Vec<Vec<bool>>,
     /// Strongest change over the beat of any view, as a share of the range of its line integrals.
     pub change: f64,
     /// Share of each view's change that lies at the border of its images.
@@ -92,6 +96,8 @@ struct Seen {
     above: Vec<Option<Vec<f32>>>,
     /// `[phase]`: pixels that show vessels.
     shown: Vec<Option<Vec<bool>>>,
+    /// Pixels that show the patient.
+    visible: Vec<bool>,
     noise: Vec<f32>,
     change: f64,
     at_border: f64,
@@ -111,11 +117,11 @@ impl Seen {
     fn new(data: &Dataset, series: &Series) -> Seen {
         let evidence = ViewEvidence::new(series);
         let level = &evidence.background.level.values;
-        let likely =
-            |p: usize| data.shows(series.view, p) && evidence.ratios.iter().flatten().any(|r| r.values[p] > LIKELY);
+        let visible: Vec<bool> = (0..data.n_pixels()).map(|p| data.shows(series.view, p)).collect();
+        let likely = |p: usize| visible[p] && evidence.ratios.iter().flatten().any(|r| r.values[p] > LIKELY);
         let mask: Vec<bool> = (0..data.n_pixels()).map(likely).collect();
         let mut wide_mask = widened(&mask, [data.width, data.height], MASK_MARGIN);
-        wide_mask.iter_mut().enumerate().for_each(|(p, m)| *m &= data.shows(series.view, p));
+        wide_mask.iter_mut().zip(&visible).for_each(|(m, v)| *m &= *v);
         let above = series.images.iter().map(|image| {
             let values = &image.as_ref()?.values;
             Some(values.iter().zip(level).map(|(y, b)| y - b).collect::<Vec<f32>>())
@@ -124,15 +130,15 @@ impl Seen {
         let view = &data.views[series.view];
         let mut shown = shown(&evidence);
         for pixels in shown.iter_mut().flatten() {
-            pixels.iter_mut().enumerate().for_each(|(p, s)| *s &= data.shows(series.view, p));
+            pixels.iter_mut().zip(&visible).for_each(|(s, v)| *s &= *v);
         }
         let stand = Stand::new(&view.geometry, &view.rays);
         let values = series.seen().flat_map(|image| &image.values);
         let [least, most] = values.fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
         let change = f64::from(evidence.background.strongest) / f64::from(most - least).max(f64::MIN_POSITIVE);
         let noise = evidence.background.noise.values;
-        let mut seen = Seen { stand, mask, wide_mask, above, shown, noise, change, at_border: 0.0 };
-        seen.at_border = seen.share_at_border(&border(data, series.view));
+        let mut seen = Seen { stand, mask, wide_mask, above, shown, visible, noise, change, at_border: 0.0 };
+        seen.at_border = seen.share_at_border(&border(&seen.visible, [data.width, data.height]));
         seen
     }
 
@@ -151,17 +157,11 @@ impl Seen {
 }
 
 /// Pixels next to what a view does not show: beyond the edges of its images, or hidden.
-fn border(data: &Dataset, view: usize) -> Vec<bool> {
-    let (width, height) = (data.width, data.height);
-    let hidden: Vec<bool> = (0..data.n_pixels()).map(|p| !data.shows(view, p)).collect();
+fn border(visible: &[bool], [width, height]: [usize; 2]) -> Vec<bool> {
+    let hidden: Vec<bool> = visible.iter().map(|v| !v).collect();
     let beside = widened(&hidden, [width, height], BORDER);
     let at_edge = |p: usize| (p % width).min(p / width).min(width - 1 - p % width).min(height - 1 - p / width) < BORDER;
-    (0..data.n_pixels()).map(|p| at_edge(p) || beside[p]).collect()
-}
-
-fn widened(mask: &[bool], [width, height]: [usize; 2], pixels: usize) -> Vec<bool> {
-    let values = mask.iter().map(|m| f32::from(u8::from(*m))).collect();
-    dilate(&Image { width, height, values }, pixels).values.iter().map(|v| *v > 0.0).collect()
+    (0..visible.len()).map(|p| at_edge(p) || beside[p]).collect()
 }
 
 impl Observed {
@@ -186,9 +186,15 @@ impl Observed {
             at_border: seen.iter().map(|s| s.at_border).collect(),
             stands: seen.iter().map(|s| s.stand.clone()).collect(),
             seen: seen.iter().map(|s| s.above.clone()).collect(),
+            visible: seen.iter().map(|s| s.visible.clone()).collect(),
             shown: seen.into_iter().map(|s| s.shown).collect(),
             factor,
         }
+    }
+
+    /// Places in [`Observed::views`] of those whose vessels the image, or what hides a part of it, cuts off.
+    pub fn cut_off(&self) -> Vec<usize> {
+        (0..self.views.len()).filter(|slot| self.at_border[*slot] > CUT_OFF).collect()
     }
 
     /// The same images by another geometry, and by its displacements of the heart, `[view][phase]` in world units.

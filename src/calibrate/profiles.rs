@@ -37,7 +37,7 @@ pub struct Pixel {
 /// What a view has to be consistent with the others: pixels, and how far each phase exceeds the still background there.
 #[derive(Debug, Clone)]
 pub struct Moving {
-    /// Where it stands.
+    /// Where the view stands.
     pub stand: Stand,
     /// Columns and rows of its images.
     pub size: [usize; 2],
@@ -107,7 +107,7 @@ pub struct PairAtPhase {
 /// Two views, by their place among those calibrated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pair {
-    /// Its views.
+    /// The two views of the pair.
     pub views: [usize; 2],
 }
 
@@ -137,7 +137,7 @@ impl Blur {
         Blur { value: gaussian(sigma, reach), slope: gaussian_slope(sigma, reach) }
     }
 
-    /// The same less a Gaussian of `wide` bins: what is as smooth as a heart or a lung that moves is taken out.
+    /// A Gaussian of `sigma` bins less one of `wide` bins: what is as smooth as a heart or a lung that moves is taken out.
     pub fn band(sigma: f64, wide: f64) -> Blur {
         let reach = (KERNEL_REACH * wide).ceil() as i32;
         let less = |a: Vec<f64>, b: Vec<f64>| a.iter().zip(b).map(|(a, b)| a - b).collect();

@@ -7,13 +7,13 @@ use crate::geometry::MM_PER_UNIT;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Standard deviations of what is corrected: angles.
+/// Standard deviation that errors of angles are expected to have, degrees.
 pub const ANGLE_DEG: f64 = 0.3;
-/// Of the patient's position across the view.
+/// Standard deviation that errors of the patient's position across the view are expected to have, mm.
 pub const IN_PLANE_MM: f64 = 3.0;
-/// Of the patient's position along the view.
+/// Standard deviation that errors of the patient's position along the view are expected to have, mm.
 pub const DEPTH_MM: f64 = 1.0;
-/// Of the heart's displacement by breathing along (posterior, left, superior).
+/// Standard deviation that breathing is expected to displace the heart by along (posterior, left, superior), mm.
 pub const BREATHING_MM: [f64; 3] = [1.5, 1.5, 4.0];
 /// Of the contrast of a frame.
 const GAIN: f64 = 0.1;
@@ -305,9 +305,9 @@ struct Normal {
 /// Sums of squares over all pairs, phases and bins.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Misfit {
-    /// Of the residuals.
+    /// Sum of the squares of the residuals.
     pub squares: f64,
-    /// Of the profiles.
+    /// Sum of the squares of the profiles.
     pub power: f64,
     count: usize,
 }

@@ -1,0 +1,98 @@
+//! Whether other views may show a vessel somewhere on a ray.
+
+use crate::calibrate::observed::Observed;
+use crate::geometry::ViewRays;
+use crate::raster::widened;
+use glam::{DMat3, DVec3};
+
+/// Depths looked at along a ray, of a pixel each at the isocentre.
+const DEPTHS_PER_SIDE: f64 = 0.5;
+
+/// What a view tells of a point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Look {
+    /// It is beyond the image's edge, or hidden.
+    Unseen,
+    /// There may be a vessel.
+    Vessel,
+    /// There is none.
+    Nothing,
+}
+
+/// What a view shows at a phase.
+struct Sight<'a> {
+    source: DVec3,
+    inverse: DMat3,
+    size: [usize; 2],
+    visible: &'a [bool],
+    vessels: Vec<bool>,
+}
+
+impl Sight<'_> {
+    fn look(&self, point: DVec3) -> Look {
+        let h = self.inverse * (point - self.source);
+        let (i, j) = ((h.x / h.z).round(), (h.y / h.z).round());
+        let inside = h.z > 0.0 && i >= 0.0 && j >= 0.0 && i < self.size[0] as f64 && j < self.size[1] as f64;
+        if !inside {
+            return Look::Unseen;
+        }
+        let pixel = j as usize * self.size[0] + i as usize;
+        match (self.visible[pixel], self.vessels[pixel]) {
+            (false, _) => Look::Unseen,
+            (true, true) => Look::Vessel,
+            (true, false) => Look::Nothing,
+        }
+    }
+}
+
+/// All views but one, at a phase.
+pub(super) struct Others<'a> {
+    /// Columns and rows of the images.
+    pub(super) size: [usize; 2],
+    sights: Vec<Sight<'a>>,
+}
+
+impl<'a> Others<'a> {
+    /// The views beside `view` that have an image at `phase`, their vessels widened by so many pixels, on rays by `rays`; none
+    /// where no other has one.
+    pub(super) fn of(
+        observed: &'a Observed,
+        view: usize,
+        phase: usize,
+        near: usize,
+        rays: impl Fn(usize) -> ViewRays,
+    ) -> Option<Others<'a>> {
+        let size = observed.fine.views[view].size;
+        let sight = |v: usize| {
+            let rays = rays(v);
+            let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
+            Some(Sight {
+                source: rays.source(),
+                inverse: basis.inverse(),
+                size,
+                visible: &observed.visible[v],
+                vessels: widened(observed.shown[v][phase].as_ref()?, size, near),
+            })
+        };
+        let sights: Vec<Sight> = (0..observed.views.len()).filter(|v| *v != view).filter_map(sight).collect();
+        (!sights.is_empty()).then_some(Others { size, sights })
+    }
+
+    /// Whether at some place on the ray of a pixel, which may lie beyond the image, a view shows a vessel, and all that see the
+    /// place do.
+    pub(super) fn may_show(&self, rays: &ViewRays, column: f64, row: f64) -> bool {
+        let pixel = 0.5 * (rays.anchor[1].length() + rays.anchor[2].length());
+        let half = (DEPTHS_PER_SIDE * self.size[0].max(self.size[1]) as f64) as i64;
+        let (anchor, direction) = rays.pixel(column, row);
+        (-half..=half).any(|k| {
+            let point = anchor + direction * (k as f64 * pixel);
+            let mut vessel = false;
+            let contradicted = self.sights.iter().any(|sight| {
+                let look = sight.look(point);
+                vessel |= look == Look::Vessel;
+                look == Look::Nothing
+            });
+            vessel && !contradicted
+        })
+    }
+}
