@@ -111,7 +111,7 @@ impl Geometry {
         }
     }
 
-    /// The same, turned by angles (primary and secondary, degrees) about the isocentre, and its patient carried a further
+    /// This geometry turned by angles (primary and secondary, degrees) about the isocentre, and its patient carried a further
     /// `shift` (world units). A matrix turns like the C-arm that looks where it looks.
     pub fn corrected(&self, angles_deg: [f64; 2], shift: DVec3) -> Geometry {
         match self {

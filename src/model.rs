@@ -14,7 +14,7 @@ use crate::config::Config;
 use crate::geometry::CArm;
 use crate::model::gaussians::MovingGaussians;
 use crate::model::hull::Hull;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
 
 /// The fields at one moment of training.
@@ -25,12 +25,12 @@ pub struct Model {
     /// Scales and boxes.
     pub scene: Scene,
     /// Where each parameter lives.
-    pub layout: ParamLayout,
+    pub param_map: ParamMap,
     /// Motion hull, when the run uses one.
     pub hull: Option<Hull>,
     /// Gaussians, where they are the moving field; else the network is.
     pub moving: Option<MovingGaussians>,
-    /// Parameters, padded as [`ParamLayout`] says.
+    /// Parameters, padded as [`ParamMap`] says.
     pub params: Vec<f32>,
     /// Iterations done.
     pub step: u32,

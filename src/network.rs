@@ -14,7 +14,7 @@ use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;
 use crate::kernels::tuning::{Layers, Tuning};
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::network::chunk::Chunk;
 use crate::network::fused::FusedNetwork;
 use crate::network::layers::LayerNetwork;
@@ -38,13 +38,13 @@ trait Path: Send + Sync {
     fn find(&self, name: Binding) -> Option<&Buffer>;
 
     /// Samples per tile, and tiles across a layer forward and backward.
-    fn tiles(&self, params: &ParamLayout) -> Tiles;
+    fn tiles(&self, params: &ParamMap) -> Tiles;
 
     /// How the backward pass leaves the gradient.
-    fn partial_sums(&self, params: &ParamLayout) -> PartialSums;
+    fn partial_sums(&self, params: &ParamMap) -> PartialSums;
 
     /// Where in a part of the samples' sums the gradient of each network parameter lies.
-    fn gradient_source(&self, params: &ParamLayout) -> Vec<u32>;
+    fn gradient_source(&self, params: &ParamMap) -> Vec<u32>;
 
     /// Records what depends on parameters alone; `phase_bias` is there.
     fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()>;
@@ -98,7 +98,7 @@ pub struct Network {
 }
 
 /// Samples a chunk may have, by the range of one storage buffer.
-pub fn largest_chunk(gpu: &Gpu, tuning: &Tuning, params: &ParamLayout) -> u32 {
+pub fn largest_chunk(gpu: &Gpu, tuning: &Tuning, params: &ParamMap) -> u32 {
     let bytes_per_sample = match tuning.layers {
         Layers::F32 => 4 * params.width,
         Layers::Matrices => 2 * params.width * params.layers.len(),
@@ -113,7 +113,7 @@ impl Network {
     /// # Errors
     /// [`Error::Config`] when matrices are asked for and do not fit; errors of the device, among them
     /// [`Error::OutOfMemory`] naming the buffer.
-    pub fn new(gpu: &Gpu, tuning: &Tuning, setup: &Setup, params: &ParamLayout, purpose: Purpose) -> Result<Network> {
+    pub fn new(gpu: &Gpu, tuning: &Tuning, setup: &Setup, params: &ParamMap, purpose: Purpose) -> Result<Network> {
         let path: Box<dyn Path> = match tuning.layers {
             Layers::F32 => Box::new(LayerNetwork::new(gpu, tuning, setup, params, purpose)?),
             Layers::Matrices => Box::new(FusedNetwork::new(gpu, tuning, setup, params, purpose)?),
@@ -223,7 +223,7 @@ impl Network {
     }
 
     /// Push constants of `march_scan` for a chunk.
-    pub fn scan(&self, params: &ParamLayout, chunk: Chunk) -> push::MarchScan {
+    pub fn scan(&self, params: &ParamMap, chunk: Chunk) -> push::MarchScan {
         let tiles = self.path.tiles(params);
         push::MarchScan {
             n_rays: chunk.n_rays,

@@ -16,11 +16,12 @@ use crate::config::{Config, DynamicTarget, GaussianForm};
 use crate::error::{Error, Result};
 use crate::kernels::layout::{self, Setup};
 use crate::model::hull::Hull;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
 use crate::plan::motion::ViewMotion;
 use crate::plan::scale::dynamic_half;
 use crate::plan::soft_hull::carve::SoftMotion;
+use crate::plan::start::StartRays;
 use crate::plan::targets::Targets;
 use crate::scan::dataset::Dataset;
 
@@ -33,7 +34,7 @@ pub struct Plan {
     /// Constants for the shaders.
     pub setup: Setup,
     /// Where each parameter lives.
-    pub params: ParamLayout,
+    pub params: ParamMap,
     /// One row per iteration.
     pub schedule: Vec<layout::Schedule>,
     /// Training views.
@@ -75,10 +76,13 @@ impl Plan {
             }
             (choose_hull(config, dataset, &motion, &mut notes), None)
         };
-        let scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
+        let mut scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
         let compared = targets.is_none() && config.loss.dynamic_target == DynamicTarget::Temporal;
-        let empty_loss =
-            compared.then(|| scene.dynamic_weight * scene.start(config, dataset, &motion, hull.as_ref()).empty_loss());
+        let rays = compared.then(|| StartRays::new(config, dataset, &motion, hull.as_ref(), scene.dynamic_depth));
+        if let Some(rays) = rays.as_ref().filter(|_| config.loss.normalise && config.dynamic.best_start) {
+            scene.dynamic_shift = rays.best_shift(scene.dynamic_gain, scene.robust_scale);
+        }
+        let empty_loss = rays.map(|rays| scene.dynamic_weight * rays.empty_loss(scene.robust_scale));
         let pixels = dataset.n_pixels();
         let training = dataset.training();
         let n_all = training.len() * pixels;
@@ -124,7 +128,7 @@ impl Plan {
                 "needs several phases in every view; use `absolute` for still objects",
             ));
         }
-        let params = ParamLayout::new(config, dataset.n_phases as usize);
+        let params = ParamMap::new(config, dataset.n_phases as usize);
         let n_motion_rays = if n_motion_list == 0 {
             0
         } else {
@@ -156,7 +160,7 @@ impl Plan {
         })
     }
 
-    /// The same in a scene that is known, as when resuming.
+    /// This plan in a scene that is known, as when resuming.
     pub fn in_scene(self, scene: Scene) -> Plan {
         let setup = Setup {
             n_motion_rays: self.setup.n_motion_rays,

@@ -21,7 +21,7 @@ use crate::render::live::Source;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::gating::RPeaks;
-use crate::score::eval::{Evaluation, evaluate};
+use crate::score::eval::{Evaluation, evaluate, moving_field_warning};
 use crate::train::trainer::StepLoss;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
@@ -78,7 +78,7 @@ pub struct Progress {
 /// Told now and then how far training is; returns whether to go on.
 pub type Observer<'a> = dyn FnMut(&Progress) -> bool + 'a;
 
-/// See the module.
+/// A reconstruction in memory that grows with its frames (see the module).
 pub struct Session {
     shared: Arc<Shared>,
     worker: Mutex<Option<JoinHandle<()>>>,
@@ -361,7 +361,7 @@ impl Session {
         self.shared.with_viewer(|live, step| live.render(step, rays, size, phase, quantity))
     }
 
-    /// As [`Session::render`], into a buffer on the device: `size.0` x `size.1` floats.
+    /// Draws a view as [`Session::render`] does, into a buffer on the device: `size.0` x `size.1` floats.
     ///
     /// # Errors
     /// As [`Session::render`]; [`Error::Internal`] when the buffer is too small.
@@ -400,8 +400,13 @@ impl Session {
         let dataset = lock(&self.shared.inbox).dataset(|_, _| true)?;
         let frames: Vec<_> = dataset.validation().iter().collect();
         let threshold = threshold_per_mm.map(|t| t * MM_PER_UNIT);
-        self.shared
-            .with_viewer(|live, step| evaluate(live.renderer(step)?, &dataset, &frames, step, threshold, |_| Ok(())))
+        self.shared.with_viewer(|live, step| {
+            let renderer = live.renderer(step)?;
+            let mut evaluation = evaluate(renderer, &dataset, &frames, step, threshold, |_| Ok(()))?;
+            evaluation.warnings.extend(moving_field_warning(renderer, &dataset)?);
+            evaluation.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
+            Ok(evaluation)
+        })
     }
 
     /// The vessels at all phases as trees of centrelines with radii, from the fields as they are after the iterations under
@@ -413,7 +418,7 @@ impl Session {
         let (gpu, tuning) = self.shared.device()?;
         let model = self.checkpoint()?.model;
         let renderer = Renderer::new(gpu, &model, tuning.clone())?;
-        let phases = (0..model.layout.phases as u32).collect();
+        let phases = (0..model.param_map.phases as u32).collect();
         vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| ())
     }
 
@@ -440,7 +445,7 @@ impl Session {
         let model = &checkpoint.model;
         let mut engine = self.shared.visit();
         let mut inbox = lock(&self.shared.inbox);
-        let phases = model.layout.phases as u32;
+        let phases = model.param_map.phases as u32;
         if inbox.options.phases != phases && !inbox.frames.is_empty() {
             let problem = format!("the session's frames are of {} phases", inbox.options.phases);
             return Err(Error::config("checkpoint: phases", phases, problem));

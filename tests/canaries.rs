@@ -8,8 +8,10 @@ mod shim;
 use common::{expect_silence, run, small_config, small_dataset};
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::kernels::layout::Gaussian;
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::model::component::Component;
+use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::baked::Baked;
 use nertca_vk::render::quantity::{Projection, Quantity};
@@ -29,22 +31,31 @@ fn gpu() -> Gpu {
         .expect("this test needs Mesa's CPU driver (Debian: mesa-vulkan-drivers) and vulkan-validationlayers")
 }
 
+/// All parameters of Gaussians, and of the grid that moves them.
+fn parameters(field: &MovingGaussians) -> Vec<f32> {
+    let of = |g: &Gaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.log_density]);
+    let moves = field.tree().map_or(Vec::new(), |tree| [&tree.grid[..], &tree.own].concat());
+    field.rows().rows.iter().flat_map(of).chain(moves.into_iter().flatten()).collect()
+}
+
 /// Trains a little and draws, in memory that starts out as `word`; everything that came of it, as bits.
 fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning) -> Tuning) -> Vec<u32> {
     shim::begin_poison(word);
     let gpu = gpu();
     let tuning = choose(Tuning::for_device(gpu.info()));
-    let dataset = small_dataset(13, 11);
-    let plan = Plan::new(&small_config(preset, settings), &dataset).unwrap();
+    let config = small_config(preset, settings);
+    let (width, height) = if config.gaussians_move() { (40, 36) } else { (13, 11) };
+    let dataset = small_dataset(width, height);
+    let plan = Plan::new(&config, &dataset).unwrap();
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning.clone()).unwrap();
-    let losses = run(&mut trainer, 9);
+    let losses = run(&mut trainer, config.gaussian_iterations() + 9);
     let checkpoint = trainer.checkpoint().unwrap();
     let renderer = Renderer::new(&gpu, &checkpoint.model, tuning).unwrap();
     let rays = &dataset.views[1].rays;
-    let exact = renderer.render(rays, 13, 11, 2).unwrap();
+    let exact = renderer.render(rays, width, height, 2).unwrap();
     let baked = Baked::for_display(Arc::new(renderer), &checkpoint.model, 4.0);
     let total = Quantity { component: Component::Total, projection: Projection::Drr };
-    let quick = baked.render(rays, 13, 11, 2, total).unwrap();
+    let quick = baked.render(rays, width, height, 2, total).unwrap();
     drop((trainer, baked));
     expect_silence(gpu);
     let (filled, unreachable, broken) = shim::end_poison();
@@ -52,7 +63,9 @@ fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning
     assert_eq!(broken, Vec::<String>::new());
     let numbers = checkpoint.model.params.iter().chain(checkpoint.moments.as_flattened());
     let pictures = exact.static_integral.iter().chain(&exact.dynamic_integral).chain(&quick);
-    let numbers: Vec<f32> = numbers.chain(pictures).copied().chain(losses.iter().map(|l| *l as f32)).collect();
+    let gaussians = checkpoint.model.moving.as_ref().map_or(Vec::new(), parameters);
+    let numbers: Vec<f32> =
+        numbers.chain(pictures).copied().chain(gaussians).chain(losses.iter().map(|l| *l as f32)).collect();
     assert!(numbers.iter().all(|v| v.is_finite()), "something that was never written was read");
     numbers.iter().map(|v| v.to_bits()).chain(checkpoint.occupancy).collect()
 }
@@ -92,4 +105,23 @@ fn matrix_layers_mind_their_buffers() {
         return;
     }
     expect_the_same("fast-mlp", FULL, &|tuning| tuning.with_layers(Layers::Matrices, String::new()));
+}
+
+#[test]
+fn gaussians_mind_their_buffers() {
+    let settings = |form| {
+        [
+            form,
+            "gaussians.iterations=12",
+            "gaussians.grow_at=4",
+            "gaussians.clear_at=8",
+            "gaussians.background_every=5",
+            "gaussians.count=60",
+            "tree.warm_iterations=6",
+            "tree.track_iterations=3",
+        ]
+    };
+    for form in ["gaussians.form=phase", "gaussians.form=tree"] {
+        expect_the_same("fast", &settings(form), &|tuning| tuning);
+    }
 }

@@ -1,5 +1,5 @@
 //! The header is what the sources say, is clean in C and C++, and changes of the ABI are seen: `tests/capi/abi.txt` holds
-//! every exported symbol, constant and struct layout. `NERTCA_BLESS=1 cargo test --test capi_header` rewrites both files.
+//! every exported symbol, constant and struct layout. `tools/bless` rewrites both files.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod capi;

@@ -63,8 +63,8 @@ fn model(gpu: &nertca_vk::gpu::device::Gpu, dataset: &Dataset, field: MovingGaus
     let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset).unwrap(), dataset, tuning(gpu)).unwrap();
     let of_network = trainer.model().unwrap();
     let config = Config::preset(Preset::Fast);
-    let layout = nertca_vk::model::params::ParamLayout::new(&config, dataset.n_phases as usize);
-    Model { params: layout.initial(&config), layout, config, moving: Some(field), hull: None, ..of_network }
+    let param_map = nertca_vk::model::params::ParamMap::new(&config, dataset.n_phases as usize);
+    Model { params: param_map.initial(&config), param_map, config, moving: Some(field), hull: None, ..of_network }
 }
 
 /// Rays of a pixel in f64.
@@ -138,7 +138,7 @@ fn checkpoints_keep_every_bit() {
     let dataset = common::small_dataset(13, 11);
     for field in forms() {
         let model = model(&gpu, &dataset, field);
-        let moments = vec![[0.25, 0.5]; model.layout.len];
+        let moments = vec![[0.25, 0.5]; model.param_map.len];
         let saved =
             Checkpoint { model, moments, occupancy: Vec::new(), loss_scale: None, data_fingerprint: "x".into() };
         let bytes = saved.to_bytes().unwrap();
@@ -148,7 +148,7 @@ fn checkpoints_keep_every_bit() {
             let at = |c: &Checkpoint| c.model.moving.as_ref().unwrap().at(phase);
             assert_eq!(at(&read), at(&saved));
         }
-        let statics = saved.model.layout.static_len;
+        let statics = saved.model.param_map.static_len;
         assert_eq!(read.model.params[..statics], saved.model.params[..statics]);
     }
     expect_silence(gpu);
@@ -158,7 +158,7 @@ fn checkpoints_keep_every_bit() {
 fn damaged_gaussians_are_refused_by_name() {
     let gpu = gpu();
     let model = model(&gpu, &common::small_dataset(13, 11), forms()[0].clone());
-    let moments = vec![[0.0; 2]; model.layout.len];
+    let moments = vec![[0.0; 2]; model.param_map.len];
     let refused = |change: &dyn Fn(&mut Gaussians)| {
         let mut model = model.clone();
         if let Some(MovingGaussians::PerPhase(sets)) = &mut model.moving {

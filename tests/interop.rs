@@ -130,11 +130,7 @@ fn compressed_exports_hold_the_same() {
         assert!(!out.join(name).exists(), "{name}");
     }
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let outcome = Command::new(root.join(".cache/python/bin/python3"))
-        .arg(root.join("tests/python/check_compressed.py"))
-        .arg(&out)
-        .output()
-        .expect("tools/setup makes .cache/python");
+    let outcome = python().arg(root.join("tests/python/check_compressed.py")).arg(&out).output().unwrap();
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
 }
 

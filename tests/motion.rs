@@ -103,7 +103,7 @@ fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
         params: plan.params.initial(&plan.config),
         config: plan.config,
         scene: plan.scene,
-        layout: plan.params,
+        param_map: plan.params,
         hull: None,
         moving,
         step: 40,
@@ -118,7 +118,7 @@ fn moving_model() -> Model {
 }
 
 fn saved(model: Model, path: &Path) -> String {
-    let moments = vec![[0.0; 2]; model.layout.len];
+    let moments = vec![[0.0; 2]; model.param_map.len];
     let checkpoint =
         Checkpoint { model, moments, occupancy: Vec::new(), loss_scale: None, data_fingerprint: "none".into() };
     checkpoint.write(path).unwrap();

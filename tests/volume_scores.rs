@@ -1,4 +1,4 @@
-//! Scores in 3D: against SciPy and scikit-image, and through the program, with a truth that the program itself exported.
+//! Scores in 3D, and SSIM: against SciPy and scikit-image, and through the program, with a truth that the program itself exported.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/program.rs"]
@@ -10,6 +10,7 @@ use glam::DVec3;
 use nertca_vk::formats::nrrd;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::random::uniform01;
+use nertca_vk::score::metrics::ssim;
 use nertca_vk::score::shapes::compare;
 use nertca_vk::vessels::centreline::centreline;
 use nertca_vk::vessels::mask::Mask;
@@ -255,4 +256,23 @@ fn reports_show_scores_in_3d_and_do_without() {
     std::fs::write(bare.join("volumes/vessels-01.nrrd"), "NRRD0004\n").unwrap();
     let warnings = evaluation().unwrap()["warnings"].to_string();
     assert!(warnings.contains("3D") && warnings.contains("vessels-01.nrrd"), "{warnings}");
+}
+
+#[test]
+fn ssim_is_that_of_scikit_image() {
+    // The pair of images of the script.
+    const WIDTH: usize = 37;
+    let pixels = (0..23 * WIDTH).map(|i| ((i % WIDTH) as f64, (i / WIDTH) as f64));
+    let (truth, prediction): (Vec<f64>, Vec<f64>) = pixels
+        .map(|(x, y)| {
+            let truth = (x * x + 3.0 * x * y + 40.0 * y) % 97.0 / 97.0 * 0.5 + 0.5 * x / WIDTH as f64;
+            (truth, 0.8 * truth + (7.0 * x + 11.0 * y) % 13.0 / 13.0 * 0.2)
+        })
+        .unzip();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/ssim_reference.py");
+    let outcome = python().arg(script).output().unwrap();
+    let said = String::from_utf8_lossy(&outcome.stdout);
+    assert!(outcome.status.success(), "{said}{}", String::from_utf8_lossy(&outcome.stderr));
+    let (got, want) = (ssim(&truth, &prediction, WIDTH), said.trim().parse::<f64>().unwrap());
+    assert!((got - want).abs() < 1e-9, "{got} where scikit-image gives {want}");
 }

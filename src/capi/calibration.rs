@@ -9,7 +9,7 @@ use crate::capi::types::{nertca_correction, nertca_geometry, read, write};
 pub const NERTCA_CORRECTION_STATED: u32 = 0;
 /// Angles and position of the frame's view are corrected.
 pub const NERTCA_CORRECTION_STATIC: u32 = 1;
-/// The same, and a displacement of the heart in this frame.
+/// A correction of the view, and a displacement of the heart in this frame.
 pub const NERTCA_CORRECTION_BREATHING: u32 = 2;
 
 fn code(correction: Correction) -> u32 {

@@ -220,7 +220,7 @@ impl QueueLock for CallerLock {
     }
 }
 
-/// As `nertca_context_create`, on a device of the caller: both then share one GPU, its memory and, if wanted, buffers.
+/// Makes a context as `nertca_context_create` does, on a device of the caller: both then share one GPU, its memory and, if wanted, buffers.
 /// Of the options, `device` and `validation` do not apply. Instance, device and queue must outlive the context, which
 /// leaves them as they are.
 ///

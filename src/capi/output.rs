@@ -48,7 +48,7 @@ impl Kind for SharedBuffer {
 }
 
 /// A view, checked.
-struct Shot {
+struct CheckedView {
     rays: ViewRays,
     size: (usize, usize),
     phase: u32,
@@ -67,7 +67,7 @@ fn component_of(component: u32) -> Outcome<Component> {
 
 /// # Safety
 /// `view` must be null or as long as it says, with a geometry whose matrix is null or has 12 numbers.
-unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
+unsafe fn checked_view(view: *const nertca_view) -> Outcome<CheckedView> {
     // SAFETY: this function asks its callers that `view` is null or as long as its size says.
     let view = unsafe { read(view) }?;
     let size = sides(view.width, view.height)?;
@@ -86,18 +86,18 @@ unsafe fn shot(view: *const nertca_view) -> Outcome<Shot> {
     let geometry = unsafe { view.geometry.geometry() }?;
     let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Failure::argument(&field, problem))?;
     let quantity = Quantity { component, projection };
-    Ok(Shot { rays, size, phase: view.phase, quantity, exact })
+    Ok(CheckedView { rays, size, phase: view.phase, quantity, exact })
 }
 
 /// Line integrals, or attenuation per mm.
-fn draw(reconstruction: &Reconstruction, shot: &Shot) -> Outcome<Vec<f32>> {
+fn draw(reconstruction: &Reconstruction, checked: &CheckedView) -> Outcome<Vec<f32>> {
     let session = &reconstruction.session;
-    let image = if shot.exact {
-        session.render_fields(&shot.rays, shot.size, shot.phase)?.show(shot.quantity)
+    let image = if checked.exact {
+        session.render_fields(&checked.rays, checked.size, checked.phase)?.show(checked.quantity)
     } else {
-        session.render(&shot.rays, shot.size, shot.phase, shot.quantity)?
+        session.render(&checked.rays, checked.size, checked.phase, checked.quantity)?
     };
-    let per_mm = if shot.quantity.projection == Projection::Mip { 1.0 / MM_PER_UNIT as f32 } else { 1.0 };
+    let per_mm = if checked.quantity.projection == Projection::Mip { 1.0 / MM_PER_UNIT as f32 } else { 1.0 };
     Ok(image.into_iter().map(|v| v * per_mm).collect())
 }
 
@@ -118,11 +118,11 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
     image: *const nertca_image,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks of `view` what `shot` does.
-        let shot = unsafe { shot(view) }?;
+        // SAFETY: the header asks of `view` what `checked_view` does.
+        let checked = unsafe { checked_view(view) }?;
         // SAFETY: the header asks that `image` is null or as long as its size says.
         let image = unsafe { read(image) }?;
-        let (width, height) = shot.size;
+        let (width, height) = checked.size;
         if ![NERTCA_PIXELS_F32, NERTCA_PIXELS_U8].contains(&image.format) {
             return Err(Failure::argument("format", format!("{} is neither F32 nor U8", image.format)));
         }
@@ -134,7 +134,7 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
         if !(image.low.is_finite() && image.high.is_finite() && image.low <= image.high) {
             return Err(Failure::argument("low, high", format!("{} to {} is no window", image.low, image.high)));
         }
-        let values = draw(reconstruction, &shot)?;
+        let values = draw(reconstruction, &checked)?;
         let rows: Vec<u8> = if image.format == NERTCA_PIXELS_F32 {
             values.iter().flat_map(|v| v.to_ne_bytes()).collect()
         } else {
@@ -158,7 +158,7 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
     })
 }
 
-/// As `nertca_reconstruction_render`, into a buffer of the same context: `width * height` floats, rows first. Live
+/// Draws a view as `nertca_reconstruction_render` does, into a buffer of the same context: `width * height` floats, rows first. Live
 /// quality is written by the device itself, without a copy; maxima are then per 100 mm (divide by 100). The buffer is
 /// complete when the call returns.
 ///
@@ -171,16 +171,16 @@ pub unsafe extern "C" fn nertca_reconstruction_render_buffer(
     buffer: *mut nertca_buffer,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks of `view` what `shot` does.
-        let shot = unsafe { shot(view) }?;
+        // SAFETY: the header asks of `view` what `checked_view` does.
+        let checked = unsafe { checked_view(view) }?;
         let target = handles::get::<SharedBuffer, _>(buffer)?;
-        check_target(reconstruction, &target, shot.size.0 * shot.size.1)?;
-        if shot.exact {
-            let per_unit = if shot.quantity.projection == Projection::Mip { MM_PER_UNIT as f32 } else { 1.0 };
-            let image: Vec<f32> = draw(reconstruction, &shot)?.into_iter().map(|v| v * per_unit).collect();
+        check_target(reconstruction, &target, checked.size.0 * checked.size.1)?;
+        if checked.exact {
+            let per_unit = if checked.quantity.projection == Projection::Mip { MM_PER_UNIT as f32 } else { 1.0 };
+            let image: Vec<f32> = draw(reconstruction, &checked)?.into_iter().map(|v| v * per_unit).collect();
             return Ok(reconstruction.claim.context.device()?.upload(&target.buffer, 0, &image)?);
         }
-        let Shot { rays, size, phase, quantity, .. } = &shot;
+        let CheckedView { rays, size, phase, quantity, .. } = &checked;
         Ok(reconstruction.session.render_into(&target.buffer, rays, *size, *phase, *quantity)?)
     })
 }
@@ -243,7 +243,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
     })
 }
 
-/// As `nertca_reconstruction_sample`, into a buffer of the same context.
+/// Samples the fields as `nertca_reconstruction_sample` does, into a buffer of the same context.
 ///
 /// # Safety
 /// `grid` must be as long as it says.

@@ -32,11 +32,11 @@ pub const NERTCA_ERROR_MEMORY: nertca_status = -7;
 pub const NERTCA_ERROR_DIVERGED: nertca_status = -8;
 /// A callback ended the call.
 pub const NERTCA_ERROR_CANCELLED: nertca_status = -9;
-/// It cannot be done while something else goes on (training, or handles that still exist).
+/// The call cannot be done while something else goes on (training, or handles that still exist).
 pub const NERTCA_ERROR_BUSY: nertca_status = -10;
 /// The buffer given is too small; the length needed was written.
 pub const NERTCA_ERROR_BUFFER: nertca_status = -11;
-/// It needs something that is still to come: frames, or training.
+/// The call needs something that is still to come: frames, or training.
 pub const NERTCA_ERROR_NOT_READY: nertca_status = -12;
 /// A handle of the parent process was used after a fork.
 pub const NERTCA_ERROR_FORKED: nertca_status = -13;

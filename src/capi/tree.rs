@@ -46,7 +46,7 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
             ..asked
         };
         *kept = Some(found);
-        // SAFETY: as above.
+        // SAFETY: the header asks for a struct of at least `tree->size` bytes that may be written.
         unsafe { write(tree, |size| nertca_tree { size, ..told }) }?;
         if !copies {
             return Ok(());

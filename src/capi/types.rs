@@ -37,7 +37,8 @@ pub const NERTCA_PROJECTION_DRR: u32 = 0;
 /// The largest attenuation along each ray, 1/mm.
 pub const NERTCA_PROJECTION_MIP: u32 = 1;
 
-/// Through volumes baked from the fields: display rates, also while training; as fine as their cells (about 0.8 mm).
+/// Display rates, also while training: Gaussians as they are, other fields through volumes baked from them, as fine as their
+/// cells (about 0.8 mm).
 pub const NERTCA_QUALITY_LIVE: u32 = 0;
 /// Through the fields themselves: exact, and many times slower.
 pub const NERTCA_QUALITY_EXACT: u32 = 1;
@@ -65,7 +66,7 @@ pub struct nertca_log {
     pub size: usize,
     /// Called for each message.
     pub callback: super::log::nertca_log_callback,
-    /// Handed to the callback.
+    /// Handed to the callback unchanged.
     pub user: *mut c_void,
     /// Least severe level wanted, one of `NERTCA_LOG_*`.
     pub level: u32,
@@ -87,7 +88,7 @@ pub struct nertca_vulkan {
     pub device: *mut c_void,
     /// `VkQueue` that computes.
     pub queue: *mut c_void,
-    /// Its family.
+    /// Family of the queue.
     pub queue_family: u32,
     /// Non-zero when the device was made with the feature `bufferDeviceAddress`.
     pub buffer_device_address: u32,
@@ -95,9 +96,9 @@ pub struct nertca_vulkan {
     pub external_memory_fd: u32,
     /// Taken around every use of the queue, for a short time, on any thread; null when the queue is the library's alone.
     pub lock: Option<unsafe extern "C" fn(user: *mut c_void)>,
-    /// Gives it back; null exactly when `lock` is.
+    /// Gives the queue back after `lock`; null exactly when `lock` is.
     pub unlock: Option<unsafe extern "C" fn(user: *mut c_void)>,
-    /// Handed to both.
+    /// Handed to `lock` and `unlock`.
     pub user: *mut c_void,
 }
 
@@ -148,9 +149,9 @@ pub struct nertca_frame {
     pub format: u32,
     /// What values mean, one of `NERTCA_INTENSITY_*`.
     pub intensity: u32,
-    /// For `INTEGRAL` and `LOG`; 0 stands for 1.
+    /// Factor on the values, for `INTEGRAL` and `LOG`; 0 stands for 1.
     pub scale: f64,
-    /// For `INTEGRAL`.
+    /// Added after the factor, for `INTEGRAL`.
     pub offset: f64,
     /// Value of an unattenuated ray, for `LOG` and `LINEAR`.
     pub i0: f64,
@@ -174,7 +175,7 @@ pub struct nertca_frame {
 pub struct nertca_view {
     /// `sizeof(nertca_view)`.
     pub size: usize,
-    /// From where.
+    /// From where the view is drawn.
     pub geometry: nertca_geometry,
     /// Columns, 1 to 8192.
     pub width: u32,
@@ -204,9 +205,9 @@ pub struct nertca_image {
     pub stride_bytes: usize,
     /// `NERTCA_PIXELS_F32` or `NERTCA_PIXELS_U8`.
     pub format: u32,
-    /// For `U8`: the value shown as 0. With `low` = `high`, both are the image's own extremes.
+    /// The value shown as 0, for `U8`. With `low` = `high`, both are the image's own extremes.
     pub low: f64,
-    /// For `U8`: the value shown as 255.
+    /// The value shown as 255, for `U8`.
     pub high: f64,
 }
 
@@ -269,9 +270,9 @@ pub struct nertca_correction {
     /// Root mean square of how far the correction moves the heart's image in this view, pixels, less what moves all views
     /// alike.
     pub moved_px: f64,
-    /// What does not agree with the other views, as a share of what moves, before.
+    /// Difference of this view's profiles from those of the others before the correction, as a share of the profiles.
     pub residual_before: f64,
-    /// And after.
+    /// Difference of this view's profiles from those of the others after the correction, as a share of the profiles.
     pub residual_after: f64,
     /// All of it, displacement of the heart included, as a row-major 3 x 4 projection from patient mm to homogeneous pixels
     /// (column, row; integers are pixel centres): what `nertca_geometry.matrix` takes.
@@ -537,11 +538,11 @@ impl nertca_frame {
 /// is also the number in its soname.
 pub const NERTCA_ABI_VERSION: u32 = 0;
 
-/// Version this header was made with.
+/// Version this header was made with, first number.
 pub const NERTCA_VERSION_MAJOR: u32 = 0;
-/// See `NERTCA_VERSION_MAJOR`.
+/// Version this header was made with, second number.
 pub const NERTCA_VERSION_MINOR: u32 = 2;
-/// See `NERTCA_VERSION_MAJOR`.
+/// Version this header was made with, third number.
 pub const NERTCA_VERSION_PATCH: u32 = 0;
 
 /// Version of the library, as `major.minor.patch`. Static text. Any thread.

@@ -37,11 +37,11 @@ pub struct PairAgreement {
 /// How well all views agree.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Agreement {
-    /// As of a pair, over all pairs, with fine profiles.
+    /// Difference of two views' profiles over all pairs, as a share of them, with fine profiles.
     pub fine: f64,
-    /// The same with profiles blurred so far that an error of geometry hardly matters.
+    /// The difference over all pairs with profiles blurred so far that an error of geometry hardly matters.
     pub coarse: f64,
-    /// Fine, pair by pair.
+    /// The difference with fine profiles, pair by pair.
     pub pairs: Vec<PairAgreement>,
 }
 
@@ -84,7 +84,7 @@ impl Comparison {
         Comparison { look, by_pair }
     }
 
-    /// The same after a change of one view: only its pairs are looked at again.
+    /// The comparison after a change of one view: only its pairs are looked at again.
     pub fn after_change(&self, views: &Views, changed: usize) -> Comparison {
         let again = |(pair, before): (&Pair, &Parts)| {
             if pair.views.contains(&changed) { compare(views, *pair, self.look) } else { *before }

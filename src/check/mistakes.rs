@@ -41,7 +41,7 @@ pub const MISTAKES: [Mistake; 8] = [
 const DARKEST: f32 = 1e-6;
 
 impl Mistake {
-    /// What it is, and how to undo it.
+    /// What the mistake is, and how to undo it.
     pub fn advice(self) -> &'static str {
         match self {
             Mistake::Transposed => "the images are transposed: exchange rows and columns of every image",
@@ -141,7 +141,7 @@ fn geometries(dataset: &Dataset, change: impl Fn(&CArm) -> CArm) -> Option<Datas
 pub struct PhaseMistake {
     /// The view, by its place among those that show motion.
     pub view: usize,
-    /// Its phases run backwards.
+    /// The view's phases run backwards.
     pub reversed: bool,
     /// Phases by which it is late.
     pub late: usize,

@@ -37,7 +37,7 @@ impl Cli {
         tuning.with_layers(layers, reason.into())
     }
 
-    /// As [`Cli::tuning`], after timing both paths where that is still to be done.
+    /// The tuning of [`Cli::tuning`], after timing both paths where that is still to be done.
     pub fn training_tuning(&self, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<Tuning> {
         let tuning = Tuning::for_device(gpu.info());
         let either = self.layers.is_none() && tuning.layers == Layers::Matrices && !config.gaussians_move();

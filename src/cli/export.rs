@@ -85,7 +85,7 @@ pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
 /// Exports volumes or surfaces.
 pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
-    let (phases, all) = phases(&args.phase, model.layout.phases as u32)?;
+    let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
     if args.motion {
         return export_motion(args, &model, phases, all);
     }

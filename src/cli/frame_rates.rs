@@ -1,7 +1,7 @@
 //! Frames per second of renderings.
 
 use super::args::Cli;
-use super::render::{RenderArgs, shot};
+use super::render::{RenderArgs, viewpoint};
 use nertca_vk::error::Result;
 use nertca_vk::model::Model;
 use nertca_vk::model::component::Component;
@@ -37,11 +37,11 @@ pub fn measure_frame_rates(
     for way in ["fields", "baked"] {
         for &size in sizes {
             let frame = |i: u32| {
-                let shot = shot(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
-                let phase = i % model.layout.phases as u32;
+                let viewpoint = viewpoint(model, f64::from(i * 7 % 180) - 90.0, 10.0, [size, size])?;
+                let phase = i % model.param_map.phases as u32;
                 match way {
-                    "fields" => renderer.show(&shot.rays, (size, size), phase, quantity),
-                    _ => baked.render(&shot.rays, size, size, phase, quantity),
+                    "fields" => renderer.show(&viewpoint.rays, (size, size), phase, quantity),
+                    _ => baked.render(&viewpoint.rays, size, size, phase, quantity),
                 }
             };
             frame(0)?;

@@ -7,6 +7,9 @@ use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+/// A moving field that leaves more than this share of the loss explains little.
+const EXPLAINS_LITTLE: f64 = 0.9;
+
 /// A flag that Ctrl-C and SIGTERM set; another of them ends the program at once.
 pub fn stop_flag() -> Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
@@ -68,9 +71,19 @@ pub fn show_progress() -> impl FnMut(&Event) {
         Event::Evaluation { .. } => evaluation(event),
         Event::Profile { .. } => (),
         Event::Saved { path, .. } => bar.set_message(format!("saved {}", path.display())),
-        Event::Finished { step, train_s, .. } => {
+        Event::Finished { step, train_s, dynamic_share, .. } => {
             bar.finish_and_clear();
             say(&bar, format!("{step} iterations in {train_s:.1} s of training"));
+            if let Some(share) = dynamic_share.filter(|share| *share > EXPLAINS_LITTLE) {
+                say(
+                    &bar,
+                    format!(
+                        "warning: the moving field leaves {:.0} % of the loss that there is without one: it has died, or views \
+                         disagree; `nertca-vk check` tells which",
+                        100.0 * share
+                    ),
+                );
+            }
         }
     }
 }

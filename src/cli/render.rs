@@ -57,14 +57,19 @@ pub struct RenderArgs {
 }
 
 /// Where and what to render.
-pub struct Shot {
+pub struct Viewpoint {
     pub rays: ViewRays,
     pub width: usize,
     pub height: usize,
 }
 
 /// A view of the model's C-arm, over the same field of view on more or fewer pixels.
-pub fn shot(model: &Model, primary_deg: f64, secondary_deg: f64, [width, height]: [usize; 2]) -> Result<Shot> {
+pub fn viewpoint(
+    model: &Model,
+    primary_deg: f64,
+    secondary_deg: f64,
+    [width, height]: [usize; 2],
+) -> Result<Viewpoint> {
     let c_arm = CArm {
         primary_deg,
         secondary_deg,
@@ -76,7 +81,7 @@ pub fn shot(model: &Model, primary_deg: f64, secondary_deg: f64, [width, height]
     };
     let rays =
         Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| Error::config(field, "", problem))?;
-    Ok(Shot { rays, width, height })
+    Ok(Viewpoint { rays, width, height })
 }
 
 /// The fields themselves, or volumes baked from them.
@@ -87,8 +92,8 @@ pub enum Renders {
 
 impl Renders {
     /// Line integrals, or maxima per mm.
-    pub fn render(&self, shot: &Shot, phase: f64, quantity: Quantity) -> Result<Vec<f32>> {
-        let (rays, width, height) = (&shot.rays, shot.width, shot.height);
+    pub fn render(&self, viewpoint: &Viewpoint, phase: f64, quantity: Quantity) -> Result<Vec<f32>> {
+        let (rays, width, height) = (&viewpoint.rays, viewpoint.width, viewpoint.height);
         let image = match self {
             Renders::Fields(renderer) => renderer.render_at(rays, width, height, phase)?.show(quantity),
             Renders::Baked(_) if phase.fract() != 0.0 => {
@@ -109,7 +114,7 @@ const LEAST_MS: u32 = 20;
 
 /// The moments of the beat that `--phase` and `--between` name.
 fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
-    let n_phases = model.layout.phases as u32;
+    let n_phases = model.param_map.phases as u32;
     let between = args.between + 1;
     if args.phase == "all" {
         return Ok((0..n_phases * between).map(|i| f64::from(i) / f64::from(between)).collect());
@@ -141,8 +146,8 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     if extension == "png" && phases.len() > 1 {
         return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
     }
-    let shot = shot(&model, args.primary, args.secondary, size)?;
-    let (width, height) = (shot.width, shot.height);
+    let viewpoint = viewpoint(&model, args.primary, args.secondary, size)?;
+    let (width, height) = (viewpoint.width, viewpoint.height);
     let gpu = cli.open_device()?;
     let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?);
     let renders = match args.baked {
@@ -151,7 +156,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     };
     let quantity = Quantity { component: args.component, projection: args.projection };
     let frames =
-        phases.iter().map(|phase| renders.render(&shot, *phase, quantity)).collect::<Result<Vec<Vec<f32>>>>()?;
+        phases.iter().map(|phase| renders.render(&viewpoint, *phase, quantity)).collect::<Result<Vec<Vec<f32>>>>()?;
     let window = Window::of(&frames.concat());
     match extension.as_str() {
         "npy" => {

@@ -47,7 +47,7 @@ impl Report<'_> {
             ("dataset".to_owned(), dataset.path.display().to_string()),
             ("images".to_owned(), images_of(dataset)),
             ("iterations".to_owned(), format!("{} of {}", model.step, model.config.train.iterations)),
-            ("parameters".to_owned(), model.layout.len.to_string()),
+            ("parameters".to_owned(), model.param_map.len.to_string()),
             ("preset".to_owned(), model.config.preset.name().to_owned()),
             ("scored on".to_owned(), gpu.info().name.clone()),
             ("commit".to_owned(), env!("NERTCA_COMMIT").to_owned()),

@@ -38,7 +38,7 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
     let unknown = || Error::config("--out", args.out.display(), "ends in none of .json .vtp .swc");
     let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
     let model = newest_model(&args.run)?;
-    let (phases, all) = phases(&args.phase, model.layout.phases as u32)?;
+    let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
     let gpu = cli.open_device()?;
     let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };

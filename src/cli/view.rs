@@ -27,6 +27,7 @@ use std::collections::HashMap;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
+use subtle::ConstantTimeEq;
 
 /// `view`.
 #[derive(Debug, Args)]
@@ -56,7 +57,7 @@ struct Viewer {
 
 /// What a picture shows.
 #[derive(Debug, Deserialize)]
-struct Shot {
+struct PictureQuery {
     primary: f64,
     secondary: f64,
     phase: u32,
@@ -75,43 +76,43 @@ fn chosen<T: Choice>(field: &str, name: &str) -> Result<T> {
 }
 
 impl Viewer {
-    fn values(&self, shot: &Shot) -> Result<(Vec<f32>, Quantity)> {
-        if !SIDES.contains(&shot.size) {
+    fn values(&self, query: &PictureQuery) -> Result<(Vec<f32>, Quantity)> {
+        if !SIDES.contains(&query.size) {
             let problem = format!("{} to {} is accepted", SIDES.start(), SIDES.end());
-            return Err(Error::config("size", shot.size, problem));
+            return Err(Error::config("size", query.size, problem));
         }
         let quantity = Quantity {
-            component: chosen("component", &shot.component)?,
-            projection: chosen("projection", &shot.projection)?,
+            component: chosen("component", &query.component)?,
+            projection: chosen("projection", &query.projection)?,
         };
         let c_arm = &self.model.c_arm;
         let [w, h] = self.model.image_size;
-        let pixel = c_arm.pixel_mm[0].max(c_arm.pixel_mm[1]) * w.max(h) as f64 / shot.size as f64;
+        let pixel = c_arm.pixel_mm[0].max(c_arm.pixel_mm[1]) * w.max(h) as f64 / query.size as f64;
         let turned = CArm {
-            primary_deg: shot.primary,
-            secondary_deg: shot.secondary,
+            primary_deg: query.primary,
+            secondary_deg: query.secondary,
             pixel_mm: [pixel; 2],
             table_mm: [0.0; 3],
             ..c_arm.clone()
         };
         let rays = Geometry::CArm(turned)
-            .rays(shot.size, shot.size)
+            .rays(query.size, query.size)
             .map_err(|(field, problem)| Error::config(field, "", problem))?;
         let baked = self.baked.lock().unwrap_or_else(PoisonError::into_inner);
-        Ok((baked.render(&rays, shot.size, shot.size, shot.phase, quantity)?, quantity))
+        Ok((baked.render(&rays, query.size, query.size, query.phase, quantity)?, quantity))
     }
 
     /// A grey PNG: vessels dark, as in an angiogram. `low` and `high` are shares of the typical range.
-    fn picture(&self, shot: &Shot) -> Result<Vec<u8>> {
-        if !(shot.low.is_finite() && shot.high.is_finite() && shot.low < shot.high) {
-            return Err(Error::config("low, high", format!("{} to {}", shot.low, shot.high), "is no window"));
+    fn picture(&self, query: &PictureQuery) -> Result<Vec<u8>> {
+        if !(query.low.is_finite() && query.high.is_finite() && query.low < query.high) {
+            return Err(Error::config("low, high", format!("{} to {}", query.low, query.high), "is no window"));
         }
-        let (values, quantity) = self.values(shot)?;
+        let (values, quantity) = self.values(query)?;
         let range = self.ranges.get(&quantity).copied().unwrap_or(1.0);
-        let (low, width) = (shot.low * range, (shot.high - shot.low) * range);
+        let (low, width) = (query.low * range, (query.high - query.low) * range);
         let codes: Vec<u8> = values.iter().map(|v| (255.0 * (1.0 - (v - low) / width)) as u8).collect();
         let mut png = Vec::new();
-        let side = shot.size as u32;
+        let side = query.size as u32;
         PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub)
             .write_image(&codes, side, side, ExtendedColorType::L8)
             .map_err(|e| Error::Internal(format!("PNG: {e}")))?;
@@ -131,9 +132,9 @@ fn authorised(viewer: &Viewer, headers: &HeaderMap, query: &str) -> bool {
     let site = headers.get("sec-fetch-site").and_then(|v| v.to_str().ok());
     let site = site.is_none_or(|s| ["same-origin", "none"].contains(&s));
     let token = query.split('&').find_map(|pair| pair.strip_prefix("token=")).unwrap_or_default();
-    let same = token.len() == viewer.token.len()
-        && token.bytes().zip(viewer.token.bytes()).fold(0, |differ, (a, b)| differ | (a ^ b)) == 0;
-    host && origin && site && same
+    // In constant time, so that how long it takes tells nothing of how much was right.
+    let same = token.as_bytes().ct_eq(viewer.token.as_bytes());
+    host && origin && site && bool::from(same)
 }
 
 async fn guard(State(viewer): State<Arc<Viewer>>, request: Request, next: Next) -> Response {
@@ -160,7 +161,7 @@ async fn guard(State(viewer): State<Arc<Viewer>>, request: Request, next: Next) 
 async fn info(State(viewer): State<Arc<Viewer>>) -> Response {
     let m = &viewer.model;
     let described = serde_json::json!({
-        "phases": m.layout.phases,
+        "phases": m.param_map.phases,
         "primary": m.c_arm.primary_deg,
         "secondary": m.c_arm.secondary_deg,
         "step": m.step,
@@ -169,8 +170,8 @@ async fn info(State(viewer): State<Arc<Viewer>>) -> Response {
     ([(header::CONTENT_TYPE, "application/json")], described.to_string()).into_response()
 }
 
-async fn frame(State(viewer): State<Arc<Viewer>>, Query(shot): Query<Shot>) -> Response {
-    let drawn = tokio::task::spawn_blocking(move || viewer.picture(&shot)).await;
+async fn frame(State(viewer): State<Arc<Viewer>>, Query(query): Query<PictureQuery>) -> Response {
+    let drawn = tokio::task::spawn_blocking(move || viewer.picture(&query)).await;
     match drawn {
         Ok(Ok(png)) => ([(header::CONTENT_TYPE, "image/png")], png).into_response(),
         Ok(Err(error @ Error::Config { .. })) => (StatusCode::BAD_REQUEST, format!("{error}\n")).into_response(),
@@ -184,7 +185,7 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let gpu = cli.open_device()?;
     let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?);
-    eprintln!("preparing {} phases on {} ...", model.layout.phases, gpu.info().name);
+    eprintln!("preparing {} phases on {} ...", model.param_map.phases, gpu.info().name);
     let baked = Baked::for_display(renderer, &model, CELL_MM);
     let mut secret = [0u8; 16];
     getrandom::fill(&mut secret).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
@@ -231,11 +232,11 @@ fn typical_ranges(viewer: &Viewer) -> Result<HashMap<Quantity, f32>> {
     let mut ranges = HashMap::new();
     for &component in Component::ALL {
         // The still background is the same at every phase.
-        let phases = if component.has_dynamic() { viewer.model.layout.phases as u32 } else { 1 };
+        let phases = if component.has_dynamic() { viewer.model.param_map.phases as u32 } else { 1 };
         for &projection in Projection::ALL {
             let mut most = f32::MIN_POSITIVE;
             for phase in 0..phases {
-                let shot = Shot {
+                let query = PictureQuery {
                     primary: viewer.model.c_arm.primary_deg,
                     secondary: viewer.model.c_arm.secondary_deg,
                     phase,
@@ -245,7 +246,7 @@ fn typical_ranges(viewer: &Viewer) -> Result<HashMap<Quantity, f32>> {
                     low: 0.0,
                     high: 1.0,
                 };
-                most = viewer.values(&shot)?.0.into_iter().fold(most, f32::max);
+                most = viewer.values(&query)?.0.into_iter().fold(most, f32::max);
             }
             ranges.insert(Quantity { component, projection }, most);
         }

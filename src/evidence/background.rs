@@ -63,7 +63,7 @@ fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
 pub struct Background {
     /// Mean of the phases at which no vessel covers the pixel.
     pub level: Image,
-    /// The same where a vessel covers the pixel at every phase: what remains without structures as thin as vessels.
+    /// The background where a vessel covers the pixel at every phase: what remains without structures as thin as vessels.
     pub low: Image,
     /// What exceeds the level at each phase and is no wider than a vessel: a heart, a lung or a diaphragm that moves changes
     /// wide areas. `None` where the view has no image.

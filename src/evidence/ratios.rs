@@ -42,7 +42,7 @@ const AMPLITUDES: usize = 8;
 pub struct ViewEvidence {
     /// Index into the dataset's views.
     pub view: usize,
-    /// Its still background.
+    /// The view's still background.
     pub background: Background,
     /// Log-likelihood ratio per pixel, one image per phase; `None` where the view has none.
     pub ratios: Vec<Option<Image>>,

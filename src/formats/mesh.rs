@@ -52,7 +52,7 @@ impl Mesh {
         sums.into_iter().map(|n| n.normalize_or(Vec3::Z).to_array()).collect()
     }
 
-    /// As binary STL.
+    /// The mesh as binary STL.
     pub fn to_stl(&self) -> Vec<u8> {
         let mut out = format!("{STL_HEADER:<STL_HEADER_BYTES$}").into_bytes();
         out.extend((self.triangles.len() as u32).to_le_bytes());
@@ -68,7 +68,7 @@ impl Mesh {
         out
     }
 
-    /// As binary PLY with normals.
+    /// The mesh as binary PLY with normals.
     pub fn to_ply(&self) -> Vec<u8> {
         let mut out = format!(
             "ply\nformat binary_little_endian 1.0\ncomment vessel surface, LPS mm\nelement vertex {}\n\
@@ -89,7 +89,7 @@ impl Mesh {
         out
     }
 
-    /// As Wavefront OBJ with normals.
+    /// The mesh as Wavefront OBJ with normals.
     pub fn to_obj(&self) -> Vec<u8> {
         let mut out = String::from("# vessel surface, LPS mm\n");
         // Writing to a string cannot fail.

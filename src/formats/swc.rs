@@ -5,7 +5,7 @@ use std::fmt::Write;
 /// A point of a tree.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
-    /// Its place.
+    /// Place of the point.
     pub position: [f64; 3],
     /// Radius there.
     pub radius: f64,

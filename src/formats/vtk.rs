@@ -40,7 +40,7 @@ pub struct PointValues {
 
 /// Closed lines of equally many points each.
 pub struct Lines {
-    /// What they are, in a line.
+    /// What the data are, in a line.
     pub title: String,
     /// Points of a line.
     pub points_per_line: usize,

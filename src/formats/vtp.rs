@@ -14,7 +14,7 @@ pub enum Values {
 
 /// Open lines through points.
 pub struct Lines {
-    /// What they are, in a comment; without `--`.
+    /// What the lines are, for a comment; without `--`.
     pub title: String,
     /// When they are so.
     pub time: f64,
@@ -50,7 +50,7 @@ fn arrays(all: &[Values]) -> String {
 }
 
 impl Lines {
-    /// They as a file.
+    /// Text of a `.vtp` file with the lines.
     pub fn to_vtp(&self) -> String {
         let (n_points, n_lines) = (self.points.len(), self.counts.len());
         let ends = self.counts.iter().scan(0, |end, count| {

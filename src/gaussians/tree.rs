@@ -86,7 +86,7 @@ impl GridBuffers {
         })
     }
 
-    /// The same grid under other constants.
+    /// This grid's buffers under other constants.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
@@ -172,7 +172,7 @@ impl OwnMotionBuffers {
 
 /// A recording of stages on a tree.
 pub struct TreePass<'a> {
-    /// Its Gaussians at rest, and what they are fitted to.
+    /// The tree's Gaussians at rest, and what they are fitted to.
     pub gaussians: GaussianPass<'a>,
     /// The tree's own stages.
     pub kernels: &'a TreeKernels,
@@ -257,7 +257,7 @@ pub struct Track {
     pub before: u32,
     /// The one that follows.
     pub before_that: u32,
-    /// Its images, which follow each other.
+    /// Images of the phase, which follow each other.
     pub images: Range<u32>,
 }
 

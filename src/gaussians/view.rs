@@ -45,7 +45,7 @@ impl SplatView {
         1.0 / d0.dot(du.cross(dv)).abs()
     }
 
-    /// The same in f32, for the device.
+    /// The view in f32, for the device.
     pub fn to_device(&self) -> layout::GaussianView {
         let pack = |v: DVec3, w: f64| [v.x as f32, v.y as f32, v.z as f32, w as f32];
         let row = |k: usize| pack(self.rows[k], self.offsets[k]);

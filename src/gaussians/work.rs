@@ -40,7 +40,7 @@ fn pixels(splat: &Splat, setup: &GaussianSetup) -> u64 {
 }
 
 impl GaussianWork {
-    /// Of the splats of the last iteration.
+    /// Work of the splats of the last iteration.
     ///
     /// # Errors
     /// Device errors.

@@ -76,7 +76,7 @@ impl Gpu {
         self.make_pipeline(code, local_size, spec, false)
     }
 
-    /// As [`Gpu::pipeline`], with subgroups of the device's default size, all of them full: for cooperative matrices,
+    /// A pipeline as [`Gpu::pipeline`] makes it, with subgroups of the device's default size, all of them full: for cooperative matrices,
     /// which only devices with [`super::capabilities::DeviceInfo::matrices`] have.
     ///
     /// # Errors

@@ -62,7 +62,7 @@ pub struct Build<'a> {
     pub lanes: Option<u32>,
     /// Values of specialisation constants.
     pub constants: &'a [(&'a str, u32)],
-    /// With full subgroups, for cooperative matrices.
+    /// Whether the stage needs full subgroups, for cooperative matrices.
     pub matrices: bool,
 }
 

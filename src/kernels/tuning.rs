@@ -144,7 +144,7 @@ impl Tuning {
         if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
     }
 
-    /// With the layers on another path, for the reason given.
+    /// This tuning with the layers on another path, for the reason given.
     pub fn with_layers(mut self, layers: Layers, reason: String) -> Tuning {
         self.layers = layers;
         self.reasons.retain(|r| !r.contains("layers"));

@@ -9,7 +9,7 @@ use crate::geometry::CArm;
 use crate::model::Model;
 use crate::model::gaussian_tensors::{self, FileTensor, GaussianHeader};
 use crate::model::hull::Hull;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
 use glam::DVec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -163,7 +163,7 @@ impl Checkpoint {
         if let Some(field) = &model.moving {
             tensors.extend(gaussian_tensors::tensors(field));
         }
-        for tensor in model.layout.tensors() {
+        for tensor in model.param_map.tensors() {
             if model.moving.is_some() && tensor.name.starts_with(NETWORK) {
                 continue;
             }
@@ -191,7 +191,7 @@ impl Checkpoint {
             gaussians: model.moving.as_ref().map(gaussian_tensors::header),
             config: model.config.clone(),
             scene: model.scene.clone(),
-            phases: model.layout.phases,
+            phases: model.param_map.phases,
             step: model.step,
             seed: model.config.seed,
             vessel_attenuation: model.vessel_attenuation,
@@ -257,10 +257,10 @@ impl Checkpoint {
         if needed > bytes.len() as u64 / 4 {
             return Err(bad("config", format!("{needed} parameters do not fit the file's {} bytes", bytes.len())));
         }
-        let layout = ParamLayout::new(&header.config, header.phases);
-        let mut params = vec![0f32; layout.len];
-        let mut moments = vec![[0f32; 2]; layout.len];
-        for tensor in layout.tensors() {
+        let param_map = ParamMap::new(&header.config, header.phases);
+        let mut params = vec![0f32; param_map.len];
+        let mut moments = vec![[0f32; 2]; param_map.len];
+        for tensor in param_map.tensors() {
             if header.gaussians.is_some() && tensor.name.starts_with(NETWORK) {
                 continue;
             }
@@ -321,7 +321,7 @@ impl Checkpoint {
             model: Model {
                 config: header.config,
                 scene: header.scene,
-                layout,
+                param_map,
                 hull,
                 moving,
                 params,

@@ -160,7 +160,7 @@ impl MovingGaussians {
         }
     }
 
-    /// Its form.
+    /// Form of the field: a set of Gaussians per phase, or one for the beat.
     pub fn form(&self) -> GaussianForm {
         match self {
             MovingGaussians::PerPhase(_) => GaussianForm::Phase,

@@ -23,7 +23,7 @@ pub struct Layer {
 
 /// Where every parameter lives.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ParamLayout {
+pub struct ParamMap {
     /// Cells per axis of the static field.
     pub grid: usize,
     /// Ranks per mode.
@@ -44,7 +44,7 @@ pub struct ParamLayout {
     pub width: usize,
     /// Numbers of the encoded input.
     pub encoded_len: usize,
-    /// The same in vec4.
+    /// Length of the encoded input in vec4, rounded up.
     pub encode_groups: usize,
     /// Numbers of a latent.
     pub latent: usize,
@@ -65,9 +65,9 @@ pub struct Tensor {
     pub positions: Vec<u32>,
 }
 
-impl ParamLayout {
-    /// Layout for a configuration and a number of phases.
-    pub fn new(config: &Config, phases: usize) -> ParamLayout {
+impl ParamMap {
+    /// Map for a configuration and a number of phases.
+    pub fn new(config: &Config, phases: usize) -> ParamMap {
         let (s, d) = (&config.static_field, &config.dynamic);
         let (grid, ranks) = (s.grid as usize, s.ranks as usize);
         let (width, latent) = (d.width as usize, d.latent as usize);
@@ -95,7 +95,7 @@ impl ParamLayout {
         let out_weights = take(width);
         let out_bias = take(1);
         let latents = take(phases * latent);
-        ParamLayout {
+        ParamMap {
             grid,
             ranks,
             rank4,
@@ -227,23 +227,23 @@ mod tests {
     fn slices_are_aligned_disjoint_and_named() {
         for preset in [Preset::FastMlp, Preset::Paper, Preset::PublicCode] {
             let config = Config::preset(preset);
-            let layout = ParamLayout::new(&config, 10);
-            let mut seen = vec![false; layout.len];
-            for tensor in layout.tensors() {
+            let map = ParamMap::new(&config, 10);
+            let mut seen = vec![false; map.len];
+            for tensor in map.tensors() {
                 assert_eq!(tensor.positions.len(), tensor.shape.iter().product::<usize>());
                 for at in tensor.positions {
                     assert!(!std::mem::replace(&mut seen[at as usize], true), "{} overlaps", tensor.name);
                 }
             }
-            assert!(layout.layers.iter().all(|l| l.bias % 4 == 0 && l.hidden.unwrap_or(0) % 4 == 0));
+            assert!(map.layers.iter().all(|l| l.bias % 4 == 0 && l.hidden.unwrap_or(0) % 4 == 0));
         }
     }
 
     #[test]
     fn public_code_has_the_authors_shapes() {
-        let layout = ParamLayout::new(&Config::preset(Preset::PublicCode), 10);
+        let map = ParamMap::new(&Config::preset(Preset::PublicCode), 10);
         let shapes: Vec<_> =
-            layout.tensors().into_iter().filter(|t| t.name.ends_with("weight")).map(|t| t.shape).collect();
+            map.tensors().into_iter().filter(|t| t.name.ends_with("weight")).map(|t| t.shape).collect();
         let want = [[128, 71], [128, 128], [128, 128], [128, 199], [128, 128], [1, 128]];
         assert_eq!(shapes, want.map(Vec::from));
     }

@@ -17,17 +17,17 @@ pub struct Scene {
     pub static_depth: [f64; 2],
     /// Depth range of the dynamic field.
     pub dynamic_depth: [f64; 2],
-    /// Encoded coordinate = (x - centre) * scale.
+    /// Centre of the network's input: an encoded coordinate is (x - centre) * scale.
     pub encode_centre: [f64; 3],
-    /// See `encode_centre`.
+    /// Scale of the network's input: an encoded coordinate is (x - centre) * scale.
     pub encode_scale: f64,
-    /// sigma_l = gain * softplus(feature + shift), per world unit.
+    /// Gain of the static field: sigma_l = gain * softplus(feature + shift), per world unit.
     pub static_gain: f64,
-    /// See `static_gain`.
+    /// Shift of the static field: sigma_l = gain * softplus(feature + shift).
     pub static_shift: f64,
-    /// sigma_s = gain * softplus(feature + shift), per world unit.
+    /// Gain of the dynamic field: sigma_s = gain * softplus(feature + shift), per world unit.
     pub dynamic_gain: f64,
-    /// See `dynamic_gain`.
+    /// Shift of the dynamic field: sigma_s = gain * softplus(feature + shift).
     pub dynamic_shift: f64,
     /// Weight of a squared residual of the static field.
     pub static_weight: f64,

@@ -3,7 +3,7 @@
 use crate::config::{Config, DynamicTarget};
 use crate::kernels::layout::Setup;
 use crate::model::hull::Hull;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
 
 /// Iterations whose losses the device keeps for the host.
@@ -13,7 +13,7 @@ pub const FIXED_POINT_BITS: u32 = 50;
 
 impl Scene {
     /// Constants for the shaders; those of a training set (ray counts, image size) stay 0.
-    pub fn setup(&self, config: &Config, params: &ParamLayout, hull: Option<&Hull>) -> Setup {
+    pub fn setup(&self, config: &Config, params: &ParamMap, hull: Option<&Hull>) -> Setup {
         let mut setup = Setup {
             seed: config.seed,
             n_rays: config.train.rays,
@@ -90,7 +90,7 @@ fn choose_samples(setup: &mut Setup, config: &Config) {
 }
 
 /// Sizes of planes, lines and network.
-fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamLayout) {
+fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
     setup.n_phases = params.phases as u32;
     setup.n_bands = config.dynamic.bands;
     setup.grid = params.grid as u32;

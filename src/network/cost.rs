@@ -1,6 +1,6 @@
 //! Operations that the network costs.
 
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use serde::{Deserialize, Serialize};
 
 /// Operations of the network per sample, a multiply-add counted as two.
@@ -16,7 +16,7 @@ pub struct NetworkCost {
 
 impl NetworkCost {
     /// Counts, without padding and without biases and latents, which cost one row per phase.
-    pub fn of(params: &ParamLayout) -> NetworkCost {
+    pub fn of(params: &ParamMap) -> NetworkCost {
         let width = params.width as u64;
         let mut forward = width;
         let mut inputs = width;

@@ -11,7 +11,7 @@ use crate::kernels::push;
 use crate::kernels::stages::{Kernels, MARCH_LANES};
 use crate::kernels::tuning::Tuning;
 use crate::model::hull::Hull;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::network::chunk::{Chunk, chunks};
 use crate::network::pass::Pass;
 use std::mem::offset_of;
@@ -27,7 +27,7 @@ buffer_set! {
         schedule,
         /// The motion hull's cells, a bit each.
         hull,
-        /// Parameters, as [`ParamLayout`] says.
+        /// Parameters, as [`ParamMap`] says.
         params,
         /// The same buffer: parameters of the static field come first.
         static_params,
@@ -67,7 +67,7 @@ impl ForwardBuffers {
         gpu: &Gpu,
         tuning: &Tuning,
         setup: &Setup,
-        params: &ParamLayout,
+        params: &ParamMap,
         n_rays: u32,
         schedule: Buffer,
         hull: Option<&Hull>,

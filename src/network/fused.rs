@@ -18,7 +18,7 @@ use crate::kernels::layout::Setup;
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
 use crate::kernels::tuning::Tuning;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::network::chunk::Chunk;
 use crate::network::pass::Pass;
 use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
@@ -58,7 +58,7 @@ struct Shape {
 impl Shape {
     /// # Errors
     /// [`Error::Config`] when the network does not fit the device's shared memory or workgroups.
-    fn new(info: &DeviceInfo, matrix: MatrixShape, largest: u32, params: &ParamLayout) -> Result<Shape> {
+    fn new(info: &DeviceInfo, matrix: MatrixShape, largest: u32, params: &ParamMap) -> Result<Shape> {
         let MatrixShape { m, n, k } = matrix;
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
@@ -119,7 +119,7 @@ impl Shape {
     }
 
     /// Where each packed weight, then each row of biases, comes from.
-    fn pack_source(&self, params: &ParamLayout) -> Vec<u32> {
+    fn pack_source(&self, params: &ParamMap) -> Vec<u32> {
         let mut source = vec![NOWHERE; self.weights_len];
         let width = params.width;
         let phase_bias =
@@ -157,7 +157,7 @@ impl Shape {
     }
 
     /// Where the gradient of each network parameter lies in the partial sums.
-    fn gradient_source(&self, params: &ParamLayout) -> Vec<u32> {
+    fn gradient_source(&self, params: &ParamMap) -> Vec<u32> {
         let mut source = vec![NOWHERE; params.network_len()];
         let width = params.width;
         let mut put = |at: usize, from: usize| source[at - params.static_len] = from as u32;
@@ -182,7 +182,7 @@ impl Shape {
     }
 
     /// Where the sum of dz over each phase, `[layer][phase][neuron]`, lies in the partial sums.
-    fn phase_source(&self, params: &ParamLayout) -> Vec<u32> {
+    fn phase_source(&self, params: &ParamMap) -> Vec<u32> {
         let mut source = Vec::new();
         for packed in &self.layers {
             for phase in 0..params.phases {
@@ -247,12 +247,12 @@ struct BackwardKernels {
 struct Builder<'a> {
     gpu: &'a Gpu,
     shape: &'a Shape,
-    params: &'a ParamLayout,
+    params: &'a ParamMap,
     build: Build<'a>,
 }
 
 impl Builder<'_> {
-    fn new<'a>(gpu: &'a Gpu, tuning: &Tuning, shape: &'a Shape, params: &'a ParamLayout) -> Builder<'a> {
+    fn new<'a>(gpu: &'a Gpu, tuning: &Tuning, shape: &'a Shape, params: &'a ParamMap) -> Builder<'a> {
         let build = Build {
             // Unrolled or not, they compute the same.
             variant: if tuning.matrices.unroll { "_unrolled" } else { "" },
@@ -303,7 +303,7 @@ impl FusedNetwork {
         gpu: &Gpu,
         tuning: &Tuning,
         setup: &Setup,
-        params: &ParamLayout,
+        params: &ParamMap,
         purpose: Purpose,
     ) -> Result<FusedNetwork> {
         let info = gpu.info();
@@ -404,15 +404,15 @@ impl Path for FusedNetwork {
         self.buffers.find(name)
     }
 
-    fn tiles(&self, _: &ParamLayout) -> Tiles {
+    fn tiles(&self, _: &ParamMap) -> Tiles {
         Tiles { samples: self.shape.fwd_tile, forward: 1, backward: 1 }
     }
 
-    fn partial_sums(&self, _: &ParamLayout) -> PartialSums {
+    fn partial_sums(&self, _: &ParamMap) -> PartialSums {
         PartialSums { splits: self.workgroups, len: self.shape.partials_len as u32 }
     }
 
-    fn gradient_source(&self, params: &ParamLayout) -> Vec<u32> {
+    fn gradient_source(&self, params: &ParamMap) -> Vec<u32> {
         self.shape.gradient_source(params)
     }
 

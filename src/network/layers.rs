@@ -10,7 +10,7 @@ use crate::kernels::layout::Setup;
 use crate::kernels::push;
 use crate::kernels::stages::LayerKernels;
 use crate::kernels::tuning::Tuning;
-use crate::model::params::{Layer, ParamLayout};
+use crate::model::params::{Layer, ParamMap};
 use crate::network::chunk::{Chunk, chunk_rays};
 use crate::network::pass::Pass;
 use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
@@ -56,7 +56,7 @@ impl LayerNetwork {
         gpu: &Gpu,
         tuning: &Tuning,
         setup: &Setup,
-        params: &ParamLayout,
+        params: &ParamMap,
         purpose: Purpose,
     ) -> Result<LayerNetwork> {
         let capacity = u64::from(setup.sample_capacity);
@@ -184,7 +184,7 @@ impl LayerNetwork {
 }
 
 /// Where a parameter of the network lies in a part of the partial sums: in the order of the parameters.
-fn in_partials(params: &ParamLayout, at: usize) -> u32 {
+fn in_partials(params: &ParamMap, at: usize) -> u32 {
     (at - params.static_len) as u32
 }
 
@@ -193,7 +193,7 @@ impl Path for LayerNetwork {
         self.buffers.find(name).or_else(|| self.training.as_ref()?.sums.find(name))
     }
 
-    fn tiles(&self, params: &ParamLayout) -> Tiles {
+    fn tiles(&self, params: &ParamMap) -> Tiles {
         let (tile, width) = (self.kernels.tuning.tile(), params.width as u32);
         Tiles {
             samples: self.kernels.tuning.tile_samples(),
@@ -202,11 +202,11 @@ impl Path for LayerNetwork {
         }
     }
 
-    fn partial_sums(&self, params: &ParamLayout) -> PartialSums {
+    fn partial_sums(&self, params: &ParamMap) -> PartialSums {
         PartialSums { splits: self.kernels.tuning.splits, len: params.network_len() as u32 }
     }
 
-    fn gradient_source(&self, params: &ParamLayout) -> Vec<u32> {
+    fn gradient_source(&self, params: &ParamMap) -> Vec<u32> {
         (0..params.network_len() as u32).collect()
     }
 

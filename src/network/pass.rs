@@ -7,7 +7,7 @@ use crate::kernels::dispatch::{Binding, BufferSet, dispatch_finding};
 use crate::kernels::layout::Setup;
 use crate::kernels::push::PushConstants;
 use crate::kernels::stages::{Kernels, Stage};
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::network::Network;
 use crate::network::forward::ForwardBuffers;
 
@@ -24,7 +24,7 @@ pub struct Pass<'a> {
     /// Further buffers when training.
     pub training: Option<&'a dyn BufferSet>,
     /// Where each parameter lives.
-    pub params: &'a ParamLayout,
+    pub params: &'a ParamMap,
     /// What stays fixed; `buffers` holds the same.
     pub setup: &'a Setup,
 }

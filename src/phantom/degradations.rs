@@ -37,9 +37,9 @@ pub struct Degradations {
 /// Standard deviations of the errors of a stated geometry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GeometryError {
-    /// Of primary and secondary angle, degrees.
+    /// Standard deviation of primary and secondary angle, degrees.
     pub angle_deg: f64,
-    /// Of the patient's position along each axis, mm.
+    /// Standard deviation of the patient's position along each axis, mm.
     pub position_mm: f64,
 }
 

@@ -43,9 +43,9 @@ impl Angles {
 /// The views of a dataset.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewAngles {
-    /// To train on.
+    /// Views to train on.
     pub training: Vec<Angles>,
-    /// To score with.
+    /// Views to score with.
     pub validation: Vec<Angles>,
 }
 

@@ -27,7 +27,7 @@ pub struct Lengths {
 }
 
 impl Lengths {
-    /// Those of images with vessels of `width` pixels ([`vessel_width`]) and noise per pixel, as a share of the strongest
+    /// Lengths for images with vessels of `width` pixels ([`vessel_width`]) and noise per pixel, as a share of the strongest
     /// change; `least_scale` is the setting.
     pub fn new(size: [usize; 2], width: f64, noise: &[f32], least_scale: f64) -> Lengths {
         let factor = size[0].min(size[1]) as f64 / SIDE;

@@ -6,7 +6,6 @@ use crate::geometry::MM_PER_UNIT;
 use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::plan::motion::ViewMotion;
-use crate::plan::start::Start;
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
@@ -57,20 +56,13 @@ impl Scene {
             robust_scale: 0.0,
         };
         if config.loss.normalise {
-            scene.normalise(config, dataset, motion, hull, static_half)?;
+            scene.normalise(config, dataset, motion, static_half)?;
         }
         Ok(scene)
     }
 
     /// Chooses gains, shifts and weights so that features, integrals and losses are near 1.
-    fn normalise(
-        &mut self,
-        config: &Config,
-        dataset: &Dataset,
-        motion: &[ViewMotion],
-        hull: Option<&Hull>,
-        static_half: f64,
-    ) -> Result<()> {
+    fn normalise(&mut self, config: &Config, dataset: &Dataset, motion: &[ViewMotion], static_half: f64) -> Result<()> {
         let training = dataset.training();
         let count = (training.len() * dataset.n_pixels()) as f64;
         let sum: f64 = training.iter().flat_map(|f| &f.integrals).map(|v| f64::from(*v)).sum();
@@ -100,22 +92,8 @@ impl Scene {
             // Both fields share one squared residual.
             DynamicTarget::Absolute => (self.static_weight, 0.0),
         };
-        let best_start = config.dynamic.best_start && config.loss.dynamic_target == DynamicTarget::Temporal;
-        let shift = best_start.then(|| self.start(config, dataset, motion, hull).best_shift());
-        self.dynamic_shift = shift.unwrap_or(config.dynamic.normalised_shift);
+        self.dynamic_shift = config.dynamic.normalised_shift;
         Ok(())
-    }
-
-    /// What is known before a run of a network starts.
-    pub fn start<'a>(
-        &self,
-        config: &'a Config,
-        dataset: &'a Dataset,
-        motion: &'a [ViewMotion],
-        hull: Option<&'a Hull>,
-    ) -> Start<'a> {
-        let (depth, gain, robust) = (self.dynamic_depth, self.dynamic_gain, self.robust_scale);
-        Start { config, dataset, motion, hull, depth, gain, robust }
     }
 }
 

@@ -30,62 +30,71 @@ struct StartRay {
     bounds: [f64; 2],
 }
 
-/// What is known before a run starts.
-pub struct Start<'a> {
-    /// Settings.
-    pub config: &'a Config,
-    /// Angiograms.
-    pub dataset: &'a Dataset,
-    /// What moves in each view.
-    pub motion: &'a [ViewMotion],
-    /// Where the field may be.
-    pub hull: Option<&'a Hull>,
+/// Rays that tell of a constant field, spread over the images evenly, those that meet the hull as often as in training.
+pub struct StartRays(Vec<StartRay>);
+
+/// What rays are made from.
+struct Source<'a> {
+    config: &'a Config,
+    dataset: &'a Dataset,
+    hull: Option<&'a Hull>,
     /// First and last depth along rays, world units.
-    pub depth: [f64; 2],
-    /// Attenuation of a softplus of 1, per world unit.
-    pub gain: f64,
-    /// Residual from which the loss grows linearly; 0: it is squared throughout.
-    pub robust: f64,
+    depth: [f64; 2],
+    /// Training images, and what moves in their views.
+    frames: Vec<(&'a Frame, &'a ViewMotion)>,
 }
 
-impl Start<'_> {
-    /// The shift inside the softplus of the constant field with the least loss with a temporal target.
-    pub fn best_shift(&self) -> f64 {
-        best_shift(&self.rays(), self.gain, self.robust)
+impl StartRays {
+    /// Rays of a dataset's training images, by what moves in each view, as deep as the moving field goes (`depth`, world units).
+    pub fn new(
+        config: &Config,
+        dataset: &Dataset,
+        motion: &[ViewMotion],
+        hull: Option<&Hull>,
+        depth: [f64; 2],
+    ) -> StartRays {
+        let of_view = |m| dataset.training().iter().filter(|f: &&Frame| f.view == m).collect::<Vec<_>>();
+        let frames = motion.iter().flat_map(|m| of_view(m.view).into_iter().map(move |f| (f, m))).collect();
+        let source = Source { config, dataset, hull, depth, frames };
+        let share = if hull.is_some() { config.train.motion_share } else { 0.0 };
+        let mut chosen = source.spread(share * RAYS, |index, p| source.moves(index, p));
+        chosen.extend(source.spread((1.0 - share) * RAYS, |index, p| source.shows(index, p)));
+        StartRays(chosen.into_par_iter().map(|(index, p)| source.ray(index, p)).collect())
+    }
+
+    /// The shift inside the softplus of the constant field with the least loss with a temporal target, where a softplus of 1 is
+    /// an attenuation of `gain` per world unit and residuals beyond `robust` cost linearly (0: none).
+    pub fn best_shift(&self, gain: f64, robust: f64) -> f64 {
+        best_shift(&self.0, gain, robust)
     }
 
     /// Mean loss of no field at all.
-    pub fn empty_loss(&self) -> f64 {
-        let rays = self.rays();
-        rays.iter().map(|ray| ray.loss(0.0, self.robust)).sum::<f64>() / rays.len().max(1) as f64
+    pub fn empty_loss(&self, robust: f64) -> f64 {
+        self.0.iter().map(|ray| ray.loss(0.0, robust)).sum::<f64>() / self.0.len().max(1) as f64
+    }
+}
+
+impl Source<'_> {
+    fn shows(&self, index: usize, pixel: usize) -> bool {
+        self.dataset.shows(self.frames[index].0.view, pixel)
     }
 
-    /// Rays spread over the images evenly, those that meet the hull as often as in training.
-    fn rays(&self) -> Vec<StartRay> {
-        let share = if self.hull.is_some() { self.config.train.motion_share } else { 0.0 };
-        let frames: Vec<(&Frame, &ViewMotion)> = self
-            .motion
-            .iter()
-            .flat_map(|m| self.dataset.training().iter().filter(|f| f.view == m.view).map(move |f| (f, m)))
-            .collect();
-        let pixels = |wanted: &(dyn Fn(&Frame, &ViewMotion, usize) -> bool + Sync)| -> Vec<(usize, usize)> {
-            let of = |index: usize| {
-                let (frame, motion) = frames[index];
-                (0..self.dataset.n_pixels()).filter(move |p| wanted(frame, motion, *p)).map(move |p| (index, p))
-            };
-            (0..frames.len()).flat_map(of).collect()
-        };
-        let moving = |frame: &Frame, motion: &ViewMotion, p: usize| {
-            let seen =
-                if self.config.hull.per_phase { &motion.moving_at[frame.phase as usize] } else { &motion.moving };
-            seen[p] && self.dataset.shows(frame.view, p)
-        };
-        let mut chosen = spread(pixels(&moving), share * RAYS);
-        chosen.extend(spread(pixels(&|frame, _, p| self.dataset.shows(frame.view, p)), (1.0 - share) * RAYS));
-        chosen.into_par_iter().map(|(index, p)| self.ray(frames[index].0, frames[index].1, p)).collect()
+    fn moves(&self, index: usize, pixel: usize) -> bool {
+        let (frame, motion) = self.frames[index];
+        let seen = if self.config.hull.per_phase { &motion.moving_at[frame.phase as usize] } else { &motion.moving };
+        seen[pixel] && self.shows(index, pixel)
     }
 
-    fn ray(&self, frame: &Frame, motion: &ViewMotion, pixel: usize) -> StartRay {
+    /// About `count` of the wanted (image, pixel), evenly. They are counted first: a list of all would be as large as the images.
+    fn spread(&self, count: f64, wanted: impl Fn(usize, usize) -> bool) -> Vec<(usize, usize)> {
+        let pixels = self.dataset.n_pixels();
+        let all = || (0..self.frames.len()).flat_map(|index| (0..pixels).map(move |p| (index, p)));
+        let every = || all().filter(|(index, p)| wanted(*index, *p));
+        spread(every().count(), count, every())
+    }
+
+    fn ray(&self, index: usize, pixel: usize) -> StartRay {
+        let (frame, motion) = self.frames[index];
         let (column, row) = (pixel % self.dataset.width, pixel / self.dataset.width);
         let (anchor, direction) = self.dataset.views[frame.view].rays.pixel(column as f64, row as f64);
         let [near, far] = self.depth;
@@ -100,11 +109,19 @@ impl Start<'_> {
     }
 }
 
-/// About `count` of the items, evenly.
-fn spread<T: Copy>(items: Vec<T>, count: f64) -> Vec<T> {
-    let step = (items.len() as f64 / count.max(1.0)).max(1.0);
-    let n = (items.len() as f64 / step) as usize;
-    if count < 1.0 { Vec::new() } else { (0..n).map(|k| items[(k as f64 * step) as usize]).collect() }
+/// About `count` of the `n` items, evenly.
+fn spread<T>(n: usize, count: f64, items: impl Iterator<Item = T>) -> Vec<T> {
+    if count < 1.0 {
+        return Vec::new();
+    }
+    let step = (n as f64 / count).max(1.0);
+    let mut taken = 0;
+    let wanted = |(k, _): &(usize, T)| {
+        let take = *k == (taken as f64 * step) as usize;
+        taken += usize::from(take);
+        take
+    };
+    items.enumerate().filter(wanted).map(|(_, item)| item).collect()
 }
 
 fn best_shift(rays: &[StartRay], gain: f64, robust: f64) -> f64 {
@@ -162,8 +179,9 @@ mod tests {
 
     #[test]
     fn items_are_taken_evenly() {
-        assert_eq!(spread((0..10).collect(), 5.0), [0, 2, 4, 6, 8]);
-        assert_eq!(spread((0..3).collect(), 5.0), [0, 1, 2]);
-        assert!(spread((0..3).collect::<Vec<_>>(), 0.0).is_empty());
+        assert_eq!(spread(10, 5.0, 0..10), [0, 2, 4, 6, 8]);
+        assert_eq!(spread(10, 4.0, 0..10), [0, 2, 5, 7]);
+        assert_eq!(spread(3, 5.0, 0..3), [0, 1, 2]);
+        assert!(spread(3, 0.0, 0..3).is_empty());
     }
 }

@@ -1,7 +1,7 @@
 //! f64 twins of the fields: plain loops over one point at a time, forward and backward.
 
 use crate::kernels::layout::Setup;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use glam::{DVec3, Vec3};
 
 /// log(1 + e^x), the identity beyond 20 as in torch.
@@ -37,7 +37,7 @@ struct ModeTaps {
 }
 
 /// Positions (without rank) and weights of the taps of each mode: XY x Z, XZ x Y, YZ x X.
-fn vm_taps(s: &Setup, p: &ParamLayout, x: DVec3) -> [ModeTaps; 3] {
+fn vm_taps(s: &Setup, p: &ParamMap, x: DVec3) -> [ModeTaps; 3] {
     let (low, high) = (point(s.static_min), point(s.static_max));
     let c = (x - low) / (high - low) * (p.grid - 1) as f64;
     [[0, 1, 2], [0, 2, 1], [1, 2, 0]].map(|[u, v, w]| {
@@ -56,7 +56,7 @@ fn vm_taps(s: &Setup, p: &ParamLayout, x: DVec3) -> [ModeTaps; 3] {
 }
 
 /// Sum over modes and ranks of plane times line (paper, section 2.1).
-pub fn vm_feature(s: &Setup, p: &ParamLayout, params: &[f64], x: DVec3) -> f64 {
+pub fn vm_feature(s: &Setup, p: &ParamMap, params: &[f64], x: DVec3) -> f64 {
     let mut sum = 0.0;
     for taps in vm_taps(s, p, x) {
         for r in 0..p.ranks {
@@ -68,7 +68,7 @@ pub fn vm_feature(s: &Setup, p: &ParamLayout, params: &[f64], x: DVec3) -> f64 {
 }
 
 /// Adds `dL_dfeature` times the feature's gradient.
-pub fn vm_feature_bwd(s: &Setup, p: &ParamLayout, params: &[f64], x: DVec3, dl_dfeature: f64, gradient: &mut [f64]) {
+pub fn vm_feature_bwd(s: &Setup, p: &ParamMap, params: &[f64], x: DVec3, dl_dfeature: f64, gradient: &mut [f64]) {
     for taps in vm_taps(s, p, x) {
         for r in 0..p.ranks {
             let at = |taps: &[(usize, f64)]| taps.iter().map(|(i, w)| w * params[i + r]).sum::<f64>();
@@ -80,7 +80,7 @@ pub fn vm_feature_bwd(s: &Setup, p: &ParamLayout, params: &[f64], x: DVec3, dl_d
 }
 
 /// Attenuation of the static field, per world unit.
-pub fn static_attenuation(s: &Setup, p: &ParamLayout, params: &[f64], x: DVec3) -> f64 {
+pub fn static_attenuation(s: &Setup, p: &ParamMap, params: &[f64], x: DVec3) -> f64 {
     f64::from(s.static_gain) * softplus(vm_feature(s, p, params, x) + f64::from(s.static_shift))
 }
 
@@ -137,13 +137,7 @@ pub struct NetworkTrace {
 }
 
 /// The network at one encoded point and phase.
-pub fn network_fwd(
-    p: &ParamLayout,
-    params: &[f64],
-    encoded: &[f64],
-    phase: usize,
-    precision: Precision,
-) -> NetworkTrace {
+pub fn network_fwd(p: &ParamMap, params: &[f64], encoded: &[f64], phase: usize, precision: Precision) -> NetworkTrace {
     let round = |x: f64| precision.round(x);
     let latent = &params[p.latents + phase * p.latent..][..p.latent];
     let encoded: Vec<f64> = encoded.iter().map(|e| round(*e)).collect();
@@ -178,7 +172,7 @@ pub fn network_fwd(
 
 /// Adds `dL_dfeature` times the feature's gradient with respect to all network parameters.
 pub fn network_bwd(
-    p: &ParamLayout,
+    p: &ParamMap,
     params: &[f64],
     trace: &NetworkTrace,
     phase: usize,

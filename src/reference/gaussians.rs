@@ -75,7 +75,7 @@ impl AlongRay {
         (self.log_density - 0.5 * (self.constant + t * (2.0 * self.linear + self.square * t))).exp()
     }
 
-    /// Where it is largest, and its standard deviation along the ray.
+    /// Where along a ray the Gaussian is largest, and its standard deviation along the ray.
     pub fn peak(&self) -> (f64, f64) {
         (-self.linear / self.square, 1.0 / self.square.sqrt())
     }

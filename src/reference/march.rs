@@ -1,7 +1,7 @@
 //! f64 twins of ray drawing, depths and the march.
 
 use crate::kernels::layout::Setup;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::plan::Plan;
 use crate::random::{STREAM_DEPTH, STREAM_MOTION_RAY, STREAM_RAY, permute, uniform01};
 use crate::reference::field::{self, NetworkTrace, Precision};
@@ -131,7 +131,7 @@ pub struct March {
 
 /// Marches one ray (twin of `march_count`..`march_fwd`).
 pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool, precision: Precision) -> March {
-    let (s, p): (&Setup, &ParamLayout) = (&plan.setup, &plan.params);
+    let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
     let row = plan.schedule[step as usize];
     let mut out = March {
         statics: Vec::new(),

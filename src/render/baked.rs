@@ -31,20 +31,21 @@ pub struct Baked {
     /// The static field, then each phase.
     volumes: Mutex<Vec<Option<Image3d>>>,
     /// Recorded once per size, phase and quantity: a frame is a view written, a submit and a picture read.
-    shots: Mutex<HashMap<ShotKey, Arc<Shot>>>,
+    recorded: Mutex<HashMap<RecordedKey, Arc<RecordedView>>>,
 }
 
 /// Recorded frames kept; a viewer in use has far fewer.
-const MOST_SHOTS: usize = 256;
+const MOST_RECORDED: usize = 256;
 
 /// Columns, rows, phase, quantity.
-type ShotKey = (usize, usize, u32, Quantity);
+type RecordedKey = (usize, usize, u32, Quantity);
 
-struct Shot {
+/// Commands that draw a view, ready to be submitted.
+struct RecordedView {
     commands: Commands,
     view: Buffer,
     image: Buffer,
-    /// A shot's buffers hold one frame.
+    /// Its buffers hold one frame.
     in_use: Mutex<()>,
 }
 
@@ -85,7 +86,7 @@ impl Baked {
         let still = Grid::over(corner(s.static_min), corner(s.static_max), still_cells);
         let moving = Grid::over(corner(s.dynamic_min), corner(s.dynamic_max), moving_cells);
         let volumes = Mutex::new(vec![None; 1 + s.n_phases as usize]);
-        Baked { still, moving, volumes, renderer, shots: Mutex::default() }
+        Baked { still, moving, volumes, renderer, recorded: Mutex::default() }
     }
 
     /// What the volumes are baked from.
@@ -156,12 +157,12 @@ impl Baked {
         if self.renderer.draws_gaussians(quantity) {
             return self.render_gaussians(rays, (width, height), phase, quantity);
         }
-        let shot = self.shot(width, height, phase, quantity)?;
-        let _alone = shot.in_use.lock().unwrap_or_else(PoisonError::into_inner);
-        shot.view.write(&[View::of(rays)])?;
-        self.renderer.gpu.wait(shot.commands.submit()?)?;
+        let recorded = self.recorded_view(width, height, phase, quantity)?;
+        let _alone = recorded.in_use.lock().unwrap_or_else(PoisonError::into_inner);
+        recorded.view.write(&[View::of(rays)])?;
+        self.renderer.gpu.wait(recorded.commands.submit()?)?;
         let mut image = vec![0f32; width * height];
-        shot.image.read(&mut image)?;
+        recorded.image.read(&mut image)?;
         Ok(image)
     }
 
@@ -182,7 +183,7 @@ impl Baked {
         Ok(image)
     }
 
-    /// As [`Baked::render`], into a buffer on the device: `width` x `height` floats.
+    /// Draws a view as [`Baked::render`] does, into a buffer on the device: `width` x `height` floats.
     ///
     /// # Errors
     /// As [`Baked::render`]; [`Error::Internal`] when the buffer is too small.
@@ -207,22 +208,22 @@ impl Baked {
         self.renderer.gpu.wait(commands.submit()?)
     }
 
-    fn shot(&self, width: usize, height: usize, phase: u32, quantity: Quantity) -> Result<Arc<Shot>> {
-        let mut shots = self.shots.lock().unwrap_or_else(PoisonError::into_inner);
+    fn recorded_view(&self, width: usize, height: usize, phase: u32, quantity: Quantity) -> Result<Arc<RecordedView>> {
+        let mut all = self.recorded.lock().unwrap_or_else(PoisonError::into_inner);
         let key = (width, height, phase, quantity);
-        if let Some(shot) = shots.get(&key) {
-            return Ok(shot.clone());
+        if let Some(recorded) = all.get(&key) {
+            return Ok(recorded.clone());
         }
-        if shots.len() >= MOST_SHOTS {
-            shots.clear();
+        if all.len() >= MOST_RECORDED {
+            all.clear();
         }
         let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
         let view = gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
         let image = gpu.buffer("image", u64::from(pixels) * 4, Memory::Readback)?;
         let commands = self.record(&view, &image, (width, height), phase, quantity)?;
-        let shot = Arc::new(Shot { commands, view, image, in_use: Mutex::default() });
-        shots.insert(key, shot.clone());
-        Ok(shot)
+        let recorded = Arc::new(RecordedView { commands, view, image, in_use: Mutex::default() });
+        all.insert(key, recorded.clone());
+        Ok(recorded)
     }
 
     fn record(

@@ -30,7 +30,7 @@ impl Grid {
         self.size.iter().map(|n| *n as usize).product()
     }
 
-    /// Whether it has no points.
+    /// Whether the grid has no points.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -25,11 +25,11 @@ const REST: u32 = 4;
 /// Where a run in training keeps what a view needs.
 #[derive(Clone)]
 pub struct Source {
-    /// Its model, with parameters if `params` has none.
+    /// Model that is drawn, with parameters if `params` has none.
     pub outline: Model,
-    /// Its parameters on the device.
+    /// Parameters of the model on the device.
     pub params: Option<Buffer>,
-    /// Its Gaussians, where they are the moving field.
+    /// Gaussians of the model, where they are the moving field.
     pub moving: Option<MovingFeed>,
 }
 
@@ -67,12 +67,12 @@ impl Live {
             params: source.params.clone(),
             moving: source.moving.clone(),
             moving_at: AtomicU64::new(u64::MAX),
-            baked_at: vec![0; 1 + model.layout.phases],
+            baked_at: vec![0; 1 + model.param_map.phases],
             rest_until: Instant::now(),
         })
     }
 
-    /// As [`Baked::render`]. A volume older than `step`, the source's present iteration, is baked anew unless the last
+    /// Draws a view as [`Baked::render`] does. A volume older than `step`, the source's present iteration, is baked anew unless the last
     /// refresh was too recent: refreshing takes at most a fifth of the time.
     ///
     /// # Errors
@@ -90,7 +90,7 @@ impl Live {
         self.baked.render(rays, size.0, size.1, phase, quantity)
     }
 
-    /// As [`Live::render`], into a buffer on the device.
+    /// Draws a view as [`Live::render`] does, into a buffer on the device.
     ///
     /// # Errors
     /// As [`Baked::render_into`].

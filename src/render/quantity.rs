@@ -26,8 +26,8 @@ impl Choice for Projection {
 /// What the pixels of a view show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Quantity {
-    /// Of which fields.
+    /// Which fields are shown.
     pub component: Component,
-    /// How they are projected.
+    /// How the fields are projected.
     pub projection: Projection,
 }

@@ -14,7 +14,7 @@ use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
 use crate::model::gaussians::MovingGaussians;
-use crate::model::params::ParamLayout;
+use crate::model::params::ParamMap;
 use crate::model::setup::sample_capacity;
 use crate::network::forward::ForwardBuffers;
 use crate::network::pass::Pass;
@@ -75,7 +75,7 @@ pub struct Renderer {
     network: Network,
     pub(super) buffers: ForwardBuffers,
     pub(super) setup: Setup,
-    model_layout: ParamLayout,
+    param_map: ParamMap,
     /// Where Gaussians are the moving field.
     pub(super) moving: Option<Blobs>,
     pictures: Option<Pictures>,
@@ -88,37 +88,37 @@ impl Renderer {
     /// Device errors.
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
         let tuning = tuning.for_network(model.moving.is_none());
-        let mut setup = model.scene.setup(&model.config, &model.layout, model.hull.as_ref());
+        let mut setup = model.scene.setup(&model.config, &model.param_map, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;
         setup.n_static_samples = model.config.march.render_samples;
         if model.moving.is_none() {
             setup.n_dynamic_samples = model.config.march.render_samples;
         }
-        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.layout));
+        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.param_map));
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
-        let network = Network::new(gpu, &tuning, &setup, &model.layout, Purpose::Render)?;
-        let kernels = Kernels::new(gpu, tuning, model.layout.line_len() as u32)?;
+        let network = Network::new(gpu, &tuning, &setup, &model.param_map, Purpose::Render)?;
+        let kernels = Kernels::new(gpu, tuning, model.param_map.line_len() as u32)?;
         let schedule = gpu.buffer("schedule", size_of::<Schedule>() as u64, Memory::Upload)?;
-        let (tuning, layout, hull) = (&kernels.tuning, &model.layout, model.hull.as_ref());
-        let buffers = ForwardBuffers::new(gpu, tuning, &setup, layout, RAYS_PER_SUBMIT, schedule, hull)?;
+        let (tuning, param_map, hull) = (&kernels.tuning, &model.param_map, model.hull.as_ref());
+        let buffers = ForwardBuffers::new(gpu, tuning, &setup, param_map, RAYS_PER_SUBMIT, schedule, hull)?;
         // The schedule has a single row, that of the model's step.
         gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
         let moving = model.moving.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
         let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
-        let model_layout = model.layout.clone();
-        let renderer = Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, model_layout, moving, pictures };
+        let param_map = model.param_map.clone();
+        let renderer = Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, param_map, moving, pictures };
         renderer.set_params(model)?;
         Ok(renderer)
     }
 
-    /// Replaces parameters, window and Gaussians by those of `model`, which must have the same layout.
+    /// Replaces parameters, window and Gaussians by those of `model`, which must have the same parameters.
     ///
     /// # Errors
-    /// [`Error::Internal`] for another layout; device errors.
+    /// [`Error::Internal`] for other parameters; device errors.
     pub fn set_model(&self, model: &Model) -> Result<()> {
-        if model.layout != self.model_layout || model.moving.is_some() != self.moving.is_some() {
-            return Err(Error::Internal("the model has another layout than the renderer".into()));
+        if model.param_map != self.param_map || model.moving.is_some() != self.moving.is_some() {
+            return Err(Error::Internal("the model has other parameters than the renderer".into()));
         }
         if let Some(field) = &model.moving {
             self.set_gaussians(field)?;
@@ -153,7 +153,7 @@ impl Renderer {
     /// [`Error::Internal`] when the buffer has another size; device errors.
     pub fn follow(&self, params: &Buffer, schedule: Schedule) -> Result<Commands> {
         let mut recording = Recording::new(&self.gpu, "follow")?;
-        recording.copy(params, 0, &self.buffers.params, 0, self.model_layout.len as u64 * 4)?;
+        recording.copy(params, 0, &self.buffers.params, 0, self.param_map.len as u64 * 4)?;
         self.buffers.schedule.write(&[schedule])?;
         let commands = recording.finish()?;
         commands.submit()?;
@@ -196,7 +196,7 @@ impl Renderer {
         buffers: &'a ForwardBuffers,
         setup: &'a Setup,
     ) -> Pass<'a> {
-        let (kernels, network, params) = (&self.kernels, &self.network, &self.model_layout);
+        let (kernels, network, params) = (&self.kernels, &self.network, &self.param_map);
         Pass { recording, kernels, network, buffers, training: None, params, setup }
     }
 
@@ -229,6 +229,11 @@ impl Renderer {
         let still = self.moving.is_none() || quantity.component.has_static();
         let parts = Parts { still, maxima: quantity.projection == Projection::Mip };
         Ok(self.render_parts(rays, (width, height), phase, parts)?.show(quantity))
+    }
+
+    /// Whether Gaussians are the moving field, not a network.
+    pub fn gaussians_move(&self) -> bool {
+        self.moving.is_some()
     }
 
     /// Whether a view of the moving field is drawn from Gaussians as they are, at display rates. The largest value of their

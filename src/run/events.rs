@@ -93,5 +93,8 @@ pub enum Event {
         train_s: f64,
         /// Seconds in all.
         elapsed_s: f64,
+        /// Loss of the moving network as a share of the loss without one; none where Gaussians move.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        dynamic_share: Option<f64>,
     },
 }

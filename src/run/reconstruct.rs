@@ -140,6 +140,8 @@ struct Loop<'a> {
     end: u32,
     /// Jobs the worker has not finished.
     waiting: u32,
+    /// Of the last iteration told of.
+    dynamic_share: Option<f64>,
 }
 
 impl<'a> Loop<'a> {
@@ -153,6 +155,7 @@ impl<'a> Loop<'a> {
             first_step: training.trainer().step(),
             end: options.stop_at.unwrap_or(config.train.iterations).min(config.train.iterations),
             waiting: 0,
+            dynamic_share: None,
             training,
             config,
             options,
@@ -201,7 +204,8 @@ impl<'a> Loop<'a> {
         }
         let (step, elapsed_s) = (self.training.trainer().step(), self.training.elapsed_s());
         (self.tell)(Event::Profile { step, passes: self.training.trainer_mut().profile_step()? })?;
-        (self.tell)(Event::Finished { step, train_s: self.training.train_s(), elapsed_s })
+        let (train_s, dynamic_share) = (self.training.train_s(), self.dynamic_share);
+        (self.tell)(Event::Finished { step, train_s, elapsed_s, dynamic_share })
     }
 
     fn cancelled(&self) -> bool {
@@ -222,8 +226,9 @@ impl<'a> Loop<'a> {
         for p in progress {
             if p.loss.step.is_multiple_of(REPORT_EVERY) || p.loss.step == self.end {
                 let empty = self.training.trainer().plan().empty_loss;
+                self.dynamic_share = empty.filter(|empty| *empty > 0.0).map(|empty| p.loss.dynamic / empty);
                 (self.tell)(Event::Progress {
-                    dynamic_share: empty.filter(|empty| *empty > 0.0).map(|empty| p.loss.dynamic / empty),
+                    dynamic_share: self.dynamic_share,
                     loss: p.loss,
                     psnr: p.smoothed_psnr_db,
                     iterations_per_s: p.iterations_per_s,

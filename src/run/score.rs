@@ -41,11 +41,11 @@ pub fn evaluate_model(
     options: &ScoreOptions<'_>,
     observe: &mut dyn FnMut(&Event),
 ) -> Result<Evaluation> {
-    if model.layout.phases != dataset.n_phases as usize {
+    if model.param_map.phases != dataset.n_phases as usize {
         return Err(Error::config(
             "dataset",
             dataset.path.display(),
-            format!("has {} phases, the run {}", dataset.n_phases, model.layout.phases),
+            format!("has {} phases, the run {}", dataset.n_phases, model.param_map.phases),
         ));
     }
     let renderer = Renderer::new(gpu, model, tuning.clone())?;
@@ -55,7 +55,8 @@ pub fn evaluate_model(
     let frames: Vec<_> = dataset.validation().iter().collect();
     let mut beats = options.pictures.map(|directory| Beats::new(dataset, directory));
     let missing = beats.as_ref().map_or(0, |beats| beats.missing(dataset).len());
-    let mut pace = Pace::new(frames.len() + missing, options.cancel, observe);
+    let as_stated: Vec<_> = if carried.is_some() { stated.validation().iter().collect() } else { Vec::new() };
+    let mut pace = Pace::new(frames.len() + missing + as_stated.len(), options.cancel, observe);
     let threshold = options.threshold_per_mm.map(|t| t * MM_PER_UNIT);
     let mut evaluation =
         evaluate(&renderer, dataset, &frames, model.step, threshold, |scoring| match (scoring, &mut beats) {
@@ -72,10 +73,11 @@ pub fn evaluate_model(
         beats.write(&renderer, dataset, &mut pace)?;
     }
     if carried.is_some() {
-        let frames: Vec<_> = stated.validation().iter().collect();
-        let go_on =
-            |_: Scoring<'_>| if options.cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) };
-        evaluation.dice_as_stated = Some(evaluate(&renderer, stated, &frames, model.step, threshold, go_on)?.dice);
+        let seen = evaluate(&renderer, stated, &as_stated, model.step, threshold, |scoring| match scoring {
+            Scoring::Rendered => pace.one_more(),
+            Scoring::Scored { .. } => pace.check(),
+        })?;
+        evaluation.dice_as_stated = Some(seen.dice);
     }
     let threshold_per_mm = evaluation.threshold.dynamic_per_mm;
     match volume::score(&renderer, &model.scene, dataset, threshold_per_mm, || pace.check()) {

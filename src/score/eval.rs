@@ -56,11 +56,11 @@ pub struct DiceMeans {
 /// Where predicted attenuation counts as vessel.
 #[derive(Debug, Clone, Serialize)]
 pub struct Thresholds {
-    /// For the dynamic field, per mm.
+    /// Threshold of the dynamic field, per mm.
     pub dynamic_per_mm: f64,
-    /// For both fields, per mm.
+    /// Threshold of the sum of both fields, per mm.
     pub total_per_mm: f64,
-    /// How they were chosen.
+    /// How the thresholds were chosen.
     pub rule: &'static str,
 }
 
@@ -77,9 +77,9 @@ pub struct BestDice {
 /// Best Dice over thresholds; none without masks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct BestDices {
-    /// Of the dynamic field.
+    /// Best Dice of the dynamic field.
     pub dynamic: Option<BestDice>,
-    /// Of both fields.
+    /// Best Dice of the sum of both fields.
     pub total: Option<BestDice>,
 }
 
@@ -260,11 +260,15 @@ pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Op
     let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
     let seen = renderer.render(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.phase)?;
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
+    let remedy = if renderer.gaussians_move() {
+        "check geometry, phases and noise of the views"
+    } else {
+        "check geometry and phases; a smaller hull.dilate_pixels, a lower dynamic.lr or another seed may help"
+    };
     Ok((strongest < DEAD_SHARE * change).then(|| {
         format!(
             "The moving field has died: its line integrals reach {strongest:.2e} where the images change by {change:.2e}. \
-             Dice says nothing here. Views may disagree by more than the motion hull allows: check geometry and phases; \
-             a smaller hull.dilate_pixels, a lower dynamic.lr or another seed may help."
+             Dice says nothing here. Views may disagree by more than the motion hull allows: {remedy}."
         )
     }))
 }

@@ -32,7 +32,7 @@ pub struct Agreement {
     pub cl_dice: Option<f64>,
     /// Connected components (26 neighbours) of ours that are large enough to count.
     pub components: f64,
-    /// Those of the truth.
+    /// Connected components of the truth, mean over the phases.
     pub true_components: f64,
 }
 

@@ -36,7 +36,7 @@ pub struct Scores {
     pub agreement: Agreement,
     /// Share of the moving field's attenuation farther than 2 pixels at the isocentre from the nearest true vessel voxel.
     pub mass_beyond_2_pixels: Option<f64>,
-    /// The same for 2 mm.
+    /// Share of the moving field's attenuation that lies more than 2 mm from a true vessel.
     pub mass_beyond_2_mm: Option<f64>,
 }
 
@@ -45,7 +45,7 @@ pub struct Scores {
 pub struct PhaseScores {
     /// Cardiac phase, from 0.
     pub phase: u32,
-    /// Its scores.
+    /// Scores of the phase.
     #[serde(flatten)]
     pub scores: Scores,
 }

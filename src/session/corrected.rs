@@ -12,11 +12,11 @@ use glam::DVec3;
 pub struct CorrectedFrame {
     /// How this frame is corrected.
     pub correction: Correction,
-    /// Its view's part; none where the view is taken as stated.
+    /// Correction of the frame's view; none where the view is taken as stated.
     pub view: Option<ViewCorrection>,
     /// Where breathing has carried the heart along (left, posterior, superior), mm.
     pub heart_shift_mm: [f64; 3],
-    /// From patient mm (left, posterior, superior) to homogeneous pixels (column, row; integers are pixel centres), rows
+    /// Projection from patient mm (left, posterior, superior) to homogeneous pixels (column, row; integers are pixel centres), rows
     /// first: draws the vessels where this frame shows them.
     pub projection: [[f64; 4]; 3],
 }

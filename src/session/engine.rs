@@ -166,6 +166,7 @@ impl Shared {
             // Views wait for what was submitted before them.
             tuning.iterations_per_submit = Some(1);
         }
+        dataset.notes.iter().for_each(|note| tracing::info!("{note}"));
         let calibration = calibrate(&dataset, &config)?;
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         let dataset = dataset.corrected(&calibration)?;

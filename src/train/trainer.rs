@@ -102,10 +102,10 @@ pub struct Trainer {
 
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
-    if checkpoint.model.layout == plan.params && checkpoint.model.moving.is_some() == plan.targets.is_some() {
+    if checkpoint.model.param_map == plan.params && checkpoint.model.moving.is_some() == plan.targets.is_some() {
         return Ok(());
     }
-    Err(Error::config("checkpoint", checkpoint.model.layout.len, "its fields have another shape"))
+    Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
 }
 
 /// Fingerprint of the training images (FNV-1a over their bits and geometry).
@@ -391,7 +391,7 @@ impl Trainer {
         Model {
             config: self.plan.config.clone(),
             scene: self.plan.scene.clone(),
-            layout: self.plan.params.clone(),
+            param_map: self.plan.params.clone(),
             // Gaussians need no hull once they are seeded.
             hull: self.plan.hull.clone().filter(|_| self.moving.is_none()),
             moving: self.moving.as_ref().map(Moving::field),
@@ -491,7 +491,7 @@ impl Snapshot {
     /// [`Error::Diverged`] when a parameter is not finite; device errors.
     pub fn wait(mut self) -> Result<Checkpoint> {
         self.gpu.wait(self.ticket)?;
-        let n = self.model.layout.len;
+        let n = self.model.param_map.len;
         let mut params = vec![0f32; n];
         self.params.read(&mut params)?;
         if let Some(bad) = params.iter().find(|p| !p.is_finite()) {

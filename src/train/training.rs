@@ -15,7 +15,7 @@ pub struct Progress {
     pub loss: StepLoss,
     /// PSNR of the iteration's rays, dB; not a number while Gaussians are fitted, which have no rays.
     pub psnr_db: f64,
-    /// The same, smoothed over iterations.
+    /// PSNR of the training rays, smoothed over iterations, dB.
     pub smoothed_psnr_db: f64,
     /// Iterations per second since the clock was started.
     pub iterations_per_s: f64,

@@ -1,7 +1,4 @@
-"""Prints the SSIM that scikit-image gives the pair of images in src/score/metrics.rs; the test there holds the number.
-
-    pip install scikit-image && python3 tests/python/ssim_reference.py
-"""
+"""Prints the SSIM that scikit-image gives a pair of images; tests/volume_scores.rs compares it with ours."""
 import numpy as np
 from skimage.metrics import structural_similarity
 

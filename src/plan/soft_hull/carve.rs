@@ -265,7 +265,7 @@ impl SoftHull {
         kept as f64 / (self.resolution.pow(3) * self.cells.len().max(1)) as f64
     }
 
-    /// The same cells as bits: what training gates samples with, and what is drawn and exported.
+    /// The hull's cells as bits: what training gates samples with, and what is drawn and exported.
     pub fn to_hull(&self) -> Hull {
         let n = self.resolution;
         let words = n.pow(3).div_ceil(32);
