@@ -44,6 +44,7 @@
 pub mod choice;
 pub mod error;
 pub mod files;
+pub mod fingerprint;
 pub mod random;
 pub mod raster;
 
