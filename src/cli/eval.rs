@@ -127,6 +127,13 @@ pub fn print_table(evaluation: &Evaluation) {
     };
     let BestDices { dynamic, total } = evaluation.best_dice;
     out!("best Dice over thresholds, found with the masks: {} / {}", best(dynamic), best(total));
+    let published = evaluation.dice_published;
+    out!(
+        "Dice at the authors' threshold, {:.4e} per mm: {} (dynamic, as in the paper) / {} (total, first image, as in their code)",
+        published.threshold_per_mm,
+        dice(published.paper),
+        dice(published.authors)
+    );
     if let Some(volume) = &evaluation.volume {
         volume_table::print(volume);
     }
