@@ -23,6 +23,7 @@ mod cli {
     pub mod frame_rates;
     pub mod info;
     pub mod page;
+    pub mod plot;
     pub mod progress;
     pub mod render;
     pub mod report;

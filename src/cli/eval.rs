@@ -5,12 +5,11 @@ use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
 use super::volume_table;
 use clap::Args;
-use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::run::info::RunInfo;
-use nertca_vk::run::score::{ScoreOptions, evaluate_model};
+use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::{BestDice, BestDices, Evaluation};
 use std::path::{Path, PathBuf};
@@ -73,14 +72,6 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     }
     evaluation.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     cli.close_device(&gpu)
-}
-
-/// A dataset by the geometry that a run went by.
-pub fn as_trained(dataset: Dataset, run: &Path) -> Result<Dataset> {
-    match Calibration::read(run)? {
-        Some(calibration) => dataset.corrected(&calibration),
-        None => Ok(dataset),
-    }
 }
 
 /// Prints scores as a table with means.
