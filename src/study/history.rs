@@ -74,12 +74,13 @@ mod tests {
             {"event":"progress","step":20,"elapsed_s":4.0}
             {"event":"started","step":20}
             {"event":"progress","step":30,"elapsed_s":1.0}
-            {"event":"validation","step":30,"train_s":0.75,"dice_dynamic":null}
-            {"event":"finished","step":30,"train_s":0.8,"elapsed_s":1.5}"#;
+            {"event":"started","step":30}
+            {"event":"validation","step":40,"train_s":0.75,"dice_dynamic":null}
+            {"event":"finished","step":40,"train_s":0.8,"elapsed_s":1.5}"#;
         let history = History::of(log);
-        assert_eq!((history.train_s, history.before_s, history.parts), (4.8, 4.0, 2));
+        assert_eq!((history.train_s, history.before_s, history.parts), (5.8, 5.0, 3));
         let curve: Vec<_> = history.curve.iter().map(|p| (p.step, p.train_s, p.dice)).collect();
-        assert_eq!(curve, [(10, 1.5, Some(0.5)), (30, 4.75, None)]);
+        assert_eq!(curve, [(10, 1.5, Some(0.5)), (40, 5.75, None)]);
         assert_eq!(History::of(""), History::default());
     }
 }
