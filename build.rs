@@ -83,12 +83,14 @@ fn link_library() -> Result<(), Failure> {
 /// Commit of the checkout, for benchmark reports; "unknown" outside one.
 fn commit() -> String {
     // Written by every commit and checkout, not by edits: a build of edited sources names the commit they are based on.
-    if Path::new(".git/logs/HEAD").exists() {
-        println!("cargo:rerun-if-changed=.git/logs/HEAD");
+    if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"]).filter(|log| Path::new(log).exists()) {
+        println!("cargo:rerun-if-changed={log}");
     }
-    let described = std::process::Command::new("git").args(["describe", "--always", "--dirty"]).output();
-    match described {
-        Ok(output) if output.status.success() => String::from_utf8_lossy(&output.stdout).trim().to_owned(),
-        _ => "unknown".to_owned(),
-    }
+    git(&["describe", "--always", "--dirty"]).unwrap_or_else(|| "unknown".to_owned())
+}
+
+/// What git says; none where it fails or is not there.
+fn git(args: &[&str]) -> Option<String> {
+    let output = std::process::Command::new("git").args(args).output().ok().filter(|output| output.status.success())?;
+    Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }

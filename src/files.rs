@@ -67,16 +67,25 @@ fn hold(file: &File) {
 #[cfg(not(unix))]
 fn hold(_: &File) {}
 
-/// Whether some process still writes a file.
+/// Tries to hold a file that is open: whether that worked, or none where the file system has no locks.
 #[cfg(unix)]
-fn is_held(file: &File) -> bool {
-    rustix::fs::flock(file, rustix::fs::FlockOperation::NonBlockingLockExclusive).is_err()
+fn try_hold(file: &File) -> Option<bool> {
+    use rustix::fs::{FlockOperation, flock};
+    match flock(file, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => Some(true),
+        Err(rustix::io::Errno::WOULDBLOCK) => Some(false),
+        Err(_) => None,
+    }
 }
 
-/// Elsewhere, open files cannot be removed anyway.
 #[cfg(not(unix))]
-fn is_held(_: &File) -> bool {
-    false
+fn try_hold(_: &File) -> Option<bool> {
+    None
+}
+
+/// Whether some process still writes a file; without locks nobody knows, but only Unix removes files that are open.
+fn is_held(file: &File) -> bool {
+    cfg!(unix) && try_hold(file) != Some(true)
 }
 
 /// Removes what a process that was killed has left half written in a directory; how many files. What other processes are
@@ -89,6 +98,25 @@ pub fn remove_partial(directory: &Path) -> usize {
     });
     let left_over = ours.filter(|entry| File::open(entry.path()).is_ok_and(|file| !is_held(&file)));
     left_over.filter(|entry| std::fs::remove_file(entry.path()).is_ok()).count()
+}
+
+/// A file that one process at a time holds, for as long as this lives; a process that is killed lets go. On systems without
+/// such locks, and on file systems without them, nobody is kept out.
+#[derive(Debug)]
+pub struct Lock {
+    _file: File,
+}
+
+impl Lock {
+    /// Takes it, and makes the file and its directory where they are missing; none while another process has it.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn take(path: &Path) -> Result<Option<Lock>> {
+        create_directory(path.parent().unwrap_or(Path::new(".")))?;
+        let file = File::create(path).map_err(Error::io("create", path))?;
+        Ok(if try_hold(&file) == Some(false) { None } else { Some(Lock { _file: file }) })
+    }
 }
 
 /// A value as indented JSON.
@@ -145,5 +173,16 @@ mod tests {
         assert!(!at(".partial-left").exists() && at("checkpoint").exists() && at(".other").exists());
         assert!(at(".partial-directory").is_dir());
         assert_eq!(remove_partial(&at("absent")), 0);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn one_at_a_time_has_a_lock() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("locks/one");
+        let held = Lock::take(&path).unwrap().unwrap();
+        assert!(Lock::take(&path).unwrap().is_none());
+        drop(held);
+        assert!(Lock::take(&path).unwrap().is_some());
     }
 }

@@ -15,8 +15,8 @@
 //! 7. [`export`] hands them to other tools, [`score`] compares them with what was seen, [`trees`] turns them into centrelines
 //!
 //! [`run`] ties these to a run directory, [`session`] is a reconstruction in memory that grows with its frames, and
-//! [`capi`] the same for C. [`mod@bench`] times the engine, [`phantom`] makes data to try it on, and [`mod@reference`] holds an
-//! f64 twin of every compute stage, for tests. Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
+//! [`capi`] the same for C. [`phantom`] makes data to try it on, `study` (a feature) puts methods beside each other on them,
+//! [`mod@bench`] times the engine, and [`mod@reference`] holds an f64 twin of every compute stage, for tests. Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
 //! without any knowledge of angiography. Modules use only what stands above them in this file.
 //!
 //! A dataset becomes a reconstruction, in memory:
@@ -77,6 +77,7 @@
 pub mod choice;
 pub mod error;
 pub mod files;
+pub mod fingerprint;
 pub mod random;
 pub mod raster;
 
@@ -281,6 +282,9 @@ pub mod phantom {
     pub mod views;
     pub mod voxels;
 }
+
+#[cfg(feature = "study")]
+pub mod study;
 
 pub mod bench;
 

@@ -23,9 +23,12 @@ mod cli {
     pub mod frame_rates;
     pub mod info;
     pub mod page;
+    pub mod plot;
     pub mod progress;
     pub mod render;
     pub mod report;
+    pub mod study;
+    pub mod study_page;
     pub mod synthetic_args;
     pub mod train;
     pub mod tree;
@@ -58,6 +61,7 @@ fn main() -> ExitCode {
         Command::Calibrate(args) => cli::calibrate::run(args),
         Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),
+        Command::Study(args) => cli::study::run(&cli, args),
         Command::Check(args) => cli::check::run(args),
         Command::Info(args) => cli::info::info(args),
         Command::Completions(args) => cli::devices::completions(args),

@@ -9,6 +9,7 @@ use super::eval::EvalArgs;
 use super::export::{ConvertArgs, ExportArgs};
 use super::info::InfoArgs;
 use super::render::RenderArgs;
+use super::study::StudyArgs;
 use super::synthetic_args::{PhantomArgs, ProjectArgs};
 use super::train::TrainArgs;
 use super::tree::TreeArgs;
@@ -72,6 +73,8 @@ pub enum Command {
     Convert(ConvertArgs),
     /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
     Bench(BenchArgs),
+    /// Run a study: data sets x methods x seeds, and tables of their results beside published ones.
+    Study(StudyArgs),
     /// Tell whether a dataset makes sense, and which of the usual mistakes it has.
     Check(CheckArgs),
     /// Describe a dataset or a run.

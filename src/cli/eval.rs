@@ -5,12 +5,11 @@ use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
 use super::volume_table;
 use clap::Args;
-use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::run::info::RunInfo;
-use nertca_vk::run::score::{ScoreOptions, evaluate_model};
+use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::{BestDice, BestDices, Evaluation};
 use std::path::{Path, PathBuf};
@@ -75,14 +74,6 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     cli.close_device(&gpu)
 }
 
-/// A dataset by the geometry that a run went by.
-pub fn as_trained(dataset: Dataset, run: &Path) -> Result<Dataset> {
-    match Calibration::read(run)? {
-        Some(calibration) => dataset.corrected(&calibration),
-        None => Ok(dataset),
-    }
-}
-
 /// Prints scores as a table with means.
 pub fn print_table(evaluation: &Evaluation) {
     let dice = |d: Option<f64>| d.map_or("    -".into(), |d| format!("{d:.3}"));
@@ -127,6 +118,13 @@ pub fn print_table(evaluation: &Evaluation) {
     };
     let BestDices { dynamic, total } = evaluation.best_dice;
     out!("best Dice over thresholds, found with the masks: {} / {}", best(dynamic), best(total));
+    let published = evaluation.dice_published;
+    out!(
+        "Dice at the authors' threshold, {:.4e} per mm: {} (dynamic, as in the paper) / {} (total, first image, as in their code)",
+        published.threshold_per_mm,
+        dice(published.paper),
+        dice(published.authors)
+    );
     if let Some(volume) = &evaluation.volume {
         volume_table::print(volume);
     }

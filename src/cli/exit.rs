@@ -17,7 +17,7 @@ pub fn code(error: &Error) -> u8 {
         Error::Config { .. } => USAGE,
         Error::NoDevice(_) => NO_DEVICE,
         Error::DeviceLost { .. } => TRY_AGAIN,
-        Error::OutOfMemory { may_pass: true, .. } => TRY_AGAIN,
+        Error::OutOfMemory { may_pass: true, .. } | Error::Busy(_) => TRY_AGAIN,
         Error::Interrupted => INTERRUPTED,
         _ => 1,
     }
@@ -47,6 +47,7 @@ mod tests {
         let memory = |may_pass| Error::OutOfMemory { object: "rays".into(), bytes: 1, detail: String::new(), may_pass };
         let lost = Error::DeviceLost { pass: "training".into() };
         assert_eq!((code(&lost), code(&memory(true))), (TRY_AGAIN, 75));
+        assert_eq!(code(&Error::Busy("another process".into())), TRY_AGAIN);
         assert_eq!(code(&memory(false)), 1, "a limit of the device stays where it is");
         assert_eq!(code(&Error::config("phase", 77, "")), USAGE);
         assert!(hint(&lost).is_some_and(|hint| hint.contains("--resume")));

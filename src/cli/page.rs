@@ -1,6 +1,7 @@
 //! `report.html`: one page that needs nothing but itself. Plots are SVG, pictures are embedded, and phases are chosen by
 //! radio buttons, so that no script is needed.
 
+use super::plot::{Line, plot};
 use super::{calibration_table, volume_table};
 use base64::Engine;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -9,13 +10,11 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::model::gaussians::Displacement;
 use nertca_vk::score::eval::Evaluation;
-use plotters::prelude::*;
+use plotters::style::RGBColor;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The paper's time on an RTX A5000, seconds.
-const PAPER_S: f64 = 37.0 * 60.0;
 /// Pictures embedded at most.
 const MOST_PICTURES: usize = 120;
 
@@ -45,7 +44,8 @@ pub struct Page<'a> {
     pub config: String,
 }
 
-const STYLE: &str = "
+/// How pages look.
+pub(super) const STYLE: &str = "
 :root{color-scheme:light dark;--ink:#1b1d21;--paper:#fcfcfb;--soft:#6c7078;--line:#d9dbdf;--mark:#b3261e}
 @media(prefers-color-scheme:dark){:root{--ink:#e7e8ea;--paper:#17181b;--soft:#9a9ea7;--line:#3a3d44;--mark:#ff8a80}
 .plot svg{filter:invert(.91) hue-rotate(180deg)}}
@@ -62,85 +62,8 @@ input.p:focus-visible+label.p{outline:2px solid}.shot{display:none}.shot img{wid
 .by-view{display:flex;flex-wrap:wrap;gap:1rem}.by-view figure{margin:0;flex:1 1 24rem}.by-view img{width:100%;image-rendering:pixelated}
 .scroll{overflow-x:auto;max-height:26rem}";
 
-/// Series of a plot.
-struct Line {
-    name: &'static str,
-    colour: RGBColor,
-    points: Vec<(f64, f64)>,
-}
-
-/// A plot over the time of training, on a logarithmic axis that reaches the paper's 37 minutes.
-fn plot(title: &str, lines: &[Line], log_y: bool) -> Result<String> {
-    let fault = |e: &dyn std::fmt::Display| Error::Internal(format!("plot: {e}"));
-    let all: Vec<(f64, f64)> = lines.iter().flat_map(|l| l.points.iter().copied()).filter(|p| p.0 > 0.0).collect();
-    if all.is_empty() {
-        return Ok(String::new());
-    }
-    let fold = |pick: fn(&(f64, f64)) -> f64, start: f64, f: fn(f64, f64) -> f64| all.iter().map(pick).fold(start, f);
-    let first = fold(|p| p.0, f64::MAX, f64::min).max(1e-3);
-    let last = fold(|p| p.0, 0.0, f64::max).max(PAPER_S * 1.3);
-    let (mut low, mut high) = (fold(|p| p.1, f64::MAX, f64::min), fold(|p| p.1, f64::MIN, f64::max));
-    if log_y {
-        (low, high) = (low.max(1e-12).log10(), high.max(1e-12).log10());
-    } else {
-        low = low.min(0.0);
-    }
-    let room = 0.06 * (high - low).max(1e-6);
-    let mut svg = String::new();
-    {
-        let area = SVGBackend::with_string(&mut svg, (900, 320)).into_drawing_area();
-        let mut chart = ChartBuilder::on(&area)
-            .margin(12)
-            .x_label_area_size(38)
-            .y_label_area_size(64)
-            .caption(title, ("sans-serif", 18))
-            .build_cartesian_2d(first.log10()..last.log10(), low..high + room)
-            .map_err(|e| fault(&e))?;
-        chart
-            .configure_mesh()
-            .light_line_style(TRANSPARENT)
-            .x_desc("seconds of training")
-            .x_label_formatter(&|x| match 10f64.powf(*x) {
-                s if s < 10.0 => format!("{s:.1}"),
-                s => format!("{s:.0}"),
-            })
-            .y_label_formatter(&|y| if log_y { format!("{:.1e}", 10f64.powf(*y)) } else { format!("{y:.2}") })
-            .draw()
-            .map_err(|e| fault(&e))?;
-        let paper = [(PAPER_S.log10(), low), (PAPER_S.log10(), high + room)];
-        chart
-            .draw_series(std::iter::once(PathElement::new(paper, RGBColor(180, 40, 30).stroke_width(1))))
-            .map_err(|e| fault(&e))?
-            .label("the paper: 37 minutes of an RTX A5000")
-            .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], RGBColor(180, 40, 30)));
-        for line in lines.iter().filter(|l| !l.points.is_empty()) {
-            let colour = line.colour;
-            let at = |p: &(f64, f64)| (p.0.max(first).log10(), if log_y { p.1.max(1e-12).log10() } else { p.1 });
-            let style = colour.stroke_width(2);
-            chart
-                .draw_series(LineSeries::new(line.points.iter().map(at), style))
-                .map_err(|e| fault(&e))?
-                .label(line.name)
-                .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], colour));
-            if line.points.len() < 40 {
-                let dots = line.points.iter().map(|p| Circle::new(at(p), 3, colour.filled()));
-                chart.draw_series(dots).map_err(|e| fault(&e))?;
-            }
-        }
-        chart
-            .configure_series_labels()
-            .position(if log_y { SeriesLabelPosition::LowerLeft } else { SeriesLabelPosition::LowerRight })
-            .background_style(WHITE.mix(0.7))
-            .label_font(("sans-serif", 14))
-            .draw()
-            .map_err(|e| fault(&e))?;
-        area.present().map_err(|e| fault(&e))?;
-    }
-    Ok(svg)
-}
-
 /// A picture as an address that holds it.
-fn embedded(path: &Path) -> Result<String> {
+pub(super) fn embedded(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
     Ok(format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes)))
 }
@@ -168,8 +91,12 @@ impl Page<'_> {
         let loss = plot(
             "Loss",
             &[
-                Line { name: "data", colour: blue, points: self.series("progress", "elapsed_s", "data") },
-                Line { name: "dynamic field", colour: orange, points: self.series("progress", "elapsed_s", "dynamic") },
+                Line { name: "data".into(), colour: blue, points: self.series("progress", "elapsed_s", "data") },
+                Line {
+                    name: "dynamic field".into(),
+                    colour: orange,
+                    points: self.series("progress", "elapsed_s", "dynamic"),
+                },
             ],
             true,
         )?;
@@ -177,12 +104,16 @@ impl Page<'_> {
             "Unseen views",
             &[
                 Line {
-                    name: "Dice, dynamic field",
+                    name: "Dice, dynamic field".into(),
                     colour: orange,
                     points: self.series("validation", "train_s", "dice_dynamic"),
                 },
-                Line { name: "Dice, both", colour: green, points: self.series("validation", "train_s", "dice_total") },
-                Line { name: "SSIM", colour: blue, points: self.series("validation", "train_s", "ssim") },
+                Line {
+                    name: "Dice, both".into(),
+                    colour: green,
+                    points: self.series("validation", "train_s", "dice_total"),
+                },
+                Line { name: "SSIM".into(), colour: blue, points: self.series("validation", "train_s", "ssim") },
             ],
             false,
         )?;

@@ -5,7 +5,8 @@ use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
 use nertca_vk::phantom::dataset::Setting;
-use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm, USUAL_BREATH_S};
+use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm};
+use nertca_vk::phantom::degradations::{USUAL_BEATS, USUAL_BREATH_S, USUAL_FRAMES_PER_S};
 use nertca_vk::phantom::noise::Photons;
 use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::scan::dataset::Layout;
@@ -141,10 +142,10 @@ pub struct DegradationArgs {
     #[arg(long, value_name = "BPM[,BPM...]", value_delimiter = ',', allow_hyphen_values = true)]
     pub heart_rate: Vec<f64>,
     /// Images per second, as 7.5, 15 or 30.
-    #[arg(long, default_value_t = 15.0, requires = "heart_rate", allow_hyphen_values = true)]
+    #[arg(long, default_value_t = USUAL_FRAMES_PER_S, requires = "heart_rate", allow_hyphen_values = true)]
     pub fps: f64,
     /// Length of each run, beats: contrast fills the vessels for about three.
-    #[arg(long, default_value_t = 3, requires = "heart_rate")]
+    #[arg(long, default_value_t = USUAL_BEATS, requires = "heart_rate")]
     pub beats: u32,
     /// How time becomes phase: `two-segment` (systole keeps its length, diastole takes the rest) or `linear`.
     #[arg(long, value_parser = choice::<BeatScaling>(), default_value = BeatScaling::TwoSegment.name(),

@@ -1,7 +1,7 @@
 //! `train`: a run and its report.
 
 use super::args::{Cli, ConfigArgs};
-use super::eval::{as_trained, print_table};
+use super::eval::print_table;
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
 use clap::Args;
@@ -15,7 +15,7 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
-use nertca_vk::run::score::{ScoreOptions, evaluate_model};
+use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::moving_field_warning;
 use std::path::{Path, PathBuf};

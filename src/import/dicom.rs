@@ -1,6 +1,7 @@
 //! One X-ray angiography run from a DICOM file: frames, geometry, times, ECG. Nothing that identifies a patient is kept.
 
 use crate::error::{Error, Result};
+use crate::fingerprint::Fingerprint;
 use crate::geometry::CArm;
 use crate::import::{ecg, lengths};
 use crate::scan::gating::RPeaks;
@@ -108,11 +109,6 @@ impl Reader<'_> {
     }
 }
 
-/// FNV-1a.
-fn hash(text: &str) -> u64 {
-    text.bytes().fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
-}
-
 impl Run {
     /// Reads a run. `pixel_mm` is the pixel pitch on the detector where the file does not say it.
     ///
@@ -154,7 +150,8 @@ impl Run {
         let relationship = r.relationship(&mut notes);
         let (frames, white) = r.frames(n, width * height, &mut notes)?;
         let r_peaks = r.r_peaks(&times_s, &mut notes);
-        let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(|tag| hash(&r.text(tag).unwrap_or_default()));
+        let hashed = |tag| Fingerprint::of(r.text(tag).unwrap_or_default().as_bytes()).value();
+        let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(hashed);
         Ok(Run {
             path: path.to_path_buf(),
             width,

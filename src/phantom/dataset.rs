@@ -20,7 +20,7 @@ use crate::scan::truth::{TrueFrame, Truth};
 use crate::scan::writer::{About, Writer};
 use crate::score::volume::VOLUMES;
 use glam::DVec3;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 /// File of the true vessels as a tree, among the volumes.
@@ -31,7 +31,8 @@ const MASK_SHARE: f64 = 0.05;
 const BLADE_DENSITY: f32 = 2.0;
 
 /// A published set-up of C-arm and volume.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Setting {
     /// The authors' XCAT set-up: DSD 2500, DSO 450, 0.25 mm voxels.
     Xcat,

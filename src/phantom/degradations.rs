@@ -9,9 +9,14 @@ use crate::phantom::noise::Photons;
 use crate::random::{STREAM_ACQUISITION, normal, uniform01};
 use crate::scan::dataset::Layout;
 use crate::scan::gating::BeatScaling;
+use serde::{Deserialize, Serialize};
 
 /// Length of a breath at rest, seconds.
 pub const USUAL_BREATH_S: f64 = 4.0;
+/// Images per second of an ordinary run.
+pub const USUAL_FRAMES_PER_S: f64 = 15.0;
+/// Length of an ordinary run, beats: contrast fills the vessels for about so long.
+pub const USUAL_BEATS: u32 = 3;
 /// Largest share of the vessels that may be cut off.
 const LARGEST_CUT: f64 = 0.9;
 
@@ -35,7 +40,8 @@ pub struct Degradations {
 }
 
 /// Standard deviations of the errors of a stated geometry.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct GeometryError {
     /// Standard deviation of primary and secondary angle, degrees.
     pub angle_deg: f64,
@@ -44,27 +50,50 @@ pub struct GeometryError {
 }
 
 /// A breathing patient.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Breathing {
     /// The heart's way along the body, peak to peak, mm.
     pub peak_to_peak_mm: f64,
     /// Length of a breath, seconds.
+    #[serde(default = "usual_breath_s")]
     pub period_s: f64,
     /// Diaphragm and lower chest breathe, too.
+    #[serde(default)]
     pub background: bool,
 }
 
+fn usual_breath_s() -> f64 {
+    USUAL_BREATH_S
+}
+
 /// When images are taken, and how they get their phases.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Rhythm {
     /// Beats per minute: one for all training views, or one for each.
     pub beats_per_min: Vec<f64>,
     /// Images per second.
+    #[serde(default = "usual_frames_per_s")]
     pub frames_per_s: f64,
     /// Length of a run, beats.
+    #[serde(default = "usual_beats")]
     pub beats: u32,
     /// How time becomes phase.
+    #[serde(default = "usual_gating")]
     pub gating: BeatScaling,
+}
+
+fn usual_frames_per_s() -> f64 {
+    USUAL_FRAMES_PER_S
+}
+
+fn usual_beats() -> u32 {
+    USUAL_BEATS
+}
+
+fn usual_gating() -> BeatScaling {
+    BeatScaling::TwoSegment
 }
 
 fn within(field: &str, value: f64, accepted: std::ops::RangeInclusive<f64>, unit: &str) -> Result<()> {

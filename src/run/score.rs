@@ -1,5 +1,6 @@
 //! Scores of a model on every unseen image, and pictures of them.
 
+use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
 use crate::gpu::device::Gpu;
@@ -25,6 +26,17 @@ pub struct ScoreOptions<'a> {
     pub pictures: Option<&'a Path>,
     /// Set to true to stop after the image under way.
     pub cancel: &'a AtomicBool,
+}
+
+/// A dataset by the geometry that a run went by.
+///
+/// # Errors
+/// [`Error::Data`] and [`Error::Io`] for a run's calibration that cannot be read or is of other data.
+pub fn as_trained(dataset: Dataset, run: &Path) -> Result<Dataset> {
+    match Calibration::read(run)? {
+        Some(calibration) => dataset.corrected(&calibration),
+        None => Ok(dataset),
+    }
 }
 
 /// Evaluates a model on all validation frames of a dataset whose training views are those the run went by. Where the truth of

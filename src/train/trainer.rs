@@ -2,6 +2,7 @@
 //! and reads losses without stalling it.
 
 use crate::error::{Error, Result};
+use crate::fingerprint::Fingerprint;
 use crate::geometry::CArm;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
@@ -108,10 +109,10 @@ fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
     Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
 }
 
-/// Fingerprint of the training images (FNV-1a over their bits and geometry).
+/// Fingerprint of the training images: of their bits and geometry.
 pub fn data_fingerprint(dataset: &Dataset) -> String {
-    let mut hash = 0xcbf2_9ce4_8422_2325u64;
-    let mut eat = |bits: u32| hash = (hash ^ u64::from(bits)).wrapping_mul(0x0100_0000_01b3);
+    let mut fingerprint = Fingerprint::default();
+    let mut eat = |bits: u32| fingerprint.word(bits);
     for frame in dataset.training() {
         eat(frame.phase);
         let rays = &dataset.views[frame.view].rays;
@@ -121,7 +122,7 @@ pub fn data_fingerprint(dataset: &Dataset) -> String {
         frame.heart_shift_mm.iter().filter(|s| **s != 0.0).for_each(|s| eat((*s as f32).to_bits()));
         frame.integrals.iter().for_each(|v| eat(v.to_bits()));
     }
-    format!("{hash:016x}")
+    fingerprint.hex()
 }
 
 impl Trainer {

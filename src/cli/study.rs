@@ -1,0 +1,293 @@
+//! `study`: many runs from one file, and tables of their results.
+
+use super::args::Cli;
+use super::data::bar;
+use super::progress::{show_progress, stop_flag};
+use super::study_page;
+use clap::{Args, Subcommand};
+use nertca_vk::error::Result;
+use nertca_vk::files;
+use nertca_vk::study::COMMIT;
+use nertca_vk::study::events::StudyEvent;
+use nertca_vk::study::file;
+use nertca_vk::study::markup::{csv, latex, markdown};
+use nertca_vk::study::outcome::Outcome;
+use nertca_vk::study::plan::{Run, RunFingerprint, Study};
+use nertca_vk::study::queue::work_off;
+use nertca_vk::study::table::Table;
+use nertca_vk::study::work::Workplace;
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// Where a study looks for files of others, where --data does not say it.
+const DATA_VARIABLE: &str = "NERTCA_DATA";
+
+/// `study`.
+#[derive(Debug, Args)]
+pub struct StudyArgs {
+    /// What to do with it.
+    #[command(subcommand)]
+    pub command: StudyCommand,
+}
+
+/// What can be done with a study.
+#[derive(Debug, Subcommand)]
+pub enum StudyCommand {
+    /// Do all runs that have no result yet, and go on with those that were interrupted.
+    Run(RunArgs),
+    /// Do one run: for schedulers. Exit code 0: it has its result, be it a failure; 75: try again.
+    One(OneArgs),
+    /// List the runs.
+    List(ListArgs),
+    /// Write table.md, table.csv and table.tex into DIR, and the first to stdout.
+    Table(PlaceArgs),
+    /// Write report.html into DIR: table, Dice over time, pictures side by side.
+    Report(PlaceArgs),
+}
+
+/// A study and its files.
+#[derive(Debug, Args)]
+pub struct FileArgs {
+    /// Study (TOML).
+    #[arg(value_name = "FILE")]
+    pub file: PathBuf,
+    /// Where the study's relative paths are looked for first, then beside it; $NERTCA_DATA by default.
+    #[arg(long, value_name = "DIR")]
+    pub data: Option<PathBuf>,
+}
+
+/// A study and its directory.
+#[derive(Debug, Args)]
+pub struct PlaceArgs {
+    /// The study.
+    #[command(flatten)]
+    pub study: FileArgs,
+    /// Directory of the study's data and runs.
+    #[arg(short, long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+/// How to do runs.
+#[derive(Debug, Args)]
+pub struct DoingArgs {
+    /// The study and its directory.
+    #[command(flatten)]
+    pub place: PlaceArgs,
+    /// Also do runs again that failed.
+    #[arg(long)]
+    pub retry_failed: bool,
+    /// One JSON object per line on stdout instead of progress.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `study run`.
+#[derive(Debug, Args)]
+pub struct RunArgs {
+    /// How.
+    #[command(flatten)]
+    pub doing: DoingArgs,
+}
+
+/// `study one`.
+#[derive(Debug, Args)]
+pub struct OneArgs {
+    /// How.
+    #[command(flatten)]
+    pub doing: DoingArgs,
+    /// The run, as `study list` names it.
+    #[arg(value_name = "RUN")]
+    pub run: String,
+}
+
+/// `study list`.
+#[derive(Debug, Args)]
+pub struct ListArgs {
+    /// The study.
+    #[command(flatten)]
+    pub study: FileArgs,
+    /// Directory of the study's runs, to say which have their result.
+    #[arg(short, long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// JSON instead of lines.
+    #[arg(long)]
+    pub json: bool,
+}
+
+impl FileArgs {
+    fn read(&self) -> Result<Study> {
+        let data = self.data.clone().or_else(|| std::env::var_os(DATA_VARIABLE).map(PathBuf::from));
+        file::read(&self.file, data.as_deref())
+    }
+}
+
+/// Does what was asked for.
+pub fn run(cli: &Cli, args: &StudyArgs) -> Result<()> {
+    match &args.command {
+        StudyCommand::Run(args) => queue(cli, &args.doing),
+        StudyCommand::One(args) => one(cli, args),
+        StudyCommand::List(args) => list(args),
+        StudyCommand::Table(args) => table(args),
+        StudyCommand::Report(args) => report(args),
+    }
+}
+
+/// Does something at the place where a study's runs are done.
+fn at_work<T>(
+    cli: &Cli,
+    args: &DoingArgs,
+    work: impl FnOnce(&Study, &Workplace<'_>, &mut dyn FnMut(&StudyEvent<'_>)) -> Result<T>,
+) -> Result<T> {
+    let study = args.place.study.read()?;
+    warn_of_edits();
+    let cancel = stop_flag()?;
+    let place = Workplace {
+        directory: &args.place.out,
+        open: &|| cli.open_device(),
+        close: &|gpu| cli.close_device(gpu),
+        tune: &|gpu, config, dataset| cli.training_tuning(gpu, config, dataset),
+        cancel: &cancel,
+        retry_failed: args.retry_failed,
+    };
+    if args.json { work(&study, &place, &mut print_json) } else { work(&study, &place, &mut show()) }
+}
+
+/// Results say which commit they are of; edits since then are not seen.
+fn warn_of_edits() {
+    if COMMIT == "unknown" || COMMIT.ends_with("-dirty") {
+        eprintln!("warning: built from sources that no commit has ({COMMIT}): results of other edits count as done");
+    }
+}
+
+fn queue(cli: &Cli, args: &DoingArgs) -> Result<()> {
+    let summary = at_work(cli, args, |study, place, observe| work_off(study, place, observe))?;
+    if summary.failed > 0 {
+        eprintln!(
+            "warning: {} of {} runs failed, and the table says why; --retry-failed",
+            summary.failed, summary.runs
+        );
+    }
+    Ok(())
+}
+
+fn one(cli: &Cli, args: &OneArgs) -> Result<()> {
+    let (run, outcome) = at_work(cli, &args.doing, |study, place, observe| {
+        let run = study.run(&args.run)?;
+        let outcome = place.work(study, &run, observe)?;
+        Ok((run, outcome))
+    })?;
+    if let Some(failure) = &outcome.failure {
+        eprintln!("warning: {} failed: {failure}", run.id);
+    }
+    Ok(())
+}
+
+/// A run in the output of `study list --json`.
+#[derive(Serialize)]
+struct Listed<'a> {
+    #[serde(flatten)]
+    run: &'a Run,
+    data: &'a str,
+    method: &'a str,
+    iterations: u32,
+    /// What it is made of: another one is another run.
+    fingerprint: RunFingerprint,
+    /// `scored`, `failed` or `waiting`; none where no directory was given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    state: Option<&'static str>,
+}
+
+fn list(args: &ListArgs) -> Result<()> {
+    let study = args.study.read()?;
+    let runs = study.runs();
+    let mut listed = Vec::new();
+    for run in &runs {
+        let state = match &args.out {
+            None => None,
+            Some(directory) => Some(match Outcome::of(&study, directory, run)? {
+                None => "waiting",
+                Some(outcome) if outcome.failure.is_some() => "failed",
+                Some(_) => "scored",
+            }),
+        };
+        let (data, method) = (study.data[run.data].id.as_str(), &study.methods[run.method]);
+        let (iterations, fingerprint) = (method.config.train.iterations, study.fingerprint(run)?);
+        listed.push(Listed { run, data, method: &method.name, iterations, fingerprint, state });
+    }
+    if args.json {
+        out!("{}", files::pretty_json(&listed)?);
+    } else {
+        listed.iter().for_each(|listed| match listed.state {
+            Some(state) => out!("{state:8} {}", listed.run.id),
+            None => out!("{}", listed.run.id),
+        });
+    }
+    Ok(())
+}
+
+fn table(args: &PlaceArgs) -> Result<()> {
+    let table = Table::gather(&args.study.read()?, &args.out)?;
+    let text = markdown(&table);
+    for (name, text) in [("table.md", &text), ("table.csv", &csv(&table)), ("table.tex", &latex(&table))] {
+        files::write_atomic(&args.out.join(name), text.as_bytes())?;
+    }
+    out!("{}", text.trim_end());
+    Ok(())
+}
+
+fn report(args: &PlaceArgs) -> Result<()> {
+    let page = args.out.join("report.html");
+    study_page::write(&args.study.read()?, &args.out, &page)?;
+    out!("{}", page.display());
+    Ok(())
+}
+
+/// One JSON object per line on stdout.
+fn print_json(event: &StudyEvent<'_>) {
+    if let Ok(line) = serde_json::to_string(event) {
+        out!("{line}");
+    }
+}
+
+/// Seconds as a person would say them.
+fn duration(seconds: f64) -> String {
+    match seconds {
+        s if s < 100.0 => format!("{s:.0} s"),
+        s if s < 6000.0 => format!("{:.0} min", s / 60.0),
+        s => format!("{:.1} h", s / 3600.0),
+    }
+}
+
+/// A line per run on stderr, and the progress of the run under way.
+fn show() -> impl FnMut(&StudyEvent<'_>) {
+    let (mut making, mut training) = (None, None);
+    move |event| match event {
+        StudyEvent::Begun { runs, done } => eprintln!("{runs} runs, {done} with their result"),
+        StudyEvent::RunBegun { run, number, of, left_s } => {
+            let left = left_s.map_or(String::new(), |s| format!(", about {} left", duration(s)));
+            eprintln!("[{number} of {of}] {run}{left}");
+        }
+        StudyEvent::Making { what, done, of, .. } => making.get_or_insert_with(bar)(what, *done, *of),
+        StudyEvent::Run { event, .. } => {
+            making = None;
+            training.get_or_insert_with(show_progress)(event);
+        }
+        StudyEvent::RunEnded { run, failure, dice, whole_s } => {
+            training = None;
+            match failure {
+                Some(failure) => eprintln!("{run} failed: {failure}"),
+                None => {
+                    let dice = dice.map_or("-".into(), |dice| format!("{dice:.3}"));
+                    eprintln!("{run}: Dice {dice}, {}", duration(*whole_s));
+                }
+            }
+        }
+        StudyEvent::RunPutOff { run, why } => {
+            training = None;
+            eprintln!("{run} is put off: {why}");
+        }
+        StudyEvent::Ended { runs, done, failed } => {
+            eprintln!("{done} of {runs} runs have their result, {failed} failed")
+        }
+    }
+}

@@ -1,0 +1,86 @@
+//! What the log of a run tells of its time: a run that was interrupted has several parts, whose clocks begin anew.
+
+use crate::study::outcome::CurvePoint;
+use serde_json::Value;
+use std::path::Path;
+
+/// The time of a run.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct History {
+    /// Seconds of training, all parts together.
+    pub(super) train_s: f64,
+    /// Seconds of all parts but the last, with what they spent on validation and saving.
+    pub(super) before_s: f64,
+    /// Parts.
+    pub(super) parts: u32,
+    pub(super) curve: Vec<CurvePoint>,
+}
+
+/// The time of one part, as far as its lines tell.
+#[derive(Default)]
+struct Part {
+    elapsed_s: f64,
+    /// Training alone, of a part that came to its end.
+    train_s: Option<f64>,
+}
+
+impl Part {
+    fn train_s(&self) -> f64 {
+        self.train_s.unwrap_or(self.elapsed_s)
+    }
+}
+
+impl History {
+    /// Reads the log of a run; nothing where there is none.
+    pub(super) fn read(run: &Path) -> History {
+        History::of(&std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default())
+    }
+
+    fn of(log: &str) -> History {
+        let (mut history, mut part) = (History::default(), Part::default());
+        for line in log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok()) {
+            let number = |key: &str| line[key].as_f64();
+            part.elapsed_s = number("elapsed_s").unwrap_or(part.elapsed_s);
+            match line["event"].as_str() {
+                Some("started") => {
+                    history.train_s += part.train_s();
+                    history.before_s += part.elapsed_s;
+                    history.parts += 1;
+                    part = Part::default();
+                }
+                Some("finished") => part.train_s = number("train_s"),
+                Some("validation") => history.curve.push(CurvePoint {
+                    step: line["step"].as_u64().unwrap_or_default() as u32,
+                    train_s: history.train_s + number("train_s").unwrap_or_default(),
+                    dice: number("dice_dynamic"),
+                }),
+                _ => (),
+            }
+        }
+        history.train_s += part.train_s();
+        history
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_add_up() {
+        let log = r#"{"event":"started","step":0}
+            {"event":"progress","step":10,"elapsed_s":2.0}
+            {"event":"validation","step":10,"train_s":1.5,"dice_dynamic":0.5}
+            {"event":"progress","step":20,"elapsed_s":4.0}
+            {"event":"started","step":20}
+            {"event":"progress","step":30,"elapsed_s":1.0}
+            {"event":"started","step":30}
+            {"event":"validation","step":40,"train_s":0.75,"dice_dynamic":null}
+            {"event":"finished","step":40,"train_s":0.8,"elapsed_s":1.5}"#;
+        let history = History::of(log);
+        assert_eq!((history.train_s, history.before_s, history.parts), (5.8, 5.0, 3));
+        let curve: Vec<_> = history.curve.iter().map(|p| (p.step, p.train_s, p.dice)).collect();
+        assert_eq!(curve, [(10, 1.5, Some(0.5)), (40, 5.75, None)]);
+        assert_eq!(History::of(""), History::default());
+    }
+}

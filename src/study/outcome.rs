@@ -1,0 +1,190 @@
+//! What a run of a study leaves: `result.json`, written last and whole.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::score::eval::Evaluation;
+use crate::study::plan::{Run, RunFingerprint, Study};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Name of the file inside a run directory.
+pub const RESULT: &str = "result.json";
+const FORMAT: &str = "nertca-study-result";
+const VERSION: u32 = 1;
+const MAX_BYTES: u64 = 16 << 20;
+
+/// What became of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Outcome {
+    /// Always `nertca-study-result`.
+    format: String,
+    /// Version of this layout: 1.
+    version: u32,
+    /// Name of the run.
+    pub run: String,
+    /// What it was made of.
+    pub fingerprint: RunFingerprint,
+    /// Seed of data and training.
+    pub seed: u32,
+    /// Name of the device.
+    pub device: String,
+    /// Its driver, with version.
+    pub driver: String,
+    /// Iterations done.
+    pub iterations: u32,
+    /// What it took.
+    pub seconds: Seconds,
+    /// Dice of some unseen images over the time of training, where the run was validated on the way.
+    pub curve: Vec<CurvePoint>,
+    /// Scores on all unseen images; none of a run that failed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scores: Option<RunScores>,
+    /// Why it failed, where it did.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
+}
+
+/// Seconds of a run; of one that was interrupted, of all its parts together, as far as they were kept.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Seconds {
+    /// Training. Parts that were interrupted are counted to their last report before the checkpoint, with saving and validation.
+    pub training: f64,
+    /// From the dataset to the scores.
+    pub whole: f64,
+    /// Parts: 1 for a run that nothing interrupted.
+    pub parts: u32,
+}
+
+/// A validation on the way.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CurvePoint {
+    /// Iterations done.
+    pub step: u32,
+    /// Seconds of training until then.
+    pub train_s: f64,
+    /// Dice of the moving field, where images have masks.
+    pub dice: Option<f64>,
+}
+
+/// Scores of a run: means over unseen images or over phases. `report/evaluation.json` beside has all of them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunScores {
+    /// Dice of the moving field.
+    pub dice: Option<f64>,
+    /// Dice of both fields.
+    pub dice_total: Option<f64>,
+    /// Dice of the moving field where unseen views were left as stated, where calibration moved them.
+    pub dice_as_stated: Option<f64>,
+    /// Dice of the moving field with the best threshold.
+    pub dice_best: Option<f64>,
+    /// Dice of the moving field at the authors' threshold, as in the paper.
+    pub dice_paper: Option<f64>,
+    /// Dice of both fields in the first image at the authors' threshold, as in their code.
+    pub dice_authors: Option<f64>,
+    /// dB.
+    pub psnr: Option<f64>,
+    /// Structural similarity.
+    pub ssim: Option<f64>,
+    /// Distance to the true vessels, mm.
+    pub chamfer_mm: Option<f64>,
+    /// Largest distance to the true vessels but for 5 %, mm.
+    pub hausdorff95_mm: Option<f64>,
+    /// Centreline Dice in 3D.
+    pub cl_dice: Option<f64>,
+    /// Attenuation from which the moving field counts as vessel, per mm, and why.
+    pub threshold_per_mm: f64,
+    /// How the threshold was chosen.
+    pub threshold_rule: String,
+    /// Unseen images.
+    pub images: usize,
+    /// Renderings per second of the evaluation: all that is scored, at the size of the images.
+    pub fps: Option<f64>,
+    /// What makes the scores worth less than they seem.
+    pub warnings: Vec<String>,
+}
+
+impl RunScores {
+    /// What an evaluation comes down to.
+    pub fn new(evaluation: &Evaluation, fps: Option<f64>) -> RunScores {
+        let finite = |value: f64| Some(value).filter(|v| v.is_finite());
+        let volume = evaluation.volume.as_ref().map(|volume| &volume.mean.agreement);
+        RunScores {
+            dice: evaluation.dice.dynamic,
+            dice_total: evaluation.dice.total,
+            dice_as_stated: evaluation.dice_as_stated.as_ref().and_then(|dice| dice.dynamic),
+            dice_best: evaluation.best_dice.dynamic.map(|best| best.dice),
+            dice_paper: evaluation.dice_published.paper,
+            dice_authors: evaluation.dice_published.authors,
+            psnr: finite(evaluation.psnr),
+            ssim: finite(evaluation.ssim),
+            chamfer_mm: volume.and_then(|v| v.chamfer_mm),
+            hausdorff95_mm: volume.and_then(|v| v.hausdorff95_mm),
+            cl_dice: volume.and_then(|v| v.cl_dice),
+            threshold_per_mm: evaluation.threshold.dynamic_per_mm,
+            threshold_rule: evaluation.threshold.rule.to_owned(),
+            images: evaluation.images.len(),
+            fps,
+            warnings: evaluation.warnings.clone(),
+        }
+    }
+}
+
+/// Where a run's directory is inside a study's.
+pub fn run_directory(study: &Path, run: &Run) -> PathBuf {
+    study.join("runs").join(&run.id)
+}
+
+impl Outcome {
+    /// An outcome without scores or failure yet.
+    pub(super) fn new(run: &Run, fingerprint: RunFingerprint) -> Outcome {
+        Outcome {
+            format: FORMAT.to_owned(),
+            version: VERSION,
+            run: run.id.clone(),
+            fingerprint,
+            seed: run.seed,
+            device: String::new(),
+            driver: String::new(),
+            iterations: 0,
+            seconds: Seconds::default(),
+            curve: Vec::new(),
+            scores: None,
+            failure: None,
+        }
+    }
+
+    pub(super) fn write(&self, directory: &Path) -> Result<()> {
+        files::write_atomic(&directory.join(RESULT), files::pretty_json(self)?.as_bytes())
+    }
+
+    /// The result in a run directory; none where there is none yet.
+    ///
+    /// # Errors
+    /// [`Error::Data`] for a file of another kind or version; [`Error::Io`].
+    pub fn read(directory: &Path) -> Result<Option<Outcome>> {
+        let file = directory.join(RESULT);
+        if !file.exists() {
+            return Ok(None);
+        }
+        let outcome: Outcome = serde_json::from_slice(&files::read_limited(&file, MAX_BYTES)?)
+            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
+        if outcome.format != FORMAT || outcome.version != VERSION {
+            let found = format!("`{}` version {}", outcome.format, outcome.version);
+            return Err(Error::data(&file, "format", format!("{found}; expected `{FORMAT}` version {VERSION}")));
+        }
+        Ok(Some(outcome))
+    }
+
+    /// The result of a run if it is of exactly these data, this configuration and this program.
+    ///
+    /// # Errors
+    /// As [`Outcome::read`].
+    pub fn of(study: &Study, directory: &Path, run: &Run) -> Result<Option<Outcome>> {
+        let wanted = study.fingerprint(run)?;
+        Ok(Outcome::read(&run_directory(directory, run))?.filter(|outcome| outcome.fingerprint == wanted))
+    }
+}

@@ -1,0 +1,121 @@
+//! A study, checked, and the runs it comes down to.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::fingerprint::Fingerprint;
+use crate::study::COMMIT;
+use crate::study::data::DataSet;
+use crate::study::layout::TableLayout;
+use crate::study::published::Published;
+use serde::{Deserialize, Serialize};
+
+/// A study that can be run.
+#[derive(Debug, Clone)]
+pub struct Study {
+    /// Title of its tables and its page.
+    pub title: String,
+    /// Seeds of data and training.
+    pub seeds: Vec<u32>,
+    /// Data sets, in the order of the file.
+    pub data: Vec<DataSet>,
+    /// Methods, in the order of the file.
+    pub methods: Vec<Method>,
+    /// How results are shown.
+    pub table: TableLayout,
+    /// Values to put beside ours.
+    pub published: Option<Published>,
+}
+
+/// A method of a study.
+#[derive(Debug, Clone)]
+pub struct Method {
+    /// Name in the study.
+    pub name: String,
+    /// Name in tables.
+    pub label: String,
+    /// Its configuration, but for the seed.
+    pub config: Config,
+    /// Length of the preset's own run.
+    pub preset_iterations: u32,
+    /// Whose published values stand beside it.
+    pub published: Option<String>,
+}
+
+/// A run of a study: one method on one data set with one seed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Run {
+    /// Its name, and that of its directory: `DATA.METHOD.sSEED`.
+    pub id: String,
+    /// Place of its data among the study's.
+    #[serde(skip)]
+    pub data: usize,
+    /// Place of its method among the study's.
+    #[serde(skip)]
+    pub method: usize,
+    /// Seed of data and training.
+    pub seed: u32,
+}
+
+/// What a run is made of. A result counts for exactly this.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunFingerprint {
+    /// Of the data: what they are made of, or their bytes.
+    pub data: String,
+    /// Of every hyper-parameter, the seed among them.
+    pub configuration: String,
+    /// Commit of the program.
+    pub commit: String,
+}
+
+impl RunFingerprint {
+    /// Whether it is the same but, perhaps, for the program.
+    pub fn asks_the_same(&self, other: &RunFingerprint) -> bool {
+        (&self.data, &self.configuration) == (&other.data, &other.configuration)
+    }
+}
+
+impl Study {
+    /// All runs: data set by data set, in each seed by seed, so that what shares data stands together.
+    pub fn runs(&self) -> Vec<Run> {
+        let mut runs = Vec::new();
+        for data in 0..self.data.len() {
+            for &seed in &self.seeds {
+                runs.extend((0..self.methods.len()).map(|method| self.run_of(data, method, seed)));
+            }
+        }
+        runs
+    }
+
+    /// The run of a method on a data set, by their places, with a seed.
+    pub fn run_of(&self, data: usize, method: usize, seed: u32) -> Run {
+        Run { id: format!("{}.{}.s{seed}", self.data[data].id, self.methods[method].name), data, method, seed }
+    }
+
+    /// The run of a name.
+    ///
+    /// # Errors
+    /// [`Error::Config`] where there is none.
+    pub fn run(&self, id: &str) -> Result<Run> {
+        let runs = self.runs();
+        let example = runs.first().map_or(String::new(), |run| format!("; the first is `{}`", run.id));
+        let none = || Error::config("run", id, format!("the study has no such run{example}"));
+        runs.iter().find(|run| run.id == id).cloned().ok_or_else(none)
+    }
+
+    /// The configuration of a run.
+    pub fn config(&self, run: &Run) -> Config {
+        Config { seed: run.seed, ..self.methods[run.method].config.clone() }
+    }
+
+    /// What a run is made of.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for a configuration that cannot be written down.
+    pub fn fingerprint(&self, run: &Run) -> Result<RunFingerprint> {
+        Ok(RunFingerprint {
+            data: self.data[run.data].fingerprint(run.seed),
+            configuration: Fingerprint::of(self.config(run).to_toml()?.as_bytes()).hex(),
+            commit: COMMIT.to_owned(),
+        })
+    }
+}

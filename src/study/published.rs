@@ -1,0 +1,80 @@
+//! What others have published, to stand beside our own results: never in their place.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::study::scores::Score;
+use crate::study::text::Text;
+use serde::Deserialize;
+use std::path::Path;
+
+const MAX_BYTES: u64 = 1 << 20;
+
+/// Published values, from a TOML file.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Published {
+    /// Where they are from.
+    pub source: String,
+    /// What to know when comparing them.
+    pub note: Option<String>,
+    rows: Vec<PublishedRow>,
+}
+
+/// Values of a method, on one data set or on all.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PublishedRow {
+    method: String,
+    /// Name of the data set in studies; without, the values are means over all.
+    data: Option<String>,
+    views: Option<u32>,
+    dice: Option<f64>,
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    minutes: Option<f64>,
+    fps: Option<f64>,
+}
+
+impl PublishedRow {
+    fn value(&self, score: Score) -> Option<f64> {
+        match score {
+            Score::Dice | Score::DicePaper => self.dice,
+            Score::Psnr => self.psnr,
+            Score::Ssim => self.ssim,
+            Score::Minutes => self.minutes,
+            Score::Fps => self.fps,
+            _ => None,
+        }
+    }
+}
+
+impl Published {
+    /// Reads published values.
+    ///
+    /// # Errors
+    /// [`Error::Data`] with the line of what is wrong; [`Error::Io`].
+    pub fn read(file: &Path) -> Result<Published> {
+        let text = String::from_utf8(files::read_limited(file, MAX_BYTES)?)
+            .map_err(|e| Error::data(file, "text", e.to_string()))?;
+        Text { file, text: &text }.parse()
+    }
+
+    /// Methods there are values for, in the order of the file.
+    pub fn methods(&self) -> Vec<&str> {
+        let mut methods: Vec<&str> = Vec::new();
+        for row in &self.rows {
+            if !methods.contains(&row.method.as_str()) {
+                methods.push(&row.method);
+            }
+        }
+        methods
+    }
+
+    /// The value of a method on a data set, or its mean over all where that is what was published.
+    pub fn value(&self, method: &str, data: &str, views: Option<u32>, score: Score) -> Option<f64> {
+        let of_method = || self.rows.iter().filter(|row| row.method == method);
+        let here = of_method().filter(|row| row.data.as_deref() == Some(data) && row.views == views);
+        let everywhere = of_method().filter(|row| row.data.is_none());
+        here.chain(everywhere).find_map(|row| row.value(score))
+    }
+}

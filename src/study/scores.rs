@@ -1,0 +1,141 @@
+//! What tables show of a run.
+
+use crate::choice::Choice;
+use crate::study::outcome::Outcome;
+use serde::{Deserialize, Serialize};
+
+/// A number of a run that a table may show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Score {
+    /// Dice of the moving field, by the rule of `eval`.
+    Dice,
+    /// Dice of both fields, by the rule of `eval`.
+    DiceTotal,
+    /// Dice of the moving field at the authors' threshold, on all unseen images.
+    DicePaper,
+    /// Dice of both fields at the authors' threshold, on the first unseen image.
+    DiceAuthors,
+    /// Dice of the moving field at the threshold that suits the truth best.
+    DiceBest,
+    /// Peak signal-to-noise ratio, dB.
+    Psnr,
+    /// Structural similarity.
+    Ssim,
+    /// Mean distance to the true vessels, mm.
+    ChamferMm,
+    /// Distance to the true vessels that 5 % exceed, mm.
+    Hausdorff95Mm,
+    /// Centreline Dice in 3D.
+    ClDice,
+    /// Minutes of training.
+    Minutes,
+    /// Renderings per second.
+    Fps,
+}
+
+/// How a score is shown.
+struct Look {
+    name: &'static str,
+    heading: &'static str,
+    meaning: &'static str,
+    digits: usize,
+    more_is_better: bool,
+}
+
+impl Score {
+    fn look(self) -> Look {
+        let (name, heading, meaning, digits, more_is_better) = match self {
+            Score::Dice => {
+                let meaning = "moving field on all unseen images, a fifth of the stated attenuation counts as vessel \
+                               (Otsu's threshold where none is stated)";
+                ("dice", "Dice", meaning, 3, true)
+            }
+            Score::DiceTotal => ("dice-total", "Dice, total", "both fields, otherwise as Dice", 3, true),
+            Score::DicePaper => {
+                let meaning = "as the paper describes it: moving field on all unseen images, at the authors' threshold \
+                               of 0.05 per 100 mm";
+                ("dice-paper", "Dice, paper's way", meaning, 3, true)
+            }
+            Score::DiceAuthors => {
+                let meaning = "as the authors' code does it: sum of both fields on the first unseen image, at 0.05 per \
+                               100 mm";
+                ("dice-authors", "Dice, authors' code", meaning, 3, true)
+            }
+            Score::DiceBest => ("dice-best", "best Dice", "at the threshold found with the masks; no score", 3, true),
+            Score::Psnr => ("psnr", "PSNR", "dB, unseen images", 2, true),
+            Score::Ssim => ("ssim", "SSIM", "unseen images", 3, true),
+            Score::ChamferMm => ("chamfer-mm", "Chamfer, mm", "mean distance to the true vessels", 2, false),
+            Score::Hausdorff95Mm => ("hausdorff95-mm", "Hausdorff 95 %, mm", "distance to the true vessels", 2, false),
+            Score::ClDice => ("cl-dice", "clDice", "centrelines in 3D", 3, true),
+            Score::Minutes => ("minutes", "minutes", "of training", 2, false),
+            Score::Fps => ("fps", "FPS", "renderings of all that is scored, at the size of the images", 2, true),
+        };
+        Look { name, heading, meaning, digits, more_is_better }
+    }
+
+    /// Heading of its column.
+    pub fn heading(self) -> &'static str {
+        self.look().heading
+    }
+
+    /// What it means, after its heading.
+    pub fn meaning(self) -> &'static str {
+        self.look().meaning
+    }
+
+    /// Digits behind the point.
+    pub fn digits(self) -> usize {
+        self.look().digits
+    }
+
+    /// Whether the largest value is the best.
+    pub fn more_is_better(self) -> bool {
+        self.look().more_is_better
+    }
+
+    /// A value as tables show it.
+    pub fn text(self, value: f64) -> String {
+        format!("{value:.*}", self.digits())
+    }
+
+    /// Its value in an outcome, where there is one.
+    pub fn of(self, outcome: &Outcome) -> Option<f64> {
+        let scores = outcome.scores.as_ref()?;
+        match self {
+            Score::Dice => scores.dice,
+            Score::DiceTotal => scores.dice_total,
+            Score::DicePaper => scores.dice_paper,
+            Score::DiceAuthors => scores.dice_authors,
+            Score::DiceBest => scores.dice_best,
+            Score::Psnr => scores.psnr,
+            Score::Ssim => scores.ssim,
+            Score::ChamferMm => scores.chamfer_mm,
+            Score::Hausdorff95Mm => scores.hausdorff95_mm,
+            Score::ClDice => scores.cl_dice,
+            Score::Minutes => Some(outcome.seconds.training / 60.0),
+            Score::Fps => scores.fps,
+        }
+    }
+}
+
+impl Choice for Score {
+    const ALL: &'static [Score] = &[
+        Score::Dice,
+        Score::DiceTotal,
+        Score::DicePaper,
+        Score::DiceAuthors,
+        Score::DiceBest,
+        Score::Psnr,
+        Score::Ssim,
+        Score::ChamferMm,
+        Score::Hausdorff95Mm,
+        Score::ClDice,
+        Score::Minutes,
+        Score::Fps,
+    ];
+
+    fn name(self) -> &'static str {
+        self.look().name
+    }
+}

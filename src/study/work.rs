@@ -1,0 +1,205 @@
+//! One run of a study, from its data to its result.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::files::{self, Lock};
+use crate::gpu::device::Gpu;
+use crate::kernels::tuning::Tuning;
+use crate::model::Model;
+use crate::model::checkpoint::{self, newest_model};
+use crate::render::renderer::Renderer;
+use crate::run::events::Event;
+use crate::run::info::RunInfo;
+use crate::run::reconstruct::{RunOptions, reconstruct};
+use crate::run::score::{ScoreOptions, as_trained, evaluate_model};
+use crate::scan::dataset::Dataset;
+use crate::score::calibrated::in_calibrated_frame;
+use crate::score::pictures;
+use crate::study::events::StudyEvent;
+use crate::study::history::History;
+use crate::study::outcome::{Outcome, RESULT, RunScores, Seconds, run_directory};
+use crate::study::plan::{Run, RunFingerprint, Study};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+/// What a run directory is being made of; written first.
+const FINGERPRINT: &str = "fingerprint.json";
+
+/// Opens a device, for one run.
+pub type Open<'a> = &'a dyn Fn() -> Result<Gpu>;
+/// Looks at a device once more after its run.
+pub type Close<'a> = &'a dyn Fn(&Gpu) -> Result<()>;
+/// Chooses paths through the kernels.
+pub type Tune<'a> = &'a dyn Fn(&Gpu, &Config, &Dataset) -> Result<Tuning>;
+/// Hears of what goes on.
+pub type Observe<'a> = &'a mut dyn FnMut(&StudyEvent<'_>);
+
+/// Where and how runs are done.
+pub struct Workplace<'a> {
+    /// Directory of the study.
+    pub directory: &'a Path,
+    /// Each run has a device of its own: one that was lost takes no other run with it.
+    pub open: Open<'a>,
+    /// What is to be done with it in the end; its error ends the work.
+    pub close: Close<'a>,
+    /// Paths through the kernels.
+    pub tune: Tune<'a>,
+    /// Set to true to stop after the iterations in flight.
+    pub cancel: &'a AtomicBool,
+    /// Runs that failed are done again.
+    pub retry_failed: bool,
+}
+
+/// Comparison of truth and prediction in the first unseen image, in a run directory.
+pub fn picture_file(run: &Path) -> PathBuf {
+    run.join("report/first-unseen.png")
+}
+
+/// Whether an error says nothing of the run itself: at another time, or elsewhere, the same run may do.
+fn will_pass(error: &Error) -> bool {
+    match error {
+        Error::Interrupted | Error::NoDevice(_) | Error::DeviceLost { .. } | Error::Busy(_) => true,
+        Error::OutOfMemory { may_pass, .. } => *may_pass,
+        _ => false,
+    }
+}
+
+impl Workplace<'_> {
+    /// The result of a run that need not be done any more.
+    ///
+    /// # Errors
+    /// As [`Outcome::read`].
+    pub fn done(&self, study: &Study, run: &Run) -> Result<Option<Outcome>> {
+        let outcome = Outcome::of(study, self.directory, run)?;
+        Ok(outcome.filter(|outcome| outcome.failure.is_none() || !self.retry_failed))
+    }
+
+    /// Does a run, goes on with one that was interrupted, or does nothing where there is a result. A run that fails by itself has
+    /// a result, too, which says why.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`] after a cancel; [`Error::Busy`] while another process is at it; what may pass: a device that was
+    /// lost, memory that others have, no device; errors of writing results.
+    pub fn work(&self, study: &Study, run: &Run, observe: Observe<'_>) -> Result<Outcome> {
+        let Some(_alone) = Lock::take(&self.directory.join("locks").join(format!("run-{}", run.id)))? else {
+            return Err(Error::Busy(format!("another process is at the run {}", run.id)));
+        };
+        if let Some(outcome) = self.done(study, run)? {
+            return Ok(outcome);
+        }
+        let directory = run_directory(self.directory, run);
+        let fingerprint = study.fingerprint(run)?;
+        let mut outcome = Outcome::new(run, fingerprint);
+        let gpu = (self.open)()?;
+        outcome.device.clone_from(&gpu.info().name);
+        outcome.driver.clone_from(&gpu.info().driver);
+        let resume = make_room(&directory, &outcome.fingerprint)?;
+        let begin = Instant::now();
+        match self.attempt(&gpu, study, run, resume, observe) {
+            Ok(scores) => outcome.scores = Some(scores),
+            Err(error) if will_pass(&error) => return Err(error),
+            Err(error) => outcome.failure = Some(error.to_string()),
+        }
+        (self.close)(&gpu)?;
+        let history = History::read(&directory);
+        outcome.iterations = checkpoint::list(&directory)?.last().map_or(0, |(step, _)| *step);
+        outcome.seconds = Seconds {
+            training: history.train_s,
+            whole: history.before_s + begin.elapsed().as_secs_f64(),
+            parts: history.parts,
+        };
+        outcome.curve = history.curve;
+        outcome.write(&directory)?;
+        Ok(outcome)
+    }
+
+    fn attempt(&self, gpu: &Gpu, study: &Study, run: &Run, resume: bool, observe: Observe<'_>) -> Result<RunScores> {
+        let directory = run_directory(self.directory, run);
+        let id = run.id.as_str();
+        let data = study.data[run.data].prepare(gpu, self.directory, run.seed, self.cancel, |what, done, of| {
+            observe(&StudyEvent::Making { run: id, what, done, of });
+        })?;
+        let dataset = Dataset::open(&data)?;
+        RunInfo { dataset: data.canonicalize().unwrap_or(data) }.write(&directory)?;
+        let config = study.config(run);
+        let tuning = (self.tune)(gpu, &config, &dataset)?;
+        let options = RunOptions { run: &directory, resume, stop_at: None, tuning: &tuning, cancel: self.cancel };
+        reconstruct(gpu, &config, &dataset, &options, &mut |event| observe(&StudyEvent::Run { run: id, event }))?;
+        let (model, dataset) = (newest_model(&directory)?, as_trained(dataset, &directory)?);
+        let scoring = ScoreOptions { threshold_per_mm: None, pictures: None, cancel: self.cancel };
+        let mut pace = RenderingPace { images: dataset.validation().len(), ..RenderingPace::default() };
+        let evaluation = evaluate_model(gpu, &tuning, &model, &dataset, &scoring, &mut |event| {
+            pace.hear(event);
+            observe(&StudyEvent::Run { run: id, event });
+        })?;
+        let text = files::pretty_json(&evaluation)?;
+        files::write_atomic(&directory.join("report/evaluation.json"), text.as_bytes())?;
+        let threshold_per_mm = evaluation.threshold.dynamic_per_mm;
+        first_picture(gpu, &tuning, &model, &dataset, threshold_per_mm, &picture_file(&directory))?;
+        Ok(RunScores::new(&evaluation, pace.fps()))
+    }
+}
+
+/// Makes a run directory ready: whether it holds checkpoints of the same run to go on from. What is left of another is removed.
+fn make_room(directory: &Path, fingerprint: &RunFingerprint) -> Result<bool> {
+    let file = directory.join(FINGERPRINT);
+    let found = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<RunFingerprint>(&text).ok());
+    if found.as_ref() == Some(fingerprint) {
+        let result = directory.join(RESULT);
+        if result.exists() {
+            std::fs::remove_file(&result).map_err(Error::io("remove", &result))?;
+        }
+        return Ok(!checkpoint::list(directory)?.is_empty());
+    }
+    if directory.exists() {
+        std::fs::remove_dir_all(directory).map_err(Error::io("remove", directory))?;
+    }
+    files::write_atomic(&file, files::pretty_json(fingerprint)?.as_bytes())?;
+    Ok(false)
+}
+
+/// How fast the unseen images of an evaluation are rendered.
+#[derive(Default)]
+struct RenderingPace {
+    /// Images that are scored.
+    images: usize,
+    /// When the first was done, seconds: with it, pipelines are made.
+    first_s: f64,
+    last_s: f64,
+}
+
+impl RenderingPace {
+    fn hear(&mut self, event: &Event) {
+        if let Event::Evaluation { images, elapsed_s, .. } = event {
+            match *images {
+                1 => self.first_s = *elapsed_s,
+                n if n == self.images => self.last_s = *elapsed_s,
+                _ => (),
+            }
+        }
+    }
+
+    /// Images per second; none of fewer than two.
+    fn fps(&self) -> Option<f64> {
+        let seconds = self.last_s - self.first_s;
+        (self.images > 1 && seconds > 0.0).then(|| (self.images - 1) as f64 / seconds)
+    }
+}
+
+fn first_picture(
+    gpu: &Gpu,
+    tuning: &Tuning,
+    model: &Model,
+    dataset: &Dataset,
+    threshold_per_mm: f64,
+    path: &Path,
+) -> Result<()> {
+    let carried = in_calibrated_frame(dataset)?;
+    let dataset = carried.as_ref().unwrap_or(dataset);
+    let Some(frame) = dataset.validation().first() else { return Ok(()) };
+    let renderer = Renderer::new(gpu, model, tuning.clone())?;
+    let seen = renderer.render(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.phase)?;
+    let threshold = threshold_per_mm * crate::geometry::MM_PER_UNIT;
+    pictures::write_comparison(path, frame, &seen, threshold, dataset.width)
+}

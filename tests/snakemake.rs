@@ -1,0 +1,97 @@
+//! Studies as jobs of Snakemake: the same table, also after Snakemake and its jobs were killed.
+#![cfg(unix)]
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
+#[path = "common/program.rs"]
+mod program;
+#[path = "common/python.rs"]
+mod python;
+
+use program::program;
+use python::python;
+use std::collections::BTreeMap;
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+const STUDIES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/studies");
+
+/// Snakemake on the smoke study, whose files it leaves in a directory.
+fn snakemake(directory: &Path, more: &[&str]) -> Command {
+    let mut command = python();
+    command.args(["-m", "snakemake", "--snakefile"]).arg(format!("{STUDIES}/Snakefile")).args(more);
+    command.args(["--config", &format!("study={STUDIES}/smoke.toml"), "out=out"]);
+    command.arg(concat!("program=", env!("CARGO_BIN_EXE_nertca-vk")));
+    // Its own notes, and the caches of the program.
+    command.current_dir(directory).env("XDG_CACHE_HOME", directory.join("cache")).env_remove("NERTCA_DATA");
+    command
+}
+
+const HERE: [&str; 4] = ["--cores", "2", "--resources", "gpu=1"];
+
+fn results(out: &Path) -> BTreeMap<String, Vec<u8>> {
+    let runs = std::fs::read_dir(out.join("runs")).into_iter().flatten().map(|run| run.unwrap());
+    let read = runs.filter_map(|run| Some((run.file_name(), std::fs::read(run.path().join("result.json")).ok()?)));
+    read.map(|(name, bytes)| (name.into_string().unwrap(), bytes)).collect()
+}
+
+/// A table, but for seconds and what follows from them.
+fn timeless(out: &Path) -> Vec<String> {
+    let csv = std::fs::read_to_string(out.join("table.csv")).unwrap();
+    let timed = |line: &str| line.contains(",minutes,") || line.contains(",fps,");
+    csv.lines().filter(|line| !timed(line)).map(str::to_owned).collect()
+}
+
+#[track_caller]
+fn ok(command: &mut Command) -> String {
+    let out = command.output().unwrap();
+    assert!(out.status.success(), "{command:?}: {}", String::from_utf8_lossy(&out.stderr));
+    // Snakemake tells what it does on stderr.
+    String::from_utf8_lossy(&[out.stdout, out.stderr].concat()).into_owned()
+}
+
+#[test]
+fn a_killed_study_comes_to_the_same_table() {
+    let directory = tempfile::tempdir().unwrap();
+    let (alone, out) = (directory.path().join("alone"), directory.path().join("out"));
+    for what in ["run", "table"] {
+        ok(program().args(["study", what]).arg(format!("{STUDIES}/smoke.toml")).arg("--out").arg(&alone));
+    }
+    // In a group of their own, so that jobs die with their master.
+    let mut killed = snakemake(directory.path(), &HERE).process_group(0).spawn().unwrap();
+    let done = loop {
+        let done = results(&out);
+        assert!(
+            killed.try_wait().unwrap().is_none(),
+            "it ended before it could be killed, with {} results",
+            done.len()
+        );
+        if done.len() >= 2 {
+            break done;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    assert!(Command::new("kill").args(["-KILL", "--", &format!("-{}", killed.id())]).status().unwrap().success());
+    killed.wait().unwrap();
+    assert!(!out.join("table.csv").exists());
+    ok(&mut snakemake(directory.path(), &["--unlock"]));
+    ok(&mut snakemake(directory.path(), &[&HERE[..], &["--rerun-incomplete"]].concat()));
+    let again = done.iter().filter(|(run, bytes)| results(&out)[*run] != **bytes).count();
+    assert!(again <= 1, "{again} runs were done again; one may have had its result and not been noted yet");
+    assert_eq!(timeless(&out), timeless(&alone));
+    assert!(out.join("report.html").is_file());
+    assert!(ok(&mut snakemake(directory.path(), &HERE)).contains("Nothing to be done"));
+}
+
+#[test]
+fn a_cluster_would_get_the_jobs() {
+    let directory = tempfile::tempdir().unwrap();
+    let profile = format!("{STUDIES}/slurm");
+    let told = ok(&mut snakemake(directory.path(), &["--profile", &profile, "--dry-run", "--printshellcmds"]));
+    for run in ["xcat-3v.paper.s1", "xcat-4v.fast.s2"] {
+        assert!(told.contains(&format!("study one {STUDIES}/smoke.toml {run} -o out")), "{run}: {told}");
+    }
+    assert_eq!(told.matches("rule run:").count(), 8, "{told}");
+    assert!(told.contains("gpu=1") && told.contains("runtime=240"), "{told}");
+}
