@@ -81,7 +81,8 @@
 #define NERTCA_PROJECTION_MIP 1
 
 /**
- * Through volumes baked from the fields: display rates, also while training; as fine as their cells (about 0.8 mm).
+ * Display rates, also while training: Gaussians as they are, other fields through volumes baked from them, as fine as their
+ * cells (about 0.8 mm).
  */
 #define NERTCA_QUALITY_LIVE 0
 
@@ -132,17 +133,17 @@
 #define NERTCA_ABI_VERSION 0
 
 /**
- * Version this header was made with.
+ * Version this header was made with, first number.
  */
 #define NERTCA_VERSION_MAJOR 0
 
 /**
- * See `NERTCA_VERSION_MAJOR`.
+ * Version this header was made with, second number.
  */
 #define NERTCA_VERSION_MINOR 2
 
 /**
- * See `NERTCA_VERSION_MAJOR`.
+ * Version this header was made with, third number.
  */
 #define NERTCA_VERSION_PATCH 0
 
@@ -172,7 +173,7 @@
 #define NERTCA_CORRECTION_STATIC 1
 
 /**
- * The same, and a displacement of the heart in this frame.
+ * A correction of the view, and a displacement of the heart in this frame.
  */
 #define NERTCA_CORRECTION_BREATHING 2
 
@@ -215,7 +216,7 @@ typedef struct {
    */
   nertca_log_callback callback;
   /**
-   * Handed to the callback.
+   * Handed to the callback unchanged.
    */
   void *user;
   /**
@@ -253,7 +254,7 @@ typedef struct {
    */
   void *queue;
   /**
-   * Its family.
+   * Family of the queue.
    */
   uint32_t queue_family;
   /**
@@ -269,11 +270,11 @@ typedef struct {
    */
   void (*lock)(void *user);
   /**
-   * Gives it back; null exactly when `lock` is.
+   * Gives the queue back after `lock`; null exactly when `lock` is.
    */
   void (*unlock)(void *user);
   /**
-   * Handed to both.
+   * Handed to `lock` and `unlock`.
    */
   void *user;
 } nertca_vulkan;
@@ -362,11 +363,11 @@ typedef struct {
    */
   uint32_t intensity;
   /**
-   * For `INTEGRAL` and `LOG`; 0 stands for 1.
+   * Factor on the values, for `INTEGRAL` and `LOG`; 0 stands for 1.
    */
   double scale;
   /**
-   * For `INTEGRAL`.
+   * Added after the factor, for `INTEGRAL`.
    */
   double offset;
   /**
@@ -471,11 +472,11 @@ typedef struct {
    */
   double moved_px;
   /**
-   * What does not agree with the other views, as a share of what moves, before.
+   * Difference of this view's profiles from those of the others before the correction, as a share of the profiles.
    */
   double residual_before;
   /**
-   * And after.
+   * Difference of this view's profiles from those of the others after the correction, as a share of the profiles.
    */
   double residual_after;
   /**
@@ -501,7 +502,7 @@ typedef struct {
    */
   size_t size;
   /**
-   * From where.
+   * From where the view is drawn.
    */
   nertca_geometry geometry;
   /**
@@ -555,11 +556,11 @@ typedef struct {
    */
   uint32_t format;
   /**
-   * For `U8`: the value shown as 0. With `low` = `high`, both are the image's own extremes.
+   * The value shown as 0, for `U8`. With `low` = `high`, both are the image's own extremes.
    */
   double low;
   /**
-   * For `U8`: the value shown as 255.
+   * The value shown as 255, for `U8`.
    */
   double high;
 } nertca_image;
@@ -738,7 +739,7 @@ typedef struct {
 #define NERTCA_ERROR_CANCELLED -9
 
 /**
- * It cannot be done while something else goes on (training, or handles that still exist).
+ * The call cannot be done while something else goes on (training, or handles that still exist).
  */
 #define NERTCA_ERROR_BUSY -10
 
@@ -748,7 +749,7 @@ typedef struct {
 #define NERTCA_ERROR_BUFFER -11
 
 /**
- * It needs something that is still to come: frames, or training.
+ * The call needs something that is still to come: frames, or training.
  */
 #define NERTCA_ERROR_NOT_READY -12
 
@@ -815,7 +816,7 @@ uint32_t nertca_abi_version(void);
 nertca_status nertca_context_create(const char *options, const nertca_log *log, nertca_context **context);
 
 /**
- * As `nertca_context_create`, on a device of the caller: both then share one GPU, its memory and, if wanted, buffers.
+ * Makes a context as `nertca_context_create` does, on a device of the caller: both then share one GPU, its memory and, if wanted, buffers.
  * Of the options, `device` and `validation` do not apply. Instance, device and queue must outlive the context, which
  * leaves them as they are.
  *
@@ -899,7 +900,8 @@ nertca_status nertca_reconstruction_destroy(nertca_reconstruction *reconstructio
 nertca_status nertca_reconstruction_add_frame(nertca_reconstruction *reconstruction, const nertca_frame *frame);
 
 /**
- * Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them. Replaces those
+ * Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them,
+ * systole keeping its length (310 ms, 35 % of the phases) and diastole taking the rest. Replaces those
  * given earlier, so that a growing list can be given again and again. Any thread.
  *
  * # Safety
@@ -943,7 +945,7 @@ nertca_status nertca_reconstruction_failure(nertca_reconstruction *reconstructio
 nertca_status nertca_reconstruction_save(nertca_reconstruction *reconstruction, const char *path);
 
 /**
- * As `nertca_reconstruction_save`, into memory. `*length` gets the bytes needed; with a null `bytes` and a `size` of
+ * Saves as `nertca_reconstruction_save` does, into memory. `*length` gets the bytes needed; with a null `bytes` and a `size` of
  * 0 nothing else is done.
  *
  * @return NERTCA_ERROR_BUFFER when `size` is too small. While training in the background the length may change by a
@@ -969,7 +971,7 @@ nertca_status nertca_reconstruction_save_memory(nertca_reconstruction *reconstru
 nertca_status nertca_reconstruction_load(nertca_reconstruction *reconstruction, const char *path);
 
 /**
- * As `nertca_reconstruction_load`, from memory.
+ * Loads as `nertca_reconstruction_load` does, from memory.
  *
  * # Safety
  * `bytes` must be readable for `size` bytes.
@@ -1083,7 +1085,7 @@ nertca_status nertca_reconstruction_render(nertca_reconstruction *reconstruction
                                            const nertca_image *image);
 
 /**
- * As `nertca_reconstruction_render`, into a buffer of the same context: `width * height` floats, rows first. Live
+ * Draws a view as `nertca_reconstruction_render` does, into a buffer of the same context: `width * height` floats, rows first. Live
  * quality is written by the device itself, without a copy; maxima are then per 100 mm (divide by 100). The buffer is
  * complete when the call returns.
  *
@@ -1107,7 +1109,7 @@ nertca_status nertca_reconstruction_sample(nertca_reconstruction *reconstruction
                                            size_t count);
 
 /**
- * As `nertca_reconstruction_sample`, into a buffer of the same context.
+ * Samples the fields as `nertca_reconstruction_sample` does, into a buffer of the same context.
  *
  * # Safety
  * `grid` must be as long as it says.
