@@ -1,6 +1,6 @@
 //! Studies: data sets x methods x seeds as one file, run until each has its result, and put beside what is published.
 //!
-//! 1. [`file`] reads a study, [`data`] says what its angiograms are made of, [`plan`] expands it into runs
+//! 1. [`mod@file`] reads a study, [`data`] says what its angiograms are made of, [`plan`] expands it into runs
 //! 2. [`work`] does one run in the study's directory, [`queue`] all of them; [`outcome`] is what a run leaves
 //! 3. [`mod@table`] puts outcomes beside [`published`] values; [`markup`] writes that as Markdown, CSV and LaTeX
 //!
