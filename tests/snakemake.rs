@@ -52,6 +52,7 @@ fn ok(command: &mut Command) -> String {
 }
 
 #[test]
+#[ignore = "minutes beside what tools/test may take: tools/test --packages"]
 fn a_killed_study_comes_to_the_same_table() {
     let directory = tempfile::tempdir().unwrap();
     let (alone, out) = (directory.path().join("alone"), directory.path().join("out"));
@@ -85,6 +86,7 @@ fn a_killed_study_comes_to_the_same_table() {
 }
 
 #[test]
+#[ignore = "minutes beside what tools/test may take: tools/test --packages"]
 fn a_cluster_would_get_the_jobs() {
     let directory = tempfile::tempdir().unwrap();
     let profile = format!("{STUDIES}/slurm");
