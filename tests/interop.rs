@@ -293,7 +293,8 @@ fn dicom_runs_get_phases_and_lose_their_patient() {
     };
     let run = |args: &[String]| nertca(&args.iter().map(String::as_str).collect::<Vec<_>>());
     // 100 beats per minute: 0.6 s, six frames of 0.1 s.
-    assert!(run(&import(&["--phases", "6", "--heart-rate", "100"])).status.success());
+    let evenly = ["--phases", "6", "--heart-rate", "100", "--beat-scaling", "linear"];
+    assert!(run(&import(&evenly)).status.success());
     let dataset = nertca_vk::scan::dataset::Dataset::open(&out).unwrap();
     assert_eq!((dataset.n_phases, dataset.training().len(), dataset.width), (6, 12, 64));
     let frame = dataset.training().iter().find(|f| f.phase == 2 && f.view == 0).unwrap();
