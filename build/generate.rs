@@ -15,9 +15,10 @@ pub fn table(kernels: &[(Kernel, Reflected)], out: &Path) -> String {
         let file = out.join(format!("{}.spv", kernel.name));
         let _ = writeln!(
             text,
-            "    KernelCode {{ name: {:?}, spirv: include_bytes!({:?}),\n        push_bytes: {}, addresses: &{:?}, \
+            "    KernelCode {{ name: {:?}, shader: {:?}, spirv: include_bytes!({:?}),\n        push_bytes: {}, addresses: &{:?}, \
              spec_constants: &{:?}, bindings: &[",
             kernel.name,
+            kernel.shader,
             file.display().to_string(),
             reflected.push.used(),
             reflected.addresses,

@@ -16,7 +16,8 @@
 //!
 //! [`run`] ties these to a run directory, [`session`] is a reconstruction in memory that grows with its frames, and
 //! [`capi`] the same for C. [`phantom`] makes data to try it on, `study` (a feature) puts methods beside each other on them,
-//! [`mod@bench`] times the engine, and [`mod@reference`] holds an f64 twin of every compute stage, for tests. Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
+//! [`mod@bench`] times the engine, and [`mod@reference`] holds an f64 twin of every compute stage, which tests and `selftest` compare the
+//! device with; `inventory` lists pipelines as drivers compile them (both of the feature `diagnostics`). Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
 //! without any knowledge of angiography. Modules use only what stands above them in this file.
 //!
 //! A dataset becomes a reconstruction, in memory:
@@ -85,12 +86,14 @@ pub mod raster;
 pub mod gpu {
     pub mod buffer;
     pub mod capabilities;
+    pub mod details;
     pub mod device;
     pub mod image;
     pub mod instance;
     mod lock;
     pub mod pipeline;
     pub mod record;
+    pub mod statistics;
     mod transfer;
 }
 
@@ -288,7 +291,7 @@ pub mod study;
 
 pub mod bench;
 
-/// f64 twins of the compute stages: plain loops, no device. For tests; nothing else uses them.
+/// f64 twins of the compute stages: plain loops, no device. For tests and `selftest`; no result stands on them.
 pub mod reference {
     pub mod blobs;
     pub mod field;
@@ -300,3 +303,8 @@ pub mod reference {
     pub mod step;
     pub mod tree;
 }
+
+#[cfg(feature = "diagnostics")]
+pub mod inventory;
+#[cfg(feature = "diagnostics")]
+pub mod selftest;

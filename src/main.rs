@@ -22,11 +22,13 @@ mod cli {
     pub mod export;
     pub mod frame_rates;
     pub mod info;
+    pub mod kernels;
     pub mod page;
     pub mod plot;
     pub mod progress;
     pub mod render;
     pub mod report;
+    pub mod selftest;
     pub mod study;
     pub mod study_page;
     pub mod synthetic_args;
@@ -61,6 +63,8 @@ fn main() -> ExitCode {
         Command::Calibrate(args) => cli::calibrate::run(args),
         Command::Convert(args) => cli::export::convert(args),
         Command::Bench(args) => cli::bench::run(&cli, args),
+        Command::Kernels(args) => cli::kernels::run(&cli, args),
+        Command::Selftest(args) => cli::selftest::run(&cli, args),
         Command::Study(args) => cli::study::run(&cli, args),
         Command::Check(args) => cli::check::run(args),
         Command::Info(args) => cli::info::info(args),

@@ -3,106 +3,44 @@
 
 mod common;
 
-use common::{expect_silence, gpu, phantom, relative_error, run, tuning};
-use glam::DVec3;
+use common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
 use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset, sections};
 use nertca_vk::error::Error;
-use nertca_vk::geometry::ViewRays;
-use nertca_vk::kernels::layout::{DeviceState, Gaussian, GaussianSetup, TreeSetup};
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
-use nertca_vk::model::component::Component;
-use nertca_vk::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units};
+use nertca_vk::model::gaussians::{Gaussians, MovingGaussians};
 use nertca_vk::plan::Plan;
-use nertca_vk::random::normal;
-use nertca_vk::reference::blobs;
-use nertca_vk::render::grid::Grid;
-use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::selftest::blobs;
+use nertca_vk::selftest::problems::drawn_fields;
 use nertca_vk::train::trainer::Trainer;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Pixel at the isocentre and strongest change of the field under test, world units.
-const UNITS: Units = Units { pixel: 0.006, strongest: 0.3 };
-
-fn random_set(n: usize, n_phases: u32) -> Gaussians {
-    let value = |i: usize, k: u32| normal(5, 0, i as u32, k);
-    let rows = (0..n).map(|i| Gaussian {
-        position: [0, 1, 2].map(|k| (11.0 * value(i, k)) as f32),
-        log_density: (-1.5 + 0.4 * value(i, 3)) as f32,
-        log_scale: [4, 5, 6].map(|k| (0.2 + 0.4 * value(i, k)) as f32),
-        phase: i as u32 % n_phases,
-        rotation: [7, 8, 9, 10].map(|k| value(i, k) as f32),
-    });
-    let setup = GaussianSetup { n_phases, cut: 3.2, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() };
-    Gaussians { units: UNITS, n_phases: n_phases as usize, setup, rows: rows.collect(), step: 7 }
-}
-
-fn random_tree(n: usize, n_phases: u32) -> MovingTree {
-    let setup = TreeSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, n_basis: 4, ..TreeSetup::default() };
-    let wave = |i: usize| [0.7, 1.1, 1.9].map(|k| (1.5 * (k * i as f64).sin()) as f32);
-    let vector = |i: usize| [wave(i)[0], wave(i)[1], wave(i)[2], 0.0];
-    let grid = (0..n_phases as usize * 64).map(|i| if i < 64 { [0.0; 4] } else { vector(i) }).collect();
-    let mut rest = random_set(n, 1);
-    (rest.n_phases, rest.setup.n_phases) = (n_phases as usize, n_phases);
-    MovingTree { rest, setup, grid, own: (0..n * 4).map(vector).collect() }
-}
-
-fn forms() -> [MovingGaussians; 2] {
-    [MovingGaussians::PerPhase(random_set(231, 3)), MovingGaussians::Tree(random_tree(77, 3))]
-}
-
-/// A model of a dataset whose moving field is `field`; its still field is untrained.
-fn model(gpu: &nertca_vk::gpu::device::Gpu, dataset: &Dataset, field: MovingGaussians) -> Model {
-    let config = Config::load(Some(Preset::FastMlp), None, &["hull.enabled=false".into()]).unwrap();
-    let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset).unwrap(), dataset, tuning(gpu)).unwrap();
-    let of_network = trainer.model().unwrap();
-    let config = Config::preset(Preset::Fast);
-    let param_map = nertca_vk::model::params::ParamMap::new(&config, dataset.n_phases as usize);
-    Model { params: param_map.initial(&config), param_map, config, moving: Some(field), hull: None, ..of_network }
-}
-
-/// Rays of a pixel in f64.
-fn ray(rays: &ViewRays, pixel: usize, width: usize) -> (DVec3, DVec3) {
-    rays.pixel((pixel % width) as f64, (pixel / width) as f64)
+/// A model of a dataset whose moving field is `field`.
+fn model(gpu: &Gpu, dataset: &Dataset, field: MovingGaussians) -> Model {
+    blobs::model(gpu, dataset, field, &tuning(gpu)).unwrap()
 }
 
 #[test]
 fn integrals_and_maxima_match_their_twin() {
     let gpu = gpu();
+    expect_agreement(|findings| blobs::compare_rays(&gpu, &tuning(&gpu), findings));
     let dataset = common::small_dataset(37, 29);
-    for field in forms() {
-        let model = model(&gpu, &dataset, field.clone());
-        let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
-        let (rays, phase) = (&dataset.views[1].rays, 2);
-        let seen = renderer.render(rays, 37, 29, phase).unwrap();
-        let set = blobs::field(&field, phase as usize);
-        let want: Vec<blobs::Along> = (0..37 * 29).map(|p| blobs::along(&set, ray(rays, p, 37))).collect();
-        let integrals: Vec<f64> = want.iter().map(|w| w.integral).collect();
-        let (error, at) = relative_error(&seen.dynamic_integral, &integrals);
-        println!("integrals {error:.1e}");
-        assert!(error < 1e-4, "pixel {at}: {} against {}", seen.dynamic_integral[at], integrals[at]);
-        // The same at display rates: affine, and cut in the image instead of in space.
-        let line = Quantity { component: Component::Dynamic, projection: Projection::Drr };
-        let quick = renderer.show(rays, (37, 29), phase, line).unwrap();
-        let (error, at) = relative_error(&quick, &integrals);
-        println!("pictures {error:.1e}");
-        assert!(error < 0.01, "pixel {at}: {} against {}", quick[at], integrals[at]);
-        let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
-        let (error, at) = relative_error(&seen.dynamic_max, &maxima);
-        println!("maxima {error:.1e}");
-        // The twin steps along the ray, so it may miss a peak by the square of its step; the device may end a climb early.
-        assert!(error < 3e-3, "pixel {at}: {} against {}", seen.dynamic_max[at], maxima[at]);
-        assert!(maxima.iter().filter(|m| **m > 0.0).count() > 60, "the case must show something");
+    for field in drawn_fields() {
+        let renderer = Renderer::new(&gpu, &model(&gpu, &dataset, field), tuning(&gpu)).unwrap();
+        let seen = renderer.render(&dataset.views[1].rays, 37, 29, 2).unwrap();
         // The still field is nearly flat, so the sum's largest value is nearly the sum of largest values.
         for ((total, still), moving) in seen.total_max.iter().zip(&seen.static_max).zip(&seen.dynamic_max) {
             assert!(*total >= still.max(*moving) * 0.999 && *total <= (still + moving) * 1.001);
         }
+        assert!(seen.dynamic_max.iter().filter(|m| **m > 0.0).count() > 60, "the case must show something");
     }
     expect_silence(gpu);
 }
@@ -110,25 +48,7 @@ fn integrals_and_maxima_match_their_twin() {
 #[test]
 fn cells_match_their_twin() {
     let gpu = gpu();
-    let dataset = common::small_dataset(13, 11);
-    let grid = Grid::over(DVec3::new(-0.17, -0.15, -0.16), DVec3::new(0.15, 0.16, 0.12), 75);
-    for field in forms() {
-        let model = model(&gpu, &dataset, field.clone());
-        let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
-        let cells = renderer.sample(Component::Dynamic, 1, &grid).unwrap();
-        let set = blobs::field(&field, 1);
-        let [nx, ny, _] = grid.size.map(|n| n as usize);
-        let point = |i: usize| {
-            grid.origin + grid.spacing * DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64)
-        };
-        let some: Vec<usize> = (0..grid.len()).step_by(17).collect();
-        let want: Vec<f64> = some.iter().map(|i| blobs::at(&set, point(*i))).collect();
-        let got: Vec<f32> = some.iter().map(|i| cells[*i]).collect();
-        let (error, at) = relative_error(&got, &want);
-        println!("cells {error:.1e}");
-        assert!(error < 1e-3, "cell {at}: {} against {}", got[at], want[at]);
-        assert!(want.iter().filter(|v| **v > 0.0).count() > want.len() / 10, "the case must show something");
-    }
+    expect_agreement(|findings| blobs::compare_cells(&gpu, &tuning(&gpu), findings));
     expect_silence(gpu);
 }
 
@@ -136,7 +56,7 @@ fn cells_match_their_twin() {
 fn checkpoints_keep_every_bit() {
     let gpu = gpu();
     let dataset = common::small_dataset(13, 11);
-    for field in forms() {
+    for field in drawn_fields() {
         let model = model(&gpu, &dataset, field);
         let moments = vec![[0.25, 0.5]; model.param_map.len];
         let saved =
@@ -157,7 +77,7 @@ fn checkpoints_keep_every_bit() {
 #[test]
 fn damaged_gaussians_are_refused_by_name() {
     let gpu = gpu();
-    let model = model(&gpu, &common::small_dataset(13, 11), forms()[0].clone());
+    let model = model(&gpu, &common::small_dataset(13, 11), drawn_fields()[0].clone());
     let moments = vec![[0.0; 2]; model.param_map.len];
     let refused = |change: &dyn Fn(&mut Gaussians)| {
         let mut model = model.clone();

@@ -5,31 +5,32 @@ mod common;
 #[path = "common/golden_file.rs"]
 mod golden_file;
 
-use common::{drop_first_view, expect_silence, gpu, phantom, relative_error, whiten};
+use common::{drop_first_view, expect_agreement, expect_silence, gpu, phantom, relative_error, whiten};
 use glam::DVec3;
 use golden_file::Golden;
-use nertca_vk::config::sections::{self, Tree};
+use nertca_vk::config::sections;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
 use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gaussians::view::SplatView;
-use nertca_vk::geometry::{CArm, Geometry};
-use nertca_vk::gpu::buffer::Buffer;
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
-use nertca_vk::model::gaussians::{Gaussians, Units};
+use nertca_vk::kernels::layout::{Gaussian, GaussianSetup};
+use nertca_vk::model::gaussians::Gaussians;
 use nertca_vk::plan::fit;
-use nertca_vk::plan::lengths::Lengths;
 use nertca_vk::plan::scale::dynamic_half;
 use nertca_vk::plan::soft_hull::carve::SoftMotion;
-use nertca_vk::plan::targets::{Place, Targets};
-use nertca_vk::random::{STREAM_JITTER, normal};
-use nertca_vk::reference::gaussians::{self as reference, AdamState, N_PARAMS, Params, params};
+use nertca_vk::plan::targets::Targets;
+use nertca_vk::reference::gaussians::{self as reference, N_PARAMS, Params, params};
 use nertca_vk::reference::maxima::maxima;
 use nertca_vk::reference::tree::{TreeParams, loss_and_gradient};
 use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::score::eval::VESSEL_SHARE;
 use nertca_vk::score::metrics;
+use nertca_vk::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
+use nertca_vk::selftest::problems::{
+    self, ANGLES_DEG, moving_tree, random_gaussians, tree_case, units, with_gaussians,
+};
+use nertca_vk::selftest::trees;
 use nertca_vk::train::gaussians::GaussianTrainer;
 use nertca_vk::train::tree::TreeTrainer;
 use std::time::Instant;
@@ -39,105 +40,12 @@ fn config() -> Config {
     Config::preset(Preset::Fast)
 }
 
-/// The defaults but for the Gaussians' settings.
-fn with_settings(gaussians: sections::Gaussians) -> Config {
-    Config { gaussians, ..config() }
-}
-
-/// Gaussians of all shapes within `reach` pixels of the isocentre.
-fn random_gaussians(n: usize, n_phases: u32, reach: f64, seed: u32) -> Vec<Gaussian> {
-    let value = |i: usize, k: u32| normal(seed, STREAM_JITTER, i as u32, k);
-    (0..n)
-        .map(|i| Gaussian {
-            position: [0, 1, 2].map(|k| (0.5 * reach * value(i, k)) as f32),
-            log_density: (-1.5 + 0.4 * value(i, 3)) as f32,
-            log_scale: [4, 5, 6].map(|k| (0.3 * value(i, k)) as f32),
-            phase: i as u32 % n_phases,
-            rotation: [7, 8, 9, 10].map(|k| value(i, k) as f32),
-        })
-        .collect()
-}
-
-const ANGLES: [[f64; 2]; 3] = [[-30.0, 30.0], [55.0, -20.0], [5.0, 8.0]];
-
-fn c_arm(angles: [f64; 2]) -> Geometry {
-    Geometry::CArm(CArm {
-        primary_deg: angles[0],
-        secondary_deg: angles[1],
-        sid_mm: 1000.0,
-        sod_mm: 620.0,
-        pixel_mm: [1.5, 1.8],
-        offset_mm: [1.0, -2.0],
-        table_mm: [0.0; 3],
-    })
-}
-
-/// The pixel of [`c_arm`] at the isocentre, world units.
-fn units() -> Units {
-    Units { pixel: 0.5 * (1.5 + 1.8) * 620.0 / 1000.0 / 100.0, strongest: 0.2 }
-}
-
-/// Targets: images that no vessel explains; the last view has no image of the last phase.
 fn targets(width: usize, height: usize, n_phases: usize) -> Targets {
-    let views: Vec<SplatView> =
-        ANGLES.iter().map(|a| SplatView::new(&c_arm(*a).rays(width, height).unwrap(), units())).collect();
-    let n_images = n_phases * views.len() - 1;
-    let n_views = views.len();
-    let views: Vec<SplatView> = views.iter().cycle().take(n_images).cloned().collect();
-    let image_of = (0..n_images).map(Some).chain([None]).collect();
-    let wave = |i: usize, k: f64| (0.5 + 0.5 * (k * i as f64).sin()) as f32;
-    let all = 0..n_images * width * height;
-    Targets {
-        units: units(),
-        width,
-        height,
-        n_phases,
-        n_views,
-        views,
-        image_of,
-        n_images,
-        low: all.clone().map(|i| wave(i, 0.37) - 0.1).collect(),
-        high: all.clone().map(|i| wave(i, 0.37) - 0.1 + 0.3 * wave(i, 0.71)).collect(),
-        weight: all.map(|i| 0.5 + 0.5 * wave(i, 0.13)).collect(),
-        noise: Vec::new(),
-        lengths: Lengths { factor: 1.0, smoothing: 1.0 },
-        images: Vec::new(),
-        most: Vec::new(),
-        places: vec![Vec::new(); n_phases],
-        cell: 1.0,
-    }
+    problems::targets(width, height, n_phases).unwrap()
 }
 
-/// Images of Gaussians, loss and gradient, by the twins.
-fn twin(targets: &Targets, setup: &GaussianSetup, all: &[(Params, usize)]) -> (Vec<f64>, f64, Vec<Params>) {
-    let n = targets.n_pixels();
-    let mut images = vec![0.0; targets.n_images * n];
-    for (p, phase) in all {
-        for (image, view) in targets.views_at(*phase) {
-            if let Some(seen) = reference::project(p, view, setup) {
-                seen.splat(setup, &mut images[image * n..][..n]);
-            }
-        }
-    }
-    let mut loss = 0.0;
-    let mut gradients = Vec::new();
-    for (i, image) in images.chunks(n).enumerate() {
-        let part = |all: &'_ [f32]| all[i * n..][..n].to_vec();
-        let (value, gradient) =
-            reference::residual(setup, image, &part(&targets.low), &part(&targets.high), &part(&targets.weight));
-        loss += value;
-        gradients.push(gradient);
-    }
-    let gradient = |(p, phase): &(Params, usize)| {
-        let mut sum = [0.0; N_PARAMS];
-        for (image, view) in targets.views_at(*phase) {
-            let Some(seen) = reference::project(p, view, setup) else { continue };
-            let one = reference::gradient(p, view, setup, seen.moments(setup, &gradients[image]));
-            sum.iter_mut().zip(one).for_each(|(sum, g)| *sum += g);
-        }
-        sum
-    };
-    (images, loss, all.iter().map(gradient).collect())
+fn hard_case() -> (Targets, Vec<Gaussian>) {
+    problems::hard_case().unwrap()
 }
 
 fn with_phases(rows: &[Gaussian]) -> Vec<(Params, usize)> {
@@ -213,92 +121,15 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     }
 }
 
-/// What kernels are compared on: sizes that are no multiples of anything, Gaussians outside the image and behind the
-/// source, a phase that a view lacks.
-fn hard_case() -> (Targets, Vec<Gaussian>) {
-    let targets = targets(33, 27, 3);
-    let mut rows = random_gaussians(77, 3, 12.0, 4);
-    rows[5].position = [300.0, 0.0, 0.0];
-    let behind = targets.views[0].source - targets.views[0].ray(16.0, 13.0) * 50.0;
-    rows[6].position = behind.as_vec3().to_array();
-    rows[7].log_scale = [2.0, -3.0, 0.1];
-    (targets, rows)
-}
-
-fn numbers(all: &[Params], range: std::ops::Range<usize>) -> Vec<f64> {
-    all.iter().flat_map(|p| p[range.clone()].to_vec()).collect()
-}
-
-const TENSORS: [(&str, std::ops::Range<usize>); 4] =
-    [("position", 0..3), ("density", 3..4), ("scale", 4..7), ("rotation", 7..11)];
-
-/// The gradient on the device, in the order of [`Params`].
-fn device_gradient(gpu: &Gpu, trainer: &GaussianTrainer) -> Vec<Params> {
-    let n = trainer.count() as usize;
-    let rows: Vec<[f32; 12]> = gpu.download(&trainer.particles().gaussian_gradient, 0, n).unwrap();
-    let pick = |r: &[f32; 12]| [0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11].map(|k| f64::from(r[k]));
-    rows.iter().map(pick).collect()
-}
-
 #[test]
-fn images_losses_and_gradients_match() {
+fn every_stage_of_an_iteration_matches() {
     let gpu = gpu();
+    expect_agreement(|findings| gaussians::compare(&gpu, findings));
+    // Out of every view.
     let (targets, rows) = hard_case();
-    let mut trainer = GaussianTrainer::with(&gpu, targets.clone(), &config(), &Particles::fresh(rows.clone())).unwrap();
-    let (images, loss, gradient) = twin(&targets, trainer.setup(), &with_phases(&rows));
-    let (error, at) = relative_error(&trainer.images().unwrap(), &images);
-    println!("images {error:.1e}");
-    // f32 positions, and sums in steps of 1e-6.
-    assert!(error < 1e-4, "pixel {at}: {error:.1e}");
-    let got = trainer.advance(1).unwrap()[0];
-    assert!((got - loss).abs() < 2e-5 * loss, "{got} against {loss}");
-    let on_device = device_gradient(&gpu, &trainer);
-    for (name, range) in TENSORS {
-        let want = numbers(&gradient, range.clone());
-        let got: Vec<f32> = numbers(&on_device, range).iter().map(|v| *v as f32).collect();
-        let (error, at) = relative_error(&got, &want);
-        println!("{name} {error:.1e}");
-        assert!(error < 1e-4, "{name}[{at}]: {} against {} ({error:.1e})", got[at], want[at]);
-        assert!(want.iter().filter(|v| **v != 0.0).count() > want.len() / 2, "{name} must have gradients");
-    }
-    assert_eq!(on_device[5], [0.0; N_PARAMS], "out of every view");
-    drop(trainer);
-    expect_silence(gpu);
-}
-
-#[test]
-fn ten_updates_match() {
-    let gpu = gpu();
-    let (targets, rows) = hard_case();
-    let config = with_settings(sections::Gaussians { iterations: 12, ..config().gaussians });
-    let mut trainer = GaussianTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
-    while trainer.step() < 10 {
-        trainer.advance(10).unwrap();
-    }
-    let setup = *trainer.setup();
-    let mut all = with_phases(&rows);
-    let mut states = vec![AdamState::default(); all.len()];
-    for row in &fit::schedule(&config.gaussians)[..10] {
-        let (_, _, gradient) = twin(&targets, &setup, &all);
-        for (((p, _), g), state) in all.iter_mut().zip(&gradient).zip(&mut states) {
-            let bias = [row.bias1, row.bias2].map(f64::from);
-            reference::adam(&setup, f64::from(row.rate), bias, g, p, state);
-        }
-    }
-    let got = trainer.model().unwrap();
-    let mut far = 0;
-    let mut moved = 0;
-    for ((want, _), (got, start)) in all.iter().zip(got.rows.iter().zip(&rows)) {
-        let (got, start) = (params(got), params(start));
-        for k in 0..N_PARAMS {
-            // Adam divides by the gradient's size, so a tiny gradient's rounding shows in full; few may.
-            far += usize::from((got[k] - want[k]).abs() > 1e-3);
-            moved += usize::from((got[k] - start[k]).abs() > 0.05);
-        }
-    }
-    println!("{far} differ, {moved} moved");
-    assert!(far * 100 <= all.len() * N_PARAMS, "{far} differ");
-    assert!(moved * 2 > all.len() * N_PARAMS, "{moved} moved");
+    let mut trainer = GaussianTrainer::with(&gpu, targets, &config(), &Particles::fresh(rows.clone())).unwrap();
+    trainer.advance(1).unwrap();
+    assert_eq!(device_gradient(&gpu, trainer.particles(), rows.len()).unwrap()[5], [0.0; N_PARAMS]);
     drop(trainer);
     expect_silence(gpu);
 }
@@ -308,7 +139,7 @@ fn runs_repeat_bit_by_bit() {
     let gpu = gpu();
     let (targets, rows) = hard_case();
     let train = |stops: &[u32]| {
-        let config = with_settings(sections::Gaussians { iterations: 30, grow_at: 0, ..config().gaussians });
+        let config = with_gaussians(sections::Gaussians { iterations: 30, grow_at: 0, ..config().gaussians });
         let particles = Particles::fresh(rows.clone());
         let mut trainer = GaussianTrainer::with(&gpu, targets.clone(), &config, &particles).unwrap();
         let mut losses = Vec::new();
@@ -337,15 +168,15 @@ impl Golden {
         let n_phases = self.size("phases");
         let mut out =
             Targets { low: Vec::new(), high: Vec::new(), weight: Vec::new(), ..targets(width, height, n_phases) };
-        out.image_of = vec![None; n_phases * ANGLES.len()];
+        out.image_of = vec![None; n_phases * ANGLES_DEG.len()];
         out.n_images = 0;
         let missing = [self.case["missing"][0][0].as_u64().unwrap(), self.case["missing"][0][1].as_u64().unwrap()];
         for phase in 0..n_phases {
-            for view in 0..ANGLES.len() {
+            for view in 0..ANGLES_DEG.len() {
                 if missing == [phase as u64, view as u64] {
                     continue;
                 }
-                out.image_of[phase * ANGLES.len() + view] = Some(out.n_images);
+                out.image_of[phase * ANGLES_DEG.len() + view] = Some(out.n_images);
                 out.n_images += 1;
                 let tensor = |name: &str| self.get(&format!("{name}/{view}/{phase}")).into_iter().map(|v| v as f32);
                 out.low.extend(tensor("low"));
@@ -379,7 +210,7 @@ fn golden_values_of_pytorch() {
     let golden = Golden::open("gaussians", "tools/reference_gaussians.py");
     let (targets, rows) = (golden.targets(), golden.gaussians("start"));
     let iterations = golden.size("iterations") as u32;
-    let config = with_settings(sections::Gaussians { iterations, grow_at: 0, ..config().gaussians });
+    let config = with_gaussians(sections::Gaussians { iterations, grow_at: 0, ..config().gaussians });
     let mut trainer = GaussianTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
     let (images, loss, gradient) = twin(&targets, trainer.setup(), &with_phases(&rows));
     let want_loss = golden.get("loss")[0];
@@ -397,7 +228,7 @@ fn golden_values_of_pytorch() {
     }
     let got = trainer.advance(1).unwrap()[0];
     assert!((got - want_loss).abs() < 1e-4 * want_loss, "{got} against {want_loss}");
-    let on_device = device_gradient(&gpu, &trainer);
+    let on_device = device_gradient(&gpu, trainer.particles(), trainer.count() as usize).unwrap();
     while trainer.step() < golden.size("updates") as u32 {
         trainer.advance(golden.size("updates") as u32).unwrap();
     }
@@ -457,7 +288,7 @@ fn check_finite(model: &Gaussians, what: &str) {
 #[test]
 fn degenerate_data_are_fitted_or_refused_in_words() {
     let gpu = gpu();
-    let config = with_settings(sections::Gaussians { iterations: 60, count: 40, ..config().gaussians });
+    let config = with_gaussians(sections::Gaussians { iterations: 60, count: 40, ..config().gaussians });
     let all = common::small_dataset(32, 32);
     for (name, form) in FORMS {
         let refused = |dataset: &Dataset, config: &Config, part: &str| {
@@ -487,7 +318,7 @@ fn degenerate_data_are_fitted_or_refused_in_words() {
         broken.frames[0].integrals[5] = f32::NAN;
         let view = broken.frames[0].view;
         refused(&broken, &config, &format!("view {view}"));
-        let none = with_settings(sections::Gaussians { weakest: 1e3, ..config.gaussians.clone() });
+        let none = with_gaussians(sections::Gaussians { weakest: 1e3, ..config.gaussians.clone() });
         refused(&all, &none, "gaussians.weakest");
     }
     expect_silence(gpu);
@@ -620,32 +451,9 @@ fn maxima_are_those_of_the_field() {
     assert!(largest > 1.0, "the case must show something: {largest}");
 }
 
-/// A tree that already moves: Gaussians at rest, own motion and grid filled with waves, phase 0 at rest.
-fn moving_tree(rows: &[Gaussian], tree: &TreeSetup, n_phases: usize) -> TreeParams {
-    let wave = |i: usize, k: f64| {
-        let at = |c: f64| f64::from((0.4 * (k * (i as f64 + c)).sin()) as f32);
-        DVec3::new(at(0.0), at(0.3), at(0.9))
-    };
-    let nodes = tree.nodes();
-    let grid = (0..n_phases * nodes).map(|i| if i < nodes { DVec3::ZERO } else { wave(i, 0.61) }).collect();
-    let own = (0..rows.len() * tree.n_basis as usize).map(|i| 0.5 * wave(i, 0.47)).collect();
-    TreeParams { rows: rows.iter().map(params).collect(), own, grid }
-}
-
-fn tree_case() -> (Targets, Vec<Gaussian>, Tree) {
-    let mut targets = targets(33, 27, 5);
-    // The grid covers the places.
-    let corner = Place { position: DVec3::splat(14.0), evidence: 18.0 };
-    targets.places[0].push(corner);
-    let mut rows = random_gaussians(31, 1, 11.0, 8);
-    rows[3].position = [300.0, 0.0, 0.0];
-    let settings = Tree { node: 12.0, smoothness: 0.5, own_penalty: 0.7, ..config().tree };
-    (targets, rows, settings)
-}
-
 #[test]
 fn tree_twin_gradient_is_the_derivative_of_its_loss() {
-    let (targets, rows, settings) = tree_case();
+    let (targets, rows, Config { tree: settings, .. }) = tree_case().unwrap();
     let setup = GaussianSetup { cut: 12.0, ..fit::gaussian_setup(&targets, &config().gaussians) };
     let tree = fit::tree_setup(&targets, &settings);
     let p = moving_tree(&rows[..7], &tree, targets.n_phases);
@@ -678,48 +486,10 @@ fn tree_twin_gradient_is_the_derivative_of_its_loss() {
 #[test]
 fn tree_kernels_match_their_twin() {
     let gpu = gpu();
-    let (targets, rows, tree) = tree_case();
-    let own_rate = tree.own_rate;
-    let config = Config { tree, ..with_settings(sections::Gaussians { grow_at: 0, ..config().gaussians }) };
-    let mut trainer = TreeTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
-    let (setup, tree) = (*trainer.setup(), *trainer.tree_setup());
-    let p = moving_tree(&rows, &tree, targets.n_phases);
-    let pack = |all: &[DVec3]| -> Vec<[f32; 4]> { all.iter().map(|v| v.extend(0.0).as_vec4().to_array()).collect() };
-    gpu.upload(&trainer.grid().motion_grid, 0, &pack(&p.grid)).unwrap();
-    gpu.upload(&trainer.own_motion().own_motion, 0, &pack(&p.own)).unwrap();
-    // Where Gaussians are, by the model and by its expansion.
-    let model = trainer.tree().unwrap();
-    assert_eq!(model.expand().rows.len(), rows.len() * targets.n_phases);
-    let (loss, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
-    let got = trainer.advance(1).unwrap()[0];
-    assert!((got - loss).abs() < 2e-5 * loss, "{got} against {loss}");
-    let flat = |all: &[DVec3]| -> Vec<f64> { all.iter().flat_map(|v| v.to_array()).collect() };
-    let compare = |name: &str, got: Vec<f32>, want: Vec<f64>, tolerance: f64| {
-        let (error, at) = relative_error(&got, &want);
-        println!("{name} {error:.1e}");
-        assert!(error < tolerance, "{name}[{at}]: {} against {} ({error:.1e})", got[at], want[at]);
-    };
-    let rows_now: Vec<[f32; 12]> = gpu.download(&trainer.particles().gaussian_gradient, 0, rows.len()).unwrap();
-    for (name, range) in TENSORS {
-        let pick = |r: &[f32; 12]| [0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11].map(|k| r[k])[range.clone()].to_vec();
-        compare(name, rows_now.iter().flat_map(pick).collect(), numbers(&gradient.rows, range.clone()), 1e-4);
-    }
-    let vectors = |buffer: &Buffer, n: usize| -> Vec<f32> {
-        let all: Vec<[f32; 4]> = gpu.download(buffer, 0, n).unwrap();
-        all.iter().flat_map(|v| v[..3].to_vec()).collect()
-    };
-    compare("grid", vectors(&trainer.grid().motion_grid_gradient, p.grid.len()), flat(&gradient.grid), 1e-4);
-    // After one update Adam's first moment is a tenth of the gradient.
-    let first: Vec<f64> = flat(&gradient.own).iter().map(|g| 0.1 * g).collect();
-    compare("own motion", vectors(&trainer.own_motion().own_motion_first, p.own.len()), first, 1e-4);
-    // And every number has moved by its rate, against the gradient.
-    let moved = vectors(&trainer.own_motion().own_motion, p.own.len());
-    let start = flat(&p.own);
-    let slope = flat(&gradient.own);
-    for i in (0..moved.len()).filter(|i| slope[*i].abs() > 1e-3) {
-        let want = start[i] - own_rate * slope[i].signum();
-        assert!((f64::from(moved[i]) - want).abs() < 1e-4, "{i}: {} against {want}", moved[i]);
-    }
+    expect_agreement(|findings| trees::compare(&gpu, findings));
+    let (targets, rows, config) = tree_case().unwrap();
+    let trainer = TreeTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
+    assert_eq!(trainer.tree().unwrap().expand().rows.len(), rows.len() * targets.n_phases);
     drop(trainer);
     expect_silence(gpu);
 }

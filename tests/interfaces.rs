@@ -375,6 +375,15 @@ fn usage_errors_have_their_exit_codes() {
     assert!(ok(&["completions", "bash"]).contains("nertca-vk"));
     let devices: Value = serde_json::from_str(&ok(&["devices", "--json"])).unwrap();
     assert!(devices[0]["paths"]["reasons"].is_array() && devices[0]["uuid"].is_string());
+    // What a report of a fault needs besides.
+    let details = &devices[0]["details"];
+    assert_eq!(details["subgroups"]["default_size"], devices[0]["subgroup_size"]);
+    assert_eq!(details["max_workgroup_count"][0], devices[0]["max_workgroup_count"]);
+    let names = |key: &str| details[key].as_array().unwrap().iter().map(Value::to_string).collect::<String>();
+    assert!(details["subgroups"]["operations"].as_str().unwrap().contains("basic"), "{details}");
+    assert!(details["int64"].is_boolean() && details["buffer_int64_atomics"].is_boolean(), "{details}");
+    assert!(names("queues").contains("compute") && names("queues").contains("timestamp_bits"), "{details}");
+    assert!(names("extensions").contains("VK_KHR_") && names("heaps").contains("device_local"), "{details}");
 }
 
 #[test]

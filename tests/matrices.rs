@@ -5,20 +5,16 @@
 
 mod common;
 
-use common::{expect_silence, gpu, relative_error, run, small_config, small_dataset};
+use common::{expect_agreement, expect_silence, gpu, run, small_config, small_dataset};
+use nertca_vk::config::Preset;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
-use nertca_vk::network::FIRST_LOSS_SCALE;
 use nertca_vk::plan::Plan;
-use nertca_vk::reference::field::Precision;
-use nertca_vk::reference::{march, step};
-use nertca_vk::render::renderer::Renderer;
+use nertca_vk::selftest::drawing;
+use nertca_vk::selftest::iteration::{self, Case, MATRIX_CASES};
 use nertca_vk::train::calibrate::{self, Verdict};
 use nertca_vk::train::trainer::Trainer;
-
-/// The twin rounds where the kernels round.
-const F16: Precision = Precision::F16 { loss_scale: FIRST_LOSS_SCALE as f64 };
 
 /// A device and its matrix path, if it has one.
 fn matrices() -> Option<(Gpu, Tuning)> {
@@ -32,56 +28,22 @@ fn matrices() -> Option<(Gpu, Tuning)> {
     Some((gpu, tuning))
 }
 
-/// Each covers what the others do not: no skip and a skip layer; the skip layer last; one layer; odd bands; several
-/// chunks; more tiles than workgroups; fewer samples than a tile; loops unrolled as on a GPU, with large tiles.
-const CASES: &[(&str, &[&str], MatrixTuning)] = &[
-    ("fast-mlp", &["dynamic.width=48", "dynamic.bands=5"], CPU),
-    ("public-code", &["dynamic.occlusion=1e-3", "loss.normalise=true"], CPU),
-    ("fast-mlp", &["dynamic.layers=3", "dynamic.skip_layer=3", "dynamic.width=64", "train.rays=100"], CPU),
-    ("paper", &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true", "dynamic.latent=12"], CPU),
-    ("fast-mlp", &["train.rays=1", "march.dynamic_samples=7"], CPU),
-    (
-        "fast-mlp",
-        &["dynamic.width=32", "dynamic.layers=3", "dynamic.bands=4", "train.rays=60"],
-        MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true },
-    ),
-];
+/// As a CPU gets them; then loops unrolled as on a GPU, with large tiles.
 const CPU: MatrixTuning = MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false };
+const GPU: MatrixTuning = MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true };
+const GPU_CASE: Case = Case {
+    preset: Preset::FastMlp,
+    settings: &["dynamic.width=32", "dynamic.layers=3", "dynamic.bands=4", "train.rays=60"],
+};
 
 #[test]
-fn losses_and_gradients_match() {
+fn every_stage_of_an_iteration_matches() {
     let Some((gpu, tuning)) = matrices() else { return };
     let dataset = small_dataset(13, 11);
-    for (preset, settings, sizes) in CASES {
-        let plan = Plan::new(&small_config(preset, settings), &dataset).unwrap();
-        let params = plan.params.initial(&plan.config);
-        let twin: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
-        let path = Tuning { matrices: *sizes, ..tuning.clone() };
-        let mut trainer = Trainer::new(&gpu, plan, &dataset, path).unwrap();
-        let got = trainer.advance(1).unwrap()[0];
-        let plan = trainer.plan();
-        let (want, gradient) = step::loss_and_gradient(plan, &twin, 0, &march::batch(plan, 0), F16);
-        for (name, g, w) in [("data", got.data, want.data), ("occlusion", got.occlusion, want.occlusion)] {
-            assert!((g - w).abs() <= 1e-4 * w.abs() + 1e-12, "{preset} {settings:?} {name}: {g} against {w}");
-        }
-        let on_device: Vec<f32> = gpu.download(&trainer.training().gradient, 0, plan.params.len).unwrap();
-        for tensor in plan.params.tensors() {
-            let (mut error, mut norm) = (0.0, 0.0);
-            for at in &tensor.positions {
-                let want = gradient[*at as usize];
-                error += (f64::from(on_device[*at as usize]) - want).powi(2);
-                norm += want * want;
-            }
-            let relative = (error / norm).sqrt();
-            assert!(norm > 0.0, "{preset} {settings:?} {} has no gradient at all", tensor.name);
-            // The twin rounds to f16 where the kernels do; sums in f32 now and then round to the other neighbour.
-            assert!(relative < 2e-4, "{preset} {settings:?} {}: {relative:.1e} off", tensor.name);
-        }
-        // The same in plain f64: what f16 costs.
-        let (_, exact) = step::loss_and_gradient(plan, &twin, 0, &march::batch(plan, 0), Precision::Exact);
-        let norm = |v: &dyn Fn(usize) -> f64| (0..exact.len()).map(|i| v(i).powi(2)).sum::<f64>().sqrt();
-        let off = norm(&|i| exact[i] - f64::from(on_device[i])) / norm(&|i| exact[i]);
-        assert!(off < 3e-2, "{preset} {settings:?}: f16 puts the gradient {off:.1e} off");
+    let cases = MATRIX_CASES.iter().map(|case| (case, CPU)).chain([(&GPU_CASE, GPU)]);
+    for (case, matrices) in cases {
+        let path = Tuning { matrices, ..tuning.clone() };
+        expect_agreement(|findings| iteration::compare(&gpu, &dataset, case, &path, findings));
     }
     expect_silence(gpu);
 }
@@ -139,31 +101,12 @@ fn an_overflow_skips_the_update_and_halves_the_scale() {
 }
 
 #[test]
-fn renderings_equal_the_twin() {
+fn views_and_volumes_equal_the_twin() {
     let Some((gpu, tuning)) = matrices() else { return };
-    let dataset = small_dataset(12, 10);
-    let config = small_config("public-code", &["loss.normalise=true", "train.chunk_samples=1500"]);
-    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning.clone()).unwrap();
-    run(&mut trainer, 20);
-    let model = trainer.model().unwrap();
-    let renderer = Renderer::new(&gpu, &model, tuning).unwrap();
-    let view = &dataset.views[2].rays;
-    let got = renderer.render(view, 12, 10, 2).unwrap().dynamic_integral;
-    let mut plan = Plan::new(&config, &dataset).unwrap().in_scene(model.scene.clone());
-    plan.setup.jitter = 0;
-    plan.setup.n_dynamic_samples = config.march.render_samples;
-    let params: Vec<f64> = model.params.iter().map(|v| f64::from(*v)).collect();
-    let want: Vec<f64> = (0..120u32)
-        .map(|pixel| {
-            let (anchor, direction) = view.pixel(f64::from(pixel % 12), f64::from(pixel / 12));
-            let ray = march::Ray { anchor, direction, phase: 2, target: 0.0, temporal: [0.0; 2], id: pixel };
-            march::fwd(&plan, &params, 20, &ray, false, F16).dynamic_integral
-        })
-        .collect();
-    let (error, at) = relative_error(&got, &want);
-    // A pixel whose ray grazes a box face may gain or lose one sample in f32.
-    assert!(error < 2e-3, "[{at}]: {} against {}", got[at], want[at]);
-    drop((trainer, renderer));
+    expect_agreement(|findings| {
+        drawing::compare_views(&gpu, Preset::PublicCode, &tuning, findings)?;
+        drawing::compare_volumes(&gpu, &tuning, findings)
+    });
     expect_silence(gpu);
 }
 

@@ -9,6 +9,7 @@ use crate::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
 use crate::kernels::tuning::{Layers, Tuning};
 use ash::vk::{self, Handle};
 use std::ffi::{c_char, c_void};
+use std::num::NonZeroU64;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use tracing::Dispatch;
@@ -92,10 +93,8 @@ fn parse(mut options: Options) -> Outcome<Parsed> {
     let truth = "true or false";
     let select = options.take("device").filter(|d| !d.is_empty());
     let without_device = select.as_deref() == Some("none");
-    let memory_limit = match options.take_as::<u64>("memory_limit_mib", "a number of MiB")? {
-        Some(0) => return Err(Failure::argument("memory_limit_mib", "is 0")),
-        limit => limit.map(|mib| mib.saturating_mul(1 << 20)),
-    };
+    let memory_limit = options.take_as::<NonZeroU64>("memory_limit_mib", "a number of MiB, 1 or more")?;
+    let memory_limit = memory_limit.map(|mib| mib.get().saturating_mul(1 << 20));
     let layers = match options.take("layers").as_deref() {
         None => None,
         Some("f32") => Some(Layers::F32),
@@ -109,6 +108,7 @@ fn parse(mut options: Options) -> Outcome<Parsed> {
             cache_dir: options.take("cache_dir").map(Into::into),
             memory_limit,
             loader: None,
+            statistics: false,
         },
         without_device,
         deterministic: options.take_as("deterministic", truth)?.unwrap_or(false),

@@ -8,7 +8,9 @@ use super::devices::{CompletionsArgs, DevicesArgs};
 use super::eval::EvalArgs;
 use super::export::{ConvertArgs, ExportArgs};
 use super::info::InfoArgs;
+use super::kernels::KernelsArgs;
 use super::render::RenderArgs;
+use super::selftest::SelftestArgs;
 use super::study::StudyArgs;
 use super::synthetic_args::{PhantomArgs, ProjectArgs};
 use super::train::TrainArgs;
@@ -73,6 +75,10 @@ pub enum Command {
     Convert(ConvertArgs),
     /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
     Bench(BenchArgs),
+    /// Compare every compute stage with its f64 twin on this device: the first thing to run on an unknown one.
+    Selftest(SelftestArgs),
+    /// List every pipeline that a preset uses, as the device's driver compiles it: registers, spills, size.
+    Kernels(KernelsArgs),
     /// Run a study: data sets x methods x seeds, and tables of their results beside published ones.
     Study(StudyArgs),
     /// Tell whether a dataset makes sense, and which of the usual mistakes it has.

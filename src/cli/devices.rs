@@ -4,6 +4,7 @@ use super::args::Cli;
 use clap::{Args, CommandFactory};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
+use nertca_vk::gpu::details::{DeviceDetails, list_details};
 use nertca_vk::gpu::device::list_devices;
 use nertca_vk::kernels::tuning::Tuning;
 use serde::Serialize;
@@ -11,7 +12,7 @@ use serde::Serialize;
 /// `devices`.
 #[derive(Debug, Args)]
 pub struct DevicesArgs {
-    /// JSON instead of text.
+    /// JSON instead of text, with all that a report of a fault needs of a device.
     #[arg(long)]
     pub json: bool,
 }
@@ -28,16 +29,17 @@ struct Row {
     #[serde(flatten)]
     info: DeviceInfo,
     paths: Tuning,
+    details: DeviceDetails,
 }
 
 /// Lists devices.
 pub fn run(args: &DevicesArgs) -> Result<()> {
-    let rows: Vec<Row> =
-        list_devices()?.into_iter().map(|info| Row { paths: Tuning::for_device(&info), info }).collect();
+    let row = |(info, details): (DeviceInfo, DeviceDetails)| Row { paths: Tuning::for_device(&info), info, details };
+    let rows: Vec<Row> = list_devices()?.into_iter().zip(list_details()?).map(row).collect();
     if args.json {
         out!("{}", nertca_vk::files::pretty_json(&rows)?);
     } else {
-        for Row { info, paths } in &rows {
+        for Row { info, paths, .. } in &rows {
             out!("{}: {} ({}, {})", info.index, info.name, info.kind, info.driver);
             out!("   uuid {}  Vulkan {}", info.uuid, info.api_version);
             out!(

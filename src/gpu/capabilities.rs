@@ -57,6 +57,8 @@ pub struct DeviceInfo {
     pub float_atomics: bool,
     /// Whether memory can be exported as file descriptors (`VK_KHR_external_memory_fd`).
     pub external_memory_fd: bool,
+    /// Whether the driver tells of the pipelines it compiles (`VK_KHR_pipeline_executable_properties`).
+    pub pipeline_statistics: bool,
     /// Why this device cannot be used, if so.
     pub unusable: Option<String>,
 }
@@ -189,8 +191,13 @@ pub(super) fn describe(
     unsafe { instance.get_physical_device_properties2(physical, &mut props) };
     let properties = props.properties;
     let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut statistics = vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default();
     let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut f12);
-    // SAFETY: the chain lives until the call returns; its structure is of Vulkan 1.2, and ignored by older devices.
+    if has(khr::pipeline_executable_properties::NAME) {
+        features = features.push_next(&mut statistics);
+    }
+    // SAFETY: the chain lives until the call returns; it holds an extension's structure only where the device has it, and
+    // that of Vulkan 1.2 is ignored by older devices.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
     // SAFETY: callers take `physical` from this instance.
     let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
@@ -265,6 +272,8 @@ pub(super) fn describe(
         float16: f12.shader_float16 == vk::TRUE,
         float_atomics: has(ext::shader_atomic_float::NAME),
         external_memory_fd: has(khr::external_memory_fd::NAME),
+        pipeline_statistics: has(khr::pipeline_executable_properties::NAME)
+            && statistics.pipeline_executable_info == vk::TRUE,
         unusable,
     }
 }

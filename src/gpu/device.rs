@@ -4,10 +4,12 @@
 use super::capabilities::{DeviceInfo, DeviceKind, MATRIX_EXTENSIONS, compute_family};
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
+use super::statistics::StatisticsKeeper;
 use crate::error::{Error, Result};
 use ash::{ext, khr, vk};
 use gpu_allocator::AllocationSizes;
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
+use std::collections::BTreeSet;
 use std::ffi::{CStr, CString};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -25,6 +27,8 @@ pub struct DeviceOptions {
     pub memory_limit: Option<u64>,
     /// An application's own loader in place of the system's.
     pub loader: Option<Loader>,
+    /// Keep what the driver tells of each pipeline; see [`Gpu::pipeline_statistics`].
+    pub statistics: bool,
 }
 
 /// A device that someone else made and goes on owning; see [`Gpu::adopt`].
@@ -74,11 +78,14 @@ pub(super) struct Shared {
     pub(super) last_submitted: AtomicU64,
     pub(super) live_objects: AtomicU64,
     pub(super) info: DeviceInfo,
+    /// Shaders that were recorded so far.
+    pub(super) recorded: Mutex<BTreeSet<&'static str>>,
     #[cfg_attr(not(unix), allow(dead_code, reason = "memory is shared on Unix only"))]
     pub(super) physical: vk::PhysicalDevice,
     memory: Memory,
     queue_lock: Option<Box<dyn QueueLock>>,
     cache_file: Option<std::path::PathBuf>,
+    pub(super) statistics: Option<StatisticsKeeper>,
     pub(super) device: Device,
 }
 
@@ -191,6 +198,7 @@ impl Device {
         physical: vk::PhysicalDevice,
         info: &DeviceInfo,
         queue_family: u32,
+        with_statistics: bool,
     ) -> Result<Device> {
         let priorities = [1.0];
         let queues =
@@ -202,6 +210,8 @@ impl Device {
         let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default()
             .subgroup_size_control(true)
             .compute_full_subgroups(true);
+        let mut statistics =
+            vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default().pipeline_executable_info(true);
         let mut extensions = Vec::new();
         if info.external_memory_fd {
             extensions.push(khr::external_memory_fd::NAME.as_ptr());
@@ -211,6 +221,10 @@ impl Device {
             f12 = f12.shader_float16(true).vulkan_memory_model(true).vulkan_memory_model_device_scope(true);
             extensions.extend(MATRIX_EXTENSIONS.map(CStr::as_ptr));
             create = create.push_next(&mut matrix).push_next(&mut size);
+        }
+        if with_statistics && info.pipeline_statistics {
+            extensions.push(khr::pipeline_executable_properties::NAME.as_ptr());
+            create = create.push_next(&mut statistics);
         }
         let create = create.enabled_extension_names(&extensions).push_next(&mut f12);
         // SAFETY: the chain consists of locals of this function; extensions and features are those `describe` found.
@@ -247,6 +261,8 @@ impl Parts {
             },
         })
         .map_err(|e| Error::Internal(format!("gpu-allocator: {e}")))?;
+        let statistics =
+            (options.statistics && device.ours).then(|| StatisticsKeeper::new(&device.instance, &device, &info));
         let cache_file = options
             .cache_dir
             .as_ref()
@@ -261,10 +277,12 @@ impl Parts {
             last_submitted: AtomicU64::new(0),
             live_objects: AtomicU64::new(0),
             info,
+            recorded: Mutex::default(),
             physical,
             memory: Memory { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) },
             queue_lock,
             cache_file,
+            statistics,
             device,
         };
         let mut kind =
@@ -293,7 +311,7 @@ impl Gpu {
         let (physical, info) = choose(instance.devices()?, options.select.as_deref())?;
         let queue_family = compute_family(&instance, physical)
             .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?;
-        let device = Device::create(instance, physical, &info, queue_family)?;
+        let device = Device::create(instance, physical, &info, queue_family, options.statistics)?;
         // SAFETY: the device was made with one queue of this family.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
         Parts { physical, info, device, queue, queue_family, queue_lock: None }.into_gpu(options)
@@ -354,6 +372,11 @@ impl Gpu {
     /// Buffers, pipelines and recordings alive at the moment; 0 once all are dropped.
     pub fn live_objects(&self) -> u64 {
         self.shared.live_objects.load(Ordering::Relaxed)
+    }
+
+    /// Shaders that dispatches were recorded of so far, for those who tell what has been tried on a device.
+    pub fn recorded_shaders(&self) -> Vec<&'static str> {
+        lock(&self.shared.recorded).iter().copied().collect()
     }
 
     /// Bytes of buffers and images alive at the moment.

@@ -3,7 +3,7 @@
 use super::capabilities::{DeviceInfo, describe};
 use super::lock::lock;
 use crate::error::{Error, Result};
-use ash::{ext, vk};
+use ash::{ext, khr, vk};
 use std::ffi::{CStr, c_void};
 use std::sync::Mutex;
 
@@ -166,6 +166,11 @@ impl Instance {
     /// What a device of this instance is and can do.
     pub fn describe(&self, index: usize, physical: vk::PhysicalDevice) -> DeviceInfo {
         describe(&self.entry, &self.raw, index, physical)
+    }
+
+    /// Functions that tell of cooperative matrices, for devices that have them.
+    pub fn cooperative_matrix(&self) -> khr::cooperative_matrix::Instance {
+        khr::cooperative_matrix::Instance::new(&self.entry, &self.raw)
     }
 
     /// Every device, usable or not.

@@ -10,6 +10,8 @@ use std::sync::Arc;
 pub struct KernelCode {
     /// Stage name: shader file, debug label and bench row share it.
     pub name: &'static str,
+    /// Shader it is a build of; the same name where there is only one.
+    pub shader: &'static str,
     /// SPIR-V bytes.
     pub spirv: &'static [u8],
     /// Bytes of push constants the caller gives.
@@ -186,7 +188,10 @@ impl Gpu {
             stage =
                 stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS).push_next(&mut subgroup_size);
         }
-        let create = [vk::ComputePipelineCreateInfo::default().stage(stage).layout(pipeline.layout)];
+        let create = [vk::ComputePipelineCreateInfo::default()
+            .flags(shared.pipeline_flags())
+            .stage(stage)
+            .layout(pipeline.layout)];
         // SAFETY: module and layout were just made; entries and values live until the call returns, and the entries lie
         // inside the values.
         let made = unsafe { device.create_compute_pipelines(shared.pipeline_cache, &create, None) };
@@ -199,6 +204,9 @@ impl Gpu {
             .next()
             .unwrap_or_default();
         shared.set_name(pipeline.raw, code.name);
+        if let Some(keeper) = &shared.statistics {
+            keeper.note(pipeline.raw, code, local_size, spec)?;
+        }
         Ok(pipeline)
     }
 }

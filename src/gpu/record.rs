@@ -4,6 +4,7 @@
 use super::buffer::Buffer;
 use super::device::{Gpu, Shared};
 use super::image::Image3d;
+use super::lock::lock;
 use super::pipeline::{BindingCode, BindingKind, Pipeline, descriptor_type};
 use crate::error::{Error, Result};
 use ash::vk;
@@ -281,6 +282,7 @@ impl Recording {
         }
         self.end_pass(code.name);
         self.commands.pipelines.push(pipeline.clone());
+        lock(&self.commands.gpu.recorded).insert(code.shader);
         Ok(())
     }
 

@@ -8,6 +8,7 @@ use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
 use crate::gpu::record::Groups;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
+use std::collections::BTreeSet;
 use std::marker::PhantomData;
 use std::sync::Arc;
 
@@ -23,6 +24,11 @@ const _: () = assert!(push::MarchEmit::LOCAL_SIZE == MARCH_LANES);
 /// [`Error::Internal`] for a name that no kernel has.
 pub fn kernel_code(name: &str) -> Result<&'static KernelCode> {
     KERNEL_TABLE.iter().find(|k| k.name == name).ok_or_else(|| Error::Internal(format!("no kernel is called `{name}`")))
+}
+
+/// Every shader there is, by name: variants are not counted apart.
+pub fn shaders() -> BTreeSet<&'static str> {
+    KERNEL_TABLE.iter().map(|code| code.shader).collect()
 }
 
 /// A pipeline of the shader whose push constants are `P`; clones share it.

@@ -137,7 +137,7 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Pr
 
 impl Projection {
     /// Index and offset from the centre of every pixel of the box.
-    pub(super) fn pixels(&self, setup: &GaussianSetup) -> impl Iterator<Item = (usize, DVec2)> + use<> {
+    pub fn pixels(&self, setup: &GaussianSetup) -> impl Iterator<Item = (usize, DVec2)> + use<> {
         let (width, mean) = (setup.width as usize, self.mean);
         let size = DVec2::new(f64::from(setup.width), f64::from(setup.height));
         let first = (mean - self.half_box).ceil().max(DVec2::ZERO);

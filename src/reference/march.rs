@@ -129,10 +129,9 @@ pub struct March {
     pub occlusion: f64,
 }
 
-/// Marches one ray (twin of `march_count`..`march_fwd`).
-pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool, precision: Precision) -> March {
+/// Marches one ray through the static field alone, if at all.
+pub fn statics(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool) -> March {
     let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
-    let row = plan.schedule[step as usize];
     let mut out = March {
         statics: Vec::new(),
         dynamics: Vec::new(),
@@ -151,6 +150,14 @@ pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool,
             }
         }
     }
+    out
+}
+
+/// Marches one ray (twin of `march_count`..`march_fwd`).
+pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool, precision: Precision) -> March {
+    let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
+    let row = plan.schedule[step as usize];
+    let mut out = statics(plan, params, step, ray, with_static);
     if row.dynamic_active == 0 {
         return out;
     }
@@ -187,10 +194,31 @@ pub fn bwd(
         }
     }
     for sample in &march.dynamics {
-        let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
-        let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
-        let slope = if per_integral < 0.0 { slope.max(s.least_slope.into()) } else { slope };
-        let dl_dfeature = per_integral * sample.dl * slope;
-        field::network_bwd(p, params, &sample.trace, ray.phase, dl_dfeature, precision, gradient);
+        sample_bwd(plan, params, ray.phase, sample, dl_dd, precision, gradient);
     }
+}
+
+/// Adds the gradient of a live sample, given dL/dD of its ray (twin of `mlp_*_bwd`).
+pub fn sample_bwd(
+    plan: &Plan,
+    params: &[f64],
+    phase: usize,
+    sample: &DynamicSample,
+    dl_dd: f64,
+    precision: Precision,
+    gradient: &mut [f64],
+) {
+    let s = &plan.setup;
+    let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
+    let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
+    let slope = if per_integral < 0.0 { slope.max(s.least_slope.into()) } else { slope };
+    field::network_bwd(
+        &plan.params,
+        params,
+        &sample.trace,
+        phase,
+        per_integral * sample.dl * slope,
+        precision,
+        gradient,
+    );
 }

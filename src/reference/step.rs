@@ -27,7 +27,7 @@ impl Losses {
 }
 
 /// Whether a ray of the batch leaves the static field out (twin of `skips_static`).
-fn skips_static(plan: &Plan, r: usize) -> bool {
+pub fn skips_static(plan: &Plan, r: usize) -> bool {
     let s = &plan.setup;
     s.temporal_target != 0 && (r as u32) < s.n_motion_rays && s.n_motion_rays < s.n_rays
 }
@@ -41,6 +41,35 @@ fn robust_square(scale: f64, r: f64) -> (f64, f64) {
     (2.0 * scale * scale * (root - 1.0), r / root)
 }
 
+/// What a ray adds to the losses.
+#[derive(Debug, Clone, Copy)]
+pub struct RayLoss {
+    /// Weighted data terms.
+    pub data: f64,
+    /// Weighted data term of the dynamic field alone.
+    pub dynamic: f64,
+    /// Derivatives of the data terms by the ray's integrals S and D.
+    pub gradient: [f64; 2],
+}
+
+/// Losses of ray `r` of `n_rays`, whose integrals are S and D (twin of `loss`).
+pub fn ray_loss(plan: &Plan, r: usize, n_rays: usize, ray: &Ray, [s_integral, d]: [f64; 2]) -> RayLoss {
+    let s = &plan.setup;
+    let temporal = s.temporal_target != 0;
+    let n_static = (0..n_rays).filter(|r| !skips_static(plan, *r)).count() as f64;
+    let static_scale = if skips_static(plan, r) { 0.0 } else { f64::from(s.static_weight) / n_static };
+    let dynamic_scale = f64::from(s.dynamic_weight) / n_rays as f64;
+    let total = s_integral + d - ray.target;
+    let dynamic_residual = if temporal { d - d.clamp(ray.temporal[0], ray.temporal[1]) } else { total };
+    let (value, slope) = robust_square(s.robust_scale.into(), dynamic_residual);
+    let dynamic = dynamic_scale * value;
+    RayLoss {
+        data: static_scale * total * total + if temporal { dynamic } else { 0.0 },
+        dynamic,
+        gradient: [2.0 * static_scale * total, 2.0 * dynamic_scale * slope],
+    }
+}
+
 /// Loss and gradient of given rays at a step.
 pub fn loss_and_gradient(
     plan: &Plan,
@@ -52,24 +81,14 @@ pub fn loss_and_gradient(
     let s = &plan.setup;
     let mut gradient = vec![0.0; plan.params.len];
     let mut losses = Losses::default();
-    let n_static = (0..rays.len()).filter(|r| !skips_static(plan, *r)).count() as f64;
-    let temporal = s.temporal_target != 0;
     for (r, ray) in rays.iter().enumerate() {
-        let skip = skips_static(plan, r);
-        let seen = march::fwd(plan, params, step, ray, !skip, precision);
-        let dynamic_scale = f64::from(s.dynamic_weight) / rays.len() as f64;
-        let static_scale = if skip { 0.0 } else { f64::from(s.static_weight) / n_static };
-        let d = seen.dynamic_integral;
-        let total = seen.static_integral + d - ray.target;
-        let dynamic_residual = if temporal { d - d.clamp(ray.temporal[0], ray.temporal[1]) } else { total };
-        let (value, slope) = robust_square(s.robust_scale.into(), dynamic_residual);
-        let dynamic_loss = dynamic_scale * value;
-        losses.data += static_scale * total * total + if temporal { dynamic_loss } else { 0.0 };
-        losses.dynamic += dynamic_loss;
+        let seen = march::fwd(plan, params, step, ray, !skips_static(plan, r), precision);
+        let loss = ray_loss(plan, r, rays.len(), ray, [seen.static_integral, seen.dynamic_integral]);
+        losses.data += loss.data;
+        losses.dynamic += loss.dynamic;
         losses.occlusion += f64::from(s.occlusion_weight) * seen.occlusion;
         losses.live += seen.dynamics.len();
-        let dl = [2.0 * static_scale * total, 2.0 * dynamic_scale * slope];
-        march::bwd(plan, params, ray, &seen, dl, precision, &mut gradient);
+        march::bwd(plan, params, ray, &seen, loss.gradient, precision, &mut gradient);
     }
     losses.tv = total_variation(plan, params, &mut gradient);
     (losses, gradient)

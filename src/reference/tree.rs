@@ -48,6 +48,11 @@ fn displaced(p: &TreeParams, i: usize, motion: &Motion) -> Params {
     out
 }
 
+/// A Gaussian as it is at a phase.
+pub fn at_phase(tree: &TreeSetup, p: &TreeParams, i: usize, phase: usize, n_phases: usize) -> Params {
+    displaced(p, i, &motion(tree, &p.rows[i], phase, n_phases))
+}
+
 /// Loss without and with penalties, and the gradient of the latter. A Gaussian's share of the nodes is taken as given.
 pub fn loss_and_gradient(
     targets: &Targets,

@@ -125,6 +125,11 @@ impl GaussianTrainer {
         &self.particles
     }
 
+    /// What is fitted to on the device, for tests.
+    pub fn target_buffers(&self) -> &TargetBuffers {
+        &self.buffers
+    }
+
     /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the losses
     /// of the iterations done. An empty list means the target was reached before.
     ///

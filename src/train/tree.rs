@@ -173,6 +173,11 @@ impl TreeTrainer {
         &self.particles
     }
 
+    /// What is fitted to on the device, for tests.
+    pub fn target_buffers(&self) -> &TargetBuffers {
+        &self.joint.targets
+    }
+
     /// The grid on the device, as [`TreeTrainer::particles`].
     pub fn grid(&self) -> &GridBuffers {
         &self.joint.grid

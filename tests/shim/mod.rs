@@ -46,6 +46,8 @@ struct State {
     /// Objects alive by kind.
     alive: BTreeMap<&'static str, i64>,
     poison: Option<Poison>,
+    /// Code of a shader, and what the driver gets instead.
+    planted: Option<(Vec<u32>, Vec<u32>)>,
 }
 
 thread_local! {
@@ -106,6 +108,11 @@ pub fn end_poison() -> (u32, u32, Vec<String>) {
         let poison = state.poison.take().unwrap();
         (poison.filled, poison.unreachable, poison.broken)
     })
+}
+
+/// Hands the driver `faulty` from now on where the engine has `code`.
+pub fn plant(code: Vec<u32>, faulty: Vec<u32>) {
+    with(|state| state.planted = Some((code, faulty)));
 }
 
 /// The loader to open a device with.
@@ -286,7 +293,6 @@ creating! {
     vkCreateQueryPool(vk::Device, vk::QueryPoolCreateInfo<'static>) -> vk::QueryPool;
     vkCreateSampler(vk::Device, vk::SamplerCreateInfo<'static>) -> vk::Sampler;
     vkCreateSemaphore(vk::Device, vk::SemaphoreCreateInfo<'static>) -> vk::Semaphore;
-    vkCreateShaderModule(vk::Device, vk::ShaderModuleCreateInfo<'static>) -> vk::ShaderModule;
 }
 
 destroying! {
@@ -394,6 +400,30 @@ unsafe extern "system" fn vkCreateComputePipelines(
     let code = unsafe { real(device, cache, n, infos, callbacks, out) };
     if code == vk::Result::SUCCESS {
         count(std::any::type_name::<vk::Pipeline>(), i64::from(n));
+    }
+    code
+}
+
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkCreateShaderModule(
+    device: vk::Device,
+    info: *const vk::ShaderModuleCreateInfo<'_>,
+    callbacks: *const vk::AllocationCallbacks<'_>,
+    out: *mut vk::ShaderModule,
+) -> vk::Result {
+    if let Some(code) = attempt("vkCreateShaderModule") {
+        return code;
+    }
+    let real: vk::PFN_vkCreateShaderModule = unsafe { std::mem::transmute(device.real(c"vkCreateShaderModule")) };
+    let mut info = unsafe { *info };
+    let words = unsafe { std::slice::from_raw_parts(info.p_code, info.code_size / 4) };
+    let faulty = with(|state| state.planted.clone().filter(|(code, _)| code == words).map(|(_, faulty)| faulty));
+    if let Some(faulty) = &faulty {
+        (info.p_code, info.code_size) = (faulty.as_ptr(), 4 * faulty.len());
+    }
+    let code = unsafe { real(device, &info, callbacks, out) };
+    if code == vk::Result::SUCCESS {
+        count(std::any::type_name::<vk::ShaderModule>(), 1);
     }
     code
 }
@@ -515,6 +545,7 @@ fn special(name: &str) -> Option<*const ()> {
         "vkDestroyInstance" => vkDestroyInstance as *const (),
         "vkDestroyDevice" => vkDestroyDevice as *const (),
         "vkCreateComputePipelines" => vkCreateComputePipelines as *const (),
+        "vkCreateShaderModule" => vkCreateShaderModule as *const (),
         "vkCreateBuffer" => vkCreateBuffer as *const (),
         "vkMapMemory" => vkMapMemory as *const (),
         "vkBindBufferMemory" => vkBindBufferMemory as *const (),

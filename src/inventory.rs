@@ -1,0 +1,232 @@
+//! Every pipeline that runs of a configuration use on a device, and what its driver's compiler made of them.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::gaussians::blobs::BlobKernels;
+use crate::gaussians::stages::GaussianKernels;
+use crate::gaussians::tree::TreeKernels;
+use crate::gpu::device::Gpu;
+use crate::gpu::statistics::PipelineStatistics;
+use crate::kernels::layout::Setup;
+use crate::kernels::stages::Kernels;
+use crate::kernels::tuning::Tuning;
+use crate::model::params::ParamMap;
+use crate::network::{Network, Purpose};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// A pipeline as the driver compiled it. Numbers that the driver does not tell are none.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Compiled {
+    /// The kernel.
+    pub kernel: String,
+    /// Invocations of a workgroup.
+    pub lanes: u32,
+    /// Specialisation constants that were set.
+    pub constants: BTreeMap<String, u32>,
+    /// Invocations of a subgroup.
+    pub subgroup_size: Option<u32>,
+    /// Registers of an invocation; on Intel the most that are live at once.
+    pub registers: Option<f64>,
+    /// What did not fit the registers, in the driver's own units: 0 is what to aim at.
+    pub spills: Option<f64>,
+    /// Shared memory of a workgroup, bytes.
+    pub shared_bytes: Option<f64>,
+    /// Subgroups that a processor holds at once, by registers, and on AMD by shared memory and workgroups.
+    pub resident: Option<f64>,
+    /// Size of the code: bytes, or instructions where the driver tells those alone.
+    pub code: Option<f64>,
+    /// The compiler's estimate of cycles: it knows nothing of memory and of how often loops run.
+    pub cycles: Option<f64>,
+}
+
+/// Names that drivers give a number; several that they have at once are added up.
+struct Names(&'static [&'static [&'static str]]);
+
+/// Mesa's drivers: NVK, RADV, ANV, in letters of either case. Of lists that a driver has something of, the first counts.
+const REGISTERS: Names = Names(&[&["Number of GPRs"], &["VGPRs"], &["Max live registers"]]);
+const SPILLS: Names =
+    Names(&[&["Spills to memory", "Fills from memory"], &["Spilled VGPRs", "Spilled SGPRs"], &["Spills", "Fills"]]);
+const SHARED: Names = Names(&[&["LDS size"], &["Workgroup memory size"]]);
+const RESIDENT: Names = Names(&[&["Max warps/SM"], &["Subgroups per SIMD"]]);
+const CODE: Names = Names(&[&["Code size"], &["Instruction count", "Instructions"]]);
+const CYCLES: Names = Names(&[&["Static cycle count"], &["Inverse Throughput"], &["Cycles"]]);
+
+impl Names {
+    fn of(&self, numbers: &BTreeMap<String, f64>) -> Option<f64> {
+        let number = |name: &&str| numbers.iter().find(|(n, _)| n.eq_ignore_ascii_case(name)).map(|(_, value)| *value);
+        let sum = |names: &&[&str]| names.iter().filter_map(number).reduce(|a, b| a + b);
+        self.0.iter().find_map(sum)
+    }
+}
+
+impl Compiled {
+    /// The driver's numbers under the names they have here.
+    pub fn of(found: &PipelineStatistics) -> Compiled {
+        let PipelineStatistics { kernel, lanes, constants, subgroup_size, numbers } = found;
+        Compiled {
+            kernel: (*kernel).to_owned(),
+            lanes: *lanes,
+            constants: constants.clone(),
+            subgroup_size: *subgroup_size,
+            registers: REGISTERS.of(numbers),
+            spills: SPILLS.of(numbers),
+            shared_bytes: SHARED.of(numbers),
+            resident: RESIDENT.of(numbers),
+            code: CODE.of(numbers),
+            cycles: CYCLES.of(numbers),
+        }
+    }
+
+    /// Whether both are the same kernel, built alike.
+    fn is_build_of(&self, other: &Compiled) -> bool {
+        (&self.kernel, self.lanes, &self.constants) == (&other.kernel, other.lanes, &other.constants)
+    }
+
+    /// Kernel and constants, for messages.
+    pub fn name(&self) -> String {
+        let constants: Vec<String> = self.constants.iter().map(|(name, value)| format!("{name}={value}")).collect();
+        [std::slice::from_ref(&self.kernel), &constants[..]].concat().join(" ")
+    }
+}
+
+/// Samples of a chunk that buffers are made for: pipelines do not depend on it.
+const CAPACITY: u32 = 1024;
+
+/// Builds every pipeline that training and rendering of a configuration use on `gpu`, which was opened to keep statistics,
+/// by the functions that they use, too. Each build of a kernel is listed once, in the order of names.
+///
+/// # Errors
+/// [`Error::Config`] where the network is not for the device; [`Error::Internal`] for a device without statistics; errors
+/// of [`Gpu::pipeline`].
+pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> Result<Vec<Compiled>> {
+    let tuning = tuning.clone().for_network(!config.gaussians_move());
+    let params = ParamMap::new(config, n_phases);
+    let setup = Setup { sample_capacity: CAPACITY, n_rays: 1, n_dynamic_samples: 1, ..Setup::default() };
+    for purpose in [Purpose::Train, Purpose::Render] {
+        Network::new(gpu, &tuning, &setup, &params, purpose)?;
+    }
+    Kernels::new(gpu, tuning.clone(), params.line_len() as u32)?;
+    if config.gaussians_move() {
+        GaussianKernels::new(gpu)?;
+        TreeKernels::new(gpu)?;
+        BlobKernels::new(gpu, &tuning)?;
+    }
+    let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
+    if all.is_empty() {
+        return Err(Error::Internal("the device was not opened to keep statistics".into()));
+    }
+    all.sort_by_key(|c| (c.kernel.clone(), c.lanes, c.constants.clone()));
+    all.dedup_by(|a, b| a.is_build_of(b));
+    Ok(all)
+}
+
+/// Growth that a comparison lets pass: compilers change a little from version to version.
+pub const GROWTH: f64 = 0.15;
+
+/// How pipelines differ from those of another time: what got worse by more than [`GROWTH`], or spills; and all else that is
+/// not the same.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Differences {
+    /// Spills, growth, fewer subgroups at once: a sentence each.
+    pub worse: Vec<String>,
+    /// Everything else: a sentence each.
+    pub other: Vec<String>,
+}
+
+/// Compares pipelines with those of `before`.
+pub fn differences(before: &[Compiled], now: &[Compiled]) -> Differences {
+    let mut found = Differences::default();
+    for new in now {
+        match before.iter().find(|old| old.is_build_of(new)) {
+            Some(old) => found.compare(old, new),
+            None => {
+                found.other.push(format!("{}: new", new.name()));
+                if new.spills.is_some_and(|spills| spills > 0.0) {
+                    found.worse.push(format!("{}: spills {}", new.name(), new.spills.unwrap_or(0.0)));
+                }
+            }
+        }
+    }
+    let gone = before.iter().filter(|old| !now.iter().any(|new| old.is_build_of(new)));
+    found.other.extend(gone.map(|old| format!("{}: gone", old.name())));
+    found
+}
+
+impl Differences {
+    fn compare(&mut self, old: &Compiled, new: &Compiled) {
+        for (what, before, now, allowed) in [
+            ("spills", old.spills, new.spills, 0.0),
+            ("registers", old.registers, new.registers, GROWTH),
+            ("shared memory", old.shared_bytes, new.shared_bytes, GROWTH),
+            ("code", old.code, new.code, GROWTH),
+            ("cycles", old.cycles, new.cycles, GROWTH),
+        ] {
+            self.compare_number(new, what, before.zip(now), |before, now| now > before * (1.0 + allowed));
+        }
+        let resident = old.resident.zip(new.resident);
+        self.compare_number(new, "resident subgroups", resident, |before, now| now < before / (1.0 + GROWTH));
+    }
+
+    fn compare_number(
+        &mut self,
+        of: &Compiled,
+        what: &str,
+        numbers: Option<(f64, f64)>,
+        is_worse: impl Fn(f64, f64) -> bool,
+    ) {
+        let Some((before, now)) = numbers.filter(|(before, now)| before != now) else { return };
+        let sentence = format!("{}: {what} {before} -> {now}", of.name());
+        if is_worse(before, now) { self.worse.push(sentence) } else { self.other.push(sentence) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn compiled(kernel: &str, spills: f64, registers: f64, resident: f64) -> Compiled {
+        Compiled {
+            kernel: kernel.into(),
+            lanes: 64,
+            constants: BTreeMap::new(),
+            subgroup_size: Some(32),
+            registers: Some(registers),
+            spills: Some(spills),
+            shared_bytes: None,
+            resident: Some(resident),
+            code: None,
+            cycles: None,
+        }
+    }
+
+    #[test]
+    fn spills_and_growth_are_worse_and_the_rest_is_told() {
+        let before =
+            [compiled("a", 0.0, 100.0, 16.0), compiled("b", 4.0, 100.0, 16.0), compiled("gone", 0.0, 1.0, 1.0)];
+        let same = differences(&before, &before);
+        assert_eq!(same, Differences::default());
+        for (now, worse) in [
+            (compiled("a", 1.0, 100.0, 16.0), Some("a: spills 0 -> 1")),
+            (compiled("a", 0.0, 116.0, 16.0), Some("a: registers 100 -> 116")),
+            (compiled("a", 0.0, 114.0, 16.0), None),
+            (compiled("a", 0.0, 100.0, 12.0), Some("a: resident subgroups 16 -> 12")),
+            (compiled("b", 3.0, 100.0, 16.0), None),
+            (compiled("new", 2.0, 1.0, 1.0), Some("new: spills 2")),
+        ] {
+            let found = differences(&before, std::slice::from_ref(&now));
+            assert_eq!(found.worse, worse.map(String::from).into_iter().collect::<Vec<_>>(), "{now:?}");
+            assert!(found.other.iter().any(|other| other == "gone: gone"), "{found:?}");
+        }
+    }
+
+    #[test]
+    fn drivers_name_numbers_in_their_own_ways() {
+        let of = |numbers: &[(&str, f64)], names: &Names| {
+            names.of(&numbers.iter().map(|(name, value)| ((*name).to_owned(), *value)).collect())
+        };
+        assert_eq!(of(&[("Spilled VGPRs", 2.0), ("Spilled SGPRs", 1.0)], &SPILLS), Some(3.0));
+        assert_eq!(of(&[("Instruction Count", 7.0), ("Code Size", 112.0)], &CODE), Some(112.0));
+        assert_eq!(of(&[("Hash", 1.0)], &CYCLES), None);
+    }
+}

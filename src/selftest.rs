@@ -1,0 +1,144 @@
+//! Every compute stage against its f64 twin, on the user's own device: what someone with an unknown card runs first, and
+//! what a report of a fault begins with. The tests use the same problems, comparisons and tolerances.
+//!
+//! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
+//! 2. [`iteration`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
+//!    [`gaussians`], [`trees`] and [`blobs`] about Gaussians; [`projections`] about phantoms
+//! 3. [`repeats`] are runs that must come to the same bits
+
+pub mod blobs;
+pub mod compare;
+pub mod drawing;
+pub mod gaussians;
+pub mod iteration;
+pub mod occupancy;
+pub mod problems;
+pub mod projections;
+pub mod repeats;
+pub mod trees;
+
+use crate::config::Preset;
+use crate::error::{Error, Result};
+use crate::gpu::device::Gpu;
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::stages;
+use crate::kernels::tuning::{Layers, Tuning};
+use crate::scan::dataset::Dataset;
+use compare::{Findings, Row};
+use serde::Serialize;
+
+/// Stages that measure a device's limits: their results are not used.
+const MEASURING: [&str; 3] = [push::PeakCopy::SHADER, push::PeakF32::SHADER, push::PeakMatrix::SHADER];
+
+/// What a self-test found.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    /// A row for each stage and path, in the order in which stages run.
+    pub rows: Vec<Row>,
+    /// Parts of the test that an error ended.
+    pub errors: Vec<Failure>,
+    /// Stages that were not compared with anything.
+    pub untested: Vec<&'static str>,
+    /// Paths through the kernels that the device got, a sentence each, and why others were left out.
+    pub paths: Vec<String>,
+}
+
+/// A part of the test that an error ended.
+#[derive(Debug, Clone, Serialize)]
+pub struct Failure {
+    /// The part.
+    pub part: String,
+    /// The error, in words.
+    pub error: String,
+}
+
+impl Report {
+    /// Rows of stages that do not compute what their twins do.
+    pub fn failed(&self) -> impl Iterator<Item = &Row> {
+        self.rows.iter().filter(|row| !row.is_ok())
+    }
+
+    /// Whether everything that was compared is as it should be. Stages that were not are listed, and no failure.
+    pub fn is_ok(&self) -> bool {
+        self.errors.is_empty() && self.failed().next().is_none() && !self.rows.is_empty()
+    }
+}
+
+/// A part of the test.
+type Part<'a> = (String, Box<dyn Fn(&mut Findings) -> Result<()> + 'a>);
+
+/// The parts for a path through the network's layers.
+fn network_parts<'a>(gpu: &'a Gpu, dataset: &'a Dataset, tuning: &'a Tuning) -> Vec<Part<'a>> {
+    let name = |what: &str| format!("{what} ({})", iteration::path_name(tuning.layers));
+    let cases = match tuning.layers {
+        Layers::F32 => iteration::F32_CASES,
+        Layers::Matrices => iteration::MATRIX_CASES,
+    };
+    let iterations = move |findings: &mut Findings| {
+        cases.iter().try_for_each(|case| iteration::compare(gpu, dataset, case, tuning, findings))
+    };
+    let views = move |findings: &mut Findings| {
+        let presets = [Preset::Paper, Preset::PublicCode, Preset::FastMlp];
+        presets.into_iter().try_for_each(|preset| drawing::compare_views(gpu, preset, tuning, findings))
+    };
+    vec![
+        (name("iterations"), Box::new(iterations)),
+        (name("empty cells"), Box::new(move |findings| occupancy::compare(gpu, dataset, tuning, findings))),
+        (name("views"), Box::new(views)),
+        (name("volumes"), Box::new(move |findings| drawing::compare_volumes(gpu, tuning, findings))),
+        (name("equal runs"), Box::new(move |findings| repeats::compare_network(gpu, dataset, tuning, findings))),
+    ]
+}
+
+/// The parts about Gaussians and phantoms, which have no choice of layers.
+fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
+    vec![
+        ("Gaussians per phase".into(), Box::new(move |findings| gaussians::compare(gpu, findings))),
+        ("a moving tree".into(), Box::new(move |findings| trees::compare(gpu, findings))),
+        ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
+        ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),
+        ("equal runs of Gaussians".into(), Box::new(move |findings| repeats::compare_gaussians(gpu, findings))),
+        ("projections of volumes".into(), Box::new(move |findings| projections::compare(gpu, findings))),
+    ]
+}
+
+/// Compares every stage that the device can run with its twin. `progress` hears the name of each part that begins, the
+/// number of those before it and of all.
+///
+/// # Errors
+/// [`Error::DeviceLost`], after which nothing can be told; other errors are part of the report.
+pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Report> {
+    let dataset = problems::small_dataset(13, 11, 3)?;
+    let chosen = Tuning::for_device(gpu.info());
+    let on = |layers| chosen.clone().with_layers(layers, String::new());
+    let (f32_layers, matrices) = (on(Layers::F32), on(Layers::Matrices));
+    let has_matrices = !gpu.info().matrices.is_empty();
+    let mut parts = other_parts(gpu, &f32_layers);
+    parts.extend(network_parts(gpu, &dataset, &f32_layers));
+    if has_matrices {
+        parts.extend(network_parts(gpu, &dataset, &matrices));
+    }
+    let (mut findings, mut errors) = (Findings::default(), Vec::new());
+    for (at, (part, compare)) in parts.iter().enumerate() {
+        progress(part, at, parts.len());
+        match compare(&mut findings) {
+            Ok(()) => {}
+            Err(lost @ Error::DeviceLost { .. }) => return Err(lost),
+            Err(error) => errors.push(Failure { part: part.clone(), error: error.to_string() }),
+        }
+    }
+    let mut paths = chosen.reasons.clone();
+    if !has_matrices {
+        paths.push("matrix layers are not tested: the device has no cooperative matrices our kernels can use".into());
+    }
+    let rows = findings.rows().to_vec();
+    Ok(Report { untested: untested(gpu, &rows), rows, errors, paths })
+}
+
+/// Stages that no row is about, or that were never recorded on the device.
+fn untested(gpu: &Gpu, rows: &[Row]) -> Vec<&'static str> {
+    let recorded = gpu.recorded_shaders();
+    let compared = |stage: &str| rows.iter().any(|row| row.stages.contains(&stage));
+    let tested = |stage: &&str| MEASURING.contains(stage) || (recorded.contains(stage) && compared(stage));
+    stages::shaders().into_iter().filter(|stage| !tested(stage)).collect()
+}

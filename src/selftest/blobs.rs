@@ -1,0 +1,103 @@
+//! Gaussians as they are drawn: along rays, in volumes, and in pictures at display rates.
+
+use crate::config::{Config, Preset};
+use crate::error::Result;
+use crate::gpu::device::Gpu;
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::tuning::Tuning;
+use crate::model::Model;
+use crate::model::component::Component;
+use crate::model::gaussians::MovingGaussians;
+use crate::model::params::ParamMap;
+use crate::plan::Plan;
+use crate::reference::blobs;
+use crate::render::grid::Grid;
+use crate::render::quantity::{Projection, Quantity};
+use crate::render::renderer::Renderer;
+use crate::scan::dataset::Dataset;
+use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::problems::{drawn_fields, small_dataset};
+use crate::train::trainer::Trainer;
+use glam::DVec3;
+
+const RAYS: &[&str] = &[push::GaussianRays::SHADER];
+const POINTS: &[&str] = &[push::GaussianPoints::SHADER];
+const PICTURES: &[&str] = &["pictures at display rates"];
+
+/// Closed forms in f32.
+const INTEGRAL: Tolerance = Tolerance::OfLargest(1e-4);
+/// The twin steps along the ray, so it may miss a peak by the square of its step; the device may end a climb early.
+const MAXIMUM: Tolerance = Tolerance::OfLargest(3e-3);
+/// A cell near the cut may fall either way in f32.
+const CELL: Tolerance = Tolerance::OfLargest(1e-3);
+/// Affine, and cut in the image instead of in space.
+const PICTURE: Tolerance = Tolerance::OfLargest(0.01);
+/// Every so many cells are compared.
+const CELL_STRIDE: usize = 17;
+
+/// A model of a dataset whose moving field is `field`; its still field is untrained.
+///
+/// # Errors
+/// Device errors.
+pub fn model(gpu: &Gpu, dataset: &Dataset, field: MovingGaussians, tuning: &Tuning) -> Result<Model> {
+    let config = Config::load(Some(Preset::FastMlp), None, &["hull.enabled=false".into()])?;
+    let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset)?, dataset, tuning.clone())?;
+    let of_network = trainer.model()?;
+    let config = Config::preset(Preset::Fast);
+    let param_map = ParamMap::new(&config, dataset.n_phases as usize);
+    Ok(Model { params: param_map.initial(&config), param_map, config, moving: Some(field), hull: None, ..of_network })
+}
+
+fn form(field: &MovingGaussians) -> &'static str {
+    if field.tree().is_some() { "tree" } else { "phase" }
+}
+
+/// Compares integrals and largest values along rays, and pictures.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_rays(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+    let (width, height, phase) = (37, 29, 2);
+    let dataset = small_dataset(width, height, 3)?;
+    for field in drawn_fields() {
+        findings.begin(form(&field), "231 Gaussians, view of 37 x 29 pixels");
+        let renderer = Renderer::new(gpu, &model(gpu, &dataset, field.clone(), tuning)?, tuning.clone())?;
+        let rays = &dataset.views[1].rays;
+        let seen = renderer.render(rays, width, height, phase)?;
+        let set = blobs::field(&field, phase as usize);
+        let ray = |pixel: usize| rays.pixel((pixel % width) as f64, (pixel / width) as f64);
+        let want: Vec<blobs::Along> = (0..width * height).map(|pixel| blobs::along(&set, ray(pixel))).collect();
+        let integrals: Vec<f64> = want.iter().map(|w| w.integral).collect();
+        let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
+        findings.numbers(RAYS, "integrals", &seen.dynamic_integral, &integrals, INTEGRAL);
+        findings.numbers(RAYS, "largest values", &seen.dynamic_max, &maxima, MAXIMUM);
+        let line = Quantity { component: Component::Dynamic, projection: Projection::Drr };
+        let quick = renderer.show(rays, (width, height), phase, line)?;
+        findings.numbers(PICTURES, "integrals", &quick, &integrals, PICTURE);
+    }
+    Ok(())
+}
+
+/// Compares cells of volumes.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_cells(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+    let dataset = small_dataset(13, 11, 3)?;
+    let grid = Grid::over(DVec3::new(-0.17, -0.15, -0.16), DVec3::new(0.15, 0.16, 0.12), 75);
+    for field in drawn_fields() {
+        findings.begin(form(&field), "231 Gaussians, 75 cells along a side");
+        let renderer = Renderer::new(gpu, &model(gpu, &dataset, field.clone(), tuning)?, tuning.clone())?;
+        let cells = renderer.sample(Component::Dynamic, 1, &grid)?;
+        let set = blobs::field(&field, 1);
+        let [nx, ny, _] = grid.size.map(|n| n as usize);
+        let point = |i: usize| {
+            grid.origin + grid.spacing * DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64)
+        };
+        let some: Vec<usize> = (0..grid.len()).step_by(CELL_STRIDE).collect();
+        let want: Vec<f64> = some.iter().map(|i| blobs::at(&set, point(*i))).collect();
+        let got: Vec<f32> = some.iter().map(|i| cells[*i]).collect();
+        findings.numbers(POINTS, "attenuation", &got, &want, CELL);
+    }
+    Ok(())
+}

@@ -1,0 +1,172 @@
+//! Renderings, samples of the fields, and baked volumes.
+
+use crate::choice::Choice;
+use crate::config::Preset;
+use crate::error::Result;
+use crate::gpu::device::Gpu;
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::tuning::{Layers, Tuning};
+use crate::model::Model;
+use crate::model::component::Component;
+use crate::network::FIRST_LOSS_SCALE;
+use crate::plan::Plan;
+use crate::reference::field::{self, Precision};
+use crate::reference::march;
+use crate::render::baked::Baked;
+use crate::render::grid::Grid;
+use crate::render::quantity::{Projection, Quantity};
+use crate::render::renderer::Renderer;
+use crate::scan::dataset::Dataset;
+use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::iteration::{STEADY, path_name, sine_factor};
+use crate::selftest::problems::{small_config, small_dataset};
+use crate::train::trainer::Trainer;
+use glam::DVec3;
+use std::sync::Arc;
+
+const VIEW: &[&str] = &[push::PoseRays::SHADER, push::MarchFwd::SHADER];
+const STATIC_CELLS: &[&str] = &[push::PoseRays::SHADER, push::VolumeStatic::SHADER];
+const DYNAMIC_CELLS: &[&str] = &[push::PoseRays::SHADER, push::VolumeDynamic::SHADER];
+const BAKED: &[&str] = &[push::BakedMarch::SHADER];
+
+/// A pixel whose ray grazes a box face may gain or lose one sample in f32.
+const PIXEL: Tolerance = Tolerance::OfLargest(2e-3);
+/// Cells are single points.
+const CELL: Tolerance = Tolerance::OfLargest(1e-4);
+/// Cells on matrices: operands are rounded to f16.
+const CELL_ON_MATRICES: Tolerance = Tolerance::OfLargest(2e-3);
+
+/// A model after a few iterations, and what its twin needs.
+struct Trained {
+    dataset: Dataset,
+    model: Model,
+    plan: Plan,
+    params: Vec<f64>,
+    precision: Precision,
+}
+
+impl Trained {
+    fn new(gpu: &Gpu, dataset: Dataset, preset: Preset, settings: &[&str], tuning: &Tuning) -> Result<Trained> {
+        let config = small_config(preset, &[STEADY, settings].concat())?;
+        let mut trainer = Trainer::new(gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
+        while trainer.step() < ITERATIONS {
+            trainer.advance(ITERATIONS)?;
+        }
+        let model = trainer.model()?;
+        let mut plan = Plan::new(&config, &dataset)?.in_scene(model.scene.clone());
+        plan.setup.jitter = 0;
+        plan.setup.n_static_samples = config.march.render_samples;
+        plan.setup.n_dynamic_samples = config.march.render_samples;
+        let params = model.params.iter().map(|v| f64::from(*v)).collect();
+        let precision = match tuning.layers {
+            Layers::F32 => Precision::Exact,
+            Layers::Matrices => Precision::F16 { loss_scale: FIRST_LOSS_SCALE.into() },
+        };
+        Ok(Trained { dataset, model, plan, params, precision })
+    }
+
+    fn attenuation(&self, feature: f64) -> f64 {
+        let s = &self.plan.setup;
+        f64::from(s.dynamic_gain) * field::softplus(feature + f64::from(s.dynamic_shift))
+    }
+}
+
+/// Iterations before anything is drawn.
+const ITERATIONS: u32 = 5;
+
+/// Compares views at a phase with the twin's.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+    findings.begin(path_name(tuning.layers), &format!("{}, view of 12 x 10 pixels", preset.name()));
+    let settings = ["loss.normalise=true", "train.chunk_samples=1500"];
+    let trained = Trained::new(gpu, small_dataset(12, 10, 3)?, preset, &settings, tuning)?;
+    let (rays, phase) = (&trained.dataset.views[2].rays, 2);
+    let seen = Renderer::new(gpu, &trained.model, tuning.clone())?.render(rays, 12, 10, phase)?;
+    let (mut statics, mut dynamics, mut largest) = (Vec::new(), Vec::new(), Vec::new());
+    for pixel in 0..120u32 {
+        let (anchor, direction) = rays.pixel(f64::from(pixel % 12), f64::from(pixel / 12));
+        let ray = march::Ray { anchor, direction, phase: phase as usize, target: 0.0, temporal: [0.0; 2], id: pixel };
+        let want = march::fwd(&trained.plan, &trained.params, ITERATIONS, &ray, true, trained.precision);
+        statics.push(want.static_integral);
+        dynamics.push(want.dynamic_integral);
+        largest.push(want.dynamics.iter().map(|x| trained.attenuation(x.trace.feature)).fold(0.0, f64::max));
+    }
+    findings.numbers(VIEW, "static integrals", &seen.static_integral, &statics, PIXEL);
+    findings.numbers(VIEW, "dynamic integrals", &seen.dynamic_integral, &dynamics, PIXEL);
+    findings.numbers(VIEW, "largest values", &seen.dynamic_max, &largest, PIXEL);
+    Ok(())
+}
+
+/// Compares cells of both fields with the twin's, and baked views with those through the fields.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_volumes(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+    findings.begin(path_name(tuning.layers), "43 x 9 x 11 cells");
+    let settings = ["train.rays=64", "train.chunk_samples=2000", "march.render_samples=200"];
+    let trained = Trained::new(gpu, small_dataset(24, 20, 3)?, Preset::FastMlp, &settings, tuning)?;
+    let renderer = Arc::new(Renderer::new(gpu, &trained.model, tuning.clone())?);
+    compare_cells(&trained, &renderer, sine_factor(gpu.info()), findings)?;
+    findings.begin(path_name(tuning.layers), "baked view of 24 x 20 pixels");
+    compare_baked(&trained, renderer, findings)
+}
+
+fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findings: &mut Findings) -> Result<()> {
+    // Reaches beyond the boxes, is different along each axis, and takes several submits.
+    let grid =
+        Grid { origin: DVec3::new(-1.113, -0.417, -0.323), spacing: DVec3::new(0.05, 0.1, 0.07), size: [43, 9, 11] };
+    let phase = 2;
+    let Trained { plan, params, .. } = trained;
+    let s = &plan.setup;
+    let window = trained.model.config.schedule(trained.model.step).window;
+    let want = |field: Component, x: DVec3| match field {
+        Component::Static if field::static_inside(s, x) => field::static_attenuation(s, &plan.params, params, x),
+        Component::Dynamic if march::dynamic_inside(plan, x, phase) => {
+            let encoded = field::encode(s, window.into(), x);
+            let trace = field::network_fwd(&plan.params, params, &encoded, phase, trained.precision);
+            trained.attenuation(trace.feature)
+        }
+        _ => 0.0,
+    };
+    let points: Vec<DVec3> = (0..grid.len())
+        .map(|i| DVec3::new((i % 43) as f64, (i / 43 % 9) as f64, (i / (43 * 9)) as f64))
+        .map(|at| grid.origin + at * grid.spacing)
+        .collect();
+    let on_matrices = trained.precision != Precision::Exact;
+    let dynamic = if on_matrices { CELL_ON_MATRICES } else { CELL }.times(sine_factor);
+    for (field, stages, tolerance) in
+        [(Component::Static, STATIC_CELLS, CELL), (Component::Dynamic, DYNAMIC_CELLS, dynamic)]
+    {
+        let got = renderer.sample(field, phase as u32, &grid)?;
+        let want: Vec<f64> = points.iter().map(|x| want(field, *x)).collect();
+        findings.numbers(stages, "attenuation", &got, &want, tolerance);
+        findings.require(stages, "cells outside the box", want.contains(&0.0));
+    }
+    Ok(())
+}
+
+/// Baked views lose what is finer than a cell.
+fn compare_baked(trained: &Trained, renderer: Arc<Renderer>, findings: &mut Findings) -> Result<()> {
+    let rays = &trained.dataset.views[1].rays;
+    let exact = renderer.render(rays, 24, 20, 1)?;
+    let baked = Baked::for_display(renderer, &trained.model, CELL_MM);
+    let (drr, mip) = (Projection::Drr, Projection::Mip);
+    let total = exact.total_integral();
+    for (quantity, component, projection, want, most) in [
+        ("static", Component::Static, drr, &exact.static_integral, 5e-2),
+        ("dynamic", Component::Dynamic, drr, &exact.dynamic_integral, 5e-2),
+        ("total", Component::Total, drr, &total, 5e-2),
+        ("static maximum", Component::Static, mip, &exact.static_max, 5e-2),
+        ("dynamic maximum", Component::Dynamic, mip, &exact.dynamic_max, 5e-2),
+    ] {
+        let want: Vec<f64> = want.iter().map(|v| f64::from(*v)).collect();
+        let got = baked.render(rays, 24, 20, 1, Quantity { component, projection })?;
+        findings.numbers(BAKED, quantity, &got, &want, Tolerance::OfNorm(most));
+    }
+    Ok(())
+}
+
+/// Cells of baked volumes.
+const CELL_MM: f64 = 2.0;

@@ -1,0 +1,588 @@
+//! One iteration on the two fields, stage by stage. Each stage is compared on what the device itself made for it, as far as
+//! its input can be read, so that a fault shows in the row of its stage.
+
+use crate::choice::Choice;
+use crate::config::Preset;
+use crate::error::{Error, Result};
+use crate::gpu::capabilities::DeviceInfo;
+use crate::gpu::device::Gpu;
+use crate::kernels::constants::NEAR_SAMPLE;
+use crate::kernels::layout::{self, RayOut};
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::tuning::{Layers, Tuning};
+use crate::model::params::{ParamMap, Tensor};
+use crate::network::FIRST_LOSS_SCALE;
+use crate::network::chunk::chunks;
+use crate::plan::Plan;
+use crate::reference::field::{self, Precision};
+use crate::reference::{march, step};
+use crate::scan::dataset::Dataset;
+use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::problems::small_config;
+use crate::train::trainer::{StepLoss, Trainer};
+use glam::DVec3;
+
+/// With the paper's learning rate, networks this small are dead after an update: nothing but zeros is left to compare.
+pub const STEADY: &[&str] = &["dynamic.lr=1e-3", "dynamic.lr_end=1e-4"];
+
+/// A configuration whose gradients are compared.
+#[derive(Debug, Clone, Copy)]
+pub struct Case {
+    /// What it is on top of.
+    pub preset: Preset,
+    /// Settings, beside those of [`small_config`].
+    pub settings: &'static [&'static str],
+}
+
+const fn case(preset: Preset, settings: &'static [&'static str]) -> Case {
+    Case { preset, settings }
+}
+
+impl Case {
+    fn name(&self) -> String {
+        [&[self.preset.name()], self.settings].concat().join(" ")
+    }
+
+    /// Its plan.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for a setting that is not usable.
+    pub fn plan(&self, dataset: &Dataset) -> Result<Plan> {
+        let settings = [STEADY, self.settings].concat();
+        let mut plan = Plan::new(&small_config(self.preset, &settings)?, dataset)?;
+        if self.settings.iter().any(|setting| setting.starts_with("dynamic.least_slope")) {
+            // Every ray asks for more.
+            plan.images.iter_mut().for_each(|value| *value += 1.0);
+        }
+        Ok(plan)
+    }
+}
+
+/// Cases of the f32 layers. Each covers a branch the others do not.
+pub const F32_CASES: &[Case] = &[
+    case(Preset::Paper, &["dynamic.occlusion=1e-3"]),
+    case(Preset::PublicCode, &["dynamic.occlusion=1e-3"]),
+    case(Preset::FastMlp, &[]),
+    // odd bands, five ranks (two vec4), no power of two anywhere, batch of one ray
+    case(
+        Preset::FastMlp,
+        &["dynamic.bands=5", "static.ranks=5", "static.grid=7", "train.rays=4", "march.dynamic_samples=33"],
+    ),
+    // more than 32 depths a lane
+    case(Preset::FastMlp, &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
+    // a field asleep, that rays call back
+    case(Preset::FastMlp, &["dynamic.best_start=false", "dynamic.normalised_shift=-9", "dynamic.least_slope=0.05"]),
+    // a single hidden layer, skip in a deep net, wide layers
+    case(Preset::Paper, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
+    case(Preset::PublicCode, &["dynamic.layers=6", "dynamic.skip_layer=3", "dynamic.width=48", "dynamic.latent=12"]),
+];
+
+/// Cases of the layers on matrices. Each covers what the others do not: no skip and a skip layer; the skip layer last; one
+/// layer; odd bands; several chunks; more tiles than workgroups; fewer samples than a tile.
+pub const MATRIX_CASES: &[Case] = &[
+    case(Preset::FastMlp, &["dynamic.width=48", "dynamic.bands=5"]),
+    case(Preset::PublicCode, &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
+    case(Preset::FastMlp, &["dynamic.layers=3", "dynamic.skip_layer=3", "dynamic.width=64", "train.rays=100"]),
+    case(Preset::Paper, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true", "dynamic.latent=12"]),
+    case(Preset::FastMlp, &["train.rays=1", "march.dynamic_samples=7"]),
+];
+
+const RAYS: &[&str] = &[push::Batch::SHADER];
+const SAMPLES: &[&str] = &[push::MarchCount::SHADER, push::MarchScan::SHADER, push::MarchEmit::SHADER];
+const FORWARD: &[&str] =
+    &[push::MlpLatentFwd::SHADER, push::Encode::SHADER, push::MlpLayerFwd::SHADER, push::MlpOutFwd::SHADER];
+const FORWARD_ON_MATRICES: &[&str] = &[push::MlpLatentFwd::SHADER, push::MlpPack::SHADER, push::MlpFusedFwd::SHADER];
+const INTEGRALS: &[&str] = &[push::MarchFwd::SHADER];
+const LOSS: &[&str] = &[push::Loss::SHADER];
+const SCATTER: &[&str] = &[push::MarchBwd::SHADER, push::GradientStatic::SHADER];
+const OUTPUT_BACKWARD: &[&str] =
+    &[push::MlpOutBwd::SHADER, push::MlpOutBwdWeight::SHADER, push::GradientNetwork::SHADER];
+const LAYERS_BACKWARD: &[&str] = &[push::MlpLayerBwdInput::SHADER, push::MlpLayerBwdWeight::SHADER];
+const BACKWARD_ON_MATRICES: &[&str] = &[push::MlpFusedBwd::SHADER, push::GradientNetwork::SHADER];
+const LATENTS_BACKWARD: &[&str] = &[push::MlpRaySum::SHADER, push::MlpPhaseSum::SHADER, push::MlpLatentBwd::SHADER];
+const LATENTS_BACKWARD_ON_MATRICES: &[&str] = &[push::MlpLatentBwd::SHADER];
+const TOTAL_VARIATION: &[&str] = &[push::RegTv::SHADER];
+const ADAM: &[&str] = &[push::Adam::SHADER];
+const REPORT: &[&str] = &[push::Report::SHADER];
+/// All stages of an iteration at once.
+const WHOLE: &[&str] = &["whole iteration"];
+/// Gradients on matrices beside those in f64.
+const F16_BESIDE_F64: &[&str] = &["f16 beside f64"];
+
+/// What a path may be off by.
+struct Tolerances {
+    /// Attenuation at samples.
+    sigma: Tolerance,
+    /// Gradient of a tensor.
+    gradient: Tolerance,
+    /// Losses.
+    loss: f64,
+}
+
+/// f32 sums of a few thousand terms; ReLU kinks are not crossed by rounding in these cases.
+const IN_F32: Tolerances = Tolerances { sigma: F32_SUMS, gradient: F32_SUMS, loss: 2e-5 };
+/// Numbers that are sums in f32.
+const F32_SUMS: Tolerance = Tolerance::OfLargest(1e-4);
+/// The twin rounds to f16 where the kernels do; sums in f32 now and then round to the other neighbour.
+const ON_MATRICES: Tolerances =
+    Tolerances { sigma: Tolerance::OfLargest(2e-3), gradient: Tolerance::OfNorm(2e-4), loss: 1e-4 };
+/// Gradients on matrices beside those of plain f64: what f16 costs.
+const F16_COST: Tolerance = Tolerance::OfNorm(3e-2);
+/// Points of rays and samples, world units: rounding of f32.
+const POSITION: f64 = 2e-6;
+/// Samples on a cell's face may fall either way in f32.
+const STRAY_SAMPLES: f64 = 2.0;
+/// Steps of the optimiser beside the largest: what f32 parameters lose of them.
+const UPDATE: Tolerance = Tolerance::OfLargest(2e-3);
+
+/// The twin's side of a comparison.
+struct Twin<'a> {
+    plan: &'a Plan,
+    step: u32,
+    params: &'a [f64],
+    rays: Vec<march::Ray>,
+    precision: Precision,
+    tolerances: Tolerances,
+}
+
+/// What the device made in an iteration.
+struct Seen {
+    loss: StepLoss,
+    rays: Vec<layout::Ray>,
+    ray_out: Vec<RayOut>,
+    ray_gradient: Vec<[f32; 2]>,
+    ray_loss: Vec<[f32; 4]>,
+    tv_gradient: Vec<f32>,
+    tv_value: Vec<f32>,
+    gradient: Vec<f32>,
+    /// Live samples, where one chunk holds all.
+    samples: Option<Vec<Sample>>,
+}
+
+/// A live sample of the device.
+struct Sample {
+    /// Of the batch.
+    ray: usize,
+    x: DVec3,
+    path_length: f64,
+    near: bool,
+    sigma: [f32; 2],
+}
+
+impl Seen {
+    fn download(gpu: &Gpu, trainer: &Trainer, loss: StepLoss) -> Result<Seen> {
+        let (forward, training, plan) = (trainer.forward(), trainer.training(), trainer.plan());
+        let n = plan.setup.n_rays as usize;
+        let one_chunk = chunks(&plan.setup, plan.setup.n_rays).count() == 1;
+        Ok(Seen {
+            loss,
+            rays: gpu.download(&forward.rays, 0, n)?,
+            ray_out: gpu.download(&forward.ray_out, 0, n)?,
+            ray_gradient: gpu.download(&training.ray_gradient, 0, n)?,
+            ray_loss: gpu.download(&training.ray_loss, 0, n)?,
+            tv_gradient: gpu.download(&training.tv_gradient, 0, plan.params.static_len)?,
+            tv_value: gpu.download(&training.tv_value, 0, plan.params.static_len)?,
+            gradient: gpu.download(&training.gradient, 0, plan.params.len)?,
+            samples: one_chunk.then(|| samples(gpu, trainer, loss.live_samples as usize)).transpose()?,
+        })
+    }
+}
+
+fn samples(gpu: &Gpu, trainer: &Trainer, live: usize) -> Result<Vec<Sample>> {
+    let (forward, capacity) = (trainer.forward(), trainer.plan().setup.sample_capacity as usize);
+    // More than fit would be a fault of the count, which is compared anyway.
+    let live = live.min(capacity);
+    let points: Vec<[f32; 4]> = gpu.download(&forward.sample_points, 0, live)?;
+    let rays: Vec<u32> = gpu.download(&forward.sample_rays, 0, live)?;
+    let sigma: Vec<[f32; 2]> = gpu.download(&forward.sample_sigma, 0, live)?;
+    let sample = |((point, ray), sigma): ((&[f32; 4], &u32), &[f32; 2])| {
+        let [x, y, z, path_length] = point.map(f64::from);
+        let (near, ray) = (ray & NEAR_SAMPLE != 0, (ray & !NEAR_SAMPLE) as usize);
+        Sample { ray, x: DVec3::new(x, y, z), path_length, near, sigma: *sigma }
+    };
+    Ok(points.iter().zip(&rays).zip(&sigma).map(sample).collect())
+}
+
+/// Compares the stages of the first iterations of a case, on the path of `tuning`.
+///
+/// # Errors
+/// Device errors; [`Error::Config`] where the path is not for the device.
+pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+    findings.begin(path_name(tuning.layers), &case.name());
+    let plan = case.plan(dataset)?;
+    let mut params = plan.params.initial(&plan.config);
+    if tuning.layers == Layers::F32 {
+        // Larger planes and lines than the default start, so that static gradients are not tiny products.
+        params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);
+    }
+    let mut trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
+    gpu.upload(&trainer.forward().params, 0, &params)?;
+    let mut moments = vec![[0f32; 2]; params.len()];
+    for _ in 0..ITERATIONS {
+        compare_stages(gpu, &mut trainer, &params, findings)?;
+        (params, moments) = compare_update(gpu, &trainer, &params, &moments, findings)?;
+    }
+    Ok(())
+}
+
+/// Iterations that are compared: the first, and one that finds what another has left.
+const ITERATIONS: usize = 2;
+
+/// Runs an iteration, which begins with `params`, and compares its stages.
+fn compare_stages(gpu: &Gpu, trainer: &mut Trainer, params: &[f32], findings: &mut Findings) -> Result<()> {
+    let step = trainer.step();
+    let loss = one_iteration(trainer)?;
+    let seen = Seen::download(gpu, trainer, loss)?;
+    let params: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
+    let precision = match trainer.tuning().layers {
+        Layers::F32 => Precision::Exact,
+        Layers::Matrices => Precision::F16 { loss_scale: FIRST_LOSS_SCALE.into() },
+    };
+    let plan = trainer.plan();
+    let tolerances = Tolerances::of(precision, gpu.info());
+    let twin = Twin { plan, step, params: &params, rays: march::batch(plan, step), precision, tolerances };
+    twin.compare_rays(&seen, findings);
+    if let Some(samples) = &seen.samples {
+        twin.compare_samples(samples, &seen, findings);
+        twin.compare_forward(samples, findings);
+    }
+    twin.compare_integrals(&seen, findings);
+    twin.compare_loss(&seen, findings);
+    twin.compare_total_variation(&seen, findings);
+    twin.compare_scatter(&seen, findings);
+    if let Some(samples) = &seen.samples {
+        twin.compare_backward(samples, &seen, findings);
+    }
+    twin.compare_report(&seen, findings);
+    twin.compare_whole(&seen, findings);
+    Ok(())
+}
+
+/// What rows call a path.
+pub fn path_name(layers: Layers) -> &'static str {
+    layers.name()
+}
+
+fn one_iteration(trainer: &mut Trainer) -> Result<StepLoss> {
+    let next = trainer.step() + 1;
+    let losses = trainer.advance(next)?;
+    losses.last().copied().ok_or_else(|| Error::Internal("an iteration left no loss".into()))
+}
+
+impl Tolerances {
+    /// Of a path on a device.
+    fn of(precision: Precision, info: &DeviceInfo) -> Tolerances {
+        let exact = match precision {
+            Precision::Exact => IN_F32,
+            Precision::F16 { .. } => ON_MATRICES,
+        };
+        let sine = sine_factor(info);
+        let Tolerances { sigma, gradient, loss } = exact;
+        Tolerances { sigma: sigma.times(sine), gradient: gradient.times(sine), loss: loss * sine }
+    }
+}
+
+/// How much more the network may be off on a device: Vulkan asks of sine and cosine an error of 2^-11 at most, which CPU drivers
+/// stay far below. Faults are larger than that by far.
+pub fn sine_factor(info: &DeviceInfo) -> f64 {
+    if info.is_cpu() { 1.0 } else { 10.0 }
+}
+
+impl Twin<'_> {
+    fn on_matrices(&self) -> bool {
+        self.precision != Precision::Exact
+    }
+
+    fn compare_rays(&self, seen: &Seen, findings: &mut Findings) {
+        let mut worst = 0f64;
+        for (got, want) in seen.rays.iter().zip(&self.rays) {
+            if (got.id, got.phase as usize) != (want.id, want.phase) {
+                worst = f64::INFINITY;
+            }
+            let off = |got: [f32; 3], want: DVec3| (DVec3::from_array(got.map(f64::from)) - want).abs().max_element();
+            let bounds = [got.temporal_low, got.temporal_high];
+            let bounds_off = bounds.iter().zip(want.temporal).map(|(got, want)| (f64::from(*got) - want).abs());
+            let places_off = [off(got.anchor, want.anchor), off(got.direction, want.direction)];
+            worst = bounds_off.chain(places_off).fold(worst, larger);
+        }
+        findings.add(RAYS, "rays", worst, POSITION);
+    }
+
+    /// Number of live samples; and where both have as many on a ray, their places.
+    fn compare_samples(&self, samples: &[Sample], seen: &Seen, findings: &mut Findings) {
+        let s = &self.plan.setup;
+        let (mut strays, mut worst) = (0, 0f64);
+        for (r, ray) in self.rays.iter().enumerate() {
+            let depths = march::depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, self.step, ray);
+            let want: Vec<(DVec3, f64)> = depths
+                .into_iter()
+                .map(|(depth, path_length)| (ray.anchor + depth * ray.direction, path_length))
+                .filter(|(x, _)| march::dynamic_inside(self.plan, *x, ray.phase))
+                .collect();
+            let got: Vec<&Sample> = samples.iter().filter(|sample| sample.ray == r).collect();
+            strays += got.len().abs_diff(want.len());
+            if got.len() == want.len() {
+                for (got, (x, path_length)) in got.iter().zip(&want) {
+                    worst = larger(worst, (got.x - *x).abs().max_element());
+                    worst = larger(worst, (got.path_length - path_length).abs());
+                }
+            }
+        }
+        strays += samples.iter().filter(|sample| sample.ray >= self.rays.len()).count();
+        strays += samples.len().abs_diff(seen.loss.live_samples as usize);
+        findings.add(SAMPLES, "live samples too many or few", strays as f64, STRAY_SAMPLES);
+        findings.add(SAMPLES, "places of samples", worst, POSITION);
+    }
+
+    fn trace(&self, sample: &Sample) -> field::NetworkTrace {
+        let (plan, phase) = (self.plan, self.phase(sample));
+        let encoded = field::encode(&plan.setup, plan.schedule[self.step as usize].window.into(), sample.x);
+        field::network_fwd(&plan.params, self.params, &encoded, phase, self.precision)
+    }
+
+    fn phase(&self, sample: &Sample) -> usize {
+        self.rays.get(sample.ray).map_or(0, |ray| ray.phase)
+    }
+
+    /// Attenuation and its slope at the device's samples.
+    fn compare_forward(&self, samples: &[Sample], findings: &mut Findings) {
+        let s = &self.plan.setup;
+        let (gain, shift) = (f64::from(s.dynamic_gain), f64::from(s.dynamic_shift));
+        let features: Vec<f64> = samples.iter().map(|sample| self.trace(sample).feature + shift).collect();
+        let sigma: Vec<f64> = features.iter().map(|x| gain * field::softplus(*x)).collect();
+        let slopes: Vec<f64> = features.iter().map(|x| gain * field::sigmoid(*x)).collect();
+        let got = |k: usize| samples.iter().map(|sample| sample.sigma[k]).collect::<Vec<f32>>();
+        let stages = if self.on_matrices() { FORWARD_ON_MATRICES } else { FORWARD };
+        let tolerance = self.tolerances.sigma;
+        findings.numbers(stages, "sample_sigma", &got(0), &sigma, tolerance);
+        findings.numbers(stages, "slope of sample_sigma", &got(1), &slopes, tolerance);
+    }
+
+    /// Integrals of the device's samples, and of the twin's static field.
+    fn compare_integrals(&self, seen: &Seen, findings: &mut Findings) {
+        let statics = |r: usize| self.march_statics(r).static_integral;
+        let want: Vec<f64> = (0..self.rays.len()).map(statics).collect();
+        let got: Vec<f32> = seen.ray_out.iter().map(|out| out.static_integral).collect();
+        findings.numbers(INTEGRALS, "static integral", &got, &want, F32_SUMS);
+        let Some(samples) = &seen.samples else { return };
+        let (mut dynamics, mut near) = (vec![0.0; self.rays.len()], vec![0.0; self.rays.len()]);
+        for sample in samples.iter().filter(|sample| sample.ray < self.rays.len()) {
+            let part = f64::from(sample.sigma[0]) * sample.path_length;
+            dynamics[sample.ray] += part;
+            near[sample.ray] += if sample.near { part } else { 0.0 };
+        }
+        let got: Vec<f32> = seen.ray_out.iter().map(|out| out.dynamic_integral).collect();
+        findings.numbers(INTEGRALS, "dynamic integral", &got, &dynamics, F32_SUMS);
+        if self.plan.setup.occlusion_weight > 0.0 {
+            let got: Vec<f32> = seen.ray_out.iter().map(|out| out.occlusion).collect();
+            findings.numbers(INTEGRALS, "occlusion", &got, &near, F32_SUMS);
+        }
+    }
+
+    /// The static field along a ray, unless it is left out there.
+    fn march_statics(&self, r: usize) -> march::March {
+        march::statics(self.plan, self.params, self.step, &self.rays[r], !step::skips_static(self.plan, r))
+    }
+
+    /// Losses and their gradient, of the device's integrals.
+    fn compare_loss(&self, seen: &Seen, findings: &mut Findings) {
+        let n = self.rays.len();
+        let loss = |(r, out): (usize, &RayOut)| {
+            let integrals = [out.static_integral, out.dynamic_integral].map(f64::from);
+            step::ray_loss(self.plan, r, n, &self.rays[r], integrals)
+        };
+        let want: Vec<step::RayLoss> = seen.ray_out.iter().enumerate().map(loss).collect();
+        for (k, name) in ["dL/dS", "dL/dD"].into_iter().enumerate() {
+            let got: Vec<f32> = seen.ray_gradient.iter().map(|g| g[k]).collect();
+            findings.numbers(LOSS, name, &got, &want.iter().map(|l| l.gradient[k]).collect::<Vec<_>>(), F32_SUMS);
+        }
+        let got = |k: usize| seen.ray_loss.iter().map(|l| l[k]).collect::<Vec<f32>>();
+        findings.numbers(LOSS, "data terms", &got(0), &want.iter().map(|l| l.data).collect::<Vec<_>>(), F32_SUMS);
+        let dynamic: Vec<f64> = want.iter().map(|l| l.dynamic).collect();
+        findings.numbers(LOSS, "dynamic data terms", &got(1), &dynamic, F32_SUMS);
+    }
+
+    fn compare_total_variation(&self, seen: &Seen, findings: &mut Findings) {
+        let mut gradient = vec![0.0; self.plan.params.len];
+        let value = step::total_variation(self.plan, self.params, &mut gradient);
+        let statics = &gradient[..self.plan.params.static_len];
+        findings.numbers(TOTAL_VARIATION, "gradient", &seen.tv_gradient, statics, F32_SUMS);
+        let sum: f64 = seen.tv_value.iter().map(|v| f64::from(*v)).sum();
+        findings.add(TOTAL_VARIATION, "value", relative(sum, value), IN_F32.loss);
+    }
+
+    /// Gradient of the static field by the device's ray gradients, total variation aside.
+    fn compare_scatter(&self, seen: &Seen, findings: &mut Findings) {
+        let params = &self.plan.params;
+        let mut want = vec![0.0; params.len];
+        for (r, ray) in self.rays.iter().enumerate() {
+            let by_integrals = [f64::from(seen.ray_gradient[r][0]), 0.0];
+            let statics = self.march_statics(r);
+            march::bwd(self.plan, self.params, ray, &statics, by_integrals, self.precision, &mut want);
+        }
+        let got: Vec<f32> = seen.gradient.iter().zip(&seen.tv_gradient).map(|(all, tv)| all - tv).collect();
+        for tensor in params.tensors().iter().filter(|tensor| is_static(tensor)) {
+            let (got, want) = (pick(&tensor.positions, &got), pick(&tensor.positions, &want));
+            findings.numbers(SCATTER, &tensor.name, &got, &want, F32_SUMS);
+        }
+    }
+
+    /// Gradient of the network by the device's samples and ray gradients.
+    fn compare_backward(&self, samples: &[Sample], seen: &Seen, findings: &mut Findings) {
+        let params = &self.plan.params;
+        let mut want = vec![0.0; params.len];
+        for sample in samples.iter().filter(|sample| sample.ray < self.rays.len()) {
+            let by_integral = seen.ray_gradient[sample.ray][1].into();
+            let Sample { x, path_length: dl, near, .. } = *sample;
+            let trace = march::DynamicSample { x, dl, near, trace: self.trace(sample) };
+            let phase = self.phase(sample);
+            march::sample_bwd(self.plan, self.params, phase, &trace, by_integral, self.precision, &mut want);
+        }
+        for Part { stages, name, positions } in parts(params, self.on_matrices()) {
+            let (got, want) = (pick(&positions, &seen.gradient), pick(&positions, &want));
+            findings.numbers(stages, &name, &got, &want, self.tolerances.gradient);
+        }
+    }
+
+    /// Sums of what the device's rays came to.
+    fn compare_report(&self, seen: &Seen, findings: &mut Findings) {
+        let sum = |k: usize| seen.ray_loss.iter().map(|loss| f64::from(loss[k])).sum::<f64>();
+        let tv: f64 = seen.tv_value.iter().map(|v| f64::from(*v)).sum();
+        let occlusion = f64::from(self.plan.setup.occlusion_weight) * sum(2);
+        let loss = &seen.loss;
+        for (name, got, want) in [
+            ("data", loss.data, sum(0)),
+            ("dynamic data", loss.dynamic, sum(1)),
+            ("total variation", loss.tv, tv),
+            ("occlusion", loss.occlusion, occlusion),
+            ("squared error", loss.squared_error, sum(3)),
+        ] {
+            findings.add(REPORT, name, relative(got, want), IN_F32.loss);
+        }
+    }
+
+    /// Losses and gradients beside those the twin comes to by itself.
+    fn compare_whole(&self, seen: &Seen, findings: &mut Findings) {
+        let whole = |precision| step::loss_and_gradient(self.plan, self.params, self.step, &self.rays, precision);
+        let (want, gradient) = whole(self.precision);
+        let (loss, tolerance) = (&seen.loss, self.tolerances.loss);
+        for (name, got, want) in [
+            ("data", loss.data, want.data),
+            ("dynamic data", loss.dynamic, want.dynamic),
+            ("total variation", loss.tv, want.tv),
+            ("occlusion", loss.occlusion, want.occlusion),
+        ] {
+            findings.add(WHOLE, name, relative(got, want), tolerance);
+        }
+        // Tensor by tensor, so that a missing small gradient cannot hide behind a large one.
+        for tensor in self.plan.params.tensors() {
+            let (got, want) = (pick(&tensor.positions, &seen.gradient), pick(&tensor.positions, &gradient));
+            findings.numbers(WHOLE, &tensor.name, &got, &want, self.tolerances.gradient);
+        }
+        if self.on_matrices() {
+            let exact = whole(Precision::Exact).1;
+            findings.numbers(F16_BESIDE_F64, "gradient", &seen.gradient, &exact, F16_COST);
+        }
+    }
+}
+
+/// A part of the network's gradient, and the stages that make it.
+struct Part {
+    stages: &'static [&'static str],
+    name: String,
+    positions: Vec<u32>,
+}
+
+/// The network's gradient by the stages that make it: the columns of latents are apart from the weights beside them.
+fn parts(params: &ParamMap, on_matrices: bool) -> Vec<Part> {
+    let [output, layers, latents] = if on_matrices {
+        [BACKWARD_ON_MATRICES, BACKWARD_ON_MATRICES, LATENTS_BACKWARD_ON_MATRICES]
+    } else {
+        [OUTPUT_BACKWARD, LAYERS_BACKWARD, LATENTS_BACKWARD]
+    };
+    let mut parts = Vec::new();
+    let mut last = Vec::new();
+    for tensor in params.tensors().into_iter().filter(|tensor| !is_static(tensor)) {
+        let layer = layer_of(&tensor).map(|i| &params.layers[i]);
+        let sees_input = layer.is_some_and(|layer| layer.latent.is_some());
+        let part = |stages, name: String, positions| Part { stages, name, positions };
+        match tensor.name.as_str() {
+            name if name.starts_with("dynamic.out") => parts.push(part(output, tensor.name, tensor.positions)),
+            name if name.ends_with(".weight") => {
+                let (columns, latent) = (tensor.shape[1], params.encoded_len..params.encoded_len + params.latent);
+                let of_latent = |at: usize| sees_input && latent.contains(&(at % columns));
+                let (mut of_latents, mut of_weights) = (Vec::new(), Vec::new());
+                for (at, position) in tensor.positions.into_iter().enumerate() {
+                    if of_latent(at) { of_latents.push(position) } else { of_weights.push(position) }
+                }
+                parts.push(part(layers, tensor.name.clone(), of_weights));
+                if sees_input {
+                    last.push(part(latents, format!("{} on the latent", tensor.name), of_latents));
+                }
+            }
+            // Biases of layers without latents are summed with the weights; the others come from the sums per phase.
+            name if name.ends_with(".bias") && !sees_input => {
+                parts.push(part(layers, tensor.name, tensor.positions));
+            }
+            _ => last.push(part(latents, tensor.name, tensor.positions)),
+        }
+    }
+    // In the order in which the stages run.
+    parts.sort_by_key(|part| part.stages != output);
+    parts.into_iter().chain(last).collect()
+}
+
+fn layer_of(tensor: &Tensor) -> Option<usize> {
+    tensor.name.strip_prefix("dynamic.layer")?.split('.').next()?.parse().ok()
+}
+
+fn is_static(tensor: &Tensor) -> bool {
+    tensor.name.starts_with("static")
+}
+
+fn pick<T: Copy>(positions: &[u32], all: &[T]) -> Vec<T> {
+    positions.iter().map(|at| all[*at as usize]).collect()
+}
+
+/// Losses below this are nothing.
+const NO_LOSS: f64 = 1e-12;
+
+/// Relative difference of losses.
+fn relative(got: f64, want: f64) -> f64 {
+    let difference = (got - want).abs();
+    if difference <= NO_LOSS { 0.0 } else { difference / want.abs() }
+}
+
+/// The larger of two deviations; NaN is larger than any.
+fn larger(a: f64, b: f64) -> f64 {
+    if a.is_nan() || b.is_nan() { f64::INFINITY } else { a.max(b) }
+}
+
+/// The optimiser, on the gradient that the device came to; parameters and moments after it.
+fn compare_update(
+    gpu: &Gpu,
+    trainer: &Trainer,
+    params: &[f32],
+    moments: &[[f32; 2]],
+    findings: &mut Findings,
+) -> Result<(Vec<f32>, Vec<[f32; 2]>)> {
+    let (plan, n) = (trainer.plan(), params.len());
+    let gradient: Vec<f32> = gpu.download(&trainer.training().gradient, 0, n)?;
+    let after: Vec<f32> = gpu.download(&trainer.forward().params, 0, n)?;
+    let moments_after: Vec<[f32; 2]> = gpu.download(&trainer.training().moments, 0, n)?;
+    let mut want: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
+    let mut want_moments: Vec<[f64; 2]> = moments.iter().map(|m| m.map(f64::from)).collect();
+    let gradient: Vec<f64> = gradient.iter().map(|v| f64::from(*v)).collect();
+    step::adam(plan, trainer.step() - 1, &gradient, &mut want, &mut want_moments);
+    for (name, range) in [("static", 0..plan.params.static_len), ("dynamic", plan.params.static_len..n)] {
+        let got: Vec<f32> = range.clone().map(|i| (f64::from(after[i]) - f64::from(params[i])) as f32).collect();
+        let want: Vec<f64> = range.map(|i| want[i] - f64::from(params[i])).collect();
+        findings.numbers(ADAM, &format!("update of {name} parameters"), &got, &want, UPDATE);
+    }
+    for (k, name) in ["first moments", "second moments"].into_iter().enumerate() {
+        let got: Vec<f32> = moments_after.iter().map(|m| m[k]).collect();
+        let want: Vec<f64> = want_moments.iter().map(|m| m[k]).collect();
+        findings.numbers(ADAM, name, &got, &want, F32_SUMS);
+    }
+    Ok((after, moments_after))
+}

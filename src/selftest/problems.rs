@@ -1,0 +1,257 @@
+//! Problems small enough for f64 twins: angiograms, configurations and Gaussians that need no file.
+
+use crate::config::sections::{self, Tree};
+use crate::config::{Config, Preset};
+use crate::error::{Error, Result};
+use crate::gaussians::view::SplatView;
+use crate::geometry::{CArm, Geometry, ViewRays};
+use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units};
+use crate::plan::lengths::Lengths;
+use crate::plan::targets::{Place, Targets};
+use crate::random::{STREAM_JITTER, normal};
+use crate::reference::gaussians::params;
+use crate::reference::tree::TreeParams;
+use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use glam::DVec3;
+use std::path::PathBuf;
+
+/// Rays of a view's pixels.
+///
+/// # Errors
+/// [`Error::Config`] for an impossible geometry or size.
+pub fn rays(geometry: &Geometry, width: usize, height: usize) -> Result<ViewRays> {
+    let size = format!("{width} x {height}");
+    geometry.rays(width, height).map_err(|(field, problem)| Error::config(field, size, problem))
+}
+
+/// A smooth blob that moves over the phases in front of a still gradient, seen from three sides; the last image is unseen.
+///
+/// # Errors
+/// [`Error::Config`] for an impossible size.
+pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Dataset> {
+    let mut views = Vec::new();
+    let mut frames = Vec::new();
+    for (v, (primary_deg, secondary_deg)) in [(-30.0, 20.0), (40.0, -10.0), (85.0, 15.0)].into_iter().enumerate() {
+        let geometry = Geometry::CArm(CArm {
+            primary_deg,
+            secondary_deg,
+            sid_mm: 1000.0,
+            sod_mm: 600.0,
+            pixel_mm: [120.0 / width as f64, 120.0 / height as f64],
+            offset_mm: [1.0, -2.0],
+            table_mm: [0.0; 3],
+        });
+        views.push(View { rays: rays(&geometry, width, height)?, geometry });
+        for phase in 0..n_phases {
+            // The way of three phases, in as many steps as there are.
+            let along = 3.0 * f64::from(phase) / f64::from(n_phases);
+            let centre = (0.4 + 0.1 * along, 0.5 - 0.05 * v as f64);
+            let integrals = (0..width * height)
+                .map(|p| {
+                    let (x, y) = ((p % width) as f64 / width as f64, (p / width) as f64 / height as f64);
+                    let d2 = (x - centre.0).powi(2) + (y - centre.1).powi(2);
+                    (0.8 + 0.3 * x - 0.2 * y + 0.5 * (-d2 / 0.005).exp()) as f32
+                })
+                .collect();
+            let split = if v == 2 && phase + 1 == n_phases { Split::Validation } else { Split::Train };
+            frames.push(Frame {
+                name: format!("v{v}p{phase}"),
+                view: v,
+                phase,
+                split,
+                integrals,
+                mask: None,
+                heart_shift_mm: [0.0; 3],
+            });
+        }
+    }
+    frames.sort_by_key(|f| f.split);
+    Ok(Dataset {
+        path: PathBuf::from("test"),
+        layout: Layout::Native,
+        views,
+        frames,
+        width,
+        height,
+        n_phases,
+        depth_range: (-0.9, 0.9),
+        hidden: Default::default(),
+        vessel_attenuation: Some(1.0),
+        notes: Vec::new(),
+    })
+}
+
+/// A configuration small enough for f64 twins, on top of a preset.
+///
+/// # Errors
+/// [`Error::Config`] for a setting that is not usable.
+pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
+    let small = [
+        "train.rays=21",
+        "train.chunk_samples=1024",
+        "train.iterations=40",
+        "train.iterations_per_submit=4",
+        "march.static_samples=24",
+        "march.dynamic_samples=40",
+        "march.render_samples=32",
+        "static.grid=9",
+        "dynamic.width=32",
+        "dynamic.delay=0",
+        "dynamic.window_iterations=20",
+        "hull.enabled=false",
+    ];
+    let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
+    Config::load(Some(preset), None, &all)
+}
+
+/// Gaussians of all shapes within `reach` pixels of the isocentre.
+pub fn random_gaussians(n: usize, n_phases: u32, reach: f64, seed: u32) -> Vec<Gaussian> {
+    let value = |i: usize, k: u32| normal(seed, STREAM_JITTER, i as u32, k);
+    (0..n)
+        .map(|i| Gaussian {
+            position: [0, 1, 2].map(|k| (0.5 * reach * value(i, k)) as f32),
+            log_density: (-1.5 + 0.4 * value(i, 3)) as f32,
+            log_scale: [4, 5, 6].map(|k| (0.3 * value(i, k)) as f32),
+            phase: i as u32 % n_phases,
+            rotation: [7, 8, 9, 10].map(|k| value(i, k) as f32),
+        })
+        .collect()
+}
+
+/// Angles of the views of [`targets`], degrees.
+pub const ANGLES_DEG: [[f64; 2]; 3] = [[-30.0, 30.0], [55.0, -20.0], [5.0, 8.0]];
+
+/// A C-arm at such angles.
+pub fn c_arm(angles_deg: [f64; 2]) -> Geometry {
+    Geometry::CArm(CArm {
+        primary_deg: angles_deg[0],
+        secondary_deg: angles_deg[1],
+        sid_mm: 1000.0,
+        sod_mm: 620.0,
+        pixel_mm: [1.5, 1.8],
+        offset_mm: [1.0, -2.0],
+        table_mm: [0.0; 3],
+    })
+}
+
+/// The pixel of [`c_arm`] at the isocentre, world units.
+pub fn units() -> Units {
+    Units { pixel: 0.5 * (1.5 + 1.8) * 620.0 / 1000.0 / 100.0, strongest: 0.2 }
+}
+
+/// Targets of Gaussians: images that no vessel explains; the last view has no image of the last phase.
+///
+/// # Errors
+/// [`Error::Config`] for an impossible size.
+pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> {
+    let view = |angles: &[f64; 2]| Ok(SplatView::new(&rays(&c_arm(*angles), width, height)?, units()));
+    let views = ANGLES_DEG.iter().map(view).collect::<Result<Vec<SplatView>>>()?;
+    let n_images = n_phases * views.len() - 1;
+    let n_views = views.len();
+    let views: Vec<SplatView> = views.iter().cycle().take(n_images).cloned().collect();
+    let image_of = (0..n_images).map(Some).chain([None]).collect();
+    let wave = |i: usize, k: f64| (0.5 + 0.5 * (k * i as f64).sin()) as f32;
+    let all = 0..n_images * width * height;
+    Ok(Targets {
+        units: units(),
+        width,
+        height,
+        n_phases,
+        n_views,
+        views,
+        image_of,
+        n_images,
+        low: all.clone().map(|i| wave(i, 0.37) - 0.1).collect(),
+        high: all.clone().map(|i| wave(i, 0.37) - 0.1 + 0.3 * wave(i, 0.71)).collect(),
+        weight: all.map(|i| 0.5 + 0.5 * wave(i, 0.13)).collect(),
+        noise: Vec::new(),
+        lengths: Lengths { factor: 1.0, smoothing: 1.0 },
+        images: Vec::new(),
+        most: Vec::new(),
+        places: vec![Vec::new(); n_phases],
+        cell: 1.0,
+    })
+}
+
+/// What kernels are compared on: sizes that are no multiples of anything, Gaussians outside the image and behind the
+/// source, a phase that a view lacks.
+///
+/// # Errors
+/// As [`targets`].
+pub fn hard_case() -> Result<(Targets, Vec<Gaussian>)> {
+    let targets = targets(33, 27, 3)?;
+    let mut rows = random_gaussians(77, 3, 12.0, 4);
+    rows[5].position = [300.0, 0.0, 0.0];
+    let behind = targets.views[0].source - targets.views[0].ray(16.0, 13.0) * 50.0;
+    rows[6].position = behind.as_vec3().to_array();
+    rows[7].log_scale = [2.0, -3.0, 0.1];
+    Ok((targets, rows))
+}
+
+/// The defaults but for the Gaussians' settings.
+pub fn with_gaussians(gaussians: sections::Gaussians) -> Config {
+    Config { gaussians, ..Config::preset(Preset::Fast) }
+}
+
+/// A tree's targets, Gaussians and settings.
+///
+/// # Errors
+/// As [`targets`].
+pub fn tree_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
+    let mut targets = targets(33, 27, 5)?;
+    // The grid covers the places.
+    let corner = Place { position: DVec3::splat(14.0), evidence: 18.0 };
+    targets.places[0].push(corner);
+    let mut rows = random_gaussians(31, 1, 11.0, 8);
+    rows[3].position = [300.0, 0.0, 0.0];
+    let preset = Config::preset(Preset::Fast);
+    let tree = Tree { node: 12.0, smoothness: 0.5, own_penalty: 0.7, ..preset.tree };
+    let gaussians = sections::Gaussians { grow_at: 0, ..preset.gaussians.clone() };
+    Ok((targets, rows, Config { tree, gaussians, ..preset }))
+}
+
+/// A tree that already moves: Gaussians at rest, own motion and grid filled with waves, phase 0 at rest.
+pub fn moving_tree(rows: &[Gaussian], tree: &TreeSetup, n_phases: usize) -> TreeParams {
+    let wave = |i: usize, k: f64| {
+        let at = |c: f64| f64::from((0.4 * (k * (i as f64 + c)).sin()) as f32);
+        DVec3::new(at(0.0), at(0.3), at(0.9))
+    };
+    let nodes = tree.nodes();
+    let grid = (0..n_phases * nodes).map(|i| if i < nodes { DVec3::ZERO } else { wave(i, 0.61) }).collect();
+    let own = (0..rows.len() * tree.n_basis as usize).map(|i| 0.5 * wave(i, 0.47)).collect();
+    TreeParams { rows: rows.iter().map(params).collect(), own, grid }
+}
+
+/// Pixel at the isocentre and strongest change of [`drawn_fields`], world units.
+const DRAWN_UNITS: Units = Units { pixel: 0.006, strongest: 0.3 };
+
+/// Sets of Gaussians per phase, to be drawn.
+fn drawn_set(n: usize, n_phases: u32) -> Gaussians {
+    let value = |i: usize, k: u32| normal(5, 0, i as u32, k);
+    let rows = (0..n).map(|i| Gaussian {
+        position: [0, 1, 2].map(|k| (11.0 * value(i, k)) as f32),
+        log_density: (-1.5 + 0.4 * value(i, 3)) as f32,
+        log_scale: [4, 5, 6].map(|k| (0.2 + 0.4 * value(i, k)) as f32),
+        phase: i as u32 % n_phases,
+        rotation: [7, 8, 9, 10].map(|k| value(i, k) as f32),
+    });
+    let setup = GaussianSetup { n_phases, cut: 3.2, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() };
+    Gaussians { units: DRAWN_UNITS, n_phases: n_phases as usize, setup, rows: rows.collect(), step: 7 }
+}
+
+/// One set of Gaussians that moves, to be drawn.
+fn drawn_tree(n: usize, n_phases: u32) -> MovingTree {
+    let setup = TreeSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, n_basis: 4, ..TreeSetup::default() };
+    let wave = |i: usize| [0.7, 1.1, 1.9].map(|k| (1.5 * (k * i as f64).sin()) as f32);
+    let vector = |i: usize| [wave(i)[0], wave(i)[1], wave(i)[2], 0.0];
+    let grid = (0..n_phases as usize * 64).map(|i| if i < 64 { [0.0; 4] } else { vector(i) }).collect();
+    let mut rest = drawn_set(n, 1);
+    (rest.n_phases, rest.setup.n_phases) = (n_phases as usize, n_phases);
+    MovingTree { rest, setup, grid, own: (0..n * 4).map(vector).collect() }
+}
+
+/// Moving fields of three phases to be drawn, one of each form.
+pub fn drawn_fields() -> [MovingGaussians; 2] {
+    [MovingGaussians::PerPhase(drawn_set(231, 3)), MovingGaussians::Tree(drawn_tree(77, 3))]
+}

@@ -1,0 +1,99 @@
+//! Runs that must come to the same bits when they are done again, however many iterations go into a submit.
+
+use crate::config::{Config, Preset, sections};
+use crate::error::Result;
+use crate::gaussians::particles::Particles;
+use crate::gpu::device::Gpu;
+use crate::kernels::layout::Gaussian;
+use crate::kernels::tuning::Tuning;
+use crate::plan::Plan;
+use crate::scan::dataset::Dataset;
+use crate::selftest::compare::Findings;
+use crate::selftest::iteration::path_name;
+use crate::selftest::problems::{hard_case, small_config, tree_case, with_gaussians};
+use crate::train::gaussians::GaussianTrainer;
+use crate::train::trainer::Trainer;
+use crate::train::tree::TreeTrainer;
+
+const REPEATS: &[&str] = &["equal runs, equal bits"];
+
+/// Iterations of each run.
+const ITERATIONS: u32 = 24;
+/// Where the second run stops on its way, so that its submits differ from the first one's.
+const STOPS: [&[u32]; 2] = [&[ITERATIONS], &[5, 6, ITERATIONS]];
+
+/// Notes how many numbers of two equal runs differ. Losses come first.
+fn compare_runs(run: impl Fn(&[u32]) -> Result<Vec<u64>>, findings: &mut Findings) -> Result<()> {
+    let [whole, parts] = [run(STOPS[0])?, run(STOPS[1])?];
+    findings.require(REPEATS, "losses that change", whole.first() != whole.get(1));
+    let differ = whole.iter().zip(&parts).filter(|(a, b)| a != b).count() + whole.len().abs_diff(parts.len());
+    findings.add(REPEATS, &format!("numbers that differ, of {}", whole.len()), differ as f64, 0.5);
+    Ok(())
+}
+
+/// Both fields, with empty cells learned on the way.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_network(gpu: &Gpu, dataset: &Dataset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+    findings.begin(path_name(tuning.layers), "24 iterations, losses and parameters");
+    let config = small_config(Preset::FastMlp, &["dynamic.lr=3e-3", "train.rays=64", "occupancy.start=2"])?;
+    let run = |stops: &[u32]| -> Result<Vec<u64>> {
+        let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset)?, dataset, tuning.clone())?;
+        let totals = |stop| Ok(trainer.advance(stop)?.iter().map(|loss| loss.total()).collect());
+        let mut bits = losses(stops, totals)?;
+        bits.extend(trainer.model()?.params.iter().map(|v| u64::from(v.to_bits())));
+        Ok(bits)
+    };
+    compare_runs(run, findings)
+}
+
+fn bits_of(rows: &[Gaussian]) -> Vec<u64> {
+    let words: &[u32] = bytemuck::cast_slice(rows);
+    words.iter().map(|word| u64::from(*word)).collect()
+}
+
+/// Bits of the losses of a run with these stops on the way; `advance` goes towards one, and comes back empty when there.
+fn losses(stops: &[u32], mut advance: impl FnMut(u32) -> Result<Vec<f64>>) -> Result<Vec<u64>> {
+    let mut bits = Vec::new();
+    for stop in stops {
+        loop {
+            let losses = advance(*stop)?;
+            if losses.is_empty() {
+                break;
+            }
+            bits.extend(losses.iter().map(|loss| loss.to_bits()));
+        }
+    }
+    Ok(bits)
+}
+
+/// Gaussians, a set per phase and one set that moves.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
+    findings.begin("phase", "24 iterations, losses and Gaussians");
+    let settings = |config: Config| sections::Gaussians { iterations: ITERATIONS, grow_at: 0, ..config.gaussians };
+    let config = with_gaussians(settings(Config::preset(Preset::Fast)));
+    let (targets, rows) = hard_case()?;
+    let run = |stops: &[u32]| -> Result<Vec<u64>> {
+        let mut trainer = GaussianTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+        let mut bits = losses(stops, |stop| trainer.advance(stop))?;
+        bits.extend(bits_of(&trainer.model()?.rows));
+        Ok(bits)
+    };
+    compare_runs(run, findings)?;
+    findings.begin("tree", "24 iterations, losses, Gaussians and their motion");
+    let (targets, rows, config) = tree_case()?;
+    let config = Config { gaussians: settings(config.clone()), ..config };
+    let run = |stops: &[u32]| -> Result<Vec<u64>> {
+        let mut trainer = TreeTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+        let mut bits = losses(stops, |stop| trainer.advance(stop))?;
+        let tree = trainer.tree()?;
+        bits.extend(bits_of(&tree.rest.rows));
+        bits.extend(tree.grid.iter().chain(&tree.own).flatten().map(|v| u64::from(v.to_bits())));
+        Ok(bits)
+    };
+    compare_runs(run, findings)
+}

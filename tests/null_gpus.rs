@@ -1,0 +1,111 @@
+//! The kernels as Mesa's compilers make them for GPUs that are not there, beside what they were: tests/golden/kernels, a file for
+//! each chip, which `NERTCA_BLESS=1` writes anew.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "common/program.rs"]
+mod program;
+
+use nertca_vk::inventory::{Compiled, differences};
+use program::program;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::process::{Command, Output};
+
+/// Chips, and whether nothing may spill there: Intel's matrix kernels do, as their compiler unrolls them.
+const CHIPS: [(&str, bool); 7] = [
+    ("nvidia:ga102", true),
+    ("nvidia:ad102", true),
+    ("nvidia:gh100", true),
+    ("nvidia:gb202", true),
+    ("amd:navi31", true),
+    ("amd:gfx1201", true),
+    ("intel:bmg", false),
+];
+const PRESETS: [&str; 3] = ["fast", "fast-mlp", "paper"];
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// The program on a chip.
+fn on(chip: &str, arguments: &[&str]) -> Output {
+    let plain = program();
+    let mut command = Command::new(root().join("tools/null-gpu"));
+    command.arg(chip).arg(plain.get_program()).args(arguments);
+    plain.get_envs().for_each(|(key, value)| {
+        command.env(key, value.unwrap_or_default());
+    });
+    command.output().unwrap()
+}
+
+/// What `kernels --json` prints of a preset on a chip.
+fn listed(chip: &str, preset: &str) -> Value {
+    let output = on(chip, &["kernels", "--json", "--preset", preset]);
+    assert!(output.status.success(), "{chip} {preset}: {}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn kernels(answer: &Value) -> Vec<Compiled> {
+    serde_json::from_value(answer["kernels"].clone()).unwrap()
+}
+
+/// As `kernels --json`, a kernel a line.
+fn write(file: &PathBuf, answer: &Value, all: &[Compiled]) {
+    let rows: Vec<String> = all.iter().map(|kernel| serde_json::to_string(kernel).unwrap()).collect();
+    let head = |key: &str| serde_json::to_string(&answer[key]).unwrap();
+    let text = format!(
+        "{{\"device\": {}, \"driver\": {}, \"paths\": {}, \"preset\": {},\n\"kernels\": [\n{}\n]}}\n",
+        head("device"),
+        head("driver"),
+        head("paths"),
+        json!(PRESETS.join(", ")),
+        rows.join(",\n")
+    );
+    std::fs::write(file, text).unwrap();
+}
+
+#[test]
+#[ignore = "downloads Mesa's drivers: run by `tools/test --packages`"]
+fn kernels_are_as_good_as_they_were() {
+    let mut worse = Vec::new();
+    for (chip, without_spills) in CHIPS {
+        let answers = PRESETS.map(|preset| listed(chip, preset));
+        let mut all: Vec<Compiled> = answers.iter().flat_map(kernels).collect();
+        all.sort_by_key(|c| (c.kernel.clone(), c.lanes, c.constants.clone()));
+        all.dedup();
+        assert!(all.len() > 40, "{chip}: {} kernels", all.len());
+        assert!(
+            all.iter().all(|c| c.registers.is_some() && c.spills.is_some()),
+            "{chip} tells of registers and spills"
+        );
+        let spilling = all.iter().filter(|c| without_spills && c.spills != Some(0.0));
+        worse.extend(spilling.map(|c| format!("{chip}: {} spills", c.name())));
+        let (_, name) = chip.split_once(':').unwrap();
+        let file = root().join(format!("tests/golden/kernels/{name}.json"));
+        if std::env::var_os("NERTCA_BLESS").is_some() {
+            write(&file, &answers[0], &all);
+        }
+        let before: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        let found = differences(&kernels(&before), &all);
+        println!("{chip}, {} then, {} now", before["driver"], answers[0]["driver"]);
+        found.other.iter().chain(&found.worse).for_each(|difference| println!("  {difference}"));
+        worse.extend(found.worse.into_iter().map(|difference| format!("{chip}: {difference}")));
+    }
+    assert!(worse.is_empty(), "{}", worse.join("\n"));
+}
+
+#[test]
+#[ignore = "downloads Mesa's drivers: run by `tools/test --packages`"]
+fn the_self_test_fails_in_words_on_devices_that_compute_nothing() {
+    for (chip, _) in CHIPS {
+        let output = on(chip, &["selftest", "--json"]);
+        let words = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(3), "{chip}: {words}");
+        assert!(words.contains("comparisons failed on") && words.contains("gaussian_project"), "{chip}: {words}");
+        let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let rows = answer["rows"].as_array().unwrap();
+        let passes = |row: &&Value| row["deviation"].as_f64().is_some_and(|d| d <= row["tolerance"].as_f64().unwrap());
+        let passed: Vec<&Value> = rows.iter().filter(passes).map(|row| &row["stages"]).collect();
+        assert!(answer["ok"] == Value::Bool(false) && rows.len() > 40 && passed.len() < 4, "{chip}: {passed:?}");
+    }
+}
