@@ -236,6 +236,7 @@ pub mod trees {
     mod sampled;
     mod tidy;
     pub mod tree;
+    mod tubes;
 }
 
 /// One run, from a dataset to a run directory.

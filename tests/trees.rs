@@ -2,115 +2,29 @@
 //! the files, SciPy compares.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests")]
 
-#[path = "common/program.rs"]
-mod program;
+#[path = "common/known_tree.rs"]
+mod known_tree;
 #[path = "common/python.rs"]
 mod python;
 
+use known_tree::{PHASES, POINTS, Trained, nertca, ok, text, train, trained};
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::{NERTCA_ERROR_BUFFER, NERTCA_OK};
 use nertca_vk::capi::tree::nertca_reconstruction_tree;
 use nertca_vk::capi::types::{nertca_log, nertca_tree};
 use nertca_vk::model::checkpoint;
-use program::program;
 use python::python;
 use serde_json::{Value, json};
-use std::f64::consts::PI;
 use std::ffi::CString;
-use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::path::Path;
 use std::ptr::{null, null_mut};
-use std::sync::OnceLock;
-
-const PHASES: usize = 4;
-/// Points of the trunk and of each branch.
-const POINTS: [usize; 3] = [40, 50, 50];
-
-/// The true vessels at rest: a trunk and two branches, RAS mm.
-fn rest() -> Vec<[f64; 3]> {
-    let trunk = |a: f64| [4.0 * (3.0 * a).sin() * (1.0 - a), 6.0 * (2.0 * a).sin() * (1.0 - a), 35.0 * (1.0 - a)];
-    let left = |a: f64| [-28.0 * a, (10.0 + 6.0 * (3.0 * a).sin()) * a, -(38.0 * a + 4.0) * a];
-    let right = |a: f64| [(26.0 + 4.0 * (4.0 * a).sin()) * a, -8.0 * a, -34.0 * a];
-    let courses: [&dyn Fn(f64) -> [f64; 3]; 3] = [&trunk, &left, &right];
-    let along = |(n, course): (usize, &dyn Fn(f64) -> [f64; 3])| {
-        (0..n).map(|i| course(i as f64 / (n - 1) as f64)).collect::<Vec<_>>()
-    };
-    POINTS.into_iter().zip(courses).flat_map(along).collect()
-}
-
-/// The true vessels over the beat, as `phantom --tree` reads them.
-fn truth() -> Value {
-    let squeezed = |phase: usize| {
-        let squeeze = (PI * phase as f64 / PHASES as f64).sin().powi(2);
-        let (across, along) = (1.0 - 0.12 * squeeze, 1.0 - 0.08 * squeeze);
-        let moved =
-            |[x, y, z]: [f64; 3]| [x * across + 3.0 * squeeze, y * across - 4.0 * squeeze, z * along + 6.0 * squeeze];
-        rest().into_iter().map(moved).collect::<Vec<_>>()
-    };
-    let radius = |first: f64, last: f64, n: usize| {
-        (0..n).map(move |i| first + (last - first) * i as f64 / (n - 1) as f64).collect::<Vec<_>>()
-    };
-    let [trunk, left, right] = POINTS;
-    let radii = [radius(2.0, 1.8, trunk), radius(1.6, 1.0, left), radius(1.5, 0.9, right)].concat();
-    json!({
-        "branches": [
-            { "name": "trunk", "first": 0, "count": trunk },
-            { "name": "left", "first": trunk, "count": left },
-            { "name": "right", "first": trunk + left, "count": right },
-        ],
-        "radius_mm": radii,
-        "points_mm": (0..PHASES).map(squeezed).collect::<Vec<_>>(),
-    })
-}
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
-}
-
-fn nertca(args: &[&str]) -> Output {
-    program().arg("--validate").args(args).output().unwrap()
-}
-
-/// What the program says on stdout and stderr.
-#[track_caller]
-fn ok(args: &[&str]) -> (String, String) {
-    let out = nertca(args);
-    let said = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    assert!(out.status.success(), "{args:?}: {}", said(&out.stderr));
-    (said(&out.stdout), said(&out.stderr))
-}
-
-struct Trained {
-    directory: tempfile::TempDir,
-    data: PathBuf,
-    run: PathBuf,
-}
-
-/// A short run on the true vessels, made once.
-fn trained() -> &'static Trained {
-    static RUN: OnceLock<Trained> = OnceLock::new();
-    RUN.get_or_init(|| {
-        let directory = tempfile::tempdir().unwrap();
-        let (tree, data, run) =
-            (directory.path().join("truth.json"), directory.path().join("data"), directory.path().join("run"));
-        std::fs::write(&tree, truth().to_string()).unwrap();
-        let phases = PHASES.to_string();
-        ok(&["phantom", text(&data), "--tree", text(&tree), "--size", "64", "--phases", &phases]);
-        train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60"]);
-        Trained { directory, data, run }
-    })
-}
-
-fn train(data: &Path, run: &Path, more: &[&str]) {
-    ok(&[&["train", text(data), "-o", text(run), "--no-eval"], more].concat());
-}
 
 #[test]
 fn the_tree_is_the_true_one_in_every_format() {
     let Trained { directory, run, .. } = trained();
     let to = |name: &str| directory.path().join(name);
-    for (name, files) in [("beat.json", 1), ("beat.vtp", PHASES + 1), ("beat.swc", PHASES)] {
+    for (name, files) in [("beat.json", 1), ("beat.vtp", PHASES + 1), ("beat.swc", PHASES), ("beat.glb", 1)] {
         let (made, said) = ok(&["tree", text(run), "-o", text(&to(name))]);
         assert_eq!(made.lines().count(), files, "{made}");
         assert!(made.lines().all(|file| Path::new(file).is_file()));
@@ -118,8 +32,18 @@ fn the_tree_is_the_true_one_in_every_format() {
     }
     let (one, _) = ok(&["tree", text(run), "-o", text(&to("one.vtp")), "--phase", "2"]);
     assert_eq!(one.trim(), text(&to("one.vtp")), "one phase is one file, under its own name");
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/check_trees.py");
-    let outcome = python().arg(script).arg(directory.path()).output().unwrap();
+    check("check_trees.py", &[directory.path()]);
+    check("check_tubes.py", &[&to("beat.glb"), &to("beat.json")]);
+    for name in ["still.json", "still.glb"] {
+        ok(&["tree", text(run), "-o", text(&to(name)), "--phase", "2"]);
+    }
+    check("check_tubes.py", &[&to("still.glb"), &to("still.json")]);
+}
+
+/// Runs one of the scripts of the tests.
+fn check(script: &str, files: &[&Path]) {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python").join(script);
+    let outcome = python().arg(script).args(files).output().unwrap();
     print!("{}", String::from_utf8_lossy(&outcome.stdout));
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
 }
@@ -137,6 +61,9 @@ fn fields_that_carry_no_points_are_not_tracked() {
     let file = directory.path().join("sets.json");
     let (_, said) = ok(&["tree", text(&run), "-o", text(&file)]);
     assert!(said.contains("not tracked"), "{said}");
+    let tubes = directory.path().join("sets.glb");
+    ok(&["tree", text(&run), "-o", text(&tubes)]);
+    check("check_tubes.py", &[&tubes, &file]);
     let tree = tree_of(&run, &file, &["--phase", "1"]);
     assert_eq!((&tree["tracked"], &tree["reference_phase"]), (&json!(false), &Value::Null));
     assert!(tree["note"].as_str().unwrap().starts_with("not tracked"));
@@ -171,8 +98,8 @@ fn what_has_no_tree_is_refused() {
         parts.iter().for_each(|part| assert!(stderr.contains(part), "{args:?} does not name `{part}`: {stderr}"));
         assert!(!out.exists());
     };
-    refuses(run, &directory.path().join("x.vtk"), &[], &["--out", "x.vtk", ".json .vtp .swc"]);
-    refuses(run, &directory.path().join("tree"), &[], &["--out", ".json .vtp .swc"]);
+    refuses(run, &directory.path().join("x.vtk"), &[], &["--out", "x.vtk", ".json .vtp .swc .glb"]);
+    refuses(run, &directory.path().join("tree"), &[], &["--out", ".json .vtp .swc .glb"]);
     refuses(run, &out, &["--threshold", "1e3"], &["threshold_per_mm", "no vessel", "lower"]);
     refuses(run, &out, &["--threshold", "0"], &["threshold_per_mm = 0", "positive"]);
     refuses(run, &out, &["--threshold", "nan"], &["threshold_per_mm", "positive"]);

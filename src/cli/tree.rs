@@ -27,15 +27,15 @@ pub struct TreeArgs {
     /// the field resolves otherwise.
     #[arg(long, value_name = "MM")]
     pub min_branch: Option<f64>,
-    /// Output: .json (all phases), .vtp (a file per phase and a .pvd of them all, for ParaView, 3D Slicer and VMTK) or .swc
-    /// (a file per phase). Millimetres along (left, posterior, superior).
+    /// Output: .json (all phases), .vtp (a file per phase and a .pvd of them all, for ParaView, 3D Slicer and VMTK), .swc
+    /// (a file per phase), in millimetres along (left, posterior, superior); or .glb (tubes, animated over the beat; metres).
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }
 
 /// Writes the vessels of a run as trees.
 pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
-    let unknown = || Error::config("--out", args.out.display(), "ends in none of .json .vtp .swc");
+    let unknown = || Error::config("--out", args.out.display(), "ends in none of .json .vtp .swc .glb");
     let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;

@@ -38,6 +38,42 @@ pub fn to_glb(meshes: &[(u32, Mesh)]) -> Result<Vec<u8>> {
     scene.into_container()
 }
 
+/// A mesh that changes its shape over the beat: the same triangles of the same vertices at all phases.
+pub struct MovingMesh {
+    /// Name of its node.
+    pub name: String,
+    /// The mesh at each phase; the triangles are those of the first.
+    pub phases: Vec<Mesh>,
+}
+
+/// Meshes that change their shapes as one binary glTF, in metres: morph targets are the phases behind the first, and the
+/// animation goes from each to the next on straight lines, from the last to the first at last.
+///
+/// # Errors
+/// [`Error::Internal`] for what JSON cannot hold.
+pub fn to_moving_glb(parts: &[MovingMesh]) -> Result<Vec<u8>> {
+    let mut scene = Scene::default();
+    parts.iter().for_each(|part| scene.add_moving_node(part));
+    let n_phases = parts.first().map_or(0, |part| part.phases.len());
+    if n_phases > 1 {
+        scene.animate_shapes(n_phases);
+    }
+    scene.into_container()
+}
+
+/// Places as glTF has them: metres.
+fn to_gltf_places(mesh: &Mesh) -> Vec<[f32; 3]> {
+    mesh.vertices.iter().map(|v| to_gltf_axes(&v.map(|x| x * METRES_PER_MM))).collect()
+}
+
+fn differences(from: &[[f32; 3]], to: &[[f32; 3]]) -> Vec<[f32; 3]> {
+    from.iter().zip(to).map(|(a, b)| [0, 1, 2].map(|axis| b[axis] - a[axis])).collect()
+}
+
+fn to_gltf_normals(mesh: &Mesh) -> Vec<[f32; 3]> {
+    mesh.normals.iter().map(to_gltf_axes).collect()
+}
+
 /// Objects of a glTF document and the binary data they speak of.
 #[derive(Default)]
 struct Scene {
@@ -88,14 +124,35 @@ impl Scene {
         self.nodes.push(node);
     }
 
-    fn add_mesh(&mut self, mesh: &Mesh) -> usize {
-        let points: Vec<[f32; 3]> = mesh.vertices.iter().map(|v| to_gltf_axes(&v.map(|x| x * METRES_PER_MM))).collect();
-        let bound = |pick: fn(f32, f32) -> f32| {
-            std::array::from_fn(|axis| points.iter().map(|p| p[axis]).fold(points[0][axis], pick))
+    /// A node that shows a mesh, and how far its vertices and normals are from there at each further phase.
+    fn add_moving_node(&mut self, part: &MovingMesh) {
+        let Some((rest, moved)) = part.phases.split_first() else { return };
+        let mesh = self.add_mesh(rest);
+        let (places, normals) = (to_gltf_places(rest), to_gltf_normals(rest));
+        let target = |mesh: &Mesh| {
+            let position = self.add_places(&differences(&places, &to_gltf_places(mesh)));
+            let normal = self.add_vectors(&differences(&normals, &to_gltf_normals(mesh)), None);
+            json!({ "POSITION": position, "NORMAL": normal })
         };
-        let position = self.add_vectors(&points, Some([bound(f32::min), bound(f32::max)]));
-        let normals: Vec<[f32; 3]> = mesh.normals.iter().map(to_gltf_axes).collect();
-        let normal = self.add_vectors(&normals, None);
+        let targets: Vec<Value> = moved.iter().map(target).collect();
+        if !targets.is_empty() {
+            self.meshes[mesh]["weights"] = json!(vec![0.0; targets.len()]);
+            self.meshes[mesh]["primitives"][0]["targets"] = json!(targets);
+        }
+        self.nodes.push(json!({ "name": part.name, "mesh": mesh }));
+    }
+
+    /// Keeps places, of which the standard wants bounds.
+    fn add_places(&mut self, places: &[[f32; 3]]) -> usize {
+        let bound = |pick: fn(f32, f32) -> f32| {
+            std::array::from_fn(|axis| places.iter().map(|p| p[axis]).fold(places[0][axis], pick))
+        };
+        self.add_vectors(places, Some([bound(f32::min), bound(f32::max)]))
+    }
+
+    fn add_mesh(&mut self, mesh: &Mesh) -> usize {
+        let position = self.add_places(&to_gltf_places(mesh));
+        let normal = self.add_vectors(&to_gltf_normals(mesh), None);
         let corners = mesh.triangles.as_flattened();
         let indices = self.add_array(
             corners.iter().flat_map(|i| i.to_le_bytes()),
@@ -107,15 +164,34 @@ impl Scene {
         self.meshes.len() - 1
     }
 
-    /// Shows each node while its phase lasts: steps of its scale between 0 and 1.
-    fn animate(&mut self) {
-        let n = self.nodes.len();
+    /// Keeps the times at which `n` phases begin, and the end of the beat.
+    fn add_times(&mut self, n: usize) -> usize {
         let times: Vec<f32> = (0..=n).map(|i| BEAT_S * i as f32 / n as f32).collect();
-        let time = self.add_floats(
+        self.add_floats(
             &times,
             None,
             json!({ "componentType": code::FLOAT, "count": n + 1, "type": "SCALAR", "min": [0.0], "max": [BEAT_S] }),
-        );
+        )
+    }
+
+    /// Gives every node the shape of each phase in turn, and that of the first at last.
+    fn animate_shapes(&mut self, n_phases: usize) {
+        let time = self.add_times(n_phases);
+        let weight = |i: usize, target: usize| f32::from(u8::from(i % n_phases == target));
+        let weights: Vec<f32> =
+            (0..=n_phases).flat_map(|i| (1..n_phases).map(move |target| weight(i, target))).collect();
+        let accessor = json!({ "componentType": code::FLOAT, "count": weights.len(), "type": "SCALAR" });
+        let output = self.add_floats(&weights, None, accessor);
+        let channel = |node: usize| json!({ "sampler": 0, "target": { "node": node, "path": "weights" } });
+        let channels: Vec<Value> = (0..self.nodes.len()).map(channel).collect();
+        let sampler = json!({ "input": time, "output": output, "interpolation": "LINEAR" });
+        self.animations.push(json!({ "name": "beat", "samplers": [sampler], "channels": channels }));
+    }
+
+    /// Shows each node while its phase lasts: steps of its scale between 0 and 1.
+    fn animate(&mut self) {
+        let n = self.nodes.len();
+        let time = self.add_times(n);
         let (mut samplers, mut channels) = (Vec::new(), Vec::new());
         for node in 0..n {
             let scales: Vec<f32> = (0..=n).flat_map(|i| [f32::from(u8::from(i % n == node)); 3]).collect();

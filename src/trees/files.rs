@@ -1,10 +1,11 @@
-//! Trees as files (see `docs/formats.md`): JSON, VTK and SWC.
+//! Trees as files (see `docs/formats.md`): JSON, VTK, SWC and glTF.
 
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::swc;
 use crate::formats::vtp::{self, Values};
 use crate::trees::tree::{BeatTree, Branch, PhaseTree};
+use crate::trees::tubes::to_glb;
 use glam::DVec3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -24,6 +25,8 @@ pub enum TreeFormat {
     Vtp,
     /// SWC, a file per phase.
     Swc,
+    /// Binary glTF: tubes, all phases in one animated file.
+    Glb,
 }
 
 impl TreeFormat {
@@ -33,6 +36,7 @@ impl TreeFormat {
             "json" => Some(TreeFormat::Json),
             "vtp" => Some(TreeFormat::Vtp),
             "swc" => Some(TreeFormat::Swc),
+            "glb" => Some(TreeFormat::Glb),
             _ => None,
         }
     }
@@ -120,6 +124,10 @@ pub fn write(beat: &BeatTree, path: &Path, format: TreeFormat, sequence: bool) -
             Ok(made)
         }
         TreeFormat::Swc => write_phases(beat, path, sequence, to_swc),
+        TreeFormat::Glb => {
+            files::write_atomic(path, &to_glb(beat)?)?;
+            Ok(vec![path.to_path_buf()])
+        }
     }
 }
 
@@ -142,7 +150,11 @@ fn write_phases(
     beat.phases.iter().map(write).collect()
 }
 
-fn to_json(beat: &BeatTree) -> Result<String> {
+/// All phases as the text of a `.json` file.
+///
+/// # Errors
+/// [`Error::Internal`] for what JSON cannot hold.
+pub fn to_json(beat: &BeatTree) -> Result<String> {
     let phases = beat.phases.iter().map(|tree| PhaseRow {
         phase: tree.phase,
         length_mm: rounded(tree.length_mm()),
@@ -253,6 +265,7 @@ mod tests {
         let of = |name: &str| TreeFormat::of(Path::new(name));
         assert_eq!(of("beat.VTP"), Some(TreeFormat::Vtp));
         assert_eq!((of("a.json"), of("a.swc")), (Some(TreeFormat::Json), Some(TreeFormat::Swc)));
+        assert_eq!(of("a.glb"), Some(TreeFormat::Glb));
         assert_eq!((of("a.vtk"), of("json"), of("a.json.gz")), (None, None, None));
     }
 }
