@@ -34,7 +34,9 @@ mod cli {
     pub mod synthetic_args;
     pub mod train;
     pub mod tree;
+    pub mod tree_section;
     pub mod view;
+    pub mod view_tree;
     pub mod volume_table;
 }
 

@@ -419,7 +419,7 @@ impl Session {
         let model = self.checkpoint()?.model;
         let renderer = Renderer::new(gpu, &model, tuning.clone())?;
         let phases = (0..model.param_map.phases as u32).collect();
-        vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| ())
+        vessel_trees(&renderer, &model, &TreeOptions { phases, threshold_per_mm, least_branch_mm }, |_, _| Ok(()))
     }
 
     /// Everything needed to continue, after the iterations under way.

@@ -231,6 +231,7 @@ fn the_viewer_answers_its_own_page_alone() {
         (frame(good), format!("{host}Origin: http://evil.example\r\n")),
         (frame(good), format!("{host}Sec-Fetch-Site: cross-site\r\n")),
         (format!("/info?x={token}"), host.clone()),
+        ("/tree".into(), host.clone()),
     ] {
         assert_eq!(ask(port, &path, &headers).0, 403, "{path} {headers}");
     }

@@ -3,6 +3,7 @@
 use super::args::Cli;
 use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
+use super::tree::of_page as tree_of_page;
 use super::volume_table;
 use clap::Args;
 use nertca_vk::error::{Error, Result};
@@ -28,6 +29,10 @@ pub struct EvalArgs {
     /// Leave comparison pictures and `report.html` here; without, a page without pictures is left in RUN as `eval.html`.
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
+    /// Find the vessels as a tree, too (seconds): over the angiograms on the page, with lengths and diameters, and as
+    /// `tree.json` beside it.
+    #[arg(long)]
+    pub tree: bool,
     /// Dice threshold on attenuation, 1/mm, instead of the rule.
     #[arg(long, value_name = "PER_MM")]
     pub threshold: Option<f64>,
@@ -48,12 +53,15 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     let tuning = cli.tuning(&gpu, &model.config);
     let cancel = stop_flag()?;
     let scoring = ScoreOptions { threshold_per_mm: args.threshold, pictures: args.images.as_deref(), cancel: &cancel };
-    let evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut show_evaluation())?;
+    let mut evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut show_evaluation())?;
     let run = if args.run.is_dir() { args.run.as_path() } else { args.run.parent().unwrap_or(Path::new("")) };
     let (pictures, page) = match &args.images {
         Some(images) => (images.as_path(), images.join("report.html")),
         None => (Path::new(""), run.join("eval.html")),
     };
+    let beside = page.parent().unwrap_or(Path::new(""));
+    let warnings = &mut evaluation.warnings;
+    let tree = if args.tree { tree_of_page(cli, &gpu, &model, beside, warnings)? } else { None };
     Report {
         gpu: &gpu,
         tuning: &tuning,
@@ -61,6 +69,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
         dataset: &dataset,
         evaluation: Some(&evaluation),
         warnings: &evaluation.warnings,
+        tree: tree.as_ref(),
         run,
         pictures,
     }

@@ -1,7 +1,8 @@
 //! `report.html`: one page that needs nothing but itself. Plots are SVG, pictures are embedded, and phases are chosen by
-//! radio buttons, so that no script is needed.
+//! radio buttons, so that no script is needed but for a vessel tree, where one was asked for.
 
 use super::plot::{Line, plot};
+use super::tree_section::TreeSection;
 use super::{calibration_table, volume_table};
 use base64::Engine;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -40,6 +41,8 @@ pub struct Page<'a> {
     pub calibration: Option<Calibration>,
     /// Picture of what each training view shows of vessels, before and after correction: view, file.
     pub silhouettes: Vec<(usize, PathBuf)>,
+    /// The vessels as a tree, where it was asked for.
+    pub tree: Option<TreeSection>,
     /// The whole configuration.
     pub config: String,
 }
@@ -310,6 +313,7 @@ impl Page<'_> {
                     (self.volume())
                     (self.plots()?)
                     (self.views()?)
+                    @if let Some(tree) = &self.tree { (tree.markup()) }
                     (self.calibration()?)
                     (self.hull()?)
                     (self.motion())

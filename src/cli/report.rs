@@ -1,6 +1,7 @@
 //! What a finished run is worth: scores on every unseen image, pictures of them, and a page to look at.
 
 use super::page::Page;
+use super::tree_section::TreeSection;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
@@ -11,6 +12,7 @@ use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::run::{hull_pictures, silhouette_pictures};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
+use nertca_vk::trees::tree::BeatTree;
 use std::path::{Path, PathBuf};
 
 /// What `report.html` is made of.
@@ -29,6 +31,8 @@ pub struct Report<'a> {
     pub warnings: &'a [String],
     /// Where it may be told how the model came about: a run directory.
     pub run: &'a Path,
+    /// The vessels as a tree, where it was asked for.
+    pub tree: Option<&'a BeatTree>,
     /// Where comparison pictures were left.
     pub pictures: &'a Path,
 }
@@ -88,6 +92,7 @@ impl Report<'_> {
             hull: of_views(hull_pictures::file),
             calibration: Calibration::read(run)?,
             silhouettes: of_views(silhouette_pictures::file),
+            tree: self.tree.map(|tree| TreeSection::new(tree, dataset)).transpose()?,
             config: model.config.to_toml()?,
         };
         page.write(path)

@@ -4,6 +4,7 @@ use super::args::{Cli, ConfigArgs};
 use super::eval::print_table;
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
+use super::tree::of_page as tree_of_page;
 use clap::Args;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
@@ -50,6 +51,10 @@ pub struct TrainArgs {
     /// Leave scores and pictures of the unseen images for `eval`.
     #[arg(long)]
     pub no_eval: bool,
+    /// Find the vessels as a tree, too (seconds): over the angiograms in the report, with lengths and diameters, and as
+    /// `tree.json` beside it.
+    #[arg(long)]
+    pub tree: bool,
     /// Start over in a directory that already holds a run.
     #[arg(short, long)]
     pub force: bool,
@@ -110,6 +115,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
         evaluation = Some(scores);
     }
     drop(observer);
+    let tree = if args.tree { tree_of_page(cli, &gpu, &model, run, &mut warnings)? } else { None };
     Report {
         gpu: &gpu,
         tuning: &tuning,
@@ -117,6 +123,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
         dataset: &dataset,
         evaluation: evaluation.as_ref(),
         warnings: &warnings,
+        tree: tree.as_ref(),
         run,
         pictures: &report,
     }

@@ -5,11 +5,14 @@ use super::data::bar;
 use super::export::phases;
 use clap::Args;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
-use std::path::PathBuf;
+use nertca_vk::trees::tree::BeatTree;
+use std::path::{Path, PathBuf};
 
 /// `tree`.
 #[derive(Debug, Args)]
@@ -33,6 +36,42 @@ pub struct TreeArgs {
     pub out: PathBuf,
 }
 
+/// Where a run keeps the tree its page shows.
+const TREE_FILE: &str = "tree.json";
+
+/// The tree of all phases of a model for a run's page, and beside the page as a file. A model without vessels has none, which
+/// is one more warning.
+pub fn of_page(
+    cli: &Cli,
+    gpu: &Gpu,
+    model: &Model,
+    directory: &Path,
+    warnings: &mut Vec<String>,
+) -> Result<Option<BeatTree>> {
+    let phases = (0..model.param_map.phases as u32).collect();
+    let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
+    match find(cli, gpu, model, &options) {
+        Ok(beat) => {
+            write(&beat, &directory.join(TREE_FILE), TreeFormat::Json, true)?;
+            Ok(Some(beat))
+        }
+        Err(error @ Error::Config { .. }) => {
+            warnings.push(format!("There is no vessel tree: {error}."));
+            Ok(None)
+        }
+        Err(error) => Err(error),
+    }
+}
+
+fn find(cli: &Cli, gpu: &Gpu, model: &Model, options: &TreeOptions) -> Result<BeatTree> {
+    let renderer = Renderer::new(gpu, model, cli.tuning(gpu, &model.config))?;
+    let mut progress = bar();
+    vessel_trees(&renderer, model, options, |n, of| {
+        progress("trees", n, of);
+        Ok(())
+    })
+}
+
 /// Writes the vessels of a run as trees.
 pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
     let unknown = || Error::config("--out", args.out.display(), "ends in none of .json .vtp .swc .glb");
@@ -40,10 +79,8 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
     let gpu = cli.open_device()?;
-    let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
-    let mut progress = bar();
-    let beat = vessel_trees(&renderer, &model, &options, |n, of| progress("trees", n, of))?;
+    let beat = find(cli, &gpu, &model, &options)?;
     let made = write(&beat, &args.out, format, all)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
@@ -62,6 +99,5 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
         beat.spacing_mm,
         note(&beat)
     );
-    drop(renderer);
     cli.close_device(&gpu)
 }

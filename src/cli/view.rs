@@ -4,6 +4,7 @@
 //! and, where a browser says so, to come from the page itself.
 
 use super::args::Cli;
+use super::view_tree::TreeWork;
 use axum::Router;
 use axum::extract::{Query, Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -11,10 +12,9 @@ use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use clap::Args;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::formats::png;
 use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
@@ -40,6 +40,10 @@ pub struct ViewArgs {
 }
 
 const PAGE: &str = include_str!("view.html");
+/// What draws trees, on this page and on that of a report.
+pub(super) const TREES_SCRIPT: &str = include_str!("trees.js");
+/// Where the page has it.
+const TREES_PLACE: &str = "/* trees.js */";
 /// Side of a picture, pixels.
 const SIDES: std::ops::RangeInclusive<usize> = 16..=2048;
 /// Side of a cell of the moving field: finer than a vessel, coarse enough to draw while dragging.
@@ -49,6 +53,8 @@ struct Viewer {
     model: Model,
     /// One picture at a time: they share the device.
     baked: Mutex<Baked>,
+    /// The vessels as a tree, once the page asks for it.
+    tree: TreeWork,
     /// Largest value of a typical view.
     ranges: HashMap<Quantity, f32>,
     token: String,
@@ -76,6 +82,13 @@ fn chosen<T: Choice>(field: &str, name: &str) -> Result<T> {
 }
 
 impl Viewer {
+    /// Side of the square on the detector that pictures show, mm.
+    fn extent_mm(&self) -> f64 {
+        let [w, h] = self.model.image_size;
+        let [across, down] = self.model.c_arm.pixel_mm;
+        across.max(down) * w.max(h) as f64
+    }
+
     fn values(&self, query: &PictureQuery) -> Result<(Vec<f32>, Quantity)> {
         if !SIDES.contains(&query.size) {
             let problem = format!("{} to {} is accepted", SIDES.start(), SIDES.end());
@@ -86,8 +99,7 @@ impl Viewer {
             projection: chosen("projection", &query.projection)?,
         };
         let c_arm = &self.model.c_arm;
-        let [w, h] = self.model.image_size;
-        let pixel = c_arm.pixel_mm[0].max(c_arm.pixel_mm[1]) * w.max(h) as f64 / query.size as f64;
+        let pixel = self.extent_mm() / query.size as f64;
         let turned = CArm {
             primary_deg: query.primary,
             secondary_deg: query.secondary,
@@ -111,12 +123,7 @@ impl Viewer {
         let range = self.ranges.get(&quantity).copied().unwrap_or(1.0);
         let (low, width) = (query.low * range, (query.high - query.low) * range);
         let codes: Vec<u8> = values.iter().map(|v| (255.0 * (1.0 - (v - low) / width)) as u8).collect();
-        let mut png = Vec::new();
-        let side = query.size as u32;
-        PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub)
-            .write_image(&codes, side, side, ExtendedColorType::L8)
-            .map_err(|e| Error::Internal(format!("PNG: {e}")))?;
-        Ok(png)
+        png::grey8(query.size, query.size, &codes)
     }
 }
 
@@ -164,10 +171,29 @@ async fn info(State(viewer): State<Arc<Viewer>>) -> Response {
         "phases": m.param_map.phases,
         "primary": m.c_arm.primary_deg,
         "secondary": m.c_arm.secondary_deg,
+        "c_arm": {
+            "sid_mm": m.c_arm.sid_mm,
+            "sod_mm": m.c_arm.sod_mm,
+            "offset_mm": m.c_arm.offset_mm,
+            "extent_mm": viewer.extent_mm(),
+        },
         "step": m.step,
         "preset": m.config.preset.name(),
     });
-    ([(header::CONTENT_TYPE, "application/json")], described.to_string()).into_response()
+    json(described.to_string())
+}
+
+fn json(text: String) -> Response {
+    ([(header::CONTENT_TYPE, "application/json")], text).into_response()
+}
+
+/// The tree, or how far it has come; who asks first sets it off.
+async fn tree(State(viewer): State<Arc<Viewer>>) -> Response {
+    let (answer, first) = viewer.tree.ask();
+    if first {
+        tokio::task::spawn_blocking(move || viewer.tree.find(&viewer.model));
+    }
+    json(answer)
 }
 
 async fn frame(State(viewer): State<Arc<Viewer>>, Query(query): Query<PictureQuery>) -> Response {
@@ -200,6 +226,7 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
             tokio::net::TcpListener::bind(address).await.map_err(Error::io("listen on", address.to_string()))?;
         let port = listener.local_addr().map_err(Error::io("listen on", address.to_string()))?.port();
         let mut viewer = Viewer {
+            tree: TreeWork::new(&gpu, cli.tuning(&gpu, &model.config)),
             model,
             baked: Mutex::new(baked),
             ranges: HashMap::new(),
@@ -210,15 +237,17 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
         out!("http://127.0.0.1:{port}/?token={}", viewer.token);
         let viewer = Arc::new(viewer);
         let app = Router::new()
-            .route("/", get(|| async { Html(PAGE) }))
+            .route("/", get(|| async { Html(PAGE.replace(TREES_PLACE, TREES_SCRIPT)) }))
             .route("/info", get(info))
             .route("/frame", get(frame))
+            .route("/tree", get(tree))
             .layer(middleware::from_fn_with_state(viewer.clone(), guard))
-            .with_state(viewer);
+            .with_state(viewer.clone());
         axum::serve(listener, app)
-            .with_graceful_shutdown(async {
+            .with_graceful_shutdown(async move {
                 // Without a handler there is no Ctrl-C to wait for: the process then ends at once.
                 let _ = tokio::signal::ctrl_c().await;
+                viewer.tree.stop();
             })
             .await
             .map_err(Error::io("serve", address.to_string()))

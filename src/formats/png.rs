@@ -4,7 +4,8 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::images::{MAX_FILE_BYTES, MAX_SIDE};
 use crate::raster::Image;
-use image::DynamicImage;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{DynamicImage, ExtendedColorType, ImageEncoder};
 use std::path::Path;
 
 /// Reads a grey PNG of 8 or 16 bits; values are its codes.
@@ -38,6 +39,21 @@ pub fn write_grey16(path: &Path, width: usize, height: usize, codes: Vec<u16>) -
     let buffer = image::ImageBuffer::<image::Luma<u16>, _>::from_raw(width as u32, height as u32, codes)
         .ok_or_else(|| Error::Internal("png buffer has the wrong size".into()))?;
     write(path, &DynamicImage::ImageLuma16(buffer))
+}
+
+/// A PNG of 8-bit grey codes, made fast rather than small: for pages, not for files.
+///
+/// # Errors
+/// [`Error::Internal`] where there are not `width` x `height` codes.
+pub fn grey8(width: usize, height: usize, codes: &[u8]) -> Result<Vec<u8>> {
+    if codes.len() != width * height {
+        return Err(Error::Internal("png buffer has the wrong size".into()));
+    }
+    let mut png = Vec::new();
+    PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub)
+        .write_image(codes, width as u32, height as u32, ExtendedColorType::L8)
+        .map_err(|e| Error::Internal(format!("PNG: {e}")))?;
+    Ok(png)
 }
 
 /// Writes a picture as PNG.

@@ -52,20 +52,21 @@ pub struct TreeOptions {
 /// The vessels of a model as trees of centrelines with radii. Where one set of Gaussians moves, the tree of phase 0 is
 /// followed: point i of branch b is the same material point in all phases, with one radius, and motion along vessels, which
 /// projections do not show, is what the Gaussians' grid makes of it. Elsewhere each phase has a tree of its own. `progress`
-/// hears of phases done and phases in all.
+/// hears of phases done and phases in all, before the first one, too; its error ends the work.
 ///
 /// # Errors
 /// [`Error::Config`] for a phase the model does not have, for lengths and thresholds that are not positive, and for a phase
-/// without vessels above the threshold; device errors.
+/// without vessels above the threshold; device errors; errors of `progress`.
 pub fn vessel_trees(
     renderer: &Renderer,
     model: &Model,
     options: &TreeOptions,
-    mut progress: impl FnMut(u64, u64),
+    mut progress: impl FnMut(u64, u64) -> Result<()>,
 ) -> Result<BeatTree> {
     options.phases.iter().try_for_each(|phase| renderer.check_phase(*phase))?;
-    let mut finder = Finder::new(renderer, model, options)?;
     let all = options.phases.len() as u64;
+    progress(0, all)?;
+    let mut finder = Finder::new(renderer, model, options)?;
     let moving = model.moving.as_ref().and_then(MovingGaussians::tree);
     let mut phases = Vec::new();
     if let Some(tree) = moving {
@@ -73,12 +74,12 @@ pub fn vessel_trees(
         let carrier = Carrier::new(tree);
         for phase in &options.phases {
             phases.push(finder.followed(&reference, &carrier, *phase)?);
-            progress(phases.len() as u64, all);
+            progress(phases.len() as u64, all)?;
         }
     } else {
         for phase in &options.phases {
             phases.push(finder.tree(*phase)?);
-            progress(phases.len() as u64, all);
+            progress(phases.len() as u64, all)?;
         }
     }
     Ok(BeatTree {

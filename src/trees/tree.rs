@@ -18,6 +18,19 @@ impl Branch {
     pub fn length_mm(&self) -> f64 {
         length_mm(&self.points_mm)
     }
+
+    /// Mean diameter of the lumen along the centreline, mm.
+    pub fn mean_diameter_mm(&self) -> f64 {
+        let steps = self.points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
+        // The sum of both radii is the mean diameter of a step.
+        let area: f64 = steps.zip(self.radius_mm.windows(2)).map(|(step, r)| step * (r[0] + r[1])).sum();
+        area / self.length_mm()
+    }
+
+    /// Least diameter of the lumen, mm.
+    pub fn least_diameter_mm(&self) -> f64 {
+        2.0 * self.radius_mm.iter().copied().fold(f64::INFINITY, f64::min)
+    }
 }
 
 /// Length of a line through points, mm.

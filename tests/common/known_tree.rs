@@ -87,7 +87,7 @@ pub fn trained() -> &'static Trained {
         // The detector is off centre, lest anybody forgets that it may be.
         let views = ["--size", "64", "--phases", &phases, "--offset", "2.5,-1.5"];
         ok(&[&["phantom", text(&data), "--tree", text(&tree)], &views[..]].concat());
-        train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60"]);
+        train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60", "--tree"]);
         Trained { directory, data, run }
     })
 }

@@ -1,0 +1,51 @@
+// The tree on a run's page: every training view with the lines of its picture's phase, one choice of phase and branch for all.
+(() => {
+  const $ = id => document.getElementById(id), SVG = "http://www.w3.org/2000/svg", REACH_PX = 12;
+  const {tree, views} = JSON.parse($("tree-data").textContent), phases = tree.phases.length;
+  const between = (a, b) => Math.min((a - b + phases) % phases, (b - a + phases) % phases);
+  let place = null;
+
+  const figures = views.map(view => {
+    const figure = document.createElement("figure"), svg = document.createElementNS(SVG, "svg");
+    const image = document.createElementNS(SVG, "image"), caption = document.createElement("figcaption");
+    svg.setAttribute("viewBox", `-0.5 -0.5 ${view.width} ${view.height}`);
+    for (const [name, value] of Object.entries({x: -0.5, y: -0.5, width: view.width, height: view.height})) image.setAttribute(name, value);
+    svg.append(image); figure.append(svg, caption); $("tree-views").append(figure);
+    const overlay = new trees.Overlay(svg);
+    svg.addEventListener("click", e => {
+      const found = overlay.pick(e.clientX, e.clientY, REACH_PX);
+      choose(found && {...found, phase: shown(view).phase, view});
+    });
+    return {view, image, caption, overlay};
+  });
+
+  // The picture of a view that is nearest to the chosen phase.
+  function shown(view) {
+    const phase = Number($("tree-phase").value);
+    return view.frames.reduce((best, frame) => between(frame.phase, phase) < between(best.phase, phase) ? frame : best);
+  }
+  function choose(found) { place = found; draw(); }
+  // Branches that are not followed are others at another phase.
+  const placeAt = phase => place && (tree.tracked || place.phase === phase) ? place : null;
+  function draw() {
+    $("tree-phase-text").textContent = $("tree-phase").value;
+    for (const {view, image, caption, overlay} of figures) {
+      const frame = shown(view);
+      image.setAttribute("href", frame.picture);
+      caption.textContent = `${view.title}, phase ${frame.phase}`;
+      if ($("tree-lines").checked) overlay.draw(trees.branchesAt(tree, frame.phase), frame.projection, placeAt(frame.phase));
+      else overlay.clear();
+    }
+    const phase = place ? shown(place.view).phase : 0;
+    const here = placeAt(phase);
+    $("tree-told").textContent = here ? `${trees.told(trees.branchesAt(tree, phase), here)} (phase ${phase}).` : "Click a line.";
+    for (const row of document.querySelectorAll("tr[data-branch]")) {
+      const of = placeAt(Number(row.dataset.phase));
+      row.classList.toggle("chosen", of !== null && of.branch === Number(row.dataset.branch));
+    }
+  }
+  for (const mark of document.querySelectorAll("[data-colour]")) mark.style.background = trees.colour(Number(mark.dataset.colour));
+  $("tree-phase").max = phases - 1;
+  for (const id of ["tree-phase", "tree-lines"]) $(id).addEventListener("input", draw);
+  draw();
+})();

@@ -1,0 +1,129 @@
+//! The vessel tree on a run's page: lines over the angiograms it was made of, lengths and diameters of its branches. The one
+//! part of the page that needs a script, which it brings along.
+
+use super::view::TREES_SCRIPT;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use maud::{Markup, PreEscaped, html};
+use nertca_vk::error::{Error, Result};
+use nertca_vk::formats::png;
+use nertca_vk::scan::dataset::{Dataset, Frame};
+use nertca_vk::scan::gating::SYSTOLE_SHARE;
+use nertca_vk::score::pictures::Window;
+use nertca_vk::trees::files::{note, to_json};
+use nertca_vk::trees::tree::{BeatTree, PhaseTree};
+use serde_json::{Value, json};
+
+const SCRIPT: &str = include_str!("report_trees.js");
+/// Angiograms embedded at most.
+const MOST_PICTURES: usize = 120;
+const STYLE: &str = "
+#tree-views svg{width:100%;display:block}#tree-views image{image-rendering:pixelated}
+#tree-views polyline{fill:none;stroke-width:2px;vector-effect:non-scaling-stroke;stroke-linejoin:round;cursor:pointer}
+#tree-views .chosen{stroke-width:5px}#tree-views .mark{fill:#fff;stroke:#000;vector-effect:non-scaling-stroke}
+tr.chosen td{font-weight:600}td i{display:inline-block;width:.8rem;height:.8rem;margin-right:.4rem}";
+
+/// What the page shows of a tree.
+pub struct TreeSection {
+    /// Tree and angiograms, JSON.
+    data: String,
+    note: &'static str,
+    /// Names of phases, and their trees.
+    tables: Vec<(&'static str, PhaseTree)>,
+}
+
+impl TreeSection {
+    /// A tree of all phases over the training views of a dataset, which are those the reconstruction went by.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for what JSON or a picture cannot hold.
+    pub fn new(beat: &BeatTree, dataset: &Dataset) -> Result<TreeSection> {
+        // Evenly thinned out where there are too many.
+        let step = dataset.training().len().div_ceil(MOST_PICTURES).max(1);
+        let views = dataset.training_views().into_iter().map(|view| view_data(dataset, view, step));
+        let views = json!(views.collect::<Result<Vec<_>>>()?).to_string();
+        let systole = (SYSTOLE_SHARE * f64::from(dataset.n_phases)).round() as u32;
+        let names = [("End of diastole", 0), ("End of systole", systole)];
+        let named = |(name, phase): (&'static str, u32)| {
+            beat.phases.iter().find(|tree| tree.phase == phase).map(|tree| (name, tree.clone()))
+        };
+        Ok(TreeSection {
+            data: format!(r#"{{"tree":{},"views":{views}}}"#, to_json(beat)?),
+            note: note(beat),
+            tables: names.into_iter().filter_map(named).collect(),
+        })
+    }
+
+    /// The section.
+    pub fn markup(&self) -> Markup {
+        html! {
+            h2 { "Vessels as a tree" }
+            p.lead { "Centrelines over the angiograms that were reconstructed from; " (self.note) "." }
+            style { (PreEscaped(STYLE)) }
+            noscript { p.warn { "The lines are drawn by a script of this page, which is switched off." } }
+            p {
+                label for="tree-phase" { "Phase " span #tree-phase-text {} " " }
+                input #tree-phase type="range" min="0" value="0" step="1";
+                " " label { input #tree-lines type="checkbox" checked; " centrelines" }
+            }
+            p #tree-told role="status" {}
+            div.by-view #tree-views {}
+            div.by-view { @for (name, tree) in &self.tables { (table(name, tree)) } }
+            // Nothing in it can end the element: it has numbers and angles.
+            script #tree-data type="application/json" { (PreEscaped(&self.data)) }
+            script { (PreEscaped(TREES_SCRIPT)) (PreEscaped(SCRIPT)) }
+        }
+    }
+}
+
+/// A training view: its angiograms, and how patient points are seen in each.
+fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
+    let mut frames: Vec<&Frame> = dataset.training().iter().filter(|frame| frame.view == view).collect();
+    frames.sort_by_key(|frame| frame.phase);
+    let window = Window::of(&frames.iter().flat_map(|frame| frame.integrals.iter().copied()).collect::<Vec<_>>());
+    let frame = |frame: &Frame| -> Result<Value> {
+        let png = png::grey8(dataset.width, dataset.height, &window.codes(&frame.integrals))?;
+        Ok(json!({
+            "phase": frame.phase,
+            "projection": dataset.heart_rays(frame).projection(),
+            "picture": format!("data:image/png;base64,{}", STANDARD.encode(png)),
+        }))
+    };
+    let frames = frames.into_iter().step_by(step).map(frame).collect::<Result<Vec<_>>>()?;
+    if frames.is_empty() {
+        return Err(Error::Internal(format!("view {view} has no training frame")));
+    }
+    let angle = |value: f64, plus: &str, minus: &str| {
+        format!("{} {:.0}°", if value >= 0.0 { plus } else { minus }, value.abs())
+    };
+    let angles = dataset.views[view].geometry.angles_deg().map_or(String::new(), |(primary, secondary)| {
+        format!(", {} {}", angle(primary, "LAO", "RAO"), angle(secondary, "CRA", "CAU"))
+    });
+    Ok(json!({
+        "title": format!("View {view}{angles}"),
+        "width": dataset.width,
+        "height": dataset.height,
+        "frames": frames,
+    }))
+}
+
+fn table(name: &str, tree: &PhaseTree) -> Markup {
+    html! {
+        div {
+            h3 { (name) " (phase " (tree.phase) ")" }
+            table {
+                tr { th { "branch" } th { "leaves" } th { "length, mm" } th { "mean diameter, mm" } th { "least, mm" } }
+                @for (index, branch) in tree.branches.iter().enumerate() {
+                    tr data-branch=(index) data-phase=(tree.phase) {
+                        td { i data-colour=(index) {} (index) }
+                        td { @match branch.parent { Some(parent) => (parent), None => "-" } }
+                        td { (format!("{:.1}", branch.length_mm())) }
+                        td { (format!("{:.2}", branch.mean_diameter_mm())) }
+                        td { (format!("{:.2}", branch.least_diameter_mm())) }
+                    }
+                }
+                tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} }
+            }
+        }
+    }
+}

@@ -1,0 +1,110 @@
+// Trees of vessels over pictures: where a point is seen, lines, what is clicked, and what is told of it. Viewer and report share
+// it. Points are patient mm (left, posterior, superior); places in pictures are columns and rows, pixel centres at integers.
+"use strict";
+const trees = (() => {
+  // Told apart on white, on grey and on black.
+  const COLOURS = ["#e6194b", "#1f8fff", "#2ca02c", "#ff8c00", "#b14bff", "#00a5a5", "#e75cc4", "#9a7b00"];
+  const SVG = "http://www.w3.org/2000/svg";
+  const MARK_PX = 5;
+  const mix = (a, b, share) => a + (b - a) * share;
+  const colour = branch => COLOURS[branch % COLOURS.length];
+
+  // The projection of a C-arm onto a picture of `side` x `side` pixels, as `CArm::rays` of src/geometry.rs has it.
+  function cArmProjection(cArm, primary, secondary, side) {
+    const [a, b] = [primary, secondary].map(degrees => degrees * Math.PI / 180);
+    const columns = [Math.cos(a), Math.sin(a), 0];
+    const rows = [Math.sin(a) * Math.sin(b), -Math.cos(a) * Math.sin(b), -Math.cos(b)];
+    const beam = [Math.sin(a) * Math.cos(b), -Math.cos(a) * Math.cos(b), Math.sin(b)];
+    const pixel = cArm.extent_mm / side, focal = cArm.sid_mm / pixel;
+    const row = (across, axis) => {
+      const centre = side / 2 - 0.5 - cArm.offset_mm[axis] / pixel;
+      return [...across.map((v, i) => focal * v + centre * beam[i]), centre * cArm.sod_mm];
+    };
+    return [row(columns, 0), row(rows, 1), [...beam, cArm.sod_mm]];
+  }
+
+  // Column and row of a point; none behind the source.
+  function project(projection, point) {
+    const [u, v, depth] = projection.map(r => r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]);
+    return depth > 0 ? [u / depth, v / depth] : null;
+  }
+
+  // Branches at a phase. Between two phases points that are followed lie on straight lines, and the beat closes; trees that are
+  // not followed are those of the nearest phase.
+  function branchesAt(tree, phase) {
+    const n = tree.phases.length, before = Math.floor(phase), share = phase - before;
+    if (!tree.tracked || share === 0) return tree.phases[Math.round(phase) % n].branches;
+    const next = tree.phases[(before + 1) % n].branches;
+    return tree.phases[before % n].branches.map((branch, b) => ({
+      points_mm: branch.points_mm.map((p, i) => p.map((v, axis) => mix(v, next[b].points_mm[i][axis], share))),
+      radius_mm: branch.radius_mm.map((r, i) => mix(r, next[b].radius_mm[i], share)),
+    }));
+  }
+
+  // Way along a line to each of its points, mm.
+  function ways(points) {
+    let way = 0;
+    return points.map((p, i) => way += i ? Math.hypot(...p.map((v, axis) => v - points[i - 1][axis])) : 0);
+  }
+
+  // Length and diameters of a branch, mm, and the diameter at a place: `share` of the way from point `from` to the next.
+  function measure(branch, {from, share}) {
+    const along = ways(branch.points_mm), wide = branch.radius_mm.map(r => 2 * r), length = along[along.length - 1];
+    const sum = wide.slice(1).reduce((sum, d, i) => sum + (d + wide[i]) / 2 * (along[i + 1] - along[i]), 0);
+    return {
+      length_mm: length, least_mm: Math.min(...wide), mean_mm: length > 0 ? sum / length : wide[0],
+      here_mm: mix(wide[from], wide[from + 1], share), along_mm: mix(along[from], along[from + 1], share),
+    };
+  }
+
+  // What is told of a clicked branch.
+  function told(branches, place) {
+    const m = measure(branches[place.branch], place), mm = v => v.toFixed(2) + " mm";
+    return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; diameter ${mm(m.least_mm)} at least, `
+      + `${mm(m.mean_mm)} in the mean, ${mm(m.here_mm)} here, ${m.along_mm.toFixed(1)} mm from its beginning`;
+  }
+
+  // Lines over one picture, in an SVG element whose units are its pixels.
+  class Overlay {
+    constructor(svg) {
+      this.svg = svg; this.lines = []; this.seen = []; this.branches = [];
+      this.mark = svg.appendChild(document.createElementNS(SVG, "circle"));
+      this.mark.setAttribute("class", "mark");
+    }
+    clear() { this.draw([], null, null); }
+    draw(branches, projection, place) {
+      this.branches = branches;
+      this.seen = branches.map(branch => branch.points_mm.map(point => project(projection, point)));
+      while (this.lines.length > branches.length) this.lines.pop().remove();
+      while (this.lines.length < branches.length) {
+        const line = document.createElementNS(SVG, "polyline");
+        line.style.stroke = colour(this.lines.length);
+        this.lines.push(this.svg.insertBefore(line, this.mark));
+      }
+      this.seen.forEach((points, b) => {
+        this.lines[b].setAttribute("points", points.filter(Boolean).map(p => p.map(v => v.toFixed(3)).join()).join(" "));
+        this.lines[b].classList.toggle("chosen", place !== null && place.branch === b);
+      });
+      const line = place && this.seen[place.branch], [from, to] = line ? [line[place.from], line[place.from + 1]] : [];
+      this.mark.setAttribute("r", from && to ? MARK_PX / this.svg.getScreenCTM().a : 0);
+      if (from && to) ["cx", "cy"].forEach((name, i) => this.mark.setAttribute(name, mix(from[i], to[i], place.share)));
+    }
+    // The place on a line nearest to where the pointer is on the screen; none farther than `reach` of the screen's pixels.
+    pick(clientX, clientY, reach) {
+      const screen = this.svg.getScreenCTM();
+      const at = new DOMPoint(clientX, clientY).matrixTransform(screen.inverse());
+      let nearest = null, best = reach / screen.a;
+      this.seen.forEach((points, branch) => points.slice(1).forEach((to, from) => {
+        const begin = points[from];
+        if (!begin || !to) return;
+        const way = [to[0] - begin[0], to[1] - begin[1]], length2 = way[0] ** 2 + way[1] ** 2;
+        const along = ((at.x - begin[0]) * way[0] + (at.y - begin[1]) * way[1]) / (length2 || 1);
+        const share = Math.max(0, Math.min(1, along));
+        const away = Math.hypot(begin[0] + share * way[0] - at.x, begin[1] + share * way[1] - at.y);
+        if (away < best) [best, nearest] = [away, {branch, from, share}];
+      }));
+      return nearest;
+    }
+  }
+  return {Overlay, branchesAt, cArmProjection, colour, told};
+})();

@@ -1,0 +1,94 @@
+//! The tree of vessels of the viewer: found once, when the page first asks for it, beside the pictures.
+
+use nertca_vk::error::{Error, Result};
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::model::Model;
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
+use nertca_vk::trees::files::to_json;
+use serde_json::json;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// How far the tree has come.
+enum TreeState {
+    /// Nobody has asked for it.
+    Unasked,
+    /// Phases that are done, and all of them.
+    Working { done: u64, of: u64 },
+    /// Why there is none.
+    Failed(String),
+    /// The tree of all phases, as `tree -o FILE.json` writes it.
+    Ready(String),
+}
+
+impl TreeState {
+    /// What the page is answered, JSON.
+    fn answer(&self) -> String {
+        match self {
+            TreeState::Unasked => json!({ "state": "working", "done": 0, "of": 0 }).to_string(),
+            TreeState::Working { done, of } => json!({ "state": "working", "done": done, "of": of }).to_string(),
+            TreeState::Failed(problem) => json!({ "state": "failed", "problem": problem }).to_string(),
+            TreeState::Ready(tree) => format!(r#"{{"state":"ready","tree":{tree}}}"#),
+        }
+    }
+}
+
+/// Finds the tree of a run on the device that draws it.
+pub struct TreeWork {
+    gpu: Gpu,
+    tuning: Tuning,
+    state: Mutex<TreeState>,
+    stop: AtomicBool,
+}
+
+impl TreeWork {
+    /// Work that begins when it is asked for.
+    pub fn new(gpu: &Gpu, tuning: Tuning) -> TreeWork {
+        TreeWork { gpu: gpu.clone(), tuning, state: Mutex::new(TreeState::Unasked), stop: AtomicBool::new(false) }
+    }
+
+    fn state(&self) -> MutexGuard<'_, TreeState> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// How far the tree has come, as JSON, and whether the caller is the first to ask: then it calls [`TreeWork::find`].
+    pub fn ask(&self) -> (String, bool) {
+        let mut state = self.state();
+        let first = matches!(*state, TreeState::Unasked);
+        if first {
+            *state = TreeState::Working { done: 0, of: 0 };
+        }
+        (state.answer(), first)
+    }
+
+    /// Finds the tree. Takes seconds.
+    pub fn find(&self, model: &Model) {
+        let found = match self.tree(model) {
+            Ok(json) => TreeState::Ready(json),
+            Err(error) => TreeState::Failed(error.to_string()),
+        };
+        *self.state() = found;
+    }
+
+    /// Ends the work under way before its next phase.
+    pub fn stop(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    fn tree(&self, model: &Model) -> Result<String> {
+        // One of its own: pictures go on through the viewer's.
+        let renderer = Renderer::new(&self.gpu, model, self.tuning.clone())?;
+        let phases = (0..model.param_map.phases as u32).collect();
+        let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
+        let beat = vessel_trees(&renderer, model, &options, |done, of| {
+            if self.stop.load(Ordering::Relaxed) {
+                return Err(Error::Interrupted);
+            }
+            *self.state() = TreeState::Working { done, of };
+            Ok(())
+        })?;
+        to_json(&beat)
+    }
+}

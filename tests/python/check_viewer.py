@@ -1,0 +1,67 @@
+"""Looks at the viewer's tree in a browser: points are where the engine sees them, and clicks tell lengths and diameters.
+
+    python3 check_viewer.py EXPECTED.json PICTURE.png   # made by tests/tree_pages.rs
+"""
+import json
+import sys
+
+import numpy as np
+from browser import Page
+from tree_numbers import measure, numbers_of
+
+NEAR_PX = 0.05
+
+expected = json.load(open(sys.argv[1]))
+tree = json.load(open(expected["tree"]))["phases"]
+
+
+def lines(page):
+    """Points of each line, pixels."""
+    points = page.evaluate("[...document.querySelectorAll('#tree polyline')].map(l => l.getAttribute('points'))")
+    return [np.array([[float(v) for v in pair.split(",")] for pair in line.split()]) for line in points]
+
+
+with Page(expected["url"]) as page:
+    page.wait("document.body.dataset.drawn > 0")
+    assert lines(page) == [], "lines come when they are asked for"
+    page.evaluate("document.getElementById('tree-shown').click()")
+    page.wait("document.querySelectorAll('#tree polyline').length > 0")
+
+    for case in expected["cases"]:
+        drawn = page.evaluate("+document.body.dataset.drawn")
+        page.evaluate(f"change({json.dumps(case['state'])})")
+        page.wait(f"document.body.dataset.drawn > {drawn} && !busy")
+        found = lines(page)
+        assert len(found) == len(case["lines"]), (len(found), len(case["lines"]))
+        away = max(np.abs(a - np.array(b)).max() for a, b in zip(found, case["lines"]))
+        print(f"{case['state']}: {away:.4f} px off at most")
+        assert away < NEAR_PX, (case["state"], away)
+
+    # A click on the middle of each branch, at the last case's whole phase.
+    phase = int(expected["cases"][-1]["state"]["phase"])
+    for branch, line in enumerate(lines(page)):
+        i = len(line) // 2
+        place = page.evaluate(f"(() => {{ const p = new DOMPoint({line[i][0]}, {line[i][1]}).matrixTransform("
+                              "document.getElementById('tree').getScreenCTM()); return [p.x, p.y]; })()")
+        page.click(*place)
+        told = page.evaluate("document.getElementById('tree-text').textContent")
+        print(told)
+        assert told.startswith(f"Branch {branch}:"), (branch, told)
+        wanted = measure(tree[phase]["branches"][branch], i)
+        # Where a vessel runs along the view, a pixel is more of its length.
+        assert np.allclose(numbers_of(told), wanted, atol=1.0), (told, wanted)
+        assert np.allclose(numbers_of(told)[:3], wanted[:3], atol=0.06), (told, wanted)
+        chosen = page.evaluate("[...document.querySelectorAll('#tree polyline')].findIndex(l => l.matches('.chosen'))")
+        assert chosen == branch, (chosen, branch)
+    page.picture(sys.argv[2])
+
+    page.evaluate("document.getElementById('tree-shown').click()")
+    assert lines(page) == [] and page.evaluate("document.getElementById('tree-text').textContent") == ""
+
+# An address may ask for it.
+first = expected["cases"][0]["state"]
+address = expected["url"] + "".join(f"&{name}={value}" for name, value in first.items()) + "&tree=1"
+with Page(address) as page:
+    page.wait("document.querySelectorAll('#tree polyline').length > 0")
+    away = max(np.abs(a - np.array(b)).max() for a, b in zip(lines(page), expected["cases"][0]["lines"]))
+    assert away < NEAR_PX, away
