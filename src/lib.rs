@@ -124,6 +124,7 @@ pub mod formats {
     pub mod swc;
     pub mod volume;
     pub mod vtk;
+    mod vtk_arrays;
     pub mod vtp;
 }
 
@@ -283,6 +284,7 @@ pub mod phantom {
     mod runs;
     mod subjects;
     pub mod tree;
+    pub mod tree_file;
     pub mod views;
     pub mod voxels;
 }

@@ -36,7 +36,8 @@ pub struct PhantomArgs {
     /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
     pub layout: Layout,
-    /// Coronary tree as JSON instead of the procedural one.
+    /// Coronary tree instead of the procedural one: .json, centrelines with radii as .vtp (at rest) of VMTK, 3D Slicer or
+    /// `tree`, or a .pvd that names such files of a beat.
     #[arg(long, value_name = "FILE")]
     pub tree: Option<PathBuf>,
     /// Chest CT in Hounsfield units behind the tree.

@@ -1,8 +1,15 @@
 //! VTK's XML poly data (`.vtp`): lines with values at points and lines, and collections of such files over time (`.pvd`).
-//! As text: centrelines are small, and every reader of VTK's formats takes it. By hand: vtkio brings a parser and three
+//! Written as text: centrelines are small, and every reader of VTK's formats takes it. By hand: vtkio brings a parser and three
 //! compressions, none of which a few arrays need.
 
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::vtk_arrays::{Arrays, Parts};
+use roxmltree::{Document, Node};
 use std::fmt::{Display, Write};
+use std::path::{Path, PathBuf};
+
+const MOST_FILE_BYTES: u64 = 1 << 30;
 
 /// Values by a name, one per point or line.
 pub enum Values {
@@ -93,4 +100,108 @@ pub fn collection(files: &[(f64, String)]) -> String {
         "<?xml version=\"1.0\"?>\n<VTKFile type=\"Collection\" version=\"1.0\" byte_order=\"LittleEndian\">\n\
          <Collection>\n{entries}</Collection>\n</VTKFile>\n"
     )
+}
+
+/// Lines of a file.
+#[derive(Debug, Default)]
+pub struct ReadLines {
+    /// All points.
+    pub points: Vec<[f64; 3]>,
+    /// Points of each line, by their place in `points`.
+    pub lines: Vec<Vec<usize>>,
+    /// Single values at all points, by their names.
+    pub of_points: Vec<(String, Vec<f64>)>,
+}
+
+fn child<'a, 'input>(node: Node<'a, 'input>, name: &str) -> Option<Node<'a, 'input>> {
+    node.children().find(|child| child.has_tag_name(name))
+}
+
+fn data_arrays<'a, 'input>(node: Option<Node<'a, 'input>>) -> impl Iterator<Item = Node<'a, 'input>> {
+    node.into_iter().flat_map(|node| node.children().filter(|child| child.has_tag_name("DataArray")))
+}
+
+fn parsed<'a>(path: &Path, text: &'a str) -> Result<Document<'a>> {
+    Document::parse(text).map_err(|e| Error::data(path, "XML", e.to_string()))
+}
+
+/// Reads the lines of a `.vtp`, however VTK keeps its arrays, but for compression by LZ4 and LZMA.
+///
+/// # Errors
+/// [`Error::Io`], and [`Error::Data`] naming the field.
+pub fn read(path: &Path) -> Result<ReadLines> {
+    let bytes = files::read_limited(path, MOST_FILE_BYTES)?;
+    let parts = Parts::of(&bytes);
+    let document = parsed(path, &parts.text)?;
+    let arrays = Arrays::of(path, &document, &parts, "PolyData")?;
+    let data = child(document.root_element(), "PolyData");
+    let mut pieces = data.into_iter().flat_map(|data| data.children().filter(|piece| piece.has_tag_name("Piece")));
+    let (Some(piece), None) = (pieces.next(), pieces.next()) else {
+        return Err(Error::data(path, "Piece", "is not there once: files of one piece are read"));
+    };
+    let points = data_arrays(child(piece, "Points")).next().map_or(Ok(Vec::new()), |points| arrays.values(points))?;
+    let (points, []) = points.as_chunks::<3>() else {
+        return Err(Error::data(path, "Points", "are not three numbers each"));
+    };
+    let of_lines = |name: &str| -> Result<Vec<f64>> {
+        let mut found = data_arrays(child(piece, "Lines")).filter(|array| array.attribute("Name") == Some(name));
+        found.next().map_or(Ok(Vec::new()), |array| arrays.values(array))
+    };
+    let lines = lines(&of_lines("connectivity")?, &of_lines("offsets")?, points.len());
+    let mut of_points = Vec::new();
+    for array in data_arrays(child(piece, "PointData")) {
+        let single = array.attribute("NumberOfComponents").is_none_or(|n| n == "1");
+        let name = array.attribute("Name").unwrap_or_default();
+        if !single {
+            continue;
+        }
+        let values = arrays.values(array)?;
+        if values.len() != points.len() {
+            let problem = format!("{} values for {} points", values.len(), points.len());
+            return Err(Error::data(path, format!("DataArray {name}"), problem));
+        }
+        of_points.push((name.to_owned(), values));
+    }
+    let lines = lines.ok_or_else(|| Error::data(path, "Lines", "leave the points or their own list"))?;
+    Ok(ReadLines { points: points.to_vec(), lines, of_points })
+}
+
+/// Points of each line, from all lines' points one after the other and where each ends; none where these leave their lists.
+fn lines(connectivity: &[f64], ends: &[f64], n_points: usize) -> Option<Vec<Vec<usize>>> {
+    let whole = |value: &f64| (*value >= 0.0 && value.fract() == 0.0).then_some(*value as usize);
+    let mut start = 0;
+    let line = |end: &f64| {
+        let end = whole(end)?;
+        let line = connectivity.get(start..end)?.iter().map(|point| whole(point).filter(|point| *point < n_points));
+        start = end;
+        line.collect()
+    };
+    ends.iter().map(line).collect()
+}
+
+/// Reads the files that a `.pvd` names, in the order of their times.
+///
+/// # Errors
+/// [`Error::Io`]; [`Error::Data`] for what is no collection, and for two files of one time.
+pub fn read_collection(path: &Path) -> Result<Vec<PathBuf>> {
+    let bytes = files::read_limited(path, MOST_FILE_BYTES)?;
+    let parts = Parts::of(&bytes);
+    let document = parsed(path, &parts.text)?;
+    Arrays::of(path, &document, &parts, "Collection")?;
+    let sets = child(document.root_element(), "Collection");
+    let sets = sets.into_iter().flat_map(|all| all.children().filter(|set| set.has_tag_name("DataSet")));
+    let mut files = Vec::new();
+    for set in sets {
+        let time = set.attribute("timestep").and_then(|time| time.parse::<f64>().ok()).filter(|time| time.is_finite());
+        let (Some(time), Some(file)) = (time, set.attribute("file")) else {
+            return Err(Error::data(path, "DataSet", "has no timestep or no file"));
+        };
+        files.push((time, path.with_file_name("").join(file)));
+    }
+    files.sort_by(|a, b| a.0.total_cmp(&b.0));
+    match files.windows(2).find(|pair| pair[0].0 == pair[1].0) {
+        Some(pair) => Err(Error::data(path, "timestep", format!("{} is that of two files", pair[0].0))),
+        None if files.is_empty() => Err(Error::data(path, "Collection", "has no file")),
+        None => Ok(files.into_iter().map(|(_, file)| file).collect()),
+    }
 }

@@ -11,7 +11,8 @@ use crate::phantom::noise::add_noise;
 use crate::phantom::projector::Projector;
 use crate::phantom::runs::{Shot, shots};
 use crate::phantom::subjects::{Moving, Patient, Placed, Pose, Reading, Subject, Thorax, Volumes};
-use crate::phantom::tree::{Tree, TreeFile};
+use crate::phantom::tree::Tree;
+use crate::phantom::tree_file::TreeFile;
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use crate::phantom::voxels::Tissues;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
@@ -77,7 +78,7 @@ pub struct PhantomOptions {
 /// A tree and a CT from files.
 #[derive(Debug, Clone)]
 pub struct Anatomy {
-    /// Tree as JSON.
+    /// Tree, as [`TreeFile::read`] reads it.
     pub tree: PathBuf,
     /// CT in Hounsfield units.
     pub background: Option<PathBuf>,

@@ -1,17 +1,13 @@
-//! A coronary tree that moves: procedural, or read from a file.
+//! A coronary tree that moves: procedural, or [read from a file](super::tree_file).
 //!
 //! Positions are patient mm (LPS), isocentre at the origin. Lumen diameters follow Dodge et al., "Lumen
 //! diameter of normal human coronary arteries", Circulation 86:232-246 (1992): left main 4.5 mm, proximal
 //! LAD 3.7 mm, distal LAD 1.9 mm, proximal LCx 3.4 mm, first diagonal and marginals about 2.2 mm,
 //! septals about 1.2 mm.
 
-use crate::error::{Error, Result};
-use crate::files;
 use crate::random::{STREAM_SHAPE, uniform01};
 use crate::scan::gating::contraction;
 use glam::DVec3;
-use serde::{Deserialize, Serialize};
-use std::path::Path;
 
 /// One vessel: a polyline.
 #[derive(Debug, Clone)]
@@ -257,120 +253,6 @@ pub(super) fn spline(controls: &[[f64; 3]], s: f64) -> [f64; 3] {
         let (t2, t3) = (t * t, t * t * t);
         (2.0 * t3 - 3.0 * t2 + 1.0) * b[k] + (t3 - 2.0 * t2 + t) * m0 + (3.0 * t2 - 2.0 * t3) * c[k] + (t3 - t2) * m1
     })
-}
-
-/// A tree and its beat, as read from a file.
-#[derive(Debug, Serialize, Deserialize)]
-pub struct TreeFile {
-    branches: Vec<TreeBranch>,
-    radius_mm: Vec<f64>,
-    points_mm: Vec<Vec<[f64; 3]>>,
-}
-
-#[derive(Debug, Serialize, Deserialize)]
-struct TreeBranch {
-    name: String,
-    first: usize,
-    count: usize,
-}
-
-impl TreeFile {
-    /// Reads a tree (see `docs/formats.md`).
-    ///
-    /// # Errors
-    /// [`Error::Data`] naming file and field.
-    pub fn read(path: &Path) -> Result<TreeFile> {
-        let bytes = files::read_limited(path, 1 << 30)?;
-        let file: TreeFile = serde_json::from_slice(&bytes)
-            .map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))?;
-        file.check(path)?;
-        Ok(file)
-    }
-
-    /// The tree that has these shapes at equal fractions of its beat; none without any. All must have the same branches.
-    pub fn of(shapes: &[Tree]) -> Option<TreeFile> {
-        let rest = shapes.first()?;
-        let firsts = rest.branches.iter().scan(0, |end, branch| {
-            let first = *end;
-            *end += branch.points.len();
-            Some(first)
-        });
-        let branch = |(branch, first): (&Branch, usize)| TreeBranch {
-            name: branch.name.clone(),
-            first,
-            count: branch.points.len(),
-        };
-        let ras = |p: &DVec3| [-p.x, -p.y, p.z];
-        let points = |tree: &Tree| tree.branches.iter().flat_map(|b| b.points.iter().map(ras)).collect();
-        Some(TreeFile {
-            branches: rest.branches.iter().zip(firsts).map(branch).collect(),
-            radius_mm: rest.branches.iter().flat_map(|b| b.radius_mm.iter().copied()).collect(),
-            points_mm: shapes.iter().map(points).collect(),
-        })
-    }
-
-    /// Writes the tree, as [`TreeFile::read`] reads it.
-    ///
-    /// # Errors
-    /// [`Error::Io`].
-    pub fn write(&self, path: &Path) -> Result<()> {
-        let json = serde_json::to_string(self).map_err(|e| Error::Internal(e.to_string()))?;
-        files::write_atomic(path, json.as_bytes())
-    }
-
-    /// The tree at a fraction (0 to 1) of its beat, between the stored phases on straight lines; the beat closes.
-    pub fn at(&self, fraction: f64) -> Tree {
-        let stored = self.points_mm.len();
-        let x = fraction * stored as f64;
-        let (a, b) = (x as usize % stored, (x as usize + 1) % stored);
-        let point = |i: usize| {
-            let (from, to) = (DVec3::from_array(self.points_mm[a][i]), DVec3::from_array(self.points_mm[b][i]));
-            let ras = from.lerp(to, x.fract());
-            DVec3::new(-ras.x, -ras.y, ras.z)
-        };
-        let branch = |b: &TreeBranch| {
-            let range = b.first..b.first + b.count;
-            Branch {
-                name: b.name.clone(),
-                points: range.clone().map(point).collect(),
-                radius_mm: self.radius_mm[range].to_vec(),
-                filling: vec![1.0; b.count],
-            }
-        };
-        Tree { branches: self.branches.iter().map(branch).collect() }
-    }
-
-    fn check(&self, path: &Path) -> Result<()> {
-        let n = self.radius_mm.len();
-        if self.points_mm.is_empty() || self.branches.is_empty() {
-            return Err(Error::data(path, "points_mm", "no phase or no branch"));
-        }
-        if let Some(i) = self.radius_mm.iter().position(|r| !(r.is_finite() && *r > 0.0)) {
-            return Err(Error::data(path, format!("radius_mm[{i}]"), "is not a positive length"));
-        }
-        for (p, points) in self.points_mm.iter().enumerate() {
-            if points.len() != n {
-                return Err(Error::data(
-                    path,
-                    format!("points_mm[{p}]"),
-                    format!("{} points for {n} radii", points.len()),
-                ));
-            }
-            if let Some(i) = points.iter().position(|x| x.iter().any(|v| !v.is_finite())) {
-                return Err(Error::data(path, format!("points_mm[{p}][{i}]"), "is not finite"));
-            }
-        }
-        for (i, b) in self.branches.iter().enumerate() {
-            if b.count < 2 || b.first.checked_add(b.count).is_none_or(|end| end > n) {
-                return Err(Error::data(
-                    path,
-                    format!("branches[{i}]"),
-                    "its range leaves the point array or is shorter than 2",
-                ));
-            }
-        }
-        Ok(())
-    }
 }
 
 #[cfg(test)]

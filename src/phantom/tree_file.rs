@@ -1,0 +1,173 @@
+//! Trees as files: what `phantom --tree` reads, and the truth that phantoms leave.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::formats::vtp::{self, ReadLines};
+use crate::phantom::tree::{Branch, Tree};
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Names of radii at points, as VMTK and 3D Slicer write them, and as others do.
+const RADII: [&str; 3] = ["MaximumInscribedSphereRadius", "Radius", "radius"];
+
+/// A tree and its beat, as read from a file.
+#[derive(Debug, Serialize, Deserialize)]
+pub struct TreeFile {
+    branches: Vec<TreeBranch>,
+    radius_mm: Vec<f64>,
+    points_mm: Vec<Vec<[f64; 3]>>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct TreeBranch {
+    name: String,
+    first: usize,
+    count: usize,
+}
+
+impl TreeFile {
+    /// Reads a tree (see `docs/formats.md`): JSON in RAS mm; lines of a `.vtp` in LPS mm, which are at rest; or the files that a
+    /// `.pvd` names, which are the phases of a beat.
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming file and field, [`Error::Io`].
+    pub fn read(path: &Path) -> Result<TreeFile> {
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+        let file = match extension.as_str() {
+            "vtp" => TreeFile::of_lines(&[(path.to_path_buf(), vtp::read(path)?)])?,
+            "pvd" => {
+                let phases = vtp::read_collection(path)?;
+                let lines = phases.into_iter().map(|file| vtp::read(&file).map(|lines| (file, lines)));
+                TreeFile::of_lines(&lines.collect::<Result<Vec<_>>>()?)?
+            }
+            _ => serde_json::from_slice(&files::read_limited(path, 1 << 30)?)
+                .map_err(|e| Error::data(path, format!("line {}", e.line()), e.to_string()))?,
+        };
+        file.check(path)?;
+        Ok(file)
+    }
+
+    /// Lines of files that are the phases of a beat; all must have the same lines. A point has its radius of the first.
+    fn of_lines(phases: &[(PathBuf, ReadLines)]) -> Result<TreeFile> {
+        let Some((first_file, rest)) = phases.first() else {
+            return Ok(TreeFile { branches: Vec::new(), radius_mm: Vec::new(), points_mm: Vec::new() });
+        };
+        let named = |name: &&str| rest.of_points.iter().find(|(found, _)| found == *name);
+        let radii = RADII.iter().find_map(|name| named(&name)).ok_or_else(|| {
+            let found: Vec<&str> = rest.of_points.iter().map(|(name, _)| name.as_str()).collect();
+            let problem = format!("has none of the radii {}; its arrays are: {}", RADII.join(", "), found.join(", "));
+            Error::data(first_file, "PointData", problem)
+        })?;
+        let mut first = 0;
+        let branch = |(index, line): (usize, &Vec<usize>)| {
+            let branch = TreeBranch { name: format!("line {index}"), first, count: line.len() };
+            first += line.len();
+            branch
+        };
+        let branches = rest.lines.iter().enumerate().map(branch).collect();
+        let count = |lines: &ReadLines| lines.lines.iter().map(Vec::len).collect::<Vec<_>>();
+        for (file, lines) in phases {
+            if count(lines) != count(rest) {
+                let problem = format!(
+                    "are others than those of {}: the lines of a beat must be followed, point by point",
+                    first_file.display()
+                );
+                return Err(Error::data(file, "Lines", problem));
+            }
+        }
+        let ras = |p: [f64; 3]| [-p[0], -p[1], p[2]];
+        let points =
+            |lines: &ReadLines| lines.lines.iter().flatten().map(|point| ras(lines.points[*point])).collect::<Vec<_>>();
+        Ok(TreeFile {
+            branches,
+            radius_mm: rest.lines.iter().flatten().map(|point| radii.1[*point]).collect(),
+            points_mm: phases.iter().map(|(_, lines)| points(lines)).collect(),
+        })
+    }
+
+    /// The tree that has these shapes at equal fractions of its beat; none without any. All must have the same branches.
+    pub fn of(shapes: &[Tree]) -> Option<TreeFile> {
+        let rest = shapes.first()?;
+        let firsts = rest.branches.iter().scan(0, |end, branch| {
+            let first = *end;
+            *end += branch.points.len();
+            Some(first)
+        });
+        let branch = |(branch, first): (&Branch, usize)| TreeBranch {
+            name: branch.name.clone(),
+            first,
+            count: branch.points.len(),
+        };
+        let ras = |p: &DVec3| [-p.x, -p.y, p.z];
+        let points = |tree: &Tree| tree.branches.iter().flat_map(|b| b.points.iter().map(ras)).collect();
+        Some(TreeFile {
+            branches: rest.branches.iter().zip(firsts).map(branch).collect(),
+            radius_mm: rest.branches.iter().flat_map(|b| b.radius_mm.iter().copied()).collect(),
+            points_mm: shapes.iter().map(points).collect(),
+        })
+    }
+
+    /// Writes the tree, as [`TreeFile::read`] reads it.
+    ///
+    /// # Errors
+    /// [`Error::Io`].
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let json = serde_json::to_string(self).map_err(|e| Error::Internal(e.to_string()))?;
+        files::write_atomic(path, json.as_bytes())
+    }
+
+    /// The tree at a fraction (0 to 1) of its beat, between the stored phases on straight lines; the beat closes.
+    pub fn at(&self, fraction: f64) -> Tree {
+        let stored = self.points_mm.len();
+        let x = fraction * stored as f64;
+        let (a, b) = (x as usize % stored, (x as usize + 1) % stored);
+        let point = |i: usize| {
+            let (from, to) = (DVec3::from_array(self.points_mm[a][i]), DVec3::from_array(self.points_mm[b][i]));
+            let ras = from.lerp(to, x.fract());
+            DVec3::new(-ras.x, -ras.y, ras.z)
+        };
+        let branch = |b: &TreeBranch| {
+            let range = b.first..b.first + b.count;
+            Branch {
+                name: b.name.clone(),
+                points: range.clone().map(point).collect(),
+                radius_mm: self.radius_mm[range].to_vec(),
+                filling: vec![1.0; b.count],
+            }
+        };
+        Tree { branches: self.branches.iter().map(branch).collect() }
+    }
+
+    fn check(&self, path: &Path) -> Result<()> {
+        let n = self.radius_mm.len();
+        if self.points_mm.is_empty() || self.branches.is_empty() {
+            return Err(Error::data(path, "points_mm", "no phase or no branch"));
+        }
+        if let Some(i) = self.radius_mm.iter().position(|r| !(r.is_finite() && *r > 0.0)) {
+            return Err(Error::data(path, format!("radius_mm[{i}]"), "is not a positive length"));
+        }
+        for (p, points) in self.points_mm.iter().enumerate() {
+            if points.len() != n {
+                return Err(Error::data(
+                    path,
+                    format!("points_mm[{p}]"),
+                    format!("{} points for {n} radii", points.len()),
+                ));
+            }
+            if let Some(i) = points.iter().position(|x| x.iter().any(|v| !v.is_finite())) {
+                return Err(Error::data(path, format!("points_mm[{p}][{i}]"), "is not finite"));
+            }
+        }
+        for (i, b) in self.branches.iter().enumerate() {
+            if b.count < 2 || b.first.checked_add(b.count).is_none_or(|end| end > n) {
+                return Err(Error::data(
+                    path,
+                    format!("branches[{i}]"),
+                    "its range leaves the point array or is shorter than 2",
+                ));
+            }
+        }
+        Ok(())
+    }
+}
