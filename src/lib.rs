@@ -222,6 +222,7 @@ pub mod score {
     pub mod metrics;
     pub mod pictures;
     pub mod shapes;
+    pub mod trees;
     pub mod volume;
 }
 
@@ -250,6 +251,7 @@ pub mod run {
     pub mod score;
     pub mod silhouette_pictures;
     mod snapshots;
+    pub mod tree_score;
 }
 
 pub mod session;

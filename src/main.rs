@@ -28,6 +28,7 @@ mod cli {
     pub mod progress;
     pub mod render;
     pub mod report;
+    pub mod score_table;
     pub mod selftest;
     pub mod study;
     pub mod study_page;
@@ -35,6 +36,7 @@ mod cli {
     pub mod train;
     pub mod tree;
     pub mod tree_section;
+    pub mod tree_table;
     pub mod view;
     pub mod view_tree;
     pub mod volume_table;

@@ -174,3 +174,18 @@ fn the_page_of_a_run_draws_the_tree_over_its_angiograms() {
     ok(&["eval", text(run)]);
     assert!(!std::fs::read_to_string(run.join("eval.html")).unwrap().contains("<script"));
 }
+
+#[test]
+fn scores_of_the_tree_are_those_of_scipy() {
+    let Trained { directory, data, run } = trained();
+    let out = directory.path().join("scored");
+    let said = ok(&["eval", text(run), "--images", text(&out), "--tree", "--json"]).0;
+    std::fs::write(out.join("evaluation.json"), &said).unwrap();
+    let page = std::fs::read_to_string(out.join("report.html")).unwrap();
+    assert!(page.contains("Scores of the tree"));
+    assert!(ok(&["eval", text(run), "--tree"]).0.contains("as a tree against the true one"), "there is a table");
+    python_test("check_tree_scores.py", &[data, &out]);
+    // Not asked for, or without a truth, there are none.
+    let untold: Value = serde_json::from_str(&ok(&["eval", text(run), "--json"]).0).unwrap();
+    assert!(untold.get("tree").is_none() && untold.get("volume").is_some());
+}

@@ -3,8 +3,8 @@
 use super::args::Cli;
 use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
-use super::tree::of_page as tree_of_page;
-use super::volume_table;
+use super::tree::{of_page as tree_of_page, score as score_tree_of_page};
+use super::{tree_table, volume_table};
 use clap::Args;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
@@ -60,8 +60,8 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
         None => (Path::new(""), run.join("eval.html")),
     };
     let beside = page.parent().unwrap_or(Path::new(""));
-    let warnings = &mut evaluation.warnings;
-    let tree = if args.tree { tree_of_page(cli, &gpu, &model, beside, warnings)? } else { None };
+    let tree = if args.tree { tree_of_page(cli, &gpu, &model, beside, &mut evaluation.warnings)? } else { None };
+    score_tree_of_page(tree.as_ref(), &dataset, &mut evaluation)?;
     Report {
         gpu: &gpu,
         tuning: &tuning,
@@ -135,6 +135,9 @@ pub fn print_table(evaluation: &Evaluation) {
         dice(published.authors)
     );
     if let Some(volume) = &evaluation.volume {
-        volume_table::print(volume);
+        volume_table::table(volume).print();
+    }
+    if let Some(tree) = &evaluation.tree {
+        tree_table::table(tree).print();
     }
 }

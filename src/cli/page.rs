@@ -3,7 +3,7 @@
 
 use super::plot::{Line, plot};
 use super::tree_section::TreeSection;
-use super::{calibration_table, volume_table};
+use super::{calibration_table, tree_table, volume_table};
 use base64::Engine;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use nertca_vk::calibrate::correction::Calibration;
@@ -184,17 +184,11 @@ impl Page<'_> {
         }
     }
 
-    fn volume(&self) -> Markup {
-        let Some(volume) = self.evaluation.and_then(|e| e.volume.as_ref()) else { return html! {} };
+    fn tables(&self) -> Markup {
+        let Some(evaluation) = self.evaluation else { return html! {} };
         html! {
-            h2 { "Scores in 3D" }
-            p.lead { (volume_table::legend(volume)) }
-            div.scroll { table {
-                tr { th { "phase" } @for column in &volume_table::COLUMNS { th { (column.heading.join(" ").trim()) } } }
-                @for (name, cells) in volume_table::rows(volume) {
-                    tr { td { (name) } @for cell in cells { td { (cell) } } }
-                }
-            } }
+            @if let Some(volume) = &evaluation.volume { (volume_table::table(volume).markup()) }
+            @if let Some(tree) = &evaluation.tree { (tree_table::table(tree).markup()) }
         }
     }
 
@@ -310,7 +304,7 @@ impl Page<'_> {
                     p.lead { "4D reconstruction of the coronary arteries, nertca-vk " (env!("CARGO_PKG_VERSION")) }
                     @for warning in &self.warnings { p.warn { (warning) } }
                     (self.scores())
-                    (self.volume())
+                    (self.tables())
                     (self.plots()?)
                     (self.views()?)
                     @if let Some(tree) = &self.tree { (tree.markup()) }

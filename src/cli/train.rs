@@ -4,7 +4,7 @@ use super::args::{Cli, ConfigArgs};
 use super::eval::print_table;
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
-use super::tree::of_page as tree_of_page;
+use super::tree::{of_page as tree_of_page, score as score_tree_of_page};
 use clap::Args;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
@@ -109,13 +109,16 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
             let (run, report) = (run.display(), report.display());
             eprintln!("the run is complete; to score it: nertca-vk eval \"{run}\" --images \"{report}\"");
         }
-        let scores = outcome?;
-        files::write_atomic(&report.join("evaluation.json"), files::pretty_json(&scores)?.as_bytes())?;
-        warnings.clone_from(&scores.warnings);
-        evaluation = Some(scores);
+        evaluation = Some(outcome?);
     }
     drop(observer);
     let tree = if args.tree { tree_of_page(cli, &gpu, &model, run, &mut warnings)? } else { None };
+    if let Some(scores) = &mut evaluation {
+        scores.warnings.append(&mut warnings);
+        score_tree_of_page(tree.as_ref(), &dataset, scores)?;
+        files::write_atomic(&report.join("evaluation.json"), files::pretty_json(scores)?.as_bytes())?;
+        warnings.clone_from(&scores.warnings);
+    }
     Report {
         gpu: &gpu,
         tuning: &tuning,

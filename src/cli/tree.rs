@@ -9,6 +9,9 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::render::renderer::Renderer;
+use nertca_vk::run::tree_score::score_tree;
+use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
 use nertca_vk::trees::tree::BeatTree;
@@ -61,6 +64,18 @@ pub fn of_page(
         }
         Err(error) => Err(error),
     }
+}
+
+/// Scores the tree of a page, where there is a truth. One that cannot be used is one more warning.
+pub fn score(tree: Option<&BeatTree>, dataset: &Dataset, evaluation: &mut Evaluation) -> Result<()> {
+    let Some(tree) = tree else { return Ok(()) };
+    match score_tree(tree, dataset) {
+        Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
+            evaluation.warnings.push(format!("There are no scores of the tree: {error}."));
+        }
+        scores => evaluation.tree = scores?,
+    }
+    Ok(())
 }
 
 fn find(cli: &Cli, gpu: &Gpu, model: &Model, options: &TreeOptions) -> Result<BeatTree> {

@@ -12,7 +12,7 @@ use crate::phantom::projector::Projector;
 use crate::phantom::runs::{Shot, shots};
 use crate::phantom::subjects::{Moving, Patient, Placed, Pose, Reading, Subject, Thorax, Volumes};
 use crate::phantom::tree::Tree;
-use crate::phantom::tree_file::TreeFile;
+use crate::phantom::tree_file::{TREE, TreeFile};
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use crate::phantom::voxels::Tissues;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
@@ -24,8 +24,6 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// File of the true vessels as a tree, among the volumes.
-const TREE: &str = "tree.json";
 /// A vessel-only line integral above this share of a 1 mm vessel's marks a vessel pixel.
 const MASK_SHARE: f64 = 0.05;
 /// A blade attenuates so many times as much as the densest part of its view.

@@ -8,6 +8,8 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
+/// File of the true vessels as a tree, among the volumes of a dataset.
+pub const TREE: &str = "tree.json";
 /// Names of radii at points, as VMTK and 3D Slicer write them, and as others do.
 const RADII: [&str; 3] = ["MaximumInscribedSphereRadius", "Radius", "radius"];
 

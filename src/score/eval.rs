@@ -9,6 +9,7 @@ use crate::render::grid::PatientGrid;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::metrics;
+use crate::score::trees::TreeScores;
 use crate::score::volume::VolumeScores;
 use serde::Serialize;
 
@@ -120,6 +121,9 @@ pub struct Evaluation {
     /// Scores in 3D, where the dataset carries its vessels as volumes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub volume: Option<VolumeScores>,
+    /// Scores of the vessels as a tree, where one was made and the dataset carries the true one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tree: Option<TreeScores>,
     /// What makes these scores worth less than they seem.
     pub warnings: Vec<String>,
     /// One row per image.
@@ -263,6 +267,7 @@ pub fn evaluate(
             rule,
         },
         volume: None,
+        tree: None,
         warnings: Vec::new(),
         images,
     })

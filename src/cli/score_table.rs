@@ -1,0 +1,72 @@
+//! Scores by phase as a table: the same columns on the terminal and on the page.
+
+use maud::{Markup, html};
+
+/// A column: what it shows, in two lines, and how.
+pub struct Column<S> {
+    /// First and second line of its heading.
+    pub heading: [&'static str; 2],
+    /// The text of a cell.
+    pub text: fn(&S) -> String,
+}
+
+/// A length that may not be known.
+pub fn mm(value: Option<f64>) -> String {
+    value.map_or("-".into(), |v| format!("{v:.2}"))
+}
+
+/// A share that may not be known.
+pub fn percent(share: Option<f64>) -> String {
+    share.map_or("-".into(), |v| format!("{:.1} %", 100.0 * v))
+}
+
+/// A table whose rows are phases and their mean.
+pub struct ScoreTable {
+    title: &'static str,
+    /// What the numbers mean.
+    legend: String,
+    headings: Vec<[&'static str; 2]>,
+    /// The phase, or `mean`, and the text of each column.
+    rows: Vec<(String, Vec<String>)>,
+}
+
+impl ScoreTable {
+    /// A table of all phases with their scores, and of the mean.
+    pub fn new<'a, S: 'a>(
+        title: &'static str,
+        legend: String,
+        columns: &[Column<S>],
+        phases: impl Iterator<Item = (u32, &'a S)>,
+        mean: &S,
+    ) -> ScoreTable {
+        let row = |name: String, scores: &S| (name, columns.iter().map(|column| (column.text)(scores)).collect());
+        let rows = phases.map(|(phase, scores)| row(phase.to_string(), scores)).chain([row("mean".into(), mean)]);
+        let rows = rows.collect();
+        ScoreTable { title, legend, headings: columns.iter().map(|column| column.heading).collect(), rows }
+    }
+
+    /// The table on a page.
+    pub fn markup(&self) -> Markup {
+        html! {
+            h2 { (self.title) }
+            p.lead { (self.legend) }
+            div.scroll { table {
+                tr { th { "phase" } @for heading in &self.headings { th { (heading.join(" ").trim()) } } }
+                @for (name, cells) in &self.rows { tr { td { (name) } @for cell in cells { td { (cell) } } } }
+            } }
+        }
+    }
+
+    /// Prints the table and what it means.
+    pub fn print(&self) {
+        let line = |name: &str, cells: Vec<&str>| {
+            out!("{name:5}{}", cells.iter().map(|cell| format!("{cell:>13}")).collect::<String>());
+        };
+        line("", self.headings.iter().map(|heading| heading[0]).collect());
+        line("phase", self.headings.iter().map(|heading| heading[1]).collect());
+        for (name, cells) in &self.rows {
+            line(name, cells.iter().map(String::as_str).collect());
+        }
+        out!("{}", self.legend);
+    }
+}

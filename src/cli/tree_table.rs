@@ -1,0 +1,27 @@
+//! Scores of a tree as a table.
+
+use super::score_table::{Column, ScoreTable, mm, percent};
+use nertca_vk::score::trees::{TreeAgreement, TreeScores};
+
+const COLUMNS: [Column<TreeAgreement>; 9] = [
+    Column { heading: ["centreline", "found"], text: |s| percent(Some(s.true_centreline_found)) },
+    Column { heading: ["centreline", "true"], text: |s| percent(Some(s.our_centreline_true)) },
+    Column { heading: ["ours to true", "mm"], text: |s| mm(Some(s.ours_to_true_mm)) },
+    Column { heading: ["radius error", "mean, mm"], text: |s| mm(s.radius_error_mm) },
+    Column { heading: ["radius error", "RMS, mm"], text: |s| mm(s.radius_rmse_mm) },
+    Column { heading: ["", "components"], text: |s| format!("{:.1}", s.components) },
+    Column { heading: ["in training", "images, mm"], text: |s| mm(s.reprojection_training_mm) },
+    Column { heading: ["in unseen", "images, mm"], text: |s| mm(s.reprojection_unseen_mm) },
+    Column { heading: ["motion", "error, mm"], text: |s| mm(s.motion_error_mm) },
+];
+
+/// The table of all phases, and their mean.
+pub fn table(tree: &TreeScores) -> ScoreTable {
+    let legend = format!(
+        "The vessels as a tree against the true one. Centrelines count within {} mm, and radii are compared there; in images \
+         by their mean distance at the isocentre; motion by where points have come since phase 0.",
+        tree.within_mm
+    );
+    let phases = tree.phases.iter().map(|p| (p.phase, &p.scores));
+    ScoreTable::new("Scores of the tree", legend, &COLUMNS, phases, &tree.mean)
+}

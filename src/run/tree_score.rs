@@ -1,0 +1,30 @@
+//! Scores of a tree, where a dataset carries its vessels as one.
+
+use crate::error::Result;
+use crate::phantom::tree::Branch;
+use crate::phantom::tree_file::{TREE, TreeFile};
+use crate::scan::dataset::Dataset;
+use crate::score::calibrated::in_calibrated_frame;
+use crate::score::trees::{self, TreeScores, TrueLine};
+use crate::score::volume::VOLUMES;
+use crate::trees::tree::BeatTree;
+
+/// Scores a tree of all phases against the one a phantom left; none where there is none. The dataset is the one that the
+/// reconstruction went by.
+///
+/// # Errors
+/// [`crate::error::Error::Io`] and [`crate::error::Error::Data`] for a truth that cannot be read.
+pub fn score_tree(beat: &BeatTree, dataset: &Dataset) -> Result<Option<TreeScores>> {
+    let file = dataset.path.join(VOLUMES).join(TREE);
+    if !file.is_file() {
+        return Ok(None);
+    }
+    let truth = TreeFile::read(&file)?;
+    let carried = in_calibrated_frame(dataset)?;
+    let lines = |moment: f64| {
+        let tree = truth.at(moment / f64::from(dataset.n_phases));
+        let line = |branch: Branch| TrueLine { points_mm: branch.points, radius_mm: branch.radius_mm };
+        tree.branches.into_iter().map(line).collect()
+    };
+    trees::score(beat, carried.as_ref().unwrap_or(dataset), lines).map(Some)
+}

@@ -1,0 +1,300 @@
+//! How far a tree of vessels agrees with the true one, over the beat (see `docs/formats.md`).
+
+use crate::error::{Error, Result};
+use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays, world_from_lps_mm};
+use crate::scan::dataset::{Dataset, Frame, Split};
+use crate::scan::truth::{TRUTH, TrueFrame, Truth};
+use crate::score::shapes::WITHIN_MM;
+use crate::trees::tree::{BeatTree, PhaseTree};
+use glam::{DVec2, DVec3};
+use rayon::prelude::*;
+use serde::Serialize;
+
+/// Lines are compared at points so far apart, mm: finer than images show.
+const STEP_MM: f64 = 0.25;
+
+/// A true vessel at one moment.
+#[derive(Debug, Clone)]
+pub struct TrueLine {
+    /// Points, LPS mm; point i is the same material point at every moment.
+    pub points_mm: Vec<DVec3>,
+    /// Radius of the lumen at each point, mm.
+    pub radius_mm: Vec<f64>,
+}
+
+/// Scores of one phase, or their means. Distances are those of points of one centreline to the nearest point of the other.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct TreeAgreement {
+    /// Share of the true centreline with ours within [`WITHIN_MM`].
+    pub true_centreline_found: f64,
+    /// Share of our centreline with a true one within [`WITHIN_MM`].
+    pub our_centreline_true: f64,
+    /// Mean distance of our centreline to the true one, mm.
+    pub ours_to_true_mm: f64,
+    /// Mean of our radius less the true one, where our centreline counts as true, mm.
+    pub radius_error_mm: Option<f64>,
+    /// Root of the mean square of the same, mm.
+    pub radius_rmse_mm: Option<f64>,
+    /// Connected trees of ours.
+    pub components: f64,
+    /// Mean distance of our centreline to the true one in the training images, mm at the isocentre.
+    pub reprojection_training_mm: Option<f64>,
+    /// The same in images of views that were not trained on.
+    pub reprojection_unseen_mm: Option<f64>,
+    /// Mean distance between where our points have come since phase 0 and where the true points beside them have, mm; where
+    /// points are followed.
+    pub motion_error_mm: Option<f64>,
+}
+
+/// Scores of one phase.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct PhaseTreeScores {
+    /// Cardiac phase, from 0.
+    pub phase: u32,
+    /// Scores of the phase.
+    #[serde(flatten)]
+    pub scores: TreeAgreement,
+}
+
+/// Scores of a tree over the beat.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TreeScores {
+    /// Centrelines this near to each other are the same vessel, mm.
+    pub within_mm: f64,
+    /// Means over the phases that have a value.
+    pub mean: TreeAgreement,
+    /// One row per phase.
+    pub phases: Vec<PhaseTreeScores>,
+}
+
+/// Scores a tree. `truth` has the true vessels at a moment of the beat, which goes from 0 to the dataset's number of phases.
+/// The dataset is the one that the reconstruction went by, with its unseen views where the reconstruction has them; where
+/// `truth.json` lies beside it, the true vessels are seen as each image was really taken.
+///
+/// # Errors
+/// [`Error::Io`] and [`Error::Data`] for a `truth.json` that cannot be read; [`Error::Data`] for a truth without vessels.
+pub fn score(beat: &BeatTree, dataset: &Dataset, truth: impl Fn(f64) -> Vec<TrueLine> + Sync) -> Result<TreeScores> {
+    let images = Images::of(dataset)?;
+    let rest = truth(0.0);
+    if rest.iter().all(|line| line.points_mm.len() < 2) {
+        return Err(Error::data(&dataset.path, "true tree", "has no line"));
+    }
+    let first = beat.phases.iter().find(|tree| Some(tree.phase) == beat.reference_phase);
+    let phases = beat.phases.par_iter().map(|tree| {
+        let now = truth(f64::from(tree.phase));
+        let mut scores = agreement(tree, &now);
+        scores.reprojection_training_mm = images.reprojection_mm(tree, Split::Train, &truth);
+        scores.reprojection_unseen_mm = images.reprojection_mm(tree, Split::Validation, &truth);
+        scores.motion_error_mm = first.and_then(|first| motion_error_mm([first, tree], [&rest, &now]));
+        PhaseTreeScores { phase: tree.phase, scores }
+    });
+    let phases: Vec<PhaseTreeScores> = phases.collect();
+    Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), phases })
+}
+
+/// The mean of what there is; none of nothing.
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (n, sum) = values.fold((0usize, 0.0), |(n, sum), value| (n + 1, sum + value));
+    (n > 0).then(|| sum / n as f64)
+}
+
+fn means(phases: &[PhaseTreeScores]) -> TreeAgreement {
+    let some = |pick: fn(&TreeAgreement) -> Option<f64>| mean(phases.iter().filter_map(|p| pick(&p.scores)));
+    let all = |pick: fn(&TreeAgreement) -> f64| mean(phases.iter().map(|p| pick(&p.scores))).unwrap_or(f64::NAN);
+    TreeAgreement {
+        true_centreline_found: all(|s| s.true_centreline_found),
+        our_centreline_true: all(|s| s.our_centreline_true),
+        ours_to_true_mm: all(|s| s.ours_to_true_mm),
+        radius_error_mm: some(|s| s.radius_error_mm),
+        radius_rmse_mm: some(|s| s.radius_rmse_mm),
+        components: all(|s| s.components),
+        reprojection_training_mm: some(|s| s.reprojection_training_mm),
+        reprojection_unseen_mm: some(|s| s.reprojection_unseen_mm),
+        motion_error_mm: some(|s| s.motion_error_mm),
+    }
+}
+
+/// A mean, weighted by lengths.
+#[derive(Default)]
+struct Along {
+    length_mm: f64,
+    sum: f64,
+}
+
+impl Along {
+    fn add(&mut self, length_mm: f64, value: f64) {
+        self.length_mm += length_mm;
+        self.sum += length_mm * value;
+    }
+
+    /// None along nothing.
+    fn mean(&self) -> Option<f64> {
+        (self.length_mm > 0.0).then(|| self.sum / self.length_mm)
+    }
+}
+
+fn is_near(away_mm: f64) -> f64 {
+    f64::from(u8::from(away_mm <= WITHIN_MM))
+}
+
+/// A place on a line: so much of the way from a point to the next.
+#[derive(Clone, Copy)]
+struct Place {
+    line: usize,
+    from: usize,
+    share: f64,
+}
+
+impl Place {
+    fn on<T, M>(&self, values: &[T], mix: M) -> T
+    where
+        T: Copy,
+        M: Fn(T, T, f64) -> T,
+    {
+        mix(values[self.from], values[self.from + 1], self.share)
+    }
+}
+
+/// The place on lines nearest to a point, and how far away it is.
+fn nearest(lines: &[&[DVec3]], point: DVec3) -> (f64, Option<Place>) {
+    let mut best = (f64::INFINITY, None);
+    for (line, points) in lines.iter().enumerate() {
+        for (from, ends) in points.windows(2).enumerate() {
+            let way = ends[1] - ends[0];
+            let share = ((point - ends[0]).dot(way) / way.length_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+            let away = point.distance_squared(ends[0] + share * way);
+            if away < best.0 {
+                best = (away, Some(Place { line, from, share }));
+            }
+        }
+    }
+    (best.0.sqrt(), best.1)
+}
+
+/// Places on lines that are [`STEP_MM`] apart at most, and the length that each stands for, mm.
+fn finely(lines: &[&[DVec3]]) -> Vec<(Place, f64)> {
+    let of_line = |(line, points): (usize, &&[DVec3])| {
+        let steps = points.windows(2).enumerate().flat_map(move |(from, ends)| {
+            let length = ends[0].distance(ends[1]);
+            let n = (length / STEP_MM).ceil().max(1.0);
+            (0..n as usize).map(move |i| (Place { line, from, share: (i as f64 + 0.5) / n }, length / n))
+        });
+        steps.collect::<Vec<_>>()
+    };
+    lines.iter().enumerate().flat_map(of_line).collect()
+}
+
+fn ours(tree: &PhaseTree) -> Vec<&[DVec3]> {
+    tree.branches.iter().map(|branch| &branch.points_mm[..]).collect()
+}
+
+fn true_points(lines: &[TrueLine]) -> Vec<&[DVec3]> {
+    lines.iter().map(|line| &line.points_mm[..]).collect()
+}
+
+fn agreement(tree: &PhaseTree, truth: &[TrueLine]) -> TreeAgreement {
+    let (our_lines, true_lines) = (ours(tree), true_points(truth));
+    let mut found = Along::default();
+    for (at, length) in finely(&true_lines) {
+        found.add(length, is_near(nearest(&our_lines, at.on(true_lines[at.line], DVec3::lerp)).0));
+    }
+    let mix = |a: f64, b: f64, share: f64| a + share * (b - a);
+    let [mut to_true, mut near, mut error, mut squared] = [(); 4].map(|()| Along::default());
+    for (at, length) in finely(&our_lines) {
+        let (away, there) = nearest(&true_lines, at.on(our_lines[at.line], DVec3::lerp));
+        to_true.add(length, away);
+        near.add(length, is_near(away));
+        if let Some(there) = there.filter(|_| away <= WITHIN_MM) {
+            let (ours, truth) = (&tree.branches[at.line].radius_mm, &truth[there.line].radius_mm);
+            let wider = at.on(ours, mix) - there.on(truth, mix);
+            error.add(length, wider);
+            squared.add(length, wider * wider);
+        }
+    }
+    TreeAgreement {
+        true_centreline_found: found.mean().unwrap_or(f64::NAN),
+        our_centreline_true: near.mean().unwrap_or(f64::NAN),
+        ours_to_true_mm: to_true.mean().unwrap_or(f64::NAN),
+        radius_error_mm: error.mean(),
+        radius_rmse_mm: squared.mean().map(f64::sqrt),
+        components: tree.components() as f64,
+        reprojection_training_mm: None,
+        reprojection_unseen_mm: None,
+        motion_error_mm: None,
+    }
+}
+
+/// How far our points go astray between two phases: against the true points that lie beside them at the first.
+fn motion_error_mm([first, now]: [&PhaseTree; 2], [true_first, true_now]: [&[TrueLine]; 2]) -> Option<f64> {
+    let (rest, moved) = (ours(first), ours(now));
+    let (true_rest, true_moved) = (true_points(true_first), true_points(true_now));
+    let mut error = Along::default();
+    for (at, length) in finely(&rest) {
+        let begin = at.on(rest[at.line], DVec3::lerp);
+        let (away, there) = nearest(&true_rest, begin);
+        let Some(there) = there.filter(|_| away <= WITHIN_MM) else { continue };
+        let way = at.on(moved[at.line], DVec3::lerp) - begin;
+        let true_way = there.on(true_moved[there.line], DVec3::lerp) - there.on(true_rest[there.line], DVec3::lerp);
+        error.add(length, way.distance(true_way));
+    }
+    error.mean()
+}
+
+/// How images were taken, as the reconstruction has it and really.
+struct Images<'a> {
+    dataset: &'a Dataset,
+    truth: Option<Truth>,
+}
+
+/// One image: how ours is seen, how the truth is, and when.
+struct Image {
+    rays: ViewRays,
+    true_rays: ViewRays,
+    moment: f64,
+}
+
+impl Images<'_> {
+    fn of(dataset: &Dataset) -> Result<Images<'_>> {
+        let truth = dataset.path.join(TRUTH).is_file().then(|| Truth::load(&dataset.path)).transpose()?;
+        Ok(Images { dataset, truth })
+    }
+
+    fn image(&self, frame: &Frame) -> Option<Image> {
+        let rays = self.dataset.heart_rays(frame);
+        let Some(truth) = &self.truth else {
+            return Some(Image { true_rays: rays.clone(), rays, moment: f64::from(frame.phase) });
+        };
+        let of_frame = |was: &&TrueFrame| (was.view, was.phase, was.split) == (frame.view, frame.phase, frame.split);
+        let was = truth.frames.iter().find(of_frame)?;
+        let seen = Geometry::CArm(was.geometry.clone()).rays(self.dataset.width, self.dataset.height).ok()?;
+        let true_rays = seen.moved(DVec3::from_array(was.heart_shift_mm) / MM_PER_UNIT);
+        Some(Image { rays, true_rays, moment: was.beat_phase })
+    }
+
+    /// Mean over the images of a phase; none without any.
+    fn reprojection_mm(&self, tree: &PhaseTree, split: Split, truth: impl Fn(f64) -> Vec<TrueLine>) -> Option<f64> {
+        let frames = self.dataset.frames.iter().filter(|frame| frame.phase == tree.phase && frame.split == split);
+        let error_mm = |frame: &Frame| {
+            let image = self.image(frame)?;
+            let pixel_mm = image.rays.anchor[1].length() * MM_PER_UNIT;
+            let seen = |rays: &ViewRays, line: &[DVec3]| -> Option<Vec<DVec3>> {
+                let place = |point: &DVec3| {
+                    rays.project(world_from_lps_mm(*point)).map(|(i, j)| DVec2::new(i, j).extend(0.0) * pixel_mm)
+                };
+                line.iter().map(place).collect()
+            };
+            let lines =
+                |rays: &ViewRays, all: &[&[DVec3]]| all.iter().filter_map(|l| seen(rays, l)).collect::<Vec<_>>();
+            let our_lines = lines(&image.rays, &ours(tree));
+            let true_lines = lines(&image.true_rays, &true_points(&truth(image.moment)));
+            let (our_lines, true_lines): (Vec<&[DVec3]>, Vec<&[DVec3]>) =
+                (our_lines.iter().map(|l| &l[..]).collect(), true_lines.iter().map(|l| &l[..]).collect());
+            let mut away = Along::default();
+            for (at, length) in finely(&our_lines) {
+                away.add(length, nearest(&true_lines, at.on(our_lines[at.line], DVec3::lerp)).0);
+            }
+            away.mean()
+        };
+        mean(frames.filter_map(error_mm))
+    }
+}

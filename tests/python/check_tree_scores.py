@@ -1,0 +1,74 @@
+"""Scores a tree against the true one by SciPy's distances and projections of its own, and compares with what `eval` says.
+
+    python3 check_tree_scores.py DATA RUN   # made by tests/tree_pages.rs; RUN has tree.json and evaluation.json
+"""
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from compare_trees import compare, finely, read_truth
+from scipy.spatial import cKDTree
+
+data, run = Path(sys.argv[1]), Path(sys.argv[2])
+truth = read_truth(data / "volumes/tree.json")
+true_points, true_radii, true_branches = truth
+tree = json.loads((run / "tree.json").read_text())["phases"]
+scores = json.loads((run / "evaluation.json").read_text())["tree"]
+frames = json.loads((data / "truth.json").read_text())["frames"]
+NEAR_MM = 1.0
+
+
+def seen(c_arm, points):
+    """Places at the isocentre, mm: angles as DICOM has them."""
+    a, b = np.radians([c_arm["primary_deg"], c_arm["secondary_deg"]])
+    across = np.array([np.cos(a), np.sin(a), 0])
+    down = np.array([np.sin(a) * np.sin(b), -np.cos(a) * np.sin(b), -np.cos(b)])
+    beam = np.array([np.sin(a) * np.cos(b), -np.cos(a) * np.cos(b), np.sin(b)])
+    depth = points @ beam + c_arm["sod_mm"]
+    return np.stack([points @ across, points @ down], axis=1) * (c_arm["sod_mm"] / depth)[:, None]
+
+
+def reprojection(row, split):
+    """Of data whose geometry is as stated: both trees are seen alike."""
+    ours = np.concatenate([finely(np.array(b["points_mm"]), b["radius_mm"])[:, :3] for b in row["branches"]])
+    true = np.concatenate([finely(true_points[row["phase"]][b], true_radii[b])[:, :3] for b in true_branches])
+    images = [f for f in frames if f["split"] == split and f["phase"] == row["phase"]]
+    away = [cKDTree(seen(f["geometry"], true)).query(seen(f["geometry"], ours))[0].mean() for f in images]
+    return np.mean(away)
+
+
+def motion_error(row):
+    def dense(points_of):
+        share = np.linspace(0, 1, 20, endpoint=False)[:, None]
+        return np.concatenate([p[i] + share * (p[i + 1] - p[i]) for p in points_of for i in range(len(p) - 1)])
+
+    rest, now = ([np.array(b["points_mm"]) for b in r["branches"]] for r in (tree[0], row))
+    true_rest, true_now = ([true_points[p][b] for b in true_branches] for p in (0, row["phase"]))
+    begin, end, true_begin, true_end = map(dense, (rest, now, true_rest, true_now))
+    away, nearest = cKDTree(true_begin).query(begin)
+    errors = np.linalg.norm(end - begin - (true_end - true_begin)[nearest], axis=1)
+    # Points of our lines are evenly apart, so that all weigh the same.
+    return errors[away <= NEAR_MM].mean()
+
+
+def close(name, found, wanted, within):
+    print(f"  {name}: {found:.4f}, SciPy {wanted:.4f}")
+    assert abs(found - wanted) <= within, (name, found, wanted)
+
+
+assert [row["phase"] for row in scores["phases"]] == [row["phase"] for row in tree]
+for row, found in zip(tree, scores["phases"]):
+    wanted = compare(truth, row["phase"], row["branches"], NEAR_MM)
+    print(f"phase {row['phase']}")
+    close("true centreline found", found["true_centreline_found"], wanted["true_near"], 0.005)
+    close("our centreline true", found["our_centreline_true"], wanted["ours_near"], 0.005)
+    close("ours to true, mm", found["ours_to_true_mm"], wanted["ours_to_true_mm"], 0.005)
+    close("radius error, mm", found["radius_error_mm"], wanted["radius_bias_mm"], 0.005)
+    close("radius RMSE, mm", found["radius_rmse_mm"], wanted["radius_rmse_mm"], 0.005)
+    close("components", found["components"], wanted["components"], 0)
+    close("training images, mm", found["reprojection_training_mm"], reprojection(row, "train"), 0.01)
+    close("unseen images, mm", found["reprojection_unseen_mm"], reprojection(row, "validation"), 0.01)
+    close("motion error, mm", found["motion_error_mm"], motion_error(row), 0.03)
+for name, mean in scores["mean"].items():
+    close(f"mean {name}", mean, np.mean([row[name] for row in scores["phases"]]), 1e-9)
