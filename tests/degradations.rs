@@ -15,7 +15,8 @@ use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, Setting, VolumeOption
 use nertca_vk::phantom::degradations::{Breathing, Degradations, GeometryError, Rhythm};
 use nertca_vk::phantom::noise::Photons;
 use nertca_vk::phantom::projector::Projector;
-use nertca_vk::phantom::tree::{Bounds, Heart, Tree, TreeFile};
+use nertca_vk::phantom::tree::{Bounds, Heart, Tree};
+use nertca_vk::phantom::tree_file::TreeFile;
 use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::phantom::voxels::{self, Breath, Tissues};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};

@@ -56,7 +56,7 @@ impl TreeFile {
             return Ok(TreeFile { branches: Vec::new(), radius_mm: Vec::new(), points_mm: Vec::new() });
         };
         let named = |name: &&str| rest.of_points.iter().find(|(found, _)| found == *name);
-        let radii = RADII.iter().find_map(|name| named(&name)).ok_or_else(|| {
+        let radii = RADII.iter().find_map(named).ok_or_else(|| {
             let found: Vec<&str> = rest.of_points.iter().map(|(name, _)| name.as_str()).collect();
             let problem = format!("has none of the radii {}; its arrays are: {}", RADII.join(", "), found.join(", "));
             Error::data(first_file, "PointData", problem)
