@@ -21,8 +21,10 @@ mod cli {
     pub mod exit;
     pub mod export;
     pub mod frame_rates;
+    pub mod geometry_picture;
     pub mod info;
     pub mod kernels;
+    pub mod lettering;
     pub mod page;
     pub mod plot;
     pub mod progress;

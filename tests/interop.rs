@@ -379,3 +379,57 @@ fn dicom_nobody_should_send_is_refused_by_name() {
     refuse("good.dcm", "size", &["--size", "2"]);
     fails(&["import", "dicom", text(dir.path()), "-o", text(&out), "--still"], 1, &["size"]);
 }
+
+/// Where a square of a colour is whose pixels are nearly all of it: its middle.
+fn square_of(picture: &image::RgbImage, colour: image::Rgb<u8>, [left, top]: [u32; 2], side: u32) -> Option<[f64; 2]> {
+    const HALF: i64 = 5;
+    let has = |x: i64, y: i64| picture.get_pixel_checked(x as u32, y as u32) == Some(&colour);
+    let full = |x: u32, y: u32| {
+        let around = (-HALF..=HALF).flat_map(|dy| (-HALF..=HALF).map(move |dx| (i64::from(x) + dx, i64::from(y) + dy)));
+        around.filter(|(x, y)| has(*x, *y)).count()
+    };
+    let places = (top + 6..top + side - 6).flat_map(|y| (left + 6..left + side - 6).map(move |x| (x, y)));
+    let (x, y) = places.max_by_key(|(x, y)| full(*x, *y))?;
+    (full(x, y) >= 95).then(|| [f64::from(x), f64::from(y)])
+}
+
+#[test]
+fn the_picture_of_a_geometry_has_sources_where_they_are() {
+    let (dir, data, run) = trained();
+    let file = dir.path().join("geometry.png");
+    assert!(ok(&["info", text(data), "--picture", text(&file)]).contains("geometry.png"));
+    let picture = image::open(&file).unwrap().to_rgb8();
+    let field = picture.width() / 2;
+    let dataset = nertca_vk::scan::dataset::Dataset::open(data).unwrap();
+    // Colours of the lines that name views: the first coloured pixel of each row of letters.
+    let mut colours: Vec<image::Rgb<u8>> = Vec::new();
+    for y in 0..field {
+        let coloured = |p: &image::Rgb<u8>| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 60;
+        let found = (field..2 * field).map(|x| *picture.get_pixel(x, y)).find(coloured);
+        colours.extend(found.filter(|colour| !colours.contains(colour)));
+    }
+    assert_eq!(colours.len(), dataset.training_views().len());
+    let mut per_mm = Vec::new();
+    for (view, colour) in dataset.training_views().into_iter().zip(colours) {
+        let nertca_vk::geometry::Geometry::CArm(c_arm) = &dataset.views[view].geometry else { panic!("a C-arm") };
+        let (a, b) = (c_arm.primary_deg.to_radians(), c_arm.secondary_deg.to_radians());
+        // Against the beam, which goes to the detector: LAO to the left, cranial to the head.
+        let source = [-a.sin() * b.cos(), a.cos() * b.cos(), -b.sin()].map(|v| v * c_arm.sod_mm);
+        let [left, posterior, superior] = source;
+        for (at, wanted) in [([0, 0], [left, posterior]), ([0, 1], [left, -superior]), ([1, 1], [posterior, -superior])]
+        {
+            let corner = at.map(|n| n * field);
+            let Some(found) = square_of(&picture, colour, corner, field) else { continue };
+            let middle = corner.map(|n| f64::from(n + field / 2));
+            let found = [found[0] - middle[0], found[1] - middle[1]];
+            let (far, length) = (found[0].hypot(found[1]), wanted[0].hypot(wanted[1]));
+            let cosine = (found[0] * wanted[0] + found[1] * wanted[1]) / (far * length);
+            assert!(cosine > 0.999, "view {view}, field {at:?}: {found:?} for {wanted:?}");
+            per_mm.push(far / length);
+        }
+    }
+    // Some hide behind others.
+    assert!(per_mm.len() >= 7, "sources are seen: {}", per_mm.len());
+    assert!(per_mm.iter().all(|scale| (scale / per_mm[0] - 1.0).abs() < 0.03), "one scale: {per_mm:?}");
+    fails(&["info", text(run), "--picture", text(&file)], 2, &["--picture", "dataset"]);
+}

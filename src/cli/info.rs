@@ -1,8 +1,9 @@
 //! `info`.
 
+use super::geometry_picture;
 use clap::Args;
 use nertca_vk::choice::Choice;
-use nertca_vk::error::Result;
+use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
@@ -20,6 +21,9 @@ pub struct InfoArgs {
     /// JSON instead of text.
     #[arg(long)]
     pub json: bool,
+    /// Leave a picture of a dataset's geometry here: sources, detectors, central rays and the patient's axes, from three sides.
+    #[arg(long, value_name = "FILE.png", conflicts_with = "schema")]
+    pub picture: Option<PathBuf>,
     /// Print the JSON schema of `dataset.json` and exit.
     #[arg(long)]
     pub schema: bool,
@@ -33,6 +37,15 @@ pub fn info(args: &InfoArgs) -> Result<()> {
     }
     let path = args.path.as_deref().unwrap_or(Path::new("."));
     let is_run = path.is_file() || checkpoint::list(path).is_ok_and(|found| !found.is_empty());
+    if let Some(picture) = &args.picture {
+        if is_run {
+            let problem = format!("shows the geometry of a dataset, and {} is a run", path.display());
+            return Err(Error::config("--picture", picture.display(), problem));
+        }
+        geometry_picture::write(&Dataset::open(path)?, picture)?;
+        out!("{}", picture.display());
+        return Ok(());
+    }
     let described = if is_run { describe_run(path)? } else { describe_dataset(path)? };
     if args.json {
         out!("{}", pretty_json(&described)?);
