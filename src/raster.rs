@@ -16,6 +16,12 @@ impl Image {
     pub fn zeros(width: usize, height: usize) -> Image {
         Image { width, height, values: vec![0.0; width * height] }
     }
+
+    /// Rows as columns.
+    fn transposed(&self) -> Image {
+        let columns = (0..self.width).flat_map(|x| self.values[x..].iter().step_by(self.width));
+        Image { width: self.height, height: self.width, values: columns.copied().collect() }
+    }
 }
 
 /// The value below which `share` of the values lie.
@@ -28,19 +34,29 @@ pub fn percentile(values: &[f32], share: f64) -> f32 {
     *sorted.select_nth_unstable_by(index, f32::total_cmp).1
 }
 
-fn filter(image: &Image, radius: usize, pick: impl Fn(f32, f32) -> f32 + Sync) -> Image {
-    let (w, h) = (image.width, image.height);
-    let window = |centre: usize, end: usize| centre.saturating_sub(radius)..(centre + radius + 1).min(end);
-    let mut rows = Image::zeros(w, h);
-    for y in 0..h {
-        for x in 0..w {
-            rows.values[y * w + x] = window(x, w).map(|k| image.values[y * w + k]).reduce(&pick).unwrap_or(0.0);
+/// Picks one of the values in a square of `2 radius + 1` pixels by comparing two at a time; `neutral` never wins.
+fn filter(image: &Image, radius: usize, neutral: f32, pick: impl Fn(f32, f32) -> f32) -> Image {
+    let rows = filter_rows(image, radius, neutral, &pick);
+    filter_rows(&rows.transposed(), radius, neutral, &pick).transposed()
+}
+
+/// Along rows, by three comparisons a pixel whatever the radius (van Herk 1992): a window is the end of one block of its
+/// length and the beginning of the next.
+fn filter_rows(image: &Image, radius: usize, neutral: f32, pick: &impl Fn(f32, f32) -> f32) -> Image {
+    let window = 2 * radius + 1;
+    let padded = (image.width + 2 * radius).next_multiple_of(window);
+    let (mut line, mut ends) = (vec![neutral; padded], vec![neutral; padded]);
+    let mut out = Image::zeros(image.width, image.height);
+    for (row, out) in image.values.chunks(image.width).zip(out.values.chunks_mut(image.width)) {
+        line.fill(neutral);
+        line[radius..][..row.len()].copy_from_slice(row);
+        ends.copy_from_slice(&line);
+        for (begins, ends) in line.chunks_mut(window).zip(ends.chunks_mut(window)) {
+            (1..window).for_each(|i| begins[i] = pick(begins[i - 1], begins[i]));
+            (0..window - 1).rev().for_each(|i| ends[i] = pick(ends[i], ends[i + 1]));
         }
-    }
-    let mut out = Image::zeros(w, h);
-    for y in 0..h {
-        for x in 0..w {
-            out.values[y * w + x] = window(y, h).map(|k| rows.values[k * w + x]).reduce(&pick).unwrap_or(0.0);
+        for (x, out) in out.iter_mut().enumerate() {
+            *out = pick(ends[x], line[x + window - 1]);
         }
     }
     out
@@ -48,7 +64,7 @@ fn filter(image: &Image, radius: usize, pick: impl Fn(f32, f32) -> f32 + Sync) -
 
 /// Grey dilation by a square of `2 radius + 1` pixels.
 pub fn dilate(image: &Image, radius: usize) -> Image {
-    filter(image, radius, f32::max)
+    filter(image, radius, f32::NEG_INFINITY, f32::max)
 }
 
 /// A mask with a margin of so many pixels, as [`dilate`] has it.
@@ -59,7 +75,7 @@ pub fn widened(mask: &[bool], [width, height]: [usize; 2], pixels: usize) -> Vec
 
 /// Grey opening: what is narrower than `2 radius + 1` pixels is cut down to its surroundings.
 pub fn opening(image: &Image, radius: usize) -> Image {
-    dilate(&filter(image, radius, f32::min), radius)
+    dilate(&filter(image, radius, f32::INFINITY, f32::min), radius)
 }
 
 /// Median of each row's `2 radius + 1` pixels, then of each column's: in one or two directions what is narrower than half
@@ -98,6 +114,30 @@ pub fn median(values: &mut [f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn windows_are_picked_from_as_one_by_one() {
+        let (w, h) = (13, 7);
+        let values: Vec<f32> = (0..w * h).map(|p| ((p * 37 + 11) % 91) as f32 - 45.0).collect();
+        let image = Image { width: w, height: h, values };
+        let within =
+            |centre: usize, radius: usize, end: usize| centre.saturating_sub(radius)..(centre + radius + 1).min(end);
+        for radius in [0, 1, 2, 3, 6, 20] {
+            let picked = |x: usize, y: usize, first: f32, pick: fn(f32, f32) -> f32| {
+                let rows = within(y, radius, h).flat_map(|y| within(x, radius, w).map(move |x| (x, y)));
+                rows.map(|(x, y)| image.values[y * w + x]).fold(first, pick)
+            };
+            let (largest, least) = (dilate(&image, radius), filter(&image, radius, f32::INFINITY, f32::min));
+            for (x, y) in (0..h).flat_map(|y| (0..w).map(move |x| (x, y))) {
+                assert_eq!(
+                    largest.values[y * w + x],
+                    picked(x, y, f32::NEG_INFINITY, f32::max),
+                    "{x}, {y} of {radius}"
+                );
+                assert_eq!(least.values[y * w + x], picked(x, y, f32::INFINITY, f32::min), "{x}, {y} of {radius}");
+            }
+        }
+    }
 
     #[test]
     fn opening_cuts_thin_and_keeps_wide() {
