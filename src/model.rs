@@ -4,6 +4,7 @@ pub mod checkpoint;
 pub mod component;
 mod gaussian_tensors;
 pub mod gaussians;
+pub mod groups;
 pub mod hull;
 pub mod params;
 pub mod scene;

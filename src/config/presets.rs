@@ -120,6 +120,7 @@ pub(super) fn gaussians() -> Gaussians {
         weakest: 0.01,
         clear_at: 65,
         faint: 0.2,
+        link: 4.0,
         missing: 0.03,
         background_every: 40,
     }

@@ -259,6 +259,9 @@ section! {
         clear_at: u32 in 0.0 to 1e6,
         /// Density below which a Gaussian is too faint, as a share of the vessels'.
         faint: f64 in 0.0 to 1.0,
+        /// Distance within which Gaussians belong to one vessel, a length as the scales are: broad ones that stand alone are dropped when all iterations are
+        /// done; 0 = never. Runs from before it was a setting did not.
+        #[serde(default)] link: f64 in 0.0 to 1e3,
         /// Missing line integral from which a Gaussian is placed; also its first density.
         missing: f64 in 1e-6 to 1e3,
         /// Iterations after which the still background is estimated anew from what the Gaussians leave of the images, and

@@ -103,6 +103,11 @@ pub fn clears(settings: &sections::Gaussians, step: u32) -> bool {
     settings.clear_at > 0 && step == settings.clear_at
 }
 
+/// Whether Gaussians that stand for no vessel are dropped after an iteration.
+pub fn parts_from_strays(settings: &sections::Gaussians, step: u32) -> bool {
+    settings.link > 0.0 && step == settings.iterations
+}
+
 /// Whether the still background is estimated anew before an iteration: not while rates fall, when little could follow.
 pub fn renews_background(settings: &sections::Gaussians, step: u32) -> bool {
     let every = settings.background_every;

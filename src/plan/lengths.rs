@@ -45,6 +45,7 @@ impl Lengths {
             least_scale,
             greatest_scale: (self.factor * settings.greatest_scale).max(least_scale),
             position_rate: self.factor * settings.position_rate,
+            link: self.factor * settings.link,
             ..settings.clone()
         }
     }

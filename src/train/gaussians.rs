@@ -9,6 +9,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{Gaussians, amplitude, dense};
+use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::train::targets::{losses, renew_bounds, take_images, target_buffers};
@@ -155,6 +156,9 @@ impl GaussianTrainer {
         }
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, stop)?;
+        if fit::parts_from_strays(&self.settings, self.step) {
+            self.drop_strays()?;
+        }
         losses(&self.buffers, first..self.step)
     }
 
@@ -180,6 +184,13 @@ impl GaussianTrainer {
     fn clear(&mut self) -> Result<()> {
         let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
         particles.retain(&dense(&particles.rows, &self.setup, self.settings.faint));
+        self.replace(&particles)
+    }
+
+    /// Drops what is alone and broad.
+    fn drop_strays(&mut self) -> Result<()> {
+        let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
+        particles.retain(&vessels(&particles.rows, &self.setup, self.settings.link));
         self.replace(&particles)
     }
 

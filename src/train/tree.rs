@@ -14,6 +14,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
 use crate::model::gaussians::{Gaussians, MovingTree, dense};
+use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
@@ -214,6 +215,9 @@ impl TreeTrainer {
         }
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, stop)?;
+        if fit::parts_from_strays(&self.config.gaussians, self.step) {
+            self.drop_strays()?;
+        }
         losses(&self.joint.targets, first..self.step)
     }
 
@@ -240,6 +244,12 @@ impl TreeTrainer {
     fn clear(&mut self) -> Result<()> {
         let (faint, setup) = (self.config.gaussians.faint, self.joint.setup);
         self.retain(|rows| dense(rows, &setup, faint)).map(|_| ())
+    }
+
+    /// Drops what is alone and broad.
+    fn drop_strays(&mut self) -> Result<()> {
+        let (link, setup) = (self.targets.lengths.gaussians(&self.config.gaussians).link, self.joint.setup);
+        self.retain(|rows| vessels(rows, &setup, link)).map(|_| ())
     }
 
     /// Keeps some of the Gaussians, on the device and as returned.

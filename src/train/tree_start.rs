@@ -42,7 +42,9 @@ impl TreeStart {
     /// # Errors
     /// As [`GaussianTrainer::new`].
     pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<TreeStart> {
-        let warm = sections::Gaussians { iterations: config.tree.warm_iterations, ..config.gaussians.clone() };
+        // Strays are told when all iterations are done: what is one at first may find its vessel.
+        let warm =
+            sections::Gaussians { iterations: config.tree.warm_iterations, link: 0.0, ..config.gaussians.clone() };
         let warm = Config { gaussians: warm, ..config.clone() };
         let warming = GaussianTrainer::new(gpu, targets, &warm)?;
         Ok(TreeStart { gpu: gpu.clone(), config: config.clone(), stage: Stage::Warming(Box::new(warming)) })
