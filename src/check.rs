@@ -41,6 +41,9 @@ pub struct CheckedView {
     pub phases: usize,
     /// Noise of a pixel, as a share of the strongest change.
     pub noise: f64,
+    /// Size, root mean square over the phases, of what moves besides vessels and is wide, as a share of the strongest change of
+    /// what is narrow; none where nothing does.
+    pub wide_motion: Option<f64>,
     /// Share of all change that is next to the edges of the image.
     pub at_edges: f64,
 }
@@ -116,6 +119,7 @@ fn checked_view(dataset: &Dataset, observed: &Observed, v: usize, series: &Serie
         angles_deg: dataset.views[observed.views[v]].geometry.angles_deg(),
         phases: series.seen().count(),
         noise: median(&background.noise.values) / f64::from(background.strongest).max(f64::MIN_POSITIVE),
+        wide_motion: background.drift.size().map(f64::from),
         at_edges: observed.at_border[v],
     }
 }

@@ -152,6 +152,7 @@ pub mod import {
 /// What each view shows by itself: its still background, its noise, and where vessels may be.
 pub mod evidence {
     pub mod background;
+    pub mod drift;
     mod filters;
     pub mod noise;
     pub mod ratios;

@@ -182,12 +182,21 @@ const SOFT_HULL_CELLS: usize = 112;
 fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {
     let soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
     let targets = Targets::new(dataset, &soft, &config.gaussians)?;
+    notes.extend(wide_motion(&soft));
     notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
     notes.push(match targets.form(config.gaussians.form) {
         GaussianForm::Tree => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
         _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))
+}
+
+/// What is said of views in which more moves than vessels.
+fn wide_motion(soft: &SoftMotion) -> Option<String> {
+    let views: Vec<usize> = soft.views.iter().filter(|v| v.background.drift.size().is_some()).map(|v| v.view).collect();
+    let what = "something wide moves besides vessels, as a heart, a diaphragm or lungs do: \
+                it is held still where vessels are looked for";
+    (!views.is_empty()).then(|| format!("views {views:?}: {what}"))
 }
 
 fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes: &mut Vec<String>) -> Option<Hull> {

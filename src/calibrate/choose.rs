@@ -19,6 +19,9 @@ const STEPS: [usize; 2] = [2, 3];
 const TEMPER: f64 = 10.0;
 /// A correction must take this share of the squared residual away at phases it has not seen: chance takes less.
 pub const LEAST_GAIN: f64 = 0.02;
+/// And this share of the profiles' squares: what noise-free views leave when nothing is wrong changes by less. An error of 0.03 pixels
+/// adds as much.
+const LEAST_DROP: f64 = 5e-4;
 /// Where vessels are cut off, which displacements of frames take up more than positions of views do, breathing must take this
 /// share away.
 pub const LARGE_GAIN: f64 = 0.3;
@@ -107,11 +110,11 @@ pub fn validate(observed: &Observed, correction: Correction) -> Validated {
 }
 
 /// The candidate that predicts unseen phases best; a later one must be better than those before by the share `gain` of the
-/// squared residual.
+/// squared residual, and by [`LEAST_DROP`].
 pub fn best(residuals: &[f64], gain: impl Fn(usize) -> f64) -> usize {
     let mut best = 0;
     for (k, residual) in residuals.iter().enumerate() {
-        if *residual < (1.0 - gain(k)) * residuals[best] {
+        if *residual < (1.0 - gain(k)) * residuals[best] && residuals[best] - residual > LEAST_DROP {
             best = k;
         }
     }
@@ -137,5 +140,6 @@ mod tests {
         assert_eq!(best(&[1.0, 0.5, 0.495], gain), 1);
         assert_eq!(best(&[1.0, 0.5, 0.4], gain), 2);
         assert_eq!(best(&[1.0, 0.5, 0.4], |_| LARGE_GAIN), 1);
+        assert_eq!(best(&[0.004, 0.0036, 0.0038], gain), 0, "next to nothing is left as it is");
     }
 }

@@ -122,7 +122,7 @@ impl Seen {
         let mask: Vec<bool> = (0..data.n_pixels()).map(likely).collect();
         let mut wide_mask = widened(&mask, [data.width, data.height], MASK_MARGIN);
         wide_mask.iter_mut().zip(&visible).for_each(|(m, v)| *m &= *v);
-        let above = series.images.iter().map(|image| {
+        let above = evidence.background.stilled.images.iter().map(|image| {
             let values = &image.as_ref()?.values;
             Some(values.iter().zip(level).map(|(y, b)| y - b).collect::<Vec<f32>>())
         });

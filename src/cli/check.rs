@@ -50,12 +50,13 @@ pub fn run(args: &CheckArgs) -> Result<()> {
 }
 
 fn print(dataset: &Dataset, found: &Check) -> Result<()> {
-    out!("view primary secondary phases    noise  at the edge");
+    out!("view primary secondary phases    noise  at the edge  wide motion");
     for v in &found.views {
         let angle = |deg: Option<f64>| deg.map_or("-".into(), |deg| format!("{deg:.1}"));
         let (primary, secondary) = (angle(v.angles_deg.map(|a| a.0)), angle(v.angles_deg.map(|a| a.1)));
         let (noise, edge) = (100.0 * v.noise, 100.0 * v.at_edges);
-        out!("{:4} {primary:>7} {secondary:>9} {:6} {noise:7.1}% {edge:11.1}%", v.view, v.phases);
+        let wide = v.wide_motion.map_or("-".into(), |size| format!("{:.1}%", 100.0 * size));
+        out!("{:4} {primary:>7} {secondary:>9} {:6} {noise:7.1}% {edge:11.1}% {wide:>12}", v.view, v.phases);
     }
     if let Some(agreement) = &found.agreement {
         out!("disagreement of views (0: one object, 100: unrelated): {:.1}", 100.0 * agreement.fine);

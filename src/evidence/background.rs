@@ -1,5 +1,6 @@
 //! What a still view looks like without its vessels, and how noisy it is.
 
+use crate::evidence::drift::Drift;
 use crate::evidence::filters::{gaussian, map2, separable};
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
 use crate::raster::{Image, dilate, median, opening, percentile};
@@ -11,7 +12,7 @@ const BACKGROUND_SIGMAS: f32 = 2.0;
 /// Times the set of phases that belong to the background is drawn up anew.
 const BACKGROUND_ROUNDS: usize = 4;
 /// Noise is never taken for less than this share of the strongest change: models are not exact either.
-const LEAST_NOISE_SHARE: f32 = 0.01;
+pub(super) const LEAST_NOISE_SHARE: f32 = 0.01;
 /// Pixels of blur before the strongest change is read off.
 const STRONGEST_BLUR: f32 = 0.7;
 /// Share of pixels whose change is below the strongest.
@@ -61,6 +62,10 @@ fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
 /// The still background of a view, and what stands out of it.
 #[derive(Debug, Clone)]
 pub struct Background {
+    /// The images as they would be if nothing wide moved: what all below is made of.
+    pub stilled: Series,
+    /// What moved.
+    pub drift: Drift,
     /// Mean of the phases at which no vessel covers the pixel.
     pub level: Image,
     /// The background where a vessel covers the pixel at every phase: what remains without structures as thin as vessels.
@@ -108,10 +113,12 @@ fn lower_mode(values: &[f32], noise: f32, bias: f32) -> f32 {
 impl Background {
     /// Analyses a view.
     pub fn new(series: &Series) -> Background {
-        let images: Vec<&Image> = series.seen().collect();
+        let drift = Drift::new(series, &noise(series));
+        let stilled = drift.stilled(series);
+        let images: Vec<&Image> = stilled.seen().collect();
         let (width, height) = (images[0].width, images[0].height);
         let image = |values: Vec<f32>| Image { width, height, values };
-        let mut noise = noise(series);
+        let mut noise = noise(&stilled);
         let bias = expected_minimum(images.len()) as f32;
         // A pixel without noise at all still rounds.
         let span = images.iter().flat_map(|i| &i.values).fold([f32::MAX, f32::MIN], |[l, h], v| [l.min(*v), h.max(*v)]);
@@ -123,7 +130,7 @@ impl Background {
         let level = image(level);
         let wide = opening_radius(WIDE_SHARE, width, height);
         let changes: Vec<Option<Image>> =
-            series.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, wide))).collect();
+            stilled.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, wide))).collect();
         let smooth: Vec<Image> = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR)).collect();
         let most = |p: usize| smooth.iter().map(|c| c.values[p]).fold(f32::MIN, f32::max);
         let largest: Vec<f32> = (0..width * height).map(most).collect();
@@ -133,7 +140,7 @@ impl Background {
         // An opening of noise is biased low, one of the smoothed background much less.
         let mut low = opening(&blur(&level, STRONGEST_BLUR), opening_radius(OPENING_SHARE, width, height));
         low.values.iter_mut().zip(&level.values).for_each(|(low, b)| *low = low.min(*b));
-        Background { level, low, changes, noise: image(noise), strongest }
+        Background { level, low, changes, noise: image(noise), strongest, drift, stilled }
     }
 }
 

@@ -57,7 +57,8 @@ impl ViewEvidence {
             background.changes.par_iter().map(|change| change.as_ref().map(|change| ladder.phase(change))).collect();
         let filtered = seen.iter().flatten().any(|p| p.filtered);
         let largest = largest_ratio(seen.iter().flatten().map(|p| &p.ratio));
-        let ratios = series
+        let ratios = background
+            .stilled
             .images
             .par_iter()
             .zip(&seen)

@@ -94,8 +94,7 @@ impl Targets {
             let problem = "a single training view has two phases: two are needed to tell where along a ray a vessel is";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
-        let series = Series::of(dataset);
-        series.iter().try_for_each(|s| check_finite(dataset, s))?;
+        Series::of(dataset).iter().try_for_each(|s| check_finite(dataset, s))?;
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
         if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
             let problem = "nothing moves that several views agree on: check geometry, phases and noise";
@@ -130,8 +129,9 @@ impl Targets {
             motion.views.iter().map(|v| weights(dataset, v, strongest, settings.noise_scale)).collect();
         // Images of a phase follow each other.
         for phase in 0..n_phases {
-            for (slot, (series, view)) in series.iter().zip(&motion.views).enumerate() {
-                let (Some(image), Some(change)) = (&series.images[phase], &view.background.changes[phase]) else {
+            for (slot, view) in motion.views.iter().enumerate() {
+                let seen = (&view.background.stilled.images[phase], &view.background.changes[phase]);
+                let (Some(image), Some(change)) = seen else {
                     continue;
                 };
                 let above = image.values.iter().zip(&view.background.low.values).map(|(y, b)| y - b);
