@@ -63,8 +63,11 @@ fn lines_of_vtk_are_read_in_each_encoding() {
 fn what_cannot_be_read_is_named() {
     let (directory, _) = written();
     let out = directory.path().join("never made");
+    // A reader that goes down with every element would end the program.
+    let deep = "<a>".repeat(100_000);
     for (name, content, parts) in [
-        ("lz4.vtp", None, &["compressor", "LZ4", "vtkZLibDataCompressor"][..]),
+        ("deep.vtp", Some(deep.as_str()), &["XML"][..]),
+        ("lz4.vtp", None, &["compressor", "LZ4", "vtkZLibDataCompressor"]),
         ("nameless.vtp", None, &["PointData", "MaximumInscribedSphereRadius", "Width"]),
         ("unlike.pvd", None, &["shorter.vtp", "Lines", "phase0.vtp"]),
         ("grid.vtp", Some("<VTKFile type=\"ImageData\"/>"), &["ImageData", "PolyData"]),

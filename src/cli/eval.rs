@@ -60,7 +60,10 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
         None => (Path::new(""), run.join("eval.html")),
     };
     let beside = page.parent().unwrap_or(Path::new(""));
-    let tree = if args.tree { tree_of_page(cli, &gpu, &model, beside, &mut evaluation.warnings)? } else { None };
+    let warnings = &mut evaluation.warnings;
+    let found = if args.tree { tree_of_page(cli, &gpu, &model, &cancel, beside, warnings) } else { Ok(None) };
+    // Scores are not lost with a tree that fails or is stopped.
+    let tree = found.or_else(|error| print_scores(args, &evaluation).and(Err(error)))?;
     score_tree_of_page(tree.as_ref(), &dataset, &mut evaluation)?;
     Report {
         gpu: &gpu,
@@ -74,13 +77,18 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
         pictures,
     }
     .write(&page)?;
-    if args.json {
-        out!("{}", pretty_json(&evaluation)?);
-    } else {
-        print_table(&evaluation);
-    }
+    print_scores(args, &evaluation)?;
     evaluation.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     cli.close_device(&gpu)
+}
+
+fn print_scores(args: &EvalArgs, evaluation: &Evaluation) -> Result<()> {
+    if args.json {
+        out!("{}", pretty_json(evaluation)?);
+    } else {
+        print_table(evaluation);
+    }
+    Ok(())
 }
 
 /// Prints scores as a table with means.

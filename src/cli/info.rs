@@ -22,7 +22,7 @@ pub struct InfoArgs {
     #[arg(long)]
     pub json: bool,
     /// Leave a picture of a dataset's geometry here: sources, detectors, central rays and the patient's axes, from three sides.
-    #[arg(long, value_name = "FILE.png", conflicts_with = "schema")]
+    #[arg(long, value_name = "FILE.png", conflicts_with_all = ["schema", "json"])]
     pub picture: Option<PathBuf>,
     /// Print the JSON schema of `dataset.json` and exit.
     #[arg(long)]

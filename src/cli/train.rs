@@ -4,7 +4,7 @@ use super::args::{Cli, ConfigArgs};
 use super::eval::print_table;
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
-use super::tree::{of_page as tree_of_page, score as score_tree_of_page};
+use super::tree::{of_page as tree_of_page, remove_old as remove_old_tree, score as score_tree_of_page};
 use clap::Args;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
@@ -18,7 +18,7 @@ use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
-use nertca_vk::score::eval::moving_field_warning;
+use nertca_vk::score::eval::{Evaluation, moving_field_warning};
 use std::path::{Path, PathBuf};
 
 /// `train`.
@@ -109,14 +109,22 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
             let (run, report) = (run.display(), report.display());
             eprintln!("the run is complete; to score it: nertca-vk eval \"{run}\" --images \"{report}\"");
         }
-        evaluation = Some(outcome?);
+        let scores = outcome?;
+        // Now, and again with those of the tree: finding that may fail or be stopped.
+        write_scores(&report, &scores)?;
+        evaluation = Some(scores);
     }
     drop(observer);
-    let tree = if args.tree { tree_of_page(cli, &gpu, &model, run, &mut warnings)? } else { None };
+    let tree = if args.tree {
+        tree_of_page(cli, &gpu, &model, &cancel, run, &mut warnings)?
+    } else {
+        remove_old_tree(run, &mut warnings);
+        None
+    };
     if let Some(scores) = &mut evaluation {
         scores.warnings.append(&mut warnings);
         score_tree_of_page(tree.as_ref(), &dataset, scores)?;
-        files::write_atomic(&report.join("evaluation.json"), files::pretty_json(scores)?.as_bytes())?;
+        write_scores(&report, scores)?;
         warnings.clone_from(&scores.warnings);
     }
     Report {
@@ -137,6 +145,10 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     }
     warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     cli.close_device(&gpu)
+}
+
+fn write_scores(report: &Path, scores: &Evaluation) -> Result<()> {
+    files::write_atomic(&report.join("evaluation.json"), files::pretty_json(scores)?.as_bytes())
 }
 
 fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {

@@ -15,7 +15,9 @@ use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::extract::{TreeOptions, vessel_trees};
 use nertca_vk::trees::files::{TreeFormat, note, write};
 use nertca_vk::trees::tree::BeatTree;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// `tree`.
 #[derive(Debug, Args)]
@@ -43,26 +45,52 @@ pub struct TreeArgs {
 const TREE_FILE: &str = "tree.json";
 
 /// The tree of all phases of a model for a run's page, and beside the page as a file. A model without vessels has none, which
-/// is one more warning.
+/// is one more warning, as is a file that cannot be written.
 pub fn of_page(
     cli: &Cli,
     gpu: &Gpu,
     model: &Model,
+    cancel: &AtomicBool,
     directory: &Path,
     warnings: &mut Vec<String>,
 ) -> Result<Option<BeatTree>> {
     let phases = (0..model.param_map.phases as u32).collect();
     let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
-    match find(cli, gpu, model, &options) {
+    match find(cli, gpu, model, cancel, &options) {
         Ok(beat) => {
-            write(&beat, &directory.join(TREE_FILE), TreeFormat::Json, true)?;
+            leave(&beat, directory, warnings)?;
             Ok(Some(beat))
         }
         Err(error @ Error::Config { .. }) => {
             warnings.push(format!("There is no vessel tree: {error}."));
+            remove_old(directory, warnings);
             Ok(None)
         }
         Err(error) => Err(error),
+    }
+}
+
+/// Leaves a tree beside its page.
+fn leave(beat: &BeatTree, directory: &Path, warnings: &mut Vec<String>) -> Result<()> {
+    match write(beat, &directory.join(TREE_FILE), TreeFormat::Json, true) {
+        Err(error @ Error::Io { .. }) => {
+            warnings.push(format!("There is no file of the vessel tree: {error}."));
+            remove_old(directory, warnings);
+            Ok(())
+        }
+        written => written.map(drop),
+    }
+}
+
+/// Removes the tree that an earlier page left in a directory, lest it passes for that of a new page without one. A file that
+/// stays is one more warning.
+pub fn remove_old(directory: &Path, warnings: &mut Vec<String>) {
+    let file = directory.join(TREE_FILE);
+    match std::fs::remove_file(&file) {
+        Err(error) if error.kind() != ErrorKind::NotFound => {
+            warnings.push(format!("{} is not of this page and could not be removed: {error}.", file.display()));
+        }
+        _ => {}
     }
 }
 
@@ -78,12 +106,12 @@ pub fn score(tree: Option<&BeatTree>, dataset: &Dataset, evaluation: &mut Evalua
     Ok(())
 }
 
-fn find(cli: &Cli, gpu: &Gpu, model: &Model, options: &TreeOptions) -> Result<BeatTree> {
+fn find(cli: &Cli, gpu: &Gpu, model: &Model, cancel: &AtomicBool, options: &TreeOptions) -> Result<BeatTree> {
     let renderer = Renderer::new(gpu, model, cli.tuning(gpu, &model.config))?;
     let mut progress = bar();
     vessel_trees(&renderer, model, options, |n, of| {
         progress("trees", n, of);
-        Ok(())
+        if cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) }
     })
 }
 
@@ -95,7 +123,8 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
     let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
     let gpu = cli.open_device()?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
-    let beat = find(cli, &gpu, &model, &options)?;
+    // Nothing is left half-way here, so that Ctrl-C may end the program at once.
+    let beat = find(cli, &gpu, &model, &AtomicBool::new(false), &options)?;
     let made = write(&beat, &args.out, format, all)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {

@@ -13,8 +13,6 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// How far the tree has come.
 enum TreeState {
-    /// Nobody has asked for it.
-    Unasked,
     /// Phases that are done, and all of them.
     Working { done: u64, of: u64 },
     /// Why there is none.
@@ -27,7 +25,6 @@ impl TreeState {
     /// What the page is answered, JSON.
     fn answer(&self) -> String {
         match self {
-            TreeState::Unasked => json!({ "state": "working", "done": 0, "of": 0 }).to_string(),
             TreeState::Working { done, of } => json!({ "state": "working", "done": done, "of": of }).to_string(),
             TreeState::Failed(problem) => json!({ "state": "failed", "problem": problem }).to_string(),
             TreeState::Ready(tree) => format!(r#"{{"state":"ready","tree":{tree}}}"#),
@@ -39,28 +36,31 @@ impl TreeState {
 pub struct TreeWork {
     gpu: Gpu,
     tuning: Tuning,
-    state: Mutex<TreeState>,
+    /// None before anybody has asked, and once a failure has been told.
+    state: Mutex<Option<TreeState>>,
     stop: AtomicBool,
 }
 
 impl TreeWork {
     /// Work that begins when it is asked for.
     pub fn new(gpu: &Gpu, tuning: Tuning) -> TreeWork {
-        TreeWork { gpu: gpu.clone(), tuning, state: Mutex::new(TreeState::Unasked), stop: AtomicBool::new(false) }
+        TreeWork { gpu: gpu.clone(), tuning, state: Mutex::new(None), stop: AtomicBool::new(false) }
     }
 
-    fn state(&self) -> MutexGuard<'_, TreeState> {
+    fn state(&self) -> MutexGuard<'_, Option<TreeState>> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How far the tree has come, as JSON, and whether the caller is the first to ask: then it calls [`TreeWork::find`].
+    /// How far the tree has come, as JSON, and whether the caller is the first to ask: then it calls [`TreeWork::find`]. A
+    /// failure is told once; who asks after that is the first again.
     pub fn ask(&self) -> (String, bool) {
         let mut state = self.state();
-        let first = matches!(*state, TreeState::Unasked);
-        if first {
-            *state = TreeState::Working { done: 0, of: 0 };
+        let first = state.is_none();
+        let answer = state.get_or_insert(TreeState::Working { done: 0, of: 0 }).answer();
+        if matches!(*state, Some(TreeState::Failed(_))) {
+            *state = None;
         }
-        (state.answer(), first)
+        (answer, first)
     }
 
     /// Finds the tree. Takes seconds.
@@ -69,7 +69,7 @@ impl TreeWork {
             Ok(json) => TreeState::Ready(json),
             Err(error) => TreeState::Failed(error.to_string()),
         };
-        *self.state() = found;
+        *self.state() = Some(found);
     }
 
     /// Ends the work under way before its next phase.
@@ -86,7 +86,7 @@ impl TreeWork {
             if self.stop.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted);
             }
-            *self.state() = TreeState::Working { done, of };
+            *self.state() = Some(TreeState::Working { done, of });
             Ok(())
         })?;
         to_json(&beat)

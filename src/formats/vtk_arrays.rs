@@ -7,8 +7,8 @@ use roxmltree::{Document, Node};
 use std::io::Read;
 use std::path::Path;
 
-/// Bytes of all arrays of a file at most, once they are unpacked.
-const MOST_BYTES: usize = 1 << 30;
+/// Bytes of an array at most, once it is unpacked.
+const MOST_BYTES: usize = 1 << 27;
 const APPENDED: &[u8] = b"<AppendedData";
 const ROOT: &str = "VTKFile";
 const ZLIB: &str = "vtkZLibDataCompressor";

@@ -5,11 +5,13 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::vtk_arrays::{Arrays, Parts};
-use roxmltree::{Document, Node};
+use roxmltree::{Document, Node, ParsingOptions};
 use std::fmt::{Display, Write};
 use std::path::{Path, PathBuf};
 
 const MOST_FILE_BYTES: u64 = 1 << 30;
+/// Elements and texts of a file at most: they may be nested as deep, and each level takes some of the stack.
+const MOST_NODES: u32 = 2048;
 
 /// Values by a name, one per point or line.
 pub enum Values {
@@ -122,7 +124,8 @@ fn data_arrays<'a, 'input>(node: Option<Node<'a, 'input>>) -> impl Iterator<Item
 }
 
 fn parsed<'a>(path: &Path, text: &'a str) -> Result<Document<'a>> {
-    Document::parse(text).map_err(|e| Error::data(path, "XML", e.to_string()))
+    let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
+    Document::parse_with_options(text, options).map_err(|e| Error::data(path, "XML", e.to_string()))
 }
 
 /// Reads the lines of a `.vtp`, however VTK keeps its arrays, but for compression by LZ4 and LZMA.

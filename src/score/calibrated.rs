@@ -12,12 +12,14 @@ use glam::DVec3;
 /// Half side of the cube of points that stand for the heart, as a share of the field of view's half.
 const HEART_SHARE: f64 = 0.5;
 
-fn true_rays(frame: &TrueFrame, dataset: &Dataset) -> Result<ViewRays> {
+/// Rays by which the image of a frame was really taken, the heart at its mean position.
+pub(super) fn true_rays(frame: &TrueFrame, dataset: &Dataset) -> Result<ViewRays> {
     let rays = Geometry::CArm(frame.geometry.clone()).rays(dataset.width, dataset.height);
     rays.map_err(|(field, problem)| Error::data(dataset.path.join(TRUTH), field, problem))
 }
 
-fn shift_of(frame: &TrueFrame) -> DVec3 {
+/// Where breathing had carried the heart, world units.
+pub(super) fn shift_of(frame: &TrueFrame) -> DVec3 {
     DVec3::from_array(frame.heart_shift_mm) / MM_PER_UNIT
 }
 
@@ -65,7 +67,7 @@ pub fn in_calibrated_frame(dataset: &Dataset) -> Result<Option<Dataset>> {
 }
 
 /// The truth of a dataset's frames.
-struct TrueFrames<'a> {
+pub(super) struct TrueFrames<'a> {
     truth: &'a Truth,
     dataset: &'a Dataset,
     /// Views of training, and those unseen: the truth counts them in this order.
@@ -74,7 +76,7 @@ struct TrueFrames<'a> {
 }
 
 impl<'a> TrueFrames<'a> {
-    fn new(truth: &'a Truth, dataset: &'a Dataset) -> TrueFrames<'a> {
+    pub(super) fn new(truth: &'a Truth, dataset: &'a Dataset) -> TrueFrames<'a> {
         let views = |frames: &[Frame]| {
             let mut views: Vec<usize> = frames.iter().map(|f| f.view).collect();
             views.sort_unstable();
@@ -84,7 +86,8 @@ impl<'a> TrueFrames<'a> {
         TrueFrames { truth, dataset, training: views(dataset.training()), unseen: views(dataset.validation()) }
     }
 
-    fn of(&self, frame: &Frame) -> Option<&'a TrueFrame> {
+    /// How the image of a frame was really taken; none where the truth is of other frames.
+    pub(super) fn of(&self, frame: &Frame) -> Option<&'a TrueFrame> {
         let place = |views: &[usize]| views.iter().position(|v| *v == frame.view);
         let view = match frame.split {
             Split::Train => place(&self.training)?,

@@ -1,9 +1,10 @@
 //! How far a tree of vessels agrees with the true one, over the beat (see `docs/formats.md`).
 
 use crate::error::{Error, Result};
-use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays, world_from_lps_mm};
+use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::scan::dataset::{Dataset, Frame, Split};
-use crate::scan::truth::{TRUTH, TrueFrame, Truth};
+use crate::scan::truth::{TRUTH, Truth};
+use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
 use crate::score::shapes::WITHIN_MM;
 use crate::trees::tree::{BeatTree, PhaseTree};
 use glam::{DVec2, DVec3};
@@ -42,7 +43,7 @@ pub struct TreeAgreement {
     /// The same in images of views that were not trained on.
     pub reprojection_unseen_mm: Option<f64>,
     /// Mean distance between where our points have come since phase 0 and where the true points beside them have, mm; where
-    /// points are followed.
+    /// points are followed, and not of phase 0 itself.
     pub motion_error_mm: Option<f64>,
 }
 
@@ -72,23 +73,26 @@ pub struct TreeScores {
 /// `truth.json` lies beside it, the true vessels are seen as each image was really taken.
 ///
 /// # Errors
-/// [`Error::Io`] and [`Error::Data`] for a `truth.json` that cannot be read; [`Error::Data`] for a truth without vessels.
+/// [`Error::Io`] and [`Error::Data`] for a `truth.json` that cannot be used; [`Error::Data`] for a truth without vessels.
 pub fn score(beat: &BeatTree, dataset: &Dataset, truth: impl Fn(f64) -> Vec<TrueLine> + Sync) -> Result<TreeScores> {
-    let images = Images::of(dataset)?;
+    let taken = dataset.path.join(TRUTH).is_file().then(|| Truth::load(&dataset.path)).transpose()?;
+    let images = Images { dataset, truth: taken.as_ref().map(|taken| TrueFrames::new(taken, dataset)) };
     let rest = truth(0.0);
     if rest.iter().all(|line| line.points_mm.len() < 2) {
         return Err(Error::data(&dataset.path, "true tree", "has no line"));
     }
     let first = beat.phases.iter().find(|tree| Some(tree.phase) == beat.reference_phase);
-    let phases = beat.phases.par_iter().map(|tree| {
+    let phases = beat.phases.par_iter().map(|tree| -> Result<PhaseTreeScores> {
         let now = truth(f64::from(tree.phase));
         let mut scores = agreement(tree, &now);
-        scores.reprojection_training_mm = images.reprojection_mm(tree, Split::Train, &truth);
-        scores.reprojection_unseen_mm = images.reprojection_mm(tree, Split::Validation, &truth);
+        scores.reprojection_training_mm = images.reprojection_mm(tree, Split::Train, &truth)?;
+        scores.reprojection_unseen_mm = images.reprojection_mm(tree, Split::Validation, &truth)?;
+        // The reference phase has no motion by definition, and would only flatter the mean.
+        let first = first.filter(|first| first.phase != tree.phase);
         scores.motion_error_mm = first.and_then(|first| motion_error_mm([first, tree], [&rest, &now]));
-        PhaseTreeScores { phase: tree.phase, scores }
+        Ok(PhaseTreeScores { phase: tree.phase, scores })
     });
-    let phases: Vec<PhaseTreeScores> = phases.collect();
+    let phases = phases.collect::<Result<Vec<PhaseTreeScores>>>()?;
     Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), phases })
 }
 
@@ -243,7 +247,7 @@ fn motion_error_mm([first, now]: [&PhaseTree; 2], [true_first, true_now]: [&[Tru
 /// How images were taken, as the reconstruction has it and really.
 struct Images<'a> {
     dataset: &'a Dataset,
-    truth: Option<Truth>,
+    truth: Option<TrueFrames<'a>>,
 }
 
 /// One image: how ours is seen, how the truth is, and when.
@@ -254,28 +258,27 @@ struct Image {
 }
 
 impl Images<'_> {
-    fn of(dataset: &Dataset) -> Result<Images<'_>> {
-        let truth = dataset.path.join(TRUTH).is_file().then(|| Truth::load(&dataset.path)).transpose()?;
-        Ok(Images { dataset, truth })
-    }
-
-    fn image(&self, frame: &Frame) -> Option<Image> {
+    /// None for a frame that `truth.json` knows nothing of.
+    fn image(&self, frame: &Frame) -> Result<Option<Image>> {
         let rays = self.dataset.heart_rays(frame);
         let Some(truth) = &self.truth else {
-            return Some(Image { true_rays: rays.clone(), rays, moment: f64::from(frame.phase) });
+            return Ok(Some(Image { true_rays: rays.clone(), rays, moment: f64::from(frame.phase) }));
         };
-        let of_frame = |was: &&TrueFrame| (was.view, was.phase, was.split) == (frame.view, frame.phase, frame.split);
-        let was = truth.frames.iter().find(of_frame)?;
-        let seen = Geometry::CArm(was.geometry.clone()).rays(self.dataset.width, self.dataset.height).ok()?;
-        let true_rays = seen.moved(DVec3::from_array(was.heart_shift_mm) / MM_PER_UNIT);
-        Some(Image { rays, true_rays, moment: was.beat_phase })
+        let Some(was) = truth.of(frame) else { return Ok(None) };
+        let true_rays = true_rays(was, self.dataset)?.moved(shift_of(was));
+        Ok(Some(Image { rays, true_rays, moment: was.beat_phase }))
     }
 
     /// Mean over the images of a phase; none without any.
-    fn reprojection_mm(&self, tree: &PhaseTree, split: Split, truth: impl Fn(f64) -> Vec<TrueLine>) -> Option<f64> {
+    fn reprojection_mm(
+        &self,
+        tree: &PhaseTree,
+        split: Split,
+        truth: impl Fn(f64) -> Vec<TrueLine>,
+    ) -> Result<Option<f64>> {
         let frames = self.dataset.frames.iter().filter(|frame| frame.phase == tree.phase && frame.split == split);
-        let error_mm = |frame: &Frame| {
-            let image = self.image(frame)?;
+        let error_mm = |frame: &Frame| -> Result<Option<f64>> {
+            let Some(image) = self.image(frame)? else { return Ok(None) };
             let pixel_mm = image.rays.anchor[1].length() * MM_PER_UNIT;
             let seen = |rays: &ViewRays, line: &[DVec3]| -> Option<Vec<DVec3>> {
                 let place = |point: &DVec3| {
@@ -293,8 +296,9 @@ impl Images<'_> {
             for (at, length) in finely(&our_lines) {
                 away.add(length, nearest(&true_lines, at.on(our_lines[at.line], DVec3::lerp)).0);
             }
-            away.mean()
+            Ok(away.mean())
         };
-        mean(frames.filter_map(error_mm))
+        let errors_mm = frames.filter_map(|frame| error_mm(frame).transpose()).collect::<Result<Vec<f64>>>()?;
+        Ok(mean(errors_mm.into_iter()))
     }
 }

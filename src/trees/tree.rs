@@ -19,12 +19,14 @@ impl Branch {
         length_mm(&self.points_mm)
     }
 
-    /// Mean diameter of the lumen along the centreline, mm.
+    /// Mean diameter of the lumen along the centreline, mm; of one without length that of its first point.
     pub fn mean_diameter_mm(&self) -> f64 {
         let steps = self.points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
         // The sum of both radii is the mean diameter of a step.
         let area: f64 = steps.zip(self.radius_mm.windows(2)).map(|(step, r)| step * (r[0] + r[1])).sum();
-        area / self.length_mm()
+        let length = self.length_mm();
+        let first = self.radius_mm.first().map_or(f64::NAN, |radius| 2.0 * radius);
+        if length > 0.0 { area / length } else { first }
     }
 
     /// Least diameter of the lumen, mm.
