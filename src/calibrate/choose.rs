@@ -21,7 +21,7 @@ const TEMPER: f64 = 10.0;
 pub const LEAST_GAIN: f64 = 0.02;
 /// And this share of the profiles' squares: what noise-free views leave when nothing is wrong changes by less. An error of 0.03 pixels
 /// adds as much.
-const LEAST_DROP: f64 = 5e-4;
+pub const LEAST_DROP: f64 = 5e-4;
 /// Where vessels are cut off, which displacements of frames take up more than positions of views do, breathing must take this
 /// share away.
 pub const LARGE_GAIN: f64 = 0.3;
