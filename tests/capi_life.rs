@@ -28,11 +28,19 @@ fn train(reconstruction: *mut nertca_reconstruction, iterations: u32) -> u32 {
 fn bytes_of(reconstruction: *mut nertca_reconstruction) -> Vec<u8> {
     let mut length = 0;
     ok(unsafe { nertca_reconstruction_save_memory(reconstruction, null_mut(), 0, &mut length) }, reconstruction);
-    let mut bytes = vec![0u8; length + 1024];
-    let to = bytes.as_mut_ptr().cast();
-    ok(unsafe { nertca_reconstruction_save_memory(reconstruction, to, bytes.len(), &mut length) }, reconstruction);
-    bytes.truncate(length);
-    bytes
+    loop {
+        let mut bytes = vec![0u8; length];
+        let to = bytes.as_mut_ptr().cast();
+        let status = unsafe { nertca_reconstruction_save_memory(reconstruction, to, bytes.len(), &mut length) };
+        // Training went on in between, and its state has grown.
+        if status == NERTCA_ERROR_BUFFER {
+            assert!(length > bytes.len(), "{length} bytes are needed, {} were given", bytes.len());
+            continue;
+        }
+        ok(status, reconstruction);
+        bytes.truncate(length);
+        return bytes;
+    }
 }
 
 fn load(reconstruction: *mut nertca_reconstruction, bytes: &[u8]) {

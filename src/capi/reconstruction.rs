@@ -270,8 +270,8 @@ pub unsafe extern "C" fn nertca_reconstruction_save(
 /// Saves as `nertca_reconstruction_save` does, into memory. `*length` gets the bytes needed; with a null `bytes` and a `size` of
 /// 0 nothing else is done.
 ///
-/// @return NERTCA_ERROR_BUFFER when `size` is too small. While training in the background the length may change by a
-/// few bytes from call to call: leave some room.
+/// @return NERTCA_ERROR_BUFFER when `size` is too small. While training goes on in the background the state grows and shrinks, by
+/// kilobytes when Gaussians are added: then try again with the new `*length`.
 ///
 /// # Safety
 /// `bytes` must hold `size` bytes; `length` must be writable.
