@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Gradient of each Gaussian of the tree from its moments in the views of some phases, in their order: of its shape and
-// place at rest, and of its place at each phase. One invocation per Gaussian.
+// place at rest, and of its place at each phase; an image between two phases counts for both. One invocation per Gaussian.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
 #include "inc/gaussian_tree.glsl"
@@ -19,7 +19,7 @@ layout(binding = 8) readonly buffer B8 { vec4 splat_moments[]; };
 // [Gaussian]: position and log-density, log-scale, rotation.
 layout(binding = 9) writeonly buffer B9 { vec4 gaussian_gradient[]; };
 // [phase][Gaussian]
-layout(binding = 10) writeonly buffer B10 { vec4 place_gradient[]; };
+layout(binding = 10) buffer B10 { vec4 place_gradient[]; };
 #include "inc/gaussian_motion.glsl"
 
 void main() {
@@ -27,23 +27,37 @@ void main() {
     if (i >= push.n_gaussians) return;
     Gaussian g = gaussians[i];
     GaussianGradient sum = no_gradient();
+    vec3 at_rest = vec3(0.0);
+    for (uint t = 0u; t < push.n_phases; t++)
+        place_gradient[(push.first_phase + t) * push.n_gaussians + i] = vec4(0.0);
     for (uint t = 0u; t < push.n_phases; t++) {
         uint phase = push.first_phase + t;
-        vec3 x = position_at(i, g.position, phase), before = sum.position;
+        vec3 here = position_at(i, g.position, phase);
         sum.position = vec3(0.0);
         for (uint view = 0u; view < gaussian_setup.n_views; view++) {
             uint at = (t * gaussian_setup.n_views + view) * push.n_gaussians + i;
             int image = image_of_splat[at];
             if (image < 0) continue;
+            float after_phase = gaussian_views[image].du.w;
+            vec3 x = position_between(i, g.position, here, phase, after_phase);
             Projection p = project(g, x, gaussian_views[image], gaussian_setup);
             if (!(p.depth > 0.0)) continue;
             vec3 linear = splat_moments[2u * at].xyz, square = splat_moments[2u * at + 1u].xyz;
+            vec3 others = sum.position;
+            sum.position = vec3(0.0);
             add_gradient(g, p, gaussian_views[image], gaussian_setup, linear, square, sum);
+            if (after_phase != 0.0) {
+                vec3 beyond = abs(after_phase) * sum.position;
+                place_gradient[phase_beyond(phase, after_phase) * push.n_gaussians + i].xyz += beyond;
+                at_rest += beyond;
+                sum.position -= beyond;
+            }
+            sum.position += others;
         }
-        place_gradient[phase * push.n_gaussians + i] = vec4(sum.position, 0.0);
-        sum.position += before;
+        place_gradient[phase * push.n_gaussians + i].xyz += sum.position;
+        at_rest += sum.position;
     }
-    gaussian_gradient[3u * i] = vec4(sum.position, sum.log_density);
+    gaussian_gradient[3u * i] = vec4(at_rest, sum.log_density);
     gaussian_gradient[3u * i + 1u] = vec4(sum.log_scale, 0.0);
     gaussian_gradient[3u * i + 2u] = sum.rotation;
 }

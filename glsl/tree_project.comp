@@ -31,6 +31,8 @@ void main() {
     Gaussian g = gaussians[i];
     uint at = gl_WorkGroupID.y * push.n_gaussians + i;
     int image = image_of_view[phase * gaussian_setup.n_views + view];
-    splats[at] = project(g, position_at(i, g.position, phase), gaussian_views[max(image, 0)], gaussian_setup).splat;
+    GaussianView seen_by = gaussian_views[max(image, 0)];
+    vec3 x = position_between(i, g.position, position_at(i, g.position, phase), phase, seen_by.du.w);
+    splats[at] = project(g, x, seen_by, gaussian_setup).splat;
     image_of_splat[at] = image;
 }

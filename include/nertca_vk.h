@@ -901,8 +901,9 @@ nertca_status nertca_reconstruction_add_frame(nertca_reconstruction *reconstruct
 
 /**
  * Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them,
- * systole keeping its length (310 ms, 35 % of the phases) and diastole taking the rest. Replaces those
- * given earlier, so that a growing list can be given again and again. Any thread.
+ * systole keeping its length (310 ms, 35 % of the phases) and diastole taking the rest; where one set of Gaussians moves, they are
+ * fitted at their own time within it. Replaces those given earlier, so that a growing list can be given again and again. Any
+ * thread.
  *
  * # Safety
  * `times_s` must be readable for `count` numbers.

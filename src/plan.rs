@@ -74,6 +74,7 @@ impl Plan {
                     "the network sees all frames of a view alike: displacements of the heart are left out".into(),
                 );
             }
+            notes.extend(between_phases(dataset, false));
             (choose_hull(config, dataset, &motion, &mut notes), None)
         };
         let mut scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
@@ -182,13 +183,22 @@ const SOFT_HULL_CELLS: usize = 112;
 fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {
     let soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
     let targets = Targets::new(dataset, &soft, &config.gaussians)?;
+    let form = targets.form(config.gaussians.form);
+    notes.extend(between_phases(dataset, form == GaussianForm::Tree));
     notes.extend(wide_motion(&soft));
     notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
-    notes.push(match targets.form(config.gaussians.form) {
+    notes.push(match form {
         GaussianForm::Tree => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
         _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))
+}
+
+/// What is said of frames that were taken between two phases; `continuous` says that the moving field knows what is there.
+fn between_phases(dataset: &Dataset, continuous: bool) -> Option<String> {
+    let n = dataset.training().iter().filter(|f| f.after_phase != 0.0).count();
+    let fate = if continuous { "are fitted at their own time" } else { "count as taken at the nearest phase" };
+    (n > 0).then(|| format!("{n} of {} frames were taken between two phases and {fate}", dataset.training().len()))
 }
 
 /// What is said of views in which more moves than vessels.

@@ -165,7 +165,13 @@ impl Session {
         let inbox = lock(&self.shared.inbox);
         let (frame, moment) = inbox.frame(frame)?;
         let size = inbox.size.ok_or_else(nothing_yet)?;
-        CorrectedFrame::new(&inbox.views[frame.view], frame, inbox.phase(*moment), size, &calibration)
+        CorrectedFrame::new(
+            &inbox.views[frame.view],
+            frame,
+            inbox.beat_time(*moment).map(|taken| taken.phase),
+            size,
+            &calibration,
+        )
     }
 
     /// Gives the R-peaks by which frames with time stamps get their phase; replaces earlier ones.

@@ -58,6 +58,7 @@ fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
                 split: Split::Train,
                 integrals: (0..SIZE * SIZE).map(integral).collect(),
                 mask: None,
+                after_phase: 0.0,
                 heart_shift_mm: [0.0; 3],
             });
         }

@@ -53,6 +53,7 @@ impl Golden {
                     split: Split::Train,
                     integrals: image.iter().map(|x| *x as f32).collect(),
                     mask: None,
+                    after_phase: 0.0,
                     heart_shift_mm: [0.0; 3],
                 });
             }

@@ -39,7 +39,7 @@ fn import(contrast: &[f64], phases: u32, frames: Option<RangeInclusive<usize>>) 
     run(&file, contrast);
     let options = ImportOptions {
         phases,
-        gating: Gating::Phases((0..phases).collect()),
+        gating: Gating::Phases((0..phases).map(f64::from).collect()),
         scaling: BeatScaling::Linear,
         frames,
         pixel_mm: None,
@@ -105,4 +105,36 @@ fn a_run_without_ecg_is_gated_by_its_images() {
     let told = import_dicom(&[file], &options(Gating::Images), &out).unwrap().join("\n");
     assert!(told.contains("50 beats per minute, by the images"), "{told}");
     assert_eq!(Dataset::open(&out).unwrap().frames.len(), 6, "{told}");
+}
+
+#[test]
+fn frames_of_a_run_keep_their_own_time() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("run.dcm");
+    run(&file, &[1.0; 7]);
+    let import = |gating: Gating, phases: u32| {
+        let options = ImportOptions {
+            phases,
+            gating,
+            scaling: BeatScaling::Linear,
+            frames: None,
+            pixel_mm: None,
+            size: None,
+            depth_half_extent_mm: 90.0,
+        };
+        let out = tempfile::tempdir().unwrap();
+        import_dicom(std::slice::from_ref(&file), &options, out.path())?;
+        Dataset::open(out.path()).map(|d| d.frames.iter().map(|f| (f.phase, f.after_phase)).collect::<Vec<_>>())
+    };
+    let same = |found: &[(u32, f64)], wanted: &[(u32, f64)]| {
+        let near = |(a, b): (&(u32, f64), &(u32, f64))| a.0 == b.0 && (a.1 - b.1).abs() < 1e-6;
+        assert!(found.len() == wanted.len() && found.iter().zip(wanted).all(near), "{found:?}");
+    };
+    // 60 beats per minute, a frame each 0.1 s: phases are 0.25 s long, and their middles at 0.125 s, 0.375 s, 0.625 s.
+    let steady = import(Gating::HeartRate(60.0), 4).unwrap();
+    same(&steady, &[(0, -0.1), (1, -0.1), (2, -0.3)]);
+    let listed = import(Gating::Phases(vec![0.0, 0.4, 1.25, 2.0, 2.25, 3.5, 3.75]), 4).unwrap();
+    same(&listed, &[(0, (0.0 + 0.4 - 0.5 - 0.25) / 4.0), (1, 0.25), (2, 0.125)]);
+    let refused = import(Gating::Phases(vec![0.0, 1.0, 2.0, 3.0, 4.0, 0.0, 1.0]), 4).unwrap_err().to_string();
+    assert!(refused.contains("4 is given where phases go from 0 to 3"), "{refused}");
 }

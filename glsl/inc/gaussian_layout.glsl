@@ -17,7 +17,7 @@ struct GaussianView {
     vec4 column;                // row that gives depth times column
     vec4 row;                   // row that gives depth times row
     vec4 d0;                    // direction of pixel (0, 0)'s ray, of unit depth; then 1 / |det (d0, du, dv)|
-    vec4 du;                    // its change per column
+    vec4 du;                    // its change per column; then how long after its phase the image was taken, in phases
     vec4 dv;                    // its change per row
 };
 

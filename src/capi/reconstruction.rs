@@ -172,8 +172,9 @@ pub unsafe extern "C" fn nertca_reconstruction_add_frame(
 }
 
 /// Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them,
-/// systole keeping its length (310 ms, 35 % of the phases) and diastole taking the rest. Replaces those
-/// given earlier, so that a growing list can be given again and again. Any thread.
+/// systole keeping its length (310 ms, 35 % of the phases) and diastole taking the rest; where one set of Gaussians moves, they are
+/// fitted at their own time within it. Replaces those given earlier, so that a growing list can be given again and again. Any
+/// thread.
 ///
 /// # Safety
 /// `times_s` must be readable for `count` numbers.

@@ -56,7 +56,7 @@ pub struct ImportDicomArgs {
     /// How times between R-peaks become phases.
     #[arg(long, value_parser = choice::<BeatScaling>(), default_value = BeatScaling::default().name())]
     pub beat_scaling: BeatScaling,
-    /// A phase from 0 for each selected frame, one per line, the same for all runs.
+    /// A phase from 0 for each selected frame, one per line, the same for all runs; a frame may lie between two, as 3.4.
     #[arg(long, value_name = "FILE")]
     pub phase_list: Option<PathBuf>,
     /// Frames of each run, from 1; those filled with contrast by default.

@@ -16,16 +16,19 @@ pub struct SplatView {
     pub direction: [DVec3; 3],
     /// The X-ray source.
     pub source: DVec3,
+    /// How long after its phase the image was taken, in phases from -0.5 to 0.5: a moving tree is seen on its way to the next
+    /// phase, or from the last.
+    pub after_phase: f64,
 }
 
 impl SplatView {
-    /// The view whose rays are given in world units.
+    /// The view at a phase whose rays are given in world units.
     pub fn new(rays: &ViewRays, units: Units) -> SplatView {
         let direction = rays.direction;
         let source = rays.source() / units.pixel;
         let inverse = DMat3::from_cols(direction[0], direction[1], direction[2]).inverse();
         let rows = [0, 1, 2].map(|k| inverse.row(k));
-        SplatView { rows, offsets: rows.map(|row| -row.dot(source)), direction, source }
+        SplatView { rows, offsets: rows.map(|row| -row.dot(source)), direction, source, after_phase: 0.0 }
     }
 
     /// Depth, column and row of a point.
@@ -55,7 +58,7 @@ impl SplatView {
             column: row(1),
             row: row(2),
             d0: pack(d0, self.inverse_det()),
-            du: pack(du, 0.0),
+            du: pack(du, self.after_phase),
             dv: pack(dv, 0.0),
         }
     }

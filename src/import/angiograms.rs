@@ -6,7 +6,7 @@ use crate::import::dicom::{Relationship, Run};
 use crate::import::image_beat;
 use crate::raster::{Image, dilate, opening, percentile};
 use crate::scan::dataset::{Layout, Split};
-use crate::scan::gating::{BeatScaling, RPeaks};
+use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
@@ -32,8 +32,8 @@ pub enum Gating {
     HeartRate(f64),
     /// How the vessels of each run move: a steady heart (see [`image_beat`]).
     Images,
-    /// A phase for each selected frame of each run, in order.
-    Phases(Vec<u32>),
+    /// A phase for each selected frame of each run, in order; it may lie between two.
+    Phases(Vec<f64>),
     /// Nothing moves: the frames of a run are averaged. Phase 0 is the object, phase 1 what it looks like without
     /// vessels, as in subtraction angiography, so that the rest of the engine sees vessels come and go.
     Still,
@@ -86,12 +86,12 @@ pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> R
     };
     let mut writer = Writer::new(out, Layout::Native, about)?;
     for (index, view) in views.iter().enumerate() {
-        for (phase, image) in &view.images {
+        for (taken, image) in &view.images {
             let (image, offset) = cut(image, width, height);
             let pixel_mm = view.c_arm.pixel_mm;
             let moved = |k: usize| view.c_arm.offset_mm[k] + offset[k] * pixel_mm[k];
             let geometry = Geometry::CArm(CArm { offset_mm: [moved(0), moved(1)], ..view.c_arm.clone() });
-            writer.frame(&geometry, Split::Train, index, *phase, &image.values, None)?;
+            writer.frame(&geometry, Split::Train, index, *taken, &image.values, None)?;
         }
     }
     writer.finish()?;
@@ -137,7 +137,7 @@ fn cross_check(runs: &mut [Run]) -> Vec<String> {
 /// A run, ready to be written.
 struct View {
     c_arm: CArm,
-    images: Vec<(u32, Image)>,
+    images: Vec<(BeatTime, Image)>,
     notes: Vec<String>,
 }
 
@@ -267,10 +267,10 @@ fn phases(
     vessel: usize,
     options: &ImportOptions,
     notes: &mut Vec<String>,
-) -> Result<Vec<(u32, Image)>> {
+) -> Result<Vec<(BeatTime, Image)>> {
     let n_phases = options.phases;
     let none = |problem: &str| Error::data(&run.path, "phases", problem.to_owned());
-    let phase_of: Vec<Option<u32>> = match &options.gating {
+    let taken: Vec<Option<BeatTime>> = match &options.gating {
         Gating::Still => {
             let mean = mean(frames, selected);
             let background = without_vessels(&mean, vessel);
@@ -279,28 +279,31 @@ fn phases(
                 run.name(),
                 selected.len()
             ));
-            return Ok(vec![(0, mean), (1, background)]);
+            return Ok(vec![(BeatTime::at_phase(0), mean), (BeatTime::at_phase(1), background)]);
         }
-        Gating::Phases(list) if list.len() == selected.len() => list.iter().map(|p| Some(*p)).collect(),
+        Gating::Phases(list) if list.len() == selected.len() => {
+            if let Some(bad) = list.iter().find(|p| !(0.0..f64::from(n_phases)).contains(*p)) {
+                return Err(none(&format!("{bad} is given where phases go from 0 to {}", n_phases - 1)));
+            }
+            list.iter().map(|p| Some(BeatTime::of(*p, n_phases))).collect()
+        }
         Gating::Phases(list) => {
             return Err(none(&format!("{} are given for {} selected frames", list.len(), selected.len())));
         }
         timed => {
             let peaks = r_peaks(timed, run, frames, selected, vessel, notes)?;
-            selected.iter().map(|i| peaks.phase(run.times_s[*i], n_phases, options.scaling)).collect()
+            selected.iter().map(|i| peaks.beat_time(run.times_s[*i], n_phases, options.scaling)).collect()
         }
     };
     let mut images = Vec::new();
     for phase in 0..n_phases {
-        let of_phase: Vec<usize> =
-            selected.iter().zip(&phase_of).filter(|(_, p)| **p == Some(phase)).map(|(i, _)| *i).collect();
+        let timed = selected.iter().zip(&taken).filter_map(|(i, taken)| Some((*i, (*taken)?)));
+        let (of_phase, times): (Vec<usize>, Vec<BeatTime>) = timed.filter(|(_, t)| t.phase == phase).unzip();
         // Frames of the same phase from several beats.
         if !of_phase.is_empty() {
-            images.push((phase, mean(frames, &of_phase)));
+            let after_phase = times.iter().map(|t| t.after_phase).sum::<f64>() / times.len() as f64;
+            images.push((BeatTime { phase, after_phase }, mean(frames, &of_phase)));
         }
-    }
-    if let Some(bad) = phase_of.iter().flatten().find(|p| **p >= n_phases) {
-        return Err(none(&format!("{bad} is given where phases go from 0 to {}", n_phases - 1)));
     }
     if images.len() < 2 {
         return Err(none(&format!("{} of {n_phases} are seen; at least two are needed", images.len())));

@@ -227,7 +227,7 @@ mod tests {
             let off = (2.0 + first_r_s - found.r_peaks.times_s()[0]).rem_euclid(beat_s) / beat_s;
             assert!(off.min(1.0 - off) < 0.04, "{rate} per minute: R-peak off by {off} of a beat; {found:?}");
             assert!(found.likeness > 0.8, "{found:?}");
-            let none = times.iter().find(|t| found.r_peaks.phase(**t, 10, BeatScaling::default()).is_none());
+            let none = times.iter().find(|t| found.r_peaks.beat_time(**t, 10, BeatScaling::default()).is_none());
             assert_eq!(none, None, "all images have a phase");
         }
     }

@@ -235,12 +235,22 @@ impl MovingTree {
         x + at(before).lerp(at((before + 1) % n_phases), share)
     }
 
-    /// Where Gaussian `index` is at a phase, which may lie between two; the beat closes.
+    /// Where Gaussian `index` is at a phase, which may lie between two: on the straight way from one to the other, as images
+    /// that were taken there are fitted. The beat closes.
     pub fn position(&self, index: usize, phase: f64) -> DVec3 {
+        let n_phases = self.rest.n_phases;
+        let phase = phase.rem_euclid(n_phases as f64);
+        let before = phase.floor() as usize % n_phases;
+        let own = self.own_way(index, before).lerp(self.own_way(index, (before + 1) % n_phases), phase.fract());
+        self.carried(self.at_rest(index), phase) + own
+    }
+
+    /// How far Gaussian `index` is from where the grid has carried it, at a phase.
+    fn own_way(&self, index: usize, phase: usize) -> DVec3 {
         let n_basis = self.setup.n_basis as usize;
         let own = &self.own[index * n_basis..][..n_basis];
-        let basis = basis(n_basis, phase / self.rest.n_phases as f64);
-        self.carried(self.at_rest(index), phase) + own.iter().zip(basis).map(|(a, b)| b * vector(a)).sum::<DVec3>()
+        let basis = basis(n_basis, phase as f64 / self.rest.n_phases as f64);
+        own.iter().zip(basis).map(|(a, b)| b * vector(a)).sum()
     }
 
     fn at_rest(&self, index: usize) -> DVec3 {

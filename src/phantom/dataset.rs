@@ -405,7 +405,7 @@ fn shoot(
                 blade.close(&mut image, mask.as_mut(), size);
             }
             let stated = Geometry::CArm(shooting.stated(c_arm, view, split));
-            let file = writer.frame(&stated, split, view, phase, &image, mask.as_deref())?;
+            let file = writer.frame(&stated, split, view, shot.stated, &image, mask.as_deref())?;
             let DVec3 { x: left, y: posterior, z: superior } = shot.breath.heart_mm;
             truth.frames.push(TrueFrame {
                 image: file,

@@ -3,7 +3,7 @@
 use crate::phantom::degradations::{Breathing, Chance, Degradations, Draw, Rhythm};
 use crate::phantom::voxels::Breath;
 use crate::scan::dataset::Split;
-use crate::scan::gating::two_segment_fraction;
+use crate::scan::gating::{BeatTime, two_segment_fraction};
 use glam::DVec3;
 
 /// Length of a beat where no heart rate is asked for, seconds: phases are its equal parts.
@@ -24,6 +24,8 @@ const LEAST_CONTRAST: f64 = 0.1;
 /// One image to be taken.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Shot {
+    /// When it is said to have been taken.
+    pub(super) stated: BeatTime,
     /// Since the first image of the run.
     pub(super) time_s: f64,
     /// Of the beat, 0 to 1: what the heart does.
@@ -37,7 +39,8 @@ impl Shot {
     /// A phase of a heart that keeps to the phases, in held breath.
     pub(super) fn at_phase(phase: u32, phases: u32) -> Shot {
         let fraction = f64::from(phase) / f64::from(phases);
-        Shot { time_s: USUAL_BEAT_S * fraction, fraction, breath: Breath::default(), contrast_gain: 1.0 }
+        let (stated, time_s) = (BeatTime::at_phase(phase), USUAL_BEAT_S * fraction);
+        Shot { stated, time_s, fraction, breath: Breath::default(), contrast_gain: 1.0 }
     }
 }
 
@@ -68,19 +71,18 @@ fn gated(rhythm: &Rhythm, chance: Chance, phases: u32) -> Vec<Option<Shot>> {
     let systole_s = SYSTOLE_S.start + (SYSTOLE_S.end - SYSTOLE_S.start) * chance.uniform(Draw::Systole);
     let start_s = beat_s * chance.uniform(Draw::RunStart);
     let images = (f64::from(rhythm.beats) * beat_s * rhythm.frames_per_s).ceil() as u32;
-    let mut nearest: Vec<Option<(f64, Shot)>> = vec![None; phases as usize];
+    let mut nearest: Vec<Option<Shot>> = vec![None; phases as usize];
     for image in 0..images {
         let time_s = f64::from(image) / rhythm.frames_per_s;
         let since_r_s = (start_s + time_s).rem_euclid(beat_s);
-        let stated = f64::from(phases) * rhythm.gating.fraction(since_r_s, beat_s);
-        let distance = (stated - stated.round()).abs();
-        let slot = &mut nearest[stated.round() as usize % phases as usize];
-        if slot.is_none_or(|(best, _)| distance < best) {
+        let stated = BeatTime::of(f64::from(phases) * rhythm.gating.fraction(since_r_s, beat_s), phases);
+        let slot = &mut nearest[stated.phase as usize];
+        if slot.is_none_or(|best| stated.after_phase.abs() < best.stated.after_phase.abs()) {
             let fraction = two_segment_fraction(since_r_s, beat_s, systole_s).rem_euclid(1.0);
-            *slot = Some((distance, Shot { time_s, fraction, breath: Breath::default(), contrast_gain: 1.0 }));
+            *slot = Some(Shot { stated, time_s, fraction, breath: Breath::default(), contrast_gain: 1.0 });
         }
     }
-    nearest.into_iter().map(|found| found.map(|(_, shot)| shot)).collect()
+    nearest
 }
 
 impl Breathing {

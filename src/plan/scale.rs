@@ -164,6 +164,7 @@ mod tests {
             split: Split::Train,
             integrals: (0..SIZE * SIZE).map(|p| if phase == 1 && middle(p) { still + change } else { still }).collect(),
             mask: None,
+            after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
         };
         Dataset {

@@ -89,7 +89,7 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
     let mut all = Vec::new();
     for (phase, places) in targets.places.iter().enumerate() {
         let weights: Vec<f64> =
-            places.iter().map(|p| enough(settings, lacking(targets, &missing, phase, p.position))).collect();
+            places.iter().map(|p| enough(settings, lacking(targets, &missing, phase, |_| p.position))).collect();
         let draw = Draw { targets, settings, seed, round: (targets.n_phases + phase) as u32 };
         all.extend(draw.gaussians(&weights, count, phase, added_density(targets, settings)));
     }
@@ -97,19 +97,20 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
 }
 
 /// New Gaussians of a tree at places of phase 0 where, carried along by `carried` (place, phase), every view lacks line
-/// integral at half the phases or more.
+/// integral at half the phases or more; phases may lie between two.
 pub fn tree_additions(
     targets: &Targets,
     settings: &sections::Gaussians,
     seed: u32,
     images: &[f32],
-    carried: impl Fn(DVec3, usize) -> DVec3,
+    carried: impl Fn(DVec3, f64) -> DVec3,
 ) -> Vec<Gaussian> {
     let missing = missing_images(targets, images);
     let count = (settings.grow_share * f64::from(settings.count)) as usize;
     let places = &targets.places[0];
     let weight = |place: &Place| {
-        let at = |phase: usize| lacking(targets, &missing, phase, carried(place.position, phase));
+        let at =
+            |phase: usize| lacking(targets, &missing, phase, |after| carried(place.position, phase as f64 + after));
         let mut all: Vec<f64> = (0..targets.n_phases).map(at).collect();
         all.sort_by(f64::total_cmp);
         enough(settings, all[(all.len() - 1) / 2])
@@ -124,9 +125,11 @@ fn added_density(targets: &Targets, settings: &sections::Gaussians) -> f64 {
     settings.missing / targets.lengths.factor
 }
 
-/// Least line integral that the views of a phase lack at a point.
-fn lacking(targets: &Targets, missing: &[f32], phase: usize, x: DVec3) -> f64 {
+/// Least line integral that the views of a phase lack at a point; `at` says where it is so long after the phase, in phases.
+fn lacking(targets: &Targets, missing: &[f32], phase: usize, at: impl Fn(f64) -> DVec3) -> f64 {
+    let at_phase = at(0.0);
     let of = |(image, view): (usize, &SplatView)| {
+        let x = if view.after_phase == 0.0 { at_phase } else { at(view.after_phase) };
         let (_, u, v) = view.project(x);
         let (u, v) = (u.round(), v.round());
         let inside = u >= 0.0 && v >= 0.0 && u < targets.width as f64 && v < targets.height as f64;

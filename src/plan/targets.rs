@@ -138,7 +138,9 @@ impl Targets {
                 let share = |change: f32| (f64::from(change) / strongest) as f32;
                 targets.image_of[phase * motion.views.len() + slot] = Some(targets.n_images);
                 targets.n_images += 1;
-                targets.views.push(SplatView::new(&dataset.heart_rays_at(view.view, phase as u32), units));
+                let seen_by = SplatView::new(&dataset.heart_rays_at(view.view, phase as u32), units);
+                let after_phase = dataset.after_phase(view.view, phase as u32);
+                targets.views.push(SplatView { after_phase, ..seen_by });
                 targets.images.extend(image.values.iter().map(|y| share(*y)));
                 targets.low.extend(change.values.iter().map(|d| share(*d)));
                 targets.high.extend(above.map(share));

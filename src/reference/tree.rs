@@ -1,5 +1,6 @@
 //! f64 twin of the tree: where Gaussians are, the loss with its penalties, and its gradient.
 
+use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, TreeSetup};
 use crate::model::gaussians::{basis, shares};
 use crate::plan::targets::Targets;
@@ -48,9 +49,20 @@ fn displaced(p: &TreeParams, i: usize, motion: &Motion) -> Params {
     out
 }
 
-/// A Gaussian as it is at a phase.
-pub fn at_phase(tree: &TreeSetup, p: &TreeParams, i: usize, phase: usize, n_phases: usize) -> Params {
-    displaced(p, i, &motion(tree, &p.rows[i], phase, n_phases))
+/// Phases that an image shows, and their shares: its own, and that beyond the time when it was taken. The beat closes.
+pub fn phases_shown(phase: usize, view: &SplatView, n_phases: usize) -> [(usize, f64); 2] {
+    let step = if view.after_phase < 0.0 { n_phases - 1 } else { 1 };
+    let share = view.after_phase.abs();
+    [(phase, 1.0 - share), ((phase + step) % n_phases, share)]
+}
+
+/// A Gaussian as an image of a phase shows it: on the straight way from one phase to another.
+pub fn shown(tree: &TreeSetup, p: &TreeParams, i: usize, phase: usize, view: &SplatView, n_phases: usize) -> Params {
+    let at = |phase: usize| displaced(p, i, &motion(tree, &p.rows[i], phase, n_phases));
+    let [(here, _), (beyond, share)] = phases_shown(phase, view, n_phases);
+    let (mut out, there) = (at(here), at(beyond));
+    (0..3).for_each(|k| out[k] += share * (there[k] - out[k]));
+    out
 }
 
 /// Loss without and with penalties, and the gradient of the latter. A Gaussian's share of the nodes is taken as given.
@@ -65,9 +77,10 @@ pub fn loss_and_gradient(
     let everywhere: Vec<(usize, usize)> =
         (0..targets.n_phases).flat_map(|phase| (0..p.rows.len()).map(move |i| (phase, i))).collect();
     let place = |phase: usize, i: usize| motion(tree, &p.rows[i], phase, targets.n_phases);
+    let shown = |phase: usize, i: usize, view: &SplatView| shown(tree, p, i, phase, view, targets.n_phases);
     for &(phase, i) in &everywhere {
-        let moved = displaced(p, i, &place(phase, i));
         for (image, view) in targets.views_at(phase) {
+            let moved = shown(phase, i, view);
             if let Some(seen) = gaussians::project(&moved, view, setup) {
                 seen.splat(setup, &mut images[image * n..][..n]);
             }
@@ -83,23 +96,29 @@ pub fn loss_and_gradient(
     }
     let mut gradient = p.zeros();
     for &(phase, i) in &everywhere {
-        let motion = place(phase, i);
-        let moved = displaced(p, i, &motion);
         for (image, view) in targets.views_at(phase) {
+            let moved = shown(phase, i, view);
             let Some(seen) = gaussians::project(&moved, view, setup) else { continue };
             let g = gaussians::gradient(&moved, view, setup, seen.moments(setup, &residuals[image]));
             gradient.rows[i].iter_mut().zip(g).for_each(|(sum, g)| *sum += g);
             let x = DVec3::new(g[0], g[1], g[2]);
-            for (k, b) in motion.basis.iter().enumerate() {
-                gradient.own[i * motion.basis.len() + k] += *b * x;
-            }
-            for (node, share) in motion.nodes.iter().filter(|_| phase > 0) {
-                gradient.grid[*node] += *share * x;
+            for (phase, share) in phases_shown(phase, view, targets.n_phases) {
+                add_place(&mut gradient, i, phase, &place(phase, i), share * x);
             }
         }
     }
     let penalty = add_penalties(tree, p, targets.n_phases, &mut gradient);
     (loss, loss + penalty, gradient)
+}
+
+/// Adds the gradient of a Gaussian's place at a phase to that of what moves it there; the grid rests at phase 0.
+fn add_place(gradient: &mut TreeParams, i: usize, phase: usize, motion: &Motion, x: DVec3) {
+    for (k, b) in motion.basis.iter().enumerate() {
+        gradient.own[i * motion.basis.len() + k] += *b * x;
+    }
+    for (node, share) in motion.nodes.iter().filter(|_| phase > 0) {
+        gradient.grid[*node] += *share * x;
+    }
 }
 
 /// Squared own motion, and squared differences of neighbouring nodes.

@@ -20,6 +20,7 @@ use crate::network::forward::ForwardBuffers;
 use crate::network::pass::Pass;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
+use crate::scan::gating::BeatTime;
 
 /// Pixels rendered by one submit.
 pub(super) const RAYS_PER_SUBMIT: u32 = 1 << 16;
@@ -253,6 +254,21 @@ impl Renderer {
         self.check_phase(phase)?;
         let blobs = self.moving.as_ref().map(|blobs| blobs.at(phase)).transpose()?;
         self.draw(rays, (width, height), phase, blobs.as_ref(), parts)
+    }
+
+    /// Renders a `width` x `height` view as it was when an image was taken; at the nearest phase where the moving field knows
+    /// whole phases alone.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`].
+    pub fn render_taken(&self, rays: &ViewRays, width: usize, height: usize, taken: BeatTime) -> Result<Rendering> {
+        let n_phases = self.setup.n_phases;
+        let continuous = self.last_moment() == n_phases;
+        if continuous {
+            self.render_at(rays, width, height, taken.phases(n_phases))
+        } else {
+            self.render(rays, width, height, taken.phase)
+        }
     }
 
     /// Renders a `width` x `height` view at a phase that may lie between two, such as 3.4, of a model whose moving field

@@ -7,9 +7,10 @@ use crate::formats::images;
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, is_at_rest};
 use crate::raster::Image;
 use crate::scan::frame_checks::{Complaint, check_phase, check_size, check_values, checked_rays};
+use crate::scan::gating::BeatTime;
 use crate::scan::nerfca;
 use glam::DVec3;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -96,7 +97,7 @@ pub struct Manifest {
     /// Free text.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub description: String,
-    /// Number of cardiac phases T; frames carry 0..T-1.
+    /// Number of cardiac phases T; the times of frames go from 0 to below T.
     pub phases: u32,
     /// Attenuation is searched within this distance before and behind the isocentre plane, mm.
     pub depth_half_extent_mm: f64,
@@ -114,8 +115,9 @@ pub struct Manifest {
 pub struct ManifestFrame {
     /// Image file (`.npy` of shape rows x columns, or grey `.png`), relative to the manifest.
     pub image: PathBuf,
-    /// Cardiac phase, from 0.
-    pub phase: u32,
+    /// When in the beat it was taken, counted in phases from 0; a frame may lie between two.
+    #[serde(serialize_with = "whole_if_so")]
+    pub phase: f64,
     /// Training or validation.
     pub split: Split,
     /// How it was taken.
@@ -134,6 +136,11 @@ pub struct ManifestFrame {
     pub stated_geometry: Option<Geometry>,
 }
 
+/// Whole numbers as such, as other readers of the manifest expect of phases.
+fn whole_if_so<S: Serializer>(phase: &f64, to: S) -> std::result::Result<S::Ok, S::Error> {
+    if phase.fract() == 0.0 { to.serialize_i64(*phase as i64) } else { to.serialize_f64(*phase) }
+}
+
 /// One image, ready for use.
 #[derive(Debug, Clone)]
 pub struct Frame {
@@ -141,8 +148,10 @@ pub struct Frame {
     pub name: String,
     /// Index into [`Dataset::views`].
     pub view: usize,
-    /// Cardiac phase, from 0.
+    /// Cardiac phase nearest to when it was taken, from 0.
     pub phase: u32,
+    /// How long after that phase it was taken, in phases: from -0.5 to 0.5.
+    pub after_phase: f64,
     /// Training or validation.
     pub split: Split,
     /// Line integrals, rows first.
@@ -154,6 +163,11 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// When in the beat it was taken.
+    pub fn beat_time(&self) -> BeatTime {
+        BeatTime { phase: self.phase, after_phase: self.after_phase }
+    }
+
     /// How far breathing has carried the heart from its mean, world units.
     pub fn heart_shift(&self) -> DVec3 {
         DVec3::from_array(self.heart_shift_mm) / MM_PER_UNIT
@@ -230,6 +244,13 @@ impl Dataset {
         frame.map_or_else(|| self.views[view].rays.clone(), |f| self.heart_rays(f))
     }
 
+    /// How long after a phase a view's training frames of that phase were taken on the mean, in phases; 0 where it has none.
+    pub fn after_phase(&self, view: usize, phase: u32) -> f64 {
+        let frames = self.training().iter().filter(|f| (f.view, f.phase) == (view, phase));
+        let (sum, n) = frames.fold((0.0, 0u32), |(sum, n), f| (sum + f.after_phase, n + 1));
+        sum / f64::from(n.max(1))
+    }
+
     /// Whether some training frame has a displacement of the heart.
     pub fn heart_shifts(&self) -> bool {
         self.training().iter().any(|f| f.heart_shift_mm != [0.0; 3])
@@ -295,7 +316,7 @@ impl Dataset {
                 index,
                 source: &image_path,
                 geometry: frame.geometry.clone(),
-                phase: frame.phase,
+                time_phases: frame.phase,
                 split: frame.split,
                 image,
                 to_integral: |v| frame.intensity.integral(v),
@@ -371,7 +392,7 @@ pub(super) struct NewFrame<'a, F: Fn(f32) -> f32> {
     pub index: usize,
     pub source: &'a Path,
     pub geometry: Geometry,
-    pub phase: u32,
+    pub time_phases: f64,
     pub split: Split,
     pub image: Image,
     pub to_integral: F,
@@ -415,7 +436,8 @@ impl Builder {
         let told = |file: &Path, Complaint { field: name, value, problem }: Complaint| {
             Error::data(file, field(&name), format!("{value} {problem}").trim_start())
         };
-        check_phase(new.phase, self.n_phases).map_err(|c| told(&self.file, c))?;
+        check_phase(new.time_phases, self.n_phases).map_err(|c| told(&self.file, c))?;
+        let taken = BeatTime::of(new.time_phases, self.n_phases);
         let size = (new.image.width, new.image.height);
         check_size(size, self.size).map_err(|c| told(new.source, c))?;
         self.size = Some(size);
@@ -436,7 +458,8 @@ impl Builder {
                 .file_stem()
                 .map_or_else(|| format!("frame-{}", new.index), |s| s.to_string_lossy().into_owned()),
             view,
-            phase: new.phase,
+            phase: taken.phase,
+            after_phase: taken.after_phase,
             split: new.split,
             integrals: new.image.values.iter().map(|v| (new.to_integral)(*v)).collect(),
             mask: new.mask,

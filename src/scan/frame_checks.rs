@@ -40,12 +40,16 @@ pub(crate) fn check_values(values: &[f32], width: usize) -> Result<(), Complaint
     }
 }
 
-/// Refuses a phase that there is not.
-pub(crate) fn check_phase(phase: u32, n_phases: u32) -> Result<(), Complaint> {
-    if phase < n_phases {
+/// Refuses a time, counted in phases, that there is not.
+pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complaint> {
+    if (0.0..f64::from(n_phases)).contains(&time_phases) {
         return Ok(());
     }
-    Err(Complaint::new("phase", phase, format!("phases go from 0 to {}", n_phases.saturating_sub(1))))
+    let problem = format!(
+        "phases go from 0 to {}, and what lies between two from 0 to below {n_phases}",
+        n_phases.saturating_sub(1)
+    );
+    Err(Complaint::new("phase", time_phases, problem))
 }
 
 /// Rays of a geometry whose source stands before what is searched, `depth_before` world units from the isocentre on.

@@ -66,6 +66,44 @@ pub fn contraction(fraction: f64) -> f64 {
     (std::f64::consts::PI * half_wave).sin().powi(2)
 }
 
+/// When in the beat: at a phase, or between two.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BeatTime {
+    /// The nearest phase, from 0.
+    pub phase: u32,
+    /// How long after that phase, in phases: from -0.5 to 0.5.
+    pub after_phase: f64,
+}
+
+/// Times that differ by less than this, in phases, are the same: no clock is that good, and sums of times are rounded.
+const SAME_TIME_PHASES: f64 = 1e-6;
+
+impl BeatTime {
+    fn new(phase: u32, after_phase: f64) -> BeatTime {
+        BeatTime { phase, after_phase: (after_phase / SAME_TIME_PHASES).round() * SAME_TIME_PHASES }
+    }
+
+    /// Exactly at a phase.
+    pub fn at_phase(phase: u32) -> BeatTime {
+        BeatTime { phase, after_phase: 0.0 }
+    }
+
+    /// A time counted in phases, of which a beat has `n_phases`; the beat closes.
+    pub fn of(time_phases: f64, n_phases: u32) -> BeatTime {
+        let nearest = time_phases.round();
+        let phase = nearest.rem_euclid(f64::from(n_phases)) as u32;
+        BeatTime::new(phase, time_phases - nearest)
+    }
+
+    /// Counted in phases, from 0 to below `n_phases`.
+    pub fn phases(self, n_phases: u32) -> f64 {
+        let beat = f64::from(n_phases);
+        let time = (f64::from(self.phase) + self.after_phase).rem_euclid(beat);
+        // Just before phase 0, the remainder may be rounded up to a whole beat.
+        if time < beat { time } else { 0.0 }
+    }
+}
+
 /// Beats longer than this many of the usual ones are gaps in the ECG, not beats.
 const LONGEST_BEAT: f64 = 1.8;
 
@@ -118,9 +156,10 @@ impl RPeaks {
         beats[beats.len() / 2]
     }
 
-    /// Phase of a time, from 0, of `n_phases` equal parts of its beat as `scaling` counts it. Up to one usual beat before the
-    /// first and after the last R-peak counts; `None` beyond, and within gaps of the ECG.
-    pub fn phase(&self, time_s: f64, n_phases: u32, scaling: BeatScaling) -> Option<u32> {
+    /// Phase of a time, from 0, of `n_phases` equal parts of its beat as `scaling` counts it, and how long after the middle of
+    /// that part. Up to one usual beat before the first and after the last R-peak counts; `None` beyond, and within gaps of
+    /// the ECG.
+    pub fn beat_time(&self, time_s: f64, n_phases: u32, scaling: BeatScaling) -> Option<BeatTime> {
         let usual = self.beat_s();
         let after = self.times_s.partition_point(|r| *r <= time_s);
         let (start, beat) = match (after, self.times_s.len()) {
@@ -132,8 +171,9 @@ impl RPeaks {
         if !(0.0..beat).contains(&since_r_s) || beat > LONGEST_BEAT * usual {
             return None;
         }
-        let share = scaling.fraction(since_r_s, beat);
-        Some(((share * f64::from(n_phases)) as u32).min(n_phases - 1))
+        let parts = scaling.fraction(since_r_s, beat) * f64::from(n_phases);
+        let phase = (parts as u32).min(n_phases - 1);
+        Some(BeatTime::new(phase, parts - f64::from(phase) - 0.5))
     }
 }
 
@@ -142,21 +182,41 @@ mod tests {
     use super::*;
     use BeatScaling::Linear;
 
+    /// Of ten phases.
+    fn phase(peaks: &RPeaks, time_s: f64, scaling: BeatScaling) -> Option<u32> {
+        peaks.beat_time(time_s, 10, scaling).map(|found| found.phase)
+    }
+
     #[test]
     fn phases_are_equal_parts_of_each_beat() {
         let peaks = RPeaks::new(&[1.0, 2.0, 2.8]).unwrap();
-        assert_eq!(peaks.phase(1.0, 10, Linear), Some(0));
-        assert_eq!(peaks.phase(1.55, 10, Linear), Some(5));
-        assert_eq!(peaks.phase(2.4, 10, Linear), Some(5), "a shorter beat has shorter phases");
-        assert_eq!(peaks.phase(0.5, 10, Linear), Some(5), "one beat before the first R-peak is known well enough");
-        assert_eq!(peaks.phase(3.5, 10, Linear), Some(7), "and one after the last");
-        assert_eq!((peaks.phase(-0.1, 10, Linear), peaks.phase(4.0, 10, Linear)), (None, None));
+        let phase = |time_s| phase(&peaks, time_s, Linear);
+        assert_eq!(phase(1.0), Some(0));
+        assert_eq!(phase(1.55), Some(5));
+        assert_eq!(phase(2.4), Some(5), "a shorter beat has shorter phases");
+        assert_eq!(phase(0.5), Some(5), "one beat before the first R-peak is known well enough");
+        assert_eq!(phase(3.5), Some(7), "and one after the last");
+        assert_eq!((phase(-0.1), phase(4.0)), (None, None));
+    }
+
+    #[test]
+    fn frames_keep_their_own_time_within_a_phase() {
+        let peaks = RPeaks::new(&[1.0, 2.0, 3.0]).unwrap();
+        for (time_s, after) in [(1.50, -0.5), (1.55, 0.0), (1.58, 0.3), (2.51, -0.4)] {
+            let found = peaks.beat_time(time_s, 10, Linear).unwrap();
+            assert_eq!(found.phase, 5);
+            assert!((found.after_phase - after).abs() < 1e-9, "{time_s} s: {found:?}");
+        }
+        let late = BeatTime::of(9.7, 10);
+        assert_eq!(late.phase, 0, "the beat closes");
+        assert!((late.after_phase + 0.3).abs() < 1e-12 && (late.phases(10) - 9.7).abs() < 1e-12);
+        assert_eq!(BeatTime::of(4.0, 10), BeatTime::at_phase(4));
     }
 
     #[test]
     fn a_slow_beat_is_slow_in_diastole() {
         let peaks = RPeaks::new(&[0.0, 1.5, 3.0]).unwrap();
-        let at = |time_s| (peaks.phase(time_s, 10, Linear), peaks.phase(time_s, 10, BeatScaling::TwoSegment));
+        let at = |time_s| (phase(&peaks, time_s, Linear), phase(&peaks, time_s, BeatScaling::TwoSegment));
         assert_eq!(at(0.305), (Some(2), Some(3)), "the end of systole");
         assert_eq!(at(1.49), (Some(9), Some(9)), "the end of the beat");
     }
@@ -164,8 +224,8 @@ mod tests {
     #[test]
     fn a_gap_in_the_ecg_has_no_phase() {
         let peaks = RPeaks::new(&[0.0, 1.0, 2.0, 5.0, 6.0]).unwrap();
-        assert_eq!(peaks.phase(3.0, 10, Linear), None);
-        assert_eq!(peaks.phase(5.5, 10, Linear), Some(5));
+        assert_eq!(phase(&peaks, 3.0, Linear), None);
+        assert_eq!(phase(&peaks, 5.5, Linear), Some(5));
     }
 
     #[test]
@@ -190,6 +250,6 @@ mod tests {
         assert!(RPeaks::new(&[1.0]).is_err());
         assert!(RPeaks::new(&[1.0, 1.0]).unwrap_err().to_string().contains("must rise"));
         assert!(RPeaks::new(&[1.0, f64::NAN]).is_err());
-        assert_eq!(RPeaks::steady(60.0, 0.5, 3.0).unwrap().phase(1.75, 4, Linear), Some(1));
+        assert_eq!(phase(&RPeaks::steady(60.0, 0.5, 3.0).unwrap(), 1.75, Linear), Some(2));
     }
 }

@@ -118,6 +118,7 @@ mod tests {
             split: Split::Train,
             integrals: (0..WIDTH * HEIGHT).map(|p| value(p % WIDTH, p / WIDTH)).collect(),
             mask: None,
+            after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
         }
     }

@@ -153,7 +153,7 @@ pub fn open(path: &Path) -> Result<Dataset> {
                 offset_mm: offset.map(|p| p * to_mm),
                 table_mm: [0.0; 3],
             }),
-            phase: numbered.partition_point(|p| p < phase) as u32,
+            time_phases: numbered.partition_point(|p| p < phase) as f64,
             split: entry.split,
             image,
             to_integral: |v| (i0 - (f64::from(v) * (high - low) + low)) as f32,

@@ -5,6 +5,7 @@ use crate::files;
 use crate::formats::{npy, png};
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
 use crate::scan::dataset::{Dataset, Intensity, Layout, MANIFEST, Manifest, ManifestFrame, Split};
+use crate::scan::gating::BeatTime;
 use crate::scan::nerfca;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -83,7 +84,8 @@ impl<'a> Writer<'a> {
         })
     }
 
-    /// Writes a frame's image and mask; the image's file, relative to the dataset.
+    /// Writes a frame's image and mask; the image's file, relative to the dataset. The authors' layout numbers phases: a frame
+    /// between two gets the nearest there.
     ///
     /// # Errors
     /// [`Error::Config`] for a geometry the authors' layout cannot state; [`Error::Io`].
@@ -92,12 +94,12 @@ impl<'a> Writer<'a> {
         geometry: &Geometry,
         split: Split,
         view: usize,
-        phase: u32,
+        taken: BeatTime,
         integrals: &[f32],
         mask: Option<&[bool]>,
     ) -> Result<PathBuf> {
         let kind = if split == Split::Train { "train" } else { "test" };
-        let name = format!("{kind}-view{view}-phase{phase:02}");
+        let name = format!("{kind}-view{view}-phase{:02}", taken.phase);
         let seen = self.names.entry(name.clone()).or_default();
         *seen += 1;
         let name = if *seen > 1 { format!("{name}-{seen}") } else { name };
@@ -113,7 +115,7 @@ impl<'a> Writer<'a> {
                 }
                 self.manifest.frames.push(ManifestFrame {
                     image: image.clone(),
-                    phase,
+                    phase: taken.phases(self.manifest.phases),
                     split,
                     geometry: geometry.clone(),
                     intensity: Intensity::Integral { scale: 1.0, offset: 0.0 },
@@ -142,7 +144,7 @@ impl<'a> Writer<'a> {
                     img_min_max: [f64::from(low), f64::from(high).max(f64::from(low) + 1e-12)],
                     mask_file_path: mask.map(|_| mask_file),
                     weighted_file_path: None,
-                    heart_phase: f64::from(phase),
+                    heart_phase: f64::from(taken.phase),
                     theta,
                     phi,
                     larm: 0.0,
@@ -246,7 +248,8 @@ pub fn write(
     )?;
     for frame in &dataset.frames {
         let geometry = &dataset.views[frame.view].geometry;
-        writer.frame(geometry, frame.split, frame.view, frame.phase, &frame.integrals, frame.mask.as_deref())?;
+        let taken = frame.beat_time();
+        writer.frame(geometry, frame.split, frame.view, taken, &frame.integrals, frame.mask.as_deref())?;
         writer.corrected(frame.heart_shift_mm, stated(frame.view).as_ref())?;
     }
     writer.finish()

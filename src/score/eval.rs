@@ -225,7 +225,7 @@ pub fn evaluate(
     let mut seen = Vec::new();
     for frame in frames {
         let rays = dataset.heart_rays(frame);
-        seen.push(renderer.render(&rays, dataset.width, dataset.height, frame.phase)?);
+        seen.push(renderer.render_taken(&rays, dataset.width, dataset.height, frame.beat_time())?);
         observe(Scoring::Rendered)?;
     }
     let (dynamic_threshold, total_threshold, rule) = choose_thresholds(&seen, dataset.vessel_attenuation, threshold);
@@ -296,7 +296,7 @@ fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
 /// Device errors.
 pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Option<String>> {
     let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
-    let seen = renderer.render(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.phase)?;
+    let seen = renderer.render_taken(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.beat_time())?;
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
     let remedy = if renderer.gaussians_move() {
         "check geometry, phases and noise of the views"

@@ -62,6 +62,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
                 split,
                 integrals,
                 mask: None,
+                after_phase: 0.0,
                 heart_shift_mm: [0.0; 3],
             });
         }
@@ -200,6 +201,12 @@ pub fn with_gaussians(gaussians: sections::Gaussians) -> Config {
 /// As [`targets`].
 pub fn tree_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
     let mut targets = targets(33, 27, 5)?;
+    // Some images were taken between two phases.
+    targets
+        .views
+        .iter_mut()
+        .zip([0.0, 0.3, -0.45].into_iter().cycle())
+        .for_each(|(view, after)| view.after_phase = after);
     // The grid covers the places.
     let corner = Place { position: DVec3::splat(14.0), evidence: 18.0 };
     targets.places[0].push(corner);

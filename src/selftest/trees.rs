@@ -6,15 +6,15 @@ use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::{BufferSet, dispatch_finding};
-use crate::kernels::layout::TreeSetup;
+use crate::kernels::layout::{GaussianSetup, TreeSetup};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
+use crate::plan::targets::Targets;
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
-use crate::reference::tree::{TreeParams, at_phase, loss_and_gradient};
+use crate::reference::tree::{TreeParams, loss_and_gradient, phases_shown, shown};
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::gaussians::{
     LOSS, NUMBERS, REPORT, SPLAT, Seen, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
-    twin_images,
 };
 use crate::selftest::problems::{moving_tree, tree_case};
 use crate::train::tree::TreeTrainer;
@@ -59,49 +59,50 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     upload(gpu, &trainer.own_motion().own_motion, &p.own)?;
     let images = trainer.images()?;
     let (n, n_views, n_phases) = (rows.len(), targets.n_views, targets.n_phases);
-    let everywhere: Vec<(Params, usize)> = (0..n_phases)
-        .flat_map(|phase| (0..n).map(move |i| (phase, i)))
-        .map(|(phase, i)| (at_phase(&tree, &p, i, phase, n_phases), phase))
-        .collect();
-    let seen: Vec<Seen> = (0..n_phases * n_views * n)
-        .map(|at| {
-            let (phase_and_view, i) = (at / n, at % n);
-            let image = targets.image_of[phase_and_view]?;
-            let moved = &everywhere[phase_and_view / n_views * n + i].0;
-            Some((image, reference::project(moved, &targets.views[image], &setup)))
-        })
-        .collect();
+    let shown_at = |splat: usize| {
+        let (phase_and_view, i) = (splat / n, splat % n);
+        let (phase, image) = (phase_and_view / n_views, targets.image_of[phase_and_view]?);
+        Some((phase, image, shown(&tree, &p, i, phase, &targets.views[image], n_phases)))
+    };
+    let shown: Vec<Option<(usize, usize, Params)>> = (0..n_phases * n_views * n).map(shown_at).collect();
+    let project = |(image, moved): (usize, &Params)| reference::project(moved, &targets.views[image], &setup);
+    let seen: Vec<Seen> =
+        shown.iter().map(|s| s.as_ref().map(|(_, image, moved)| (*image, project((*image, moved))))).collect();
     compare_splats(gpu, trainer.particles(), &setup, PROJECT, &seen, findings)?;
-    findings.numbers(SPLAT, "images", &images, &twin_images(&targets, &setup, &everywhere), NUMBERS);
+    findings.numbers(SPLAT, "images", &images, &drawn(&targets, &setup, &seen), NUMBERS);
     let loss = trainer.advance(1)?.first().copied().unwrap_or(f64::NAN);
     let buffers = (trainer.target_buffers(), trainer.particles());
     let (twin_loss, moments) = compare_backward(gpu, (&targets, &setup), buffers, &images, &seen, findings)?;
-    // Gradients of each Gaussian at each phase by the device's moments.
-    let gradient = |at: usize| {
-        let (phase, i) = (at / n, at % n);
-        let mut sum = [0.0; N_PARAMS];
-        for view in 0..n_views {
-            let splat = (phase * n_views + view) * n + i;
-            if let Some((image, Some(_))) = &seen[splat] {
-                let one = reference::gradient(&everywhere[at].0, &targets.views[*image], &setup, moments[splat]);
-                sum.iter_mut().zip(one).for_each(|(sum, g)| *sum += g);
-            }
+    // By the device's moments: gradients of each Gaussian, and of its place at each phase.
+    let (mut want, mut places) = (vec![[0.0; N_PARAMS]; n], vec![DVec3::ZERO; n_phases * n]);
+    for (splat, shown) in shown.iter().enumerate() {
+        let Some((phase, image, moved)) = shown else { continue };
+        let view = &targets.views[*image];
+        let one = reference::gradient(moved, view, &setup, moments[splat]);
+        want[splat % n].iter_mut().zip(one).for_each(|(sum, g)| *sum += g);
+        for (phase, share) in phases_shown(*phase, view, n_phases) {
+            places[phase * n + splat % n] += share * DVec3::new(one[0], one[1], one[2]);
         }
-        sum
-    };
-    let places: Vec<Params> = (0..everywhere.len()).map(gradient).collect();
-    let mut want = vec![[0.0; N_PARAMS]; n];
-    for (at, place) in places.iter().enumerate() {
-        want[at % n].iter_mut().zip(place).for_each(|(sum, g)| *sum += g);
     }
     compare_gradient(&device_gradient(gpu, trainer.particles(), n)?, &want, GRADIENT, findings);
-    let want: Vec<f64> = places.iter().flat_map(|g| g[..3].to_vec()).collect();
     let got = vectors(gpu, &trainer.own_motion().place_gradient, places.len())?;
+    let want: Vec<f64> = places.iter().flat_map(DVec3::to_array).collect();
     findings.numbers(GRADIENT, "gradient of places", &got, &want, NUMBERS);
     let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
     compare_motion(gpu, &trainer, &tree, (&p, &gradient), findings)?;
     findings.add(REPORT, "loss", (loss / twin_loss - 1.0).abs(), LOSS);
     compare_guess(gpu, &trainer, &p, n_phases, findings)
+}
+
+/// Images of splats as the twin sees them.
+fn drawn(targets: &Targets, setup: &GaussianSetup, seen: &[Seen]) -> Vec<f64> {
+    let mut images = vec![0.0; targets.n_images * targets.n_pixels()];
+    for (image, projection) in seen.iter().flatten() {
+        if let Some(projection) = projection {
+            projection.splat(setup, &mut images[image * targets.n_pixels()..][..targets.n_pixels()]);
+        }
+    }
+    images
 }
 
 /// Gradients of grid and own motion, and the first step along them.

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use crate::scan::frame_checks::{Complaint, check_phase, check_size, check_values, checked_rays};
-use crate::scan::gating::{BeatScaling, RPeaks};
+use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -79,7 +79,7 @@ impl Inbox {
         check_size((new.width, new.height), self.size).map_err(told)?;
         check_values(&new.integrals, new.width).map_err(told)?;
         match new.moment {
-            Moment::Phase(phase) => check_phase(phase, self.options.phases).map_err(told)?,
+            Moment::Phase(phase) => check_phase(phase.into(), self.options.phases).map_err(told)?,
             Moment::TimeS(time) if !time.is_finite() => {
                 return Err(bad("time", time.to_string(), "is not a time in seconds".into()));
             }
@@ -95,6 +95,7 @@ impl Inbox {
             split: new.split,
             integrals: new.integrals,
             mask: new.mask,
+            after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
         };
         self.frames.push((frame, new.moment));
@@ -130,11 +131,11 @@ impl Inbox {
         })
     }
 
-    /// Cardiac phase of a moment, where it is known.
-    pub(super) fn phase(&self, moment: Moment) -> Option<u32> {
+    /// When in the beat a moment is, where that is known.
+    pub(super) fn beat_time(&self, moment: Moment) -> Option<BeatTime> {
         match (moment, &self.r_peaks) {
-            (Moment::Phase(phase), _) => Some(phase),
-            (Moment::TimeS(time), Some(peaks)) => peaks.phase(time, self.options.phases, BeatScaling::default()),
+            (Moment::Phase(phase), _) => Some(BeatTime::at_phase(phase)),
+            (Moment::TimeS(time), Some(peaks)) => peaks.beat_time(time, self.options.phases, BeatScaling::default()),
             (Moment::TimeS(_), None) => None,
         }
     }
@@ -144,7 +145,10 @@ impl Inbox {
         let known: Vec<Frame> = self
             .frames
             .iter()
-            .filter_map(|(frame, moment)| self.phase(*moment).map(|phase| Frame { phase, ..frame.clone() }))
+            .filter_map(|(frame, moment)| {
+                let BeatTime { phase, after_phase } = self.beat_time(*moment)?;
+                Some(Frame { phase, after_phase, ..frame.clone() })
+            })
             .collect();
         let mut frames: Vec<Frame> = known.iter().filter(|f| keep(f, &known)).cloned().collect();
         frames.sort_by_key(|f| f.split);

@@ -199,7 +199,7 @@ fn first_picture(
     let dataset = carried.as_ref().unwrap_or(dataset);
     let Some(frame) = dataset.validation().first() else { return Ok(()) };
     let renderer = Renderer::new(gpu, model, tuning.clone())?;
-    let seen = renderer.render(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.phase)?;
+    let seen = renderer.render_taken(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.beat_time())?;
     let threshold = threshold_per_mm * crate::geometry::MM_PER_UNIT;
     pictures::write_comparison(path, frame, &seen, threshold, dataset.width)
 }

@@ -119,7 +119,8 @@ pub fn data_fingerprint(dataset: &Dataset) -> String {
         for v in rays.anchor.iter().chain(&rays.direction).flat_map(|p| p.to_array()) {
             eat((v as f32).to_bits());
         }
-        frame.heart_shift_mm.iter().filter(|s| **s != 0.0).for_each(|s| eat((*s as f32).to_bits()));
+        let rest = frame.heart_shift_mm.iter().chain([&frame.after_phase]);
+        rest.filter(|s| **s != 0.0).for_each(|s| eat((*s as f32).to_bits()));
         frame.integrals.iter().for_each(|v| eat(v.to_bits()));
     }
     fingerprint.hex()
@@ -540,6 +541,7 @@ mod tests {
             split,
             integrals: vec![value, 1.0, 2.0, 3.0],
             mask: None,
+            after_phase: 0.0,
             heart_shift_mm: [0.0; 3],
         };
         Dataset {

@@ -8,11 +8,12 @@ use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
 use crate::gaussians::tree::{record_guess, record_images, record_step, record_track};
+use crate::gaussians::view::SplatView;
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
-use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, TreeSetup};
 use crate::model::gaussians::{Gaussians, MovingTree, dense};
 use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
@@ -66,8 +67,12 @@ impl Fit {
             });
             padded(&images.collect::<Vec<_>>(), targets, &setup)
         };
+        // One phase at a time: what lies beyond is not known yet.
+        let at_phase = |view: &SplatView| SplatView { after_phase: 0.0, ..view.clone() }.to_device();
+        let views: Vec<GaussianView> = targets.views.iter().map(at_phase).collect();
         let buffers = TargetBuffers {
             gaussian_setup: gpu.buffer_with("gaussian_setup of tracking", &[setup])?,
+            gaussian_views: gpu.buffer_with("gaussian_views of tracking", &views)?,
             bound_low: gpu.buffer_with("bound_low of tracking", &blurred(&targets.low))?,
             bound_high: gpu.buffer_with("bound_high of tracking", &blurred(&targets.high))?,
             gaussian_schedule: gpu.buffer_with("gaussian_schedule of tracking", &fit::track_schedule(settings))?,
@@ -227,7 +232,7 @@ impl TreeTrainer {
         let (weakest, setup) = (self.config.gaussians.weakest, self.joint.setup);
         let (mut particles, mut own) = self.retain(|rows| strong(rows, &setup, weakest))?;
         let tree = self.tree()?;
-        let carried = |x: DVec3, phase: usize| tree.carried(x, phase as f64);
+        let carried = |x: DVec3, phase: f64| tree.carried(x, phase);
         let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
         let additions = seeds::tree_additions(&self.targets, &settings, seed, &self.images()?, carried);
         // They move as their nearest neighbour does.

@@ -126,6 +126,7 @@ impl Studio {
                     split: *split,
                     integrals,
                     mask,
+                    after_phase: 0.0,
                     heart_shift_mm: [0.0; 3],
                 });
                 breath.push(world_from_lps_mm(lps));

@@ -1,0 +1,71 @@
+//! Frames that were taken between two phases: read, written, refused, and handed to the fit.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
+mod common;
+
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::plan::Plan;
+use nertca_vk::scan::dataset::{Dataset, Layout, Split};
+use nertca_vk::scan::writer;
+use serde_json::Value;
+use std::path::Path;
+
+/// A written dataset of three phases; the time of its first frame is `phase`.
+fn with_first_frame_at(directory: &Path, phase: Value) {
+    writer::convert(&common::small_dataset(8, 8), Layout::Native, directory).unwrap();
+    let file = directory.join("dataset.json");
+    let mut manifest: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    assert!(manifest["frames"][0]["phase"].is_u64(), "whole phases are written as whole numbers");
+    manifest["frames"][0]["phase"] = phase;
+    std::fs::write(file, manifest.to_string()).unwrap();
+}
+
+#[test]
+fn a_frame_keeps_its_time_from_file_to_file() {
+    for (phase, nearest, after) in [(1.3, 1, 0.3), (2.75, 0, -0.25), (2.0, 2, 0.0)] {
+        let [first, second] = [0, 1].map(|_| tempfile::tempdir().unwrap());
+        with_first_frame_at(first.path(), phase.into());
+        let read = Dataset::open(first.path()).unwrap();
+        writer::convert(&read, Layout::Native, second.path()).unwrap();
+        for dataset in [read, Dataset::open(second.path()).unwrap()] {
+            let frame = &dataset.frames[0];
+            assert_eq!(frame.phase, nearest, "phase {phase}: the beat closes");
+            assert!((frame.after_phase - after).abs() < 1e-9, "phase {phase}: {}", frame.after_phase);
+            assert!((frame.beat_time().phases(dataset.n_phases) - phase).abs() < 1e-9);
+        }
+    }
+}
+
+#[test]
+fn times_outside_the_beat_are_refused() {
+    for phase in [Value::from(3), 3.2.into(), (-0.1).into(), "2".into(), Value::Null] {
+        let directory = tempfile::tempdir().unwrap();
+        with_first_frame_at(directory.path(), phase.clone());
+        let refused = Dataset::open(directory.path()).unwrap_err().to_string();
+        let named = refused.contains("frames[0].phase") && refused.contains("phases go from 0 to 2");
+        assert!(named || !phase.is_number() && refused.contains("line"), "{phase}: {refused}");
+    }
+}
+
+#[test]
+fn a_moving_tree_is_fitted_to_frames_at_their_own_time() {
+    let mut dataset = common::small_dataset(40, 40);
+    dataset.frames.iter_mut().filter(|f| f.phase == 1).for_each(|f| f.after_phase = 0.25);
+    let taken = dataset.training().iter().filter(|f| f.split == Split::Train && f.after_phase != 0.0).count();
+    let config = |form: &str| Config::load(Some(Preset::Fast), None, &[format!("gaussians.form={form}")]).unwrap();
+    let planned = |form: &str| Plan::new(&config(form), &dataset).unwrap();
+    let plan = planned("tree");
+    let targets = plan.targets.as_ref().unwrap();
+    for phase in 0..targets.n_phases {
+        let wanted = if phase == 1 { 0.25 } else { 0.0 };
+        assert!(targets.views_at(phase).count() > 1);
+        assert!(targets.views_at(phase).all(|(_, view)| view.after_phase == wanted), "phase {phase}");
+    }
+    let told =
+        |plan: &Plan, fate: &str| plan.notes.iter().any(|n| n.starts_with(&format!("{taken} of")) && n.contains(fate));
+    assert!(told(&plan, "fitted at their own time"), "{:?}", plan.notes);
+    for form in ["phase", "none"] {
+        let plan = planned(form);
+        assert!(told(&plan, "count as taken at the nearest phase"), "{form}: {:?}", plan.notes);
+    }
+}
