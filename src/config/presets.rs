@@ -169,8 +169,9 @@ fn fast(mlp: Config) -> Config {
             ..mlp.train
         },
         march: March { dynamic_samples: 2, ..mlp.march },
-        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does not.
-        static_field: StaticField { tv: 100.0, ..mlp.static_field },
+        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does not. Few
+        // iterations take long steps.
+        static_field: StaticField { tv: 100.0, lr: 3e-2, lr_end: 3e-3, ..mlp.static_field },
         // The network is never asked; the smallest one takes no memory.
         dynamic: DynamicField {
             layers: 1,
