@@ -21,6 +21,8 @@ layout(binding = 9) writeonly buffer B9 { vec4 gaussian_gradient[]; };
 // [phase][Gaussian]
 layout(binding = 10) buffer B10 { vec4 place_gradient[]; };
 #include "inc/gaussian_motion.glsl"
+// No time after a phase.
+const float NEVER = 2.0;
 
 void main() {
     uint i = gl_GlobalInvocationID.x;
@@ -32,14 +34,17 @@ void main() {
         place_gradient[(push.first_phase + t) * push.n_gaussians + i] = vec4(0.0);
     for (uint t = 0u; t < push.n_phases; t++) {
         uint phase = push.first_phase + t;
-        vec3 here = position_at(i, g.position, phase);
         sum.position = vec3(0.0);
+        // Most images of a phase were taken at the same time.
+        vec3 x;
+        float x_after_phase = NEVER;
         for (uint view = 0u; view < gaussian_setup.n_views; view++) {
             uint at = (t * gaussian_setup.n_views + view) * push.n_gaussians + i;
             int image = image_of_splat[at];
             if (image < 0) continue;
             float after_phase = gaussian_views[image].du.w;
-            vec3 x = position_between(i, g.position, here, phase, after_phase);
+            if (after_phase != x_after_phase) x = position_at(i, g.position, phase, after_phase);
+            x_after_phase = after_phase;
             Projection p = project(g, x, gaussian_views[image], gaussian_setup);
             if (!(p.depth > 0.0)) continue;
             vec3 linear = splat_moments[2u * at].xyz, square = splat_moments[2u * at + 1u].xyz;

@@ -32,7 +32,7 @@ void main() {
     uint at = gl_WorkGroupID.y * push.n_gaussians + i;
     int image = image_of_view[phase * gaussian_setup.n_views + view];
     GaussianView seen_by = gaussian_views[max(image, 0)];
-    vec3 x = position_between(i, g.position, position_at(i, g.position, phase), phase, seen_by.du.w);
+    vec3 x = position_at(i, g.position, phase, seen_by.du.w);
     splats[at] = project(g, x, seen_by, gaussian_setup).splat;
     image_of_splat[at] = image;
 }
