@@ -30,10 +30,13 @@ use solve::{ANGLE_DEG, BREATHING_MM, DEPTH_MM, IN_PLANE_MM};
 
 /// Corrections beyond so many standard deviations of what is expected are not believed.
 const BOUND: f64 = 4.0;
-/// Where vessels are cut off, profiles differ whatever the geometry, and the same way at all phases: there, a correction must leave at
-/// most this share of the squared residual, ...
-const LARGE_GAIN_LEAVES: f64 = 0.5;
-/// ... or of the vessel pixels that the other views do not explain as stated.
+/// Where vessels are cut off, profiles differ whatever the geometry, and the same way at all phases. There, a correction must leave
+/// at most this share of the squared residual; blades alone leave .80 and more of it where views are where they are said to be.
+const LARGE_GAIN_LEAVES: f64 = 0.65;
+/// And the other views must not explain fewer vessel pixels than as stated by more than this share: a correction that only brought
+/// ends of vessels together made it .11.
+const LESS_EXPLAINED: f64 = 0.02;
+/// Or it must leave at most this share of the vessel pixels that the other views do not explain as stated.
 const LEFT_UNEXPLAINED: f64 = 0.75;
 /// Changes over the beat below this share of the images' range are rounding.
 const LEAST_CHANGE: f64 = 1e-5;
@@ -315,7 +318,8 @@ impl Calibrator<'_> {
 /// or the explained pixels before and after it.
 fn helps_clearly(correction: Correction, tried: &[(Correction, f64)], explained: [f64; 2]) -> bool {
     let residual = |of: Correction| tried.iter().find(|(c, _)| *c == of).map_or(f64::NAN, |(_, share)| share * share);
-    residual(correction) <= LARGE_GAIN_LEAVES * residual(Correction::Stated)
+    let closer = residual(correction) <= LARGE_GAIN_LEAVES * residual(Correction::Stated);
+    closer && explained[1] >= explained[0] - LESS_EXPLAINED
         || 1.0 - explained[1] <= LEFT_UNEXPLAINED * (1.0 - explained[0])
 }
 
@@ -381,5 +385,22 @@ impl Calibration {
                 v.view, v.primary_deg, v.secondary_deg
             ));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cut_vessels_can_cause_is_no_clear_help() {
+        let helps = |residuals: [f64; 2], explained| {
+            let tried = [(Correction::Stated, residuals[0]), (Correction::Static, residuals[1])];
+            helps_clearly(Correction::Static, &tried, explained)
+        };
+        assert!(helps([1.03, 0.79], [0.88, 0.89]), "views that disagree");
+        assert!(!helps([0.765, 0.685], [0.90, 0.90]), "blades before views that agree");
+        assert!(!helps([0.82, 0.63], [0.94, 0.83]), "ends of vessels brought together");
+        assert!(helps([0.90, 0.85], [0.60, 0.75]), "much more is explained");
     }
 }
