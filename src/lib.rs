@@ -221,6 +221,7 @@ pub mod score {
     pub mod calibrated;
     pub mod eval;
     pub mod metrics;
+    mod nearest;
     pub mod pictures;
     pub mod shapes;
     pub mod trees;

@@ -3,8 +3,8 @@
 
 use crate::calibrate::linear::Symmetric;
 use crate::calibrate::pose::{Poses, Stand};
-use crate::geometry::ViewRays;
-use glam::{DMat3, DVec3};
+use crate::geometry::{ViewRays, lps_mm_from_world, world_from_lps_mm};
+use glam::{DAffine3, DMat3, DVec3};
 
 /// What a shift of each view does across its axis, and the inverse of the sum over views.
 struct Across {
@@ -84,6 +84,14 @@ impl RigidMotion {
     /// Where a point (world units) goes at a phase.
     pub fn carry(&self, point: DVec3, phase: usize) -> DVec3 {
         self.turn() * point + self.translations[phase]
+    }
+
+    /// Where points in patient mm (left, posterior, superior) go at a phase.
+    pub fn patient_mm(&self, phase: usize) -> DAffine3 {
+        let carried = |point_mm: DVec3| lps_mm_from_world(self.carry(world_from_lps_mm(point_mm), phase));
+        let origin = carried(DVec3::ZERO);
+        let [x, y, z] = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| carried(axis) - origin);
+        DAffine3::from_mat3_translation(DMat3::from_cols(x, y, z), origin)
     }
 
     /// The rays that see a carried object as these see it at rest.
@@ -185,6 +193,11 @@ mod tests {
             assert!((*a - *b).length() < 1e-6, "{found:?}");
         }
         assert!(found.remainder_px(&frames, &points) < 1e-4);
+        // The same in patient millimetres.
+        let place_mm = DVec3::new(12.0, -34.0, 56.0);
+        let away = motion.patient_mm(1).transform_point3(place_mm)
+            - lps_mm_from_world(motion.carry(world_from_lps_mm(place_mm), 1));
+        assert!(away.length() < 1e-9, "{away}");
         assert!(RigidMotion::none(3).remainder_px(&frames, &points) > 0.02 * SIZE[0] as f64);
     }
 }

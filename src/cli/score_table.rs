@@ -20,28 +20,35 @@ pub fn percent(share: Option<f64>) -> String {
     share.map_or("-".into(), |v| format!("{:.1} %", 100.0 * v))
 }
 
+/// What tables say whose truth was carried.
+const CARRIED: &str = "The truth was carried by the motion that all calibrated views share, which no image tells; without \
+    that, means are as stated.";
+
 /// A table whose rows are phases and their mean.
 pub struct ScoreTable {
     title: &'static str,
     /// What the numbers mean.
     legend: String,
     headings: Vec<[&'static str; 2]>,
-    /// The phase, or `mean`, and the text of each column.
+    /// The phase, `mean` or `as stated`, and the text of each column.
     rows: Vec<(String, Vec<String>)>,
 }
 
 impl ScoreTable {
-    /// A table of all phases with their scores, and of the mean.
+    /// A table of all phases with their scores, of the mean, and of the mean with the truth left as stated.
     pub fn new<'a, S: 'a>(
         title: &'static str,
         legend: String,
         columns: &[Column<S>],
         phases: impl Iterator<Item = (u32, &'a S)>,
         mean: &S,
+        as_stated: Option<&S>,
     ) -> ScoreTable {
         let row = |name: String, scores: &S| (name, columns.iter().map(|column| (column.text)(scores)).collect());
-        let rows = phases.map(|(phase, scores)| row(phase.to_string(), scores)).chain([row("mean".into(), mean)]);
+        let means = [Some(row("mean".into(), mean)), as_stated.map(|scores| row("as stated".into(), scores))];
+        let rows = phases.map(|(phase, scores)| row(phase.to_string(), scores)).chain(means.into_iter().flatten());
         let rows = rows.collect();
+        let legend = if as_stated.is_some() { format!("{legend} {CARRIED}") } else { legend };
         ScoreTable { title, legend, headings: columns.iter().map(|column| column.heading).collect(), rows }
     }
 
@@ -60,7 +67,7 @@ impl ScoreTable {
     /// Prints the table and what it means.
     pub fn print(&self) {
         let line = |name: &str, cells: Vec<&str>| {
-            out!("{name:5}{}", cells.iter().map(|cell| format!("{cell:>13}")).collect::<String>());
+            out!("{name:9}{}", cells.iter().map(|cell| format!("{cell:>13}")).collect::<String>());
         };
         line("", self.headings.iter().map(|heading| heading[0]).collect());
         line("phase", self.headings.iter().map(|heading| heading[1]).collect());

@@ -23,5 +23,5 @@ pub fn table(tree: &TreeScores) -> ScoreTable {
         tree.within_mm
     );
     let phases = tree.phases.iter().map(|p| (p.phase, &p.scores));
-    ScoreTable::new("Scores of the tree", legend, &COLUMNS, phases, &tree.mean)
+    ScoreTable::new("Scores of the tree", legend, &COLUMNS, phases, &tree.mean, tree.mean_as_stated.as_ref())
 }

@@ -10,8 +10,8 @@ const COLUMNS: [Column<Scores>; 10] = [
     Column { heading: ["centreline", "found"], text: |s| percent(s.agreement.true_centreline_found) },
     Column { heading: ["centreline", "true"], text: |s| percent(s.agreement.our_centreline_true) },
     Column { heading: ["", "clDice"], text: |s| s.agreement.cl_dice.map_or("-".into(), |v| format!("{v:.3}")) },
-    Column { heading: ["", "components"], text: |s| s.agreement.components.to_string() },
-    Column { heading: ["components", "of truth"], text: |s| s.agreement.true_components.to_string() },
+    Column { heading: ["", "components"], text: |s| format!("{:.1}", s.agreement.components) },
+    Column { heading: ["components", "of truth"], text: |s| format!("{:.1}", s.agreement.true_components) },
     Column { heading: ["mass beyond", "2 pixels"], text: |s| percent(s.mass_beyond_2_pixels) },
     Column { heading: ["mass beyond", "2 mm"], text: |s| percent(s.mass_beyond_2_mm) },
 ];
@@ -19,7 +19,7 @@ const COLUMNS: [Column<Scores>; 10] = [
 /// The table of all phases, and their mean.
 pub fn table(volume: &VolumeScores) -> ScoreTable {
     let phases = volume.phases.iter().map(|p| (p.phase, &p.scores));
-    ScoreTable::new("Scores in 3D", legend(volume), &COLUMNS, phases, &volume.mean)
+    ScoreTable::new("Scores in 3D", legend(volume), &COLUMNS, phases, &volume.mean, volume.mean_as_stated.as_ref())
 }
 
 /// What the numbers of the table mean.

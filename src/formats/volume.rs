@@ -5,6 +5,7 @@ use crate::error::{Error, Result};
 use crate::formats::{metaimage, nifti, npy, nrrd, raw};
 use crate::geometry::world_from_lps_mm;
 use glam::{DAffine3, DMat3, DVec3};
+use rayon::prelude::*;
 use std::path::Path;
 
 /// Largest accepted volume, voxels (2 GiB of floats).
@@ -78,6 +79,33 @@ impl Volume {
         let row = |y, z| mix(at(0, y, z), at(1, y, z), share.x);
         let plane = |z| mix(row(0, z), row(1, z), share.y);
         mix(plane(0), plane(1), share.z)
+    }
+
+    /// What a volume shows where `carry` (patient mm to patient mm, rigid) takes it, on a grid of the same spacings along the
+    /// patient's axes; between voxels by linear interpolation, and 0 where the volume knows nothing.
+    pub fn carried(&self, carry: &DAffine3) -> Volume {
+        let spacing_mm =
+            DVec3::from_array(self.index_to_lps.matrix3.to_cols_array_2d().map(|axis| DVec3::from(axis).length()));
+        let last = DVec3::from_array(self.size.map(|n| n as f64 - 1.0));
+        let place = *carry * self.index_to_lps;
+        let corner = |k: usize| DVec3::from_array([0, 1, 2].map(|axis| (k >> axis & 1) as f64)) * last;
+        let corners = [0, 1, 2, 3, 4, 5, 6, 7].map(|k| place.transform_point3(corner(k)));
+        let low_mm = corners.into_iter().fold(DVec3::INFINITY, DVec3::min);
+        let high_mm = corners.into_iter().fold(DVec3::NEG_INFINITY, DVec3::max);
+        let size = ((high_mm - low_mm) / spacing_mm).ceil().as_usizevec3().to_array().map(|n| n + 1);
+        let index_to_lps = DAffine3::from_mat3_translation(DMat3::from_diagonal(spacing_mm), low_mm);
+        let to_index = place.inverse() * index_to_lps;
+        let mut values = vec![0f32; size.iter().product()];
+        values.par_chunks_mut(size[0]).enumerate().for_each(|(row, values)| {
+            let (y, z) = ((row % size[1]) as f64, (row / size[1]) as f64);
+            for (x, value) in values.iter_mut().enumerate() {
+                let index = to_index.transform_point3(DVec3::new(x as f64, y, z));
+                if index.cmpge(DVec3::splat(-0.5)).all() && index.cmple(last + 0.5).all() {
+                    *value = self.interpolated(index);
+                }
+            }
+        });
+        Volume { size, values, index_to_lps }
     }
 
     /// Largest distance of a corner from the isocentre in the axial plane, mm.

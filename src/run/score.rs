@@ -9,7 +9,7 @@ use crate::model::Model;
 use crate::render::renderer::Renderer;
 use crate::run::events::Event;
 use crate::scan::dataset::Dataset;
-use crate::score::calibrated::in_calibrated_frame;
+use crate::score::calibrated::{carried_by, in_calibrated_frame};
 use crate::score::eval::{Evaluation, Scoring, evaluate, moving_field_warning};
 use crate::score::pictures::{self, Window};
 use crate::score::volume;
@@ -40,7 +40,8 @@ pub fn as_trained(dataset: Dataset, run: &Path) -> Result<Dataset> {
 }
 
 /// Evaluates a model on all validation frames of a dataset whose training views are those the run went by. Where the truth of
-/// synthetic data tells, unseen views are seen from where the reconstruction has them, and Dice as stated is told beside it.
+/// synthetic data tells, unseen views are seen from where the reconstruction has them and true vessels are carried there, and
+/// scores as stated are told beside.
 /// `observe` hears of [`Event::Evaluation`] after every image.
 ///
 /// # Errors
@@ -92,16 +93,13 @@ pub fn evaluate_model(
         evaluation.dice_as_stated = Some(seen.dice);
     }
     let threshold_per_mm = evaluation.threshold.dynamic_per_mm;
-    match volume::score(&renderer, &model.scene, dataset, threshold_per_mm, || pace.check()) {
+    let motion = carried_by(stated)?;
+    match volume::score(&renderer, &model.scene, dataset, threshold_per_mm, motion.as_ref(), || pace.check()) {
         // The truth is at fault: images are scored all the same.
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
             evaluation.warnings.push(format!("There are no scores in 3D: {error}."));
         }
         scores => evaluation.volume = scores?,
-    }
-    if carried.is_some() && evaluation.volume.is_some() {
-        let warning = "Distances in 3D hold the common motion of all calibrated views, which no image tells.";
-        evaluation.warnings.push(warning.into());
     }
     evaluation.warnings.extend(moving_field_warning(&renderer, dataset)?);
     Ok(evaluation)

@@ -4,13 +4,13 @@ use crate::error::Result;
 use crate::phantom::tree::Branch;
 use crate::phantom::tree_file::{TREE, TreeFile};
 use crate::scan::dataset::Dataset;
-use crate::score::calibrated::in_calibrated_frame;
+use crate::score::calibrated::{carried_by, in_calibrated_frame};
 use crate::score::trees::{self, TreeScores, TrueLine};
 use crate::score::volume::VOLUMES;
 use crate::trees::tree::BeatTree;
 
 /// Scores a tree of all phases against the one a phantom left; none where there is none. The dataset is the one that the
-/// reconstruction went by.
+/// reconstruction went by. Scores are made in the frame of the reconstruction, with the means as stated beside.
 ///
 /// # Errors
 /// [`crate::error::Error::Io`] and [`crate::error::Error::Data`] for a truth that cannot be read.
@@ -20,11 +20,15 @@ pub fn score_tree(beat: &BeatTree, dataset: &Dataset) -> Result<Option<TreeScore
         return Ok(None);
     }
     let truth = TreeFile::read(&file)?;
-    let carried = in_calibrated_frame(dataset)?;
     let lines = |moment: f64| {
         let tree = truth.at(moment / f64::from(dataset.n_phases));
         let line = |branch: Branch| TrueLine { points_mm: branch.points, radius_mm: branch.radius_mm };
         tree.branches.into_iter().map(line).collect()
     };
-    trees::score(beat, carried.as_ref().unwrap_or(dataset), lines).map(Some)
+    let (carried, motion) = (in_calibrated_frame(dataset)?, carried_by(dataset)?);
+    let mut scores = trees::score(beat, carried.as_ref().unwrap_or(dataset), motion.as_ref(), lines)?;
+    if carried.is_some() || motion.is_some() {
+        scores.mean_as_stated = Some(trees::score(beat, dataset, None, lines)?.mean);
+    }
+    Ok(Some(scores))
 }

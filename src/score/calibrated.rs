@@ -1,6 +1,6 @@
 //! Scores of synthetic data in the frame that the reconstruction lives in. Views know nothing of a motion that all of them
 //! share, so a reconstruction of corrected views is carried by one against the truth. Where `truth.json` says how images
-//! were really taken, that motion is found, and unseen views are carried along.
+//! were really taken, that motion is found, and unseen views and true vessels are carried along.
 
 use crate::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
 use crate::error::{Error, Result};
@@ -8,6 +8,8 @@ use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
 use crate::scan::dataset::{Dataset, Frame, Split};
 use crate::scan::truth::{TRUTH, TrueFrame, Truth};
 use glam::DVec3;
+use std::collections::BTreeMap;
+use std::ffi::OsStr;
 
 /// Half side of the cube of points that stand for the heart, as a share of the field of view's half.
 const HEART_SHARE: f64 = 0.5;
@@ -35,65 +37,81 @@ fn points(dataset: &Dataset) -> Vec<DVec3> {
 /// Ways that no score shows, pixels.
 const NEGLIGIBLE_PX: f64 = 0.01;
 
-/// The dataset, of corrected training views, with its unseen views where the reconstruction has them. None without
-/// `truth.json`, where that is of other frames, or where nothing moves by it.
-///
-/// # Errors
-/// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read.
-pub fn in_calibrated_frame(dataset: &Dataset) -> Result<Option<Dataset>> {
+/// The truth beside a dataset; none where there is none, or where it is of other frames.
+fn truth_of(dataset: &Dataset) -> Result<Option<Truth>> {
     if !dataset.path.join(TRUTH).is_file() {
         return Ok(None);
     }
     let truth = Truth::load(&dataset.path)?;
+    let of_these = dataset.frames.iter().all(|frame| TrueFrames::new(&truth, dataset).of(frame).is_some());
+    Ok(of_these.then_some(truth))
+}
+
+/// The dataset, of corrected training views, with its unseen images where the reconstruction has them; of a view that is both
+/// trained and scored, the scored images get a view of their own. None without `truth.json`, where that is of other frames,
+/// or where nothing moves by it.
+///
+/// # Errors
+/// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read.
+pub fn in_calibrated_frame(dataset: &Dataset) -> Result<Option<Dataset>> {
+    let Some(truth) = truth_of(dataset)? else { return Ok(None) };
     let found = TrueFrames::new(&truth, dataset);
-    if dataset.frames.iter().any(|f| found.of(f).is_none()) {
-        return Ok(None);
-    }
     let motion = found.motion()?;
     let mean = motion.translations.iter().sum::<DVec3>() / f64::from(dataset.n_phases);
     let still = RigidMotion { rotation: motion.rotation, translations: vec![mean] };
+    let trained = dataset.training_views();
+    let mut own = BTreeMap::new();
     let mut carried = dataset.clone();
     for (f, frame) in dataset.frames.iter().zip(&mut carried.frames) {
-        // Views that training shares with scoring are where they were corrected to.
-        if f.split == Split::Train || found.training.contains(&f.view) {
-            continue;
+        let Some(was) = found.of(f).filter(|_| f.split == Split::Validation) else { continue };
+        if trained.contains(&f.view) {
+            frame.view = *own.entry(f.view).or_insert_with(|| {
+                carried.views.push(dataset.views[f.view].clone());
+                carried.views.len() - 1
+            });
+            if let Some(hidden) = dataset.hidden.get(&f.view) {
+                carried.hidden.insert(frame.view, hidden.clone());
+            }
         }
-        let Some(was) = found.of(f) else { continue };
-        carried.views[f.view].rays = still.carry_rays(&true_rays(was, dataset)?, 0);
+        carried.views[frame.view].rays = still.carry_rays(&true_rays(was, dataset)?, 0);
         let shift = still.carry(shift_of(was), 0) - motion.translations[f.phase as usize];
         frame.heart_shift_mm = (shift * MM_PER_UNIT).to_array();
     }
     Ok((farthest_px(dataset, &carried) > NEGLIGIBLE_PX).then_some(carried))
 }
 
+/// What the reconstruction of a dataset's corrected training views is carried by against the true vessels, phase by phase.
+/// None without `truth.json`, where that is of other frames, or where the heart is carried nowhere.
+///
+/// # Errors
+/// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read.
+pub fn carried_by(dataset: &Dataset) -> Result<Option<RigidMotion>> {
+    let Some(truth) = truth_of(dataset)? else { return Ok(None) };
+    let motion = TrueFrames::new(&truth, dataset).motion()?;
+    let negligible = NEGLIGIBLE_PX * dataset.views[0].rays.anchor[1].length();
+    let points = points(dataset);
+    let moves = |phase: usize| points.iter().any(|p| motion.carry(*p, phase).distance(*p) > negligible);
+    Ok((0..dataset.n_phases as usize).any(moves).then_some(motion))
+}
+
 /// The truth of a dataset's frames.
 pub(super) struct TrueFrames<'a> {
     truth: &'a Truth,
     dataset: &'a Dataset,
-    /// Views of training, and those unseen: the truth counts them in this order.
-    training: Vec<usize>,
-    unseen: Vec<usize>,
 }
 
 impl<'a> TrueFrames<'a> {
     pub(super) fn new(truth: &'a Truth, dataset: &'a Dataset) -> TrueFrames<'a> {
-        let views = |frames: &[Frame]| {
-            let mut views: Vec<usize> = frames.iter().map(|f| f.view).collect();
-            views.sort_unstable();
-            views.dedup();
-            views
-        };
-        TrueFrames { truth, dataset, training: views(dataset.training()), unseen: views(dataset.validation()) }
+        TrueFrames { truth, dataset }
     }
 
     /// How the image of a frame was really taken; none where the truth is of other frames.
     pub(super) fn of(&self, frame: &Frame) -> Option<&'a TrueFrame> {
-        let place = |views: &[usize]| views.iter().position(|v| *v == frame.view);
-        let view = match frame.split {
-            Split::Train => place(&self.training)?,
-            Split::Validation => self.training.len() + place(&self.unseen)?,
+        let is = |was: &&TrueFrame| {
+            (was.split, was.phase) == (frame.split, frame.phase)
+                && was.image.file_stem() == Some(OsStr::new(&frame.name))
         };
-        self.truth.frames.iter().find(|f| (f.split, f.view, f.phase) == (frame.split, view, frame.phase))
+        self.truth.frames.iter().find(is)
     }
 
     /// What the reconstruction is carried by.

@@ -1,10 +1,12 @@
 //! How far a tree of vessels agrees with the true one, over the beat (see `docs/formats.md`).
 
+use crate::calibrate::gauge::RigidMotion;
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::scan::dataset::{Dataset, Frame, Split};
 use crate::scan::truth::{TRUTH, Truth};
 use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
+use crate::score::nearest::{Lines, Place};
 use crate::score::shapes::WITHIN_MM;
 use crate::trees::tree::{BeatTree, PhaseTree};
 use glam::{DVec2, DVec3};
@@ -64,26 +66,43 @@ pub struct TreeScores {
     pub within_mm: f64,
     /// Means over the phases that have a value.
     pub mean: TreeAgreement,
+    /// Where the truth was carried to the frame of the reconstruction: the means where it was left as stated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mean_as_stated: Option<TreeAgreement>,
     /// One row per phase.
     pub phases: Vec<PhaseTreeScores>,
 }
 
 /// Scores a tree. `truth` has the true vessels at a moment of the beat, which goes from 0 to the dataset's number of phases.
 /// The dataset is the one that the reconstruction went by, with its unseen views where the reconstruction has them; where
-/// `truth.json` lies beside it, the true vessels are seen as each image was really taken.
+/// `truth.json` lies beside it, the true vessels are seen as each image was really taken. Where the reconstruction is `carried`
+/// against the truth, true vessels are carried along before they are compared in 3D.
 ///
 /// # Errors
 /// [`Error::Io`] and [`Error::Data`] for a `truth.json` that cannot be used; [`Error::Data`] for a truth without vessels.
-pub fn score(beat: &BeatTree, dataset: &Dataset, truth: impl Fn(f64) -> Vec<TrueLine> + Sync) -> Result<TreeScores> {
+pub fn score(
+    beat: &BeatTree,
+    dataset: &Dataset,
+    carried: Option<&RigidMotion>,
+    truth: impl Fn(f64) -> Vec<TrueLine> + Sync,
+) -> Result<TreeScores> {
     let taken = dataset.path.join(TRUTH).is_file().then(|| Truth::load(&dataset.path)).transpose()?;
     let images = Images { dataset, truth: taken.as_ref().map(|taken| TrueFrames::new(taken, dataset)) };
-    let rest = truth(0.0);
+    let true_at = |phase: u32| {
+        let mut lines = truth(f64::from(phase));
+        if let Some(motion) = carried {
+            let carry = motion.patient_mm(phase as usize);
+            lines.iter_mut().flat_map(|line| &mut line.points_mm).for_each(|p| *p = carry.transform_point3(*p));
+        }
+        lines
+    };
+    let rest = true_at(0);
     if rest.iter().all(|line| line.points_mm.len() < 2) {
         return Err(Error::data(&dataset.path, "true tree", "has no line"));
     }
     let first = beat.phases.iter().find(|tree| Some(tree.phase) == beat.reference_phase);
     let phases = beat.phases.par_iter().map(|tree| -> Result<PhaseTreeScores> {
-        let now = truth(f64::from(tree.phase));
+        let now = true_at(tree.phase);
         let mut scores = agreement(tree, &now);
         scores.reprojection_training_mm = images.reprojection_mm(tree, Split::Train, &truth)?;
         scores.reprojection_unseen_mm = images.reprojection_mm(tree, Split::Validation, &truth)?;
@@ -93,7 +112,7 @@ pub fn score(beat: &BeatTree, dataset: &Dataset, truth: impl Fn(f64) -> Vec<True
         Ok(PhaseTreeScores { phase: tree.phase, scores })
     });
     let phases = phases.collect::<Result<Vec<PhaseTreeScores>>>()?;
-    Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), phases })
+    Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), mean_as_stated: None, phases })
 }
 
 /// The mean of what there is; none of nothing.
@@ -141,40 +160,6 @@ fn is_near(away_mm: f64) -> f64 {
     f64::from(u8::from(away_mm <= WITHIN_MM))
 }
 
-/// A place on a line: so much of the way from a point to the next.
-#[derive(Clone, Copy)]
-struct Place {
-    line: usize,
-    from: usize,
-    share: f64,
-}
-
-impl Place {
-    fn on<T, M>(&self, values: &[T], mix: M) -> T
-    where
-        T: Copy,
-        M: Fn(T, T, f64) -> T,
-    {
-        mix(values[self.from], values[self.from + 1], self.share)
-    }
-}
-
-/// The place on lines nearest to a point, and how far away it is.
-fn nearest(lines: &[&[DVec3]], point: DVec3) -> (f64, Option<Place>) {
-    let mut best = (f64::INFINITY, None);
-    for (line, points) in lines.iter().enumerate() {
-        for (from, ends) in points.windows(2).enumerate() {
-            let way = ends[1] - ends[0];
-            let share = ((point - ends[0]).dot(way) / way.length_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
-            let away = point.distance_squared(ends[0] + share * way);
-            if away < best.0 {
-                best = (away, Some(Place { line, from, share }));
-            }
-        }
-    }
-    (best.0.sqrt(), best.1)
-}
-
 /// Places on lines that are [`STEP_MM`] apart at most, and the length that each stands for, mm.
 fn finely(lines: &[&[DVec3]]) -> Vec<(Place, f64)> {
     let of_line = |(line, points): (usize, &&[DVec3])| {
@@ -198,14 +183,15 @@ fn true_points(lines: &[TrueLine]) -> Vec<&[DVec3]> {
 
 fn agreement(tree: &PhaseTree, truth: &[TrueLine]) -> TreeAgreement {
     let (our_lines, true_lines) = (ours(tree), true_points(truth));
+    let (near_ours, near_truth) = (Lines::new(&our_lines), Lines::new(&true_lines));
     let mut found = Along::default();
     for (at, length) in finely(&true_lines) {
-        found.add(length, is_near(nearest(&our_lines, at.on(true_lines[at.line], DVec3::lerp)).0));
+        found.add(length, is_near(near_ours.nearest(at.on(true_lines[at.line], DVec3::lerp)).0));
     }
     let mix = |a: f64, b: f64, share: f64| a + share * (b - a);
     let [mut to_true, mut near, mut error, mut squared] = [(); 4].map(|()| Along::default());
     for (at, length) in finely(&our_lines) {
-        let (away, there) = nearest(&true_lines, at.on(our_lines[at.line], DVec3::lerp));
+        let (away, there) = near_truth.nearest(at.on(our_lines[at.line], DVec3::lerp));
         to_true.add(length, away);
         near.add(length, is_near(away));
         if let Some(there) = there.filter(|_| away <= WITHIN_MM) {
@@ -232,10 +218,11 @@ fn agreement(tree: &PhaseTree, truth: &[TrueLine]) -> TreeAgreement {
 fn motion_error_mm([first, now]: [&PhaseTree; 2], [true_first, true_now]: [&[TrueLine]; 2]) -> Option<f64> {
     let (rest, moved) = (ours(first), ours(now));
     let (true_rest, true_moved) = (true_points(true_first), true_points(true_now));
+    let beside = Lines::new(&true_rest);
     let mut error = Along::default();
     for (at, length) in finely(&rest) {
         let begin = at.on(rest[at.line], DVec3::lerp);
-        let (away, there) = nearest(&true_rest, begin);
+        let (away, there) = beside.nearest(begin);
         let Some(there) = there.filter(|_| away <= WITHIN_MM) else { continue };
         let way = at.on(moved[at.line], DVec3::lerp) - begin;
         let true_way = there.on(true_moved[there.line], DVec3::lerp) - there.on(true_rest[there.line], DVec3::lerp);
@@ -292,9 +279,9 @@ impl Images<'_> {
             let true_lines = lines(&image.true_rays, &true_points(&truth(image.moment)));
             let (our_lines, true_lines): (Vec<&[DVec3]>, Vec<&[DVec3]>) =
                 (our_lines.iter().map(|l| &l[..]).collect(), true_lines.iter().map(|l| &l[..]).collect());
-            let mut away = Along::default();
+            let (mut away, seen) = (Along::default(), Lines::new(&true_lines));
             for (at, length) in finely(&our_lines) {
-                away.add(length, nearest(&true_lines, at.on(our_lines[at.line], DVec3::lerp)).0);
+                away.add(length, seen.nearest(at.on(our_lines[at.line], DVec3::lerp)).0);
             }
             Ok(away.mean())
         };

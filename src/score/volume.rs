@@ -1,5 +1,6 @@
 //! Scores in 3D, where a dataset carries its vessels as volumes (see `docs/formats.md`).
 
+use crate::calibrate::gauge::RigidMotion;
 use crate::error::{Error, Result};
 use crate::formats::volume::{Volume, VolumeHints};
 use crate::geometry::MM_PER_UNIT;
@@ -63,6 +64,9 @@ pub struct VolumeScores {
     pub smallest_component_mm3: f64,
     /// Means over the phases; none where a phase has none.
     pub mean: Scores,
+    /// Where the truth was carried to the frame of the reconstruction: the means where it was left as stated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mean_as_stated: Option<Scores>,
     /// One row per phase.
     pub phases: Vec<PhaseScores>,
 }
@@ -73,7 +77,8 @@ pub fn truth_file(volumes: &Path, phase: u32) -> PathBuf {
 }
 
 /// Scores the moving field where it exceeds `threshold_per_mm` at every phase whose truth lies in the dataset's directory;
-/// none where there is no truth. `proceed` is asked before every phase; its error ends the work.
+/// none where there is no truth. Where the reconstruction is `carried` against it, the truth is carried along, and the means
+/// as stated are told beside. `proceed` is asked before every phase; its error ends the work.
 ///
 /// # Errors
 /// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read, that does not follow the patient's axes, or that has
@@ -83,22 +88,33 @@ pub fn score(
     scene: &Scene,
     dataset: &Dataset,
     threshold_per_mm: f64,
+    carried: Option<&RigidMotion>,
     mut proceed: impl FnMut() -> Result<()>,
 ) -> Result<Option<VolumeScores>> {
-    let c_arm = dataset.reference_c_arm();
-    let pixel_mm = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
+    let pixel_mm = pixel_mm(dataset);
     let smallest_component_mm3 = (COMPONENT_PIXELS * pixel_mm).powi(3);
     let volumes = dataset.path.join(VOLUMES);
-    let mut phases = Vec::new();
+    let (mut phases, mut as_stated) = (Vec::new(), Vec::new());
     for phase in 0..dataset.n_phases {
         let file = truth_file(&volumes, phase);
         if !file.is_file() {
             continue;
         }
-        proceed()?;
-        let truth = Truth::read(&file, dataset.vessel_attenuation.map(|v| v / MM_PER_UNIT))?;
+        let volume = read(&file)?;
         let moving = MovingField { renderer, scene, phase, pixel_mm, threshold_per_mm };
-        phases.push(PhaseScores { phase, scores: scores(&moving, &truth, &file, smallest_component_mm3)? });
+        let coarse = moving.coarse()?;
+        let mut against = |volume: &Volume| -> Result<PhaseScores> {
+            proceed()?;
+            let truth = Truth::new(volume, dataset);
+            Ok(PhaseScores { phase, scores: scores(&moving, &coarse, &truth, &file, smallest_component_mm3)? })
+        };
+        match carried {
+            None => phases.push(against(&volume)?),
+            Some(motion) => {
+                phases.push(against(&volume.carried(&motion.patient_mm(phase as usize)))?);
+                as_stated.push(against(&volume)?);
+            }
+        }
     }
     Ok((!phases.is_empty()).then(|| VolumeScores {
         threshold_per_mm,
@@ -106,6 +122,7 @@ pub fn score(
         within_mm: WITHIN_MM,
         smallest_component_mm3,
         mean: mean(&phases),
+        mean_as_stated: (!as_stated.is_empty()).then(|| mean(&as_stated)),
         phases,
     }))
 }
@@ -132,32 +149,48 @@ fn mean(phases: &[PhaseScores]) -> Scores {
     }
 }
 
+/// Pixel at the isocentre, mm.
+pub(super) fn pixel_mm(dataset: &Dataset) -> f64 {
+    let c_arm = dataset.reference_c_arm();
+    c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm
+}
+
 /// True vessels of a phase.
-struct Truth {
+pub(super) struct Truth {
     grid: PatientGrid,
     inside: Vec<bool>,
 }
 
+/// True attenuation per mm on a grid along the patient's axes.
+pub(super) fn read(file: &Path) -> Result<Volume> {
+    let volume = Volume::read(file, &VolumeHints::default())?;
+    let spacing_mm = spacing_mm(&volume);
+    if volume.index_to_lps.matrix3 != DMat3::from_diagonal(spacing_mm) || spacing_mm.min_element() <= 0.0 {
+        return Err(Error::data(file, "space directions", "are not left, posterior and superior, in this order"));
+    }
+    Ok(volume)
+}
+
+/// Distances of voxels along the patient's axes.
+fn spacing_mm(volume: &Volume) -> DVec3 {
+    let axes = volume.index_to_lps.matrix3;
+    DVec3::new(axes.x_axis.x, axes.y_axis.y, axes.z_axis.z)
+}
+
 impl Truth {
-    /// Reads true attenuation per mm. Vessel is what reaches a share of the vessels' attenuation, or of the largest value
-    /// where that is not stated.
-    fn read(file: &Path, vessel_per_mm: Option<f64>) -> Result<Truth> {
-        let volume = Volume::read(file, &VolumeHints::default())?;
-        let axes = volume.index_to_lps.matrix3;
-        let spacing_mm = DVec3::new(axes.x_axis.x, axes.y_axis.y, axes.z_axis.z);
-        if axes != DMat3::from_diagonal(spacing_mm) || spacing_mm.min_element() <= 0.0 {
-            return Err(Error::data(file, "space directions", "are not left, posterior and superior, in this order"));
-        }
+    /// Vessel is what reaches a share of the vessels' attenuation, or of the largest value where that is not stated.
+    pub(super) fn new(volume: &Volume, dataset: &Dataset) -> Truth {
         let largest = || f64::from(volume.values.iter().copied().fold(0.0, f32::max));
+        let vessel_per_mm = dataset.vessel_attenuation.map(|v| v / MM_PER_UNIT);
         let threshold = TRUTH_SHARE * vessel_per_mm.unwrap_or_else(largest);
-        Ok(Truth {
+        Truth {
             grid: PatientGrid {
                 origin_mm: volume.index_to_lps.translation,
-                spacing_mm,
+                spacing_mm: spacing_mm(volume),
                 size: volume.size.map(|n| n as u32),
             },
             inside: volume.values.iter().map(|v| f64::from(*v) > threshold).collect(),
-        })
+        }
     }
 
     /// The same vessels on a grid that reaches from one corner to another at least.
@@ -224,14 +257,30 @@ impl Mass {
     }
 }
 
-/// Scores of a field against the truth, on a grid of its voxels that holds the truth and what of the field is vessel.
-fn scores(field: &MovingField<'_>, truth: &Truth, file: &Path, smallest_component_mm3: f64) -> Result<Scores> {
-    let coarse = field.coarse()?;
+/// True vessels, and those of a field, on a grid of the truth's voxels that holds both.
+pub(super) fn on_one_grid(
+    field: &MovingField<'_>,
+    coarse: &CoarseField,
+    truth: &Truth,
+    file: &Path,
+) -> Result<(PatientGrid, [Mask; 2])> {
     let own = Corners::of(&truth.grid).grown(FAR_MM.max(FAR_PIXELS * field.pixel_mm));
     let reach = coarse.reach(field.threshold_per_mm).map_or(own, |reach| own.joined(reach));
     let (grid, true_vessels) = truth.reaching(reach, file)?;
-    let ours = vessels(field, &coarse, &grid)?;
-    let mass = DistanceMap::to(&true_vessels).map(|to_truth| Mass::of(&coarse, &grid, &to_truth, field.pixel_mm));
+    let ours = vessels(field, coarse, &grid)?;
+    Ok((grid, [true_vessels, ours]))
+}
+
+/// Scores of a field against the truth.
+fn scores(
+    field: &MovingField<'_>,
+    coarse: &CoarseField,
+    truth: &Truth,
+    file: &Path,
+    smallest_component_mm3: f64,
+) -> Result<Scores> {
+    let (grid, [true_vessels, ours]) = on_one_grid(field, coarse, truth, file)?;
+    let mass = DistanceMap::to(&true_vessels).map(|to_truth| Mass::of(coarse, &grid, &to_truth, field.pixel_mm));
     Ok(Scores {
         agreement: compare(&true_vessels, &ours, smallest_component_mm3)?,
         mass_beyond_2_pixels: mass.and_then(|m| m.share(m.far_pixels)),

@@ -28,9 +28,9 @@ fn rest() -> Vec<[f64; 3]> {
 }
 
 /// The true vessels over the beat, as `phantom --tree` reads them.
-fn truth() -> Value {
+fn truth(phases: usize) -> Value {
     let squeezed = |phase: usize| {
-        let squeeze = (PI * phase as f64 / PHASES as f64).sin().powi(2);
+        let squeeze = (PI * phase as f64 / phases as f64).sin().powi(2);
         let (across, along) = (1.0 - 0.12 * squeeze, 1.0 - 0.08 * squeeze);
         let moved =
             |[x, y, z]: [f64; 3]| [x * across + 3.0 * squeeze, y * across - 4.0 * squeeze, z * along + 6.0 * squeeze];
@@ -48,7 +48,7 @@ fn truth() -> Value {
             { "name": "right", "first": trunk + left, "count": right },
         ],
         "radius_mm": radii,
-        "points_mm": (0..PHASES).map(squeezed).collect::<Vec<_>>(),
+        "points_mm": (0..phases).map(squeezed).collect::<Vec<_>>(),
     })
 }
 
@@ -80,16 +80,19 @@ pub fn trained() -> &'static Trained {
     static RUN: OnceLock<Trained> = OnceLock::new();
     RUN.get_or_init(|| {
         let directory = tempfile::tempdir().unwrap();
-        let (tree, data, run) =
-            (directory.path().join("truth.json"), directory.path().join("data"), directory.path().join("run"));
-        std::fs::write(&tree, truth().to_string()).unwrap();
-        let phases = PHASES.to_string();
+        let (data, run) = (directory.path().join("data"), directory.path().join("run"));
         // The detector is off centre, lest anybody forgets that it may be.
-        let views = ["--size", "64", "--phases", &phases, "--offset", "2.5,-1.5"];
-        ok(&[&["phantom", text(&data), "--tree", text(&tree)], &views[..]].concat());
+        phantom(&data, PHASES, &["--size", "64", "--offset", "2.5,-1.5"]);
         train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60", "--tree"]);
         Trained { directory, data, run }
     })
+}
+
+/// Angiograms of the true vessels.
+pub fn phantom(data: &Path, phases: usize, more: &[&str]) {
+    let tree = data.with_file_name("truth.json");
+    std::fs::write(&tree, truth(phases).to_string()).unwrap();
+    ok(&[&["phantom", text(data), "--tree", text(&tree), "--phases", &phases.to_string()], more].concat());
 }
 
 pub fn train(data: &Path, run: &Path, more: &[&str]) {
