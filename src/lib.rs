@@ -219,6 +219,7 @@ pub mod vessels {
 /// What a reconstruction is worth.
 pub mod score {
     pub mod calibrated;
+    pub mod distance;
     pub mod eval;
     pub mod metrics;
     mod nearest;
@@ -246,6 +247,7 @@ pub mod trees {
 /// One run, from a dataset to a run directory.
 pub mod run {
     pub mod events;
+    pub mod history;
     pub mod hull_pictures;
     pub mod info;
     mod log;

@@ -10,7 +10,6 @@
 pub mod data;
 pub mod events;
 pub mod file;
-mod history;
 pub mod layout;
 pub mod markup;
 pub mod outcome;

@@ -37,7 +37,7 @@ fn scores_in_3d_are_made_where_the_reconstruction_is() {
     ] {
         let (data, run) = (directory.path().join(name), directory.path().join(format!("{name}-run")));
         phantom(&data, PHASES, &[&["--size", "80", "--test-angles", "60,-10"], wrong].concat());
-        let (said, _) = ok(&["train", text(&data), "-o", text(&run), "--tree"]);
+        let (said, _) = ok(&["train", text(&data), "-o", text(&run), "--tree", "--set", "train.validate_every=100"]);
         let evaluation = evaluation(&run);
         for of in ["volume", "tree"] {
             let scores = &evaluation[of];
@@ -48,6 +48,15 @@ fn scores_in_3d_are_made_where_the_reconstruction_is() {
         assert_eq!(said.matches("\nas stated ").count(), 2, "{said}");
         let page = std::fs::read_to_string(run.join("report.html")).unwrap();
         assert_eq!(page.matches("<td>as stated</td>").count(), 2);
+        // On the way, distances are those of the same frame: the end of systole is phase 3 of 8.
+        let log = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+        let lines = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+        let told: Vec<Value> = lines.filter(|line| line["event"] == "validation").collect();
+        assert!(told.len() >= 3, "{log}");
+        let last = told.last().unwrap()["chamfer_mm"].as_f64().unwrap();
+        let expected = evaluation["volume"]["phases"][3]["chamfer_mm"].as_f64().unwrap();
+        assert!((last - expected).abs() < 1e-9, "{name}: {last} mm on the way, {expected} mm in the end");
+        assert!(page.contains("Distance to the true vessels at the end of systole"));
     }
 }
 

@@ -10,6 +10,7 @@ use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::model::gaussians::Displacement;
+use nertca_vk::run::history::{History, Losses, Validated};
 use nertca_vk::score::eval::Evaluation;
 use plotters::style::RGBColor;
 use serde_json::Value;
@@ -18,6 +19,9 @@ use std::path::{Path, PathBuf};
 
 /// Pictures embedded at most.
 const MOST_PICTURES: usize = 120;
+
+/// Title of the plot of distances on the way.
+pub(super) const DISTANCE_TITLE: &str = "Distance to the true vessels at the end of systole, mm";
 
 /// What a page tells.
 pub struct Page<'a> {
@@ -29,6 +33,8 @@ pub struct Page<'a> {
     pub warnings: Vec<String>,
     /// Lines of `metrics.jsonl`; empty when there are none.
     pub metrics: Vec<Value>,
+    /// What those lines tell over time.
+    pub history: History,
     /// Scores, where there were views to score.
     pub evaluation: Option<&'a Evaluation>,
     /// How far Gaussians that move have come at each phase; empty for other fields.
@@ -84,45 +90,39 @@ fn by_view(what: &str, pictures: &[(usize, PathBuf)]) -> Result<Markup> {
 }
 
 impl Page<'_> {
-    fn series(&self, event: &str, time: &str, value: &str) -> Vec<(f64, f64)> {
-        let of_event = self.metrics.iter().filter(|line| line["event"] == event);
-        of_event.filter_map(|line| Some((line[time].as_f64()?, line[value].as_f64()?))).collect()
-    }
-
+    /// Losses, and scores of some unseen images, over the time of training.
     fn plots(&self) -> Result<Markup> {
         let (blue, orange, green) = (RGBColor(30, 100, 190), RGBColor(215, 120, 20), RGBColor(40, 130, 70));
-        let loss = plot(
-            "Loss",
-            &[
-                Line { name: "data".into(), colour: blue, points: self.series("progress", "elapsed_s", "data") },
-                Line {
-                    name: "dynamic field".into(),
-                    colour: orange,
-                    points: self.series("progress", "elapsed_s", "dynamic"),
-                },
-            ],
-            true,
-        )?;
-        let dice = plot(
-            "Unseen views",
-            &[
-                Line {
-                    name: "Dice, dynamic field".into(),
-                    colour: orange,
-                    points: self.series("validation", "train_s", "dice_dynamic"),
-                },
-                Line {
-                    name: "Dice, both".into(),
-                    colour: green,
-                    points: self.series("validation", "train_s", "dice_total"),
-                },
-                Line { name: "SSIM".into(), colour: blue, points: self.series("validation", "train_s", "ssim") },
-            ],
-            false,
-        )?;
+        let History { losses, curve, .. } = &self.history;
+        let loss = |name: &str, colour: RGBColor, pick: fn(&Losses) -> Option<f64>| Line {
+            name: name.into(),
+            colour,
+            points: losses.iter().filter_map(|l| Some((l.elapsed_s, pick(l)?))).collect(),
+        };
+        let score = |name: &str, colour: RGBColor, pick: fn(&Validated) -> Option<f64>| Line {
+            name: name.into(),
+            colour,
+            points: curve.iter().filter_map(|v| Some((v.train_s, pick(v)?))).collect(),
+        };
+        let plots = [
+            plot("Loss", &[loss("data", blue, |l| l.data), loss("dynamic field", orange, |l| l.dynamic)], true)?,
+            plot(
+                "Some unseen images",
+                &[
+                    score("Dice, dynamic field", orange, |v| v.dice),
+                    score("Dice, both", green, |v| v.dice_total),
+                    score("SSIM", blue, |v| v.ssim),
+                ],
+                false,
+            )?,
+            plot(DISTANCE_TITLE, &[score("Chamfer, mm", orange, |v| v.chamfer_mm)], false)?,
+        ];
         Ok(html! {
-            @if !loss.is_empty() || !dice.is_empty() { h2 { "Over time" } }
-            @for svg in [loss, dice] { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } }
+            @if plots.iter().any(|svg| !svg.is_empty()) { h2 { "Over time" } }
+            @for svg in plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } }
+            @if curve.is_empty() && !losses.is_empty() && self.evaluation.is_some() {
+                p.lead { "Scores over time are told of runs that validate on the way: --set train.validate_every=100." }
+            }
         })
     }
 

@@ -9,6 +9,7 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
 use nertca_vk::model::gaussians::MovingGaussians;
+use nertca_vk::run::history::History;
 use nertca_vk::run::{hull_pictures, silhouette_pictures};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
@@ -83,6 +84,7 @@ impl Report<'_> {
             facts,
             warnings: self.all_warnings(),
             metrics,
+            history: History::read(run),
             evaluation,
             motion: tree.map_or(Vec::new(), |t| (0..t.rest.n_phases).map(|p| t.displacement(p as f64)).collect()),
             pictures: frames

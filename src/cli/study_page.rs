@@ -1,12 +1,12 @@
 //! The page of a study: its table, Dice over the time of training, and pictures side by side; needs nothing but itself.
 
-use super::page::{STYLE, embedded};
+use super::page::{DISTANCE_TITLE, STYLE, embedded};
 use super::plot::{Line, plot};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use nertca_vk::error::Result;
 use nertca_vk::files;
 use nertca_vk::study::data::DataSet;
-use nertca_vk::study::outcome::{Outcome, run_directory};
+use nertca_vk::study::outcome::{CurvePoint, Outcome, run_directory};
 use nertca_vk::study::plan::{Run, Study};
 use nertca_vk::study::scores::Score;
 use nertca_vk::study::table::{Cell, Table};
@@ -105,11 +105,25 @@ fn rows(table: &Table) -> Markup {
     }
 }
 
-/// Dice over the time of training: a line per run, a colour per method, and where published runs ended.
+/// Dice, and distances to true vessels, over the time of training.
 fn curves(study: &Study, finished: &[&Finished]) -> Result<Markup> {
+    let mut dice = lines(study, finished, |point| point.dice);
+    if let Some(Finished { run, .. }) = finished.first().filter(|_| !dice.is_empty()) {
+        dice.extend(published_ends(study, &study.data[run.data]));
+    }
+    let distances = lines(study, finished, |point| point.chamfer_mm);
+    let plots = [
+        plot("Dice of the moving field on some unseen images", &dice, false)?,
+        plot(DISTANCE_TITLE, &distances, false)?,
+    ];
+    Ok(html! { @for svg in plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } } })
+}
+
+/// A line per run, a colour per method.
+fn lines(study: &Study, finished: &[&Finished], pick: fn(&CurvePoint) -> Option<f64>) -> Vec<Line> {
     let mut lines: Vec<Line> = Vec::new();
     for Finished { run, outcome } in finished {
-        let points: Vec<(f64, f64)> = outcome.curve.iter().filter_map(|p| Some((p.train_s, p.dice?))).collect();
+        let points: Vec<(f64, f64)> = outcome.curve.iter().filter_map(|p| Some((p.train_s, pick(p)?))).collect();
         if points.is_empty() {
             continue;
         }
@@ -117,11 +131,7 @@ fn curves(study: &Study, finished: &[&Finished]) -> Result<Markup> {
         let name = if lines.iter().any(|line| line.name == *label) { String::new() } else { label.clone() };
         lines.push(Line { name, colour: COLOURS[run.method % COLOURS.len()], points });
     }
-    if let Some(Finished { run, .. }) = finished.first().filter(|_| !lines.is_empty()) {
-        lines.extend(published_ends(study, &study.data[run.data]));
-    }
-    let svg = plot("Dice of the moving field on some unseen images", &lines, false)?;
-    Ok(html! { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } })
+    lines
 }
 
 /// Where published runs on a data set ended, as far as that is known.

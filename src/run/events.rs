@@ -59,6 +59,9 @@ pub enum Event {
         psnr: f64,
         /// Structural similarity.
         ssim: f64,
+        /// Where the dataset has its vessels as volumes: mean distance to them (Chamfer) at the end of systole, mm.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        chamfer_mm: Option<f64>,
     },
     /// A checkpoint was written.
     Saved {

@@ -6,6 +6,7 @@
 use crate::calibrate::calibrate;
 use crate::calibrate::choose::Correction;
 use crate::calibrate::correction::Calibration;
+use crate::calibrate::gauge::RigidMotion;
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files;
@@ -18,7 +19,8 @@ use crate::run::log::MetricsLog;
 use crate::run::snapshots::{Answer, Job, SnapshotWorker};
 use crate::run::{hull_pictures, silhouette_pictures};
 use crate::scan::dataset::Dataset;
-use crate::score::calibrated::in_calibrated_frame;
+use crate::score::calibrated::{carried_by, in_calibrated_frame};
+use crate::score::distance::Distance;
 use crate::score::eval;
 use crate::train::trainer::Trainer;
 use crate::train::training::{Progress, Training};
@@ -60,7 +62,7 @@ pub fn reconstruct(
     for directory in [options.run, &options.run.join("report")] {
         files::remove_partial(directory);
     }
-    let (dataset, calibration) = calibrated(config, dataset, options)?;
+    let Calibrated { dataset, carried, calibration } = calibrated(config, dataset, options)?;
     let dataset = &dataset;
     let trainer = if options.resume {
         let saved = Checkpoint::read(&checkpoint::newest(options.run)?)?;
@@ -85,6 +87,14 @@ pub fn reconstruct(
     notes.extend(calibration.notes);
     notes.extend(trainer.plan().notes.iter().cloned());
     notes.extend(trainer.tuning().reasons.iter().cloned());
+    let distance = match Distance::new(dataset, carried.as_ref()) {
+        // Images are scored all the same.
+        Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
+            notes.push(format!("there are no distances on the way: {error}"));
+            None
+        }
+        distance => distance?,
+    };
     tell(Event::Started {
         device: gpu.info().name.clone(),
         step: trainer.step(),
@@ -100,6 +110,7 @@ pub fn reconstruct(
         run: options.run,
         dataset,
         validation: eval::spread_validation(dataset, config.train.validate_images as usize),
+        distance,
         begin,
         cancel: options.cancel,
     };
@@ -112,8 +123,17 @@ pub fn reconstruct(
     })
 }
 
+/// What a run goes by.
+struct Calibrated {
+    /// By the corrected geometry, unseen images where the reconstruction has them.
+    dataset: Dataset,
+    /// What the reconstruction is carried by against the truth, where that is known.
+    carried: Option<RigidMotion>,
+    calibration: Calibration,
+}
+
 /// The dataset by the geometry that the run goes by: found now, or when the run was begun.
-fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> Result<(Dataset, Calibration)> {
+fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> Result<Calibrated> {
     let calibration = if options.resume {
         Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
     } else {
@@ -126,7 +146,8 @@ fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> R
     if !options.resume && calibration.correction != Correction::Stated {
         silhouette_pictures::write(&options.run.join("report"), dataset, &corrected)?;
     }
-    Ok((in_calibrated_frame(&corrected)?.unwrap_or(corrected), calibration))
+    let carried = carried_by(&corrected)?;
+    Ok(Calibrated { dataset: in_calibrated_frame(&corrected)?.unwrap_or(corrected), carried, calibration })
 }
 
 /// Runs the iterations. Snapshots go to the worker, which works beside training where `tuning.overlap` says so, and

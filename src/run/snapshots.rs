@@ -6,6 +6,7 @@ use crate::kernels::tuning::Tuning;
 use crate::render::renderer::Renderer;
 use crate::run::events::Event;
 use crate::scan::dataset::{Dataset, Frame};
+use crate::score::distance::Distance;
 use crate::score::eval::{Scoring, evaluate};
 use crate::train::trainer::Snapshot;
 use std::path::Path;
@@ -32,6 +33,7 @@ pub(super) struct SnapshotWorker<'a> {
     pub(super) run: &'a Path,
     pub(super) dataset: &'a Dataset,
     pub(super) validation: Vec<&'a Frame>,
+    pub(super) distance: Option<Distance>,
     pub(super) begin: Instant,
     /// Ends a validation under way once it is true.
     pub(super) cancel: &'a AtomicBool,
@@ -75,6 +77,11 @@ impl SnapshotWorker<'_> {
                 Err(Error::Interrupted) => return Ok(()),
                 score => score?,
             };
+            let scene = &saved.model.scene;
+            let chamfer_mm = match &self.distance {
+                Some(distance) => distance.chamfer_mm(renderer, scene, score.threshold.dynamic_per_mm)?,
+                None => None,
+            };
             events.push(Event::Validation {
                 step,
                 train_s,
@@ -82,6 +89,7 @@ impl SnapshotWorker<'_> {
                 dice_total: score.dice.total,
                 psnr: score.psnr,
                 ssim: score.ssim,
+                chamfer_mm,
             });
         }
         Ok(())

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
+use crate::run::history::Validated;
 use crate::score::eval::Evaluation;
 use crate::study::plan::{Run, RunFingerprint, Study};
 use serde::{Deserialize, Serialize};
@@ -67,6 +68,17 @@ pub struct CurvePoint {
     pub train_s: f64,
     /// Dice of the moving field, where images have masks.
     pub dice: Option<f64>,
+    /// Distance to the true vessels at one phase, mm, where the data have them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub chamfer_mm: Option<f64>,
+}
+
+impl CurvePoint {
+    /// What a study keeps of a validation.
+    pub(super) fn of(validated: &Validated) -> CurvePoint {
+        let Validated { step, train_s, dice, chamfer_mm, .. } = *validated;
+        CurvePoint { step, train_s, dice, chamfer_mm }
+    }
 }
 
 /// Scores of a run: means over unseen images or over phases. `report/evaluation.json` beside has all of them.

@@ -9,6 +9,7 @@ use crate::model::Model;
 use crate::model::checkpoint::{self, newest_model};
 use crate::render::renderer::Renderer;
 use crate::run::events::Event;
+use crate::run::history::History;
 use crate::run::info::RunInfo;
 use crate::run::reconstruct::{RunOptions, reconstruct};
 use crate::run::score::{ScoreOptions, as_trained, evaluate_model};
@@ -16,8 +17,7 @@ use crate::scan::dataset::Dataset;
 use crate::score::calibrated::in_calibrated_frame;
 use crate::score::pictures;
 use crate::study::events::StudyEvent;
-use crate::study::history::History;
-use crate::study::outcome::{Outcome, RESULT, RunScores, Seconds, run_directory};
+use crate::study::outcome::{CurvePoint, Outcome, RESULT, RunScores, Seconds, run_directory};
 use crate::study::plan::{Run, RunFingerprint, Study};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -109,7 +109,7 @@ impl Workplace<'_> {
             whole: history.before_s + begin.elapsed().as_secs_f64(),
             parts: history.parts,
         };
-        outcome.curve = history.curve;
+        outcome.curve = history.curve.iter().map(CurvePoint::of).collect();
         outcome.write(&directory)?;
         Ok(outcome)
     }

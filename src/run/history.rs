@@ -1,19 +1,49 @@
 //! What the log of a run tells of its time: a run that was interrupted has several parts, whose clocks begin anew.
 
-use crate::study::outcome::CurvePoint;
 use serde_json::Value;
 use std::path::Path;
 
 /// The time of a run.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct History {
+pub struct History {
     /// Seconds of training, all parts together.
-    pub(super) train_s: f64,
+    pub train_s: f64,
     /// Seconds of all parts but the last, with what they spent on validation and saving.
-    pub(super) before_s: f64,
+    pub before_s: f64,
     /// Parts.
-    pub(super) parts: u32,
-    pub(super) curve: Vec<CurvePoint>,
+    pub parts: u32,
+    /// Validations on the way.
+    pub curve: Vec<Validated>,
+    /// Losses on the way.
+    pub losses: Vec<Losses>,
+}
+
+/// A validation on the way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Validated {
+    /// Iterations done.
+    pub step: u32,
+    /// Seconds of training until then, all parts together.
+    pub train_s: f64,
+    /// Dice of the moving field, where images have masks.
+    pub dice: Option<f64>,
+    /// Dice of both fields.
+    pub dice_total: Option<f64>,
+    /// Structural similarity.
+    pub ssim: Option<f64>,
+    /// Distance to the true vessels at one phase, mm.
+    pub chamfer_mm: Option<f64>,
+}
+
+/// Losses of an iteration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Losses {
+    /// Seconds until then, all parts together, with what they spent on validation and saving.
+    pub elapsed_s: f64,
+    /// Of the images.
+    pub data: Option<f64>,
+    /// Of the moving field.
+    pub dynamic: Option<f64>,
 }
 
 /// The time of one part, as far as its lines tell.
@@ -32,7 +62,7 @@ impl Part {
 
 impl History {
     /// Reads the log of a run; nothing where there is none.
-    pub(super) fn read(run: &Path) -> History {
+    pub fn read(run: &Path) -> History {
         History::of(&std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default())
     }
 
@@ -49,10 +79,18 @@ impl History {
                     part = Part::default();
                 }
                 Some("finished") => part.train_s = number("train_s"),
-                Some("validation") => history.curve.push(CurvePoint {
+                Some("validation") => history.curve.push(Validated {
                     step: line["step"].as_u64().unwrap_or_default() as u32,
                     train_s: history.train_s + number("train_s").unwrap_or_default(),
                     dice: number("dice_dynamic"),
+                    dice_total: number("dice_total"),
+                    ssim: number("ssim"),
+                    chamfer_mm: number("chamfer_mm"),
+                }),
+                Some("progress") => history.losses.push(Losses {
+                    elapsed_s: history.before_s + part.elapsed_s,
+                    data: number("data"),
+                    dynamic: number("dynamic"),
                 }),
                 _ => (),
             }
@@ -70,17 +108,19 @@ mod tests {
     fn parts_add_up() {
         let log = r#"{"event":"started","step":0}
             {"event":"progress","step":10,"elapsed_s":2.0}
-            {"event":"validation","step":10,"train_s":1.5,"dice_dynamic":0.5}
+            {"event":"validation","step":10,"train_s":1.5,"dice_dynamic":0.5,"chamfer_mm":2.5}
             {"event":"progress","step":20,"elapsed_s":4.0}
             {"event":"started","step":20}
-            {"event":"progress","step":30,"elapsed_s":1.0}
+            {"event":"progress","step":30,"elapsed_s":1.0,"data":0.25}
             {"event":"started","step":30}
             {"event":"validation","step":40,"train_s":0.75,"dice_dynamic":null}
             {"event":"finished","step":40,"train_s":0.8,"elapsed_s":1.5}"#;
         let history = History::of(log);
         assert_eq!((history.train_s, history.before_s, history.parts), (5.8, 5.0, 3));
-        let curve: Vec<_> = history.curve.iter().map(|p| (p.step, p.train_s, p.dice)).collect();
-        assert_eq!(curve, [(10, 1.5, Some(0.5)), (40, 5.75, None)]);
+        let curve: Vec<_> = history.curve.iter().map(|p| (p.step, p.train_s, p.dice, p.chamfer_mm)).collect();
+        assert_eq!(curve, [(10, 1.5, Some(0.5), Some(2.5)), (40, 5.75, None, None)]);
+        let losses: Vec<_> = history.losses.iter().map(|l| (l.elapsed_s, l.data)).collect();
+        assert_eq!(losses, [(2.0, None), (4.0, None), (5.0, Some(0.25))]);
         assert_eq!(History::of(""), History::default());
     }
 }

@@ -1,0 +1,52 @@
+//! How far the vessels of a run in training are from the true ones: one number at one phase, soon told.
+
+use crate::calibrate::gauge::RigidMotion;
+use crate::error::Result;
+use crate::model::scene::Scene;
+use crate::render::renderer::Renderer;
+use crate::scan::dataset::Dataset;
+use crate::scan::gating::SYSTOLE_SHARE;
+use crate::score::shapes::chamfer_mm;
+use crate::score::volume::{Truth, VOLUMES, on_one_grid, pixel_mm, read, truth_file};
+use crate::vessels::field::MovingField;
+use std::path::PathBuf;
+
+/// The true vessels at the phase nearest to the end of systole, when they have come farthest.
+pub struct Distance {
+    truth: Truth,
+    file: PathBuf,
+    phase: u32,
+    pixel_mm: f64,
+}
+
+impl Distance {
+    /// Reads the truth in the dataset's directory; none where there is none. Where the reconstruction is `carried` against the
+    /// truth, the truth is carried along.
+    ///
+    /// # Errors
+    /// As [`crate::score::volume::score`] for a truth that cannot be used.
+    pub fn new(dataset: &Dataset, carried: Option<&RigidMotion>) -> Result<Option<Distance>> {
+        let systole = SYSTOLE_SHARE * f64::from(dataset.n_phases);
+        let file = |phase: u32| truth_file(&dataset.path.join(VOLUMES), phase);
+        let known = (0..dataset.n_phases).filter(|phase| file(*phase).is_file());
+        let away = |phase: &u32| (f64::from(*phase) - systole).abs();
+        let Some(phase) = known.min_by(|a, b| away(a).total_cmp(&away(b))) else { return Ok(None) };
+        let file = file(phase);
+        let mut volume = read(&file)?;
+        if let Some(motion) = carried {
+            volume = volume.carried(&motion.patient_mm(phase as usize));
+        }
+        Ok(Some(Distance { truth: Truth::new(&volume, dataset), file, phase, pixel_mm: pixel_mm(dataset) }))
+    }
+
+    /// The Chamfer distance, mm, of the moving field where it exceeds a threshold; none where it nowhere does.
+    ///
+    /// # Errors
+    /// As [`crate::score::volume::score`].
+    pub fn chamfer_mm(&self, renderer: &Renderer, scene: &Scene, threshold_per_mm: f64) -> Result<Option<f64>> {
+        let Distance { truth, file, phase, pixel_mm } = self;
+        let field = MovingField { renderer, scene, phase: *phase, pixel_mm: *pixel_mm, threshold_per_mm };
+        let (_, [truth, ours]) = on_one_grid(&field, &field.coarse()?, truth, file)?;
+        Ok(chamfer_mm(&truth, &ours))
+    }
+}
