@@ -145,7 +145,9 @@ pub mod import {
     pub mod angiograms;
     pub mod dicom;
     pub mod ecg;
+    pub mod folder;
     pub mod image_beat;
+    pub mod intake;
     mod lengths;
 }
 

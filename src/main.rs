@@ -17,6 +17,7 @@ mod cli {
     pub mod data;
     pub mod device;
     pub mod devices;
+    pub mod dicom_args;
     pub mod eval;
     pub mod exit;
     pub mod export;
@@ -40,8 +41,11 @@ mod cli {
     pub mod tree_section;
     pub mod tree_table;
     pub mod view;
+    pub mod view_server;
     pub mod view_tree;
     pub mod volume_table;
+    pub mod watch;
+    pub mod watch_live;
 }
 
 use clap::Parser;
@@ -64,6 +68,7 @@ fn main() -> ExitCode {
         Command::Eval(args) => cli::eval::eval(&cli, args),
         Command::Render(args) => cli::render::render(&cli, args),
         Command::View(args) => cli::view::view(&cli, args),
+        Command::Watch(args) => cli::watch::run(&cli, args),
         Command::Export(args) => cli::export::export(&cli, args),
         Command::Tree(args) => cli::tree::run(&cli, args),
         Command::Calibrate(args) => cli::calibrate::run(args),

@@ -16,6 +16,7 @@ use super::synthetic_args::{PhantomArgs, ProjectArgs};
 use super::train::TrainArgs;
 use super::tree::TreeArgs;
 use super::view::ViewArgs;
+use super::watch::WatchArgs;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 use nertca_vk::choice::Choice;
@@ -65,6 +66,8 @@ pub enum Command {
     Render(RenderArgs),
     /// Look at a run in a browser: turn the C-arm with the mouse while the beat plays.
     View(ViewArgs),
+    /// Reconstruct DICOM runs as they appear in a folder, and look at it meanwhile in a browser.
+    Watch(WatchArgs),
     /// Export volumes or vessel surfaces of a run for other tools.
     Export(ExportArgs),
     /// Vessels of a run as trees: centrelines with radii in mm, followed over the beat.

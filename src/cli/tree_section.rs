@@ -1,7 +1,7 @@
 //! The vessel tree on a run's page: lines over the angiograms it was made of, lengths and diameters of its branches. The one
 //! part of the page that needs a script, which it brings along.
 
-use super::view::TREES_SCRIPT;
+use super::view_server::TREES_SCRIPT;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use maud::{Markup, PreEscaped, html};

@@ -63,13 +63,21 @@ impl TreeWork {
         (answer, first)
     }
 
-    /// Finds the tree. Takes seconds.
-    pub fn find(&self, model: &Model) {
-        let found = match self.tree(model) {
+    /// Finds the tree of a model, if there is one. Takes seconds.
+    pub fn find(&self, model: Result<Model>) {
+        let found = match model.and_then(|model| self.tree(&model)) {
             Ok(json) => TreeState::Ready(json),
             Err(error) => TreeState::Failed(error.to_string()),
         };
         *self.state() = Some(found);
+    }
+
+    /// Forgets a tree that was found: it is of vessels as they were.
+    pub fn forget(&self) {
+        let mut state = self.state();
+        if matches!(*state, Some(TreeState::Ready(_))) {
+            *state = None;
+        }
     }
 
     /// Ends the work under way before its next phase.

@@ -1,13 +1,12 @@
-//! DICOM runs -> a dataset: frames chosen, phases assigned, collimator cut away, runs checked against one another.
+//! DICOM runs -> a dataset: frames chosen, phases assigned, collimator cut away.
 
 use crate::error::{Error, Result};
-use crate::geometry::{CArm, Geometry};
+use crate::geometry::CArm;
 use crate::import::dicom::{Relationship, Run};
 use crate::import::image_beat;
+use crate::import::intake::{Intake, MOST_RUNS};
 use crate::raster::{Image, dilate, opening, percentile};
-use crate::scan::dataset::{Layout, Split};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
-use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -63,86 +62,25 @@ pub struct ImportOptions {
 /// # Errors
 /// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. Nothing is written then.
 pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
-    if files.is_empty() || files.len() > 64 {
-        return Err(Error::config("FILE", files.len(), "1 to 64 runs are accepted"));
+    if files.is_empty() || files.len() > MOST_RUNS {
+        return Err(Error::config("FILE", files.len(), format!("1 to {MOST_RUNS} runs are accepted")));
     }
-    let mut runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
-    let mut notes: Vec<String> =
-        runs.iter().flat_map(|run| run.notes.iter().map(|note| format!("{}: {note}", run.name()))).collect();
-    notes.extend(cross_check(&mut runs));
-    let views = runs.par_iter().map(|run| View::prepare(run, options)).collect::<Result<Vec<_>>>()?;
-    notes.extend(views.iter().flat_map(|view| view.notes.iter().cloned()));
-    // One size for all: the smallest open area, around the middle of each.
-    let width = views.iter().map(|v| v.images[0].1.width).min().unwrap_or(1);
-    let height = views.iter().map(|v| v.images[0].1.height).min().unwrap_or(1);
-    let phases = if matches!(options.gating, Gating::Still) { 2 } else { options.phases };
-    let about = About {
-        description: format!("{} X-ray angiography runs", runs.len()),
-        phases,
-        depth_half_extent_mm: options.depth_half_extent_mm,
-        vessel_attenuation_per_mm: None,
-        size: [width, height],
-        c_arm: views[0].c_arm.clone(),
-    };
-    let mut writer = Writer::new(out, Layout::Native, about)?;
-    for (index, view) in views.iter().enumerate() {
-        for (taken, image) in &view.images {
-            let (image, offset) = cut(image, width, height);
-            let pixel_mm = view.c_arm.pixel_mm;
-            let moved = |k: usize| view.c_arm.offset_mm[k] + offset[k] * pixel_mm[k];
-            let geometry = Geometry::CArm(CArm { offset_mm: [moved(0), moved(1)], ..view.c_arm.clone() });
-            writer.frame(&geometry, Split::Train, index, *taken, &image.values, None)?;
-        }
-    }
-    writer.finish()?;
-    notes.push(format!("{} views of {width} x {height} pixels at {phases} phases", views.len()));
+    let runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
+    let mut intake = Intake::new(options.clone());
+    let mut notes = intake.take(runs)?;
+    notes.push(intake.write(out)?);
     Ok(notes)
 }
 
-/// What does not fit together; the table is taken from the first run's.
-fn cross_check(runs: &mut [Run]) -> Vec<String> {
-    let mut notes = Vec::new();
-    let (first_identity, first_table, first_name) = (runs[0].identity, runs[0].c_arms[0].table_mm, runs[0].name());
-    for run in runs.iter_mut() {
-        let name = run.name();
-        if run.identity[0] != first_identity[0] {
-            notes.push(format!("warning: {name} is of another patient than {first_name}"));
-        } else if run.identity[1] != first_identity[1] {
-            notes.push(format!("warning: {name} is of another study than {first_name}"));
-        }
-        for c_arm in &mut run.c_arms {
-            for (now, first) in c_arm.table_mm.iter_mut().zip(first_table) {
-                *now -= first;
-            }
-        }
-        let [left, down, along] = run.c_arms[0].table_mm;
-        if [left, down, along] != [0.0; 3] {
-            notes.push(format!(
-                "{name}: the table moved by {left} mm to the left and {down} mm down since {first_name}, which was taken \
-                 into account; a move along the patient is not in public tags"
-            ));
-        }
-    }
-    let arms: Vec<_> = runs.iter().map(|r| (r.c_arms[0].primary_deg, r.c_arms[0].secondary_deg, r.name())).collect();
-    for (i, a) in arms.iter().enumerate() {
-        for b in &arms[i + 1..] {
-            if (a.0 - b.0).abs() < 5.0 && (a.1 - b.1).abs() < 5.0 {
-                notes.push(format!("warning: {} and {} look from almost the same angle", a.2, b.2));
-            }
-        }
-    }
-    notes
-}
-
 /// A run, ready to be written.
-struct View {
-    c_arm: CArm,
-    images: Vec<(BeatTime, Image)>,
-    notes: Vec<String>,
+pub(super) struct View {
+    pub(super) c_arm: CArm,
+    pub(super) images: Vec<(BeatTime, Image)>,
+    pub(super) notes: Vec<String>,
 }
 
 impl View {
-    fn prepare(run: &Run, options: &ImportOptions) -> Result<View> {
+    pub(super) fn prepare(run: &Run, options: &ImportOptions) -> Result<View> {
         let mut notes = Vec::new();
         let (columns, rows) = run.open.clone();
         if (columns.len(), rows.len()) != (run.width, run.height) {
@@ -408,12 +346,4 @@ fn without_text(frame: &[f32], width: usize, text: &[usize]) -> Vec<f32> {
         }
     }
     out
-}
-
-/// The middle `width` x `height` pixels, and by how many pixels the middle moved.
-fn cut(image: &Image, width: usize, height: usize) -> (Image, [f64; 2]) {
-    let (x, y) = ((image.width - width) / 2, (image.height - height) / 2);
-    let values = (0..height).flat_map(|j| image.values[(y + j) * image.width + x..][..width].iter().copied()).collect();
-    let moved = |start: usize, kept: usize, all: usize| start as f64 + 0.5 * kept as f64 - 0.5 * all as f64;
-    (Image { width, height, values }, [moved(x, width, image.width), moved(y, height, image.height)])
 }

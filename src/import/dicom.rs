@@ -57,6 +57,8 @@ pub struct Run {
     pub burnt_in: bool,
     /// What tells patients and studies apart, hashed: only equality means anything.
     pub identity: [u64; 2],
+    /// What tells runs apart, hashed: copies of one have the same. None where the file does not say.
+    pub instance: Option<u64>,
     /// What was assumed, and what is odd.
     pub notes: Vec<String>,
 }
@@ -152,6 +154,7 @@ impl Run {
         let r_peaks = r.r_peaks(&times_s, &mut notes);
         let hashed = |tag| Fingerprint::of(r.text(tag).unwrap_or_default().as_bytes()).value();
         let identity = [tags::PATIENT_ID, tags::STUDY_INSTANCE_UID].map(hashed);
+        let instance = r.text(tags::SOP_INSTANCE_UID).map(|uid| Fingerprint::of(uid.as_bytes()).value());
         Ok(Run {
             path: path.to_path_buf(),
             width,
@@ -165,6 +168,7 @@ impl Run {
             open: r.open_area(width, height)?,
             burnt_in: r.text(tags::BURNED_IN_ANNOTATION).is_some_and(|t| t.eq_ignore_ascii_case("YES")),
             identity,
+            instance,
             notes,
         })
     }

@@ -107,10 +107,8 @@ impl<'a> TrueFrames<'a> {
 
     /// How the image of a frame was really taken; none where the truth is of other frames.
     pub(super) fn of(&self, frame: &Frame) -> Option<&'a TrueFrame> {
-        let is = |was: &&TrueFrame| {
-            (was.split, was.phase) == (frame.split, frame.phase)
-                && was.image.file_stem() == Some(OsStr::new(&frame.name))
-        };
+        // A frame between two phases may count as the one or the other; names tell.
+        let is = |was: &&TrueFrame| was.split == frame.split && was.image.file_stem() == Some(OsStr::new(&frame.name));
         self.truth.frames.iter().find(is)
     }
 

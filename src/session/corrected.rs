@@ -5,6 +5,7 @@ use crate::calibrate::correction::{Calibration, ViewCorrection};
 use crate::error::{Error, Result};
 use crate::geometry::world_from_lps_mm;
 use crate::scan::dataset::{Frame, View};
+use crate::session::{Session, lock};
 use glam::DVec3;
 
 /// A frame as calibration sees it.
@@ -19,6 +20,13 @@ pub struct CorrectedFrame {
     /// Projection from patient mm (left, posterior, superior) to homogeneous pixels (column, row; integers are pixel centres), rows
     /// first: draws the vessels where this frame shows them.
     pub projection: [[f64; 4]; 3],
+}
+
+impl Session {
+    /// How views are corrected that training goes by; none before it begins, and of a checkpoint that was loaded.
+    pub fn calibration(&self) -> Option<Calibration> {
+        lock(&self.shared.calibration).clone()
+    }
 }
 
 impl CorrectedFrame {

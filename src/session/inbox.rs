@@ -29,6 +29,8 @@ pub struct SessionOptions {
 pub enum Moment {
     /// At a known cardiac phase, from 0.
     Phase(u32),
+    /// At a known time of the beat, which may lie between two phases.
+    Beat(BeatTime),
     /// At a time in seconds, on the clock of the R-peaks.
     TimeS(f64),
 }
@@ -80,6 +82,7 @@ impl Inbox {
         check_values(&new.integrals, new.width).map_err(told)?;
         match new.moment {
             Moment::Phase(phase) => check_phase(phase.into(), self.options.phases).map_err(told)?,
+            Moment::Beat(taken) => check_phase(taken.phase.into(), self.options.phases).map_err(told)?,
             Moment::TimeS(time) if !time.is_finite() => {
                 return Err(bad("time", time.to_string(), "is not a time in seconds".into()));
             }
@@ -135,6 +138,7 @@ impl Inbox {
     pub(super) fn beat_time(&self, moment: Moment) -> Option<BeatTime> {
         match (moment, &self.r_peaks) {
             (Moment::Phase(phase), _) => Some(BeatTime::at_phase(phase)),
+            (Moment::Beat(taken), _) => Some(taken),
             (Moment::TimeS(time), Some(peaks)) => peaks.beat_time(time, self.options.phases, BeatScaling::default()),
             (Moment::TimeS(_), None) => None,
         }

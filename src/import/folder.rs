@@ -1,0 +1,95 @@
+//! A folder that files appear in: which of them are whole, and new.
+
+use crate::error::{Error, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+/// What tells whether a file has changed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Version {
+    bytes: u64,
+    modified: Option<SystemTime>,
+}
+
+/// A file that was seen.
+struct Seen {
+    version: Version,
+    /// Whether it was handed out as it is.
+    told: bool,
+}
+
+/// A folder that is looked at again and again. Files in folders inside it, and hidden files, are left alone.
+pub struct Folder {
+    path: PathBuf,
+    seen: BTreeMap<PathBuf, Seen>,
+}
+
+impl Folder {
+    /// A folder that nobody has looked at yet.
+    pub fn new(path: &Path) -> Folder {
+        Folder { path: path.to_path_buf(), seen: BTreeMap::new() }
+    }
+
+    /// Files that have not changed between the last look and this one, each once as it is: by name. One that changes later is
+    /// handed out again.
+    ///
+    /// # Errors
+    /// [`Error::Io`] for a folder that cannot be read.
+    pub fn look(&mut self) -> Result<Vec<PathBuf>> {
+        let unreadable = || Error::io("read", &self.path);
+        let mut now = BTreeMap::new();
+        for entry in std::fs::read_dir(&self.path).map_err(unreadable())? {
+            let entry = entry.map_err(unreadable())?;
+            let hidden = entry.file_name().to_string_lossy().starts_with('.');
+            // One that is gone by now will be looked at when it is back.
+            let Some(meta) = std::fs::metadata(entry.path()).ok().filter(|meta| meta.is_file() && !hidden) else {
+                continue;
+            };
+            now.insert(entry.path(), Version { bytes: meta.len(), modified: meta.modified().ok() });
+        }
+        self.seen.retain(|path, _| now.contains_key(path));
+        let mut whole = Vec::new();
+        for (path, version) in now {
+            let seen = self
+                .seen
+                .entry(path.clone())
+                .or_insert(Seen { version: Version { bytes: u64::MAX, modified: None }, told: false });
+            if seen.version != version {
+                *seen = Seen { version, told: false };
+            } else if !seen.told {
+                seen.told = true;
+                whole.push(path);
+            }
+        }
+        Ok(whole)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_handed_out_once_they_rest() {
+        let directory = tempfile::tempdir().unwrap();
+        let (file, mut folder) = (directory.path().join("a.dcm"), Folder::new(directory.path()));
+        std::fs::create_dir(directory.path().join("inner")).unwrap();
+        std::fs::write(directory.path().join(".hidden"), "x").unwrap();
+        let none: [PathBuf; 0] = [];
+        assert_eq!(folder.look().unwrap(), none);
+        std::fs::write(&file, "x").unwrap();
+        assert_eq!(folder.look().unwrap(), none, "it may grow still");
+        std::fs::write(&file, "xyz").unwrap();
+        assert_eq!(folder.look().unwrap(), none, "it has grown");
+        assert_eq!(folder.look().unwrap(), std::slice::from_ref(&file));
+        assert_eq!(folder.look().unwrap(), none, "it was handed out");
+        std::fs::write(&file, "longer").unwrap();
+        assert_eq!((folder.look().unwrap(), folder.look().unwrap()), (none.to_vec(), vec![file.clone()]));
+        std::fs::remove_file(&file).unwrap();
+        assert_eq!(folder.look().unwrap(), none);
+        std::fs::write(&file, "longer").unwrap();
+        assert_eq!((folder.look().unwrap(), folder.look().unwrap()), (none.to_vec(), vec![file]));
+        assert!(matches!(Folder::new(&directory.path().join("gone")).look(), Err(Error::Io { .. })));
+    }
+}
