@@ -205,6 +205,8 @@ pub mod train {
 
 /// A model for other tools: volumes, surfaces and motion.
 pub mod export {
+    #[cfg(feature = "dicom")]
+    pub mod dicom;
     pub mod motion;
     pub mod surfaces;
     pub mod volumes;

@@ -5,6 +5,7 @@ use super::frame_rates::print_measured;
 use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::export::dicom::{self, DicomView};
 use nertca_vk::formats::images::MAX_SIDE;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
@@ -14,8 +15,9 @@ use nertca_vk::model::component::Component;
 use nertca_vk::render::baked::{BAKED_CELLS, Baked};
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::gating::{SYSTOLE_S, SYSTOLE_SHARE};
 use nertca_vk::score::pictures::{self, Window};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// `render`.
@@ -51,7 +53,8 @@ pub struct RenderArgs {
     /// 200 x 200, 512 x 512, and --size.
     #[arg(long)]
     pub fps: bool,
-    /// Output: .png, .npy (floats; all phases stacked) or .gif (all phases).
+    /// Output: .png, .npy (floats; all phases stacked), .gif (all phases) or .dcm (line integrals as an X-ray angiogram, derived
+    /// and for research only, with the detector centred).
     #[arg(short, long, value_name = "FILE", required_unless_present = "fps")]
     pub out: Option<PathBuf>,
 }
@@ -63,14 +66,9 @@ pub struct Viewpoint {
     pub height: usize,
 }
 
-/// A view of the model's C-arm, over the same field of view on more or fewer pixels.
-pub fn viewpoint(
-    model: &Model,
-    primary_deg: f64,
-    secondary_deg: f64,
-    [width, height]: [usize; 2],
-) -> Result<Viewpoint> {
-    let c_arm = CArm {
+/// The model's C-arm, turned, over the same field of view on more or fewer pixels.
+fn turned(model: &Model, primary_deg: f64, secondary_deg: f64, [width, height]: [usize; 2]) -> CArm {
+    CArm {
         primary_deg,
         secondary_deg,
         pixel_mm: [
@@ -78,7 +76,17 @@ pub fn viewpoint(
             model.c_arm.pixel_mm[1] * model.image_size[1] as f64 / height as f64,
         ],
         ..model.c_arm.clone()
-    };
+    }
+}
+
+/// A view of the model's C-arm, over the same field of view on more or fewer pixels.
+pub fn viewpoint(
+    model: &Model,
+    primary_deg: f64,
+    secondary_deg: f64,
+    [width, height]: [usize; 2],
+) -> Result<Viewpoint> {
+    let c_arm = turned(model, primary_deg, secondary_deg, [width, height]);
     let rays =
         Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| Error::config(field, "", problem))?;
     Ok(Viewpoint { rays, width, height })
@@ -112,6 +120,28 @@ impl Renders {
 const PHASE_MS: u32 = 90;
 const LEAST_MS: u32 = 20;
 
+/// Writes frames as an angiogram of a heart of 68 beats per minute: how fast it really beat is not kept.
+fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoint, frames: &[Vec<f32>]) -> Result<()> {
+    let size = [viewpoint.width, viewpoint.height];
+    let beat_frames = model.param_map.phases as u32 * (args.between + 1);
+    let mut seeds = [[0u8; 16]; 3];
+    for seed in &mut seeds {
+        getrandom::fill(seed).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
+    }
+    let shown = args.component.name();
+    let description =
+        format!("Reconstruction of {} iterations rendered: {shown} attenuation, phase {}", model.step, args.phase);
+    let view = DicomView {
+        c_arm: &turned(model, args.primary, args.secondary, size),
+        size,
+        frames,
+        frame_ms: 1e3 * SYSTOLE_S / SYSTOLE_SHARE / f64::from(beat_frames),
+        description: &description,
+        seeds: seeds.map(u128::from_le_bytes),
+    };
+    dicom::write(out, &view)
+}
+
 /// The moments of the beat that `--phase` and `--between` name.
 fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
     let n_phases = model.param_map.phases as u32;
@@ -132,19 +162,30 @@ fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
 
 /// Renders a run.
 pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
-    let model = newest_model(&args.run)?;
+    let mut model = newest_model(&args.run)?;
     let size = args.size.map_or(model.image_size, |n| [n, n]);
     if !(1..=MAX_SIDE).contains(&size[0]) {
         return Err(Error::config("--size", size[0], format!("1 to {} is accepted", MAX_SIDE)));
     }
     let Some(out) = &args.out else { return print_measured(cli, args, &model) };
     let extension = out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
-    if !["png", "npy", "gif"].contains(&extension.as_str()) {
-        return Err(Error::config("--out", out.display(), "ends in none of .png .npy .gif"));
+    if !["png", "npy", "gif", "dcm"].contains(&extension.as_str()) {
+        return Err(Error::config("--out", out.display(), "ends in none of .png .npy .gif .dcm"));
+    }
+    if extension == "dcm" && args.projection != Projection::Drr {
+        return Err(Error::config(
+            "--projection",
+            args.projection.name(),
+            "an angiogram (.dcm) has line integrals: `drr`",
+        ));
     }
     let phases = moments(args, &model)?;
     if extension == "png" && phases.len() > 1 {
         return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
+    }
+    if extension == "dcm" {
+        // A file can say neither where the detector's middle is nor where the table stands.
+        (model.c_arm.offset_mm, model.c_arm.table_mm) = ([0.0; 2], [0.0; 3]);
     }
     let viewpoint = viewpoint(&model, args.primary, args.secondary, size)?;
     let (width, height) = (viewpoint.width, viewpoint.height);
@@ -167,6 +208,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
             let ms = (PHASE_MS / (args.between + 1)).max(LEAST_MS);
             pictures::write_gif(out, &frames, width, window, ms)?;
         }
+        "dcm" => write_dicom(args, out, &model, &viewpoint, &frames)?,
         _ => pictures::write_grey(out, &frames[0], width, window)?,
     }
     drop(renders);

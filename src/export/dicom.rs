@@ -1,0 +1,192 @@
+//! Rendered views as DICOM: X-ray angiograms (XA Image Storage) that say they are derived, and not for diagnosis.
+//!
+//! Values are those of a detector that is linear in intensity: 65535 exp(-integral), so that readers that know what LIN means get
+//! the line integrals back. Source runs are not referred to: no UID of theirs reaches a dataset.
+
+use crate::error::{Error, Result};
+use crate::files;
+use crate::geometry::CArm;
+use dicom_core::{DataElement, PrimitiveValue, Tag, VR};
+use dicom_dictionary_std::{tags, uids};
+use dicom_object::{FileMetaTableBuilder, InMemDicomObject};
+use std::path::Path;
+
+/// Value of a pixel through which nothing is absorbed.
+const WHITE: f64 = 65535.0;
+const EXPLICIT_LITTLE_ENDIAN: &str = "1.2.840.10008.1.2.1";
+/// What viewers show beside the picture, wherever they show text of the file.
+const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
+/// Characters of a decimal string at most.
+const DECIMAL_CHARACTERS: usize = 16;
+/// Pixel data of explicit length end here.
+const MOST_BYTES: usize = u32::MAX as usize - 1;
+
+/// A view over some moments of a beat.
+#[derive(Debug, Clone)]
+pub struct DicomView<'a> {
+    /// How it is seen; the detector is centred and the patient at the isocentre, since nothing in the file could say otherwise.
+    pub c_arm: &'a CArm,
+    /// Columns and rows.
+    pub size: [usize; 2],
+    /// Line integrals of each frame, rows first.
+    pub frames: &'a [Vec<f32>],
+    /// Time between frames, ms.
+    pub frame_ms: f64,
+    /// What is shown, in a few words.
+    pub description: &'a str,
+    /// Random numbers that make the UIDs of study, series and image new.
+    pub seeds: [u128; 3],
+}
+
+/// A number as text of a length that DICOM accepts, as exact as that allows.
+fn decimal(value: f64) -> String {
+    let texts = (0..=DECIMAL_CHARACTERS).rev().map(|digits| format!("{value:.digits$}"));
+    let fits = texts.filter(|text| text.len() <= DECIMAL_CHARACTERS).map(|text| match text.contains('.') {
+        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
+        false => text,
+    });
+    fits.into_iter().next().unwrap_or_else(|| format!("{value:.8e}"))
+}
+
+/// Writes a view.
+///
+/// # Errors
+/// [`Error::Config`] for frames that no file holds; [`Error::Io`].
+pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
+    let [width, height] = view.size;
+    let (columns, rows) = (u16::try_from(width), u16::try_from(height));
+    let (Ok(columns), Ok(rows)) = (columns, rows) else {
+        return Err(Error::config("size", format!("{width} x {height}"), "sides of 1 to 65535 pixels are accepted"));
+    };
+    if view.frames.is_empty() || view.frames.len() * width * height * 2 > MOST_BYTES {
+        return Err(Error::config("frames", view.frames.len(), "the pixels of 1 frame to 4 GiB are accepted"));
+    }
+    let mut object = InMemDicomObject::new_empty();
+    describe(&mut object, view);
+    geometry(&mut object, view);
+    pixels(&mut object, view, [columns, rows]);
+    let failed = |e: &dyn std::error::Error| Error::Internal(format!("DICOM: {e}"));
+    let meta = FileMetaTableBuilder::new().transfer_syntax(EXPLICIT_LITTLE_ENDIAN);
+    let file = object.with_meta(meta).map_err(|e| failed(&e))?;
+    let mut bytes = Vec::new();
+    file.write_all(&mut bytes).map_err(|e| failed(&e))?;
+    files::write_atomic(path, &bytes)
+}
+
+fn text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str) {
+    object.put(DataElement::new(tag, vr, PrimitiveValue::from(value)));
+}
+
+/// Attributes that must be there, and of which nothing is known.
+fn unknown(object: &mut InMemDicomObject, tag: Tag, vr: VR) {
+    object.put(DataElement::new(tag, vr, PrimitiveValue::Empty));
+}
+
+/// What the object is, of whom, and made by what.
+fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
+    for (tag, vr) in [
+        (tags::PATIENT_BIRTH_DATE, VR::DA),
+        (tags::PATIENT_SEX, VR::CS),
+        (tags::STUDY_DATE, VR::DA),
+        (tags::STUDY_TIME, VR::TM),
+        (tags::REFERRING_PHYSICIAN_NAME, VR::PN),
+        (tags::STUDY_ID, VR::SH),
+        (tags::ACCESSION_NUMBER, VR::SH),
+        (tags::PATIENT_ORIENTATION, VR::CS),
+        (tags::KVP, VR::DS),
+        (tags::X_RAY_TUBE_CURRENT, VR::IS),
+        (tags::EXPOSURE_TIME, VR::IS),
+    ] {
+        unknown(object, tag, vr);
+    }
+    let [study, series, image] = view.seeds.map(|seed| format!("2.25.{seed}"));
+    for (tag, vr, value) in [
+        (tags::SPECIFIC_CHARACTER_SET, VR::CS, "ISO_IR 192"),
+        (tags::SOP_CLASS_UID, VR::UI, uids::X_RAY_ANGIOGRAPHIC_IMAGE_STORAGE),
+        (tags::SOP_INSTANCE_UID, VR::UI, &image),
+        (tags::STUDY_INSTANCE_UID, VR::UI, &study),
+        (tags::SERIES_INSTANCE_UID, VR::UI, &series),
+        (tags::IMAGE_TYPE, VR::CS, "DERIVED\\SECONDARY\\SINGLE PLANE"),
+        (tags::MODALITY, VR::CS, "XA"),
+        (tags::PATIENT_NAME, VR::PN, "RESEARCH^RECONSTRUCTION"),
+        (tags::PATIENT_ID, VR::LO, "RESEARCH"),
+        (tags::STUDY_DESCRIPTION, VR::LO, LABEL),
+        (tags::SERIES_DESCRIPTION, VR::LO, LABEL),
+        (tags::SERIES_NUMBER, VR::IS, "1"),
+        (tags::INSTANCE_NUMBER, VR::IS, "1"),
+        (tags::IMAGE_COMMENTS, VR::LT, LABEL),
+        (tags::DERIVATION_DESCRIPTION, VR::ST, &format!("{LABEL}. {}", view.description)),
+        (tags::MANUFACTURER, VR::LO, "nertca-vk"),
+        (tags::MANUFACTURER_MODEL_NAME, VR::LO, "nertca-vk"),
+        (tags::SOFTWARE_VERSIONS, VR::LO, env!("CARGO_PKG_VERSION")),
+        (tags::RADIATION_SETTING, VR::CS, "GR"),
+        (tags::BURNED_IN_ANNOTATION, VR::CS, "NO"),
+        (tags::LOSSY_IMAGE_COMPRESSION, VR::CS, "00"),
+        (tags::PATIENT_POSITION, VR::CS, "HFS"),
+    ] {
+        text(object, tag, vr, value);
+    }
+}
+
+/// How the view is seen.
+fn geometry(object: &mut InMemDicomObject, view: &DicomView<'_>) {
+    let c_arm = view.c_arm;
+    text(object, tags::POSITIONER_MOTION, VR::CS, "STATIC");
+    for (tag, value) in [
+        (tags::POSITIONER_PRIMARY_ANGLE, c_arm.primary_deg),
+        (tags::POSITIONER_SECONDARY_ANGLE, c_arm.secondary_deg),
+        (tags::DISTANCE_SOURCE_TO_DETECTOR, c_arm.sid_mm),
+        (tags::DISTANCE_SOURCE_TO_PATIENT, c_arm.sod_mm),
+        (tags::ESTIMATED_RADIOGRAPHIC_MAGNIFICATION_FACTOR, c_arm.sid_mm / c_arm.sod_mm),
+    ] {
+        text(object, tag, VR::DS, &decimal(value));
+    }
+    // DICOM gives rows first.
+    let [across, down] = c_arm.pixel_mm.map(decimal);
+    text(object, tags::IMAGER_PIXEL_SPACING, VR::DS, &format!("{down}\\{across}"));
+}
+
+fn pixels(object: &mut InMemDicomObject, view: &DicomView<'_>, [columns, rows]: [u16; 2]) {
+    for (tag, value) in [
+        (tags::SAMPLES_PER_PIXEL, 1),
+        (tags::ROWS, rows),
+        (tags::COLUMNS, columns),
+        (tags::BITS_ALLOCATED, 16),
+        (tags::BITS_STORED, 16),
+        (tags::HIGH_BIT, 15),
+        (tags::PIXEL_REPRESENTATION, 0),
+    ] {
+        object.put(DataElement::new(tag, VR::US, PrimitiveValue::from(value)));
+    }
+    let codes: Vec<u16> =
+        view.frames.iter().flatten().map(|v| (WHITE * (-f64::from(*v)).exp()).round() as u16).collect();
+    let (least, most) = codes.iter().fold((u16::MAX, 0), |(least, most), code| (least.min(*code), most.max(*code)));
+    let (least, most) = (f64::from(least), f64::from(most));
+    for (tag, vr, value) in [
+        (tags::PHOTOMETRIC_INTERPRETATION, VR::CS, "MONOCHROME2"),
+        (tags::PIXEL_INTENSITY_RELATIONSHIP, VR::CS, "LIN"),
+        (tags::NUMBER_OF_FRAMES, VR::IS, &view.frames.len().to_string()),
+        (tags::FRAME_TIME, VR::DS, &decimal(view.frame_ms)),
+        (tags::WINDOW_CENTER, VR::DS, &decimal(0.5 * (least + most))),
+        (tags::WINDOW_WIDTH, VR::DS, &decimal((most - least).max(1.0))),
+    ] {
+        text(object, tag, vr, value);
+    }
+    object.put(DataElement::new(tags::FRAME_INCREMENT_POINTER, VR::AT, PrimitiveValue::from(tags::FRAME_TIME)));
+    object.put(DataElement::new(tags::PIXEL_DATA, VR::OW, PrimitiveValue::U16(codes.into())));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_fit_what_dicom_accepts() {
+        for value in [0.0, -12.5, 1.0 / 3.0, -1_234.567_890_123, 2500.0, 1e-9] {
+            let text = decimal(value);
+            assert!(text.len() <= DECIMAL_CHARACTERS, "{text}");
+            assert!((text.parse::<f64>().unwrap() - value).abs() < 1e-9 * value.abs().max(1.0), "{text}");
+        }
+        assert_eq!([0.0, 30.0, -12.5].map(decimal), ["0", "30", "-12.5"]);
+    }
+}
