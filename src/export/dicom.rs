@@ -41,11 +41,11 @@ pub struct DicomView<'a> {
 /// A number as text of a length that DICOM accepts, as exact as that allows.
 fn decimal(value: f64) -> String {
     let texts = (0..=DECIMAL_CHARACTERS).rev().map(|digits| format!("{value:.digits$}"));
-    let fits = texts.filter(|text| text.len() <= DECIMAL_CHARACTERS).map(|text| match text.contains('.') {
+    let mut fits = texts.filter(|text| text.len() <= DECIMAL_CHARACTERS).map(|text| match text.contains('.') {
         true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
         false => text,
     });
-    fits.into_iter().next().unwrap_or_else(|| format!("{value:.8e}"))
+    fits.next().unwrap_or_else(|| format!("{value:.8e}"))
 }
 
 /// Writes a view.
@@ -60,6 +60,11 @@ pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
     };
     if view.frames.is_empty() || view.frames.len() * width * height * 2 > MOST_BYTES {
         return Err(Error::config("frames", view.frames.len(), "the pixels of 1 frame to 4 GiB are accepted"));
+    }
+    let secondary_deg = view.c_arm.secondary_deg;
+    if secondary_deg.abs() > 90.0 {
+        let problem = "DICOM has angles of -90 to 90 deg here: turn the primary angle by 180 deg instead";
+        return Err(Error::config("secondary angle", secondary_deg, problem));
     }
     let mut object = InMemDicomObject::new_empty();
     describe(&mut object, view);
@@ -99,7 +104,7 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     ] {
         unknown(object, tag, vr);
     }
-    let [study, series, image] = view.seeds.map(|seed| format!("2.25.{seed}"));
+    let [study, series, image] = view.seeds.map(uid);
     for (tag, vr, value) in [
         (tags::SPECIFIC_CHARACTER_SET, VR::CS, "ISO_IR 192"),
         (tags::SOP_CLASS_UID, VR::UI, uids::X_RAY_ANGIOGRAPHIC_IMAGE_STORAGE),
@@ -128,12 +133,24 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     }
 }
 
+/// An angle from -180 to below 180 deg.
+fn half_turn_deg(angle_deg: f64) -> f64 {
+    (angle_deg + 180.0).rem_euclid(360.0) - 180.0
+}
+
+/// A new UID: a random UUID (version 4, RFC 9562) as a number, PS3.5 B.2.
+fn uid(random: u128) -> String {
+    let version = 0xf_u128 << 76;
+    let variant = 0b11_u128 << 62;
+    format!("2.25.{}", random & !version & !variant | 4 << 76 | 0b10 << 62)
+}
+
 /// How the view is seen.
 fn geometry(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     let c_arm = view.c_arm;
     text(object, tags::POSITIONER_MOTION, VR::CS, "STATIC");
     for (tag, value) in [
-        (tags::POSITIONER_PRIMARY_ANGLE, c_arm.primary_deg),
+        (tags::POSITIONER_PRIMARY_ANGLE, half_turn_deg(c_arm.primary_deg)),
         (tags::POSITIONER_SECONDARY_ANGLE, c_arm.secondary_deg),
         (tags::DISTANCE_SOURCE_TO_DETECTOR, c_arm.sid_mm),
         (tags::DISTANCE_SOURCE_TO_PATIENT, c_arm.sod_mm),
@@ -188,5 +205,19 @@ mod tests {
             assert!((text.parse::<f64>().unwrap() - value).abs() < 1e-9 * value.abs().max(1.0), "{text}");
         }
         assert_eq!([0.0, 30.0, -12.5].map(decimal), ["0", "30", "-12.5"]);
+    }
+
+    #[test]
+    fn angles_are_those_that_dicom_has() {
+        assert_eq!([0.0, -90.0, 180.0, 270.0, -200.0].map(half_turn_deg), [0.0, -90.0, -180.0, -90.0, 160.0]);
+    }
+
+    #[test]
+    fn a_uid_is_a_uuid() {
+        for random in [0, u128::MAX, 0x0123_4567_89ab_cdef_0123_4567_89ab_cdef] {
+            let text = uid(random);
+            let hex = format!("{:032x}", text.strip_prefix("2.25.").unwrap().parse::<u128>().unwrap());
+            assert!(text.len() <= 64 && hex.as_bytes()[12] == b'4' && b"89ab".contains(&hex.as_bytes()[16]), "{hex}");
+        }
     }
 }
