@@ -197,7 +197,11 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
 /// What is said of frames that were taken between two phases; `continuous` says that the moving field knows what is there.
 fn between_phases(dataset: &Dataset, continuous: bool) -> Option<String> {
     let n = dataset.training().iter().filter(|f| f.after_phase != 0.0).count();
-    let fate = if continuous { "are fitted at their own time" } else { "count as taken at the nearest phase" };
+    let fate = if continuous {
+        "are fitted at their own time (the mean of those that share a phase and a view)"
+    } else {
+        "count as taken at the nearest phase"
+    };
     (n > 0).then(|| format!("{n} of {} frames were taken between two phases and {fate}", dataset.training().len()))
 }
 

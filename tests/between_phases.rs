@@ -3,10 +3,16 @@
 
 mod common;
 
+use common::{gpu, tuning};
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::gaussians::pictures::Pictures;
 use nertca_vk::plan::Plan;
+use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout, Split};
+use nertca_vk::scan::gating::BeatTime;
 use nertca_vk::scan::writer;
+use nertca_vk::selftest::blobs;
+use nertca_vk::selftest::problems::drawn_fields;
 use serde_json::Value;
 use std::path::Path;
 
@@ -68,4 +74,33 @@ fn a_moving_tree_is_fitted_to_frames_at_their_own_time() {
         let plan = planned(form);
         assert!(told(&plan, "count as taken at the nearest phase"), "{form}: {:?}", plan.notes);
     }
+}
+
+#[test]
+fn pictures_and_views_show_the_field_at_their_time() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(37, 29);
+    let rays = &dataset.views[1].rays;
+    let far = |a: &[f32], b: &[f32]| {
+        let most = b.iter().fold(1e-9f32, |m, v| m.max(*v));
+        a.iter().zip(b).map(|(a, b)| (a - b).abs() / most).fold(0.0, f32::max)
+    };
+    let [sets, tree] = drawn_fields();
+    for (field, moves) in [(sets, false), (tree, true)] {
+        let pictures = Pictures::new(&gpu, &field).unwrap();
+        let model = blobs::model(&gpu, &dataset, field, &tuning(&gpu)).unwrap();
+        let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
+        let view = |phase: u32, after_phase: f64| {
+            let taken = BeatTime { phase, after_phase };
+            renderer.render_taken(rays, 37, 29, taken).unwrap().dynamic_integral
+        };
+        for (phase, after_phase, time) in [(1, 0.4, 1.4), (0, -0.3, 2.7), (2, 0.0, 2.0)] {
+            let wanted = view(phase, after_phase);
+            let drawn = pictures.draw_at(rays, (37, 29), time).unwrap();
+            assert!(far(&drawn, &wanted) < 0.03, "phase {time}: {}", far(&drawn, &wanted));
+            let elsewhere = far(&wanted, &view(phase, 0.0));
+            assert_eq!(elsewhere > 0.05, moves && after_phase != 0.0, "phase {time}: {elsewhere} from the whole phase");
+        }
+    }
+    common::expect_silence(gpu);
 }

@@ -12,6 +12,7 @@ use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
 use nertca_vk::capi::types::*;
+use nertca_vk::scan::gating::{SYSTOLE_S, SYSTOLE_SHARE};
 use std::ffi::{CString, c_char, c_void};
 use std::ptr::{null, null_mut};
 use std::sync::atomic::{AtomicI64, AtomicU32, Ordering};
@@ -328,8 +329,14 @@ fn time_stamps_and_r_peaks_give_phases() {
     for view in 0..3 {
         for phase in 0..PHASES {
             let pixels = pixels(view, phase);
-            // Views are taken at different beats: 0.8 s long, the second R-peak at 1.0 s.
-            let time_s = 0.2 + 0.8 * view as f64 + 0.8 * (f64::from(phase) + 0.5) / f64::from(PHASES);
+            // In the middle of the phase, and of different beats: 0.8 s long, the second R-peak at 1.0 s.
+            let share = (f64::from(phase) + 0.5) / f64::from(PHASES);
+            let since_r_s = if share < SYSTOLE_SHARE {
+                SYSTOLE_S * share / SYSTOLE_SHARE
+            } else {
+                SYSTOLE_S + (0.8 - SYSTOLE_S) * (share - SYSTOLE_SHARE) / (1.0 - SYSTOLE_SHARE)
+            };
+            let time_s = 0.2 + 0.8 * view as f64 + since_r_s;
             let frame = nertca_frame { phase: -1, time_s, ..frame(view, phase, &pixels) };
             ok(unsafe { nertca_reconstruction_add_frame(stamped, &frame) }, stamped);
         }
@@ -342,7 +349,7 @@ fn time_stamps_and_r_peaks_give_phases() {
     let given = reconstruction(context, SMALL);
     add_frames(given, 0..3);
     train(given, 3);
-    assert_eq!(bytes_of(stamped), bytes_of(given));
+    assert!(bytes_of(stamped) == bytes_of(given), "the same frames by time and by phase");
     close(context, &[stamped, given]);
 }
 

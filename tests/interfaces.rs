@@ -307,7 +307,7 @@ fn malformed_datasets_are_named_file_and_field() {
         ("three axes", |d, _| npy::write(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(), &["1.npy", "two axes"]),
         ("not a number", |d, _| npy::write(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(), &["1.npy", "row 0"]),
         ("phase", |_, m| m["frames"][1]["phase"] = json!(2), &["dataset.json", "frames[1].phase"]),
-        ("negative phase", |_, m| m["frames"][1]["phase"] = json!(-1), &["dataset.json", "line"]),
+        ("negative phase", |_, m| m["frames"][1]["phase"] = json!(-1), &["dataset.json", "frames[1].phase"]),
         ("no frames", |_, m| m["frames"] = json!([]), &["dataset.json", "frames"]),
         (
             "no training",

@@ -58,8 +58,11 @@ fn place(i: usize, phase: f64) -> DVec3 {
     let (before, share) = (phase as usize % PHASES, phase.fract());
     let x = rest(i);
     let moved = (1.0 - share) * displacement(x, before) + share * displacement(x, (before + 1) % PHASES);
-    let angle = std::f64::consts::TAU * phase / PHASES as f64;
-    x + moved + (angle.cos() - 1.0) * own(i)[0] + angle.sin() * own(i)[1]
+    let own_at = |phase: usize| {
+        let angle = std::f64::consts::TAU * phase as f64 / PHASES as f64;
+        (angle.cos() - 1.0) * own(i)[0] + angle.sin() * own(i)[1]
+    };
+    x + moved + own_at(before).lerp(own_at(before + 1), share)
 }
 
 fn tree() -> MovingTree {

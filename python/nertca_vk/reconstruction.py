@@ -215,7 +215,8 @@ class Reconstruction:
             return self._frames - 1
 
     def set_r_peaks(self, times_s: "Union[Sequence[float], npt.NDArray[np.float64]]") -> None:
-        """Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them.
+        """Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them, and where one
+        set of Gaussians moves they are fitted at their own time within it.
 
         Replaces those given earlier, so that a growing list can be given again and again.
         """

@@ -9,6 +9,8 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::import::angiograms::import_dicom;
 use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
+use nertca_vk::phantom::degradations::Degradations;
+use nertca_vk::scan::dataset::Layout;
 use std::path::PathBuf;
 
 /// `import`.
@@ -53,6 +55,13 @@ pub fn bar() -> impl FnMut(&str, u64, u64) {
     }
 }
 
+/// Tells what the authors' layout cannot say of times.
+fn tell_of_times(layout: Layout, degradations: &Degradations) {
+    if layout == Layout::Nerfca && degradations.rhythm.is_some() {
+        eprintln!("this layout numbers phases: frames between two get the nearest");
+    }
+}
+
 /// Makes a phantom.
 pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
     if args.tree.is_none() && !args.c_arm.is_default() {
@@ -76,6 +85,7 @@ pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
         }),
         volumes: !args.no_volumes,
     };
+    tell_of_times(options.layout, &options.degradations);
     make(&gpu, &options, &args.out, bar())?;
     out!("{}", args.out.display());
     cli.close_device(&gpu)
@@ -102,6 +112,7 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
         degradations: args.degradations.degradations(false),
         layout: args.layout,
     };
+    tell_of_times(options.layout, &options.degradations);
     project_volumes(&gpu, &options, &args.out, bar())?;
     out!("{}", args.out.display());
     cli.close_device(&gpu)

@@ -156,6 +156,10 @@ fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: b
 /// Converts a dataset between layouts.
 pub fn convert(args: &ConvertArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
+    let between = dataset.frames.iter().filter(|frame| frame.after_phase != 0.0).count();
+    if args.layout == Layout::Nerfca && between > 0 {
+        eprintln!("{between} frames lie between two phases; this layout numbers phases, and gives them the nearest");
+    }
     nertca_vk::scan::writer::convert(&dataset, args.layout, &args.out)?;
     out!("{}", args.out.display());
     Ok(())

@@ -79,12 +79,14 @@ impl TreeSection {
 /// A training view: its angiograms, and how patient points are seen in each.
 fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
     let mut frames: Vec<&Frame> = dataset.training().iter().filter(|frame| frame.view == view).collect();
-    frames.sort_by_key(|frame| frame.phase);
+    // A thousandth of a phase, so that captions are short.
+    let phases = |frame: &Frame| (1e3 * frame.beat_time().phases(dataset.n_phases)).round() / 1e3;
+    frames.sort_by(|a, b| phases(a).total_cmp(&phases(b)));
     let window = Window::of(&frames.iter().flat_map(|frame| frame.integrals.iter().copied()).collect::<Vec<_>>());
     let frame = |frame: &Frame| -> Result<Value> {
         let png = png::grey8(dataset.width, dataset.height, &window.codes(&frame.integrals))?;
         Ok(json!({
-            "phase": frame.phase,
+            "phase": phases(frame),
             "projection": dataset.heart_rays(frame).projection(),
             "picture": format!("data:image/png;base64,{}", STANDARD.encode(png)),
         }))

@@ -19,8 +19,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// Pictures kept recorded; a display in use has far fewer.
 const MOST_RECORDED: usize = 256;
 
-/// Columns, rows, phase.
-type Key = (usize, usize, u32);
+/// What a recorded picture is of.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+struct Key {
+    columns: usize,
+    rows: usize,
+    /// Bits of the time in phases.
+    time: u64,
+}
 
 /// Draws line integrals of a moving field that is made of Gaussians.
 pub struct Pictures {
@@ -88,8 +94,16 @@ impl Pictures {
     ///
     /// # Errors
     /// Device errors.
-    pub fn draw(&self, rays: &ViewRays, (width, height): (usize, usize), phase: u32) -> Result<Vec<f32>> {
-        let (units, picture) = self.picture((width, height, phase))?;
+    pub fn draw(&self, rays: &ViewRays, size: (usize, usize), phase: u32) -> Result<Vec<f32>> {
+        self.draw_at(rays, size, f64::from(phase))
+    }
+
+    /// The same at a time counted in phases; at the nearest phase where each has a set of its own.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn draw_at(&self, rays: &ViewRays, (width, height): (usize, usize), phases: f64) -> Result<Vec<f32>> {
+        let (units, picture) = self.picture(Key { columns: width, rows: height, time: phases.to_bits() })?;
         let _alone = picture.in_use.lock().unwrap_or_else(PoisonError::into_inner);
         picture.buffers.gaussian_views.write(&[SplatView::new(rays, units).to_device()])?;
         self.gpu.wait(picture.commands.submit()?)?;
@@ -113,9 +127,10 @@ impl Pictures {
         Ok((units, picture))
     }
 
-    fn record(&self, field: &MovingGaussians, (width, height, phase): Key) -> Result<Picture> {
+    fn record(&self, field: &MovingGaussians, key: Key) -> Result<Picture> {
         let (gpu, sets) = (&self.gpu, field.rows());
-        let rows = field.at(phase as usize);
+        let (width, height) = (key.columns, key.rows);
+        let rows = field.at_time(f64::from_bits(key.time));
         let n = rows.len() as u32;
         let pixels = (width * height) as u32;
         let setup = GaussianSetup {

@@ -170,9 +170,14 @@ impl MovingGaussians {
 
     /// Gaussians at a phase, from 0.
     pub fn at(&self, phase: usize) -> Vec<Gaussian> {
+        self.at_time(phase as f64)
+    }
+
+    /// Gaussians at a time counted in phases; those of the nearest phase where each has a set of its own.
+    pub fn at_time(&self, phases: f64) -> Vec<Gaussian> {
         match self {
-            MovingGaussians::PerPhase(sets) => sets.at(phase).copied().collect(),
-            MovingGaussians::Tree(tree) => tree.at(phase as f64),
+            MovingGaussians::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
+            MovingGaussians::Tree(tree) => tree.at(phases),
         }
     }
 

@@ -4,6 +4,7 @@ use crate::calibrate::gauge::RigidMotion;
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::scan::dataset::{Dataset, Frame, Split};
+use crate::scan::gating::BeatTime;
 use crate::scan::truth::{TRUTH, Truth};
 use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
 use crate::score::nearest::{Lines, Place};
@@ -104,8 +105,8 @@ pub fn score(
     let phases = beat.phases.par_iter().map(|tree| -> Result<PhaseTreeScores> {
         let now = true_at(tree.phase);
         let mut scores = agreement(tree, &now);
-        scores.reprojection_training_mm = images.reprojection_mm(tree, Split::Train, &truth)?;
-        scores.reprojection_unseen_mm = images.reprojection_mm(tree, Split::Validation, &truth)?;
+        scores.reprojection_training_mm = images.reprojection_mm(beat, tree, Split::Train, &truth)?;
+        scores.reprojection_unseen_mm = images.reprojection_mm(beat, tree, Split::Validation, &truth)?;
         // The reference phase has no motion by definition, and would only flatter the mean.
         let first = first.filter(|first| first.phase != tree.phase);
         scores.motion_error_mm = first.and_then(|first| motion_error_mm([first, tree], [&rest, &now]));
@@ -175,6 +176,17 @@ fn finely(lines: &[&[DVec3]]) -> Vec<(Place, f64)> {
 
 fn ours(tree: &PhaseTree) -> Vec<&[DVec3]> {
     tree.branches.iter().map(|branch| &branch.points_mm[..]).collect()
+}
+
+/// Our lines as an image shows them that was taken near the phase of `tree`: where points are followed, on the straight way to the
+/// phase beyond.
+fn shown(beat: &BeatTree, tree: &PhaseTree, taken: BeatTime, n_phases: u32) -> Vec<Vec<DVec3>> {
+    let step = if taken.after_phase < 0.0 { n_phases - 1 } else { 1 };
+    let beyond =
+        beat.phases.iter().find(|t| beat.reference_phase.is_some() && t.phase == (tree.phase + step) % n_phases);
+    let (here, there, share) = (ours(tree), beyond.map_or_else(|| ours(tree), ours), taken.after_phase.abs());
+    let between = |(a, b): (&[DVec3], &[DVec3])| a.iter().zip(b).map(|(a, b)| a.lerp(*b, share)).collect();
+    here.into_iter().zip(there).map(between).collect()
 }
 
 fn true_points(lines: &[TrueLine]) -> Vec<&[DVec3]> {
@@ -249,7 +261,11 @@ impl Images<'_> {
     fn image(&self, frame: &Frame) -> Result<Option<Image>> {
         let rays = self.dataset.heart_rays(frame);
         let Some(truth) = &self.truth else {
-            return Ok(Some(Image { true_rays: rays.clone(), rays, moment: f64::from(frame.phase) }));
+            return Ok(Some(Image {
+                true_rays: rays.clone(),
+                rays,
+                moment: frame.beat_time().phases(self.dataset.n_phases),
+            }));
         };
         let Some(was) = truth.of(frame) else { return Ok(None) };
         let true_rays = true_rays(was, self.dataset)?.moved(shift_of(was));
@@ -259,6 +275,7 @@ impl Images<'_> {
     /// Mean over the images of a phase; none without any.
     fn reprojection_mm(
         &self,
+        beat: &BeatTree,
         tree: &PhaseTree,
         split: Split,
         truth: impl Fn(f64) -> Vec<TrueLine>,
@@ -275,7 +292,8 @@ impl Images<'_> {
             };
             let lines =
                 |rays: &ViewRays, all: &[&[DVec3]]| all.iter().filter_map(|l| seen(rays, l)).collect::<Vec<_>>();
-            let our_lines = lines(&image.rays, &ours(tree));
+            let ours = shown(beat, tree, frame.beat_time(), self.dataset.n_phases);
+            let our_lines = lines(&image.rays, &ours.iter().map(|line| &line[..]).collect::<Vec<_>>());
             let true_lines = lines(&image.true_rays, &true_points(&truth(image.moment)));
             let (our_lines, true_lines): (Vec<&[DVec3]>, Vec<&[DVec3]>) =
                 (our_lines.iter().map(|l| &l[..]).collect(), true_lines.iter().map(|l| &l[..]).collect());
@@ -287,5 +305,32 @@ impl Images<'_> {
         };
         let errors_mm = frames.filter_map(|frame| error_mm(frame).transpose()).collect::<Result<Vec<f64>>>()?;
         Ok(mean(errors_mm.into_iter()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::trees::tree::Branch;
+
+    fn beat(reference_phase: Option<u32>) -> BeatTree {
+        let line = |phase: u32| (0..3).map(|i| DVec3::new(f64::from(i), f64::from(phase * phase), 0.0)).collect();
+        let branch = |phase| Branch { parent: None, points_mm: line(phase), radius_mm: vec![1.0; 3] };
+        let phases = (0..4).map(|phase| PhaseTree { phase, branches: vec![branch(phase)] }).collect();
+        BeatTree { reference_phase, threshold_per_mm: 0.1, resolution_mm: 1.0, spacing_mm: 1.0, phases }
+    }
+
+    #[test]
+    fn images_between_two_phases_show_what_is_between() {
+        let height = |beat: &BeatTree, phase: u32, after_phase: f64| {
+            let taken = BeatTime { phase, after_phase };
+            shown(beat, &beat.phases[phase as usize], taken, 4)[0][1].y
+        };
+        let followed = beat(Some(0));
+        assert_eq!(height(&followed, 2, 0.0), 4.0);
+        assert_eq!(height(&followed, 2, 0.4), 4.0 + 0.4 * 5.0);
+        assert_eq!(height(&followed, 2, -0.5), 2.5);
+        assert_eq!((height(&followed, 3, 0.25), height(&followed, 0, -0.25)), (6.75, 2.25), "the beat closes");
+        assert_eq!(height(&beat(None), 2, 0.4), 4.0, "nothing joins phases that have trees of their own");
     }
 }

@@ -82,6 +82,9 @@ impl Inbox {
         check_values(&new.integrals, new.width).map_err(told)?;
         match new.moment {
             Moment::Phase(phase) => check_phase(phase.into(), self.options.phases).map_err(told)?,
+            Moment::Beat(BeatTime { after_phase, .. }) if !(-0.5..=0.5).contains(&after_phase) => {
+                return Err(bad("time", after_phase.to_string(), "phases after the nearest phase: -0.5 to 0.5".into()));
+            }
             Moment::Beat(taken) => check_phase(taken.phase.into(), self.options.phases).map_err(told)?,
             Moment::TimeS(time) if !time.is_finite() => {
                 return Err(bad("time", time.to_string(), "is not a time in seconds".into()));

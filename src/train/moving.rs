@@ -136,8 +136,8 @@ pub(super) struct Moving {
     /// Until its iterations are done; the still field begins then.
     fit: Option<MovingFit>,
     feed: MovingFeed,
-    /// Where each training image was taken, and its phase.
-    shots: Vec<(ViewRays, u32)>,
+    /// Where each training image was taken, and when: counted in phases.
+    shots: Vec<(ViewRays, f64)>,
 }
 
 impl Moving {
@@ -155,7 +155,7 @@ impl Moving {
         per_submit: u32,
     ) -> Result<Option<Moving>> {
         let Some(targets) = plan.targets.take() else { return Ok(None) };
-        let shot = |frame: &Frame| (dataset.heart_rays(frame), frame.phase);
+        let shot = |frame: &Frame| (dataset.heart_rays(frame), frame.beat_time().phases(dataset.n_phases));
         let (done, end) = (saved.map_or(0, |model| model.step), plan.config.gaussian_iterations());
         let (fit, field) = match saved.and_then(|model| model.moving.as_ref()).filter(|_| done >= end) {
             Some(field) => (None, field.clone()),
@@ -223,8 +223,8 @@ impl Moving {
         let pictures = Pictures::new(gpu, &self.field())?;
         let (width, pixels) = (plan.setup.image_width as usize, plan.setup.n_pixels as usize);
         let mut remains = plan.images.clone();
-        for ((rays, phase), image) in self.shots.iter().zip(remains.chunks_mut(pixels)) {
-            let seen = pictures.draw(rays, (width, pixels / width), *phase)?;
+        for ((rays, phases), image) in self.shots.iter().zip(remains.chunks_mut(pixels)) {
+            let seen = pictures.draw_at(rays, (width, pixels / width), *phases)?;
             image.iter_mut().zip(seen).for_each(|(y, seen)| *y -= seen);
         }
         Ok(remains)
