@@ -7,6 +7,7 @@ mod program;
 #[path = "common/python.rs"]
 mod python;
 
+use dicom_dictionary_std::tags;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::Geometry;
 use nertca_vk::model::checkpoint::newest_model;
@@ -83,12 +84,11 @@ fn a_rendered_beat_is_an_angiogram() {
     assert!((0..2).all(|k| (c_arm.pixel_mm[k] / model.pixel_mm[k] - 1.0).abs() < 1e-9), "{c_arm:?}");
 
     // Each file is one of its own.
-    let (beat, still) = (std::fs::read(beat).unwrap(), std::fs::read(still).unwrap());
-    let uid = |bytes: &[u8]| {
-        let at = bytes.windows(5).rposition(|w| w == b"2.25.").unwrap();
-        bytes[at..].iter().take_while(|b| b.is_ascii_digit() || **b == b'.').copied().collect::<Vec<u8>>()
-    };
-    assert_ne!(uid(&beat), uid(&still));
+    let [beat, still] = [beat, still].map(|file| dicom_object::open_file(file).unwrap());
+    for tag in [tags::STUDY_INSTANCE_UID, tags::SERIES_INSTANCE_UID, tags::SOP_INSTANCE_UID] {
+        let [of_beat, of_still] = [&beat, &still].map(|file| file.element(tag).unwrap().to_str().unwrap());
+        assert_ne!(of_beat, of_still, "{tag}");
+    }
     let (said, refused) = render("most.dcm", &["--projection", "mip"], false);
     assert!(said.contains("--projection") && said.contains("line integrals") && !refused.exists(), "{said}");
 }
