@@ -170,7 +170,6 @@ impl Shared {
         let calibration = calibrate(&dataset, &config)?;
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         let dataset = dataset.corrected(&calibration)?;
-        *lock(&self.calibration) = Some(calibration);
         let fresh = Plan::new(&config, &dataset)?;
         if let Some(training) = &mut engine.training {
             let state = training.trainer_mut().checkpoint()?;
@@ -190,6 +189,7 @@ impl Shared {
         };
         tracing::info!("training on {} frames from iteration {}", dataset.training().len(), trainer.step());
         trainer.plan().notes.iter().for_each(|note| tracing::info!("{note}"));
+        *lock(&self.calibration) = Some(calibration);
         engine.frames = dataset.training().len() as u32;
         engine.version = version;
         let took = begin.elapsed();
