@@ -165,7 +165,7 @@ fn authorised(viewer: &Viewer, headers: &HeaderMap, query: &str) -> bool {
 async fn guard(State(viewer): State<Arc<Viewer>>, request: Request, next: Next) -> Response {
     let query = request.uri().query().unwrap_or_default().to_owned();
     if !authorised(&viewer, request.headers(), &query) {
-        return (StatusCode::FORBIDDEN, "open the address that `nertca-vk view` printed\n").into_response();
+        return (StatusCode::FORBIDDEN, "open the address that this program printed\n").into_response();
     }
     let mut response = next.run(request).await;
     for (name, value) in [
@@ -186,6 +186,7 @@ async fn guard(State(viewer): State<Arc<Viewer>>, request: Request, next: Next) 
 async fn info(State(viewer): State<Arc<Viewer>>) -> Response {
     let mut about = viewer.shown.about();
     about["phases"] = json!(viewer.shown.phases());
+    about["tree"] = json!(viewer.tree.generation());
     if let Ok(taken) = viewer.shown.taken() {
         about["primary"] = json!(taken.c_arm.primary_deg);
         about["secondary"] = json!(taken.c_arm.secondary_deg);
@@ -206,8 +207,8 @@ fn json_answer(text: String) -> Response {
 /// The tree, or how far it has come; who asks first sets it off.
 async fn tree(State(viewer): State<Arc<Viewer>>) -> Response {
     let (answer, first) = viewer.tree.ask();
-    if first {
-        tokio::task::spawn_blocking(move || viewer.tree.find(viewer.shown.model()));
+    if let Some(generation) = first {
+        tokio::task::spawn_blocking(move || viewer.tree.find(generation, viewer.shown.model()));
     }
     json_answer(answer)
 }
