@@ -45,6 +45,7 @@ mod cli {
     pub mod view_tree;
     pub mod volume_table;
     pub mod watch;
+    pub mod watch_leave;
     pub mod watch_live;
 }
 

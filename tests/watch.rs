@@ -125,6 +125,19 @@ impl Watcher {
         serde_json::from_slice(&self.ask("/info?").1).unwrap()
     }
 
+    /// Waits until the page says that it is done so far.
+    #[track_caller]
+    fn reach(&self, done: impl Fn(&Value) -> bool) {
+        while !done(&self.about()) {
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    fn interrupt(&self) {
+        let sent = std::process::Command::new("kill").args(["-INT", &self.process.id().to_string()]).status();
+        assert!(sent.unwrap().success());
+    }
+
     /// What it said in all, and whether it ended well.
     fn end(mut self) -> (String, bool) {
         let status = self.process.wait().unwrap();
@@ -245,9 +258,67 @@ fn a_folder_without_runs_leaves_nothing() {
     std::fs::create_dir(&inbox).unwrap();
     let mut watcher = Watcher::new(&[text(&inbox), "-o", text(&run)]);
     watcher.hear("watching ");
-    let interrupted = std::process::Command::new("kill").args(["-INT", &watcher.process.id().to_string()]).status();
-    assert!(interrupted.unwrap().success());
+    watcher.interrupt();
     let (said, well) = watcher.end();
     assert!(!well && said.contains("nothing was reconstructed"), "{said}");
     assert!(!run.exists());
+}
+
+/// Two runs, a third once training is `far` enough, and Ctrl-C. What is left goes on with `train --resume`. Returns what was said,
+/// and the runs that were left.
+fn interrupted_after_a_third_run(iterations: u32, far: impl Fn(&Value) -> bool) -> (String, usize) {
+    let directory = tempfile::tempdir().unwrap();
+    let at = |name: &str| directory.path().join(name);
+    let (runs, inbox, run) = (runs(directory.path()), at("inbox"), at("run"));
+    std::fs::create_dir(&inbox).unwrap();
+    let list: String = (0..PHASES).map(|phase| format!("{phase}\n")).collect();
+    std::fs::write(at("phases.txt"), list).unwrap();
+    let (frames, phases, phase_list) = (format!("1-{PHASES}"), PHASES.to_string(), at("phases.txt"));
+    let (whole, fit) =
+        (format!("train.iterations={iterations}"), format!("gaussians.iterations={}", iterations / 4 * 3));
+    let mut watcher = Watcher::new(&[
+        text(&inbox),
+        "-o",
+        text(&run),
+        "--phases",
+        &phases,
+        "--frames",
+        &frames,
+        "--phase-list",
+        text(&phase_list),
+        "--set",
+        &whole,
+        "--set",
+        &fit,
+    ]);
+    for (view, file) in runs.iter().take(2).enumerate() {
+        std::fs::copy(file, inbox.join(format!("view{view}.dcm"))).unwrap();
+        watcher.hear(&format!("taken in: view{view} ("));
+    }
+    watcher.reach(far);
+    std::fs::copy(&runs[2], inbox.join("view2.dcm")).unwrap();
+    watcher.hear("taken in: view2 (");
+    watcher.interrupt();
+    let (said, well) = watcher.end();
+    assert!(well, "{said}");
+    let (saved, data) = (nertca_vk::model::checkpoint::list(&run).unwrap(), run.join("data"));
+    let (next, left) = ((saved[0].0 + 1).to_string(), Dataset::open(&data).unwrap().training_views().len());
+    ok(&["train", text(&data), "-o", text(&run), "--resume", "--stop-at", &next, "--no-eval"]);
+    let refused = program().args(["watch", text(&inbox), "-o", text(&run)]).output().unwrap();
+    let why = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(!refused.status.success() && why.contains("--out") && why.contains("checkpoint-"), "{why}");
+    (said, left)
+}
+
+#[test]
+fn what_was_trained_stays_until_training_with_a_later_run_has_come_as_far() {
+    let (said, left) = interrupted_after_a_third_run(400, |about| about["state"] == "trained");
+    assert_eq!(left, 2, "{said}");
+    assert!(said.contains("made of the first 2 of 3 runs"), "{said}");
+}
+
+#[test]
+fn what_is_left_is_of_the_runs_that_were_trained_on() {
+    let (said, left) = interrupted_after_a_third_run(4000, |about| about["runs"] == 2);
+    assert_eq!(said.contains("made of the first 2 of 3 runs"), left == 2, "{said}");
 }

@@ -3,35 +3,29 @@
 use super::args::{Cli, ConfigArgs};
 use super::dicom_args::DicomArgs;
 use super::progress::stop_flag;
-use super::report::Report;
 use super::view_server::{Server, Taken};
 use super::view_tree::TreeWork;
+use super::watch_leave::{Kept, prepare, remove_empty};
 use super::watch_live::Live;
 use clap::Args;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::files;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::import::angiograms::ImportOptions;
 use nertca_vk::import::dicom::Run;
 use nertca_vk::import::folder::Folder;
 use nertca_vk::import::intake::Intake;
 use nertca_vk::kernels::tuning::Tuning;
-use nertca_vk::model::checkpoint;
-use nertca_vk::run::info::RunInfo;
-use nertca_vk::run::score::as_trained;
-use nertca_vk::scan::dataset::{Dataset, Split};
+use nertca_vk::scan::dataset::Split;
 use nertca_vk::session::{Moment, NewFrame, Session, SessionOptions, State};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 
 /// Time between two looks at the folder.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// Dataset of the runs that were taken in, inside the run directory.
-const DATA: &str = "data";
 
 /// `watch`.
 #[derive(Debug, Args)]
@@ -67,9 +61,7 @@ pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     let (config, options) = (args.config.load([])?, args.reading.options()?);
     let mut folder = Folder::new(&args.directory);
     folder.look()?;
-    if args.out.exists() && !checkpoint::list(&args.out)?.is_empty() {
-        return Err(Error::config("--out", args.out.display(), "already holds a run: choose another directory"));
-    }
+    prepare(&args.out)?;
     let stop = stop_flag()?;
     let gpu = cli.open_device()?;
     let tuning = cli.tuning(&gpu, &config);
@@ -86,13 +78,28 @@ pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
             let _ = ended.await;
         })
     });
-    let mut watch = Watch { gpu: &gpu, tuning, config, options, intake, live, tree, session: None, failed: false };
-    let watched = watch.until(&mut folder, &stop, args.until_idle);
+    let mut watch = Watch {
+        gpu: &gpu,
+        tuning,
+        config,
+        options,
+        intake,
+        live,
+        tree,
+        under_way: None,
+        kept: None,
+        failed: false,
+        training: false,
+    };
+    let ends = || stop.load(Ordering::Relaxed) || serving.is_finished();
+    let watched = watch.until(&mut folder, &ends, args.until_idle);
+    // Before all that may fail or take its time.
+    let left = watch.leave(&args.out);
     drop(end);
     watch.live.follow(None, None, 0);
     let served = serving.join().unwrap_or_else(|_| Err(Error::Internal("the viewer's server panicked".into())));
     watched?;
-    watch.leave(&args.out)?;
+    left?;
     served?;
     cli.close_device(&gpu)
 }
@@ -106,17 +113,47 @@ struct Watch<'a> {
     intake: Intake,
     live: Arc<Live>,
     tree: Arc<TreeWork>,
-    /// What trains, and the size of its images.
-    session: Option<(Arc<Session>, [usize; 2])>,
+    /// What trains, or has.
+    under_way: Option<UnderWay>,
+    /// What was reconstructed before training began anew.
+    kept: Option<Kept>,
     /// Whether it was told that training has failed.
     failed: bool,
+    /// Whether training went on when it was looked at last.
+    training: bool,
+}
+
+/// A session of runs.
+struct UnderWay {
+    session: Arc<Session>,
+    /// Of its images.
+    size: [usize; 2],
+    /// Runs handed to it.
+    runs: usize,
 }
 
 impl Watch<'_> {
-    fn until(&mut self, folder: &mut Folder, stop: &AtomicBool, until_idle: Option<Duration>) -> Result<()> {
-        let mut busy = Instant::now();
-        while !stop.load(Ordering::Relaxed) {
-            for file in folder.look()? {
+    fn until(&mut self, folder: &mut Folder, ends: &dyn Fn() -> bool, until_idle: Option<Duration>) -> Result<()> {
+        let (mut busy, mut unreadable) = (Instant::now(), false);
+        while !ends() {
+            let files = match folder.look() {
+                // It may come back, as shares on a network do.
+                Err(error @ Error::Io { .. }) => {
+                    if !unreadable {
+                        eprintln!("{error}; it is looked at again");
+                    }
+                    unreadable = true;
+                    Vec::new()
+                }
+                files => {
+                    unreadable = false;
+                    files?
+                }
+            };
+            for file in files {
+                if ends() {
+                    break;
+                }
                 if self.take(&file)? {
                     busy = Instant::now();
                 }
@@ -134,12 +171,18 @@ impl Watch<'_> {
 
     /// Whether training goes on; tells once that it has failed.
     fn trains(&mut self) -> bool {
-        let Some((session, _)) = &self.session else { return false };
+        let Some(UnderWay { session, .. }) = &self.under_way else { return false };
         if let Some(problem) = session.failure().filter(|_| !self.failed) {
             eprintln!("training ended: {problem}; it begins anew with the next run");
             self.failed = true;
         }
-        session.state() == State::Running
+        let trains = session.state() == State::Running;
+        if self.training && !trains {
+            // What was found on the way is of vessels as they were.
+            self.tree.forget();
+        }
+        self.training = trains;
+        trains
     }
 
     /// Takes a file in; whether it could be.
@@ -183,12 +226,12 @@ impl Watch<'_> {
             matches!(state, State::Running | State::Waiting) && 2 * session.step() <= self.config.train.iterations
         };
         let newest = self.intake.runs() - 1;
-        match &self.session {
-            Some((session, of)) if *of == size && young(session) => self.add(session, newest)?,
+        match &self.under_way {
+            Some(now) if now.size == size && young(&now.session) => self.add(&now.session, newest)?,
             _ => {
                 // The old one's memory is needed first.
                 self.live.follow(None, None, newest);
-                self.session = None;
+                self.keep();
                 let options = SessionOptions {
                     config: self.config.clone(),
                     phases: self.intake.phases(),
@@ -199,11 +242,15 @@ impl Watch<'_> {
                 let session = Session::new(Some(self.gpu.clone()), Some(self.tuning.clone()), options)?;
                 (0..=newest).try_for_each(|run| self.add(&session, run))?;
                 session.start(Box::new(|_| true))?;
-                (self.session, self.failed) = (Some((Arc::new(session), size)), false);
+                self.under_way = Some(UnderWay { session: Arc::new(session), size, runs: 0 });
+                self.failed = false;
             }
         }
         self.tree.forget();
-        let session = self.session.as_ref().map(|(session, _)| session.clone());
+        let session = self.under_way.as_mut().map(|now| {
+            now.runs = newest + 1;
+            now.session.clone()
+        });
         self.live.follow(session, Some(Taken { c_arm, image_size: size }), newest + 1);
         Ok(())
     }
@@ -222,37 +269,37 @@ impl Watch<'_> {
         })
     }
 
+    /// Keeps what training has come to, where that is better than what was kept before; the reason where it has come to nothing.
+    fn keep(&mut self) -> Option<Error> {
+        let UnderWay { session, runs, .. } = self.under_way.take()?;
+        match Kept::of(&session, runs) {
+            Ok(kept) => {
+                if self.kept.as_ref().is_none_or(|before| kept.replaces(before)) {
+                    self.kept = Some(kept);
+                }
+                None
+            }
+            Err(error) => Some(session.failure().map_or(error, Error::NotReady)),
+        }
+    }
+
     /// Leaves a run directory as `train` does, with its dataset.
-    fn leave(self, run: &Path) -> Result<()> {
-        let none = || Error::NotReady("nothing was reconstructed: runs from two angles are needed".into());
-        let (session, _) = self.session.ok_or_else(none)?;
-        session.stop()?;
-        let checkpoint = session.checkpoint().map_err(|error| match session.failure() {
-            Some(problem) => Error::NotReady(format!("nothing was reconstructed: {problem}")),
-            None if matches!(error, Error::NotReady(_)) => none(),
-            None => error,
-        })?;
-        let data = run.join(DATA);
-        eprintln!("{}", self.intake.write(&data)?);
-        RunInfo { dataset: data.canonicalize().unwrap_or_else(|_| data.clone()) }.write(run)?;
-        files::write_atomic(&run.join("config.toml"), checkpoint.model.config.to_toml()?.as_bytes())?;
-        if let Some(calibration) = session.calibration() {
-            calibration.write(run)?;
+    fn leave(&mut self, run: &Path) -> Result<()> {
+        let nothing = self.keep();
+        let Some(kept) = &self.kept else {
+            remove_empty(run);
+            let why = match nothing {
+                Some(Error::NotReady(why)) if self.failed => why,
+                Some(error) if !matches!(error, Error::NotReady(_)) => return Err(error),
+                _ => "runs from two angles are needed".into(),
+            };
+            return Err(Error::NotReady(format!("nothing was reconstructed: {why}")));
+        };
+        if let Some(error) = nothing {
+            eprintln!("what was reconstructed before is left: {error}");
         }
-        let saved = checkpoint.save(run)?;
-        Report {
-            gpu: self.gpu,
-            tuning: &self.tuning,
-            model: &checkpoint.model,
-            dataset: &as_trained(Dataset::open(&data)?, run)?,
-            evaluation: None,
-            warnings: &[],
-            tree: None,
-            run,
-            pictures: Path::new(""),
-        }
-        .write(&run.join("report.html"))?;
-        eprintln!("{} of {} iterations", checkpoint.model.step, self.config.train.iterations);
+        let saved = kept.leave(&self.intake, (self.gpu, &self.tuning), run)?;
+        eprintln!("{} of {} iterations", kept.step(), self.config.train.iterations);
         out!("{}", saved.display());
         Ok(())
     }

@@ -1,11 +1,12 @@
 //! Runs that are taken in, together or one after the other, checked against one another, and brought to one size.
 
 use crate::error::{Error, Result};
-use crate::geometry::{CArm, Geometry};
+use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
 use crate::import::angiograms::{Gating, ImportOptions, View};
 use crate::import::dicom::Run;
 use crate::raster::Image;
 use crate::scan::dataset::{Layout, Split};
+use crate::scan::frame_checks::{check_values, checked_rays};
 use crate::scan::gating::BeatTime;
 use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
@@ -105,6 +106,7 @@ impl Intake {
         }
         let options = &self.options;
         let views = runs.par_iter().map(|run| View::prepare(run, options)).collect::<Result<Vec<_>>>()?;
+        runs.iter().zip(&views).try_for_each(|(run, view)| trainable(run, view, options))?;
         notes.extend(views.iter().flat_map(|view| view.notes.iter().cloned()));
         self.taken = taken;
         self.views.extend(views);
@@ -113,13 +115,22 @@ impl Intake {
 
     /// Columns and rows that all runs have: the smallest open area, around the middle of each. None without runs.
     pub fn size(&self) -> Option<[usize; 2]> {
+        self.size_of(self.runs())
+    }
+
+    /// Columns and rows that the first `runs` have.
+    fn size_of(&self, runs: usize) -> Option<[usize; 2]> {
         let image = |view: &View| [view.images[0].1.width, view.images[0].1.height];
-        self.views.iter().map(image).reduce(|a, b| [a[0].min(b[0]), a[1].min(b[1])])
+        self.views.iter().take(runs).map(image).reduce(|a, b| [a[0].min(b[0]), a[1].min(b[1])])
     }
 
     /// The images of a run, counted from 0, cut to the size of all.
     pub fn frames(&self, run: usize) -> Vec<TakenFrame> {
-        let Some((view, [width, height])) = self.views.get(run).zip(self.size()) else { return Vec::new() };
+        self.size().map_or_else(Vec::new, |size| self.frames_of_size(run, size))
+    }
+
+    fn frames_of_size(&self, run: usize, [width, height]: [usize; 2]) -> Vec<TakenFrame> {
+        let Some(view) = self.views.get(run) else { return Vec::new() };
         let frame = |(taken, image): &(BeatTime, Image)| {
             let (image, offset) = cut(image, width, height);
             let moved = |k: usize| view.c_arm.offset_mm[k] + offset[k] * view.c_arm.pixel_mm[k];
@@ -134,10 +145,19 @@ impl Intake {
     /// # Errors
     /// [`Error::NotReady`] without runs; [`Error::Io`].
     pub fn write(&self, out: &Path) -> Result<String> {
+        self.write_first(self.runs(), out)
+    }
+
+    /// Writes the first `runs` as [`Intake::write`] would have before others came.
+    ///
+    /// # Errors
+    /// As [`Intake::write`].
+    pub fn write_first(&self, runs: usize, out: &Path) -> Result<String> {
         let none = || Error::NotReady("no run was taken in".into());
-        let ([width, height], c_arm) = self.size().zip(self.c_arm()).ok_or_else(none)?;
+        let runs = runs.min(self.runs());
+        let ([width, height], c_arm) = self.size_of(runs).zip(self.c_arm()).ok_or_else(none)?;
         let about = About {
-            description: format!("{} X-ray angiography runs", self.runs()),
+            description: format!("{runs} X-ray angiography runs"),
             phases: self.phases(),
             depth_half_extent_mm: self.options.depth_half_extent_mm,
             vessel_attenuation_per_mm: None,
@@ -145,14 +165,27 @@ impl Intake {
             c_arm: c_arm.clone(),
         };
         let mut writer = Writer::new(out, Layout::Native, about)?;
-        for run in 0..self.runs() {
-            for TakenFrame { geometry, taken, image } in self.frames(run) {
+        for run in 0..runs {
+            for TakenFrame { geometry, taken, image } in self.frames_of_size(run, [width, height]) {
                 writer.frame(&geometry, Split::Train, run, taken, &image.values, None)?;
             }
         }
         writer.finish()?;
-        Ok(format!("{} views of {width} x {height} pixels at {} phases", self.runs(), self.phases()))
+        Ok(format!("{runs} views of {width} x {height} pixels at {} phases", self.phases()))
     }
+}
+
+/// Refuses a run that no training could use, as those who read its dataset would.
+fn trainable(run: &Run, view: &View, options: &ImportOptions) -> Result<()> {
+    let geometry = Geometry::CArm(view.c_arm.clone());
+    view.images
+        .iter()
+        .try_for_each(|(_, image)| {
+            check_values(&image.values, image.width)?;
+            let depth_before = options.depth_half_extent_mm / MM_PER_UNIT;
+            checked_rays(&geometry, (image.width, image.height), depth_before).map(drop)
+        })
+        .map_err(|found| Error::data(&run.path, found.field, format!("{}: {}", found.value, found.problem)))
 }
 
 /// What does not fit to the runs before.
