@@ -32,20 +32,25 @@ fn run(path: &Path, contrast: &[f64]) {
     });
 }
 
+/// All else as little as can be asked for.
+fn options(gating: Gating, phases: u32) -> ImportOptions {
+    ImportOptions {
+        phases,
+        gating,
+        scaling: BeatScaling::Linear,
+        frames: None,
+        pixel_mm: None,
+        size: None,
+        depth_half_extent_mm: 90.0,
+    }
+}
+
 /// Imports frames, each as a phase of its own; what the user is told, and how many there are.
 fn import(contrast: &[f64], phases: u32, frames: Option<RangeInclusive<usize>>) -> (String, usize) {
     let directory = tempfile::tempdir().unwrap();
     let (file, out) = (directory.path().join("run.dcm"), directory.path().join("data"));
     run(&file, contrast);
-    let options = ImportOptions {
-        phases,
-        gating: Gating::Phases((0..phases).map(f64::from).collect()),
-        scaling: BeatScaling::Linear,
-        frames,
-        pixel_mm: None,
-        size: None,
-        depth_half_extent_mm: 90.0,
-    };
+    let options = ImportOptions { frames, ..options(Gating::Phases((0..phases).map(f64::from).collect()), phases) };
     let notes = import_dicom(&[file], &options, &out).unwrap();
     (notes.join("\n"), Dataset::open(&out).unwrap().frames.len())
 }
@@ -91,18 +96,9 @@ fn a_run_without_ecg_is_gated_by_its_images() {
         o.put(DataElement::new(tags::NUMBER_OF_FRAMES, VR::IS, PrimitiveValue::from(frames.to_string())));
         o.put(DataElement::new(tags::PIXEL_DATA, VR::OB, PrimitiveValue::from(pixels.clone())));
     });
-    let options = |gating| ImportOptions {
-        phases: 6,
-        gating,
-        scaling: BeatScaling::Linear,
-        frames: None,
-        pixel_mm: None,
-        size: None,
-        depth_half_extent_mm: 90.0,
-    };
-    let refused = import_dicom(std::slice::from_ref(&file), &options(Gating::Ecg), &out).unwrap_err().to_string();
+    let refused = import_dicom(std::slice::from_ref(&file), &options(Gating::Ecg, 6), &out).unwrap_err().to_string();
     assert!(refused.contains("have the beat found in the images"), "{refused}");
-    let told = import_dicom(&[file], &options(Gating::Images), &out).unwrap().join("\n");
+    let told = import_dicom(&[file], &options(Gating::Images, 6), &out).unwrap().join("\n");
     assert!(told.contains("50 beats per minute, by the images"), "{told}");
     assert_eq!(Dataset::open(&out).unwrap().frames.len(), 6, "{told}");
 }
@@ -113,17 +109,8 @@ fn frames_of_a_run_keep_their_own_time() {
     let file = directory.path().join("run.dcm");
     run(&file, &[1.0; 7]);
     let import = |gating: Gating, phases: u32| {
-        let options = ImportOptions {
-            phases,
-            gating,
-            scaling: BeatScaling::Linear,
-            frames: None,
-            pixel_mm: None,
-            size: None,
-            depth_half_extent_mm: 90.0,
-        };
         let out = tempfile::tempdir().unwrap();
-        import_dicom(std::slice::from_ref(&file), &options, out.path())?;
+        import_dicom(std::slice::from_ref(&file), &options(gating, phases), out.path())?;
         Dataset::open(out.path()).map(|d| d.frames.iter().map(|f| (f.phase, f.after_phase)).collect::<Vec<_>>())
     };
     let same = |found: &[(u32, f64)], wanted: &[(u32, f64)]| {
