@@ -47,5 +47,7 @@ void main() {
     ray.temporal_low = ray.target - background.y;
     ray.id = id;
     ray.temporal_high = ray.target - background.x;
+    ray.beyond = frame.beyond;
+    ray.beyond_share = frame.beyond_share;
     rays[r] = ray;
 }

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Positional encoding of the live samples. One invocation per padded sample.
-//   sample_phases[s] = phase of the sample's ray;
+//   sample_times[s] = when the sample's ray was taken;
 //   features[q * capacity + s] = vec4 of numbers 4q..4q+3 of the encoding, zero-padded.
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
@@ -14,7 +14,7 @@ layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
 layout(binding = 5) readonly buffer B5 { uint sample_rays[]; };
 layout(binding = 6) readonly buffer B6 { Ray rays[]; };
 layout(binding = 7) writeonly buffer B7 { vec4 features[]; };
-layout(binding = 8) writeonly buffer B8 { uint sample_phases[]; };
+layout(binding = 8) writeonly buffer B8 { SampleTime sample_times[]; };
 
 #include "inc/encoding.glsl"
 
@@ -24,11 +24,12 @@ void main() {
     uint groups = (3u + 6u * setup.n_bands + 3u) / 4u;
     uint stride = setup.sample_capacity;
     if (s >= live.count) {
-        sample_phases[s] = 0u;
+        sample_times[s] = SampleTime(0u, 0u, 0.0);
         for (uint q = 0u; q < groups; q++) features[q * stride + s] = vec4(0.0);
         return;
     }
-    sample_phases[s] = rays[ray_of(sample_rays[s])].phase;
+    Ray ray = rays[ray_of(sample_rays[s])];
+    sample_times[s] = SampleTime(ray.phase, ray.beyond, ray.beyond_share);
     float window = schedule[state.step].window;
     vec3 x = encoded_point(sample_points[s].xyz);
     // Two bands make 12 numbers, so three whole vec4 leave the carry (x, y, z) as it was.

@@ -14,6 +14,13 @@ layout(binding = 7) writeonly buffer B7 { uint ray_counts[]; };
 
 shared uint counts[gl_WorkGroupSize.x];
 
+// Whether the field is evaluated at a point of a ray: where it may exist at one of the phases that the ray shows.
+bool searched(vec3 x, Ray ray) {
+    if (dynamic_inside(x, ray.phase) && occupied(x, ray.phase, state.step)) return true;
+    if (ray.beyond_share == 0.0) return false;
+    return dynamic_inside(x, ray.beyond) && occupied(x, ray.beyond, state.step);
+}
+
 void main() {
     uint lane = gl_LocalInvocationID.x;
     uint r = gl_WorkGroupID.x;
@@ -26,7 +33,7 @@ void main() {
         uint first = begin + 32u * word;
         for (uint k = first; k < min(first + 32u, end); k++) {
             vec3 x = ray.anchor + dynamic_depth(k, ray) * ray.direction;
-            if (dynamic_inside(x, ray.phase) && occupied(x, ray.phase, state.step)) mask |= 1u << (k - first);
+            if (searched(x, ray)) mask |= 1u << (k - first);
         }
         lane_masks[(r * gl_WorkGroupSize.x + lane) * mask_words() + word] = mask;
         live += bitCount(mask);

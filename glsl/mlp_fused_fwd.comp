@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // The whole network for a tile of samples, in shared memory and registers: encoding, hidden layers, output,
-// activation. Bias and latent of a layer that sees the input are columns of its weights, picked by a one-hot phase
-// behind the encoding, so that their gradients come out of the weight gradient.
+// activation. Bias and latent of a layer that sees the input are columns of its weights, one per phase, picked by the shares
+// of the phases behind the encoding, so that their gradients come out of the weight gradient.
 //   features16[s][encoded], activations16_i[s][width]: f16, kept for the backward pass if `keep`;
 //   sample_sigma[s] = (sigma_s, d sigma_s / d feature).
 //   weights16: per layer [width][encoded] if it sees the input, then [width][width] unless it is the first; at last
@@ -11,7 +11,8 @@
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 #include "inc/softplus.glsl"
-layout(constant_id = 7) const uint encoded = 80u;     // numbers of encoding and one-hot phase, padded
+#include "inc/phase_share.glsl"
+layout(constant_id = 7) const uint encoded = 80u;     // numbers of encoding and shares of phases, padded
 layout(constant_id = 8) const uint layers = 4u;       // hidden layers
 layout(constant_id = 9) const uint skip = 0u;         // layer (from 0) that sees the input again; 0: none
 layout(constant_id = 10) const uint keep = 1u;
@@ -45,8 +46,8 @@ const uint column_tiles = width / n / subgroups;
 shared uvec4 tile16[shared_size];
 shared float output_tile[tile * n];
 
-// Number i of a sample's input: encoding, then one-hot phase, then zeros.
-float input_number(uint i, vec3 x, uint phase, float window) {
+// Number i of a sample's input: encoding, then the shares of phases, then zeros.
+float input_number(uint i, vec3 x, Ray ray, float window) {
     if (i < 3u) return x[i];
     uint band = (i - 3u) / 6u;
     if (band < setup.n_bands) {
@@ -54,7 +55,7 @@ float input_number(uint i, vec3 x, uint phase, float window) {
         float angle = reduce_angle(vec3(x[part % 3u] * float(1u << band))).x;
         return clamp(window - float(band), 0.0, 1.0) * (part < 3u ? sin(angle) : cos(angle));
     }
-    return i == 3u + 6u * setup.n_bands + phase ? 1.0 : 0.0;
+    return phase_share(ray, i - 3u - 6u * setup.n_bands);
 }
 
 // One invocation writes eight numbers of a sample at a time.
@@ -66,10 +67,10 @@ void encode_tile(uint first) {
         uvec4 packed = uvec4(0u);
         if (s < live.count) {
             vec3 x = encoded_point(sample_points[s].xyz);
-            uint phase = rays[ray_of(sample_rays[s])].phase;
+            Ray ray = rays[ray_of(sample_rays[s])];
             for (uint pair = 0u; pair < 4u; pair++) {
                 uint i = 8u * (e % encoded8) + 2u * pair;
-                packed[pair] = pack2(vec2(input_number(i, x, phase, window), input_number(i + 1u, x, phase, window)));
+                packed[pair] = pack2(vec2(input_number(i, x, ray, window), input_number(i + 1u, x, ray, window)));
             }
         }
         tile16[encoded_at + row * encoded_stride + e % encoded8] = packed;

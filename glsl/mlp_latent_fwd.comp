@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// One ray has one phase, so bias and latent act as one row per phase:
+// Bias and latent act as one row per phase, and between two phases as what lies between their rows:
 //   phase_bias[layer][phase][j] = bias[j] + sum_l latent_weight[j][l] * latent[phase][l].
 // One invocation per (phase, neuron); one dispatch per layer.
 #include "inc/layout.glsl"

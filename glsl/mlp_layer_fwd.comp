@@ -1,7 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// One hidden layer: activations = relu(W_a input_a + W_b input_b + phase_bias[phase]).
+// One hidden layer: activations = relu(W_a input_a + W_b input_b + bias), the bias that of the sample's phase, or between those
+// of two phases: phase_bias[phase].
 // A lane keeps SAMPLES samples x OUTPUTS neurons in registers; weights are uniform loads.
 //   input_*[q * capacity + s], activations[q * capacity + s]: vec4 of 4 consecutive features.
 //   weights row-major [out][in], 4 inputs to a vec4.
@@ -22,7 +23,7 @@ READ_VEC4(0, B0, input_a);
 READ_VEC4(1, B1, input_b);
 READ_VEC4(2, B2, params);
 layout(binding = 3) readonly buffer B3 { LiveSamples live; };
-layout(binding = 4) readonly buffer B4 { uint sample_phases[]; };
+layout(binding = 4) readonly buffer B4 { SampleTime sample_times[]; };
 layout(binding = 5) readonly buffer B5 { vec4 phase_bias[]; };
 layout(binding = 6) writeonly buffer B6 { vec4 activations[]; };
 
@@ -45,15 +46,29 @@ uint sample_of(uint t) {
     return min(base + t * gl_WorkGroupSize.x, padded - 1u);
 }
 
+// Where four neurons' biases of a phase are, from a neuron on.
+uint bias_at(uint phase, uint neuron) {
+    return (push.bias + phase * push.width + min(neuron, push.width - 4u)) / 4u;
+}
+
 void main() {
     base = gl_WorkGroupID.x * (gl_WorkGroupSize.x * SAMPLES) + gl_LocalInvocationID.x;
     padded = live.padded;
     uint first = gl_WorkGroupID.y * OUTPUTS;
     float sum[OUTPUTS][SAMPLES];
     [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
-        uint row = push.bias + sample_phases[sample_of(t)] * push.width;
+        SampleTime taken = sample_times[sample_of(t)];
         [[unroll]] for (uint j = 0u; j < OUTPUTS; j += 4u) {
-            vec4 bias = phase_bias[(row + min(first + j, push.width - 4u)) / 4u];
+            vec4 bias = phase_bias[bias_at(taken.phase, first + j)];
+            sum[j][t] = bias.x;
+            sum[j + 1u][t] = bias.y;
+            sum[j + 2u][t] = bias.z;
+            sum[j + 3u][t] = bias.w;
+        }
+        if (taken.beyond_share == 0.0) continue;
+        [[unroll]] for (uint j = 0u; j < OUTPUTS; j += 4u) {
+            vec4 bias = vec4(sum[j][t], sum[j + 1u][t], sum[j + 2u][t], sum[j + 3u][t]);
+            bias = mix(bias, phase_bias[bias_at(taken.beyond, first + j)], taken.beyond_share);
             sum[j][t] = bias.x;
             sum[j + 1u][t] = bias.y;
             sum[j + 2u][t] = bias.z;

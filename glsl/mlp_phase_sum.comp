@@ -1,8 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Sums ray_dz over the rays of each phase: phase_dz[layer][phase][4 neurons]. One workgroup per
-// (4 neurons, phase), fixed order; later chunks of an iteration add.
+// Sums ray_dz over the rays of each phase: phase_dz[layer][phase][4 neurons]. A ray between two phases counts for both. One
+// workgroup per (4 neurons, phase), fixed order; later chunks of an iteration add.
 #include "inc/layout.glsl"
+#include "inc/phase_share.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; uint row; uint groups; uint accumulate; } push;
 layout(binding = 0) readonly buffer B0 { Ray rays[]; };
@@ -16,7 +17,8 @@ void main() {
     uint phase = gl_WorkGroupID.y;
     vec4 sum = vec4(0.0);
     for (uint r = gl_LocalInvocationID.x; r < push.n_rays; r += gl_WorkGroupSize.x) {
-        if (rays[push.first_ray + r].phase == phase) sum += ray_dz[q * push.n_rays + r];
+        float share = phase_share(rays[push.first_ray + r], phase);
+        if (share > 0.0) sum += share * ray_dz[q * push.n_rays + r];
     }
     lanes_sum[gl_LocalInvocationID.x] = sum;
     barrier();

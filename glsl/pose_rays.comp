@@ -4,7 +4,9 @@
 #include "inc/layout.glsl"
 #include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint first_pixel; uint n_rays; uint phase; uint image_width; uint view; } push;
+layout(push_constant) uniform Push {
+    uint first_pixel; uint n_rays; uint phase; uint beyond; float beyond_share; uint image_width; uint view;
+} push;
 layout(binding = 0) readonly buffer B0 { View views[]; };
 layout(binding = 1) writeonly buffer B1 { Ray rays[]; };
 
@@ -22,5 +24,7 @@ void main() {
     ray.temporal_low = 0.0;
     ray.id = pixel;
     ray.temporal_high = 0.0;
+    ray.beyond = push.beyond;
+    ray.beyond_share = push.beyond_share;
     rays[r] = ray;
 }

@@ -42,3 +42,10 @@ pub struct Model {
     /// Columns and rows of the training images.
     pub image_size: [usize; 2],
 }
+
+impl Model {
+    /// Whether the moving field has a value between phases: a network or one set of Gaussians that moves, not sets per phase.
+    pub fn is_continuous(&self) -> bool {
+        self.moving.as_ref().is_none_or(|field| field.tree().is_some())
+    }
+}

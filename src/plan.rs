@@ -74,7 +74,7 @@ impl Plan {
                     "the network sees all frames of a view alike: displacements of the heart are left out".into(),
                 );
             }
-            notes.extend(between_phases(dataset, false));
+            notes.extend(between_phases(dataset, "are learned at their own time"));
             (choose_hull(config, dataset, &motion, &mut notes), None)
         };
         let mut scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
@@ -102,10 +102,12 @@ impl Plan {
         let mut images = Vec::with_capacity(n_all);
         let mut listed_rays = Vec::new();
         for (index, frame) in training.iter().enumerate() {
-            let slot = slot_of_view[frame.view];
+            let (slot, taken) = (slot_of_view[frame.view], frame.beat_time());
             frames.push(layout::Frame {
                 view: slot,
                 phase: frame.phase,
+                beyond: taken.beyond(dataset.n_phases),
+                beyond_share: taken.after_phase.abs() as f32,
                 image_offset: (index * pixels) as u32,
                 background_offset: slot * pixels as u32,
             });
@@ -184,7 +186,13 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     let soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
     let targets = Targets::new(dataset, &soft, &config.gaussians)?;
     let form = targets.form(config.gaussians.form);
-    notes.extend(between_phases(dataset, form == GaussianForm::Tree));
+    notes.extend(between_phases(
+        dataset,
+        match form {
+            GaussianForm::Tree => "are fitted at their own time (the mean of those that share a phase and a view)",
+            _ => "count as taken at the nearest phase",
+        },
+    ));
     notes.extend(wide_motion(&soft));
     notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
     notes.push(match form {
@@ -194,14 +202,9 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     Ok((soft.hull.to_hull(), targets))
 }
 
-/// What is said of frames that were taken between two phases; `continuous` says that the moving field knows what is there.
-fn between_phases(dataset: &Dataset, continuous: bool) -> Option<String> {
+/// What is said of frames that were taken between two phases, and of their `fate`.
+fn between_phases(dataset: &Dataset, fate: &str) -> Option<String> {
     let n = dataset.training().iter().filter(|f| f.after_phase != 0.0).count();
-    let fate = if continuous {
-        "are fitted at their own time (the mean of those that share a phase and a view)"
-    } else {
-        "count as taken at the nearest phase"
-    };
     (n > 0).then(|| format!("{n} of {} frames were taken between two phases and {fate}", dataset.training().len()))
 }
 

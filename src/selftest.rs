@@ -108,7 +108,7 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
 /// # Errors
 /// [`Error::DeviceLost`], after which nothing can be told; other errors are part of the report.
 pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Report> {
-    let dataset = problems::small_dataset(13, 11, 3)?;
+    let dataset = problems::uneven_dataset(13, 11)?;
     let chosen = Tuning::for_device(gpu.info());
     let on = |layers| chosen.clone().with_layers(layers, String::new());
     let (f32_layers, matrices) = (on(Layers::F32), on(Layers::Matrices));

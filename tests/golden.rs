@@ -33,6 +33,8 @@ impl Golden {
         let arm_pair = |key: &str| [0, 1].map(|i| arm[key][i].as_f64().unwrap());
         let mut views = Vec::new();
         let mut frames = Vec::new();
+        let after = self.case["after_phases"].as_array().unwrap();
+        let after: Vec<f64> = after.iter().map(|after| after.as_f64().unwrap()).collect();
         for (v, angles) in self.case["angles"].as_array().unwrap().iter().enumerate() {
             let geometry = Geometry::CArm(CArm {
                 primary_deg: angles[0].as_f64().unwrap(),
@@ -53,7 +55,7 @@ impl Golden {
                     split: Split::Train,
                     integrals: image.iter().map(|x| *x as f32).collect(),
                     mask: None,
-                    after_phase: 0.0,
+                    after_phase: after[frames.len() % after.len()],
                     heart_shift_mm: [0.0; 3],
                 });
             }

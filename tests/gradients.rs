@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{small_config, small_dataset};
+use common::{small_config, uneven_dataset};
 use glam::DVec3;
 use nertca_vk::plan::Plan;
 use nertca_vk::random;
@@ -12,7 +12,7 @@ use nertca_vk::reference::field::{self, Precision};
 use nertca_vk::reference::{march, step};
 
 fn plan(preset: &str, settings: &[&str]) -> Plan {
-    Plan::new(&small_config(preset, settings), &small_dataset(9, 8)).unwrap()
+    Plan::new(&small_config(preset, settings), &uneven_dataset(9, 8)).unwrap()
 }
 
 fn start(plan: &Plan) -> Vec<f64> {

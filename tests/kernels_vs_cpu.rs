@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{expect_agreement, expect_silence, gpu, small_config, small_dataset, tuning};
+use common::{expect_agreement, expect_silence, gpu, small_config, small_dataset, tuning, uneven_dataset};
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::kernels::layout::Ray;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
@@ -17,7 +17,7 @@ use nertca_vk::train::trainer::Trainer;
 #[test]
 fn rays_and_depths_match() {
     let gpu = gpu();
-    let dataset = small_dataset(13, 11);
+    let dataset = uneven_dataset(13, 11);
     let plan = Plan::new(
         &small_config("fast-mlp", &["hull.enabled=true", "hull.max_share=1", "hull.resolution=24"]),
         &dataset,
@@ -32,7 +32,9 @@ fn rays_and_depths_match() {
     let params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
     let mut live = 0;
     for (g, w) in got.iter().zip(&want) {
-        assert_eq!((g.id, g.phase as usize), (w.id, w.phase));
+        let [(nearest, _), (beyond, share)] = w.shown;
+        assert_eq!((g.id, g.phase as usize, g.beyond as usize), (w.id, nearest, beyond));
+        assert!((f64::from(g.beyond_share) - share).abs() < 1e-7);
         for axis in 0..3 {
             assert!((f64::from(g.anchor[axis]) - w.anchor[axis]).abs() < 1e-6);
             assert!((f64::from(g.direction[axis]) - w.direction[axis]).abs() < 1e-6);
@@ -74,7 +76,7 @@ fn paths() -> [Tuning; 3] {
 #[test]
 fn every_stage_of_an_iteration_matches() {
     let gpu = gpu();
-    let dataset = small_dataset(13, 11);
+    let dataset = uneven_dataset(13, 11);
     for path in paths() {
         expect_agreement(|findings| {
             F32_CASES.iter().try_for_each(|case| iteration::compare(&gpu, &dataset, case, &path, findings))
@@ -86,14 +88,14 @@ fn every_stage_of_an_iteration_matches() {
 #[test]
 fn occupancy_is_learned_and_heeded() {
     let gpu = gpu();
-    expect_agreement(|findings| occupancy::compare(&gpu, &small_dataset(13, 11), &tuning(&gpu), findings));
+    expect_agreement(|findings| occupancy::compare(&gpu, &uneven_dataset(13, 11), &tuning(&gpu), findings));
     expect_silence(gpu);
 }
 
 #[test]
 fn ten_updates_across_the_delay_match() {
     let gpu = gpu();
-    let dataset = small_dataset(9, 8);
+    let dataset = uneven_dataset(9, 8);
     for preset in ["paper", "public-code", "fast-mlp"] {
         // Starts at the sixth iteration; the optimiser is re-created there. A softer shift than -10 lets
         // the network move, so that the comparison sees it.

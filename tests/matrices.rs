@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::{expect_agreement, expect_silence, gpu, run, small_config, small_dataset};
+use common::{expect_agreement, expect_silence, gpu, run, small_config, small_dataset, uneven_dataset};
 use nertca_vk::config::Preset;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
@@ -39,7 +39,7 @@ const GPU_CASE: Case = Case {
 #[test]
 fn every_stage_of_an_iteration_matches() {
     let Some((gpu, tuning)) = matrices() else { return };
-    let dataset = small_dataset(13, 11);
+    let dataset = uneven_dataset(13, 11);
     let cases = MATRIX_CASES.iter().map(|case| (case, CPU)).chain([(&GPU_CASE, GPU)]);
     for (case, matrices) in cases {
         let path = Tuning { matrices, ..tuning.clone() };
@@ -51,7 +51,7 @@ fn every_stage_of_an_iteration_matches() {
 #[test]
 fn training_repeats_bit_by_bit_resumes_and_follows_f32() {
     let Some((gpu, tuning)) = matrices() else { return };
-    let dataset = small_dataset(13, 11);
+    let dataset = uneven_dataset(13, 11);
     let config = small_config("fast-mlp", &["dynamic.lr=3e-3", "train.iterations=120", "train.rays=64"]);
     let start = |layers| {
         let tuning = tuning.clone().with_layers(layers, String::new());

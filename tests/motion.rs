@@ -244,10 +244,15 @@ fn the_program_renders_between_phases() {
     let sets =
         saved(model("fast", Some(MovingGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
-    for run in [&sets, &network] {
-        refuses(&["render", run, "--out", "x.npy", "--phase", "0.5"], &["between two phases", "whole", "tree"]);
-        refuses(&["render", run, "--out", "x.npy", "--phase", "3"], &["--phase", "0 to 2"]);
-    }
+    refuses(&["render", &sets, "--out", "x.npy", "--phase", "0.5"], &["between two phases", "whole", "tree"]);
+    refuses(&["render", &sets, "--out", "x.npy", "--phase", "3"], &["--phase", "0 to 2"]);
+    // A network has latents between those of two phases.
+    let [first, between, last, closed] = ["0", "2.5", "2", "3"].map(|phase| {
+        ok(&["render", &network, "--component", "dynamic", "--phase", phase, "--out", &file("network.npy")]);
+        npy::read(Path::new(&file("network.npy")), 1 << 20).unwrap().values
+    });
+    assert_eq!(first, closed, "the next beat's first phase");
+    assert!(between != first && between != last, "what the network shows is at neither phase");
 }
 
 /// LPS mm of what is along (posterior, left, superior) in pixels.

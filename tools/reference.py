@@ -24,7 +24,7 @@ U32 = 0xFFFFFFFF
 COMMON = dict(
     seed=5, width_px=7, height_px=6, phases=3, rays=21, static_samples=20, dynamic_samples=20, grid=6, ranks=3,
     mlp_width=16, latent=8, iterations=40, delay=4, window_iterations=12, depth=0.9, tv_plane=1e-2, tv_line=1e-3,
-    betas=(0.9, 0.99), occlusion_share=0.2,
+    betas=(0.9, 0.99), occlusion_share=0.2, after_phases=(0.0,),
 )
 PRESETS = {
     "paper": dict(
@@ -42,6 +42,7 @@ PRESETS = {
     "fast": dict(
         layers=3, skip=0, bands=6, window_start=3.0, per_ray=True, temporal=True, decay="linear",
         static_lr=(1e-2, 1e-3), dynamic_lr=(3e-3, 3e-4), tv=1e-3, occlusion=0.0, eps=1e-6, n_motion=12,
+        after_phases=(0.0, 0.375, -0.25, 0.5),
         scene=dict(static_half=0.9, dynamic_half=0.45, static_gain=0.5, static_shift=0.54, dynamic_gain=4.0,
                    dynamic_shift=-2.0, static_weight=1.2, dynamic_weight=9.0, robust_scale=0.05, centre=(0.02, -0.01, 0.03), scale=6.5),
     ),
@@ -207,13 +208,21 @@ def static_feature(c, p, x, half):
     return total
 
 
-def network(c, p, x, phase, window, scene):
+def latent(c, p, time):
+    """Latent at a time counted in phases: on the straight way from one phase to the next; the beat closes."""
+    before = math.floor(time)
+    share = time - before
+    rows = p["dynamic.latent"]
+    return (1 - share) * rows[before % c["phases"]] + share * rows[(before + 1) % c["phases"]]
+
+
+def network(c, p, x, time, window, scene):
     x = (x - torch.tensor(scene["centre"])) * scene["scale"]
     parts = [x]
     for k in range(c["bands"]):
         a = min(max(window - k, 0.0), 1.0)
         parts += [a * torch.sin(2.0**k * x), a * torch.cos(2.0**k * x)]
-    inputs = torch.cat(parts + [p["dynamic.latent"][phase]], -1)
+    inputs = torch.cat(parts + [latent(c, p, time).expand(len(x), -1)], -1)
     h = inputs
     for i in range(c["layers"]):
         if i + 1 == c["skip"]:
@@ -252,7 +261,8 @@ def losses(c, frames, p, step):
         if active and inside.any():
             n = int(inside.sum())
             live += n
-            f = network(c, p, torch.tensor(x[inside]), torch.full((n,), phase), window, scene)
+            time = phase + c["after_phases"][frame % len(c["after_phases"])]
+            f = network(c, p, torch.tensor(x[inside]), time, window, scene)
             mass = scene["dynamic_gain"] * torch.nn.functional.softplus(f + scene["dynamic_shift"])
             mass = mass * torch.tensor(dl[inside])
             occlusion = occlusion + (mass * torch.tensor((t[inside] < near_limit).astype(float))).sum()

@@ -121,13 +121,15 @@ struct IndirectArguments {
 // One ray: anchor is the point at the isocentre plane, direction has unit depth.
 struct Ray {
     vec3 anchor;                // point at the isocentre plane
-    uint phase;                 // cardiac phase
+    uint phase;                 // cardiac phase nearest to when it was taken
     vec3 direction;             // towards the detector, of unit depth
     float norm;                 // length of `direction`
     float target;               // measured line integral
     float temporal_low;         // bounds of the integral above the pixel's still background
     uint id;                    // frame * pixels + pixel
     float temporal_high;        // see `temporal_low`
+    uint beyond;                // phase on the other side of when it was taken
+    float beyond_share;         // what it shows of that phase: 0 to 0.5
 };
 
 // Rays of a view as affine functions of pixel column and row.
@@ -143,9 +145,18 @@ struct View {
 // One training image.
 struct Frame {
     uint view;                  // of the training views
-    uint phase;                 // cardiac phase
+    uint phase;                 // cardiac phase nearest to when it was taken
+    uint beyond;                // phase on the other side of when it was taken
+    float beyond_share;         // what it shows of that phase: 0 to 0.5
     uint image_offset;          // floats into images
     uint background_offset;     // vec2 into backgrounds
+};
+
+// When a live sample's ray was taken.
+struct SampleTime {
+    uint phase;                 // nearest cardiac phase
+    uint beyond;                // phase on the other side of that time
+    float beyond_share;         // what is shown of that phase: 0 to 0.5
 };
 
 // What a ray sees.

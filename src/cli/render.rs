@@ -31,7 +31,8 @@ pub struct RenderArgs {
     /// Secondary angle, degrees, cranial positive.
     #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
     pub secondary: f64,
-    /// Phase from 0, or `all`; between two, as 3.4, where one set of Gaussians moves (preset fast, gaussians.form = "tree").
+    /// Phase from 0, or `all`; between two, as 3.4, where a network or one set of Gaussians moves (all but fast's
+    /// gaussians.form = "phase").
     #[arg(long, default_value = "0", allow_negative_numbers = true)]
     pub phase: String,
     /// Pictures between neighbouring phases, for smooth animations with --phase all.
@@ -152,8 +153,8 @@ fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
     if args.between > 0 {
         return Err(Error::config("--between", args.between, "pictures between phases need --phase all"));
     }
-    // The beat of Gaussians that move closes: it ends where it begins.
-    let last = if model.moving.as_ref().is_some_and(|field| field.tree().is_some()) { n_phases } else { n_phases - 1 };
+    // A beat that is continuous closes: it ends where it begins.
+    let last = if model.is_continuous() { n_phases } else { n_phases - 1 };
     match args.phase.parse::<f64>() {
         Ok(phase) if (0.0..=f64::from(last)).contains(&phase) => Ok(vec![phase]),
         _ => Err(Error::config("--phase", &args.phase, format!("`all` or a phase from 0 to {last} is accepted"))),

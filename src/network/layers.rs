@@ -6,7 +6,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
 use crate::kernels::constants::NOWHERE;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
-use crate::kernels::layout::Setup;
+use crate::kernels::layout::{SampleTime, Setup};
 use crate::kernels::push;
 use crate::kernels::stages::LayerKernels;
 use crate::kernels::tuning::Tuning;
@@ -27,8 +27,8 @@ pub(super) struct LayerNetwork {
 buffer_set! {
     /// Buffers of the forward pass.
     struct LayerBuffers {
-        /// Phase of each live sample.
-        sample_phases,
+        /// When the ray of each live sample was taken.
+        sample_times,
         /// Encoding of each live sample.
         features,
     }
@@ -78,7 +78,7 @@ impl LayerNetwork {
         Ok(LayerNetwork {
             kernels: LayerKernels::new(gpu, tuning.clone())?,
             buffers: LayerBuffers {
-                sample_phases: gpu.buffer("sample_phases", capacity * 4, Memory::Device)?,
+                sample_times: gpu.buffer("sample_times", capacity * size_of::<SampleTime>() as u64, Memory::Device)?,
                 features: operand("features", capacity * params.encode_groups as u64 * 16)?,
             },
             activations: (0..params.layers.len())

@@ -136,10 +136,14 @@ pub struct NetworkTrace {
     pub feature: f64,
 }
 
-/// The network at one encoded point and phase.
-pub fn network_fwd(p: &ParamMap, params: &[f64], encoded: &[f64], phase: usize, precision: Precision) -> NetworkTrace {
+/// Phases that a ray shows, and what it shows of each; see [`BeatTime::shown`].
+///
+/// [`BeatTime::shown`]: crate::scan::gating::BeatTime::shown
+pub type Shown = [(usize, f64); 2];
+
+/// The network at one encoded point, at one phase or between two.
+pub fn network_fwd(p: &ParamMap, params: &[f64], encoded: &[f64], shown: Shown, precision: Precision) -> NetworkTrace {
     let round = |x: f64| precision.round(x);
-    let latent = &params[p.latents + phase * p.latent..][..p.latent];
     let encoded: Vec<f64> = encoded.iter().map(|e| round(*e)).collect();
     let mut hidden: Vec<Vec<f64>> = Vec::new();
     for layer in &p.layers {
@@ -148,9 +152,13 @@ pub fn network_fwd(p: &ParamMap, params: &[f64], encoded: &[f64], phase: usize, 
             .map(|j| {
                 let mut z = params[layer.bias + j];
                 if let Some(at) = layer.latent {
-                    z += latent.iter().enumerate().map(|(l, v)| params[at + j * p.latent + l] * v).sum::<f64>();
-                    // On matrices, bias and latent are a column of the weights.
-                    z = round(z);
+                    let weights = &params[at + j * p.latent..][..p.latent];
+                    let row = |phase: usize| {
+                        let latent = &params[p.latents + phase * p.latent..][..p.latent];
+                        z + weights.iter().zip(latent).map(|(w, v)| w * v).sum::<f64>()
+                    };
+                    // On matrices, bias and latent are a column of the weights, and shares are numbers of the input.
+                    z = shown.iter().map(|(phase, share)| round(row(*phase)) * round(*share)).sum();
                 }
                 if let Some(at) = layer.encoded {
                     let row = at + j * p.encode_groups * 4;
@@ -175,7 +183,7 @@ pub fn network_bwd(
     p: &ParamMap,
     params: &[f64],
     trace: &NetworkTrace,
-    phase: usize,
+    shown: Shown,
     dl_dfeature: f64,
     precision: Precision,
     gradient: &mut [f64],
@@ -200,10 +208,10 @@ pub fn network_bwd(
                 trace.encoded.iter().enumerate().for_each(|(k, e)| gradient[row + k] += g * e);
             }
             if let Some(at) = layer.latent {
-                for l in 0..p.latent {
+                for (l, (phase, share)) in (0..p.latent).flat_map(|l| shown.map(|shown| (l, shown))) {
                     let value = p.latents + phase * p.latent + l;
-                    gradient[at + j * p.latent + l] += g * params[value];
-                    gradient[value] += g * params[at + j * p.latent + l];
+                    gradient[at + j * p.latent + l] += share * g * params[value];
+                    gradient[value] += share * g * params[at + j * p.latent + l];
                 }
             }
             if let (Some(at), true) = (layer.hidden, i > 0) {

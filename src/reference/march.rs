@@ -4,7 +4,7 @@ use crate::kernels::layout::Setup;
 use crate::model::params::ParamMap;
 use crate::plan::Plan;
 use crate::random::{STREAM_DEPTH, STREAM_MOTION_RAY, STREAM_RAY, permute, uniform01};
-use crate::reference::field::{self, NetworkTrace, Precision};
+use crate::reference::field::{self, NetworkTrace, Precision, Shown};
 use glam::DVec3;
 
 /// One ray; see `Ray` in the shaders.
@@ -14,8 +14,8 @@ pub struct Ray {
     pub anchor: DVec3,
     /// Direction of unit depth.
     pub direction: DVec3,
-    /// Cardiac phase.
-    pub phase: usize,
+    /// Phases that it shows.
+    pub shown: Shown,
     /// Measured line integral.
     pub target: f64,
     /// Bounds of the integral above the pixel's still background.
@@ -55,12 +55,13 @@ pub fn ray(plan: &Plan, id: u32) -> Ray {
     let pixel = id % s.n_pixels;
     let (i, j) = (f64::from(pixel % s.image_width), f64::from(pixel / s.image_width));
     let target = f64::from(plan.images[(frame.image_offset + pixel) as usize]);
+    let beyond_share = f64::from(frame.beyond_share);
     let [low, high] = plan.backgrounds[(frame.background_offset + pixel) as usize];
     let v = |a: [f32; 4]| DVec3::new(a[0].into(), a[1].into(), a[2].into());
     Ray {
         anchor: v(view.anchor00) + i * v(view.anchor_du) + j * v(view.anchor_dv),
         direction: v(view.direction00) + i * v(view.direction_du) + j * v(view.direction_dv),
-        phase: frame.phase as usize,
+        shown: [(frame.phase as usize, 1.0 - beyond_share), (frame.beyond as usize, beyond_share)],
         target,
         temporal: [high, low].map(|background| target - f64::from(background)),
         id,
@@ -86,11 +87,17 @@ pub fn depths(s: &Setup, n: u32, near: f32, far: f32, step: u32, ray: &Ray) -> V
     (0..n as usize).map(|k| (at[k], if k + 1 < n as usize { at[k + 1] - at[k] } else { 1e-10 } * norm)).collect()
 }
 
-/// Whether the dynamic field may exist at a point: its box and, if used, the hull.
+/// Whether the dynamic field may exist at a point at a phase: its box and, if used, the hull.
 pub fn dynamic_inside(plan: &Plan, x: DVec3, phase: usize) -> bool {
     let s = &plan.setup;
     let (low, high) = (field::point(s.dynamic_min), field::point(s.dynamic_max));
     x.cmpge(low).all() && x.cmple(high).all() && plan.hull.as_ref().is_none_or(|h| h.contains_point(x, phase))
+}
+
+/// Whether the dynamic field is evaluated at a point of a ray (twin of `searched`); `occupied` says so of a phase.
+pub fn searched(plan: &Plan, x: DVec3, ray: &Ray, occupied: impl Fn(usize) -> bool) -> bool {
+    let shows = |(phase, share): &(usize, f64)| *share > 0.0 && dynamic_inside(plan, x, *phase) && occupied(*phase);
+    ray.shown.iter().any(shows)
 }
 
 /// A static sample: where, path length, feature.
@@ -163,10 +170,10 @@ pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool,
     }
     for (t, dl) in depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray) {
         let x = ray.anchor + t * ray.direction;
-        if !dynamic_inside(plan, x, ray.phase) {
+        if !searched(plan, x, ray, |_| true) {
             continue;
         }
-        let trace = field::network_fwd(p, params, &field::encode(s, row.window.into(), x), ray.phase, precision);
+        let trace = field::network_fwd(p, params, &field::encode(s, row.window.into(), x), ray.shown, precision);
         let sigma = f64::from(s.dynamic_gain) * field::softplus(trace.feature + f64::from(s.dynamic_shift));
         let near = t < f64::from(s.occlusion_depth);
         out.dynamic_integral += sigma * dl;
@@ -194,7 +201,7 @@ pub fn bwd(
         }
     }
     for sample in &march.dynamics {
-        sample_bwd(plan, params, ray.phase, sample, dl_dd, precision, gradient);
+        sample_bwd(plan, params, ray.shown, sample, dl_dd, precision, gradient);
     }
 }
 
@@ -202,7 +209,7 @@ pub fn bwd(
 pub fn sample_bwd(
     plan: &Plan,
     params: &[f64],
-    phase: usize,
+    shown: Shown,
     sample: &DynamicSample,
     dl_dd: f64,
     precision: Precision,
@@ -216,7 +223,7 @@ pub fn sample_bwd(
         &plan.params,
         params,
         &sample.trace,
-        phase,
+        shown,
         per_integral * sample.dl * slope,
         precision,
         gradient,

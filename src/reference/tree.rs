@@ -5,6 +5,7 @@ use crate::kernels::layout::{GaussianSetup, TreeSetup};
 use crate::model::gaussians::{basis, shares};
 use crate::plan::targets::Targets;
 use crate::reference::gaussians::{self, N_PARAMS, Params};
+use crate::scan::gating::BeatTime;
 use glam::DVec3;
 
 /// Everything that is fitted, or its gradient.
@@ -49,11 +50,9 @@ fn displaced(p: &TreeParams, i: usize, motion: &Motion) -> Params {
     out
 }
 
-/// Phases that an image shows, and their shares: its own, and that beyond the time when it was taken. The beat closes.
+/// Phases that an image shows, and their shares.
 pub fn phases_shown(phase: usize, view: &SplatView, n_phases: usize) -> [(usize, f64); 2] {
-    let step = if view.after_phase < 0.0 { n_phases - 1 } else { 1 };
-    let share = view.after_phase.abs();
-    [(phase, 1.0 - share), ((phase + step) % n_phases, share)]
+    BeatTime { phase: phase as u32, after_phase: view.after_phase }.shown(n_phases as u32)
 }
 
 /// A Gaussian as an image of a phase shows it: on the straight way from one phase to another.

@@ -253,7 +253,7 @@ impl Renderer {
     ) -> Result<Rendering> {
         self.check_phase(phase)?;
         let blobs = self.moving.as_ref().map(|blobs| blobs.at(phase)).transpose()?;
-        self.draw(rays, (width, height), phase, blobs.as_ref(), parts)
+        self.draw(rays, (width, height), BeatTime::at_phase(phase), blobs.as_ref(), parts)
     }
 
     /// Renders a `width` x `height` view as it was when an image was taken; at the nearest phase where the moving field knows
@@ -272,38 +272,39 @@ impl Renderer {
     }
 
     /// Renders a `width` x `height` view at a phase that may lie between two, such as 3.4, of a model whose moving field
-    /// is one set of Gaussians that moves; its beat closes, so that the number of phases is phase 0 again. Whole phases are
-    /// those of [`Renderer::render`].
+    /// is one set of Gaussians that moves, or a network, whose latents have values between those of two phases; its beat
+    /// closes, so that the number of phases is phase 0 again. Whole phases are those of [`Renderer::render`].
     ///
     /// # Errors
     /// [`Error::Config`] for a phase below 0 or beyond the beat, and for one between two where the moving field is a set
-    /// of Gaussians per phase or a network; device errors.
+    /// of Gaussians per phase; device errors.
     pub fn render_at(&self, rays: &ViewRays, width: usize, height: usize, phase: f64) -> Result<Rendering> {
         let last = self.last_moment();
         if !(0.0..=f64::from(self.setup.n_phases)).contains(&phase) {
             return Err(Error::config("phase", phase, format!("phases go from 0 to {last}")));
         }
         if phase.fract() != 0.0 {
-            // The static field is the same at every phase.
             let all = Parts { still: true, maxima: true };
-            return self.draw(rays, (width, height), 0, Some(&self.between(phase)?), all);
+            let taken = BeatTime::of(phase, self.setup.n_phases);
+            let blobs = self.moving.as_ref().map(|_| self.between(phase)).transpose()?;
+            return self.draw(rays, (width, height), taken, blobs.as_ref(), all);
         }
         let closes = last == self.setup.n_phases && phase == f64::from(last);
         self.render(rays, width, height, if closes { 0 } else { phase as u32 })
     }
 
-    /// The last phase that can be asked for: that of a set of Gaussians that moves is the first of the next beat.
+    /// The last phase that can be asked for: that of a field that is continuous in time is the first of the next beat.
     fn last_moment(&self) -> u32 {
-        let moves = self.moving.as_ref().is_some_and(Blobs::move_between_phases);
-        if moves { self.setup.n_phases } else { self.setup.n_phases - 1 }
+        let continuous = self.moving.as_ref().is_none_or(Blobs::move_between_phases);
+        if continuous { self.setup.n_phases } else { self.setup.n_phases - 1 }
     }
 
-    /// Renders a view at a phase, with `blobs` where Gaussians are the moving field.
+    /// Renders a view at a time, with `blobs` of that time where Gaussians are the moving field.
     fn draw(
         &self,
         rays: &ViewRays,
         (width, height): (usize, usize),
-        phase: u32,
+        taken: BeatTime,
         blobs: Option<&BlobList>,
         parts: Parts,
     ) -> Result<Rendering> {
@@ -316,7 +317,7 @@ impl Renderer {
         for first_pixel in (0..pixels).step_by(at_once as usize) {
             let n_rays = at_once.min(pixels - first_pixel);
             let mut recording = Recording::new(&self.gpu, "render")?;
-            let push = push::PoseRays { first_pixel, n_rays, phase, image_width, view: 0 };
+            let push = pose(taken, self.setup.n_phases, first_pixel, n_rays, image_width);
             self.buffers.record_pose(&mut recording, &self.kernels, &views, push)?;
             if parts.still {
                 self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
@@ -331,6 +332,12 @@ impl Renderer {
         }
         Ok(out)
     }
+}
+
+/// Rays of the pixels of a view, from `first_pixel` on, as they were at a time.
+pub(super) fn pose(taken: BeatTime, n_phases: u32, first_pixel: u32, n_rays: u32, image_width: u32) -> push::PoseRays {
+    let (phase, beyond, beyond_share) = (taken.phase, taken.beyond(n_phases), taken.after_phase.abs() as f32);
+    push::PoseRays { first_pixel, n_rays, phase, beyond, beyond_share, image_width, view: 0 }
 }
 
 /// What of a rendering is wanted; the rest is undefined.

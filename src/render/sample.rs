@@ -10,7 +10,8 @@ use crate::kernels::push;
 use crate::model::component::Component;
 use crate::network::forward::ForwardBuffers;
 use crate::render::grid::{Grid, PatientGrid};
-use crate::render::renderer::{RAYS_PER_SUBMIT, Renderer};
+use crate::render::renderer::{RAYS_PER_SUBMIT, Renderer, pose};
+use crate::scan::gating::BeatTime;
 use glam::DVec3;
 
 /// Cells sampled by one submit: 16 MiB on their way to the host.
@@ -66,7 +67,7 @@ impl Renderer {
             let views = self.constants(&mut r, "views", bytemuck::bytes_of(&view))?;
             let setup_buffer = self.constants(&mut r, "setup", bytemuck::bytes_of(&setup))?;
             let buffers = ForwardBuffers { setup: setup_buffer, ..self.buffers.clone() };
-            let push = push::PoseRays { first_pixel: first, n_rays: n, phase, image_width: ny, view: 0 };
+            let push = pose(BeatTime::at_phase(phase), self.setup.n_phases, first, n, ny);
             buffers.record_pose(&mut r, &self.kernels, &views, push)?;
             match (field, &self.moving) {
                 (Component::Static, _) => {

@@ -95,6 +95,18 @@ impl BeatTime {
         BeatTime::new(phase, time_phases - nearest)
     }
 
+    /// The phase on the other side of this time, of the `n_phases` of a beat, which closes.
+    pub fn beyond(self, n_phases: u32) -> u32 {
+        let step = if self.after_phase < 0.0 { n_phases - 1 } else { 1 };
+        (self.phase + step) % n_phases
+    }
+
+    /// The phases around this time, the nearest first, and what an image shows of each.
+    pub fn shown(self, n_phases: u32) -> [(usize, f64); 2] {
+        let share = self.after_phase.abs();
+        [(self.phase as usize, 1.0 - share), (self.beyond(n_phases) as usize, share)]
+    }
+
     /// Counted in phases, from 0 to below `n_phases`.
     pub fn phases(self, n_phases: u32) -> f64 {
         let beat = f64::from(n_phases);

@@ -181,9 +181,8 @@ fn ours(tree: &PhaseTree) -> Vec<&[DVec3]> {
 /// Our lines as an image shows them that was taken near the phase of `tree`: where points are followed, on the straight way to the
 /// phase beyond.
 fn shown(beat: &BeatTree, tree: &PhaseTree, taken: BeatTime, n_phases: u32) -> Vec<Vec<DVec3>> {
-    let step = if taken.after_phase < 0.0 { n_phases - 1 } else { 1 };
-    let beyond =
-        beat.phases.iter().find(|t| beat.reference_phase.is_some() && t.phase == (tree.phase + step) % n_phases);
+    let next = BeatTime { phase: tree.phase, ..taken }.beyond(n_phases);
+    let beyond = beat.phases.iter().find(|t| beat.reference_phase.is_some() && t.phase == next);
     let (here, there, share) = (ours(tree), beyond.map_or_else(|| ours(tree), ours), taken.after_phase.abs());
     let between = |(a, b): (&[DVec3], &[DVec3])| a.iter().zip(b).map(|(a, b)| a.lerp(*b, share)).collect();
     here.into_iter().zip(there).map(between).collect()

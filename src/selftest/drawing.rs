@@ -17,6 +17,7 @@ use crate::render::grid::Grid;
 use crate::render::quantity::{Projection, Quantity};
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
+use crate::scan::gating::BeatTime;
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::iteration::{STEADY, path_name, sine_factor};
 use crate::selftest::problems::{small_config, small_dataset};
@@ -74,7 +75,7 @@ impl Trained {
 /// Iterations before anything is drawn.
 const ITERATIONS: u32 = 5;
 
-/// Compares views at a phase with the twin's.
+/// Compares views between two phases with the twin's.
 ///
 /// # Errors
 /// Device errors.
@@ -82,12 +83,13 @@ pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut 
     findings.begin(path_name(tuning.layers), &format!("{}, view of 12 x 10 pixels", preset.name()));
     let settings = ["loss.normalise=true", "train.chunk_samples=1500"];
     let trained = Trained::new(gpu, small_dataset(12, 10, 3)?, preset, &settings, tuning)?;
-    let (rays, phase) = (&trained.dataset.views[2].rays, 2);
-    let seen = Renderer::new(gpu, &trained.model, tuning.clone())?.render(rays, 12, 10, phase)?;
+    let (rays, taken) = (&trained.dataset.views[2].rays, BeatTime { phase: 2, after_phase: 0.375 });
+    let seen = Renderer::new(gpu, &trained.model, tuning.clone())?.render_taken(rays, 12, 10, taken)?;
     let (mut statics, mut dynamics, mut largest) = (Vec::new(), Vec::new(), Vec::new());
     for pixel in 0..120u32 {
         let (anchor, direction) = rays.pixel(f64::from(pixel % 12), f64::from(pixel / 12));
-        let ray = march::Ray { anchor, direction, phase: phase as usize, target: 0.0, temporal: [0.0; 2], id: pixel };
+        let shown = taken.shown(trained.dataset.n_phases);
+        let ray = march::Ray { anchor, direction, shown, target: 0.0, temporal: [0.0; 2], id: pixel };
         let want = march::fwd(&trained.plan, &trained.params, ITERATIONS, &ray, true, trained.precision);
         statics.push(want.static_integral);
         dynamics.push(want.dynamic_integral);
@@ -118,14 +120,15 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
     let grid =
         Grid { origin: DVec3::new(-1.113, -0.417, -0.323), spacing: DVec3::new(0.05, 0.1, 0.07), size: [43, 9, 11] };
     let phase = 2;
+    let shown = BeatTime::at_phase(phase).shown(trained.dataset.n_phases);
     let Trained { plan, params, .. } = trained;
     let s = &plan.setup;
     let window = trained.model.config.schedule(trained.model.step).window;
     let want = |field: Component, x: DVec3| match field {
         Component::Static if field::static_inside(s, x) => field::static_attenuation(s, &plan.params, params, x),
-        Component::Dynamic if march::dynamic_inside(plan, x, phase) => {
+        Component::Dynamic if march::dynamic_inside(plan, x, phase as usize) => {
             let encoded = field::encode(s, window.into(), x);
-            let trace = field::network_fwd(&plan.params, params, &encoded, phase, trained.precision);
+            let trace = field::network_fwd(&plan.params, params, &encoded, shown, trained.precision);
             trained.attenuation(trace.feature)
         }
         _ => 0.0,
@@ -139,7 +142,7 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
     for (field, stages, tolerance) in
         [(Component::Static, STATIC_CELLS, CELL), (Component::Dynamic, DYNAMIC_CELLS, dynamic)]
     {
-        let got = renderer.sample(field, phase as u32, &grid)?;
+        let got = renderer.sample(field, phase, &grid)?;
         let want: Vec<f64> = points.iter().map(|x| want(field, *x)).collect();
         findings.numbers(stages, "attenuation", &got, &want, tolerance);
         findings.require(stages, "cells outside the box", want.contains(&0.0));

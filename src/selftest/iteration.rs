@@ -14,7 +14,7 @@ use crate::model::params::{ParamMap, Tensor};
 use crate::network::FIRST_LOSS_SCALE;
 use crate::network::chunk::chunks;
 use crate::plan::Plan;
-use crate::reference::field::{self, Precision};
+use crate::reference::field::{self, Precision, Shown};
 use crate::reference::{march, step};
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance};
@@ -296,9 +296,11 @@ impl Twin<'_> {
     fn compare_rays(&self, seen: &Seen, findings: &mut Findings) {
         let mut worst = 0f64;
         for (got, want) in seen.rays.iter().zip(&self.rays) {
-            if (got.id, got.phase as usize) != (want.id, want.phase) {
+            let [(nearest, _), (beyond, share)] = want.shown;
+            if (got.id, got.phase as usize, got.beyond as usize) != (want.id, nearest, beyond) {
                 worst = f64::INFINITY;
             }
+            worst = larger(worst, (f64::from(got.beyond_share) - share).abs());
             let off = |got: [f32; 3], want: DVec3| (DVec3::from_array(got.map(f64::from)) - want).abs().max_element();
             let bounds = [got.temporal_low, got.temporal_high];
             let bounds_off = bounds.iter().zip(want.temporal).map(|(got, want)| (f64::from(*got) - want).abs());
@@ -317,7 +319,7 @@ impl Twin<'_> {
             let want: Vec<(DVec3, f64)> = depths
                 .into_iter()
                 .map(|(depth, path_length)| (ray.anchor + depth * ray.direction, path_length))
-                .filter(|(x, _)| march::dynamic_inside(self.plan, *x, ray.phase))
+                .filter(|(x, _)| march::searched(self.plan, *x, ray, |_| true))
                 .collect();
             let got: Vec<&Sample> = samples.iter().filter(|sample| sample.ray == r).collect();
             strays += got.len().abs_diff(want.len());
@@ -335,13 +337,13 @@ impl Twin<'_> {
     }
 
     fn trace(&self, sample: &Sample) -> field::NetworkTrace {
-        let (plan, phase) = (self.plan, self.phase(sample));
+        let (plan, shown) = (self.plan, self.shown(sample));
         let encoded = field::encode(&plan.setup, plan.schedule[self.step as usize].window.into(), sample.x);
-        field::network_fwd(&plan.params, self.params, &encoded, phase, self.precision)
+        field::network_fwd(&plan.params, self.params, &encoded, shown, self.precision)
     }
 
-    fn phase(&self, sample: &Sample) -> usize {
-        self.rays.get(sample.ray).map_or(0, |ray| ray.phase)
+    fn shown(&self, sample: &Sample) -> Shown {
+        self.rays.get(sample.ray).map_or([(0, 1.0), (0, 0.0)], |ray| ray.shown)
     }
 
     /// Attenuation and its slope at the device's samples.
@@ -435,8 +437,8 @@ impl Twin<'_> {
             let by_integral = seen.ray_gradient[sample.ray][1].into();
             let Sample { x, path_length: dl, near, .. } = *sample;
             let trace = march::DynamicSample { x, dl, near, trace: self.trace(sample) };
-            let phase = self.phase(sample);
-            march::sample_bwd(self.plan, self.params, phase, &trace, by_integral, self.precision, &mut want);
+            let shown = self.shown(sample);
+            march::sample_bwd(self.plan, self.params, shown, &trace, by_integral, self.precision, &mut want);
         }
         for Part { stages, name, positions } in parts(params, self.on_matrices()) {
             let (got, want) = (pick(&positions, &seen.gradient), pick(&positions, &want));

@@ -76,12 +76,14 @@ fn compare_notes(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> R
     let mut kinds = [0u32; 2];
     for ((point, ray), sigma) in points.iter().zip(&rays).zip(&sigma) {
         let x = DVec3::new(point[0].into(), point[1].into(), point[2].into());
-        let phase = batch.get((ray & !NEAR_SAMPLE) as usize).map_or(0, |ray| ray.phase);
-        let entry = occupancy::entry(&setup, x, phase);
+        let Some(ray) = batch.get((ray & !NEAR_SAMPLE) as usize) else { continue };
         let full = sigma[0] > setup.occupancy_threshold;
         kinds[usize::from(full)] += 1;
         let bits = SEEN | if full { OCCUPIED } else { 0 };
-        want[words + (entry / CELLS_PER_WORD) as usize] |= bits << (2 * (entry % CELLS_PER_WORD));
+        for phase in [Some(ray.phase), (ray.beyond_share > 0.0).then_some(ray.beyond)].into_iter().flatten() {
+            let entry = occupancy::entry(&setup, x, phase);
+            want[words + (entry / CELLS_PER_WORD) as usize] |= bits << (2 * (entry % CELLS_PER_WORD));
+        }
     }
     let wrong = after.iter().zip(&want).filter(|(after, want)| after != want).count();
     findings.add(NOTES, &format!("words with other bits, of {}", want.len()), wrong as f64, 0.5);
@@ -100,10 +102,9 @@ fn compare_use(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> Res
     for ray in march::batch(plan, HEEDING) {
         for (t, _) in march::depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, HEEDING, &ray) {
             let x = ray.anchor + t * ray.direction;
-            if march::dynamic_inside(plan, x, ray.phase) {
-                all += 1;
-                kept += u64::from(occupancy::occupied(s, &noted, x, ray.phase as u32, HEEDING));
-            }
+            let noted = |phase: usize| occupancy::occupied(s, &noted, x, phase as u32, HEEDING);
+            all += u64::from(march::searched(plan, x, &ray, |_| true));
+            kept += u64::from(march::searched(plan, x, &ray, noted));
         }
     }
     // A sample on a cell face may fall either way in f32.

@@ -83,6 +83,17 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
     })
 }
 
+/// [`small_dataset`] of three phases, of which some images were taken between two, before and after the nearest.
+///
+/// # Errors
+/// As [`small_dataset`].
+pub fn uneven_dataset(width: usize, height: usize) -> Result<Dataset> {
+    let mut dataset = small_dataset(width, height, 3)?;
+    let after = [0.0, 0.3, -0.45, 0.5].into_iter().cycle();
+    dataset.frames.iter_mut().zip(after).for_each(|(frame, after)| frame.after_phase = after);
+    Ok(dataset)
+}
+
 /// A configuration small enough for f64 twins, on top of a preset.
 ///
 /// # Errors

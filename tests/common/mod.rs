@@ -55,6 +55,11 @@ pub fn small_dataset(width: usize, height: usize) -> Dataset {
     problems::small_dataset(width, height, 3).unwrap()
 }
 
+/// The same, of which some images were taken between two phases.
+pub fn uneven_dataset(width: usize, height: usize) -> Dataset {
+    problems::uneven_dataset(width, height).unwrap()
+}
+
 /// A configuration small enough for f64 twins, on top of a preset.
 pub fn small_config(preset: &str, settings: &[&str]) -> Config {
     problems::small_config(Preset::named(preset).unwrap(), settings).unwrap()
