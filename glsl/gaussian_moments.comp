@@ -1,9 +1,10 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // What the gradient of a Gaussian needs of an image: sums over its box of h = dL/dD times its value there, plain and
-// weighted by du, dv, du^2, du dv, dv^2, each in the order of the pixels. One invocation per splat, as in
-// gaussian_splat.
+// weighted by du, dv, du^2, du dv, dv^2, each in the order of the pixels. One invocation per splat, or as many as share
+// one, as in gaussian_splat.
 #include "inc/gaussian.glsl"
+#include "inc/splat_lanes.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_splats; } push;
 layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
@@ -14,8 +15,7 @@ layout(binding = 3) readonly buffer B3 { float splat_image_gradient[]; };
 layout(binding = 4) writeonly buffer B4 { vec4 splat_moments[]; };
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
-    if (i >= push.n_splats) return;
+    uint i = min(splat_index(), push.n_splats - 1u);
     Splat s = splats[i];
     int image = image_of_splat[i];
     ivec4 box = pixels_of(s, gaussian_setup);
@@ -23,17 +23,18 @@ void main() {
     uint first = uint(max(image, 0)) * gaussian_setup.image_stride;
     vec3 half_log2 = -HALF_LOG2_E * s.conic;
     vec3 linear = vec3(0.0), square = vec3(0.0);
-    ivec2 at = box.xy;
     uint n = n_pixels(box);
-    for (uint k = 0u; k < n; k++) {
-        vec2 d = vec2(at) - s.mean;
-        float h = splat_image_gradient[first + uint(at.y) * gaussian_setup.width + uint(at.x)] * falloff(half_log2, d);
+    for (Walk walk = walk_from(box); walk.k < n; walk_on(walk, box)) {
+        vec2 d = vec2(walk.at) - s.mean;
+        uint pixel = uint(walk.at.y) * gaussian_setup.width + uint(walk.at.x);
+        float h = splat_image_gradient[first + pixel] * falloff(half_log2, d);
         vec2 hd = h * d;
         linear += vec3(h, hd);
         square += vec3(hd.x * d.x, hd.x * d.y, hd.y * d.y);
-        at.x++;
-        if (at.x > box.z) at = ivec2(box.x, at.y + 1);
     }
+    linear = splat_sum(linear);
+    square = splat_sum(square);
+    if (splat_lane() != 0u || splat_index() >= push.n_splats) return;
     splat_moments[2u * i] = vec4(s.amplitude * linear, 0.0);
     splat_moments[2u * i + 1u] = vec4(s.amplitude * square, 0.0);
 }

@@ -2,8 +2,9 @@
 #extension GL_GOOGLE_include_directive : require
 // Images of Gaussians: each adds itself to the pixels of its box. An image is a plain sum, so there is no sorting; sums
 // are integers of a fixed point, so their order does not matter and runs repeat bit by bit.
-// One invocation per splat; it walks its own box, so nothing is reduced across lanes.
+// One invocation per splat, or as many as share one; each walks its own pixels, so nothing is reduced across lanes.
 #include "inc/gaussian.glsl"
+#include "inc/splat_lanes.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_splats; } push;
 layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
@@ -13,20 +14,18 @@ layout(binding = 2) readonly buffer B2 { int image_of_splat[]; };
 layout(binding = 3) buffer B3 { int splat_images[]; };
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = splat_index();
     if (i >= push.n_splats || image_of_splat[i] < 0) return;
     Splat s = splats[i];
     uint first = uint(image_of_splat[i]) * gaussian_setup.image_stride;
     vec3 half_log2 = -HALF_LOG2_E * s.conic;
     float amplitude = s.amplitude * gaussian_setup.fixed_point;
     ivec4 box = pixels_of(s, gaussian_setup);
-    ivec2 at = box.xy;
     uint n = n_pixels(box);
     // One loop over the box instead of two nested ones: lanes of different boxes wait for each other once.
-    for (uint k = 0u; k < n; k++) {
-        float value = amplitude * falloff(half_log2, vec2(at) - s.mean);
-        atomicAdd(splat_images[first + uint(at.y) * gaussian_setup.width + uint(at.x)], int(roundEven(value)));
-        at.x++;
-        if (at.x > box.z) at = ivec2(box.x, at.y + 1);
+    for (Walk walk = walk_from(box); walk.k < n; walk_on(walk, box)) {
+        float value = amplitude * falloff(half_log2, vec2(walk.at) - s.mean);
+        uint pixel = uint(walk.at.y) * gaussian_setup.width + uint(walk.at.x);
+        atomicAdd(splat_images[first + pixel], int(roundEven(value)));
     }
 }

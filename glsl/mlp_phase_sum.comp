@@ -10,7 +10,7 @@ layout(binding = 0) readonly buffer B0 { Ray rays[]; };
 layout(binding = 1) readonly buffer B1 { vec4 ray_dz[]; };
 layout(binding = 2) buffer B2 { vec4 phase_dz[]; };
 
-shared vec4 lanes_sum[gl_WorkGroupSize.x];
+#include "inc/reduce.glsl"
 
 void main() {
     uint q = gl_WorkGroupID.x;
@@ -20,11 +20,8 @@ void main() {
         float share = phase_share(rays[push.first_ray + r], phase);
         if (share > 0.0) sum += share * ray_dz[q * push.n_rays + r];
     }
-    lanes_sum[gl_LocalInvocationID.x] = sum;
-    barrier();
+    vec4 total = workgroup_sum(sum);
     if (gl_LocalInvocationID.x != 0u) return;
-    vec4 total = lanes_sum[0];
-    for (uint l = 1u; l < gl_WorkGroupSize.x; l++) total += lanes_sum[l];
     uint at = (push.row + phase) * push.groups + q;
     phase_dz[at] = total + (push.accumulate != 0u ? phase_dz[at] : vec4(0.0));
 }

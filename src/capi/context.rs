@@ -107,8 +107,7 @@ fn parse(mut options: Options) -> Outcome<Parsed> {
             validation: options.take_as("validation", truth)?.unwrap_or(false),
             cache_dir: options.take("cache_dir").map(Into::into),
             memory_limit,
-            loader: None,
-            statistics: false,
+            ..DeviceOptions::default()
         },
         without_device,
         deterministic: options.take_as("deterministic", truth)?.unwrap_or(false),

@@ -10,7 +10,7 @@ use crate::kernels::constants;
 use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
 use crate::kernels::layout::GaussianSetup;
 use crate::kernels::push::{self, PushConstants};
-use crate::kernels::stages::{Build, Stage};
+use crate::kernels::stages::{Build, Stage, full_subgroup};
 use std::ops::Range;
 
 /// Losses kept on the device.
@@ -32,7 +32,12 @@ pub struct GaussianKernels {
     pub update: Stage<push::GaussianUpdate>,
     /// Loss and step count.
     pub report: Stage<push::GaussianReport>,
+    /// Invocations that share a splat.
+    lanes_per_splat: u32,
 }
+
+/// Invocations that share a splat, where a subgroup's exchange values: a splat has some hundred pixels.
+const LANES_PER_SPLAT: u32 = 8;
 
 impl GaussianKernels {
     /// Builds the pipelines.
@@ -41,13 +46,19 @@ impl GaussianKernels {
     /// Errors of [`Gpu::pipeline`].
     pub fn new(gpu: &Gpu) -> Result<GaussianKernels> {
         let plain = Build::default();
+        let exchanges = Build { exchanges: true, ..plain };
+        let subgroup = full_subgroup(gpu, push::GaussianSplat::LOCAL_SIZE);
+        let lanes_per_splat = subgroup.map_or(1, |size| size.min(LANES_PER_SPLAT));
+        let lanes = [("lanes_per_splat", lanes_per_splat)];
+        let splats = Build { constants: if subgroup.is_some() { &lanes } else { &[] }, ..exchanges };
         Ok(GaussianKernels {
             project: plain.stage(gpu)?,
-            splat: plain.stage(gpu)?,
-            residual: plain.stage(gpu)?,
-            moments: plain.stage(gpu)?,
+            splat: splats.stage(gpu)?,
+            residual: exchanges.stage(gpu)?,
+            moments: splats.stage(gpu)?,
             update: plain.stage(gpu)?,
-            report: plain.stage(gpu)?,
+            report: exchanges.stage(gpu)?,
+            lanes_per_splat,
         })
     }
 }
@@ -121,17 +132,22 @@ impl GaussianPass<'_> {
     /// Records the images of splats that are projected already.
     pub(super) fn splats(&mut self, n_splats: u32) -> Result<()> {
         let splat = &self.kernels.splat;
-        self.run(splat, splat.groups_for(n_splats), &[], push::GaussianSplat { n_splats })
+        self.run(
+            splat,
+            splat.groups_for(n_splats * self.kernels.lanes_per_splat),
+            &[],
+            push::GaussianSplat { n_splats },
+        )
     }
 
     /// Records the residuals of some images, and the moments of all splats.
     pub(super) fn residual(&mut self, images: Range<u32>, n_splats: u32) -> Result<()> {
         let [first_quad, n_quads] = [images.start, images.len() as u32].map(|n| n * self.setup.image_stride / 4);
-        let GaussianKernels { residual, moments, .. } = self.kernels;
+        let GaussianKernels { residual, moments, lanes_per_splat, .. } = self.kernels;
         let push = push::GaussianResidual { first_quad, n_quads };
         let groups = Groups::Direct([loss_parts(n_quads).max(1), 1, 1]);
         self.run(residual, groups, &[], push)?;
-        self.run(moments, moments.groups_for(n_splats), &[], push::GaussianMoments { n_splats })
+        self.run(moments, moments.groups_for(n_splats * lanes_per_splat), &[], push::GaussianMoments { n_splats })
     }
 
     /// Records the end of an iteration: its loss, and the count.

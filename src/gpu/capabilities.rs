@@ -26,6 +26,9 @@ pub struct DeviceInfo {
     pub mesa_major: Option<u32>,
     /// Default subgroup size.
     pub subgroup_size: u32,
+    /// Invocations of the subgroups that a compute shader's workgroup can be asked to consist of, where they also exchange
+    /// values (shuffles); none where the device cannot do either.
+    pub full_subgroups: Option<u32>,
     /// Shared memory of a workgroup, bytes.
     pub max_shared_memory: u32,
     /// Invocations of a workgroup.
@@ -113,8 +116,24 @@ fn c_chars(text: &[std::ffi::c_char]) -> String {
     text.iter().take_while(|c| **c != 0).map(|c| char::from(*c as u8)).collect()
 }
 
+/// See [`DeviceInfo::full_subgroups`].
+fn full_subgroups(
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+    subgroup: &vk::PhysicalDeviceSubgroupProperties<'_>,
+) -> Option<u32> {
+    let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut size);
+    // SAFETY: the caller checked that the device has the extension of the chained structure, which lives until the call returns.
+    unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    let whole = size.subgroup_size_control == vk::TRUE && size.compute_full_subgroups == vk::TRUE;
+    let exchanges = subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE)
+        && subgroup.supported_operations.contains(vk::SubgroupFeatureFlags::SHUFFLE);
+    (whole && exchanges && subgroup.subgroup_size.is_power_of_two()).then_some(subgroup.subgroup_size)
+}
+
 /// Device extensions the matrix kernels need.
-pub(super) const MATRIX_EXTENSIONS: [&CStr; 2] = [khr::cooperative_matrix::NAME, ext::subgroup_size_control::NAME];
+const MATRIX_EXTENSIONS: [&CStr; 2] = [khr::cooperative_matrix::NAME, ext::subgroup_size_control::NAME];
 
 /// Matrix shapes our kernels can use on a device with [`MATRIX_EXTENSIONS`], most work per product first; or why they
 /// cannot be told.
@@ -214,6 +233,8 @@ pub(super) fn describe(
             Vec::new()
         })
     };
+    let full_subgroups =
+        has(ext::subgroup_size_control::NAME).then(|| full_subgroups(instance, physical, &subgroup)).flatten();
     let unusable = if fault.is_some() {
         fault
     } else if version < vk::API_VERSION_1_2 {
@@ -247,6 +268,7 @@ pub(super) fn describe(
         ),
         is_llvmpipe: driver.driver_id == vk::DriverId::MESA_LLVMPIPE,
         subgroup_size: subgroup.subgroup_size,
+        full_subgroups,
         max_shared_memory: limits.max_compute_shared_memory_size,
         max_workgroup_invocations: limits.max_compute_work_group_invocations,
         max_workgroup_count: limits.max_compute_work_group_count[0],

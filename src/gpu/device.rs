@@ -1,7 +1,7 @@
 //! The choice of a device, adoption of someone else's, and what all objects made from one share: queue, allocator,
 //! timeline, debug names.
 
-use super::capabilities::{DeviceInfo, DeviceKind, MATRIX_EXTENSIONS, compute_family};
+use super::capabilities::{DeviceInfo, DeviceKind, compute_family};
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
 use super::statistics::StatisticsKeeper;
@@ -10,7 +10,7 @@ use ash::{ext, khr, vk};
 use gpu_allocator::AllocationSizes;
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 use std::collections::BTreeSet;
-use std::ffi::{CStr, CString};
+use std::ffi::CString;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
@@ -29,6 +29,8 @@ pub struct DeviceOptions {
     pub loader: Option<Loader>,
     /// Keep what the driver tells of each pipeline; see [`Gpu::pipeline_statistics`].
     pub statistics: bool,
+    /// Do without operations across a subgroup, as on a device that lacks them.
+    pub without_subgroups: bool,
 }
 
 /// A device that someone else made and goes on owning; see [`Gpu::adopt`].
@@ -219,8 +221,12 @@ impl Device {
         let mut create = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
         if !info.matrices.is_empty() {
             f12 = f12.shader_float16(true).vulkan_memory_model(true).vulkan_memory_model_device_scope(true);
-            extensions.extend(MATRIX_EXTENSIONS.map(CStr::as_ptr));
-            create = create.push_next(&mut matrix).push_next(&mut size);
+            extensions.push(khr::cooperative_matrix::NAME.as_ptr());
+            create = create.push_next(&mut matrix);
+        }
+        if !info.matrices.is_empty() || info.full_subgroups.is_some() {
+            extensions.push(ext::subgroup_size_control::NAME.as_ptr());
+            create = create.push_next(&mut size);
         }
         if with_statistics && info.pipeline_statistics {
             extensions.push(khr::pipeline_executable_properties::NAME.as_ptr());
@@ -308,7 +314,10 @@ impl Gpu {
     /// [`Error::NoDevice`] when none fits, with the list of those found.
     pub fn open(options: &DeviceOptions) -> Result<Gpu> {
         let instance = Instance::create(options.loader, options.validation)?;
-        let (physical, info) = choose(instance.devices()?, options.select.as_deref())?;
+        let (physical, mut info) = choose(instance.devices()?, options.select.as_deref())?;
+        if options.without_subgroups {
+            info.full_subgroups = None;
+        }
         let queue_family = compute_family(&instance, physical)
             .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?;
         let device = Device::create(instance, physical, &info, queue_family, options.statistics)?;
@@ -348,6 +357,7 @@ impl Gpu {
         info.buffer_device_address &= adoption.buffer_device_address;
         info.external_memory_fd &= adoption.external_memory_fd;
         info.matrices.clear();
+        info.full_subgroups = None;
         let parts = Parts {
             physical: adoption.physical_device,
             info,

@@ -95,6 +95,27 @@ impl Gpu {
         self.make_pipeline(code, local_size, spec, true)
     }
 
+    /// Builds a kernel whose subgroups must be full, of [`DeviceInfo::full_subgroups`] invocations each.
+    ///
+    /// [`DeviceInfo::full_subgroups`]: crate::gpu::capabilities::DeviceInfo::full_subgroups
+    ///
+    /// # Errors
+    /// As [`Gpu::pipeline`]; [`Error::Internal`] where subgroups cannot be full.
+    pub fn subgroup_pipeline(
+        &self,
+        code: &'static KernelCode,
+        local_size: u32,
+        spec: &[(&str, u32)],
+    ) -> Result<Pipeline> {
+        if !self.info().full_subgroups.is_some_and(|size| local_size.is_multiple_of(size)) {
+            return Err(Error::Internal(format!(
+                "kernel {}: {local_size} invocations are no full subgroups",
+                code.name
+            )));
+        }
+        self.make_pipeline(code, local_size, spec, true)
+    }
+
     fn make_pipeline(
         &self,
         code: &'static KernelCode,

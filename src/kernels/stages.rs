@@ -70,7 +70,17 @@ pub struct Build<'a> {
     pub constants: &'a [(&'a str, u32)],
     /// Whether the stage needs full subgroups, for cooperative matrices.
     pub matrices: bool,
+    /// Whether the shader also has a variant whose lanes exchange values within full subgroups: it is taken where they can.
+    pub exchanges: bool,
 }
+
+/// Invocations of the subgroups that a workgroup of so many `lanes` consists of, if they are full and exchange values.
+pub fn full_subgroup(gpu: &Gpu, lanes: u32) -> Option<u32> {
+    gpu.info().full_subgroups.filter(|size| lanes.is_multiple_of(*size))
+}
+
+/// Suffix of variants whose lanes exchange values.
+const EXCHANGING: &str = "_subgroup";
 
 impl Build<'_> {
     /// Builds the stage.
@@ -78,10 +88,15 @@ impl Build<'_> {
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
     pub fn stage<P: PushConstants>(self, gpu: &Gpu) -> Result<Stage<P>> {
-        let code = kernel_code(&format!("{}{}", P::SHADER, self.variant))?;
         let lanes = self.lanes.unwrap_or(P::LOCAL_SIZE);
+        // Operands through texel buffers are for drivers that are old and slow at all else.
+        let exchanges = self.exchanges && self.variant.is_empty() && full_subgroup(gpu, lanes).is_some();
+        let variant = if exchanges { EXCHANGING } else { self.variant };
+        let code = kernel_code(&format!("{}{variant}", P::SHADER))?;
         let pipeline = if self.matrices {
             gpu.matrix_pipeline(code, lanes, self.constants)?
+        } else if exchanges {
+            gpu.subgroup_pipeline(code, lanes, self.constants)?
         } else {
             gpu.pipeline(code, lanes, self.constants)?
         };
@@ -145,6 +160,7 @@ impl Kernels {
     pub fn new(gpu: &Gpu, tuning: Tuning, line_params: u32) -> Result<Kernels> {
         let plain = Build::default();
         let vec4 = Build { variant: vec4_variant(&tuning), ..plain };
+        let sums = Build { exchanges: true, ..plain };
         let private_lines = [("private_lines", tuning.private_lines(line_params))];
         let loss_scaling = [("loss_scaling", u32::from(tuning.layers == Layers::Matrices))];
         Ok(Kernels {
@@ -155,8 +171,8 @@ impl Kernels {
             march_emit: plain.stage(gpu)?,
             occupancy_mark: plain.stage(gpu)?,
             occupancy_clear: plain.stage(gpu)?,
-            march_fwd: vec4.stage(gpu)?,
-            march_fwd_maxima: Build { constants: &[("with_maxima", 1)], ..vec4 }.stage(gpu)?,
+            march_fwd: Build { exchanges: true, ..vec4 }.stage(gpu)?,
+            march_fwd_maxima: Build { constants: &[("with_maxima", 1)], exchanges: true, ..vec4 }.stage(gpu)?,
             volume_dynamic: plain.stage(gpu)?,
             volume_static: vec4.stage(gpu)?,
             baked_march: plain.stage(gpu)?,
@@ -168,7 +184,7 @@ impl Kernels {
             gradient_network: plain.stage(gpu)?,
             reg_tv: plain.stage(gpu)?,
             adam: plain.stage(gpu)?,
-            report: Build { constants: &loss_scaling, ..plain }.stage(gpu)?,
+            report: Build { constants: &loss_scaling, ..sums }.stage(gpu)?,
             tuning,
         })
     }
@@ -213,11 +229,11 @@ impl LayerKernels {
             mlp_layer_fwd: layer.stage(gpu)?,
             mlp_out_fwd: vec4.stage(gpu)?,
             mlp_out_bwd: vec4.stage(gpu)?,
-            mlp_out_bwd_weight: Build { lanes: weight_lanes, ..vec4 }.stage(gpu)?,
+            mlp_out_bwd_weight: Build { lanes: weight_lanes, exchanges: true, ..vec4 }.stage(gpu)?,
             mlp_layer_bwd_input: layer.stage(gpu)?,
             mlp_layer_bwd_weight: Build { lanes: weight_lanes, ..layer }.stage(gpu)?,
             mlp_ray_sum: vec4.stage(gpu)?,
-            mlp_phase_sum: Build { lanes: weight_lanes, ..plain }.stage(gpu)?,
+            mlp_phase_sum: Build { lanes: weight_lanes, exchanges: true, ..plain }.stage(gpu)?,
             tuning,
         })
     }

@@ -257,8 +257,8 @@ impl Builder<'_> {
             // Unrolled or not, they compute the same.
             variant: if tuning.matrices.unroll { "_unrolled" } else { "" },
             lanes: Some(shape.subgroups * gpu.info().subgroup_size),
-            constants: &[],
             matrices: true,
+            ..Build::default()
         };
         Builder { gpu, shape, params, build }
     }
