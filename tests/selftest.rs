@@ -114,8 +114,10 @@ struct Fault {
 
 /// The code that the device gets of a stage.
 fn code(gpu: &Gpu, stage: &str) -> Vec<u32> {
-    let texel = kernel_code(&format!("{stage}_texel")).ok().filter(|_| tuning(gpu).operands == Operands::Texel);
-    bytemuck::pod_collect_to_vec(texel.unwrap_or_else(|| kernel_code(stage).unwrap()).spirv)
+    let variant = |name: &str, taken: bool| kernel_code(&format!("{stage}_{name}")).ok().filter(|_| taken);
+    let texel = variant("texel", tuning(gpu).operands == Operands::Texel);
+    let taken = texel.or_else(|| variant("subgroup", gpu.info().full_subgroups.is_some()));
+    bytemuck::pod_collect_to_vec(taken.unwrap_or_else(|| kernel_code(stage).unwrap()).spirv)
 }
 
 /// Faults in the code of shaders as the driver gets it: each is found in the row of its stage, and in no row before.

@@ -2,7 +2,7 @@
 //! Affine around each centre: the error is below that of the cut.
 
 use crate::error::Result;
-use crate::gaussians::stages::FIXED_POINT_BITS;
+use crate::gaussians::stages::{FIXED_POINT_BITS, SplatStage};
 use crate::gaussians::view::SplatView;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::Memory;
@@ -32,7 +32,7 @@ struct Key {
 pub struct Pictures {
     gpu: Gpu,
     project: Stage<push::GaussianProject>,
-    splat: Stage<push::GaussianSplat>,
+    splat: SplatStage<push::GaussianSplat>,
     state: Mutex<State>,
 }
 
@@ -76,12 +76,7 @@ impl Pictures {
     /// Errors of [`Gpu::pipeline`].
     pub fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<Pictures> {
         let state = Mutex::new(State { field: field.clone(), recorded: HashMap::new() });
-        Ok(Pictures {
-            gpu: gpu.clone(),
-            project: Build::default().stage(gpu)?,
-            splat: Build::default().stage(gpu)?,
-            state,
-        })
+        Ok(Pictures { gpu: gpu.clone(), project: Build::default().stage(gpu)?, splat: SplatStage::new(gpu)?, state })
     }
 
     /// Draws another field from now on.
@@ -168,7 +163,7 @@ impl Pictures {
             let groups = Groups::Direct([n.div_ceil(self.project.local_size()), 1, 1]);
             dispatch_finding(&mut recording, &self.project, groups, &[], find, push)?;
             let push = push::GaussianSplat { n_splats: n };
-            dispatch_finding(&mut recording, &self.splat, self.splat.groups_for(n), &[], find, push)?;
+            dispatch_finding(&mut recording, &self.splat.stage, self.splat.groups_for(n), &[], find, push)?;
         }
         Ok(Picture { commands: recording.finish()?, buffers, in_use: Mutex::default() })
     }

@@ -23,21 +23,44 @@ pub struct GaussianKernels {
     /// How every view sees every Gaussian of a set per phase.
     pub project: Stage<push::GaussianProject>,
     /// Images.
-    pub splat: Stage<push::GaussianSplat>,
+    pub splat: SplatStage<push::GaussianSplat>,
     /// Residuals, their gradients and losses.
     pub residual: Stage<push::GaussianResidual>,
     /// What gradients need of the images.
-    pub moments: Stage<push::GaussianMoments>,
+    pub moments: SplatStage<push::GaussianMoments>,
     /// Gradients and the optimiser.
     pub update: Stage<push::GaussianUpdate>,
     /// Loss and step count.
     pub report: Stage<push::GaussianReport>,
-    /// Invocations that share a splat.
+}
+
+/// A stage on splats, of which lanes of a subgroup share each where they exchange values.
+pub struct SplatStage<P> {
+    pub(super) stage: Stage<P>,
     lanes_per_splat: u32,
 }
 
-/// Invocations that share a splat, where a subgroup's exchange values: a splat has some hundred pixels.
+/// Lanes that share a splat, of some hundred pixels.
 const LANES_PER_SPLAT: u32 = 8;
+
+impl<P: PushConstants> SplatStage<P> {
+    /// Builds the pipeline.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<SplatStage<P>> {
+        let subgroup = full_subgroup(gpu, P::LOCAL_SIZE);
+        let lanes_per_splat = subgroup.map_or(1, |size| size.min(LANES_PER_SPLAT));
+        let lanes = [("lanes_per_splat", lanes_per_splat)];
+        let constants: &[_] = if subgroup.is_some() { &lanes } else { &[] };
+        Ok(SplatStage { stage: Build { constants, exchanges: true, ..Build::default() }.stage(gpu)?, lanes_per_splat })
+    }
+
+    /// Workgroups for so many splats.
+    pub fn groups_for(&self, n_splats: u32) -> Groups<'static> {
+        self.stage.groups_for(n_splats * self.lanes_per_splat)
+    }
+}
 
 impl GaussianKernels {
     /// Builds the pipelines.
@@ -47,18 +70,13 @@ impl GaussianKernels {
     pub fn new(gpu: &Gpu) -> Result<GaussianKernels> {
         let plain = Build::default();
         let exchanges = Build { exchanges: true, ..plain };
-        let subgroup = full_subgroup(gpu, push::GaussianSplat::LOCAL_SIZE);
-        let lanes_per_splat = subgroup.map_or(1, |size| size.min(LANES_PER_SPLAT));
-        let lanes = [("lanes_per_splat", lanes_per_splat)];
-        let splats = Build { constants: if subgroup.is_some() { &lanes } else { &[] }, ..exchanges };
         Ok(GaussianKernels {
             project: plain.stage(gpu)?,
-            splat: splats.stage(gpu)?,
+            splat: SplatStage::new(gpu)?,
             residual: exchanges.stage(gpu)?,
-            moments: splats.stage(gpu)?,
+            moments: SplatStage::new(gpu)?,
             update: plain.stage(gpu)?,
             report: exchanges.stage(gpu)?,
-            lanes_per_splat,
         })
     }
 }
@@ -132,22 +150,17 @@ impl GaussianPass<'_> {
     /// Records the images of splats that are projected already.
     pub(super) fn splats(&mut self, n_splats: u32) -> Result<()> {
         let splat = &self.kernels.splat;
-        self.run(
-            splat,
-            splat.groups_for(n_splats * self.kernels.lanes_per_splat),
-            &[],
-            push::GaussianSplat { n_splats },
-        )
+        self.run(&splat.stage, splat.groups_for(n_splats), &[], push::GaussianSplat { n_splats })
     }
 
     /// Records the residuals of some images, and the moments of all splats.
     pub(super) fn residual(&mut self, images: Range<u32>, n_splats: u32) -> Result<()> {
         let [first_quad, n_quads] = [images.start, images.len() as u32].map(|n| n * self.setup.image_stride / 4);
-        let GaussianKernels { residual, moments, lanes_per_splat, .. } = self.kernels;
+        let GaussianKernels { residual, moments, .. } = self.kernels;
         let push = push::GaussianResidual { first_quad, n_quads };
         let groups = Groups::Direct([loss_parts(n_quads).max(1), 1, 1]);
         self.run(residual, groups, &[], push)?;
-        self.run(moments, moments.groups_for(n_splats * lanes_per_splat), &[], push::GaussianMoments { n_splats })
+        self.run(&moments.stage, moments.groups_for(n_splats), &[], push::GaussianMoments { n_splats })
     }
 
     /// Records the end of an iteration: its loss, and the count.

@@ -1,0 +1,42 @@
+//! Kernels whose lanes exchange values within subgroups, and their counterparts for devices on which lanes cannot: both agree with
+//! the f64 twins, and each repeats bit by bit.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+
+use common::{expect_agreement, expect_silence, tuning, uneven_dataset};
+use nertca_vk::gpu::buffer::Operands;
+use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::selftest::iteration::{self, F32_CASES};
+use nertca_vk::selftest::{gaussians, repeats, trees};
+
+fn open(without_subgroups: bool) -> Gpu {
+    Gpu::open(&DeviceOptions { validation: true, statistics: true, without_subgroups, ..DeviceOptions::default() })
+        .unwrap()
+}
+
+/// Workgroups of the layers' sums as a GPU has them, of full subgroups, with operands whose kernels have both variants.
+fn as_on_a_gpu(gpu: &Gpu) -> Tuning {
+    Tuning { operands: Operands::Storage, layer_lanes: 64, weight_lanes: 64, splits: 3, ..tuning(gpu) }
+}
+
+#[test]
+fn every_stage_matches_with_and_without_subgroups() {
+    for without in [false, true] {
+        let gpu = open(without);
+        assert_eq!(gpu.info().full_subgroups.is_none(), without, "this driver has no shuffles in full subgroups");
+        let (dataset, path) = (uneven_dataset(13, 11), as_on_a_gpu(&gpu));
+        expect_agreement(|findings| {
+            F32_CASES.iter().try_for_each(|case| iteration::compare(&gpu, &dataset, case, &path, findings))
+        });
+        expect_agreement(|findings| gaussians::compare(&gpu, findings));
+        expect_agreement(|findings| trees::compare(&gpu, findings));
+        expect_agreement(|findings| repeats::compare_gaussians(&gpu, findings));
+        expect_agreement(|findings| repeats::compare_network(&gpu, &dataset, &path, findings));
+        let built = gpu.pipeline_statistics();
+        assert!(built.iter().any(|kernel| kernel.kernel.starts_with("gaussian_moments")));
+        assert_eq!(built.iter().any(|kernel| kernel.kernel.ends_with("_subgroup")), !without);
+        expect_silence(gpu);
+    }
+}
