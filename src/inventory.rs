@@ -1,6 +1,6 @@
 //! Every pipeline that runs of a configuration use on a device, and what its driver's compiler made of them.
 
-use crate::config::Config;
+use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::gaussians::blobs::BlobKernels;
 use crate::gaussians::stages::GaussianKernels;
@@ -109,7 +109,9 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     Kernels::new(gpu, tuning.clone(), params.line_len() as u32)?;
     if config.gaussians_move() {
         GaussianKernels::new(gpu)?;
-        TreeKernels::new(gpu)?;
+        if config.gaussians.form != GaussianForm::Phase {
+            TreeKernels::new(gpu)?;
+        }
         BlobKernels::new(gpu, &tuning)?;
     }
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();

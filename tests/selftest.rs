@@ -161,10 +161,11 @@ fn builds<'a>(all: impl IntoIterator<Item = &'a PipelineStatistics>) -> BTreeSet
 #[test]
 fn the_inventory_is_what_a_run_builds() {
     let open = || Gpu::open(&DeviceOptions { statistics: true, ..DeviceOptions::default() }).unwrap();
-    for (preset, size) in [(Preset::Paper, 13), (Preset::Fast, 32)] {
+    for (preset, size, form) in [(Preset::Paper, 13, "none"), (Preset::Fast, 32, "tree"), (Preset::Fast, 32, "phase")] {
         let settings =
             ["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"];
-        let settings: Vec<String> = settings.iter().map(|s| (*s).to_owned()).collect();
+        let form = format!("gaussians.form={form}");
+        let settings: Vec<String> = settings.iter().map(|s| (*s).to_owned()).chain([form]).collect();
         let config = Config::load(Some(preset), None, &settings).unwrap();
         let listed = open();
         let inventory = inventory::compile(&listed, &config, 3, &tuning(&listed)).unwrap();
@@ -177,7 +178,7 @@ fn the_inventory_is_what_a_run_builds() {
             trainer.advance(config.gaussian_iterations()).unwrap();
         }
         let _renderer = Renderer::new(&used, &trainer.model().unwrap(), tuning(&used)).unwrap();
-        assert_eq!(names, builds(&used.pipeline_statistics()), "{preset:?}");
+        assert_eq!(names, builds(&used.pipeline_statistics()), "{preset:?} {settings:?}");
         assert!(inventory.iter().all(|c| c.lanes > 0));
     }
 }
