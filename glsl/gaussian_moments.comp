@@ -4,8 +4,8 @@
 // weighted by du, dv, du^2, du dv, dv^2, each in the order of the pixels. One invocation per splat, or as many as share
 // one, as in gaussian_splat.
 #include "inc/gaussian.glsl"
-#include "inc/splat_lanes.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/splat_lanes.glsl"
 layout(push_constant) uniform Push { uint n_splats; } push;
 layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { Splat splats[]; };
@@ -15,6 +15,7 @@ layout(binding = 3) readonly buffer B3 { float splat_image_gradient[]; };
 layout(binding = 4) writeonly buffer B4 { vec4 splat_moments[]; };
 
 void main() {
+    if (push.n_splats == 0u) return;
     uint i = min(splat_index(), push.n_splats - 1u);
     Splat s = splats[i];
     int image = image_of_splat[i];

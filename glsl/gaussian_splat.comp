@@ -4,8 +4,8 @@
 // are integers of a fixed point, so their order does not matter and runs repeat bit by bit.
 // One invocation per splat, or as many as share one; each walks its own pixels, so nothing is reduced across lanes.
 #include "inc/gaussian.glsl"
-#include "inc/splat_lanes.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/splat_lanes.glsl"
 layout(push_constant) uniform Push { uint n_splats; } push;
 layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { Splat splats[]; };

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Notes for the cell of each live sample, at the phases that it shows, that it was seen, and whether it was occupied. One
-// invocation per sample.
+// Notes for the cell of each live sample, at the phases that it shows, that it was seen, and whether it was occupied: of a phase
+// that it shows little of, only that it was occupied. One invocation per sample.
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -26,7 +26,8 @@ void main() {
     if (s >= live.count) return;
     vec3 x = sample_points[s].xyz;
     Ray ray = rays[ray_of(sample_rays[s])];
-    uint bits = SEEN | (sample_sigma[s].x > setup.occupancy_threshold ? OCCUPIED : 0u);
+    bool full = sample_sigma[s].x > setup.occupancy_threshold;
+    uint bits = SEEN | (full ? OCCUPIED : 0u);
     mark(occupancy_entry(x, ray.phase), bits);
-    if (ray.beyond_share > 0.0) mark(occupancy_entry(x, ray.beyond), bits);
+    if (ray.beyond_share >= LITTLE_SHOWN || full && ray.beyond_share > 0.0) mark(occupancy_entry(x, ray.beyond), bits);
 }

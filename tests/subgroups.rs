@@ -25,7 +25,11 @@ fn as_on_a_gpu(gpu: &Gpu) -> Tuning {
 fn every_stage_matches_with_and_without_subgroups() {
     for without in [false, true] {
         let gpu = open(without);
-        assert_eq!(gpu.info().full_subgroups.is_none(), without, "this driver has no shuffles in full subgroups");
+        if gpu.info().full_subgroups.is_none() && !without {
+            assert!(!gpu.info().is_llvmpipe, "lavapipe has shuffles in full subgroups");
+            println!("{} has no shuffles in full subgroups: nothing is compared with them", gpu.info().name);
+            continue;
+        }
         let (dataset, path) = (uneven_dataset(13, 11), as_on_a_gpu(&gpu));
         expect_agreement(|findings| {
             F32_CASES.iter().try_for_each(|case| iteration::compare(&gpu, &dataset, case, &path, findings))

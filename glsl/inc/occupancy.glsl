@@ -6,6 +6,7 @@ const uint SEEN = 1u;                // a sample was evaluated in the cell
 const uint OCCUPIED = 2u;            // one was not empty
 const uint OCCUPANCY_EPOCHS = 3u;    // kept, in turn
 const uint CELLS_PER_WORD = 16u;     // of occupancy, two bits each
+const float LITTLE_SHOWN = 0.25;     // share of a phase below which an empty sample tells nothing of it
 
 // Words of one epoch.
 uint occupancy_words() {

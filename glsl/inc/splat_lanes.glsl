@@ -1,14 +1,21 @@
 // Which splat an invocation works on, and which pixels of its box. With SUBGROUP, lanes of a full subgroup share a splat.
+// Included behind the layout that gives the size of the workgroup, without which it would count as 1.
+
+// Workgroups lie along two axes: there may be more than one axis takes.
+uint workgroup() {
+    return gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
+}
+
 #ifdef SUBGROUP
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
 layout(constant_id = 1) const uint lanes_per_splat = 8u;    // power of two, at most a subgroup
 
-uint invocation() {
-    return (gl_WorkGroupID.x * gl_NumSubgroups + gl_SubgroupID) * gl_SubgroupSize + gl_SubgroupInvocationID;
+uint splat_index() {
+    uint invocation = (workgroup() * gl_NumSubgroups + gl_SubgroupID) * gl_SubgroupSize + gl_SubgroupInvocationID;
+    return invocation / lanes_per_splat;
 }
 
-uint splat_index() { return invocation() / lanes_per_splat; }
 uint splat_lane() { return gl_SubgroupInvocationID % lanes_per_splat; }
 
 // Sum over the lanes of a splat, in a fixed order; all get it.
@@ -19,7 +26,7 @@ vec3 splat_sum(vec3 value) {
 #else
 const uint lanes_per_splat = 1u;
 
-uint splat_index() { return gl_GlobalInvocationID.x; }
+uint splat_index() { return workgroup() * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
 uint splat_lane() { return 0u; }
 vec3 splat_sum(vec3 value) { return value; }
 #endif

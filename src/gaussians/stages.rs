@@ -42,6 +42,8 @@ pub struct SplatStage<P> {
 
 /// Lanes that share a splat, of some hundred pixels.
 const LANES_PER_SPLAT: u32 = 8;
+/// Workgroups along an axis that every device takes.
+const MOST_GROUPS: u32 = 65_535;
 
 impl<P: PushConstants> SplatStage<P> {
     /// Builds the pipeline.
@@ -56,9 +58,11 @@ impl<P: PushConstants> SplatStage<P> {
         Ok(SplatStage { stage: Build { constants, exchanges: true, ..Build::default() }.stage(gpu)?, lanes_per_splat })
     }
 
-    /// Workgroups for so many splats.
+    /// Workgroups for so many splats, along two axes where one does not take them all.
     pub fn groups_for(&self, n_splats: u32) -> Groups<'static> {
-        self.stage.groups_for(n_splats * self.lanes_per_splat)
+        let groups = n_splats.div_ceil(self.stage.local_size() / self.lanes_per_splat).max(1);
+        let rows = groups.div_ceil(MOST_GROUPS);
+        Groups::Direct([groups.div_ceil(rows), rows, 1])
     }
 }
 

@@ -68,6 +68,17 @@ pub struct Pipeline {
     pub local_size: u32,
 }
 
+/// What a kernel needs of its subgroups.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Subgroups {
+    /// Nothing.
+    Any,
+    /// All full, of the device's default size.
+    Full,
+    /// The same, and that size is asked for: as cooperative matrices need it where several sizes are possible.
+    OfSize,
+}
+
 impl Gpu {
     /// Builds a pipeline. `spec` gives values by name; constants not named keep the shader's default.
     ///
@@ -75,7 +86,7 @@ impl Gpu {
     /// [`Error::Internal`] for an unknown constant, [`Error::NoDevice`] when the kernel binds more than the device allows,
     /// [`Error::Vulkan`] when the driver refuses the shader.
     pub fn pipeline(&self, code: &'static KernelCode, local_size: u32, spec: &[(&str, u32)]) -> Result<Pipeline> {
-        self.make_pipeline(code, local_size, spec, false)
+        self.make_pipeline(code, local_size, spec, Subgroups::Any)
     }
 
     /// A pipeline as [`Gpu::pipeline`] makes it, with subgroups of the device's default size, all of them full: for cooperative matrices,
@@ -92,7 +103,7 @@ impl Gpu {
         if self.info().matrices.is_empty() {
             return Err(Error::Internal(format!("kernel {}: {} has no matrices", code.name, self.info().name)));
         }
-        self.make_pipeline(code, local_size, spec, true)
+        self.make_pipeline(code, local_size, spec, Subgroups::OfSize)
     }
 
     /// Builds a kernel whose subgroups must be full, of [`DeviceInfo::full_subgroups`] invocations each.
@@ -113,7 +124,7 @@ impl Gpu {
                 code.name
             )));
         }
-        self.make_pipeline(code, local_size, spec, true)
+        self.make_pipeline(code, local_size, spec, Subgroups::Full)
     }
 
     fn make_pipeline(
@@ -121,7 +132,7 @@ impl Gpu {
         code: &'static KernelCode,
         local_size: u32,
         spec: &[(&str, u32)],
-        full_subgroups: bool,
+        subgroups: Subgroups,
     ) -> Result<Pipeline> {
         let info = self.info();
         if local_size == 0
@@ -205,9 +216,11 @@ impl Gpu {
             .module(module)
             .name(c"main")
             .specialization_info(&specialization);
-        if full_subgroups {
-            stage =
-                stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS).push_next(&mut subgroup_size);
+        if subgroups != Subgroups::Any {
+            stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
+        }
+        if subgroups == Subgroups::OfSize {
+            stage = stage.push_next(&mut subgroup_size);
         }
         let create = [vk::ComputePipelineCreateInfo::default()
             .flags(shared.pipeline_flags())

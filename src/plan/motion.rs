@@ -24,7 +24,8 @@ pub struct ViewMotion {
     pub noise: Vec<f32>,
     /// Pixels that move at some phase.
     pub moving: Vec<bool>,
-    /// Pixels that stand out of the background at each phase of the dataset; empty for phases not seen.
+    /// Pixels that stand out of the background at each phase of the dataset, or in an image taken on the way to or from it; empty
+    /// for phases not seen.
     pub moving_at: Vec<Vec<bool>>,
     /// Training phases of this view.
     pub n_phases: usize,
@@ -75,7 +76,15 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
             let mut moving_at = vec![Vec::new(); dataset.n_phases as usize];
             for frame in &frames {
                 let stands_out = |p: usize| frame.integrals[p] - background_low[p] > threshold(p);
-                moving_at[frame.phase as usize] = grow(&|p| range[p] > threshold(p) && stands_out(p));
+                let seen = grow(&|p| range[p] > threshold(p) && stands_out(p));
+                // What is seen between two phases, or at another moment near one, is no reason to rule it out at either.
+                for (phase, _) in
+                    frame.beat_time().shown(dataset.n_phases).into_iter().filter(|(_, share)| *share > 0.0)
+                {
+                    let moving: &mut Vec<bool> = &mut moving_at[phase];
+                    moving.resize(pixels, false);
+                    moving.iter_mut().zip(&seen).for_each(|(moving, seen)| *moving |= seen);
+                }
             }
             let moving = grow(&|p| range[p] > threshold(p));
             ViewMotion { view, moving, moving_at, background, background_low, range, noise, n_phases: n }

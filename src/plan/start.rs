@@ -24,7 +24,7 @@ const LEAST_BLIND_SHIFT: f64 = -5.0;
 /// What a ray asks of a constant field.
 #[derive(Debug, Clone, Copy)]
 struct StartRay {
-    /// Length inside the hull at the ray's phase, world units.
+    /// Length inside the hull at the phases that the ray shows, world units.
     length: f64,
     /// Bounds of its line integral.
     bounds: [f64; 2],
@@ -99,7 +99,10 @@ impl Source<'_> {
         let (anchor, direction) = self.dataset.views[frame.view].rays.pixel(column as f64, row as f64);
         let [near, far] = self.depth;
         let step = (far - near) / DEPTHS as f64;
-        let inside = |point: DVec3| self.hull.is_none_or(|hull| hull.contains_point(point, frame.phase as usize));
+        let shown = frame.beat_time().shown(self.dataset.n_phases);
+        let searched =
+            |hull: &Hull, point| shown.iter().any(|(t, share)| *share > 0.0 && hull.contains_point(point, *t));
+        let inside = |point: DVec3| self.hull.is_none_or(|hull| searched(hull, point));
         let met = (0..DEPTHS).filter(|k| inside(anchor + direction * (near + (*k as f64 + 0.5) * step))).count();
         let target = f64::from(frame.integrals[pixel]);
         StartRay {

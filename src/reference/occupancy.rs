@@ -6,6 +6,9 @@ use crate::random::{STREAM_OCCUPANCY, pcg4d};
 use crate::reference::field::point;
 use glam::DVec3;
 
+/// Share of a phase below which an empty sample tells nothing of it, as in `occupancy_mark`.
+pub const LITTLE_SHOWN: f32 = 0.25;
+
 /// Position of a cell's two bits.
 pub fn entry(s: &Setup, x: DVec3, phase: u32) -> u32 {
     let (low, high) = (point(s.dynamic_min), point(s.dynamic_max));

@@ -180,7 +180,7 @@ impl Renderer {
                 "phase",
                 phase,
                 "lies between two phases, and the moving field of this model knows whole ones alone: ask for a whole \
-                 phase, or train one set of Gaussians that moves (preset fast with gaussians.form = \"tree\")",
+                 phase, or train one set of Gaussians that moves (preset fast with gaussians.form = \"tree\") or a network",
             )),
         }
     }

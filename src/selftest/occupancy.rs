@@ -80,7 +80,8 @@ fn compare_notes(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> R
         let full = sigma[0] > setup.occupancy_threshold;
         kinds[usize::from(full)] += 1;
         let bits = SEEN | if full { OCCUPIED } else { 0 };
-        for phase in [Some(ray.phase), (ray.beyond_share > 0.0).then_some(ray.beyond)].into_iter().flatten() {
+        let tells = ray.beyond_share >= occupancy::LITTLE_SHOWN || full && ray.beyond_share > 0.0;
+        for phase in [Some(ray.phase), tells.then_some(ray.beyond)].into_iter().flatten() {
             let entry = occupancy::entry(&setup, x, phase);
             want[words + (entry / CELLS_PER_WORD) as usize] |= bits << (2 * (entry % CELLS_PER_WORD));
         }
