@@ -347,7 +347,7 @@ typedef struct {
    */
   size_t stride_bytes;
   /**
-   * Columns, 1 to 8192. All frames of a reconstruction have one size.
+   * Columns, 1 to 8192. Frames of a reconstruction may differ in size.
    */
   uint32_t width;
   /**

@@ -104,7 +104,7 @@ impl Session {
         if let Some(attenuation) = options.vessel_attenuation_per_mm {
             positive("vessel_attenuation_per_mm", attenuation)?;
         }
-        let inbox = Inbox { options, size: None, views: Vec::new(), frames: Vec::new(), r_peaks: None };
+        let inbox = Inbox { options, views: Vec::new(), frames: Vec::new(), r_peaks: None };
         Ok(Session {
             shared: Arc::new(Shared {
                 gpu,
@@ -164,12 +164,10 @@ impl Session {
         let calibration = lock(&self.shared.calibration).clone().unwrap_or_else(|| Calibration::none(None));
         let inbox = lock(&self.shared.inbox);
         let (frame, moment) = inbox.frame(frame)?;
-        let size = inbox.size.ok_or_else(nothing_yet)?;
         CorrectedFrame::new(
             &inbox.views[frame.view],
             frame,
             inbox.beat_time(*moment).map(|taken| taken.phase),
-            size,
             &calibration,
         )
     }

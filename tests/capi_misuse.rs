@@ -340,8 +340,6 @@ fn frames(b: &Bench) {
         change(&mut frame);
         b.refuses(add, NERTCA_ERROR_ARGUMENT, part, unsafe { nertca_reconstruction_add_frame(b.bare, &frame) });
     }
-    let smaller = nertca_frame { width: 10, ..good };
-    b.refuses(add, NERTCA_ERROR_ARGUMENT, "one size", unsafe { nertca_reconstruction_add_frame(b.trained, &smaller) });
 }
 
 fn checkpoints(b: &Bench) {

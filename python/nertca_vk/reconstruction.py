@@ -176,7 +176,8 @@ class Reconstruction:
     ) -> int:
         """Adds a calibrated angiogram, which is copied, and returns its number, from 0.
 
-        pixels: shape (rows, columns) of uint8, uint16, float32, or float64, which becomes float32; all frames of one size.
+        pixels: shape (rows, columns) of uint8, uint16, float32, or float64, which becomes float32; frames may differ in
+            size.
         geometry: how it was taken.
         phase: cardiac phase, from 0; or `time_s`: its time in seconds, on the clock of the R-peaks.
         intensity: what pixel values mean; line integrals of attenuation unless stated.

@@ -141,7 +141,7 @@ pub struct nertca_frame {
     pub pixels_bytes: usize,
     /// Bytes from one row to the next; 0 when rows follow each other at once.
     pub stride_bytes: usize,
-    /// Columns, 1 to 8192. All frames of a reconstruction have one size.
+    /// Columns, 1 to 8192. Frames of a reconstruction may differ in size.
     pub width: u32,
     /// Rows, 1 to 8192.
     pub height: u32,
