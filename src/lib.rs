@@ -282,6 +282,7 @@ pub mod capi {
     pub mod status;
     pub mod training;
     pub mod tree;
+    pub mod truth;
     pub mod types;
 }
 

@@ -11,6 +11,7 @@ use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
+use nertca_vk::capi::truth::*;
 use nertca_vk::capi::types::*;
 use nertca_vk::scan::gating::{SYSTOLE_S, SYSTOLE_SHARE};
 use std::ffi::{CString, c_char, c_void};
