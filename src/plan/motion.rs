@@ -79,7 +79,7 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
             let lowest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::INFINITY, f32::min)).collect();
             let highest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::NEG_INFINITY, f32::max)).collect();
             let background: Vec<f32> =
-                lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { 0.0 }).collect();
+                lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { *l }).collect();
             let image = |values: Vec<f32>| Image { width: size[0], height: size[1], values };
             let vessel = config.vessel_pixels as usize;
             let background_low = if vessel > 0 && n > 1 {

@@ -91,8 +91,9 @@ impl Targets {
     /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
     pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
         if motion.views.is_empty() {
-            let problem = "no training view has two phases, so nothing is known of motion; \
-                           for a still object take the preset fast-mlp with loss.dynamic_target = absolute";
+            let problem = "no training view has two phases, so what stands still behind the vessels is not known, as where a C-arm or \
+                           a table moves from image to image: the preset paper trains on whole images, and so does \
+                           fast-mlp with loss.dynamic_target = absolute, which is for still objects, too";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
         if motion.views.len() == 1 {
