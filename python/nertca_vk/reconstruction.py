@@ -4,7 +4,7 @@ import functools
 import os
 import threading
 import time
-from typing import Any, Literal, Mapping, Optional, Sequence, Union, cast
+from typing import Any, Hashable, Literal, Mapping, Optional, Sequence, Union, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +42,6 @@ Quality = Literal["live", "exact"]
 Split = Literal["train", "validation"]
 """To train on, or to score with only."""
 
-F32 = lib.NERTCA_PIXELS_F32
 # How long a wait leaves Ctrl-C unheard.
 SLICE_MS = 100
 # Of a volume: room is made before the library can refuse.
@@ -82,6 +81,17 @@ def _as_view(
 
 # A beat is drawn again and again from where it was drawn. Typed: 1.0 is no phase where 1 is one.
 _known_view = functools.lru_cache(maxsize=1024, typed=True)(_as_view)
+
+
+class _Room(threading.local):
+    """Structs that each thread fills anew for each call."""
+
+    def __init__(self) -> None:
+        self.picture = new("nertca_image")
+        self.picture.format = lib.NERTCA_PIXELS_F32
+
+
+_ROOM = _Room()
 
 
 class _Core:
@@ -430,13 +440,12 @@ class Reconstruction:
         """
         rows, columns = shape
         try:
-            view, kept = _known_view(geometry, rows, columns, phase, component, projection, quality)
+            view, kept = _known_view(cast(Hashable, geometry), rows, columns, phase, component, projection, quality)
         except TypeError:  # an array, or a list among the geometry's fields: nothing to look up later
             view, kept = _as_view(geometry, rows, columns, phase, component, projection, quality)
         drawn = target("out", out, (view.height, view.width))
-        picture = new("nertca_image")
+        picture = _ROOM.picture
         picture.pixels, picture.pixels_bytes = writable(drawn), drawn.nbytes
-        picture.format = F32
         handle = self.handle
         check(lib.nertca_reconstruction_render(handle, view, picture), handle)
         del kept
@@ -521,7 +530,7 @@ class Reconstruction:
         if inside is None:
             check(lib.nertca_reconstruction_set_true_vessels(handle, struct, ffi.NULL, 0), handle)
             return
-        shape = tuple(reversed(struct.points))
+        shape = tuple(struct.points)[::-1]
         given = np.asarray(inside)
         if given.dtype not in (np.bool_, np.uint8) or given.shape != shape:
             raise wrong("inside", f"{given.dtype} of shape {given.shape}; bool or uint8 of shape {shape} is needed")
