@@ -22,6 +22,10 @@ impl Dataset {
         for view in 0..self.views.len() {
             let of_view = self.frames.iter().filter(|f| f.view == view);
             let images: Vec<Cow<'_, [f32]>> = of_view.map(|f| self.own(view, &f.integrals)).collect();
+            // A session keeps views whose frames are not used, which the canvas may be too small for.
+            if images.is_empty() {
+                continue;
+            }
             let size = self.views[view].size;
             let hidden = hidden(&images, size[0], size[1]);
             let count = hidden.iter().filter(|h| **h).count();
