@@ -347,7 +347,7 @@ typedef struct {
    */
   size_t stride_bytes;
   /**
-   * Columns, 1 to 8192. All frames of a reconstruction have one size.
+   * Columns, 1 to 8192. Frames of a reconstruction may differ in size.
    */
   uint32_t width;
   /**
@@ -596,44 +596,6 @@ typedef struct {
 } nertca_grid;
 
 /**
- * Scores on the frames added for validation.
- */
-typedef struct {
-  /**
-   * `sizeof(nertca_scores)`.
-   */
-  size_t size;
-  /**
-   * Iterations of the model.
-   */
-  uint32_t step;
-  /**
-   * Images scored.
-   */
-  uint32_t images;
-  /**
-   * Mean Dice of the moving vessels; NaN without masks.
-   */
-  double dice_dynamic;
-  /**
-   * Mean Dice of both fields; NaN without masks.
-   */
-  double dice_total;
-  /**
-   * Mean PSNR, dB.
-   */
-  double psnr_db;
-  /**
-   * Mean structural similarity.
-   */
-  double ssim;
-  /**
-   * Attenuation from which the moving field counts as vessel, 1/mm.
-   */
-  double threshold_per_mm;
-} nertca_scores;
-
-/**
  * Vessels as trees of centrelines with radii: what is asked for, and room for the answer.
  */
 typedef struct {
@@ -687,6 +649,112 @@ typedef struct {
    */
   double *radius_mm;
 } nertca_tree;
+
+/**
+ * Scores on the frames added for validation.
+ */
+typedef struct {
+  /**
+   * `sizeof(nertca_scores)`.
+   */
+  size_t size;
+  /**
+   * Iterations of the model.
+   */
+  uint32_t step;
+  /**
+   * Images scored.
+   */
+  uint32_t images;
+  /**
+   * Mean Dice of the moving vessels; NaN without masks.
+   */
+  double dice_dynamic;
+  /**
+   * Mean Dice of both fields; NaN without masks.
+   */
+  double dice_total;
+  /**
+   * Mean PSNR, dB.
+   */
+  double psnr_db;
+  /**
+   * Mean structural similarity.
+   */
+  double ssim;
+  /**
+   * Attenuation from which the moving field counts as vessel, 1/mm.
+   */
+  double threshold_per_mm;
+  /**
+   * Phases whose true vessels are known as voxels (`nertca_reconstruction_set_true_vessels`).
+   */
+  uint32_t volume_phases;
+  /**
+   * Phases whose true vessels are known as a tree (`nertca_reconstruction_set_true_tree`).
+   */
+  uint32_t tree_phases;
+  /**
+   * Dice of the voxels that are vessel; this and what follows are means over the phases, and NaN where nothing is known.
+   */
+  double volume_dice;
+  /**
+   * Mean distance of a voxel of one set to the nearest of the other, both directions weighing the same, mm.
+   */
+  double chamfer_mm;
+  /**
+   * The larger of both directions' 95th percentiles of these distances, mm.
+   */
+  double hausdorff95_mm;
+  /**
+   * Share of the true centreline's voxels with one of ours within 1 mm.
+   */
+  double true_centreline_found;
+  /**
+   * Share of our centreline's voxels with a true one within 1 mm.
+   */
+  double our_centreline_true;
+  /**
+   * Centreline Dice: the harmonic mean of the shares of each centreline inside the other set.
+   */
+  double cl_dice;
+  /**
+   * Connected components of ours that are a pixel at the isocentre wide or more.
+   */
+  double components;
+  /**
+   * Connected components of the truth.
+   */
+  double true_components;
+  /**
+   * Share of the true tree's length with ours within 1 mm.
+   */
+  double tree_true_centreline_found;
+  /**
+   * Share of our tree's length with a true one within 1 mm.
+   */
+  double tree_our_centreline_true;
+  /**
+   * Mean distance of our centreline to the true one, mm.
+   */
+  double tree_ours_to_true_mm;
+  /**
+   * Connected trees of ours.
+   */
+  double tree_components;
+  /**
+   * Mean of our radius less the true one, where our centreline is true, mm.
+   */
+  double radius_error_mm;
+  /**
+   * Root of the mean square of the same, mm.
+   */
+  double radius_rmse_mm;
+  /**
+   * Mean distance between where our points have come since phase 0 and where the true points beside them have, mm.
+   */
+  double motion_error_mm;
+} nertca_scores;
 
 /**
  * Done.
@@ -1120,18 +1188,6 @@ nertca_status nertca_reconstruction_sample_buffer(nertca_reconstruction *reconst
                                                   nertca_buffer *buffer);
 
 /**
- * Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`. `threshold_per_mm` is the attenuation from which
- * the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
- * Any thread, also while training.
- *
- * # Safety
- * `scores` must be writable, with its size set.
- */
-nertca_status nertca_reconstruction_evaluate(nertca_reconstruction *reconstruction,
-                                             double threshold_per_mm,
-                                             nertca_scores *scores);
-
-/**
  * Makes a buffer on the device that can be shared through `VK_KHR_external_memory_fd`. `*buffer` is null on failure.
  * Any thread.
  *
@@ -1176,6 +1232,49 @@ nertca_status nertca_buffer_destroy(nertca_buffer *buffer);
  */
 nertca_status nertca_reconstruction_tree(nertca_reconstruction *reconstruction,
                                          nertca_tree *tree);
+
+/**
+ * Says which voxels are vessel at the phase of `grid`, in place of what was said of that phase before: a non-zero byte for each
+ * point of the grid that is inside one, left fastest; its component does not matter. `nertca_reconstruction_evaluate` then has
+ * scores in 3D. Null `vessels`, with `bytes` 0, forget the phase. The bytes are copied. Any thread.
+ *
+ * @return NERTCA_ERROR_ARGUMENT for a phase that there is not, a grid of more than 2^26 points, or too few bytes.
+ *
+ * # Safety
+ * `grid` must be as long as it says; `vessels` must be readable for `bytes` bytes or null.
+ */
+nertca_status nertca_reconstruction_set_true_vessels(nertca_reconstruction *reconstruction,
+                                                     const nertca_grid *grid,
+                                                     const uint8_t *vessels,
+                                                     size_t bytes);
+
+/**
+ * Says where the true centrelines are, and how wide the vessels, in place of what was said before: arrays as
+ * `nertca_reconstruction_tree` fills them, of one phase or more, of which 0 is one, with the same branches of as many points at
+ * each; point i of a branch is the same material point at every phase. `branch_parent` may be null. No branches forget them.
+ * `nertca_reconstruction_evaluate` then finds the vessels as a tree, which takes seconds, and scores it. The arrays are copied.
+ * Any thread.
+ *
+ * @return NERTCA_ERROR_ARGUMENT naming what is wrong.
+ *
+ * # Safety
+ * `tree` must be as long as it says, and its arrays readable for `branches` and `points` elements.
+ */
+nertca_status nertca_reconstruction_set_true_tree(nertca_reconstruction *reconstruction,
+                                                  const nertca_tree *tree);
+
+/**
+ * Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`, of which there must be one, and what was reconstructed
+ * against the true vessels, where these are known. `threshold_per_mm` is the attenuation from which
+ * the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
+ * Any thread, also while training.
+ *
+ * # Safety
+ * `scores` must be writable, with its size set.
+ */
+nertca_status nertca_reconstruction_evaluate(nertca_reconstruction *reconstruction,
+                                             double threshold_per_mm,
+                                             nertca_scores *scores);
 
 #ifdef __cplusplus
 }  // extern "C"

@@ -177,6 +177,23 @@ class Reconstruction : public detail::Owner<nertca_reconstruction, nertca_recons
     check(nertca_reconstruction_sample(handle_, &grid, values.data(), values.size()));
     return values;
   }
+  // A byte for each point of the grid, left fastest: not zero inside vessels. None forget the grid's phase.
+  void set_true_vessels(const nertca_grid &grid, const std::vector<std::uint8_t> &vessels) {
+    const std::uint8_t *bytes = vessels.empty() ? nullptr : vessels.data();
+    check(nertca_reconstruction_set_true_vessels(handle_, &grid, bytes, vessels.size()));
+  }
+  // As `tree` returns it; one without branches forgets what was said before.
+  void set_true_tree(const Tree &tree) {
+    nertca_tree truth = make<nertca_tree>();
+    truth.branches = tree.branch_phase.size();
+    truth.points = tree.radius_mm.size();
+    truth.branch_phase = const_cast<std::uint32_t *>(tree.branch_phase.data());
+    truth.branch_first = const_cast<std::uint32_t *>(tree.branch_first.data());
+    truth.branch_points = const_cast<std::uint32_t *>(tree.branch_points.data());
+    truth.points_mm = const_cast<double *>(tree.points_mm.data());
+    truth.radius_mm = const_cast<double *>(tree.radius_mm.data());
+    check(nertca_reconstruction_set_true_tree(handle_, &truth));
+  }
   nertca_scores evaluate(double threshold_per_mm = 0) {
     nertca_scores scores = make<nertca_scores>();
     check(nertca_reconstruction_evaluate(handle_, threshold_per_mm, &scores));

@@ -19,6 +19,7 @@ pub mod solve;
 use crate::config::{CalibrateMode, Config};
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, lps_mm_from_world};
+use crate::scan::canvas::corner;
 use crate::scan::dataset::Dataset;
 use choose::{Correction, Validated, best, fit, misfit, validate};
 use correction::{Calibration, FrameCorrection, ViewCorrection};
@@ -98,17 +99,18 @@ pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
     let stated = Poses::stated(before.views.len(), before.n_phases());
     let displaced = Poses { heart, ..stated.clone() };
     let of_view = |slot: usize| {
+        let (size, canvas_width) = (before.sizes[slot], before.fine.views[slot].size[0]);
         let count = |t: &usize| before.shown[slot][*t].iter().flatten().filter(|s| **s).count();
         let phase = (0..before.n_phases()).max_by_key(count)?;
         Some(Silhouettes {
             view: before.views[slot],
             phase: phase as u32,
-            width: before.fine.views[slot].size[0],
-            seen: before.seen[slot][phase].clone()?,
-            shown: before.shown[slot][phase].clone()?,
+            width: size[0],
+            seen: corner(before.seen[slot][phase].as_ref()?, canvas_width, size),
+            shown: corner(before.shown[slot][phase].as_ref()?, canvas_width, size),
             explained: [
-                silhouettes::explained_pixels(&before, &stated, slot, phase)?,
-                silhouettes::explained_pixels(&after, &displaced, slot, phase)?,
+                corner(&silhouettes::explained_pixels(&before, &stated, slot, phase)?, canvas_width, size),
+                corner(&silhouettes::explained_pixels(&after, &displaced, slot, phase)?, canvas_width, size),
             ],
         })
     };
@@ -284,7 +286,7 @@ impl Calibrator<'_> {
     /// Points that stand for the heart: the corners and the middle of a cube.
     fn points(&self) -> Vec<DVec3> {
         let rays = &self.observed.stands[0].rays;
-        let [width, height] = self.observed.fine.views[0].size.map(|n| n as f64);
+        let [width, height] = self.observed.sizes[0].map(|n| n as f64);
         let half = HEART_SHARE * 0.5 * rays.anchor[1].length().min(rays.anchor[2].length()) * width.min(height);
         let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { half } else { -half };
         let corners = (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2)));

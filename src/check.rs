@@ -185,7 +185,9 @@ fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<E
     for b in 0..observed.views.len() {
         for pair in (0..b).map(|a| [observed.views[a], observed.views[b]]) {
             let advice = format!("views {} and {} are exchanged: each has the images of the other", pair[0], pair[1]);
-            consider(advice, Observed::new(&exchanged(dataset, pair)).fine);
+            if let Some(undone) = exchanged(dataset, pair) {
+                consider(advice, Observed::new(&undone).fine);
+            }
         }
     }
     let stated = Comparison::of(&observed.fine, Look::Fine);

@@ -130,6 +130,7 @@ pub mod formats {
 
 /// Angiograms with their geometry and phase.
 pub mod scan {
+    pub mod canvas;
     pub mod dataset;
     pub(crate) mod frame_checks;
     pub mod gating;
@@ -149,6 +150,7 @@ pub mod import {
     pub mod image_beat;
     pub mod intake;
     mod lengths;
+    mod stands;
 }
 
 /// What each view shows by itself: its still background, its noise, and where vessels may be.
@@ -280,6 +282,7 @@ pub mod capi {
     pub mod status;
     pub mod training;
     pub mod tree;
+    pub mod truth;
     pub mod types;
 }
 

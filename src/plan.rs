@@ -124,12 +124,9 @@ impl Plan {
             let shown = |id: &usize| dataset.shows(training[id / pixels].view, id % pixels);
             listed_rays.extend((0..n_all).filter(shown).map(|id| id as u32));
         }
-        if config.loss.dynamic_target == DynamicTarget::Temporal && motion.iter().any(|m| m.n_phases < 2) {
-            return Err(Error::config(
-                "loss.dynamic_target",
-                "temporal",
-                "needs several phases in every view; use `absolute` for still objects",
-            ));
+        if compared && motion.iter().any(|m| m.n_phases < 2) {
+            let problem = "needs several phases in every view; use `absolute` for still objects, and where a C-arm or a table moves";
+            return Err(Error::config("loss.dynamic_target", "temporal", problem));
         }
         let params = ParamMap::new(config, dataset.n_phases as usize);
         let n_motion_rays = if n_motion_list == 0 {
@@ -194,6 +191,7 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
         },
     ));
     notes.extend(wide_motion(&soft));
+    notes.extend(without_motion(dataset, &soft));
     notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
     notes.push(match form {
         GaussianForm::Tree => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
@@ -206,6 +204,19 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
 fn between_phases(dataset: &Dataset, fate: &str) -> Option<String> {
     let n = dataset.training().iter().filter(|f| f.after_phase != 0.0).count();
     (n > 0).then(|| format!("{n} of {} frames were taken between two phases and {fate}", dataset.training().len()))
+}
+
+/// What is said of frames that Gaussians are not fitted to: those of views that have one phase alone.
+fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
+    let fitted = |view: usize| soft.views.iter().any(|v| v.view == view);
+    let left = dataset.training().iter().filter(|frame| !fitted(frame.view)).count();
+    (left > 0).then(|| {
+        format!(
+            "{left} of {} frames are the only phase of their view, as where a C-arm or a table moves: they tell of what stands still, \
+             not of vessels",
+            dataset.training().len()
+        )
+    })
 }
 
 /// What is said of views in which more moves than vessels.

@@ -7,10 +7,11 @@
 mod corrected;
 mod engine;
 mod inbox;
+mod truth;
 
 use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
-use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
+use crate::geometry::{Geometry, ViewRays};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -21,7 +22,6 @@ use crate::render::live::Source;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::gating::RPeaks;
-use crate::score::eval::{Evaluation, evaluate, moving_field_warning};
 use crate::train::trainer::StepLoss;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
@@ -33,6 +33,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
+use truth::Known;
 
 /// Name of the thread that trains in the background.
 pub const TRAINING_THREAD: &str = "nertca-train";
@@ -84,6 +85,7 @@ pub struct Session {
     worker: Mutex<Option<JoinHandle<()>>>,
     /// Held by training in a caller's thread.
     blocking: Mutex<()>,
+    known: Mutex<Known>,
 }
 
 impl Session {
@@ -104,7 +106,7 @@ impl Session {
         if let Some(attenuation) = options.vessel_attenuation_per_mm {
             positive("vessel_attenuation_per_mm", attenuation)?;
         }
-        let inbox = Inbox { options, size: None, views: Vec::new(), frames: Vec::new(), r_peaks: None };
+        let inbox = Inbox { options, views: Vec::new(), frames: Vec::new(), r_peaks: None };
         Ok(Session {
             shared: Arc::new(Shared {
                 gpu,
@@ -124,6 +126,7 @@ impl Session {
             }),
             worker: Mutex::new(None),
             blocking: Mutex::default(),
+            known: Mutex::default(),
         })
     }
 
@@ -164,12 +167,10 @@ impl Session {
         let calibration = lock(&self.shared.calibration).clone().unwrap_or_else(|| Calibration::none(None));
         let inbox = lock(&self.shared.inbox);
         let (frame, moment) = inbox.frame(frame)?;
-        let size = inbox.size.ok_or_else(nothing_yet)?;
         CorrectedFrame::new(
             &inbox.views[frame.view],
             frame,
             inbox.beat_time(*moment).map(|taken| taken.phase),
-            size,
             &calibration,
         )
     }
@@ -396,23 +397,6 @@ impl Session {
     /// As [`Session::render`] and [`crate::render::renderer::Renderer::sample_patient`].
     pub fn sample(&self, component: Component, phase: u32, grid: &PatientGrid) -> Result<Vec<f32>> {
         self.shared.with_viewer(|live, step| live.renderer(step)?.sample_patient(component, phase, grid))
-    }
-
-    /// Scores the frames that were added for validation. `threshold_per_mm` replaces the rule for the Dice threshold.
-    ///
-    /// # Errors
-    /// [`Error::Data`] without such frames; as [`Session::render`].
-    pub fn evaluate(&self, threshold_per_mm: Option<f64>) -> Result<Evaluation> {
-        let dataset = lock(&self.shared.inbox).dataset(|_, _| true)?;
-        let frames: Vec<_> = dataset.validation().iter().collect();
-        let threshold = threshold_per_mm.map(|t| t * MM_PER_UNIT);
-        self.shared.with_viewer(|live, step| {
-            let renderer = live.renderer(step)?;
-            let mut evaluation = evaluate(renderer, &dataset, &frames, step, threshold, |_| Ok(()))?;
-            evaluation.warnings.extend(moving_field_warning(renderer, &dataset)?);
-            evaluation.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
-            Ok(evaluation)
-        })
     }
 
     /// The vessels at all phases as trees of centrelines with radii, from the fields as they are after the iterations under

@@ -11,6 +11,7 @@ use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
+use nertca_vk::capi::truth::*;
 use nertca_vk::capi::types::*;
 use nertca_vk::scan::gating::{SYSTOLE_S, SYSTOLE_SHARE};
 use std::ffi::{CString, c_char, c_void};
@@ -320,6 +321,68 @@ fn geometry_is_told_and_can_be_known_better_later() {
     assert!(away < 1e-4, "drawn by its matrix, a view differs by {away}");
     assert!(far(&drawn(corrected, &by_matrix), &a) > 0.01, "two views differ");
     close(context, &[corrected, given]);
+}
+
+/// The corner of an image that a small detector beside its middle sees, and its geometry.
+fn corner_of(view: usize, phase: u32, [columns, rows]: [u32; 2]) -> (Vec<f32>, nertca_geometry) {
+    let first = SIZE - columns;
+    let kept = |p: &usize| *p as u32 % SIZE >= first && (*p as u32 / SIZE) < rows;
+    let all = pixels(view, phase);
+    let pixels = (0..all.len()).filter(kept).map(|p| all[p]).collect();
+    let of = geometry(view);
+    let middle = [0.5 * f64::from(SIZE + first), 0.5 * f64::from(rows)];
+    let moved = [0, 1].map(|k| (middle[k] - 0.5 * f64::from(SIZE)) * of.pixel_mm[k]);
+    (pixels, nertca_geometry { offset_mm: [of.offset_mm[0] + moved[0], of.offset_mm[1] + moved[1]], ..of })
+}
+
+#[test]
+fn frames_of_different_sizes_go_together() {
+    let context = context("validation = true\ndeterministic = true");
+    let (whole, mixed) = (reconstruction(context, SMALL), reconstruction(context, SMALL));
+    let add = |to, view, phase, size: [u32; 2], split| {
+        let (pixels, geometry) = corner_of(view, phase, size);
+        let mask: Vec<u8> = pixels.iter().map(|p| u8::from(*p > 1.1)).collect();
+        let frame = nertca_frame {
+            geometry,
+            width: size[0],
+            height: size[1],
+            split,
+            mask: mask.as_ptr(),
+            mask_bytes: mask.len(),
+            ..frame(view, phase, &pixels)
+        };
+        ok(unsafe { nertca_reconstruction_add_frame(to, &frame) }, to);
+    };
+    let (small, large, train_on, score) = ([17, 14], [SIZE; 2], NERTCA_SPLIT_TRAIN, NERTCA_SPLIT_VALIDATION);
+    for phase in 0..PHASES {
+        (0..2).for_each(|view| add(mixed, view, phase, small, train_on));
+        (0..3).for_each(|view| add(whole, view, phase, large, train_on));
+    }
+    train(mixed, 5);
+    // Larger ones come later; a small one is scored.
+    (0..PHASES).for_each(|phase| add(mixed, 2, phase, large, train_on));
+    add(mixed, 2, 1, small, score);
+    train(mixed, 40);
+    train(whole, 40);
+    // A cropped frame is seen where it was, three columns further to the left.
+    let (seen, was) = (correction(mixed, 1).matrix, correction(whole, 1).matrix);
+    let scale = was.iter().flatten().fold(0f64, |m, v| m.max(v.abs()));
+    for k in 0..4 {
+        let expected = [was[0][k] - 3.0 * was[2][k], was[1][k], was[2][k]];
+        (0..3).for_each(|r| assert!((seen[r][k] - expected[r]).abs() < 1e-9 * scale, "row {r}, column {k}"));
+    }
+    let mut scores = nertca_scores { size: size_of::<nertca_scores>(), ..zeroed() };
+    ok(unsafe { nertca_reconstruction_evaluate(mixed, 0.0, &mut scores) }, mixed);
+    let (pixels, geometry) = corner_of(2, 1, small);
+    let as_small = nertca_view { geometry, width: small[0], height: small[1], ..exact(1, NERTCA_COMPONENT_TOTAL) };
+    let drawn = drawn(mixed, &as_small);
+    let [low, high] = pixels.iter().fold([f32::MAX, f32::MIN], |[l, h], v| [l.min(*v), h.max(*v)]);
+    let squared = pixels.iter().zip(&drawn).map(|(a, b)| f64::from((a - b) / (high - low)).powi(2)).sum::<f64>();
+    let psnr = -10.0 * (squared / pixels.len() as f64).log10();
+    println!("PSNR {} of the small frame, {psnr} by hand", scores.psnr_db);
+    assert_eq!(scores.images, 1);
+    assert!((scores.psnr_db - psnr).abs() < 1e-3, "{} is not {psnr}, of the small frame alone", scores.psnr_db);
+    close(context, &[whole, mixed]);
 }
 
 #[test]

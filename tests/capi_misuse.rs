@@ -12,6 +12,7 @@ use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
 use nertca_vk::capi::tree::*;
+use nertca_vk::capi::truth::*;
 use nertca_vk::capi::types::*;
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -340,8 +341,6 @@ fn frames(b: &Bench) {
         change(&mut frame);
         b.refuses(add, NERTCA_ERROR_ARGUMENT, part, unsafe { nertca_reconstruction_add_frame(b.bare, &frame) });
     }
-    let smaller = nertca_frame { width: 10, ..good };
-    b.refuses(add, NERTCA_ERROR_ARGUMENT, "one size", unsafe { nertca_reconstruction_add_frame(b.trained, &smaller) });
 }
 
 fn checkpoints(b: &Bench) {
@@ -551,6 +550,26 @@ fn volumes_and_scores(b: &Bench) {
     b.refuses(evaluate, NERTCA_ERROR_DATA, "none is for validation", unsafe {
         nertca_reconstruction_evaluate(b.trained, 0.0, &mut scores)
     });
+    let set_vessels = "nertca_reconstruction_set_true_vessels";
+    let (voxels, points) = ([1u8; 64], good.points.iter().product::<u32>() as usize);
+    b.handles(set_vessels, stale(b), b.context.cast(), |h| unsafe {
+        nertca_reconstruction_set_true_vessels(h, &good, voxels.as_ptr(), points)
+    });
+    let set = |grid: *const nertca_grid, at: *const u8, bytes: usize| unsafe {
+        nertca_reconstruction_set_true_vessels(b.trained, grid, at, bytes)
+    };
+    b.refuses(set_vessels, NERTCA_ERROR_ARGUMENT, "nertca_grid", set(null(), voxels.as_ptr(), points));
+    b.refuses(set_vessels, NERTCA_ERROR_ARGUMENT, "vessels", set(&good, null(), points));
+    b.refuses(set_vessels, NERTCA_ERROR_ARGUMENT, "bytes", set(&good, voxels.as_ptr(), points - 1));
+    let late = nertca_grid { phase: PHASES, ..good };
+    b.refuses(set_vessels, NERTCA_ERROR_ARGUMENT, "phase", set(&late, voxels.as_ptr(), points));
+    let set_tree = "nertca_reconstruction_set_true_tree";
+    let none = nertca_tree { size: size_of::<nertca_tree>(), ..zeroed() };
+    b.handles(set_tree, stale(b), b.context.cast(), |h| unsafe { nertca_reconstruction_set_true_tree(h, &none) });
+    let set = |tree: nertca_tree| unsafe { nertca_reconstruction_set_true_tree(b.trained, &tree) };
+    b.refuses(set_tree, NERTCA_ERROR_ARGUMENT, "nertca_tree.size", set(zeroed()));
+    b.refuses(set_tree, NERTCA_ERROR_ARGUMENT, "branch_phase", set(nertca_tree { branches: 1, ..none }));
+    b.refuses(set_tree, NERTCA_ERROR_ARGUMENT, "points", set(nertca_tree { points: usize::MAX, ..none }));
 }
 
 fn buffers(b: &Bench) {

@@ -12,6 +12,7 @@ use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::training::*;
+use nertca_vk::capi::truth::*;
 use nertca_vk::capi::types::*;
 use std::ffi::CString;
 use std::ptr::{null, null_mut, without_provenance_mut};

@@ -35,7 +35,7 @@ fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
             offset_mm: [0.0; 2],
             table_mm: [0.0; 3],
         });
-        View { rays: geometry.rays(SIZE, SIZE).unwrap(), geometry }
+        View::new(geometry, [SIZE; 2]).unwrap()
     };
     let mut frames = Vec::new();
     for v in 0..n_views {

@@ -45,7 +45,7 @@ impl Golden {
                 offset_mm: arm_pair("offset_mm"),
                 table_mm: [0.0; 3],
             });
-            views.push(View { rays: geometry.rays(width, height).unwrap(), geometry });
+            views.push(View::new(geometry, [width, height]).unwrap());
             for phase in 0..phases {
                 let image = self.get(&format!("image/{}", v * phases as usize + phase as usize));
                 frames.push(Frame {

@@ -303,7 +303,16 @@ fn malformed_datasets_are_named_file_and_field() {
             &["1.npy", "truncated"],
         ),
         ("empty image", |d, _| std::fs::write(d.join("1.npy"), b"").unwrap(), &["1.npy"]),
-        ("wrong shape", |d, _| npy::write(&d.join("1.npy"), &[5, 4], &[0.5; 20]).unwrap(), &["1.npy", "one size"]),
+        (
+            "too large together",
+            |d, m| {
+                npy::write(&d.join("0.npy"), &[1, 8192], &[0.5; 8192]).unwrap();
+                npy::write(&d.join("1.npy"), &[8192, 1], &[0.5; 8192]).unwrap();
+                let frame = m["frames"][1].clone();
+                m["frames"].as_array_mut().unwrap().extend(vec![frame; 16]);
+            },
+            &["dataset.json", "8192 columns and 8192 rows", "make the large ones smaller"],
+        ),
         ("three axes", |d, _| npy::write(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(), &["1.npy", "two axes"]),
         ("not a number", |d, _| npy::write(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(), &["1.npy", "row 0"]),
         ("phase", |_, m| m["frames"][1]["phase"] = json!(2), &["dataset.json", "frames[1].phase"]),

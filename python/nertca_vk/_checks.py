@@ -14,6 +14,7 @@ Pixels = Union[npt.NDArray[np.uint8], npt.NDArray[np.uint16], npt.NDArray[np.flo
 """An image of shape (rows, columns)."""
 
 LARGEST_U32: Final = 2**32 - 1
+FLOAT32: Final = np.dtype(np.float32)
 PIXEL_FORMATS: Final = {
     np.dtype(np.uint8): lib.NERTCA_PIXELS_U8,
     np.dtype(np.uint16): lib.NERTCA_PIXELS_U16,
@@ -97,12 +98,16 @@ def target(name: str, out: object, shape: tuple[int, ...]) -> "npt.NDArray[np.fl
     """Room for results: a new array, or the caller's own where it fits."""
     if out is None:
         return np.empty(shape, np.float32)
-    if not isinstance(out, np.ndarray) or out.dtype != np.float32 or out.shape != shape:
+    # The same object is told at once.
+    if not isinstance(out, np.ndarray) or (out.dtype is not FLOAT32 and out.dtype != FLOAT32) or out.shape != shape:
         found = f"{out.dtype} of shape {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
         raise wrong(name, f"{found}; a float32 array of shape {shape} is needed")
-    if not (out.flags.c_contiguous and out.flags.writeable and out.flags.aligned):
+    if not out.flags.carray:  # in C's order, aligned, and to be written to
         raise wrong(name, "is read-only, or its rows do not follow each other at once")
     return out
+
+
+BYTES: Final = ffi.typeof("char[]")
 
 
 def readable(array: "np.ndarray[Any, np.dtype[Any]]") -> Any:
@@ -112,4 +117,4 @@ def readable(array: "np.ndarray[Any, np.dtype[Any]]") -> Any:
 
 def writable(array: "np.ndarray[Any, np.dtype[Any]]") -> Any:
     """As `readable`, for the library to write to."""
-    return ffi.from_buffer(array, require_writable=True)
+    return ffi.from_buffer(BYTES, array, True)

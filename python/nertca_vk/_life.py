@@ -39,7 +39,7 @@ class Life:
     def handle(self) -> Any:
         """For the library."""
         handle = self._handle
-        if handle == ffi.NULL:
+        if not handle:
             raise HandleError(f"{self._name}: is closed", lib.NERTCA_ERROR_HANDLE)
         if self._process != os.getpid():
             raise _forked(f"{self._name}: used")

@@ -1,9 +1,10 @@
 """Reconstructions: frames in; training; views, volumes, trees and scores out."""
 
+import functools
 import os
 import threading
 import time
-from typing import Any, Literal, Mapping, Optional, Sequence, Union, cast
+from typing import Any, Hashable, Literal, Mapping, Optional, Sequence, Union, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +48,50 @@ SLICE_MS = 100
 MOST_POINTS = 1 << 30
 # Checkpoints may grow by a few bytes between being measured and being copied.
 ROOM_BYTES = 4096
+
+
+def _as_grid(grid: Grid) -> Any:
+    """A `nertca_grid *` of phase 0."""
+    if len(grid.points) != 3:
+        raise wrong("grid.points", f"{len(grid.points)} numbers where 3 are needed")
+    left, posterior, superior = (whole("grid.points", n, 1, 4096) for n in grid.points)
+    if left * posterior * superior > MOST_POINTS:
+        raise wrong("grid.points", f"{left} x {posterior} x {superior}; at most 2^30 in all are accepted")
+    struct = new("nertca_grid")
+    struct.origin_mm = reals("grid.origin_mm", grid.origin_mm, 3)
+    struct.spacing_mm = reals("grid.spacing_mm", grid.spacing_mm, 3)
+    struct.points = [left, posterior, superior]
+    return struct
+
+
+def _as_view(
+    geometry: Geometry, rows: int, columns: int, phase: int, component: str, projection: str, quality: str
+) -> tuple[Any, Any]:
+    """A `nertca_view *`, not to be written to, and what must be kept while it is used."""
+    view = new("nertca_view")
+    view.height, view.width = whole("shape", rows, 1, 8192), whole("shape", columns, 1, 8192)
+    stated, kept = as_struct(geometry)
+    view.geometry = stated[0]
+    view.phase = whole("phase", phase)
+    view.component = constant("component", component, "NERTCA_COMPONENT_")
+    view.projection = constant("projection", projection, "NERTCA_PROJECTION_")
+    view.quality = constant("quality", quality, "NERTCA_QUALITY_")
+    return view, kept
+
+
+# A beat is drawn again and again from where it was drawn. Typed: 1.0 is no phase where 1 is one.
+_known_view = functools.lru_cache(maxsize=1024, typed=True)(_as_view)
+
+
+class _Room(threading.local):
+    """Structs that each thread fills anew for each call."""
+
+    def __init__(self) -> None:
+        self.picture = new("nertca_image")
+        self.picture.format = lib.NERTCA_PIXELS_F32
+
+
+_ROOM = _Room()
 
 
 class _Core:
@@ -176,7 +221,8 @@ class Reconstruction:
     ) -> int:
         """Adds a calibrated angiogram, which is copied, and returns its number, from 0.
 
-        pixels: shape (rows, columns) of uint8, uint16, float32, or float64, which becomes float32; all frames of one size.
+        pixels: shape (rows, columns) of uint8, uint16, float32, or float64, which becomes float32; frames may differ in
+            size.
         geometry: how it was taken.
         phase: cardiac phase, from 0; or `time_s`: its time in seconds, on the clock of the R-peaks.
         intensity: what pixel values mean; line integrals of attenuation unless stated.
@@ -392,19 +438,14 @@ class Reconstruction:
 
         Raises NotReadyError before anything was trained or loaded; ArgumentError naming what is wrong.
         """
-        rows, columns = (whole("shape", side, 1, 8192) for side in shape)
-        view = new("nertca_view")
-        view.width, view.height = columns, rows
-        stated, kept = as_struct(geometry)
-        view.geometry = stated[0]
-        view.phase = whole("phase", phase)
-        view.component = constant("component", component, "NERTCA_COMPONENT_")
-        view.projection = constant("projection", projection, "NERTCA_PROJECTION_")
-        view.quality = constant("quality", quality, "NERTCA_QUALITY_")
-        drawn = target("out", out, (rows, columns))
-        picture = new("nertca_image")
+        rows, columns = shape
+        try:
+            view, kept = _known_view(cast(Hashable, geometry), rows, columns, phase, component, projection, quality)
+        except TypeError:  # an array, or a list among the geometry's fields: nothing to look up later
+            view, kept = _as_view(geometry, rows, columns, phase, component, projection, quality)
+        drawn = target("out", out, (view.height, view.width))
+        picture = _ROOM.picture
         picture.pixels, picture.pixels_bytes = writable(drawn), drawn.nbytes
-        picture.format = lib.NERTCA_PIXELS_F32
         handle = self.handle
         check(lib.nertca_reconstruction_render(handle, view, picture), handle)
         del kept
@@ -423,16 +464,8 @@ class Reconstruction:
 
         out: an array of that shape to write into instead of a new one.
         """
-        asked = Grid.around_isocentre() if grid is None else grid
-        if len(asked.points) != 3:
-            raise wrong("grid.points", f"{len(asked.points)} numbers where 3 are needed")
-        left, posterior, superior = (whole("grid.points", n, 1, 4096) for n in asked.points)
-        if left * posterior * superior > MOST_POINTS:
-            raise wrong("grid.points", f"{left} x {posterior} x {superior}; at most 2^30 in all are accepted")
-        struct = new("nertca_grid")
-        struct.origin_mm = reals("grid.origin_mm", asked.origin_mm, 3)
-        struct.spacing_mm = reals("grid.spacing_mm", asked.spacing_mm, 3)
-        struct.points = [left, posterior, superior]
+        struct = _as_grid(Grid.around_isocentre() if grid is None else grid)
+        left, posterior, superior = struct.points
         struct.component = constant("component", component, "NERTCA_COMPONENT_")
         struct.phase = whole("phase", phase)
         values = target("out", out, (superior, posterior, left))
@@ -481,8 +514,63 @@ class Reconstruction:
         ]
         return Tree(threshold_per_mm=struct.threshold_per_mm, followed=struct.followed == 1, branches=branches)
 
+    def set_true_vessels(
+        self, inside: "Union[npt.NDArray[np.bool_], npt.NDArray[np.uint8], None]", grid: Grid, phase: int = 0
+    ) -> None:
+        """Says which points of a grid are vessel at a phase, in place of what was said of it: `evaluate` then scores in 3D.
+
+        inside: True or non-zero inside vessels, of shape (superior, posterior, left); None forgets the phase.
+
+        The true vessels are compared where they are said to be, whatever calibration did to the views. Raises ArgumentError
+        naming what is wrong.
+        """
+        struct = _as_grid(grid)
+        struct.phase = whole("phase", phase)
+        handle = self.handle
+        if inside is None:
+            check(lib.nertca_reconstruction_set_true_vessels(handle, struct, ffi.NULL, 0), handle)
+            return
+        shape = tuple(struct.points)[::-1]
+        given = np.asarray(inside)
+        if given.dtype not in (np.bool_, np.uint8) or given.shape != shape:
+            raise wrong("inside", f"{given.dtype} of shape {given.shape}; bool or uint8 of shape {shape} is needed")
+        voxels = np.ascontiguousarray(given)
+        memory = ffi.cast("uint8_t *", readable(voxels))
+        check(lib.nertca_reconstruction_set_true_vessels(handle, struct, memory, voxels.nbytes), handle)
+
+    def set_true_tree(self, tree: Optional[Tree]) -> None:
+        """Says where the true centrelines are, and how wide the vessels: `evaluate` then finds a tree and scores it.
+
+        tree: of one phase or more, of which 0 is one, with the same branches of as many points at each; point i of a branch is
+        the same material point at every phase. None forgets it.
+
+        Raises ArgumentError naming what is wrong.
+        """
+        branches = [] if tree is None else tree.branches
+        struct = new("nertca_tree")
+        counts = [len(branch.radius_mm) for branch in branches]
+        words = {
+            "branch_phase": [whole("phase", branch.phase) for branch in branches],
+            "branch_first": [sum(counts[:number]) for number in range(len(counts))],
+            "branch_points": counts,
+        }
+        for branch in branches:
+            if np.shape(branch.points_mm) != (len(branch.radius_mm), 3):
+                raise wrong("points_mm", f"of shape {np.shape(branch.points_mm)} with {len(branch.radius_mm)} radii")
+        points_mm = np.array([point for branch in branches for point in branch.points_mm], np.float64)
+        radius_mm = np.array([radius for branch in branches for radius in branch.radius_mm], np.float64)
+        arrays = {name: np.array(values, np.uint32) for name, values in words.items()}
+        all_arrays: dict[str, npt.NDArray[Any]] = {**arrays, "points_mm": points_mm, "radius_mm": radius_mm}
+        kept = {name: readable(array) for name, array in all_arrays.items()}
+        for name, memory in kept.items():
+            setattr(struct, name, ffi.cast(ffi.typeof(getattr(struct, name)), memory))
+        struct.branches, struct.points = len(branches), len(radius_mm)
+        handle = self.handle
+        check(lib.nertca_reconstruction_set_true_tree(handle, struct), handle)
+
     def evaluate(self, threshold_per_mm: float = 0.0) -> Scores:
-        """Scores the frames that were added for validation.
+        """Scores the frames that were added for validation, of which there must be one, and what was reconstructed against the
+        true vessels, where `set_true_vessels` or `set_true_tree` said where they are.
 
         threshold_per_mm: attenuation from which the moving field counts as vessel; 0 for a fifth of
         `vessel_attenuation_per_mm`, or Otsu's where that is unknown.

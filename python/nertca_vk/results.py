@@ -54,7 +54,7 @@ class Correction:
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores on the frames added for validation."""
+    """Scores on the frames added for validation, and in 3D where the true vessels are known."""
 
     step: int
     """Iterations of the model."""
@@ -70,6 +70,40 @@ class Scores:
     """Mean structural similarity."""
     threshold_per_mm: float
     """Attenuation from which the moving field counts as vessel, 1/mm."""
+    volume_phases: int
+    """Phases whose true vessels are known as voxels (`set_true_vessels`); what follows are means over them, NaN without."""
+    tree_phases: int
+    """Phases whose true vessels are known as a tree (`set_true_tree`)."""
+    volume_dice: float
+    """Dice of the voxels that are vessel."""
+    chamfer_mm: float
+    """Mean distance of a voxel of one set to the nearest of the other, both directions weighing the same, mm."""
+    hausdorff95_mm: float
+    """The larger of both directions' 95th percentiles of these distances, mm."""
+    true_centreline_found: float
+    """Share of the true centreline's voxels with one of ours within 1 mm."""
+    our_centreline_true: float
+    """Share of our centreline's voxels with a true one within 1 mm."""
+    cl_dice: float
+    """Centreline Dice: the harmonic mean of the shares of each centreline inside the other set."""
+    components: float
+    """Connected components of ours that are a pixel at the isocentre wide or more."""
+    true_components: float
+    """Connected components of the truth."""
+    tree_true_centreline_found: float
+    """Share of the true tree's length with ours within 1 mm."""
+    tree_our_centreline_true: float
+    """Share of our tree's length with a true one within 1 mm."""
+    tree_ours_to_true_mm: float
+    """Mean distance of our centreline to the true one, mm."""
+    tree_components: float
+    """Connected trees of ours."""
+    radius_error_mm: float
+    """Mean of our radius less the true one, where our centreline is true, mm."""
+    radius_rmse_mm: float
+    """Root of the mean square of the same, mm."""
+    motion_error_mm: float
+    """Mean distance between where our points have come since phase 0 and where the true points beside them have, mm."""
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ impl Dataset {
             let view = view.ok_or_else(|| other(format!("view {}", c.view)))?;
             view.rays = c
                 .corrected
-                .rays(self.width, self.height)
+                .rays(view.size[0], view.size[1])
                 .map_err(|(field, problem)| Error::config(FILE, format!("view {}: {field}", c.view), problem))?;
             view.geometry = c.corrected.clone();
         }

@@ -5,7 +5,7 @@ use crate::calibrate::profiles::{Moving, Views};
 use crate::evidence::background::Series;
 use crate::evidence::ratios::ViewEvidence;
 use crate::raster::widened;
-use crate::scan::dataset::{Dataset, Frame};
+use crate::scan::dataset::{Dataset, Frame, View};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -37,12 +37,14 @@ pub struct Observed {
     pub coarse: Views,
     /// Differences from the still background, of either sign: tell the rest.
     pub fine: Views,
-    /// `[view][phase]`: images above the still background.
+    /// `[view][phase]`: images above the still background; these and all others on the canvas of the dataset's images.
     pub seen: Vec<Vec<Option<Vec<f32>>>>,
     /// `[view][phase]`: pixels that show vessels.
     pub shown: Vec<Vec<Option<Vec<bool>>>>,
     /// `[view]`: pixels that show the patient.
     pub visible: Vec<Vec<bool>>,
+    /// `[view]`: columns and rows of its images.
+    pub sizes: Vec<[usize; 2]>,
     /// Strongest change over the beat of any view, as a share of the range of its line integrals.
     pub change: f64,
     /// Share of each view's change that lies at the border of its images.
@@ -81,7 +83,13 @@ fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
         notes: Vec::new(),
         ..*dataset
     };
-    coarse.views.iter_mut().for_each(|view| view.rays = view.rays.binned(factor));
+    for view in &mut coarse.views {
+        *view = View {
+            geometry: view.geometry.clone(),
+            size: view.size.map(|n| n / factor),
+            rays: view.rays.binned(factor),
+        };
+    }
     coarse
 }
 
@@ -115,7 +123,7 @@ fn shown(evidence: &ViewEvidence) -> Vec<Option<Vec<bool>>> {
 
 impl Seen {
     fn new(data: &Dataset, series: &Series) -> Seen {
-        let evidence = ViewEvidence::new(series);
+        let evidence = ViewEvidence::new(series).on_canvas(data.canvas());
         let level = &evidence.background.level.values;
         let visible: Vec<bool> = (0..data.n_pixels()).map(|p| data.shows(series.view, p)).collect();
         let likely = |p: usize| visible[p] && evidence.ratios.iter().flatten().any(|r| r.values[p] > LIKELY);
@@ -184,6 +192,7 @@ impl Observed {
             fine: Views::new(seen.iter().map(signed).collect(), n_phases),
             change: seen.iter().map(|s| s.change).fold(0.0, f64::max),
             at_border: seen.iter().map(|s| s.at_border).collect(),
+            sizes: series.iter().map(|s| data.views[s.view].size).collect(),
             stands: seen.iter().map(|s| s.stand.clone()).collect(),
             seen: seen.iter().map(|s| s.above.clone()).collect(),
             visible: seen.iter().map(|s| s.visible.clone()).collect(),

@@ -8,7 +8,7 @@ use crate::capi::status::{Failure, NERTCA_OK, Outcome, call, nertca_status};
 use crate::capi::types::{
     NERTCA_COMPONENT_DYNAMIC, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_TOTAL, NERTCA_PIXELS_F32, NERTCA_PIXELS_U8,
     NERTCA_PROJECTION_DRR, NERTCA_PROJECTION_MIP, NERTCA_QUALITY_EXACT, NERTCA_QUALITY_LIVE, nertca_grid, nertca_image,
-    nertca_scores, nertca_view, pixel_bytes, read, sides, stride, write,
+    nertca_view, pixel_bytes, read, sides, stride,
 };
 use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::buffer::Buffer;
@@ -198,7 +198,7 @@ fn check_target(reconstruction: &Reconstruction, target: &SharedBuffer, floats: 
 
 /// # Safety
 /// `grid` must be null or as long as it says.
-unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Component, u32)> {
+pub(super) unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Component, u32)> {
     // SAFETY: this function asks its callers that `grid` is null or as long as its size says.
     let grid = unsafe { read(grid) }?;
     let component = component_of(grid.component)?;
@@ -260,42 +260,6 @@ pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
         check_target(reconstruction, &target, grid.size.iter().map(|n| *n as usize).product())?;
         let cells = reconstruction.session.sample(component, phase, &grid)?;
         Ok(reconstruction.claim.context.device()?.upload(&target.buffer, 0, &cells)?)
-    })
-}
-
-/// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`. `threshold_per_mm` is the attenuation from which
-/// the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
-/// Any thread, also while training.
-///
-/// # Safety
-/// `scores` must be writable, with its size set.
-#[unsafe(no_mangle)]
-pub unsafe extern "C" fn nertca_reconstruction_evaluate(
-    reconstruction: *mut nertca_reconstruction,
-    threshold_per_mm: f64,
-    scores: *mut nertca_scores,
-) -> nertca_status {
-    on_reconstruction(reconstruction, |reconstruction| {
-        if !(threshold_per_mm.is_finite() && threshold_per_mm >= 0.0) {
-            return Err(Failure::argument("threshold_per_mm", format!("{threshold_per_mm} is no attenuation")));
-        }
-        if scores.is_null() {
-            return Err(Failure::argument("scores", "is null"));
-        }
-        let found = reconstruction.session.evaluate((threshold_per_mm > 0.0).then_some(threshold_per_mm))?;
-        // SAFETY: the header asks that `scores` is as long as its size says; it is not null.
-        unsafe {
-            write(scores, |size| nertca_scores {
-                size,
-                step: found.step,
-                images: found.images.len() as u32,
-                dice_dynamic: found.dice.dynamic.unwrap_or(f64::NAN),
-                dice_total: found.dice.total.unwrap_or(f64::NAN),
-                psnr_db: found.psnr,
-                ssim: found.ssim,
-                threshold_per_mm: found.threshold.dynamic_per_mm,
-            })
-        }
     })
 }
 

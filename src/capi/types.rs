@@ -141,7 +141,7 @@ pub struct nertca_frame {
     pub pixels_bytes: usize,
     /// Bytes from one row to the next; 0 when rows follow each other at once.
     pub stride_bytes: usize,
-    /// Columns, 1 to 8192. All frames of a reconstruction have one size.
+    /// Columns, 1 to 8192. Frames of a reconstruction may differ in size.
     pub width: u32,
     /// Rows, 1 to 8192.
     pub height: u32,
@@ -330,6 +330,40 @@ pub struct nertca_scores {
     pub ssim: f64,
     /// Attenuation from which the moving field counts as vessel, 1/mm.
     pub threshold_per_mm: f64,
+    /// Phases whose true vessels are known as voxels (`nertca_reconstruction_set_true_vessels`).
+    pub volume_phases: u32,
+    /// Phases whose true vessels are known as a tree (`nertca_reconstruction_set_true_tree`).
+    pub tree_phases: u32,
+    /// Dice of the voxels that are vessel; this and what follows are means over the phases, and NaN where nothing is known.
+    pub volume_dice: f64,
+    /// Mean distance of a voxel of one set to the nearest of the other, both directions weighing the same, mm.
+    pub chamfer_mm: f64,
+    /// The larger of both directions' 95th percentiles of these distances, mm.
+    pub hausdorff95_mm: f64,
+    /// Share of the true centreline's voxels with one of ours within 1 mm.
+    pub true_centreline_found: f64,
+    /// Share of our centreline's voxels with a true one within 1 mm.
+    pub our_centreline_true: f64,
+    /// Centreline Dice: the harmonic mean of the shares of each centreline inside the other set.
+    pub cl_dice: f64,
+    /// Connected components of ours that are a pixel at the isocentre wide or more.
+    pub components: f64,
+    /// Connected components of the truth.
+    pub true_components: f64,
+    /// Share of the true tree's length with ours within 1 mm.
+    pub tree_true_centreline_found: f64,
+    /// Share of our tree's length with a true one within 1 mm.
+    pub tree_our_centreline_true: f64,
+    /// Mean distance of our centreline to the true one, mm.
+    pub tree_ours_to_true_mm: f64,
+    /// Connected trees of ours.
+    pub tree_components: f64,
+    /// Mean of our radius less the true one, where our centreline is true, mm.
+    pub radius_error_mm: f64,
+    /// Root of the mean square of the same, mm.
+    pub radius_rmse_mm: f64,
+    /// Mean distance between where our points have come since phase 0 and where the true points beside them have, mm.
+    pub motion_error_mm: f64,
 }
 
 /// Told now and then how far training is; a non-zero result ends it. `progress` is valid during the call. Called on the
@@ -344,6 +378,8 @@ pub type nertca_progress_callback =
 /// `#[repr(C)]`, with a `usize` first, and no field with invalid bit patterns.
 pub(super) unsafe trait Versioned: Copy {
     const NAME: &'static str;
+    /// Size in the version of the ABI that had it first: fields behind that are left out for callers who do not know them.
+    const FIRST: usize = size_of::<Self>();
 }
 
 macro_rules! versioned {
@@ -355,10 +391,16 @@ macro_rules! versioned {
     )* };
 }
 versioned!(nertca_log nertca_vulkan nertca_geometry nertca_frame nertca_view nertca_image nertca_grid nertca_progress
-       nertca_correction nertca_tree nertca_scores);
+       nertca_correction nertca_tree);
+
+// SAFETY: integers and floats after a `usize`.
+unsafe impl Versioned for nertca_scores {
+    const NAME: &'static str = "nertca_scores";
+    const FIRST: usize = std::mem::offset_of!(nertca_scores, volume_phases);
+}
 
 fn check_size<T: Versioned>(size: usize) -> Outcome<()> {
-    if size < size_of::<T>() || size > 4096 {
+    if size < T::FIRST || size > 4096 {
         let name = T::NAME;
         let problem = format!("{size} where sizeof({name}) = {} is needed: was the struct set up?", size_of::<T>());
         return Err(Failure::argument(&format!("{name}.size"), problem));
@@ -366,7 +408,8 @@ fn check_size<T: Versioned>(size: usize) -> Outcome<()> {
     Ok(())
 }
 
-/// Reads a struct of the caller. A longer one, of a later version, is accepted if what is unknown here is zero.
+/// Reads a struct of the caller. A longer one, of a later version, is accepted if what is unknown here is zero; what a shorter one
+/// lacks is zero here.
 ///
 /// # Safety
 /// `from` must be null or point to a struct as long as it says.
@@ -377,17 +420,18 @@ pub(super) unsafe fn read<T: Versioned>(from: *const T) -> Outcome<T> {
     // SAFETY: a size comes first.
     let size = unsafe { from.cast::<usize>().read_unaligned() };
     check_size::<T>(size)?;
+    let known = size.min(size_of::<T>());
     // SAFETY: the struct is as long as it says.
-    let rest = unsafe {
-        let end = from.cast::<u8>().add(size_of::<T>());
-        std::slice::from_raw_parts(end, size - size_of::<T>())
-    };
+    let rest = unsafe { std::slice::from_raw_parts(from.cast::<u8>().add(known), size - known) };
     if rest.iter().any(|byte| *byte != 0) {
         return Err(Failure::argument(T::NAME, "asks for what this version of the library does not know"));
     }
-    // SAFETY: a struct as long as its size says has at least our fields, as `check_size` saw, and every bit pattern of
-    // them is a value.
-    Ok(unsafe { from.read_unaligned() })
+    let mut value = std::mem::MaybeUninit::<T>::zeroed();
+    // SAFETY: the struct is as long as its size says, ours has room for as much, and every bit pattern of it is a value.
+    unsafe {
+        std::ptr::copy_nonoverlapping(from.cast::<u8>(), value.as_mut_ptr().cast(), known);
+        Ok(value.assume_init())
+    }
 }
 
 /// Writes a struct to the caller, whose `size` must be set.
@@ -401,8 +445,11 @@ pub(super) unsafe fn write<T: Versioned>(to: *mut T, value: impl FnOnce(usize) -
     // SAFETY: a size comes first.
     let size = unsafe { to.cast::<usize>().read_unaligned() };
     check_size::<T>(size)?;
-    // SAFETY: the struct is at least as long as ours.
-    unsafe { to.write_unaligned(value(size)) };
+    let value = value(size);
+    // SAFETY: the struct is as long as its size says, and bytes need no alignment.
+    unsafe {
+        std::ptr::copy_nonoverlapping((&raw const value).cast::<u8>(), to.cast::<u8>(), size.min(size_of::<T>()));
+    }
     Ok(())
 }
 

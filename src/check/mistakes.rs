@@ -2,6 +2,7 @@
 
 use crate::calibrate::profiles::Views;
 use crate::geometry::{CArm, Geometry};
+use crate::scan::canvas::{framed, onto_canvas};
 use crate::scan::dataset::{Dataset, View};
 
 /// Something that is wrong with all images or all geometries alike.
@@ -71,12 +72,11 @@ impl Mistake {
 
     /// The data without the mistake; none where it cannot have been made.
     pub fn undone(self, dataset: &Dataset) -> Option<Dataset> {
-        let (w, h) = (dataset.width, dataset.height);
         match self {
-            Mistake::Transposed => moved(dataset, (h, w), |i| i % h * w + i / h),
-            Mistake::Mirrored => moved(dataset, (w, h), |i| i / w * w + (w - 1 - i % w)),
-            Mistake::UpsideDown => moved(dataset, (w, h), |i| (h - 1 - i / w) * w + i % w),
-            Mistake::Turned => moved(dataset, (w, h), |i| w * h - 1 - i),
+            Mistake::Transposed => moved(dataset, |[w, h]| [h, w], |i, [w, h]| i % h * w + i / h),
+            Mistake::Mirrored => moved(dataset, |size| size, |i, [w, _]| i / w * w + (w - 1 - i % w)),
+            Mistake::UpsideDown => moved(dataset, |size| size, |i, [w, h]| (h - 1 - i / w) * w + i % w),
+            Mistake::Turned => moved(dataset, |size| size, |i, [w, h]| w * h - 1 - i),
             Mistake::AnglesExchanged => geometries(dataset, |c| CArm {
                 primary_deg: c.secondary_deg,
                 secondary_deg: c.primary_deg,
@@ -96,20 +96,31 @@ impl Mistake {
     }
 }
 
-/// The dataset with the pixels of its training images elsewhere: `from` says where each was.
-fn moved(dataset: &Dataset, (width, height): (usize, usize), from: impl Fn(usize) -> usize) -> Option<Dataset> {
+/// The dataset with the pixels of its training images elsewhere: `sized` gives the size (columns, rows) of images of another, and
+/// `from` where each pixel was in an image of a size.
+fn moved(
+    dataset: &Dataset,
+    sized: impl Fn([usize; 2]) -> [usize; 2],
+    from: impl Fn(usize, [usize; 2]) -> usize,
+) -> Option<Dataset> {
     let mut changed = revalued(dataset, |v| v);
-    (changed.width, changed.height) = (width, height);
-    for frame in &mut changed.frames {
-        frame.integrals = (0..frame.integrals.len()).map(|i| frame.integrals[from(i)]).collect();
-    }
-    for hidden in changed.hidden.values_mut() {
-        *hidden = (0..hidden.len()).map(|i| hidden[from(i)]).collect();
-    }
-    if (width, height) != (dataset.width, dataset.height) {
-        for view in &mut changed.views {
-            view.rays = view.geometry.rays(width, height).ok()?;
+    for view in &mut changed.views {
+        let size = sized(view.size);
+        if size != view.size {
+            *view = View::new(view.geometry.clone(), size).ok()?;
         }
+    }
+    let was = |view: usize| dataset.views[view].size;
+    for frame in &mut changed.frames {
+        let own = dataset.own(frame.view, &frame.integrals);
+        frame.integrals = (0..own.len()).map(|i| own[from(i, was(frame.view))]).collect();
+    }
+    let [width, height] = onto_canvas(&changed.views, &mut changed.frames).ok()??;
+    (changed.width, changed.height) = (width, height);
+    for (view, hidden) in &mut changed.hidden {
+        let own = dataset.own(*view, hidden);
+        let own: Vec<bool> = (0..own.len()).map(|i| own[from(i, was(*view))]).collect();
+        *hidden = framed(&own, changed.views[*view].size, [width, height], true);
     }
     Some(changed)
 }
@@ -130,8 +141,7 @@ fn geometries(dataset: &Dataset, change: impl Fn(&CArm) -> CArm) -> Option<Datas
     for view in &mut changed.views {
         let Geometry::CArm(c_arm) = &view.geometry else { return None };
         let geometry = Geometry::CArm(change(c_arm));
-        let rays = geometry.rays(dataset.width, dataset.height).ok()?;
-        *view = View { geometry, rays };
+        *view = View::new(geometry, view.size).ok()?;
     }
     Some(changed)
 }
@@ -168,9 +178,15 @@ impl PhaseMistake {
     }
 }
 
-/// Two views whose images, or geometries, are exchanged.
-pub fn exchanged(dataset: &Dataset, [a, b]: [usize; 2]) -> Dataset {
+/// Two views whose images, or geometries, are exchanged; none where one is impossible for the other's images.
+pub fn exchanged(dataset: &Dataset, [a, b]: [usize; 2]) -> Option<Dataset> {
     let mut changed = dataset.clone();
     changed.views.swap(a, b);
-    changed
+    for view in [a, b] {
+        let size = dataset.views[view].size;
+        if changed.views[view].size != size {
+            changed.views[view] = View::new(changed.views[view].geometry.clone(), size).ok()?;
+        }
+    }
+    Some(changed)
 }

@@ -67,7 +67,7 @@ impl Stand {
             Geometry::CArm(c_arm) => c_arm.sid_mm / MM_PER_UNIT,
             Geometry::Matrix(_) => MATRIX_SID * seen.rays.sod,
         };
-        let (source, [right, bottom]) = (seen.rays.source(), [dataset.width, dataset.height].map(|n| n as f64 - 0.5));
+        let (source, [right, bottom]) = (seen.rays.source(), seen.size.map(|n| n as f64 - 0.5));
         let at = |i: f64, j: f64| lps_mm_from_world(source + sid * seen.rays.pixel(i, j).1);
         let [primary, secondary] = angles_deg_of(seen.rays.axis());
         let angle = |value: f64, plus: &str, minus: &str| {

@@ -92,6 +92,7 @@ fn describe_dataset(path: &Path) -> Result<serde_json::Value> {
             let of = |split| dataset.frames.iter().filter(|f| f.view == index && f.split == split).count();
             serde_json::json!({
                 "geometry": view.geometry,
+                "image": view.size,
                 "training_frames": of(Split::Train),
                 "validation_frames": of(Split::Validation),
             })
@@ -101,7 +102,7 @@ fn describe_dataset(path: &Path) -> Result<serde_json::Value> {
     Ok(serde_json::json!({
         "kind": "dataset",
         "layout": dataset.layout,
-        "image": [dataset.width, dataset.height],
+        "image": dataset.canvas(),
         "phases": dataset.n_phases,
         "depth_range_mm": [dataset.depth_range.0 * MM_PER_UNIT, dataset.depth_range.1 * MM_PER_UNIT],
         "line_integrals": [range.low, range.high],

@@ -11,6 +11,7 @@ use nertca_vk::model::Model;
 use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::run::history::History;
 use nertca_vk::run::{hull_pictures, silhouette_pictures};
+use nertca_vk::scan::canvas::in_words;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::tree::BeatTree;
@@ -142,9 +143,8 @@ fn gaussians_of(field: &MovingGaussians) -> String {
 
 fn images_of(dataset: &Dataset) -> String {
     format!(
-        "{} x {}, {} to train on from {} views, {} to score with, {} phases",
-        dataset.width,
-        dataset.height,
+        "{}, {} to train on from {} views, {} to score with, {} phases",
+        in_words(&dataset.sizes()),
         dataset.training().len(),
         dataset.training_views().len(),
         dataset.validation().len(),

@@ -82,9 +82,11 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
     // A thousandth of a phase, so that captions are short.
     let phases = |frame: &Frame| (1e3 * frame.beat_time().phases(dataset.n_phases)).round() / 1e3;
     frames.sort_by(|a, b| phases(a).total_cmp(&phases(b)));
-    let window = Window::of(&frames.iter().flat_map(|frame| frame.integrals.iter().copied()).collect::<Vec<_>>());
+    let [width, height] = dataset.views[view].size;
+    let own = |frame: &Frame| dataset.own(view, &frame.integrals).into_owned();
+    let window = Window::of(&frames.iter().flat_map(|frame| own(frame)).collect::<Vec<_>>());
     let frame = |frame: &Frame| -> Result<Value> {
-        let png = png::grey8(dataset.width, dataset.height, &window.codes(&frame.integrals))?;
+        let png = png::grey8(width, height, &window.codes(&own(frame)))?;
         Ok(json!({
             "phase": phases(frame),
             "projection": dataset.heart_rays(frame).projection(),
@@ -103,8 +105,8 @@ fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
     });
     Ok(json!({
         "title": format!("View {view}{angles}"),
-        "width": dataset.width,
-        "height": dataset.height,
+        "width": width,
+        "height": height,
         "frames": frames,
     }))
 }

@@ -10,6 +10,7 @@ use super::watch_live::Live;
 use clap::Args;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
+use nertca_vk::geometry::Geometry;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::import::angiograms::ImportOptions;
 use nertca_vk::import::dicom::Run;
@@ -126,8 +127,6 @@ struct Watch<'a> {
 /// A session of runs.
 struct UnderWay {
     session: Arc<Session>,
-    /// Of its images.
-    size: [usize; 2],
     /// Runs handed to it.
     runs: usize,
 }
@@ -217,17 +216,18 @@ impl Watch<'_> {
         }
     }
 
-    /// Hands the newest run to training. Where that is past its half or over, or images have another size now, it begins anew
-    /// with all runs: the last iterations alone would not do the new ones justice.
+    /// Hands the newest run to training. Where that is past its half or over, it begins anew with all runs: the last iterations
+    /// alone would not do the new ones justice.
     fn feed(&mut self) -> Result<()> {
-        let Some((size, c_arm)) = self.intake.size().zip(self.intake.c_arm().cloned()) else { return Ok(()) };
+        let Some(first) = self.intake.first() else { return Ok(()) };
+        let taken = Taken { c_arm: first.c_arm.clone(), image_size: [first.image.width, first.image.height] };
         let young = |session: &Session| {
             let state = session.state();
             matches!(state, State::Running | State::Waiting) && 2 * session.step() <= self.config.train.iterations
         };
         let newest = self.intake.runs() - 1;
         match &self.under_way {
-            Some(now) if now.size == size && young(&now.session) => self.add(&now.session, newest)?,
+            Some(now) if young(&now.session) => self.add(&now.session, newest)?,
             _ => {
                 // The old one's memory is needed first.
                 self.live.follow(None, None, newest);
@@ -242,7 +242,7 @@ impl Watch<'_> {
                 let session = Session::new(Some(self.gpu.clone()), Some(self.tuning.clone()), options)?;
                 (0..=newest).try_for_each(|run| self.add(&session, run))?;
                 session.start(Box::new(|_| true))?;
-                self.under_way = Some(UnderWay { session: Arc::new(session), size, runs: 0 });
+                self.under_way = Some(UnderWay { session: Arc::new(session), runs: 0 });
                 self.failed = false;
             }
         }
@@ -251,19 +251,19 @@ impl Watch<'_> {
             now.runs = newest + 1;
             now.session.clone()
         });
-        self.live.follow(session, Some(Taken { c_arm, image_size: size }), newest + 1);
+        self.live.follow(session, Some(taken), newest + 1);
         Ok(())
     }
 
     fn add(&self, session: &Session, run: usize) -> Result<()> {
-        self.intake.frames(run).into_iter().try_for_each(|frame| {
+        self.intake.frames(run).iter().try_for_each(|frame| {
             session.add_frame(NewFrame {
-                geometry: frame.geometry,
+                geometry: Geometry::CArm(frame.c_arm.clone()),
                 moment: Moment::Beat(frame.taken),
                 split: Split::Train,
                 width: frame.image.width,
                 height: frame.image.height,
-                integrals: frame.image.values,
+                integrals: frame.image.values.clone(),
                 mask: None,
             })
         })

@@ -4,6 +4,7 @@ use crate::evidence::drift::Drift;
 use crate::evidence::filters::{gaussian, map2, separable};
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
 use crate::raster::{Image, dilate, median, opening, percentile};
+use crate::scan::canvas::continued;
 use crate::scan::dataset::Dataset;
 use rayon::prelude::*;
 
@@ -31,7 +32,7 @@ const LEAST_OPENING_RADIUS: usize = 2;
 pub struct Series {
     /// Index into [`Dataset::views`].
     pub view: usize,
-    /// An image per phase of the dataset, rows first; `None` where the view has none.
+    /// An image per phase of the dataset, as large as the view's; `None` where the view has none.
     pub images: Vec<Option<Image>>,
 }
 
@@ -54,9 +55,11 @@ impl Series {
 fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
     let frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view && f.phase == phase).collect();
     let scale = 1.0 / frames.len() as f32;
-    let value = |p: usize| frames.iter().map(|f| f.integrals[p]).sum::<f32>() * scale;
-    let values = (0..dataset.n_pixels()).map(value).collect();
-    (!frames.is_empty()).then_some(Image { width: dataset.width, height: dataset.height, values })
+    let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
+    let [width, height] = dataset.views[view].size;
+    let value = |p: usize| images.iter().map(|image| image[p]).sum::<f32>() * scale;
+    let values = (0..width * height).map(value).collect();
+    (!frames.is_empty()).then_some(Image { width, height, values })
 }
 
 /// The still background of a view, and what stands out of it.
@@ -141,6 +144,19 @@ impl Background {
         let mut low = opening(&blur(&level, STRONGEST_BLUR), opening_radius(OPENING_SHARE, width, height));
         low.values.iter_mut().zip(&level.values).for_each(|(low, b)| *low = low.min(*b));
         Background { level, low, changes, noise: image(noise), strongest, drift, stilled }
+    }
+
+    /// The same in the corner of a canvas (columns, rows), on which its edges go on.
+    pub(super) fn on_canvas(self, canvas: [usize; 2]) -> Background {
+        let all = |images: Vec<Option<Image>>| images.into_iter().map(|i| Some(continued(i?, canvas))).collect();
+        Background {
+            level: continued(self.level, canvas),
+            low: continued(self.low, canvas),
+            changes: all(self.changes),
+            noise: continued(self.noise, canvas),
+            stilled: Series { images: all(self.stilled.images), ..self.stilled },
+            ..self
+        }
     }
 }
 

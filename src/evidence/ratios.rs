@@ -6,6 +6,7 @@
 use crate::evidence::background::{Background, Series, largest_within};
 use crate::evidence::filters::{Estimate, LineFilter, blob, map2};
 use crate::raster::Image;
+use crate::scan::canvas::continued;
 use rayon::prelude::*;
 
 /// The weakest vessel looked for, as a share of the view's strongest change.
@@ -68,6 +69,15 @@ impl ViewEvidence {
             })
             .collect();
         ViewEvidence { view: series.view, background, ratios }
+    }
+
+    /// The same in the corner of a canvas (columns, rows), on which its edges go on.
+    pub fn on_canvas(self, canvas: [usize; 2]) -> ViewEvidence {
+        ViewEvidence {
+            background: self.background.on_canvas(canvas),
+            ratios: self.ratios.into_iter().map(|ratio| Some(continued(ratio?, canvas))).collect(),
+            ..self
+        }
     }
 }
 

@@ -5,9 +5,11 @@ use crate::geometry::CArm;
 use crate::import::dicom::{Relationship, Run};
 use crate::import::image_beat;
 use crate::import::intake::{Intake, MOST_RUNS};
+use crate::import::stands::stands;
 use crate::raster::{Image, dilate, opening, percentile};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
@@ -72,15 +74,25 @@ pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> R
     Ok(notes)
 }
 
+/// An image of a run as it is trained on.
+#[derive(Clone)]
+pub struct TakenFrame {
+    /// How it was taken.
+    pub c_arm: CArm,
+    /// When in the beat.
+    pub taken: BeatTime,
+    /// Line integrals.
+    pub image: Image,
+}
+
 /// A run, ready to be written.
-pub(super) struct View {
-    pub(super) c_arm: CArm,
-    pub(super) images: Vec<(BeatTime, Image)>,
+pub(super) struct Prepared {
+    pub(super) frames: Vec<TakenFrame>,
     pub(super) notes: Vec<String>,
 }
 
-impl View {
-    pub(super) fn prepare(run: &Run, options: &ImportOptions) -> Result<View> {
+impl Prepared {
+    pub(super) fn new(run: &Run, options: &ImportOptions) -> Result<Prepared> {
         let mut notes = Vec::new();
         let (columns, rows) = run.open.clone();
         if (columns.len(), rows.len()) != (run.width, run.height) {
@@ -115,26 +127,132 @@ impl View {
         let middle = |range: &std::ops::Range<usize>, kept: usize, all: usize| {
             range.start as f64 + 0.5 * (kept * factor) as f64 - 0.5 * all as f64
         };
-        let of = &run.c_arms[0];
         let (x, y) = (middle(&columns, width, run.width), middle(&rows, height, run.height));
-        let c_arm = CArm {
+        let kept = |of: &CArm| CArm {
             pixel_mm: of.pixel_mm.map(|p| p * factor as f64),
             offset_mm: [of.offset_mm[0] + x * of.pixel_mm[0], of.offset_mm[1] + y * of.pixel_mm[1]],
             ..of.clone()
         };
-        if run.c_arms.iter().any(|arm| arm != of) {
-            let problem = "the C-arm or table moves during the run: its frames have no common view; choose frames without movement";
-            let selected = options.frames.clone().unwrap_or(1..=run.frames.len());
-            let still = selected.clone().all(|f| run.c_arms.get(f - 1) == run.c_arms.get(selected.start() - 1));
-            if !still {
-                return Err(Error::data(&run.path, "PositionerMotion", problem));
-            }
-        }
-        let at_isocentre = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
+        let c_arms: Vec<CArm> = run.c_arms.iter().map(kept).collect();
+        let stands = stands(&c_arms, [width, height]);
+        let at_isocentre = c_arms[0].pixel_mm[0] * c_arms[0].sod_mm / c_arms[0].sid_mm;
         let vessel = ((0.5 * WIDEST_VESSEL_MM / at_isocentre).ceil() as usize).max(2);
         let selected = select(run, &frames, vessel, options, &mut notes)?;
-        let images = phases(run, &frames, &selected, vessel, options, &mut notes)?;
-        Ok(View { c_arm, images, notes })
+        let chosen = Chosen { run, frames: &frames, stands: &stands, selected: &selected, vessel };
+        let views = chosen.stands_of(&selected).len();
+        if views > 1 {
+            notes.push(format!(
+                "{}: the C-arm or the table moves: its {} frames are of {views} views",
+                run.name(),
+                selected.len()
+            ));
+        }
+        let images = chosen.phases(options, &mut notes)?;
+        let taken =
+            |(taken, stand, image): (BeatTime, usize, Image)| TakenFrame { c_arm: c_arms[stand].clone(), taken, image };
+        Ok(Prepared { frames: images.into_iter().map(taken).collect(), notes })
+    }
+}
+
+/// Frames of a run that are taken.
+struct Chosen<'a> {
+    run: &'a Run,
+    /// All of them, as line integrals.
+    frames: &'a [Image],
+    /// Of each frame, the first that was taken from where it was.
+    stands: &'a [usize],
+    /// Those that are taken; indices from 0.
+    selected: &'a [usize],
+    /// Radius of the widest vessel looked for, pixels.
+    vessel: usize,
+}
+
+impl Chosen<'_> {
+    /// From where some frames were taken.
+    fn stands_of(&self, frames: &[usize]) -> BTreeSet<usize> {
+        frames.iter().map(|frame| self.stands[*frame]).collect()
+    }
+
+    /// Means of the frames that were taken at one phase from one place: when, from where, and what they show.
+    fn phases(&self, options: &ImportOptions, notes: &mut Vec<String>) -> Result<Vec<(BeatTime, usize, Image)>> {
+        let (run, selected, n_phases) = (self.run, self.selected, options.phases);
+        let none = |problem: &str| Error::data(&run.path, "phases", problem.to_owned());
+        let from =
+            |stand: usize, of: &[usize]| of.iter().copied().filter(|i| self.stands[*i] == stand).collect::<Vec<_>>();
+        let taken: Vec<Option<BeatTime>> = match &options.gating {
+            Gating::Still => {
+                notes.push(format!(
+                    "{}: {} frames averaged; phase 1 is the image without structures up to {WIDEST_VESSEL_MM} mm wide",
+                    run.name(),
+                    selected.len()
+                ));
+                let of_stand = |stand: usize| {
+                    let mean = mean(self.frames, &from(stand, selected));
+                    let background = without_vessels(&mean, self.vessel);
+                    [(BeatTime::at_phase(0), stand, mean), (BeatTime::at_phase(1), stand, background)]
+                };
+                return Ok(self.stands_of(selected).into_iter().flat_map(of_stand).collect());
+            }
+            Gating::Phases(list) if list.len() == selected.len() => {
+                if let Some(bad) = list.iter().find(|p| !(0.0..f64::from(n_phases)).contains(*p)) {
+                    return Err(none(&format!("{bad} is given where phases go from 0 to {}", n_phases - 1)));
+                }
+                list.iter().map(|p| Some(BeatTime::of(*p, n_phases))).collect()
+            }
+            Gating::Phases(list) => {
+                return Err(none(&format!("{} are given for {} selected frames", list.len(), selected.len())));
+            }
+            timed => {
+                let peaks = self.r_peaks(timed, notes)?;
+                selected.iter().map(|i| peaks.beat_time(run.times_s[*i], n_phases, options.scaling)).collect()
+            }
+        };
+        let (mut images, mut seen) = (Vec::new(), 0);
+        for phase in 0..n_phases {
+            let timed = selected.iter().zip(&taken).filter_map(|(i, taken)| Some((*i, (*taken)?)));
+            let of_phase: BTreeMap<usize, BeatTime> = timed.filter(|(_, t)| t.phase == phase).collect();
+            let frames: Vec<usize> = of_phase.keys().copied().collect();
+            seen += usize::from(!frames.is_empty());
+            for stand in self.stands_of(&frames) {
+                // Frames of the same phase from several beats.
+                let frames = from(stand, &frames);
+                let after_phase = frames.iter().map(|i| of_phase[i].after_phase).sum::<f64>() / frames.len() as f64;
+                images.push((BeatTime { phase, after_phase }, stand, mean(self.frames, &frames)));
+            }
+        }
+        if seen < 2 {
+            return Err(none(&format!("{seen} of {n_phases} are seen; at least two are needed")));
+        }
+        notes.push(format!("{}: {seen} of {n_phases} phases from {} frames", run.name(), selected.len()));
+        Ok(images)
+    }
+
+    /// The beats of the run, by what is asked for.
+    fn r_peaks(&self, gating: &Gating, notes: &mut Vec<String>) -> Result<RPeaks> {
+        let run = self.run;
+        match gating {
+            Gating::RPeaks(peaks) => Ok(peaks.clone()),
+            Gating::HeartRate(rate) => RPeaks::steady(*rate, 0.0, run.times_s.last().copied().unwrap_or(0.0)),
+            Gating::Images => {
+                let images: Vec<&Image> = self.selected.iter().map(|i| &self.frames[*i]).collect();
+                let times_s: Vec<f64> = self.selected.iter().map(|i| run.times_s[*i]).collect();
+                let found = image_beat::beat(&images, &times_s, self.vessel)
+                    .map_err(|e| Error::data(&run.path, "phases", e.to_string()))?;
+                notes.push(format!(
+                    "{}: {:.0} beats per minute, by the images (vessels move like a contracting ventricle with a correlation of \
+                     {:.2}); taken to be steady",
+                    run.name(),
+                    found.beats_per_min,
+                    found.likeness
+                ));
+                Ok(found.r_peaks)
+            }
+            _ => run.r_peaks.clone().ok_or_else(|| {
+                let problem = "the file has no ECG: give R-peaks, a heart rate or a list of phases, have the beat found in the \
+                               images, or say that the object is at rest";
+                Error::data(&run.path, "phases", problem)
+            }),
+        }
     }
 }
 
@@ -196,91 +314,6 @@ fn select(
         best.end
     ));
     Ok(best.collect())
-}
-
-fn phases(
-    run: &Run,
-    frames: &[Image],
-    selected: &[usize],
-    vessel: usize,
-    options: &ImportOptions,
-    notes: &mut Vec<String>,
-) -> Result<Vec<(BeatTime, Image)>> {
-    let n_phases = options.phases;
-    let none = |problem: &str| Error::data(&run.path, "phases", problem.to_owned());
-    let taken: Vec<Option<BeatTime>> = match &options.gating {
-        Gating::Still => {
-            let mean = mean(frames, selected);
-            let background = without_vessels(&mean, vessel);
-            notes.push(format!(
-                "{}: {} frames averaged; phase 1 is the image without structures up to {WIDEST_VESSEL_MM} mm wide",
-                run.name(),
-                selected.len()
-            ));
-            return Ok(vec![(BeatTime::at_phase(0), mean), (BeatTime::at_phase(1), background)]);
-        }
-        Gating::Phases(list) if list.len() == selected.len() => {
-            if let Some(bad) = list.iter().find(|p| !(0.0..f64::from(n_phases)).contains(*p)) {
-                return Err(none(&format!("{bad} is given where phases go from 0 to {}", n_phases - 1)));
-            }
-            list.iter().map(|p| Some(BeatTime::of(*p, n_phases))).collect()
-        }
-        Gating::Phases(list) => {
-            return Err(none(&format!("{} are given for {} selected frames", list.len(), selected.len())));
-        }
-        timed => {
-            let peaks = r_peaks(timed, run, frames, selected, vessel, notes)?;
-            selected.iter().map(|i| peaks.beat_time(run.times_s[*i], n_phases, options.scaling)).collect()
-        }
-    };
-    let mut images = Vec::new();
-    for phase in 0..n_phases {
-        let timed = selected.iter().zip(&taken).filter_map(|(i, taken)| Some((*i, (*taken)?)));
-        let (of_phase, times): (Vec<usize>, Vec<BeatTime>) = timed.filter(|(_, t)| t.phase == phase).unzip();
-        // Frames of the same phase from several beats.
-        if !of_phase.is_empty() {
-            let after_phase = times.iter().map(|t| t.after_phase).sum::<f64>() / times.len() as f64;
-            images.push((BeatTime { phase, after_phase }, mean(frames, &of_phase)));
-        }
-    }
-    if images.len() < 2 {
-        return Err(none(&format!("{} of {n_phases} are seen; at least two are needed", images.len())));
-    }
-    notes.push(format!("{}: {} of {n_phases} phases from {} frames", run.name(), images.len(), selected.len()));
-    Ok(images)
-}
-
-/// The beats of a run, by what is asked for.
-fn r_peaks(
-    gating: &Gating,
-    run: &Run,
-    frames: &[Image],
-    selected: &[usize],
-    vessel: usize,
-    notes: &mut Vec<String>,
-) -> Result<RPeaks> {
-    match gating {
-        Gating::RPeaks(peaks) => Ok(peaks.clone()),
-        Gating::HeartRate(rate) => RPeaks::steady(*rate, 0.0, run.times_s.last().copied().unwrap_or(0.0)),
-        Gating::Images => {
-            let images: Vec<&Image> = selected.iter().map(|i| &frames[*i]).collect();
-            let times_s: Vec<f64> = selected.iter().map(|i| run.times_s[*i]).collect();
-            let found = image_beat::beat(&images, &times_s, vessel)
-                .map_err(|e| Error::data(&run.path, "phases", e.to_string()))?;
-            notes.push(format!(
-                "{}: {:.0} beats per minute, by the images (vessels move like a contracting ventricle with a correlation of {:.2});                  taken to be steady",
-                run.name(),
-                found.beats_per_min,
-                found.likeness
-            ));
-            Ok(found.r_peaks)
-        }
-        _ => run.r_peaks.clone().ok_or_else(|| {
-            let problem = "the file has no ECG: give R-peaks, a heart rate or a list of phases, have the beat found in the images, or \
-                           say that the object is at rest";
-            Error::data(&run.path, "phases", problem)
-        }),
-    }
 }
 
 /// The image without structures as thin as vessels: where something stands out of its surroundings by more than noise

@@ -1,13 +1,12 @@
-//! Runs that are taken in, together or one after the other, checked against one another, and brought to one size.
+//! Runs that are taken in, together or one after the other, and checked against one another.
 
 use crate::error::{Error, Result};
-use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
-use crate::import::angiograms::{Gating, ImportOptions, View};
+use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::import::angiograms::{Gating, ImportOptions, Prepared, TakenFrame};
 use crate::import::dicom::Run;
-use crate::raster::Image;
+use crate::scan::canvas::in_words;
 use crate::scan::dataset::{Layout, Split};
-use crate::scan::frame_checks::{check_values, checked_rays};
-use crate::scan::gating::BeatTime;
+use crate::scan::frame_checks::{check_values, checked_view};
 use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
 use std::path::Path;
@@ -41,27 +40,17 @@ impl Taken {
     }
 }
 
-/// An image of a run as it is trained on.
-pub struct TakenFrame {
-    /// How it was taken.
-    pub geometry: Geometry,
-    /// When in the beat.
-    pub taken: BeatTime,
-    /// Line integrals.
-    pub image: Image,
-}
-
 /// Runs that were taken in.
 pub struct Intake {
     options: ImportOptions,
     taken: Vec<Taken>,
-    views: Vec<View>,
+    runs: Vec<Prepared>,
 }
 
 impl Intake {
     /// No runs yet.
     pub fn new(options: ImportOptions) -> Intake {
-        Intake { options, taken: Vec::new(), views: Vec::new() }
+        Intake { options, taken: Vec::new(), runs: Vec::new() }
     }
 
     /// Cardiac phases of the images.
@@ -71,12 +60,12 @@ impl Intake {
 
     /// Runs taken in so far.
     pub fn runs(&self) -> usize {
-        self.views.len()
+        self.runs.len()
     }
 
-    /// How the first run was taken.
-    pub fn c_arm(&self) -> Option<&CArm> {
-        self.views.first().map(|view| &view.c_arm)
+    /// The first image of the first run; none without runs.
+    pub fn first(&self) -> Option<&TakenFrame> {
+        self.runs.first().and_then(|run| run.frames.first())
     }
 
     /// Name of the run taken in that a run is a copy of.
@@ -105,39 +94,17 @@ impl Intake {
             }
         }
         let options = &self.options;
-        let views = runs.par_iter().map(|run| View::prepare(run, options)).collect::<Result<Vec<_>>>()?;
-        runs.iter().zip(&views).try_for_each(|(run, view)| trainable(run, view, options))?;
-        notes.extend(views.iter().flat_map(|view| view.notes.iter().cloned()));
+        let prepared = runs.par_iter().map(|run| Prepared::new(run, options)).collect::<Result<Vec<_>>>()?;
+        runs.iter().zip(&prepared).try_for_each(|(run, prepared)| trainable(run, prepared, options))?;
+        notes.extend(prepared.iter().flat_map(|prepared| prepared.notes.iter().cloned()));
         self.taken = taken;
-        self.views.extend(views);
+        self.runs.extend(prepared);
         Ok(notes)
     }
 
-    /// Columns and rows that all runs have: the smallest open area, around the middle of each. None without runs.
-    pub fn size(&self) -> Option<[usize; 2]> {
-        self.size_of(self.runs())
-    }
-
-    /// Columns and rows that the first `runs` have.
-    fn size_of(&self, runs: usize) -> Option<[usize; 2]> {
-        let image = |view: &View| [view.images[0].1.width, view.images[0].1.height];
-        self.views.iter().take(runs).map(image).reduce(|a, b| [a[0].min(b[0]), a[1].min(b[1])])
-    }
-
-    /// The images of a run, counted from 0, cut to the size of all.
-    pub fn frames(&self, run: usize) -> Vec<TakenFrame> {
-        self.size().map_or_else(Vec::new, |size| self.frames_of_size(run, size))
-    }
-
-    fn frames_of_size(&self, run: usize, [width, height]: [usize; 2]) -> Vec<TakenFrame> {
-        let Some(view) = self.views.get(run) else { return Vec::new() };
-        let frame = |(taken, image): &(BeatTime, Image)| {
-            let (image, offset) = cut(image, width, height);
-            let moved = |k: usize| view.c_arm.offset_mm[k] + offset[k] * view.c_arm.pixel_mm[k];
-            let geometry = Geometry::CArm(CArm { offset_mm: [moved(0), moved(1)], ..view.c_arm.clone() });
-            TakenFrame { geometry, taken: *taken, image }
-        };
-        view.images.iter().map(frame).collect()
+    /// The images of a run, counted from 0.
+    pub fn frames(&self, run: usize) -> &[TakenFrame] {
+        self.runs.get(run).map_or(&[], |run| &run.frames)
     }
 
     /// Writes the runs as a dataset; how many views of which size there are.
@@ -155,35 +122,42 @@ impl Intake {
     pub fn write_first(&self, runs: usize, out: &Path) -> Result<String> {
         let none = || Error::NotReady("no run was taken in".into());
         let runs = runs.min(self.runs());
-        let ([width, height], c_arm) = self.size_of(runs).zip(self.c_arm()).ok_or_else(none)?;
+        let first = self.first().ok_or_else(none)?;
         let about = About {
             description: format!("{runs} X-ray angiography runs"),
             phases: self.phases(),
             depth_half_extent_mm: self.options.depth_half_extent_mm,
             vessel_attenuation_per_mm: None,
-            size: [width, height],
-            c_arm: c_arm.clone(),
+            size: [first.image.width, first.image.height],
+            c_arm: first.c_arm.clone(),
         };
         let mut writer = Writer::new(out, Layout::Native, about)?;
-        for run in 0..runs {
-            for TakenFrame { geometry, taken, image } in self.frames_of_size(run, [width, height]) {
-                writer.frame(&geometry, Split::Train, run, taken, &image.values, None)?;
+        let (mut views, mut sizes) = (Vec::new(), Vec::new());
+        for TakenFrame { c_arm, taken, image } in self.runs.iter().take(runs).flat_map(|run| &run.frames) {
+            let size = [image.width, image.height];
+            if !sizes.contains(&size) {
+                sizes.push(size);
             }
+            let view = views.iter().position(|view| *view == (c_arm, size)).unwrap_or_else(|| {
+                views.push((c_arm, size));
+                views.len() - 1
+            });
+            writer.frame(&Geometry::CArm(c_arm.clone()), Split::Train, view, *taken, image, None)?;
         }
         writer.finish()?;
-        Ok(format!("{runs} views of {width} x {height} pixels at {} phases", self.phases()))
+        Ok(format!("{} views of {} pixels at {} phases", views.len(), in_words(&sizes), self.phases()))
     }
 }
 
 /// Refuses a run that no training could use, as those who read its dataset would.
-fn trainable(run: &Run, view: &View, options: &ImportOptions) -> Result<()> {
-    let geometry = Geometry::CArm(view.c_arm.clone());
-    view.images
+fn trainable(run: &Run, prepared: &Prepared, options: &ImportOptions) -> Result<()> {
+    prepared
+        .frames
         .iter()
-        .try_for_each(|(_, image)| {
+        .try_for_each(|TakenFrame { c_arm, image, .. }| {
             check_values(&image.values, image.width)?;
             let depth_before = options.depth_half_extent_mm / MM_PER_UNIT;
-            checked_rays(&geometry, (image.width, image.height), depth_before).map(drop)
+            checked_view(Geometry::CArm(c_arm.clone()), [image.width, image.height], depth_before).map(drop)
         })
         .map_err(|found| Error::data(&run.path, found.field, format!("{}: {}", found.value, found.problem)))
 }
@@ -209,12 +183,4 @@ fn check(run: &Run, before: &[Taken]) -> Vec<String> {
     let near = before.iter().filter(near);
     notes.extend(near.map(|other| format!("warning: {} and {name} look from almost the same angle", other.name)));
     notes
-}
-
-/// The middle `width` x `height` pixels, and by how many pixels the middle moved.
-fn cut(image: &Image, width: usize, height: usize) -> (Image, [f64; 2]) {
-    let (x, y) = ((image.width - width) / 2, (image.height - height) / 2);
-    let values = (0..height).flat_map(|j| image.values[(y + j) * image.width + x..][..width].iter().copied()).collect();
-    let moved = |start: usize, kept: usize, all: usize| start as f64 + 0.5 * kept as f64 - 0.5 * all as f64;
-    (Image { width, height, values }, [moved(x, width, image.width), moved(y, height, image.height)])
 }

@@ -15,6 +15,7 @@ use crate::phantom::tree::Tree;
 use crate::phantom::tree_file::{TREE, TreeFile};
 use crate::phantom::views::{CArmOptions, PixelPitch, ViewAngles};
 use crate::phantom::voxels::Tissues;
+use crate::raster::Image;
 use crate::scan::dataset::{Layout, MANIFEST, Split};
 use crate::scan::nerfca;
 use crate::scan::truth::{TrueFrame, Truth};
@@ -405,6 +406,7 @@ fn shoot(
                 blade.close(&mut image, mask.as_mut(), size);
             }
             let stated = Geometry::CArm(shooting.stated(c_arm, view, split));
+            let image = Image { width: size, height: size, values: image };
             let file = writer.frame(&stated, split, view, shot.stated, &image, mask.as_deref())?;
             let DVec3 { x: left, y: posterior, z: superior } = shot.breath.heart_mm;
             truth.frames.push(TrueFrame {

@@ -27,10 +27,10 @@ pub struct Lengths {
 }
 
 impl Lengths {
-    /// Lengths for images with vessels of `width` pixels ([`vessel_width`]) and noise per pixel, as a share of the strongest
-    /// change; `least_scale` is the setting.
-    pub fn new(size: [usize; 2], width: f64, noise: &[f32], least_scale: f64) -> Lengths {
-        let factor = size[0].min(size[1]) as f64 / SIDE;
+    /// Lengths for images whose smaller side has `side` pixels, with vessels of `width` pixels ([`vessel_width`]) and noise per
+    /// pixel, as a share of the strongest change; `least_scale` is the setting.
+    pub fn new(side: usize, width: f64, noise: &[f32], least_scale: f64) -> Lengths {
+        let factor = side as f64 / SIDE;
         let share = f64::from(percentile(noise, 0.5)) / NOISY;
         let wanted = 1.0 + (SMOOTHEST - 1.0) * share.clamp(0.0, 1.0);
         let possible = SHARE_OF_WIDTH * width / (factor * least_scale);
@@ -109,7 +109,7 @@ mod tests {
     fn lengths_follow_the_images_and_noise_the_vessels_width() {
         let settings = Config::preset(Preset::Fast).gaussians;
         let least = |size: usize, width: f64, noise: f32| {
-            Lengths::new([size, size + 20], width, &[noise; 9], settings.least_scale).gaussians(&settings).least_scale
+            Lengths::new(size, width, &[noise; 9], settings.least_scale).gaussians(&settings).least_scale
         };
         assert!((least(100, 5.0, 0.0) - 0.4).abs() < 1e-9 && (least(200, 10.0, 0.0) - 0.8).abs() < 1e-9);
         assert!((least(100, 5.0, 0.2) - 0.6).abs() < 1e-9 && (least(200, 10.0, 0.2) - 1.2).abs() < 1e-9);

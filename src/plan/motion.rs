@@ -4,10 +4,11 @@
 use crate::config;
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
 use crate::raster::{Image, dilate, median, opening, percentile};
+use crate::scan::canvas::{continued, framed};
 use crate::scan::dataset::Dataset;
 use rayon::prelude::*;
 
-/// Temporal behaviour of one training view.
+/// Temporal behaviour of one training view; its pixels are those of the dataset's canvas.
 #[derive(Debug, Clone)]
 pub struct ViewMotion {
     /// Index into [`Dataset::views`].
@@ -31,6 +32,27 @@ pub struct ViewMotion {
     pub n_phases: usize,
 }
 
+impl ViewMotion {
+    /// The same for images of `size` (columns, rows) in the corner of a canvas, beyond which nothing moves.
+    fn on_canvas(self, size: [usize; 2], canvas: [usize; 2]) -> ViewMotion {
+        if size == canvas {
+            return self;
+        }
+        let goes_on = |values: Vec<f32>| continued(Image { width: size[0], height: size[1], values }, canvas).values;
+        let still = |moving: Vec<bool>| framed(&moving, size, canvas, false);
+        let of_phase = |moving: Vec<bool>| if moving.is_empty() { moving } else { still(moving) };
+        ViewMotion {
+            background: goes_on(self.background),
+            background_low: goes_on(self.background_low),
+            range: goes_on(self.range),
+            noise: goes_on(self.noise),
+            moving: still(self.moving),
+            moving_at: self.moving_at.into_iter().map(of_phase).collect(),
+            ..self
+        }
+    }
+}
+
 /// Analyses each training view.
 pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMotion> {
     let views = dataset.training_views();
@@ -41,14 +63,15 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
             let mut frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view).collect();
             frames.sort_by_key(|f| f.phase);
             let n = frames.len();
-            let pixels = dataset.n_pixels();
-            let at = |p: usize| frames.iter().map(move |f| f.integrals[p]);
+            let size = dataset.views[view].size;
+            let pixels = size[0] * size[1];
+            let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
+            let at = |p: usize| images.iter().map(move |image| image[p]);
             let mean: Vec<f32> = (0..pixels).map(|p| at(p).sum::<f32>() / n as f32).collect();
             // Successive differences over sqrt 2: slow change over the beat counts little.
             let deviation: Vec<f32> = (0..pixels)
                 .map(|p| {
-                    let mut steps: Vec<f32> =
-                        frames.windows(2).map(|w| (w[1].integrals[p] - w[0].integrals[p]).abs()).collect();
+                    let mut steps: Vec<f32> = images.windows(2).map(|w| (w[1][p] - w[0][p]).abs()).collect();
                     median(&mut steps) * (1.4826 / std::f32::consts::SQRT_2)
                 })
                 .collect();
@@ -57,8 +80,8 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
             let lowest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::INFINITY, f32::min)).collect();
             let highest: Vec<f32> = (0..pixels).map(|p| at(p).fold(f32::NEG_INFINITY, f32::max)).collect();
             let background: Vec<f32> =
-                lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { 0.0 }).collect();
-            let image = |values: Vec<f32>| Image { width: dataset.width, height: dataset.height, values };
+                lowest.iter().zip(&noise).map(|(l, s)| if n > 1 { l + bias * s } else { *l }).collect();
+            let image = |values: Vec<f32>| Image { width: size[0], height: size[1], values };
             let vessel = config.vessel_pixels as usize;
             let background_low = if vessel > 0 && n > 1 {
                 opening(&image(background.clone()), vessel).values
@@ -74,8 +97,8 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
                 grown.values.iter().map(|v| *v > 0.0).collect()
             };
             let mut moving_at = vec![Vec::new(); dataset.n_phases as usize];
-            for frame in &frames {
-                let stands_out = |p: usize| frame.integrals[p] - background_low[p] > threshold(p);
+            for (frame, values) in frames.iter().zip(&images) {
+                let stands_out = |p: usize| values[p] - background_low[p] > threshold(p);
                 let seen = grow(&|p| range[p] > threshold(p) && stands_out(p));
                 // What is seen between two phases, or at another moment near one, is no reason to rule it out at either.
                 for (phase, _) in
@@ -87,7 +110,8 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
                 }
             }
             let moving = grow(&|p| range[p] > threshold(p));
-            ViewMotion { view, moving, moving_at, background, background_low, range, noise, n_phases: n }
+            let motion = ViewMotion { view, moving, moving_at, background, background_low, range, noise, n_phases: n };
+            motion.on_canvas(size, dataset.canvas())
         })
         .collect()
 }

@@ -64,9 +64,13 @@ impl Scene {
     /// Chooses gains, shifts and weights so that features, integrals and losses are near 1.
     fn normalise(&mut self, config: &Config, dataset: &Dataset, motion: &[ViewMotion], static_half: f64) -> Result<()> {
         let training = dataset.training();
-        let count = (training.len() * dataset.n_pixels()) as f64;
-        let sum: f64 = training.iter().flat_map(|f| &f.integrals).map(|v| f64::from(*v)).sum();
-        let mean = sum / count;
+        let (mut count, mut sum) = (0, 0.0);
+        for frame in training {
+            let image = dataset.own(frame.view, &frame.integrals);
+            count += image.len();
+            image.iter().for_each(|v| sum += f64::from(*v));
+        }
+        let mean = sum / count as f64;
         if !(mean.is_finite() && mean > 0.0) {
             return Err(Error::data(
                 &dataset.path,
@@ -99,9 +103,9 @@ impl Scene {
 
 /// Radius around the isocentre that the views see, world units.
 fn field_of_view(dataset: &Dataset) -> f64 {
-    let (w, h) = (dataset.width as f64 - 0.5, dataset.height as f64 - 0.5);
     let mut radius = 0f64;
     for view in dataset.training_views() {
+        let [w, h] = dataset.views[view].size.map(|n| n as f64 - 0.5);
         for (i, j) in [(-0.5, -0.5), (w, -0.5), (-0.5, h), (w, h)] {
             radius = radius.max(dataset.views[view].rays.pixel(i, j).0.length());
         }
@@ -153,7 +157,7 @@ mod tests {
                     offset_mm: [0.0; 2],
                     table_mm: [0.0; 3],
                 });
-                View { rays: geometry.rays(SIZE, SIZE).unwrap(), geometry }
+                View::new(geometry, [SIZE; 2]).unwrap()
             })
             .into();
         let middle = |p: usize| (2..6).contains(&(p % SIZE)) && (2..6).contains(&(p / SIZE));

@@ -75,7 +75,8 @@ pub fn seeds(targets: &Targets, settings: &sections::Gaussians, seed: u32) -> Ve
 
 /// Density of the first Gaussians, from what they show with a density of 1: `images`, `[image][pixel]`.
 pub fn first_density(targets: &Targets, images: &[f32]) -> f64 {
-    let total = |values: &[f32]| -> f64 { values.iter().map(|v| f64::from(v.max(0.0))).sum() };
+    let weighted = |values: &[f32], p: usize| if targets.weight[p] > 0.0 { f64::from(values[p].max(0.0)) } else { 0.0 };
+    let total = |values: &[f32]| -> f64 { (0..values.len()).map(|p| weighted(values, p)).sum() };
     let (shown, wanted) = (total(images), FIRST_SHARE * total(&targets.low));
     // Without anything to show, or to explain, there is nothing to go by.
     if shown > 0.0 && wanted > 0.0 { wanted / shown } else { 1.0 }

@@ -8,6 +8,7 @@ use crate::gaussians::view::SplatView;
 use crate::model::gaussians::Units;
 use crate::plan::lengths::{Lengths, vessel_width};
 use crate::plan::soft_hull::carve::{HullCell, SoftMotion};
+use crate::raster::Image;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
@@ -62,8 +63,12 @@ pub struct Targets {
 /// Refuses a line integral that is not a number, naming its image.
 fn check_finite(dataset: &Dataset, series: &Series) -> Result<()> {
     for (phase, image) in series.images.iter().enumerate() {
-        let Some(pixel) = image.as_ref().and_then(|i| i.values.iter().position(|v| !v.is_finite())) else { continue };
-        let (column, row) = (pixel % dataset.width, pixel / dataset.width);
+        let Some((width, pixel)) =
+            image.as_ref().and_then(|i| Some((i.width, i.values.iter().position(|v| !v.is_finite())?)))
+        else {
+            continue;
+        };
+        let (column, row) = (pixel % width, pixel / width);
         let at = format!("{}, view {}, phase {phase}", dataset.path.display(), series.view);
         let problem = format!(
             "the line integral at column {column}, row {row} is not finite: leave the image out, or correct it"
@@ -86,8 +91,9 @@ impl Targets {
     /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
     pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
         if motion.views.is_empty() {
-            let problem = "no training view has two phases, so nothing is known of motion; \
-                           for a still object take the preset fast-mlp with loss.dynamic_target = absolute";
+            let problem = "no training view has two phases, so what stands still behind the vessels is not known, as where a C-arm or \
+                           a table moves from image to image: the preset paper trains on whole images, and so does \
+                           fast-mlp with loss.dynamic_target = absolute, which is for still objects, too";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
         if motion.views.len() == 1 {
@@ -149,10 +155,18 @@ impl Targets {
             }
         }
         targets.most.clone_from(&targets.high);
-        let changes = motion.views.iter().flat_map(|v| v.background.changes.iter().flatten());
-        let width = vessel_width(changes, strongest as f32);
-        let size = [dataset.width, dataset.height];
-        targets.lengths = Lengths::new(size, width, &targets.noise, settings.least_scale);
+        let own = |view: usize, change: &Image| {
+            let [width, height] = dataset.views[view].size;
+            Image { width, height, values: dataset.own(view, &change.values).into_owned() }
+        };
+        let changes =
+            |v: &ViewEvidence| v.background.changes.iter().flatten().map(|c| own(v.view, c)).collect::<Vec<_>>();
+        let changes: Vec<Image> = motion.views.iter().flat_map(changes).collect();
+        let width = vessel_width(changes.iter(), strongest as f32);
+        let mut sides: Vec<usize> =
+            motion.views.iter().map(|v| dataset.views[v.view].size).map(|s| s[0].min(s[1])).collect();
+        sides.sort_unstable();
+        targets.lengths = Lengths::new(sides[sides.len() / 2], width, &targets.noise, settings.least_scale);
         let place = |c: &HullCell| Place {
             position: motion.hull.centre(c.index) / units.pixel,
             evidence: f64::from(c.evidence),

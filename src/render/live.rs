@@ -10,6 +10,7 @@ use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
 use crate::model::gaussians::MovingFeed;
+use crate::model::scene::Scene;
 use crate::render::baked::Baked;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
@@ -44,6 +45,7 @@ impl Source {
 pub struct Live {
     baked: Baked,
     config: Config,
+    scene: Scene,
     params: Option<Buffer>,
     moving: Option<MovingFeed>,
     /// Change of the feed that is drawn.
@@ -64,6 +66,7 @@ impl Live {
         Ok(Live {
             baked: Baked::for_display(renderer, model, CELL_MM),
             config: model.config.clone(),
+            scene: model.scene.clone(),
             params: source.params.clone(),
             moving: source.moving.clone(),
             moving_at: AtomicU64::new(u64::MAX),
@@ -144,6 +147,11 @@ impl Live {
     pub fn renderer(&self, step: u32) -> Result<&Renderer> {
         self.follow(step)?;
         Ok(self.baked.renderer())
+    }
+
+    /// Scales and boxes of what is drawn.
+    pub fn scene(&self) -> &Scene {
+        &self.scene
     }
 
     fn follow(&self, step: u32) -> Result<Option<Commands>> {

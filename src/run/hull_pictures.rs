@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::files;
 use crate::model::hull::Hull;
-use crate::scan::dataset::Dataset;
+use crate::scan::dataset::{Dataset, View};
 use crate::score::pictures;
 use std::path::{Path, PathBuf};
 
@@ -22,9 +22,9 @@ pub fn write(directory: &Path, dataset: &Dataset, hull: &Hull) -> Result<()> {
     for view in dataset.training_views() {
         let frames = training.iter().filter(|frame| frame.view == view);
         let Some(frame) = frames.min_by_key(|frame| frame.phase) else { continue };
-        let size = (dataset.width, dataset.height);
-        let covered = hull.silhouette(&dataset.views[view].rays, size, frame.phase as usize);
-        pictures::write_hull(&file(directory, view), &frame.integrals, &covered, dataset.width)?;
+        let View { rays, size: [width, height], .. } = &dataset.views[view];
+        let covered = hull.silhouette(rays, (*width, *height), frame.phase as usize);
+        pictures::write_hull(&file(directory, view), &dataset.own(view, &frame.integrals), &covered, *width)?;
     }
     Ok(())
 }

@@ -8,7 +8,7 @@ use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::render::renderer::Renderer;
 use crate::run::events::Event;
-use crate::scan::dataset::Dataset;
+use crate::scan::dataset::{Dataset, View};
 use crate::score::calibrated::{carried_by, in_calibrated_frame};
 use crate::score::eval::{Evaluation, Scoring, evaluate, moving_field_warning};
 use crate::score::pictures::{self, Window};
@@ -79,7 +79,7 @@ pub fn evaluate_model(
                 pace.check()?;
                 beats.images.insert((frame.view, frame.phase), rendering.dynamic_integral.clone());
                 let path = beats.directory.join(format!("{}.png", frame.name));
-                pictures::write_comparison(&path, frame, rendering, threshold, dataset.width)
+                pictures::write_comparison(&path, frame, rendering, threshold, dataset.views[frame.view].size[0])
             }
         })?;
     if let Some(beats) = beats {
@@ -164,8 +164,8 @@ impl<'a> Beats<'a> {
 
     fn write(mut self, renderer: &Renderer, dataset: &Dataset, pace: &mut Pace<'_>) -> Result<()> {
         for (view, phase) in self.missing(dataset) {
-            let rays = &dataset.views[view].rays;
-            let seen = renderer.render(rays, dataset.width, dataset.height, phase)?;
+            let View { rays, size: [width, height], .. } = &dataset.views[view];
+            let seen = renderer.render(rays, *width, *height, phase)?;
             self.images.insert((view, phase), seen.dynamic_integral);
             pace.one_more()?;
         }
@@ -173,7 +173,7 @@ impl<'a> Beats<'a> {
             let beat: Vec<Vec<f32>> = (0..dataset.n_phases).filter_map(|p| self.images.remove(&(*view, p))).collect();
             let high = beat.iter().flatten().copied().fold(f32::MIN_POSITIVE, f32::max);
             let path = self.directory.join(format!("beat-view{index}.gif"));
-            pictures::write_gif(&path, &beat, dataset.width, Window { low: 0.0, high: 0.8 * high }, 90)?;
+            pictures::write_gif(&path, &beat, dataset.views[*view].size[0], Window { low: 0.0, high: 0.8 * high }, 90)?;
             pace.check()?;
         }
         Ok(())

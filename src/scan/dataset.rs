@@ -6,7 +6,8 @@ use crate::files;
 use crate::formats::images;
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, is_at_rest};
 use crate::raster::Image;
-use crate::scan::frame_checks::{Complaint, check_phase, check_size, check_values, checked_rays};
+use crate::scan::canvas::onto_canvas;
+use crate::scan::frame_checks::{Complaint, check_phase, check_values, checked_view};
 use crate::scan::gating::BeatTime;
 use crate::scan::nerfca;
 use glam::DVec3;
@@ -154,9 +155,9 @@ pub struct Frame {
     pub after_phase: f64,
     /// Training or validation.
     pub split: Split,
-    /// Line integrals, rows first.
+    /// Line integrals, rows first; in a dataset, on the canvas of all images (see [`crate::scan::canvas`]).
     pub integrals: Vec<f32>,
-    /// Vessel mask, where known.
+    /// Vessel mask, where known; none of it is beyond the image's own size.
     pub mask: Option<Vec<bool>>,
     /// How far breathing has carried the heart from its mean along (posterior, left, superior), mm.
     pub heart_shift_mm: [f64; 3],
@@ -174,13 +175,26 @@ impl Frame {
     }
 }
 
-/// A geometry shared by frames.
+/// A geometry and a size shared by frames.
 #[derive(Debug, Clone)]
 pub struct View {
     /// Geometry as stated in the file.
     pub geometry: Geometry,
+    /// Columns and rows of its images.
+    pub size: [usize; 2],
     /// Rays in world units.
     pub rays: ViewRays,
+}
+
+impl View {
+    /// A view of images of `size` (columns, rows).
+    ///
+    /// # Errors
+    /// Field and problem, for an impossible geometry.
+    pub fn new(geometry: Geometry, size: [usize; 2]) -> std::result::Result<View, (String, String)> {
+        let rays = geometry.rays(size[0], size[1])?;
+        Ok(View { geometry, size, rays })
+    }
 }
 
 /// Which layout a dataset was read from.
@@ -211,16 +225,16 @@ pub struct Dataset {
     pub path: PathBuf,
     /// Layout of the files it was read from.
     pub layout: Layout,
-    /// Distinct geometries.
+    /// Distinct geometries and sizes.
     pub views: Vec<View>,
     /// All images; those of training first.
     pub frames: Vec<Frame>,
-    /// Pixels that show nothing of the patient, such as those behind a collimator's blade, by index into `views`; views without
-    /// such pixels are left out.
+    /// Pixels of the canvas that show nothing of the patient, such as those behind a collimator's blade or beyond a smaller image,
+    /// by index into `views`; views without such pixels are left out.
     pub hidden: BTreeMap<usize, Vec<bool>>,
-    /// Image columns.
+    /// Columns of the canvas: those of the widest image.
     pub width: usize,
-    /// Image rows.
+    /// Rows of the canvas: those of the highest image.
     pub height: usize,
     /// Cardiac phases.
     pub n_phases: u32,
@@ -341,14 +355,21 @@ impl Dataset {
         self.frames.iter().take_while(|f| f.split == Split::Train).count()
     }
 
-    /// Pixels of one image.
+    /// Pixels of the canvas.
     pub fn n_pixels(&self) -> usize {
         self.width * self.height
     }
 
-    /// The C-arm of the first training view; for an explicit matrix, one with the same magnification.
+    /// The first of the training views with the most pixels: what is drawn without saying how is drawn like it.
+    pub fn reference_view(&self) -> &View {
+        let views = self.training().iter().map(|frame| &self.views[frame.view]);
+        let larger = |a: &View, b: &View| b.size[0] * b.size[1] > a.size[0] * a.size[1];
+        views.reduce(|a, b| if larger(a, b) { b } else { a }).unwrap_or(&self.views[0])
+    }
+
+    /// The C-arm of [`Dataset::reference_view`]; for an explicit matrix, one with the same magnification.
     pub fn reference_c_arm(&self) -> CArm {
-        let view = &self.views[self.frames[0].view];
+        let view = self.reference_view();
         match &view.geometry {
             Geometry::CArm(c_arm) => c_arm.clone(),
             Geometry::Matrix(_) => {
@@ -382,7 +403,6 @@ pub(super) struct Builder {
     n_phases: u32,
     depth_range: (f64, f64),
     vessel_attenuation: Option<f64>,
-    size: Option<(usize, usize)>,
     views: Vec<View>,
     frames: Vec<Frame>,
     pub(super) notes: Vec<String>,
@@ -418,7 +438,6 @@ impl Builder {
             n_phases,
             depth_range,
             vessel_attenuation,
-            size: None,
             views: Vec::new(),
             frames: Vec::new(),
             notes: Vec::new(),
@@ -438,17 +457,14 @@ impl Builder {
         };
         check_phase(new.time_phases, self.n_phases).map_err(|c| told(&self.file, c))?;
         let taken = BeatTime::of(new.time_phases, self.n_phases);
-        let size = (new.image.width, new.image.height);
-        check_size(size, self.size).map_err(|c| told(new.source, c))?;
-        self.size = Some(size);
-        check_values(&new.image.values, size.0).map_err(|c| told(new.source, c))?;
-        let view = match self.views.iter().position(|v| v.geometry == new.geometry) {
+        let size = [new.image.width, new.image.height];
+        check_values(&new.image.values, size[0]).map_err(|c| told(new.source, c))?;
+        let view = match self.views.iter().position(|v| v.geometry == new.geometry && v.size == size) {
             Some(view) => view,
             None => {
                 let of_geometry = |c: Complaint| Complaint { field: format!("geometry.{}", c.field), ..c };
-                let rays = checked_rays(&new.geometry, size, -self.depth_range.0)
-                    .map_err(|c| told(&self.file, of_geometry(c)))?;
-                self.views.push(View { geometry: new.geometry, rays });
+                let view = checked_view(new.geometry, size, -self.depth_range.0);
+                self.views.push(view.map_err(|c| told(&self.file, of_geometry(c)))?);
                 self.views.len() - 1
             }
         };
@@ -469,7 +485,9 @@ impl Builder {
     }
 
     pub(super) fn finish(mut self, path: &Path, layout: Layout) -> Result<Dataset> {
-        let Some((width, height)) = self.size else {
+        let canvas = onto_canvas(&self.views, &mut self.frames);
+        let canvas = canvas.map_err(|c| Error::data(&self.file, "frames", format!("{}: {}", c.value, c.problem)))?;
+        let Some([width, height]) = canvas else {
             return Err(Error::data(&self.file, "frames", "is empty"));
         };
         if !self.frames.iter().any(|f| f.split == Split::Train) {

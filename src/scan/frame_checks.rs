@@ -1,6 +1,7 @@
 //! What every frame must satisfy, whether it comes from a file or from a caller.
 
-use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
+use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::scan::dataset::View;
 
 /// What is wrong with a frame.
 pub(crate) struct Complaint {
@@ -13,19 +14,8 @@ pub(crate) struct Complaint {
 }
 
 impl Complaint {
-    fn new(field: &str, value: impl ToString, problem: impl ToString) -> Complaint {
+    pub(crate) fn new(field: &str, value: impl ToString, problem: impl ToString) -> Complaint {
         Complaint { field: field.into(), value: value.to_string(), problem: problem.to_string() }
-    }
-}
-
-/// Refuses a size (columns, rows) that earlier frames do not have.
-pub(crate) fn check_size(size: (usize, usize), earlier: Option<(usize, usize)>) -> Result<(), Complaint> {
-    match earlier {
-        Some(earlier) if earlier != size => {
-            let problem = format!("earlier frames have {} x {}; all must be of one size", earlier.0, earlier.1);
-            Err(Complaint::new("size", format!("{} x {}", size.0, size.1), problem))
-        }
-        _ => Ok(()),
     }
 }
 
@@ -52,16 +42,13 @@ pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complai
     Err(Complaint::new("phase", time_phases, problem))
 }
 
-/// Rays of a geometry whose source stands before what is searched, `depth_before` world units from the isocentre on.
-pub(crate) fn checked_rays(
-    geometry: &Geometry,
-    size: (usize, usize),
-    depth_before: f64,
-) -> Result<ViewRays, Complaint> {
-    let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Complaint::new(&field, "", problem))?;
-    if rays.sod <= depth_before {
+/// A view of images of `size` (columns, rows) whose source stands before what is searched, `depth_before` world units from the
+/// isocentre on.
+pub(crate) fn checked_view(geometry: Geometry, size: [usize; 2], depth_before: f64) -> Result<View, Complaint> {
+    let view = View::new(geometry, size).map_err(|(field, problem)| Complaint::new(&field, "", problem))?;
+    if view.rays.sod <= depth_before {
         let problem = format!("the source stands inside the depth range of {:.0} mm", depth_before * MM_PER_UNIT);
-        return Err(Complaint::new("sod_mm", format!("{:.0}", rays.sod * MM_PER_UNIT), problem));
+        return Err(Complaint::new("sod_mm", format!("{:.0}", view.rays.sod * MM_PER_UNIT), problem));
     }
-    Ok(rays)
+    Ok(view)
 }

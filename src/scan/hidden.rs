@@ -1,6 +1,9 @@
-//! Pixels that show nothing of the patient: behind a collimator's blade, or outside a round detector.
+//! Pixels that show nothing of the patient: behind a collimator's blade, outside a round detector, or beyond an image that is
+//! smaller than others.
 
-use crate::scan::dataset::{Dataset, Frame, Split};
+use crate::scan::canvas::framed;
+use crate::scan::dataset::{Dataset, Split};
+use std::borrow::Cow;
 use std::collections::VecDeque;
 
 /// Pixels so little below the darkest, as a share of an image's range, are as dark.
@@ -14,19 +17,28 @@ impl Dataset {
 
     /// Finds the pixels that hide the patient. What a blade or a rim hides reads the same number in all images of a view,
     /// the darkest of each, from the border of the image on; the pixels next to it are half hidden. Training images go on
-    /// there as at the edge, so that nothing takes a blade for tissue.
+    /// there as at the edge, so that nothing takes a blade for tissue. All that is beyond an image on the canvas is hidden.
     pub(crate) fn hide(&mut self) {
         for view in 0..self.views.len() {
-            let frames: Vec<&Frame> = self.frames.iter().filter(|f| f.view == view).collect();
-            let hidden = hidden(&frames, self.width, self.height);
-            let count = hidden.iter().filter(|h| **h).count();
-            if count == 0 {
+            let of_view = self.frames.iter().filter(|f| f.view == view);
+            let images: Vec<Cow<'_, [f32]>> = of_view.map(|f| self.own(view, &f.integrals)).collect();
+            // A session keeps views whose frames are not used, which the canvas may be too small for.
+            if images.is_empty() {
                 continue;
             }
-            self.notes.push(format!(
-                "view {view}: {:.0} % of the pixels are hidden, as behind a collimator's blade: nothing is learned from them",
-                100.0 * count as f64 / self.n_pixels() as f64
-            ));
+            let size = self.views[view].size;
+            let hidden = hidden(&images, size[0], size[1]);
+            let count = hidden.iter().filter(|h| **h).count();
+            if count > 0 {
+                self.notes.push(format!(
+                    "view {view}: {:.0} % of the pixels are hidden, as behind a collimator's blade: nothing is learned from them",
+                    100.0 * count as f64 / hidden.len() as f64
+                ));
+            }
+            let hidden = framed(&hidden, size, self.canvas(), true);
+            if !hidden.contains(&true) {
+                continue;
+            }
             let nearest = nearest_shown(&hidden, self.width);
             for frame in self.frames.iter_mut().filter(|f| f.view == view && f.split == Split::Train) {
                 frame.integrals = nearest.iter().map(|p| frame.integrals[*p]).collect();
@@ -37,12 +49,12 @@ impl Dataset {
 }
 
 /// Hidden pixels of a view, of which some are shown; none where fewer are as dark than the shorter side of the image has.
-fn hidden(frames: &[&Frame], width: usize, height: usize) -> Vec<bool> {
-    let mut dark = vec![!frames.is_empty(); width * height];
-    for frame in frames {
-        let [least, most] = frame.integrals.iter().fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
+fn hidden(images: &[Cow<'_, [f32]>], width: usize, height: usize) -> Vec<bool> {
+    let mut dark = vec![!images.is_empty(); width * height];
+    for image in images {
+        let [least, most] = image.iter().fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
         let limit = most - AS_DARK * (most - least);
-        dark.iter_mut().zip(&frame.integrals).for_each(|(dark, v)| *dark &= least < most && *v >= limit);
+        dark.iter_mut().zip(image.as_ref()).for_each(|(dark, v)| *dark &= least < most && *v >= limit);
     }
     let border = (0..dark.len()).filter(|p| dark[*p] && at_border(*p, width, height));
     let reached = flood(border, width, height, |p| dark[p]);
@@ -106,6 +118,7 @@ fn neighbours(pixel: usize, width: usize, height: usize) -> impl Iterator<Item =
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scan::dataset::Frame;
 
     const WIDTH: usize = 30;
     const HEIGHT: usize = 20;
@@ -124,7 +137,7 @@ mod tests {
     }
 
     fn hidden_of(frames: &[Frame]) -> Vec<bool> {
-        hidden(&frames.iter().collect::<Vec<_>>(), WIDTH, HEIGHT)
+        hidden(&frames.iter().map(|frame| Cow::from(&frame.integrals)).collect::<Vec<_>>(), WIDTH, HEIGHT)
     }
 
     /// A chest, a vessel that moves, and darkness from `first` on.

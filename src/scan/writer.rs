@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::{npy, png};
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT};
+use crate::raster::Image;
 use crate::scan::dataset::{Dataset, Intensity, Layout, MANIFEST, Manifest, ManifestFrame, Split};
 use crate::scan::gating::BeatTime;
 use crate::scan::nerfca;
@@ -24,7 +25,7 @@ pub struct About {
     pub depth_half_extent_mm: f64,
     /// Attenuation of filled vessels, 1/mm, where known.
     pub vessel_attenuation_per_mm: Option<f64>,
-    /// Columns and rows.
+    /// Columns and rows of all images in the authors' layout, which has them once.
     pub size: [usize; 2],
     /// The authors' layout has distances and pixels once for all views: those of this C-arm.
     pub c_arm: CArm,
@@ -84,18 +85,18 @@ impl<'a> Writer<'a> {
         })
     }
 
-    /// Writes a frame's image and mask; the image's file, relative to the dataset. The authors' layout numbers phases: a frame
-    /// between two gets the nearest there.
+    /// Writes a frame's image of line integrals and its mask; the image's file, relative to the dataset. The authors' layout
+    /// numbers phases: a frame between two gets the nearest there.
     ///
     /// # Errors
-    /// [`Error::Config`] for a geometry the authors' layout cannot state; [`Error::Io`].
+    /// [`Error::Config`] for a geometry or a size that the authors' layout cannot state; [`Error::Io`].
     pub fn frame(
         &mut self,
         geometry: &Geometry,
         split: Split,
         view: usize,
         taken: BeatTime,
-        integrals: &[f32],
+        image: &Image,
         mask: Option<&[bool]>,
     ) -> Result<PathBuf> {
         let kind = if split == Split::Train { "train" } else { "test" };
@@ -103,18 +104,19 @@ impl<'a> Writer<'a> {
         let seen = self.names.entry(name.clone()).or_default();
         *seen += 1;
         let name = if *seen > 1 { format!("{name}-{seen}") } else { name };
-        let [width, height] = self.size;
+        let Image { width, height, values: integrals } = image;
+        let (width, height) = (*width, *height);
         match self.layout {
             Layout::Native => {
-                let image = PathBuf::from(format!("images/{name}.npy"));
+                let file = PathBuf::from(format!("images/{name}.npy"));
                 let mask_file = PathBuf::from(format!("masks/{name}.png"));
-                npy::write(&self.out.join(&image), &[height, width], integrals)?;
+                npy::write(&self.out.join(&file), &[height, width], integrals)?;
                 if let Some(mask) = mask {
                     let codes = mask.iter().map(|m| if *m { u16::MAX } else { 0 }).collect();
                     png::write_grey16(&self.out.join(&mask_file), width, height, codes)?;
                 }
                 self.manifest.frames.push(ManifestFrame {
-                    image: image.clone(),
+                    image: file.clone(),
                     phase: taken.phases(self.manifest.phases),
                     split,
                     geometry: geometry.clone(),
@@ -123,16 +125,20 @@ impl<'a> Writer<'a> {
                     heart_shift_mm: [0.0; 3],
                     stated_geometry: None,
                 });
-                Ok(image)
+                Ok(file)
             }
             Layout::Nerfca => {
+                if [width, height] != self.size {
+                    let problem = "has one size for all images, and this dataset has several";
+                    return Err(Error::config("layout", "nerfca", problem));
+                }
                 let values: Vec<f32> = integrals.iter().map(|y| (I0_LOG - f64::from(*y)) as f32).collect();
                 let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
                 let range = f64::from(high) - f64::from(low);
                 let unit: Vec<f32> =
                     values.iter().map(|v| ((f64::from(*v) - f64::from(low)) / range.max(1e-12)) as f32).collect();
-                let (image, mask_file) = (format!("{name}.npy"), format!("{name}-mask.npy"));
-                npy::write(&self.out.join(&image), &[height, width], &unit)?;
+                let (file, mask_file) = (format!("{name}.npy"), format!("{name}-mask.npy"));
+                npy::write(&self.out.join(&file), &[height, width], &unit)?;
                 if let Some(mask) = mask {
                     let masked: Vec<f32> =
                         values.iter().zip(mask).map(|(v, m)| if *m { *v } else { I0_LOG as f32 }).collect();
@@ -140,7 +146,7 @@ impl<'a> Writer<'a> {
                 }
                 let (theta, phi) = self.authors_angles(geometry)?;
                 self.lists[usize::from(split == Split::Validation)].push(nerfca::FrameEntry {
-                    file_path: image.clone(),
+                    file_path: file.clone(),
                     img_min_max: [f64::from(low), f64::from(high).max(f64::from(low) + 1e-12)],
                     mask_file_path: mask.map(|_| mask_file),
                     weighted_file_path: None,
@@ -149,7 +155,7 @@ impl<'a> Writer<'a> {
                     phi,
                     larm: 0.0,
                 });
-                Ok(PathBuf::from(image))
+                Ok(PathBuf::from(file))
             }
         }
     }
@@ -242,14 +248,15 @@ pub fn write(
             phases: dataset.n_phases,
             depth_half_extent_mm: low.abs().max(high.abs()) * MM_PER_UNIT,
             vessel_attenuation_per_mm: dataset.vessel_attenuation.map(|a| a / MM_PER_UNIT),
-            size: [dataset.width, dataset.height],
+            size: dataset.canvas(),
             c_arm: dataset.reference_c_arm(),
         },
     )?;
     for frame in &dataset.frames {
-        let geometry = &dataset.views[frame.view].geometry;
-        let taken = frame.beat_time();
-        writer.frame(geometry, frame.split, frame.view, taken, &frame.integrals, frame.mask.as_deref())?;
+        let view = &dataset.views[frame.view];
+        let (own, [width, height]) = (dataset.own_frame(frame).into_owned(), view.size);
+        let image = Image { width, height, values: own.integrals };
+        writer.frame(&view.geometry, frame.split, frame.view, frame.beat_time(), &image, own.mask.as_deref())?;
         writer.corrected(frame.heart_shift_mm, stated(frame.view).as_ref())?;
     }
     writer.finish()

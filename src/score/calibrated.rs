@@ -5,7 +5,7 @@
 use crate::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
-use crate::scan::dataset::{Dataset, Frame, Split};
+use crate::scan::dataset::{Dataset, Frame, Split, View};
 use crate::scan::truth::{TRUTH, TrueFrame, Truth};
 use glam::DVec3;
 use std::collections::BTreeMap;
@@ -14,9 +14,10 @@ use std::ffi::OsStr;
 /// Half side of the cube of points that stand for the heart, as a share of the field of view's half.
 const HEART_SHARE: f64 = 0.5;
 
-/// Rays by which the image of a frame was really taken, the heart at its mean position.
-pub(super) fn true_rays(frame: &TrueFrame, dataset: &Dataset) -> Result<ViewRays> {
-    let rays = Geometry::CArm(frame.geometry.clone()).rays(dataset.width, dataset.height);
+/// Rays by which the image of a frame of a view was really taken, the heart at its mean position.
+pub(super) fn true_rays(frame: &TrueFrame, view: usize, dataset: &Dataset) -> Result<ViewRays> {
+    let [width, height] = dataset.views[view].size;
+    let rays = Geometry::CArm(frame.geometry.clone()).rays(width, height);
     rays.map_err(|(field, problem)| Error::data(dataset.path.join(TRUTH), field, problem))
 }
 
@@ -27,9 +28,9 @@ pub(super) fn shift_of(frame: &TrueFrame) -> DVec3 {
 
 /// Points that stand for the heart: the corners and the middle of a cube.
 fn points(dataset: &Dataset) -> Vec<DVec3> {
-    let rays = &dataset.views[0].rays;
+    let View { rays, size: [width, height], .. } = &dataset.views[0];
     let pixel = rays.anchor[1].length().min(rays.anchor[2].length());
-    let half = HEART_SHARE * 0.5 * pixel * dataset.width.min(dataset.height) as f64;
+    let half = HEART_SHARE * 0.5 * pixel * *width.min(height) as f64;
     let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { half } else { -half };
     (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2))).chain([DVec3::ZERO]).collect()
 }
@@ -73,7 +74,7 @@ pub fn in_calibrated_frame(dataset: &Dataset) -> Result<Option<Dataset>> {
                 carried.hidden.insert(frame.view, hidden.clone());
             }
         }
-        carried.views[frame.view].rays = still.carry_rays(&true_rays(was, dataset)?, 0);
+        carried.views[frame.view].rays = still.carry_rays(&true_rays(was, f.view, dataset)?, 0);
         let shift = still.carry(shift_of(was), 0) - motion.translations[f.phase as usize];
         frame.heart_shift_mm = (shift * MM_PER_UNIT).to_array();
     }
@@ -119,7 +120,7 @@ impl<'a> TrueFrames<'a> {
         for f in dataset.training() {
             let Some(was) = self.of(f) else { continue };
             breathes |= shift_of(was) != DVec3::ZERO;
-            let truth = true_rays(was, dataset)?.moved(shift_of(was));
+            let truth = true_rays(was, f.view, dataset)?.moved(shift_of(was));
             frames.push(FrameRays { phase: f.phase as usize, truth, corrected: dataset.heart_rays(f) });
         }
         Ok(common_motion(&frames, &points(dataset), dataset.n_phases as usize, breathes))

@@ -7,13 +7,13 @@ use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
 use crate::scan::gating::SYSTOLE_SHARE;
 use crate::score::shapes::chamfer_mm;
-use crate::score::volume::{Truth, VOLUMES, on_one_grid, pixel_mm, read, truth_file};
+use crate::score::volume::{TrueVessels, VOLUMES, on_one_grid, pixel_mm, read, truth_file};
 use crate::vessels::field::MovingField;
 use std::path::PathBuf;
 
 /// The true vessels at the phase nearest to the end of systole, when they have come farthest.
 pub struct Distance {
-    truth: Truth,
+    truth: TrueVessels,
     file: PathBuf,
     phase: u32,
     pixel_mm: f64,
@@ -36,7 +36,7 @@ impl Distance {
         if let Some(motion) = carried {
             volume = volume.carried(&motion.patient_mm(phase as usize));
         }
-        Ok(Some(Distance { truth: Truth::new(&volume, dataset), file, phase, pixel_mm: pixel_mm(dataset) }))
+        Ok(Some(Distance { truth: TrueVessels::new(&volume, dataset), file, phase, pixel_mm: pixel_mm(dataset) }))
     }
 
     /// The Chamfer distance, mm, of the moving field where it exceeds a threshold; none where it nowhere does.

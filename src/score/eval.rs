@@ -12,6 +12,7 @@ use crate::score::metrics;
 use crate::score::trees::TreeScores;
 use crate::score::volume::VolumeScores;
 use serde::Serialize;
+use std::borrow::Cow;
 
 /// Share of the vessels' stated attenuation from which a field counts as vessel. Fields are smoother than vessels, so half
 /// of it would cut thin ones off; a tenth would take noise in. Of the shares tried (docs/performance.md) a fifth is within
@@ -136,7 +137,7 @@ pub enum Scoring<'a> {
     Rendered,
     /// An image is scored.
     Scored {
-        /// The image.
+        /// The image, as large as those of its view.
         frame: &'a Frame,
         /// What the model makes of it.
         rendering: &'a Rendering,
@@ -206,6 +207,15 @@ fn published_dice(frames: &[&Frame], seen: &[Rendering]) -> PublishedDice {
     }
 }
 
+/// What a reconstruction shows of a frame, as large as the view's images.
+///
+/// # Errors
+/// Device errors.
+pub fn rendered(renderer: &Renderer, dataset: &Dataset, frame: &Frame) -> Result<Rendering> {
+    let [width, height] = dataset.views[frame.view].size;
+    renderer.render_taken(&dataset.heart_rays(frame), width, height, frame.beat_time())
+}
+
 /// Scores frames of a dataset. `threshold` (per world unit) overrides the rule. `observe` hears of every image; its
 /// error ends the work.
 ///
@@ -224,10 +234,11 @@ pub fn evaluate(
     }
     let mut seen = Vec::new();
     for frame in frames {
-        let rays = dataset.heart_rays(frame);
-        seen.push(renderer.render_taken(&rays, dataset.width, dataset.height, frame.beat_time())?);
+        seen.push(rendered(renderer, dataset, frame)?);
         observe(Scoring::Rendered)?;
     }
+    let own: Vec<Cow<'_, Frame>> = frames.iter().map(|frame| dataset.own_frame(frame)).collect();
+    let frames: Vec<&Frame> = own.iter().map(Cow::as_ref).collect();
     let (dynamic_threshold, total_threshold, rule) = choose_thresholds(&seen, dataset.vessel_attenuation, threshold);
     let mut images = Vec::new();
     for (frame, rendering) in frames.iter().zip(&seen) {
@@ -243,7 +254,7 @@ pub fn evaluate(
             dice_dynamic: overlap(&rendering.dynamic_max, dynamic_threshold),
             dice_total: overlap(&rendering.total_max, total_threshold),
             psnr: metrics::psnr(&truth, &prediction),
-            ssim: metrics::ssim(&truth, &prediction, dataset.width),
+            ssim: metrics::ssim(&truth, &prediction, dataset.views[frame.view].size[0]),
         });
     }
     let mean = |pick: &dyn Fn(&ImageScore) -> Option<f64>| mean(images.iter().filter_map(pick));
@@ -258,7 +269,7 @@ pub fn evaluate(
         dice: DiceMeans { dynamic: mean(&|i| i.dice_dynamic), total: mean(&|i| i.dice_total) },
         dice_as_stated: None,
         best_dice: BestDices { dynamic: best(DYNAMIC, dynamic_threshold), total: best(TOTAL, total_threshold) },
-        dice_published: published_dice(frames, &seen),
+        dice_published: published_dice(&frames, &seen),
         psnr: mean(&|i| Some(i.psnr)).unwrap_or(f64::NAN),
         ssim: mean(&|i| Some(i.ssim)).unwrap_or(f64::NAN),
         threshold: Thresholds {
@@ -278,11 +289,11 @@ pub fn evaluate(
 fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
     let changes = dataset.training_views().into_iter().flat_map(|view| {
         let frames: Vec<&Frame> = dataset.training().iter().filter(|f| f.view == view).collect();
-        let still: Vec<f32> = (0..dataset.n_pixels())
-            .map(|p| frames.iter().map(|f| f.integrals[p]).fold(f32::INFINITY, f32::min))
-            .collect();
-        frames.into_iter().map(move |frame| {
-            let above: Vec<f32> = frame.integrals.iter().zip(&still).map(|(v, s)| v - s).collect();
+        let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
+        let least = |p: usize| images.iter().map(|image| image[p]).fold(f32::INFINITY, f32::min);
+        let still: Vec<f32> = (0..images[0].len()).map(least).collect();
+        frames.into_iter().zip(images).map(move |(frame, image)| {
+            let above: Vec<f32> = image.iter().zip(&still).map(|(v, s)| v - s).collect();
             (frame, f64::from(percentile(&above, 1.0 - STRONGEST)))
         })
     });
@@ -296,7 +307,7 @@ fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
 /// Device errors.
 pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Option<String>> {
     let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
-    let seen = renderer.render_taken(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.beat_time())?;
+    let seen = rendered(renderer, dataset, frame)?;
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
     let remedy = if renderer.gaussians_move() {
         "check geometry, phases and noise of the views"

@@ -267,7 +267,7 @@ impl Images<'_> {
             }));
         };
         let Some(was) = truth.of(frame) else { return Ok(None) };
-        let true_rays = true_rays(was, self.dataset)?.moved(shift_of(was));
+        let true_rays = true_rays(was, frame.view, self.dataset)?.moved(shift_of(was));
         Ok(Some(Image { rays, true_rays, moment: was.beat_phase }))
     }
 

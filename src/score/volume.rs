@@ -14,6 +14,7 @@ use crate::vessels::field::{CoarseField, Corners, MovingField};
 use crate::vessels::mask::Mask;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Directory of the volumes inside a dataset.
@@ -27,7 +28,7 @@ const FAR_MM: f64 = 2.0;
 /// Side of the smallest cube that counts as a component, pixels.
 const COMPONENT_PIXELS: f64 = 1.0;
 /// Voxels at most that are compared.
-const MOST_VOXELS: u64 = 1 << 26;
+pub(crate) const MOST_VOXELS: u64 = 1 << 26;
 
 /// Scores of one phase, or their means.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -92,7 +93,7 @@ pub fn score(
     mut proceed: impl FnMut() -> Result<()>,
 ) -> Result<Option<VolumeScores>> {
     let pixel_mm = pixel_mm(dataset);
-    let smallest_component_mm3 = (COMPONENT_PIXELS * pixel_mm).powi(3);
+    let least_mm3 = smallest_component_mm3(pixel_mm);
     let volumes = dataset.path.join(VOLUMES);
     let (mut phases, mut as_stated) = (Vec::new(), Vec::new());
     for phase in 0..dataset.n_phases {
@@ -105,8 +106,8 @@ pub fn score(
         let coarse = moving.coarse()?;
         let mut against = |volume: &Volume| -> Result<PhaseScores> {
             proceed()?;
-            let truth = Truth::new(volume, dataset);
-            Ok(PhaseScores { phase, scores: scores(&moving, &coarse, &truth, &file, smallest_component_mm3)? })
+            let truth = TrueVessels::new(volume, dataset);
+            Ok(PhaseScores { phase, scores: scores(&moving, &coarse, &truth, &file, least_mm3)? })
         };
         match carried {
             None => phases.push(against(&volume)?),
@@ -117,14 +118,50 @@ pub fn score(
         }
     }
     Ok((!phases.is_empty()).then(|| VolumeScores {
-        threshold_per_mm,
-        pixel_mm,
-        within_mm: WITHIN_MM,
-        smallest_component_mm3,
-        mean: mean(&phases),
         mean_as_stated: (!as_stated.is_empty()).then(|| mean(&as_stated)),
-        phases,
+        ..VolumeScores::of(phases, threshold_per_mm, pixel_mm)
     }))
+}
+
+/// Scores the moving field where it exceeds `threshold_per_mm` at the phases whose true vessels are known; none where none are.
+/// A pixel has `pixel_mm` at the isocentre.
+///
+/// # Errors
+/// [`Error::Data`] for a truth that has too many voxels; device errors.
+pub fn score_known(
+    renderer: &Renderer,
+    scene: &Scene,
+    known: &BTreeMap<u32, TrueVessels>,
+    threshold_per_mm: f64,
+    pixel_mm: f64,
+) -> Result<Option<VolumeScores>> {
+    let of_phase = |(phase, truth): (&u32, &TrueVessels)| -> Result<PhaseScores> {
+        let moving = MovingField { renderer, scene, phase: *phase, pixel_mm, threshold_per_mm };
+        let of = PathBuf::from(format!("true vessels of phase {phase}"));
+        let least_mm3 = smallest_component_mm3(pixel_mm);
+        Ok(PhaseScores { phase: *phase, scores: scores(&moving, &moving.coarse()?, truth, &of, least_mm3)? })
+    };
+    let phases = known.iter().map(of_phase).collect::<Result<Vec<_>>>()?;
+    Ok((!phases.is_empty()).then(|| VolumeScores::of(phases, threshold_per_mm, pixel_mm)))
+}
+
+/// The smallest component that counts, where a pixel has so many mm at the isocentre.
+fn smallest_component_mm3(pixel_mm: f64) -> f64 {
+    (COMPONENT_PIXELS * pixel_mm).powi(3)
+}
+
+impl VolumeScores {
+    fn of(phases: Vec<PhaseScores>, threshold_per_mm: f64, pixel_mm: f64) -> VolumeScores {
+        VolumeScores {
+            threshold_per_mm,
+            pixel_mm,
+            within_mm: WITHIN_MM,
+            smallest_component_mm3: smallest_component_mm3(pixel_mm),
+            mean: mean(&phases),
+            mean_as_stated: None,
+            phases,
+        }
+    }
 }
 
 /// Means over phases; none where a phase has none.
@@ -150,15 +187,18 @@ fn mean(phases: &[PhaseScores]) -> Scores {
 }
 
 /// Pixel at the isocentre, mm.
-pub(super) fn pixel_mm(dataset: &Dataset) -> f64 {
+pub(crate) fn pixel_mm(dataset: &Dataset) -> f64 {
     let c_arm = dataset.reference_c_arm();
     c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm
 }
 
 /// True vessels of a phase.
-pub(super) struct Truth {
-    grid: PatientGrid,
-    inside: Vec<bool>,
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrueVessels {
+    /// Where the voxels are.
+    pub grid: PatientGrid,
+    /// Which of them are vessel, left fastest.
+    pub inside: Vec<bool>,
 }
 
 /// True attenuation per mm on a grid along the patient's axes.
@@ -177,13 +217,13 @@ fn spacing_mm(volume: &Volume) -> DVec3 {
     DVec3::new(axes.x_axis.x, axes.y_axis.y, axes.z_axis.z)
 }
 
-impl Truth {
+impl TrueVessels {
     /// Vessel is what reaches a share of the vessels' attenuation, or of the largest value where that is not stated.
-    pub(super) fn new(volume: &Volume, dataset: &Dataset) -> Truth {
+    pub(super) fn new(volume: &Volume, dataset: &Dataset) -> TrueVessels {
         let largest = || f64::from(volume.values.iter().copied().fold(0.0, f32::max));
         let vessel_per_mm = dataset.vessel_attenuation.map(|v| v / MM_PER_UNIT);
         let threshold = TRUTH_SHARE * vessel_per_mm.unwrap_or_else(largest);
-        Truth {
+        TrueVessels {
             grid: PatientGrid {
                 origin_mm: volume.index_to_lps.translation,
                 spacing_mm: spacing_mm(volume),
@@ -261,7 +301,7 @@ impl Mass {
 pub(super) fn on_one_grid(
     field: &MovingField<'_>,
     coarse: &CoarseField,
-    truth: &Truth,
+    truth: &TrueVessels,
     file: &Path,
 ) -> Result<(PatientGrid, [Mask; 2])> {
     let own = Corners::of(&truth.grid).grown(FAR_MM.max(FAR_PIXELS * field.pixel_mm));
@@ -275,7 +315,7 @@ pub(super) fn on_one_grid(
 fn scores(
     field: &MovingField<'_>,
     coarse: &CoarseField,
-    truth: &Truth,
+    truth: &TrueVessels,
     file: &Path,
     smallest_component_mm3: f64,
 ) -> Result<Scores> {
@@ -332,7 +372,7 @@ mod tests {
     fn the_grid_grows_by_whole_voxels() {
         let (origin_mm, spacing_mm) = (DVec3::new(1.0, 2.0, 3.0), DVec3::new(0.5, 1.0, 2.0));
         let grid = PatientGrid { origin_mm, spacing_mm, size: [2, 3, 2] };
-        let truth = Truth { grid, inside: (0..12).map(|i| i % 5 == 0).collect() };
+        let truth = TrueVessels { grid, inside: (0..12).map(|i| i % 5 == 0).collect() };
         let file = Path::new("vessels-00.nrrd");
         let same = truth.reaching(Corners { low_mm: DVec3::splat(3.5), high_mm: DVec3::ZERO }, file).unwrap();
         assert_eq!((same.0, &same.1.inside), (grid, &truth.inside));

@@ -42,7 +42,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
             offset_mm: [1.0, -2.0],
             table_mm: [0.0; 3],
         });
-        views.push(View { rays: rays(&geometry, width, height)?, geometry });
+        views.push(View { rays: rays(&geometry, width, height)?, size: [width, height], geometry });
         for phase in 0..n_phases {
             // The way of three phases, in as many steps as there are.
             let along = 3.0 * f64::from(phase) / f64::from(n_phases);

@@ -30,18 +30,17 @@ impl Session {
 }
 
 impl CorrectedFrame {
-    /// `phase` and `size` (columns, rows) are those of the frame, which is of `view`.
+    /// `phase` is that of the frame, which is of `view`.
     pub(super) fn new(
         view: &View,
         frame: &Frame,
         phase: Option<u32>,
-        size: (usize, usize),
         calibration: &Calibration,
     ) -> Result<CorrectedFrame> {
         // What was stated may have been changed since.
         let corrected = calibration.views.iter().find(|c| c.view == frame.view && c.stated == view.geometry);
         let rays = match corrected {
-            Some(c) => c.corrected.rays(size.0, size.1).map_err(|(field, problem)| {
+            Some(c) => c.corrected.rays(view.size[0], view.size[1]).map_err(|(field, problem)| {
                 Error::config("frame", &frame.name, format!("corrected geometry: {field}: {problem}"))
             })?,
             None => view.rays.clone(),

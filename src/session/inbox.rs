@@ -2,9 +2,10 @@
 
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
-use crate::geometry::{Geometry, MM_PER_UNIT, ViewRays};
+use crate::geometry::{Geometry, MM_PER_UNIT};
+use crate::scan::canvas::onto_canvas;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use crate::scan::frame_checks::{Complaint, check_phase, check_size, check_values, checked_rays};
+use crate::scan::frame_checks::{Complaint, check_phase, check_values, checked_view};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -65,7 +66,6 @@ fn told(complaint: Complaint) -> Error {
 /// Checked frames, and how they are to be used.
 pub(super) struct Inbox {
     pub(super) options: SessionOptions,
-    pub(super) size: Option<(usize, usize)>,
     pub(super) views: Vec<View>,
     pub(super) frames: Vec<(Frame, Moment)>,
     pub(super) r_peaks: Option<RPeaks>,
@@ -78,7 +78,6 @@ impl Inbox {
             let size = format!("{} x {}", new.width, new.height);
             return Err(bad("size", size, "does not fit its pixels or mask".into()));
         }
-        check_size((new.width, new.height), self.size).map_err(told)?;
         check_values(&new.integrals, new.width).map_err(told)?;
         match new.moment {
             Moment::Phase(phase) => check_phase(phase.into(), self.options.phases).map_err(told)?,
@@ -91,9 +90,7 @@ impl Inbox {
             }
             Moment::TimeS(_) => (),
         }
-        let rays = self.rays(&new.geometry, (new.width, new.height))?;
-        self.size = Some((new.width, new.height));
-        let view = self.view(View { geometry: new.geometry, rays });
+        let view = self.view(new.geometry, [new.width, new.height])?;
         let frame = Frame {
             name: format!("frame-{}", self.frames.len()),
             view,
@@ -110,10 +107,8 @@ impl Inbox {
 
     /// States another geometry for a frame, counted from 0 as they were added.
     pub(super) fn set_geometry(&mut self, index: usize, geometry: Geometry) -> Result<()> {
-        self.frame(index)?;
-        let Some(size) = self.size else { return Ok(()) };
-        let rays = self.rays(&geometry, size)?;
-        self.frames[index].0.view = self.view(View { geometry, rays });
+        let size = self.views[self.frame(index)?.0.view].size;
+        self.frames[index].0.view = self.view(geometry, size)?;
         Ok(())
     }
 
@@ -123,18 +118,14 @@ impl Inbox {
         self.frames.get(index).ok_or_else(none)
     }
 
-    /// Rays of a geometry that frames of a size can have.
-    fn rays(&self, geometry: &Geometry, size: (usize, usize)) -> Result<ViewRays> {
-        checked_rays(geometry, size, self.options.depth_half_extent_mm / MM_PER_UNIT).map_err(told)
-    }
-
-    /// Index of a view, which is new unless an earlier frame was taken from there.
-    fn view(&mut self, view: View) -> usize {
-        let known = self.views.iter().position(|v| v.geometry == view.geometry);
-        known.unwrap_or_else(|| {
-            self.views.push(view);
-            self.views.len() - 1
-        })
+    /// Index of the view of images of `size` (columns, rows), which is new unless an earlier frame was taken from there.
+    fn view(&mut self, geometry: Geometry, size: [usize; 2]) -> Result<usize> {
+        if let Some(known) = self.views.iter().position(|v| v.geometry == geometry && v.size == size) {
+            return Ok(known);
+        }
+        let depth_before = self.options.depth_half_extent_mm / MM_PER_UNIT;
+        self.views.push(checked_view(geometry, size, depth_before).map_err(told)?);
+        Ok(self.views.len() - 1)
     }
 
     /// When in the beat a moment is, where that is known.
@@ -159,7 +150,7 @@ impl Inbox {
             .collect();
         let mut frames: Vec<Frame> = known.iter().filter(|f| keep(f, &known)).cloned().collect();
         frames.sort_by_key(|f| f.split);
-        let Some((width, height)) = self.size.filter(|_| !frames.is_empty()) else {
+        let Some([width, height]) = onto_canvas(&self.views, &mut frames).map_err(told)? else {
             let n = self.frames.len();
             return Err(Error::NotReady(format!(
                 "none of {n} frames can be used: a phase, or a time stamp and R-peaks, is needed, and two phases of a view"

@@ -15,6 +15,7 @@ use crate::run::reconstruct::{RunOptions, reconstruct};
 use crate::run::score::{ScoreOptions, as_trained, evaluate_model};
 use crate::scan::dataset::Dataset;
 use crate::score::calibrated::in_calibrated_frame;
+use crate::score::eval::rendered;
 use crate::score::pictures;
 use crate::study::events::StudyEvent;
 use crate::study::outcome::{CurvePoint, Outcome, RESULT, RunScores, Seconds, run_directory};
@@ -199,7 +200,8 @@ fn first_picture(
     let dataset = carried.as_ref().unwrap_or(dataset);
     let Some(frame) = dataset.validation().first() else { return Ok(()) };
     let renderer = Renderer::new(gpu, model, tuning.clone())?;
-    let seen = renderer.render_taken(&dataset.heart_rays(frame), dataset.width, dataset.height, frame.beat_time())?;
+    let seen = rendered(&renderer, dataset, frame)?;
     let threshold = threshold_per_mm * crate::geometry::MM_PER_UNIT;
-    pictures::write_comparison(path, frame, &seen, threshold, dataset.width)
+    let width = dataset.views[frame.view].size[0];
+    pictures::write_comparison(path, &dataset.own_frame(frame), &seen, threshold, width)
 }

@@ -121,7 +121,7 @@ pub fn data_fingerprint(dataset: &Dataset) -> String {
         }
         let rest = frame.heart_shift_mm.iter().chain([&frame.after_phase]);
         rest.filter(|s| **s != 0.0).for_each(|s| eat((*s as f32).to_bits()));
-        frame.integrals.iter().for_each(|v| eat(v.to_bits()));
+        dataset.own(frame.view, &frame.integrals).iter().for_each(|v| eat(v.to_bits()));
     }
     fingerprint.hex()
 }
@@ -246,7 +246,7 @@ impl Trainer {
             moving,
             vessel_attenuation: dataset.vessel_attenuation,
             c_arm: dataset.reference_c_arm(),
-            image_size: [dataset.width, dataset.height],
+            image_size: dataset.reference_view().size,
             data_fingerprint,
             plan,
         };
@@ -547,7 +547,7 @@ mod tests {
         Dataset {
             path: "test".into(),
             layout: Layout::Native,
-            views: vec![View { rays: geometry.rays(2, 2).unwrap(), geometry }],
+            views: vec![View::new(geometry, [2, 2]).unwrap()],
             frames: vec![frame(0, Split::Train, 0.0), frame(1, Split::Validation, 4.0)],
             width: 2,
             height: 2,

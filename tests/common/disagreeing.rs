@@ -140,7 +140,7 @@ impl Studio {
     fn empty(&self, stated: &[CArm]) -> Dataset {
         let view = |c_arm: &CArm| {
             let geometry = Geometry::CArm(c_arm.clone());
-            View { rays: geometry.rays(self.size, self.size).unwrap(), geometry }
+            View::new(geometry, [self.size; 2]).unwrap()
         };
         Dataset {
             path: "phantom".into(),

@@ -43,7 +43,7 @@ pub struct SoftHull {
 /// The evidence of every training view with at least two phases, and the hull carved by it.
 #[derive(Debug, Clone)]
 pub struct SoftMotion {
-    /// What the views say.
+    /// What the views say, on the dataset's canvas.
     pub views: Vec<ViewEvidence>,
     /// What remains.
     pub hull: SoftHull,
@@ -54,7 +54,8 @@ impl SoftMotion {
     /// along each axis.
     pub fn new(dataset: &Dataset, half: f64, resolution: usize) -> SoftMotion {
         let series = Series::of(dataset);
-        let views: Vec<ViewEvidence> = series.par_iter().map(ViewEvidence::new).collect();
+        let views: Vec<ViewEvidence> =
+            series.par_iter().map(|s| ViewEvidence::new(s).on_canvas(dataset.canvas())).collect();
         let hull = SoftHull::carve(dataset, &views, half, resolution.next_multiple_of(2));
         SoftMotion { views, hull }
     }

@@ -143,6 +143,55 @@ def test_frames_for_validation_are_scored(context: Context) -> None:
         assert made.evaluate(0.03).threshold_per_mm == pytest.approx(0.03)
 
 
+def test_scores_in_3d_know_the_true_vessels(context: Context) -> None:
+    grid = Grid.around_isocentre(20.0, 2.0)
+    with filled(context) as made:
+        made.train()
+        made.add_frame(pixels(1, 1), geometry(1), phase=1, split="validation", mask=pixels(1, 1) > 1.1)
+        assert made.evaluate().volume_phases == 0 and np.isnan(made.evaluate().chamfer_mm)
+        ours = made.volume(grid, phase=1)
+        threshold = float(np.quantile(ours, 0.98))
+        # What was reconstructed is its own truth; moved by a voxel to the left, it is off by as much.
+        inside = ours > threshold
+        made.set_true_vessels(inside, grid, phase=1)
+        same = made.evaluate(threshold)
+        assert (same.volume_phases, same.volume_dice, same.chamfer_mm, same.hausdorff95_mm) == (1, 1.0, 0.0, 0.0)
+        assert same.components == same.true_components and same.cl_dice == 1.0
+        first = (grid.origin_mm[0] + 2.0, *grid.origin_mm[1:])
+        made.set_true_vessels(inside.astype(np.uint8), Grid(first, grid.spacing_mm, grid.points), phase=1)
+        moved = made.evaluate(threshold)
+        assert 0 < moved.volume_dice < 1 and 0 < moved.chamfer_mm <= 2.0
+        made.set_true_vessels(None, grid, phase=1)
+        assert made.evaluate(threshold).volume_phases == 0
+        with pytest.raises(nertca_vk.ArgumentError, match="inside"):
+            made.set_true_vessels(inside[:-1], grid, phase=1)
+        with pytest.raises(nertca_vk.ArgumentError, match="inside"):
+            made.set_true_vessels(inside.astype(np.float32), grid, phase=1)
+        with pytest.raises(nertca_vk.ArgumentError, match="phase"):
+            made.set_true_vessels(inside, grid, phase=PHASES)
+
+
+def test_a_tree_is_its_own_truth(context: Context) -> None:
+    with filled(context) as made:
+        made.train()
+        made.add_frame(pixels(1, 1), geometry(1), phase=1, split="validation")
+        threshold = float(np.quantile(made.volume(Grid.around_isocentre(20.0, 1.0)), 0.98))
+        tree = made.tree(threshold_per_mm=threshold)
+        at_rest = nertca_vk.Tree(tree.threshold_per_mm, False, tree.at(0))
+        made.set_true_tree(at_rest)
+        scores = made.evaluate(threshold)
+        assert (scores.tree_phases, scores.tree_true_centreline_found, scores.tree_our_centreline_true) == (1, 1.0, 1.0)
+        assert abs(scores.radius_rmse_mm) < 1e-9 and scores.tree_ours_to_true_mm < 1e-9
+        made.set_true_tree(None)
+        assert made.evaluate(threshold).tree_phases == 0
+        late = [nertca_vk.Branch(1, None, branch.points_mm, branch.radius_mm) for branch in tree.at(0)]
+        with pytest.raises(nertca_vk.ArgumentError, match="phase 0"):
+            made.set_true_tree(nertca_vk.Tree(0.0, False, late))
+        short = [nertca_vk.Branch(0, None, branch.points_mm[:-1], branch.radius_mm) for branch in tree.at(0)]
+        with pytest.raises(nertca_vk.ArgumentError, match="points_mm"):
+            made.set_true_tree(nertca_vk.Tree(0.0, False, short))
+
+
 def test_phases_come_from_r_peaks(context: Context) -> None:
     with empty(context) as by_time, filled(context) as by_phase:
         for view, phase, image in frames():

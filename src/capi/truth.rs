@@ -1,0 +1,176 @@
+//! What the caller knows of the true vessels, and scores.
+
+use crate::capi::output::grid_of;
+use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
+use crate::capi::status::{Failure, Outcome, nertca_status};
+use crate::capi::types::{nertca_grid, nertca_scores, nertca_tree, read, write};
+use crate::score::eval::Evaluation;
+use crate::score::trees::TrueLine;
+use crate::score::volume::TrueVessels;
+use glam::DVec3;
+use std::collections::BTreeMap;
+
+/// Points and branches of a true tree at most.
+const MOST_ELEMENTS: usize = 1 << 24;
+
+/// Says which voxels are vessel at the phase of `grid`, in place of what was said of that phase before: a non-zero byte for each
+/// point of the grid that is inside one, left fastest; its component does not matter. `nertca_reconstruction_evaluate` then has
+/// scores in 3D. Null `vessels`, with `bytes` 0, forget the phase. The bytes are copied. Any thread.
+///
+/// @return NERTCA_ERROR_ARGUMENT for a phase that there is not, a grid of more than 2^26 points, or too few bytes.
+///
+/// # Safety
+/// `grid` must be as long as it says; `vessels` must be readable for `bytes` bytes or null.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_set_true_vessels(
+    reconstruction: *mut nertca_reconstruction,
+    grid: *const nertca_grid,
+    vessels: *const u8,
+    bytes: usize,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: the header asks of `grid` what `grid_of` does.
+        let (grid, _, phase) = unsafe { grid_of(grid) }?;
+        if vessels.is_null() && bytes == 0 {
+            return Ok(reconstruction.session.set_true_vessels(phase, None)?);
+        }
+        if vessels.is_null() {
+            return Err(Failure::argument("vessels", "is null"));
+        }
+        let needed = grid.size.iter().map(|n| *n as usize).product::<usize>();
+        if bytes < needed {
+            return Err(Failure::argument("bytes", format!("{bytes} where {needed} are needed")));
+        }
+        // SAFETY: not null, and the header asks for `bytes` bytes, which are enough and which nobody changes during the call.
+        let inside = unsafe { std::slice::from_raw_parts(vessels, needed) }.iter().map(|v| *v != 0).collect();
+        Ok(reconstruction.session.set_true_vessels(phase, Some(TrueVessels { grid, inside }))?)
+    })
+}
+
+/// Says where the true centrelines are, and how wide the vessels, in place of what was said before: arrays as
+/// `nertca_reconstruction_tree` fills them, of one phase or more, of which 0 is one, with the same branches of as many points at
+/// each; point i of a branch is the same material point at every phase. `branch_parent` may be null. No branches forget them.
+/// `nertca_reconstruction_evaluate` then finds the vessels as a tree, which takes seconds, and scores it. The arrays are copied.
+/// Any thread.
+///
+/// @return NERTCA_ERROR_ARGUMENT naming what is wrong.
+///
+/// # Safety
+/// `tree` must be as long as it says, and its arrays readable for `branches` and `points` elements.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_set_true_tree(
+    reconstruction: *mut nertca_reconstruction,
+    tree: *const nertca_tree,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        // SAFETY: the header asks that `tree` is null or as long as its size says.
+        let tree = unsafe { read(tree) }?;
+        // SAFETY: the header asks for arrays as long as the struct says.
+        Ok(reconstruction.session.set_true_trees(unsafe { lines(&tree) }?)?)
+    })
+}
+
+/// The lines of each phase.
+///
+/// # Safety
+/// The arrays must be readable for as many elements as the struct says.
+unsafe fn lines(tree: &nertca_tree) -> Outcome<BTreeMap<u32, Vec<TrueLine>>> {
+    for (name, count) in [("branches", tree.branches), ("points", tree.points)] {
+        if count > MOST_ELEMENTS {
+            return Err(Failure::argument(name, format!("{count}; at most 2^24 are accepted")));
+        }
+    }
+    // SAFETY: this function asks its callers for as many elements, which need no alignment.
+    let (phases, firsts, counts, points, radii) = unsafe {
+        (
+            copied("branch_phase", tree.branch_phase.cast_const(), tree.branches)?,
+            copied("branch_first", tree.branch_first.cast_const(), tree.branches)?,
+            copied("branch_points", tree.branch_points.cast_const(), tree.branches)?,
+            copied("points_mm", tree.points_mm.cast_const(), 3 * tree.points)?,
+            copied("radius_mm", tree.radius_mm.cast_const(), tree.points)?,
+        )
+    };
+    let mut lines: BTreeMap<u32, Vec<TrueLine>> = BTreeMap::new();
+    for (branch, phase) in phases.iter().enumerate() {
+        let (first, count) = (firsts[branch] as usize, counts[branch] as usize);
+        if first + count > tree.points {
+            let problem = format!("branch {branch} ends at point {} of {}", first + count, tree.points);
+            return Err(Failure::argument("branch_points", problem));
+        }
+        let range = first..first + count;
+        let points_mm = points[3 * range.start..3 * range.end].chunks(3).map(DVec3::from_slice).collect();
+        lines.entry(*phase).or_default().push(TrueLine { points_mm, radius_mm: radii[range].to_vec() });
+    }
+    Ok(lines)
+}
+
+/// # Safety
+/// `from` must be null or readable for `count` elements.
+unsafe fn copied<T: Copy>(name: &str, from: *const T, count: usize) -> Outcome<Vec<T>> {
+    if from.is_null() && count > 0 {
+        return Err(Failure::argument(name, "is null"));
+    }
+    // SAFETY: this function asks its callers for as many elements, which need no alignment.
+    Ok((0..count).map(|i| unsafe { from.add(i).read_unaligned() }).collect())
+}
+
+/// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`, of which there must be one, and what was reconstructed
+/// against the true vessels, where these are known. `threshold_per_mm` is the attenuation from which
+/// the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
+/// Any thread, also while training.
+///
+/// # Safety
+/// `scores` must be writable, with its size set.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nertca_reconstruction_evaluate(
+    reconstruction: *mut nertca_reconstruction,
+    threshold_per_mm: f64,
+    scores: *mut nertca_scores,
+) -> nertca_status {
+    on_reconstruction(reconstruction, |reconstruction| {
+        if !(threshold_per_mm.is_finite() && threshold_per_mm >= 0.0) {
+            return Err(Failure::argument("threshold_per_mm", format!("{threshold_per_mm} is no attenuation")));
+        }
+        if scores.is_null() {
+            return Err(Failure::argument("scores", "is null"));
+        }
+        let found = reconstruction.session.evaluate((threshold_per_mm > 0.0).then_some(threshold_per_mm))?;
+        // SAFETY: the header asks that `scores` is as long as its size says; it is not null.
+        unsafe { write(scores, |size| told(size, &found)) }
+    })
+}
+
+/// NaN where nothing is known.
+fn told(size: usize, found: &Evaluation) -> nertca_scores {
+    let (volume, tree) = (found.volume.as_ref(), found.tree.as_ref());
+    let shape = volume.map(|v| v.mean.agreement);
+    let line = tree.map(|t| t.mean);
+    let or_nan = |value: Option<f64>| value.unwrap_or(f64::NAN);
+    nertca_scores {
+        size,
+        step: found.step,
+        images: found.images.len() as u32,
+        dice_dynamic: or_nan(found.dice.dynamic),
+        dice_total: or_nan(found.dice.total),
+        psnr_db: found.psnr,
+        ssim: found.ssim,
+        threshold_per_mm: found.threshold.dynamic_per_mm,
+        volume_phases: volume.map_or(0, |v| v.phases.len() as u32),
+        tree_phases: tree.map_or(0, |t| t.phases.len() as u32),
+        volume_dice: or_nan(shape.map(|s| s.dice)),
+        chamfer_mm: or_nan(shape.and_then(|s| s.chamfer_mm)),
+        hausdorff95_mm: or_nan(shape.and_then(|s| s.hausdorff95_mm)),
+        true_centreline_found: or_nan(shape.and_then(|s| s.true_centreline_found)),
+        our_centreline_true: or_nan(shape.and_then(|s| s.our_centreline_true)),
+        cl_dice: or_nan(shape.and_then(|s| s.cl_dice)),
+        components: or_nan(shape.map(|s| s.components)),
+        true_components: or_nan(shape.map(|s| s.true_components)),
+        tree_true_centreline_found: or_nan(line.map(|l| l.true_centreline_found)),
+        tree_our_centreline_true: or_nan(line.map(|l| l.our_centreline_true)),
+        tree_ours_to_true_mm: or_nan(line.map(|l| l.ours_to_true_mm)),
+        tree_components: or_nan(line.map(|l| l.components)),
+        radius_error_mm: or_nan(line.and_then(|l| l.radius_error_mm)),
+        radius_rmse_mm: or_nan(line.and_then(|l| l.radius_rmse_mm)),
+        motion_error_mm: or_nan(line.and_then(|l| l.motion_error_mm)),
+    }
+}

@@ -1,0 +1,113 @@
+//! Images of different sizes side by side: each stands in the upper left corner of a canvas that holds them all. Rays begin at
+//! pixel (0, 0), so they are the same on the canvas, and what is beyond an image is hidden as what is behind a blade.
+
+use crate::raster::Image;
+use crate::scan::dataset::{Dataset, Frame, View};
+use crate::scan::frame_checks::Complaint;
+use std::borrow::Cow;
+
+/// Pixels of all images on a canvas, at most, where it is larger than some of them.
+const MOST_PIXELS: usize = 1 << 30;
+
+/// The upper left corner, of `size` (columns, rows), of what has `width` columns.
+pub fn corner<T: Copy>(values: &[T], width: usize, [columns, rows]: [usize; 2]) -> Vec<T> {
+    values.chunks(width).take(rows).flat_map(|row| &row[..columns]).copied().collect()
+}
+
+/// Values of `size` (columns, rows) in the upper left corner of a canvas, and `margin` elsewhere.
+pub fn framed<T: Copy>(values: &[T], [columns, rows]: [usize; 2], [width, height]: [usize; 2], margin: T) -> Vec<T> {
+    let mut canvas = vec![margin; width * height];
+    for (to, from) in canvas.chunks_mut(width).zip(values.chunks(columns)).take(rows) {
+        to[..columns].copy_from_slice(from);
+    }
+    canvas
+}
+
+/// An image in the upper left corner of a canvas (columns, rows) on which its right and lower edges go on.
+pub fn continued(image: Image, [width, height]: [usize; 2]) -> Image {
+    if (image.width, image.height) == (width, height) {
+        return image;
+    }
+    let nearest = |p: usize| (p / width).min(image.height - 1) * image.width + (p % width).min(image.width - 1);
+    Image { width, height, values: (0..width * height).map(|p| image.values[nearest(p)]).collect() }
+}
+
+/// Brings frames that have the sizes of their views onto a canvas that holds them all: its columns and rows. None without frames.
+pub(crate) fn onto_canvas(views: &[View], frames: &mut [Frame]) -> Result<Option<[usize; 2]>, Complaint> {
+    let sizes = || frames.iter().map(|frame| views[frame.view].size);
+    let Some(canvas) = sizes().reduce(|a, b| [a[0].max(b[0]), a[1].max(b[1])]) else { return Ok(None) };
+    if sizes().all(|size| size == canvas) {
+        return Ok(Some(canvas));
+    }
+    let [width, height] = canvas;
+    if frames.len() * width * height > MOST_PIXELS {
+        let value = format!("{} images, the largest of {width} columns and {height} rows", frames.len());
+        let problem = format!("more than {MOST_PIXELS} pixels once all are as large: make the large ones smaller");
+        return Err(Complaint::new("size", value, problem));
+    }
+    for frame in frames {
+        let size = views[frame.view].size;
+        let image = Image { width: size[0], height: size[1], values: std::mem::take(&mut frame.integrals) };
+        frame.integrals = continued(image, canvas).values;
+        frame.mask = frame.mask.take().map(|mask| framed(&mask, size, canvas, false));
+    }
+    Ok(Some(canvas))
+}
+
+impl Dataset {
+    /// Columns and rows of the canvas.
+    pub fn canvas(&self) -> [usize; 2] {
+        [self.width, self.height]
+    }
+
+    /// What a view's image has of values on the canvas.
+    pub fn own<'a, T: Copy>(&self, view: usize, values: &'a [T]) -> Cow<'a, [T]> {
+        let size = self.views[view].size;
+        if size == self.canvas() { Cow::Borrowed(values) } else { Cow::Owned(corner(values, self.width, size)) }
+    }
+
+    /// A frame as large as the images of its view, as it was taken.
+    pub fn own_frame<'a>(&self, frame: &'a Frame) -> Cow<'a, Frame> {
+        if self.views[frame.view].size == self.canvas() {
+            return Cow::Borrowed(frame);
+        }
+        Cow::Owned(Frame {
+            name: frame.name.clone(),
+            integrals: self.own(frame.view, &frame.integrals).into_owned(),
+            mask: frame.mask.as_ref().map(|mask| self.own(frame.view, mask).into_owned()),
+            ..*frame
+        })
+    }
+
+    /// Sizes (columns, rows) of the images, each once, in the order of the views.
+    pub fn sizes(&self) -> Vec<[usize; 2]> {
+        let mut sizes: Vec<[usize; 2]> = Vec::new();
+        for view in &self.views {
+            if !sizes.contains(&view.size) {
+                sizes.push(view.size);
+            }
+        }
+        sizes
+    }
+}
+
+/// Sizes (columns, rows) as a person writes them.
+pub fn in_words(sizes: &[[usize; 2]]) -> String {
+    sizes.iter().map(|[columns, rows]| format!("{columns} x {rows}")).collect::<Vec<_>>().join(" and ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn images_stand_in_the_corner_and_go_on_at_their_edges() {
+        let image = Image { width: 2, height: 2, values: vec![1.0, 2.0, 3.0, 4.0] };
+        let canvas = continued(image.clone(), [4, 3]);
+        assert_eq!(canvas.values, [1.0, 2.0, 2.0, 2.0, 3.0, 4.0, 4.0, 4.0, 3.0, 4.0, 4.0, 4.0]);
+        assert_eq!(corner(&canvas.values, 4, [2, 2]), image.values);
+        let mask = framed(&[true; 4], [2, 2], [3, 3], false);
+        assert_eq!(mask, [true, true, false, true, true, false, false, false, false]);
+        assert_eq!(corner(&mask, 3, [2, 2]), [true; 4]);
+    }
+}
