@@ -1267,7 +1267,8 @@ nertca_status nertca_reconstruction_set_true_tree(nertca_reconstruction *reconst
  * Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`, of which there must be one, and what was reconstructed
  * against the true vessels, where these are known. `threshold_per_mm` is the attenuation from which
  * the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
- * Any thread, also while training.
+ * Any thread, also while training. A library of an earlier version leaves fields alone that it does not know: set them to NaN before,
+ * where that may be.
  *
  * # Safety
  * `scores` must be writable, with its size set.

@@ -56,7 +56,8 @@
 //!
 //! // Draw the first view at the first phase.
 //! let renderer = Renderer::new(&gpu, &model, tuning)?;
-//! let view = renderer.render(&dataset.views[0].rays, dataset.width, dataset.height, 0)?;
+//! let [width, height] = dataset.views[0].size;
+//! let view = renderer.render(&dataset.views[0].rays, width, height, 0)?;
 //! println!("the moving vessels' largest line integral: {}", view.dynamic_integral.iter().fold(0.0, |m, v| v.max(m)));
 //!
 //! // Export the vessels of all phases, on cells of 2 mm.

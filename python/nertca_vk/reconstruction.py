@@ -551,7 +551,7 @@ class Reconstruction:
         counts = [len(branch.radius_mm) for branch in branches]
         words = {
             "branch_phase": [whole("phase", branch.phase) for branch in branches],
-            "branch_first": [sum(counts[:number]) for number in range(len(counts))],
+            "branch_first": np.cumsum([0, *counts])[:-1],
             "branch_points": counts,
         }
         for branch in branches:

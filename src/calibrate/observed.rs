@@ -11,6 +11,8 @@ use rayon::prelude::*;
 
 /// Longer sides are brought to about so many pixels.
 const SIDE: usize = 128;
+/// Least side of a view's images on larger pixels.
+const LEAST_SIDE: usize = 32;
 /// Log-likelihood ratio of "a vessel is here" from which a pixel takes part, at any phase: next to the most a view says.
 const LIKELY: f32 = 2.0;
 /// Pixels that take part are so many more around: tight masks bias noisy data.
@@ -68,6 +70,13 @@ fn binned(values: &[f32], width: usize, factor: usize) -> Vec<f32> {
 fn binned_hidden(hidden: &[bool], width: usize, factor: usize) -> Vec<bool> {
     let values: Vec<f32> = hidden.iter().map(|h| f32::from(u8::from(*h))).collect();
     binned(&values, width, factor).iter().map(|share| *share > 0.0).collect()
+}
+
+/// How many pixels along one larger pixel make the training images about [`SIDE`] wide, and none too small.
+fn factor(dataset: &Dataset) -> usize {
+    let sides = || dataset.training_views().into_iter().flat_map(|view| dataset.views[view].size);
+    let (least, most) = (sides().min().unwrap_or(0), sides().max().unwrap_or(0));
+    ((most as f64 / SIDE as f64).round() as usize).min(least / LEAST_SIDE).max(1)
 }
 
 /// The training frames on larger pixels.
@@ -175,7 +184,7 @@ fn border(visible: &[bool], [width, height]: [usize; 2]) -> Vec<bool> {
 impl Observed {
     /// Analyses a dataset.
     pub fn new(dataset: &Dataset) -> Observed {
-        let factor = ((dataset.width.max(dataset.height) as f64 / SIDE as f64).round() as usize).max(1);
+        let factor = factor(dataset);
         let data = coarsened(dataset, factor);
         let size = [data.width, data.height];
         let n_phases = data.n_phases as usize;

@@ -91,11 +91,13 @@ unsafe fn lines(tree: &nertca_tree) -> Outcome<BTreeMap<u32, Vec<TrueLine>>> {
         )
     };
     let mut lines: BTreeMap<u32, Vec<TrueLine>> = BTreeMap::new();
+    let mut taken = 0;
     for (branch, phase) in phases.iter().enumerate() {
         let (first, count) = (firsts[branch] as usize, counts[branch] as usize);
-        if first + count > tree.points {
-            let problem = format!("branch {branch} ends at point {} of {}", first + count, tree.points);
-            return Err(Failure::argument("branch_points", problem));
+        taken += count;
+        if first.saturating_add(count) > tree.points || taken > tree.points {
+            let problem = format!("branch {branch} has points {first} to {first} + {count} of {}", tree.points);
+            return Err(Failure::argument("branch_points", format!("{problem}, or branches share points")));
         }
         let range = first..first + count;
         let points_mm = points[3 * range.start..3 * range.end].chunks(3).map(DVec3::from_slice).collect();
@@ -117,7 +119,8 @@ unsafe fn copied<T: Copy>(name: &str, from: *const T, count: usize) -> Outcome<V
 /// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`, of which there must be one, and what was reconstructed
 /// against the true vessels, where these are known. `threshold_per_mm` is the attenuation from which
 /// the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
-/// Any thread, also while training.
+/// Any thread, also while training. A library of an earlier version leaves fields alone that it does not know: set them to NaN before,
+/// where that may be.
 ///
 /// # Safety
 /// `scores` must be writable, with its size set.

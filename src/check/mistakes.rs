@@ -117,6 +117,8 @@ fn moved(
     }
     let [width, height] = onto_canvas(&changed.views, &mut changed.frames).ok()??;
     (changed.width, changed.height) = (width, height);
+    let seen: Vec<usize> = changed.training_views();
+    changed.hidden.retain(|view, _| seen.contains(view));
     for (view, hidden) in &mut changed.hidden {
         let own = dataset.own(*view, hidden);
         let own: Vec<bool> = (0..own.len()).map(|i| own[from(i, was(*view))]).collect();

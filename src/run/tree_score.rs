@@ -4,6 +4,7 @@ use crate::error::Result;
 use crate::phantom::tree::Branch;
 use crate::phantom::tree_file::{TREE, TreeFile};
 use crate::scan::dataset::Dataset;
+use crate::scan::truth::{TRUTH, Truth};
 use crate::score::calibrated::{carried_by, in_calibrated_frame};
 use crate::score::trees::{self, TreeScores, TrueLine};
 use crate::score::volume::VOLUMES;
@@ -26,9 +27,11 @@ pub fn score_tree(beat: &BeatTree, dataset: &Dataset) -> Result<Option<TreeScore
         tree.branches.into_iter().map(line).collect()
     };
     let (carried, motion) = (in_calibrated_frame(dataset)?, carried_by(dataset)?);
-    let mut scores = trees::score(beat, carried.as_ref().unwrap_or(dataset), motion.as_ref(), lines)?;
+    let taken = dataset.path.join(TRUTH).is_file().then(|| Truth::load(&dataset.path)).transpose()?;
+    let score = |dataset, motion| trees::score(beat, dataset, taken.as_ref(), motion, lines);
+    let mut scores = score(carried.as_ref().unwrap_or(dataset), motion.as_ref())?;
     if carried.is_some() || motion.is_some() {
-        scores.mean_as_stated = Some(trees::score(beat, dataset, None, lines)?.mean);
+        scores.mean_as_stated = Some(score(dataset, None)?.mean);
     }
     Ok(Some(scores))
 }

@@ -13,6 +13,8 @@ use std::path::{Path, PathBuf};
 
 /// ln(8.670397): the value of an unattenuated pixel in the authors' images.
 pub const I0_LOG: f64 = 2.159_914_6;
+/// What is said of a dataset whose images the authors' layout cannot hold.
+const ONE_SIZE: &str = "has one size for all images, and this dataset has several";
 
 /// What a dataset says besides its frames.
 #[derive(Debug, Clone)]
@@ -129,8 +131,7 @@ impl<'a> Writer<'a> {
             }
             Layout::Nerfca => {
                 if [width, height] != self.size {
-                    let problem = "has one size for all images, and this dataset has several";
-                    return Err(Error::config("layout", "nerfca", problem));
+                    return Err(Error::config("layout", "nerfca", ONE_SIZE));
                 }
                 let values: Vec<f32> = integrals.iter().map(|y| (I0_LOG - f64::from(*y)) as f32).collect();
                 let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
@@ -239,6 +240,9 @@ pub fn write(
     let (low, high) = dataset.depth_range;
     if layout == Layout::Nerfca && (low + high).abs() > 1e-9 {
         return Err(Error::config("layout", "nerfca", "the depth range is not centred"));
+    }
+    if layout == Layout::Nerfca && dataset.sizes().len() > 1 {
+        return Err(Error::config("layout", "nerfca", ONE_SIZE));
     }
     let mut writer = Writer::new(
         out,

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, ViewRays, world_from_lps_mm};
 use crate::scan::dataset::{Dataset, Frame, Split};
 use crate::scan::gating::BeatTime;
-use crate::scan::truth::{TRUTH, Truth};
+use crate::scan::truth::Truth;
 use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
 use crate::score::nearest::{Lines, Place};
 use crate::score::shapes::WITHIN_MM;
@@ -75,20 +75,20 @@ pub struct TreeScores {
 }
 
 /// Scores a tree. `truth` has the true vessels at a moment of the beat, which goes from 0 to the dataset's number of phases.
-/// The dataset is the one that the reconstruction went by, with its unseen views where the reconstruction has them; where
-/// `truth.json` lies beside it, the true vessels are seen as each image was really taken. Where the reconstruction is `carried`
+/// The dataset is the one that the reconstruction went by, with its unseen views where the reconstruction has them; where it is
+/// known how images were really `taken`, the true vessels are seen so. Where the reconstruction is `carried`
 /// against the truth, true vessels are carried along before they are compared in 3D.
 ///
 /// # Errors
-/// [`Error::Io`] and [`Error::Data`] for a `truth.json` that cannot be used; [`Error::Data`] for a truth without vessels.
+/// [`Error::Data`] for a truth without vessels.
 pub fn score(
     beat: &BeatTree,
     dataset: &Dataset,
+    taken: Option<&Truth>,
     carried: Option<&RigidMotion>,
     truth: impl Fn(f64) -> Vec<TrueLine> + Sync,
 ) -> Result<TreeScores> {
-    let taken = dataset.path.join(TRUTH).is_file().then(|| Truth::load(&dataset.path)).transpose()?;
-    let images = Images { dataset, truth: taken.as_ref().map(|taken| TrueFrames::new(taken, dataset)) };
+    let images = Images { dataset, truth: taken.map(|taken| TrueFrames::new(taken, dataset)) };
     let true_at = |phase: u32| {
         let mut lines = truth(f64::from(phase));
         if let Some(motion) = carried {

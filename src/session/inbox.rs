@@ -183,7 +183,10 @@ impl Inbox {
         })?;
         let views = dataset.training_views().len();
         if temporal && views < 2 {
-            return Err(Error::NotReady(format!("{views} views at two phases or more, where at least two are needed")));
+            return Err(Error::NotReady(format!(
+                "{views} views at two phases or more, where at least two are needed (where the C-arm turns or the table moves, \
+                 each frame is a view: the preset paper goes by whole images instead)"
+            )));
         }
         Ok(dataset)
     }

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
+use crate::scan::gating::BeatTime;
 use crate::score::eval::{Evaluation, evaluate, moving_field_warning};
 use crate::score::trees::{self, TrueLine};
 use crate::score::volume::{MOST_VOXELS, TrueVessels, pixel_mm, score_known};
@@ -86,12 +87,23 @@ impl Session {
             // What `tree` finds by itself: its threshold is not that of the images.
             let mut beat = self.trees(threshold_per_mm, None)?;
             beat.phases.retain(|tree| lines.contains_key(&tree.phase));
-            let at = |moment: f64| lines.get(&(moment.round() as u32 % dataset.n_phases)).cloned().unwrap_or_default();
-            evaluation.tree = Some(trees::score(&beat, &dataset, None, at)?);
+            let at = |moment: f64| between(&lines, BeatTime::of(moment, dataset.n_phases), dataset.n_phases);
+            evaluation.tree = Some(trees::score(&beat, &dataset, None, None, at)?);
         }
         evaluation.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
         Ok(evaluation)
     }
+}
+
+/// The lines at a time: those of the nearest phase, on the straight way to the next where that is known; none where neither is.
+fn between(known: &BTreeMap<u32, Vec<TrueLine>>, time: BeatTime, n_phases: u32) -> Vec<TrueLine> {
+    let Some(mut lines) = known.get(&time.phase).cloned() else { return Vec::new() };
+    let [_, (beyond, share)] = time.shown(n_phases);
+    for (line, next) in lines.iter_mut().zip(known.get(&(beyond as u32)).into_iter().flatten()) {
+        line.points_mm.iter_mut().zip(&next.points_mm).for_each(|(a, b)| *a = a.lerp(*b, share));
+        line.radius_mm.iter_mut().zip(&next.radius_mm).for_each(|(a, b)| *a += share * (b - *a));
+    }
+    lines
 }
 
 /// Refuses what is no tree over a beat.

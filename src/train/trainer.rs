@@ -123,6 +123,10 @@ pub fn data_fingerprint(dataset: &Dataset) -> String {
         rest.filter(|s| **s != 0.0).for_each(|s| eat((*s as f32).to_bits()));
         dataset.own(frame.view, &frame.integrals).iter().for_each(|v| eat(v.to_bits()));
     }
+    if dataset.sizes().len() > 1 {
+        // Rays are numbered on the canvas.
+        dataset.canvas().into_iter().for_each(|n| eat(n as u32));
+    }
     fingerprint.hex()
 }
 
