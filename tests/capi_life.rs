@@ -353,6 +353,10 @@ fn frames_of_different_sizes_go_together() {
         };
         ok(unsafe { nertca_reconstruction_add_frame(to, &frame) }, to);
     };
+    // Of no known phase, and larger than all that is trained on at first.
+    let image = pixels(0, 0);
+    let stamped = nertca_frame { phase: -1, time_s: 1.0, ..frame(0, 0, &image) };
+    ok(unsafe { nertca_reconstruction_add_frame(mixed, &stamped) }, mixed);
     let (small, large, train_on, score) = ([17, 14], [SIZE; 2], NERTCA_SPLIT_TRAIN, NERTCA_SPLIT_VALIDATION);
     for phase in 0..PHASES {
         (0..2).for_each(|view| add(mixed, view, phase, small, train_on));
@@ -365,7 +369,7 @@ fn frames_of_different_sizes_go_together() {
     train(mixed, 40);
     train(whole, 40);
     // A cropped frame is seen where it was, three columns further to the left.
-    let (seen, was) = (correction(mixed, 1).matrix, correction(whole, 1).matrix);
+    let (seen, was) = (correction(mixed, 2).matrix, correction(whole, 1).matrix);
     let scale = was.iter().flatten().fold(0f64, |m, v| m.max(v.abs()));
     for k in 0..4 {
         let expected = [was[0][k] - 3.0 * was[2][k], was[1][k], was[2][k]];
