@@ -55,7 +55,7 @@ fn crop_png(file: &Path, w: &Window) {
 }
 
 /// The same dataset with some views cut, and what is said of their detectors with them.
-fn cropped(full: &Dataset, to: &Path) -> Dataset {
+fn cropped(full: &Dataset, to: &Path, windows: &[Window]) -> Dataset {
     for folder in ["images", "masks"] {
         std::fs::create_dir_all(to.join(folder)).unwrap();
     }
@@ -65,7 +65,7 @@ fn cropped(full: &Dataset, to: &Path) -> Dataset {
         for file in &files {
             std::fs::copy(full.path.join(file), to.join(file)).unwrap();
         }
-        let Some(w) = CROPPED.iter().find(|w| files[0].contains(&format!("view{}-", w.view))) else { continue };
+        let Some(w) = windows.iter().find(|w| files[0].contains(&format!("view{}-", w.view))) else { continue };
         crop_npy(&to.join(&files[0]), w);
         crop_png(&to.join(&files[1]), w);
         for axis in 0..2 {
@@ -103,7 +103,7 @@ fn scored(gpu: &Gpu, model: &Model, dataset: &Dataset) -> Evaluation {
 fn a_cropped_view_has_the_rays_and_pixels_it_had() {
     let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
     let full = phantom(&gpu, &directory.path().join("full"), SIZE, 4);
-    let cut = cropped(&full, &directory.path().join("cut"));
+    let cut = cropped(&full, &directory.path().join("cut"), &CROPPED);
     assert_eq!((cut.canvas(), cut.views.len()), ([SIZE; 2], full.views.len()));
     for w in &CROPPED {
         let (a, b) = (&full.views[view(&full, w.view)], view(&cut, w.view));
@@ -139,6 +139,25 @@ fn a_cropped_view_has_the_rays_and_pixels_it_had() {
     assert!(again.frames.iter().zip(&cut.frames).all(|(a, b)| a.integrals == b.integrals && a.mask == b.mask));
     let refused = convert(&cut, Layout::Nerfca, &directory.path().join("theirs")).unwrap_err().to_string();
     assert!(refused.contains("one size for all images"), "{refused}");
+    assert!(!directory.path().join("theirs").exists(), "nothing is written of what cannot be");
+    expect_silence(gpu);
+}
+
+/// What `check` tries turns images on their side, whose canvas then is another.
+#[test]
+fn unseen_images_of_another_shape_change_no_check() {
+    let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
+    let full = phantom(&gpu, &directory.path().join("full"), SIZE, 4);
+    let window = |view| match view {
+        0..4 => Window { view, first: [5, 0], size: [90, SIZE] },
+        _ => Window { view, first: [0, 5], size: [SIZE, 90] },
+    };
+    let windows: Vec<Window> = (0..full.views.len()).map(window).collect();
+    let cut = cropped(&full, &directory.path().join("cut"), &windows);
+    let training = cut.training_views();
+    assert!((0..cut.views.len()).all(|view| (cut.views[view].size == [90, SIZE]) == training.contains(&view)));
+    assert_eq!(cut.canvas(), [SIZE; 2]);
+    assert!(check(&cut).unwrap().sound());
     expect_silence(gpu);
 }
 
@@ -146,7 +165,7 @@ fn a_cropped_view_has_the_rays_and_pixels_it_had() {
 fn a_reconstruction_of_cropped_views_is_as_good_and_scored_on_what_they_show() {
     let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
     let full = phantom(&gpu, &directory.path().join("full"), SIZE, 4);
-    let cut = cropped(&full, &directory.path().join("cut"));
+    let cut = cropped(&full, &directory.path().join("cut"), &CROPPED);
     let (of_full, of_cut) = (trained(&gpu, &full), trained(&gpu, &cut));
     // Of the same model, images that were left alone score the same, and cut ones as they do by hand.
     let (a, b) = (scored(&gpu, &of_full, &full), scored(&gpu, &of_full, &cut));

@@ -98,7 +98,7 @@ def test_detectors_mean_what_they_say(context: Context) -> None:
 def test_views_are_drawn_as_they_were_taken(trained: Reconstruction) -> None:
     image = drawn(trained)
     assert image.shape == (SIZE, SIZE) and image.dtype == np.float32
-    assert np.abs(image - pixels(0, 0)).mean() < 0.1
+    assert np.abs(image - pixels(0, 0)).mean() < 0.15
     parts = drawn(trained, component="static") + drawn(trained, component="dynamic")
     np.testing.assert_allclose(parts, image, atol=1e-5)
     assert drawn(trained, projection="mip").max() < 0.2, "1/mm"
@@ -193,12 +193,14 @@ def test_a_tree_is_its_own_truth(context: Context) -> None:
 
 
 def test_phases_come_from_r_peaks(context: Context) -> None:
+    # In the middle of phases, which are even parts of a beat of this length.
+    beat_s = 0.31 / 0.35
     with empty(context) as by_time, filled(context) as by_phase:
         for view, phase, image in frames():
-            by_time.add_frame(image, geometry(view), time_s=10.0 + (phase + 0.1) / PHASES)
+            by_time.add_frame(image, geometry(view), time_s=10.0 + beat_s * (phase + 0.5) / PHASES)
         with pytest.raises(nertca_vk.NotReadyError):
             by_time.train(5)
-        by_time.set_r_peaks([10.0, 11.0])
+        by_time.set_r_peaks([10.0, 10.0 + beat_s])
         assert by_time.train(5) == by_phase.train(5) == 5
         assert by_time.save_bytes() == by_phase.save_bytes()
 
