@@ -125,7 +125,8 @@ fn gaussians_are_measured_as_they_run() {
     let passes = report["passes_ms"].as_object().unwrap();
     for name in ["tree_project", "gaussian_splat", "gaussian_residual", "gaussian_moments", "tree_grid_update", "adam"]
     {
-        assert!(passes[name].as_f64().unwrap() > 0.0, "{name}");
+        // Of whichever variant the device takes.
+        assert!(passes.iter().any(|(pass, ms)| pass.starts_with(name) && ms.as_f64().unwrap() > 0.0), "{name}");
     }
     assert!(!passes.contains_key("tree_guess") && !passes.contains_key("gaussian_update"));
     // A report of a version without Gaussians.

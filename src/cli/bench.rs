@@ -294,7 +294,7 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
 
 /// Whether a pass is one over pairs of a Gaussian and a pixel, whose operations are counted.
 fn is_over_pairs(pass: &str) -> bool {
-    ["gaussian_splat", "gaussian_moments"].contains(&pass)
+    ["gaussian_splat", "gaussian_moments"].iter().any(|stage| pass.starts_with(stage))
 }
 
 /// Whether a pass belongs to the network whose operations are counted.
