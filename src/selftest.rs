@@ -67,15 +67,16 @@ impl Report {
 /// A part of the test.
 type Part<'a> = (String, Box<dyn Fn(&mut Findings) -> Result<()> + 'a>);
 
-/// The parts for a path through the network's layers.
-fn network_parts<'a>(gpu: &'a Gpu, dataset: &'a Dataset, tuning: &'a Tuning) -> Vec<Part<'a>> {
+/// The parts for a path through the network's layers, on images at phases (`even`) and between them (`dataset`).
+fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuning: &'a Tuning) -> Vec<Part<'a>> {
     let name = |what: &str| format!("{what} ({})", iteration::path_name(tuning.layers));
     let cases = match tuning.layers {
-        Layers::F32 => iteration::F32_CASES,
-        Layers::Matrices => iteration::MATRIX_CASES,
+        Layers::F32 => vec![(dataset, iteration::F32_CASES)],
+        Layers::Matrices => vec![(even, iteration::MATRIX_CASES), (dataset, iteration::MATRIX_CASES_BETWEEN_PHASES)],
     };
     let iterations = move |findings: &mut Findings| {
-        cases.iter().try_for_each(|case| iteration::compare(gpu, dataset, case, tuning, findings))
+        let mut all = cases.iter().flat_map(|(images, cases)| cases.iter().map(move |case| (images, case)));
+        all.try_for_each(|(images, case)| iteration::compare(gpu, images, case, tuning, findings))
     };
     let views = move |findings: &mut Findings| {
         let presets = [Preset::Paper, Preset::PublicCode, Preset::FastMlp];
@@ -108,15 +109,15 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
 /// # Errors
 /// [`Error::DeviceLost`], after which nothing can be told; other errors are part of the report.
 pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Report> {
-    let dataset = problems::uneven_dataset(13, 11)?;
+    let (even, dataset) = (problems::small_dataset(13, 11, 3)?, problems::uneven_dataset(13, 11)?);
     let chosen = Tuning::for_device(gpu.info());
     let on = |layers| chosen.clone().with_layers(layers, String::new());
     let (f32_layers, matrices) = (on(Layers::F32), on(Layers::Matrices));
     let has_matrices = !gpu.info().matrices.is_empty();
     let mut parts = other_parts(gpu, &f32_layers);
-    parts.extend(network_parts(gpu, &dataset, &f32_layers));
+    parts.extend(network_parts(gpu, &even, &dataset, &f32_layers));
     if has_matrices {
-        parts.extend(network_parts(gpu, &dataset, &matrices));
+        parts.extend(network_parts(gpu, &even, &dataset, &matrices));
     }
     let (mut findings, mut errors) = (Findings::default(), Vec::new());
     for (at, (part, compare)) in parts.iter().enumerate() {

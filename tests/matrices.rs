@@ -12,7 +12,7 @@ use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
 use nertca_vk::selftest::drawing;
-use nertca_vk::selftest::iteration::{self, Case, MATRIX_CASES};
+use nertca_vk::selftest::iteration::{self, Case, MATRIX_CASES, MATRIX_CASES_BETWEEN_PHASES};
 use nertca_vk::train::calibrate::{self, Verdict};
 use nertca_vk::train::trainer::Trainer;
 
@@ -39,11 +39,13 @@ const GPU_CASE: Case = Case {
 #[test]
 fn every_stage_of_an_iteration_matches() {
     let Some((gpu, tuning)) = matrices() else { return };
-    let dataset = uneven_dataset(13, 11);
-    let cases = MATRIX_CASES.iter().map(|case| (case, CPU)).chain([(&GPU_CASE, GPU)]);
-    for (case, matrices) in cases {
+    let (even, uneven) = (small_dataset(13, 11), uneven_dataset(13, 11));
+    let at_phases = MATRIX_CASES.iter().map(|case| (&even, case, CPU)).chain([(&even, &GPU_CASE, GPU)]);
+    for (dataset, case, matrices) in
+        at_phases.chain(MATRIX_CASES_BETWEEN_PHASES.iter().map(|case| (&uneven, case, CPU)))
+    {
         let path = Tuning { matrices, ..tuning.clone() };
-        expect_agreement(|findings| iteration::compare(&gpu, &dataset, case, &path, findings));
+        expect_agreement(|findings| iteration::compare(&gpu, dataset, case, &path, findings));
     }
     expect_silence(gpu);
 }

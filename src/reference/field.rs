@@ -202,16 +202,18 @@ pub fn network_bwd(
         let mut dz_in = vec![0.0; p.width];
         for (j, scaled) in dz.iter().enumerate() {
             let g = scaled / scale;
-            gradient[layer.bias + j] += g;
+            // Where a layer has latents, its bias is part of the phases' rows.
+            let rows = shown.iter().map(|(_, share)| round(*share)).sum::<f64>();
+            gradient[layer.bias + j] += if layer.latent.is_some() { rows * g } else { g };
             if let Some(at) = layer.encoded {
                 let row = at + j * p.encode_groups * 4;
                 trace.encoded.iter().enumerate().for_each(|(k, e)| gradient[row + k] += g * e);
             }
             if let Some(at) = layer.latent {
                 for (l, (phase, share)) in (0..p.latent).flat_map(|l| shown.map(|shown| (l, shown))) {
-                    let value = p.latents + phase * p.latent + l;
-                    gradient[at + j * p.latent + l] += share * g * params[value];
-                    gradient[value] += share * g * params[at + j * p.latent + l];
+                    let (value, of_phase) = (p.latents + phase * p.latent + l, round(share) * g);
+                    gradient[at + j * p.latent + l] += of_phase * params[value];
+                    gradient[value] += of_phase * params[at + j * p.latent + l];
                 }
             }
             if let (Some(at), true) = (layer.hidden, i > 0) {

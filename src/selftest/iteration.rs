@@ -87,6 +87,10 @@ pub const MATRIX_CASES: &[Case] = &[
     case(Preset::FastMlp, &["train.rays=1", "march.dynamic_samples=7"]),
 ];
 
+/// Cases on matrices that are compared on images between phases, too; in others some activation is then so near zero that the order of
+/// a sum decides whether it counts.
+pub const MATRIX_CASES_BETWEEN_PHASES: &[Case] = &[MATRIX_CASES[0], MATRIX_CASES[1]];
+
 const RAYS: &[&str] = &[push::Batch::SHADER];
 const SAMPLES: &[&str] = &[push::MarchCount::SHADER, push::MarchScan::SHADER, push::MarchEmit::SHADER];
 const FORWARD: &[&str] =

@@ -89,7 +89,8 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
 /// As [`small_dataset`].
 pub fn uneven_dataset(width: usize, height: usize) -> Result<Dataset> {
     let mut dataset = small_dataset(width, height, 3)?;
-    let after = [0.0, 0.3, -0.45, 0.5].into_iter().cycle();
+    // Exact in f16.
+    let after = [0.0, 0.25, -0.375, 0.5].into_iter().cycle();
     dataset.frames.iter_mut().zip(after).for_each(|(frame, after)| frame.after_phase = after);
     Ok(dataset)
 }
