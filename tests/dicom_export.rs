@@ -6,30 +6,20 @@
 mod program;
 #[path = "common/python.rs"]
 mod python;
+#[path = "common/said.rs"]
+mod said;
 
 use dicom_dictionary_std::tags;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::Geometry;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::scan::dataset::Dataset;
-use program::program;
 use python::python;
+use said::{run, text};
 use std::path::Path;
 
 const PHASES: usize = 4;
 const ANGLES: (f64, f64) = (-31.25, 22.5);
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
-}
-
-#[track_caller]
-fn run(args: &[&str], succeeds: bool) -> String {
-    let out = program().args(args).output().unwrap();
-    let said = String::from_utf8(out.stderr).unwrap();
-    assert_eq!(out.status.success(), succeeds, "{args:?}: {said}");
-    said
-}
 
 #[test]
 fn a_rendered_beat_is_an_angiogram() {

@@ -7,28 +7,18 @@
 mod program;
 #[path = "common/python.rs"]
 mod python;
+#[path = "common/said.rs"]
+mod said;
 
 use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::scan::dataset::Dataset;
-use program::program;
 use python::python;
+use said::{run, text};
 use std::path::{Path, PathBuf};
 
 const PHASES: usize = 6;
 /// Frames of the run that turns, by 10 degrees each.
 const TURNING: usize = 12;
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
-}
-
-#[track_caller]
-fn run(args: &[&str], succeeds: bool) -> String {
-    let out = program().args(args).output().unwrap();
-    let said = String::from_utf8(out.stderr).unwrap();
-    assert_eq!(out.status.success(), succeeds, "{args:?}: {said}");
-    said
-}
 
 fn c_arms(data: &Path) -> Vec<CArm> {
     let c_arm = |geometry: &Geometry| match geometry {
