@@ -386,6 +386,35 @@ fn contrast_varies_by_the_gains_of_the_truth() {
 }
 
 #[test]
+fn contrast_flows_in_with_the_time_of_a_run() {
+    let gpu = gpu();
+    let files = Files::new();
+    // Regular phases are equal parts of a second.
+    let (full, flowing) = (
+        files.patient(&gpu, false, Degradations::default()),
+        files.patient(&gpu, false, Degradations { inflow_s: 0.5, ..Degradations::default() }),
+    );
+    let mut shares: Vec<Vec<f64>> = vec![Vec::new(); TRAINING];
+    for (frame, truth) in flowing.frames() {
+        let everything = full.same(frame);
+        let sum = |integrals: &[f32]| integrals.iter().map(|v| f64::from(*v)).sum::<f64>();
+        if truth.split == Split::Validation || truth.time_s >= 0.5 {
+            assert_eq!((truth.filled_to, bits(&frame.integrals)), (1.0, bits(&everything.integrals)), "{}", frame.name);
+        } else {
+            assert!((truth.filled_to - truth.time_s / 0.5).abs() < 1e-12);
+            let above = frame.integrals.iter().zip(&everything.integrals).all(|(some, all)| *some <= all + 1e-6);
+            assert!(above, "{}: nothing is denser than when full", frame.name);
+            shares[truth.view].push(sum(&frame.integrals) / sum(&everything.integrals));
+        }
+    }
+    for view in shares {
+        assert!(view[0] == 0.0 && view.windows(2).all(|pair| pair[1] > pair[0]), "{view:?}");
+        assert!(view.len() > 1 && view[view.len() - 1] > 0.2, "{view:?}");
+    }
+    expect_silence(gpu);
+}
+
+#[test]
 fn images_show_the_heart_at_the_time_they_are_taken() {
     let gpu = gpu();
     let pictures = Pictures::new(&gpu);
@@ -603,6 +632,7 @@ fn volumes_are_degraded_like_phantoms() {
     refused(Degradations { contrast_variation: 0.1, ..Degradations::default() }, "vessel_per_mm");
     refused(Degradations { collimated_share: 0.1, ..Degradations::default() }, "vessel_per_mm");
     refused(Degradations { catheter: true, ..Degradations::default() }, "ostium");
+    refused(Degradations { inflow_s: 0.5, ..Degradations::default() }, "ostium");
     expect_silence(gpu);
 }
 

@@ -138,6 +138,10 @@ pub struct DegradationArgs {
     /// Contrast density differs between runs: its standard deviation, percent. Within a run it drifts half as much.
     #[arg(long, value_name = "PERCENT", default_value_t = 0.0, allow_hyphen_values = true)]
     pub contrast_variation: f64,
+    /// Contrast enters the vessels with the first image of a run and reaches their ends after so many seconds. Full from the
+    /// start without.
+    #[arg(long, value_name = "S", default_value_t = 0.0, allow_hyphen_values = true)]
+    pub inflow: f64,
     /// Beats per minute, one for all training views or one for each: images are taken at --fps from anywhere in the beat, and
     /// each phase gets the nearest image by --gating, where one is nearer than half a phase. Regular phases without.
     #[arg(long, value_name = "BPM[,BPM...]", value_delimiter = ',', allow_hyphen_values = true)]
@@ -167,6 +171,7 @@ impl DegradationArgs {
             breathing: self.breathing.map(|breathing| Breathing { background, ..breathing }),
             photons: open.or(self.detector_photons.map(Photons::Detector)),
             contrast_variation: self.contrast_variation / 100.0,
+            inflow_s: self.inflow,
             rhythm: (!self.heart_rate.is_empty()).then(|| Rhythm {
                 beats_per_min: self.heart_rate.clone(),
                 frames_per_s: self.fps,

@@ -217,8 +217,12 @@ pub fn project_volumes(
 
 /// Refuses degradations of volumes that lack what they are done to.
 fn check_vessels(degradations: &Degradations, vessel_per_mm: Option<f64>) -> Result<()> {
+    const WITHOUT_OSTIUM: &str = "volumes do not say where the ostium is; phantoms do";
     if degradations.catheter {
-        return Err(Error::config("catheter", true, "volumes do not say where the ostium is; phantoms do"));
+        return Err(Error::config("catheter", true, WITHOUT_OSTIUM));
+    }
+    if degradations.inflow_s > 0.0 {
+        return Err(Error::config("inflow_s", degradations.inflow_s, WITHOUT_OSTIUM));
     }
     let of_vessels =
         [("contrast_variation", degradations.contrast_variation), ("collimated_share", degradations.collimated_share)];
@@ -298,7 +302,7 @@ impl<'a> Camera<'a> {
     }
 
     fn expose(&mut self, view: usize, shot: &Shot, catheter: bool) -> Result<Exposure> {
-        let pose = Pose { fraction: shot.fraction, breath: shot.breath, catheter };
+        let pose = Pose { fraction: shot.fraction, breath: shot.breath, catheter, filled_to: shot.filled_to };
         let moving = match self.drawn.take() {
             Some((drawn, moving)) if drawn == pose => moving,
             _ => self.stage.subject.moving(self.projector, &pose)?,
@@ -419,6 +423,7 @@ fn shoot(
                 beat_phase: shot.fraction * f64::from(stage.phases),
                 time_s: shot.time_s,
                 contrast_gain: shot.contrast_gain,
+                filled_to: shot.filled_to,
                 cut_share: blade.as_ref().map_or(0.0, |blade| blade.cut_share),
             });
         }

@@ -17,6 +17,8 @@ pub const USUAL_BREATH_S: f64 = 4.0;
 pub const USUAL_FRAMES_PER_S: f64 = 15.0;
 /// Length of an ordinary run, beats: contrast fills the vessels for about so long.
 pub const USUAL_BEATS: u32 = 3;
+/// Contrast that takes longer to reach the ends of the vessels is none that one takes angiograms of, seconds.
+const LONGEST_INFLOW_S: f64 = 10.0;
 /// Largest share of the vessels that may be cut off.
 const LARGEST_CUT: f64 = 0.9;
 
@@ -31,6 +33,9 @@ pub struct Degradations {
     pub photons: Option<Photons>,
     /// Standard deviation of a run's contrast density as a share of it; within a run it drifts half as much.
     pub contrast_variation: f64,
+    /// Contrast enters the vessels with the first image of a run and reaches their ends after so many seconds; vessels are full
+    /// from the start where it is 0.
+    pub inflow_s: f64,
     /// Hearts that beat at rates of their own, seen at a frame rate.
     pub rhythm: Option<Rhythm>,
     /// Share of the moving vessels that blades hide in each view, 0 to 0.9.
@@ -132,6 +137,7 @@ impl Degradations {
             within(field, value, 1.0..=1e15, "")?;
         }
         within("contrast_variation", self.contrast_variation, 0.0..=1.0, "")?;
+        within("inflow_s", self.inflow_s, 0.0..=LONGEST_INFLOW_S, " s")?;
         within("collimated_share", self.collimated_share, 0.0..=LARGEST_CUT, "")?;
         self.rhythm.as_ref().map_or(Ok(()), |rhythm| rhythm.check(training_views))
     }

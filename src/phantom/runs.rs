@@ -33,14 +33,20 @@ pub(super) struct Shot {
     pub(super) breath: Breath,
     /// Factor on the vessels' contrast.
     pub(super) contrast_gain: f64,
+    /// Share of the way to the farthest end of the vessels that contrast has come; 1 and more where it is everywhere.
+    pub(super) filled_to: f64,
 }
 
 impl Shot {
     /// A phase of a heart that keeps to the phases, in held breath.
     pub(super) fn at_phase(phase: u32, phases: u32) -> Shot {
         let fraction = f64::from(phase) / f64::from(phases);
-        let (stated, time_s) = (BeatTime::at_phase(phase), USUAL_BEAT_S * fraction);
-        Shot { stated, time_s, fraction, breath: Breath::default(), contrast_gain: 1.0 }
+        Shot::full(BeatTime::at_phase(phase), USUAL_BEAT_S * fraction, fraction)
+    }
+
+    /// Of full vessels in held breath.
+    fn full(stated: BeatTime, time_s: f64, fraction: f64) -> Shot {
+        Shot { stated, time_s, fraction, breath: Breath::default(), contrast_gain: 1.0, filled_to: 1.0 }
     }
 }
 
@@ -59,6 +65,9 @@ pub(super) fn shots(options: &Degradations, seed: u32, view: usize, split: Split
         shot.breath = options.breathing.map_or_else(Breath::default, |breathing| breathing.at(shot.time_s, chance));
         if options.contrast_variation > 0.0 {
             shot.contrast_gain = contrast_gain(options.contrast_variation, shot.time_s, chance);
+        }
+        if options.inflow_s > 0.0 {
+            shot.filled_to = (shot.time_s / options.inflow_s).min(1.0);
         }
     }
     shots
@@ -79,7 +88,7 @@ fn gated(rhythm: &Rhythm, chance: Chance, phases: u32) -> Vec<Option<Shot>> {
         let slot = &mut nearest[stated.phase as usize];
         if slot.is_none_or(|best| stated.after_phase.abs() < best.stated.after_phase.abs()) {
             let fraction = two_segment_fraction(since_r_s, beat_s, systole_s).rem_euclid(1.0);
-            *slot = Some(Shot { stated, time_s, fraction, breath: Breath::default(), contrast_gain: 1.0 });
+            *slot = Some(Shot::full(stated, time_s, fraction));
         }
     }
     nearest

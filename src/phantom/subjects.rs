@@ -26,6 +26,8 @@ pub(super) struct Pose {
     pub(super) fraction: f64,
     pub(super) breath: Breath,
     pub(super) catheter: bool,
+    /// As in [`crate::phantom::runs::Shot`].
+    pub(super) filled_to: f64,
 }
 
 impl Pose {
@@ -140,7 +142,7 @@ impl Subject for Thorax {
         Ok(Moving {
             background: Some(Placed::at_rest(projector.load(self.background(pose.fraction, pose.breath))?)),
             vessels: Some(Placed {
-                volume: Arc::new(projector.load(self.vessels(&tree))?),
+                volume: Arc::new(projector.load(self.vessels(&tree.filled_to(pose.filled_to)))?),
                 shift_mm: pose.breath.heart_mm,
             }),
             catheter: catheter.map(|volume| projector.load(volume)).transpose()?.map(Placed::at_rest),
@@ -207,7 +209,7 @@ impl Subject for Patient {
         Ok(Moving {
             background: None,
             vessels: Some(Placed {
-                volume: Arc::new(projector.load(self.vessels(&tree))?),
+                volume: Arc::new(projector.load(self.vessels(&tree.filled_to(pose.filled_to)))?),
                 shift_mm: pose.breath.heart_mm,
             }),
             catheter: catheter.map(|volume| projector.load(volume)).transpose()?.map(Placed::at_rest),

@@ -52,8 +52,16 @@ pub struct TrueFrame {
     pub time_s: f64,
     /// Factor on the contrast of the vessels.
     pub contrast_gain: f64,
+    /// Share of the way to the farthest end of the vessels that contrast has come; 1 where it is everywhere.
+    #[serde(default = "everywhere")]
+    pub filled_to: f64,
     /// Share of the view's moving vessels that a blade hides, all phases taken together.
     pub cut_share: f64,
+}
+
+/// [`TrueFrame::filled_to`] in files from before it was told.
+fn everywhere() -> f64 {
+    1.0
 }
 
 impl Truth {

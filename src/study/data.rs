@@ -59,6 +59,7 @@ pub struct PhantomSection {
     /// Per pixel at the detector.
     detector_photons: Option<f64>,
     contrast_variation_percent: Option<f64>,
+    inflow_s: Option<f64>,
     heart: Option<Rhythm>,
     collimated_share: Option<f64>,
 }
@@ -85,6 +86,7 @@ impl PhantomSection {
             photons: if counted { self.photons } else { common.photons },
             detector_photons: if counted { self.detector_photons } else { common.detector_photons },
             contrast_variation_percent: self.contrast_variation_percent.or(common.contrast_variation_percent),
+            inflow_s: self.inflow_s.or(common.inflow_s),
             heart: self.heart.or(common.heart),
             collimated_share: self.collimated_share.or(common.collimated_share),
         }
@@ -100,6 +102,7 @@ impl PhantomSection {
             breathing: self.breathing,
             photons,
             contrast_variation: self.contrast_variation_percent.unwrap_or(0.0) / 100.0,
+            inflow_s: self.inflow_s.unwrap_or(0.0),
             rhythm: self.heart.clone(),
             collimated_share: self.collimated_share.unwrap_or(0.0),
             catheter: self.catheter.unwrap_or(false),

@@ -182,6 +182,7 @@ impl Shot {
             beat_phase: f.phase.into(),
             time_s: 0.0,
             contrast_gain: 1.0,
+            filled_to: 1.0,
             cut_share: 0.0,
         };
         let mut truth = Truth::new(0, PHASES);
