@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Gradient of the grid's displacements: of the Gaussians around each node, in their order, and of the smoothness
-// penalty on squared differences of neighbouring nodes. One invocation per node (x) and PHASES phases (y):
+// penalty on squared differences of neighbouring nodes; none at the phase of rest. One invocation per node (x) and PHASES phases (y):
 // a Gaussian's share of a node is the same at all of them.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_tree.glsl"
@@ -39,6 +39,7 @@ void main() {
             if (node[axis] + 1u < n) bend += here - motion_grid[at + stride];
             stride *= n;
         }
-        motion_grid_gradient[at] = sums[t - begin] + 2.0 * tree_setup.smoothness * bend;
+        bool rests = push.first_phase + t == tree_setup.rest_phase;
+        motion_grid_gradient[at] = rests ? vec4(0.0) : sums[t - begin] + 2.0 * tree_setup.smoothness * bend;
     }
 }

@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adam on the grid's displacements. One invocation per node (x) and phase (y).
+// Adam on the grid's displacements, which rests at one phase. One invocation per node (x) and phase (y).
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_tree.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -17,8 +17,9 @@ layout(binding = 7) buffer B7 { vec4 motion_grid_second[]; };
 
 void main() {
     uint n_nodes = tree_setup.n_nodes * tree_setup.n_nodes * tree_setup.n_nodes;
-    if (gl_GlobalInvocationID.x >= n_nodes) return;
-    uint at = (push.first_phase + gl_WorkGroupID.y) * n_nodes + gl_GlobalInvocationID.x;
+    uint phase = push.first_phase + gl_WorkGroupID.y;
+    if (gl_GlobalInvocationID.x >= n_nodes || phase == tree_setup.rest_phase) return;
+    uint at = phase * n_nodes + gl_GlobalInvocationID.x;
     vec4 first = motion_grid_first[at], second = motion_grid_second[at];
     GaussianSchedule now = gaussian_schedule[gaussian_step];
     motion_grid[at] -= adam(motion_grid_gradient[at], vec4(tree_setup.grid_rate), now, first, second);

@@ -10,7 +10,7 @@ layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { TreeSetup tree_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { Gaussian gaussians[]; };
-// [phase][node]: displacement; none at phase 0.
+// [phase][node]: displacement; none at the phase of rest.
 layout(binding = 4) readonly buffer B4 { vec4 motion_grid[]; };
 // [Gaussian][basis function]
 layout(binding = 5) readonly buffer B5 { vec4 own_motion[]; };

@@ -751,7 +751,7 @@ typedef struct {
    */
   double radius_rmse_mm;
   /**
-   * Mean distance between where our points have come since phase 0 and where the true points beside them have, mm.
+   * Mean distance between where our points have come since the phase that is followed and where the true points beside them have, mm.
    */
   double motion_error_mm;
 } nertca_scores;

@@ -195,6 +195,7 @@ pub mod render {
 /// Training: from a plan to a checkpoint.
 pub mod train {
     pub mod calibrate;
+    mod carried;
     pub mod gaussians;
     pub mod moving;
     pub mod step;
@@ -293,6 +294,7 @@ pub mod phantom {
     mod catheter;
     pub mod dataset;
     pub mod degradations;
+    mod inflow;
     pub mod noise;
     pub mod projector;
     mod runs;

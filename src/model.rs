@@ -2,6 +2,7 @@
 
 pub mod checkpoint;
 pub mod component;
+mod conversions;
 mod gaussian_tensors;
 pub mod gaussians;
 pub mod groups;

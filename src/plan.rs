@@ -194,7 +194,13 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     notes.extend(without_motion(dataset, &soft));
     notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
     notes.push(match form {
-        GaussianForm::Tree => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
+        GaussianForm::Tree => match targets.rest_phase {
+            0 => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
+            phase => format!(
+                "one set of Gaussians moves over the beat (gaussians.form = \"tree\") from phase {phase} on, which shows more of the \
+                 vessels than phase 0"
+            ),
+        },
         _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))

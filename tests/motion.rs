@@ -30,14 +30,16 @@ const NODES: u32 = 5;
 const HALF_SIDE: f64 = 44.0;
 /// Columns and rows of the pictures.
 const SIZE: [usize; 2] = [19, 15];
+/// The phase at which Gaussians are where their positions say.
+const REST: usize = 1;
 
 /// What the grid adds to a point at each phase: linear in the point, so that a grid holds it exactly.
 fn displacement(x: DVec3, phase: usize) -> DVec3 {
     let turn =
         DMat3::from_cols(DVec3::new(0.06, 0.02, -0.03), DVec3::new(-0.05, 0.04, 0.01), DVec3::new(0.02, -0.04, 0.03));
     match phase {
-        0 => DVec3::ZERO,
-        1 => turn * x + DVec3::new(2.0, -3.0, 1.0),
+        REST => DVec3::ZERO,
+        0 => turn * x + DVec3::new(2.0, -3.0, 1.0),
         _ => 0.5 * (turn * x) + DVec3::new(-1.5, 0.5, 3.0),
     }
 }
@@ -59,7 +61,7 @@ fn place(i: usize, phase: f64) -> DVec3 {
     let x = rest(i);
     let moved = (1.0 - share) * displacement(x, before) + share * displacement(x, (before + 1) % PHASES);
     let own_at = |phase: usize| {
-        let angle = std::f64::consts::TAU * phase as f64 / PHASES as f64;
+        let angle = std::f64::consts::TAU * (phase as f64 - REST as f64) / PHASES as f64;
         (angle.cos() - 1.0) * own(i)[0] + angle.sin() * own(i)[1]
     };
     x + moved + own_at(before).lerp(own_at(before + 1), share)
@@ -74,7 +76,7 @@ fn tree() -> MovingTree {
         position: rest(i).as_vec3().to_array(),
         log_density: -1.0 + 0.1 * i as f32,
         log_scale: [0.1 * i as f32, 0.4, -0.2],
-        phase: 0,
+        phase: REST as u32,
         rotation: [1.0, 0.2 * i as f32, -0.3, 0.5],
     };
     MovingTree {
@@ -91,6 +93,7 @@ fn tree() -> MovingTree {
             half_side: HALF_SIDE as f32,
             inverse_step: (1.0 / step) as f32,
             n_basis: 2,
+            rest_phase: REST as u32,
             ..TreeSetup::default()
         },
         grid: (0..PHASES).flat_map(|t| (0..n.pow(3)).map(move |i| pack(displacement(node(i), t)))).collect(),
@@ -278,6 +281,7 @@ fn motion_opens_in_other_tools() {
     assert!(places.iter().all(|x| x.abs().max_element() < HALF_SIDE));
     let expected = json!({
         "phases": PHASES,
+        "rest_phase": REST,
         "size": NODES,
         "places_mm": places.iter().map(|x| lps_mm(*x)).collect::<Vec<_>>(),
         "displacements_mm": (0..PHASES)
@@ -332,11 +336,12 @@ fn a_run_of_gaussians_is_described() {
     let run = saved(moving_model(), &dir.path().join("tree.safetensors"));
     let info: Value = serde_json::from_str(&ok(&["info", &run, "--json"])).unwrap();
     let told = &info["gaussians"];
-    assert_eq!((&told["form"], &told["count"]), (&json!("tree"), &json!(6)));
+    assert_eq!((&told["form"], &told["count"], &told["rest_phase"]), (&json!("tree"), &json!(6), &json!(REST)));
     // 11 numbers a Gaussian, two vectors of own motion, and the grid.
     assert_eq!(told["bytes"], 4 * (6 * 11 + 6 * 2 * 3 + PHASES * 125 * 3));
     for phase in 0..PHASES {
-        let mm: Vec<f64> = (0..6).map(|i| 100.0 * UNITS.pixel * place(i, phase as f64).distance(rest(i))).collect();
+        let mm: Vec<f64> =
+            (0..6).map(|i| 100.0 * UNITS.pixel * place(i, phase as f64).distance(place(i, 0.0))).collect();
         let of = &told["displacement_from_phase_0"][phase];
         let (mean, largest) = (mm.iter().sum::<f64>() / 6.0, mm.iter().copied().fold(0.0, f64::max));
         assert!((of["mean_mm"].as_f64().unwrap() - mean).abs() < 1e-4, "{of} at phase {phase}, not {mean}");

@@ -64,6 +64,7 @@ struct TreeSetup {
     float own_penalty;          // penalty on squared own motion
     float grid_rate;            // Adam's rate of displacements
     float own_rate;             // Adam's rate of own motion
+    uint rest_phase;            // cardiac phase at which Gaussians are where their positions say
 };
 
 // A Gaussian in an image: q = a du^2 + 2 b du dv + c dv^2, value = amplitude exp(-q / 2) within the box.

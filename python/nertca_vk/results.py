@@ -103,7 +103,7 @@ class Scores:
     radius_rmse_mm: float
     """Root of the mean square of the same, mm."""
     motion_error_mm: float
-    """Mean distance between where our points have come since phase 0 and where the true points beside them have, mm."""
+    """Mean distance between where our points have come since the phase that is followed and where the true points beside them have, mm."""
 
 
 @dataclass(frozen=True)

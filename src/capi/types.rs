@@ -362,7 +362,7 @@ pub struct nertca_scores {
     pub radius_error_mm: f64,
     /// Root of the mean square of the same, mm.
     pub radius_rmse_mm: f64,
-    /// Mean distance between where our points have come since phase 0 and where the true points beside them have, mm.
+    /// Mean distance between where our points have come since the phase that is followed and where the true points beside them have, mm.
     pub motion_error_mm: f64,
 }
 

@@ -78,6 +78,7 @@ fn describe_gaussians(field: &MovingGaussians) -> serde_json::Value {
         "form": field.form().name(),
         "count": field.rows().rows.len(),
         "bytes": field.bytes(),
+        "rest_phase": field.tree().map(|tree| tree.setup.rest_phase),
         "displacement_from_phase_0": field.tree().map(|tree| phases.map(|p| tree.displacement(p as f64)).collect::<Vec<_>>()),
     })
 }

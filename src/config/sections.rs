@@ -273,9 +273,9 @@ section! {
 section! {
     /// One set of Gaussians that moves over the beat. Lengths are those of `gaussians`.
     Tree, "tree" {
-        /// Iterations of a set per phase, before the tree is made of phase 0's.
+        /// Iterations of a set per phase, before the tree is made of one of them.
         warm_iterations: u32 in 1.0 to 1e6,
-        /// Amplitude from which a Gaussian of phase 0 is taken into the tree, share of the views' strongest change.
+        /// Amplitude from which a Gaussian of the phase of rest is taken into the tree, share of the views' strongest change.
         take: f64 in 0.0 to 1e3,
         /// Distance of the grid's nodes.
         node: f64 in 1.0 to 1e4,

@@ -21,8 +21,6 @@ use glam::DVec3;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// What the vectors are.
-const QUANTITY: &str = "displacement from phase 0, mm";
 /// What every file says of them.
 const CAVEAT: &str = "motion along a vessel is not observed in projections";
 
@@ -89,7 +87,7 @@ pub struct MotionExport<'a> {
 }
 
 impl MotionExport<'_> {
-    /// Writes the displacement of every node of the grid from phase 0 to each phase, mm along (left, posterior, superior);
+    /// Writes the displacement of every node of the grid from the phase of rest to each phase, mm along (left, posterior, superior);
     /// left is fastest in the files. Returns the files made. Gaussians' own motion is not part of it.
     ///
     /// # Errors
@@ -117,7 +115,7 @@ impl MotionExport<'_> {
             spacing_mm: lps_mm(self.tree, DVec3::splat(step)),
             size: [setup.n_nodes; 3],
             phases: self.sequence.then(|| self.phases.clone()),
-            quantity: QUANTITY,
+            quantity: format!("displacement from phase {}, mm", setup.rest_phase),
         }
     }
 
@@ -155,7 +153,7 @@ impl MotionExport<'_> {
         let one = |phase: &u32| {
             let file =
                 if self.sequence { path.with_file_name(format!("{stem}_{phase:04}.vtk")) } else { path.to_path_buf() };
-            let title = format!("{QUANTITY}, LPS, phase {phase}; {CAVEAT}");
+            let title = format!("{}, LPS, phase {phase}; {CAVEAT}", self.header().quantity);
             files::write_atomic_with(&file, |out| {
                 out.write_all(&vtk::vector_header_of(&self.header(), "displacement_mm", &title))?;
                 raw::write_floats(out, &self.vectors(*phase), ByteOrder::Big)

@@ -182,7 +182,7 @@ impl VolumeExport {
             spacing_mm: self.grid.spacing_mm,
             size: self.grid.size,
             phases: self.sequence.then(|| self.phases.clone()),
-            quantity: QUANTITY,
+            quantity: QUANTITY.to_owned(),
         }
     }
 

@@ -114,7 +114,7 @@ fn header_on_grid(h: &VolumeHeader, beside: Beside<'_>, encoding: Encoding, comm
     let [nx, ny, nz] = h.size;
     let axes = DMat3::from_diagonal(h.spacing_mm);
     let index_to_lps = DAffine3::from_mat3_translation(axes, h.origin_mm);
-    header(&format!("{nx} {ny} {nz}"), &index_to_lps, beside, encoding, h.quantity, comments).into_bytes()
+    header(&format!("{nx} {ny} {nz}"), &index_to_lps, beside, encoding, &h.quantity, comments).into_bytes()
 }
 
 /// The header of a file that is written piece by piece. The values of a sequence follow with all phases of a voxel

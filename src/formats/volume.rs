@@ -216,7 +216,7 @@ pub struct VolumeHeader {
     /// Phases of a sequence; none for a single volume.
     pub phases: Option<Vec<u32>>,
     /// What the values are.
-    pub quantity: &'static str,
+    pub quantity: String,
 }
 
 /// The numbers of a header field, with or without brackets and commas.

@@ -72,7 +72,8 @@ impl GridBuffers {
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
     pub fn new(gpu: &Gpu, tree: &TreeSetup, n_phases: usize) -> Result<GridBuffers> {
-        let basis_at = |phase: usize| basis(tree.n_basis as usize, phase as f64 / n_phases as f64);
+        let since_rest = |phase: usize| (phase as f64 - f64::from(tree.rest_phase)) / n_phases as f64;
+        let basis_at = |phase: usize| basis(tree.n_basis as usize, since_rest(phase));
         let basis: Vec<f32> = (0..n_phases).flat_map(basis_at).map(|v| v as f32).collect();
         let at_rest = vec![[0f32; 4]; n_phases * tree.nodes()];
         let grid = |name: Binding| gpu.buffer_with(name.name(), &at_rest);
@@ -210,10 +211,8 @@ impl TreePass<'_> {
         let (first_phase, n_phases) = (phases.start, phases.len() as u32);
         let push = push::TreeGradient { n_gaussians, first_phase, n_phases };
         self.run(gradient, gradient.groups_for(n_gaussians), push)?;
-        // The grid rests at phase 0.
-        let moving = phases.start.max(1)..phases.end;
-        let push = push::TreeGridGradient { n_gaussians, first_phase: moving.start, n_phases: moving.len() as u32 };
-        let groups = moving.len().div_ceil(constants::tree_grid_gradient::PHASES as usize);
+        let push = push::TreeGridGradient { n_gaussians, first_phase, n_phases };
+        let groups = phases.len().div_ceil(constants::tree_grid_gradient::PHASES as usize);
         self.run(grid_gradient, self.nodes(grid_gradient, groups), push)
     }
 
@@ -244,7 +243,7 @@ pub fn record_step(pass: &mut TreePass<'_>) -> Result<()> {
     let (update, setup, n_gaussians) = (&pass.kernels.update, pass.gaussians.setup, pass.gaussians.n);
     pass.gradient(0..setup.n_phases, 0..setup.n_images)?;
     pass.run(update, update.groups_for(n_gaussians), push::TreeUpdate { n_gaussians })?;
-    pass.grid_update(1..setup.n_phases)?;
+    pass.grid_update(0..setup.n_phases)?;
     pass.gaussians.report()
 }
 

@@ -28,6 +28,9 @@ pub(super) struct GaussianHeader {
     greatest_scale: f32,
     /// Iterations of the fit.
     step: u32,
+    /// Views it was fitted to; 0 where that is not known.
+    #[serde(default)]
+    views: u32,
     /// The grid that moves a tree; none for a set per phase.
     grid: Option<GridHeader>,
 }
@@ -40,6 +43,9 @@ struct GridHeader {
     half_side: f32,
     /// Numbers per axis of a Gaussian's own motion.
     basis: u32,
+    /// Phase at which Gaussians are where their positions say.
+    #[serde(default)]
+    rest_phase: u32,
 }
 
 pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
@@ -51,12 +57,14 @@ pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
         least_scale: sets.setup.least_scale,
         greatest_scale: sets.setup.greatest_scale,
         step: sets.step,
+        views: sets.setup.n_views,
         grid: match field {
             MovingGaussians::PerPhase(_) => None,
             MovingGaussians::Tree(tree) => Some(GridHeader {
                 nodes: tree.setup.n_nodes,
                 half_side: tree.setup.half_side,
                 basis: tree.setup.n_basis,
+                rest_phase: tree.setup.rest_phase,
             }),
         },
     }
@@ -119,10 +127,11 @@ pub(super) fn read(
     let log_density = file.floats("gaussians.log_density", &[Some(n)])?;
     let phase = match &header.grid {
         None => file.words("gaussians.phase", n)?,
-        Some(_) => vec![0; n],
+        Some(grid) => vec![grid.rest_phase; n],
     };
     if let Some(bad) = phase.iter().find(|p| **p as usize >= n_phases) {
-        return Err(Error::data(path, "gaussians.phase", format!("{bad} of {n_phases} phases")));
+        let field = if header.grid.is_some() { "gaussians.grid.rest_phase" } else { "gaussians.phase" };
+        return Err(Error::data(path, field, format!("{bad} of {n_phases} phases")));
     }
     let row = |i: usize| Gaussian {
         position: [0, 1, 2].map(|k| position[3 * i + k]),
@@ -135,6 +144,7 @@ pub(super) fn read(
         units: Units { pixel: header.pixel, strongest: header.strongest },
         n_phases,
         setup: GaussianSetup {
+            n_views: header.views,
             n_phases: n_phases as u32,
             cut: header.cut,
             least_scale: header.least_scale,
@@ -164,6 +174,7 @@ pub(super) fn read(
             half_side: grid.half_side,
             inverse_step: inverse_step(grid.nodes, grid.half_side),
             n_basis: grid.basis,
+            rest_phase: grid.rest_phase,
             ..TreeSetup::default()
         },
         grid: vectors("gaussians.motion.grid", &[Some(n_phases), nodes, nodes, nodes, Some(3)])?,

@@ -121,11 +121,11 @@ pub fn inverse_step(n_nodes: u32, half_side: f32) -> f32 {
 /// One set of Gaussians for the whole beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MovingTree {
-    /// Gaussians as they are at phase 0.
+    /// Gaussians as they are at the phase of rest.
     pub rest: Gaussians,
     /// The grid.
     pub setup: TreeSetup,
-    /// `[phase][node]`: displacement (x, y, z, 0), pixels at the isocentre; none at phase 0.
+    /// `[phase][node]`: displacement (x, y, z, 0), pixels at the isocentre; none at the phase of rest.
     pub grid: Vec<[f32; 4]>,
     /// `[Gaussian][basis function]`: own motion (x, y, z, 0), pixels at the isocentre.
     pub own: Vec<[f32; 4]>,
@@ -144,7 +144,7 @@ pub enum MovingGaussians {
 pub type MovingFeed = Arc<Mutex<(u64, MovingGaussians)>>;
 
 impl MovingGaussians {
-    /// The set, for a tree as it is at phase 0.
+    /// The set, for a tree as it is at its phase of rest.
     pub fn rows(&self) -> &Gaussians {
         match self {
             MovingGaussians::PerPhase(sets) => sets,
@@ -190,7 +190,8 @@ impl MovingGaussians {
     }
 }
 
-/// Values of the basis functions of own motion at a fraction of the beat: harmonics that vanish at its start.
+/// Values of the basis functions of own motion at a fraction of the beat, counted from the phase of rest: harmonics that vanish
+/// there.
 pub fn basis(n_basis: usize, fraction: f64) -> Vec<f64> {
     let angle = |k: usize| std::f64::consts::TAU * fraction * k as f64;
     let harmonics = n_basis / 2;
@@ -222,12 +223,13 @@ pub struct Displacement {
     pub largest_mm: f64,
 }
 
-fn vector(v: &[f32; 4]) -> DVec3 {
+/// The first three of four numbers.
+pub(super) fn vector(v: &[f32; 4]) -> DVec3 {
     DVec3::new(v[0].into(), v[1].into(), v[2].into())
 }
 
 impl MovingTree {
-    /// Where the grid carries a point of phase 0 at a phase, which may lie between two; the beat closes.
+    /// Where the grid carries a point of the phase of rest at a phase, which may lie between two; the beat closes.
     pub fn carried(&self, x: DVec3, phase: f64) -> DVec3 {
         let n_phases = self.rest.n_phases;
         let phase = phase.rem_euclid(n_phases as f64);
@@ -254,7 +256,8 @@ impl MovingTree {
     fn own_way(&self, index: usize, phase: usize) -> DVec3 {
         let n_basis = self.setup.n_basis as usize;
         let own = &self.own[index * n_basis..][..n_basis];
-        let basis = basis(n_basis, phase as f64 / self.rest.n_phases as f64);
+        let since_rest = phase as f64 - f64::from(self.setup.rest_phase);
+        let basis = basis(n_basis, since_rest / self.rest.n_phases as f64);
         own.iter().zip(basis).map(|(a, b)| b * vector(a)).sum()
     }
 
@@ -266,14 +269,14 @@ impl MovingTree {
     pub fn displacement(&self, phase: f64) -> Displacement {
         let mm = self.rest.units.pixel * MM_PER_UNIT;
         let n = self.rest.rows.len();
-        let lengths: Vec<f64> = (0..n).map(|i| mm * self.position(i, phase).distance(self.at_rest(i))).collect();
+        let lengths: Vec<f64> = (0..n).map(|i| mm * self.position(i, phase).distance(self.position(i, 0.0))).collect();
         Displacement {
             mean_mm: lengths.iter().sum::<f64>() / n.max(1) as f64,
             largest_mm: lengths.into_iter().fold(0.0, f64::max),
         }
     }
 
-    /// The Gaussian nearest to a point of phase 0.
+    /// The Gaussian nearest to a point of the phase of rest.
     pub fn nearest(&self, x: DVec3) -> usize {
         let distance = |i: usize| self.at_rest(i).distance_squared(x);
         (0..self.rest.rows.len()).min_by(|a, b| distance(*a).total_cmp(&distance(*b))).unwrap_or(0)

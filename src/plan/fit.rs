@@ -73,6 +73,7 @@ pub fn tree_setup(targets: &Targets, settings: &sections::Tree) -> TreeSetup {
         own_penalty: settings.own_penalty as f32,
         grid_rate: settings.grid_rate as f32,
         own_rate: settings.own_rate as f32,
+        rest_phase: targets.rest_phase as u32,
     }
 }
 
@@ -114,6 +115,11 @@ pub fn renews_background(settings: &sections::Gaussians, step: u32) -> bool {
     every > 0 && step > 0 && step.is_multiple_of(every) && rate(settings, step) == 1.0
 }
 
+/// The iteration from which a fit goes on that is carried to other data: where the background is first estimated anew.
+pub fn carried_step(settings: &sections::Gaussians) -> u32 {
+    (1..settings.iterations).find(|step| renews_background(settings, *step)).unwrap_or(0)
+}
+
 /// Where iterations from `step` on towards `until` must stop, as something is to be done before the next.
 pub fn next_stop(settings: &sections::Gaussians, step: u32, until: u32) -> u32 {
     (step + 1..until)
@@ -143,8 +149,9 @@ mod tests {
         let settings = Config::preset(Preset::Fast).gaussians;
         let stops = std::iter::successors(Some(0), |s| (*s < 120).then(|| next_stop(&settings, *s, 120)));
         assert_eq!(stops.collect::<Vec<_>>(), [0, 40, 50, 65, 80, 120]);
+        assert_eq!(carried_step(&settings), 40);
         assert!(renews_background(&settings, 40) && !renews_background(&settings, 0) && grows(&settings, 50));
         let never = sections::Gaussians { background_every: 0, grow_at: 0, clear_at: 0, ..settings };
-        assert_eq!((next_stop(&never, 3, 70), renews_background(&never, 40)), (70, false));
+        assert_eq!((next_stop(&never, 3, 70), renews_background(&never, 40), carried_step(&never)), (70, false, 0));
     }
 }

@@ -135,6 +135,7 @@ mod tests {
             noise: vec![0.01; low.len()],
             low,
             lengths: Lengths { factor: 1.0, smoothing: 1.0 },
+            rest_phase: 0,
             places: vec![Vec::new(); PHASES],
             cell: 1.0,
         }

@@ -97,7 +97,7 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
     all
 }
 
-/// New Gaussians of a tree at places of phase 0 where, carried along by `carried` (place, phase), every view lacks line
+/// New Gaussians of a tree at places of its phase of rest where, carried along by `carried` (place, phase), every view lacks line
 /// integral at half the phases or more; phases may lie between two.
 pub fn tree_additions(
     targets: &Targets,
@@ -108,7 +108,7 @@ pub fn tree_additions(
 ) -> Vec<Gaussian> {
     let missing = missing_images(targets, images);
     let count = (settings.grow_share * f64::from(settings.count)) as usize;
-    let places = &targets.places[0];
+    let places = &targets.places[targets.rest_phase];
     let weight = |place: &Place| {
         let at =
             |phase: usize| lacking(targets, &missing, phase, |after| carried(place.position, phase as f64 + after));
@@ -118,7 +118,7 @@ pub fn tree_additions(
     };
     let weights: Vec<f64> = places.iter().map(weight).collect();
     let draw = Draw { targets, settings, seed, round: targets.n_phases as u32 };
-    draw.gaussians(&weights, count, 0, added_density(targets, settings)).collect()
+    draw.gaussians(&weights, count, targets.rest_phase, added_density(targets, settings)).collect()
 }
 
 /// Density of a new Gaussian: the same line integral whatever a pixel is.

@@ -12,6 +12,11 @@ use crate::raster::Image;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
+/// The first phase is one to rest at where it shows this share of what the one shows that shows most.
+const MUCH: f64 = 0.75;
+/// A line integral of so many standard deviations of its noise is no noise.
+const STANDS_OUT: f32 = 4.0;
+
 /// A place where a vessel may be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Place {
@@ -54,6 +59,8 @@ pub struct Targets {
     pub noise: Vec<f32>,
     /// What lengths in the settings mean here.
     pub lengths: Lengths,
+    /// The phase at which the Gaussians of a tree rest.
+    pub rest_phase: usize,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<Place>>,
     /// Side of a cell, pixels at the isocentre.
@@ -128,6 +135,7 @@ impl Targets {
             weight: Vec::new(),
             noise: Vec::new(),
             lengths: Lengths { factor: 1.0, smoothing: 1.0 },
+            rest_phase: 0,
             places: Vec::new(),
             cell: motion.hull.cell / units.pixel,
         };
@@ -154,6 +162,7 @@ impl Targets {
                 targets.noise.extend(view.background.noise.values.iter().map(|s| share(*s)));
             }
         }
+        targets.rest_phase = targets.phase_that_shows_most();
         targets.most.clone_from(&targets.high);
         let own = |view: usize, change: &Image| {
             let [width, height] = dataset.views[view].size;
@@ -176,14 +185,36 @@ impl Targets {
     }
 
     /// The form of moving field that suits the data where `asked` leaves it open: a tree shares one set of Gaussians over
-    /// the beat, which takes phases enough to follow it from one to the next and a first phase that two views show.
+    /// the beat, which takes phases enough to follow it from one to the next and a phase to rest at that two views show.
     pub fn form(&self, asked: GaussianForm) -> GaussianForm {
         const LEAST_PHASES: usize = 4;
         match asked {
-            GaussianForm::Auto if self.n_phases >= LEAST_PHASES && self.views_at(0).count() >= 2 => GaussianForm::Tree,
+            GaussianForm::Auto if self.n_phases >= LEAST_PHASES && self.views_at(self.rest_phase).count() >= 2 => {
+                GaussianForm::Tree
+            }
             GaussianForm::Auto => GaussianForm::Phase,
             asked => asked,
         }
+    }
+
+    /// The phase whose images show most of the vessels, all views taken together; the first one unless it lacks much of that, as
+    /// where contrast has not arrived, or a view has no image.
+    fn phase_that_shows_most(&self) -> usize {
+        let shown: Vec<f64> = (0..self.n_phases).map(|phase| self.shown_at(phase)).collect();
+        let most = (0..self.n_phases).max_by(|a, b| shown[*a].total_cmp(&shown[*b])).unwrap_or(0);
+        if shown[0] >= MUCH * shown[most] { 0 } else { most }
+    }
+
+    /// Sum over all images of a phase of the line integrals that stand out from noise, shares of the strongest change.
+    fn shown_at(&self, phase: usize) -> f64 {
+        let pixels = self.views_at(phase).flat_map(|(image, _)| self.pixels_that_stand_out(image));
+        pixels.map(|p| f64::from(self.low[p])).sum()
+    }
+
+    /// Pixels of an image where more moves than noise, counted over all images.
+    pub fn pixels_that_stand_out(&self, image: usize) -> impl Iterator<Item = usize> {
+        let pixels = image * self.n_pixels()..(image + 1) * self.n_pixels();
+        pixels.filter(|p| self.weight[*p] > 0.0 && self.low[*p] > STANDS_OUT * self.noise[*p])
     }
 
     /// Phases that some view has.

@@ -15,7 +15,7 @@ pub struct TreeParams {
     pub rows: Vec<Params>,
     /// `[Gaussian][basis function]`.
     pub own: Vec<DVec3>,
-    /// `[phase][node]`; phase 0 stays at rest.
+    /// `[phase][node]`; the phase of rest stays as it is.
     pub grid: Vec<DVec3>,
 }
 
@@ -38,7 +38,8 @@ struct Motion {
 
 fn motion(tree: &TreeSetup, rest: &Params, phase: usize, n_phases: usize) -> Motion {
     let nodes = shares(tree, DVec3::new(rest[0], rest[1], rest[2])).map(|(n, share)| (phase * tree.nodes() + n, share));
-    Motion { nodes, basis: basis(tree.n_basis as usize, phase as f64 / n_phases as f64) }
+    let since_rest = (phase as f64 - f64::from(tree.rest_phase)) / n_phases as f64;
+    Motion { nodes, basis: basis(tree.n_basis as usize, since_rest) }
 }
 
 fn displaced(p: &TreeParams, i: usize, motion: &Motion) -> Params {
@@ -102,7 +103,7 @@ pub fn loss_and_gradient(
             gradient.rows[i].iter_mut().zip(g).for_each(|(sum, g)| *sum += g);
             let x = DVec3::new(g[0], g[1], g[2]);
             for (phase, share) in phases_shown(phase, view, targets.n_phases) {
-                add_place(&mut gradient, i, phase, &place(phase, i), share * x);
+                add_place(&mut gradient, i, phase == tree.rest_phase as usize, &place(phase, i), share * x);
             }
         }
     }
@@ -110,12 +111,12 @@ pub fn loss_and_gradient(
     (loss, loss + penalty, gradient)
 }
 
-/// Adds the gradient of a Gaussian's place at a phase to that of what moves it there; the grid rests at phase 0.
-fn add_place(gradient: &mut TreeParams, i: usize, phase: usize, motion: &Motion, x: DVec3) {
+/// Adds the gradient of a Gaussian's place at a phase to that of what moves it there: at the phase of rest not the grid.
+fn add_place(gradient: &mut TreeParams, i: usize, at_rest: bool, motion: &Motion, x: DVec3) {
     for (k, b) in motion.basis.iter().enumerate() {
         gradient.own[i * motion.basis.len() + k] += *b * x;
     }
-    for (node, share) in motion.nodes.iter().filter(|_| phase > 0) {
+    for (node, share) in motion.nodes.iter().filter(|_| !at_rest) {
         gradient.grid[*node] += *share * x;
     }
 }
@@ -129,7 +130,7 @@ fn add_penalties(tree: &TreeSetup, p: &TreeParams, n_phases: usize, gradient: &m
         penalty += own * a.length_squared();
     }
     let n = tree.n_nodes as usize;
-    for phase in 1..n_phases {
+    for phase in (0..n_phases).filter(|phase| *phase != tree.rest_phase as usize) {
         for node in 0..tree.nodes() {
             for stride in [1, n, n * n] {
                 if node / stride % n + 1 == n {

@@ -45,8 +45,8 @@ pub struct TreeAgreement {
     pub reprojection_training_mm: Option<f64>,
     /// The same in images of views that were not trained on.
     pub reprojection_unseen_mm: Option<f64>,
-    /// Mean distance between where our points have come since phase 0 and where the true points beside them have, mm; where
-    /// points are followed, and not of phase 0 itself.
+    /// Mean distance between where our points have come since the phase that is followed and where the true points beside them have, mm; where
+    /// points are followed, and not of that phase itself.
     pub motion_error_mm: Option<f64>,
 }
 
@@ -97,7 +97,7 @@ pub fn score(
         }
         lines
     };
-    let rest = true_at(0);
+    let rest = true_at(beat.reference_phase.unwrap_or(0));
     if rest.iter().all(|line| line.points_mm.len() < 2) {
         return Err(Error::data(&dataset.path, "true tree", "has no line"));
     }

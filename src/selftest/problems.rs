@@ -180,6 +180,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         weight: all.map(|i| 0.5 + 0.5 * wave(i, 0.13)).collect(),
         noise: Vec::new(),
         lengths: Lengths { factor: 1.0, smoothing: 1.0 },
+        rest_phase: 0,
         images: Vec::new(),
         most: Vec::new(),
         places: vec![Vec::new(); n_phases],
@@ -219,6 +220,7 @@ pub fn tree_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
         .iter_mut()
         .zip([0.0, 0.3, -0.45].into_iter().cycle())
         .for_each(|(view, after)| view.after_phase = after);
+    targets.rest_phase = 3;
     // The grid covers the places.
     let corner = Place { position: DVec3::splat(14.0), evidence: 18.0 };
     targets.places[0].push(corner);
@@ -230,14 +232,15 @@ pub fn tree_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
     Ok((targets, rows, Config { tree, gaussians, ..preset }))
 }
 
-/// A tree that already moves: Gaussians at rest, own motion and grid filled with waves, phase 0 at rest.
+/// A tree that already moves: Gaussians at rest, own motion, and a grid filled with waves where it does not rest.
 pub fn moving_tree(rows: &[Gaussian], tree: &TreeSetup, n_phases: usize) -> TreeParams {
     let wave = |i: usize, k: f64| {
         let at = |c: f64| f64::from((0.4 * (k * (i as f64 + c)).sin()) as f32);
         DVec3::new(at(0.0), at(0.3), at(0.9))
     };
     let nodes = tree.nodes();
-    let grid = (0..n_phases * nodes).map(|i| if i < nodes { DVec3::ZERO } else { wave(i, 0.61) }).collect();
+    let rests = |i: usize| i / nodes == tree.rest_phase as usize;
+    let grid = (0..n_phases * nodes).map(|i| if rests(i) { DVec3::ZERO } else { wave(i, 0.61) }).collect();
     let own = (0..rows.len() * tree.n_basis as usize).map(|i| 0.5 * wave(i, 0.47)).collect();
     TreeParams { rows: rows.iter().map(params).collect(), own, grid }
 }
@@ -261,10 +264,19 @@ fn drawn_set(n: usize, n_phases: u32) -> Gaussians {
 
 /// One set of Gaussians that moves, to be drawn.
 fn drawn_tree(n: usize, n_phases: u32) -> MovingTree {
-    let setup = TreeSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, n_basis: 4, ..TreeSetup::default() };
+    const REST_PHASE: u32 = 1;
+    let setup = TreeSetup {
+        n_nodes: 4,
+        half_side: 30.0,
+        inverse_step: 0.05,
+        n_basis: 4,
+        rest_phase: REST_PHASE,
+        ..TreeSetup::default()
+    };
     let wave = |i: usize| [0.7, 1.1, 1.9].map(|k| (1.5 * (k * i as f64).sin()) as f32);
     let vector = |i: usize| [wave(i)[0], wave(i)[1], wave(i)[2], 0.0];
-    let grid = (0..n_phases as usize * 64).map(|i| if i < 64 { [0.0; 4] } else { vector(i) }).collect();
+    let rests = |i: usize| i / 64 == REST_PHASE as usize;
+    let grid = (0..n_phases as usize * 64).map(|i| if rests(i) { [0.0; 4] } else { vector(i) }).collect();
     let mut rest = drawn_set(n, 1);
     (rest.n_phases, rest.setup.n_phases) = (n_phases as usize, n_phases);
     MovingTree { rest, setup, grid, own: (0..n * 4).map(vector).collect() }

@@ -171,17 +171,19 @@ impl Shared {
         calibration.notes.iter().for_each(|note| tracing::info!("{note}"));
         let dataset = dataset.corrected(&calibration)?;
         let fresh = Plan::new(&config, &dataset)?;
+        let mut earlier = None;
         if let Some(training) = &mut engine.training {
-            let state = training.trainer_mut().checkpoint()?;
+            let mut state = training.trainer_mut().checkpoint()?;
             let fits = holds(&state.model.scene, &fresh.scene);
             if !fits {
                 tracing::warn!("new frames show vessels outside the box trained so far: training starts over");
+                earlier = state.model.moving.take();
             }
             engine.saved = fits.then_some(state);
         }
         (engine.training, engine.version) = (None, 0); // its memory is needed
         let trainer = match &engine.saved {
-            None => Trainer::new(gpu, fresh, &dataset, tuning)?,
+            None => Trainer::start_over(gpu, fresh, &dataset, tuning, earlier.as_ref())?,
             Some(state) => {
                 let plan = fresh.in_scene(state.model.scene.clone());
                 Trainer::carry_on(gpu, plan, &dataset, tuning, state)?

@@ -12,6 +12,7 @@ use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::plan::Plan;
 use crate::plan::targets::Targets;
 use crate::scan::dataset::{Dataset, Frame};
+use crate::train::carried::Carried;
 use crate::train::gaussians::GaussianTrainer;
 use crate::train::tree::TreeTrainer;
 use crate::train::tree_start::TreeStart;
@@ -37,6 +38,29 @@ impl MovingFit {
             GaussianForm::Tree => MovingFit::Start(Box::new(TreeStart::new(gpu, targets, config)?)),
             _ => MovingFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
         })
+    }
+
+    /// As [`MovingFit::new`], but goes on from what was fitted to `earlier` data where that is of use.
+    ///
+    /// # Errors
+    /// As [`MovingFit::new`] and [`Carried::new`].
+    fn after(gpu: &Gpu, mut targets: Targets, config: &Config, earlier: &MovingGaussians) -> Result<MovingFit> {
+        if let (GaussianForm::Tree, Some(tree)) = (targets.form(config.gaussians.form), earlier.tree()) {
+            match Carried::new(gpu, targets, config, tree)? {
+                Carried::On(fit) => return Ok(MovingFit::Tree(fit)),
+                Carried::Anew(same) => targets = same,
+            }
+        }
+        MovingFit::new(gpu, targets, config)
+    }
+
+    /// Whether the field is worth more than one that was fitted to fewer frames.
+    fn is_presentable(&self) -> bool {
+        match self {
+            MovingFit::PerPhase(fit) => fit.is_half_done(),
+            MovingFit::Start(_) => false,
+            MovingFit::Tree(_) => true,
+        }
     }
 
     /// Iterations done.
@@ -136,6 +160,8 @@ pub(super) struct Moving {
     /// Until its iterations are done; the still field begins then.
     fit: Option<MovingFit>,
     feed: MovingFeed,
+    /// What is shown is of earlier data, until the fit has something better.
+    shows_earlier: bool,
     /// Where each training image was taken, and when: counted in phases.
     shots: Vec<(ViewRays, f64)>,
 }
@@ -143,7 +169,7 @@ pub(super) struct Moving {
 impl Moving {
     /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where the network
     /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits, however
-    /// many iterations go into a submit.
+    /// many iterations go into a submit. A field that was fitted to `earlier` data is shown, and gone on from, where it can be.
     ///
     /// # Errors
     /// As [`MovingFit::new`], and as [`TreeStart::advance`] for what is done again.
@@ -152,6 +178,7 @@ impl Moving {
         plan: &mut Plan,
         dataset: &Dataset,
         saved: Option<&Model>,
+        earlier: Option<&MovingGaussians>,
         per_submit: u32,
     ) -> Result<Option<Moving>> {
         let Some(targets) = plan.targets.take() else { return Ok(None) };
@@ -162,7 +189,10 @@ impl Moving {
             None => {
                 let mut config = plan.config.clone();
                 config.train.iterations_per_submit = per_submit;
-                let mut fit = MovingFit::new(gpu, targets, &config)?;
+                let mut fit = match earlier {
+                    Some(earlier) => MovingFit::after(gpu, targets, &config, earlier)?,
+                    None => MovingFit::new(gpu, targets, &config)?,
+                };
                 while fit.step() < done {
                     fit.advance(done)?;
                 }
@@ -170,8 +200,11 @@ impl Moving {
                 (Some(fit), field)
             }
         };
+        let shown = earlier.filter(|_| fit.as_ref().is_some_and(|fit| !fit.is_presentable()));
+        let shows_earlier = shown.is_some();
+        let feed = Arc::new(Mutex::new((0, shown.cloned().unwrap_or(field))));
         let shots = dataset.training().iter().map(shot).collect();
-        Ok(Some(Moving { fit, feed: Arc::new(Mutex::new((0, field))), shots }))
+        Ok(Some(Moving { fit, feed, shows_earlier, shots }))
     }
 
     /// Iterations done of a fit that is not finished.
@@ -206,6 +239,10 @@ impl Moving {
     pub(super) fn advance(&mut self, until: u32, end: u32) -> Result<Vec<f64>> {
         let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
         let losses = fit.advance(until.min(end))?;
+        self.shows_earlier &= !fit.is_presentable();
+        if self.shows_earlier {
+            return Ok(losses);
+        }
         let field = fit.field()?;
         if fit.step() >= end {
             self.fit = None;

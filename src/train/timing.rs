@@ -44,7 +44,7 @@ pub struct GaussianTiming {
     pub form: String,
     /// Gaussians after the timed iterations.
     pub count: u32,
-    /// Seconds from targets to the first iteration: seeds, and of a tree the fit of phase 0 and the tracking of its grid.
+    /// Seconds from targets to the first iteration: seeds, and of a tree the sets per phase and the tracking of its grid.
     pub preparation_s: f64,
     /// Milliseconds per iteration of each repeat; the fit goes on from one to the next.
     pub ms: Vec<f64>,

@@ -12,7 +12,7 @@ use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
-use crate::model::gaussians::MovingFeed;
+use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::model::setup::{RING_LENGTH, sample_capacity};
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::pass::Pass;
@@ -137,7 +137,22 @@ impl Trainer {
     /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, None)
+        Self::start(gpu, plan, dataset, tuning, None, None)
+    }
+
+    /// Starts a run from scratch but for its Gaussians, which go on from those that were fitted to `earlier` data as in
+    /// [`Trainer::carry_on`].
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub fn start_over(
+        gpu: &Gpu,
+        plan: Plan,
+        dataset: &Dataset,
+        tuning: Tuning,
+        earlier: Option<&MovingGaussians>,
+    ) -> Result<Trainer> {
+        Self::start(gpu, plan, dataset, tuning, None, earlier)
     }
 
     /// Continues a run: the result is the same as without interruption.
@@ -159,10 +174,11 @@ impl Trainer {
             ));
         }
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Some(checkpoint))
+        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), None)
     }
 
-    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians are then fitted anew.
+    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians go on from those so far where these
+    /// explain every view and phase, and are fitted anew elsewhere.
     ///
     /// # Errors
     /// [`Error::Config`] when parameters and plan do not fit; device errors.
@@ -174,7 +190,7 @@ impl Trainer {
         checkpoint: &Checkpoint,
     ) -> Result<Trainer> {
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Some(checkpoint))
+        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), checkpoint.model.moving.as_ref())
     }
 
     fn start(
@@ -183,6 +199,7 @@ impl Trainer {
         dataset: &Dataset,
         tuning: Tuning,
         saved: Option<&Checkpoint>,
+        earlier: Option<&MovingGaussians>,
     ) -> Result<Trainer> {
         let tuning = tuning.for_network(!plan.config.gaussians_move());
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params));
@@ -211,7 +228,9 @@ impl Trainer {
         let data_fingerprint = data_fingerprint(dataset);
         let of_these_data = saved.filter(|saved| saved.data_fingerprint == data_fingerprint);
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
-        let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data.map(|saved| &saved.model), per_submit)?;
+        let earlier = earlier.filter(|_| of_these_data.is_none());
+        let saved_model = of_these_data.map(|saved| &saved.model);
+        let moving = Moving::begin(gpu, &mut plan, dataset, saved_model, earlier, per_submit)?;
         let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
         // The still field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());

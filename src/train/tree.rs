@@ -1,4 +1,4 @@
-//! Fits a moving tree: Gaussians of phase 0, carried through the beat by a grid, all of it together. [`TreeStart`] brings
+//! Fits a moving tree: Gaussians of one phase, carried through the beat by a grid, all of it together. [`TreeStart`] brings
 //! it about.
 
 use crate::config::{Config, sections};
@@ -102,7 +102,7 @@ impl TreeTrainer {
         }
     }
 
-    /// Starts from given Gaussians of phase 0 at rest.
+    /// Starts from given Gaussians at rest.
     ///
     /// # Errors
     /// As [`TreeTrainer::new`].
@@ -149,7 +149,7 @@ impl TreeTrainer {
         self.gpu.wait(recording.finish()?.submit()?)
     }
 
-    /// Iterations done, those of phase 0 and of tracking not counted.
+    /// Iterations done, those of the sets per phase and of tracking not counted.
     pub fn step(&self) -> u32 {
         self.step
     }
@@ -162,6 +162,20 @@ impl TreeTrainer {
     /// What the run is fitted to.
     pub fn targets(&self) -> &Targets {
         &self.targets
+    }
+
+    /// The same, when the run is not wanted.
+    pub(super) fn into_targets(self) -> Targets {
+        self.targets
+    }
+
+    /// Gives the Gaussians, which have been fitted before, the motion of a tree of the same ones on the same grid; iterations go on
+    /// from where the background is estimated anew.
+    pub(super) fn move_as(&mut self, tree: &MovingTree) -> Result<()> {
+        self.gpu.upload(&self.joint.grid.motion_grid, 0, &tree.grid)?;
+        self.gpu.upload(&self.own.own_motion, 0, &tree.own)?;
+        self.step = fit::carried_step(&self.config.gaussians);
+        self.gpu.upload(&self.joint.targets.gaussian_step, 0, &[self.step])
     }
 
     /// Constants of the run.

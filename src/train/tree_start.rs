@@ -1,4 +1,4 @@
-//! How a moving tree begins: a set of Gaussians per phase, of which phase 0's becomes the tree; then the grid tracked from
+//! How a moving tree begins: a set of Gaussians per phase, of which that of the phase of rest becomes the tree; then the grid tracked from
 //! phase to phase.
 
 use crate::config::{Config, sections};
@@ -53,7 +53,7 @@ impl TreeStart {
     /// Does some of the work, a submit or two; the tree when it is ready to be fitted as a whole.
     ///
     /// # Errors
-    /// [`Error::Config`] when phase 0 shows nothing; [`Error::Diverged`]; device errors.
+    /// [`Error::Config`] when the phase of rest shows nothing; [`Error::Diverged`]; device errors.
     pub fn advance(&mut self) -> Result<Option<TreeTrainer>> {
         let warm_iterations = self.config.tree.warm_iterations;
         match std::mem::replace(&mut self.stage, Stage::Over) {
@@ -75,7 +75,7 @@ impl TreeStart {
         Ok(None)
     }
 
-    /// Makes a tree of what phase 0 shows.
+    /// Makes a tree of what the phase of rest shows.
     fn plant(&self, mut first: GaussianTrainer) -> Result<Tracking> {
         if self.config.gaussians.background_every > 0 {
             first.renew_background()?;
@@ -83,7 +83,9 @@ impl TreeStart {
         let meanwhile = first.model()?;
         let mut found = Particles::fresh(meanwhile.rows.clone());
         let strong = strong(&found.rows, first.setup(), self.config.tree.take);
-        let keep: Vec<bool> = found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == 0).collect();
+        let rest_phase = first.targets().rest_phase as u32;
+        let keep: Vec<bool> =
+            found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == rest_phase).collect();
         found.retain(&keep);
         let trainer = TreeTrainer::with(&self.gpu, first.into_targets(), &self.config, &found)?;
         let (fit, mut left) = (trainer.tracking()?, tracks(trainer.targets()));
@@ -125,16 +127,20 @@ impl TreeStart {
     }
 }
 
-/// In which order phases are tracked, each from the two before it: forward and backward from phase 0 to the middle of the
-/// beat.
+/// In which order phases are tracked, each from the two before it: forward and backward from the phase of rest to the
+/// middle of the beat.
 fn tracks(targets: &Targets) -> Vec<Track> {
-    let n = targets.n_phases as u32;
+    let (n, rest_phase) = (targets.n_phases as u32, targets.rest_phase as u32);
+    // Counted from the phase of rest.
     let forward = (1..=n / 2).map(|t| [t, t - 1, t.saturating_sub(2)]);
     let backward = (n / 2 + 1..n).rev().map(|t| [t, (t + 1) % n, if t + 2 < n { t + 2 } else { 0 }]);
     let images = |phase: u32| {
         let images: Vec<u32> = targets.views_at(phase as usize).map(|(image, _)| image as u32).collect();
         images.first().map_or(0..0, |first| *first..first + images.len() as u32)
     };
-    let track = |[phase, before, before_that]: [u32; 3]| Track { phase, before, before_that, images: images(phase) };
+    let track = |since_rest: [u32; 3]| {
+        let [phase, before, before_that] = since_rest.map(|t| (rest_phase + t) % n);
+        Track { phase, before, before_that, images: images(phase) }
+    };
     forward.chain(backward).map(track).collect()
 }

@@ -23,9 +23,6 @@ use crate::vessels::field::{Corners, MovingField};
 use crate::vessels::mask::Mask;
 use glam::DVec3;
 
-/// The phase whose points are followed: Gaussians rest there, and of a beat that begins with the R peak it is the end of
-/// diastole, when the vessels are longest and lie apart.
-const REFERENCE_PHASE: u32 = 0;
 /// Distance between points of the grid that a field is sampled on, in units of what it resolves.
 const GRID_STEP: f64 = 0.5;
 /// Points of that grid at most; vessels that need more are looked at more coarsely.
@@ -49,8 +46,8 @@ pub struct TreeOptions {
     pub least_branch_mm: Option<f64>,
 }
 
-/// The vessels of a model as trees of centrelines with radii. Where one set of Gaussians moves, the tree of phase 0 is
-/// followed: point i of branch b is the same material point in all phases, with one radius, and motion along vessels, which
+/// The vessels of a model as trees of centrelines with radii. Where one set of Gaussians moves, the tree of the phase at which
+/// they rest is followed: point i of branch b is the same material point in all phases, with one radius, and motion along vessels, which
 /// projections do not show, is what the Gaussians' grid makes of it. Elsewhere each phase has a tree of its own. `progress`
 /// hears of phases done and phases in all, before the first one, too; its error ends the work.
 ///
@@ -70,7 +67,7 @@ pub fn vessel_trees(
     let moving = model.moving.as_ref().and_then(MovingGaussians::tree);
     let mut phases = Vec::new();
     if let Some(tree) = moving {
-        let reference = finder.tree(REFERENCE_PHASE)?;
+        let reference = finder.tree(tree.setup.rest_phase)?;
         let carrier = Carrier::new(tree);
         for phase in &options.phases {
             phases.push(finder.followed(&reference, &carrier, *phase)?);
@@ -83,7 +80,7 @@ pub fn vessel_trees(
         }
     }
     Ok(BeatTree {
-        reference_phase: moving.map(|_| REFERENCE_PHASE),
+        reference_phase: moving.map(|tree| tree.setup.rest_phase),
         threshold_per_mm: finder.threshold_per_mm,
         resolution_mm: finder.resolution_mm,
         spacing_mm: finder.spacing_mm,
@@ -132,7 +129,7 @@ impl Finder<'_> {
         let finder =
             Finder { renderer, model, pixel_mm, resolution_mm, threshold_per_mm, least_branch_mm, spacing_mm: 0.0 };
         // The rule gives nothing where the field is nothing at the first phase.
-        if threshold_per_mm > 0.0 { Ok(finder) } else { Err(finder.no_vessels(REFERENCE_PHASE)) }
+        if threshold_per_mm > 0.0 { Ok(finder) } else { Err(finder.no_vessels(0)) }
     }
 
     fn no_vessels(&self, phase: u32) -> Error {

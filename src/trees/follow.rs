@@ -40,7 +40,7 @@ impl Carrier<'_> {
         Carrier { tree, shapes: tree.rest.rows.iter().copied().map(shape).collect() }
     }
 
-    /// Where points of phase 0 are at a phase, LPS mm: the grid carries them, and what Gaussians move by themselves they do
+    /// Where points of the phase of rest are at a phase, LPS mm: the grid carries them, and what Gaussians move by themselves they do
     /// in the mean of the Gaussians around, each by its density there.
     pub(super) fn carried_mm(&self, points_mm: &[DVec3], phase: u32) -> Vec<DVec3> {
         let (tree, phase) = (self.tree, f64::from(phase));

@@ -57,7 +57,9 @@ spacing = numbers(fields["space directions"]).reshape(3, 3)
 assert np.allclose(spacing, np.eye(3) * spacing[0, 0])
 spacing, origin = np.diag(spacing), numbers(fields["space origin"])
 assert numbers(fields["axis 4 index values"]).tolist() == list(range(phases))
-assert (every[..., 0] == 0).all() and np.abs(every[..., 1]).max() > 1
+rest = expected["rest_phase"]
+assert fields["quantity"] == f"displacement from phase {rest}, mm", fields["quantity"]
+assert (every[..., rest] == 0).all() and np.abs(every[..., 0]).max() > 1
 for phase in range(phases):
     for place, want in zip(places, moved[phase]):
         got = at(every[..., phase], origin, spacing, place)

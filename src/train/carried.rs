@@ -1,0 +1,74 @@
+//! Goes on from a tree that was fitted before frames were added, or geometry stated anew, instead of beginning from seeds.
+
+use crate::config::Config;
+use crate::error::Result;
+use crate::gaussians::particles::Particles;
+use crate::gpu::device::Gpu;
+use crate::model::gaussians::MovingTree;
+use crate::plan::targets::Targets;
+use crate::train::tree::TreeTrainer;
+
+/// A tree that explains less of the images of a view or a phase does not know that view or phase.
+const LEAST_EXPLAINED: f64 = 0.7;
+
+/// What became of an attempt to go on.
+pub(super) enum Carried {
+    /// The fit goes on from the earlier tree.
+    On(Box<TreeTrainer>),
+    /// The earlier tree is none of these images: they are to be fitted anew.
+    Anew(Targets),
+}
+
+impl Carried {
+    /// Goes on from an earlier tree, unless it has another shape or leaves much of a view or a phase unexplained.
+    ///
+    /// # Errors
+    /// As [`TreeTrainer::with`].
+    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config, earlier: &MovingTree) -> Result<Carried> {
+        let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
+        let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
+        // Another view tells more than a fit that does without it can take in.
+        let seen_alike = was.n_views as usize == targets.n_views;
+        if !phases_alike || !rests_alike || !seen_alike || earlier.rest.rows.is_empty() {
+            return Ok(Carried::Anew(targets));
+        }
+        let rest = earlier.rest.in_units(targets.units);
+        let mut trainer = TreeTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
+        let setup = *trainer.tree_setup();
+        if setup.n_basis != earlier.setup.n_basis {
+            return Ok(Carried::Anew(trainer.into_targets()));
+        }
+        trainer.move_as(&earlier.on_grid(rest, setup))?;
+        let explained = least_explained(trainer.targets(), &trainer.images()?);
+        if explained < LEAST_EXPLAINED {
+            tracing::info!(
+                "Gaussians are fitted anew: those so far explain {:.0} % of some view or phase",
+                100.0 * explained
+            );
+            return Ok(Carried::Anew(trainer.into_targets()));
+        }
+        tracing::info!(
+            "Gaussians go on from those so far, which explain {:.0} % of every view and phase",
+            100.0 * explained
+        );
+        Ok(Carried::On(Box::new(trainer)))
+    }
+}
+
+/// Share of what vessels are known to add to the images that a field explains: the least of all views and phases. `drawn` is
+/// `[image][pixel]`, shares of the strongest change.
+fn least_explained(targets: &Targets, drawn: &[f32]) -> f64 {
+    let shares = |images: &mut dyn Iterator<Item = usize>| -> Option<f64> {
+        let (mut explained, mut there) = (0.0, 0.0);
+        for pixel in images.flat_map(|image| targets.pixels_that_stand_out(image)) {
+            explained += f64::from(drawn[pixel].min(targets.low[pixel]));
+            there += f64::from(targets.low[pixel]);
+        }
+        (there > 0.0).then(|| explained / there)
+    };
+    let of_phase = |phase: usize| shares(&mut targets.views_at(phase).map(|(image, _)| image));
+    let of_view =
+        |view: usize| shares(&mut targets.image_of.iter().skip(view).step_by(targets.n_views).flatten().copied());
+    let all = (0..targets.n_phases).filter_map(of_phase).chain((0..targets.n_views).filter_map(of_view));
+    all.fold(1.0, f64::min)
+}

@@ -1,0 +1,65 @@
+//! Contrast that arrives while images are taken: phase 0 shows nothing, and what is reconstructed rests at a later phase.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "common/program.rs"]
+mod program;
+#[path = "common/said.rs"]
+mod said;
+
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::plan::Plan;
+use nertca_vk::scan::dataset::Dataset;
+use said::{run, text};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// Phases of a second in which contrast reaches the ends of the vessels after 0.4 s: from phase 4 on they are full.
+const PHASES: usize = 10;
+const FULL_FROM: usize = 4;
+
+/// A phantom of 64 x 64 pixels.
+fn phantom(directory: &Path, extra: &[&str]) -> PathBuf {
+    let data = directory.join("data");
+    run(&[&["phantom", text(&data), "--size", "64", "--no-volumes"], extra].concat(), true);
+    data
+}
+
+fn rest_phase(data: &Path) -> (usize, Vec<String>) {
+    let plan = Plan::new(&Config::preset(Preset::Fast), &Dataset::open(data).unwrap()).unwrap();
+    (plan.targets.unwrap().rest_phase, plan.notes)
+}
+
+#[test]
+fn a_tree_rests_where_vessels_are_full() {
+    let directory = tempfile::tempdir().unwrap();
+    let data = phantom(directory.path(), &["--inflow", "0.4"]);
+    let (rest, notes) = rest_phase(&data);
+    assert!((FULL_FROM..PHASES).contains(&rest), "rests at phase {rest}");
+    assert!(notes.iter().any(|note| note.contains(&format!("from phase {rest} on"))), "{notes:?}");
+
+    let finished = directory.path().join("run");
+    let said = run(&["train", text(&data), "-o", text(&finished), "--preset", "fast"], true);
+    assert!(said.contains(&format!("from phase {rest} on")), "{said}");
+    let evaluation: Value =
+        serde_json::from_slice(&std::fs::read(finished.join("report/evaluation.json")).unwrap()).unwrap();
+    let images = evaluation["images"].as_array().unwrap();
+    let mean_dice = |wanted: &dyn Fn(usize) -> bool| {
+        let dice: Vec<f64> = images
+            .iter()
+            .filter(|image| wanted(image["phase"].as_u64().unwrap() as usize))
+            .map(|image| image["dice_dynamic"].as_f64().unwrap())
+            .collect();
+        dice.iter().sum::<f64>() / dice.len() as f64
+    };
+    // From phase 0 on it is .1 and .2.
+    let (full, filling) = (mean_dice(&|phase| phase > FULL_FROM), mean_dice(&|phase| phase < FULL_FROM));
+    assert!(full > 0.8 && filling > 0.4, "{full} where vessels are full, {filling} where they are being filled");
+}
+
+#[test]
+fn full_vessels_rest_at_phase_0() {
+    let directory = tempfile::tempdir().unwrap();
+    let (rest, notes) = rest_phase(&phantom(directory.path(), &["--photons", "2e7"]));
+    assert_eq!(rest, 0, "{notes:?}");
+    assert!(!notes.iter().any(|note| note.contains("from phase")), "{notes:?}");
+}
