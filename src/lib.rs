@@ -227,6 +227,7 @@ pub mod vessels {
 /// What a reconstruction is worth.
 pub mod score {
     pub mod calibrated;
+    pub mod ceiling;
     pub mod distance;
     pub mod eval;
     pub mod metrics;

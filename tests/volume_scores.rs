@@ -141,8 +141,13 @@ fn vessels_of(field: &Volume) -> Volume {
     Volume { values, ..field.clone() }
 }
 
-/// Scores of the run against other true vessels in its dataset.
+/// Scores in 3D of the run against other true vessels in its dataset.
 fn scores(name: &str, truth: impl Fn(&Volume) -> Volume) -> Value {
+    evaluated(name, truth)["volume"].take()
+}
+
+/// All scores of the run against other true vessels in its dataset.
+fn evaluated(name: &str, truth: impl Fn(&Volume) -> Volume) -> Value {
     let Trained { directory, data, run, fields } = trained();
     let copy = directory.path().join(name);
     for part in ["images", "masks"] {
@@ -158,9 +163,8 @@ fn scores(name: &str, truth: impl Fn(&Volume) -> Volume) -> Value {
         nrrd::write(&file, &truth(field), "attenuation per mm").unwrap();
     }
     let threshold = THRESHOLD_PER_MM.to_string();
-    let said = ok(&["eval", text(run), "--data", text(&copy), "--threshold", &threshold, "--json"]);
-    let mut evaluation: Value = serde_json::from_str(&said).unwrap();
-    evaluation["volume"].take()
+    let said = ok(&["eval", text(run), "--data", text(&copy), "--threshold", &threshold, "--ceiling", "--json"]);
+    serde_json::from_str(&said).unwrap()
 }
 
 fn number(scores: &Value, name: &str) -> f64 {
@@ -234,6 +238,26 @@ fn a_moved_truth_is_as_far_away_as_it_was_moved() {
     }
 }
 
+/// The reconstruction's own field as the truth: rays through its volumes find what rays through the field find.
+#[test]
+fn true_vessels_are_scored_as_the_field_is() {
+    let evaluation = evaluated("ceiling", Volume::clone);
+    let ceiling = &evaluation["ceiling"];
+    let field = [number(&evaluation["dice"], "dynamic"), number(&evaluation["best_dice"]["dynamic"], "dice")];
+    let volumes = [number(ceiling, "dice"), number(&ceiling["best"], "dice")];
+    for (field, volumes) in field.into_iter().zip(volumes) {
+        assert!(field > 0.2 && (volumes - field).abs() < 0.05, "{volumes} of the volumes, {field} of the field");
+    }
+    // Elsewhere they score nothing.
+    let moved = |field: &Volume| {
+        let mut volume = field.clone();
+        volume.index_to_lps.translation += DVec3::new(0.0, 0.0, 15.0);
+        volume
+    };
+    let moved = evaluated("elsewhere", moved);
+    assert!(number(&moved["ceiling"], "dice") < 0.5 * field[0], "{}", moved["ceiling"]);
+}
+
 #[test]
 fn reports_show_scores_in_3d_and_do_without() {
     let Trained { directory, run, .. } = trained();
@@ -249,8 +273,11 @@ fn reports_show_scores_in_3d_and_do_without() {
     // Without volumes there is not even the field.
     let bare = directory.path().join("bare");
     ok(&["phantom", text(&bare), "--size", "40", "--phases", &PHASES.to_string(), "--no-volumes"]);
-    let evaluation = || serde_json::from_str::<Value>(&ok(&["eval", text(run), "--data", text(&bare), "--json"]));
-    assert!(evaluation().unwrap().get("volume").is_none());
+    let evaluation =
+        || serde_json::from_str::<Value>(&ok(&["eval", text(run), "--data", text(&bare), "--ceiling", "--json"]));
+    let without = evaluation().unwrap();
+    assert!(without.get("volume").is_none() && without.get("ceiling").is_none());
+    assert!(without["warnings"].to_string().contains("no ceiling"), "{}", without["warnings"]);
     // A truth that cannot be used is told of, and images are scored all the same.
     std::fs::create_dir_all(bare.join("volumes")).unwrap();
     std::fs::write(bare.join("volumes/vessels-01.nrrd"), "NRRD0004\n").unwrap();

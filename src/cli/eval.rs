@@ -12,8 +12,10 @@ use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
+use nertca_vk::score::ceiling::truth_dice;
 use nertca_vk::score::eval::{BestDice, BestDices, Evaluation};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// `eval`.
 #[derive(Debug, Args)]
@@ -33,6 +35,9 @@ pub struct EvalArgs {
     /// `tree.json` beside it.
     #[arg(long)]
     pub tree: bool,
+    /// Score the true vessels by the same rule, too, where the dataset has their volumes: what a perfect field would reach.
+    #[arg(long)]
+    pub ceiling: bool,
     /// Dice threshold on attenuation, 1/mm, instead of the rule.
     #[arg(long, value_name = "PER_MM")]
     pub threshold: Option<f64>,
@@ -54,6 +59,9 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     let cancel = stop_flag()?;
     let scoring = ScoreOptions { threshold_per_mm: args.threshold, pictures: args.images.as_deref(), cancel: &cancel };
     let mut evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut show_evaluation())?;
+    if args.ceiling {
+        add_ceiling(&data, &mut evaluation, &cancel)?;
+    }
     let run = if args.run.is_dir() { args.run.as_path() } else { args.run.parent().unwrap_or(Path::new("")) };
     let (pictures, page) = match &args.images {
         Some(images) => (images.as_path(), images.join("report.html")),
@@ -80,6 +88,25 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     print_scores(args, &evaluation)?;
     evaluation.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
     cli.close_device(&gpu)
+}
+
+/// Scores the true vessels of a dataset as the model was scored, by the geometry that the dataset states.
+fn add_ceiling(data: &Path, evaluation: &mut Evaluation, cancel: &AtomicBool) -> Result<()> {
+    let proceed = || if cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) };
+    let found = truth_dice(&Dataset::open(data)?, evaluation.threshold.dynamic_per_mm, proceed);
+    let without = match found {
+        // The truth is at fault: the model is scored all the same.
+        Err(error @ (Error::Data { .. } | Error::Io { .. })) => Some(error.to_string()),
+        Ok(None) => {
+            Some(format!("no unseen image of {} has a mask and a true volume (volumes/) of its phase", data.display()))
+        }
+        found => {
+            evaluation.ceiling = found?;
+            None
+        }
+    };
+    evaluation.warnings.extend(without.map(|why| format!("There is no ceiling: {why}.")));
+    Ok(())
 }
 
 fn print_scores(args: &EvalArgs, evaluation: &Evaluation) -> Result<()> {
@@ -135,6 +162,9 @@ pub fn print_table(evaluation: &Evaluation) {
     };
     let BestDices { dynamic, total } = evaluation.best_dice;
     out!("best Dice over thresholds, found with the masks: {} / {}", best(dynamic), best(total));
+    if let Some(ceiling) = evaluation.ceiling {
+        out!("the true vessels by the same rule: {:.3}; best over thresholds {}", ceiling.dice, best(ceiling.best));
+    }
     let published = evaluation.dice_published;
     out!(
         "Dice at the authors' threshold, {:.4e} per mm: {} (dynamic, as in the paper) / {} (total, first image, as in their code)",

@@ -8,6 +8,7 @@ use crate::raster::percentile;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::dataset::{Dataset, Frame};
+use crate::score::ceiling::TruthDice;
 use crate::score::metrics;
 use crate::score::trees::TreeScores;
 use crate::score::volume::VolumeScores;
@@ -119,6 +120,9 @@ pub struct Evaluation {
     pub ssim: f64,
     /// Thresholds used.
     pub threshold: Thresholds,
+    /// What the true vessels score on the same images, where that was asked for and the dataset carries them as volumes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ceiling: Option<TruthDice>,
     /// Scores in 3D, where the dataset carries its vessels as volumes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub volume: Option<VolumeScores>,
@@ -184,14 +188,14 @@ pub fn vessel_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &Patien
 }
 
 /// Dice of what exceeds a threshold with the mask of a frame; none without a mask.
-fn overlap(frame: &Frame, values: &[f32], threshold: f64) -> Option<f64> {
+pub(super) fn overlap(frame: &Frame, values: &[f32], threshold: f64) -> Option<f64> {
     let mask = frame.mask.as_ref()?;
     let predicted: Vec<bool> = values.iter().map(|v| f64::from(*v) > threshold).collect();
     Some(metrics::dice(&predicted, mask))
 }
 
 /// The mean; none of nothing.
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+pub(super) fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     let (n, sum) = values.fold((0usize, 0.0), |(n, sum), value| (n + 1, sum + value));
     (n > 0).then(|| sum / n as f64)
 }
@@ -277,6 +281,7 @@ pub fn evaluate(
             total_per_mm: per_mm(total_threshold),
             rule,
         },
+        ceiling: None,
         volume: None,
         tree: None,
         warnings: Vec::new(),
