@@ -5,10 +5,10 @@ use crate::error::Result;
 use crate::gaussians::stages::{FIXED_POINT_BITS, SplatStage};
 use crate::gaussians::view::SplatView;
 use crate::geometry::ViewRays;
-use crate::gpu::buffer::Memory;
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, Groups, Recording};
-use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
+use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch, dispatch_finding};
 use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, Splat};
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
@@ -18,6 +18,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Pictures kept recorded; a display in use has far fewer.
 const MOST_RECORDED: usize = 256;
+
+/// Line integral of a unit of the sums in fixed point.
+fn line_integral(units: Units) -> f32 {
+    (units.strongest / 2f64.powi(FIXED_POINT_BITS)) as f32
+}
 
 /// What a recorded picture is of.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
@@ -33,6 +38,7 @@ pub struct Pictures {
     gpu: Gpu,
     project: Stage<push::GaussianProject>,
     splat: SplatStage<push::GaussianSplat>,
+    show: Stage<push::GaussianPicture>,
     state: Mutex<State>,
 }
 
@@ -76,7 +82,14 @@ impl Pictures {
     /// Errors of [`Gpu::pipeline`].
     pub fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<Pictures> {
         let state = Mutex::new(State { field: field.clone(), recorded: HashMap::new() });
-        Ok(Pictures { gpu: gpu.clone(), project: Build::default().stage(gpu)?, splat: SplatStage::new(gpu)?, state })
+        let plain = Build::default();
+        Ok(Pictures {
+            gpu: gpu.clone(),
+            project: plain.stage(gpu)?,
+            splat: SplatStage::new(gpu)?,
+            show: plain.stage(gpu)?,
+            state,
+        })
     }
 
     /// Draws another field from now on.
@@ -104,8 +117,34 @@ impl Pictures {
         self.gpu.wait(picture.commands.submit()?)?;
         let mut sums = vec![0i32; width * height];
         picture.buffers.splat_images.read(&mut sums)?;
-        let unit = units.strongest / 2f64.powi(FIXED_POINT_BITS);
-        Ok(sums.iter().map(|v| (f64::from(*v) * unit) as f32).collect())
+        Ok(sums.iter().map(|v| *v as f32 * line_integral(units)).collect())
+    }
+
+    /// Draws a view as [`Pictures::draw`] does, into a buffer on the device: `width` x `height` floats, `in_front` of the line
+    /// integrals that it holds or instead of them.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn draw_into(
+        &self,
+        target: &Buffer,
+        rays: &ViewRays,
+        (width, height): (usize, usize),
+        phase: u32,
+        in_front: bool,
+    ) -> Result<()> {
+        let time = f64::from(phase).to_bits();
+        let (units, picture) = self.picture(Key { columns: width, rows: height, time })?;
+        let _alone = picture.in_use.lock().unwrap_or_else(PoisonError::into_inner);
+        picture.buffers.gaussian_views.write(&[SplatView::new(rays, units).to_device()])?;
+        let n_pixels = (width * height) as u32;
+        let push = push::GaussianPicture { n_pixels, unit: line_integral(units), in_front: u32::from(in_front) };
+        let bound = [(Binding::splat_images, (&picture.buffers.splat_images).into()), (Binding::image, target.into())];
+        let mut recording = Recording::new(&self.gpu, "picture of Gaussians into a buffer")?;
+        dispatch(&mut recording, &self.show, self.show.groups_for(n_pixels), &bound, push)?;
+        let shown = recording.finish()?;
+        self.gpu.wait(picture.commands.submit()?)?;
+        self.gpu.wait(shown.submit()?)
     }
 
     fn picture(&self, key: Key) -> Result<(Units, Arc<Picture>)> {

@@ -198,14 +198,33 @@ impl Baked {
         self.renderer.check_phase(phase)?;
         target.check_range(0, (width * height * 4) as u64)?;
         if self.renderer.draws_gaussians(quantity) {
-            // Their kernels leave a picture among other things, so it goes through the host.
-            let image = self.render_gaussians(rays, (width, height), phase, quantity)?;
-            return self.renderer.gpu.upload(target, 0, &image);
+            return self.render_gaussians_into(target, rays, (width, height), phase, quantity);
         }
         let view = self.renderer.gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
         view.write(&[View::of(rays)])?;
         let commands = self.record(&view, target, (width, height), phase, quantity)?;
         self.renderer.gpu.wait(commands.submit()?)
+    }
+
+    /// [`Baked::render_gaussians`] into a buffer. Only their largest values, which are climbed to with a few other things, come
+    /// by way of the host.
+    fn render_gaussians_into(
+        &self,
+        target: &Buffer,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: u32,
+        quantity: Quantity,
+    ) -> Result<()> {
+        if quantity.projection == Projection::Mip {
+            let image = self.render_gaussians(rays, size, phase, quantity)?;
+            return self.renderer.gpu.upload(target, 0, &image);
+        }
+        let has_static = quantity.component.has_static();
+        if has_static {
+            self.render_into(target, rays, size, phase, Quantity { component: Component::Static, ..quantity })?;
+        }
+        self.renderer.show_gaussians_into(target, rays, size, phase, has_static)
     }
 
     fn recorded_view(&self, width: usize, height: usize, phase: u32, quantity: Quantity) -> Result<Arc<RecordedView>> {

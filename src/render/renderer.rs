@@ -232,6 +232,24 @@ impl Renderer {
         Ok(self.render_parts(rays, (width, height), phase, parts)?.show(quantity))
     }
 
+    /// Draws line integrals of Gaussians as [`Renderer::show`] does, into a buffer on the device, `in_front` of what it holds or
+    /// instead of it.
+    ///
+    /// # Errors
+    /// As [`Renderer::render`]; [`Error::Internal`] where a network moves.
+    pub(crate) fn show_gaussians_into(
+        &self,
+        target: &Buffer,
+        rays: &ViewRays,
+        size: (usize, usize),
+        phase: u32,
+        in_front: bool,
+    ) -> Result<()> {
+        self.check_phase(phase)?;
+        let pictures = self.pictures.as_ref().ok_or_else(|| Error::Internal("no Gaussians to draw".into()))?;
+        pictures.draw_into(target, rays, size, phase, in_front)
+    }
+
     /// Whether Gaussians are the moving field, not a network.
     pub fn gaussians_move(&self) -> bool {
         self.moving.is_some()

@@ -24,6 +24,10 @@ const RAYS: &[&str] = &[push::GaussianRays::SHADER];
 const POINTS: &[&str] = &[push::GaussianPoints::SHADER];
 const PICTURES: &[&str] = &["pictures at display rates"];
 
+const INTO_BUFFERS: &[&str] = &[push::GaussianPicture::SHADER];
+
+/// The host and the device round alike.
+const SAME: Tolerance = Tolerance::OfLargest(0.0);
 /// Closed forms in f32.
 const INTEGRAL: Tolerance = Tolerance::OfLargest(1e-4);
 /// The twin steps along the ray, so it may miss a peak by the square of its step; the device may end a climb early.
@@ -74,6 +78,19 @@ pub fn compare_rays(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Resu
         let line = Quantity { component: Component::Dynamic, projection: Projection::Drr };
         let quick = renderer.show(rays, (width, height), phase, line)?;
         findings.numbers(PICTURES, "integrals", &quick, &integrals, PICTURE);
+        // In front of what a buffer holds, and instead of it.
+        let held: Vec<f32> = (0..quick.len()).map(|pixel| 0.1 + 0.01 * (pixel % 7) as f32).collect();
+        let buffer = gpu.buffer_with("image", &held)?;
+        for in_front in [true, false] {
+            renderer.show_gaussians_into(&buffer, rays, (width, height), phase, in_front)?;
+            let shown: Vec<f32> = gpu.download(&buffer, 0, quick.len())?;
+            let wanted: Vec<f64> = if in_front {
+                quick.iter().zip(&held).map(|(a, b)| f64::from(a + b)).collect()
+            } else {
+                quick.iter().copied().map(f64::from).collect()
+            };
+            findings.numbers(INTO_BUFFERS, "integrals", &shown, &wanted, SAME);
+        }
     }
     Ok(())
 }
