@@ -24,6 +24,8 @@ use crate::network::pass::Pass;
 
 /// Loss scale a run on matrices starts with.
 pub const FIRST_LOSS_SCALE: f32 = 65_536.0;
+/// The same where both fields are networks, whose attenuations and gradients are a hundred times as small: the largest there is.
+pub const FIRST_LOSS_SCALE_OF_TWO: f32 = 16_777_216.0;
 
 /// What a network is built for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,6 +97,7 @@ buffer_set! {
 pub struct Network {
     map: NetworkMap,
     layers: Layers,
+    first_loss_scale: f32,
     path: Box<dyn Path>,
     phase_bias: Buffer,
     gradient: Option<GradientBuffers>,
@@ -135,7 +138,12 @@ impl Network {
                 })
             }
         };
-        Ok(Network { map: params.clone(), layers: tuning.layers, path, phase_bias, gradient })
+        let first_loss_scale = match tuning.layers {
+            Layers::F32 => 1.0,
+            Layers::Matrices if setup.two_networks != 0 => FIRST_LOSS_SCALE_OF_TWO,
+            Layers::Matrices => FIRST_LOSS_SCALE,
+        };
+        Ok(Network { map: params.clone(), layers: tuning.layers, first_loss_scale, path, phase_bias, gradient })
     }
 
     /// Where its parameters live.
@@ -150,10 +158,7 @@ impl Network {
 
     /// Loss scale to start with.
     pub fn first_loss_scale(&self) -> f32 {
-        match self.layers {
-            Layers::F32 => 1.0,
-            Layers::Matrices => FIRST_LOSS_SCALE,
-        }
+        self.first_loss_scale
     }
 
     /// Where the gradient is summed; none when built for rendering.

@@ -45,7 +45,7 @@ section! {
         iterations: u32 in 1.0 to 1e6,
         /// Rays of a batch.
         rays: u32 in 1.0 to 65_535.0,
-        /// Share of the batch drawn from rays that meet the motion hull.
+        /// Share of the batch drawn from rays that meet the motion hull; with two networks, from those that change.
         motion_share: f64 in 0.0 to 1.0,
         /// Samples evaluated at once, at most: bounds device memory, not results. A device may allow fewer.
         chunk_samples: u32 in 1024.0 to 1_048_576.0,
@@ -153,7 +153,7 @@ section! {
         least_slope: f64 in 0.0 to 1.0,
         /// Weight of occlusion minimisation, lambda_o.
         occlusion: f64 in 0.0 to 1e6,
-        /// Share of the depth range, from the source, it covers.
+        /// Share of the depth range, from the source, it covers; with two networks, that `networks.near_integral` does.
         occlusion_share: f64 in 0.0 to 1.0,
     }
 }

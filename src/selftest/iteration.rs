@@ -11,8 +11,8 @@ use crate::kernels::layout::{self, RayOut};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::params::{ParamMap, Tensor};
-use crate::network::FIRST_LOSS_SCALE;
 use crate::network::chunk::chunks;
+use crate::network::{FIRST_LOSS_SCALE, FIRST_LOSS_SCALE_OF_TWO};
 use crate::plan::Plan;
 use crate::reference::field::{self, Precision, Shown};
 use crate::reference::{march, step};
@@ -262,8 +262,10 @@ fn compare_stages(gpu: &Gpu, trainer: &mut Trainer, params: &[f32], findings: &m
 
 /// Precision of the path that a run takes, for as long as its loss scale is the first.
 pub(super) fn precision_of(trainer: &Trainer) -> Precision {
+    let of_two = trainer.plan().params.still.is_some();
     match trainer.tuning().layers {
         Layers::F32 => Precision::Exact,
+        Layers::Matrices if of_two => Precision::F16 { loss_scale: FIRST_LOSS_SCALE_OF_TWO.into() },
         Layers::Matrices => Precision::F16 { loss_scale: FIRST_LOSS_SCALE.into() },
     }
 }
