@@ -16,8 +16,10 @@ void main() {
     if (i >= setup.n_params) return;
     Schedule now = schedule[state.step];
     bool is_static = i < setup.static_params;
-    // The network's gradient overflowed, so this update is skipped.
-    if (!is_static && (now.dynamic_active == 0u || state.overflowed != 0u)) return;
+    if (state.stopped != 0u) return;
+    // A network's gradient overflowed, so this update is skipped.
+    bool of_network = !is_static || setup.two_networks != 0u;
+    if (of_network && (now.dynamic_active == 0u || state.overflowed != 0u)) return;
     float g = gradient[i];
     vec2 moment = now.reset != 0u ? vec2(0.0) : moments[i];
     moment.x = setup.beta1 * moment.x + (1.0 - setup.beta1) * g;

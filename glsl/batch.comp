@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Draws the rays of one iteration. One invocation per ray.
-//   rays[n_rays] <- permutations of the rays that meet the hull, and of all training rays or those listed as shown, without
-//   replacement.
+//   rays[n_rays] <- permutations of the rays that meet the hull (two networks: of those that change), and of all training rays or
+//   those listed as shown, without replacement.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/pixel_ray.glsl"
@@ -14,7 +14,8 @@ layout(binding = 3) readonly buffer B3 { Frame frames[]; };
 layout(binding = 4) readonly buffer B4 { float images[]; };
 layout(binding = 5) readonly buffer B5 { vec2 backgrounds[]; };
 layout(binding = 6) readonly buffer B6 { uint listed_rays[]; };
-layout(binding = 7) writeonly buffer B7 { Ray rays[]; };
+layout(binding = 7) readonly buffer B7 { float pixel_changes[]; };
+layout(binding = 8) writeonly buffer B8 { Ray rays[]; };
 
 uint draw(uint slot, uint per_step, uint n, uint stream) {
     uint counter = state.step * per_step + slot;
@@ -41,7 +42,7 @@ void main() {
     ray.anchor = line.anchor;
     ray.phase = frame.phase;
     ray.direction = line.direction;
-    ray.norm = length(line.direction);
+    ray.norm = setup.along_axis != 0u ? 1.0 : length(line.direction);
     ray.target = images[frame.image_offset + pixel];
     vec2 background = backgrounds[frame.background_offset + pixel];
     ray.temporal_low = ray.target - background.y;
@@ -49,5 +50,6 @@ void main() {
     ray.temporal_high = ray.target - background.x;
     ray.beyond = frame.beyond;
     ray.beyond_share = frame.beyond_share;
+    ray.change = setup.two_networks != 0u ? pixel_changes[frame.background_offset + pixel] : 0.0;
     rays[r] = ray;
 }

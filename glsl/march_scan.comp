@@ -1,7 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Turns the counts of a chunk into offsets (exclusive prefix sum over rays, one workgroup) and writes the
-// indirect arguments of all passes over live samples. While the dynamic field is delayed nothing is live.
+// indirect arguments of all passes over live samples. While the dynamic field is delayed, and when learning has ended, nothing
+// is live.
 //   ray_counts[n_rays] -> ray_start[n_rays + 1];  live: how many.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
@@ -19,7 +20,7 @@ shared uint totals[gl_WorkGroupSize.x];
 
 void main() {
     uint lane = gl_LocalInvocationID.x;
-    uint active_now = schedule[state.step].dynamic_active;
+    uint active_now = state.stopped != 0u ? 0u : schedule[state.step].dynamic_active;
     uint per = (push.n_rays + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
     uint begin = min(lane * per, push.n_rays);
     uint end = min(begin + per, push.n_rays);

@@ -33,6 +33,7 @@ layout(binding = 9) readonly buffer B9 { uvec4 outputs16[]; };
 layout(binding = 10) readonly buffer B10 { uvec4 dz16[]; };
 layout(binding = 11) writeonly buffer B11 { uvec4 dz_in16[]; };
 layout(binding = 12) buffer B12 { float partials[]; };
+layout(binding = 13) readonly buffer B13 { float sigma_gradient[]; };
 
 const uint width8 = width / 8u;
 const uint columns8 = columns / 8u;

@@ -17,6 +17,7 @@ READ_VEC4(6, B6, activations);
 READ_VEC4(7, B7, params);
 layout(binding = 8) writeonly buffer B8 { float sample_feature_gradient[]; };
 layout(binding = 9) writeonly buffer B9 { vec4 dz[]; };
+layout(binding = 10) readonly buffer B10 { float sigma_gradient[]; };
 #include "inc/sample_gradient.glsl"
 
 void main() {

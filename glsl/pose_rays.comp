@@ -6,6 +6,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
     uint first_pixel; uint n_rays; uint phase; uint beyond; float beyond_share; uint image_width; uint view;
+    uint along_axis;
 } push;
 layout(binding = 0) readonly buffer B0 { View views[]; };
 layout(binding = 1) writeonly buffer B1 { Ray rays[]; };
@@ -19,12 +20,13 @@ void main() {
     ray.anchor = line.anchor;
     ray.phase = push.phase;
     ray.direction = line.direction;
-    ray.norm = length(line.direction);
+    ray.norm = push.along_axis != 0u ? 1.0 : length(line.direction);
     ray.target = 0.0;
     ray.temporal_low = 0.0;
     ray.id = pixel;
     ray.temporal_high = 0.0;
     ray.beyond = push.beyond;
     ray.beyond_share = push.beyond_share;
+    ray.change = 0.0;
     rays[r] = ray;
 }

@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 // Closes an iteration: sums the losses into a ring the host reads now and then, adapts the loss scale, and counts
 // the step.
-//   ring[step % ring_length]: what the iteration came to.
+//   ring[step % ring_length]: what the iteration came to; once learning has ended, what the last one came to.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint loss_scaling = 0u;
@@ -11,7 +11,9 @@ layout(binding = 1) buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { vec4 ray_loss[]; };
 layout(binding = 3) readonly buffer B3 { float tv_value[]; };
 layout(binding = 4) readonly buffer B4 { LiveSamples live; };
-layout(binding = 5) writeonly buffer B5 { StepReport ring[]; };
+layout(binding = 5) buffer B5 { StepReport ring[]; };
+layout(binding = 6) readonly buffer B6 { vec4 ray_regularisers[]; };
+layout(binding = 7) readonly buffer B7 { Schedule schedule[]; };
 #include "inc/reduce.glsl"
 
 const uint GOOD_UPDATES_TO_GROW = 500u;
@@ -30,22 +32,49 @@ void adapt_scale(float scale) {
     state.good_updates = good;
 }
 
+// The losses of two networks beside those that every iteration has.
+StepReport with_regularisers(StepReport result, vec4 regularisers) {
+    Schedule now = schedule[state.step];
+    float vanishing = min(regularisers.x, regularisers.y);
+    bool over = setup.stop_after > 0u && result.step > setup.stop_after && vanishing < setup.stop_below;
+    result.favour_static = now.favour_static * regularisers.x;
+    result.ray_entropy = now.ray_entropy * regularisers.y;
+    result.static_size = now.static_size * regularisers.z;
+    result.stopped = over ? 1u : 0u;
+    return result;
+}
+
 void main() {
     uint lane = gl_LocalInvocationID.x;
+    bool two_networks = setup.two_networks != 0u;
     vec4 losses = vec4(0.0);
-    for (uint r = lane; r < setup.n_rays; r += gl_WorkGroupSize.x) losses += ray_loss[r];
+    vec4 regularisers = vec4(0.0);
+    for (uint r = lane; r < setup.n_rays; r += gl_WorkGroupSize.x) {
+        losses += ray_loss[r];
+        if (two_networks) regularisers += ray_regularisers[r];
+    }
     float tv = 0.0;
-    for (uint i = lane; i < setup.static_params; i += gl_WorkGroupSize.x) tv += tv_value[i];
+    uint n_tv = two_networks ? 0u : setup.static_params;
+    for (uint i = lane; i < n_tv; i += gl_WorkGroupSize.x) tv += tv_value[i];
     float data = workgroup_sum(losses.x);
     float dynamic_data = workgroup_sum(losses.y);
     float occlusion = workgroup_sum(losses.z);
     float squared = workgroup_sum(losses.w);
     tv = workgroup_sum(tv);
+    if (two_networks) regularisers = workgroup_sum(regularisers);
     if (lane == 0u) {
         uint step = state.step;
-        ring[step % setup.ring_length] =
-            StepReport(data, dynamic_data, tv, setup.occlusion_weight * occlusion, squared, live.of_iteration,
-                       step + 1u, state.loss_scale);
+        float occlusion_weight = two_networks ? schedule[step].near_integral : setup.occlusion_weight;
+        StepReport result = StepReport(data, dynamic_data, tv, occlusion_weight * occlusion, squared, live.of_iteration,
+                                       step + 1u, state.loss_scale, 0.0, 0.0, 0.0, 0u);
+        if (two_networks) result = with_regularisers(result, regularisers);
+        if (state.stopped != 0u) {
+            result = ring[(step - 1u) % setup.ring_length];
+            result.step = step + 1u;
+        }
+        result.stopped = max(result.stopped, state.stopped);
+        ring[step % setup.ring_length] = result;
+        state.stopped = result.stopped;
         if (loss_scaling != 0u && live.of_iteration > 0u) adapt_scale(state.loss_scale);
         state.step = step + 1u;
     }

@@ -8,7 +8,8 @@ pub mod sections;
 use crate::choice::Choice;
 use crate::error::{Error, Result};
 use sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree, check_range,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, StaticField, Train, Tree,
+    check_range,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -26,10 +27,12 @@ pub enum Preset {
     Paper,
     /// As the authors' public code does it.
     PublicCode,
+    /// NeRF-CA, which the paper compares itself with, as its public code does it: both fields are networks.
+    NerfCa,
 }
 
 impl Choice for Preset {
-    const ALL: &'static [Preset] = &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode];
+    const ALL: &'static [Preset] = &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa];
 
     fn name(self) -> &'static str {
         match self {
@@ -37,6 +40,29 @@ impl Choice for Preset {
             Preset::FastMlp => "fast-mlp",
             Preset::Paper => "paper",
             Preset::PublicCode => "public-code",
+            Preset::NerfCa => "nerf-ca",
+        }
+    }
+}
+
+/// What the still field is made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum StaticForm {
+    /// Planes and lines.
+    #[default]
+    Tensor,
+    /// A network like that of the dynamic field, but for the latents; their attenuations add up at the same samples.
+    Network,
+}
+
+impl Choice for StaticForm {
+    const ALL: &'static [StaticForm] = &[StaticForm::Tensor, StaticForm::Network];
+
+    fn name(self) -> &'static str {
+        match self {
+            StaticForm::Tensor => "tensor",
+            StaticForm::Network => "network",
         }
     }
 }
@@ -143,6 +169,9 @@ pub struct Config {
     pub hull: Hull,
     /// Occupancy learned while training.
     pub occupancy: Occupancy,
+    /// Two networks as the fields; checkpoints of before have none.
+    #[serde(default = "presets::networks")]
+    pub networks: Networks,
     /// The optimiser.
     pub adam: Adam,
     /// Gaussians as the moving field; checkpoints of before have none.
@@ -201,6 +230,11 @@ impl Config {
         self.gaussians.form != GaussianForm::None
     }
 
+    /// Whether the still field is a network, too.
+    pub fn two_networks(&self) -> bool {
+        self.static_field.form == StaticForm::Network
+    }
+
     /// Iterations, the first of the run, that go to Gaussians; the still field has the others.
     pub fn gaussian_iterations(&self) -> u32 {
         if self.gaussians_move() { self.gaussians.iterations.min(self.train.iterations) } else { 0 }
@@ -225,6 +259,7 @@ impl Config {
         self.loss.check_ranges()?;
         self.hull.check_ranges()?;
         self.occupancy.check_ranges()?;
+        self.networks.check_ranges()?;
         self.adam.check_ranges()?;
         self.gaussians.check_ranges()?;
         self.tree.check_ranges()?;
@@ -256,6 +291,43 @@ impl Config {
         }
         if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
             return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
+        }
+        if self.two_networks() { self.check_two_networks() } else { Ok(()) }
+    }
+
+    /// Refuses what does not go with two networks.
+    fn check_two_networks(&self) -> Result<()> {
+        let form = "does not go with static.form = \"network\"";
+        let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
+            Err(Error::config(field, value, format!("{form}: {instead}")))
+        };
+        if self.gaussians_move() {
+            return refuse("gaussians.form", &self.gaussians.form.name(), "take \"none\", or static.form = \"tensor\"");
+        }
+        for (field, is_on) in [
+            ("hull.enabled", self.hull.enabled),
+            ("occupancy.enabled", self.occupancy.enabled),
+            ("loss.normalise", self.loss.normalise),
+            ("dynamic.encode_box", self.dynamic.encode_box),
+            ("march.fit_dynamic_range", self.march.fit_dynamic_range),
+            ("march.fit_static_range", self.march.fit_static_range),
+        ] {
+            if is_on {
+                return refuse(field, &true, "both fields are asked everywhere, in world units; take false");
+            }
+        }
+        if self.loss.dynamic_target != DynamicTarget::Absolute {
+            return refuse("loss.dynamic_target", &"temporal", "one residual drives both fields; take \"absolute\"");
+        }
+        for (field, value) in [
+            ("dynamic.delay", f64::from(self.dynamic.delay)),
+            ("dynamic.least_slope", self.dynamic.least_slope),
+            ("dynamic.occlusion", self.dynamic.occlusion),
+        ] {
+            if value != 0.0 {
+                let instead = "take 0 (networks.near_integral weighs what is near, networks.delay and ramp say when)";
+                return refuse(field, &value, instead);
+            }
         }
         Ok(())
     }
@@ -326,9 +398,28 @@ mod tests {
             ("gaussians.count=0", "gaussians.count"),
             ("tree.track_blur=0", "tree.track_blur"),
             ("train", "setting"),
+            ("static.form=network", "gaussians.form"),
+            ("networks.gain=-1", "networks.gain"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
+        }
+    }
+
+    #[test]
+    fn what_does_not_go_with_two_networks_is_named() {
+        for (setting, part) in [
+            ("hull.enabled=true", "hull.enabled"),
+            ("occupancy.enabled=true", "occupancy.enabled"),
+            ("gaussians.form=tree", "gaussians.form"),
+            ("loss.dynamic_target=temporal", "loss.dynamic_target"),
+            ("loss.normalise=true", "loss.normalise"),
+            ("march.fit_static_range=true", "march.fit_static_range"),
+            ("dynamic.delay=3", "dynamic.delay"),
+            ("dynamic.occlusion=1e-8", "networks.near_integral"),
+        ] {
+            let message = Config::load(Some(Preset::NerfCa), None, &[setting.into()]).unwrap_err().to_string();
+            assert!(message.contains(part) && message.contains("static.form"), "{setting}: {message}");
         }
     }
 
@@ -346,6 +437,10 @@ mod tests {
         let config = Config::preset(Preset::FastMlp);
         let mut table = toml::Table::try_from(&config).unwrap();
         assert!(table.remove("gaussians").is_some() && table.remove("tree").is_some());
+        assert!(table.remove("networks").is_some());
+        for (section, key) in [("static", "form"), ("march", "along_axis"), ("adam", "decay_share")] {
+            assert!(table[section].as_table_mut().unwrap().remove(key).is_some());
+        }
         assert_eq!(table.try_into::<Config>().unwrap(), config);
     }
 }

@@ -8,7 +8,7 @@ use crate::gaussians::tree::TreeKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
 use crate::kernels::layout::Setup;
-use crate::kernels::stages::Kernels;
+use crate::kernels::stages::{Kernels, StillKernels};
 use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamMap;
 use crate::network::{Network, Purpose};
@@ -104,7 +104,10 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     let params = ParamMap::new(config, n_phases);
     let setup = Setup { sample_capacity: CAPACITY, n_rays: 1, n_dynamic_samples: 1, ..Setup::default() };
     for purpose in [Purpose::Train, Purpose::Render] {
-        Network::new(gpu, &tuning, &setup, &params, purpose)?;
+        params.networks().try_for_each(|map| Network::new(gpu, &tuning, &setup, map, purpose).map(|_| ()))?;
+    }
+    if params.still.is_some() {
+        StillKernels::new(gpu)?;
     }
     Kernels::new(gpu, tuning.clone(), params.line_len() as u32)?;
     if config.gaussians_move() {

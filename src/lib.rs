@@ -318,6 +318,7 @@ pub mod reference {
     pub mod gaussians;
     pub mod march;
     pub mod maxima;
+    pub mod networks;
     pub mod occupancy;
     pub mod projector;
     pub mod step;

@@ -1,4 +1,5 @@
-//! The dynamic field's network within an iteration, on either of two paths: [`layers`] or [`fused`].
+//! A field's network within an iteration, on either of two paths: [`layers`] or [`fused`]. The dynamic field is one; the still
+//! field may be another ([`still`]).
 
 pub mod chunk;
 pub mod cost;
@@ -6,6 +7,7 @@ pub mod forward;
 pub mod fused;
 pub mod layers;
 pub mod pass;
+pub mod still;
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::{Buffer, Memory};
@@ -14,7 +16,7 @@ use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;
 use crate::kernels::tuning::{Layers, Tuning};
-use crate::model::params::ParamMap;
+use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
 use crate::network::fused::FusedNetwork;
 use crate::network::layers::LayerNetwork;
@@ -22,6 +24,8 @@ use crate::network::pass::Pass;
 
 /// Loss scale a run on matrices starts with.
 pub const FIRST_LOSS_SCALE: f32 = 65_536.0;
+/// The same where both fields are networks, whose attenuations and gradients are a hundred times as small: the largest there is.
+pub const FIRST_LOSS_SCALE_OF_TWO: f32 = 16_777_216.0;
 
 /// What a network is built for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,13 +42,13 @@ trait Path: Send + Sync {
     fn find(&self, name: Binding) -> Option<&Buffer>;
 
     /// Samples per tile, and tiles across a layer forward and backward.
-    fn tiles(&self, params: &ParamMap) -> Tiles;
+    fn tiles(&self, params: &NetworkMap) -> Tiles;
 
     /// How the backward pass leaves the gradient.
-    fn partial_sums(&self, params: &ParamMap) -> PartialSums;
+    fn partial_sums(&self, params: &NetworkMap) -> PartialSums;
 
     /// Where in a part of the samples' sums the gradient of each network parameter lies.
-    fn gradient_source(&self, params: &ParamMap) -> Vec<u32>;
+    fn gradient_source(&self, params: &NetworkMap) -> Vec<u32>;
 
     /// Records what depends on parameters alone; `phase_bias` is there.
     fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()>;
@@ -89,16 +93,18 @@ buffer_set! {
     }
 }
 
-/// The dynamic field's network: kernels and buffers.
+/// A network: kernels and buffers.
 pub struct Network {
+    map: NetworkMap,
     layers: Layers,
+    first_loss_scale: f32,
     path: Box<dyn Path>,
     phase_bias: Buffer,
     gradient: Option<GradientBuffers>,
 }
 
 /// Samples a chunk may have, by the range of one storage buffer.
-pub fn largest_chunk(gpu: &Gpu, tuning: &Tuning, params: &ParamMap) -> u32 {
+pub fn largest_chunk(gpu: &Gpu, tuning: &Tuning, params: &NetworkMap) -> u32 {
     let bytes_per_sample = match tuning.layers {
         Layers::F32 => 4 * params.width,
         Layers::Matrices => 2 * params.width * params.layers.len(),
@@ -113,7 +119,7 @@ impl Network {
     /// # Errors
     /// [`Error::Config`] when matrices are asked for and do not fit; errors of the device, among them
     /// [`Error::OutOfMemory`] naming the buffer.
-    pub fn new(gpu: &Gpu, tuning: &Tuning, setup: &Setup, params: &ParamMap, purpose: Purpose) -> Result<Network> {
+    pub fn new(gpu: &Gpu, tuning: &Tuning, setup: &Setup, params: &NetworkMap, purpose: Purpose) -> Result<Network> {
         let path: Box<dyn Path> = match tuning.layers {
             Layers::F32 => Box::new(LayerNetwork::new(gpu, tuning, setup, params, purpose)?),
             Layers::Matrices => Box::new(FusedNetwork::new(gpu, tuning, setup, params, purpose)?),
@@ -132,7 +138,17 @@ impl Network {
                 })
             }
         };
-        Ok(Network { layers: tuning.layers, path, phase_bias, gradient })
+        let first_loss_scale = match tuning.layers {
+            Layers::F32 => 1.0,
+            Layers::Matrices if setup.two_networks != 0 => FIRST_LOSS_SCALE_OF_TWO,
+            Layers::Matrices => FIRST_LOSS_SCALE,
+        };
+        Ok(Network { map: params.clone(), layers: tuning.layers, first_loss_scale, path, phase_bias, gradient })
+    }
+
+    /// Where its parameters live.
+    pub fn map(&self) -> &NetworkMap {
+        &self.map
     }
 
     /// The path that computes the layers.
@@ -142,10 +158,7 @@ impl Network {
 
     /// Loss scale to start with.
     pub fn first_loss_scale(&self) -> f32 {
-        match self.layers {
-            Layers::F32 => 1.0,
-            Layers::Matrices => FIRST_LOSS_SCALE,
-        }
+        self.first_loss_scale
     }
 
     /// Where the gradient is summed; none when built for rendering.
@@ -163,7 +176,7 @@ impl Network {
     /// # Errors
     /// As [`Pass::run`]; so do all that follow.
     pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let (stage, params) = (&pass.kernels.mlp_latent_fwd, pass.params);
+        let (stage, params) = (&pass.kernels.mlp_latent_fwd, pass.network.map());
         for (i, layer) in params.layers.iter().enumerate() {
             let push = push::MlpLatentFwd {
                 layer: i as u32,
@@ -199,9 +212,9 @@ impl Network {
     /// As [`Network::record_weights`].
     pub fn record_gradient(&self, pass: &mut Pass<'_>) -> Result<()> {
         let Some(gradient) = &self.gradient else { return Err(built_for_rendering()) };
-        let (k, params) = (pass.kernels, pass.params);
+        let (k, params) = (pass.kernels, pass.network.map());
         let PartialSums { splits, len: n_partials } = self.path.partial_sums(params);
-        let (first, count) = (params.static_len as u32, params.network_len() as u32);
+        let (first, count) = (params.first as u32, params.len as u32);
         let push = push::GradientNetwork { first, count, splits, n_partials };
         pass.run(&k.gradient_network, k.gradient_network.groups_for(count), push)?;
         self.path.record_phase_sums(pass, gradient)?;
@@ -223,8 +236,8 @@ impl Network {
     }
 
     /// Push constants of `march_scan` for a chunk.
-    pub fn scan(&self, params: &ParamMap, chunk: Chunk) -> push::MarchScan {
-        let tiles = self.path.tiles(params);
+    pub fn scan(&self, chunk: Chunk) -> push::MarchScan {
+        let tiles = self.path.tiles(&self.map);
         push::MarchScan {
             n_rays: chunk.n_rays,
             tile_samples: tiles.samples,

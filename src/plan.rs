@@ -2,6 +2,7 @@
 //! hull, backgrounds, ray lists, schedule. Pure host code; both the engine and its CPU twin start here.
 
 pub mod carve;
+pub mod changes;
 pub mod fit;
 pub mod lengths;
 pub mod motion;
@@ -45,7 +46,10 @@ pub struct Plan {
     pub images: Vec<f32>,
     /// Bounds of the still background of each pixel of each view.
     pub backgrounds: Vec<[f32; 2]>,
-    /// Rays as frame * pixels + pixel: first those that meet the hull, then, where some pixels are hidden, all that are not.
+    /// How much each pixel of each view changes over the beat, where two networks are the fields; else empty.
+    pub pixel_changes: Vec<f32>,
+    /// Rays as frame * pixels + pixel: first those that meet the hull, then, where some pixels are hidden, all that are not. Of
+    /// two networks, first those that change, then the others that are not hidden.
     pub listed_rays: Vec<u32>,
     /// The hull, when it is used.
     pub hull: Option<Hull>,
@@ -119,8 +123,14 @@ impl Plan {
                 listed_rays.extend(shown.map(|p| (index * pixels + p) as u32));
             }
         }
-        let n_motion_list = listed_rays.len();
-        if !dataset.hidden.is_empty() {
+        let mut n_motion_list = listed_rays.len();
+        let mut pixel_changes = Vec::new();
+        if config.two_networks() {
+            let changes = changes::of_views(dataset, &motion);
+            (listed_rays, n_motion_list) = changes::rays(dataset, &motion, &changes, config.networks.least_change);
+            pixel_changes = changes.concat();
+            notes.extend(two_networks(config, n_motion_list as f64 / n_all as f64));
+        } else if !dataset.hidden.is_empty() {
             let shown = |id: &usize| dataset.shows(training[id / pixels].view, id % pixels);
             listed_rays.extend((0..n_all).filter(shown).map(|id| id as u32));
         }
@@ -152,6 +162,7 @@ impl Plan {
             frames,
             images,
             backgrounds,
+            pixel_changes,
             listed_rays,
             hull,
             targets,
@@ -231,6 +242,26 @@ fn wide_motion(soft: &SoftMotion) -> Option<String> {
     let what = "something wide moves besides vessels, as a heart, a diaphragm or lungs do: \
                 it is held still where vessels are looked for";
     (!views.is_empty()).then(|| format!("views {views:?}: {what}"))
+}
+
+/// What is said of two networks, of whose rays a `share` changes over the beat.
+fn two_networks(config: &Config, share: f64) -> [String; 2] {
+    let near = config.dynamic.occlusion_share;
+    [
+        format!(
+            "two networks are the fields, in no box and no hull; {:.1} % of the rays change over the beat",
+            100.0 * share
+        ),
+        if near >= 1.0 {
+            "the dynamic field is kept small along whole rays, as NeRF-CA's code does (dynamic.occlusion_share = 1)"
+                .into()
+        } else {
+            format!(
+                "the dynamic field is kept small along the near {:.0} % of rays (dynamic.occlusion_share)",
+                100.0 * near
+            )
+        },
+    ]
 }
 
 fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes: &mut Vec<String>) -> Option<Hull> {

@@ -2,7 +2,7 @@
 //! what a report of a fault begins with. The tests use the same problems, comparisons and tolerances.
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
-//! 2. [`iteration`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
+//! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
 //!    [`gaussians`], [`trees`] and [`blobs`] about Gaussians; [`projections`] about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 
@@ -11,6 +11,7 @@ pub mod compare;
 pub mod drawing;
 pub mod gaussians;
 pub mod iteration;
+pub mod networks;
 pub mod occupancy;
 pub mod problems;
 pub mod projections;
@@ -78,12 +79,16 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
         let mut all = cases.iter().flat_map(|(images, cases)| cases.iter().map(move |case| (images, case)));
         all.try_for_each(|(images, case)| iteration::compare(gpu, images, case, tuning, findings))
     };
+    let both = move |findings: &mut Findings| {
+        networks::CASES.iter().try_for_each(|case| networks::compare(gpu, dataset, case, tuning, findings))
+    };
     let views = move |findings: &mut Findings| {
-        let presets = [Preset::Paper, Preset::PublicCode, Preset::FastMlp];
+        let presets = [Preset::Paper, Preset::PublicCode, Preset::FastMlp, Preset::NerfCa];
         presets.into_iter().try_for_each(|preset| drawing::compare_views(gpu, preset, tuning, findings))
     };
     vec![
         (name("iterations"), Box::new(iterations)),
+        (name("two networks"), Box::new(both)),
         (name("empty cells"), Box::new(move |findings| occupancy::compare(gpu, dataset, tuning, findings))),
         (name("views"), Box::new(views)),
         (name("volumes"), Box::new(move |findings| drawing::compare_volumes(gpu, tuning, findings))),

@@ -59,8 +59,14 @@ fn checkpoints_keep_every_bit() {
     for field in drawn_fields() {
         let model = model(&gpu, &dataset, field);
         let moments = vec![[0.25, 0.5]; model.param_map.len];
-        let saved =
-            Checkpoint { model, moments, occupancy: Vec::new(), loss_scale: None, data_fingerprint: "x".into() };
+        let saved = Checkpoint {
+            model,
+            moments,
+            occupancy: Vec::new(),
+            loss_scale: None,
+            stopped: false,
+            data_fingerprint: "x".into(),
+        };
         let bytes = saved.to_bytes().unwrap();
         let read = Checkpoint::from_bytes(&bytes, Path::new("test")).unwrap();
         assert_eq!(read.to_bytes().unwrap(), bytes);
@@ -89,6 +95,7 @@ fn damaged_gaussians_are_refused_by_name() {
             moments: moments.clone(),
             occupancy: Vec::new(),
             loss_scale: None,
+            stopped: false,
             data_fingerprint: String::new(),
         };
         Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()

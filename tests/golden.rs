@@ -15,7 +15,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::reference::field::Precision;
 use nertca_vk::reference::{march, step};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use nertca_vk::train::trainer::Trainer;
+use nertca_vk::train::trainer::{StepLoss, Trainer};
 
 impl Golden {
     fn number(&self, key: &str) -> f64 {
@@ -109,6 +109,41 @@ impl Golden {
         Config::load(Some(preset), None, &settings).unwrap()
     }
 
+    /// Settings of two networks, whose losses are delayed and not the field.
+    fn networks(&self) -> Config {
+        let n = |key: &str| self.number(key);
+        let mut settings = vec![
+            format!("seed={}", n("seed")),
+            format!("train.rays={}", n("rays")),
+            format!("train.motion_share={}", n("n_motion") / n("rays")),
+            format!("train.iterations={}", n("iterations")),
+            "train.chunk_samples=1024".into(),
+            "train.iterations_per_submit=1".into(),
+            format!("march.dynamic_samples={}", n("dynamic_samples")),
+            "march.render_samples=16".into(),
+            format!("dynamic.layers={}", n("layers")),
+            format!("dynamic.width={}", n("mlp_width")),
+            format!("dynamic.window_iterations={}", n("window_iterations")),
+            format!("dynamic.occlusion_share={}", n("occlusion_share")),
+            format!("adam.epsilon={}", n("eps")),
+            format!("networks.delay={}", n("delay")),
+        ];
+        for (section, keys) in [
+            ("static", &[("lr", "static_lr")][..]),
+            ("dynamic", &[("lr", "dynamic_lr")]),
+            ("networks", &["favour_static", "ray_entropy", "near_integral", "static_size"].map(|key| (key, key))),
+        ] {
+            for (key, golden) in keys {
+                let [start, end] = self.pair(golden);
+                settings.extend([format!("{section}.{key}={start}"), format!("{section}.{key}_end={end}")]);
+            }
+        }
+        for key in ["gain", "ramp", "least_change", "least_integral", "change_weight"] {
+            settings.push(format!("networks.{key}={}", n(key)));
+        }
+        Config::load(Some(Preset::NerfCa), None, &settings).unwrap()
+    }
+
     fn scene(&self) -> Scene {
         let s = &self.case["scene"];
         let n = |key: &str| s[key].as_f64().unwrap();
@@ -157,16 +192,47 @@ fn check(preset: Preset, name: &str) {
     plan.listed_rays = (0..plan.setup.n_all_rays).step_by(3).collect();
     plan.setup.n_motion_list = plan.listed_rays.len() as u32;
     plan.setup.n_motion_rays = golden.number("n_motion") as u32;
+    check_plan(&golden, plan, &dataset, name);
+}
+
+/// What a loss came to, by the names that the reference gives.
+type Terms = Vec<(&'static str, f64)>;
+
+fn terms_of_twin(losses: &step::Losses) -> Terms {
+    vec![
+        ("data", losses.data),
+        ("tv", losses.tv),
+        ("occlusion", losses.occlusion),
+        ("favour_static", losses.favour_static),
+        ("ray_entropy", losses.ray_entropy),
+        ("static_size", losses.static_size),
+    ]
+}
+
+fn terms_of_engine(loss: &StepLoss) -> Terms {
+    let mut terms = vec![("data", loss.data), ("tv", loss.tv), ("occlusion", loss.occlusion)];
+    if let Some(networks) = &loss.networks {
+        terms.extend([
+            ("favour_static", networks.favour_static),
+            ("ray_entropy", networks.ray_entropy),
+            ("static_size", networks.static_size),
+        ]);
+    }
+    terms
+}
+
+fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
+    let two_networks = plan.params.still.is_some();
     let gpu = gpu();
-    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
-    let initial: Vec<f32> = gather(&golden, trainer.plan(), "initial").iter().map(|v| *v as f32).collect();
+    let mut trainer = Trainer::new(&gpu, plan, dataset, tuning(&gpu)).unwrap();
+    let initial: Vec<f32> = gather(golden, trainer.plan(), "initial").iter().map(|v| *v as f32).collect();
     gpu.upload(&trainer.forward().params, 0, &initial).unwrap();
     let compared = [0u32, golden.number("delay") as u32, golden.number("delay") as u32 + 3];
     for step in 0..10 {
         // Comparing a gradient at parameters that already differ by rounding would mix two things, so the
         // reference's parameters are loaded where gradients are compared.
         if compared.contains(&step) {
-            let params = gather(&golden, trainer.plan(), &format!("params{step}"));
+            let params = gather(golden, trainer.plan(), &format!("params{step}"));
             let (losses, gradient) = step::loss_and_gradient(
                 trainer.plan(),
                 &params,
@@ -174,9 +240,9 @@ fn check(preset: Preset, name: &str) {
                 &march::batch(trainer.plan(), step),
                 Precision::Exact,
             );
-            let reference = gather(&golden, trainer.plan(), &format!("gradient{step}"));
+            let reference = gather(golden, trainer.plan(), &format!("gradient{step}"));
             assert_eq!(losses.live as f64, golden.get(&format!("loss{step}/live"))[0], "{name} step {step}");
-            for (term, value) in [("data", losses.data), ("tv", losses.tv), ("occlusion", losses.occlusion)] {
+            for (term, value) in terms_of_twin(&losses).into_iter().take(if two_networks { 6 } else { 3 }) {
                 let want = golden.get(&format!("loss{step}/{term}"))[0];
                 // Set-up constants are f32 in twin and engine alike; the reference's are f64.
                 assert!((value - want).abs() <= 2e-6 * want.abs() + 1e-15, "twin {name} {step} {term}: {value} {want}");
@@ -187,18 +253,18 @@ fn check(preset: Preset, name: &str) {
         }
         let loss = trainer.advance(step + 1).unwrap()[0];
         if compared.contains(&step) {
-            for (term, value) in [("data", loss.data), ("tv", loss.tv), ("occlusion", loss.occlusion)] {
+            for (term, value) in terms_of_engine(&loss) {
                 let want = golden.get(&format!("loss{step}/{term}"))[0];
                 assert!((value - want).abs() <= 1e-4 * want.abs() + 1e-12, "{name} {step} {term}: {value} {want}");
             }
             let len = trainer.plan().params.len;
             let got: Vec<f32> = gpu.download(&trainer.training().gradient, 0, len).unwrap();
-            let want = gather(&golden, trainer.plan(), &format!("gradient{step}"));
+            let want = gather(golden, trainer.plan(), &format!("gradient{step}"));
             compare(&got, &want, trainer.plan(), 1e-4, name);
         }
     }
     let got = trainer.model().unwrap().params;
-    let want = gather(&golden, trainer.plan(), "final");
+    let want = gather(golden, trainer.plan(), "final");
     compare(&got, &want, trainer.plan(), 1e-3, name);
     drop(trainer);
     expect_silence(gpu);
@@ -226,4 +292,14 @@ fn public_code() {
 #[test]
 fn fast_mlp() {
     check(Preset::FastMlp, "fast");
+}
+
+/// NeRF-CA. Its plan is taken as it is: the rays that change, their weights, and boxes that leave no point of a ray out are checked
+/// as well.
+#[test]
+fn nerf_ca() {
+    let golden = Golden::open("nerf-ca", "tools/reference.py");
+    let dataset = golden.dataset();
+    let plan = Plan::new(&golden.networks(), &dataset).unwrap();
+    check_plan(&golden, plan, &dataset, "nerf-ca");
 }

@@ -17,7 +17,9 @@ fn plan(preset: &str, settings: &[&str]) -> Plan {
 
 fn start(plan: &Plan) -> Vec<f64> {
     let mut params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
-    params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);
+    if plan.params.still.is_none() {
+        params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);
+    }
     params
 }
 
@@ -34,7 +36,7 @@ fn a_sleeping_field_is_called_back() {
         }
         let rays = march::batch(&plan, 0);
         let (_, gradient) = step::loss_and_gradient(&plan, &start(&plan), 0, &rays, Precision::Exact);
-        gradient[plan.params.out_bias]
+        gradient[plan.params.moving.out_bias]
     };
     let (deaf, hears) = (of("0", true), of("1e-3", true));
     assert!(deaf < 0.0 && hears < 0.0, "rays ask for more: {deaf}, {hears}");
@@ -43,6 +45,21 @@ fn a_sleeping_field_is_called_back() {
     let less = of("1e-3", false);
     assert!(less > 0.0 && less == of("0", false), "{less}");
 }
+
+/// Weights of two networks' losses with which each shows beside the others.
+const LARGE_WEIGHTS: &[&str] = &[
+    "networks.gain=0.5",
+    "networks.delay=1",
+    "networks.ramp=4",
+    "networks.favour_static=0.05",
+    "networks.favour_static_end=0.3",
+    "networks.ray_entropy=0.02",
+    "networks.ray_entropy_end=0.1",
+    "networks.near_integral=0.01",
+    "networks.near_integral_end=0.3",
+    "networks.static_size=1e-3",
+    "networks.static_size_end=1e-2",
+];
 
 #[test]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
@@ -53,6 +70,21 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
         ("fast-mlp", &["dynamic.least_slope=0", "loss.dynamic_target=absolute"]),
         ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0"]),
         ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0.3"]),
+        ("nerf-ca", LARGE_WEIGHTS),
+        // Fields of next to nothing, whose entropies count all the same; the near part of rays alone.
+        (
+            "nerf-ca",
+            &[
+                "networks.gain=1e-4",
+                "networks.least_integral=0",
+                "networks.ray_entropy=1",
+                "networks.favour_static=1",
+                "networks.delay=0",
+                "networks.ramp=1",
+                "dynamic.occlusion_share=0.3",
+                "networks.near_integral_end=1",
+            ],
+        ),
     ] {
         let plan = plan(preset, settings);
         let params = start(&plan);
@@ -98,7 +130,7 @@ fn temporal_residual_is_flat_between_its_bounds() {
     let seen = march::fwd(&plan, &params, 0, &ray, true, Precision::Exact).dynamic_integral;
     let gradient_with = |ray: &march::Ray| {
         let (_, g) = step::loss_and_gradient(&plan, &params, 0, std::slice::from_ref(ray), Precision::Exact);
-        g[plan.params.out_bias]
+        g[plan.params.moving.out_bias]
     };
     ray.temporal = [seen - 1.0, seen + 1.0];
     assert_eq!(gradient_with(&ray), 0.0);
@@ -146,7 +178,7 @@ fn line_integrals_and_their_backward_pass_are_adjoint() {
     let rays = march::batch(&plan, 1);
     let random = |a: u32, b: usize| random::uniform01(11, 78, a, b as u32) - 0.5;
     let planes = 0..p.line(0, 0, 0);
-    let out_neuron = (p.out_weights..p.out_weights + p.width).chain([p.out_bias]);
+    let out_neuron = (p.moving.out_weights..p.moving.out_weights + p.moving.width).chain([p.moving.out_bias]);
     let mut direction = vec![0.0; p.len];
     planes.chain(out_neuron).for_each(|i| direction[i] = random(0, i));
     let moved: Vec<f64> = params.iter().zip(&direction).map(|(p, d)| p + d).collect();

@@ -86,14 +86,17 @@ fn an_overflow_skips_the_update_and_halves_the_scale() {
     let plan = Plan::new(&small_config("fast-mlp", &[]), &dataset).unwrap();
     let (before, first) = (plan.params.initial(&plan.config), plan.params.static_len);
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning).unwrap();
-    let huge = DeviceState { step: 0, loss_scale: 2f32.powi(60), overflowed: 0, good_updates: 7 };
+    let huge = DeviceState { step: 0, loss_scale: 2f32.powi(60), overflowed: 0, good_updates: 7, stopped: 0 };
     gpu.upload(&trainer.forward().state, 0, &[huge]).unwrap();
     trainer.advance(1).unwrap();
     let after = trainer.model().unwrap().params;
     assert_eq!(before[first..], after[first..], "the network moved");
     assert_ne!(before[..first], after[..first], "the static field needs no scale");
     let state = |trainer: &Trainer| -> DeviceState { gpu.download(&trainer.forward().state, 0, 1).unwrap()[0] };
-    assert_eq!(state(&trainer), DeviceState { step: 1, loss_scale: 2f32.powi(59), overflowed: 0, good_updates: 0 });
+    assert_eq!(
+        state(&trainer),
+        DeviceState { step: 1, loss_scale: 2f32.powi(59), overflowed: 0, good_updates: 0, stopped: 0 }
+    );
     // Back and back until gradients fit; then the network moves again.
     run(&mut trainer, 40);
     assert!(state(&trainer).good_updates > 0, "{:?}", state(&trainer));

@@ -125,8 +125,14 @@ fn moving_model() -> Model {
 
 fn saved(model: Model, path: &Path) -> String {
     let moments = vec![[0.0; 2]; model.param_map.len];
-    let checkpoint =
-        Checkpoint { model, moments, occupancy: Vec::new(), loss_scale: None, data_fingerprint: "none".into() };
+    let checkpoint = Checkpoint {
+        model,
+        moments,
+        occupancy: Vec::new(),
+        loss_scale: None,
+        stopped: false,
+        data_fingerprint: "none".into(),
+    };
     checkpoint.write(path).unwrap();
     path.to_str().unwrap().to_owned()
 }

@@ -20,7 +20,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::selftest::compare::Findings;
 use nertca_vk::selftest::iteration::F32_CASES;
-use nertca_vk::selftest::{gaussians, iteration, problems, trees};
+use nertca_vk::selftest::{gaussians, iteration, networks, problems, trees};
 use nertca_vk::train::trainer::Trainer;
 use program::program;
 use serde_json::Value;
@@ -105,6 +105,11 @@ fn an_iteration(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     iteration::compare(gpu, &small_dataset(13, 11), &F32_CASES[2], &tuning, findings)
 }
 
+fn two_networks(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
+    let tuning = Tuning::for_device(gpu.info()).with_layers(Layers::F32, String::new());
+    networks::compare(gpu, &small_dataset(13, 11), &networks::CASES[0], &tuning, findings)
+}
+
 /// A fault in the code of a stage.
 struct Fault {
     stage: &'static str,
@@ -132,6 +137,9 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("gradient_static", missing_clear, an_iteration),
         fault("mlp_latent_bwd", sum_for_product, an_iteration),
         fault("adam", wrong_sign, an_iteration),
+        fault("march_fwd_samples", one_too_many, two_networks),
+        fault("loss_samples", wrong_sign, two_networks),
+        fault("loss_samples", one_too_many, two_networks),
     ] {
         shim::begin(shim::Failing::None);
         let open = || Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap();
@@ -161,7 +169,12 @@ fn builds<'a>(all: impl IntoIterator<Item = &'a PipelineStatistics>) -> BTreeSet
 #[test]
 fn the_inventory_is_what_a_run_builds() {
     let open = || Gpu::open(&DeviceOptions { statistics: true, ..DeviceOptions::default() }).unwrap();
-    for (preset, size, form) in [(Preset::Paper, 13, "none"), (Preset::Fast, 32, "tree"), (Preset::Fast, 32, "phase")] {
+    for (preset, size, form) in [
+        (Preset::Paper, 13, "none"),
+        (Preset::NerfCa, 13, "none"),
+        (Preset::Fast, 32, "tree"),
+        (Preset::Fast, 32, "phase"),
+    ] {
         let settings =
             ["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"];
         let form = format!("gaussians.form={form}");

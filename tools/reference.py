@@ -6,7 +6,7 @@ the first and a later iteration, and the parameters after ten Adam updates acros
 field. Nothing here is shared with the engine: geometry, ray order, depths, fields (torch's grid_sample and
 matrix products), losses, autograd and torch.optim.Adam are all this script's own.
 
-    python3 tools/reference.py [--out tests/golden]      (needs torch and numpy)
+    python3 tools/reference.py [--out tests/golden] [--preset nerf-ca]      (needs torch and numpy)
 """
 
 import argparse
@@ -24,7 +24,7 @@ U32 = 0xFFFFFFFF
 COMMON = dict(
     seed=5, width_px=7, height_px=6, phases=3, rays=21, static_samples=20, dynamic_samples=20, grid=6, ranks=3,
     mlp_width=16, latent=8, iterations=40, delay=4, window_iterations=12, depth=0.9, tv_plane=1e-2, tv_line=1e-3,
-    betas=(0.9, 0.99), occlusion_share=0.2, after_phases=(0.0,),
+    betas=(0.9, 0.99), occlusion_share=0.2, after_phases=(0.0,), decay_share=1.0,
 )
 PRESETS = {
     "paper": dict(
@@ -46,7 +46,16 @@ PRESETS = {
         scene=dict(static_half=0.9, dynamic_half=0.45, static_gain=0.5, static_shift=0.54, dynamic_gain=4.0,
                    dynamic_shift=-2.0, static_weight=1.2, dynamic_weight=9.0, robust_scale=0.05, centre=(0.02, -0.01, 0.03), scale=6.5),
     ),
+    # Two networks; weights large enough for each loss to show in the gradient. `delay` is that of the losses.
+    "nerf-ca": dict(
+        layers=5, skip=0, bands=12, window_start=1.0, per_ray=False, decay="linear", iterations=12, decay_share=0.75,
+        static_lr=(1e-3, 1e-5), dynamic_lr=(1e-3, 1e-5), betas=(0.9, 0.999), eps=1e-6, n_motion=12, occlusion_share=0.4,
+        gain=0.5, ramp=5, favour_static=(0.05, 0.2), ray_entropy=(0.02, 0.1), near_integral=(0.01, 0.3),
+        static_size=(1e-3, 1e-2), least_change=0.03, least_integral=0.63, change_weight=1.0,
+        scene=dict(centre=(0.0, 0.0, 0.0), scale=1.0),
+    ),
 }
+TWO_NETWORKS = "nerf-ca"
 
 
 # -- counter-based random numbers -----------------------------------------------------------------------------
@@ -132,21 +141,32 @@ def still_background(c, frames, view):
     return f32(high - 0.1), high
 
 
-def motion_rays(c, frames):
-    """Rays said to meet the hull: every third one."""
-    return list(range(0, len(frames) * c["width_px"] * c["height_px"], 3))
+def changes(frames, view):
+    """Variance over the phases of the transmission, from 0 to 1 within the view."""
+    variance = np.exp(-np.stack([f[2] for f in frames if f[0] == view])).var(0)
+    return (variance - variance.min()) / (variance.max() - variance.min())
+
+
+def ray_lists(c, frames):
+    """Rays that are drawn first, and those that the others are drawn from."""
+    everything = range(len(frames) * c["width_px"] * c["height_px"])
+    if c["two_networks"]:
+        changing = np.concatenate([changes(frames, f[0]).flatten() for f in frames]) > c["least_change"]
+        return [r for r in everything if changing[r]], [r for r in everything if not changing[r]]
+    # Every third one is said to meet the hull.
+    return list(everything[::3]), list(everything)
 
 
 def batch(c, frames, step):
     """Frame index, pixel and id of each ray."""
-    pixels, moving = c["width_px"] * c["height_px"], motion_rays(c, frames)
+    pixels, lists = c["width_px"] * c["height_px"], ray_lists(c, frames)
     out = []
     for r in range(c["rays"]):
         first = r < c["n_motion"]
-        per, n = (c["n_motion"], len(moving)) if first else (c["rays"] - c["n_motion"], len(frames) * pixels)
+        per, rays = (c["n_motion"], lists[0]) if first else (c["rays"] - c["n_motion"], lists[1])
         counter = step * per + (r if first else r - c["n_motion"])
-        chosen = permute(counter % n, n, c["seed"], counter // n, 3 if first else 2)
-        ray_id = moving[chosen] if first else chosen
+        chosen = permute(counter % len(rays), len(rays), c["seed"], counter // len(rays), 3 if first else 2)
+        ray_id = rays[chosen]
         out.append((ray_id // pixels, ray_id % pixels, ray_id))
     return out
 
@@ -165,27 +185,35 @@ def depths(c, n, near, far, step, ray_id, norm):
 
 # -- model -----------------------------------------------------------------------------------------------------
 
-def shapes(c):
-    d, r, w = c["grid"], c["ranks"], c["mlp_width"]
-    encoded = 3 + 6 * c["bands"]
-    out = {f"static.plane.{p}": (r, d, d) for p in ("xy", "xz", "yz")}
-    out |= {f"static.line.{p}": (r, d) for p in ("z", "y", "x")}
+def network_shapes(c, field, latent):
+    w, encoded = c["mlp_width"], 3 + 6 * c["bands"]
+    out = {}
     for i in range(c["layers"]):
         inputs = w
         if i == 0:
-            inputs = encoded + c["latent"]
+            inputs = encoded + latent
         elif i + 1 == c["skip"]:
-            inputs = encoded + c["latent"] + w
-        out[f"dynamic.layer{i}.weight"] = (w, inputs)
-        out[f"dynamic.layer{i}.bias"] = (w,)
-    return out | {"dynamic.out.weight": (1, w), "dynamic.out.bias": (1,), "dynamic.latent": (c["phases"], c["latent"])}
+            inputs = encoded + latent + w
+        out[f"{field}.layer{i}.weight"] = (w, inputs)
+        out[f"{field}.layer{i}.bias"] = (w,)
+    return out | {f"{field}.out.weight": (1, w), f"{field}.out.bias": (1,)}
+
+
+def shapes(c):
+    d, r = c["grid"], c["ranks"]
+    if c["two_networks"]:
+        out = network_shapes(c, "static", 0)
+    else:
+        out = {f"static.plane.{p}": (r, d, d) for p in ("xy", "xz", "yz")}
+        out |= {f"static.line.{p}": (r, d) for p in ("z", "y", "x")}
+    return out | network_shapes(c, "dynamic", c["latent"]) | {"dynamic.latent": (c["phases"], c["latent"])}
 
 
 def initial(c):
     torch.manual_seed(c["seed"])
     params = {}
     for name, shape in shapes(c).items():
-        if name.startswith("static"):
+        if name.startswith(("static.plane", "static.line")):
             value = 0.5 * torch.randn(shape)
         elif name == "dynamic.latent":
             value = torch.rand(shape)
@@ -216,22 +244,67 @@ def latent(c, p, time):
     return (1 - share) * rows[before % c["phases"]] + share * rows[(before + 1) % c["phases"]]
 
 
-def network(c, p, x, time, window, scene):
+def network(c, p, x, time, window, scene, field="dynamic"):
     x = (x - torch.tensor(scene["centre"])) * scene["scale"]
     parts = [x]
     for k in range(c["bands"]):
         a = min(max(window - k, 0.0), 1.0)
         parts += [a * torch.sin(2.0**k * x), a * torch.cos(2.0**k * x)]
-    inputs = torch.cat(parts + [latent(c, p, time).expand(len(x), -1)], -1)
+    if field == "dynamic":
+        parts.append(latent(c, p, time).expand(len(x), -1))
+    inputs = torch.cat(parts, -1)
     h = inputs
     for i in range(c["layers"]):
         if i + 1 == c["skip"]:
             h = torch.cat([inputs, h], -1)
-        h = torch.relu(torch.nn.functional.linear(h, p[f"dynamic.layer{i}.weight"], p[f"dynamic.layer{i}.bias"]))
-    return torch.nn.functional.linear(h, p["dynamic.out.weight"], p["dynamic.out.bias"])[:, 0]
+        h = torch.relu(torch.nn.functional.linear(h, p[f"{field}.layer{i}.weight"], p[f"{field}.layer{i}.bias"]))
+    return torch.nn.functional.linear(h, p[f"{field}.out.weight"], p[f"{field}.out.bias"])[:, 0]
+
+
+def ramp(c, name, step, delay):
+    """A weight that goes from one value to another on a straight line after a delay, then stays."""
+    start, end = c[name]
+    return 0.0 if step < delay else start + (end - start) * min((step - delay) / c["ramp"], 1.0)
+
+
+def losses_of_two_networks(c, frames, p, step):
+    """NeRF-CA: both fields at the same points, everywhere between the first and the last depth."""
+    depth, n, small = c["depth"], c["rays"], 1e-10
+    opened = c["window_start"] + (c["bands"] - c["window_start"]) * step / c["window_iterations"]
+    near_limit = -depth + 2 * depth * c["occlusion_share"]
+    terms = dict.fromkeys(("data", "favour_static", "ray_entropy", "occlusion", "static_size"), 0.0)
+    counted = 0
+    for frame, pixel, ray_id in batch(c, frames, step):
+        view, phase, image = frames[frame]
+        anchor, direction = pixel_ray(c, view, pixel)
+        t, dl = depths(c, c["dynamic_samples"], -depth, depth, step, ray_id, 1.0)
+        x, dl = torch.tensor(anchor + t[:, None] * direction), torch.tensor(dl)
+        field = lambda name: c["gain"] * torch.nn.functional.softplus(
+            network(c, p, x, phase, min(opened, c["bands"]), c["scene"], name))
+        still, moving = field("static"), field("dynamic")
+        change = changes(frames, view).flatten()[pixel]
+        residual = ((still + moving) * dl).sum() - image.flatten()[pixel]
+        terms["data"] += (1 + c["change_weight"] * change) * residual**2 / n
+        b = torch.clamp(moving / (still + moving + small), 1e-19, 1 - 1e-19)
+        rest = torch.clamp(1 - b, min=1e-19)
+        terms["favour_static"] += -(b * torch.log(b) + rest * torch.log(rest)).mean() / n
+        mass = moving * dl
+        if mass.sum() >= c["least_integral"] or change > c["least_change"]:
+            share = mass / torch.clamp(mass.sum(), min=1e-19)
+            terms["ray_entropy"] += -(share * torch.log(share + small)).sum() / n
+            counted += 1
+        terms["occlusion"] += (mass * torch.tensor((t < near_limit).astype(float))).sum() / n
+        terms["static_size"] += (still * dl).sum() + ((still * dl) ** 2).sum()
+    assert 0 < counted < n, f"the entropy of {counted} of {n} rays counts: the case is about both"
+    for name, delay in (("favour_static", c["delay"]), ("ray_entropy", 0), ("static_size", 0)):
+        terms[name] = ramp(c, name, step, delay) * terms[name]
+    terms["occlusion"] = ramp(c, "near_integral", step, c["delay"]) * terms["occlusion"]
+    return terms | dict(dynamic=terms["data"], tv=0.0, live=float(n * c["dynamic_samples"]))
 
 
 def losses(c, frames, p, step):
+    if c["two_networks"]:
+        return losses_of_two_networks(c, frames, p, step)
     scene, depth = c["scene"], c["depth"]
     active = step >= c["delay"]
     since = max(step - c["delay"], 0)
@@ -292,7 +365,7 @@ def losses(c, frames, p, step):
 
 def rate(c, name, step):
     start, end = c[name]
-    x = step / c["iterations"]
+    x = min(step / c["iterations"] / c["decay_share"], 1.0)
     return start + (end - start) * x if c["decay"] == "linear" else start * (end / start) ** x
 
 
@@ -302,6 +375,10 @@ def optimiser(c, p):
         dict(params=[v for k, v in p.items() if k.startswith("dynamic")], name="dynamic_lr"),
     ]
     return torch.optim.Adam(groups, lr=0.0, betas=c["betas"], eps=c["eps"])
+
+
+# Terms that are minimised.
+OBJECTIVE = ("data", "tv", "occlusion", "favour_static", "ray_entropy", "static_size")
 
 
 def run(c):
@@ -314,11 +391,11 @@ def run(c):
         out |= {f"background/{view}/low": torch.tensor(low), f"background/{view}/high": torch.tensor(high)}
     adam = optimiser(c, p)
     for step in range(10):
-        if step == c["delay"]:
+        if step == c["delay"] and not c["two_networks"]:
             adam = optimiser(c, p)
         terms = losses(c, frames, p, step)
         adam.zero_grad()
-        (terms["data"] + terms["tv"] + terms["occlusion"]).backward()
+        sum(terms[name] for name in OBJECTIVE if name in terms).backward()
         for name, value in terms.items():
             out[f"loss{step}/{name}"] = torch.as_tensor(value).detach().reshape(1).clone()
         if step in (0, c["delay"], c["delay"] + 3):
@@ -326,7 +403,7 @@ def run(c):
             out |= {f"params{step}/{k}": v.detach().clone() for k, v in p.items()}
         for group in adam.param_groups:
             group["lr"] = rate(c, group["name"], step)
-        if step < c["delay"]:
+        if step < c["delay"] and not c["two_networks"]:
             for k, v in p.items():
                 if k.startswith("dynamic"):
                     v.grad = None
@@ -348,10 +425,13 @@ def write_safetensors(path, tensors, metadata):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).parent.parent / "tests" / "golden")
-    out = parser.parse_args().out
+    parser.add_argument("--preset", action="append", choices=PRESETS, help="of these alone; repeatable")
+    args = parser.parse_args()
+    out = args.out
     out.mkdir(parents=True, exist_ok=True)
-    for name, preset in PRESETS.items():
-        c = COMMON | preset
+    for name in args.preset or PRESETS:
+        c = COMMON | PRESETS[name]
+        c["two_networks"] = name == TWO_NETWORKS
         case = c | dict(preset=name, angles=ANGLES, arm=ARM)
         write_safetensors(out / f"{name}.safetensors", run(c), dict(case=json.dumps(case), torch=torch.__version__))
         print(out / f"{name}.safetensors")

@@ -64,6 +64,13 @@ struct Setup {
     float beta2;                // decay of Adam's second moments
     float epsilon;              // Adam's smallest denominator
     uint ring_length;           // iterations whose reports are kept
+    uint two_networks;          // 1: the static field is a network, too; gradients differ from sample to sample (loss_samples)
+    uint along_axis;            // 1: path lengths are counted along the source-detector axis, not along the ray
+    float change_weight;        // a ray weighs 1 + change_weight * ray.change
+    float least_change;         // of a ray, beyond which its entropy counts whatever it sees
+    float least_integral;       // of the dynamic field, from which the entropy of a ray counts
+    uint stop_after;            // iterations after which a vanished entropy ends learning; 0: none does
+    float stop_below;           // entropy that has vanished
 };
 
 // One row per iteration, made on the host from the schedules.
@@ -75,6 +82,10 @@ struct Schedule {
     uint reset;                 // optimiser state is re-created before this iteration
     float bias_correction1;     // 1 - beta1^t
     float bias_correction2;     // 1 - beta2^t
+    float favour_static;        // weight of the entropy of the fields' shares at samples
+    float ray_entropy;          // weight of the entropy of the dynamic field along rays
+    float near_integral;        // weight of the dynamic field's integral over near samples, two networks
+    float static_size;          // weight of the static field's integrals and their squares
 };
 
 // What the device counts from iteration to iteration.
@@ -83,6 +94,7 @@ struct DeviceState {
     float loss_scale;           // factor on gradients in f16; 1 on the f32 path
     uint overflowed;            // 1 while the gradient of an iteration is not finite
     uint good_updates;          // updates since the scale changed
+    uint stopped;               // 1: learning has ended
 };
 
 // What an iteration came to.
@@ -95,6 +107,10 @@ struct StepReport {
     uint live_samples;          // live dynamic samples of the batch
     uint step;                  // iterations done after it
     float loss_scale;           // factor on gradients in f16; 1 on the f32 path
+    float favour_static;        // entropy of the fields' shares at samples, weighted
+    float ray_entropy;          // entropy of the dynamic field along rays, weighted
+    float static_size;          // the static field's integrals and their squares, weighted
+    uint stopped;               // 1: learning has ended
 };
 
 // Live dynamic samples.
@@ -123,13 +139,14 @@ struct Ray {
     vec3 anchor;                // point at the isocentre plane
     uint phase;                 // cardiac phase nearest to when it was taken
     vec3 direction;             // towards the detector, of unit depth
-    float norm;                 // length of `direction`
+    float norm;                 // path length per unit of depth
     float target;               // measured line integral
     float temporal_low;         // bounds of the integral above the pixel's still background
     uint id;                    // frame * pixels + pixel
     float temporal_high;        // see `temporal_low`
     uint beyond;                // phase on the other side of when it was taken
     float beyond_share;         // what it shows of that phase: 0 to 0.5
+    float change;               // over the beat, of what passes at its pixel: 0 to 1 in each view
 };
 
 // Rays of a view as affine functions of pixel column and row.

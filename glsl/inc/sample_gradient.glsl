@@ -1,10 +1,11 @@
-// dL/d feature of a sample of the dynamic field; what includes this declares the buffers of samples and rays first.
+// dL/d feature of a sample of a network; what includes this declares the buffers of samples and rays first.
 // Where the softplus is flat nothing would tell the network that a ray asks for more: there the slope is at least
-// `least_slope`. A ray that asks for less needs no such help.
+// `least_slope`. A ray that asks for less needs no such help. Of two networks, `sigma_gradient` has dL/d sigma of each sample.
 float feature_gradient(uint s) {
+    float slope = sample_sigma[s].y;
+    if (setup.two_networks != 0u) return sigma_gradient[s] * slope;
     uint ray = sample_rays[s];
     float per_integral = ray_gradient[ray_of(ray)].y + (is_near(ray) ? setup.occlusion_weight : 0.0);
-    float slope = sample_sigma[s].y;
     if (per_integral < 0.0) slope = max(slope, setup.least_slope);
     return per_integral * sample_points[s].w * slope;
 }

@@ -107,8 +107,9 @@ pub(super) fn pair(text: &str) -> Option<[f64; 2]> {
 /// Hyper-parameters, for every command that trains.
 #[derive(Debug, Args)]
 pub struct ConfigArgs {
-    /// Set of defaults: `fast` (normalised, hull-gated, tuned), `paper` (as the paper states it) or `public-code` (as the
-    /// authors' code does it); `fast`, unless a configuration file names one.
+    /// Set of defaults: `fast` (Gaussians move; normalised, tuned), `fast-mlp` (a network does), `paper` (as the paper states it),
+    /// `public-code` (as the authors' code does it) or `nerf-ca` (two networks, the method that the paper compares itself with);
+    /// `fast`, unless a configuration file names one.
     #[arg(long, value_parser = choice::<Preset>())]
     pub preset: Option<Preset>,
     /// TOML file with hyper-parameters.

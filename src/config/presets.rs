@@ -1,9 +1,9 @@
 //! The presets.
 
 use crate::config::sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Occupancy, StaticField, Train, Tree,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, StaticField, Train, Tree,
 };
-use crate::config::{CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset};
+use crate::config::{CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset, StaticForm};
 
 impl Config {
     /// Defaults of a preset.
@@ -13,6 +13,7 @@ impl Config {
             Preset::FastMlp => fast_mlp(paper()),
             Preset::Paper => paper(),
             Preset::PublicCode => public_code(paper()),
+            Preset::NerfCa => nerf_ca(paper()),
         }
     }
 }
@@ -40,8 +41,10 @@ fn paper() -> Config {
             per_ray_depths: true,
             fit_dynamic_range: false,
             fit_static_range: false,
+            along_axis: false,
         },
         static_field: StaticField {
+            form: StaticForm::Tensor,
             grid: 48,
             ranks: 3,
             half_extent_mm: 50.0,
@@ -86,7 +89,8 @@ fn paper() -> Config {
             max_share: 0.35,
         },
         occupancy: Occupancy { enabled: false, cells: 64, start: 15_000, threshold: 0.01 },
-        adam: Adam { beta1: 0.9, beta2: 0.99, epsilon: 1e-8 },
+        networks: networks(),
+        adam: Adam { beta1: 0.9, beta2: 0.99, epsilon: 1e-8, decay_share: 1.0 },
         gaussians: gaussians(),
         tree: tree(),
     }
@@ -154,6 +158,68 @@ fn public_code(paper: Config) -> Config {
     }
 }
 
+/// Weights and durations of NeRF-CA's public code, for a run of 200,000 iterations.
+pub(super) fn networks() -> Networks {
+    Networks {
+        gain: 0.01,
+        change_weight: 1.0,
+        least_change: 0.03,
+        least_integral: 1e-4,
+        delay: 40_000,
+        ramp: 100_000,
+        favour_static: 1e-12,
+        favour_static_end: 1e-10,
+        ray_entropy: 1e-10,
+        ray_entropy_end: 1e-8,
+        near_integral: 1e-8,
+        near_integral_end: 1e-4,
+        static_size: 1e-8,
+        static_size_end: 1e-15,
+        stop_after: 150_000,
+        stop_below: 1e-15,
+    }
+}
+
+/// NeRF-CA as its public code does it: two networks, no boxes, nothing left out.
+fn nerf_ca(paper: Config) -> Config {
+    Config {
+        preset: Preset::NerfCa,
+        train: Train {
+            iterations: 200_000,
+            rays: 1024,
+            motion_share: 0.5,
+            checkpoint_every: 5000,
+            validate_every: 5000,
+            ..paper.train
+        },
+        march: March {
+            static_samples: 500,
+            dynamic_samples: 500,
+            render_samples: 500,
+            per_ray_depths: false,
+            along_axis: true,
+            ..paper.march
+        },
+        static_field: StaticField { form: StaticForm::Network, lr: 1e-3, lr_end: 1e-5, ..paper.static_field },
+        dynamic: DynamicField {
+            layers: 5,
+            bands: 12,
+            window_start: 1.0,
+            // A band opens every 12,500 iterations.
+            window_iterations: 137_500,
+            delay: 0,
+            lr: 1e-3,
+            lr_end: 1e-5,
+            occlusion: 0.0,
+            // The code covers the near fifth of rays with a mask, then all of them with another.
+            occlusion_share: 1.0,
+            ..paper.dynamic
+        },
+        adam: Adam { beta2: 0.999, decay_share: 0.75, ..paper.adam },
+        ..paper
+    }
+}
+
 /// Gaussians in front of the still field of [`fast_mlp`].
 fn fast(mlp: Config) -> Config {
     Config {
@@ -208,6 +274,7 @@ fn fast_mlp(paper: Config) -> Config {
             per_ray_depths: true,
             fit_dynamic_range: true,
             fit_static_range: true,
+            along_axis: false,
         },
         static_field: StaticField { half_extent_mm: 0.0, tv: 1e-3, ..paper.static_field },
         dynamic: DynamicField {

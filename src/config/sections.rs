@@ -1,6 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{CalibrateMode, Decay, DynamicTarget, GaussianForm};
+use crate::config::{CalibrateMode, Decay, DynamicTarget, GaussianForm, StaticForm};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -34,6 +34,10 @@ pub(super) fn check_range(field: &str, value: f64, low: f64, high: f64) -> Resul
     Err(Error::config(field, value, format!("{low} to {high} is accepted")))
 }
 
+fn whole_run() -> f64 {
+    1.0
+}
+
 section! {
     /// The loop.
     Train, "train" {
@@ -41,7 +45,7 @@ section! {
         iterations: u32 in 1.0 to 1e6,
         /// Rays of a batch.
         rays: u32 in 1.0 to 65_535.0,
-        /// Share of the batch drawn from rays that meet the motion hull.
+        /// Share of the batch drawn from rays that meet the motion hull; with two networks, from those that change.
         motion_share: f64 in 0.0 to 1.0,
         /// Samples evaluated at once, at most: bounds device memory, not results. A device may allow fewer.
         chunk_samples: u32 in 1024.0 to 1_048_576.0,
@@ -79,12 +83,16 @@ section! {
         fit_dynamic_range: bool,
         /// Look for the static field only as near and as far as its box reaches.
         fit_static_range: bool,
+        /// Count path lengths along the source-detector axis, not along the ray, as NeRF-CA does.
+        #[serde(default)] along_axis: bool,
     }
 }
 
 section! {
-    /// The low-rank static field.
+    /// The static field. As a network ("network") it has the dynamic one's layers, and of what is below the learning rate alone.
     StaticField, "static" {
+        /// What it is made of: "tensor" (low-rank planes and lines) or "network".
+        #[serde(default)] form: StaticForm,
         /// Cells per axis, D.
         grid: u32 in 2.0 to 512.0,
         /// Ranks per mode, R.
@@ -145,7 +153,7 @@ section! {
         least_slope: f64 in 0.0 to 1.0,
         /// Weight of occlusion minimisation, lambda_o.
         occlusion: f64 in 0.0 to 1e6,
-        /// Share of the depth range, from the source, it covers.
+        /// Share of the depth range, from the source, it covers; with two networks, that `networks.near_integral` does.
         occlusion_share: f64 in 0.0 to 1.0,
     }
 }
@@ -204,6 +212,45 @@ section! {
 }
 
 section! {
+    /// Two networks as the fields (`static.form = "network"`), as NeRF-CA has them. Weights of losses go from one value to
+    /// another on a straight line, then stay.
+    Networks, "networks" {
+        /// Attenuation of either field where its softplus is 1, per world unit.
+        gain: f64 in 1e-9 to 1e6,
+        /// What a ray weighs more whose pixel changes most over the beat, in what passes of the X-rays.
+        change_weight: f64 in 0.0 to 1e3,
+        /// Change, as a share of the view's greatest, beyond which `train.motion_share` counts a ray as one that moves.
+        least_change: f64 in 0.0 to 1.0,
+        /// Line integral of the dynamic field from which its entropy along a ray counts though the ray does not change.
+        least_integral: f64 in 0.0 to 1e6,
+        /// Iterations before the shares' entropy and near samples count.
+        delay: u32 in 0.0 to 1e6,
+        /// Iterations that weights take from the first value to the last.
+        ramp: u32 in 1.0 to 1e6,
+        /// First weight of the entropy of the fields' shares at samples: each is to belong to one.
+        favour_static: f64 in 0.0 to 1e6,
+        /// Last weight of it.
+        favour_static_end: f64 in 0.0 to 1e6,
+        /// First weight of the entropy of the dynamic field along rays.
+        ray_entropy: f64 in 0.0 to 1e6,
+        /// Last weight of it.
+        ray_entropy_end: f64 in 0.0 to 1e6,
+        /// First weight of the dynamic field's integral over the share `dynamic.occlusion_share` of the ray that is near.
+        near_integral: f64 in 0.0 to 1e6,
+        /// Last weight of it.
+        near_integral_end: f64 in 0.0 to 1e6,
+        /// First weight of the static field's integrals over intervals, and their squares.
+        static_size: f64 in 0.0 to 1e6,
+        /// Last weight of it.
+        static_size_end: f64 in 0.0 to 1e6,
+        /// Iterations after which learning ends when an entropy has vanished; 0 = it does not.
+        stop_after: u32 in 0.0 to 1e6,
+        /// Entropy that has vanished, before it is weighted.
+        stop_below: f64 in 0.0 to 1.0,
+    }
+}
+
+section! {
     /// The optimiser.
     Adam, "adam" {
         /// Decay of the first moment.
@@ -212,6 +259,8 @@ section! {
         beta2: f64 in 0.0 to 0.999_999,
         /// Added to the denominator.
         epsilon: f64 in 1e-30 to 1.0,
+        /// Share of the run over which learning rates go from start to end; then they stay.
+        #[serde(default = "whole_run")] decay_share: f64 in 0.001 to 1.0,
     }
 }
 

@@ -190,6 +190,25 @@ impl Kernels {
     }
 }
 
+/// Pipelines of a still field that is a network.
+pub struct StillKernels {
+    /// Line integrals of two networks, and maxima.
+    pub march_fwd_samples: Stage<push::MarchFwdSamples>,
+    /// Losses of two networks and their gradient at each sample.
+    pub loss_samples: Stage<push::LossSamples>,
+}
+
+impl StillKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<StillKernels> {
+        let sums = Build { exchanges: true, ..Build::default() };
+        Ok(StillKernels { march_fwd_samples: sums.stage(gpu)?, loss_samples: sums.stage(gpu)? })
+    }
+}
+
 /// Pipelines of the f32 network.
 pub struct LayerKernels {
     /// Choices they were built with.

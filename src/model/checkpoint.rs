@@ -37,6 +37,8 @@ pub struct Checkpoint {
     pub occupancy: Vec<u32>,
     /// Loss scale of a run on matrices.
     pub loss_scale: Option<LossScale>,
+    /// Whether learning has ended before the run, as an entropy of two networks vanished.
+    pub stopped: bool,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
 }
@@ -64,6 +66,8 @@ struct Header {
     data_fingerprint: String,
     #[serde(default)]
     loss_scale: Option<LossScale>,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    stopped: bool,
     hull: Option<HullHeader>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     gaussians: Option<GaussianHeader>,
@@ -199,6 +203,7 @@ impl Checkpoint {
             image_size: model.image_size,
             data_fingerprint: self.data_fingerprint.clone(),
             loss_scale: self.loss_scale,
+            stopped: self.stopped,
             hull: model.hull.as_ref().map(|h| HullHeader {
                 size: h.size,
                 min: h.min.to_array(),
@@ -252,8 +257,9 @@ impl Checkpoint {
         let tensors = SafeTensors::deserialize(bytes).map_err(|e| bad("tensors", e.to_string()))?;
         let (s, d) = (&header.config.static_field, &header.config.dynamic);
         let [grid, ranks, layers, width] = [s.grid, s.ranks, d.layers, d.width].map(u64::from);
-        let needed =
-            3 * ranks * grid * (grid + 1) + layers * width * width + header.phases as u64 * u64::from(d.latent);
+        let hidden = layers * width * width;
+        let still = if header.config.two_networks() { hidden } else { 3 * ranks * grid * (grid + 1) };
+        let needed = still + hidden + header.phases as u64 * u64::from(d.latent);
         if needed > bytes.len() as u64 / 4 {
             return Err(bad("config", format!("{needed} parameters do not fit the file's {} bytes", bytes.len())));
         }
@@ -332,6 +338,7 @@ impl Checkpoint {
             },
             moments,
             loss_scale: header.loss_scale,
+            stopped: header.stopped,
             data_fingerprint: header.data_fingerprint,
         })
     }

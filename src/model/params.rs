@@ -1,12 +1,14 @@
 //! One flat buffer of parameters: named slices with shape, offset and seeded initial values.
 //!
-//! Order: static planes, static lines (both with ranks padded to a multiple of 4), then the network:
-//! per hidden layer encoded-input weights, hidden weights, latent weights, bias; output weights, output
-//! bias, latents. Every slice starts at a multiple of 4 so that shaders can read vec4. Padding is zero,
-//! gets zero gradient and so stays zero.
+//! Order: the still field, which is planes, then lines (both with ranks padded to a multiple of 4), or a network; then the
+//! moving field's network: per hidden layer encoded-input weights, hidden weights, latent weights, bias; output weights,
+//! output bias, latents. Every slice starts at a multiple of 4 so that shaders can read vec4. Padding is zero, gets zero
+//! gradient and so stays zero.
 
-use crate::config::Config;
+use crate::config::sections::DynamicField;
+use crate::config::{Config, StaticForm};
 use crate::random::{STREAM_INIT, normal, uniform01};
+use std::ops::Range;
 
 /// Where the parts of one hidden layer live.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,17 +23,11 @@ pub struct Layer {
     pub bias: usize,
 }
 
-/// Where every parameter lives.
+/// Where the parameters of a network live.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ParamMap {
-    /// Cells per axis of the static field.
-    pub grid: usize,
-    /// Ranks per mode.
-    pub ranks: usize,
-    /// `ranks` rounded up to vec4, in vec4.
-    pub rank4: usize,
-    /// Parameters of the static field; the network follows.
-    pub static_len: usize,
+pub struct NetworkMap {
+    /// First of its parameters.
+    pub first: usize,
     /// Hidden layers in order.
     pub layers: Vec<Layer>,
     /// Output weights, `[width]`.
@@ -46,8 +42,29 @@ pub struct ParamMap {
     pub encoded_len: usize,
     /// Length of the encoded input in vec4, rounded up.
     pub encode_groups: usize,
-    /// Numbers of a latent.
+    /// Numbers of a latent; 0: it is the same at all phases.
     pub latent: usize,
+    /// Cardiac phases.
+    pub phases: usize,
+    /// Its parameters, padding included.
+    pub len: usize,
+}
+
+/// Where every parameter lives.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ParamMap {
+    /// Cells per axis of the static field; 0 where it is a network.
+    pub grid: usize,
+    /// Ranks per mode; 0 where it is a network.
+    pub ranks: usize,
+    /// `ranks` rounded up to vec4, in vec4.
+    pub rank4: usize,
+    /// Parameters of the static field; those of the dynamic field follow.
+    pub static_len: usize,
+    /// The static field, where it is a network.
+    pub still: Option<NetworkMap>,
+    /// The dynamic field's network.
+    pub moving: NetworkMap,
     /// Cardiac phases.
     pub phases: usize,
     /// All parameters, padding included.
@@ -65,29 +82,25 @@ pub struct Tensor {
     pub positions: Vec<u32>,
 }
 
-impl ParamMap {
-    /// Map for a configuration and a number of phases.
-    pub fn new(config: &Config, phases: usize) -> ParamMap {
-        let (s, d) = (&config.static_field, &config.dynamic);
-        let (grid, ranks) = (s.grid as usize, s.ranks as usize);
-        let (width, latent) = (d.width as usize, d.latent as usize);
-        let rank4 = ranks.div_ceil(4);
-        let static_len = 3 * (grid * grid + grid) * rank4 * 4;
-        let encoded_len = 3 + 6 * d.bands as usize;
+impl NetworkMap {
+    /// A network of the shape that the dynamic field has, from parameter `first` on, with `latent` numbers for each phase.
+    fn new(shape: &DynamicField, first: usize, latent: usize, phases: usize) -> NetworkMap {
+        let width = shape.width as usize;
+        let encoded_len = 3 + 6 * shape.bands as usize;
         let encode_groups = encoded_len.div_ceil(4);
-        let mut next = static_len;
+        let mut next = first;
         let mut take = |len: usize| {
             let at = next;
             next += len.next_multiple_of(4);
             at
         };
-        let layers = (0..d.layers as usize)
+        let layers = (0..shape.layers as usize)
             .map(|i| {
-                let sees_input = i == 0 || i + 1 == d.skip_layer as usize;
+                let sees_input = i == 0 || i + 1 == shape.skip_layer as usize;
                 Layer {
                     encoded: sees_input.then(|| take(width * encode_groups * 4)),
                     hidden: (i > 0).then(|| take(width * width)),
-                    latent: sees_input.then(|| take(width * latent)),
+                    latent: (sees_input && latent > 0).then(|| take(width * latent)),
                     bias: take(width),
                 }
             })
@@ -95,11 +108,9 @@ impl ParamMap {
         let out_weights = take(width);
         let out_bias = take(1);
         let latents = take(phases * latent);
-        ParamMap {
-            grid,
-            ranks,
-            rank4,
-            static_len,
+        let len = next - first;
+        NetworkMap {
+            first,
             layers,
             out_weights,
             out_bias,
@@ -109,51 +120,16 @@ impl ParamMap {
             encode_groups,
             latent,
             phases,
-            len: next,
+            len,
         }
     }
 
-    /// Parameters of the network, padding included; they follow those of the static field.
-    pub fn network_len(&self) -> usize {
-        self.len - self.static_len
-    }
-
-    /// Numbers on the lines of the static field, padding included; they are its last.
-    pub fn line_len(&self) -> usize {
-        3 * self.grid * self.rank4 * 4
-    }
-
-    /// Position of plane element `(mode, rank, v, u)`; `u` runs along the plane's first axis.
-    pub fn plane(&self, mode: usize, rank: usize, v: usize, u: usize) -> usize {
-        ((mode * self.grid + v) * self.grid + u) * self.rank4 * 4 + rank
-    }
-
-    /// Position of line element `(mode, rank, w)`.
-    pub fn line(&self, mode: usize, rank: usize, w: usize) -> usize {
-        (3 * self.grid * self.grid + mode * self.grid + w) * self.rank4 * 4 + rank
-    }
-
-    /// Every tensor under its documented name, padding left out. A layer that sees the input has one
-    /// weight matrix on `[encoded, latent]` or `[encoded, latent, hidden]`, as in the authors' code.
-    pub fn tensors(&self) -> Vec<Tensor> {
+    /// Every tensor, its name after that of the field. A layer that sees the input has one weight matrix on `[encoded, latent]`
+    /// or `[encoded, latent, hidden]`, as in the authors' code.
+    fn tensors(&self, field: &str) -> Vec<Tensor> {
         let mut out = Vec::new();
-        let mut push = |name: String, shape: Vec<usize>, positions: Vec<usize>| {
-            out.push(Tensor { name, shape, positions: positions.into_iter().map(|p| p as u32).collect() });
-        };
-        for (mode, plane) in ["xy", "xz", "yz"].into_iter().enumerate() {
-            let mut at = Vec::new();
-            for r in 0..self.ranks {
-                for v in 0..self.grid {
-                    at.extend((0..self.grid).map(|u| self.plane(mode, r, v, u)));
-                }
-            }
-            push(format!("static.plane.{plane}"), vec![self.ranks, self.grid, self.grid], at);
-        }
-        for (mode, line) in ["z", "y", "x"].into_iter().enumerate() {
-            let at = (0..self.ranks).flat_map(|r| (0..self.grid).map(move |w| (r, w)));
-            let at = at.map(|(r, w)| self.line(mode, r, w)).collect();
-            push(format!("static.line.{line}"), vec![self.ranks, self.grid], at);
-        }
+        let mut push =
+            |name: String, shape: Vec<usize>, positions: Vec<usize>| out.push(tensor(name, shape, positions));
         for (i, layer) in self.layers.iter().enumerate() {
             let mut at = Vec::new();
             let mut inputs = 0;
@@ -171,20 +147,97 @@ impl ParamMap {
                 inputs = row.len();
                 at.extend(row);
             }
-            push(format!("dynamic.layer{i}.weight"), vec![self.width, inputs], at);
-            push(format!("dynamic.layer{i}.bias"), vec![self.width], (layer.bias..layer.bias + self.width).collect());
+            push(format!("{field}.layer{i}.weight"), vec![self.width, inputs], at);
+            push(format!("{field}.layer{i}.bias"), vec![self.width], slice(layer.bias, self.width).collect());
         }
-        push(
-            "dynamic.out.weight".into(),
-            vec![1, self.width],
-            (self.out_weights..self.out_weights + self.width).collect(),
-        );
-        push("dynamic.out.bias".into(), vec![1], vec![self.out_bias]);
-        push(
-            "dynamic.latent".into(),
-            vec![self.phases, self.latent],
-            (self.latents..self.latents + self.phases * self.latent).collect(),
-        );
+        push(format!("{field}.out.weight"), vec![1, self.width], slice(self.out_weights, self.width).collect());
+        push(format!("{field}.out.bias"), vec![1], vec![self.out_bias]);
+        if self.latent > 0 {
+            let shape = vec![self.phases, self.latent];
+            push(format!("{field}.latent"), shape, slice(self.latents, self.phases * self.latent).collect());
+        }
+        out
+    }
+
+    /// Inputs of what makes a tensor of [`NetworkMap::tensors`]; none for latents.
+    fn inputs(&self, name: &str) -> Option<usize> {
+        if name.ends_with(".latent") {
+            return None;
+        }
+        let layer = name.split(".layer").nth(1).and_then(|rest| rest.split('.').next()?.parse::<usize>().ok());
+        Some(layer.map_or(self.width, |i| {
+            let Layer { encoded, hidden, .. } = &self.layers[i];
+            encoded.map_or(0, |_| self.encoded_len + self.latent) + hidden.map_or(0, |_| self.width)
+        }))
+    }
+}
+
+fn slice(first: usize, len: usize) -> Range<usize> {
+    first..first + len
+}
+
+fn tensor(name: String, shape: Vec<usize>, positions: Vec<usize>) -> Tensor {
+    Tensor { name, shape, positions: positions.into_iter().map(|p| p as u32).collect() }
+}
+
+impl ParamMap {
+    /// Map for a configuration and a number of phases.
+    pub fn new(config: &Config, phases: usize) -> ParamMap {
+        let (s, d) = (&config.static_field, &config.dynamic);
+        let (grid, ranks, still) = match s.form {
+            StaticForm::Tensor => (s.grid as usize, s.ranks as usize, None),
+            StaticForm::Network => (0, 0, Some(NetworkMap::new(d, 0, 0, phases))),
+        };
+        let rank4 = ranks.div_ceil(4);
+        let static_len = still.as_ref().map_or(3 * (grid * grid + grid) * rank4 * 4, |network| network.len);
+        let moving = NetworkMap::new(d, static_len, d.latent as usize, phases);
+        let len = static_len + moving.len;
+        ParamMap { grid, ranks, rank4, static_len, still, moving, phases, len }
+    }
+
+    /// The networks there are, the static field's first.
+    pub fn networks(&self) -> impl Iterator<Item = &NetworkMap> {
+        self.still.iter().chain([&self.moving])
+    }
+
+    /// Numbers on the lines of the static field, padding included; they are its last.
+    pub fn line_len(&self) -> usize {
+        3 * self.grid * self.rank4 * 4
+    }
+
+    /// Position of plane element `(mode, rank, v, u)`; `u` runs along the plane's first axis.
+    pub fn plane(&self, mode: usize, rank: usize, v: usize, u: usize) -> usize {
+        ((mode * self.grid + v) * self.grid + u) * self.rank4 * 4 + rank
+    }
+
+    /// Position of line element `(mode, rank, w)`.
+    pub fn line(&self, mode: usize, rank: usize, w: usize) -> usize {
+        (3 * self.grid * self.grid + mode * self.grid + w) * self.rank4 * 4 + rank
+    }
+
+    /// Every tensor under its documented name, padding left out.
+    pub fn tensors(&self) -> Vec<Tensor> {
+        let mut out = self.still.as_ref().map_or_else(|| self.planes_and_lines(), |network| network.tensors("static"));
+        out.extend(self.moving.tensors("dynamic"));
+        out
+    }
+
+    fn planes_and_lines(&self) -> Vec<Tensor> {
+        let mut out = Vec::new();
+        for (mode, plane) in ["xy", "xz", "yz"].into_iter().enumerate() {
+            let mut at = Vec::new();
+            for r in 0..self.ranks {
+                for v in 0..self.grid {
+                    at.extend((0..self.grid).map(|u| self.plane(mode, r, v, u)));
+                }
+            }
+            out.push(tensor(format!("static.plane.{plane}"), vec![self.ranks, self.grid, self.grid], at));
+        }
+        for (mode, line) in ["z", "y", "x"].into_iter().enumerate() {
+            let at = (0..self.ranks).flat_map(|r| (0..self.grid).map(move |w| (r, w)));
+            let at = at.map(|(r, w)| self.line(mode, r, w)).collect();
+            out.push(tensor(format!("static.line.{line}"), vec![self.ranks, self.grid], at));
+        }
         out
     }
 
@@ -193,28 +246,19 @@ impl ParamMap {
     pub fn initial(&self, config: &Config) -> Vec<f32> {
         let mut params = vec![0f32; self.len];
         for (index, tensor) in self.tensors().into_iter().enumerate() {
-            let inputs = match tensor.name.as_str() {
-                "dynamic.out.weight" | "dynamic.out.bias" => Some(self.width),
-                "dynamic.latent" => None,
-                name if name.starts_with("dynamic.layer") => Some(self.layer_inputs(name)),
-                _ => None,
-            };
+            let is_static = tensor.name.starts_with("static.");
+            let network = if is_static { self.still.as_ref() } else { Some(&self.moving) };
+            let inputs = network.map(|network| network.inputs(&tensor.name));
             for (i, &at) in tensor.positions.iter().enumerate() {
                 let (a, b) = (index as u32, i as u32);
                 params[at as usize] = match inputs {
-                    Some(n) => (uniform01(config.seed, STREAM_INIT, a, b) * 2.0 - 1.0) / (n as f64).sqrt(),
-                    None if tensor.name == "dynamic.latent" => uniform01(config.seed, STREAM_INIT, a, b),
+                    Some(Some(n)) => (uniform01(config.seed, STREAM_INIT, a, b) * 2.0 - 1.0) / (n as f64).sqrt(),
+                    Some(None) => uniform01(config.seed, STREAM_INIT, a, b),
                     None => config.static_field.init_std * normal(config.seed, STREAM_INIT, a, b),
                 } as f32;
             }
         }
         params
-    }
-
-    fn layer_inputs(&self, name: &str) -> usize {
-        let index: usize = name.chars().filter(char::is_ascii_digit).collect::<String>().parse().unwrap_or(0);
-        let layer = &self.layers[index];
-        layer.encoded.map_or(0, |_| self.encoded_len + self.latent) + layer.hidden.map_or(0, |_| self.width)
     }
 }
 
@@ -225,7 +269,7 @@ mod tests {
 
     #[test]
     fn slices_are_aligned_disjoint_and_named() {
-        for preset in [Preset::FastMlp, Preset::Paper, Preset::PublicCode] {
+        for preset in [Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa] {
             let config = Config::preset(preset);
             let map = ParamMap::new(&config, 10);
             let mut seen = vec![false; map.len];
@@ -235,7 +279,8 @@ mod tests {
                     assert!(!std::mem::replace(&mut seen[at as usize], true), "{} overlaps", tensor.name);
                 }
             }
-            assert!(map.layers.iter().all(|l| l.bias % 4 == 0 && l.hidden.unwrap_or(0) % 4 == 0));
+            let mut layers = map.networks().flat_map(|network| &network.layers);
+            assert!(layers.all(|l| l.bias % 4 == 0 && l.hidden.unwrap_or(0) % 4 == 0));
         }
     }
 
@@ -246,5 +291,33 @@ mod tests {
             map.tensors().into_iter().filter(|t| t.name.ends_with("weight")).map(|t| t.shape).collect();
         let want = [[128, 71], [128, 128], [128, 128], [128, 199], [128, 128], [1, 128]];
         assert_eq!(shapes, want.map(Vec::from));
+    }
+
+    #[test]
+    fn nerf_ca_has_the_parameters_of_its_authors() {
+        let map = ParamMap::new(&Config::preset(Preset::NerfCa), 10);
+        let count = |field: &str| {
+            let of_field = |t: &Tensor| t.name.starts_with(field);
+            map.tensors().iter().filter(|t| of_field(t)).map(|t| t.positions.len()).sum::<usize>()
+        };
+        assert_eq!((count("static."), count("dynamic.")), (75_905, 76_929 + 80));
+    }
+
+    #[test]
+    fn layers_start_within_one_over_the_root_of_their_inputs() {
+        let config = Config::preset(Preset::NerfCa);
+        let map = ParamMap::new(&config, 10);
+        let params = map.initial(&config);
+        for (name, inputs) in [
+            ("static.layer0.weight", 75.0),
+            ("static.layer3.bias", 128.0),
+            ("dynamic.layer0.bias", 83.0),
+            ("dynamic.out.weight", 128.0),
+        ] {
+            let tensor = map.tensors().into_iter().find(|t| t.name == name).unwrap();
+            let largest = tensor.positions.iter().map(|at| params[*at as usize].abs()).fold(0.0, f32::max);
+            let most = 1.0 / f32::sqrt(inputs);
+            assert!(largest <= most && largest > 0.9 * most, "{name}: {largest} of {most}");
+        }
     }
 }

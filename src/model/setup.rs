@@ -1,5 +1,6 @@
 //! The constants that shaders read, from a model.
 
+use crate::config::sections::Networks;
 use crate::config::{Config, DynamicTarget};
 use crate::kernels::layout::Setup;
 use crate::model::hull::Hull;
@@ -30,6 +31,9 @@ impl Scene {
         self.weigh_losses(&mut setup, config);
         self.set_occupancy(&mut setup, config);
         set_optimiser(&mut setup, config);
+        if config.two_networks() {
+            set_networks(&mut setup, &config.networks);
+        }
         setup
     }
 
@@ -85,6 +89,7 @@ fn choose_samples(setup: &mut Setup, config: &Config) {
     setup.n_dynamic_samples = march.dynamic_samples;
     setup.jitter = 1;
     setup.per_ray_depths = u32::from(march.per_ray_depths);
+    setup.along_axis = u32::from(march.along_axis);
     let most = config.train.chunk_samples.max(march.dynamic_samples).max(march.render_samples);
     setup.sample_capacity = sample_capacity(most);
 }
@@ -95,11 +100,21 @@ fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
     setup.n_bands = config.dynamic.bands;
     setup.grid = params.grid as u32;
     setup.rank4 = params.rank4 as u32;
-    setup.latent_width = params.latent as u32;
-    setup.n_layers = params.layers.len() as u32;
-    setup.mlp_width = params.width as u32;
+    setup.latent_width = params.moving.latent as u32;
+    setup.n_layers = params.moving.layers.len() as u32;
+    setup.mlp_width = params.moving.width as u32;
     setup.static_params = params.static_len as u32;
     setup.n_params = params.len as u32;
+}
+
+/// Losses of two networks that have no schedule.
+fn set_networks(setup: &mut Setup, networks: &Networks) {
+    setup.two_networks = 1;
+    setup.change_weight = networks.change_weight as f32;
+    setup.least_change = networks.least_change as f32;
+    setup.least_integral = networks.least_integral as f32;
+    setup.stop_after = networks.stop_after;
+    setup.stop_below = networks.stop_below as f32;
 }
 
 fn set_optimiser(setup: &mut Setup, config: &Config) {

@@ -1,10 +1,10 @@
 //! Operations that the network costs.
 
-use crate::model::params::ParamMap;
+use crate::model::params::{NetworkMap, ParamMap};
 use serde::{Deserialize, Serialize};
 
-/// Operations of the network per sample, a multiply-add counted as two.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+/// Operations of the networks per sample, a multiply-add counted as two.
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 pub struct NetworkCost {
     /// Forward.
     pub forward: u64,
@@ -15,8 +15,16 @@ pub struct NetworkCost {
 }
 
 impl NetworkCost {
-    /// Counts, without padding and without biases and latents, which cost one row per phase.
+    /// Counts all networks, without padding and without biases and latents, which cost one row per phase.
     pub fn of(params: &ParamMap) -> NetworkCost {
+        params.networks().map(NetworkCost::of_network).fold(NetworkCost::default(), |a, b| NetworkCost {
+            forward: a.forward + b.forward,
+            weights: a.weights + b.weights,
+            inputs: a.inputs + b.inputs,
+        })
+    }
+
+    fn of_network(params: &NetworkMap) -> NetworkCost {
         let width = params.width as u64;
         let mut forward = width;
         let mut inputs = width;
@@ -31,5 +39,20 @@ impl NetworkCost {
     /// All three.
     pub fn total(&self) -> u64 {
         self.forward + self.weights + self.inputs
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Preset};
+
+    #[test]
+    fn both_networks_of_nerf_ca_count() {
+        let cost = NetworkCost::of(&ParamMap::new(&Config::preset(Preset::NerfCa), 10));
+        // Products of 75 numbers, four hidden layers and an output, in each of two networks; latents are rows per phase.
+        let forward = 2 * 2 * (128 * 75 + 4 * 128 * 128 + 128);
+        assert_eq!((cost.forward, cost.weights), (forward, forward));
+        assert_eq!(cost.inputs, 2 * 2 * (4 * 128 * 128 + 128));
     }
 }

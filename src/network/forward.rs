@@ -154,7 +154,7 @@ impl Pass<'_> {
         let k = self.kernels;
         let Chunk { first_ray, n_rays } = chunk;
         self.run(&k.march_count, chunk.per_ray(), push::MarchCount { first_ray, n_rays })?;
-        self.run(&k.march_scan, Groups::Direct([1, 1, 1]), self.network.scan(self.params, chunk))?;
+        self.run(&k.march_scan, Groups::Direct([1, 1, 1]), self.network.scan(chunk))?;
         self.run(&k.march_emit, chunk.per_ray(), push::MarchEmit { first_ray, n_rays })
     }
 
@@ -174,6 +174,24 @@ impl Pass<'_> {
         Ok(())
     }
 
+    /// Records what depends on parameters alone, of each network.
+    ///
+    /// # Errors
+    /// As [`Pass::run`].
+    pub fn weights(&mut self) -> Result<()> {
+        self.network.record_weights(self)?;
+        self.still.map_or(Ok(()), |still| still.record_weights(self))
+    }
+
+    /// Records the networks at the live samples.
+    ///
+    /// # Errors
+    /// As [`Pass::run`].
+    pub fn fields(&mut self) -> Result<()> {
+        self.network.record_forward(self)?;
+        self.still.map_or(Ok(()), |still| still.record_forward(self))
+    }
+
     /// Records a rendering of `n_rays` rays already in `rays`: integrals and maxima land in `ray_out`.
     ///
     /// # Errors
@@ -182,13 +200,18 @@ impl Pass<'_> {
         if self.setup.jitter != 0 {
             return Err(Error::Internal("rendering wants regular depths".into()));
         }
-        let (k, network) = (self.kernels, self.network);
-        network.record_weights(self)?;
+        self.weights()?;
         for chunk in chunks(self.setup, n_rays) {
             self.samples(chunk)?;
-            network.record_forward(self)?;
+            self.fields()?;
             let Chunk { first_ray, n_rays } = chunk;
-            self.run(&k.march_fwd_maxima, chunk.per_ray(), push::MarchFwd { first_ray, n_rays })?;
+            match self.still {
+                None => {
+                    let push = push::MarchFwd { first_ray, n_rays };
+                    self.run(&self.kernels.march_fwd_maxima, chunk.per_ray(), push)?;
+                }
+                Some(still) => still.record_integrals(self, chunk, true)?,
+            }
         }
         Ok(())
     }

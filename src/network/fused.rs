@@ -18,7 +18,7 @@ use crate::kernels::layout::Setup;
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
 use crate::kernels::tuning::Tuning;
-use crate::model::params::ParamMap;
+use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
 use crate::network::pass::Pass;
 use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
@@ -58,7 +58,7 @@ struct Shape {
 impl Shape {
     /// # Errors
     /// [`Error::Config`] when the network does not fit the device's shared memory or workgroups.
-    fn new(info: &DeviceInfo, matrix: MatrixShape, largest: u32, params: &ParamMap) -> Result<Shape> {
+    fn new(info: &DeviceInfo, matrix: MatrixShape, largest: u32, params: &NetworkMap) -> Result<Shape> {
         let MatrixShape { m, n, k } = matrix;
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
@@ -119,7 +119,7 @@ impl Shape {
     }
 
     /// Where each packed weight, then each row of biases, comes from.
-    fn pack_source(&self, params: &ParamMap) -> Vec<u32> {
+    fn pack_source(&self, params: &NetworkMap) -> Vec<u32> {
         let mut source = vec![NOWHERE; self.weights_len];
         let width = params.width;
         let phase_bias =
@@ -131,7 +131,9 @@ impl Shape {
                     for (c, s) in row[..params.encoded_len].iter_mut().enumerate() {
                         *s = (from + j * 4 * params.encode_groups + c) as u32;
                     }
-                    for (phase, s) in row[params.encoded_len..][..params.phases].iter_mut().enumerate() {
+                    // Without latents a bias is a bias, the same at all phases.
+                    let columns = if layer.latent.is_some() { params.phases } else { 0 };
+                    for (phase, s) in row[params.encoded_len..][..columns].iter_mut().enumerate() {
                         *s = phase_bias(l, phase, j);
                     }
                 }
@@ -157,10 +159,10 @@ impl Shape {
     }
 
     /// Where the gradient of each network parameter lies in the partial sums.
-    fn gradient_source(&self, params: &ParamMap) -> Vec<u32> {
-        let mut source = vec![NOWHERE; params.network_len()];
+    fn gradient_source(&self, params: &NetworkMap) -> Vec<u32> {
+        let mut source = vec![NOWHERE; params.len];
         let width = params.width;
-        let mut put = |at: usize, from: usize| source[at - params.static_len] = from as u32;
+        let mut put = |at: usize, from: usize| source[at - params.first] = from as u32;
         for (packed, layer) in self.layers.iter().zip(&params.layers) {
             for j in 0..width {
                 if let (Some(from), Some(to)) = (packed.encoded, layer.encoded) {
@@ -182,7 +184,7 @@ impl Shape {
     }
 
     /// Where the sum of dz over each phase, `[layer][phase][neuron]`, lies in the partial sums.
-    fn phase_source(&self, params: &ParamMap) -> Vec<u32> {
+    fn phase_source(&self, params: &NetworkMap) -> Vec<u32> {
         let mut source = Vec::new();
         for packed in &self.layers {
             for phase in 0..params.phases {
@@ -247,12 +249,12 @@ struct BackwardKernels {
 struct Builder<'a> {
     gpu: &'a Gpu,
     shape: &'a Shape,
-    params: &'a ParamMap,
+    params: &'a NetworkMap,
     build: Build<'a>,
 }
 
 impl Builder<'_> {
-    fn new<'a>(gpu: &'a Gpu, tuning: &Tuning, shape: &'a Shape, params: &'a ParamMap) -> Builder<'a> {
+    fn new<'a>(gpu: &'a Gpu, tuning: &Tuning, shape: &'a Shape, params: &'a NetworkMap) -> Builder<'a> {
         let build = Build {
             // Unrolled or not, they compute the same.
             variant: if tuning.matrices.unroll { "_unrolled" } else { "" },
@@ -303,7 +305,7 @@ impl FusedNetwork {
         gpu: &Gpu,
         tuning: &Tuning,
         setup: &Setup,
-        params: &ParamMap,
+        params: &NetworkMap,
         purpose: Purpose,
     ) -> Result<FusedNetwork> {
         let info = gpu.info();
@@ -357,7 +359,7 @@ impl FusedNetwork {
 
     /// Records one or two passes through layer `l`: over the layer below, and over the encoding if it sees that.
     fn record_layer_backward(&self, pass: &mut Pass<'_>, l: usize, chunk: Chunk) -> Result<()> {
-        let (shape, training, params) = (&self.shape, self.training()?, pass.params);
+        let (shape, training, params) = (&self.shape, self.training()?, pass.network.map());
         let (k, packed) = (&training.kernels, &self.shape.layers[l]);
         let is_last = l + 1 == params.layers.len();
         let capacity = pass.setup.sample_capacity;
@@ -404,37 +406,37 @@ impl Path for FusedNetwork {
         self.buffers.find(name)
     }
 
-    fn tiles(&self, _: &ParamMap) -> Tiles {
+    fn tiles(&self, _: &NetworkMap) -> Tiles {
         Tiles { samples: self.shape.fwd_tile, forward: 1, backward: 1 }
     }
 
-    fn partial_sums(&self, _: &ParamMap) -> PartialSums {
+    fn partial_sums(&self, _: &NetworkMap) -> PartialSums {
         PartialSums { splits: self.workgroups, len: self.shape.partials_len as u32 }
     }
 
-    fn gradient_source(&self, params: &ParamMap) -> Vec<u32> {
+    fn gradient_source(&self, params: &NetworkMap) -> Vec<u32> {
         self.shape.gradient_source(params)
     }
 
     /// f16 copies of the weights.
     fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
         let n_pairs = (self.shape.weights_len / 2) as u32;
-        let n_bias = pass.params.layers.len() as u32 * self.shape.matrix.m * pass.params.width as u32;
+        let n_bias = pass.network.map().layers.len() as u32 * self.shape.matrix.m * pass.network.map().width as u32;
         pass.run(&self.mlp_pack, self.mlp_pack.groups_for(n_pairs + n_bias), push::MlpPack { n_pairs, n_bias })
     }
 
     fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let push = push::MlpFusedFwd { out_bias: pass.params.out_bias as u32 };
+        let push = push::MlpFusedFwd { out_bias: pass.network.map().out_bias as u32 };
         pass.run(&self.mlp_fused_fwd, pass.buffers.forward_tiles(), push)
     }
 
     fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        (0..pass.params.layers.len()).rev().try_for_each(|l| self.record_layer_backward(pass, l, chunk))
+        (0..pass.network.map().layers.len()).rev().try_for_each(|l| self.record_layer_backward(pass, l, chunk))
     }
 
     /// They are part of the partial sums.
     fn record_phase_sums(&self, pass: &mut Pass<'_>, gradient: &GradientBuffers) -> Result<()> {
-        let (stage, params, training) = (&pass.kernels.gradient_network, pass.params, self.training()?);
+        let (stage, params, training) = (&pass.kernels.gradient_network, pass.network.map(), self.training()?);
         let count = (params.layers.len() * params.phases * params.width) as u32;
         let PartialSums { splits, len: n_partials } = self.partial_sums(params);
         let bound =

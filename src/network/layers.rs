@@ -10,7 +10,7 @@ use crate::kernels::layout::{SampleTime, Setup};
 use crate::kernels::push;
 use crate::kernels::stages::LayerKernels;
 use crate::kernels::tuning::Tuning;
-use crate::model::params::{Layer, ParamMap};
+use crate::model::params::{Layer, NetworkMap};
 use crate::network::chunk::{Chunk, chunk_rays};
 use crate::network::pass::Pass;
 use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
@@ -56,7 +56,7 @@ impl LayerNetwork {
         gpu: &Gpu,
         tuning: &Tuning,
         setup: &Setup,
-        params: &ParamMap,
+        params: &NetworkMap,
         purpose: Purpose,
     ) -> Result<LayerNetwork> {
         let capacity = u64::from(setup.sample_capacity);
@@ -99,7 +99,7 @@ impl LayerNetwork {
 
     /// Records the gradient at the output neuron and of its weights, and dz of the last layer.
     fn record_output_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        let (k, params, training) = (&self.kernels, pass.params, self.training()?);
+        let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
         let capacity = pass.setup.sample_capacity;
         let groups = params.width as u32 / 4;
         let last = params.layers.len() - 1;
@@ -122,7 +122,7 @@ impl LayerNetwork {
     /// Records dz of the layer below `i`, which has one.
     fn record_input_gradient(&self, pass: &mut Pass<'_>, i: usize, weights: usize) -> Result<()> {
         let (k, training) = (&self.kernels, self.training()?);
-        let groups = pass.params.width as u32 / 4;
+        let groups = pass.network.map().width as u32 / 4;
         let bound = [
             (Binding::dz, (&training.dz[i % 2]).into()),
             (Binding::activations, (&self.activations[i - 1]).into()),
@@ -139,10 +139,12 @@ impl LayerNetwork {
 
     /// Records the gradient of a layer's weights on each of its inputs.
     fn record_weight_gradients(&self, pass: &mut Pass<'_>, i: usize, layer: &Layer, chunk: Chunk) -> Result<()> {
-        let (k, params, training) = (&self.kernels, pass.params, self.training()?);
+        let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
         let (width, groups) = (params.width as u32, params.width as u32 / 4);
         let PartialSums { splits, len: n_partials } = self.partial_sums(params);
         let tile = k.tuning.tile();
+        // Biases of layers without latents are summed here, once; the others come from the sums per phase.
+        let mut bias = layer.latent.is_none().then(|| in_partials(params, layer.bias));
         let inputs = [
             (&self.buffers.features, params.encode_groups as u32, layer.encoded),
             (self.below(i), groups, layer.hidden),
@@ -156,8 +158,7 @@ impl LayerNetwork {
                 splits,
                 n_partials,
                 accumulate: chunk.accumulate(),
-                // Biases of layers without latents are summed here; the others come from the sums per phase.
-                bias: if layer.latent.is_none() { in_partials(params, layer.bias) } else { NOWHERE },
+                bias: bias.take().unwrap_or(NOWHERE),
                 out_groups: groups,
             };
             let inputs_per_group = tile.weight_inputs * k.mlp_layer_bwd_weight.local_size();
@@ -170,7 +171,7 @@ impl LayerNetwork {
 
     /// Records the sums of dz over the rays of each phase.
     fn record_phase_sum(&self, pass: &mut Pass<'_>, i: usize, chunk: Chunk) -> Result<()> {
-        let (k, params, training) = (&self.kernels, pass.params, self.training()?);
+        let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
         let groups = params.width as u32 / 4;
         let Chunk { first_ray, n_rays } = chunk;
         let rays = Groups::Direct([n_rays.div_ceil(k.mlp_ray_sum.local_size()), groups, 1]);
@@ -184,8 +185,8 @@ impl LayerNetwork {
 }
 
 /// Where a parameter of the network lies in a part of the partial sums: in the order of the parameters.
-fn in_partials(params: &ParamMap, at: usize) -> u32 {
-    (at - params.static_len) as u32
+fn in_partials(params: &NetworkMap, at: usize) -> u32 {
+    (at - params.first) as u32
 }
 
 impl Path for LayerNetwork {
@@ -193,7 +194,7 @@ impl Path for LayerNetwork {
         self.buffers.find(name).or_else(|| self.training.as_ref()?.sums.find(name))
     }
 
-    fn tiles(&self, params: &ParamMap) -> Tiles {
+    fn tiles(&self, params: &NetworkMap) -> Tiles {
         let (tile, width) = (self.kernels.tuning.tile(), params.width as u32);
         Tiles {
             samples: self.kernels.tuning.tile_samples(),
@@ -202,12 +203,12 @@ impl Path for LayerNetwork {
         }
     }
 
-    fn partial_sums(&self, params: &ParamMap) -> PartialSums {
-        PartialSums { splits: self.kernels.tuning.splits, len: params.network_len() as u32 }
+    fn partial_sums(&self, params: &NetworkMap) -> PartialSums {
+        PartialSums { splits: self.kernels.tuning.splits, len: params.len as u32 }
     }
 
-    fn gradient_source(&self, params: &ParamMap) -> Vec<u32> {
-        (0..params.network_len() as u32).collect()
+    fn gradient_source(&self, params: &NetworkMap) -> Vec<u32> {
+        (0..params.len as u32).collect()
     }
 
     fn record_weights(&self, _: &mut Pass<'_>) -> Result<()> {
@@ -216,7 +217,7 @@ impl Path for LayerNetwork {
 
     /// `encode`, `mlp_layer_fwd` of each layer and `mlp_out_fwd`.
     fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let (k, params, buffers) = (&self.kernels, pass.params, pass.buffers);
+        let (k, params, buffers) = (&self.kernels, pass.network.map(), pass.buffers);
         let capacity = pass.setup.sample_capacity;
         let (groups, encode_groups) = (params.width as u32 / 4, params.encode_groups as u32);
         pass.run(&k.encode, buffers.per_sample(), push::Encode {})?;
@@ -246,7 +247,7 @@ impl Path for LayerNetwork {
     /// `partials` and `phase_dz`.
     fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         self.record_output_backward(pass, chunk)?;
-        for (i, layer) in pass.params.layers.iter().enumerate().rev() {
+        for (i, layer) in pass.network.map().layers.iter().enumerate().rev() {
             if let (Some(weights), true) = (layer.hidden, i > 0) {
                 // The input gradient goes first: nothing below writes what it reads, so the three may overlap.
                 self.record_input_gradient(pass, i, weights)?;

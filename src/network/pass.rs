@@ -10,6 +10,7 @@ use crate::kernels::stages::{Kernels, Stage};
 use crate::model::params::ParamMap;
 use crate::network::Network;
 use crate::network::forward::ForwardBuffers;
+use crate::network::still::StillNetwork;
 
 /// Where stages are recorded, and what they work with.
 pub struct Pass<'a> {
@@ -19,6 +20,8 @@ pub struct Pass<'a> {
     pub kernels: &'a Kernels,
     /// The dynamic field's network.
     pub network: &'a Network,
+    /// The still field, where it is a network as well.
+    pub still: Option<&'a StillNetwork>,
     /// Buffers of the forward pass.
     pub buffers: &'a ForwardBuffers,
     /// Further buffers when training.

@@ -58,7 +58,19 @@ impl Scene {
         if config.loss.normalise {
             scene.normalise(config, dataset, motion, static_half)?;
         }
+        if config.two_networks() {
+            scene.hold_all_rays(config, dataset);
+        }
         Ok(scene)
+    }
+
+    /// Boxes of two networks, which hold every point of every view's rays: none is left out. Their activations.
+    fn hold_all_rays(&mut self, config: &Config, dataset: &Dataset) {
+        let half = reach(dataset);
+        (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
+        (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
+        (self.static_gain, self.dynamic_gain) = (config.networks.gain, config.networks.gain);
+        (self.static_shift, self.dynamic_shift) = (0.0, 0.0);
     }
 
     /// Chooses gains, shifts and weights so that features, integrals and losses are near 1.
@@ -120,6 +132,22 @@ fn static_half(config: &Config, dataset: &Dataset) -> f64 {
         return config.static_field.half_extent_mm / MM_PER_UNIT;
     }
     half_depth(dataset).min(STATIC_FIELDS_OF_VIEW * field_of_view(dataset))
+}
+
+/// Half side of the least box around the isocentre that holds all rays of the views over the depth range, and a little more, so that
+/// rounding leaves none out.
+fn reach(dataset: &Dataset) -> f64 {
+    let mut reach = 0f64;
+    for view in &dataset.views {
+        let [w, h] = view.size.map(|n| n as f64 - 0.5);
+        for (i, j) in [(-0.5, -0.5), (w, -0.5), (-0.5, h), (w, h)] {
+            let (anchor, direction) = view.rays.pixel(i, j);
+            for depth in [dataset.depth_range.0, dataset.depth_range.1] {
+                reach = reach.max((anchor + depth * direction).abs().max_element());
+            }
+        }
+    }
+    reach * (1.0 + 1e-5)
 }
 
 fn half_depth(dataset: &Dataset) -> f64 {
@@ -223,6 +251,27 @@ mod tests {
         // Fields that share one residual share its weight, and there is nothing to be robust against.
         let absolute = normalised(&data, &["loss.dynamic_target=absolute", "loss.robust=0.3"]).unwrap();
         assert_eq!((absolute.dynamic_weight, absolute.robust_scale), (absolute.static_weight, 0.0));
+    }
+
+    #[test]
+    fn boxes_of_two_networks_hold_every_point_of_every_ray() {
+        let data = dataset(2.0, 0.4);
+        let config = Config::preset(Preset::NerfCa);
+        let scene = Scene::new(&config, &data, &crate::plan::motion::analyse(&data, &config.hull), None).unwrap();
+        let mut largest = 0f64;
+        for view in &data.views {
+            for (i, j) in (0..SIZE).flat_map(|i| (0..SIZE).map(move |j| (i as f64, j as f64))) {
+                let (anchor, direction) = view.rays.pixel(i, j);
+                largest = [-0.9, 0.9].iter().fold(largest, |m, t| m.max((anchor + *t * direction).abs().max_element()));
+            }
+        }
+        let half = scene.dynamic_max[0];
+        assert!(largest < half && half < 1.2 * largest, "{largest} {half}");
+        assert_eq!((scene.static_max, scene.dynamic_min), ([half; 3], [-half; 3]));
+        assert_eq!(
+            (scene.static_gain, scene.dynamic_gain, scene.static_shift, scene.dynamic_shift),
+            (0.01, 0.01, 0.0, 0.0)
+        );
     }
 
     #[test]

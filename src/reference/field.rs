@@ -1,7 +1,7 @@
 //! f64 twins of the fields: plain loops over one point at a time, forward and backward.
 
 use crate::kernels::layout::Setup;
-use crate::model::params::ParamMap;
+use crate::model::params::{NetworkMap, ParamMap};
 use glam::{DVec3, Vec3};
 
 /// log(1 + e^x), the identity beyond 20 as in torch.
@@ -142,7 +142,13 @@ pub struct NetworkTrace {
 pub type Shown = [(usize, f64); 2];
 
 /// The network at one encoded point, at one phase or between two.
-pub fn network_fwd(p: &ParamMap, params: &[f64], encoded: &[f64], shown: Shown, precision: Precision) -> NetworkTrace {
+pub fn network_fwd(
+    p: &NetworkMap,
+    params: &[f64],
+    encoded: &[f64],
+    shown: Shown,
+    precision: Precision,
+) -> NetworkTrace {
     let round = |x: f64| precision.round(x);
     let encoded: Vec<f64> = encoded.iter().map(|e| round(*e)).collect();
     let mut hidden: Vec<Vec<f64>> = Vec::new();
@@ -180,7 +186,7 @@ pub fn network_fwd(p: &ParamMap, params: &[f64], encoded: &[f64], shown: Shown, 
 
 /// Adds `dL_dfeature` times the feature's gradient with respect to all network parameters.
 pub fn network_bwd(
-    p: &ParamMap,
+    p: &NetworkMap,
     params: &[f64],
     trace: &NetworkTrace,
     shown: Shown,

@@ -22,6 +22,8 @@ pub struct Ray {
     pub temporal: [f64; 2],
     /// frame * pixels + pixel.
     pub id: u32,
+    /// How much its pixel changes over the beat; 0 but for two networks.
+    pub change: f64,
 }
 
 /// Rays of iteration `step` (twin of `batch`).
@@ -65,6 +67,7 @@ pub fn ray(plan: &Plan, id: u32) -> Ray {
         target,
         temporal: [high, low].map(|background| target - f64::from(background)),
         id,
+        change: plan.pixel_changes.get((frame.background_offset + pixel) as usize).copied().unwrap_or(0.0).into(),
     }
 }
 
@@ -83,7 +86,7 @@ pub fn depths(s: &Setup, n: u32, near: f32, far: f32, step: u32, ray: &Ray) -> V
             lower + (upper - lower) * uniform01(s.seed, STREAM_DEPTH.wrapping_add(stream << 4), step, k)
         })
         .collect();
-    let norm = ray.direction.length();
+    let norm = if s.along_axis != 0 { 1.0 } else { ray.direction.length() };
     (0..n as usize).map(|k| (at[k], if k + 1 < n as usize { at[k + 1] - at[k] } else { 1e-10 } * norm)).collect()
 }
 
@@ -173,7 +176,8 @@ pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool,
         if !searched(plan, x, ray, |_| true) {
             continue;
         }
-        let trace = field::network_fwd(p, params, &field::encode(s, row.window.into(), x), ray.shown, precision);
+        let trace =
+            field::network_fwd(&p.moving, params, &field::encode(s, row.window.into(), x), ray.shown, precision);
         let sigma = f64::from(s.dynamic_gain) * field::softplus(trace.feature + f64::from(s.dynamic_shift));
         let near = t < f64::from(s.occlusion_depth);
         out.dynamic_integral += sigma * dl;
@@ -220,7 +224,7 @@ pub fn sample_bwd(
     let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
     let slope = if per_integral < 0.0 { slope.max(s.least_slope.into()) } else { slope };
     field::network_bwd(
-        &plan.params,
+        &plan.params.moving,
         params,
         &sample.trace,
         shown,

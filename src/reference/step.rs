@@ -3,6 +3,7 @@
 use crate::plan::Plan;
 use crate::reference::field::Precision;
 use crate::reference::march::{self, Ray};
+use crate::reference::networks;
 
 /// Losses of an iteration; see `report`.
 #[derive(Debug, Clone, Copy, Default)]
@@ -15,6 +16,12 @@ pub struct Losses {
     pub tv: f64,
     /// Occlusion, weighted.
     pub occlusion: f64,
+    /// Entropy of two networks' shares at samples, weighted.
+    pub favour_static: f64,
+    /// Entropy of the dynamic field along rays, weighted; of two networks.
+    pub ray_entropy: f64,
+    /// The static field's integrals over intervals and their squares, weighted; of two networks.
+    pub static_size: f64,
     /// Live dynamic samples.
     pub live: usize,
 }
@@ -22,7 +29,7 @@ pub struct Losses {
 impl Losses {
     /// The objective.
     pub fn total(&self) -> f64 {
-        self.data + self.tv + self.occlusion
+        self.data + self.tv + self.occlusion + self.favour_static + self.ray_entropy + self.static_size
     }
 }
 
@@ -78,6 +85,9 @@ pub fn loss_and_gradient(
     rays: &[Ray],
     precision: Precision,
 ) -> (Losses, Vec<f64>) {
+    if plan.params.still.is_some() {
+        return networks::loss_and_gradient(plan, params, step, rays, precision);
+    }
     let s = &plan.setup;
     let mut gradient = vec![0.0; plan.params.len];
     let mut losses = Losses::default();

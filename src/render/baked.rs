@@ -1,5 +1,6 @@
 //! Fields baked into 3D images, for display rates.
 
+use crate::config::StaticForm;
 use crate::error::{Error, Result};
 use crate::geometry::{MM_PER_UNIT, ViewRays};
 use crate::gpu::buffer::{Buffer, Memory};
@@ -75,7 +76,10 @@ impl Baked {
         let scene = &model.scene;
         let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
         let moving_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(32, BAKED_CELLS);
-        let still_cells = (2 * model.config.static_field.grid).clamp(32, BAKED_CELLS);
+        let still_cells = match model.config.static_field.form {
+            StaticForm::Tensor => (2 * model.config.static_field.grid).clamp(32, BAKED_CELLS),
+            StaticForm::Network => moving_cells,
+        };
         Self::empty(renderer, still_cells, moving_cells)
     }
 

@@ -18,6 +18,7 @@ use crate::model::params::ParamMap;
 use crate::model::setup::sample_capacity;
 use crate::network::forward::ForwardBuffers;
 use crate::network::pass::Pass;
+use crate::network::still::StillNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
 use crate::scan::gating::BeatTime;
@@ -74,6 +75,8 @@ pub struct Renderer {
     pub(super) gpu: Gpu,
     pub(super) kernels: Kernels,
     network: Network,
+    /// The still field, where it is a network as well.
+    pub(super) still: Option<StillNetwork>,
     pub(super) buffers: ForwardBuffers,
     pub(super) setup: Setup,
     param_map: ParamMap,
@@ -96,19 +99,23 @@ impl Renderer {
         if model.moving.is_none() {
             setup.n_dynamic_samples = model.config.march.render_samples;
         }
-        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.param_map));
+        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.param_map.moving));
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
-        let network = Network::new(gpu, &tuning, &setup, &model.param_map, Purpose::Render)?;
+        let network = Network::new(gpu, &tuning, &setup, &model.param_map.moving, Purpose::Render)?;
         let kernels = Kernels::new(gpu, tuning, model.param_map.line_len() as u32)?;
         let schedule = gpu.buffer("schedule", size_of::<Schedule>() as u64, Memory::Upload)?;
         let (tuning, param_map, hull) = (&kernels.tuning, &model.param_map, model.hull.as_ref());
         let buffers = ForwardBuffers::new(gpu, tuning, &setup, param_map, RAYS_PER_SUBMIT, schedule, hull)?;
+        let still = param_map.still.as_ref();
+        let still = still.map(|map| StillNetwork::new(gpu, tuning, &setup, map, &buffers, Purpose::Render));
+        let still = still.transpose()?;
         // The schedule has a single row, that of the model's step.
         gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
         let moving = model.moving.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
         let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
         let param_map = model.param_map.clone();
-        let renderer = Renderer { gpu: gpu.clone(), kernels, network, buffers, setup, param_map, moving, pictures };
+        let gpu = gpu.clone();
+        let renderer = Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -198,7 +205,7 @@ impl Renderer {
         setup: &'a Setup,
     ) -> Pass<'a> {
         let (kernels, network, params) = (&self.kernels, &self.network, &self.param_map);
-        Pass { recording, kernels, network, buffers, training: None, params, setup }
+        Pass { recording, kernels, network, still: self.still.as_ref(), buffers, training: None, params, setup }
     }
 
     /// Renders a `width` x `height` view at a phase.
@@ -335,7 +342,7 @@ impl Renderer {
         for first_pixel in (0..pixels).step_by(at_once as usize) {
             let n_rays = at_once.min(pixels - first_pixel);
             let mut recording = Recording::new(&self.gpu, "render")?;
-            let push = pose(taken, self.setup.n_phases, first_pixel, n_rays, image_width);
+            let push = pose(taken, &self.setup, first_pixel, n_rays, image_width);
             self.buffers.record_pose(&mut recording, &self.kernels, &views, push)?;
             if parts.still {
                 self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
@@ -353,9 +360,10 @@ impl Renderer {
 }
 
 /// Rays of the pixels of a view, from `first_pixel` on, as they were at a time.
-pub(super) fn pose(taken: BeatTime, n_phases: u32, first_pixel: u32, n_rays: u32, image_width: u32) -> push::PoseRays {
-    let (phase, beyond, beyond_share) = (taken.phase, taken.beyond(n_phases), taken.after_phase.abs() as f32);
-    push::PoseRays { first_pixel, n_rays, phase, beyond, beyond_share, image_width, view: 0 }
+pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32, n_rays: u32, image_width: u32) -> push::PoseRays {
+    let (phase, beyond, beyond_share) = (taken.phase, taken.beyond(setup.n_phases), taken.after_phase.abs() as f32);
+    let along_axis = setup.along_axis;
+    push::PoseRays { first_pixel, n_rays, phase, beyond, beyond_share, image_width, view: 0, along_axis }
 }
 
 /// What of a rendering is wanted; the rest is undefined.

@@ -9,6 +9,8 @@ use crate::kernels::layout::View;
 use crate::kernels::push;
 use crate::model::component::Component;
 use crate::network::forward::ForwardBuffers;
+use crate::network::pass::Pass;
+use crate::network::still::still_setup;
 use crate::render::grid::{Grid, PatientGrid};
 use crate::render::renderer::{RAYS_PER_SUBMIT, Renderer, pose};
 use crate::scan::gating::BeatTime;
@@ -53,6 +55,10 @@ impl Renderer {
         setup.n_dynamic_samples = nx;
         setup.dynamic_near = grid.origin.x as f32;
         setup.dynamic_far = (grid.origin.x + grid.spacing.x * f64::from(nx - 1)) as f32;
+        let still = self.still.as_ref().filter(|_| field == Component::Static);
+        if still.is_some() {
+            setup = still_setup(&setup);
+        }
         let rows = ny * nz;
         let rows_at_once = RAYS_PER_SUBMIT.min((CELLS_PER_SUBMIT / nx).max(1)).min(rows);
         let bytes = u64::from(rows_at_once) * u64::from(nx) * 4;
@@ -67,17 +73,22 @@ impl Renderer {
             let views = self.constants(&mut r, "views", bytemuck::bytes_of(&view))?;
             let setup_buffer = self.constants(&mut r, "setup", bytemuck::bytes_of(&setup))?;
             let buffers = ForwardBuffers { setup: setup_buffer, ..self.buffers.clone() };
-            let push = pose(BeatTime::at_phase(phase), self.setup.n_phases, first, n, ny);
+            let push = pose(BeatTime::at_phase(phase), &setup, first, n, ny);
             buffers.record_pose(&mut r, &self.kernels, &views, push)?;
-            match (field, &self.moving) {
-                (Component::Static, _) => {
+            match (field, &self.moving, still) {
+                (Component::Static, _, Some(still)) => {
+                    r.fill(&cells, 0);
+                    let moving = self.pass(&mut r, &buffers, &setup);
+                    Pass { network: still.network(), still: None, ..moving }.volume(n, &cells)?;
+                }
+                (Component::Static, _, None) => {
                     let stage = &self.kernels.volume_static;
                     let bound = [(Binding::volume, (&cells).into())];
                     let push = push::VolumeStatic { n_rays: n };
                     self.pass(&mut r, &buffers, &setup).run_with(stage, stage.groups_for(n * nx), &bound, push)?;
                 }
-                (_, Some(blobs)) => blobs.record_points(&mut r, &buffers, phase, n, nx, &cells)?,
-                (_, None) => {
+                (_, Some(blobs), _) => blobs.record_points(&mut r, &buffers, phase, n, nx, &cells)?,
+                (_, None, _) => {
                     r.fill(&cells, 0);
                     self.pass(&mut r, &buffers, &setup).volume(n, &cells)?;
                 }

@@ -11,7 +11,8 @@ use crate::model::component::Component;
 use crate::network::FIRST_LOSS_SCALE;
 use crate::plan::Plan;
 use crate::reference::field::{self, Precision};
-use crate::reference::march;
+use crate::reference::networks::Place;
+use crate::reference::{march, networks};
 use crate::render::baked::Baked;
 use crate::render::grid::Grid;
 use crate::render::quantity::{Projection, Quantity};
@@ -26,6 +27,7 @@ use glam::DVec3;
 use std::sync::Arc;
 
 const VIEW: &[&str] = &[push::PoseRays::SHADER, push::MarchFwd::SHADER];
+const VIEW_OF_TWO: &[&str] = &[push::PoseRays::SHADER, push::MarchFwdSamples::SHADER];
 const STATIC_CELLS: &[&str] = &[push::PoseRays::SHADER, push::VolumeStatic::SHADER];
 const DYNAMIC_CELLS: &[&str] = &[push::PoseRays::SHADER, push::VolumeDynamic::SHADER];
 const BAKED: &[&str] = &[push::BakedMarch::SHADER];
@@ -81,7 +83,9 @@ const ITERATIONS: u32 = 5;
 /// Device errors.
 pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), &format!("{}, view of 12 x 10 pixels", preset.name()));
-    let settings = ["loss.normalise=true", "train.chunk_samples=1500"];
+    let two_networks = preset == Preset::NerfCa;
+    let scaled = if two_networks { "networks.gain=0.5" } else { "loss.normalise=true" };
+    let settings = [scaled, "train.chunk_samples=1500"];
     let trained = Trained::new(gpu, small_dataset(12, 10, 3)?, preset, &settings, tuning)?;
     let (rays, taken) = (&trained.dataset.views[2].rays, BeatTime { phase: 2, after_phase: 0.375 });
     let seen = Renderer::new(gpu, &trained.model, tuning.clone())?.render_taken(rays, 12, 10, taken)?;
@@ -89,15 +93,23 @@ pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut 
     for pixel in 0..120u32 {
         let (anchor, direction) = rays.pixel(f64::from(pixel % 12), f64::from(pixel / 12));
         let shown = taken.shown(trained.dataset.n_phases);
-        let ray = march::Ray { anchor, direction, shown, target: 0.0, temporal: [0.0; 2], id: pixel };
+        let ray = march::Ray { anchor, direction, shown, target: 0.0, temporal: [0.0; 2], id: pixel, change: 0.0 };
+        if two_networks {
+            let want = networks::seen(&trained.plan, &trained.params, ITERATIONS, &ray, trained.precision);
+            statics.push(want.fields[0]);
+            dynamics.push(want.fields[1]);
+            largest.push(want.largest[1]);
+            continue;
+        }
         let want = march::fwd(&trained.plan, &trained.params, ITERATIONS, &ray, true, trained.precision);
         statics.push(want.static_integral);
         dynamics.push(want.dynamic_integral);
         largest.push(want.dynamics.iter().map(|x| trained.attenuation(x.trace.feature)).fold(0.0, f64::max));
     }
-    findings.numbers(VIEW, "static integrals", &seen.static_integral, &statics, PIXEL);
-    findings.numbers(VIEW, "dynamic integrals", &seen.dynamic_integral, &dynamics, PIXEL);
-    findings.numbers(VIEW, "largest values", &seen.dynamic_max, &largest, PIXEL);
+    let stages = if two_networks { VIEW_OF_TWO } else { VIEW };
+    findings.numbers(stages, "static integrals", &seen.static_integral, &statics, PIXEL);
+    findings.numbers(stages, "dynamic integrals", &seen.dynamic_integral, &dynamics, PIXEL);
+    findings.numbers(stages, "largest values", &seen.dynamic_max, &largest, PIXEL);
     Ok(())
 }
 
@@ -111,6 +123,10 @@ pub fn compare_volumes(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> R
     let trained = Trained::new(gpu, small_dataset(24, 20, 3)?, Preset::FastMlp, &settings, tuning)?;
     let renderer = Arc::new(Renderer::new(gpu, &trained.model, tuning.clone())?);
     compare_cells(&trained, &renderer, sine_factor(gpu.info()), findings)?;
+    findings.begin(path_name(tuning.layers), "43 x 9 x 11 cells of two networks");
+    let two = Trained::new(gpu, small_dataset(24, 20, 3)?, Preset::NerfCa, &settings, tuning)?;
+    let of_two = Renderer::new(gpu, &two.model, tuning.clone())?;
+    compare_cells(&two, &of_two, sine_factor(gpu.info()), findings)?;
     findings.begin(path_name(tuning.layers), "baked view of 24 x 20 pixels");
     compare_baked(&trained, renderer, findings)
 }
@@ -124,11 +140,20 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
     let Trained { plan, params, .. } = trained;
     let s = &plan.setup;
     let window = trained.model.config.schedule(trained.model.step).window;
+    let of_two = |x: DVec3| {
+        let traces = networks::traces(plan, params, trained.model.step, Place { x, shown }, trained.precision);
+        networks::attenuations(plan, &traces).map(|[sigma, _]| sigma)
+    };
+    let still = plan.params.still.is_some();
+    let inside = |x: DVec3| march::dynamic_inside(plan, x, phase as usize);
     let want = |field: Component, x: DVec3| match field {
-        Component::Static if field::static_inside(s, x) => field::static_attenuation(s, &plan.params, params, x),
-        Component::Dynamic if march::dynamic_inside(plan, x, phase as usize) => {
+        Component::Static if still && inside(x) => of_two(x)[0],
+        Component::Static if !still && field::static_inside(s, x) => {
+            field::static_attenuation(s, &plan.params, params, x)
+        }
+        Component::Dynamic if inside(x) => {
             let encoded = field::encode(s, window.into(), x);
-            let trace = field::network_fwd(&plan.params, params, &encoded, shown, trained.precision);
+            let trace = field::network_fwd(&plan.params.moving, params, &encoded, shown, trained.precision);
             trained.attenuation(trace.feature)
         }
         _ => 0.0,
@@ -139,8 +164,9 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
         .collect();
     let on_matrices = trained.precision != Precision::Exact;
     let dynamic = if on_matrices { CELL_ON_MATRICES } else { CELL }.times(sine_factor);
+    let statics = if still { (DYNAMIC_CELLS, dynamic) } else { (STATIC_CELLS, CELL) };
     for (field, stages, tolerance) in
-        [(Component::Static, STATIC_CELLS, CELL), (Component::Dynamic, DYNAMIC_CELLS, dynamic)]
+        [(Component::Static, statics.0, statics.1), (Component::Dynamic, DYNAMIC_CELLS, dynamic)]
     {
         let got = renderer.sample(field, phase, &grid)?;
         let want: Vec<f64> = points.iter().map(|x| want(field, *x)).collect();

@@ -11,8 +11,8 @@ use crate::kernels::layout::{self, RayOut};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::params::{ParamMap, Tensor};
-use crate::network::FIRST_LOSS_SCALE;
 use crate::network::chunk::chunks;
+use crate::network::{FIRST_LOSS_SCALE, FIRST_LOSS_SCALE_OF_TWO};
 use crate::plan::Plan;
 use crate::reference::field::{self, Precision, Shown};
 use crate::reference::{march, step};
@@ -39,7 +39,7 @@ const fn case(preset: Preset, settings: &'static [&'static str]) -> Case {
 }
 
 impl Case {
-    fn name(&self) -> String {
+    pub(super) fn name(&self) -> String {
         [&[self.preset.name()], self.settings].concat().join(" ")
     }
 
@@ -114,19 +114,19 @@ const WHOLE: &[&str] = &["whole iteration"];
 const F16_BESIDE_F64: &[&str] = &["f16 beside f64"];
 
 /// What a path may be off by.
-struct Tolerances {
+pub(super) struct Tolerances {
     /// Attenuation at samples.
-    sigma: Tolerance,
+    pub(super) sigma: Tolerance,
     /// Gradient of a tensor.
-    gradient: Tolerance,
+    pub(super) gradient: Tolerance,
     /// Losses.
-    loss: f64,
+    pub(super) loss: f64,
 }
 
 /// f32 sums of a few thousand terms; ReLU kinks are not crossed by rounding in these cases.
 const IN_F32: Tolerances = Tolerances { sigma: F32_SUMS, gradient: F32_SUMS, loss: 2e-5 };
 /// Numbers that are sums in f32.
-const F32_SUMS: Tolerance = Tolerance::OfLargest(1e-4);
+pub(super) const F32_SUMS: Tolerance = Tolerance::OfLargest(1e-4);
 /// The twin rounds to f16 where the kernels do; sums in f32 now and then round to the other neighbour.
 const ON_MATRICES: Tolerances =
     Tolerances { sigma: Tolerance::OfLargest(2e-3), gradient: Tolerance::OfNorm(2e-4), loss: 1e-4 };
@@ -164,13 +164,13 @@ struct Seen {
 }
 
 /// A live sample of the device.
-struct Sample {
+pub(super) struct Sample {
     /// Of the batch.
-    ray: usize,
-    x: DVec3,
-    path_length: f64,
-    near: bool,
-    sigma: [f32; 2],
+    pub(super) ray: usize,
+    pub(super) x: DVec3,
+    pub(super) path_length: f64,
+    pub(super) near: bool,
+    pub(super) sigma: [f32; 2],
 }
 
 impl Seen {
@@ -192,7 +192,8 @@ impl Seen {
     }
 }
 
-fn samples(gpu: &Gpu, trainer: &Trainer, live: usize) -> Result<Vec<Sample>> {
+/// The live samples of an iteration, which one chunk held.
+pub(super) fn samples(gpu: &Gpu, trainer: &Trainer, live: usize) -> Result<Vec<Sample>> {
     let (forward, capacity) = (trainer.forward(), trainer.plan().setup.sample_capacity as usize);
     // More than fit would be a fault of the count, which is compared anyway.
     let live = live.min(capacity);
@@ -230,7 +231,7 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
 }
 
 /// Iterations that are compared: the first, and one that finds what another has left.
-const ITERATIONS: usize = 2;
+pub(super) const ITERATIONS: usize = 2;
 
 /// Runs an iteration, which begins with `params`, and compares its stages.
 fn compare_stages(gpu: &Gpu, trainer: &mut Trainer, params: &[f32], findings: &mut Findings) -> Result<()> {
@@ -238,10 +239,7 @@ fn compare_stages(gpu: &Gpu, trainer: &mut Trainer, params: &[f32], findings: &m
     let loss = one_iteration(trainer)?;
     let seen = Seen::download(gpu, trainer, loss)?;
     let params: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
-    let precision = match trainer.tuning().layers {
-        Layers::F32 => Precision::Exact,
-        Layers::Matrices => Precision::F16 { loss_scale: FIRST_LOSS_SCALE.into() },
-    };
+    let precision = precision_of(trainer);
     let plan = trainer.plan();
     let tolerances = Tolerances::of(precision, gpu.info());
     let twin = Twin { plan, step, params: &params, rays: march::batch(plan, step), precision, tolerances };
@@ -262,12 +260,22 @@ fn compare_stages(gpu: &Gpu, trainer: &mut Trainer, params: &[f32], findings: &m
     Ok(())
 }
 
+/// Precision of the path that a run takes, for as long as its loss scale is the first.
+pub(super) fn precision_of(trainer: &Trainer) -> Precision {
+    let of_two = trainer.plan().params.still.is_some();
+    match trainer.tuning().layers {
+        Layers::F32 => Precision::Exact,
+        Layers::Matrices if of_two => Precision::F16 { loss_scale: FIRST_LOSS_SCALE_OF_TWO.into() },
+        Layers::Matrices => Precision::F16 { loss_scale: FIRST_LOSS_SCALE.into() },
+    }
+}
+
 /// What rows call a path.
 pub fn path_name(layers: Layers) -> &'static str {
     layers.name()
 }
 
-fn one_iteration(trainer: &mut Trainer) -> Result<StepLoss> {
+pub(super) fn one_iteration(trainer: &mut Trainer) -> Result<StepLoss> {
     let next = trainer.step() + 1;
     let losses = trainer.advance(next)?;
     losses.last().copied().ok_or_else(|| Error::Internal("an iteration left no loss".into()))
@@ -275,7 +283,7 @@ fn one_iteration(trainer: &mut Trainer) -> Result<StepLoss> {
 
 impl Tolerances {
     /// Of a path on a device.
-    fn of(precision: Precision, info: &DeviceInfo) -> Tolerances {
+    pub(super) fn of(precision: Precision, info: &DeviceInfo) -> Tolerances {
         let exact = match precision {
             Precision::Exact => IN_F32,
             Precision::F16 { .. } => ON_MATRICES,
@@ -343,7 +351,7 @@ impl Twin<'_> {
     fn trace(&self, sample: &Sample) -> field::NetworkTrace {
         let (plan, shown) = (self.plan, self.shown(sample));
         let encoded = field::encode(&plan.setup, plan.schedule[self.step as usize].window.into(), sample.x);
-        field::network_fwd(&plan.params, self.params, &encoded, shown, self.precision)
+        field::network_fwd(&plan.params.moving, self.params, &encoded, shown, self.precision)
     }
 
     fn shown(&self, sample: &Sample) -> Shown {
@@ -509,13 +517,14 @@ fn parts(params: &ParamMap, on_matrices: bool) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut last = Vec::new();
     for tensor in params.tensors().into_iter().filter(|tensor| !is_static(tensor)) {
-        let layer = layer_of(&tensor).map(|i| &params.layers[i]);
+        let layer = layer_of(&tensor).map(|i| &params.moving.layers[i]);
         let sees_input = layer.is_some_and(|layer| layer.latent.is_some());
         let part = |stages, name: String, positions| Part { stages, name, positions };
         match tensor.name.as_str() {
             name if name.starts_with("dynamic.out") => parts.push(part(output, tensor.name, tensor.positions)),
             name if name.ends_with(".weight") => {
-                let (columns, latent) = (tensor.shape[1], params.encoded_len..params.encoded_len + params.latent);
+                let (columns, latent) =
+                    (tensor.shape[1], params.moving.encoded_len..params.moving.encoded_len + params.moving.latent);
                 let of_latent = |at: usize| sees_input && latent.contains(&(at % columns));
                 let (mut of_latents, mut of_weights) = (Vec::new(), Vec::new());
                 for (at, position) in tensor.positions.into_iter().enumerate() {
@@ -546,7 +555,7 @@ fn is_static(tensor: &Tensor) -> bool {
     tensor.name.starts_with("static")
 }
 
-fn pick<T: Copy>(positions: &[u32], all: &[T]) -> Vec<T> {
+pub(super) fn pick<T: Copy>(positions: &[u32], all: &[T]) -> Vec<T> {
     positions.iter().map(|at| all[*at as usize]).collect()
 }
 
@@ -554,7 +563,7 @@ fn pick<T: Copy>(positions: &[u32], all: &[T]) -> Vec<T> {
 const NO_LOSS: f64 = 1e-12;
 
 /// Relative difference of losses.
-fn relative(got: f64, want: f64) -> f64 {
+pub(super) fn relative(got: f64, want: f64) -> f64 {
     let difference = (got - want).abs();
     if difference <= NO_LOSS { 0.0 } else { difference / want.abs() }
 }
@@ -565,7 +574,7 @@ fn larger(a: f64, b: f64) -> f64 {
 }
 
 /// The optimiser, on the gradient that the device came to; parameters and moments after it.
-fn compare_update(
+pub(super) fn compare_update(
     gpu: &Gpu,
     trainer: &Trainer,
     params: &[f32],

@@ -229,15 +229,22 @@ fn method(text: &Text<'_>, section: &MethodSection) -> Result<Method> {
 
 const ITERATIONS: &str = "train.iterations";
 
-/// Settings of a run of another length: what the preset counts in iterations of the network's schedule keeps its share of the
+/// Settings of a run of another length: what the preset counts in iterations of the networks' schedule keeps its share of the
 /// run, but for what was `given`.
 fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
     let share = f64::from(iterations) / f64::from(preset.train.iterations);
-    let schedule = [
+    let mut schedule = vec![
         ("dynamic.delay", preset.dynamic.delay),
         ("dynamic.window_iterations", preset.dynamic.window_iterations),
         ("occupancy.start", preset.occupancy.start),
     ];
+    if preset.two_networks() {
+        schedule.extend([
+            ("networks.delay", preset.networks.delay),
+            ("networks.ramp", preset.networks.ramp),
+            ("networks.stop_after", preset.networks.stop_after),
+        ]);
+    }
     let moved = schedule.into_iter().filter(|(key, _)| !given.contains(key));
     let moved = moved.map(|(key, count)| format!("{key}={}", (share * f64::from(count)).round()));
     moved.chain([format!("{ITERATIONS}={iterations}")]).collect()

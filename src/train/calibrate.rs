@@ -60,8 +60,9 @@ const FILE: &str = "paths.json";
 /// What a verdict holds for.
 fn key(info: &DeviceInfo, config: &Config) -> String {
     let d = &config.dynamic;
+    let networks = if config.two_networks() { "two networks of " } else { "" };
     format!(
-        "{} | {} | {} | {} layers of {}, skip {}, {} bands",
+        "{} | {} | {} | {networks}{} layers of {}, skip {}, {} bands",
         info.uuid,
         info.driver,
         env!("CARGO_PKG_VERSION"),

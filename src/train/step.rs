@@ -3,6 +3,9 @@
 //! batch -> march_count -> march_scan -> march_emit -> network forward -> march_fwd -> loss
 //! -> march_bwd, network backward -> reg_tv -> gradient_* -> adam -> report
 //!
+//! Where the still field is a network, too, `march_fwd_samples` and `loss_samples` take the places of `march_fwd` and `loss`, and its
+//! passes those of `march_bwd` and `reg_tv`.
+//!
 //! Nothing here waits for the host: counters, schedules and random numbers live on the device.
 
 use crate::error::Result;
@@ -31,6 +34,8 @@ buffer_set! {
         images,
         /// Still backgrounds of each view: lower and upper bound per pixel.
         backgrounds,
+        /// How much each pixel of each view changes, where two networks are the fields.
+        pixel_changes,
         /// Rays that meet the hull, then those that are not hidden, where some are.
         listed_rays,
         /// [`StepReport`]s of the last iterations.
@@ -39,6 +44,10 @@ buffer_set! {
         ray_gradient,
         /// Each ray's share of the losses.
         ray_loss,
+        /// Each ray's share of the losses that two networks have, not weighted.
+        ray_regularisers,
+        /// Gradient of each sample's attenuation in the dynamic field, where two networks are the fields.
+        sigma_gradient,
         /// Gradient of the static field in 64-bit fixed point.
         static_gradient,
         /// Gradient of the total variation.
@@ -59,7 +68,11 @@ impl TrainingBuffers {
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<TrainingBuffers> {
         let n_rays = u64::from(plan.setup.n_rays);
-        let (static_len, len) = (plan.params.static_len as u64, plan.params.len as u64);
+        let two_networks = plan.params.still.is_some();
+        // Bound by kernels that do not read them then.
+        let if_two = |bytes: u64| if two_networks { bytes } else { 16 };
+        let static_len = if two_networks { 4 } else { plan.params.static_len as u64 };
+        let len = plan.params.len as u64;
         let ring_bytes = u64::from(plan.setup.ring_length) * size_of::<StepReport>() as u64;
         let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
         Ok(TrainingBuffers {
@@ -67,10 +80,13 @@ impl TrainingBuffers {
             frames: gpu.buffer_with("frames", &plan.frames)?,
             images: gpu.buffer_with("images", &plan.images)?,
             backgrounds: gpu.buffer_with("backgrounds", &plan.backgrounds)?,
+            pixel_changes: gpu.buffer_with("pixel_changes", or_one(&plan.pixel_changes))?,
             listed_rays: gpu.buffer_with("listed_rays", &plan.listed_rays)?,
             ring: gpu.buffer("ring", ring_bytes, Memory::Readback)?,
             ray_gradient: new(Binding::ray_gradient, n_rays * 8)?,
             ray_loss: new(Binding::ray_loss, n_rays * 16)?,
+            ray_regularisers: new(Binding::ray_regularisers, if_two(n_rays * 16))?,
+            sigma_gradient: new(Binding::sigma_gradient, if_two(u64::from(plan.setup.sample_capacity) * 4))?,
             static_gradient: new(Binding::static_gradient, static_len * 8)?,
             tv_gradient: new(Binding::tv_gradient, static_len * 4)?,
             tv_value: new(Binding::tv_value, static_len * 4)?,
@@ -78,6 +94,11 @@ impl TrainingBuffers {
             moments: new(Binding::moments, len * 8)?,
         })
     }
+}
+
+/// Values, or one that is never read where there are none.
+fn or_one(values: &[f32]) -> &[f32] {
+    if values.is_empty() { &[0.0] } else { values }
 }
 
 /// Buffers of the forward pass for the plan's batches; parameters are left undefined.
@@ -93,15 +114,20 @@ pub fn forward_buffers(gpu: &Gpu, tuning: &Tuning, plan: &Plan) -> Result<Forwar
 ///
 /// # Errors
 /// Device errors.
-pub fn clear(gpu: &Gpu, network: &Network, forward: &ForwardBuffers, training: &TrainingBuffers) -> Result<()> {
+pub fn clear<'a>(
+    gpu: &Gpu,
+    networks: impl IntoIterator<Item = &'a Network>,
+    forward: &ForwardBuffers,
+    training: &TrainingBuffers,
+) -> Result<()> {
     let mut recording = Recording::new(gpu, "clear")?;
     for buffer in [&forward.state, &forward.params, &forward.occupancy] {
         recording.fill(buffer, 0);
     }
-    for buffer in [&training.static_gradient, &training.gradient, &training.moments] {
+    for buffer in [&training.static_gradient, &training.gradient, &training.moments, &training.ring] {
         recording.fill(buffer, 0);
     }
-    if let Some(sums) = network.gradient() {
+    for sums in networks.into_iter().filter_map(Network::gradient) {
         recording.fill(&sums.partials, 0);
         recording.fill(&sums.phase_dz, 0);
     }
@@ -113,25 +139,19 @@ pub fn clear(gpu: &Gpu, network: &Network, forward: &ForwardBuffers, training: &
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
 pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
-    let (k, network, buffers) = (pass.kernels, pass.network, pass.buffers);
-    let (setup, params) = (pass.setup, pass.params);
+    let (k, network, buffers, setup) = (pass.kernels, pass.network, pass.buffers, pass.setup);
     pass.run(&k.batch, k.batch.groups_for(setup.n_rays), push::Batch {})?;
-    network.record_weights(pass)?;
+    pass.weights()?;
     for chunk in chunks(setup, setup.n_rays) {
-        let Chunk { first_ray, n_rays } = chunk;
         pass.samples(chunk)?;
-        network.record_forward(pass)?;
+        pass.fields()?;
         if setup.occupancy_cells > 0 {
             pass.run(&k.occupancy_mark, buffers.per_sample(), push::OccupancyMark {})?;
         }
-        pass.run(&k.march_fwd, chunk.per_ray(), push::MarchFwd { first_ray, n_rays })?;
-        pass.run(&k.loss, k.loss.groups_for(n_rays), push::Loss { first_ray, n_rays })?;
-        pass.run(&k.march_bwd, chunk.per_ray(), push::MarchBwd { first_ray, n_rays })?;
+        record_losses(pass, chunk)?;
         network.record_backward(pass, chunk)?;
     }
-    let static_len = params.static_len as u32;
-    pass.run(&k.reg_tv, k.reg_tv.groups_for(static_len), push::RegTv { ranks: params.ranks as u32 })?;
-    pass.run(&k.gradient_static, k.gradient_static.groups_for(static_len), push::GradientStatic {})?;
+    record_static_gradient(pass)?;
     network.record_gradient(pass)?;
     if setup.occupancy_cells > 0 {
         let slice = (setup.occupancy_words() as u32).div_ceil(OCCUPANCY_EPOCH);
@@ -139,4 +159,28 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
     }
     pass.run(&k.adam, k.adam.groups_for(setup.n_params), push::Adam {})?;
     pass.run(&k.report, Groups::Direct([1, 1, 1]), push::Report {})
+}
+
+/// Records integrals and losses of a chunk, and the backward pass of the static field.
+fn record_losses(pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+    let (k, Chunk { first_ray, n_rays }) = (pass.kernels, chunk);
+    if let Some(still) = pass.still {
+        still.record_integrals(pass, chunk, false)?;
+        still.record_losses(pass, chunk)?;
+        return still.record_backward(pass, chunk);
+    }
+    pass.run(&k.march_fwd, chunk.per_ray(), push::MarchFwd { first_ray, n_rays })?;
+    pass.run(&k.loss, k.loss.groups_for(n_rays), push::Loss { first_ray, n_rays })?;
+    pass.run(&k.march_bwd, chunk.per_ray(), push::MarchBwd { first_ray, n_rays })
+}
+
+/// Records the gradient of the static field's parameters.
+fn record_static_gradient(pass: &mut Pass<'_>) -> Result<()> {
+    let (k, params) = (pass.kernels, pass.params);
+    if let Some(still) = pass.still {
+        return still.record_gradient(pass);
+    }
+    let static_len = params.static_len as u32;
+    pass.run(&k.reg_tv, k.reg_tv.groups_for(static_len), push::RegTv { ranks: params.ranks as u32 })?;
+    pass.run(&k.gradient_static, k.gradient_static.groups_for(static_len), push::GradientStatic {})
 }

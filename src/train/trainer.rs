@@ -16,6 +16,7 @@ use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::model::setup::{RING_LENGTH, sample_capacity};
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::pass::Pass;
+use crate::network::still::StillNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
@@ -52,6 +53,38 @@ pub struct StepLoss {
     pub live_samples: u64,
     /// Factor on gradients in f16; 1 on the f32 path.
     pub loss_scale: f64,
+    /// Losses that two networks have beside these.
+    #[serde(flatten)]
+    pub networks: Option<NetworkLosses>,
+}
+
+/// Losses of two networks beside those of every run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct NetworkLosses {
+    /// Entropy of the fields' shares at samples, weighted.
+    pub favour_static: f64,
+    /// Entropy of the dynamic field along rays, weighted.
+    pub ray_entropy: f64,
+    /// The static field's integrals over intervals and their squares, weighted.
+    pub static_size: f64,
+    /// Whether an entropy has vanished and learning ended.
+    pub stopped: bool,
+}
+
+impl NetworkLosses {
+    fn of(report: &StepReport) -> NetworkLosses {
+        NetworkLosses {
+            favour_static: report.favour_static.into(),
+            ray_entropy: report.ray_entropy.into(),
+            static_size: report.static_size.into(),
+            stopped: report.stopped != 0,
+        }
+    }
+
+    /// What they add to the objective.
+    fn total(&self) -> f64 {
+        self.favour_static + self.ray_entropy + self.static_size
+    }
 }
 
 impl StepLoss {
@@ -66,13 +99,14 @@ impl StepLoss {
             squared_error: f64::NAN,
             live_samples: 0,
             loss_scale: 1.0,
+            networks: None,
         };
         StepLoss { data: loss, dynamic: loss, ..none }
     }
 
     /// The objective.
     pub fn total(&self) -> f64 {
-        self.data + self.tv + self.occlusion
+        self.data + self.tv + self.occlusion + self.networks.map_or(0.0, |networks| networks.total())
     }
 }
 
@@ -82,6 +116,8 @@ pub struct Trainer {
     plan: Plan,
     kernels: Kernels,
     network: Network,
+    /// The still field, where it is a network as well.
+    still: Option<StillNetwork>,
     forward: ForwardBuffers,
     training: TrainingBuffers,
     /// Gaussians, where they are the moving field.
@@ -202,20 +238,26 @@ impl Trainer {
         earlier: Option<&MovingGaussians>,
     ) -> Result<Trainer> {
         let tuning = tuning.for_network(!plan.config.gaussians_move());
-        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params));
+        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params.moving));
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
-        let network = Network::new(gpu, &tuning, &plan.setup, &plan.params, Purpose::Train)?;
+        let network = Network::new(gpu, &tuning, &plan.setup, &plan.params.moving, Purpose::Train)?;
         let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32)?;
         let (forward, training) = (forward_buffers(gpu, &kernels.tuning, &plan)?, TrainingBuffers::new(gpu, &plan)?);
-        clear(gpu, &network, &forward, &training)?;
+        let still = plan.params.still.as_ref();
+        let still =
+            still.map(|map| StillNetwork::new(gpu, &kernels.tuning, &plan.setup, map, &forward, Purpose::Train));
+        let still = still.transpose()?;
+        let networks = still.iter().map(StillNetwork::network).chain([&network]);
+        clear(gpu, networks, &forward, &training)?;
         match saved {
             Some(saved) => gpu.upload(&forward.params, 0, &saved.model.params)?,
             None => gpu.upload(&forward.params, 0, &plan.params.initial(&plan.config))?,
         }
-        let mut now = DeviceState { step: 0, loss_scale: network.first_loss_scale(), overflowed: 0, good_updates: 0 };
+        let mut now = DeviceState { loss_scale: network.first_loss_scale(), ..DeviceState::default() };
         if let Some(saved) = saved {
             gpu.upload(&training.moments, 0, &saved.moments)?;
             now.step = saved.model.step;
+            now.stopped = u32::from(saved.stopped);
             // One of another size, as of an older version, starts anew.
             if saved.occupancy.len() as u64 * 4 == occupancy_bytes(&plan.setup) && !saved.occupancy.is_empty() {
                 gpu.upload(&forward.occupancy, 0, &saved.occupancy)?;
@@ -241,6 +283,7 @@ impl Trainer {
                 recording: &mut recording,
                 kernels: &kernels,
                 network: &network,
+                still: still.as_ref(),
                 buffers: &forward,
                 training: Some(&training),
                 params: &plan.params,
@@ -256,6 +299,7 @@ impl Trainer {
             gpu: gpu.clone(),
             kernels,
             network,
+            still,
             forward,
             training,
             per_submit,
@@ -303,6 +347,11 @@ impl Trainer {
     /// Buffers of training, for tests.
     pub fn training(&self) -> &TrainingBuffers {
         &self.training
+    }
+
+    /// The still field's network, where it is one, for tests.
+    pub fn still(&self) -> Option<&StillNetwork> {
+        self.still.as_ref()
     }
 
     /// Keeps the device busy towards `until` and returns the losses that became known. Returns with work
@@ -377,6 +426,7 @@ impl Trainer {
                 squared_error: report.squared_error.into(),
                 live_samples: report.live_samples.into(),
                 loss_scale: report.loss_scale.into(),
+                networks: self.still.as_ref().map(|_| NetworkLosses::of(&report)),
             };
             let first = *self.first_loss.get_or_insert(loss.total());
             if !loss.total().is_finite() || loss.total() > EXPLOSION * first.max(1e-12) {
@@ -398,6 +448,7 @@ impl Trainer {
             recording: &mut recording,
             kernels: &self.kernels,
             network: &self.network,
+            still: self.still.as_ref(),
             buffers: &self.forward,
             training: Some(&self.training),
             params: &self.plan.params,
@@ -530,12 +581,13 @@ impl Snapshot {
         self.state.read(&mut state)?;
         let mut occupancy = vec![0u32; self.occupancy_words];
         self.occupancy.read(&mut occupancy)?;
-        let [DeviceState { loss_scale: scale, good_updates, .. }] = state;
+        let [DeviceState { loss_scale: scale, good_updates, stopped, .. }] = state;
         Ok(Checkpoint {
             model: self.model,
             moments,
             occupancy,
             loss_scale: self.scaled.then_some(LossScale { scale, good_updates }),
+            stopped: stopped != 0,
             data_fingerprint: self.data_fingerprint,
         })
     }
@@ -611,7 +663,10 @@ mod tests {
             squared_error: 7.0,
             live_samples: 3,
             loss_scale: 1.0,
+            networks: None,
         };
         assert_eq!(loss.total(), 1.625);
+        let networks = NetworkLosses { favour_static: 2.0, ray_entropy: 4.0, static_size: 8.0, stopped: false };
+        assert_eq!(StepLoss { networks: Some(networks), ..loss }.total(), 15.625);
     }
 }

@@ -1,0 +1,171 @@
+//! The still field as a second network, at the samples of the moving one: attenuations add up (NeRF-CA). It runs through the same
+//! stages, on buffers of its own where the two differ; what a ray sees and the gradient of the losses take both fields
+//! at each sample.
+
+use crate::error::Result;
+use crate::gpu::buffer::{Buffer, Memory};
+use crate::gpu::device::Gpu;
+use crate::kernels::dispatch::{Binding, BufferSet};
+use crate::kernels::layout::Setup;
+use crate::kernels::push;
+use crate::kernels::stages::StillKernels;
+use crate::kernels::tuning::Tuning;
+use crate::model::params::NetworkMap;
+use crate::network::chunk::Chunk;
+use crate::network::forward::ForwardBuffers;
+use crate::network::pass::Pass;
+use crate::network::{Network, Purpose, built_for_rendering};
+
+/// The still field's network: kernels and buffers.
+pub struct StillNetwork {
+    kernels: StillKernels,
+    network: Network,
+    /// Those of the moving field but for constants and attenuations.
+    buffers: ForwardBuffers,
+    training: Option<StillTraining>,
+}
+
+/// What the backward pass needs besides.
+struct StillTraining {
+    /// Gradient of each sample's attenuation.
+    gradient: Buffer,
+}
+
+/// What a network's backward pass finds: its own gradient at samples before all else.
+struct Own<'a> {
+    gradient: &'a Buffer,
+    rest: Option<&'a dyn BufferSet>,
+}
+
+impl BufferSet for Own<'_> {
+    fn find(&self, name: Binding) -> Option<&Buffer> {
+        match name {
+            Binding::sigma_gradient => Some(self.gradient),
+            _ => self.rest?.find(name),
+        }
+    }
+}
+
+/// Constants by which the stages of a network compute the still field.
+pub fn still_setup(setup: &Setup) -> Setup {
+    Setup { dynamic_gain: setup.static_gain, dynamic_shift: setup.static_shift, ..*setup }
+}
+
+impl StillNetwork {
+    /// Builds kernels and buffers beside `moving`, those of the moving field.
+    ///
+    /// # Errors
+    /// As [`Network::new`].
+    pub fn new(
+        gpu: &Gpu,
+        tuning: &Tuning,
+        setup: &Setup,
+        params: &NetworkMap,
+        moving: &ForwardBuffers,
+        purpose: Purpose,
+    ) -> Result<StillNetwork> {
+        let capacity = u64::from(setup.sample_capacity);
+        let new = |name: &str, bytes: u64| gpu.buffer(name, bytes, Memory::Device);
+        let buffers = ForwardBuffers {
+            setup: gpu.buffer_with("still_setup", &[still_setup(setup)])?,
+            sample_sigma: new("still_sigma", capacity * 8)?,
+            ..moving.clone()
+        };
+        let training = match purpose {
+            Purpose::Render => None,
+            Purpose::Train => Some(StillTraining { gradient: new("still_gradient", capacity * 4)? }),
+        };
+        Ok(StillNetwork {
+            kernels: StillKernels::new(gpu)?,
+            network: Network::new(gpu, tuning, setup, params, purpose)?,
+            buffers,
+            training,
+        })
+    }
+
+    /// The network.
+    pub fn network(&self) -> &Network {
+        &self.network
+    }
+
+    /// Attenuation of each live sample and its derivative.
+    pub fn sigma(&self) -> &Buffer {
+        &self.buffers.sample_sigma
+    }
+
+    /// Gradient of each live sample's attenuation; none when built for rendering.
+    pub fn sigma_gradient(&self) -> Option<&Buffer> {
+        self.training.as_ref().map(|training| &training.gradient)
+    }
+
+    /// Records `stages` of this network, as those of the moving field go in `pass`.
+    fn with(&self, pass: &mut Pass<'_>, stages: impl FnOnce(&Network, &mut Pass<'_>) -> Result<()>) -> Result<()> {
+        let own = self.training.as_ref().map(|training| Own { gradient: &training.gradient, rest: pass.training });
+        let mut still = Pass {
+            recording: &mut *pass.recording,
+            kernels: pass.kernels,
+            network: &self.network,
+            still: None,
+            buffers: &self.buffers,
+            training: own.as_ref().map(|own| own as &dyn BufferSet),
+            params: pass.params,
+            setup: pass.setup,
+        };
+        stages(&self.network, &mut still)
+    }
+
+    /// Records what depends on parameters alone.
+    ///
+    /// # Errors
+    /// As [`Pass::run`]; so do all that follow.
+    pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
+        self.with(pass, Network::record_weights)
+    }
+
+    /// Records the network over the live samples.
+    ///
+    /// # Errors
+    /// As [`StillNetwork::record_weights`].
+    pub fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
+        self.with(pass, Network::record_forward)
+    }
+
+    /// Records the line integrals of both fields, and on demand their maxima: `ray_out`.
+    ///
+    /// # Errors
+    /// As [`StillNetwork::record_weights`].
+    pub fn record_integrals(&self, pass: &mut Pass<'_>, chunk: Chunk, maxima: bool) -> Result<()> {
+        let Chunk { first_ray, n_rays } = chunk;
+        let bound = [(Binding::still_sigma, self.sigma().into())];
+        let push = push::MarchFwdSamples { first_ray, n_rays, with_maxima: u32::from(maxima) };
+        pass.run_with(&self.kernels.march_fwd_samples, chunk.per_ray(), &bound, push)
+    }
+
+    /// Records the losses of a chunk and their gradient at each sample of both fields, after [`StillNetwork::record_integrals`].
+    ///
+    /// # Errors
+    /// As [`StillNetwork::record_weights`].
+    pub fn record_losses(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        let gradient = self.sigma_gradient().ok_or_else(built_for_rendering)?;
+        let Chunk { first_ray, n_rays } = chunk;
+        let bound = [(Binding::still_sigma, self.sigma().into()), (Binding::still_gradient, gradient.into())];
+        let push = push::LossSamples { first_ray, n_rays };
+        pass.run_with(&self.kernels.loss_samples, chunk.per_ray(), &bound, push)
+    }
+
+    /// Records the backward pass of a chunk.
+    ///
+    /// # Errors
+    /// As [`StillNetwork::record_weights`].
+    pub fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        self.with(pass, |network, pass| network.record_backward(pass, chunk))
+    }
+
+    /// Records the gradient of its parameters.
+    ///
+    /// # Errors
+    /// As [`StillNetwork::record_weights`].
+    pub fn record_gradient(&self, pass: &mut Pass<'_>) -> Result<()> {
+        self.with(pass, Network::record_gradient)
+    }
+}
