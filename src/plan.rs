@@ -212,6 +212,9 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
                  vessels than phase 0"
             ),
         },
+        _ if targets.contrast_comes_and_goes() => {
+            "each phase has Gaussians of its own (gaussians.form = \"phase\"): contrast comes or goes during the beat".into()
+        }
         _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))

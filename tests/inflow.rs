@@ -24,8 +24,10 @@ fn phantom(directory: &Path, extra: &[&str]) -> PathBuf {
     data
 }
 
-fn rest_phase(data: &Path) -> (usize, Vec<String>) {
-    let plan = Plan::new(&Config::preset(Preset::Fast), &Dataset::open(data).unwrap()).unwrap();
+/// The phase at which Gaussians of a form rest, and what a run says.
+fn rest_phase(data: &Path, form: &str) -> (usize, Vec<String>) {
+    let config = Config::load(Some(Preset::Fast), None, &[format!("gaussians.form={form}")]).unwrap();
+    let plan = Plan::new(&config, &Dataset::open(data).unwrap()).unwrap();
     (plan.targets.unwrap().rest_phase, plan.notes)
 }
 
@@ -33,12 +35,13 @@ fn rest_phase(data: &Path) -> (usize, Vec<String>) {
 fn a_tree_rests_where_vessels_are_full() {
     let directory = tempfile::tempdir().unwrap();
     let data = phantom(directory.path(), &["--inflow", "0.4"]);
-    let (rest, notes) = rest_phase(&data);
+    let (rest, notes) = rest_phase(&data, "tree");
     assert!((FULL_FROM..PHASES).contains(&rest), "rests at phase {rest}");
     assert!(notes.iter().any(|note| note.contains(&format!("from phase {rest} on"))), "{notes:?}");
 
     let finished = directory.path().join("run");
-    let said = run(&["train", text(&data), "-o", text(&finished), "--preset", "fast"], true);
+    let tree = ["--preset", "fast", "--set", "gaussians.form=tree"];
+    let said = run(&[&["train", text(&data), "-o", text(&finished)], &tree[..]].concat(), true);
     assert!(said.contains(&format!("from phase {rest} on")), "{said}");
     let evaluation: Value =
         serde_json::from_slice(&std::fs::read(finished.join("report/evaluation.json")).unwrap()).unwrap();
@@ -57,9 +60,17 @@ fn a_tree_rests_where_vessels_are_full() {
 }
 
 #[test]
+fn sets_per_phase_are_taken_where_vessels_fill() {
+    let directory = tempfile::tempdir().unwrap();
+    let (_, notes) = rest_phase(&phantom(directory.path(), &["--inflow", "0.2"]), "auto");
+    assert!(notes.iter().any(|note| note.contains("contrast comes or goes during the beat")), "{notes:?}");
+}
+
+#[test]
 fn full_vessels_rest_at_phase_0() {
     let directory = tempfile::tempdir().unwrap();
-    let (rest, notes) = rest_phase(&phantom(directory.path(), &["--photons", "2e7"]));
+    let (rest, notes) = rest_phase(&phantom(directory.path(), &["--photons", "2e7"]), "auto");
     assert_eq!(rest, 0, "{notes:?}");
-    assert!(!notes.iter().any(|note| note.contains("from phase")), "{notes:?}");
+    let tells = |what: &str| notes.iter().any(|note| note.contains(what));
+    assert!(tells("one set of Gaussians moves") && !tells("from phase"), "{notes:?}");
 }

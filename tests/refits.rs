@@ -5,7 +5,7 @@
 mod common;
 
 use common::{expect_silence, gpu, tuning};
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::{Config, GaussianForm, Preset};
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::checkpoint::Checkpoint;
@@ -44,8 +44,13 @@ fn phantom(gpu: &Gpu) -> (tempfile::TempDir, Dataset) {
 }
 
 fn session(gpu: &Gpu, dataset: &Dataset) -> Session {
+    session_of(gpu, dataset, GaussianForm::Tree, GAUSSIAN_ITERATIONS + 1)
+}
+
+fn session_of(gpu: &Gpu, dataset: &Dataset, form: GaussianForm, iterations: u32) -> Session {
     let mut config = Config::preset(Preset::Fast);
-    config.train.iterations = GAUSSIAN_ITERATIONS + 1;
+    config.gaussians.form = form;
+    config.train.iterations = iterations;
     let options = SessionOptions {
         config,
         phases: PHASES,
@@ -125,6 +130,25 @@ fn gaussians_go_on_where_they_explain_what_is_new() {
         add(&grown, &dataset, late);
         assert_eq!(train(&grown), GAUSSIAN_ITERATIONS + 1);
         assert_eq!(field(&grown), anew);
+    }
+    expect_silence(gpu);
+}
+
+/// A run that is over before a fit would go on, or is half done.
+#[test]
+fn short_runs_take_in_frames_as_well() {
+    const ITERATIONS: u32 = 30;
+    let gpu = gpu();
+    let (_directory, dataset) = phantom(&gpu);
+    for form in [GaussianForm::Phase, GaussianForm::Tree] {
+        let [at_once, grown] = [(); 2].map(|()| session_of(&gpu, &dataset, form, ITERATIONS));
+        add(&at_once, &dataset, |_| true);
+        assert_eq!(train(&at_once), ITERATIONS);
+        add(&grown, &dataset, |f| f.phase < 8);
+        assert_eq!(train(&grown), ITERATIONS);
+        add(&grown, &dataset, |f| f.phase >= 8);
+        assert_eq!(train(&grown), ITERATIONS);
+        assert_eq!(field(&grown), field(&at_once), "{form:?}");
     }
     expect_silence(gpu);
 }

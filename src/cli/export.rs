@@ -43,7 +43,7 @@ pub struct ExportArgs {
     /// Attenuation of the surface, 1/mm; the Dice threshold otherwise.
     #[arg(long, requires = "mesh", value_name = "PER_MM")]
     pub iso: Option<f64>,
-    /// Motion instead of volumes: displacements from phase 0 at the nodes of the grid that moves the Gaussians, mm, where
+    /// Motion instead of volumes: displacements from the phase of rest (mostly 0) at the nodes of the grid that moves the Gaussians, mm, where
     /// one set moves (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion along a vessel is not observed in
     /// projections: displacements along vessels come from smoothness alone, and no strain can be read from them.
     #[arg(long, conflicts_with_all = ["mesh", "format", "component", "spacing"])]

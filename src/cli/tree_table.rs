@@ -19,7 +19,7 @@ const COLUMNS: [Column<TreeAgreement>; 9] = [
 pub fn table(tree: &TreeScores) -> ScoreTable {
     let legend = format!(
         "The vessels as a tree against the true one. Centrelines count within {} mm, and radii are compared there; in images \
-         by their mean distance at the isocentre; motion by where points have come since phase 0.",
+         by their mean distance at the isocentre; motion by where points have come since the phase that is followed (mostly 0).",
         tree.within_mm
     );
     let phases = tree.phases.iter().map(|p| (p.phase, &p.scores));

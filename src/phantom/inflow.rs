@@ -2,8 +2,10 @@
 
 use crate::phantom::tree::{Branch, Tree};
 
-/// A branch leaves another one where its first point lies so near to it, mm beyond the other's radius.
-const ATTACHED_MM: f64 = 4.0;
+/// A branch leaves another one where its first point lies so near to the other's centreline: so many of the other's radii, and so
+/// many mm. Branches are taken to be told from their beginnings on.
+const NEAR_RADII: f64 = 2.0;
+const NEAR_MM: f64 = 1.0;
 /// Over this share of the longest way, contrast goes from nothing to what there is behind.
 const FRONT: f64 = 0.2;
 
@@ -24,48 +26,70 @@ impl Tree {
         Tree { branches: self.branches.into_iter().zip(ways_mm).map(branch).collect() }
     }
 
-    /// Way along the vessels from the nearest root to each point of each branch, mm. The first branch begins at a root, and so
-    /// does each that leaves no other.
+    /// Way along the vessels from the nearest root to each point of each branch, mm. Roots are the first points of branches that
+    /// leave no other; where branches leave each other in a ring, of the one listed first.
     fn ways_mm(&self) -> Vec<Vec<f64>> {
-        let along = |branch: &Branch| {
-            let steps = branch.points.windows(2).map(|pair| pair[0].distance(pair[1]));
-            let ways = std::iter::once(0.0).chain(steps).scan(0.0, |way, step| {
-                *way += step;
-                Some(*way)
-            });
-            ways.collect::<Vec<f64>>()
-        };
-        let mut ways_mm: Vec<Vec<f64>> = self.branches.iter().map(along).collect();
-        let mut starts_mm = vec![f64::INFINITY; ways_mm.len()];
-        while let Some(root) = starts_mm.iter().position(|start| start.is_infinite()) {
-            starts_mm[root] = 0.0;
-            // A branch may leave one that is listed behind it.
-            for _ in 0..starts_mm.len() {
-                for branch in 0..starts_mm.len() {
-                    starts_mm[branch] = starts_mm[branch].min(self.start_mm(branch, &ways_mm, &starts_mm));
-                }
-            }
+        let along_mm: Vec<Vec<f64>> = self.branches.iter().map(Branch::along_mm).collect();
+        let joints: Vec<Vec<Joint>> = (0..self.branches.len()).map(|branch| self.joints(branch, &along_mm)).collect();
+        let mut starts_mm: Vec<f64> =
+            joints.iter().map(|joints| if joints.is_empty() { 0.0 } else { f64::INFINITY }).collect();
+        loop {
+            spread(&joints, &mut starts_mm);
+            let Some(ring) = starts_mm.iter().position(|start| start.is_infinite()) else { break };
+            starts_mm[ring] = 0.0;
         }
-        for (ways, start) in ways_mm.iter_mut().zip(starts_mm) {
-            ways.iter_mut().for_each(|way| *way += start);
-        }
-        ways_mm
+        along_mm.into_iter().zip(starts_mm).map(|(along, start)| along.iter().map(|mm| start + mm).collect()).collect()
     }
 
-    /// The way to where a branch leaves the nearest point of another, mm; infinite where it leaves none that is reached.
-    fn start_mm(&self, branch: usize, along_mm: &[Vec<f64>], starts_mm: &[f64]) -> f64 {
-        let Some(first) = self.branches[branch].points.first() else { return f64::INFINITY };
+    /// Where a branch may leave others.
+    fn joints(&self, branch: usize, along_mm: &[Vec<f64>]) -> Vec<Joint> {
+        let Some(first) = self.branches[branch].points.first() else { return Vec::new() };
         let others = (0..self.branches.len()).filter(|other| *other != branch);
-        let points = others.flat_map(|other| {
+        let shortest = |other: usize| {
             let Branch { points, radius_mm, .. } = &self.branches[other];
-            let ways = along_mm[other].iter().map(move |way| starts_mm[other] + way);
-            points.iter().zip(radius_mm).zip(ways)
+            let near = points.iter().zip(radius_mm).zip(&along_mm[other]).filter_map(|((point, radius_mm), way_mm)| {
+                let gap_mm = point.distance(*first);
+                (gap_mm < NEAR_RADII * radius_mm + NEAR_MM).then_some(way_mm + gap_mm)
+            });
+            near.reduce(f64::min).map(|way_mm| Joint { other, way_mm })
+        };
+        others.filter_map(shortest).collect()
+    }
+}
+
+/// A branch begins near another one.
+struct Joint {
+    other: usize,
+    /// Way from the first point of the other to the first of the branch, mm; the shortest.
+    way_mm: f64,
+}
+
+/// Carries ways to first points from branch to branch, wherever that shortens one.
+fn spread(joints: &[Vec<Joint>], starts_mm: &mut [f64]) {
+    loop {
+        let mut changed = false;
+        for (branch, joints) in joints.iter().enumerate() {
+            let shortest = joints.iter().map(|j| starts_mm[j.other] + j.way_mm).fold(f64::INFINITY, f64::min);
+            if shortest < starts_mm[branch] {
+                starts_mm[branch] = shortest;
+                changed = true;
+            }
+        }
+        if !changed {
+            return;
+        }
+    }
+}
+
+impl Branch {
+    /// Way along the branch from its first point to each, mm.
+    fn along_mm(&self) -> Vec<f64> {
+        let steps = self.points.windows(2).map(|pair| pair[0].distance(pair[1]));
+        let ways = std::iter::once(0.0).chain(steps).scan(0.0, |way, step| {
+            *way += step;
+            Some(*way)
         });
-        let attached = points.filter_map(|((point, radius_mm), way_mm)| {
-            let gap_mm = point.distance(*first);
-            (gap_mm < ATTACHED_MM + radius_mm).then_some(way_mm + gap_mm)
-        });
-        attached.fold(f64::INFINITY, f64::min)
+        ways.collect()
     }
 }
 
@@ -90,24 +114,27 @@ mod tests {
         let stem = branch("stem", DVec3::ZERO, end);
         let late = branch("late", end + DVec3::Z * 52.0, end + DVec3::new(0.0, 50.0, 52.0));
         let side = branch("side", end + DVec3::Z * 2.0, end + DVec3::Z * 52.0);
-        Tree { branches: vec![stem, late, side, branch("other", far, far + DVec3::X * 30.0)] }
+        let fork = far + DVec3::X * 30.0;
+        let child = branch("child", fork + DVec3::Z, fork + DVec3::Z * 11.0);
+        Tree { branches: vec![stem, late, side, child, branch("other", far, fork)] }
     }
 
     #[test]
     fn ways_go_along_the_vessels() {
         let ways_mm = tree().ways_mm();
         let ends = |i: usize| [ways_mm[i][0], ways_mm[i][10]].map(f64::round);
-        assert_eq!([ends(0), ends(1), ends(2), ends(3)], [[0.0, 50.0], [102.0, 152.0], [52.0, 102.0], [0.0, 30.0]]);
+        assert_eq!([ends(0), ends(1), ends(2)], [[0.0, 50.0], [102.0, 152.0], [52.0, 102.0]]);
+        assert_eq!([ends(3), ends(4)], [[31.0, 41.0], [0.0, 30.0]], "from an ostium of their own");
     }
 
     #[test]
     fn contrast_comes_from_the_ostium_and_fills_everything() {
         let sum = |tree: &Tree, i: usize| tree.branches[i].filling.iter().sum::<f64>();
         let filled = |share: f64| tree().filled_to(share);
-        assert!((0..4).all(|i| sum(&filled(0.0), i) == 0.0));
-        assert!((0..4).all(|i| (sum(&filled(0.9999), i) - 5.5).abs() < 0.02));
+        assert!((0..5).all(|i| sum(&filled(0.0), i) == 0.0));
+        assert!((0..5).all(|i| (sum(&filled(0.9999), i) - 5.5).abs() < 0.02));
         let half = filled(0.45);
         assert!(sum(&half, 0) > 5.0 && sum(&half, 2) > 0.1 && sum(&half, 2) < 3.0 && sum(&half, 1) == 0.0);
-        assert_eq!(sum(&half, 3), 5.5, "each ostium fills its vessels");
+        assert_eq!(sum(&half, 4), 5.5, "each ostium fills its vessels");
     }
 }

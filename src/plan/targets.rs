@@ -14,6 +14,10 @@ use glam::DVec3;
 
 /// The first phase is one to rest at where it shows this share of what the one shows that shows most.
 const MUCH: f64 = 0.75;
+/// A phase that shows less than this share of what another shows lacks contrast: the beat itself takes a quarter at most.
+const LITTLE: f64 = 0.5;
+/// Views that tell where along a ray a vessel is.
+const LEAST_VIEWS: usize = 2;
 /// A line integral of so many standard deviations of its noise is no noise.
 const STANDS_OUT: f32 = 4.0;
 
@@ -185,11 +189,13 @@ impl Targets {
     }
 
     /// The form of moving field that suits the data where `asked` leaves it open: a tree shares one set of Gaussians over
-    /// the beat, which takes phases enough to follow it from one to the next and a phase to rest at that two views show.
+    /// the beat, which takes phases enough to follow it from one to the next, a phase to rest at that two views show, and
+    /// vessels that are full all the time.
     pub fn form(&self, asked: GaussianForm) -> GaussianForm {
         const LEAST_PHASES: usize = 4;
+        let rests = self.views_at(self.rest_phase).count() >= LEAST_VIEWS;
         match asked {
-            GaussianForm::Auto if self.n_phases >= LEAST_PHASES && self.views_at(self.rest_phase).count() >= 2 => {
+            GaussianForm::Auto if self.n_phases >= LEAST_PHASES && rests && !self.contrast_comes_and_goes() => {
                 GaussianForm::Tree
             }
             GaussianForm::Auto => GaussianForm::Phase,
@@ -197,12 +203,26 @@ impl Targets {
         }
     }
 
-    /// The phase whose images show most of the vessels, all views taken together; the first one unless it lacks much of that, as
-    /// where contrast has not arrived, or a view has no image.
+    /// The phase whose images show most of the vessels, of those that two views show; the first one unless it lacks much of that,
+    /// as where contrast has not arrived.
     fn phase_that_shows_most(&self) -> usize {
-        let shown: Vec<f64> = (0..self.n_phases).map(|phase| self.shown_at(phase)).collect();
-        let most = (0..self.n_phases).max_by(|a, b| shown[*a].total_cmp(&shown[*b])).unwrap_or(0);
-        if shown[0] >= MUCH * shown[most] { 0 } else { most }
+        let seen: Vec<usize> =
+            (0..self.n_phases).filter(|phase| self.views_at(*phase).count() >= LEAST_VIEWS).collect();
+        let most = seen.iter().copied().max_by(|a, b| self.shown_at(*a).total_cmp(&self.shown_at(*b))).unwrap_or(0);
+        let first_shows_much = seen.contains(&0) && self.shown_at(0) >= MUCH * self.shown_at(most);
+        if first_shows_much { 0 } else { most }
+    }
+
+    /// Whether some phase shows so much less than another that contrast must have come or gone meanwhile: per image, since not
+    /// every view has every phase.
+    pub fn contrast_comes_and_goes(&self) -> bool {
+        let per_image = |phase: usize| {
+            let images = self.views_at(phase).count();
+            (images >= LEAST_VIEWS).then(|| self.shown_at(phase) / images as f64)
+        };
+        let shown: Vec<f64> = (0..self.n_phases).filter_map(per_image).collect();
+        let most = shown.iter().copied().fold(0.0, f64::max);
+        shown.iter().any(|shown| *shown < LITTLE * most)
     }
 
     /// Sum over all images of a phase of the line integrals that stand out from noise, shares of the strongest change.

@@ -5,6 +5,7 @@ use crate::error::Result;
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::model::gaussians::MovingTree;
+use crate::plan::fit;
 use crate::plan::targets::Targets;
 use crate::train::tree::TreeTrainer;
 
@@ -27,9 +28,10 @@ impl Carried {
     pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config, earlier: &MovingTree) -> Result<Carried> {
         let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
         let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
+        let has_room = fit::carried_step(&config.gaussians) < config.gaussian_iterations();
         // Another view tells more than a fit that does without it can take in.
         let seen_alike = was.n_views as usize == targets.n_views;
-        if !phases_alike || !rests_alike || !seen_alike || earlier.rest.rows.is_empty() {
+        if !(phases_alike && rests_alike && seen_alike && has_room) || earlier.rest.rows.is_empty() {
             return Ok(Carried::Anew(targets));
         }
         let rest = earlier.rest.in_units(targets.units);
@@ -39,25 +41,20 @@ impl Carried {
             return Ok(Carried::Anew(trainer.into_targets()));
         }
         trainer.move_as(&earlier.on_grid(rest, setup))?;
-        let explained = least_explained(trainer.targets(), &trainer.images()?);
+        let explained = least_explained(trainer.targets(), &trainer.images()?).unwrap_or(0.0);
+        let percent = 100.0 * explained;
         if explained < LEAST_EXPLAINED {
-            tracing::info!(
-                "Gaussians are fitted anew: those so far explain {:.0} % of some view or phase",
-                100.0 * explained
-            );
+            tracing::info!("Gaussians are fitted anew: those so far explain {percent:.0} % of some view or phase");
             return Ok(Carried::Anew(trainer.into_targets()));
         }
-        tracing::info!(
-            "Gaussians go on from those so far, which explain {:.0} % of every view and phase",
-            100.0 * explained
-        );
+        tracing::info!("Gaussians go on from those so far, which explain {percent:.0} % of every view and phase");
         Ok(Carried::On(Box::new(trainer)))
     }
 }
 
-/// Share of what vessels are known to add to the images that a field explains: the least of all views and phases. `drawn` is
-/// `[image][pixel]`, shares of the strongest change.
-fn least_explained(targets: &Targets, drawn: &[f32]) -> f64 {
+/// Share of what vessels are known to add to the images that a field explains: the least of all views and phases; none
+/// where nothing is known. `drawn` is `[image][pixel]`, shares of the strongest change.
+fn least_explained(targets: &Targets, drawn: &[f32]) -> Option<f64> {
     let shares = |images: &mut dyn Iterator<Item = usize>| -> Option<f64> {
         let (mut explained, mut there) = (0.0, 0.0);
         for pixel in images.flat_map(|image| targets.pixels_that_stand_out(image)) {
@@ -70,5 +67,5 @@ fn least_explained(targets: &Targets, drawn: &[f32]) -> f64 {
     let of_view =
         |view: usize| shares(&mut targets.image_of.iter().skip(view).step_by(targets.n_views).flatten().copied());
     let all = (0..targets.n_phases).filter_map(of_phase).chain((0..targets.n_views).filter_map(of_view));
-    all.fold(1.0, f64::min)
+    all.reduce(f64::min)
 }

@@ -101,11 +101,6 @@ impl GaussianTrainer {
         self.step
     }
 
-    /// Whether half of the iterations are done.
-    pub(super) fn is_half_done(&self) -> bool {
-        self.step >= self.settings.iterations / 2
-    }
-
     /// Gaussians of all phases.
     pub fn count(&self) -> u32 {
         self.n

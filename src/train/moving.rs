@@ -54,10 +54,10 @@ impl MovingFit {
         MovingFit::new(gpu, targets, config)
     }
 
-    /// Whether the field is worth more than one that was fitted to fewer frames.
-    fn is_presentable(&self) -> bool {
+    /// Whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
+    fn is_presentable(&self, end: u32) -> bool {
         match self {
-            MovingFit::PerPhase(fit) => fit.is_half_done(),
+            MovingFit::PerPhase(fit) => fit.step() >= end / 2,
             MovingFit::Start(_) => false,
             MovingFit::Tree(_) => true,
         }
@@ -169,7 +169,7 @@ pub(super) struct Moving {
 impl Moving {
     /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where the network
     /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits, however
-    /// many iterations go into a submit. A field that was fitted to `earlier` data is shown, and gone on from, where it can be.
+    /// many iterations go into a submit (but for one that had gone on from an earlier tree, which begins from seeds). A field that was fitted to `earlier` data is shown, and gone on from, where it can be.
     ///
     /// # Errors
     /// As [`MovingFit::new`], and as [`TreeStart::advance`] for what is done again.
@@ -200,7 +200,7 @@ impl Moving {
                 (Some(fit), field)
             }
         };
-        let shown = earlier.filter(|_| fit.as_ref().is_some_and(|fit| !fit.is_presentable()));
+        let shown = earlier.filter(|_| fit.as_ref().is_some_and(|fit| !fit.is_presentable(end)));
         let shows_earlier = shown.is_some();
         let feed = Arc::new(Mutex::new((0, shown.cloned().unwrap_or(field))));
         let shots = dataset.training().iter().map(shot).collect();
@@ -239,7 +239,7 @@ impl Moving {
     pub(super) fn advance(&mut self, until: u32, end: u32) -> Result<Vec<f64>> {
         let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
         let losses = fit.advance(until.min(end))?;
-        self.shows_earlier &= !fit.is_presentable();
+        self.shows_earlier &= !fit.is_presentable(end);
         if self.shows_earlier {
             return Ok(losses);
         }
