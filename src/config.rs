@@ -289,14 +289,17 @@ impl Config {
                 "at least the samples of one ray are needed",
             ));
         }
+        if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
+            return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
+        }
+        if self.two_networks() {
+            self.check_two_networks()?;
+        }
         if m.along_axis && self.gaussians_move() {
             let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
             return Err(Error::config("march.along_axis", true, problem));
         }
-        if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
-            return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
-        }
-        if self.two_networks() { self.check_two_networks() } else { Ok(()) }
+        Ok(())
     }
 
     /// Refuses what does not go with two networks.
