@@ -50,7 +50,7 @@ void main() {
     uint pixel = gl_GlobalInvocationID.x;
     if (pixel >= push.n_pixels) return;
     Line line = line_through(views[0], pixel, push.image_width);
-    float norm = length(line.direction);
+    float norm = setup.along_axis != 0u ? 1.0 : length(line.direction);
     vec2 still = vec2(0.0);
     vec2 moving = vec2(0.0);
     if (push.with_static != 0u) {

@@ -292,7 +292,14 @@ impl Config {
         if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
             return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
         }
-        if self.two_networks() { self.check_two_networks() } else { Ok(()) }
+        if self.two_networks() {
+            self.check_two_networks()?;
+        }
+        if m.along_axis && self.gaussians_move() {
+            let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
+            return Err(Error::config("march.along_axis", true, problem));
+        }
+        Ok(())
     }
 
     /// Refuses what does not go with two networks.
@@ -399,6 +406,7 @@ mod tests {
             ("tree.track_blur=0", "tree.track_blur"),
             ("train", "setting"),
             ("static.form=network", "gaussians.form"),
+            ("march.along_axis=true", "march.along_axis"),
             ("networks.gain=-1", "networks.gain"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
