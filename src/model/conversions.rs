@@ -67,7 +67,9 @@ mod tests {
     fn tree() -> MovingTree {
         let setup = grid(5, 40.0);
         let node = |i: usize| DVec3::new((i % 5) as f64, (i / 5 % 5) as f64, (i / 25) as f64) * 20.0 - 40.0;
-        let displacement = |phase: usize, x: DVec3| (phase as f64 - 1.0) * (0.1 * x.yzx() + DVec3::new(1.0, -2.0, 0.5));
+        let displacement = |phase: usize, x: DVec3| {
+            (phase as f64 - 1.0) * (0.1 * DVec3::new(x.y, x.z, x.x) + DVec3::new(1.0, -2.0, 0.5))
+        };
         let pack = |v: DVec3| [v.x as f32, v.y as f32, v.z as f32, 0.0];
         let row = |i: usize| Gaussian {
             position: [3.0 * i as f32, -5.0, 11.0 - 4.0 * i as f32],
