@@ -54,6 +54,7 @@ impl Scene {
             static_weight: 1.0,
             dynamic_weight: 1.0,
             robust_scale: 0.0,
+            region: None,
         };
         if config.loss.normalise {
             scene.normalise(config, dataset, motion, static_half)?;
@@ -70,6 +71,9 @@ impl Scene {
         let half = reach(dataset);
         (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
         (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
+        // Most of that is seen by no view or by one: no place to look for vessels.
+        let seen = seen_half(dataset);
+        self.region = Some([[-seen; 3], [seen; 3]]);
         (self.static_gain, self.dynamic_gain) = (config.networks.gain, config.networks.gain);
         (self.static_shift, self.dynamic_shift) = (0.0, 0.0);
     }
@@ -160,8 +164,13 @@ pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
     if config.dynamic.half_extent_mm > 0.0 {
         config.dynamic.half_extent_mm / MM_PER_UNIT
     } else {
-        field_of_view(dataset).min(half_depth(dataset))
+        seen_half(dataset)
     }
+}
+
+/// Half side of the box of what the views see, within the depth range, world units.
+fn seen_half(dataset: &Dataset) -> f64 {
+    field_of_view(dataset).min(half_depth(dataset))
 }
 
 #[cfg(test)]
@@ -169,6 +178,7 @@ mod tests {
     use super::*;
     use crate::config::Preset;
     use crate::geometry::Geometry;
+    use crate::model::component::Component;
     use crate::scan::dataset::{Frame, Layout, Split, View};
 
     const SIZE: usize = 8;
@@ -279,6 +289,10 @@ mod tests {
         let longest = corners(&data.views[0]).iter().fold(0f64, |m, x| m.max(x.length()));
         assert!(half < 1.001 * longest, "{half} {longest}");
         assert_eq!((scene.static_max, scene.dynamic_min), ([half; 3], [-half; 3]));
+        // Vessels are looked for in the field of view.
+        let [low, high] = scene.region_of(Component::Dynamic);
+        assert_eq!((low, high), ([-field_of_view(&data); 3], [field_of_view(&data); 3]));
+        assert!(high[0] < 0.6 * half && scene.region_of(Component::Total) == [low, high]);
         assert_eq!(
             (scene.static_gain, scene.dynamic_gain, scene.static_shift, scene.dynamic_shift),
             (0.01, 0.01, 0.0, 0.0)
