@@ -161,11 +161,7 @@ fn half_depth(dataset: &Dataset) -> f64 {
 
 /// Half side of the box the dynamic field is searched in, world units.
 pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
-    if config.dynamic.half_extent_mm > 0.0 {
-        config.dynamic.half_extent_mm / MM_PER_UNIT
-    } else {
-        seen_half(dataset)
-    }
+    if config.dynamic.half_extent_mm > 0.0 { config.dynamic.half_extent_mm / MM_PER_UNIT } else { seen_half(dataset) }
 }
 
 /// Half side of the box of what the views see, within the depth range, world units.
