@@ -32,6 +32,12 @@ layout(binding = 13) writeonly buffer B13 { vec4 ray_regularisers[]; };
 
 const float SMALL = 1e-10;       // e
 const float SMALLEST = 1e-19;    // least share, and least D to divide by
+const float SERIES = 1e-3;       // share below which a series is closer than a logarithm
+
+// ln(a), where a + rest = 1. Near 1 a logarithm may be off by 2^-21, and a itself by 2^-24: more than a faint field's entropy.
+float log_share(float a, float rest) {
+    return rest < SERIES ? -rest - 0.5 * rest * rest : log(a);
+}
 
 // Entropy of the shares of both fields, and its derivatives by sigma_l and sigma_s.
 vec3 share_entropy(float still, float moving) {
@@ -40,8 +46,10 @@ vec3 share_entropy(float still, float moving) {
     // 1 - b, of which f32 would keep nothing where the static field is faint.
     float rest = max((still + SMALL) / sum, SMALLEST);
     bool clipped = b <= SMALLEST || rest <= SMALLEST;
-    float slope = clipped ? 0.0 : (log(rest) - log(b)) / sum;
-    return vec3(-b * log(b) - rest * log(rest), -slope * (moving / sum), slope * ((still + SMALL) / sum));
+    float log_b = log_share(b, rest);
+    float log_rest = log_share(rest, b);
+    float slope = clipped ? 0.0 : (log_rest - log_b) / sum;
+    return vec3(-b * log_b - rest * log_rest, -slope * (moving / sum), slope * ((still + SMALL) / sum));
 }
 
 // What a sample's share p of a ray's integral adds to the entropy along it, and its negative derivative.

@@ -336,6 +336,17 @@ impl Config {
                 return refuse(field, &value, instead);
             }
         }
+        let preset = Config::preset(self.preset);
+        for (field, value, unused) in [
+            ("dynamic.half_extent_mm", self.dynamic.half_extent_mm, preset.dynamic.half_extent_mm),
+            ("dynamic.normalised_shift", self.dynamic.normalised_shift, preset.dynamic.normalised_shift),
+            ("march.static_samples", self.march.static_samples.into(), preset.march.static_samples.into()),
+        ] {
+            if value != unused {
+                let instead = format!("it has no effect there; leave it at the preset's {unused}");
+                return refuse(field, &value, &instead);
+            }
+        }
         Ok(())
     }
 }
@@ -425,6 +436,9 @@ mod tests {
             ("march.fit_static_range=true", "march.fit_static_range"),
             ("dynamic.delay=3", "dynamic.delay"),
             ("dynamic.occlusion=1e-8", "networks.near_integral"),
+            ("dynamic.half_extent_mm=20", "dynamic.half_extent_mm"),
+            ("dynamic.normalised_shift=-9", "dynamic.normalised_shift"),
+            ("march.static_samples=24", "march.static_samples"),
         ] {
             let message = Config::load(Some(Preset::NerfCa), None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part) && message.contains("static.form"), "{setting}: {message}");

@@ -65,6 +65,7 @@ fn checkpoints_keep_every_bit() {
             occupancy: Vec::new(),
             loss_scale: None,
             stopped: false,
+            last_report: Vec::new(),
             data_fingerprint: "x".into(),
         };
         let bytes = saved.to_bytes().unwrap();
@@ -96,6 +97,7 @@ fn damaged_gaussians_are_refused_by_name() {
             occupancy: Vec::new(),
             loss_scale: None,
             stopped: false,
+            last_report: Vec::new(),
             data_fingerprint: String::new(),
         };
         Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()

@@ -164,6 +164,7 @@ impl Golden {
             static_weight: n("static_weight"),
             dynamic_weight: n("dynamic_weight"),
             robust_scale: n("robust_scale"),
+            region: None,
         }
     }
 }

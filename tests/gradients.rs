@@ -10,6 +10,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::random;
 use nertca_vk::reference::field::{self, Precision};
 use nertca_vk::reference::{march, step};
+use nertca_vk::selftest::networks::LARGE;
 
 fn plan(preset: &str, settings: &[&str]) -> Plan {
     Plan::new(&small_config(preset, settings), &uneven_dataset(9, 8)).unwrap()
@@ -46,21 +47,6 @@ fn a_sleeping_field_is_called_back() {
     assert!(less > 0.0 && less == of("0", false), "{less}");
 }
 
-/// Weights of two networks' losses with which each shows beside the others.
-const LARGE_WEIGHTS: &[&str] = &[
-    "networks.gain=0.5",
-    "networks.delay=1",
-    "networks.ramp=4",
-    "networks.favour_static=0.05",
-    "networks.favour_static_end=0.3",
-    "networks.ray_entropy=0.02",
-    "networks.ray_entropy_end=0.1",
-    "networks.near_integral=0.01",
-    "networks.near_integral_end=0.3",
-    "networks.static_size=1e-3",
-    "networks.static_size_end=1e-2",
-];
-
 #[test]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     for (preset, settings) in [
@@ -70,7 +56,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
         ("fast-mlp", &["dynamic.least_slope=0", "loss.dynamic_target=absolute"]),
         ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0"]),
         ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0.3"]),
-        ("nerf-ca", LARGE_WEIGHTS),
+        ("nerf-ca", LARGE),
         // Fields of next to nothing, whose entropies count all the same; the near part of rays alone.
         (
             "nerf-ca",

@@ -131,6 +131,7 @@ fn saved(model: Model, path: &Path) -> String {
         occupancy: Vec::new(),
         loss_scale: None,
         stopped: false,
+        last_report: Vec::new(),
         data_fingerprint: "none".into(),
     };
     checkpoint.write(path).unwrap();

@@ -131,11 +131,16 @@ fn learning_ends_where_an_entropy_vanishes() {
     let dataset = small_dataset(13, 11);
     // Any entropy is below this one.
     let config = quick(&["networks.stop_after=30", "networks.stop_below=1", "networks.gain=0.01"]);
+    let to_the_end = |trainer: &mut Trainer| {
+        let mut losses = Vec::new();
+        while trainer.step() < 120 {
+            losses.extend(trainer.advance(120).unwrap());
+        }
+        losses
+    };
     let mut whole = start(&gpu, &config, &dataset);
-    let mut stopped = Vec::new();
-    while whole.step() < 120 {
-        stopped.extend(whole.advance(120).unwrap().iter().map(|loss| (loss.networks.unwrap().stopped, loss.total())));
-    }
+    let losses = to_the_end(&mut whole);
+    let stopped: Vec<_> = losses.iter().map(|loss| (loss.networks.unwrap().stopped, loss.total())).collect();
     // The iteration that finds it is the last to learn; all that follow tell of it.
     assert_eq!(stopped.iter().position(|(stopped, _)| *stopped), Some(30));
     assert!(stopped[30..].iter().all(|after| *after == stopped[30]));
@@ -145,8 +150,13 @@ fn learning_ends_where_an_entropy_vanishes() {
     assert!(then.stopped);
     assert_eq!(then.model.params, whole.model().unwrap().params);
     let mut resumed = resume(&gpu, &config, &dataset, &then);
-    run(&mut resumed, 120);
+    assert_eq!(to_the_end(&mut resumed), losses[31..], "what a resumed run says differs");
     assert_eq!(then.model.params, resumed.model().unwrap().params);
+    // Saved long after learning ended, and before the run went on.
+    let at_the_end = whole.checkpoint().unwrap().last_report;
+    assert!(!at_the_end.is_empty() && at_the_end == resumed.checkpoint().unwrap().last_report);
+    let at_once = resume(&gpu, &config, &dataset, &then).checkpoint().unwrap();
+    assert_eq!(at_once.last_report, then.last_report);
     let on = quick(&["networks.gain=0.01"]);
     let mut learning = start(&gpu, &on, &dataset);
     run(&mut learning, 120);

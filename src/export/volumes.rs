@@ -115,7 +115,7 @@ const QUANTITY: &str = "attenuation per mm";
 /// Cells of a slab.
 const SLAB_CELLS: usize = 1 << 22;
 
-/// The patient grid over the box of a scene's fields: points `spacing_mm` apart, one at each cell's middle.
+/// The patient grid over where a scene's fields are looked at ([`Scene::region_of`]): points `spacing_mm` apart, one at each cell's middle.
 ///
 /// # Errors
 /// [`Error::Config`] for a spacing that gives no or too many points.
@@ -123,13 +123,8 @@ pub fn grid_over(scene: &Scene, component: Component, spacing_mm: f64) -> Result
     if !(spacing_mm.is_finite() && spacing_mm > 0.0) {
         return Err(Error::config("spacing_mm", spacing_mm, "is not a positive length in mm"));
     }
-    let (low, high) = match component {
-        Component::Dynamic => (scene.dynamic_min, scene.dynamic_max),
-        Component::Total | Component::Static => (scene.static_min, scene.static_max),
-    };
     // World axes are (posterior, left, superior).
-    let lps = |v: [f64; 3]| DVec3::new(v[1], v[0], v[2]) * MM_PER_UNIT;
-    let (low, high) = (lps(low), lps(high));
+    let [low, high] = scene.region_of(component).map(|v| DVec3::new(v[1], v[0], v[2]) * MM_PER_UNIT);
     let size = ((high - low) / spacing_mm).ceil().max(DVec3::ONE);
     if size.max_element() > 4096.0 {
         let smallest = (high - low).max_element() / 4096.0;

@@ -22,6 +22,8 @@ const FORMAT: &str = "nertca-checkpoint-2";
 const GAUSSIAN_FORMAT: &str = "nertca-checkpoint-3";
 /// What names of the network's tensors begin with.
 const NETWORK: &str = "dynamic.";
+const OCCUPANCY: &str = "occupancy.bits";
+const LAST_REPORT: &str = "report.words";
 const MAX_BYTES: u64 = 4 << 30;
 /// Checkpoints kept besides the newest.
 const KEEP_OLDER: usize = 2;
@@ -39,6 +41,9 @@ pub struct Checkpoint {
     pub loss_scale: Option<LossScale>,
     /// Whether learning has ended before the run, as an entropy of two networks vanished.
     pub stopped: bool,
+    /// Words of the last [`crate::kernels::layout::StepReport`], which a run whose learning has ended repeats; empty while it
+    /// learns.
+    pub last_report: Vec<u32>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
 }
@@ -186,9 +191,11 @@ impl Checkpoint {
             let bytes = hull.bits.iter().flat_map(|w| w.to_le_bytes()).collect();
             tensors.push(("hull.bits".into(), Dtype::U32, vec![hull.bits.len()], bytes));
         }
-        if !self.occupancy.is_empty() {
-            let bytes = self.occupancy.iter().flat_map(|w| w.to_le_bytes()).collect();
-            tensors.push(("occupancy.bits".into(), Dtype::U32, vec![self.occupancy.len()], bytes));
+        for (name, words) in [(OCCUPANCY, &self.occupancy), (LAST_REPORT, &self.last_report)] {
+            if !words.is_empty() {
+                let bytes = words.iter().flat_map(|w| w.to_le_bytes()).collect();
+                tensors.push((name.into(), Dtype::U32, vec![words.len()], bytes));
+            }
         }
         let header = Header {
             format: if model.moving.is_some() { GAUSSIAN_FORMAT } else { FORMAT }.into(),
@@ -318,12 +325,13 @@ impl Checkpoint {
             Some(about) => Some(gaussian_tensors::read(about, &tensors, header.phases, path)?),
             None => None,
         };
-        let occupancy = match tensors.tensor("occupancy.bits") {
+        let words = |name: &str| match tensors.tensor(name) {
             Ok(view) if view.dtype() == Dtype::U32 => to_words(view.data()),
             _ => Vec::new(),
         };
         Ok(Checkpoint {
-            occupancy,
+            occupancy: words(OCCUPANCY),
+            last_report: words(LAST_REPORT),
             model: Model {
                 config: header.config,
                 scene: header.scene,

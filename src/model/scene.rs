@@ -1,5 +1,6 @@
 //! How numbers are scaled and where the fields live.
 
+use crate::model::component::Component;
 use serde::{Deserialize, Serialize};
 
 /// How numbers are scaled and where fields live; kept in checkpoints.
@@ -35,4 +36,18 @@ pub struct Scene {
     pub dynamic_weight: f64,
     /// Residual of the dynamic field from which the loss grows linearly; 0 = never.
     pub robust_scale: f64,
+    /// Lower and upper corner of where the fields are looked at, world units, where their boxes hold much more than views see, as
+    /// those of two networks do; none where the boxes are it, and in checkpoints of before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub region: Option<[[f64; 3]; 2]>,
+}
+
+impl Scene {
+    /// Lower and upper corner of where the fields of a component are looked at, as for vessels and exports, world units.
+    pub fn region_of(&self, component: Component) -> [[f64; 3]; 2] {
+        self.region.unwrap_or(match component {
+            Component::Dynamic => [self.dynamic_min, self.dynamic_max],
+            Component::Total | Component::Static => [self.static_min, self.static_max],
+        })
+    }
 }

@@ -54,6 +54,7 @@ impl Scene {
             static_weight: 1.0,
             dynamic_weight: 1.0,
             robust_scale: 0.0,
+            region: None,
         };
         if config.loss.normalise {
             scene.normalise(config, dataset, motion, static_half)?;
@@ -64,11 +65,15 @@ impl Scene {
         Ok(scene)
     }
 
-    /// Boxes of two networks, which hold every point of every view's rays: none is left out. Their activations.
+    /// Boxes of two networks, which hold every point of the views' rays, however a C-arm turns them about the isocentre: none
+    /// is left out, of poses that no view has either. Their activations.
     fn hold_all_rays(&mut self, config: &Config, dataset: &Dataset) {
         let half = reach(dataset);
         (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
         (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
+        // Most of that is seen by no view or by one: no place to look for vessels.
+        let seen = seen_half(dataset);
+        self.region = Some([[-seen; 3], [seen; 3]]);
         (self.static_gain, self.dynamic_gain) = (config.networks.gain, config.networks.gain);
         (self.static_shift, self.dynamic_shift) = (0.0, 0.0);
     }
@@ -134,8 +139,8 @@ fn static_half(config: &Config, dataset: &Dataset) -> f64 {
     half_depth(dataset).min(STATIC_FIELDS_OF_VIEW * field_of_view(dataset))
 }
 
-/// Half side of the least box around the isocentre that holds all rays of the views over the depth range, and a little more, so that
-/// rounding leaves none out.
+/// Radius of the least ball around the isocentre that holds all rays of the views over the depth range, and a little more, so that
+/// rounding leaves none out. Largest coordinates would be those of the views' own directions, and leave out ends of rays from others.
 fn reach(dataset: &Dataset) -> f64 {
     let mut reach = 0f64;
     for view in &dataset.views {
@@ -143,7 +148,7 @@ fn reach(dataset: &Dataset) -> f64 {
         for (i, j) in [(-0.5, -0.5), (w, -0.5), (-0.5, h), (w, h)] {
             let (anchor, direction) = view.rays.pixel(i, j);
             for depth in [dataset.depth_range.0, dataset.depth_range.1] {
-                reach = reach.max((anchor + depth * direction).abs().max_element());
+                reach = reach.max((anchor + depth * direction).length());
             }
         }
     }
@@ -156,11 +161,12 @@ fn half_depth(dataset: &Dataset) -> f64 {
 
 /// Half side of the box the dynamic field is searched in, world units.
 pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
-    if config.dynamic.half_extent_mm > 0.0 {
-        config.dynamic.half_extent_mm / MM_PER_UNIT
-    } else {
-        field_of_view(dataset).min(half_depth(dataset))
-    }
+    if config.dynamic.half_extent_mm > 0.0 { config.dynamic.half_extent_mm / MM_PER_UNIT } else { seen_half(dataset) }
+}
+
+/// Half side of the box of what the views see, within the depth range, world units.
+fn seen_half(dataset: &Dataset) -> f64 {
+    field_of_view(dataset).min(half_depth(dataset))
 }
 
 #[cfg(test)]
@@ -168,26 +174,27 @@ mod tests {
     use super::*;
     use crate::config::Preset;
     use crate::geometry::Geometry;
+    use crate::model::component::Component;
     use crate::scan::dataset::{Frame, Layout, Split, View};
 
     const SIZE: usize = 8;
 
+    fn view(primary_deg: f64, secondary_deg: f64) -> View {
+        let geometry = Geometry::CArm(crate::geometry::CArm {
+            primary_deg,
+            secondary_deg,
+            sid_mm: 1000.0,
+            sod_mm: 600.0,
+            pixel_mm: [15.0; 2],
+            offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
+        });
+        View::new(geometry, [SIZE; 2]).unwrap()
+    }
+
     /// Two views of two phases of pixels that are `still`, but for the middle ones, which gain `change` at the second.
     fn dataset(still: f32, change: f32) -> Dataset {
-        let views: Vec<View> = [-30.0, 60.0]
-            .map(|primary_deg| {
-                let geometry = Geometry::CArm(crate::geometry::CArm {
-                    primary_deg,
-                    secondary_deg: 0.0,
-                    sid_mm: 1000.0,
-                    sod_mm: 600.0,
-                    pixel_mm: [15.0; 2],
-                    offset_mm: [0.0; 2],
-                    table_mm: [0.0; 3],
-                });
-                View::new(geometry, [SIZE; 2]).unwrap()
-            })
-            .into();
+        let views: Vec<View> = [-30.0, 60.0].map(|primary_deg| view(primary_deg, 0.0)).into();
         let middle = |p: usize| (2..6).contains(&(p % SIZE)) && (2..6).contains(&(p / SIZE));
         let frame = |view, phase| Frame {
             name: format!("v{view}p{phase}"),
@@ -253,21 +260,35 @@ mod tests {
         assert_eq!((absolute.dynamic_weight, absolute.robust_scale), (absolute.static_weight, 0.0));
     }
 
+    /// Ends of the rays at the corners of a view.
+    fn corners(view: &View) -> Vec<DVec3> {
+        let edges = [-0.5, SIZE as f64 - 0.5];
+        let rays = edges.into_iter().flat_map(|i| edges.map(|j| view.rays.pixel(i, j)));
+        rays.flat_map(|(anchor, direction)| [-0.9f64, 0.9].map(|depth| anchor + depth * direction)).collect()
+    }
+
     #[test]
-    fn boxes_of_two_networks_hold_every_point_of_every_ray() {
+    fn boxes_of_two_networks_hold_every_ray_of_any_pose() {
         let data = dataset(2.0, 0.4);
         let config = Config::preset(Preset::NerfCa);
         let scene = Scene::new(&config, &data, &crate::plan::motion::analyse(&data, &config.hull), None).unwrap();
-        let mut largest = 0f64;
-        for view in &data.views {
-            for (i, j) in (0..SIZE).flat_map(|i| (0..SIZE).map(move |j| (i as f64, j as f64))) {
-                let (anchor, direction) = view.rays.pixel(i, j);
-                largest = [-0.9, 0.9].iter().fold(largest, |m, t| m.max((anchor + *t * direction).abs().max_element()));
-            }
-        }
         let half = scene.dynamic_max[0];
-        assert!(largest < half && half < 1.2 * largest, "{largest} {half}");
+        let coordinate = |view: &View| corners(view).iter().fold(0f64, |m, x| m.max(x.abs().max_element()));
+        let own = data.views.iter().map(coordinate).fold(0.0, f64::max);
+        assert!(own <= half, "{own} {half}");
+        // The corners of this one lie along an axis.
+        let other = coordinate(&view(24.0, 24.0));
+        assert!(other > 1.05 * own && other <= half, "{other} {own} {half}");
+        for pose in [view(0.0, 0.0), view(30.0, -25.0), view(-80.0, 40.0)] {
+            assert!(coordinate(&pose) <= half);
+        }
+        let longest = corners(&data.views[0]).iter().fold(0f64, |m, x| m.max(x.length()));
+        assert!(half < 1.001 * longest, "{half} {longest}");
         assert_eq!((scene.static_max, scene.dynamic_min), ([half; 3], [-half; 3]));
+        // Vessels are looked for in the field of view.
+        let [low, high] = scene.region_of(Component::Dynamic);
+        assert_eq!((low, high), ([-field_of_view(&data); 3], [field_of_view(&data); 3]));
+        assert!(high[0] < 0.6 * half && scene.region_of(Component::Total) == [low, high]);
         assert_eq!(
             (scene.static_gain, scene.dynamic_gain, scene.static_shift, scene.dynamic_shift),
             (0.01, 0.01, 0.0, 0.0)

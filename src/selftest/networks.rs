@@ -19,8 +19,8 @@ use crate::selftest::iteration::{
 };
 use crate::train::trainer::{NetworkLosses, StepLoss, Trainer};
 
-/// Weights with which each loss shows beside the others.
-const LARGE: &[&str] = &[
+/// Settings with which each loss of two networks shows beside the others.
+pub const LARGE: &[&str] = &[
     "networks.gain=0.5",
     "networks.delay=1",
     "networks.ramp=4",

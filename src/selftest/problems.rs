@@ -105,7 +105,6 @@ pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
         "train.chunk_samples=1024",
         "train.iterations=40",
         "train.iterations_per_submit=4",
-        "march.static_samples=24",
         "march.dynamic_samples=40",
         "march.render_samples=32",
         "static.grid=9",
@@ -114,7 +113,9 @@ pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
         "dynamic.window_iterations=20",
         "hull.enabled=false",
     ];
-    let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
+    // Two networks share the dynamic field's samples and refuse others.
+    let still: &[&str] = if preset == Preset::NerfCa { &[] } else { &["march.static_samples=24"] };
+    let all: Vec<String> = small.iter().chain(still).chain(settings).map(|setting| (*setting).to_owned()).collect();
     Config::load(Some(preset), None, &all)
 }
 

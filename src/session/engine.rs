@@ -5,7 +5,9 @@ use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
+use crate::model::Model;
 use crate::model::checkpoint::Checkpoint;
+use crate::model::scene::Scene;
 use crate::plan::Plan;
 use crate::render::live::{Live, Source};
 use crate::session::inbox::Inbox;
@@ -174,7 +176,7 @@ impl Shared {
         let mut earlier = None;
         if let Some(training) = &mut engine.training {
             let mut state = training.trainer_mut().checkpoint()?;
-            let fits = holds(&state.model.scene, &fresh.scene);
+            let fits = holds(&state.model, &fresh.scene);
             if !fits {
                 tracing::warn!("new frames show vessels outside the box trained so far: training starts over");
                 earlier = state.model.moving.take();
@@ -185,7 +187,8 @@ impl Shared {
         let trainer = match &engine.saved {
             None => Trainer::start_over(gpu, fresh, &dataset, tuning, earlier.as_ref())?,
             Some(state) => {
-                let plan = fresh.in_scene(state.model.scene.clone());
+                // Boxes of two networks are those of the rays there are.
+                let plan = if config.two_networks() { fresh } else { fresh.in_scene(state.model.scene.clone()) };
                 Trainer::carry_on(gpu, plan, &dataset, tuning, state)?
             }
         };
@@ -322,11 +325,14 @@ impl Shared {
     }
 }
 
-/// Whether fields trained in an old scene can go on in a new one: their box holds it, and numbers are of a like size.
-fn holds(old: &crate::model::scene::Scene, new: &crate::model::scene::Scene) -> bool {
+/// Whether fields trained in an old scene can go on in a new one: their box holds it, and numbers are of a like size. Two networks
+/// are functions of all space, whose boxes hold rays and do not bound the fields: theirs may grow.
+fn holds(model: &Model, new: &Scene) -> bool {
+    let old = &model.scene;
     let slack = 0.02 * (0..3).map(|i| old.dynamic_max[i] - old.dynamic_min[i]).fold(0.0, f64::max);
-    let inside = (0..3)
-        .all(|i| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack);
+    let within =
+        |i: usize| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack;
+    let inside = model.config.two_networks() || (0..3).all(within);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
     inside && alike(old.static_gain, new.static_gain) && alike(old.dynamic_gain, new.dynamic_gain)
 }

@@ -28,6 +28,14 @@ use std::collections::VecDeque;
 /// A loss this many times the first one means the run exploded.
 const EXPLOSION: f64 = 1e6;
 
+/// Bytes of an iteration's report.
+const REPORT_BYTES: u64 = size_of::<StepReport>() as u64;
+
+/// Where the ring has the report of the last of `step` iterations, bytes.
+fn last_report_at(step: u32) -> u64 {
+    u64::from(step.saturating_sub(1) % RING_LENGTH) * REPORT_BYTES
+}
+
 /// Submits under way at once: two keep a GPU from waiting for the host; on a CPU nothing waits, and views of a run in
 /// training come up sooner.
 fn submits_in_flight(gpu: &Gpu) -> usize {
@@ -258,6 +266,10 @@ impl Trainer {
             gpu.upload(&training.moments, 0, &saved.moments)?;
             now.step = saved.model.step;
             now.stopped = u32::from(saved.stopped);
+            // A run whose learning has ended repeats what came last; one of before this was kept repeats zeros.
+            if saved.stopped && saved.last_report.len() * 4 == REPORT_BYTES as usize {
+                gpu.upload(&training.ring, last_report_at(now.step), &saved.last_report)?;
+            }
             // One of another size, as of an older version, starts anew.
             if saved.occupancy.len() as u64 * 4 == occupancy_bytes(&plan.setup) && !saved.occupancy.is_empty() {
                 gpu.upload(&forward.occupancy, 0, &saved.occupancy)?;
@@ -491,18 +503,19 @@ impl Trainer {
     /// Device errors.
     pub fn snapshot(&self) -> Result<Snapshot> {
         let mut recording = Recording::new(&self.gpu, "snapshot")?;
-        let mut copy = |from: &Buffer, bytes: u64| -> Result<Buffer> {
+        let mut copy = |from: &Buffer, at: u64, bytes: u64| -> Result<Buffer> {
             let staging = self.gpu.buffer(&format!("{} snapshot", from.name()), bytes, Memory::Readback)?;
             if bytes > 0 {
-                recording.copy(from, 0, &staging, 0, bytes)?;
+                recording.copy(from, at, &staging, 0, bytes)?;
             }
             Ok(staging)
         };
         let n = self.plan.params.len as u64;
-        let params = copy(&self.forward.params, 4 * n)?;
-        let moments = copy(&self.training.moments, 8 * n)?;
-        let state = copy(&self.forward.state, size_of::<DeviceState>() as u64)?;
-        let occupancy = copy(&self.forward.occupancy, occupancy_bytes(&self.plan.setup))?;
+        let params = copy(&self.forward.params, 0, 4 * n)?;
+        let moments = copy(&self.training.moments, 0, 8 * n)?;
+        let state = copy(&self.forward.state, 0, size_of::<DeviceState>() as u64)?;
+        let report = copy(&self.training.ring, last_report_at(self.submitted), REPORT_BYTES)?;
+        let occupancy = copy(&self.forward.occupancy, 0, occupancy_bytes(&self.plan.setup))?;
         let commands = recording.finish()?;
         let ticket = commands.submit()?;
         Ok(Snapshot {
@@ -512,6 +525,7 @@ impl Trainer {
             params,
             moments,
             state,
+            report,
             occupancy,
             occupancy_words: occupancy_bytes(&self.plan.setup) as usize / 4,
             scaled: self.network.layers() == Layers::Matrices,
@@ -548,6 +562,7 @@ pub struct Snapshot {
     params: Buffer,
     moments: Buffer,
     state: Buffer,
+    report: Buffer,
     occupancy: Buffer,
     occupancy_words: usize,
     scaled: bool,
@@ -582,12 +597,18 @@ impl Snapshot {
         let mut occupancy = vec![0u32; self.occupancy_words];
         self.occupancy.read(&mut occupancy)?;
         let [DeviceState { loss_scale: scale, good_updates, stopped, .. }] = state;
+        let mut last_report = Vec::new();
+        if stopped != 0 {
+            last_report.resize(REPORT_BYTES as usize / 4, 0u32);
+            self.report.read(&mut last_report)?;
+        }
         Ok(Checkpoint {
             model: self.model,
             moments,
             occupancy,
             loss_scale: self.scaled.then_some(LossScale { scale, good_updates }),
             stopped: stopped != 0,
+            last_report,
             data_fingerprint: self.data_fingerprint,
         })
     }

@@ -61,8 +61,8 @@ pub(crate) struct MovingField<'a> {
 impl MovingField<'_> {
     /// The whole field at points a pixel apart; of large fields, farther apart.
     pub(crate) fn coarse(&self) -> Result<CoarseField> {
-        let size = DVec3::from_array(self.scene.dynamic_max) - DVec3::from_array(self.scene.dynamic_min);
-        let longest_mm = size.max_element() * MM_PER_UNIT;
+        let [low, high] = self.scene.region_of(Component::Dynamic).map(DVec3::from_array);
+        let longest_mm = (high - low).max_element() * MM_PER_UNIT;
         let spacing_mm = (COARSE_PIXELS * self.pixel_mm).max(longest_mm / COARSE_POINTS);
         let grid = grid_over(self.scene, Component::Dynamic, spacing_mm)?;
         Ok(CoarseField { grid, values: self.renderer.sample_patient(Component::Dynamic, self.phase, &grid)? })
