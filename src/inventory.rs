@@ -3,6 +3,7 @@
 use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::gaussians::blobs::BlobKernels;
+use crate::gaussians::pictures::into_buffers;
 use crate::gaussians::stages::GaussianKernels;
 use crate::gaussians::tree::TreeKernels;
 use crate::gpu::device::Gpu;
@@ -116,6 +117,7 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
             TreeKernels::new(gpu)?;
         }
         BlobKernels::new(gpu, &tuning)?;
+        into_buffers(gpu)?;
     }
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
     if all.is_empty() {

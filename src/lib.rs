@@ -197,6 +197,7 @@ pub mod train {
     pub mod calibrate;
     mod carried;
     pub mod gaussians;
+    pub mod losses;
     pub mod moving;
     pub mod step;
     mod targets;

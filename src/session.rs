@@ -22,7 +22,7 @@ use crate::render::live::Source;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::gating::RPeaks;
-use crate::train::trainer::StepLoss;
+use crate::train::losses::StepLoss;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;

@@ -15,7 +15,8 @@ use nertca_vk::plan::Plan;
 use nertca_vk::reference::field::Precision;
 use nertca_vk::reference::{march, step};
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use nertca_vk::train::trainer::{StepLoss, Trainer};
+use nertca_vk::train::losses::StepLoss;
+use nertca_vk::train::trainer::Trainer;
 
 impl Golden {
     fn number(&self, key: &str) -> f64 {

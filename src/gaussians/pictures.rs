@@ -19,6 +19,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// Pictures kept recorded; a display in use has far fewer.
 const MOST_RECORDED: usize = 256;
 
+/// What leaves a picture in a buffer; the other stages are those of fits.
+///
+/// # Errors
+/// Errors of [`Gpu::pipeline`].
+pub fn into_buffers(gpu: &Gpu) -> Result<Stage<push::GaussianPicture>> {
+    Build::default().stage(gpu)
+}
+
 /// Line integral of a unit of the sums in fixed point.
 fn line_integral(units: Units) -> f32 {
     (units.strongest / 2f64.powi(FIXED_POINT_BITS)) as f32
@@ -82,14 +90,8 @@ impl Pictures {
     /// Errors of [`Gpu::pipeline`].
     pub fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<Pictures> {
         let state = Mutex::new(State { field: field.clone(), recorded: HashMap::new() });
-        let plain = Build::default();
-        Ok(Pictures {
-            gpu: gpu.clone(),
-            project: plain.stage(gpu)?,
-            splat: SplatStage::new(gpu)?,
-            show: plain.stage(gpu)?,
-            state,
-        })
+        let project = Build::default().stage(gpu)?;
+        Ok(Pictures { gpu: gpu.clone(), project, splat: SplatStage::new(gpu)?, show: into_buffers(gpu)?, state })
     }
 
     /// Draws another field from now on.

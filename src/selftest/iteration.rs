@@ -19,7 +19,8 @@ use crate::reference::{march, step};
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::problems::small_config;
-use crate::train::trainer::{StepLoss, Trainer};
+use crate::train::losses::StepLoss;
+use crate::train::trainer::Trainer;
 use glam::DVec3;
 
 /// With the paper's learning rate, networks this small are dead after an update: nothing but zeros is left to compare.

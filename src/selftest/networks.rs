@@ -17,7 +17,8 @@ use crate::selftest::iteration::{
     Case, F32_SUMS, ITERATIONS, Sample, Tolerances, compare_update, one_iteration, path_name, pick, precision_of,
     relative, samples,
 };
-use crate::train::trainer::{NetworkLosses, StepLoss, Trainer};
+use crate::train::losses::{NetworkLosses, StepLoss};
+use crate::train::trainer::Trainer;
 
 /// Settings with which each loss of two networks shows beside the others.
 pub const LARGE: &[&str] = &[

@@ -13,7 +13,8 @@ use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
 use crate::selftest::iteration::path_name;
 use crate::selftest::problems::small_config;
-use crate::train::trainer::{StepLoss, Trainer};
+use crate::train::losses::StepLoss;
+use crate::train::trainer::Trainer;
 use glam::DVec3;
 
 const NOTES: &[&str] = &[push::OccupancyMark::SHADER, push::OccupancyClear::SHADER];

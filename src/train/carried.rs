@@ -17,10 +17,14 @@ pub(super) enum Carried {
     /// The fit goes on from the earlier tree.
     On(Box<TreeTrainer>),
     /// The earlier tree is none of these images: they are to be fitted anew.
-    Anew(Targets),
+    Anew(Box<Targets>),
 }
 
 impl Carried {
+    fn anew(targets: Targets) -> Carried {
+        Carried::Anew(Box::new(targets))
+    }
+
     /// Goes on from an earlier tree, unless it has another shape or leaves much of a view or a phase unexplained.
     ///
     /// # Errors
@@ -32,20 +36,20 @@ impl Carried {
         // Another view tells more than a fit that does without it can take in.
         let seen_alike = was.n_views as usize == targets.n_views;
         if !(phases_alike && rests_alike && seen_alike && has_room) || earlier.rest.rows.is_empty() {
-            return Ok(Carried::Anew(targets));
+            return Ok(Carried::anew(targets));
         }
         let rest = earlier.rest.in_units(targets.units);
         let mut trainer = TreeTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
         let setup = *trainer.tree_setup();
         if setup.n_basis != earlier.setup.n_basis {
-            return Ok(Carried::Anew(trainer.into_targets()));
+            return Ok(Carried::anew(trainer.into_targets()));
         }
         trainer.move_as(&earlier.on_grid(rest, setup))?;
         let explained = least_explained(trainer.targets(), &trainer.images()?).unwrap_or(0.0);
         let percent = 100.0 * explained;
         if explained < LEAST_EXPLAINED {
             tracing::info!("Gaussians are fitted anew: those so far explain {percent:.0} % of some view or phase");
-            return Ok(Carried::Anew(trainer.into_targets()));
+            return Ok(Carried::anew(trainer.into_targets()));
         }
         tracing::info!("Gaussians go on from those so far, which explain {percent:.0} % of every view and phase");
         Ok(Carried::On(Box::new(trainer)))

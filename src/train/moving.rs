@@ -48,7 +48,7 @@ impl MovingFit {
         if let (GaussianForm::Tree, Some(tree)) = (targets.form(config.gaussians.form), earlier.tree()) {
             match Carried::new(gpu, targets, config, tree)? {
                 Carried::On(fit) => return Ok(MovingFit::Tree(fit)),
-                Carried::Anew(same) => targets = same,
+                Carried::Anew(same) => targets = *same,
             }
         }
         MovingFit::new(gpu, targets, config)

@@ -2,7 +2,8 @@
 //! directory, [`crate::session`] in memory.
 
 use crate::error::Result;
-use crate::train::trainer::{StepLoss, Trainer};
+use crate::train::losses::StepLoss;
+use crate::train::trainer::Trainer;
 use std::time::Instant;
 
 /// Weight of the newest squared error in the smoothed one.
