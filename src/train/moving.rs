@@ -169,7 +169,8 @@ pub(super) struct Moving {
 impl Moving {
     /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where the network
     /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits, however
-    /// many iterations go into a submit (but for one that had gone on from an earlier tree, which begins from seeds). A field that was fitted to `earlier` data is shown, and gone on from, where it can be.
+    /// many iterations go into a submit (but for one that had gone on from an earlier tree, which begins from seeds). A field that
+    /// was fitted to `earlier` data is shown, and gone on from, where it can be.
     ///
     /// # Errors
     /// As [`MovingFit::new`], and as [`TreeStart::advance`] for what is done again.

@@ -145,8 +145,8 @@ impl Trainer {
         Self::start(gpu, plan, dataset, tuning, Some(checkpoint), None)
     }
 
-    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians go on from those so far where these
-    /// explain every view and phase, and are fitted anew elsewhere.
+    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians go on from those so far where
+    /// these explain every view and phase, and are fitted anew elsewhere.
     ///
     /// # Errors
     /// [`Error::Config`] when parameters and plan do not fit; device errors.
