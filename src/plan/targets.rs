@@ -14,7 +14,8 @@ use glam::DVec3;
 
 /// The first phase is one to rest at where it shows this share of what the one shows that shows most.
 const MUCH: f64 = 0.75;
-/// A phase that shows less than this share of what another shows lacks contrast: the beat itself takes a quarter at most.
+/// A phase that shows less than this share of what its views show at most lacks contrast: the beat and noise have been seen to take
+/// a third.
 const LITTLE: f64 = 0.5;
 /// Views that tell where along a ray a vessel is.
 const LEAST_VIEWS: usize = 2;
@@ -213,22 +214,28 @@ impl Targets {
         if first_shows_much { 0 } else { most }
     }
 
-    /// Whether some phase shows so much less than another that contrast must have come or gone meanwhile: per image, since not
-    /// every view has every phase.
+    /// Whether some phase shows so much less than others that contrast must have come or gone meanwhile. Each view is compared
+    /// with itself: not every view has every phase, and some see more of the vessels than others.
     pub fn contrast_comes_and_goes(&self) -> bool {
-        let per_image = |phase: usize| {
-            let images = self.views_at(phase).count();
-            (images >= LEAST_VIEWS).then(|| self.shown_at(phase) / images as f64)
+        let shown = |phase: usize, view: usize| Some(self.shown_in(self.image_of[phase * self.n_views + view]?));
+        let most_in = |view: usize| (0..self.n_phases).filter_map(|phase| shown(phase, view)).fold(0.0, f64::max);
+        let most: Vec<f64> = (0..self.n_views).map(most_in).collect();
+        let lacks = |phase: usize| {
+            let views = (0..self.n_views).filter(|view| most[*view] > 0.0);
+            let shares: Vec<f64> = views.filter_map(|view| Some(shown(phase, view)? / most[view])).collect();
+            shares.len() >= LEAST_VIEWS && shares.iter().sum::<f64>() < LITTLE * shares.len() as f64
         };
-        let shown: Vec<f64> = (0..self.n_phases).filter_map(per_image).collect();
-        let most = shown.iter().copied().fold(0.0, f64::max);
-        shown.iter().any(|shown| *shown < LITTLE * most)
+        (0..self.n_phases).any(lacks)
     }
 
-    /// Sum over all images of a phase of the line integrals that stand out from noise, shares of the strongest change.
+    /// What all images of a phase show.
     fn shown_at(&self, phase: usize) -> f64 {
-        let pixels = self.views_at(phase).flat_map(|(image, _)| self.pixels_that_stand_out(image));
-        pixels.map(|p| f64::from(self.low[p])).sum()
+        self.views_at(phase).map(|(image, _)| self.shown_in(image)).sum()
+    }
+
+    /// Sum over an image of the line integrals that stand out from noise, shares of the strongest change.
+    fn shown_in(&self, image: usize) -> f64 {
+        self.pixels_that_stand_out(image).map(|p| f64::from(self.low[p])).sum()
     }
 
     /// Pixels of an image where more moves than noise, counted over all images.
