@@ -11,6 +11,7 @@ macro_rules! out {
 mod cli {
     pub mod args;
     pub mod bench;
+    pub mod bench_report;
     pub mod calibrate;
     pub mod calibration_table;
     pub mod check;

@@ -6,6 +6,7 @@ pub mod cost;
 pub mod forward;
 pub mod fused;
 pub mod layers;
+pub mod ledger;
 pub mod pass;
 pub mod still;
 
@@ -20,12 +21,20 @@ use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
 use crate::network::fused::FusedNetwork;
 use crate::network::layers::LayerNetwork;
+use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
 
 /// Loss scale a run on matrices starts with.
 pub const FIRST_LOSS_SCALE: f32 = 65_536.0;
 /// The same where both fields are networks, whose attenuations and gradients are a hundred times as small: the largest there is.
 pub const FIRST_LOSS_SCALE_OF_TWO: f32 = 16_777_216.0;
+
+/// Bytes of a number in f32.
+pub(crate) const F32_BYTES: u64 = 4;
+/// Bytes of a number in f16.
+const F16_BYTES: u64 = 2;
+/// Bytes of a live sample's place, ray and pair of attenuations.
+const SAMPLE_BYTES: u64 = 16 + 4 + 8;
 
 /// What a network is built for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,6 +67,9 @@ trait Path: Send + Sync {
 
     /// Records the backward pass of a chunk: `partials`.
     fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()>;
+
+    /// Least work of the stages that see samples, for so many of them.
+    fn work(&self, params: &NetworkMap, samples: u64) -> Ledger;
 
     /// Records the sums of dz over each phase, unless they are there: `phase_dz`.
     fn record_phase_sums(&self, pass: &mut Pass<'_>, gradient: &GradientBuffers) -> Result<()>;
@@ -159,6 +171,16 @@ impl Network {
     /// Loss scale to start with.
     pub fn first_loss_scale(&self) -> f32 {
         self.first_loss_scale
+    }
+
+    /// Least work of an iteration's stages with so many live samples.
+    pub fn work(&self, samples: u64) -> Ledger {
+        let mut ledger = self.path.work(&self.map, samples);
+        let sums = self.path.partial_sums(&self.map);
+        // A gradient is a sum over the parts, and written once.
+        let numbers = u64::from(sums.splits) * u64::from(sums.len) + self.map.len as u64;
+        add(&mut ledger, "gradient_network", StageWork::per_item(numbers, 1, F32_BYTES));
+        ledger
     }
 
     /// Where the gradient is summed; none when built for rendering.

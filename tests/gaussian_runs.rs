@@ -92,12 +92,14 @@ fn read(file: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap()
 }
 
+/// Three short repeats at once.
+const TIMES: [&str; 6] = ["--warm-up", "0", "--iterations", "2", "--repeats", "3"];
+
 #[test]
 fn gaussians_are_measured_as_they_run() {
     let dir = tempfile::tempdir().unwrap();
     let (file, old) = (dir.path().join("bench.json"), dir.path().join("old.json"));
-    let bench =
-        [&["bench", data(), "--kernels", "--iterations", "2", "--repeats", "3", "--preset", "fast"], SHORT].concat();
+    let bench = [&["bench", data(), "--kernels", "--preset", "fast"], &TIMES[..], SHORT].concat();
     let said = ok(&[&bench[..], &["--json", file.to_str().unwrap()]].concat());
     for part in [
         "Gaussians, form tree",
@@ -109,6 +111,7 @@ fn gaussians_are_measured_as_they_run() {
         assert!(said.contains(part), "`{part}` is missing: {said}");
     }
     assert!(!said.contains("with the network"), "nobody asks it: {said}");
+    assert!(!said.contains("x as fast"), "it is another method than that of the 37 minutes: {said}");
     let report = read(&file);
     assert_eq!((&report["after"], &report["network_cost"]), (&Value::Null, &Value::Null));
     let gaussians = &report["gaussians"];
@@ -121,6 +124,7 @@ fn gaussians_are_measured_as_they_run() {
     let whole = (f64::from(GAUSSIAN_ITERATIONS) * median(gaussians) + still) * 1e-3
         + gaussians["preparation_s"].as_f64().unwrap();
     assert!((report["whole_run_s"].as_f64().unwrap() - whole).abs() < 1e-9);
+    assert_eq!((&gaussians["iterations"], &report["before"]["iterations"]), (&json!(2), &json!(2)));
     // Passes of both parts, and none of the network's or of tracking.
     let passes = report["passes_ms"].as_object().unwrap();
     for name in ["tree_project", "gaussian_splat", "gaussian_residual", "gaussian_moments", "tree_grid_update", "adam"]
@@ -129,6 +133,9 @@ fn gaussians_are_measured_as_they_run() {
         assert!(passes.iter().any(|(pass, ms)| pass.starts_with(name) && ms.as_f64().unwrap() > 0.0), "{name}");
     }
     assert!(!passes.contains_key("tree_guess") && !passes.contains_key("gaussian_update"));
+    // A tree's two rounds over splats: once per iteration each.
+    assert_eq!(report["passes_per_iteration"]["tree_grid_update"], 1.0);
+    assert_eq!(report["passes_per_iteration"].as_object().unwrap().len(), passes.len());
     // A report of a version without Gaussians.
     let mut older = report.clone();
     let fields = older.as_object_mut().unwrap();

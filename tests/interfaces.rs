@@ -431,7 +431,7 @@ fn measurements_and_baked_views() {
     let run = directory.path().join("run");
     ok(&[&["train", text(&data), "-o", text(&run)], SHORT].concat());
     let file = directory.path().join("bench.json");
-    let quick = ["--preset", "fast-mlp", "--iterations", "2", "--repeats", "3"];
+    let quick = ["--preset", "fast-mlp", "--warm-up", "0", "--iterations", "2", "--repeats", "3"];
     let full = [&["bench", text(&data), "--full", "--json", text(&file), "--set", "dynamic.delay=5"], SHORT, &quick];
     let said = ok(&full.concat());
     for part in ["before the network starts", "peaks: f32", "37:00", "really run", "network passes alone"] {
@@ -441,6 +441,14 @@ fn measurements_and_baked_views() {
     assert_eq!(report["after"]["ms"].as_array().unwrap().len(), 3);
     assert!(report["peaks"]["f32_tflops"].as_f64().unwrap() > 0.0);
     assert_eq!(report["config"]["train"]["rays"], 64);
+    assert_eq!((&report["tuning"]["layers"], &report["after"]["iterations"]), (&"f32".into(), &2.into()));
+    // Four iterations to begin with, and one to see how long they take.
+    assert_eq!(report["after"]["learned"], 5);
+    assert!(
+        said.contains("left out: ") && said.contains("repeats of 2 iterations, after 5 iterations of learning"),
+        "{said}"
+    );
+    assert!(report["host"]["threads"].as_u64().unwrap() > 0);
     // 5 iterations without the network and 25 with it.
     let median = |part: &str| {
         let mut ms: Vec<f64> = report[part]["ms"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
@@ -454,6 +462,10 @@ fn measurements_and_baked_views() {
     assert_eq!(report["network_cost"]["forward"], forward);
     assert_eq!(report["network_cost"]["weights"], forward);
     assert_eq!(report["network_cost"]["inputs"], 2 * (3 * 16 * 16 + 16));
+    // What is no number is null, which can be read again.
+    let mut unscored = report.clone();
+    unscored["full"]["psnr"] = Value::Null;
+    std::fs::write(&file, unscored.to_string()).unwrap();
     let compared = [&["bench", text(&data), "--kernels", "--compare", text(&file)], SHORT, &quick];
     let said = ok(&compared.concat());
     assert!(said.contains("with the network, ms") && said.contains("another configuration"), "{said}");

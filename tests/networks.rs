@@ -265,6 +265,8 @@ fn the_program_trains_resumes_scores_draws_exports_and_times_them() {
             .iter()
             .all(|name| { listed.iter().any(|kernel| kernel["kernel"].as_str().unwrap().starts_with(name)) })
     );
-    let timed = ok(&[&["bench", text(&data), "--iterations", "1", "--repeats", "1", "--kernels"], TINY].concat());
+    let timed =
+        ok(&[&["bench", text(&data), "--warm-up", "0", "--iterations", "1", "--repeats", "1", "--kernels"], TINY]
+            .concat());
     assert!(timed.contains("loss_samples") && timed.contains("network passes alone"), "{timed}");
 }

@@ -1,9 +1,10 @@
 //! `bench`: iterations, passes and renderings against the device's own limits and the paper's 37 minutes.
 
 use super::args::{Cli, ConfigArgs};
-use super::frame_rates::{FrameRate, measure_frame_rates, print_frame_rates};
+use super::bench_report::{FullRun, Host, Report, compare, print};
+use super::frame_rates::{FrameRate, measure_frame_rates};
 use clap::Args;
-use nertca_vk::bench::{self, PAPER_SECONDS, Peaks};
+use nertca_vk::bench::peaks::peaks;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
@@ -12,6 +13,7 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::network::cost::NetworkCost;
+use nertca_vk::network::ledger::Ledger;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::views::ViewAngles;
@@ -21,10 +23,8 @@ use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::scan::dataset::{Dataset, Layout};
-use nertca_vk::train::timing::{GaussianSubject, GaussianTiming, Subject, Timing};
+use nertca_vk::train::timing::{GaussianSubject, GaussianTiming, Length, Pace, Passes, Subject, Timing};
 use nertca_vk::train::trainer::Trainer;
-use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -37,9 +37,15 @@ pub struct BenchArgs {
     /// Hyper-parameters.
     #[command(flatten)]
     pub config: ConfigArgs,
-    /// Iterations of each timed repeat.
-    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u32).range(1..=2000))]
-    pub iterations: u32,
+    /// Seconds of iterations before any is timed.
+    #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = seconds)]
+    pub warm_up: f64,
+    /// Seconds that all timed repeats take together; fits of Gaussians are timed whole.
+    #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = seconds, conflicts_with = "iterations")]
+    pub sample: f64,
+    /// Iterations of each timed repeat, instead of seconds; of Gaussians, the first of a fit.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=2000))]
+    pub iterations: Option<u32>,
     /// Timed repeats.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=10))]
     pub repeats: u32,
@@ -60,53 +66,31 @@ pub struct BenchArgs {
     pub compare: Option<PathBuf>,
 }
 
-/// Iterations timed pass by pass.
+/// Iterations timed pass by pass, at most.
 const PROFILED: u32 = 8;
+/// An hour is too long for a measurement.
+const MOST_SECONDS: f64 = 3600.0;
+/// What times of iterations leave out.
+const LEFT_OUT: &str = "opening the device and compiling, reading data, calibration, hull, validation, checkpoints";
 
-/// Everything measured; what `--json` writes and `--compare` reads.
-#[derive(Serialize, Deserialize)]
-struct Report {
-    version: String,
-    commit: String,
-    device: String,
-    driver: String,
-    /// Choices about data and device: the paths taken.
-    paths: Vec<String>,
-    preset: String,
-    config: serde_json::Value,
-    rays: u32,
-    peaks: Peaks,
-    /// Operations of the network per live sample; none where Gaussians move.
-    network_cost: Option<NetworkCost>,
-    /// Iterations of Gaussians; none where the network moves, and in reports of versions that had none.
-    #[serde(default)]
-    gaussians: Option<GaussianTiming>,
-    /// Iterations of the still field alone: those before the network starts, none without a delay; or those after Gaussians.
-    before: Option<Timing>,
-    /// Iterations with the network; none where Gaussians move.
-    after: Option<Timing>,
-    /// Iterations of the whole run times the medians, and what Gaussians need before their first.
-    whole_run_s: f64,
-    /// Milliseconds of each pass, kept apart.
-    passes_ms: BTreeMap<String, f64>,
-    frame_rates: Vec<FrameRate>,
-    /// The whole run, really run.
-    full: Option<FullRun>,
+fn seconds(text: &str) -> std::result::Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.0..=MOST_SECONDS).contains(&seconds) => Ok(seconds),
+        _ => Err(format!("a number of seconds from 0 to {MOST_SECONDS} is needed")),
+    }
 }
 
-/// A whole run.
-#[derive(Serialize, Deserialize)]
-struct FullRun {
-    /// Seconds of training, validation excluded.
-    train_s: f64,
-    /// Seconds of everything.
-    elapsed_s: f64,
-    /// Validations on the way: iterations, seconds of training, Dice of the dynamic field.
-    curve: Vec<(u32, f64, Option<f64>)>,
-    /// Dice of the dynamic field on all unseen images.
-    dice: Option<f64>,
-    /// PSNR on them, dB.
-    psnr: f64,
+impl BenchArgs {
+    fn pace(&self) -> Pace {
+        let share = self.sample / f64::from(self.repeats);
+        let length = self.iterations.map_or(Length::Seconds(share), Length::Iterations);
+        Pace { warm_up_s: self.warm_up, repeats: self.repeats, length }
+    }
+
+    /// Iterations timed pass by pass.
+    fn profiled(&self) -> u32 {
+        self.iterations.map_or(PROFILED, |n| n.min(PROFILED))
+    }
 }
 
 /// Measures.
@@ -163,52 +147,18 @@ fn measure(
     scratch: &Path,
 ) -> Result<Report> {
     let tuning = cli.training_tuning(gpu, config, dataset)?;
-    let peaks = bench::peaks(gpu)?;
+    let peaks = peaks(gpu)?;
     let timings = match config.gaussians_move() {
         true => time_gaussians(args, gpu, config, dataset, &tuning)?,
         false => time_network(args, gpu, config, dataset, &tuning)?,
     };
     let frame_rates = match args.render {
         false => Vec::new(),
-        true => {
-            // Any parameters cost the same, so untrained ones serve.
-            let mut trainer = Trainer::new(gpu, Plan::new(config, dataset)?, dataset, tuning.clone())?;
-            // But for Gaussians, which cost the more the larger they are.
-            while trainer.step() < config.gaussian_iterations() {
-                trainer.advance(config.gaussian_iterations())?;
-            }
-            let model = trainer.model()?;
-            let renderer = Arc::new(Renderer::new(gpu, &model, tuning.clone())?);
-            measure_frame_rates(&renderer, &model, Component::Total, &[200, 512], 2.0)?
-        }
+        true => frame_rates(gpu, config, dataset, &tuning)?,
     };
     let full = match args.full {
         false => None,
-        true => {
-            let directory = scratch.join("run");
-            let never = AtomicBool::new(false);
-            let options = RunOptions { tuning: &tuning, run: &directory, resume: false, stop_at: None, cancel: &never };
-            let (mut curve, mut train_s, mut elapsed_s) = (Vec::new(), 0.0, 0.0);
-            reconstruct(gpu, config, dataset, &options, &mut |event| match event {
-                Event::Validation { step, train_s, dice_dynamic, .. } => curve.push((*step, *train_s, *dice_dynamic)),
-                Event::Finished { train_s: t, elapsed_s: e, .. } => (train_s, elapsed_s) = (*t, *e),
-                _ => {}
-            })?;
-            let score = match dataset.validation().is_empty() {
-                true => None,
-                false => {
-                    let scoring = ScoreOptions { threshold_per_mm: None, pictures: None, cancel: &never };
-                    Some(evaluate_model(gpu, &tuning, &newest_model(&directory)?, dataset, &scoring, &mut |_| ())?)
-                }
-            };
-            Some(FullRun {
-                train_s,
-                elapsed_s,
-                curve,
-                dice: score.as_ref().and_then(|s| s.dice.dynamic),
-                psnr: score.map_or(f64::NAN, |s| s.psnr),
-            })
-        }
+        true => Some(run_whole(gpu, config, dataset, &tuning, scratch)?),
     };
     Ok(Report {
         version: env!("CARGO_PKG_VERSION").into(),
@@ -217,7 +167,7 @@ fn measure(
         driver: gpu.info().driver.clone(),
         paths: timings.paths,
         preset: config.preset.name().into(),
-        config: serde_json::to_value(config).map_err(|e| Error::Internal(e.to_string()))?,
+        config: serde_json::to_value(config).map_err(internal)?,
         rays: timings.rays,
         peaks,
         network_cost: timings.network_cost,
@@ -225,10 +175,49 @@ fn measure(
         before: timings.before,
         after: timings.after,
         whole_run_s: timings.whole_run_s,
-        passes_ms: timings.passes_ms,
+        passes_ms: timings.passes.iter().map(|(name, pass)| (name.clone(), pass.ms)).collect(),
+        passes_per_iteration: timings.passes.into_iter().map(|(name, pass)| (name, pass.count)).collect(),
+        work: timings.work,
         frame_rates,
         full,
+        left_out: LEFT_OUT.into(),
+        tuning: serde_json::to_value(&tuning).map_err(internal)?,
+        host: Host::this(),
     })
+}
+
+/// Frames per second of the fields as a run begins with them: any parameters of a network cost the same.
+fn frame_rates(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Vec<FrameRate>> {
+    let mut trainer = Trainer::new(gpu, Plan::new(config, dataset)?, dataset, tuning.clone())?;
+    // But for Gaussians, which cost the more the larger they are.
+    while trainer.step() < config.gaussian_iterations() {
+        trainer.advance(config.gaussian_iterations())?;
+    }
+    let model = trainer.model()?;
+    let renderer = Arc::new(Renderer::new(gpu, &model, tuning.clone())?);
+    measure_frame_rates(&renderer, &model, Component::Total, &[200, 512], 2.0)
+}
+
+/// The whole run, really run.
+fn run_whole(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, scratch: &Path) -> Result<FullRun> {
+    let directory = scratch.join("run");
+    let never = AtomicBool::new(false);
+    let options = RunOptions { tuning, run: &directory, resume: false, stop_at: None, cancel: &never };
+    let (mut curve, mut train_s, mut elapsed_s) = (Vec::new(), 0.0, 0.0);
+    reconstruct(gpu, config, dataset, &options, &mut |event| match event {
+        Event::Validation { step, train_s, dice_dynamic, .. } => curve.push((*step, *train_s, *dice_dynamic)),
+        Event::Finished { train_s: t, elapsed_s: e, .. } => (train_s, elapsed_s) = (*t, *e),
+        _ => {}
+    })?;
+    let score = match dataset.validation().is_empty() {
+        true => None,
+        false => {
+            let scoring = ScoreOptions { threshold_per_mm: None, pictures: None, cancel: &never };
+            Some(evaluate_model(gpu, tuning, &newest_model(&directory)?, dataset, &scoring, &mut |_| ())?)
+        }
+    };
+    let dice = score.as_ref().and_then(|s| s.dice.dynamic);
+    Ok(FullRun { train_s, elapsed_s, curve, dice, psnr: score.map(|s| s.psnr) })
 }
 
 /// What was timed of a run.
@@ -240,7 +229,12 @@ struct Timings {
     before: Option<Timing>,
     after: Option<Timing>,
     whole_run_s: f64,
-    passes_ms: BTreeMap<String, f64>,
+    passes: Passes,
+    work: Ledger,
+}
+
+fn internal(error: serde_json::Error) -> Error {
+    Error::Internal(error.to_string())
 }
 
 /// Times a run whose moving field is the network.
@@ -248,10 +242,10 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
     let delay = config.dynamic.delay.min(config.train.iterations);
     let before = match delay {
         0 => None,
-        _ => Some(Subject::new(gpu, config, dataset, tuning, false)?.time(args.iterations, args.repeats)?),
+        _ => Some(Subject::new(gpu, config, dataset, tuning, false)?.time(&args.pace())?),
     };
     let mut subject = Subject::new(gpu, config, dataset, tuning, true)?;
-    let after = subject.time(args.iterations, args.repeats)?;
+    let after = subject.time(&args.pace())?;
     let whole_run_s = 1e-3
         * (before.as_ref().map_or(0.0, Timing::median) * f64::from(delay)
             + after.median() * f64::from(config.train.iterations - delay));
@@ -259,24 +253,24 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
         paths: subject.notes(),
         rays: subject.rays(),
         network_cost: Some(subject.cost()),
+        work: subject.work(after.live_samples),
         gaussians: None,
         before,
         after: Some(after),
         whole_run_s,
-        passes_ms: subject.passes(PROFILED.min(args.iterations))?,
+        passes: subject.passes(args.profiled())?,
     })
 }
 
 /// Times a run whose moving field is made of Gaussians: their iterations, then those of the still field.
 fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
-    let profiled = PROFILED.min(args.iterations);
-    let mut fit = GaussianSubject::new(gpu, config, dataset, args.iterations * args.repeats + profiled)?;
-    let gaussians = fit.time(args.iterations, args.repeats)?;
-    let mut passes_ms = fit.passes(profiled)?;
-    drop(fit);
+    let (pace, profiled) = (args.pace(), args.profiled());
+    let fits = GaussianSubject::new(gpu, config, dataset, pace.length, profiled)?;
+    let (gaussians, mut passes) = fits.time(&pace, profiled)?;
+    drop(fits);
     let mut still = Subject::new(gpu, config, dataset, tuning, false)?;
-    let before = still.time(args.iterations, args.repeats)?;
-    passes_ms.extend(still.passes(profiled)?);
+    let before = still.time(&pace)?;
+    passes.extend(still.passes(profiled)?);
     let first = config.gaussian_iterations();
     let whole_run_s = gaussians.preparation_s
         + 1e-3 * (gaussians.median() * f64::from(first) + before.median() * f64::from(config.train.iterations - first));
@@ -288,146 +282,8 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
         before: Some(before),
         after: None,
         whole_run_s,
-        passes_ms,
+        passes,
+        // Of the still field alone, whose stages have none but for the optimiser; the network, which nobody asks, sees no sample.
+        work: Ledger::new(),
     })
-}
-
-/// Whether a pass is one over pairs of a Gaussian and a pixel, whose operations are counted.
-fn is_over_pairs(pass: &str) -> bool {
-    ["gaussian_splat", "gaussian_moments"].iter().any(|stage| pass.starts_with(stage))
-}
-
-/// Whether a pass belongs to the network whose operations are counted.
-fn is_network(pass: &str) -> bool {
-    pass.starts_with("mlp_layer") || pass.starts_with("mlp_out") || pass.starts_with("mlp_fused")
-}
-
-fn clock(seconds: f64) -> String {
-    format!("{:02}:{:02}", seconds as u64 / 60, seconds as u64 % 60)
-}
-
-fn print(report: &Report, kernels: bool) {
-    out!("{} ({}), nertca-vk {} {}", report.device, report.driver, report.version, report.commit);
-    report.paths.iter().for_each(|p| out!("- {p}"));
-    let p = &report.peaks;
-    let matrix = p.matrix_tflops.map_or("none".to_owned(), |t| format!("{t:.3} TFLOP/s"));
-    out!("peaks: f32 {:.3} TFLOP/s, f16 matrices {matrix}, copy {:.1} GB/s", p.f32_tflops, p.copy_gb_per_s);
-    out!("preset {}, {} rays per iteration", report.preset, report.rays);
-    if let Some(gaussians) = &report.gaussians {
-        print_gaussians(report, gaussians);
-    }
-    if let Some(before) = &report.before {
-        let name = if report.gaussians.is_some() { "still field after them" } else { "before the network starts" };
-        print_times(name, &before.ms, before.median(), before.host_cpu_share);
-    }
-    if let Some(after) = &report.after {
-        print_network(report, after);
-    }
-    let speedup = PAPER_SECONDS / report.whole_run_s;
-    out!("whole run: {} against 37:00 of the paper, extrapolated: {speedup:.3} x as fast", clock(report.whole_run_s));
-    if let Some(full) = &report.full {
-        out!(
-            "whole run, really run: {:.1} s of training ({:.2} x as fast as 37:00), {:.1} s in all; Dice {}, PSNR {:.2} dB",
-            full.train_s,
-            PAPER_SECONDS / full.train_s,
-            full.elapsed_s,
-            full.dice.map_or("-".into(), |d| format!("{d:.3}")),
-            full.psnr
-        );
-        for (step, seconds, dice) in &full.curve {
-            out!("  {step:6} iterations {seconds:8.1} s: Dice {}", dice.map_or("-".into(), |d| format!("{d:.3}")));
-        }
-    }
-    print_frame_rates(&report.frame_rates);
-    if kernels {
-        let mut passes: Vec<_> = report.passes_ms.iter().collect();
-        passes.sort_by(|a, b| b.1.total_cmp(a.1));
-        passes.iter().for_each(|(name, ms)| out!("{name:32} {ms:9.3} ms"));
-    }
-}
-
-/// Times of an iteration, in a line.
-fn print_times(name: &str, ms: &[f64], median: f64, host_cpu_share: Option<f64>) {
-    let (low, high) = ms.iter().fold((f64::INFINITY, 0f64), |(l, h), ms| (l.min(*ms), h.max(*ms)));
-    let cpu = host_cpu_share.map_or(String::new(), |s| format!(", process uses {s:.2} CPUs"));
-    out!("{name:25}: {median:.3} ms per iteration (median of {}; {low:.3} to {high:.3}){cpu}", ms.len());
-}
-
-/// Milliseconds of some passes together.
-fn ms_of(report: &Report, belongs: impl Fn(&str) -> bool) -> f64 {
-    report.passes_ms.iter().filter(|(name, _)| belongs(name)).map(|(_, ms)| ms).sum()
-}
-
-fn print_gaussians(report: &Report, gaussians: &GaussianTiming) {
-    let GaussianTiming { form, count, work, .. } = gaussians;
-    out!("{count} Gaussians, form {form}; {:.2} s before their first iteration", gaussians.preparation_s);
-    let ms = gaussians.median();
-    print_times("Gaussians", &gaussians.ms, ms, gaussians.host_cpu_share);
-    out!(
-        "  {} pairs of a Gaussian and a pixel: {:.3e} pairs/s, {:.4} TFLOP/s and {:.2} GB/s over whole iterations",
-        work.pairs,
-        work.pairs as f64 / ms * 1e3,
-        work.gflop / ms,
-        work.megabytes / ms
-    );
-    let pairs_ms = ms_of(report, is_over_pairs);
-    if pairs_ms > 0.0 {
-        let tflops = work.gflop / pairs_ms;
-        let share = 100.0 * tflops / report.peaks.f32_tflops;
-        out!("  passes over pairs alone: {tflops:.4} TFLOP/s: {share:.0} % of the f32 peak");
-    }
-}
-
-fn print_network(report: &Report, after: &Timing) {
-    let ms = after.median();
-    print_times("with the network", &after.ms, ms, after.host_cpu_share);
-    let live = after.live_samples;
-    out!(
-        "  {live} live samples: {:.3e} samples/s, {:.4} TFLOP/s over whole iterations",
-        live as f64 / ms * 1e3,
-        after.network_gflop / ms
-    );
-    let network_ms = ms_of(report, is_network);
-    if network_ms > 0.0 {
-        let tflops = after.network_gflop / network_ms;
-        let of = |peak: f64| 100.0 * tflops / peak;
-        let matrices = report.peaks.matrix_tflops;
-        let share = matrices.map_or(String::new(), |m| format!(", {:.0} % of the matrix peak", of(m)));
-        out!(
-            "  network passes alone: {tflops:.4} TFLOP/s: {:.0} % of the f32 peak{share}",
-            of(report.peaks.f32_tflops)
-        );
-    }
-}
-
-fn compare(this: &Report, other: &Report) {
-    out!("compared with {} on {} (ratios: this / other):", other.commit, other.device);
-    if (&this.device, &this.driver) != (&other.device, &other.driver) {
-        out!("  another device or driver");
-    }
-    if this.config != other.config || this.rays != other.rays {
-        out!("  another configuration: see both files");
-    }
-    let ratio = |name: &str, a: f64, b: f64| out!("  {name:32} {:6.3}  ({a:.3} / {b:.3})", a / b);
-    if let (Some(a), Some(b)) = (&this.gaussians, &other.gaussians) {
-        ratio("Gaussians, ms", a.median(), b.median());
-        ratio("before the first of them, s", a.preparation_s, b.preparation_s);
-    }
-    if let (Some(a), Some(b)) = (&this.before, &other.before) {
-        ratio("without the network, ms", a.median(), b.median());
-    }
-    if let (Some(a), Some(b)) = (&this.after, &other.after) {
-        ratio("with the network, ms", a.median(), b.median());
-    }
-    ratio("whole run, extrapolated, s", this.whole_run_s, other.whole_run_s);
-    for (name, ms) in &this.passes_ms {
-        if let Some(theirs) = other.passes_ms.get(name) {
-            ratio(name, *ms, *theirs);
-        }
-    }
-    for rate in &this.frame_rates {
-        if let Some(theirs) = other.frame_rates.iter().find(|r| (&r.way, r.size) == (&rate.way, rate.size)) {
-            ratio(&format!("{} {}, frames/s", rate.way, rate.size), rate.fps, theirs.fps);
-        }
-    }
 }

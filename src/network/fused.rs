@@ -20,8 +20,11 @@ use crate::kernels::stages::{Build, Stage};
 use crate::kernels::tuning::Tuning;
 use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
+use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
-use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
+use crate::network::{
+    F16_BYTES, GradientBuffers, PartialSums, Path, Purpose, SAMPLE_BYTES, Tiles, built_for_rendering,
+};
 
 /// Shared memory beside the tiles, bytes.
 const SHARED_RESERVE: u32 = 512;
@@ -401,7 +404,38 @@ impl FusedNetwork {
     }
 }
 
+/// Least work of the passes, with so many columns of weights on the encoding. Forward, encoding and activations are kept;
+/// backward, each pass reads its layer's dz and input, and leaves the dz of the layer below.
+fn work(params: &NetworkMap, encoded: u64, samples: u64) -> Ledger {
+    let width = params.width as u64;
+    let mut ledger = Ledger::new();
+    let mut count = |stage: &str, flop: u64, numbers: u64, bytes: u64| {
+        add(&mut ledger, stage, StageWork::per_item(samples, flop, numbers * F16_BYTES + bytes));
+    };
+    count("mlp_fused_fwd", 2 * width, encoded, SAMPLE_BYTES);
+    for (l, layer) in params.layers.iter().enumerate() {
+        count("mlp_fused_fwd", 0, width, 0);
+        if layer.encoded.is_some() {
+            count("mlp_fused_fwd", 2 * width * params.encoded_len as u64, 0, 0);
+            count("mlp_fused_bwd", 2 * width * params.encoded_len as u64, width + encoded, 0);
+        }
+        if layer.hidden.is_some() {
+            count("mlp_fused_fwd", 2 * width * width, 0, 0);
+            count("mlp_fused_bwd", 4 * width * width, 3 * width, 0);
+        }
+        if l + 1 == params.layers.len() {
+            // The last dz comes from the output, where the loss is.
+            count("mlp_fused_bwd", 4 * width, 0, SAMPLE_BYTES);
+        }
+    }
+    ledger
+}
+
 impl Path for FusedNetwork {
+    fn work(&self, params: &NetworkMap, samples: u64) -> Ledger {
+        work(params, self.shape.encoded as u64, samples)
+    }
+
     fn find(&self, name: Binding) -> Option<&Buffer> {
         self.buffers.find(name)
     }
@@ -447,5 +481,26 @@ impl Path for FusedNetwork {
             &bound,
             push::GradientNetwork { first: 0, count, splits, n_partials },
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Preset};
+    use crate::model::params::ParamMap;
+    use crate::network::cost::NetworkCost;
+
+    #[test]
+    fn the_papers_network_moves_four_kilobytes_a_sample() {
+        let params = ParamMap::new(&Config::preset(Preset::Paper), 10);
+        // 63 numbers and 10 phases, filled up to 80 columns.
+        let (ledger, cost) = (work(&params.moving, 80, 1_000_000_000), NetworkCost::of(&params));
+        let [forward, backward] = ["mlp_fused_fwd", "mlp_fused_bwd"].map(|stage| ledger[stage]);
+        assert_eq!(forward.gflop as u64, cost.forward);
+        assert_eq!(backward.gflop as u64, cost.weights + cost.inputs);
+        // Two bytes of 80 columns and 4 x 128 activations; three passes of 3 x 128 numbers and one of 128 + 80.
+        assert_eq!(forward.megabytes as u64, 1_000 * (160 + 4 * 256 + SAMPLE_BYTES));
+        assert_eq!(backward.megabytes as u64, 1_000 * (3 * 768 + 256 + 160 + SAMPLE_BYTES));
     }
 }

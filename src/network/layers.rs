@@ -12,8 +12,11 @@ use crate::kernels::stages::LayerKernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::params::{Layer, NetworkMap};
 use crate::network::chunk::{Chunk, chunk_rays};
+use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
-use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
+use crate::network::{
+    F32_BYTES, GradientBuffers, PartialSums, Path, Purpose, SAMPLE_BYTES, Tiles, built_for_rendering,
+};
 
 /// Kernels and buffers of the f32 network.
 pub(super) struct LayerNetwork {
@@ -189,7 +192,37 @@ fn in_partials(params: &NetworkMap, at: usize) -> u32 {
     (at - params.first) as u32
 }
 
+/// Least work of the stages: every one reads what the one before it wrote.
+fn work(params: &NetworkMap, samples: u64) -> Ledger {
+    let (width, encoded) = (params.width as u64, 4 * params.encode_groups as u64);
+    let mut ledger = Ledger::new();
+    let mut count = |stage: &str, flop: u64, numbers: u64, bytes: u64| {
+        add(&mut ledger, stage, StageWork::per_item(samples, flop, numbers * F32_BYTES + bytes));
+    };
+    count("encode", 0, encoded, SAMPLE_BYTES);
+    for layer in &params.layers {
+        let inputs =
+            [layer.encoded.map(|_| (params.encoded_len as u64, encoded)), layer.hidden.map(|_| (width, width))];
+        for (used, stored) in inputs.into_iter().flatten() {
+            count("mlp_layer_fwd", 2 * width * used, stored, 0);
+            count("mlp_layer_bwd_weight", 2 * width * used, width + stored, 0);
+        }
+        count("mlp_layer_fwd", 0, width, 0);
+        if layer.hidden.is_some() {
+            count("mlp_layer_bwd_input", 2 * width * width, 3 * width, 0);
+        }
+    }
+    count("mlp_out_fwd", 2 * width, width, SAMPLE_BYTES);
+    count("mlp_out_bwd", 2 * width, 2 * width + 1, SAMPLE_BYTES);
+    count("mlp_out_bwd_weight", 2 * width, width + 1, 0);
+    ledger
+}
+
 impl Path for LayerNetwork {
+    fn work(&self, params: &NetworkMap, samples: u64) -> Ledger {
+        work(params, samples)
+    }
+
     fn find(&self, name: Binding) -> Option<&Buffer> {
         self.buffers.find(name).or_else(|| self.training.as_ref()?.sums.find(name))
     }
@@ -262,5 +295,25 @@ impl Path for LayerNetwork {
 
     fn record_phase_sums(&self, _: &mut Pass<'_>, _: &GradientBuffers) -> Result<()> {
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Config, Preset};
+    use crate::model::params::ParamMap;
+    use crate::network::cost::NetworkCost;
+
+    #[test]
+    fn operations_of_the_stages_are_those_of_the_network() {
+        for preset in [Preset::Paper, Preset::PublicCode, Preset::FastMlp] {
+            let params = ParamMap::new(&Config::preset(preset), 10);
+            let (ledger, cost) = (work(&params.moving, 1_000_000_000), NetworkCost::of(&params));
+            let flop = |stages: &[&str]| stages.iter().map(|stage| ledger[*stage].gflop).sum::<f64>() as u64;
+            assert_eq!(flop(&["mlp_layer_fwd", "mlp_out_fwd"]), cost.forward);
+            assert_eq!(flop(&["mlp_layer_bwd_weight", "mlp_out_bwd_weight"]), cost.weights);
+            assert_eq!(flop(&["mlp_layer_bwd_input", "mlp_out_bwd"]), cost.inputs);
+        }
     }
 }

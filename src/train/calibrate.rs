@@ -8,7 +8,7 @@ use crate::gpu::capabilities::DeviceInfo;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::scan::dataset::Dataset;
-use crate::train::timing::Subject;
+use crate::train::timing::{Length, Pace, Subject};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -43,6 +43,9 @@ impl Verdict {
     }
 }
 
+/// Both paths after the same warming up: the first must not pay for clocks that rise.
+const PACE: Pace = Pace { warm_up_s: 0.5, repeats: 5, length: Length::Seconds(0.05) };
+
 /// Times both paths on the task at hand.
 ///
 /// # Errors
@@ -50,7 +53,7 @@ impl Verdict {
 pub fn measure(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Verdict> {
     let time = |layers: Layers| -> Result<f64> {
         let path = tuning.clone().with_layers(layers, String::new());
-        Ok(Subject::new(gpu, config, dataset, &path, true)?.time(2, 3)?.median())
+        Ok(Subject::new(gpu, config, dataset, &path, true)?.time(&PACE)?.median())
     };
     Ok(Verdict { f32_ms: time(Layers::F32)?, matrices_ms: time(Layers::Matrices)? })
 }
@@ -59,10 +62,10 @@ const FILE: &str = "paths.json";
 
 /// What a verdict holds for.
 fn key(info: &DeviceInfo, config: &Config) -> String {
-    let d = &config.dynamic;
+    let (d, rays, samples) = (&config.dynamic, config.train.rays, config.march.dynamic_samples);
     let networks = if config.two_networks() { "two networks of " } else { "" };
     format!(
-        "{} | {} | {} | {networks}{} layers of {}, skip {}, {} bands",
+        "{} | {} | {} | {networks}{} layers of {}, skip {}, {} bands | {rays} rays of {samples} samples",
         info.uuid,
         info.driver,
         env!("CARGO_PKG_VERSION"),

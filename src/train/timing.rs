@@ -1,5 +1,6 @@
 //! Timing of training iterations.
 
+use crate::bench::sensors::{Readings, Watch};
 use crate::choice::Choice;
 use crate::config::Config;
 use crate::config::sections::Tree;
@@ -9,13 +10,35 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::kernels::tuning::Tuning;
 use crate::network::cost::NetworkCost;
+use crate::network::ledger::Ledger;
 use crate::plan::Plan;
+use crate::plan::targets::Targets;
 use crate::scan::dataset::Dataset;
 use crate::train::moving::MovingFit;
 use crate::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
+
+/// How long is measured.
+#[derive(Debug, Clone, Copy)]
+pub struct Pace {
+    /// Least time of iterations before any is timed, seconds: the clocks of a GPU take some to come to rest.
+    pub warm_up_s: f64,
+    /// Timed repeats.
+    pub repeats: u32,
+    /// Length of one.
+    pub length: Length,
+}
+
+/// Length of a timed repeat.
+#[derive(Debug, Clone, Copy)]
+pub enum Length {
+    /// So many iterations; of Gaussians, as many of a fit's first at most.
+    Iterations(u32),
+    /// About so many seconds; of Gaussians, whole fits, as many as fill all repeats.
+    Seconds(f64),
+}
 
 /// Times of some iterations.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -28,6 +51,15 @@ pub struct Timing {
     pub network_gflop: f64,
     /// Host CPU seconds per second of training, all threads of the process; a CPU driver's work is among them.
     pub host_cpu_share: Option<f64>,
+    /// Iterations of each repeat; not told in reports of before.
+    #[serde(default)]
+    pub iterations: u32,
+    /// Iterations that the fields had learned for before the first repeat.
+    #[serde(default)]
+    pub learned: u32,
+    /// Clock, power and temperature meanwhile, where the system tells.
+    #[serde(default)]
+    pub readings: Option<Readings>,
 }
 
 impl Timing {
@@ -44,14 +76,21 @@ pub struct GaussianTiming {
     pub form: String,
     /// Gaussians after the timed iterations.
     pub count: u32,
-    /// Seconds from targets to the first iteration: seeds, and of a tree the sets per phase and the tracking of its grid.
+    /// Seconds from targets to the first iteration, median of the repeats: seeds, and of a tree the sets per phase and the
+    /// tracking of its grid.
     pub preparation_s: f64,
-    /// Milliseconds per iteration of each repeat; the fit goes on from one to the next.
+    /// Milliseconds per iteration of each repeat, which is a fit of its own.
     pub ms: Vec<f64>,
     /// Host CPU seconds per second of the fit, all threads of the process; a CPU driver's work is among them.
     pub host_cpu_share: Option<f64>,
     /// Work of the last timed iteration.
     pub work: GaussianWork,
+    /// Iterations of each repeat; not told in reports of before.
+    #[serde(default)]
+    pub iterations: u32,
+    /// Clock, power and temperature meanwhile, where the system tells.
+    #[serde(default)]
+    pub readings: Option<Readings>,
 }
 
 impl GaussianTiming {
@@ -76,34 +115,63 @@ fn cpu_time() -> Option<Duration> {
     Some(Duration::from_millis(10 * ticks))
 }
 
-/// Milliseconds per iteration of `repeats` times `iterations` iterations that `run` runs, and CPU seconds per second.
-fn time_repeats(iterations: u32, repeats: u32, mut run: impl FnMut() -> Result<()>) -> Result<(Vec<f64>, Option<f64>)> {
-    let (cpu, all, mut ms) = (cpu_time(), Instant::now(), Vec::new());
-    for _ in 0..repeats {
-        let begin = Instant::now();
-        run()?;
-        ms.push(begin.elapsed().as_secs_f64() * 1e3 / f64::from(iterations));
+/// What the host and the device showed while something ran.
+struct Meanwhile {
+    cpu: Option<Duration>,
+    begin: Instant,
+    watch: Option<Watch>,
+}
+
+impl Meanwhile {
+    fn begin(gpu: &Gpu) -> Meanwhile {
+        Meanwhile { cpu: cpu_time(), begin: Instant::now(), watch: Watch::begin(gpu.info()) }
     }
-    let share = cpu.zip(cpu_time()).map(|(before, after)| (after - before).as_secs_f64() / all.elapsed().as_secs_f64());
-    Ok((ms, share))
+
+    /// CPU seconds per second, and the device's sensors.
+    fn end(self) -> (Option<f64>, Option<Readings>) {
+        let share =
+            |(before, after): (Duration, Duration)| (after - before).as_secs_f64() / self.begin.elapsed().as_secs_f64();
+        (self.cpu.zip(cpu_time()).map(share), self.watch.and_then(Watch::end))
+    }
+}
+
+/// Passes of an iteration by their stages' names.
+pub type Passes = BTreeMap<String, PassMean>;
+
+/// All passes of a stage in an iteration.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct PassMean {
+    /// How many there are.
+    pub count: f64,
+    /// Milliseconds of all of them, each kept apart from the others.
+    pub ms: f64,
 }
 
 /// Adds the passes of an iteration to means over `iterations`.
-fn add_passes(means: &mut BTreeMap<String, f64>, passes: Vec<PassTime>, iterations: u32) {
+fn add_passes(means: &mut Passes, passes: Vec<PassTime>, iterations: u32) {
     for pass in passes {
-        *means.entry(pass.name.to_owned()).or_default() += pass.ms / f64::from(iterations);
+        let mean = means.entry(pass.name.to_owned()).or_default();
+        mean.count += 1.0 / f64::from(iterations);
+        mean.ms += pass.ms / f64::from(iterations);
     }
 }
 
-/// A run to time: nothing is learned, so that a schedule's high learning rates cannot make it diverge; work does not
-/// depend on the parameters' values.
+/// A run to time. It learns, slowly, so that operands are those of a field that has learned something and a schedule's high
+/// rates cannot make it diverge; all bands of the encoding are open.
 pub struct Subject {
+    gpu: Gpu,
     trainer: Trainer,
     cost: NetworkCost,
     n_rays: u32,
+    /// Iterations that there is a schedule for.
+    most: u32,
 }
 
-/// Iterations before anything is timed.
+/// Share of its last learning rates that a timed run learns with.
+const SLOWLY: f64 = 0.1;
+/// Iterations that a schedule is made for, at most; nothing is timed longer.
+const MOST_ITERATIONS: u32 = 300_000;
+/// Iterations before anything is timed, at least: a CPU's driver compiles in the first.
 const WARM_UP: u32 = 4;
 
 impl Subject {
@@ -114,22 +182,21 @@ impl Subject {
     /// Errors of the configuration, the data and the device.
     pub fn new(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, with_network: bool) -> Result<Subject> {
         let mut config = config.clone();
-        config.train.iterations = config.train.iterations.max(30_000);
-        for rate in [
-            &mut config.dynamic.lr,
-            &mut config.dynamic.lr_end,
-            &mut config.static_field.lr,
-            &mut config.static_field.lr_end,
-        ] {
-            *rate = 0.0;
-        }
+        let most = MOST_ITERATIONS.min(u32::MAX / config.train.rays);
+        config.train.iterations = most;
+        let (dynamic, still) = (&mut config.dynamic, &mut config.static_field);
+        dynamic.window_start = dynamic.bands.into();
+        dynamic.lr_end *= SLOWLY;
+        still.lr_end *= SLOWLY;
+        (dynamic.lr, still.lr) = (dynamic.lr_end, still.lr_end);
         // As few Gaussians' iterations as can be, which leave the still field the same work.
         config.gaussians.iterations = 1;
         config.tree = Tree { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.tree };
         config.dynamic.delay = if with_network { 0 } else { config.train.iterations };
         let plan = Plan::new(&config, dataset)?;
         let (cost, n_rays) = (NetworkCost::of(&plan.params), plan.setup.n_rays);
-        let mut subject = Subject { trainer: Trainer::new(gpu, plan, dataset, tuning.clone())?, cost, n_rays };
+        let trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
+        let mut subject = Subject { gpu: gpu.clone(), trainer, cost, n_rays, most };
         subject.run(config.gaussian_iterations() + WARM_UP)?;
         Ok(subject)
     }
@@ -149,6 +216,11 @@ impl Subject {
         self.cost
     }
 
+    /// Least work of an iteration's stages with so many live samples.
+    pub fn work(&self, live_samples: u64) -> Ledger {
+        self.trainer.work(live_samples)
+    }
+
     fn run(&mut self, n: u32) -> Result<u64> {
         let target = self.trainer.step() + n;
         let mut live = 0;
@@ -158,26 +230,48 @@ impl Subject {
         Ok(live)
     }
 
-    /// Times `repeats` times `iterations` iterations.
+    /// Warms up, and times repeats.
     ///
     /// # Errors
-    /// Device errors.
-    pub fn time(&mut self, iterations: u32, repeats: u32) -> Result<Timing> {
-        let mut live_samples = 0;
-        let (ms, host_cpu_share) = time_repeats(iterations, repeats, || {
+    /// [`Error::Diverged`]; device errors.
+    pub fn time(&mut self, pace: &Pace) -> Result<Timing> {
+        let ms_before = self.warm_up(pace.warm_up_s)?;
+        let left = self.most.saturating_sub(self.trainer.step()) / 2 / pace.repeats;
+        let iterations = match pace.length {
+            Length::Iterations(n) => n,
+            Length::Seconds(seconds) => ((1e3 * seconds / ms_before).ceil() as u32).clamp(1, left.max(1)),
+        };
+        let (learned, mut live_samples, mut ms) = (self.trainer.step(), 0, Vec::new());
+        let meanwhile = Meanwhile::begin(&self.gpu);
+        for _ in 0..pace.repeats {
+            let begin = Instant::now();
             live_samples = self.run(iterations)?;
-            Ok(())
-        })?;
+            ms.push(begin.elapsed().as_secs_f64() * 1e3 / f64::from(iterations));
+        }
+        let (host_cpu_share, readings) = meanwhile.end();
         let network_gflop = live_samples as f64 * self.cost.total() as f64 * 1e-9;
-        Ok(Timing { ms, live_samples, network_gflop, host_cpu_share })
+        Ok(Timing { ms, live_samples, network_gflop, host_cpu_share, iterations, learned, readings })
+    }
+
+    /// Runs for so many seconds, an iteration at least; milliseconds of one.
+    fn warm_up(&mut self, seconds: f64) -> Result<f64> {
+        let (begin, mut done) = (Instant::now(), 0);
+        while done == 0 || (begin.elapsed().as_secs_f64() < seconds && self.trainer.step() < self.most / 2) {
+            // As many as the time so far makes a tenth of the whole, so that submits stay full.
+            let rate = f64::from(done) / begin.elapsed().as_secs_f64().max(1e-9);
+            let n = ((0.1 * seconds * rate) as u32).clamp(1, (self.most / 20).max(1));
+            self.run(n)?;
+            done += n;
+        }
+        Ok(begin.elapsed().as_secs_f64() * 1e3 / f64::from(done))
     }
 
     /// Milliseconds of each pass, kept apart, averaged over `iterations`.
     ///
     /// # Errors
     /// Device errors.
-    pub fn passes(&mut self, iterations: u32) -> Result<BTreeMap<String, f64>> {
-        let mut passes = BTreeMap::new();
+    pub fn passes(&mut self, iterations: u32) -> Result<Passes> {
+        let mut passes = Passes::new();
         for _ in 0..iterations {
             add_passes(&mut passes, self.trainer.profile_step()?, iterations);
         }
@@ -185,21 +279,43 @@ impl Subject {
     }
 }
 
-/// A fit of Gaussians to time. It is a real one from its seeds on: its work depends on how large Gaussians become.
+/// Fits of Gaussians to time: real ones from their seeds on, as their work depends on how large Gaussians become.
 pub struct GaussianSubject {
+    gpu: Gpu,
+    targets: Targets,
+    config: Config,
+    /// Iterations of a fit that are timed.
+    timed: u32,
+}
+
+/// A fit that was timed.
+struct TimedFit {
     fit: MovingFit,
     preparation_s: f64,
+    /// Per iteration.
+    ms: f64,
 }
 
 impl GaussianSubject {
-    /// Prepares the fit of a configuration whose moving field is made of Gaussians, with `most` iterations to time and to
-    /// profile, or as many as the configuration has if these are more.
+    /// Prepares fits of a configuration whose moving field is made of Gaussians, of which `profiled` more iterations may be
+    /// timed pass by pass.
     ///
     /// # Errors
-    /// [`Error::Config`] where the network moves; errors of the configuration, the data and the device.
-    pub fn new(gpu: &Gpu, config: &Config, dataset: &Dataset, most: u32) -> Result<GaussianSubject> {
+    /// [`Error::Config`] where the network moves; errors of the configuration and the data.
+    pub fn new(
+        gpu: &Gpu,
+        config: &Config,
+        dataset: &Dataset,
+        length: Length,
+        profiled: u32,
+    ) -> Result<GaussianSubject> {
         let mut config = config.clone();
-        config.gaussians.iterations = config.gaussians.iterations.max(most + WARM_UP);
+        let of_fit = config.gaussians.iterations.saturating_sub(WARM_UP).max(1);
+        let timed = match length {
+            Length::Iterations(n) => n,
+            Length::Seconds(_) => of_fit,
+        };
+        config.gaussians.iterations = config.gaussians.iterations.max(WARM_UP + timed) + profiled;
         let Some(targets) = Plan::new(&config, dataset)?.targets else {
             return Err(Error::config(
                 "gaussians.form",
@@ -207,51 +323,69 @@ impl GaussianSubject {
                 "there are no Gaussians to time",
             ));
         };
+        Ok(GaussianSubject { gpu: gpu.clone(), targets, config, timed })
+    }
+
+    fn fit(&self) -> Result<TimedFit> {
         let begin = Instant::now();
-        let mut subject = GaussianSubject { fit: MovingFit::new(gpu, targets, &config)?, preparation_s: 0.0 };
-        while subject.fit.preparation().is_some() {
-            subject.fit.advance(0)?;
+        let mut fit = MovingFit::new(&self.gpu, self.targets.clone(), &self.config)?;
+        while fit.preparation().is_some() {
+            fit.advance(0)?;
         }
-        subject.preparation_s = begin.elapsed().as_secs_f64();
-        subject.run(WARM_UP)?;
-        Ok(subject)
+        let preparation_s = begin.elapsed().as_secs_f64();
+        run_fit(&mut fit, WARM_UP)?;
+        let begin = Instant::now();
+        run_fit(&mut fit, WARM_UP + self.timed)?;
+        let ms = begin.elapsed().as_secs_f64() * 1e3 / f64::from(self.timed);
+        Ok(TimedFit { fit, preparation_s, ms })
     }
 
-    fn run(&mut self, n: u32) -> Result<()> {
-        let target = self.fit.step() + n;
-        while self.fit.step() < target {
-            if self.fit.advance(target)?.is_empty() {
-                return Err(Error::Internal("the timed fit is over".into()));
-            }
-        }
-        Ok(())
-    }
-
-    /// Times `repeats` times `iterations` iterations.
-    ///
-    /// # Errors
-    /// [`Error::Internal`] beyond the iterations prepared for; device errors.
-    pub fn time(&mut self, iterations: u32, repeats: u32) -> Result<GaussianTiming> {
-        let (ms, host_cpu_share) = time_repeats(iterations, repeats, || self.run(iterations))?;
-        Ok(GaussianTiming {
-            form: self.fit.form().name().into(),
-            count: self.fit.count(),
-            preparation_s: self.preparation_s,
-            ms,
-            host_cpu_share,
-            work: self.fit.work()?,
-        })
-    }
-
-    /// Milliseconds of each pass, kept apart, averaged over `iterations`.
+    /// Warms up by whole fits, times others, and says what the passes of an iteration after the last of them take.
     ///
     /// # Errors
     /// Device errors.
-    pub fn passes(&mut self, iterations: u32) -> Result<BTreeMap<String, f64>> {
-        let mut passes = BTreeMap::new();
-        for _ in 0..iterations {
-            add_passes(&mut passes, self.fit.profile_step()?, iterations);
+    pub fn time(&self, pace: &Pace, profiled: u32) -> Result<(GaussianTiming, Passes)> {
+        let begin = Instant::now();
+        while begin.elapsed().as_secs_f64() < pace.warm_up_s {
+            self.fit()?;
         }
-        Ok(passes)
+        let (begin, meanwhile) = (Instant::now(), Meanwhile::begin(&self.gpu));
+        let mut last = self.fit()?;
+        let (mut ms, mut preparation_s) = (vec![last.ms], vec![last.preparation_s]);
+        let more = |done: usize| match pace.length {
+            Length::Iterations(_) => done < pace.repeats as usize,
+            Length::Seconds(seconds) => begin.elapsed().as_secs_f64() < seconds * f64::from(pace.repeats),
+        };
+        while more(ms.len()) {
+            last = self.fit()?;
+            ms.push(last.ms);
+            preparation_s.push(last.preparation_s);
+        }
+        let (host_cpu_share, readings) = meanwhile.end();
+        let timing = GaussianTiming {
+            form: last.fit.form().name().into(),
+            count: last.fit.count(),
+            preparation_s: median(&preparation_s),
+            ms,
+            host_cpu_share,
+            work: last.fit.work()?,
+            iterations: self.timed,
+            readings,
+        };
+        let mut passes = Passes::new();
+        for _ in 0..profiled {
+            add_passes(&mut passes, last.fit.profile_step()?, profiled);
+        }
+        Ok((timing, passes))
     }
+}
+
+/// Runs a fit up to an iteration.
+fn run_fit(fit: &mut MovingFit, until: u32) -> Result<()> {
+    while fit.step() < until {
+        if fit.advance(until)?.is_empty() {
+            return Err(Error::Internal("the timed fit is over".into()));
+        }
+    }
+    Ok(())
 }

@@ -15,9 +15,10 @@ use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::model::setup::{RING_LENGTH, sample_capacity};
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
+use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
 use crate::network::still::StillNetwork;
-use crate::network::{Network, Purpose, largest_chunk};
+use crate::network::{F32_BYTES, Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::train::losses::{NetworkLosses, StepLoss};
@@ -288,6 +289,18 @@ impl Trainer {
     /// The still field's network, where it is one, for tests.
     pub fn still(&self) -> Option<&StillNetwork> {
         self.still.as_ref()
+    }
+
+    /// Least work of an iteration's stages with so many live samples. What of the still tensor field is looked up stays in caches,
+    /// so its stages over samples are not among them.
+    pub fn work(&self, live_samples: u64) -> Ledger {
+        let mut ledger = self.network.work(live_samples);
+        for (stage, work) in self.still.iter().flat_map(|still| still.network().work(live_samples)) {
+            add(&mut ledger, &stage, work);
+        }
+        // Gradient read, parameter and two moments read and written.
+        add(&mut ledger, "adam", StageWork::per_item(self.plan.params.len as u64, 0, 7 * F32_BYTES));
+        ledger
     }
 
     /// Keeps the device busy towards `until` and returns the losses that became known. Returns with work
