@@ -5,10 +5,13 @@ The counterpart of `nertca-vk bench`, to be run beside it on one machine:
 
     python3 tools/bench-pytorch.py --preset paper --device cuda                 # eager
     python3 tools/bench-pytorch.py --preset paper --device cuda --compile       # torch.compile
+    python3 tools/bench-pytorch.py --preset paper --device cuda --compile --amp --graph   # its best
     python3 tools/bench-pytorch.py --preset paper --rays 256 --device cpu --threads 2
 
-Data are random: time does not depend on them. Only torch is needed. Rays and samples are those of a batch in which
-every dynamic sample is live, as with the authors' code; `--live` keeps a share of them, as a hull does.
+An iteration never waits for the host; Adam is fused where the device is a GPU. Iterations are timed several at a time,
+between two waits, after seconds of warming up. Data are random: time does not depend on them. Only torch is needed.
+Rays and samples are those of a batch in which every dynamic sample is live, as with the authors' code; `--live` keeps a
+share of them, as a hull does.
 """
 
 import argparse
@@ -24,6 +27,8 @@ PRESETS = {
     "fast": dict(rays=1024, static=32, dynamic=128, width=96, layers=4, skip=0, bands=8),
 }
 GRID, RANKS, PHASES, LATENT = 48, 3, 10, 8
+# Factor on the loss while gradients are f16: as many bits as nertca-vk begins with.
+LOSS_SCALE = 65_536.0
 
 
 class StaticField(torch.nn.Module):
@@ -72,7 +77,21 @@ class DynamicField(torch.nn.Module):
         h = inputs
         for i, layer in enumerate(self.hidden):
             h = torch.relu(layer(torch.cat((inputs, h), -1) if self.skip and i == self.skip - 1 else h))
-        return torch.nn.functional.softplus(self.out(h)[:, 0] - 10)
+        return torch.nn.functional.softplus(self.out(h)[:, 0].float() - 10)
+
+
+def captured(iteration):
+    """The iteration as a CUDA graph, after some on a stream of their own, as capturing asks for."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            iteration()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        iteration()
+    return graph.replay
 
 
 def main():
@@ -83,9 +102,12 @@ def main():
     parser.add_argument("--live", type=float, default=1.0, help="share of the dynamic samples that is evaluated")
     parser.add_argument("--compile", action="store_true", help="torch.compile the iteration's forward pass")
     parser.add_argument("--tf32", action="store_true", help="allow TF32 matrix products (CUDA)")
+    parser.add_argument("--amp", action="store_true", help="f16 products and a constant loss scale (CUDA), or bf16 (CPU)")
+    parser.add_argument("--graph", action="store_true", help="replay each iteration as one CUDA graph")
     parser.add_argument("--threads", type=int, help="CPU threads")
-    parser.add_argument("--warm-up", type=int, default=3)
-    parser.add_argument("--iterations", type=int, default=10)
+    parser.add_argument("--warm-up", type=float, default=5.0, help="seconds of iterations before any is timed")
+    parser.add_argument("--sample", type=float, default=10.0, help="seconds that all repeats take together")
+    parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     if args.threads:
@@ -94,13 +116,22 @@ def main():
     torch.manual_seed(1)
     shape = dict(PRESETS[args.preset], **({"rays": args.rays} if args.rays else {}))
     device, rays = torch.device(args.device), shape["rays"]
+    on_gpu = device.type == "cuda"
+    if args.graph and not on_gpu:
+        parser.error("--graph needs a CUDA device")
+    loss_scale = LOSS_SCALE if args.amp and on_gpu else 1.0
     static = StaticField().to(device)
     dynamic = DynamicField(shape["width"], shape["layers"], shape["skip"], shape["bands"]).to(device)
-    optimiser = torch.optim.Adam([*static.parameters(), *dynamic.parameters()], lr=1e-4, betas=(0.9, 0.99))
+    parameters = [*static.parameters(), *dynamic.parameters()]
+    optimiser = torch.optim.Adam(parameters, lr=1e-4, betas=(0.9, 0.99), fused=on_gpu, capturable=args.graph)
     anchor = 0.3 * torch.randn(rays, 1, 3, device=device)
     direction = torch.nn.functional.normalize(torch.randn(rays, 1, 3, device=device), dim=-1)
     target, phase = torch.rand(rays, device=device), torch.randint(PHASES, (rays,), device=device)
     live = torch.rand(rays, shape["dynamic"], device=device) < args.live
+    # Which samples these are is looked up once: finding out makes the device wait for the host.
+    live_at = live.flatten().nonzero()[:, 0]
+    live_rays = live_at // shape["dynamic"]
+    live_phases, n_live = phase[live_rays], len(live_at)
 
     def points(n):
         """Stratified depths of every ray."""
@@ -121,43 +152,56 @@ def main():
     def iteration():
         x_static, dl_static = points(shape["static"])
         x_dynamic, dl_dynamic = points(shape["dynamic"])
-        rays_of = live.nonzero()[:, 0]
-        loss = forward(x_static, dl_static, x_dynamic[live], dl_dynamic[live], rays_of, phase[rays_of], 5.0)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        x_live, dl_live = x_dynamic.flatten(0, 1)[live_at], dl_dynamic.flatten()[live_at]
+        with torch.autocast(device.type, torch.float16 if on_gpu else torch.bfloat16, enabled=args.amp):
+            loss = forward(x_static, dl_static, x_live, dl_live, live_rays, live_phases, 5.0)
+        (loss_scale * loss).backward()
+        if loss_scale != 1.0:
+            torch._foreach_mul_([p.grad for p in parameters], 1.0 / loss_scale)
         optimiser.step()
+        optimiser.zero_grad(set_to_none=not args.graph)
 
     def synchronise():
-        if device.type == "cuda":
+        if on_gpu:
             torch.cuda.synchronize()
 
-    for _ in range(args.warm_up):
-        iteration()
-    ms = []
-    for _ in range(args.iterations):
+    if args.graph:
+        iteration = captured(iteration)
+
+    def run(n):
+        """Milliseconds of an iteration, of n that follow each other."""
         synchronise()
         begin = time.perf_counter()
-        iteration()
+        for _ in range(n):
+            iteration()
         synchronise()
-        ms.append(1e3 * (time.perf_counter() - begin))
+        return 1e3 * (time.perf_counter() - begin) / n
+
+    begin, last = time.perf_counter(), run(1)
+    while time.perf_counter() - begin < args.warm_up:
+        last = run(max(1, int(100 / last)))
+    iterations = max(1, int(1e3 * args.sample / args.repeats / last))
+    ms = [run(iterations) for _ in range(args.repeats)]
     inputs, width = 3 + 6 * shape["bands"], shape["width"]
     hidden = (shape["layers"] - 1) * width * width
     encoded = inputs * width * (2 if shape["skip"] else 1)
     # Latents and biases left out, as nertca-vk counts.
-    gflop = 2e-9 * int(live.sum()) * (2 * (encoded + hidden + width) + hidden + width)
+    gflop = 2e-9 * n_live * (2 * (encoded + hidden + width) + hidden + width)
     median = statistics.median(ms)
     result = dict(
         torch=torch.__version__, device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
-        threads=torch.get_num_threads(), compiled=args.compile, tf32=args.tf32, preset=args.preset, rays=rays,
-        live_samples=int(live.sum()), ms=ms, median_ms=median, network_tflops=gflop / median, cost_gflop=gflop,
+        threads=torch.get_num_threads(), compiled=args.compile, tf32=args.tf32, amp=args.amp, graph=args.graph,
+        preset=args.preset, rays=rays, live_samples=n_live, iterations=iterations, ms=ms, median_ms=median,
+        network_tflops=gflop / median, cost_gflop=gflop,
     )
     if args.json:
         print(json.dumps(result))
     else:
-        way = "compiled" if args.compile else "eager"
+        chosen = [("compiled", args.compile), ("TF32", args.tf32), ("AMP", args.amp), ("CUDA graph", args.graph)]
+        way = ", ".join(name for name, on in chosen if on) or "eager"
         print(f"PyTorch {torch.__version__} on {result['device']} ({result['threads']} threads), {way}, {args.preset}")
-        print(f"{median:.2f} ms per iteration (median of {len(ms)}; {min(ms):.2f} to {max(ms):.2f}), {rays} rays, "
-              f"{result['live_samples']} live samples")
+        print(f"{median:.2f} ms per iteration (median of {len(ms)} times {iterations}; {min(ms):.2f} to {max(ms):.2f}), "
+              f"{rays} rays, {n_live} live samples")
         print(f"{gflop / median:.4f} TFLOP/s over whole iterations; 30,000 of them take {30 * median / 60:.1f} minutes")
 
 
