@@ -4,6 +4,7 @@
 // moments restart where the schedule re-creates the optimiser.
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
@@ -12,7 +13,7 @@ layout(binding = 4) buffer B4 { vec2 moments[]; };
 layout(binding = 5) buffer B5 { float params[]; };
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = invocation();
     if (i >= setup.n_params) return;
     Schedule now = schedule[state.step];
     bool is_static = i < setup.static_params;

@@ -5,6 +5,7 @@
 #include "inc/layout.glsl"
 #include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(push_constant) uniform Push {
     uint n_pixels; uint image_width; uint with_static; uint with_dynamic; uint maximum;
 } push;
@@ -47,7 +48,7 @@ vec2 along(sampler3D volume, Line line, float norm, vec3 low, vec3 high, vec2 de
 }
 
 void main() {
-    uint pixel = gl_GlobalInvocationID.x;
+    uint pixel = invocation();
     if (pixel >= push.n_pixels) return;
     Line line = line_through(views[0], pixel, push.image_width);
     float norm = setup.along_axis != 0u ? 1.0 : length(line.direction);

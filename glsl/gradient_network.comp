@@ -20,6 +20,7 @@ void main() {
     if (at != NOWHERE) {
         for (uint split = 0u; split < push.splits; split++) sum += partials[split * push.n_partials + at];
     }
-    if (isnan(sum) || isinf(sum)) state.overflowed = 1u;
+    // All bits of the exponent: a compiler may assume that isinf and isnan are false.
+    if ((floatBitsToUint(sum) & 0x7f800000u) == 0x7f800000u) state.overflowed = 1u;
     gradient[push.first + i] = sum / state.loss_scale;
 }

@@ -4,6 +4,7 @@
 // One invocation per parameter.
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { float tv_gradient[]; };
 layout(binding = 2) buffer B2 { uint static_gradient[]; };
@@ -22,7 +23,7 @@ float from_fixed(uint parameter) {
 }
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = invocation();
     if (i >= setup.static_params) return;
     gradient[i] = from_fixed(i) + tv_gradient[i];
     static_gradient[2u * i] = 0u;

@@ -83,18 +83,18 @@ void stage(uint first) {
         uvec4 packed;
         if (from_output != 0u) {
             uvec4 outputs = outputs16[push.outputs_at + (first + row) * width8 + q];
-            for (uint i = 0u; i < 4u; i++) {
+            [[unroll]] for (uint i = 0u; i < 4u; i++) {
                 vec2 h = unpackHalf2x16(outputs[i]);
                 out_sum[2u * i] += tile_gradient[row] * h.x;
                 out_sum[2u * i + 1u] += tile_gradient[row] * h.y;
                 vec2 dz = tile_gradient[row] * unpackHalf2x16(out_weights[i]);
-                // Not clamped: an overflow must show in the sums, for the loss scale to give way.
+                dz = vec2(overflowing(dz.x), overflowing(dz.y));
                 packed[i] = packHalf2x16(mix(vec2(0.0), dz, greaterThan(h, vec2(0.0))));
             }
         } else {
             packed = dz16[(first + row) * width8 + q];
         }
-        for (uint i = 0u; i < 4u; i++) {
+        [[unroll]] for (uint i = 0u; i < 4u; i++) {
             vec2 dz = unpackHalf2x16(packed[i]);
             bias_sum[2u * i] += dz.x;
             bias_sum[2u * i + 1u] += dz.y;
@@ -120,9 +120,10 @@ void input_gradient(uint first) {
                 sum = coopMatMulAdd(dz, weights, sum);
             }
             // Element order may differ between component types, so the mask is applied between equal types.
+            [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = overflowing(sum[i]);
             SUM16 gradient = SUM16(sum), on;
             coopMatLoad(on, tile_in, r * m * input_stride + column / 8u, input_stride, ROWS);
-            for (uint i = 0u; i < gradient.length(); i++) {
+            [[unroll]] for (uint i = 0u; i < gradient.length(); i++) {
                 gradient[i] = on[i] > float16_t(0.0) ? gradient[i] : float16_t(0.0);
             }
             coopMatStore(gradient, dz_in16, (first + r * m) * columns8 + column / 8u, columns8, ROWS);
@@ -158,7 +159,7 @@ void put(uint at, float value) {
 // Adds the eight sums of each invocation over the rows of staging, in row order.
 void put_neuron_sums(float sums[8], uint at) {
     barrier();
-    for (uint i = 0u; i < 2u; i++) {
+    [[unroll]] for (uint i = 0u; i < 2u; i++) {
         tile_dz[2u * gl_LocalInvocationIndex + i] =
             floatBitsToUint(vec4(sums[4u * i], sums[4u * i + 1u], sums[4u * i + 2u], sums[4u * i + 3u]));
     }
@@ -176,7 +177,7 @@ void main() {
     uint row0 = gl_SubgroupID / halves * grad_rows * m;
     uint column0 = gl_SubgroupID % halves * grad_columns * n;
     [[unroll]] for (uint i = 0u; i < grad_rows * grad_columns; i++) weight_gradient[i] = SUM(0.0);
-    for (uint i = 0u; i < 8u; i++) {
+    [[unroll]] for (uint i = 0u; i < 8u; i++) {
         bias_sum[i] = 0.0;
         out_sum[i] = 0.0;
     }

@@ -119,7 +119,7 @@ void main() {
         [[unroll]] for (uint r = 0u; r < row_tiles; r++) {
             [[unroll]] for (uint c = 0u; c < column_tiles; c++) {
                 SUM sum = sums[r * column_tiles + c];
-                for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
+                [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
                 SUM16 rectified = SUM16(sum);
                 uint column = (column0 + c * n) / 8u;
                 coopMatStore(rectified, tile16, r * m * hidden_stride + column, hidden_stride, ROWS);

@@ -6,6 +6,7 @@
 #include "inc/layout.glsl"
 #include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(push_constant) uniform Push {
     vec4 row_x; vec4 row_y; vec4 row_z;   // world units -> voxel index
     uvec3 size; uint view;
@@ -34,7 +35,7 @@ float trilinear(vec3 index) {
 }
 
 void main() {
-    uint pixel = gl_GlobalInvocationID.x;
+    uint pixel = invocation();
     if (pixel >= push.n_pixels) return;
     Line line = line_through(views[push.view], pixel, push.image_width);
     // March in index space; skip to the slab where the ray meets the volume.

@@ -5,6 +5,7 @@
 //   Each neighbour pair belongs to its lower element. One invocation per static parameter.
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint ranks; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { float params[]; };
@@ -22,7 +23,7 @@ void axis(uint i, uint at, uint stride, float weight, inout float value, inout f
 }
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = invocation();
     if (i >= setup.static_params) return;
     uint d = setup.grid;
     uint components = 4u * setup.rank4;

@@ -8,6 +8,7 @@
 #include "inc/depths.glsl"
 #include "inc/softplus.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_rays; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
@@ -16,7 +17,7 @@ layout(binding = 3) writeonly buffer B3 { float volume[]; };
 #include "inc/tensor_vm.glsl"
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = invocation();
     uint n = setup.n_dynamic_samples;
     if (i >= push.n_rays * n) return;
     Ray ray = rays[i / n];

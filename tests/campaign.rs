@@ -1,4 +1,5 @@
 //! `tools/gpu-campaign` as far as it can be tried without a GPU: its first part, as small as it goes.
+#![allow(missing_docs, clippy::unwrap_used)]
 
 use serde_json::Value;
 use std::path::Path;

@@ -63,6 +63,7 @@ fn paths() -> [Tuning; 3] {
         private_line_bytes,
         chunk_samples: 1 << 16,
         iterations_per_submit: None,
+        longest_submit_s: None,
         overlap: false,
         reasons: Vec::new(),
     };

@@ -1,10 +1,7 @@
 // Which splat an invocation works on, and which pixels of its box. With SUBGROUP, lanes of a full subgroup share a splat.
 // Included behind the layout that gives the size of the workgroup, without which it would count as 1.
 
-// Workgroups lie along two axes: there may be more than one axis takes.
-uint workgroup() {
-    return gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
-}
+#include "inc/workgroup.glsl"
 
 #ifdef SUBGROUP
 #extension GL_KHR_shader_subgroup_basic : require
@@ -26,7 +23,7 @@ vec3 splat_sum(vec3 value) {
 #else
 const uint lanes_per_splat = 1u;
 
-uint splat_index() { return workgroup() * gl_WorkGroupSize.x + gl_LocalInvocationID.x; }
+uint splat_index() { return invocation(); }
 uint splat_lane() { return 0u; }
 vec3 splat_sum(vec3 value) { return value; }
 #endif

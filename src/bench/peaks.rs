@@ -88,7 +88,7 @@ fn matrix_peak(gpu: &Gpu, MatrixShape { m, n, k }: MatrixShape) -> Result<f64> {
     let subgroups = 8;
     let (groups, steps): (u32, u32) = if info.is_cpu() { (4, 2000) } else { (4096, 2048) };
     let constants = [("m", m), ("n", n), ("k", k), ("subgroups", subgroups)];
-    let lanes = Some(subgroups * info.subgroup_size);
+    let lanes = Some(subgroups * info.matrix_subgroup);
     let stage: Stage<push::PeakMatrix> =
         Build { lanes, constants: &constants, matrices: true, ..Build::default() }.stage(gpu)?;
     let random: Vec<half::f16> =

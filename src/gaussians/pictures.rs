@@ -143,7 +143,7 @@ impl Pictures {
         let push = push::GaussianPicture { n_pixels, unit: line_integral(units), in_front: u32::from(in_front) };
         let bound = [(Binding::splat_images, (&picture.buffers.splat_images).into()), (Binding::image, target.into())];
         let mut recording = Recording::new(&self.gpu, "picture of Gaussians into a buffer")?;
-        dispatch(&mut recording, &self.show, self.show.groups_for(n_pixels), &bound, push)?;
+        dispatch(&mut recording, &self.show, self.show.groups_over(n_pixels), &bound, push)?;
         let shown = recording.finish()?;
         self.gpu.wait(picture.commands.submit()?)?;
         self.gpu.wait(shown.submit()?)

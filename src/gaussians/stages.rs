@@ -10,7 +10,7 @@ use crate::kernels::constants;
 use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
 use crate::kernels::layout::GaussianSetup;
 use crate::kernels::push::{self, PushConstants};
-use crate::kernels::stages::{Build, Stage, full_subgroup};
+use crate::kernels::stages::{Build, Stage, along_two_axes, full_subgroup};
 use std::ops::Range;
 
 /// Losses kept on the device.
@@ -42,9 +42,6 @@ pub struct SplatStage<P> {
 
 /// Lanes that share a splat, of some hundred pixels.
 const LANES_PER_SPLAT: u32 = 8;
-/// Workgroups along an axis that every device takes.
-const MOST_GROUPS: u32 = 65_535;
-
 impl<P: PushConstants> SplatStage<P> {
     /// Builds the pipeline.
     ///
@@ -60,9 +57,7 @@ impl<P: PushConstants> SplatStage<P> {
 
     /// Workgroups for so many splats, along two axes where one does not take them all.
     pub fn groups_for(&self, n_splats: u32) -> Groups<'static> {
-        let groups = n_splats.div_ceil(self.stage.local_size() / self.lanes_per_splat).max(1);
-        let rows = groups.div_ceil(MOST_GROUPS);
-        Groups::Direct([groups.div_ceil(rows), rows, 1])
+        along_two_axes(n_splats.div_ceil(self.stage.local_size() / self.lanes_per_splat))
     }
 }
 

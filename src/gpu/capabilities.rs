@@ -29,6 +29,10 @@ pub struct DeviceInfo {
     /// Invocations of the subgroups that a compute shader's workgroup can be asked to consist of, where they also exchange
     /// values (shuffles); none where the device cannot do either.
     pub full_subgroups: Option<u32>,
+    /// Invocations of the subgroups that kernels on matrices ask for.
+    pub matrix_subgroup: u32,
+    /// Whether shaders can ask for a size of their subgroups.
+    pub asks_for_subgroups: bool,
     /// Shared memory of a workgroup, bytes.
     pub max_shared_memory: u32,
     /// Invocations of a workgroup.
@@ -45,7 +49,9 @@ pub struct DeviceInfo {
     pub max_push_constants: u32,
     /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
     pub timestamp_period_ns: f32,
-    /// Device-local memory, bytes.
+    /// Bits of the queue's timestamps that mean something.
+    pub timestamp_bits: u32,
+    /// Device-local memory, bytes: the largest heap.
     pub device_memory: u64,
     /// Whether shaders can read buffers through their addresses.
     pub buffer_device_address: bool,
@@ -62,6 +68,8 @@ pub struct DeviceInfo {
     pub external_memory_fd: bool,
     /// Whether the driver tells of the pipelines it compiles (`VK_KHR_pipeline_executable_properties`).
     pub pipeline_statistics: bool,
+    /// Whether the device is Vulkan on top of another interface, as on macOS (`VK_KHR_portability_subset`).
+    pub portability_subset: bool,
     /// Why this device cannot be used, if so.
     pub unusable: Option<String>,
 }
@@ -116,20 +124,74 @@ fn c_chars(text: &[std::ffi::c_char]) -> String {
     text.iter().take_while(|c| **c != 0).map(|c| char::from(*c as u8)).collect()
 }
 
-/// See [`DeviceInfo::full_subgroups`].
-fn full_subgroups(
-    instance: &ash::Instance,
-    physical: vk::PhysicalDevice,
-    subgroup: &vk::PhysicalDeviceSubgroupProperties<'_>,
-) -> Option<u32> {
-    let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
-    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut size);
-    // SAFETY: the caller checked that the device has the extension of the chained structure, which lives until the call returns.
-    unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    let whole = size.subgroup_size_control == vk::TRUE && size.compute_full_subgroups == vk::TRUE;
-    let exchanges = subgroup.supported_stages.contains(vk::ShaderStageFlags::COMPUTE)
-        && subgroup.supported_operations.contains(vk::SubgroupFeatureFlags::SHUFFLE);
-    (whole && exchanges && subgroup.subgroup_size.is_power_of_two()).then_some(subgroup.subgroup_size)
+/// Sizes that a shader's subgroups can have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct SubgroupSizes {
+    default: u32,
+    /// Least and greatest that a compute shader may ask for; none where it cannot ask.
+    asked: Option<(u32, u32)>,
+    /// Whether workgroups can be asked to consist of full ones.
+    full: bool,
+    /// Whether lanes exchange values.
+    exchanges: bool,
+}
+
+/// Lanes that workgroups of 32 are full subgroups of.
+const USUAL_SUBGROUP: u32 = 32;
+/// Intel's number among vendors.
+const INTEL: u32 = 0x8086;
+
+impl SubgroupSizes {
+    fn of(instance: &ash::Instance, physical: vk::PhysicalDevice, has_size_control: bool) -> SubgroupSizes {
+        let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+        let mut sizes = vk::PhysicalDeviceSubgroupSizeControlProperties::default();
+        let mut subgroup = vk::PhysicalDeviceSubgroupProperties::default();
+        let mut features = vk::PhysicalDeviceFeatures2::default();
+        let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut subgroup);
+        if has_size_control {
+            features = features.push_next(&mut size);
+            properties = properties.push_next(&mut sizes);
+        }
+        // SAFETY: the device has the extension of the chained structures where they are chained; these live until the calls
+        // return.
+        unsafe {
+            instance.get_physical_device_features2(physical, &mut features);
+            instance.get_physical_device_properties2(physical, &mut properties);
+        }
+        let compute = vk::ShaderStageFlags::COMPUTE;
+        let can_ask = size.subgroup_size_control == vk::TRUE && sizes.required_subgroup_size_stages.contains(compute);
+        SubgroupSizes {
+            default: subgroup.subgroup_size,
+            asked: can_ask.then_some((sizes.min_subgroup_size, sizes.max_subgroup_size)),
+            full: size.subgroup_size_control == vk::TRUE && size.compute_full_subgroups == vk::TRUE,
+            exchanges: subgroup.supported_stages.contains(compute)
+                && subgroup.supported_operations.contains(vk::SubgroupFeatureFlags::SHUFFLE),
+        }
+    }
+
+    /// A size that shaders can have, by asking for it or by default.
+    fn can_be(&self, size: u32) -> bool {
+        size == self.default || self.asked_for(size)
+    }
+
+    /// See [`DeviceInfo::full_subgroups`].
+    fn full(&self) -> Option<u32> {
+        let usual = self.default > USUAL_SUBGROUP && self.can_be(USUAL_SUBGROUP);
+        let size = if usual { USUAL_SUBGROUP } else { self.default };
+        (self.full && self.exchanges && size.is_power_of_two()).then_some(size)
+    }
+
+    /// See [`DeviceInfo::matrix_subgroup`]; none where no size can be asked for.
+    fn for_matrices(&self, vendor: u32) -> Option<u32> {
+        let (least, _) = self.asked.filter(|_| self.full)?;
+        // Intel's matrix unit is as wide as its smallest subgroups: in larger ones operands take twice the registers.
+        let wanted = if vendor == INTEL { least } else { self.default.min(USUAL_SUBGROUP) };
+        [wanted, self.default].into_iter().find(|size| self.asked_for(*size))
+    }
+
+    fn asked_for(&self, size: u32) -> bool {
+        self.asked.is_some_and(|(least, greatest)| (least..=greatest).contains(&size))
+    }
 }
 
 /// Device extensions the matrix kernels need.
@@ -225,7 +287,10 @@ pub(super) fn describe(
     // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives,
     // the simplest product crashes the process.
     let crashes = driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8;
-    let matrices = if crashes || !MATRIX_EXTENSIONS.iter().all(|name| has(name)) {
+    let sizes = SubgroupSizes::of(instance, physical, has(ext::subgroup_size_control::NAME));
+    let matrix_subgroup = sizes.for_matrices(properties.vendor_id);
+    let lacks = |name: &&CStr| !has(name);
+    let matrices = if crashes || matrix_subgroup.is_none() || MATRIX_EXTENSIONS.iter().any(lacks) {
         Vec::new()
     } else {
         matrix_shapes(entry, instance, physical).unwrap_or_else(|why| {
@@ -233,8 +298,6 @@ pub(super) fn describe(
             Vec::new()
         })
     };
-    let full_subgroups =
-        has(ext::subgroup_size_control::NAME).then(|| full_subgroups(instance, physical, &subgroup)).flatten();
     let unusable = if fault.is_some() {
         fault
     } else if version < vk::API_VERSION_1_2 {
@@ -246,6 +309,7 @@ pub(super) fn describe(
     } else {
         None
     };
+    let timestamp_bits = compute_family(instance, physical).map_or(0, |family| family.timestamp_bits);
     let driver_info = c_chars(&driver.driver_info);
     DeviceInfo {
         index,
@@ -268,7 +332,9 @@ pub(super) fn describe(
         ),
         is_llvmpipe: driver.driver_id == vk::DriverId::MESA_LLVMPIPE,
         subgroup_size: subgroup.subgroup_size,
-        full_subgroups,
+        full_subgroups: sizes.full(),
+        matrix_subgroup: matrix_subgroup.unwrap_or(subgroup.subgroup_size),
+        asks_for_subgroups: sizes.asked.is_some(),
         max_shared_memory: limits.max_compute_shared_memory_size,
         max_workgroup_invocations: limits.max_compute_work_group_invocations,
         max_workgroup_count: limits.max_compute_work_group_count[0],
@@ -278,16 +344,14 @@ pub(super) fn describe(
             .min(limits.max_descriptor_set_storage_buffers),
         max_texel_buffer_elements: limits.max_texel_buffer_elements,
         max_push_constants: limits.max_push_constants_size,
-        timestamp_period_ns: if limits.timestamp_compute_and_graphics == vk::TRUE {
-            limits.timestamp_period
-        } else {
-            0.0
-        },
+        timestamp_period_ns: if timestamp_bits > 0 { limits.timestamp_period } else { 0.0 },
+        timestamp_bits,
         device_memory: memory.memory_heaps[..memory.memory_heap_count as usize]
             .iter()
             .filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
             .map(|h| h.size)
-            .sum(),
+            .max()
+            .unwrap_or_default(),
         buffer_device_address: f12.buffer_device_address == vk::TRUE,
         matrices,
         multiprocessors: multiprocessors.shader_sm_count,
@@ -296,19 +360,80 @@ pub(super) fn describe(
         external_memory_fd: has(khr::external_memory_fd::NAME),
         pipeline_statistics: has(khr::pipeline_executable_properties::NAME)
             && statistics.pipeline_executable_info == vk::TRUE,
+        portability_subset: has(khr::portability_subset::NAME),
         unusable,
     }
 }
 
-pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<u32> {
+/// A family of queues that compute.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct ComputeFamily {
+    /// Its place among the device's families.
+    pub index: u32,
+    /// Bits of its timestamps that mean something; 0 without timestamps.
+    pub timestamp_bits: u32,
+}
+
+/// The family whose queue we take: one that only computes where there is one, so that what draws the screen does not wait for us.
+pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<ComputeFamily> {
+    // SAFETY: callers take `physical` from this instance.
+    best_family(&unsafe { instance.get_physical_device_queue_family_properties(physical) })
+}
+
+/// A family of a device by its place.
+pub(super) fn family_at(instance: &ash::Instance, physical: vk::PhysicalDevice, index: u32) -> Option<ComputeFamily> {
     // SAFETY: callers take `physical` from this instance.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
-    families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE)).map(|i| i as u32)
+    families.get(index as usize).map(|f| ComputeFamily { index, timestamp_bits: f.timestamp_valid_bits })
+}
+
+fn best_family(families: &[vk::QueueFamilyProperties]) -> Option<ComputeFamily> {
+    let computes = |f: &vk::QueueFamilyProperties| f.queue_count > 0 && f.queue_flags.contains(vk::QueueFlags::COMPUTE);
+    let draws = |f: &vk::QueueFamilyProperties| f.queue_flags.contains(vk::QueueFlags::GRAPHICS);
+    // Without timestamps nothing can be measured; the first of equals is the driver's own choice.
+    let usable = families.iter().enumerate().filter(|(_, f)| computes(f));
+    let best = usable.min_by_key(|(_, f)| (f.timestamp_valid_bits == 0, draws(f)));
+    best.map(|(i, f)| ComputeFamily { index: i as u32, timestamp_bits: f.timestamp_valid_bits })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn subgroups_are_of_a_size_that_the_device_has() {
+        let sizes = |default, asked| SubgroupSizes { default, asked, full: true, exchanges: true };
+        let chosen = |sizes: SubgroupSizes, vendor| (sizes.full(), sizes.for_matrices(vendor));
+        // NVIDIA; AMD's chips of either generation, as Mesa's drivers tell; Intel; llvmpipe.
+        assert_eq!(chosen(sizes(32, Some((32, 32))), 0x10de), (Some(32), Some(32)));
+        assert_eq!(chosen(sizes(64, Some((32, 64))), 0x1002), (Some(32), Some(32)));
+        assert_eq!(chosen(sizes(64, Some((64, 64))), 0x1002), (Some(64), Some(64)));
+        assert_eq!(chosen(sizes(32, Some((16, 32))), INTEL), (Some(32), Some(16)));
+        assert_eq!(chosen(sizes(8, Some((8, 8))), 0x10005), (Some(8), Some(8)));
+        // Where nothing can be asked for, the default has to do, and matrices, whose kernels must know, cannot be had.
+        assert_eq!(chosen(sizes(64, None), 0x1002), (Some(64), None));
+        assert_eq!(SubgroupSizes { full: false, ..sizes(32, None) }.full(), None);
+    }
+
+    #[test]
+    fn queues_that_only_compute_come_first() {
+        use vk::QueueFlags as Flags;
+        let family = |queue_flags, timestamp_valid_bits| vk::QueueFamilyProperties {
+            queue_flags,
+            queue_count: 1,
+            timestamp_valid_bits,
+            ..Default::default()
+        };
+        let all = family(Flags::GRAPHICS | Flags::COMPUTE | Flags::TRANSFER, 64);
+        let (copies, alone) = (family(Flags::TRANSFER, 64), family(Flags::COMPUTE | Flags::TRANSFER, 36));
+        let none = vk::QueueFamilyProperties { queue_count: 0, ..alone };
+        let taken = |families: &[_]| best_family(families).map(|f| (f.index, f.timestamp_bits));
+        assert_eq!(taken(&[all, copies, alone]), Some((2, 36)));
+        assert_eq!(taken(&[copies, all, all]), Some((1, 64)));
+        assert_eq!(taken(&[all, none]), Some((0, 64)));
+        assert_eq!(taken(&[all, family(Flags::COMPUTE, 0)]), Some((0, 64)), "nothing could be measured");
+        assert_eq!(taken(&[copies]), None);
+    }
 
     #[test]
     fn kinds_are_written_as_they_are_shown() {

@@ -1,7 +1,7 @@
 //! The choice of a device, adoption of someone else's, and what all objects made from one share: queue, allocator,
 //! timeline, debug names.
 
-use super::capabilities::{DeviceInfo, DeviceKind, compute_family};
+use super::capabilities::{DeviceInfo, DeviceKind, compute_family, family_at};
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
 use super::statistics::StatisticsKeeper;
@@ -218,6 +218,9 @@ impl Device {
         if info.external_memory_fd {
             extensions.push(khr::external_memory_fd::NAME.as_ptr());
         }
+        if info.portability_subset {
+            extensions.push(khr::portability_subset::NAME.as_ptr());
+        }
         let mut create = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
         if !info.matrices.is_empty() {
             f12 = f12.shader_float16(true).vulkan_memory_model(true).vulkan_memory_model_device_scope(true);
@@ -319,7 +322,8 @@ impl Gpu {
             info.full_subgroups = None;
         }
         let queue_family = compute_family(&instance, physical)
-            .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?;
+            .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?
+            .index;
         let device = Device::create(instance, physical, &info, queue_family, options.statistics)?;
         // SAFETY: the device was made with one queue of this family.
         let queue = unsafe { device.get_device_queue(queue_family, 0) };
@@ -355,6 +359,11 @@ impl Gpu {
         }
         // What a device was made with cannot be asked of it.
         info.buffer_device_address &= adoption.buffer_device_address;
+        let family = family_at(&instance, adoption.physical_device, adoption.queue_family);
+        info.timestamp_bits = family.map_or(0, |family| family.timestamp_bits);
+        if info.timestamp_bits == 0 {
+            info.timestamp_period_ns = 0.0;
+        }
         info.external_memory_fd &= adoption.external_memory_fd;
         info.matrices.clear();
         info.full_subgroups = None;

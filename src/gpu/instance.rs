@@ -76,6 +76,14 @@ fn no_instance(code: vk::Result) -> Error {
     })
 }
 
+/// Whether the loader hides drivers such as MoltenVK from those who do not ask for them.
+fn lists_portability_drivers(entry: &ash::Entry) -> Result<bool> {
+    // SAFETY: needs nothing but a loader, which `entry` keeps loaded.
+    let found = unsafe { entry.enumerate_instance_extension_properties(None) }
+        .map_err(Error::vulkan("vkEnumerateInstanceExtensionProperties", "loader"))?;
+    Ok(found.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == khr::portability_enumeration::NAME)))
+}
+
 fn require_validation_layer(entry: &ash::Entry) -> Result<()> {
     // SAFETY: needs nothing but a loader, which `entry` keeps loaded.
     let found = unsafe { entry.enumerate_instance_layer_properties() }
@@ -100,6 +108,11 @@ impl Instance {
             .api_version(vk::API_VERSION_1_2);
         let mut layers = Vec::new();
         let mut extensions = Vec::new();
+        let mut flags = vk::InstanceCreateFlags::empty();
+        if lists_portability_drivers(&entry)? {
+            extensions.push(khr::portability_enumeration::NAME.as_ptr());
+            flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
+        }
         if validation {
             require_validation_layer(&entry)?;
             layers.push(VALIDATION_LAYER.as_ptr());
@@ -109,6 +122,7 @@ impl Instance {
         let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&enabled);
         let mut create = vk::InstanceCreateInfo::default()
             .application_info(&app)
+            .flags(flags)
             .enabled_layer_names(&layers)
             .enabled_extension_names(&extensions);
         if validation {

@@ -73,10 +73,8 @@ pub struct Pipeline {
 enum Subgroups {
     /// Nothing.
     Any,
-    /// All full, of the device's default size.
-    Full,
-    /// The same, and that size is asked for: as cooperative matrices need it where several sizes are possible.
-    OfSize,
+    /// All full, of so many invocations.
+    Full(u32),
 }
 
 impl Gpu {
@@ -103,7 +101,7 @@ impl Gpu {
         if self.info().matrices.is_empty() {
             return Err(Error::Internal(format!("kernel {}: {} has no matrices", code.name, self.info().name)));
         }
-        self.make_pipeline(code, local_size, spec, Subgroups::OfSize)
+        self.make_pipeline(code, local_size, spec, Subgroups::Full(self.info().matrix_subgroup))
     }
 
     /// Builds a kernel whose subgroups must be full, of [`DeviceInfo::full_subgroups`] invocations each.
@@ -118,13 +116,12 @@ impl Gpu {
         local_size: u32,
         spec: &[(&str, u32)],
     ) -> Result<Pipeline> {
-        if !self.info().full_subgroups.is_some_and(|size| local_size.is_multiple_of(size)) {
-            return Err(Error::Internal(format!(
-                "kernel {}: {local_size} invocations are no full subgroups",
-                code.name
-            )));
+        match self.info().full_subgroups {
+            Some(size) if local_size.is_multiple_of(size) => {
+                self.make_pipeline(code, local_size, spec, Subgroups::Full(size))
+            }
+            _ => Err(Error::Internal(format!("kernel {}: {local_size} invocations are no full subgroups", code.name))),
         }
-        self.make_pipeline(code, local_size, spec, Subgroups::Full)
     }
 
     fn make_pipeline(
@@ -209,18 +206,18 @@ impl Gpu {
             .map_err(Error::vulkan("vkCreateShaderModule", code.name))?;
         let specialization =
             vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&values));
-        let mut subgroup_size =
-            vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default().required_subgroup_size(info.subgroup_size);
+        let mut subgroup_size = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default();
         let mut stage = vk::PipelineShaderStageCreateInfo::default()
             .stage(vk::ShaderStageFlags::COMPUTE)
             .module(module)
             .name(c"main")
             .specialization_info(&specialization);
-        if subgroups != Subgroups::Any {
+        if let Subgroups::Full(size) = subgroups {
             stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
-        }
-        if subgroups == Subgroups::OfSize {
-            stage = stage.push_next(&mut subgroup_size);
+            if info.asks_for_subgroups {
+                subgroup_size = subgroup_size.required_subgroup_size(size);
+                stage = stage.push_next(&mut subgroup_size);
+            }
         }
         let create = [vk::ComputePipelineCreateInfo::default()
             .flags(shared.pipeline_flags())

@@ -31,6 +31,9 @@ impl<'a> Bound<'a> {
     }
 }
 
+/// Workgroups along an axis that every device takes.
+pub const MOST_GROUPS: u32 = 65_535;
+
 /// How many workgroups to run.
 pub enum Groups<'a> {
     /// Known now.
@@ -222,7 +225,7 @@ impl Recording {
     /// Records one dispatch. `given` are bound by the names the shader gives them.
     ///
     /// # Errors
-    /// [`Error::Internal`] when a name, a push-constant size or a group count does not fit the shader.
+    /// [`Error::Internal`] when a name or a push-constant size does not fit the shader, or a group count the device.
     pub fn dispatch<P: bytemuck::Pod>(
         &mut self,
         pipeline: &Arc<Pipeline>,
@@ -245,6 +248,11 @@ impl Recording {
                 .find(|(n, _)| *n == binding.name)
                 .ok_or_else(|| fault(format!("nothing is bound to `{}`", binding.name)))?;
             bound.push((binding, *what));
+        }
+        if let Groups::Direct([x, y, z]) = groups
+            && (x > self.commands.gpu.info.max_workgroup_count || y.max(z) > MOST_GROUPS)
+        {
+            return Err(fault(format!("{x} x {y} x {z} workgroups, more than {} takes", self.commands.gpu.info.name)));
         }
         let mut reads: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.reads).filter_map(|(_, x)| x.buffer()).collect();
         let writes: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.writes).filter_map(|(_, x)| x.buffer()).collect();
@@ -519,11 +527,14 @@ impl Commands {
         unsafe { self.gpu.device.get_query_pool_results(self.queries, 0, &mut ticks, flags) }
             .map_err(Error::vulkan("vkGetQueryPoolResults", &self.name))?;
         let period_ms = f64::from(self.gpu.info.timestamp_period_ns) * 1e-6;
+        // Counters of fewer bits begin again at zero.
+        let bits = self.gpu.info.timestamp_bits;
+        let mask = if bits < u64::BITS { (1 << bits) - 1 } else { u64::MAX };
         Ok(self
             .passes
             .iter()
             .zip(ticks.chunks_exact(2))
-            .map(|(name, t)| PassTime { name, ms: t[1].saturating_sub(t[0]) as f64 * period_ms })
+            .map(|(name, t)| PassTime { name, ms: (t[1].wrapping_sub(t[0]) & mask) as f64 * period_ms })
             .collect())
     }
 }

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 use crate::gpu::buffer::Operands;
 use crate::gpu::device::Gpu;
 use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
-use crate::gpu::record::Groups;
+use crate::gpu::record::{Groups, MOST_GROUPS};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
 use std::collections::BTreeSet;
@@ -57,6 +57,17 @@ impl<P: PushConstants> Stage<P> {
     pub fn groups_for(&self, n: u32) -> Groups<'static> {
         Groups::Direct([n.div_ceil(self.local_size()).max(1), 1, 1])
     }
+
+    /// Workgroups for `n` invocations of a shader that counts them by `inc/workgroup.glsl`, however many there are.
+    pub fn groups_over(&self, n: u32) -> Groups<'static> {
+        along_two_axes(n.div_ceil(self.local_size()))
+    }
+}
+
+/// So many workgroups or a few more, along two axes where one does not take them all.
+pub fn along_two_axes(groups: u32) -> Groups<'static> {
+    let rows = groups.div_ceil(MOST_GROUPS).max(1);
+    Groups::Direct([groups.div_ceil(rows).max(1), rows, 1])
 }
 
 /// How a stage is built: as its shader says, unless stated otherwise.
@@ -88,7 +99,8 @@ impl Build<'_> {
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
     pub fn stage<P: PushConstants>(self, gpu: &Gpu) -> Result<Stage<P>> {
-        let lanes = self.lanes.unwrap_or(P::LOCAL_SIZE);
+        // Not every device takes workgroups as large as some shaders would like; these work with any power of two.
+        let lanes = self.lanes.unwrap_or(P::LOCAL_SIZE.min(power_of_two_below(gpu.info().max_workgroup_invocations)));
         // Operands through texel buffers are for drivers that are old and slow at all else.
         let exchanges = self.exchanges && self.variant.is_empty() && full_subgroup(gpu, lanes).is_some();
         let variant = if exchanges { EXCHANGING } else { self.variant };
@@ -102,6 +114,11 @@ impl Build<'_> {
         };
         Ok(Stage { pipeline: Arc::new(pipeline), push: PhantomData })
     }
+}
+
+/// The largest power of two that is not larger.
+fn power_of_two_below(n: u32) -> u32 {
+    1 << n.max(1).ilog2()
 }
 
 /// Pipelines of every path.

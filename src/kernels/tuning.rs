@@ -3,6 +3,7 @@
 use crate::choice::Choice;
 use crate::gpu::buffer::Operands;
 use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
+use crate::gpu::pace::LONGEST_SUBMIT_S;
 use crate::kernels::constants;
 use serde::Serialize;
 
@@ -71,12 +72,23 @@ pub struct Tuning {
     pub private_line_bytes: u32,
     /// Samples handled at once, at most; the configuration may ask for fewer.
     pub chunk_samples: u32,
-    /// Iterations handed to the device at once, instead of what the configuration says.
+    /// Iterations handed to the device at once, at most, instead of what the configuration says.
     pub iterations_per_submit: Option<u32>,
+    /// Longest submit, seconds; none where nothing watches over the device.
+    pub longest_submit_s: Option<f64>,
     /// Validate and save beside training instead of between iterations.
     pub overlap: bool,
     /// One sentence per choice.
     pub reasons: Vec<String>,
+}
+
+/// Workgroups that keep a device busy whose number of multiprocessors the driver does not tell: too many write and add up sums of
+/// their own for nothing.
+fn workgroups_untold(kind: DeviceKind) -> u32 {
+    match kind {
+        DeviceKind::Integrated => 32,
+        _ => 264,
+    }
 }
 
 impl Tuning {
@@ -109,8 +121,9 @@ impl Tuning {
         let matrices = match info.multiprocessors {
             // Unrolled, a CPU driver compiles these kernels for minutes.
             _ if info.is_cpu() => MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false },
-            // Two workgroups per multiprocessor; 132 of them where the driver does not tell their number.
-            n => MatrixTuning { workgroups: if n == 0 { 264 } else { 2 * n }, largest_tile: 128, unroll: true },
+            0 => MatrixTuning { workgroups: workgroups_untold(info.kind), largest_tile: 128, unroll: true },
+            // Two workgroups per multiprocessor.
+            n => MatrixTuning { workgroups: 2 * n, largest_tile: 128, unroll: true },
         };
         // Some kilobytes per sample must fit beside all else.
         let chunk_samples = match info.kind {
@@ -134,6 +147,7 @@ impl Tuning {
             private_line_bytes,
             chunk_samples,
             iterations_per_submit: None,
+            longest_submit_s: (!info.is_cpu()).then_some(LONGEST_SUBMIT_S),
             overlap,
             reasons,
         }

@@ -1,6 +1,6 @@
 //! Rays whose samples are handled at once.
 
-use crate::gpu::record::Groups;
+use crate::gpu::record::{Groups, MOST_GROUPS};
 use crate::kernels::layout::Setup;
 
 /// Rays whose samples are handled at once.
@@ -24,9 +24,9 @@ impl Chunk {
     }
 }
 
-/// Rays handled at once: their samples fit one chunk even if all are live.
+/// Rays handled at once: their samples fit one chunk even if all are live, and a dispatch takes a workgroup for each.
 pub fn chunk_rays(setup: &Setup) -> u32 {
-    (setup.sample_capacity / 128 * 128 / setup.n_dynamic_samples).max(1)
+    (setup.sample_capacity / 128 * 128 / setup.n_dynamic_samples).clamp(1, MOST_GROUPS)
 }
 
 /// A batch in chunks.

@@ -66,8 +66,9 @@ impl Shape {
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
         let unfit = |what: String| Error::config("dynamic.width", width, what);
-        let subgroups = (1..=8).rev().find(|s| (width / n).is_multiple_of(*s)).unwrap_or(1);
-        if subgroups * info.subgroup_size < width / 8 {
+        let most = (info.max_workgroup_invocations / info.matrix_subgroup).min(8);
+        let subgroups = (1..=most).rev().find(|s| (width / n).is_multiple_of(*s)).unwrap_or(1);
+        if subgroups * info.matrix_subgroup < width / 8 {
             return Err(unfit("is too wide for the matrix kernels on this device".into()));
         }
         let skips = params.layers.iter().skip(1).any(|l| l.encoded.is_some());
@@ -80,7 +81,7 @@ impl Shape {
         let (hidden_row, encoded_row) = (row(width), row(encoded as u32));
         let rows = if skips { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
         let fwd_tile = tile_within(largest, &|t| t * (rows + 4 * n));
-        let scratch = 2 * 16 * subgroups * info.subgroup_size;
+        let scratch = 2 * 16 * subgroups * info.matrix_subgroup;
         let bwd_tile =
             tile_within(largest.min(64), &|t| (t * hidden_row).max(scratch) + t * (hidden_row.max(encoded_row) + 4));
         let (Some(fwd_tile), Some(bwd_tile)) = (fwd_tile, bwd_tile) else {
@@ -261,7 +262,7 @@ impl Builder<'_> {
         let build = Build {
             // Unrolled or not, they compute the same.
             variant: if tuning.matrices.unroll { "_unrolled" } else { "" },
-            lanes: Some(shape.subgroups * gpu.info().subgroup_size),
+            lanes: Some(shape.subgroups * gpu.info().matrix_subgroup),
             matrices: true,
             ..Build::default()
         };

@@ -90,7 +90,7 @@ impl Projector {
                 (Binding::volume, (&loaded.values).into()),
                 (Binding::integrals, (&integrals).into()),
             ];
-            dispatch(&mut recording, &self.project, self.project.groups_for(pixels as u32), &bound, push)?;
+            dispatch(&mut recording, &self.project, self.project.groups_over(pixels as u32), &bound, push)?;
         }
         self.gpu.wait(recording.finish()?.submit()?)?;
         let all: Vec<f32> = self.gpu.download(&integrals, 0, views.len() * pixels)?;

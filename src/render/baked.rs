@@ -281,7 +281,7 @@ impl Baked {
         };
         let stage = &self.renderer.kernels.baked_march;
         let mut recording = Recording::new(gpu, "baked render")?;
-        dispatch(&mut recording, stage, stage.groups_for(pixels), &bound, push)?;
+        dispatch(&mut recording, stage, stage.groups_over(pixels), &bound, push)?;
         recording.finish()
     }
 }

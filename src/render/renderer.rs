@@ -6,7 +6,8 @@ use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::gpu::record::{Commands, Recording};
+use crate::gpu::pace::SubmitPace;
+use crate::gpu::record::{Commands, MOST_GROUPS, Recording};
 use crate::kernels::layout::{DeviceState, RayOut, Schedule, Setup, View};
 use crate::kernels::push;
 use crate::kernels::stages::Kernels;
@@ -22,9 +23,13 @@ use crate::network::still::StillNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
 use crate::scan::gating::BeatTime;
+use std::time::Instant;
 
-/// Pixels rendered by one submit.
-pub(super) const RAYS_PER_SUBMIT: u32 = 1 << 16;
+/// Pixels rendered by one submit, which has a workgroup for each.
+pub(super) const RAYS_PER_SUBMIT: u32 = MOST_GROUPS;
+
+/// Pixels rendered by the first submits, where these tell how many the next may have.
+const FIRST_RAYS: u32 = 4096;
 
 /// What every pixel of a view sees; all lists are rows first, attenuation per world unit.
 #[derive(Debug, Clone, Default)]
@@ -83,6 +88,8 @@ pub struct Renderer {
     /// Where Gaussians are the moving field.
     pub(super) moving: Option<Blobs>,
     pictures: Option<Pictures>,
+    /// Of rays.
+    pace: SubmitPace,
 }
 
 impl Renderer {
@@ -115,7 +122,8 @@ impl Renderer {
         let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
         let param_map = model.param_map.clone();
         let gpu = gpu.clone();
-        let renderer = Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures };
+        let pace = SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
+        let renderer = Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, pace };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -336,11 +344,12 @@ impl Renderer {
         let views = self.gpu.buffer_with("views", &[View::of(rays)])?;
         let pixels = (width * height) as u32;
         let image_width = width as u32;
-        // Whole rows, which tiles of pixels are made of.
-        let at_once = (RAYS_PER_SUBMIT / image_width * image_width).max(RAYS_PER_SUBMIT.min(image_width));
-        let mut out = Rendering::default();
-        for first_pixel in (0..pixels).step_by(at_once as usize) {
+        let (mut out, mut first_pixel) = (Rendering::default(), 0);
+        while first_pixel < pixels {
+            // Whole rows, which tiles of pixels are made of.
+            let at_once = (self.pace.items() / image_width * image_width).max(RAYS_PER_SUBMIT.min(image_width));
             let n_rays = at_once.min(pixels - first_pixel);
+            let begin = Instant::now();
             let mut recording = Recording::new(&self.gpu, "render")?;
             let push = pose(taken, &self.setup, first_pixel, n_rays, image_width);
             self.buffers.record_pose(&mut recording, &self.kernels, &views, push)?;
@@ -352,8 +361,10 @@ impl Renderer {
                 kernels.record_rays(&mut recording, &self.buffers, list, n_rays, row, parts.maxima)?;
             }
             self.gpu.wait(recording.finish()?.submit()?)?;
+            self.pace.note(n_rays, begin.elapsed().as_secs_f64());
             let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
             out.extend(&seen);
+            first_pixel += n_rays;
         }
         Ok(out)
     }

@@ -85,7 +85,7 @@ impl Renderer {
                     let stage = &self.kernels.volume_static;
                     let bound = [(Binding::volume, (&cells).into())];
                     let push = push::VolumeStatic { n_rays: n };
-                    self.pass(&mut r, &buffers, &setup).run_with(stage, stage.groups_for(n * nx), &bound, push)?;
+                    self.pass(&mut r, &buffers, &setup).run_with(stage, stage.groups_over(n * nx), &bound, push)?;
                 }
                 (_, Some(blobs), _) => blobs.record_points(&mut r, &buffers, phase, n, nx, &cells)?,
                 (_, None, _) => {

@@ -157,7 +157,7 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
         let slice = (setup.occupancy_words() as u32).div_ceil(OCCUPANCY_EPOCH);
         pass.run(&k.occupancy_clear, k.occupancy_clear.groups_for(slice), push::OccupancyClear {})?;
     }
-    pass.run(&k.adam, k.adam.groups_for(setup.n_params), push::Adam {})?;
+    pass.run(&k.adam, k.adam.groups_over(setup.n_params), push::Adam {})?;
     pass.run(&k.report, Groups::Direct([1, 1, 1]), push::Report {})
 }
 
@@ -181,6 +181,6 @@ fn record_static_gradient(pass: &mut Pass<'_>) -> Result<()> {
         return still.record_gradient(pass);
     }
     let static_len = params.static_len as u32;
-    pass.run(&k.reg_tv, k.reg_tv.groups_for(static_len), push::RegTv { ranks: params.ranks as u32 })?;
-    pass.run(&k.gradient_static, k.gradient_static.groups_for(static_len), push::GradientStatic {})
+    pass.run(&k.reg_tv, k.reg_tv.groups_over(static_len), push::RegTv { ranks: params.ranks as u32 })?;
+    pass.run(&k.gradient_static, k.gradient_static.groups_over(static_len), push::GradientStatic {})
 }

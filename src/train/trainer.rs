@@ -6,6 +6,7 @@ use crate::fingerprint::Fingerprint;
 use crate::geometry::CArm;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
+use crate::gpu::pace::SubmitPace;
 use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::layout::{DeviceState, StepReport};
 use crate::kernels::stages::Kernels;
@@ -25,6 +26,7 @@ use crate::train::losses::{NetworkLosses, StepLoss};
 use crate::train::moving::Moving;
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use std::collections::VecDeque;
+use std::time::Instant;
 
 /// A loss this many times the first one means the run exploded.
 const EXPLOSION: f64 = 1e6;
@@ -55,10 +57,10 @@ pub struct Trainer {
     training: TrainingBuffers,
     /// Gaussians, where they are the moving field.
     moving: Option<Moving>,
-    /// Iterations of `several`.
-    per_submit: u32,
-    several: Commands,
+    pace: SubmitPace,
     single: Commands,
+    /// As many iterations as a submit takes, once that is known.
+    several: Option<(Commands, u32)>,
     in_flight: VecDeque<(Ticket, u32)>,
     submitted: u32,
     completed: u32,
@@ -214,34 +216,28 @@ impl Trainer {
         // The still field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
-        let record = |n: u32| -> Result<Commands> {
-            let mut recording = Recording::new(gpu, &format!("{n} training iterations"))?;
-            let mut pass = Pass {
-                recording: &mut recording,
-                kernels: &kernels,
-                network: &network,
-                still: still.as_ref(),
-                buffers: &forward,
-                training: Some(&training),
-                params: &plan.params,
-                setup: &plan.setup,
-            };
-            for _ in 0..n {
-                record_step(&mut pass)?;
-            }
-            recording.finish()
-        };
-        let (several, single) = (record(per_submit)?, record(1)?);
+        let mut recording = Recording::new(gpu, "training iteration")?;
+        record_step(&mut Pass {
+            recording: &mut recording,
+            kernels: &kernels,
+            network: &network,
+            still: still.as_ref(),
+            buffers: &forward,
+            training: Some(&training),
+            params: &plan.params,
+            setup: &plan.setup,
+        })?;
+        let single = recording.finish()?;
         let trainer = Trainer {
+            pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit),
             gpu: gpu.clone(),
             kernels,
             network,
             still,
             forward,
             training,
-            per_submit,
-            several,
             single,
+            several: None,
             in_flight: VecDeque::new(),
             submitted: step,
             completed: step,
@@ -313,11 +309,15 @@ impl Trainer {
         if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
             return self.advance_gaussians(until);
         }
+        if self.pace.is_trying() && self.in_flight.is_empty() && self.submitted < until {
+            return self.try_iteration();
+        }
+        self.record_several()?;
         while self.submitted < until && self.in_flight.len() < submits_in_flight(&self.gpu) {
-            let (commands, n) = if until - self.submitted >= self.per_submit {
-                (&self.several, self.per_submit)
-            } else {
-                (&self.single, 1)
+            let fits = |(_, n): &&(Commands, u32)| until - self.submitted >= *n;
+            let (commands, n) = match self.several.as_ref().filter(fits) {
+                Some((commands, n)) => (commands, *n),
+                None => (&self.single, 1),
             };
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
@@ -326,6 +326,42 @@ impl Trainer {
         self.gpu.wait(ticket)?;
         self.completed += n;
         self.read_losses()
+    }
+
+    /// Runs an iteration alone, to see how long it takes.
+    fn try_iteration(&mut self) -> Result<Vec<StepLoss>> {
+        let begin = Instant::now();
+        self.submitted += 1;
+        self.gpu.wait(self.single.submit()?)?;
+        self.completed += 1;
+        self.pace.note(1, begin.elapsed().as_secs_f64());
+        self.read_losses()
+    }
+
+    /// Records as many iterations as a submit takes, once that is known.
+    fn record_several(&mut self) -> Result<()> {
+        let n = self.pace.items();
+        if self.several.is_none() && !self.pace.is_trying() && n > 1 {
+            let mut recording = Recording::new(&self.gpu, &format!("{n} training iterations"))?;
+            for _ in 0..n {
+                record_step(&mut self.pass(&mut recording))?;
+            }
+            self.several = Some((recording.finish()?, n));
+        }
+        Ok(())
+    }
+
+    fn pass<'a>(&'a self, recording: &'a mut Recording) -> Pass<'a> {
+        Pass {
+            recording,
+            kernels: &self.kernels,
+            network: &self.network,
+            still: self.still.as_ref(),
+            buffers: &self.forward,
+            training: Some(&self.training),
+            params: &self.plan.params,
+            setup: &self.plan.setup,
+        }
     }
 
     /// Share done of what comes before the first iteration; none when that has begun.
@@ -393,16 +429,7 @@ impl Trainer {
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
-        record_step(&mut Pass {
-            recording: &mut recording,
-            kernels: &self.kernels,
-            network: &self.network,
-            still: self.still.as_ref(),
-            buffers: &self.forward,
-            training: Some(&self.training),
-            params: &self.plan.params,
-            setup: &self.plan.setup,
-        })?;
+        record_step(&mut self.pass(&mut recording))?;
         let commands = recording.finish()?;
         self.gpu.wait(commands.submit()?)?;
         self.submitted += 1;

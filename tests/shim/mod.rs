@@ -1,5 +1,5 @@
 //! A Vulkan loader between the engine and the system's: it counts what is made and destroyed, makes calls fail on
-//! request, and fills new memory with a pattern, with canaries behind each buffer. One state per thread, since the engine
+//! request, fills new memory with a pattern, with canaries behind each buffer, and makes devices look poorer than they are. One state per thread, since the engine
 //! calls Vulkan on its caller's thread as long as nobody starts another.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 #![allow(clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks, reason = "passes on what it is given")]
@@ -48,6 +48,21 @@ struct State {
     poison: Option<Poison>,
     /// Code of a shader, and what the driver gets instead.
     planted: Option<(Vec<u32>, Vec<u32>)>,
+    /// What devices claim to have.
+    poor: Option<Poor>,
+}
+
+/// What a device may still claim to have.
+#[derive(Debug, Clone, Copy)]
+pub struct Poor {
+    /// Device extensions.
+    pub extensions: bool,
+    /// Buffer addresses and 16-bit floats.
+    pub features: bool,
+    /// Timestamps.
+    pub timestamps: bool,
+    /// Lowers limits.
+    pub limits: fn(&mut vk::PhysicalDeviceLimits),
 }
 
 thread_local! {
@@ -108,6 +123,12 @@ pub fn end_poison() -> (u32, u32, Vec<String>) {
         let poison = state.poison.take().unwrap();
         (poison.filled, poison.unreachable, poison.broken)
     })
+}
+
+/// Devices look poorer from now on.
+pub fn impoverish(poor: Poor) {
+    begin(Failing::None);
+    with(|state| state.poor = Some(poor));
 }
 
 /// Hands the driver `faulty` from now on where the engine has `code`.
@@ -315,8 +336,6 @@ destroying! {
 
 fallible! {
     vkEnumeratePhysicalDevices(vk::Instance, count: *mut u32, out: *mut vk::PhysicalDevice);
-    vkEnumerateDeviceExtensionProperties(
-        vk::PhysicalDevice, layer: *const c_char, count: *mut u32, out: *mut vk::ExtensionProperties);
     vkGetPhysicalDeviceCooperativeMatrixPropertiesKHR(
         vk::PhysicalDevice, count: *mut u32, out: *mut vk::CooperativeMatrixPropertiesKHR<'static>);
     vkAllocateCommandBuffers(
@@ -348,6 +367,90 @@ unsafe extern "system" fn vkEnumerateInstanceLayerProperties(
     let real: vk::PFN_vkEnumerateInstanceLayerProperties =
         unsafe { std::mem::transmute(vk::Instance::null().real(c"vkEnumerateInstanceLayerProperties")) };
     unsafe { real(count, out) }
+}
+
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkEnumerateInstanceExtensionProperties(
+    layer: *const c_char,
+    count: *mut u32,
+    out: *mut vk::ExtensionProperties,
+) -> vk::Result {
+    if let Some(code) = attempt("vkEnumerateInstanceExtensionProperties") {
+        return code;
+    }
+    let real: vk::PFN_vkEnumerateInstanceExtensionProperties =
+        unsafe { std::mem::transmute(vk::Instance::null().real(c"vkEnumerateInstanceExtensionProperties")) };
+    unsafe { real(layer, count, out) }
+}
+
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkEnumerateDeviceExtensionProperties(
+    device: vk::PhysicalDevice,
+    layer: *const c_char,
+    count: *mut u32,
+    out: *mut vk::ExtensionProperties,
+) -> vk::Result {
+    if let Some(code) = attempt("vkEnumerateDeviceExtensionProperties") {
+        return code;
+    }
+    if with(|state| state.poor).is_some_and(|poor| !poor.extensions) {
+        unsafe { *count = 0 };
+        return vk::Result::SUCCESS;
+    }
+    let real: vk::PFN_vkEnumerateDeviceExtensionProperties =
+        unsafe { std::mem::transmute(device.real(c"vkEnumerateDeviceExtensionProperties")) };
+    unsafe { real(device, layer, count, out) }
+}
+
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkGetPhysicalDeviceProperties2(
+    device: vk::PhysicalDevice,
+    out: *mut vk::PhysicalDeviceProperties2<'_>,
+) {
+    let real: vk::PFN_vkGetPhysicalDeviceProperties2 =
+        unsafe { std::mem::transmute(device.real(c"vkGetPhysicalDeviceProperties2")) };
+    unsafe { real(device, out) };
+    if let Some(poor) = with(|state| state.poor) {
+        (poor.limits)(unsafe { &mut (*out).properties.limits });
+    }
+}
+
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkGetPhysicalDeviceFeatures2(
+    device: vk::PhysicalDevice,
+    out: *mut vk::PhysicalDeviceFeatures2<'_>,
+) {
+    let real: vk::PFN_vkGetPhysicalDeviceFeatures2 =
+        unsafe { std::mem::transmute(device.real(c"vkGetPhysicalDeviceFeatures2")) };
+    unsafe { real(device, out) };
+    if with(|state| state.poor).is_none_or(|poor| poor.features) {
+        return;
+    }
+    let mut next = unsafe { (*out).p_next.cast::<vk::BaseOutStructure<'_>>() };
+    while let Some(structure) = unsafe { next.as_mut() } {
+        if structure.s_type == vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_2_FEATURES {
+            let features = unsafe { &mut *next.cast::<vk::PhysicalDeviceVulkan12Features<'_>>() };
+            features.buffer_device_address = vk::FALSE;
+            features.shader_float16 = vk::FALSE;
+        }
+        next = structure.p_next;
+    }
+}
+
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkGetPhysicalDeviceQueueFamilyProperties(
+    device: vk::PhysicalDevice,
+    count: *mut u32,
+    out: *mut vk::QueueFamilyProperties,
+) {
+    let real: vk::PFN_vkGetPhysicalDeviceQueueFamilyProperties =
+        unsafe { std::mem::transmute(device.real(c"vkGetPhysicalDeviceQueueFamilyProperties")) };
+    unsafe { real(device, count, out) };
+    if !out.is_null() && with(|state| state.poor).is_some_and(|poor| !poor.timestamps) {
+        for family in unsafe { std::slice::from_raw_parts_mut(out, *count as usize) } {
+            family.timestamp_valid_bits = 0;
+        }
+    }
 }
 
 #[allow(non_snake_case)]
@@ -541,6 +644,11 @@ fn special(name: &str) -> Option<*const ()> {
         "vkGetInstanceProcAddr" => get_instance_proc_addr as *const (),
         "vkGetDeviceProcAddr" => get_device_proc_addr as *const (),
         "vkEnumerateInstanceLayerProperties" => vkEnumerateInstanceLayerProperties as *const (),
+        "vkEnumerateInstanceExtensionProperties" => vkEnumerateInstanceExtensionProperties as *const (),
+        "vkEnumerateDeviceExtensionProperties" => vkEnumerateDeviceExtensionProperties as *const (),
+        "vkGetPhysicalDeviceProperties2" => vkGetPhysicalDeviceProperties2 as *const (),
+        "vkGetPhysicalDeviceFeatures2" => vkGetPhysicalDeviceFeatures2 as *const (),
+        "vkGetPhysicalDeviceQueueFamilyProperties" => vkGetPhysicalDeviceQueueFamilyProperties as *const (),
         "vkCreateInstance" => vkCreateInstance as *const (),
         "vkDestroyInstance" => vkDestroyInstance as *const (),
         "vkDestroyDevice" => vkDestroyDevice as *const (),
