@@ -29,6 +29,8 @@ pub struct DeviceInfo {
     /// Invocations of the subgroups that a compute shader's workgroup can be asked to consist of, where they also exchange
     /// values (shuffles); none where the device cannot do either.
     pub full_subgroups: Option<u32>,
+    /// The same for workgroups that are smaller than these; none where they are no larger than usual, or have one size.
+    pub small_subgroups: Option<u32>,
     /// Invocations of the subgroups that kernels on matrices ask for.
     pub matrix_subgroup: u32,
     /// Whether shaders can ask for a size of their subgroups.
@@ -128,18 +130,18 @@ fn c_chars(text: &[std::ffi::c_char]) -> String {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct SubgroupSizes {
     default: u32,
-    /// Least and greatest that a compute shader may ask for; none where it cannot ask.
-    asked: Option<(u32, u32)>,
+    /// Least and greatest.
+    range: (u32, u32),
+    /// Whether compute shaders can ask for one between these.
+    can_ask: bool,
     /// Whether workgroups can be asked to consist of full ones.
     full: bool,
     /// Whether lanes exchange values.
     exchanges: bool,
 }
 
-/// Lanes that workgroups of 32 are full subgroups of.
+/// Subgroups that workgroups of as many lanes consist of.
 const USUAL_SUBGROUP: u32 = 32;
-/// Intel's number among vendors.
-const INTEL: u32 = 0x8086;
 
 impl SubgroupSizes {
     fn of(instance: &ash::Instance, physical: vk::PhysicalDevice, has_size_control: bool) -> SubgroupSizes {
@@ -162,35 +164,31 @@ impl SubgroupSizes {
         let can_ask = size.subgroup_size_control == vk::TRUE && sizes.required_subgroup_size_stages.contains(compute);
         SubgroupSizes {
             default: subgroup.subgroup_size,
-            asked: can_ask.then_some((sizes.min_subgroup_size, sizes.max_subgroup_size)),
+            range: (sizes.min_subgroup_size, sizes.max_subgroup_size),
+            can_ask,
             full: size.subgroup_size_control == vk::TRUE && size.compute_full_subgroups == vk::TRUE,
             exchanges: subgroup.supported_stages.contains(compute)
                 && subgroup.supported_operations.contains(vk::SubgroupFeatureFlags::SHUFFLE),
         }
     }
 
-    /// A size that shaders can have, by asking for it or by default.
-    fn can_be(&self, size: u32) -> bool {
-        size == self.default || self.asked_for(size)
-    }
-
     /// See [`DeviceInfo::full_subgroups`].
     fn full(&self) -> Option<u32> {
-        let usual = self.default > USUAL_SUBGROUP && self.can_be(USUAL_SUBGROUP);
-        let size = if usual { USUAL_SUBGROUP } else { self.default };
-        (self.full && self.exchanges && size.is_power_of_two()).then_some(size)
+        (self.full && self.exchanges && self.default.is_power_of_two()).then_some(self.default)
     }
 
-    /// See [`DeviceInfo::matrix_subgroup`]; none where no size can be asked for.
-    fn for_matrices(&self, vendor: u32) -> Option<u32> {
-        let (least, _) = self.asked.filter(|_| self.full)?;
-        // Intel's matrix unit is as wide as its smallest subgroups: in larger ones operands take twice the registers.
-        let wanted = if vendor == INTEL { least } else { self.default.min(USUAL_SUBGROUP) };
-        [wanted, self.default].into_iter().find(|size| self.asked_for(*size))
+    /// See [`DeviceInfo::small_subgroups`].
+    fn small(&self) -> Option<u32> {
+        let usual = self.can_ask && (self.range.0..=self.range.1).contains(&USUAL_SUBGROUP);
+        self.full().filter(|size| *size > USUAL_SUBGROUP && usual).map(|_| USUAL_SUBGROUP)
     }
 
-    fn asked_for(&self, size: u32) -> bool {
-        self.asked.is_some_and(|(least, greatest)| (least..=greatest).contains(&size))
+    /// See [`DeviceInfo::matrix_subgroup`]; none where nobody knows it. The default is the best by the estimates of compilers, of
+    /// Intel's 16 and 32 and AMD's 32 and 64.
+    fn for_matrices(&self) -> Option<u32> {
+        let (least, greatest) = self.range;
+        let is_known = self.can_ask || (least, greatest) == (self.default, self.default);
+        (self.full && is_known).then_some(self.default.clamp(least, greatest.max(least)))
     }
 }
 
@@ -288,7 +286,7 @@ pub(super) fn describe(
     // the simplest product crashes the process.
     let crashes = driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8;
     let sizes = SubgroupSizes::of(instance, physical, has(ext::subgroup_size_control::NAME));
-    let matrix_subgroup = sizes.for_matrices(properties.vendor_id);
+    let matrix_subgroup = sizes.for_matrices();
     let lacks = |name: &&CStr| !has(name);
     let matrices = if crashes || matrix_subgroup.is_none() || MATRIX_EXTENSIONS.iter().any(lacks) {
         Vec::new()
@@ -333,8 +331,9 @@ pub(super) fn describe(
         is_llvmpipe: driver.driver_id == vk::DriverId::MESA_LLVMPIPE,
         subgroup_size: subgroup.subgroup_size,
         full_subgroups: sizes.full(),
+        small_subgroups: sizes.small(),
         matrix_subgroup: matrix_subgroup.unwrap_or(subgroup.subgroup_size),
-        asks_for_subgroups: sizes.asked.is_some(),
+        asks_for_subgroups: sizes.can_ask,
         max_shared_memory: limits.max_compute_shared_memory_size,
         max_workgroup_invocations: limits.max_compute_work_group_invocations,
         max_workgroup_count: limits.max_compute_work_group_count[0],
@@ -402,17 +401,19 @@ mod tests {
 
     #[test]
     fn subgroups_are_of_a_size_that_the_device_has() {
-        let sizes = |default, asked| SubgroupSizes { default, asked, full: true, exchanges: true };
-        let chosen = |sizes: SubgroupSizes, vendor| (sizes.full(), sizes.for_matrices(vendor));
+        let sizes = |default, range| SubgroupSizes { default, range, can_ask: true, full: true, exchanges: true };
+        let fixed = |default, range| SubgroupSizes { can_ask: false, ..sizes(default, range) };
+        let chosen = |sizes: SubgroupSizes| (sizes.full(), sizes.small(), sizes.for_matrices());
         // NVIDIA; AMD's chips of either generation, as Mesa's drivers tell; Intel; llvmpipe.
-        assert_eq!(chosen(sizes(32, Some((32, 32))), 0x10de), (Some(32), Some(32)));
-        assert_eq!(chosen(sizes(64, Some((32, 64))), 0x1002), (Some(32), Some(32)));
-        assert_eq!(chosen(sizes(64, Some((64, 64))), 0x1002), (Some(64), Some(64)));
-        assert_eq!(chosen(sizes(32, Some((16, 32))), INTEL), (Some(32), Some(16)));
-        assert_eq!(chosen(sizes(8, Some((8, 8))), 0x10005), (Some(8), Some(8)));
-        // Where nothing can be asked for, the default has to do, and matrices, whose kernels must know, cannot be had.
-        assert_eq!(chosen(sizes(64, None), 0x1002), (Some(64), None));
-        assert_eq!(SubgroupSizes { full: false, ..sizes(32, None) }.full(), None);
+        assert_eq!(chosen(sizes(32, (32, 32))), (Some(32), None, Some(32)));
+        assert_eq!(chosen(sizes(64, (32, 64))), (Some(64), Some(32), Some(64)));
+        assert_eq!(chosen(sizes(64, (64, 64))), (Some(64), None, Some(64)));
+        assert_eq!(chosen(sizes(32, (16, 32))), (Some(32), None, Some(32)));
+        assert_eq!(chosen(sizes(8, (8, 8))), (Some(8), None, Some(8)));
+        // Where nothing can be asked for, the default has to do; matrices, whose kernels must know, need one that is the only one.
+        assert_eq!(chosen(fixed(32, (32, 32))), (Some(32), None, Some(32)));
+        assert_eq!(chosen(fixed(64, (32, 64))), (Some(64), None, None));
+        assert_eq!(SubgroupSizes { full: false, ..sizes(32, (32, 32)) }.full(), None);
     }
 
     #[test]

@@ -319,7 +319,7 @@ impl Gpu {
         let instance = Instance::create(options.loader, options.validation)?;
         let (physical, mut info) = choose(instance.devices()?, options.select.as_deref())?;
         if options.without_subgroups {
-            info.full_subgroups = None;
+            (info.full_subgroups, info.small_subgroups) = (None, None);
         }
         let queue_family = compute_family(&instance, physical)
             .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?
@@ -366,7 +366,7 @@ impl Gpu {
         }
         info.external_memory_fd &= adoption.external_memory_fd;
         info.matrices.clear();
-        info.full_subgroups = None;
+        (info.full_subgroups, info.small_subgroups) = (None, None);
         let parts = Parts {
             physical: adoption.physical_device,
             info,

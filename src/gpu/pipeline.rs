@@ -104,9 +104,11 @@ impl Gpu {
         self.make_pipeline(code, local_size, spec, Subgroups::Full(self.info().matrix_subgroup))
     }
 
-    /// Builds a kernel whose subgroups must be full, of [`DeviceInfo::full_subgroups`] invocations each.
+    /// Builds a kernel whose subgroups must be full, of so many invocations each: [`DeviceInfo::full_subgroups`], or
+    /// [`DeviceInfo::small_subgroups`].
     ///
     /// [`DeviceInfo::full_subgroups`]: crate::gpu::capabilities::DeviceInfo::full_subgroups
+    /// [`DeviceInfo::small_subgroups`]: crate::gpu::capabilities::DeviceInfo::small_subgroups
     ///
     /// # Errors
     /// As [`Gpu::pipeline`]; [`Error::Internal`] where subgroups cannot be full.
@@ -114,14 +116,15 @@ impl Gpu {
         &self,
         code: &'static KernelCode,
         local_size: u32,
+        size: u32,
         spec: &[(&str, u32)],
     ) -> Result<Pipeline> {
-        match self.info().full_subgroups {
-            Some(size) if local_size.is_multiple_of(size) => {
-                self.make_pipeline(code, local_size, spec, Subgroups::Full(size))
-            }
-            _ => Err(Error::Internal(format!("kernel {}: {local_size} invocations are no full subgroups", code.name))),
+        let info = self.info();
+        if ![info.full_subgroups, info.small_subgroups].contains(&Some(size)) || !local_size.is_multiple_of(size) {
+            let problem = format!("{local_size} invocations are no full subgroups of {size}");
+            return Err(Error::Internal(format!("kernel {}: {problem}", code.name)));
         }
+        self.make_pipeline(code, local_size, spec, Subgroups::Full(size))
     }
 
     fn make_pipeline(

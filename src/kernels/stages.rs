@@ -87,7 +87,8 @@ pub struct Build<'a> {
 
 /// Invocations of the subgroups that a workgroup of so many `lanes` consists of, if they are full and exchange values.
 pub fn full_subgroup(gpu: &Gpu, lanes: u32) -> Option<u32> {
-    gpu.info().full_subgroups.filter(|size| lanes.is_multiple_of(*size))
+    let info = gpu.info();
+    [info.full_subgroups, info.small_subgroups].into_iter().flatten().find(|size| lanes.is_multiple_of(*size))
 }
 
 /// Suffix of variants whose lanes exchange values.
@@ -102,13 +103,13 @@ impl Build<'_> {
         // Not every device takes workgroups as large as some shaders would like; these work with any power of two.
         let lanes = self.lanes.unwrap_or(P::LOCAL_SIZE.min(power_of_two_below(gpu.info().max_workgroup_invocations)));
         // Operands through texel buffers are for drivers that are old and slow at all else.
-        let exchanges = self.exchanges && self.variant.is_empty() && full_subgroup(gpu, lanes).is_some();
-        let variant = if exchanges { EXCHANGING } else { self.variant };
+        let subgroup = full_subgroup(gpu, lanes).filter(|_| self.exchanges && self.variant.is_empty());
+        let variant = if subgroup.is_some() { EXCHANGING } else { self.variant };
         let code = kernel_code(&format!("{}{variant}", P::SHADER))?;
         let pipeline = if self.matrices {
             gpu.matrix_pipeline(code, lanes, self.constants)?
-        } else if exchanges {
-            gpu.subgroup_pipeline(code, lanes, self.constants)?
+        } else if let Some(size) = subgroup {
+            gpu.subgroup_pipeline(code, lanes, size, self.constants)?
         } else {
             gpu.pipeline(code, lanes, self.constants)?
         };
