@@ -60,6 +60,9 @@ SUM weight_gradient[grad_rows * grad_columns];
 float bias_sum[8];
 float out_sum[8];
 float out_bias_sum;
+// Largest gradient that became f16: what is larger than any f16 becomes infinite on some devices, the largest f16 on others.
+float largest;
+shared uint overflowed;
 
 #include "inc/sample_gradient.glsl"
 
@@ -88,7 +91,7 @@ void stage(uint first) {
                 out_sum[2u * i] += tile_gradient[row] * h.x;
                 out_sum[2u * i + 1u] += tile_gradient[row] * h.y;
                 vec2 dz = tile_gradient[row] * unpackHalf2x16(out_weights[i]);
-                dz = vec2(overflowing(dz.x), overflowing(dz.y));
+                largest = max(largest, max(abs(dz.x), abs(dz.y)));
                 packed[i] = packHalf2x16(mix(vec2(0.0), dz, greaterThan(h, vec2(0.0))));
             }
         } else {
@@ -120,7 +123,7 @@ void input_gradient(uint first) {
                 sum = coopMatMulAdd(dz, weights, sum);
             }
             // Element order may differ between component types, so the mask is applied between equal types.
-            [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = overflowing(sum[i]);
+            [[unroll]] for (uint i = 0u; i < sum.length(); i++) largest = max(largest, abs(sum[i]));
             SUM16 gradient = SUM16(sum), on;
             coopMatLoad(on, tile_in, r * m * input_stride + column / 8u, input_stride, ROWS);
             [[unroll]] for (uint i = 0u; i < gradient.length(); i++) {
@@ -182,6 +185,8 @@ void main() {
         out_sum[i] = 0.0;
     }
     out_bias_sum = 0.0;
+    largest = 0.0;
+    overflowed = 0u;
     uint tiles = (live.padded + tile - 1u) / tile;
     [[dont_unroll]] for (uint t = gl_WorkGroupID.x; t < tiles; t += gl_NumWorkGroups.x) {
         stage(t * tile);
@@ -189,12 +194,17 @@ void main() {
         add_weight_gradient(row0, column0);
         barrier();
     }
+    barrier();
+    if (largest > LARGEST) overflowed = 1u;
+    barrier();
     uint mine = gl_WorkGroupID.x * push.n_partials;
     [[unroll]] for (uint r = 0u; r < grad_rows; r++) {
         if (overhang == 0u || row0 + r * m < width) {
             [[unroll]] for (uint c = 0u; c < grad_columns; c++) {
                 uint at = mine + push.weights + (row0 + r * m) * columns + column0 + c * n;
                 SUM sum = weight_gradient[r * grad_columns + c];
+                // An overflow must show in the sums, for the loss scale to give way.
+                if (r == 0u && c == 0u && overflowed != 0u) sum[0] = uintBitsToFloat(0x7f800000u);
                 if (push.accumulate != 0u) {
                     SUM before;
                     coopMatLoad(before, partials, at, columns, ROWS);

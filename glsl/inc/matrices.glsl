@@ -29,13 +29,6 @@ layout(constant_id = 6) const uint width = 128u;      // neurons of a hidden lay
 // Largest f16; activations saturate rather than overflow.
 const float LARGEST = 65504.0;
 
-// What is larger than any f16 becomes infinite: some devices convert it to the largest, and an overflow of gradients must show
-// in their sums, for the loss scale to give way.
-float overflowing(float x) {
-    uint bits = floatBitsToUint(x);
-    return (bits & 0x7fffffffu) > floatBitsToUint(LARGEST) ? uintBitsToFloat((bits & 0x80000000u) | 0x7f800000u) : x;
-}
-
 uint pack2(vec2 pair) {
     return packHalf2x16(clamp(pair, vec2(-LARGEST), vec2(LARGEST)));
 }
