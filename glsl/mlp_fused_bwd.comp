@@ -60,7 +60,7 @@ SUM weight_gradient[grad_rows * grad_columns];
 float bias_sum[8];
 float out_sum[8];
 float out_bias_sum;
-// Largest gradient that became f16: what is larger than any f16 becomes infinite on some devices, the largest f16 on others.
+// Largest gradient in f16: what is larger than any becomes infinite on some devices, the largest there is on others.
 float largest;
 shared uint overflowed;
 
@@ -91,8 +91,9 @@ void stage(uint first) {
                 out_sum[2u * i] += tile_gradient[row] * h.x;
                 out_sum[2u * i + 1u] += tile_gradient[row] * h.y;
                 vec2 dz = tile_gradient[row] * unpackHalf2x16(out_weights[i]);
+                dz = mix(vec2(0.0), dz, greaterThan(h, vec2(0.0)));
                 largest = max(largest, max(abs(dz.x), abs(dz.y)));
-                packed[i] = packHalf2x16(mix(vec2(0.0), dz, greaterThan(h, vec2(0.0))));
+                packed[i] = packHalf2x16(dz);
             }
         } else {
             packed = dz16[(first + row) * width8 + q];
@@ -123,11 +124,11 @@ void input_gradient(uint first) {
                 sum = coopMatMulAdd(dz, weights, sum);
             }
             // Element order may differ between component types, so the mask is applied between equal types.
-            [[unroll]] for (uint i = 0u; i < sum.length(); i++) largest = max(largest, abs(sum[i]));
             SUM16 gradient = SUM16(sum), on;
             coopMatLoad(on, tile_in, r * m * input_stride + column / 8u, input_stride, ROWS);
             [[unroll]] for (uint i = 0u; i < gradient.length(); i++) {
                 gradient[i] = on[i] > float16_t(0.0) ? gradient[i] : float16_t(0.0);
+                largest = max(largest, abs(float(gradient[i])));
             }
             coopMatStore(gradient, dz_in16, (first + r * m) * columns8 + column / 8u, columns8, ROWS);
         }
@@ -195,7 +196,7 @@ void main() {
         barrier();
     }
     barrier();
-    if (largest > LARGEST) overflowed = 1u;
+    if (largest >= LARGEST) overflowed = 1u;
     barrier();
     uint mine = gl_WorkGroupID.x * push.n_partials;
     [[unroll]] for (uint r = 0u; r < grad_rows; r++) {

@@ -1,7 +1,9 @@
 //! `tools/gpu-campaign` as far as it can be tried without a GPU: its first part, as small as it goes.
+#![cfg(unix)]
 #![allow(missing_docs, clippy::unwrap_used)]
 
 use serde_json::Value;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -43,6 +45,13 @@ fn a_campaign_keeps_each_step_and_goes_on() {
     std::fs::write(out.join("part1.json"), fewer.to_string()).unwrap();
     let again = String::from_utf8(campaign(program, &out, &[]).stdout).unwrap();
     assert!(again.contains("part 1: devices") && !again.contains("part 1: selftest"), "{again}");
+    // Results of something else are not gone on with.
+    let mut of: Value = serde_json::from_slice(&std::fs::read(out.join("of.json")).unwrap()).unwrap();
+    of["rehearsal"] = false.into();
+    std::fs::write(out.join("of.json"), of.to_string()).unwrap();
+    let refused = campaign(program, &out, &[]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("take another directory"));
     let files = std::fs::read_dir(&out).unwrap().count();
     assert!(files <= 8, "{files} files come back");
 }
@@ -50,8 +59,13 @@ fn a_campaign_keeps_each_step_and_goes_on() {
 #[test]
 fn steps_that_fail_are_rows_that_say_why() {
     let dir = tempfile::tempdir().unwrap();
-    let failed = campaign("/bin/false", dir.path(), &[]);
+    // It lists devices and says its version, and fails at all else.
+    let program = dir.path().join("program");
+    let text = "#!/bin/sh\ncase $1 in devices) echo '[]';; --version) echo 1;; *) echo no such stage >&2; exit 3;; esac\n";
+    std::fs::write(&program, text).unwrap();
+    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let failed = campaign(program.to_str().unwrap(), dir.path(), &[]);
     assert_eq!(failed.status.code(), Some(1));
-    assert_eq!(part(dir.path())["selftest"]["failure"], "exit code 1: ");
-    assert!(String::from_utf8_lossy(&failed.stdout).contains("| `selftest` | exit code 1:  |"));
+    assert_eq!(part(dir.path())["selftest"]["failure"], "exit code 3: no such stage");
+    assert!(String::from_utf8_lossy(&failed.stdout).contains("| `selftest` | exit code 3: no such stage |"));
 }

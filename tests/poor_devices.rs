@@ -1,5 +1,5 @@
-//! Devices that have no more than Vulkan 1.2 asks of any: no extension, no timestamps, the least limits we can do with. The driver
-//! is the real one, which a loader in between makes look poor.
+//! Devices that have no more than Vulkan 1.2 asks of any: no extension, no timestamps, the least limits we can do with. The
+//! driver is the real one, which a loader in between makes look poor.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;

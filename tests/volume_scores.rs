@@ -285,6 +285,34 @@ fn reports_show_scores_in_3d_and_do_without() {
     assert!(warnings.contains("3D") && warnings.contains("vessels-01.nrrd"), "{warnings}");
 }
 
+/// A field that fills its box cannot be compared voxel by voxel; that is no reason for a run to end.
+#[test]
+fn a_field_everywhere_has_no_distance_and_trains_on() {
+    let directory = tempfile::tempdir().unwrap();
+    let (data, run) = (directory.path().join("data"), directory.path().join("run"));
+    // Small pixels, so that the box of the paper's moving field has too many voxels.
+    ok(&["phantom", text(&data), "--size", "100", "--phases", "2"]);
+    let settings = [
+        "train.rays=32",
+        "train.validate_every=1",
+        "train.validate_images=1",
+        "march.static_samples=32",
+        "march.dynamic_samples=32",
+        "march.render_samples=32",
+        "dynamic.width=16",
+        "dynamic.delay=0",
+        "loss.normalise=true",
+        "dynamic.normalised_shift=8",
+    ];
+    let settings: Vec<&str> = settings.iter().flat_map(|setting| ["--set", setting]).collect();
+    let train = ["train", text(&data), "-o", text(&run), "--preset", "paper", "--iterations", "2", "--no-eval"];
+    ok(&[&train[..], &settings].concat());
+    let metrics = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
+    let lines = metrics.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+    let validations: Vec<Value> = lines.filter(|line| line["event"] == "validation").collect();
+    assert!(!validations.is_empty() && validations.iter().all(|line| line["chamfer_mm"].is_null()), "{metrics}");
+}
+
 #[test]
 fn ssim_is_that_of_scikit_image() {
     // The pair of images of the script.

@@ -24,7 +24,7 @@ import torch
 PRESETS = {
     "paper": dict(rays=2048, static=256, dynamic=256, width=128, layers=4, skip=0, bands=10),
     "public-code": dict(rays=2048, static=256, dynamic=256, width=128, layers=5, skip=4, bands=10),
-    "fast": dict(rays=1024, static=32, dynamic=128, width=96, layers=4, skip=0, bands=8),
+    "fast-mlp": dict(rays=1024, static=32, dynamic=128, width=96, layers=4, skip=0, bands=8),
 }
 GRID, RANKS, PHASES, LATENT = 48, 3, 10, 8
 # Factor on the loss while gradients are f16: as many bits as nertca-vk begins with.

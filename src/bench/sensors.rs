@@ -3,14 +3,17 @@
 
 use crate::gpu::capabilities::DeviceInfo;
 use serde::{Deserialize, Serialize};
+use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Time from one reading to the next.
 const PAUSE: Duration = Duration::from_millis(500);
+/// Time that a program may take to tell.
+const PATIENCE: Duration = Duration::from_secs(3);
 /// Where Linux keeps devices that draw.
 const DRM: &str = "/sys/class/drm";
 
@@ -101,8 +104,29 @@ fn nvidia_uuid(digits: &str) -> Option<String> {
 
 fn read_nvidia(uuid: &str) -> Option<Reading> {
     let query = ["--query-gpu=clocks.sm,power.draw,temperature.gpu", "--format=csv,noheader,nounits"];
-    let output = Command::new("nvidia-smi").arg(format!("--id={uuid}")).args(query).output().ok()?;
-    output.status.success().then(|| nvidia_line(&String::from_utf8_lossy(&output.stdout)))?
+    let mut command = Command::new("nvidia-smi");
+    command.arg(format!("--id={uuid}")).args(query).stdout(Stdio::piped()).stderr(Stdio::null());
+    nvidia_line(&output_within(command, PATIENCE)?)
+}
+
+/// What a command prints, if it succeeds in time; it hangs where a driver does. What it prints must fit a pipe.
+fn output_within(mut command: Command, patience: Duration) -> Option<String> {
+    let mut child = command.spawn().ok()?;
+    let end = Instant::now() + patience;
+    let status = loop {
+        match child.try_wait().ok()? {
+            Some(status) => break status,
+            None if Instant::now() < end => std::thread::sleep(PAUSE / 50),
+            None => {
+                // Killed or gone: either way there is nothing to read.
+                let _ = child.kill();
+                return None;
+            }
+        }
+    };
+    let mut text = String::new();
+    child.stdout.take()?.read_to_string(&mut text).ok()?;
+    status.success().then_some(text)
 }
 
 /// A line of `nvidia-smi`: numbers, or words in brackets for what the card does not tell.
@@ -136,12 +160,12 @@ fn read_amdgpu(directory: &Path) -> Option<Reading> {
     })
 }
 
-/// Mean clock of the processors that `/proc/cpuinfo` lists.
+/// The greatest clock of the processors that `/proc/cpuinfo` lists: others may be idle.
 fn cpu_clock(cpuinfo: &str) -> Option<Reading> {
     let field = |line: &str| line.strip_prefix("cpu MHz")?.split(':').nth(1)?.trim().parse::<f64>().ok();
     let clocks: Vec<f64> = cpuinfo.lines().filter_map(field).collect();
     let span = span(clocks.into_iter())?;
-    Some(Reading { clock_mhz: Some(span.mean), ..Reading::default() })
+    Some(Reading { clock_mhz: Some(span.greatest), ..Reading::default() })
 }
 
 /// The name that `/proc/cpuinfo` has for the host's processor.
@@ -219,6 +243,19 @@ mod tests {
         assert_eq!(nvidia_uuid("0123"), None);
     }
 
+    #[cfg(unix)]
+    #[test]
+    fn a_program_that_hangs_is_given_up() {
+        let shell = |script: &str| {
+            let mut command = Command::new("sh");
+            command.args(["-c", script]).stdout(Stdio::piped());
+            command
+        };
+        assert_eq!(output_within(shell("echo 7"), PATIENCE).unwrap(), "7\n");
+        assert_eq!(output_within(shell("echo 7; exit 3"), PATIENCE), None);
+        assert_eq!(output_within(shell("exec sleep 60"), Duration::from_millis(20)), None);
+    }
+
     #[test]
     fn sensors_of_the_only_amd_card_are_read() {
         let drm = tempfile::tempdir().unwrap();
@@ -250,7 +287,7 @@ mod tests {
         assert_eq!(told.power_w.unwrap().mean, 200.0);
         assert_eq!((told.count, told.temperature_c), (3, None));
         let cpu = cpu_clock("processor\t: 0\ncpu MHz\t\t: 2400.5\nprocessor\t: 1\ncpu MHz\t\t: 2600.5\n").unwrap();
-        assert_eq!(cpu.clock_mhz, Some(2500.5));
+        assert_eq!(cpu.clock_mhz, Some(2600.5));
         assert_eq!(cpu_clock("processor\t: 0\n"), None);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::args::Cli;
 use nertca_vk::config::Config;
-use nertca_vk::error::Result;
+use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::scan::dataset::Dataset;
@@ -45,7 +45,14 @@ impl Cli {
         let Some(cache) = cache.filter(|cache| calibrate::recall(cache, gpu.info(), config).is_none()) else {
             return Ok(self.tuning(gpu, config));
         };
-        let verdict = calibrate::measure(gpu, config, dataset, &tuning)?;
+        let verdict = match calibrate::measure(gpu, config, dataset, &tuning) {
+            // A driver that offers matrices and does not take their kernels; if it is something else, f32 tells as well.
+            Err(error @ (Error::Vulkan { .. } | Error::Config { .. })) => {
+                let reason = format!("f32 layers: those on matrices fail on this device ({error})");
+                return Ok(tuning.with_layers(Layers::F32, reason));
+            }
+            verdict => verdict?,
+        };
         if let Err(error) = calibrate::remember(&cache, gpu.info(), config, verdict) {
             // It only has to be measured again.
             tracing::warn!("{error}");

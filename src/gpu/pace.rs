@@ -1,57 +1,62 @@
 //! How much goes into a submit: as much as no watchdog minds.
 
+use super::capabilities::DeviceInfo;
 use std::sync::{Mutex, PoisonError};
 
 /// Longest submit, seconds: systems reset devices that are busy for two, and what draws the screen waits behind each.
 pub const LONGEST_SUBMIT_S: f64 = 0.1;
-/// Submits that are looked at before more than the first few items go into one: the first of all may have waited for others.
-const TRIALS: u32 = 3;
+/// Submits that are remembered: where the least of them took long, it was not for waiting behind others.
+const REMEMBERED: usize = 3;
 
-/// How many items, iterations or rays, a submit takes on a device; found by its first submits.
+/// How many items, iterations or rays, a submit takes on a device: what its last submits say.
 #[derive(Debug)]
 pub struct SubmitPace {
     longest_s: Option<f64>,
     first: u32,
     most: u32,
-    seen: Mutex<Seen>,
+    /// Seconds per item of the last submits, newest last.
+    seen: Mutex<Vec<f64>>,
 }
 
-#[derive(Debug, Clone, Copy)]
-struct Seen {
-    submits: u32,
-    least_s_per_item: f64,
+/// The longest submit of a device, seconds; none where nothing watches over it.
+pub fn longest_submit_s(info: &DeviceInfo) -> Option<f64> {
+    (!info.is_cpu()).then_some(LONGEST_SUBMIT_S)
 }
 
 impl SubmitPace {
     /// Begins with `first` items to a submit, and never takes more than `most`; without a longest submit it takes these at once.
     pub fn new(longest_s: Option<f64>, first: u32, most: u32) -> SubmitPace {
-        let seen = Mutex::new(Seen { submits: 0, least_s_per_item: f64::INFINITY });
-        SubmitPace { longest_s, first: first.min(most), most, seen }
+        SubmitPace { longest_s, first: first.min(most), most, seen: Mutex::default() }
     }
 
-    fn seen(&self) -> Seen {
-        *self.seen.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Whether submits are still looked at.
+    /// Whether too few submits are known.
     pub fn is_trying(&self) -> bool {
-        self.longest_s.is_some() && self.seen().submits < TRIALS
+        self.longest_s.is_some() && self.seen.lock().unwrap_or_else(PoisonError::into_inner).len() < REMEMBERED
     }
 
     /// Items of the next submit, at least one.
     pub fn items(&self) -> u32 {
-        match self.longest_s {
-            None => self.most,
-            Some(_) if self.is_trying() => self.first,
-            Some(longest_s) => ((longest_s / self.seen().least_s_per_item) as u32).clamp(1, self.most),
+        let Some(longest_s) = self.longest_s else { return self.most };
+        if self.is_trying() {
+            return self.first;
         }
+        let seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        let least_s = seen.iter().copied().fold(f64::INFINITY, f64::min);
+        ((longest_s / least_s) as u32).clamp(1, self.most)
     }
 
     /// Tells how long a submit of so many items took, the wait for it included.
     pub fn note(&self, items: u32, seconds: f64) {
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        seen.submits = seen.submits.saturating_add(1);
-        seen.least_s_per_item = seen.least_s_per_item.min(seconds / f64::from(items.max(1)));
+        if seen.len() == REMEMBERED {
+            seen.remove(0);
+        }
+        seen.push(seconds / f64::from(items.max(1)));
+    }
+
+    /// Forgets what it knows, before items of another kind.
+    pub fn restart(&self) {
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
 }
 
@@ -68,17 +73,22 @@ mod tests {
             pace.note(4, seconds);
         }
         assert_eq!((pace.items(), pace.is_trying()), (50, false));
-        // A slow one says that the device was busy, a fast one that it can do more.
+        // A slow one may have waited; several have not.
+        pace.note(50, 1.0);
         pace.note(50, 1.0);
         assert_eq!(pace.items(), 50);
-        pace.note(50, 0.001);
+        pace.note(50, 1.0);
+        assert_eq!(pace.items(), 5);
+        pace.note(5, 0.0001);
         assert_eq!(pace.items(), 1000);
+        pace.restart();
+        assert_eq!((pace.items(), pace.is_trying()), (4, true));
     }
 
     #[test]
     fn slow_devices_get_one_item_and_processors_all() {
         let pace = SubmitPace::new(Some(0.1), 1, 16);
-        (0..TRIALS).for_each(|_| pace.note(1, 5.0));
+        (0..REMEMBERED).for_each(|_| pace.note(1, 5.0));
         assert_eq!(pace.items(), 1);
         let pace = SubmitPace::new(None, 1, 16);
         assert_eq!((pace.items(), pace.is_trying()), (16, false));

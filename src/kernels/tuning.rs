@@ -3,7 +3,7 @@
 use crate::choice::Choice;
 use crate::gpu::buffer::Operands;
 use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
-use crate::gpu::pace::LONGEST_SUBMIT_S;
+use crate::gpu::pace::longest_submit_s;
 use crate::kernels::constants;
 use serde::Serialize;
 
@@ -147,7 +147,7 @@ impl Tuning {
             private_line_bytes,
             chunk_samples,
             iterations_per_submit: None,
-            longest_submit_s: (!info.is_cpu()).then_some(LONGEST_SUBMIT_S),
+            longest_submit_s: longest_submit_s(info),
             overlap,
             reasons,
         }

@@ -88,8 +88,8 @@ pub struct Renderer {
     /// Where Gaussians are the moving field.
     pub(super) moving: Option<Blobs>,
     pictures: Option<Pictures>,
-    /// Of rays.
-    pace: SubmitPace,
+    /// Of rays, without and with the still field, of integrals and of maxima: what one kind takes says nothing of another.
+    paces: [SubmitPace; 4],
 }
 
 impl Renderer {
@@ -122,8 +122,9 @@ impl Renderer {
         let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
         let param_map = model.param_map.clone();
         let gpu = gpu.clone();
-        let pace = SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
-        let renderer = Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, pace };
+        let pace = |_| SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
+        let paces = std::array::from_fn(pace);
+        let renderer = Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, paces };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -344,10 +345,11 @@ impl Renderer {
         let views = self.gpu.buffer_with("views", &[View::of(rays)])?;
         let pixels = (width * height) as u32;
         let image_width = width as u32;
+        let pace = &self.paces[usize::from(parts.still) + 2 * usize::from(parts.maxima)];
         let (mut out, mut first_pixel) = (Rendering::default(), 0);
         while first_pixel < pixels {
             // Whole rows, which tiles of pixels are made of.
-            let at_once = (self.pace.items() / image_width * image_width).max(RAYS_PER_SUBMIT.min(image_width));
+            let at_once = (pace.items() / image_width * image_width).max(RAYS_PER_SUBMIT.min(image_width));
             let n_rays = at_once.min(pixels - first_pixel);
             let begin = Instant::now();
             let mut recording = Recording::new(&self.gpu, "render")?;
@@ -361,7 +363,7 @@ impl Renderer {
                 kernels.record_rays(&mut recording, &self.buffers, list, n_rays, row, parts.maxima)?;
             }
             self.gpu.wait(recording.finish()?.submit()?)?;
-            self.pace.note(n_rays, begin.elapsed().as_secs_f64());
+            pace.note(n_rays, begin.elapsed().as_secs_f64());
             let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
             out.extend(&seen);
             first_pixel += n_rays;

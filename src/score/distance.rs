@@ -1,7 +1,7 @@
 //! How far the vessels of a run in training are from the true ones: one number at one phase, soon told.
 
 use crate::calibrate::gauge::RigidMotion;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::model::scene::Scene;
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
@@ -39,14 +39,17 @@ impl Distance {
         Ok(Some(Distance { truth: TrueVessels::new(&volume, dataset), file, phase, pixel_mm: pixel_mm(dataset) }))
     }
 
-    /// The Chamfer distance, mm, of the moving field where it exceeds a threshold; none where it nowhere does.
+    /// The Chamfer distance, mm, of the moving field where it exceeds a threshold; none where it nowhere does, and where it fills
+    /// more of its box than can be compared, as fields may on their way.
     ///
     /// # Errors
-    /// As [`crate::score::volume::score`].
+    /// Device errors.
     pub fn chamfer_mm(&self, renderer: &Renderer, scene: &Scene, threshold_per_mm: f64) -> Result<Option<f64>> {
         let Distance { truth, file, phase, pixel_mm } = self;
         let field = MovingField { renderer, scene, phase: *phase, pixel_mm: *pixel_mm, threshold_per_mm };
-        let (_, [truth, ours]) = on_one_grid(&field, &field.coarse()?, truth, file)?;
-        Ok(chamfer_mm(&truth, &ours))
+        match on_one_grid(&field, &field.coarse()?, truth, file) {
+            Err(Error::Data { .. }) => Ok(None),
+            grid => grid.map(|(_, [truth, ours])| chamfer_mm(&truth, &ours)),
+        }
     }
 }

@@ -6,6 +6,7 @@ use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers, record_images, record_step};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
+use crate::gpu::pace::{SubmitPace, longest_submit_s};
 use crate::gpu::record::{Commands, PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{Gaussians, amplitude, dense};
@@ -13,6 +14,7 @@ use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::train::targets::{losses, renew_bounds, take_images, target_buffers};
+use std::time::Instant;
 
 /// A run on a device.
 pub struct GaussianTrainer {
@@ -35,19 +37,23 @@ pub(super) struct Iterations {
     several: Commands,
     n_several: u32,
     single: Commands,
+    pace: SubmitPace,
 }
 
 impl Iterations {
     /// Records them, as many to a submit and one by one, by a function that records so many.
-    pub(super) fn record(per_submit: u32, make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
-        Ok(Iterations { several: make(per_submit)?, n_several: per_submit, single: make(1)? })
+    pub(super) fn record(gpu: &Gpu, per_submit: u32, make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
+        let pace = SubmitPace::new(longest_submit_s(gpu.info()), 1, per_submit);
+        Ok(Iterations { several: make(per_submit)?, n_several: per_submit, single: make(1)?, pace })
     }
 
     /// Runs some, at most up to `stop`; how many.
     pub(super) fn run(&self, gpu: &Gpu, step: u32, stop: u32) -> Result<u32> {
-        let several = stop - step >= self.n_several;
+        let several = stop - step >= self.n_several && self.pace.items() >= self.n_several;
         let (commands, n) = if several { (&self.several, self.n_several) } else { (&self.single, 1) };
+        let begin = Instant::now();
         gpu.wait(commands.submit()?)?;
+        self.pace.note(n, begin.elapsed().as_secs_f64());
         Ok(n)
     }
 }
@@ -288,7 +294,7 @@ fn record(
     n: u32,
     per_submit: u32,
 ) -> Result<Iterations> {
-    Iterations::record(per_submit, |iterations| {
+    Iterations::record(gpu, per_submit, |iterations| {
         let mut recording = Recording::new(gpu, &format!("{iterations} iterations of Gaussians"))?;
         let mut pass = GaussianPass { recording: &mut recording, kernels, targets, particles, setup, n };
         for _ in 0..iterations {

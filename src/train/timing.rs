@@ -36,7 +36,7 @@ pub struct Pace {
 pub enum Length {
     /// So many iterations; of Gaussians, as many of a fit's first at most.
     Iterations(u32),
-    /// About so many seconds; of Gaussians, whole fits, as many as fill all repeats.
+    /// About so many seconds; of Gaussians, whole fits, as many as fill all repeats, and three at least.
     Seconds(f64),
 }
 
@@ -45,7 +45,7 @@ pub enum Length {
 pub struct Timing {
     /// Milliseconds per iteration of each repeat.
     pub ms: Vec<f64>,
-    /// Live dynamic samples of the last iteration.
+    /// Live dynamic samples of an iteration, mean of those timed.
     pub live_samples: u64,
     /// Counted operations of an iteration's network, forward and backward, GFLOP.
     pub network_gflop: f64,
@@ -221,11 +221,12 @@ impl Subject {
         self.trainer.work(live_samples)
     }
 
+    /// Runs so many iterations; live samples of all of them.
     fn run(&mut self, n: u32) -> Result<u64> {
         let target = self.trainer.step() + n;
         let mut live = 0;
         while self.trainer.step() < target {
-            live = self.trainer.advance(target)?.last().map_or(live, |l| l.live_samples);
+            live += self.trainer.advance(target)?.iter().map(|l| l.live_samples).sum::<u64>();
         }
         Ok(live)
     }
@@ -245,10 +246,11 @@ impl Subject {
         let meanwhile = Meanwhile::begin(&self.gpu);
         for _ in 0..pace.repeats {
             let begin = Instant::now();
-            live_samples = self.run(iterations)?;
+            live_samples += self.run(iterations)?;
             ms.push(begin.elapsed().as_secs_f64() * 1e3 / f64::from(iterations));
         }
         let (host_cpu_share, readings) = meanwhile.end();
+        let live_samples = live_samples / u64::from(iterations * pace.repeats);
         let network_gflop = live_samples as f64 * self.cost.total() as f64 * 1e-9;
         Ok(Timing { ms, live_samples, network_gflop, host_cpu_share, iterations, learned, readings })
     }
@@ -287,6 +289,9 @@ pub struct GaussianSubject {
     /// Iterations of a fit that are timed.
     timed: u32,
 }
+
+/// Fits at least: one says nothing of how they differ.
+const LEAST_FITS: usize = 3;
 
 /// A fit that was timed.
 struct TimedFit {
@@ -354,7 +359,9 @@ impl GaussianSubject {
         let (mut ms, mut preparation_s) = (vec![last.ms], vec![last.preparation_s]);
         let more = |done: usize| match pace.length {
             Length::Iterations(_) => done < pace.repeats as usize,
-            Length::Seconds(seconds) => begin.elapsed().as_secs_f64() < seconds * f64::from(pace.repeats),
+            Length::Seconds(seconds) => {
+                done < LEAST_FITS || begin.elapsed().as_secs_f64() < seconds * f64::from(pace.repeats)
+            }
         };
         while more(ms.len()) {
             last = self.fit()?;

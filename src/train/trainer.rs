@@ -58,6 +58,8 @@ pub struct Trainer {
     /// Gaussians, where they are the moving field.
     moving: Option<Moving>,
     pace: SubmitPace,
+    /// When the last submit was done, or the one under way began.
+    last_completion: Instant,
     single: Commands,
     /// As many iterations as a submit takes, once that is known.
     several: Option<(Commands, u32)>,
@@ -236,6 +238,7 @@ impl Trainer {
             still,
             forward,
             training,
+            last_completion: Instant::now(),
             single,
             several: None,
             in_flight: VecDeque::new(),
@@ -309,39 +312,44 @@ impl Trainer {
         if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
             return self.advance_gaussians(until);
         }
-        if self.pace.is_trying() && self.in_flight.is_empty() && self.submitted < until {
-            return self.try_iteration();
-        }
         self.record_several()?;
-        while self.submitted < until && self.in_flight.len() < submits_in_flight(&self.gpu) {
-            let fits = |(_, n): &&(Commands, u32)| until - self.submitted >= *n;
+        if self.in_flight.is_empty() {
+            self.last_completion = Instant::now();
+        }
+        while self.submitted < until && self.in_flight.len() < self.submits_in_flight() {
+            // The network's iterations are others than those before it starts: they are tried anew.
+            let starts = self.plan.config.dynamic.delay;
+            let stop = if self.submitted < starts { until.min(starts) } else { until };
+            let fits = |(_, n): &&(Commands, u32)| !self.pace.is_trying() && stop - self.submitted >= *n;
             let (commands, n) = match self.several.as_ref().filter(fits) {
                 Some((commands, n)) => (commands, *n),
                 None => (&self.single, 1),
             };
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
+            if self.submitted == starts {
+                self.pace.restart();
+            }
         }
         let Some((ticket, n)) = self.in_flight.pop_front() else { return Ok(Vec::new()) };
         self.gpu.wait(ticket)?;
         self.completed += n;
+        self.pace.note(n, self.last_completion.elapsed().as_secs_f64());
+        self.last_completion = Instant::now();
         self.read_losses()
     }
 
-    /// Runs an iteration alone, to see how long it takes.
-    fn try_iteration(&mut self) -> Result<Vec<StepLoss>> {
-        let begin = Instant::now();
-        self.submitted += 1;
-        self.gpu.wait(self.single.submit()?)?;
-        self.completed += 1;
-        self.pace.note(1, begin.elapsed().as_secs_f64());
-        self.read_losses()
+    /// Submits under way at once: one while it is seen how long they take.
+    fn submits_in_flight(&self) -> usize {
+        if self.pace.is_trying() { 1 } else { submits_in_flight(&self.gpu) }
     }
 
-    /// Records as many iterations as a submit takes, once that is known.
+    /// Records as many iterations as a submit takes, once that is known, and again where it takes fewer, or twice as many.
     fn record_several(&mut self) -> Result<()> {
-        let n = self.pace.items();
-        if self.several.is_none() && !self.pace.is_trying() && n > 1 {
+        let (n, recorded) = (self.pace.items(), self.several.as_ref().map_or(1, |(_, n)| *n));
+        if !self.pace.is_trying() && n == 1 {
+            self.several = None;
+        } else if !self.pace.is_trying() && (n < recorded || n >= 2 * recorded) {
             let mut recording = Recording::new(&self.gpu, &format!("{n} training iterations"))?;
             for _ in 0..n {
                 record_step(&mut self.pass(&mut recording))?;

@@ -387,7 +387,7 @@ fn record(
     n: u32,
     per_submit: u32,
 ) -> Result<Iterations> {
-    Iterations::record(per_submit, |iterations| {
+    Iterations::record(gpu, per_submit, |iterations| {
         let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a tree"))?;
         let mut pass = pass(&mut recording, kernels, fit, bound, n);
         for _ in 0..iterations {

@@ -1,6 +1,6 @@
 //! A Vulkan loader between the engine and the system's: it counts what is made and destroyed, makes calls fail on
-//! request, fills new memory with a pattern, with canaries behind each buffer, and makes devices look poorer than they are. One state per thread, since the engine
-//! calls Vulkan on its caller's thread as long as nobody starts another.
+//! request, fills new memory with a pattern, with canaries behind each buffer, and makes devices look poorer than they are.
+//! One state per thread, since the engine calls Vulkan on its caller's thread as long as nobody starts another.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 #![allow(clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks, reason = "passes on what it is given")]
 
