@@ -273,13 +273,26 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
     let mut fit = GaussianSubject::new(gpu, config, dataset, args.iterations * args.repeats + profiled)?;
     let gaussians = fit.time(args.iterations, args.repeats)?;
     let mut passes_ms = fit.passes(profiled)?;
+    let notes = fit.notes().to_vec();
     drop(fit);
+    let whole_fit_s = |iterations: u32| gaussians.preparation_s + 1e-3 * gaussians.median() * f64::from(iterations);
+    if config.is_r2() {
+        return Ok(Timings {
+            paths: notes,
+            rays: 0,
+            network_cost: None,
+            whole_run_s: whole_fit_s(config.train.iterations),
+            gaussians: Some(gaussians),
+            before: None,
+            after: None,
+            passes_ms,
+        });
+    }
     let mut still = Subject::new(gpu, config, dataset, tuning, false)?;
     let before = still.time(args.iterations, args.repeats)?;
     passes_ms.extend(still.passes(profiled)?);
     let first = config.gaussian_iterations();
-    let whole_run_s = gaussians.preparation_s
-        + 1e-3 * (gaussians.median() * f64::from(first) + before.median() * f64::from(config.train.iterations - first));
+    let whole_run_s = whole_fit_s(first) + 1e-3 * before.median() * f64::from(config.train.iterations - first);
     Ok(Timings {
         paths: still.notes(),
         rays: still.rays(),
@@ -312,7 +325,11 @@ fn print(report: &Report, kernels: bool) {
     let p = &report.peaks;
     let matrix = p.matrix_tflops.map_or("none".to_owned(), |t| format!("{t:.3} TFLOP/s"));
     out!("peaks: f32 {:.3} TFLOP/s, f16 matrices {matrix}, copy {:.1} GB/s", p.f32_tflops, p.copy_gb_per_s);
-    out!("preset {}, {} rays per iteration", report.preset, report.rays);
+    match report.rays {
+        // Whole images are compared.
+        0 => out!("preset {}", report.preset),
+        rays => out!("preset {}, {rays} rays per iteration", report.preset),
+    }
     if let Some(gaussians) = &report.gaussians {
         print_gaussians(report, gaussians);
     }

@@ -184,9 +184,9 @@ pub(super) fn read(
 }
 
 /// Where tensors are read from.
-struct File<'a> {
-    tensors: &'a SafeTensors<'a>,
-    path: &'a Path,
+pub(super) struct File<'a> {
+    pub(super) tensors: &'a SafeTensors<'a>,
+    pub(super) path: &'a Path,
 }
 
 impl File<'_> {
@@ -202,7 +202,7 @@ impl File<'_> {
         Ok(view.data())
     }
 
-    fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
+    pub(super) fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
         let bytes = self.bytes(name, Dtype::F32, shape)?.chunks_exact(4);
         let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
         match values.iter().all(|v| v.is_finite()) {
@@ -211,7 +211,7 @@ impl File<'_> {
         }
     }
 
-    fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
+    pub(super) fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
         let bytes = self.bytes(name, Dtype::U32, &[Some(n)])?.chunks_exact(4);
         Ok(bytes.map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect())
     }

@@ -189,6 +189,7 @@ impl Subject {
 pub struct GaussianSubject {
     fit: MovingFit,
     preparation_s: f64,
+    notes: Vec<String>,
 }
 
 impl GaussianSubject {
@@ -200,21 +201,30 @@ impl GaussianSubject {
     pub fn new(gpu: &Gpu, config: &Config, dataset: &Dataset, most: u32) -> Result<GaussianSubject> {
         let mut config = config.clone();
         config.gaussians.iterations = config.gaussians.iterations.max(most + WARM_UP);
-        let Some(targets) = Plan::new(&config, dataset)?.targets else {
+        if config.is_r2() {
+            config.train.iterations = config.train.iterations.max(most + WARM_UP);
+        }
+        let mut plan = Plan::new(&config, dataset)?;
+        let begin = Instant::now();
+        let Some(fit) = MovingFit::begin(gpu, &mut plan, &config)? else {
             return Err(Error::config(
                 "gaussians.form",
                 config.gaussians.form.name(),
                 "there are no Gaussians to time",
             ));
         };
-        let begin = Instant::now();
-        let mut subject = GaussianSubject { fit: MovingFit::new(gpu, targets, &config)?, preparation_s: 0.0 };
+        let mut subject = GaussianSubject { fit, preparation_s: 0.0, notes: plan.notes };
         while subject.fit.preparation().is_some() {
             subject.fit.advance(0)?;
         }
         subject.preparation_s = begin.elapsed().as_secs_f64();
         subject.run(WARM_UP)?;
         Ok(subject)
+    }
+
+    /// Choices about data and settings.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     fn run(&mut self, n: u32) -> Result<()> {

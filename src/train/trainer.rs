@@ -13,6 +13,7 @@ use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
+use crate::model::r2::R2State;
 use crate::model::setup::{RING_LENGTH, sample_capacity};
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::pass::Pass;
@@ -54,10 +55,10 @@ pub struct Trainer {
     training: TrainingBuffers,
     /// Gaussians, where they are the moving field.
     moving: Option<Moving>,
-    /// Iterations of `several`.
+    /// Iterations handed to the device at once.
     per_submit: u32,
-    several: Commands,
-    single: Commands,
+    /// Iterations of fields that rays are marched through; none where Gaussians are all there is.
+    marching: Option<Marching>,
     in_flight: VecDeque<(Ticket, u32)>,
     submitted: u32,
     completed: u32,
@@ -69,9 +70,17 @@ pub struct Trainer {
     data_fingerprint: String,
 }
 
+/// Recorded iterations.
+struct Marching {
+    /// As many as go to the device at once.
+    several: Commands,
+    single: Commands,
+}
+
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
-    if checkpoint.model.param_map == plan.params && checkpoint.model.moving.is_some() == plan.targets.is_some() {
+    let has_gaussians = plan.targets.is_some() || plan.r2.is_some();
+    if checkpoint.model.param_map == plan.params && checkpoint.model.moving.is_some() == has_gaussians {
         return Ok(());
     }
     Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
@@ -207,8 +216,7 @@ impl Trainer {
         let of_these_data = saved.filter(|saved| saved.data_fingerprint == data_fingerprint);
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
         let earlier = earlier.filter(|_| of_these_data.is_none());
-        let saved_model = of_these_data.map(|saved| &saved.model);
-        let moving = Moving::begin(gpu, &mut plan, dataset, saved_model, earlier, per_submit)?;
+        let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data, earlier, per_submit)?;
         let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
         // The still field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
@@ -230,7 +238,8 @@ impl Trainer {
             }
             recording.finish()
         };
-        let (several, single) = (record(per_submit)?, record(1)?);
+        let has_still_field = !plan.config.is_r2();
+        let marching = has_still_field.then(|| Ok(Marching { several: record(per_submit)?, single: record(1)? })).transpose()?;
         let trainer = Trainer {
             gpu: gpu.clone(),
             kernels,
@@ -239,8 +248,7 @@ impl Trainer {
             forward,
             training,
             per_submit,
-            several,
-            single,
+            marching,
             in_flight: VecDeque::new(),
             submitted: step,
             completed: step,
@@ -300,11 +308,12 @@ impl Trainer {
         if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
             return self.advance_gaussians(until);
         }
-        while self.submitted < until && self.in_flight.len() < submits_in_flight(&self.gpu) {
+        let most = submits_in_flight(&self.gpu);
+        while let Some(marching) = self.marching.as_ref().filter(|_| self.submitted < until && self.in_flight.len() < most) {
             let (commands, n) = if until - self.submitted >= self.per_submit {
-                (&self.several, self.per_submit)
+                (&marching.several, self.per_submit)
             } else {
-                (&self.single, 1)
+                (&marching.single, 1)
             };
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
@@ -379,6 +388,9 @@ impl Trainer {
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
+        if let Some(passes) = self.moving.as_mut().filter(|_| self.marching.is_none()).map(Moving::profile_step) {
+            return passes;
+        }
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
         record_step(&mut Pass {
             recording: &mut recording,
@@ -442,6 +454,10 @@ impl Trainer {
         let occupancy = copy(&self.forward.occupancy, 0, occupancy_bytes(&self.plan.setup))?;
         let commands = recording.finish()?;
         let ticket = commands.submit()?;
+        let (mut model, mut r2) = (self.outline(), None);
+        if let Some((state, field)) = self.moving.as_ref().map(Moving::r2_state).transpose()?.flatten() {
+            (model.moving, r2) = (Some(field), Some(state));
+        }
         Ok(Snapshot {
             gpu: self.gpu.clone(),
             ticket,
@@ -453,7 +469,8 @@ impl Trainer {
             occupancy,
             occupancy_words: occupancy_bytes(&self.plan.setup) as usize / 4,
             scaled: self.network.layers() == Layers::Matrices,
-            model: self.outline(),
+            model,
+            r2,
             data_fingerprint: self.data_fingerprint.clone(),
         })
     }
@@ -491,6 +508,7 @@ pub struct Snapshot {
     occupancy_words: usize,
     scaled: bool,
     model: Model,
+    r2: Option<R2State>,
     data_fingerprint: String,
 }
 
@@ -533,6 +551,7 @@ impl Snapshot {
             loss_scale: self.scaled.then_some(LossScale { scale, good_updates }),
             stopped: stopped != 0,
             last_report,
+            r2: self.r2,
             data_fingerprint: self.data_fingerprint,
         })
     }
