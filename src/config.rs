@@ -34,14 +34,8 @@ pub enum Preset {
 }
 
 impl Choice for Preset {
-    const ALL: &'static [Preset] = &[
-        Preset::Fast,
-        Preset::FastMlp,
-        Preset::Paper,
-        Preset::PublicCode,
-        Preset::NerfCa,
-        Preset::R2Gaussian,
-    ];
+    const ALL: &'static [Preset] =
+        &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa, Preset::R2Gaussian];
 
     fn name(self) -> &'static str {
         match self {

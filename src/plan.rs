@@ -251,7 +251,9 @@ fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
         );
     }
     if !dataset.hidden.is_empty() {
-        notes.push("pixels that show nothing of the patient are fitted like all others: R2-Gaussian knows no masks".into());
+        notes.push(
+            "pixels that show nothing of the patient are fitted like all others: R2-Gaussian knows no masks".into(),
+        );
     }
     if dataset.heart_shifts() {
         notes.push("R2-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());

@@ -104,6 +104,7 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
         ("R2-Gaussian".into(), Box::new(move |findings| r2::compare(gpu, findings))),
         ("a moving tree".into(), Box::new(move |findings| trees::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
+        ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_crowd(gpu, tuning, findings))),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),
         ("equal runs of Gaussians".into(), Box::new(move |findings| repeats::compare_gaussians(gpu, findings))),
         ("projections of volumes".into(), Box::new(move |findings| projections::compare(gpu, findings))),

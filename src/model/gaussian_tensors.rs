@@ -33,6 +33,9 @@ pub(super) struct GaussianHeader {
     views: u32,
     /// The grid that moves a tree; none for a set per phase.
     grid: Option<GridHeader>,
+    /// Whether Gaussians are all there is and overlap by the hundred.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    crowd: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -58,6 +61,7 @@ pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
         greatest_scale: sets.setup.greatest_scale,
         step: sets.step,
         views: sets.setup.n_views,
+        crowd: sets.is_crowd,
         grid: match field {
             MovingGaussians::PerPhase(_) => None,
             MovingGaussians::Tree(tree) => Some(GridHeader {
@@ -153,6 +157,7 @@ pub(super) fn read(
         },
         rows: (0..n).map(row).collect(),
         step: header.step,
+        is_crowd: header.crowd,
     };
     let Some(grid) = &header.grid else { return Ok(MovingGaussians::PerPhase(sets)) };
     if !(2..=MOST_NODES).contains(&grid.nodes)

@@ -42,6 +42,9 @@ pub struct Gaussians {
     pub rows: Vec<Gaussian>,
     /// Iterations done.
     pub step: u32,
+    /// Whether Gaussians are all there is and overlap by the hundred, as R2-Gaussian's do: their largest sum along a ray is
+    /// sought among all of them.
+    pub is_crowd: bool,
 }
 
 impl Gaussians {

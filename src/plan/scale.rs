@@ -72,6 +72,8 @@ impl Scene {
     fn hold_volume(&mut self, half: f64, seen: f64) {
         (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
         (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
+        let corner = half * 3f64.sqrt();
+        (self.static_depth, self.dynamic_depth) = ([-corner, corner], [-corner, corner]);
         self.region = Some([[-seen.min(half); 3], [seen.min(half); 3]]);
         self.static_gain = 0.0;
     }

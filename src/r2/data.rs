@@ -126,6 +126,7 @@ impl R2Data {
             },
             rows,
             step,
+            is_crowd: true,
         }
     }
 }

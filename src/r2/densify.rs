@@ -37,7 +37,8 @@ pub fn densified(before: &R2State, n_sets: usize, settings: &R2, seed: u32, step
         after.rows[row].density = shared(&before.rows[row]);
     }
     after.retain(&fates.iter().map(|fate| *fate != Fate::Split).collect::<Vec<_>>());
-    let clones = chosen(Fate::Cloned).into_iter().map(|i| R2Gaussian { density: shared(&before.rows[i]), ..before.rows[i] });
+    let clones =
+        chosen(Fate::Cloned).into_iter().map(|i| R2Gaussian { density: shared(&before.rows[i]), ..before.rows[i] });
     after.append(clones.collect());
     for child in 0..CHILDREN {
         let of = |i: usize| split(&before.rows[i], bounds, |axis| deviate(seed, step, i, 3 * child + axis));

@@ -63,7 +63,8 @@ pub fn schedule(config: &Config) -> Vec<R2Schedule> {
     let row = |step: u32| {
         let is_update = !densifies(r2, step);
         updates += i32::from(is_update);
-        let rate = |start: f64, end: f64| (start * (end / start).powf((f64::from(step) / f64::from(n)).min(1.0))) as f32;
+        let rate =
+            |start: f64, end: f64| (start * (end / start).powf((f64::from(step) / f64::from(n)).min(1.0))) as f32;
         let bias = |beta: f64| (1.0 - beta.powi(updates.max(1))) as f32;
         R2Schedule {
             position_rate: rate(r2.position_rate, r2.position_rate_end),

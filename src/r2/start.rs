@@ -143,9 +143,7 @@ impl PointGrid {
         range(home[2]).flat_map(move |z| {
             range(home[1]).flat_map(move |y| {
                 let edge = z.abs_diff(home[2]) == shell || y.abs_diff(home[1]) == shell;
-                range(home[0])
-                    .filter(move |x| edge || x.abs_diff(home[0]) == shell)
-                    .map(move |x| self.index([x, y, z]))
+                range(home[0]).filter(move |x| edge || x.abs_diff(home[0]) == shell).map(move |x| self.index([x, y, z]))
             })
         })
     }
@@ -159,8 +157,11 @@ mod tests {
     fn nothing_nearer_is_passed_over() {
         for n in [1, 2, 3, 4, 5, 200] {
             // Crowded in a corner, and a few elsewhere.
-            let points: Vec<DVec3> =
-                anywhere(n, 3).iter().enumerate().map(|(i, (x, _))| if i % 7 == 0 { *x } else { 0.1 * *x - 0.8 }).collect();
+            let points: Vec<DVec3> = anywhere(n, 3)
+                .iter()
+                .enumerate()
+                .map(|(i, (x, _))| if i % 7 == 0 { *x } else { 0.1 * *x - 0.8 })
+                .collect();
             for (i, spacing) in spacings(&points).into_iter().enumerate() {
                 let mut all: Vec<f64> =
                     (0..n).filter(|k| *k != i).map(|k| points[i].distance_squared(points[k])).collect();

@@ -161,9 +161,8 @@ pub fn gradient(p: &Params, view: &SplatView, setup: &GaussianSetup, moments: [f
     let d_mean = seen.conic * DVec2::new(hu, hv) + seen.follows * d_held;
     let d_depth = -(seen.slopes[0].dot(d_slopes[0]) + seen.slopes[1].dot(d_slopes[1]) + 2.0 * h) / z;
     let by_position = |k: usize, mean: f64| (view.rows[k] - mean * view.rows[0]) / z;
-    let d_position = d_mean.x * by_position(1, seen.mean.x)
-        + d_mean.y * by_position(2, seen.mean.y)
-        + d_depth * view.rows[0];
+    let d_position =
+        d_mean.x * by_position(1, seen.mean.x) + d_mean.y * by_position(2, seen.mean.y) + d_depth * view.rows[0];
     let d_scale = seen.alpha * d_alpha + seen.beta * d_beta + h;
     let column = |k: usize| scale[k] * (d_alpha[k] * seen.slopes[0] + d_beta[k] * seen.slopes[1]);
     let d_rotation = rotation_gradient(p, DMat3::from_cols(column(0), column(1), column(2)));
@@ -304,8 +303,7 @@ impl VoxelBox<'_> {
         let mut sums = [0.0; 10];
         for (at, c) in self.near(p) {
             let h = gradient[at] * softplus(p[3]) * (-0.5 * c.length_squared()).exp();
-            let terms =
-                [1.0, c.x, c.y, c.z, c.x * c.x, c.y * c.y, c.z * c.z, c.x * c.y, c.x * c.z, c.y * c.z];
+            let terms = [1.0, c.x, c.y, c.z, c.x * c.x, c.y * c.y, c.z * c.z, c.x * c.y, c.x * c.z, c.y * c.z];
             sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += h * term);
         }
         sums
@@ -317,8 +315,7 @@ impl VoxelBox<'_> {
         let (axes, scale) = (axes(p), scale(p, self.setup));
         let moves = if self.r2.tv_moves_centres != 0 { 1.0 } else { 0.0 };
         let d_position = moves * (axes * (DVec3::new(x, y, z) / scale));
-        let second =
-            [DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz)];
+        let second = [DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz)];
         let column = |k: usize| -(axes * (scale * second[k])) / scale[k];
         let d_rotation = rotation_gradient(p, DMat3::from_cols(column(0), column(1), column(2)));
         together(d_position, h, DVec3::new(xx, yy, zz), d_rotation)

@@ -229,6 +229,7 @@ impl GaussianTrainer {
             setup: self.setup,
             rows: self.gpu.download(&self.particles.gaussians, 0, self.n as usize)?,
             step: self.step,
+            is_crowd: false,
         };
         model.check()?;
         Ok(model)

@@ -239,7 +239,8 @@ impl Trainer {
             recording.finish()
         };
         let has_still_field = !plan.config.is_r2();
-        let marching = has_still_field.then(|| Ok(Marching { several: record(per_submit)?, single: record(1)? })).transpose()?;
+        let marching =
+            has_still_field.then(|| Ok(Marching { several: record(per_submit)?, single: record(1)? })).transpose()?;
         let trainer = Trainer {
             gpu: gpu.clone(),
             kernels,
@@ -309,7 +310,9 @@ impl Trainer {
             return self.advance_gaussians(until);
         }
         let most = submits_in_flight(&self.gpu);
-        while let Some(marching) = self.marching.as_ref().filter(|_| self.submitted < until && self.in_flight.len() < most) {
+        while let Some(marching) =
+            self.marching.as_ref().filter(|_| self.submitted < until && self.in_flight.len() < most)
+        {
             let (commands, n) = if until - self.submitted >= self.per_submit {
                 (&marching.several, self.per_submit)
             } else {

@@ -322,6 +322,7 @@ impl TreeTrainer {
             setup: self.joint.setup,
             rows: self.gpu.download(&self.particles.gaussians, 0, n)?,
             step: self.step,
+            is_crowd: false,
         };
         rest.check()?;
         Ok(MovingTree { rest, setup: tree, grid, own })
