@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// The largest attenuation along each ray where far more Gaussians overlap than gaussian_rays keeps peaks of, and where there is
-// no still field: their sum at regular depths, then uphill from the largest, over all of them each time. One workgroup per
-// tile of 8 x 8 pixels, one invocation per ray.
+// The largest attenuation along each ray where far more Gaussians overlap than gaussian_rays keeps peaks of, and where
+// there is no still field: their sum at regular depths, then uphill from the largest, over all of them each time. One
+// workgroup per tile of 8 x 8 pixels, one invocation per ray.
 //   ray_out[ray].dynamic_max, total_max
 // Twin: reference::blobs.
 #include "inc/layout.glsl"

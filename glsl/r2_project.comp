@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// How each Gaussian of R2-Gaussian is seen by the view that its set looks at in this iteration. One invocation per Gaussian.
+// How each Gaussian of R2-Gaussian is seen by the view that its set looks at in this iteration. One invocation per
+// Gaussian.
 #include "inc/r2.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; } push;

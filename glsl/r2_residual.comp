@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Last pass of SSIM, along columns, and the gradient of each set's loss by its picture x, of N pixels, whose image is y:
+// Last pass of SSIM, along columns, and the gradient of each set's loss by its picture x, of N pixels, whose image is
+// y:
 //   (sign(x - y) - ssim_weight (G P + 2 x G Q + y G T)) / N
 // with G the window. One invocation per pixel (x) and set (y).
 #include "inc/gaussian_layout.glsl"

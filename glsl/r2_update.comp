@@ -1,7 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of each Gaussian of R2-Gaussian from its moments in the view and in the box of voxels, down to what is stored; the
-// statistic of density control, how strongly the image pulls at its centre; and Adam. One invocation per Gaussian.
+// Gradient of each Gaussian of R2-Gaussian from its moments in the view and in the box of voxels, down to what is
+// stored; the statistic of density control, how strongly the image pulls at its centre; and Adam. One invocation per
+// Gaussian.
 #include "inc/r2.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; } push;
@@ -66,7 +67,8 @@ void main() {
     vec4 place = vec4(sum.position, sum.log_density * density_slope(g));
     vec4 place_rate = vec4(vec3(now.position_rate), now.density_rate);
     vec4 moved = step_of(3u * i, place, place_rate, now);
-    vec4 grown = step_of(3u * i + 1u, vec4(sum.log_scale * scale_slope(g, gaussian_setup), 0.0), vec4(now.scale_rate), now);
+    vec4 scale = vec4(sum.log_scale * scale_slope(g, gaussian_setup), 0.0);
+    vec4 grown = step_of(3u * i + 1u, scale, vec4(now.scale_rate), now);
     vec4 turned = step_of(3u * i + 2u, sum.rotation, vec4(now.rotation_rate), now);
     r2_gaussians[i].position = g.position - moved.xyz;
     r2_gaussians[i].density = g.density - moved.w;

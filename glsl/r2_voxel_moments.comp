@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What the gradient of a Gaussian needs of the voxels near it: sums of h = dL/d(attenuation) times its value there, plain and
-// weighted by c and c c^T, with c the way from its centre in standard deviations along its axes. One invocation per Gaussian,
-// or as many as share one.
+// What the gradient of a Gaussian needs of the voxels near it: sums of h = dL/d(attenuation) times its value there,
+// plain and weighted by c and c c^T, with c the way from its centre in standard deviations along its axes. One
+// invocation per Gaussian, or as many as share one.
 #include "inc/r2.glsl"
 #include "inc/r2_voxels.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Attenuation at the voxels of each set's box: each Gaussian adds itself to those near it, in integers of a fixed point, so
-// that runs repeat bit by bit. One invocation per Gaussian, or as many as share one, as in gaussian_splat.
+// Attenuation at the voxels of each set's box: each Gaussian adds itself to those near it, in integers of a fixed
+// point, so that runs repeat bit by bit. One invocation per Gaussian, or as many as share one, as in gaussian_splat.
 #include "inc/r2.glsl"
 #include "inc/r2_voxels.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Total variation of each set's box of s^3 voxels: the mean of |difference| over the 3 (s - 1) s^2 pairs of neighbours, and
-// its gradient by each voxel. One invocation per voxel (x) and set (y).
+// Total variation of each set's box of s^3 voxels: the mean of |difference| over the 3 (s - 1) s^2 pairs of neighbours,
+// and its gradient by each voxel. One invocation per voxel (x) and set (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/r2_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// First pass of SSIM between each set's picture x and its image y: along rows, the window's sums of x, y, x^2, y^2 and x y.
-// One invocation per pixel (x) and set (y).
+// First pass of SSIM between each set's picture x and its image y: along rows, the window's sums of x, y, x^2, y^2 and
+// x y. One invocation per pixel (x) and set (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/r2_layout.glsl"
 #include "inc/ssim.glsl"

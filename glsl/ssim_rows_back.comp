@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Third pass of SSIM: along rows, the window's sums of the factors of its gradient; with zeros beyond the image the window is
-// its own adjoint. One invocation per pixel (x) and set (y).
+// Third pass of SSIM: along rows, the window's sums of the factors of its gradient; with zeros beyond the image the
+// window is its own adjoint. One invocation per pixel (x) and set (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/ssim.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

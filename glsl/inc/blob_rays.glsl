@@ -1,5 +1,5 @@
-// Gaussians along the rays of a tile of 8 x 8 pixels, one invocation per ray. Needs `push`, `rays`, "inc/blobs.glsl" and
-// "inc/reduce.glsl".
+// Gaussians along the rays of a tile of 8 x 8 pixels, one invocation per ray. Needs `push`, `rays`, "inc/blobs.glsl"
+// and "inc/reduce.glsl".
 
 // A tile's first ray, and how far others stray from it at depth 0 and per depth.
 struct Tile {

@@ -4,7 +4,8 @@
 #include "inc/r2_layout.glsl"
 #include "inc/softplus.glsl"
 
-// The slopes of a projection are those at the image's border, this many half images from its middle, for all that is beyond.
+// The slopes of a projection are those at the image's border, this many half images from its middle, for all that is
+// beyond.
 const float SLOPES_END = 1.3;
 // Least squared difference of a splat's variances along its axes, pixels^4, when its radius is found.
 const float LEAST_SPREAD = 0.1;

@@ -1,6 +1,6 @@
-// Structures of R2-Gaussian shared with the host: build.rs makes Rust's from them, comments included. Lengths are half sides
-// of the volume, which is the cube from -1 to 1; densities are 1 where vessels attenuate as they are said to; line
-// integrals are their product.
+// Structures of R2-Gaussian shared with the host: build.rs makes Rust's from them, comments included. Lengths are half
+// sides of the volume, which is the cube from -1 to 1; densities are 1 where vessels attenuate as they are said to;
+// line integrals are their product.
 
 // A Gaussian as R2-Gaussian stores it: its density is softplus(density), a sigmoid keeps each scale between its bounds.
 struct R2Gaussian {
@@ -11,7 +11,7 @@ struct R2Gaussian {
     vec4 rotation;              // quaternion (w, x, y, z) of its axes; its length does not matter
 };
 
-// What stays fixed during a fit, beside GaussianSetup.
+// What stays fixed during a fit, beside GaussianSetup, whose lengths are half sides here, too.
 struct R2Setup {
     uint n_sets;                // sets of Gaussians, each fitted by itself
     uint box_side;              // voxels along each side of the box whose total variation counts

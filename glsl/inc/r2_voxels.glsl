@@ -1,4 +1,5 @@
-// Which voxels of a set's box a Gaussian reaches, and what it adds to each. Needs "inc/r2.glsl". Twin: src/reference/r2.rs.
+// Which voxels of a set's box a Gaussian reaches, and what it adds to each. Needs "inc/r2.glsl". Twin:
+// src/reference/r2.rs.
 
 // Standard deviations along its longest axis at which a Gaussian ends.
 const float VOXEL_CUT = 3.0;

@@ -268,8 +268,8 @@ section! {
     /// Gaussians as the moving field. Lengths are pixels at the isocentre of images whose smaller side has 100, and grow with
     /// the images; line integrals are shares of the views' strongest change.
     Gaussians, "gaussians" {
-        /// What the moving field is made of: "none" (the network), "phase", "tree", "auto", or "r2" (section `r2`, and of this one
-        /// nothing else).
+        /// What the moving field is made of: "none" (the network), "phase", "tree", "auto", or "r2" (section
+        /// `r2`, and of this one nothing else).
         form: GaussianForm,
         /// Iterations, each over all images.
         iterations: u32 in 1.0 to 1e6,
@@ -349,16 +349,19 @@ section! {
 }
 
 section! {
-    /// Gaussians as R2-Gaussian fits them (`gaussians.form = "r2"`), with what its code uses as defaults. Its volume is a cube
-    /// around the isocentre; lengths are shares of that cube's side unless they are called rates, which count half sides.
+    /// Gaussians as R2-Gaussian fits them (`gaussians.form = "r2"`), with what its code uses as defaults. Its volume is a
+    /// cube around the isocentre; lengths are shares of that cube's side unless they are called rates, which count half
+    /// sides.
     R2, "r2" {
-        /// Which images a set of Gaussians sees: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one set).
+        /// Which images a set of Gaussians sees: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one
+        /// set).
         static_data: StaticData,
         /// Where the fit begins: "fdk" (at voxels of a filtered back-projection) or "random".
         init: R2Start,
         /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities are near 1.
         normalise: bool,
-        /// Half side of the volume, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is less.
+        /// Half side of the volume, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is
+        /// less.
         half_extent_mm: f64 in 0.0 to 1e5,
         /// Voxels along each side of the volume, for the back-projection and the box of total variation.
         voxels: u32 in 8.0 to 512.0,
@@ -394,8 +397,8 @@ section! {
         tv: f64 in 0.0 to 1e3,
         /// Voxels along each side of that box, which is elsewhere in each iteration.
         tv_box: u32 in 2.0 to 128.0,
-        /// Let total variation move Gaussians: what its code computes, but scales by the square of a voxel's side by mistake, so
-        /// that it is nothing.
+        /// Let total variation move Gaussians: what its code computes, but scales by the square of a voxel's side by
+        /// mistake, so that it is nothing.
         tv_moves_centres: bool,
         /// Iterations after which Gaussians are added and taken away, and again after as many; 0 = never.
         densify_every: u32 in 0.0 to 1e6,

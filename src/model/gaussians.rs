@@ -163,9 +163,10 @@ impl MovingGaussians {
         }
     }
 
-    /// Form of the field: a set of Gaussians per phase, or one for the beat.
+    /// Form of the field: a set of Gaussians per phase, R2-Gaussian's or another, or one for the beat.
     pub fn form(&self) -> GaussianForm {
         match self {
+            MovingGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
             MovingGaussians::PerPhase(_) => GaussianForm::Phase,
             MovingGaussians::Tree(_) => GaussianForm::Tree,
         }

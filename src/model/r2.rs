@@ -3,8 +3,8 @@
 use crate::error::{Error, Result};
 use crate::kernels::layout::R2Gaussian;
 
-/// Stored Gaussians with the optimiser's moments and what density control goes by: with the iteration's number, all that a fit
-/// goes on from.
+/// Stored Gaussians with the optimiser's moments and what density control goes by: with the iteration's number, all
+/// that a fit goes on from.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct R2State {
     /// Parameters.

@@ -1,5 +1,5 @@
-//! A dataset as R2-Gaussian sees it: a cube around the isocentre from -1 to 1, whole images in its units, and which images each
-//! set of Gaussians is fitted to.
+//! A dataset as R2-Gaussian sees it: a cube around the isocentre from -1 to 1, whole images in its units, and which
+//! images each set of Gaussians is fitted to.
 
 use crate::config::StaticData;
 use crate::config::sections::R2;
@@ -10,8 +10,8 @@ use crate::model::gaussians::{Gaussians, Units};
 use crate::r2::parameters::ScaleBounds;
 use crate::scan::dataset::Dataset;
 
-/// Standard deviations at which Gaussians end where they are drawn: of what is fitted, whose squares reach three of the longest,
-/// next to nothing is beyond.
+/// Standard deviations at which Gaussians end where they are drawn: of what is fitted, whose squares reach three of the
+/// longest, next to nothing is beyond.
 const DRAWN_CUT: f32 = 4.0;
 /// Bounds of drawn scales are a little wider than what scales can be, so that rounding changes none.
 const SLACK: f64 = 1e-3;
@@ -82,6 +82,30 @@ impl R2Data {
             images_of_set,
             phase_of_set,
         })
+    }
+
+    /// Images of `size` (columns, rows) in the volume of world units, each set of a phase of its own: for tests.
+    #[cfg(test)]
+    pub(crate) fn of_images(
+        [width, height]: [usize; 2],
+        views: Vec<SplatView>,
+        images: Vec<f32>,
+        images_of_set: Vec<Vec<usize>>,
+    ) -> R2Data {
+        let n_phases = images_of_set.len();
+        let phase_of_set = (0..n_phases as u32).map(Some).collect();
+        R2Data {
+            half: 1.0,
+            attenuation: 1.0,
+            pixel: 1.0,
+            width,
+            height,
+            n_phases,
+            views,
+            images,
+            images_of_set,
+            phase_of_set,
+        }
     }
 
     /// Pixels of an image.

@@ -1,5 +1,5 @@
-//! Density control of R2-Gaussian: where images pull hard, small Gaussians are cloned and large ones split, and weak ones and
-//! those that have left the volume are taken away. Each set by itself.
+//! Density control of R2-Gaussian: where images pull hard, small Gaussians are cloned and large ones split, and weak
+//! ones and those that have left the volume are taken away. Each set by itself.
 
 use crate::config::sections::R2;
 use crate::kernels::layout::R2Gaussian;
@@ -26,8 +26,8 @@ enum Fate {
     Split,
 }
 
-/// The Gaussians after density control at `step`: survivors with their moments, clones, first children, second children;
-/// statistics begin anew.
+/// The Gaussians after density control at `step`: survivors with their moments, clones, first children, second
+/// children; statistics begin anew.
 pub fn densified(before: &R2State, n_sets: usize, settings: &R2, seed: u32, step: u32) -> R2State {
     let bounds = ScaleBounds::of(settings);
     let fates = fates(before, n_sets, settings, bounds);
@@ -78,7 +78,8 @@ fn deviate(seed: u32, step: u32, row: usize, number: u32) -> f64 {
     normal(seed.wrapping_add(step), STREAM_R2_CHILD, row as u32, number)
 }
 
-/// A narrower Gaussian at a place drawn from the one that is split; `deviate` gives a standard normal number for each axis.
+/// A narrower Gaussian at a place drawn from the one that is split; `deviate` gives a standard normal number for each
+/// axis.
 fn split(g: &R2Gaussian, bounds: ScaleBounds, deviate: impl Fn(u32) -> f64) -> R2Gaussian {
     let scales = g.scales(bounds);
     let away = g.axes() * (scales * DVec3::new(deviate(0), deviate(1), deviate(2)));

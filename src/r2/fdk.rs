@@ -1,6 +1,7 @@
-//! Filtered back-projection of cone beams (Feldkamp, Davis and Kress) as TIGRE computes it for R2-Gaussian's start: the cosine of
-//! each ray, the ramp of Ram and Lak along rows, and at each voxel the squared share of the way from the source to the
-//! isocentre. Views are few and truncated here, and rows of a tilted C-arm share no plane: a crude start, and mostly streaks.
+//! Filtered back-projection of cone beams (Feldkamp, Davis and Kress) as TIGRE computes it for R2-Gaussian's start: the
+//! cosine of each ray, the ramp of Ram and Lak along rows, and at each voxel the squared share of the way from the
+//! source to the isocentre. Views are few and truncated here, and rows of a tilted C-arm share no plane: a crude start,
+//! and mostly streaks.
 
 use crate::gaussians::view::SplatView;
 use crate::r2::data::R2Data;

@@ -1,5 +1,5 @@
-//! What R2-Gaussian stores of a Gaussian and what that stands for, in f64: densities through a softplus, scales between bounds
-//! through a sigmoid. Lengths are half sides of the volume, which is the cube from -1 to 1.
+//! What R2-Gaussian stores of a Gaussian and what that stands for, in f64: densities through a softplus, scales between
+//! bounds through a sigmoid. Lengths are half sides of the volume, which is the cube from -1 to 1.
 
 use crate::config::sections::R2;
 use crate::kernels::layout::R2Gaussian;

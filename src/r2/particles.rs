@@ -10,7 +10,7 @@ use crate::model::r2::R2State;
 buffer_set! {
     /// Gaussians on the device, and what an iteration computes of each.
     pub struct R2ParticleBuffers {
-        /// [`R2Gaussian`]s.
+        /// [`crate::kernels::layout::R2Gaussian`]s.
         r2_gaussians,
         /// First moments of Adam, three vec4 per Gaussian: position and density, scale, rotation.
         gaussian_adam_first,

@@ -79,8 +79,8 @@ pub fn schedule(config: &Config) -> Vec<R2Schedule> {
     (1..=n + 1).map(row).collect()
 }
 
-/// What each set sees in each iteration of the schedule: images in an order that is drawn anew when all have been seen, and a
-/// box anywhere in the volume.
+/// What each set sees in each iteration of the schedule: images in an order that is drawn anew when all have been seen,
+/// and a box anywhere in the volume.
 pub fn turns(data: &R2Data, config: &Config) -> Vec<R2Turn> {
     let r2 = &config.r2;
     let voxel = 2.0 / f64::from(r2.voxels);
@@ -95,4 +95,57 @@ pub fn turns(data: &R2Data, config: &Config) -> Vec<R2Turn> {
         }
     };
     (0..=config.train.iterations).flat_map(|step| (0..data.n_sets()).map(move |set| turn(step, set))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+    use crate::gaussians::view::SplatView;
+
+    #[test]
+    fn rates_fall_and_density_control_takes_no_step() {
+        let config = Config::preset(Preset::R2Gaussian);
+        let rows = schedule(&config);
+        assert_eq!(rows.len(), 30_001);
+        let close = |got: f32, want: f64| assert!((f64::from(got) / want - 1.0).abs() < 1e-5, "{got} {want}");
+        close(rows[29_999].position_rate, 2e-5);
+        close(rows[14_999].density_rate, 1e-2 * 0.1f64.sqrt());
+        assert_eq!(rows.iter().filter(|row| row.updates == 0).count(), 144);
+        assert_eq!((rows[598].updates, rows[599].updates, rows[600].updates), (1, 0, 1));
+        // The optimiser counts its own steps.
+        close(rows[0].bias1, 0.1);
+        close(rows[600].bias2, 1.0 - 0.999f64.powi(600));
+        close(rows[700].bias2, 1.0 - 0.999f64.powi(699));
+    }
+
+    #[test]
+    fn every_image_has_its_turn_and_boxes_stay_inside() {
+        let config = Config::preset(Preset::R2Gaussian);
+        let view = SplatView {
+            rows: [glam::DVec3::X; 3],
+            offsets: [0.0; 3],
+            direction: [glam::DVec3::X; 3],
+            source: glam::DVec3::ZERO,
+            after_phase: 0.0,
+        };
+        let images_of_set = vec![vec![0, 2, 4, 5], vec![1, 3, 6]];
+        let data = R2Data::of_images([2, 1], vec![view; 7], vec![0.0; 14], images_of_set);
+        let turns = turns(&data, &config);
+        for (set, images) in data.images_of_set.iter().enumerate() {
+            let shown: Vec<usize> = turns.iter().skip(set).step_by(2).map(|turn| turn.image as usize).collect();
+            let mut orders = std::collections::BTreeSet::new();
+            for epoch in shown.chunks_exact(images.len()).take(100) {
+                let mut sorted = epoch.to_vec();
+                sorted.sort_unstable();
+                assert_eq!(&sorted, images);
+                orders.insert(epoch.to_vec());
+            }
+            assert_eq!(orders.len(), if images.len() == 4 { 24 } else { 6 }, "all orders come");
+        }
+        let (half_voxel, side) = (1.0 / 256.0, 32.0 / 128.0);
+        for corner in turns.iter().flat_map(|turn| turn.corner).map(|x| f64::from(x) - half_voxel) {
+            assert!((-1.0 - 1e-6..=1.0 - side + 1e-6).contains(&corner), "{corner}");
+        }
+    }
 }

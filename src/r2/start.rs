@@ -40,8 +40,8 @@ fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f
     if candidates.len() < count {
         let name = data.name_of_set(set);
         let note = format!(
-            "the back-projection of {name} is above {} at {} voxels, and {count} Gaussians are to begin there: they begin anywhere \
-             (r2.count, r2.voxels, r2.candidate; r2.init = \"random\" does so without asking)",
+            "the back-projection of {name} is above {} at {} voxels, and {count} Gaussians are to begin there: they begin \
+             anywhere (r2.count, r2.voxels, r2.candidate; r2.init = \"random\" does so without asking)",
             settings.candidate,
             candidates.len()
         );
@@ -77,8 +77,8 @@ fn gaussians(places: &[(DVec3, f64)], bounds: ScaleBounds, set: u32) -> Vec<R2Ga
     pairs.map(|((x, density), scale)| round(*x, density.max(LEAST_DENSITY), scale, bounds, set)).collect()
 }
 
-/// Root of the mean squared distance to the nearest three other points, of each; of the other points where there are fewer, and
-/// the volume's side without any.
+/// Root of the mean squared distance to the nearest three other points, of each; of the other points where there are
+/// fewer, and the volume's side without any.
 fn spacings(points: &[DVec3]) -> Vec<f64> {
     let grid = PointGrid::new(points);
     (0..points.len())
@@ -116,7 +116,8 @@ impl PointGrid {
         (z * self.side + y) * self.side + x
     }
 
-    /// Squared distances to the nearest of the other points, shell by shell of cells, until no further shell can hold a nearer one.
+    /// Squared distances to the nearest of the other points, shell by shell of cells, until no further shell can hold a
+    /// nearer one.
     fn nearest_squared(&self, points: &[DVec3], of: usize) -> Vec<f64> {
         let (mut best, home) = (Vec::new(), self.cell(points[of]));
         let width = 2.0 / self.side as f64;

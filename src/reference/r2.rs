@@ -298,7 +298,8 @@ impl VoxelBox<'_> {
         (sum, gradient)
     }
 
-    /// Sums over the voxels near a Gaussian of h = dL/d(attenuation) times value: h, h c, and h c c^T as xx, yy, zz, xy, xz, yz.
+    /// Sums over the voxels near a Gaussian of h = dL/d(attenuation) times value: h, h c, and h c c^T as xx, yy, zz,
+    /// xy, xz, yz.
     pub fn moments(&self, p: &Params, gradient: &[f64]) -> [f64; 10] {
         let mut sums = [0.0; 10];
         for (at, c) in self.near(p) {
@@ -309,8 +310,8 @@ impl VoxelBox<'_> {
         sums
     }
 
-    /// Gradient by position, the logarithms of density and scales, and the quaternion, from these moments. Centres are left where
-    /// they are unless the setting says otherwise.
+    /// Gradient by position, the logarithms of density and scales, and the quaternion, from these moments. Centres are
+    /// left where they are unless the setting says otherwise.
     pub fn gradient(&self, p: &Params, [h, x, y, z, xx, yy, zz, xy, xz, yz]: [f64; 10]) -> Params {
         let (axes, scale) = (axes(p), scale(p, self.setup));
         let moves = if self.r2.tv_moves_centres != 0 { 1.0 } else { 0.0 };

@@ -1,4 +1,5 @@
-//! R2-Gaussian: an iteration of its fit, stage by stage, each on what the device made for it, and the optimiser over ten.
+//! R2-Gaussian: an iteration of its fit, stage by stage, each on what the device made for it, and the optimiser over
+//! ten.
 
 use crate::config::{Config, Preset};
 use crate::error::Result;
@@ -40,8 +41,8 @@ const VARIANCES: Tolerance = Tolerance::OfLargest(2e-3);
 const SPLAT_ERROR: f64 = 1e-3;
 /// Losses are sums of many pixels.
 const LOSS: f64 = 2e-5;
-/// Parameters that may differ by more than [`FAR`] of their rates after ten updates, as a share: Adam divides by the gradient's
-/// size, so a tiny gradient's rounding shows in full.
+/// Parameters that may differ by more than [`FAR`] of their rates after ten updates, as a share: Adam divides by the
+/// gradient's size, so a tiny gradient's rounding shows in full.
 const FAR_SHARE: f64 = 0.01;
 const FAR: f64 = 0.1;
 /// Updates that are compared.
@@ -64,8 +65,8 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
     Config::load(Some(Preset::R2Gaussian), None, &all)
 }
 
-/// Data and Gaussians that kernels are compared on: sizes that are no multiples of anything; centres in view, outside where
-/// slopes end to follow them, outside the volume, and behind the source.
+/// Data and Gaussians that kernels are compared on: sizes that are no multiples of anything; centres in view, outside
+/// where slopes end to follow them, outside the volume, and behind the source.
 ///
 /// # Errors
 /// As [`small_dataset`] and [`Plan::new`].
@@ -118,7 +119,8 @@ impl<'a> Turn<'a> {
         reference::project(p, &self.data.views[self.image], self.voxels.setup)
     }
 
-    /// Gradient of what is stored from moments in the view and in the box, and how the image pulls, where it sees the Gaussian.
+    /// Gradient of what is stored from moments in the view and in the box, and how the image pulls, where it sees the
+    /// Gaussian.
     fn gradient(&self, p: &Params, of_picture: [f64; 6], of_voxels: [f64; 10]) -> (Params, Option<f64>) {
         let setup = self.voxels.setup;
         let seen = self.project(p).filter(|seen| seen.pixels(setup).next().is_some());

@@ -229,11 +229,12 @@ fn method(text: &Text<'_>, section: &MethodSection) -> Result<Method> {
 
 const ITERATIONS: &str = "train.iterations";
 const DENSIFY_EVERY: &str = "r2.densify_every";
-/// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have one.
+/// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have
+/// one.
 const LEAST_BETWEEN_DENSIFYING: f64 = 10.0;
 
-/// Settings of a run of another length: what the preset counts in iterations of the networks' schedule, and of density control,
-/// keeps its share of the run, but for what was `given`.
+/// Settings of a run of another length: what the preset counts in iterations of the networks' schedule, and of density
+/// control, keeps its share of the run, but for what was `given`.
 fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
     let share = f64::from(iterations) / f64::from(preset.train.iterations);
     let mut schedule = vec![

@@ -21,8 +21,8 @@ use crate::train::tree::TreeTrainer;
 use crate::train::tree_start::TreeStart;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Iterations of R2-Gaussian after which those who draw the field get it anew: of half a million Gaussians per phase that takes
-/// as long as some iterations.
+/// Iterations of R2-Gaussian after which those who draw the field get it anew: of half a million Gaussians per phase that
+/// takes as long as some iterations.
 const R2_SHOWN_EVERY: u32 = 100;
 
 /// A fit under way.

@@ -92,8 +92,8 @@ impl R2Trainer {
         &self.buffers
     }
 
-    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the losses
-    /// of the iterations done, each the mean over the sets. An empty list means the target was reached before.
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the
+    /// losses of the iterations done, each the mean over the sets. An empty list means the target was reached before.
     ///
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite; device errors.
@@ -171,7 +171,14 @@ impl R2Trainer {
 /// Their number; a set without any cannot be fitted.
 fn check_count(state: &R2State, data: &R2Data) -> Result<u32> {
     let mut counts = vec![0usize; data.n_sets()];
-    state.rows.iter().for_each(|g| counts[g.set as usize] += 1);
+    for g in &state.rows {
+        match counts.get_mut(g.set as usize) {
+            Some(count) => *count += 1,
+            None => {
+                return Err(Error::config("checkpoint", g.set, "its sets of Gaussians are not those of the images"));
+            }
+        }
+    }
     if let Some(empty) = counts.iter().position(|count| *count == 0) {
         let problem = format!(
             "no Gaussian of {} is left: r2.weakest is too high, or the images show nothing",
