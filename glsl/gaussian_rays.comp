@@ -19,6 +19,7 @@ READ_VEC4(3, B3, static_params);
 layout(binding = 4) buffer B4 { RayOut ray_out[]; };
 #include "inc/tensor_vm.glsl"
 #include "inc/blobs.glsl"
+#include "inc/blob_rays.glsl"
 
 // Most Gaussians of a ray that its maximum is sought among; the strongest are kept.
 const uint MOST_PEAKS = 32u;
@@ -62,51 +63,23 @@ float sum_at(float depth, out float next) {
 }
 
 void main() {
-    uint lane = gl_LocalInvocationID.x;
-    uint tiles = (push.image_width + 7u) / 8u;
-    uvec2 corner = 8u * uvec2(gl_WorkGroupID.x % tiles, gl_WorkGroupID.x / tiles);
-    uvec2 pixel = corner + uvec2(lane % 8u, lane / 8u);
-    uint r = pixel.y * push.image_width + pixel.x;
-    bool wanted = pixel.x < push.image_width && r < push.n_rays;
-    Ray first = rays[corner.y * push.image_width + corner.x];
-    Ray ray = first;
-    if (wanted) ray = rays[r];
-    // No ray of the tile strays further from its first one.
-    float spread = workgroup_max(distance(ray.anchor, first.anchor));
-    float spread_per_depth = workgroup_max(distance(ray.direction, first.direction));
-    float first_squared = dot(first.direction, first.direction);
-    float squared = dot(ray.direction, ray.direction);
+    TileRay own = ray_of_lane();
+    Tile tile = tile_of(own.ray);
+    uint r = own.index;
     float integral = 0.0;
     for (uint begin = 0u; begin < push.n_blobs; begin += 64u) {
-        bool near = false;
-        if (begin + lane < push.n_blobs) {
-            Blob b = blobs[push.first_blob + begin + lane];
-            vec3 w = b.centre - first.anchor;
-            float depth = dot(w, first.direction) / first_squared;
-            float away = length(w - depth * first.direction);
-            // A ray's closest point is not at the first ray's depth: a tenth more covers that.
-            near = away <= b.reach + 1.1 * (spread + (abs(depth) + b.reach) * spread_per_depth);
-        }
-        mark_near(near);
+        uint at = begin + gl_LocalInvocationID.x;
+        mark_near(at < push.n_blobs && is_near(blobs[push.first_blob + min(at, push.n_blobs - 1u)], tile));
         for (uint word = 0u; word < 2u; word++) {
             for (uint bits = near_blobs[word]; bits != 0u; bits &= bits - 1u) {
-                Blob b = blobs[push.first_blob + begin + 32u * word + uint(findLSB(bits))];
-                vec3 w = b.centre - ray.anchor;
-                // From the ray's point nearest to the centre: numbers stay small.
-                float depth = dot(w, ray.direction) / squared;
-                w -= depth * ray.direction;
-                vec3 along = blob_times(b, ray.direction);
-                float steepness = dot(ray.direction, along);
-                float offset = dot(w, along) / steepness;
-                float q = max(dot(w, blob_times(b, w)) - offset * offset * steepness, 0.0);
-                if (q >= b.cut) continue;
-                float height = b.density * exp(-0.5 * q);
-                integral += height * sqrt(TWO_PI / steepness) * ray.norm;
-                if (with_maxima != 0u) keep_peak(depth + offset, steepness, height);
+                Profile p = profile_of(blobs[push.first_blob + begin + 32u * word + uint(findLSB(bits))], own.ray);
+                if (p.height == 0.0) continue;
+                integral += p.height * sqrt(TWO_PI / p.steepness) * own.ray.norm;
+                if (with_maxima != 0u) keep_peak(p.at, p.steepness, p.height);
             }
         }
     }
-    if (!wanted) return;
+    if (!own.wanted) return;
     ray_out[r].dynamic_integral = integral;
     if (with_maxima == 0u) return;
     float dynamic_max = 0.0;
@@ -119,7 +92,7 @@ void main() {
         }
         float value = sum_at(depth, next);
         dynamic_max = max(dynamic_max, value);
-        vec3 x = ray.anchor + depth * ray.direction;
+        vec3 x = own.ray.anchor + depth * own.ray.direction;
         total_max = max(total_max, value + (static_inside(x) ? static_attenuation(x) : 0.0));
     }
     ray_out[r].dynamic_max = dynamic_max;

@@ -56,8 +56,8 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
     if mode == CalibrateMode::Off {
         return Ok(Calibration::none(None));
     }
-    if mode == CalibrateMode::Breathing && !config.gaussians_move() {
-        let problem = "the network takes corrections per view only: choose static, or Gaussians as the moving field";
+    if mode == CalibrateMode::Breathing && !config.follows_breath() {
+        let problem = "networks and R2-Gaussian take corrections per view only: choose static, or other Gaussians as the moving field";
         return Err(Error::config("calibrate.mode", "breathing", problem));
     }
     let observed = Observed::new(dataset);
@@ -72,7 +72,7 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
              correction is assumed only where views then agree clearly better"
         ));
     }
-    let candidates = candidates(mode, config.gaussians_move(), &mut notes);
+    let candidates = candidates(mode, config.follows_breath(), &mut notes);
     Ok(Calibrator { dataset, observed: &observed, notes }.choose(&candidates))
 }
 

@@ -2,14 +2,14 @@
 //!
 //! Precedence: preset < TOML file < single settings `key=value`.
 
+mod checks;
 mod presets;
 pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
 use sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, StaticField, Train, Tree,
-    check_range,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -29,10 +29,13 @@ pub enum Preset {
     PublicCode,
     /// NeRF-CA, which the paper compares itself with, as its public code does it: both fields are networks.
     NerfCa,
+    /// R2-Gaussian, a static method the paper compares itself with: each phase by itself, all of it Gaussians.
+    R2Gaussian,
 }
 
 impl Choice for Preset {
-    const ALL: &'static [Preset] = &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa];
+    const ALL: &'static [Preset] =
+        &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa, Preset::R2Gaussian];
 
     fn name(self) -> &'static str {
         match self {
@@ -41,6 +44,7 @@ impl Choice for Preset {
             Preset::Paper => "paper",
             Preset::PublicCode => "public-code",
             Preset::NerfCa => "nerf-ca",
+            Preset::R2Gaussian => "r2-gaussian",
         }
     }
 }
@@ -54,15 +58,18 @@ pub enum StaticForm {
     Tensor,
     /// A network like that of the dynamic field, but for the latents; their attenuations add up at the same samples.
     Network,
+    /// Nothing: the moving field is all there is.
+    None,
 }
 
 impl Choice for StaticForm {
-    const ALL: &'static [StaticForm] = &[StaticForm::Tensor, StaticForm::Network];
+    const ALL: &'static [StaticForm] = &[StaticForm::Tensor, StaticForm::Network, StaticForm::None];
 
     fn name(self) -> &'static str {
         match self {
             StaticForm::Tensor => "tensor",
             StaticForm::Network => "network",
+            StaticForm::None => "none",
         }
     }
 }
@@ -89,11 +96,13 @@ pub enum GaussianForm {
     Tree,
     /// A tree where the data allow it, a set per phase else.
     Auto,
+    /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all: no still field beside them.
+    R2,
 }
 
 impl Choice for GaussianForm {
     const ALL: &'static [GaussianForm] =
-        &[GaussianForm::None, GaussianForm::Phase, GaussianForm::Tree, GaussianForm::Auto];
+        &[GaussianForm::None, GaussianForm::Phase, GaussianForm::Tree, GaussianForm::Auto, GaussianForm::R2];
 
     fn name(self) -> &'static str {
         match self {
@@ -101,6 +110,49 @@ impl Choice for GaussianForm {
             GaussianForm::Phase => "phase",
             GaussianForm::Tree => "tree",
             GaussianForm::Auto => "auto",
+            GaussianForm::R2 => "r2",
+        }
+    }
+}
+
+/// Which images a static method sees of an object that moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum StaticData {
+    /// A set of Gaussians for each phase, which sees that phase's images.
+    PerPhase,
+    /// One set, which sees all images and is shown at every phase.
+    Pooled,
+}
+
+impl Choice for StaticData {
+    const ALL: &'static [StaticData] = &[StaticData::PerPhase, StaticData::Pooled];
+
+    fn name(self) -> &'static str {
+        match self {
+            StaticData::PerPhase => "per-phase",
+            StaticData::Pooled => "pooled",
+        }
+    }
+}
+
+/// Where R2-Gaussian's fit begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum R2Start {
+    /// At voxels of a filtered back-projection.
+    Fdk,
+    /// Anywhere in the volume.
+    Random,
+}
+
+impl Choice for R2Start {
+    const ALL: &'static [R2Start] = &[R2Start::Fdk, R2Start::Random];
+
+    fn name(self) -> &'static str {
+        match self {
+            R2Start::Fdk => "fdk",
+            R2Start::Random => "random",
         }
     }
 }
@@ -180,6 +232,9 @@ pub struct Config {
     /// One set of Gaussians that moves; checkpoints of before have none.
     #[serde(default = "presets::tree")]
     pub tree: Tree,
+    /// Gaussians as R2-Gaussian fits them; checkpoints of before have none.
+    #[serde(default = "presets::r2")]
+    pub r2: R2,
 }
 
 impl Config {
@@ -235,119 +290,28 @@ impl Config {
         self.static_field.form == StaticForm::Network
     }
 
+    /// Whether the moving field is R2-Gaussian's, which is all there is: the still field is nothing.
+    pub fn is_r2(&self) -> bool {
+        self.gaussians.form == GaussianForm::R2
+    }
+
+    /// Whether the moving field takes displacements of the heart, frame by frame: a method that sees whole images cannot.
+    pub fn follows_breath(&self) -> bool {
+        self.gaussians_move() && !self.is_r2()
+    }
+
     /// Iterations, the first of the run, that go to Gaussians; the still field has the others.
     pub fn gaussian_iterations(&self) -> u32 {
-        if self.gaussians_move() { self.gaussians.iterations.min(self.train.iterations) } else { 0 }
+        match self.gaussians.form {
+            GaussianForm::None => 0,
+            GaussianForm::R2 => self.train.iterations,
+            _ => self.gaussians.iterations.min(self.train.iterations),
+        }
     }
 
     /// The configuration as TOML.
     pub fn to_toml(&self) -> Result<String> {
         toml::to_string_pretty(self).map_err(|e| Error::Internal(e.to_string()))
-    }
-
-    /// Refuses values no run could use.
-    ///
-    /// # Errors
-    /// [`Error::Config`] naming the key.
-    pub fn check(&self) -> Result<()> {
-        let (t, m, d) = (&self.train, &self.march, &self.dynamic);
-        self.train.check_ranges()?;
-        self.calibrate.check_ranges()?;
-        self.march.check_ranges()?;
-        self.static_field.check_ranges()?;
-        self.dynamic.check_ranges()?;
-        self.loss.check_ranges()?;
-        self.hull.check_ranges()?;
-        self.occupancy.check_ranges()?;
-        self.networks.check_ranges()?;
-        self.adam.check_ranges()?;
-        self.gaussians.check_ranges()?;
-        self.tree.check_ranges()?;
-        if self.gaussians.least_scale > self.gaussians.greatest_scale {
-            let problem = format!("exceeds gaussians.greatest_scale = {}", self.gaussians.greatest_scale);
-            return Err(Error::config("gaussians.least_scale", self.gaussians.least_scale, problem));
-        }
-        check_range("dynamic.skip_layer", d.skip_layer.into(), 0.0, d.layers.into())?;
-        check_range("dynamic.window_start", d.window_start, 0.0, d.bands.into())?;
-        if d.width % 16 != 0 {
-            return Err(Error::config("dynamic.width", d.width, "a multiple of 16 is needed"));
-        }
-        if d.latent % 4 != 0 {
-            return Err(Error::config("dynamic.latent", d.latent, "a multiple of 4 is needed"));
-        }
-        if d.skip_layer == 1 {
-            return Err(Error::config(
-                "dynamic.skip_layer",
-                1,
-                "the first layer sees the input anyway; 0 or 2.. is accepted",
-            ));
-        }
-        if m.static_samples.max(m.dynamic_samples).max(m.render_samples) > t.chunk_samples {
-            return Err(Error::config(
-                "train.chunk_samples",
-                t.chunk_samples,
-                "at least the samples of one ray are needed",
-            ));
-        }
-        if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
-            return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
-        }
-        if self.two_networks() {
-            self.check_two_networks()?;
-        }
-        if m.along_axis && self.gaussians_move() {
-            let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
-            return Err(Error::config("march.along_axis", true, problem));
-        }
-        Ok(())
-    }
-
-    /// Refuses what does not go with two networks.
-    fn check_two_networks(&self) -> Result<()> {
-        let form = "does not go with static.form = \"network\"";
-        let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
-            Err(Error::config(field, value, format!("{form}: {instead}")))
-        };
-        if self.gaussians_move() {
-            return refuse("gaussians.form", &self.gaussians.form.name(), "take \"none\", or static.form = \"tensor\"");
-        }
-        for (field, is_on) in [
-            ("hull.enabled", self.hull.enabled),
-            ("occupancy.enabled", self.occupancy.enabled),
-            ("loss.normalise", self.loss.normalise),
-            ("dynamic.encode_box", self.dynamic.encode_box),
-            ("march.fit_dynamic_range", self.march.fit_dynamic_range),
-            ("march.fit_static_range", self.march.fit_static_range),
-        ] {
-            if is_on {
-                return refuse(field, &true, "both fields are asked everywhere, in world units; take false");
-            }
-        }
-        if self.loss.dynamic_target != DynamicTarget::Absolute {
-            return refuse("loss.dynamic_target", &"temporal", "one residual drives both fields; take \"absolute\"");
-        }
-        for (field, value) in [
-            ("dynamic.delay", f64::from(self.dynamic.delay)),
-            ("dynamic.least_slope", self.dynamic.least_slope),
-            ("dynamic.occlusion", self.dynamic.occlusion),
-        ] {
-            if value != 0.0 {
-                let instead = "take 0 (networks.near_integral weighs what is near, networks.delay and ramp say when)";
-                return refuse(field, &value, instead);
-            }
-        }
-        let preset = Config::preset(self.preset);
-        for (field, value, unused) in [
-            ("dynamic.half_extent_mm", self.dynamic.half_extent_mm, preset.dynamic.half_extent_mm),
-            ("dynamic.normalised_shift", self.dynamic.normalised_shift, preset.dynamic.normalised_shift),
-            ("march.static_samples", self.march.static_samples.into(), preset.march.static_samples.into()),
-        ] {
-            if value != unused {
-                let instead = format!("it has no effect there; leave it at the preset's {unused}");
-                return refuse(field, &value, &instead);
-            }
-        }
-        Ok(())
     }
 }
 
@@ -419,6 +383,9 @@ mod tests {
             ("static.form=network", "gaussians.form"),
             ("march.along_axis=true", "march.along_axis"),
             ("networks.gain=-1", "networks.gain"),
+            ("static.form=none", "static.form"),
+            ("gaussians.form=r2", "static.form"),
+            ("r2.count=0", "r2.count"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
@@ -446,6 +413,26 @@ mod tests {
     }
 
     #[test]
+    fn what_does_not_go_with_r2_is_named() {
+        for (setting, part) in [
+            ("static.form=tensor", "static.form"),
+            ("gaussians.form=phase", "static.form"),
+            ("hull.enabled=true", "hull.enabled"),
+            ("occupancy.enabled=true", "occupancy.enabled"),
+            ("loss.normalise=true", "loss.normalise"),
+            ("loss.dynamic_target=temporal", "loss.dynamic_target"),
+            ("march.along_axis=true", "march.along_axis"),
+            ("r2.tv_box=300", "r2.tv_box"),
+            ("r2.least_scale=0.6", "r2.least_scale"),
+            ("r2.most=10", "r2.count"),
+            ("r2.static_data=both", "both"),
+        ] {
+            let message = Config::load(Some(Preset::R2Gaussian), None, &[setting.into()]).unwrap_err().to_string();
+            assert!(message.contains(part), "{setting}: {message}");
+        }
+    }
+
+    #[test]
     fn a_printed_configuration_reads_back() {
         for preset in Preset::ALL.iter().copied() {
             let config = Config::preset(preset);
@@ -459,7 +446,7 @@ mod tests {
         let config = Config::preset(Preset::FastMlp);
         let mut table = toml::Table::try_from(&config).unwrap();
         assert!(table.remove("gaussians").is_some() && table.remove("tree").is_some());
-        assert!(table.remove("networks").is_some());
+        assert!(table.remove("networks").is_some() && table.remove("r2").is_some());
         for (section, key) in [("static", "form"), ("march", "along_axis"), ("adam", "decay_share")] {
             assert!(table[section].as_table_mut().unwrap().remove(key).is_some());
         }

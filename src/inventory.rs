@@ -9,10 +9,12 @@ use crate::gaussians::tree::TreeKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
 use crate::kernels::layout::Setup;
-use crate::kernels::stages::{Kernels, StillKernels};
+use crate::kernels::push;
+use crate::kernels::stages::{Build, Kernels, StillKernels};
 use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamMap;
 use crate::network::{Network, Purpose};
+use crate::r2::stages::R2Kernels;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -112,9 +114,18 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     }
     Kernels::new(gpu, tuning.clone(), params.line_len() as u32)?;
     if config.gaussians_move() {
-        GaussianKernels::new(gpu)?;
-        if config.gaussians.form != GaussianForm::Phase {
-            TreeKernels::new(gpu)?;
+        match config.gaussians.form {
+            GaussianForm::R2 => {
+                R2Kernels::new(gpu)?;
+                // Pictures are drawn by a stage of other fits.
+                Build::default().stage::<push::GaussianProject>(gpu)?;
+            }
+            form => {
+                GaussianKernels::new(gpu)?;
+                if form != GaussianForm::Phase {
+                    TreeKernels::new(gpu)?;
+                }
+            }
         }
         BlobKernels::new(gpu, &tuning)?;
         into_buffers(gpu)?;

@@ -181,6 +181,18 @@ pub mod gaussians {
     pub mod work;
 }
 
+/// R2-Gaussian, a static method that the paper compares itself with: its data, where it begins, its stages and density control.
+pub mod r2 {
+    pub mod data;
+    pub mod densify;
+    pub mod fdk;
+    pub mod parameters;
+    pub mod particles;
+    pub mod setup;
+    pub mod stages;
+    pub mod start;
+}
+
 pub mod plan;
 
 /// Drawing a model, for any pose and phase.
@@ -200,6 +212,8 @@ pub mod train {
     pub mod gaussians;
     pub mod losses;
     pub mod moving;
+    pub mod r2;
+    pub mod snapshot;
     pub mod step;
     mod targets;
     pub mod timing;
@@ -323,6 +337,7 @@ pub mod reference {
     pub mod networks;
     pub mod occupancy;
     pub mod projector;
+    pub mod r2;
     pub mod step;
     pub mod tree;
 }

@@ -8,6 +8,8 @@ pub mod gaussians;
 pub mod groups;
 pub mod hull;
 pub mod params;
+pub mod r2;
+mod r2_tensors;
 pub mod scene;
 mod schedule;
 pub mod setup;

@@ -13,8 +13,9 @@ pub mod soft_hull;
 pub mod start;
 pub mod targets;
 
-use crate::config::{Config, DynamicTarget, GaussianForm};
+use crate::config::{Config, DynamicTarget, GaussianForm, StaticData};
 use crate::error::{Error, Result};
+use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{self, Setup};
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
@@ -24,6 +25,7 @@ use crate::plan::scale::dynamic_half;
 use crate::plan::soft_hull::carve::SoftMotion;
 use crate::plan::start::StartRays;
 use crate::plan::targets::Targets;
+use crate::r2::data::R2Data;
 use crate::scan::dataset::Dataset;
 
 /// A run, ready to start.
@@ -53,8 +55,10 @@ pub struct Plan {
     pub listed_rays: Vec<u32>,
     /// The hull, when it is used.
     pub hull: Option<Hull>,
-    /// What Gaussians are fitted to, when they are the moving field.
+    /// What Gaussians are fitted to, when they are the moving field and follow it.
     pub targets: Option<Targets>,
+    /// What R2-Gaussian's are fitted to, when they are all there is.
+    pub r2: Option<R2Data>,
     /// Weighted loss of the moving field when there is none, where a network moves with a temporal target.
     pub empty_loss: Option<f64>,
     /// Decisions worth telling the user.
@@ -69,7 +73,11 @@ impl Plan {
     pub fn new(config: &Config, dataset: &Dataset) -> Result<Plan> {
         let mut notes = Vec::new();
         let motion = motion::analyse(dataset, &config.hull);
-        let (hull, targets) = if config.gaussians_move() {
+        let mut r2 = None;
+        let (hull, targets) = if config.is_r2() {
+            r2 = Some(plan_r2(config, dataset, &mut notes)?);
+            (None, None)
+        } else if config.gaussians_move() {
             let (hull, targets) = plan_gaussians(config, dataset, &mut notes)?;
             (Some(hull), Some(targets))
         } else {
@@ -166,6 +174,7 @@ impl Plan {
             listed_rays,
             hull,
             targets,
+            r2,
             empty_loss,
             notes,
         })
@@ -218,6 +227,39 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
         _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))
+}
+
+/// What R2-Gaussian is fitted to, and what is to be said of that.
+fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
+    let half = scale::volume_half(config, dataset);
+    let data = R2Data::new(dataset, &config.r2, half)?;
+    let side_mm = 2.0 * half * MM_PER_UNIT;
+    notes.push(match config.r2.static_data {
+        StaticData::PerPhase => format!(
+            "R2-Gaussian, a static method: each phase is reconstructed from its own images, in a cube of {side_mm:.1} mm \
+             (r2.static_data = \"per-phase\")"
+        ),
+        StaticData::Pooled => format!(
+            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} mm, is shown \
+             at each (r2.static_data = \"pooled\")"
+        ),
+    });
+    if config.r2.normalise && dataset.vessel_attenuation.is_none() {
+        notes.push(
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and what R2-Gaussian fixes of them may not fit"
+                .into(),
+        );
+    }
+    if !dataset.hidden.is_empty() {
+        notes.push(
+            "pixels that show nothing of the patient are fitted like all others: R2-Gaussian knows no masks".into(),
+        );
+    }
+    if dataset.heart_shifts() {
+        notes.push("R2-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+    }
+    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    Ok(data)
 }
 
 /// What is said of frames that were taken between two phases, and of their `fate`.

@@ -3,7 +3,7 @@
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
 //! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
-//!    [`gaussians`], [`trees`] and [`blobs`] about Gaussians; [`projections`] about phantoms
+//!    [`gaussians`], [`trees`], [`mod@r2`] and [`blobs`] about Gaussians; [`projections`] about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 
 pub mod blobs;
@@ -15,6 +15,7 @@ pub mod networks;
 pub mod occupancy;
 pub mod problems;
 pub mod projections;
+pub mod r2;
 pub mod repeats;
 pub mod trees;
 
@@ -100,8 +101,10 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
 fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
     vec![
         ("Gaussians per phase".into(), Box::new(move |findings| gaussians::compare(gpu, findings))),
+        ("R2-Gaussian".into(), Box::new(move |findings| r2::compare(gpu, findings))),
         ("a moving tree".into(), Box::new(move |findings| trees::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
+        ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_crowd(gpu, tuning, findings))),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),
         ("equal runs of Gaussians".into(), Box::new(move |findings| repeats::compare_gaussians(gpu, findings))),
         ("projections of volumes".into(), Box::new(move |findings| projections::compare(gpu, findings))),

@@ -61,7 +61,8 @@ fn steps_that_fail_are_rows_that_say_why() {
     let dir = tempfile::tempdir().unwrap();
     // It lists devices and says its version, and fails at all else.
     let program = dir.path().join("program");
-    let text = "#!/bin/sh\ncase $1 in devices) echo '[]';; --version) echo 1;; *) echo no such stage >&2; exit 3;; esac\n";
+    let text =
+        "#!/bin/sh\ncase $1 in devices) echo '[]';; --version) echo 1;; *) echo no such stage >&2; exit 3;; esac\n";
     std::fs::write(&program, text).unwrap();
     std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
     let failed = campaign(program.to_str().unwrap(), dir.path(), &[]);

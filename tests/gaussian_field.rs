@@ -66,6 +66,7 @@ fn checkpoints_keep_every_bit() {
             loss_scale: None,
             stopped: false,
             last_report: Vec::new(),
+            r2: None,
             data_fingerprint: "x".into(),
         };
         let bytes = saved.to_bytes().unwrap();
@@ -98,6 +99,7 @@ fn damaged_gaussians_are_refused_by_name() {
             loss_scale: None,
             stopped: false,
             last_report: Vec::new(),
+            r2: None,
             data_fingerprint: String::new(),
         };
         Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()

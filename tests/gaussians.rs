@@ -432,7 +432,14 @@ fn forms_on_data() {
 fn maxima_are_those_of_the_field() {
     let targets = targets(33, 27, 2);
     let setup = GaussianSetup { cut: 6.0, ..fit::gaussian_setup(&targets, &config().gaussians) };
-    let model = Gaussians { units: units(), n_phases: 2, setup, rows: random_gaussians(40, 2, 8.0, 6), step: 0 };
+    let model = Gaussians {
+        units: units(),
+        n_phases: 2,
+        setup,
+        rows: random_gaussians(40, 2, 8.0, 6),
+        step: 0,
+        is_crowd: false,
+    };
     let view = &targets.views[1];
     let seen = maxima(&model, view, 33, 27, 1);
     let field: Vec<Params> = model.at(1).map(params).collect();

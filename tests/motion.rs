@@ -87,6 +87,7 @@ fn tree() -> MovingTree {
             setup: GaussianSetup { cut: 6.0, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() },
             rows: (0..6).map(gaussian).collect(),
             step: 1,
+            is_crowd: false,
         },
         setup: TreeSetup {
             n_nodes: NODES,
@@ -132,6 +133,7 @@ fn saved(model: Model, path: &Path) -> String {
         loss_scale: None,
         stopped: false,
         last_report: Vec::new(),
+        r2: None,
         data_fingerprint: "none".into(),
     };
     checkpoint.write(path).unwrap();

@@ -20,7 +20,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::selftest::compare::Findings;
 use nertca_vk::selftest::iteration::F32_CASES;
-use nertca_vk::selftest::{gaussians, iteration, networks, problems, trees};
+use nertca_vk::selftest::{blobs, gaussians, iteration, networks, problems, r2, trees};
 use nertca_vk::train::trainer::Trainer;
 use program::program;
 use serde_json::Value;
@@ -110,6 +110,10 @@ fn two_networks(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     networks::compare(gpu, &small_dataset(13, 11), &networks::CASES[0], &tuning, findings)
 }
 
+fn many_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
+    blobs::compare_crowd(gpu, &Tuning::for_device(gpu.info()), findings)
+}
+
 /// A fault in the code of a stage.
 struct Fault {
     stage: &'static str,
@@ -140,6 +144,15 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("march_fwd_samples", one_too_many, two_networks),
         fault("loss_samples", wrong_sign, two_networks),
         fault("loss_samples", one_too_many, two_networks),
+        fault("r2_project", wrong_sign, r2::compare),
+        fault("ssim_rows", sum_for_product, r2::compare),
+        fault("ssim_columns", wrong_sign, r2::compare),
+        fault("r2_residual", wrong_sign, r2::compare),
+        fault("r2_voxel_splat", wrong_sign, r2::compare),
+        fault("r2_voxel_tv", one_too_many, r2::compare),
+        fault("r2_voxel_moments", wrong_sign, r2::compare),
+        fault("r2_update", wrong_sign, r2::compare),
+        fault("gaussian_crowd", wrong_sign, many_gaussians),
     ] {
         shim::begin(shim::Failing::None);
         let open = || Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap();
@@ -174,11 +187,17 @@ fn the_inventory_is_what_a_run_builds() {
         (Preset::NerfCa, 13, "none"),
         (Preset::Fast, 32, "tree"),
         (Preset::Fast, 32, "phase"),
+        (Preset::R2Gaussian, 13, "r2"),
     ] {
         let settings =
             ["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"];
+        let short = if preset == Preset::R2Gaussian {
+            &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"][..]
+        } else {
+            &[]
+        };
         let form = format!("gaussians.form={form}");
-        let settings: Vec<String> = settings.iter().map(|s| (*s).to_owned()).chain([form]).collect();
+        let settings: Vec<String> = settings.iter().chain(short).map(|s| (*s).to_owned()).chain([form]).collect();
         let config = Config::load(Some(preset), None, &settings).unwrap();
         let listed = open();
         let inventory = inventory::compile(&listed, &config, 3, &tuning(&listed)).unwrap();

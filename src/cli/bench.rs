@@ -287,13 +287,27 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
     let (pace, profiled) = (args.pace(), args.profiled());
     let fits = GaussianSubject::new(gpu, config, dataset, pace.length, profiled)?;
     let (gaussians, mut passes) = fits.time(&pace, profiled)?;
+    let notes = fits.notes().to_vec();
     drop(fits);
+    let whole_fit_s = |iterations: u32| gaussians.preparation_s + 1e-3 * gaussians.median() * f64::from(iterations);
+    if config.is_r2() {
+        return Ok(Timings {
+            paths: notes,
+            rays: 0,
+            network_cost: None,
+            whole_run_s: whole_fit_s(config.train.iterations),
+            gaussians: Some(gaussians),
+            before: None,
+            after: None,
+            passes,
+            work: Ledger::new(),
+        });
+    }
     let mut still = Subject::new(gpu, config, dataset, tuning, false)?;
     let before = still.time(&pace)?;
     passes.extend(still.passes(profiled)?);
     let first = config.gaussian_iterations();
-    let whole_run_s = gaussians.preparation_s
-        + 1e-3 * (gaussians.median() * f64::from(first) + before.median() * f64::from(config.train.iterations - first));
+    let whole_run_s = whole_fit_s(first) + 1e-3 * before.median() * f64::from(config.train.iterations - first);
     Ok(Timings {
         paths: still.notes(),
         rays: still.rays(),

@@ -1,9 +1,11 @@
 //! The presets.
 
 use crate::config::sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, StaticField, Train, Tree,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree,
 };
-use crate::config::{CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset, StaticForm};
+use crate::config::{
+    CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset, R2Start, StaticData, StaticForm,
+};
 
 impl Config {
     /// Defaults of a preset.
@@ -14,6 +16,7 @@ impl Config {
             Preset::Paper => paper(),
             Preset::PublicCode => public_code(paper()),
             Preset::NerfCa => nerf_ca(paper()),
+            Preset::R2Gaussian => r2_gaussian(paper()),
         }
     }
 }
@@ -93,6 +96,7 @@ fn paper() -> Config {
         adam: Adam { beta1: 0.9, beta2: 0.99, epsilon: 1e-8, decay_share: 1.0 },
         gaussians: gaussians(),
         tree: tree(),
+        r2: r2(),
     }
 }
 
@@ -216,6 +220,64 @@ fn nerf_ca(paper: Config) -> Config {
             ..paper.dynamic
         },
         adam: Adam { beta2: 0.999, decay_share: 0.75, ..paper.adam },
+        ..paper
+    }
+}
+
+/// The constants of R2-Gaussian's public code, for a run of 30,000 iterations.
+pub(super) fn r2() -> R2 {
+    R2 {
+        static_data: StaticData::PerPhase,
+        init: R2Start::Fdk,
+        normalise: true,
+        half_extent_mm: 0.0,
+        voxels: 256,
+        count: 50_000,
+        density_share: 0.15,
+        candidate: 0.05,
+        least_scale: 0.0005,
+        greatest_scale: 0.5,
+        position_rate: 2e-4,
+        position_rate_end: 2e-5,
+        density_rate: 1e-2,
+        density_rate_end: 1e-3,
+        scale_rate: 5e-3,
+        scale_rate_end: 5e-4,
+        rotation_rate: 1e-3,
+        rotation_rate_end: 1e-4,
+        ssim: 0.25,
+        tv: 0.05,
+        tv_box: 32,
+        tv_moves_centres: false,
+        densify_every: 100,
+        densify_from: 500,
+        densify_until: 15_000,
+        densify_gradient: 5e-5,
+        size_limit: 0.1,
+        most: 500_000,
+        weakest: 1e-5,
+    }
+}
+
+/// R2-Gaussian as its public code does it: a static method, fitted to the whole images of each phase.
+fn r2_gaussian(paper: Config) -> Config {
+    Config {
+        preset: Preset::R2Gaussian,
+        train: Train {
+            iterations: 30_000,
+            // Divides what lies between changes of the Gaussians' number.
+            iterations_per_submit: 10,
+            checkpoint_every: 5000,
+            validate_every: 5000,
+            ..paper.train
+        },
+        // Neither field is marched through: the still one is nothing.
+        march: March { static_samples: 2, dynamic_samples: 2, render_samples: 2, ..paper.march },
+        static_field: StaticField { form: StaticForm::None, ..paper.static_field },
+        // The network is never asked; the smallest one takes no memory.
+        dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, delay: 0, ..paper.dynamic },
+        adam: Adam { beta2: 0.999, epsilon: 1e-15, ..paper.adam },
+        gaussians: Gaussians { form: GaussianForm::R2, ..paper.gaussians },
         ..paper
     }
 }

@@ -1,6 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{CalibrateMode, Decay, DynamicTarget, GaussianForm, StaticForm};
+use crate::config::{CalibrateMode, Decay, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -91,7 +91,7 @@ section! {
 section! {
     /// The static field. As a network ("network") it has the dynamic one's layers, and of what is below the learning rate alone.
     StaticField, "static" {
-        /// What it is made of: "tensor" (low-rank planes and lines) or "network".
+        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian alone.
         #[serde(default)] form: StaticForm,
         /// Cells per axis, D.
         grid: u32 in 2.0 to 512.0,
@@ -268,7 +268,8 @@ section! {
     /// Gaussians as the moving field. Lengths are pixels at the isocentre of images whose smaller side has 100, and grow with
     /// the images; line integrals are shares of the views' strongest change.
     Gaussians, "gaussians" {
-        /// What the moving field is made of: "none" (the network), "phase", "tree" or "auto".
+        /// What the moving field is made of: "none" (the network), "phase", "tree", "auto", or "r2" (section
+        /// `r2`, and of this one nothing else).
         form: GaussianForm,
         /// Iterations, each over all images.
         iterations: u32 in 1.0 to 1e6,
@@ -344,5 +345,74 @@ section! {
         track_rate: f64 in 0.0 to 100.0,
         /// Iterations per tracked phase.
         track_iterations: u32 in 0.0 to 1e6,
+    }
+}
+
+section! {
+    /// Gaussians as R2-Gaussian fits them (`gaussians.form = "r2"`), with what its code uses as defaults. Its volume is a
+    /// cube around the isocentre; lengths are shares of that cube's side unless they are called rates, which count half
+    /// sides.
+    R2, "r2" {
+        /// Which images a set of Gaussians sees: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one
+        /// set).
+        static_data: StaticData,
+        /// Where the fit begins: "fdk" (at voxels of a filtered back-projection) or "random".
+        init: R2Start,
+        /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities are near 1.
+        normalise: bool,
+        /// Half side of the volume, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is
+        /// less.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Voxels along each side of the volume, for the back-projection and the box of total variation.
+        voxels: u32 in 8.0 to 512.0,
+        /// Gaussians of a set at the start.
+        count: u32 in 1.0 to 1_048_576.0,
+        /// Density of a Gaussian at the start, as a share of the back-projection there.
+        density_share: f64 in 1e-6 to 1e3,
+        /// Back-projection beyond which a Gaussian may begin at a voxel.
+        candidate: f64 in 0.0 to 1e3,
+        /// Least standard deviation.
+        least_scale: f64 in 1e-6 to 1.0,
+        /// Greatest standard deviation.
+        greatest_scale: f64 in 1e-6 to 10.0,
+        /// Adam's rate of positions at the start; rates fall by a constant factor per iteration.
+        position_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of positions at the end.
+        position_rate_end: f64 in 1e-12 to 100.0,
+        /// Adam's rate of densities, before the softplus, at the start.
+        density_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of densities at the end.
+        density_rate_end: f64 in 1e-12 to 100.0,
+        /// Adam's rate of scales, before the sigmoid, at the start.
+        scale_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of scales at the end.
+        scale_rate_end: f64 in 1e-12 to 100.0,
+        /// Adam's rate of quaternions at the start.
+        rotation_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of quaternions at the end.
+        rotation_rate_end: f64 in 1e-12 to 100.0,
+        /// Weight of 1 - SSIM beside the mean absolute difference, which has 1.
+        ssim: f64 in 0.0 to 1e3,
+        /// Weight of total variation in a box of voxels.
+        tv: f64 in 0.0 to 1e3,
+        /// Voxels along each side of that box, which is elsewhere in each iteration.
+        tv_box: u32 in 2.0 to 128.0,
+        /// Let total variation move Gaussians: what its code computes, but scales by the square of a voxel's side by
+        /// mistake, so that it is nothing.
+        tv_moves_centres: bool,
+        /// Iterations after which Gaussians are added and taken away, and again after as many; 0 = never.
+        densify_every: u32 in 0.0 to 1e6,
+        /// Iteration beyond which that begins.
+        densify_from: u32 in 0.0 to 1e6,
+        /// Iteration from which it no longer happens.
+        densify_until: u32 in 0.0 to 1e6,
+        /// Mean gradient of the loss by a centre, in half images, from which a Gaussian is cloned or split.
+        densify_gradient: f64 in 0.0 to 1e6,
+        /// Greatest standard deviation up to which a Gaussian is cloned, and beyond which it is split.
+        size_limit: f64 in 0.0 to 10.0,
+        /// Most Gaussians of a set.
+        most: u32 in 1.0 to 1_048_576.0,
+        /// Density below which a Gaussian is taken away.
+        weakest: f64 in 0.0 to 1e3,
     }
 }

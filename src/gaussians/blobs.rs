@@ -6,7 +6,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::dispatch::{Binding, BufferSet, dispatch_finding};
 use crate::kernels::layout::{Blob, Gaussian, GaussianSetup};
-use crate::kernels::push;
+use crate::kernels::push::{self, GaussianRays};
 use crate::kernels::stages::{Build, Stage, vec4_variant};
 use crate::kernels::tuning::Tuning;
 use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units, scales};
@@ -23,6 +23,8 @@ pub struct BlobKernels {
     pub rays: Stage<push::GaussianRays>,
     /// Line integrals and maxima.
     pub rays_maxima: Stage<push::GaussianRays>,
+    /// Maxima where many overlap.
+    pub crowd: Stage<push::GaussianCrowd>,
     /// Attenuation at the cells of rows.
     pub points: Stage<push::GaussianPoints>,
 }
@@ -38,6 +40,7 @@ impl BlobKernels {
             rays: Build { variant: vec4_variant(tuning), ..plain }.stage(gpu)?,
             rays_maxima: Build { variant: vec4_variant(tuning), constants: &[("with_maxima", 1)], ..plain }
                 .stage(gpu)?,
+            crowd: Build { exchanges: true, ..plain }.stage(gpu)?,
             points: plain.stage(gpu)?,
         })
     }
@@ -77,6 +80,8 @@ struct BlobSet {
     phases: Vec<Range<u32>>,
     /// What moves between phases, if anything does.
     tree: Option<MovingTree>,
+    /// Whether so many overlap that the strongest of a ray do not tell their sum.
+    is_crowd: bool,
 }
 
 impl BlobSet {
@@ -87,7 +92,7 @@ impl BlobSet {
             all.extend(field.at(phase).iter().map(|g| Blob::of(g, sets.units, &sets.setup)));
             phases.push(first..all.len() as u32);
         }
-        Ok(BlobSet { blobs: upload(gpu, all)?, phases, tree: field.tree().cloned() })
+        Ok(BlobSet { blobs: upload(gpu, all)?, phases, tree: field.tree().cloned(), is_crowd: sets.is_crowd })
     }
 }
 
@@ -172,11 +177,18 @@ impl Blobs {
     ) -> Result<()> {
         let rows = n_rays.div_ceil(image_width);
         let tiles = image_width.div_ceil(TILE) * rows.div_ceil(TILE);
-        let push = push::GaussianRays { n_rays, image_width, first_blob: range.start, n_blobs: range.len() as u32 };
+        let push = GaussianRays { n_rays, image_width, first_blob: range.start, n_blobs: range.len() as u32 };
         let bound = [(Binding::blobs, blobs.into())];
-        let stage = if maxima { &self.kernels.rays_maxima } else { &self.kernels.rays };
-        let groups = Groups::Direct([tiles, 1, 1]);
-        dispatch_finding(recording, stage, groups, &bound, |name| buffers.find(name), push)
+        let is_crowd = maxima && self.set.lock().unwrap_or_else(PoisonError::into_inner).is_crowd;
+        let stage = if maxima && !is_crowd { &self.kernels.rays_maxima } else { &self.kernels.rays };
+        let (groups, find) = (|| Groups::Direct([tiles, 1, 1]), |name| buffers.find(name));
+        dispatch_finding(recording, stage, groups(), &bound, find, push)?;
+        if is_crowd {
+            let GaussianRays { n_rays, image_width, first_blob, n_blobs } = push;
+            let push = push::GaussianCrowd { n_rays, image_width, first_blob, n_blobs };
+            dispatch_finding(recording, &self.kernels.crowd, groups(), &bound, find, push)?;
+        }
+        Ok(())
     }
 
     /// Records the field at the cells of `volume`: rows of `row_cells` along the rays `rows` in `buffers`.

@@ -36,7 +36,7 @@ pub struct GaussianKernels {
 
 /// A stage on splats, of which lanes of a subgroup share each where they exchange values.
 pub struct SplatStage<P> {
-    pub(super) stage: Stage<P>,
+    pub(crate) stage: Stage<P>,
     lanes_per_splat: u32,
 }
 

@@ -1,7 +1,7 @@
 //! What an iteration of a fit costs: pairs of a splat and a pixel, operations, bytes.
 
 use crate::error::Result;
-use crate::gaussians::particles::ParticleBuffers;
+use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{GaussianSetup, Splat};
 use serde::{Deserialize, Serialize};
@@ -44,9 +44,14 @@ impl GaussianWork {
     ///
     /// # Errors
     /// Device errors.
-    pub fn of(gpu: &Gpu, setup: &GaussianSetup, particles: &ParticleBuffers, n_splats: u32) -> Result<GaussianWork> {
-        let splats: Vec<Splat> = gpu.download(&particles.splats, 0, n_splats as usize)?;
-        let images: Vec<i32> = gpu.download(&particles.image_of_splat, 0, n_splats as usize)?;
+    pub fn of(
+        gpu: &Gpu,
+        setup: &GaussianSetup,
+        (splats, image_of_splat): (&Buffer, &Buffer),
+        n_splats: u32,
+    ) -> Result<GaussianWork> {
+        let splats: Vec<Splat> = gpu.download(splats, 0, n_splats as usize)?;
+        let images: Vec<i32> = gpu.download(image_of_splat, 0, n_splats as usize)?;
         let seen = splats.iter().zip(&images).filter(|(_, image)| **image >= 0);
         let pairs = seen.map(|(splat, _)| pixels(splat, setup)).sum::<u64>();
         let image_pixels = u64::from(setup.n_images) * u64::from(setup.image_stride);

@@ -2,7 +2,7 @@
 //! and (as JSON in the metadata) configuration, scene, step and seed. Random numbers are a function of seed
 //! and step, so these two are the generator's whole state.
 
-use crate::config::Config;
+use crate::config::{Config, StaticForm};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::geometry::CArm;
@@ -10,6 +10,8 @@ use crate::model::Model;
 use crate::model::gaussian_tensors::{self, FileTensor, GaussianHeader};
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
+use crate::model::r2::R2State;
+use crate::model::r2_tensors;
 use crate::model::scene::Scene;
 use glam::DVec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -44,6 +46,8 @@ pub struct Checkpoint {
     /// Words of the last [`crate::kernels::layout::StepReport`], which a run whose learning has ended repeats; empty while it
     /// learns.
     pub last_report: Vec<u32>,
+    /// State of a fit as R2-Gaussian does it; none of other methods.
+    pub r2: Option<R2State>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
 }
@@ -172,6 +176,7 @@ impl Checkpoint {
         if let Some(field) = &model.moving {
             tensors.extend(gaussian_tensors::tensors(field));
         }
+        tensors.extend(self.r2.iter().flat_map(r2_tensors::tensors));
         for tensor in model.param_map.tensors() {
             if model.moving.is_some() && tensor.name.starts_with(NETWORK) {
                 continue;
@@ -265,7 +270,11 @@ impl Checkpoint {
         let (s, d) = (&header.config.static_field, &header.config.dynamic);
         let [grid, ranks, layers, width] = [s.grid, s.ranks, d.layers, d.width].map(u64::from);
         let hidden = layers * width * width;
-        let still = if header.config.two_networks() { hidden } else { 3 * ranks * grid * (grid + 1) };
+        let still = match header.config.static_field.form {
+            StaticForm::Tensor => 3 * ranks * grid * (grid + 1),
+            StaticForm::Network => hidden,
+            StaticForm::None => 0,
+        };
         let needed = still + hidden + header.phases as u64 * u64::from(d.latent);
         if needed > bytes.len() as u64 / 4 {
             return Err(bad("config", format!("{needed} parameters do not fit the file's {} bytes", bytes.len())));
@@ -329,7 +338,9 @@ impl Checkpoint {
             Ok(view) if view.dtype() == Dtype::U32 => to_words(view.data()),
             _ => Vec::new(),
         };
+        let is_r2 = header.config.is_r2();
         Ok(Checkpoint {
+            r2: is_r2.then(|| r2_tensors::read(&tensors, header.phases, path)).transpose()?,
             occupancy: words(OCCUPANCY),
             last_report: words(LAST_REPORT),
             model: Model {

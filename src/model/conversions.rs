@@ -85,6 +85,7 @@ mod tests {
                 setup: GaussianSetup { least_scale: 0.1, greatest_scale: 9.0, ..GaussianSetup::default() },
                 rows: (0..4).map(row).collect(),
                 step: 9,
+                is_crowd: false,
             },
             setup,
             grid: (0..N_PHASES).flat_map(|t| (0..125).map(move |i| pack(displacement(t, node(i))))).collect(),

@@ -33,6 +33,9 @@ pub(super) struct GaussianHeader {
     views: u32,
     /// The grid that moves a tree; none for a set per phase.
     grid: Option<GridHeader>,
+    /// Whether Gaussians are all there is and overlap by the hundred.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    crowd: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -58,6 +61,7 @@ pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
         greatest_scale: sets.setup.greatest_scale,
         step: sets.step,
         views: sets.setup.n_views,
+        crowd: sets.is_crowd,
         grid: match field {
             MovingGaussians::PerPhase(_) => None,
             MovingGaussians::Tree(tree) => Some(GridHeader {
@@ -153,6 +157,7 @@ pub(super) fn read(
         },
         rows: (0..n).map(row).collect(),
         step: header.step,
+        is_crowd: header.crowd,
     };
     let Some(grid) = &header.grid else { return Ok(MovingGaussians::PerPhase(sets)) };
     if !(2..=MOST_NODES).contains(&grid.nodes)
@@ -184,9 +189,9 @@ pub(super) fn read(
 }
 
 /// Where tensors are read from.
-struct File<'a> {
-    tensors: &'a SafeTensors<'a>,
-    path: &'a Path,
+pub(super) struct File<'a> {
+    pub(super) tensors: &'a SafeTensors<'a>,
+    pub(super) path: &'a Path,
 }
 
 impl File<'_> {
@@ -202,7 +207,7 @@ impl File<'_> {
         Ok(view.data())
     }
 
-    fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
+    pub(super) fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
         let bytes = self.bytes(name, Dtype::F32, shape)?.chunks_exact(4);
         let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
         match values.iter().all(|v| v.is_finite()) {
@@ -211,7 +216,7 @@ impl File<'_> {
         }
     }
 
-    fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
+    pub(super) fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
         let bytes = self.bytes(name, Dtype::U32, &[Some(n)])?.chunks_exact(4);
         Ok(bytes.map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect())
     }

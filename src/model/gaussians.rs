@@ -42,6 +42,9 @@ pub struct Gaussians {
     pub rows: Vec<Gaussian>,
     /// Iterations done.
     pub step: u32,
+    /// Whether Gaussians are all there is and overlap by the hundred, as R2-Gaussian's do: their largest sum along a ray is
+    /// sought among all of them.
+    pub is_crowd: bool,
 }
 
 impl Gaussians {
@@ -160,9 +163,10 @@ impl MovingGaussians {
         }
     }
 
-    /// Form of the field: a set of Gaussians per phase, or one for the beat.
+    /// Form of the field: a set of Gaussians per phase, R2-Gaussian's or another, or one for the beat.
     pub fn form(&self) -> GaussianForm {
         match self {
+            MovingGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
             MovingGaussians::PerPhase(_) => GaussianForm::Phase,
             MovingGaussians::Tree(_) => GaussianForm::Tree,
         }

@@ -53,9 +53,9 @@ pub struct NetworkMap {
 /// Where every parameter lives.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ParamMap {
-    /// Cells per axis of the static field; 0 where it is a network.
+    /// Cells per axis of the static field; 0 where it is a network or nothing.
     pub grid: usize,
-    /// Ranks per mode; 0 where it is a network.
+    /// Ranks per mode; 0 where it is a network or nothing.
     pub ranks: usize,
     /// `ranks` rounded up to vec4, in vec4.
     pub rank4: usize,
@@ -187,6 +187,7 @@ impl ParamMap {
         let (grid, ranks, still) = match s.form {
             StaticForm::Tensor => (s.grid as usize, s.ranks as usize, None),
             StaticForm::Network => (0, 0, Some(NetworkMap::new(d, 0, 0, phases))),
+            StaticForm::None => (0, 0, None),
         };
         let rank4 = ranks.div_ceil(4);
         let static_len = still.as_ref().map_or(3 * (grid * grid + grid) * rank4 * 4, |network| network.len);
@@ -224,6 +225,9 @@ impl ParamMap {
 
     fn planes_and_lines(&self) -> Vec<Tensor> {
         let mut out = Vec::new();
+        if self.grid == 0 {
+            return out;
+        }
         for (mode, plane) in ["xy", "xz", "yz"].into_iter().enumerate() {
             let mut at = Vec::new();
             for r in 0..self.ranks {
@@ -269,7 +273,7 @@ mod tests {
 
     #[test]
     fn slices_are_aligned_disjoint_and_named() {
-        for preset in [Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa] {
+        for preset in [Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa, Preset::R2Gaussian] {
             let config = Config::preset(preset);
             let map = ParamMap::new(&config, 10);
             let mut seen = vec![false; map.len];

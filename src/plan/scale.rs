@@ -62,7 +62,20 @@ impl Scene {
         if config.two_networks() {
             scene.hold_all_rays(config, dataset);
         }
+        if config.is_r2() {
+            scene.hold_volume(volume_half(config, dataset), seen_half(dataset));
+        }
         Ok(scene)
+    }
+
+    /// Boxes of R2-Gaussian's volume, of half a side each way, and of what the views see of it. The still field is nothing.
+    fn hold_volume(&mut self, half: f64, seen: f64) {
+        (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
+        (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
+        let corner = half * 3f64.sqrt();
+        (self.static_depth, self.dynamic_depth) = ([-corner, corner], [-corner, corner]);
+        self.region = Some([[-seen.min(half); 3], [seen.min(half); 3]]);
+        self.static_gain = 0.0;
     }
 
     /// Boxes of two networks, which hold every point of the views' rays, however a C-arm turns them about the isocentre: none
@@ -133,8 +146,12 @@ fn field_of_view(dataset: &Dataset) -> f64 {
 /// Half side of the box of the still field, world units: what is far outside the field of view is seen by one view at a time,
 /// and a box that holds it spends the field on it.
 fn static_half(config: &Config, dataset: &Dataset) -> f64 {
-    if config.static_field.half_extent_mm > 0.0 {
-        return config.static_field.half_extent_mm / MM_PER_UNIT;
+    box_half(config.static_field.half_extent_mm, dataset)
+}
+
+fn box_half(stated_mm: f64, dataset: &Dataset) -> f64 {
+    if stated_mm > 0.0 {
+        return stated_mm / MM_PER_UNIT;
     }
     half_depth(dataset).min(STATIC_FIELDS_OF_VIEW * field_of_view(dataset))
 }
@@ -153,6 +170,11 @@ fn reach(dataset: &Dataset) -> f64 {
         }
     }
     reach * (1.0 + 1e-5)
+}
+
+/// Half side of R2-Gaussian's volume, a cube around the isocentre, world units.
+pub(super) fn volume_half(config: &Config, dataset: &Dataset) -> f64 {
+    box_half(config.r2.half_extent_mm, dataset)
 }
 
 fn half_depth(dataset: &Dataset) -> f64 {

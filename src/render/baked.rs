@@ -21,6 +21,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Cells of a baked volume along its longest side.
 pub const BAKED_CELLS: u32 = 192;
+/// Fewest.
+const LEAST_BAKED_CELLS: u32 = 32;
 
 /// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates;
 /// finer detail than a cell is lost, but for Gaussians, which are drawn as they are in front of the baked static field.
@@ -75,10 +77,11 @@ impl Baked {
     pub fn for_display(renderer: Arc<Renderer>, model: &Model, cell_mm: f64) -> Baked {
         let scene = &model.scene;
         let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
-        let moving_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(32, BAKED_CELLS);
+        let moving_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(LEAST_BAKED_CELLS, BAKED_CELLS);
         let still_cells = match model.config.static_field.form {
-            StaticForm::Tensor => (2 * model.config.static_field.grid).clamp(32, BAKED_CELLS),
+            StaticForm::Tensor => (2 * model.config.static_field.grid).clamp(LEAST_BAKED_CELLS, BAKED_CELLS),
             StaticForm::Network => moving_cells,
+            StaticForm::None => LEAST_BAKED_CELLS,
         };
         Self::empty(renderer, still_cells, moving_cells)
     }

@@ -8,7 +8,7 @@ use crate::run::events::Event;
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::distance::Distance;
 use crate::score::eval::{Scoring, evaluate};
-use crate::train::trainer::Snapshot;
+use crate::train::snapshot::Snapshot;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender};

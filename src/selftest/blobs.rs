@@ -1,7 +1,7 @@
 //! Gaussians as they are drawn: along rays, in volumes, and in pictures at display rates.
 
 use crate::config::{Config, Preset};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
@@ -16,11 +16,13 @@ use crate::render::quantity::{Projection, Quantity};
 use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance};
-use crate::selftest::problems::{drawn_fields, small_dataset};
+use crate::selftest::problems::{drawn_fields, random_gaussians, small_dataset};
+use crate::selftest::r2;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
 const RAYS: &[&str] = &[push::GaussianRays::SHADER];
+const CROWD: &[&str] = &[push::GaussianCrowd::SHADER];
 const POINTS: &[&str] = &[push::GaussianPoints::SHADER];
 const PICTURES: &[&str] = &["pictures at display rates"];
 
@@ -93,6 +95,42 @@ pub fn compare_rays(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Resu
         }
     }
     Ok(())
+}
+
+/// Compares the largest values along rays where more Gaussians overlap than peaks are kept of.
+///
+/// # Errors
+/// Device errors.
+pub fn compare_crowd(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+    findings.begin("r2", "600 Gaussians that overlap, view of 37 x 29 pixels");
+    let (width, height) = (37, 29);
+    let dataset = small_dataset(width, height, 3)?;
+    let config = r2::small_config(&[])?;
+    let mut trainer = Trainer::new(gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
+    let mut model = trainer.model()?;
+    let crowd = crowd(&model)?;
+    model.moving = Some(crowd.clone());
+    let rays = &dataset.views[1].rays;
+    let seen = Renderer::new(gpu, &model, tuning.clone())?.render(rays, width, height, 0)?;
+    let set = blobs::field(&crowd, 0);
+    let ray = |pixel: usize| rays.pixel((pixel % width) as f64, (pixel / width) as f64);
+    let want: Vec<blobs::Along> = (0..width * height).map(|pixel| blobs::along(&set, ray(pixel))).collect();
+    let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
+    findings.numbers(CROWD, "largest values", &seen.dynamic_max, &maxima, MAXIMUM);
+    findings.require(CROWD, "the same with a still field that is nothing", seen.total_max == seen.dynamic_max);
+    Ok(())
+}
+
+/// Gaussians of phase 0, about a tenth of the volume wide, in a model of R2-Gaussian.
+fn crowd(model: &Model) -> Result<MovingGaussians> {
+    let Some(MovingGaussians::PerPhase(mut field)) = model.moving.clone() else {
+        return Err(Error::Internal("the model has no sets of Gaussians".into()));
+    };
+    let pixels = model.scene.static_max[0] / field.units.pixel;
+    let mut rows = random_gaussians(600, 1, 0.5 * pixels, 6);
+    rows.iter_mut().for_each(|g| g.log_scale = g.log_scale.map(|log| log + (0.08 * pixels).ln() as f32));
+    field.rows = rows;
+    Ok(MovingGaussians::PerPhase(field))
 }
 
 /// Compares cells of volumes.

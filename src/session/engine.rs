@@ -334,5 +334,6 @@ fn holds(model: &Model, new: &Scene) -> bool {
         |i: usize| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack;
     let inside = model.config.two_networks() || (0..3).all(within);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
-    inside && alike(old.static_gain, new.static_gain) && alike(old.dynamic_gain, new.dynamic_gain)
+    let still_alike = old.static_gain == new.static_gain || alike(old.static_gain, new.static_gain);
+    inside && still_alike && alike(old.dynamic_gain, new.dynamic_gain)
 }

@@ -228,9 +228,13 @@ fn method(text: &Text<'_>, section: &MethodSection) -> Result<Method> {
 }
 
 const ITERATIONS: &str = "train.iterations";
+const DENSIFY_EVERY: &str = "r2.densify_every";
+/// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have
+/// one.
+const LEAST_BETWEEN_DENSIFYING: f64 = 10.0;
 
-/// Settings of a run of another length: what the preset counts in iterations of the networks' schedule keeps its share of the
-/// run, but for what was `given`.
+/// Settings of a run of another length: what the preset counts in iterations of the networks' schedule, and of density
+/// control, keeps its share of the run, but for what was `given`.
 fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
     let share = f64::from(iterations) / f64::from(preset.train.iterations);
     let mut schedule = vec![
@@ -245,8 +249,16 @@ fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
             ("networks.stop_after", preset.networks.stop_after),
         ]);
     }
+    if preset.is_r2() {
+        schedule.extend([
+            (DENSIFY_EVERY, preset.r2.densify_every),
+            ("r2.densify_from", preset.r2.densify_from),
+            ("r2.densify_until", preset.r2.densify_until),
+        ]);
+    }
     let moved = schedule.into_iter().filter(|(key, _)| !given.contains(key));
-    let moved = moved.map(|(key, count)| format!("{key}={}", (share * f64::from(count)).round()));
+    let least = |key: &str| if key == DENSIFY_EVERY { LEAST_BETWEEN_DENSIFYING } else { 0.0 };
+    let moved = moved.map(|(key, count)| format!("{key}={}", (share * f64::from(count)).round().max(least(key))));
     moved.chain([format!("{ITERATIONS}={iterations}")]).collect()
 }
 

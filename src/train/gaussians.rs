@@ -165,7 +165,7 @@ impl GaussianTrainer {
         if fit::parts_from_strays(&self.settings, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.buffers, first..self.step)
+        losses(&self.buffers.gaussian_ring, first..self.step)
     }
 
     /// Estimates the still background anew from what the Gaussians leave of the images, and with it the bounds of the
@@ -235,6 +235,7 @@ impl GaussianTrainer {
             setup: self.setup,
             rows: self.gpu.download(&self.particles.gaussians, 0, self.n as usize)?,
             step: self.step,
+            is_crowd: false,
         };
         model.check()?;
         Ok(model)
@@ -256,7 +257,8 @@ impl GaussianTrainer {
     /// # Errors
     /// Device errors.
     pub fn work(&self) -> Result<GaussianWork> {
-        GaussianWork::of(&self.gpu, &self.setup, &self.particles, self.n * self.setup.n_views)
+        let splats = (&self.particles.splats, &self.particles.image_of_splat);
+        GaussianWork::of(&self.gpu, &self.setup, splats, self.n * self.setup.n_views)
     }
 }
 

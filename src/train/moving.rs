@@ -7,16 +7,40 @@ use crate::gaussians::work::GaussianWork;
 use crate::geometry::ViewRays;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
-use crate::model::Model;
+use crate::model::checkpoint::Checkpoint;
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
+use crate::model::r2::R2State;
 use crate::plan::Plan;
 use crate::plan::targets::Targets;
+use crate::r2::data::R2Data;
 use crate::scan::dataset::{Dataset, Frame};
 use crate::train::carried::Carried;
 use crate::train::gaussians::GaussianTrainer;
+use crate::train::r2::R2Trainer;
 use crate::train::tree::TreeTrainer;
 use crate::train::tree_start::TreeStart;
 use std::sync::{Arc, Mutex, PoisonError};
+
+/// Iterations of R2-Gaussian after which those who draw the field get it anew: of half a million Gaussians per phase that
+/// takes as long as some iterations.
+const R2_SHOWN_EVERY: u32 = 100;
+
+/// What Gaussians are fitted to.
+#[derive(Clone)]
+pub(super) enum FitData {
+    /// Bounds of the moving field's images.
+    Targets(Box<Targets>),
+    /// Whole images.
+    R2(Box<R2Data>),
+}
+
+impl FitData {
+    /// What a plan has; none where the network moves.
+    pub(super) fn take(plan: &mut Plan) -> Option<FitData> {
+        let r2 = plan.r2.take().map(|data| FitData::R2(Box::new(data)));
+        r2.or_else(|| plan.targets.take().map(|targets| FitData::Targets(Box::new(targets))))
+    }
+}
 
 /// A fit under way.
 pub(super) enum MovingFit {
@@ -26,14 +50,30 @@ pub(super) enum MovingFit {
     Start(Box<TreeStart>),
     /// One set for the beat.
     Tree(Box<TreeTrainer>),
+    /// Static sets as R2-Gaussian fits them.
+    R2(Box<R2Trainer>),
 }
 
 impl MovingFit {
+    /// Begins a fit, and what is to be said of its beginning.
+    ///
+    /// # Errors
+    /// As [`R2Trainer::new`], [`GaussianTrainer::new`] and [`TreeStart::new`].
+    pub(super) fn of(gpu: &Gpu, data: FitData, config: &Config) -> Result<(MovingFit, Vec<String>)> {
+        Ok(match data {
+            FitData::Targets(targets) => (MovingFit::new(gpu, *targets, config)?, Vec::new()),
+            FitData::R2(data) => {
+                let (fit, notes) = R2Trainer::new(gpu, *data, config)?;
+                (MovingFit::R2(Box::new(fit)), notes)
+            }
+        })
+    }
+
     /// Begins a fit of the form that configuration and data ask for.
     ///
     /// # Errors
     /// As [`GaussianTrainer::new`] and [`TreeStart::new`].
-    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<MovingFit> {
+    fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<MovingFit> {
         Ok(match targets.form(config.gaussians.form) {
             GaussianForm::Tree => MovingFit::Start(Box::new(TreeStart::new(gpu, targets, config)?)),
             _ => MovingFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
@@ -59,7 +99,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(fit) => fit.step() >= end / 2,
             MovingFit::Start(_) => false,
-            MovingFit::Tree(_) => true,
+            MovingFit::Tree(_) | MovingFit::R2(_) => true,
         }
     }
 
@@ -69,6 +109,7 @@ impl MovingFit {
             MovingFit::PerPhase(fit) => fit.step(),
             MovingFit::Start(_) => 0,
             MovingFit::Tree(fit) => fit.step(),
+            MovingFit::R2(fit) => fit.step(),
         }
     }
 
@@ -76,7 +117,7 @@ impl MovingFit {
     pub(super) fn preparation(&self) -> Option<f64> {
         match self {
             MovingFit::Start(start) => Some(start.share()),
-            MovingFit::PerPhase(_) | MovingFit::Tree(_) => None,
+            MovingFit::PerPhase(_) | MovingFit::Tree(_) | MovingFit::R2(_) => None,
         }
     }
 
@@ -94,6 +135,7 @@ impl MovingFit {
                 Ok(Vec::new())
             }
             MovingFit::Tree(fit) => fit.advance(until),
+            MovingFit::R2(fit) => fit.advance(until),
         }
     }
 
@@ -106,6 +148,7 @@ impl MovingFit {
             MovingFit::PerPhase(fit) => MovingGaussians::PerPhase(fit.model()?),
             MovingFit::Start(start) => MovingGaussians::PerPhase(start.field()?),
             MovingFit::Tree(fit) => MovingGaussians::Tree(fit.tree()?),
+            MovingFit::R2(fit) => MovingGaussians::PerPhase(fit.model()?),
         })
     }
 
@@ -115,6 +158,7 @@ impl MovingFit {
             MovingFit::PerPhase(fit) => fit.count(),
             MovingFit::Start(start) => start.count(),
             MovingFit::Tree(fit) => fit.count(),
+            MovingFit::R2(fit) => fit.count(),
         }
     }
 
@@ -123,6 +167,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(_) => GaussianForm::Phase,
             MovingFit::Start(_) | MovingFit::Tree(_) => GaussianForm::Tree,
+            MovingFit::R2(_) => GaussianForm::R2,
         }
     }
 
@@ -135,6 +180,7 @@ impl MovingFit {
             MovingFit::PerPhase(fit) => fit.profile_step(),
             MovingFit::Start(_) => Err(not_begun()),
             MovingFit::Tree(fit) => fit.profile_step(),
+            MovingFit::R2(fit) => fit.profile_step(),
         }
     }
 
@@ -147,6 +193,7 @@ impl MovingFit {
             MovingFit::PerPhase(fit) => fit.work(),
             MovingFit::Start(_) => Err(not_begun()),
             MovingFit::Tree(fit) => fit.work(),
+            MovingFit::R2(fit) => fit.work(),
         }
     }
 }
@@ -178,18 +225,22 @@ impl Moving {
         gpu: &Gpu,
         plan: &mut Plan,
         dataset: &Dataset,
-        saved: Option<&Model>,
+        saved: Option<&Checkpoint>,
         earlier: Option<&MovingGaussians>,
         per_submit: u32,
     ) -> Result<Option<Moving>> {
+        let mut config = plan.config.clone();
+        config.train.iterations_per_submit = per_submit;
+        if let Some(data) = plan.r2.take() {
+            return Self::begin_r2(gpu, data, &config, saved, &mut plan.notes).map(Some);
+        }
         let Some(targets) = plan.targets.take() else { return Ok(None) };
         let shot = |frame: &Frame| (dataset.heart_rays(frame), frame.beat_time().phases(dataset.n_phases));
-        let (done, end) = (saved.map_or(0, |model| model.step), plan.config.gaussian_iterations());
+        let saved = saved.map(|saved| &saved.model);
+        let (done, end) = (saved.map_or(0, |model| model.step), config.gaussian_iterations());
         let (fit, field) = match saved.and_then(|model| model.moving.as_ref()).filter(|_| done >= end) {
             Some(field) => (None, field.clone()),
             None => {
-                let mut config = plan.config.clone();
-                config.train.iterations_per_submit = per_submit;
                 let mut fit = match earlier {
                     Some(earlier) => MovingFit::after(gpu, targets, &config, earlier)?,
                     None => MovingFit::new(gpu, targets, &config)?,
@@ -206,6 +257,45 @@ impl Moving {
         let feed = Arc::new(Mutex::new((0, shown.cloned().unwrap_or(field))));
         let shots = dataset.training().iter().map(shot).collect();
         Ok(Some(Moving { fit, feed, shows_earlier, shots }))
+    }
+
+    /// Begins R2-Gaussian's fit, or goes on from what was `saved` of one to the same images.
+    fn begin_r2(
+        gpu: &Gpu,
+        data: R2Data,
+        config: &Config,
+        saved: Option<&Checkpoint>,
+        notes: &mut Vec<String>,
+    ) -> Result<Moving> {
+        let fit = match saved.and_then(|saved| Some((saved.r2.as_ref()?, saved.model.step))) {
+            Some((state, step)) => R2Trainer::with(gpu, data, config, state, step)?,
+            None => {
+                let (fit, more) = R2Trainer::new(gpu, data, config)?;
+                notes.extend(more);
+                fit
+            }
+        };
+        let feed = Arc::new(Mutex::new((0, MovingGaussians::PerPhase(fit.model()?))));
+        Ok(Moving { fit: Some(MovingFit::R2(Box::new(fit))), feed, shows_earlier: false, shots: Vec::new() })
+    }
+
+    /// The state of R2-Gaussian's fit, and the field it stands for; none of other fits.
+    ///
+    /// # Errors
+    /// As [`R2Trainer::state`].
+    pub(super) fn r2_state(&self) -> Result<Option<(R2State, MovingGaussians)>> {
+        let Some(MovingFit::R2(fit)) = &self.fit else { return Ok(None) };
+        let state = fit.state()?;
+        let field = MovingGaussians::PerPhase(fit.field_of(&state));
+        Ok(Some((state, field)))
+    }
+
+    /// Runs one iteration of the fit with a timestamp around each pass.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when the fit is over; device errors.
+    pub(super) fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        self.fit.as_mut().ok_or_else(|| Error::Internal("the fit is over".into()))?.profile_step()
     }
 
     /// Iterations done of a fit that is not finished.
@@ -241,11 +331,14 @@ impl Moving {
         let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
         let losses = fit.advance(until.min(end))?;
         self.shows_earlier &= !fit.is_presentable(end);
-        if self.shows_earlier {
+        let is_r2 = matches!(fit, MovingFit::R2(_));
+        let is_shown = !is_r2 || fit.step() >= until.min(end) || fit.step().is_multiple_of(R2_SHOWN_EVERY);
+        if self.shows_earlier || !is_shown {
             return Ok(losses);
         }
         let field = fit.field()?;
-        if fit.step() >= end {
+        // No still field comes after R2-Gaussian's.
+        if fit.step() >= end && !is_r2 {
             self.fit = None;
         }
         let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);

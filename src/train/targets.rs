@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::gaussians::stages::{RING_LENGTH, TargetBuffers};
-use crate::gpu::buffer::Memory;
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::Binding;
@@ -83,9 +83,9 @@ pub(super) fn take_images(
 }
 
 /// The losses of some iterations.
-pub(super) fn losses(buffers: &TargetBuffers, steps: Range<u32>) -> Result<Vec<f64>> {
+pub(super) fn losses(ring_buffer: &Buffer, steps: Range<u32>) -> Result<Vec<f64>> {
     let mut ring = vec![0f32; RING_LENGTH as usize];
-    buffers.gaussian_ring.read(&mut ring)?;
+    ring_buffer.read(&mut ring)?;
     let losses: Vec<f64> = steps.clone().map(|s| f64::from(ring[(s % RING_LENGTH) as usize])).collect();
     match losses.iter().position(|l| !l.is_finite()) {
         Some(at) => {

@@ -12,9 +12,8 @@ use crate::kernels::tuning::Tuning;
 use crate::network::cost::NetworkCost;
 use crate::network::ledger::Ledger;
 use crate::plan::Plan;
-use crate::plan::targets::Targets;
 use crate::scan::dataset::Dataset;
-use crate::train::moving::MovingFit;
+use crate::train::moving::{FitData, MovingFit};
 use crate::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -284,11 +283,15 @@ impl Subject {
 /// Fits of Gaussians to time: real ones from their seeds on, as their work depends on how large Gaussians become.
 pub struct GaussianSubject {
     gpu: Gpu,
-    targets: Targets,
+    data: FitData,
     config: Config,
     /// Iterations of a fit that are timed.
     timed: u32,
+    notes: Vec<String>,
 }
+
+/// Iterations of R2-Gaussian that are timed, of thousands that come before its Gaussians become more.
+const R2_TIMED: u32 = 200;
 
 /// Fits at least: one says nothing of how they differ.
 const LEAST_FITS: usize = 3;
@@ -315,25 +318,36 @@ impl GaussianSubject {
         profiled: u32,
     ) -> Result<GaussianSubject> {
         let mut config = config.clone();
-        let of_fit = config.gaussians.iterations.saturating_sub(WARM_UP).max(1);
+        let (of_fit, is_r2) = (config.gaussians.iterations, config.is_r2());
+        let of_fit = if is_r2 { config.train.iterations.min(R2_TIMED) } else { of_fit };
         let timed = match length {
             Length::Iterations(n) => n,
-            Length::Seconds(_) => of_fit,
+            Length::Seconds(_) => of_fit.saturating_sub(WARM_UP).max(1),
         };
-        config.gaussians.iterations = config.gaussians.iterations.max(WARM_UP + timed) + profiled;
-        let Some(targets) = Plan::new(&config, dataset)?.targets else {
+        let least = WARM_UP + timed;
+        config.gaussians.iterations = config.gaussians.iterations.max(least) + profiled;
+        if is_r2 {
+            config.train.iterations = config.train.iterations.max(least) + profiled;
+        }
+        let mut plan = Plan::new(&config, dataset)?;
+        let Some(data) = FitData::take(&mut plan) else {
             return Err(Error::config(
                 "gaussians.form",
                 config.gaussians.form.name(),
                 "there are no Gaussians to time",
             ));
         };
-        Ok(GaussianSubject { gpu: gpu.clone(), targets, config, timed })
+        Ok(GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes })
+    }
+
+    /// Choices about data and settings.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     fn fit(&self) -> Result<TimedFit> {
         let begin = Instant::now();
-        let mut fit = MovingFit::new(&self.gpu, self.targets.clone(), &self.config)?;
+        let (mut fit, _) = MovingFit::of(&self.gpu, self.data.clone(), &self.config)?;
         while fit.preparation().is_some() {
             fit.advance(0)?;
         }

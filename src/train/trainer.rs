@@ -24,15 +24,13 @@ use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::train::losses::{NetworkLosses, StepLoss};
 use crate::train::moving::Moving;
+use crate::train::snapshot::{REPORT_BYTES, Snapshot};
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use std::collections::VecDeque;
 use std::time::Instant;
 
 /// A loss this many times the first one means the run exploded.
 const EXPLOSION: f64 = 1e6;
-
-/// Bytes of an iteration's report.
-const REPORT_BYTES: u64 = size_of::<StepReport>() as u64;
 
 /// Where the ring has the report of the last of `step` iterations, bytes.
 fn last_report_at(step: u32) -> u64 {
@@ -60,8 +58,9 @@ pub struct Trainer {
     pace: SubmitPace,
     /// When the last submit was done, or the one under way began.
     last_completion: Instant,
-    single: Commands,
-    /// As many iterations as a submit takes, once that is known.
+    /// An iteration of fields that rays are marched through; none where Gaussians are all there is.
+    single: Option<Commands>,
+    /// As many of them as a submit takes, once that is known.
     several: Option<(Commands, u32)>,
     in_flight: VecDeque<(Ticket, u32)>,
     submitted: u32,
@@ -76,7 +75,8 @@ pub struct Trainer {
 
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
-    if checkpoint.model.param_map == plan.params && checkpoint.model.moving.is_some() == plan.targets.is_some() {
+    let has_gaussians = plan.targets.is_some() || plan.r2.is_some();
+    if checkpoint.model.param_map == plan.params && checkpoint.model.moving.is_some() == has_gaussians {
         return Ok(());
     }
     Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
@@ -212,24 +212,27 @@ impl Trainer {
         let of_these_data = saved.filter(|saved| saved.data_fingerprint == data_fingerprint);
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
         let earlier = earlier.filter(|_| of_these_data.is_none());
-        let saved_model = of_these_data.map(|saved| &saved.model);
-        let moving = Moving::begin(gpu, &mut plan, dataset, saved_model, earlier, per_submit)?;
+        let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data, earlier, per_submit)?;
         let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
         // The still field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
-        let mut recording = Recording::new(gpu, "training iteration")?;
-        record_step(&mut Pass {
-            recording: &mut recording,
-            kernels: &kernels,
-            network: &network,
-            still: still.as_ref(),
-            buffers: &forward,
-            training: Some(&training),
-            params: &plan.params,
-            setup: &plan.setup,
-        })?;
-        let single = recording.finish()?;
+        let record_single = || {
+            let mut recording = Recording::new(gpu, "training iteration")?;
+            record_step(&mut Pass {
+                recording: &mut recording,
+                kernels: &kernels,
+                network: &network,
+                still: still.as_ref(),
+                buffers: &forward,
+                training: Some(&training),
+                params: &plan.params,
+                setup: &plan.setup,
+            })?;
+            recording.finish()
+        };
+        let has_still_field = !plan.config.is_r2();
+        let single = has_still_field.then(record_single).transpose()?;
         let trainer = Trainer {
             pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit),
             gpu: gpu.clone(),
@@ -316,14 +319,17 @@ impl Trainer {
         if self.in_flight.is_empty() {
             self.last_completion = Instant::now();
         }
-        while self.submitted < until && self.in_flight.len() < self.submits_in_flight() {
+        while let Some(single) = &self.single {
+            if self.submitted >= until || self.in_flight.len() >= self.submits_in_flight() {
+                break;
+            }
             // The network's iterations are others than those before it starts: they are tried anew.
             let starts = self.plan.config.dynamic.delay;
             let stop = if self.submitted < starts { until.min(starts) } else { until };
             let fits = |(_, n): &&(Commands, u32)| !self.pace.is_trying() && stop - self.submitted >= *n;
             let (commands, n) = match self.several.as_ref().filter(fits) {
                 Some((commands, n)) => (commands, *n),
-                None => (&self.single, 1),
+                None => (single, 1),
             };
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
@@ -347,7 +353,7 @@ impl Trainer {
     /// Records as many iterations as a submit takes, once that is known, and again where it takes fewer, or twice as many.
     fn record_several(&mut self) -> Result<()> {
         let (n, recorded) = (self.pace.items(), self.several.as_ref().map_or(1, |(_, n)| *n));
-        if !self.pace.is_trying() && n == 1 {
+        if self.single.is_none() || (!self.pace.is_trying() && n == 1) {
             self.several = None;
         } else if !self.pace.is_trying() && (n < recorded || n >= 2 * recorded) {
             let mut recording = Recording::new(&self.gpu, &format!("{n} training iterations"))?;
@@ -436,6 +442,13 @@ impl Trainer {
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
+        if let Some(moving) = self.moving.as_mut().filter(|_| self.single.is_none()) {
+            let passes = moving.profile_step()?;
+            self.submitted += 1;
+            self.completed += 1;
+            self.reported += 1;
+            return Ok(passes);
+        }
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
         record_step(&mut self.pass(&mut recording))?;
         let commands = recording.finish()?;
@@ -490,6 +503,10 @@ impl Trainer {
         let occupancy = copy(&self.forward.occupancy, 0, occupancy_bytes(&self.plan.setup))?;
         let commands = recording.finish()?;
         let ticket = commands.submit()?;
+        let (mut model, mut r2) = (self.outline(), None);
+        if let Some((state, field)) = self.moving.as_ref().map(Moving::r2_state).transpose()?.flatten() {
+            (model.moving, r2) = (Some(field), Some(state));
+        }
         Ok(Snapshot {
             gpu: self.gpu.clone(),
             ticket,
@@ -501,7 +518,8 @@ impl Trainer {
             occupancy,
             occupancy_words: occupancy_bytes(&self.plan.setup) as usize / 4,
             scaled: self.network.layers() == Layers::Matrices,
-            model: self.outline(),
+            model,
+            r2,
             data_fingerprint: self.data_fingerprint.clone(),
         })
     }
@@ -523,66 +541,6 @@ impl Trainer {
             self.advance(self.submitted)?;
         }
         self.snapshot()?.wait()
-    }
-}
-
-/// A run's state on its way to the host.
-pub struct Snapshot {
-    gpu: Gpu,
-    ticket: Ticket,
-    _commands: Commands,
-    params: Buffer,
-    moments: Buffer,
-    state: Buffer,
-    report: Buffer,
-    occupancy: Buffer,
-    occupancy_words: usize,
-    scaled: bool,
-    model: Model,
-    data_fingerprint: String,
-}
-
-impl Snapshot {
-    /// Iterations it holds.
-    pub fn step(&self) -> u32 {
-        self.model.step
-    }
-
-    /// Waits until the device has come this far.
-    ///
-    /// # Errors
-    /// [`Error::Diverged`] when a parameter is not finite; device errors.
-    pub fn wait(mut self) -> Result<Checkpoint> {
-        self.gpu.wait(self.ticket)?;
-        let n = self.model.param_map.len;
-        let mut params = vec![0f32; n];
-        self.params.read(&mut params)?;
-        if let Some(bad) = params.iter().find(|p| !p.is_finite()) {
-            let (step, value) = (u64::from(self.model.step), f64::from(*bad));
-            return Err(Error::Diverged { step, quantity: "parameter", value });
-        }
-        self.model.params = params;
-        let mut moments = vec![[0f32; 2]; n];
-        self.moments.read(&mut moments)?;
-        let mut state = [DeviceState::default()];
-        self.state.read(&mut state)?;
-        let mut occupancy = vec![0u32; self.occupancy_words];
-        self.occupancy.read(&mut occupancy)?;
-        let [DeviceState { loss_scale: scale, good_updates, stopped, .. }] = state;
-        let mut last_report = Vec::new();
-        if stopped != 0 {
-            last_report.resize(REPORT_BYTES as usize / 4, 0u32);
-            self.report.read(&mut last_report)?;
-        }
-        Ok(Checkpoint {
-            model: self.model,
-            moments,
-            occupancy,
-            loss_scale: self.scaled.then_some(LossScale { scale, good_updates }),
-            stopped: stopped != 0,
-            last_report,
-            data_fingerprint: self.data_fingerprint,
-        })
     }
 }
 

@@ -237,7 +237,7 @@ impl TreeTrainer {
         if fit::parts_from_strays(&self.config.gaussians, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.joint.targets, first..self.step)
+        losses(&self.joint.targets.gaussian_ring, first..self.step)
     }
 
     /// Drops weak Gaussians and places new ones where data are missing at half the phases. Once in a run, on the host, as
@@ -322,6 +322,7 @@ impl TreeTrainer {
             setup: self.joint.setup,
             rows: self.gpu.download(&self.particles.gaussians, 0, n)?,
             step: self.step,
+            is_crowd: false,
         };
         rest.check()?;
         Ok(MovingTree { rest, setup: tree, grid, own })
@@ -345,7 +346,8 @@ impl TreeTrainer {
     /// Device errors.
     pub fn work(&self) -> Result<GaussianWork> {
         let setup = &self.joint.setup;
-        GaussianWork::of(&self.gpu, setup, &self.particles, self.n * setup.n_views * setup.n_phases)
+        let splats = (&self.particles.splats, &self.particles.image_of_splat);
+        GaussianWork::of(&self.gpu, setup, splats, self.n * setup.n_views * setup.n_phases)
     }
 }
 

@@ -87,6 +87,7 @@ mod tests {
                 setup: GaussianSetup { cut: 3.2, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() },
                 rows: vec![gaussian(-15.0), gaussian(15.0)],
                 step: 1,
+                is_crowd: false,
             },
             setup: TreeSetup {
                 n_nodes: 4,

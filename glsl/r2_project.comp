@@ -1,0 +1,27 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// How each Gaussian of R2-Gaussian is seen by the view that its set looks at in this iteration. One invocation per
+// Gaussian.
+#include "inc/r2.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint n_gaussians; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { R2Setup r2_setup; };
+// Of each image.
+layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
+layout(binding = 3) readonly buffer B3 { R2Gaussian r2_gaussians[]; };
+// [iteration][set]
+layout(binding = 4) readonly buffer B4 { R2Turn r2_turns[]; };
+layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
+layout(binding = 6) writeonly buffer B6 { Splat splats[]; };
+// The picture each belongs to: one per set.
+layout(binding = 7) writeonly buffer B7 { int image_of_splat[]; };
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= push.n_gaussians) return;
+    R2Gaussian g = r2_gaussians[i];
+    R2Turn turn = r2_turns[gaussian_step * r2_setup.n_sets + g.set];
+    splats[i] = project_r2(g, gaussian_views[turn.image], gaussian_setup).splat;
+    image_of_splat[i] = int(g.set);
+}

@@ -1,0 +1,77 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Gradient of each Gaussian of R2-Gaussian from its moments in the view and in the box of voxels, down to what is
+// stored; the statistic of density control, how strongly the image pulls at its centre; and Adam. One invocation per
+// Gaussian.
+#include "inc/r2.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(push_constant) uniform Push { uint n_gaussians; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { R2Setup r2_setup; };
+layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
+layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
+layout(binding = 4) readonly buffer B4 { R2Schedule r2_schedule[]; };
+layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
+layout(binding = 6) readonly buffer B6 { vec4 splat_moments[]; };
+layout(binding = 7) readonly buffer B7 { vec4 r2_voxel_moments[]; };
+layout(binding = 8) buffer B8 { R2Gaussian r2_gaussians[]; };
+// First and second moments of Adam, laid out as Gaussians: position and density, scale, rotation.
+layout(binding = 9) buffer B9 { vec4 gaussian_adam_first[]; };
+layout(binding = 10) buffer B10 { vec4 gaussian_adam_second[]; };
+// The gradient, laid out alike.
+layout(binding = 11) writeonly buffer B11 { vec4 gaussian_gradient[]; };
+// Per Gaussian: the sum over iterations of the gradient by its centre, in half images, and how often it was seen.
+layout(binding = 12) buffer B12 { vec2 r2_statistics[]; };
+
+// Adds the gradient of total variation.
+void add_voxels(uint i, R2Gaussian g, R2Projection p, inout GaussianGradient sum) {
+    vec4 linear = r2_voxel_moments[3u * i];
+    vec3 square = r2_voxel_moments[3u * i + 1u].xyz, mixed = r2_voxel_moments[3u * i + 2u].xyz;
+    if (r2_setup.tv_moves_centres != 0u) sum.position += p.axes * (linear.xyz / p.scale);
+    sum.log_density += linear.w;
+    sum.log_scale += square;
+    mat3 second = mat3(square.x, mixed.x, mixed.y, mixed.x, square.y, mixed.z, mixed.y, mixed.z, square.z);
+    mat3 d_axes;
+    for (int k = 0; k < 3; k++) d_axes[k] = -(p.axes * (p.scale * second[k])) / p.scale[k];
+    sum.rotation += rotation_gradient(g.rotation, d_axes);
+}
+
+vec4 step_of(uint at, vec4 g, vec4 rate, R2Schedule now) {
+    gaussian_gradient[at] = g;
+    if (now.updates == 0u) return vec4(0.0);
+    float beta1 = gaussian_setup.beta1, beta2 = gaussian_setup.beta2;
+    vec4 first = beta1 * gaussian_adam_first[at] + (1.0 - beta1) * g;
+    vec4 second = beta2 * gaussian_adam_second[at] + (1.0 - beta2) * g * g;
+    gaussian_adam_first[at] = first;
+    gaussian_adam_second[at] = second;
+    return rate * (first / now.bias1) / (sqrt(second / now.bias2) + gaussian_setup.epsilon);
+}
+
+void main() {
+    uint i = gl_GlobalInvocationID.x;
+    if (i >= push.n_gaussians) return;
+    R2Schedule now = r2_schedule[gaussian_step];
+    R2Gaussian g = r2_gaussians[i];
+    GaussianView view = gaussian_views[r2_turns[gaussian_step * r2_setup.n_sets + g.set].image];
+    R2Projection p = project_r2(g, view, gaussian_setup);
+    GaussianGradient sum = no_gradient();
+    if (n_pixels(pixels_of(p.splat, gaussian_setup)) > 0u) {
+        vec3 linear = splat_moments[2u * i].xyz, square = splat_moments[2u * i + 1u].xyz;
+        sum = gradient_r2(g, p, view, linear, square);
+        vec2 half_image = 0.5 * vec2(float(gaussian_setup.width), float(gaussian_setup.height));
+        vec3 conic = p.splat.conic;
+        vec2 pull = half_image * vec2(dot(conic.xy, linear.yz), dot(conic.yz, linear.yz));
+        r2_statistics[i] += vec2(length(pull), 1.0);
+    }
+    if (r2_setup.tv_weight > 0.0) add_voxels(i, g, p, sum);
+    vec4 place = vec4(sum.position, sum.log_density * density_slope(g));
+    vec4 place_rate = vec4(vec3(now.position_rate), now.density_rate);
+    vec4 moved = step_of(3u * i, place, place_rate, now);
+    vec4 scale = vec4(sum.log_scale * scale_slope(g, gaussian_setup), 0.0);
+    vec4 grown = step_of(3u * i + 1u, scale, vec4(now.scale_rate), now);
+    vec4 turned = step_of(3u * i + 2u, sum.rotation, vec4(now.rotation_rate), now);
+    r2_gaussians[i].position = g.position - moved.xyz;
+    r2_gaussians[i].density = g.density - moved.w;
+    r2_gaussians[i].scale = g.scale - grown.xyz;
+    r2_gaussians[i].rotation = g.rotation - turned;
+}

@@ -1,0 +1,157 @@
+//! What is refused of a configuration.
+
+use crate::choice::Choice;
+use crate::config::sections::check_range;
+use crate::config::{Config, DynamicTarget, StaticForm};
+use crate::error::{Error, Result};
+
+impl Config {
+    /// Refuses values no run could use.
+    ///
+    /// # Errors
+    /// [`Error::Config`] naming the key.
+    pub fn check(&self) -> Result<()> {
+        let (t, m, d) = (&self.train, &self.march, &self.dynamic);
+        self.train.check_ranges()?;
+        self.calibrate.check_ranges()?;
+        self.march.check_ranges()?;
+        self.static_field.check_ranges()?;
+        self.dynamic.check_ranges()?;
+        self.loss.check_ranges()?;
+        self.hull.check_ranges()?;
+        self.occupancy.check_ranges()?;
+        self.networks.check_ranges()?;
+        self.adam.check_ranges()?;
+        self.gaussians.check_ranges()?;
+        self.tree.check_ranges()?;
+        self.r2.check_ranges()?;
+        if self.gaussians.least_scale > self.gaussians.greatest_scale {
+            let problem = format!("exceeds gaussians.greatest_scale = {}", self.gaussians.greatest_scale);
+            return Err(Error::config("gaussians.least_scale", self.gaussians.least_scale, problem));
+        }
+        check_range("dynamic.skip_layer", d.skip_layer.into(), 0.0, d.layers.into())?;
+        check_range("dynamic.window_start", d.window_start, 0.0, d.bands.into())?;
+        if d.width % 16 != 0 {
+            return Err(Error::config("dynamic.width", d.width, "a multiple of 16 is needed"));
+        }
+        if d.latent % 4 != 0 {
+            return Err(Error::config("dynamic.latent", d.latent, "a multiple of 4 is needed"));
+        }
+        if d.skip_layer == 1 {
+            return Err(Error::config(
+                "dynamic.skip_layer",
+                1,
+                "the first layer sees the input anyway; 0 or 2.. is accepted",
+            ));
+        }
+        if m.static_samples.max(m.dynamic_samples).max(m.render_samples) > t.chunk_samples {
+            return Err(Error::config(
+                "train.chunk_samples",
+                t.chunk_samples,
+                "at least the samples of one ray are needed",
+            ));
+        }
+        if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
+            return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
+        }
+        if self.two_networks() {
+            self.check_two_networks()?;
+        }
+        self.check_r2()?;
+        if m.along_axis && self.gaussians_move() {
+            let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
+            return Err(Error::config("march.along_axis", true, problem));
+        }
+        Ok(())
+    }
+
+    /// Refuses what does not go with two networks.
+    fn check_two_networks(&self) -> Result<()> {
+        let form = "does not go with static.form = \"network\"";
+        let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
+            Err(Error::config(field, value, format!("{form}: {instead}")))
+        };
+        if self.gaussians_move() {
+            return refuse("gaussians.form", &self.gaussians.form.name(), "take \"none\", or static.form = \"tensor\"");
+        }
+        for (field, is_on) in [
+            ("hull.enabled", self.hull.enabled),
+            ("occupancy.enabled", self.occupancy.enabled),
+            ("loss.normalise", self.loss.normalise),
+            ("dynamic.encode_box", self.dynamic.encode_box),
+            ("march.fit_dynamic_range", self.march.fit_dynamic_range),
+            ("march.fit_static_range", self.march.fit_static_range),
+        ] {
+            if is_on {
+                return refuse(field, &true, "both fields are asked everywhere, in world units; take false");
+            }
+        }
+        if self.loss.dynamic_target != DynamicTarget::Absolute {
+            return refuse("loss.dynamic_target", &"temporal", "one residual drives both fields; take \"absolute\"");
+        }
+        for (field, value) in [
+            ("dynamic.delay", f64::from(self.dynamic.delay)),
+            ("dynamic.least_slope", self.dynamic.least_slope),
+            ("dynamic.occlusion", self.dynamic.occlusion),
+        ] {
+            if value != 0.0 {
+                let instead = "take 0 (networks.near_integral weighs what is near, networks.delay and ramp say when)";
+                return refuse(field, &value, instead);
+            }
+        }
+        let preset = Config::preset(self.preset);
+        for (field, value, unused) in [
+            ("dynamic.half_extent_mm", self.dynamic.half_extent_mm, preset.dynamic.half_extent_mm),
+            ("dynamic.normalised_shift", self.dynamic.normalised_shift, preset.dynamic.normalised_shift),
+            ("march.static_samples", self.march.static_samples.into(), preset.march.static_samples.into()),
+        ] {
+            if value != unused {
+                let instead = format!("it has no effect there; leave it at the preset's {unused}");
+                return refuse(field, &value, &instead);
+            }
+        }
+        Ok(())
+    }
+
+    /// Refuses what R2-Gaussian cannot do, and a run without a still field where that is not meant.
+    fn check_r2(&self) -> Result<()> {
+        let form = self.static_field.form;
+        if !self.is_r2() {
+            if form == StaticForm::None {
+                let problem = "all other methods have a still field: take \"tensor\", or gaussians.form = \"r2\"";
+                return Err(Error::config("static.form", form.name(), problem));
+            }
+            return Ok(());
+        }
+        let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
+            Err(Error::config(field, value, format!("does not go with gaussians.form = \"r2\": {instead}")))
+        };
+        if form != StaticForm::None {
+            return refuse("static.form", &form.name(), "its Gaussians are the whole object; take \"none\"");
+        }
+        for (field, is_on) in [
+            ("hull.enabled", self.hull.enabled),
+            ("occupancy.enabled", self.occupancy.enabled),
+            ("loss.normalise", self.loss.normalise),
+        ] {
+            if is_on {
+                return refuse(field, &true, "it knows none; take false");
+            }
+        }
+        if self.loss.dynamic_target != DynamicTarget::Absolute {
+            return refuse("loss.dynamic_target", &"temporal", "it is fitted to whole images; take \"absolute\"");
+        }
+        let r2 = &self.r2;
+        if r2.tv_box > r2.voxels {
+            return Err(Error::config("r2.tv_box", r2.tv_box, format!("exceeds r2.voxels = {}", r2.voxels)));
+        }
+        if r2.least_scale >= r2.greatest_scale {
+            let problem = format!("is not below r2.greatest_scale = {}", r2.greatest_scale);
+            return Err(Error::config("r2.least_scale", r2.least_scale, problem));
+        }
+        if r2.count > r2.most {
+            return Err(Error::config("r2.count", r2.count, format!("exceeds r2.most = {}", r2.most)));
+        }
+        Ok(())
+    }
+}

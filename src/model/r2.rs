@@ -1,0 +1,63 @@
+//! The state of a fit as R2-Gaussian does it, plain data: stored Gaussians and what the fit knows of each.
+
+use crate::error::{Error, Result};
+use crate::kernels::layout::R2Gaussian;
+
+/// Stored Gaussians with the optimiser's moments and what density control goes by: with the iteration's number, all
+/// that a fit goes on from.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct R2State {
+    /// Parameters.
+    pub rows: Vec<R2Gaussian>,
+    /// First moments of Adam: position and density, scale and nothing, rotation.
+    pub first: Vec<[f32; 12]>,
+    /// Second moments, laid out alike.
+    pub second: Vec<[f32; 12]>,
+    /// Sum over iterations of the gradient by the centre, in half images, and how often a view saw it.
+    pub statistics: Vec<[f32; 2]>,
+}
+
+fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
+    let mut marks = keep.iter();
+    values.retain(|_| marks.next().is_some_and(|keep| *keep));
+}
+
+impl R2State {
+    /// Gaussians that were never updated.
+    pub fn fresh(rows: Vec<R2Gaussian>) -> R2State {
+        let n = rows.len();
+        R2State { rows, first: vec![[0.0; 12]; n], second: vec![[0.0; 12]; n], statistics: vec![[0.0; 2]; n] }
+    }
+
+    /// Keeps those marked in `keep`, one mark per Gaussian.
+    pub fn retain(&mut self, keep: &[bool]) {
+        retain_marked(&mut self.rows, keep);
+        retain_marked(&mut self.first, keep);
+        retain_marked(&mut self.second, keep);
+        retain_marked(&mut self.statistics, keep);
+    }
+
+    /// Adds Gaussians that were never updated.
+    pub fn append(&mut self, rows: Vec<R2Gaussian>) {
+        let fresh = R2State::fresh(rows);
+        self.rows.extend(fresh.rows);
+        self.first.extend(fresh.first);
+        self.second.extend(fresh.second);
+        self.statistics.extend(fresh.statistics);
+    }
+
+    /// Refuses parameters that are not finite.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] with the first of them.
+    pub fn check(&self, step: u32) -> Result<()> {
+        let numbers = |g: &R2Gaussian| g.position.into_iter().chain(g.scale).chain(g.rotation).chain([g.density]);
+        match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
+            Some(bad) => {
+                let quantity = "parameter of a Gaussian";
+                Err(Error::Diverged { step: step.into(), quantity, value: bad.into() })
+            }
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! A dataset as R2-Gaussian sees it: a cube around the isocentre from -1 to 1, whole images in its units, and which
+//! images each set of Gaussians is fitted to.
+
+use crate::config::StaticData;
+use crate::config::sections::R2;
+use crate::error::{Error, Result};
+use crate::gaussians::view::SplatView;
+use crate::kernels::layout::{Gaussian, GaussianSetup, R2Gaussian};
+use crate::model::gaussians::{Gaussians, Units};
+use crate::r2::parameters::ScaleBounds;
+use crate::scan::dataset::Dataset;
+
+/// Standard deviations at which Gaussians end where they are drawn: of what is fitted, whose squares reach three of the
+/// longest, next to nothing is beyond.
+const DRAWN_CUT: f32 = 4.0;
+/// Bounds of drawn scales are a little wider than what scales can be, so that rounding changes none.
+const SLACK: f64 = 1e-3;
+
+/// The data in R2-Gaussian's units.
+#[derive(Debug, Clone)]
+pub struct R2Data {
+    /// Half a side of the volume, world units: the unit of length.
+    pub half: f64,
+    /// Attenuation per world unit of a density of 1.
+    pub attenuation: f64,
+    /// Side of a pixel at the isocentre, world units.
+    pub pixel: f64,
+    /// Columns of an image.
+    pub width: usize,
+    /// Rows of an image.
+    pub height: usize,
+    /// Cardiac phases.
+    pub n_phases: usize,
+    /// The view of each image.
+    pub views: Vec<SplatView>,
+    /// `[image][pixel]`: line integrals.
+    pub images: Vec<f32>,
+    /// Images of each set.
+    pub images_of_set: Vec<Vec<usize>>,
+    /// Phase of each set; none where there is one for all phases.
+    phase_of_set: Vec<Option<u32>>,
+}
+
+impl R2Data {
+    /// Brings a dataset into a volume of half a side `half` each way, world units.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for images of several sizes, and for a pixel that is not a number.
+    pub fn new(dataset: &Dataset, settings: &R2, half: f64) -> Result<R2Data> {
+        let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
+        if dataset.sizes().len() > 1 {
+            return refuse("R2-Gaussian compares images of one size; these differ: take the preset fast".into());
+        }
+        let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
+        let units = Units { pixel: half, strongest: half * attenuation };
+        let training = dataset.training();
+        let mut images = Vec::with_capacity(training.len() * dataset.n_pixels());
+        for frame in training {
+            if let Some(p) = frame.integrals.iter().position(|v| !v.is_finite()) {
+                let (column, row) = (p % dataset.width, p / dataset.width);
+                return refuse(format!("{}: column {column}, row {row} is not a finite number", frame.name));
+            }
+            images.extend(frame.integrals.iter().map(|v| (f64::from(*v) / units.strongest) as f32));
+        }
+        let n_phases = dataset.n_phases;
+        let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
+        let (images_of_set, phase_of_set) = match settings.static_data {
+            StaticData::Pooled => (vec![(0..training.len()).collect()], vec![None]),
+            StaticData::PerPhase => {
+                (0..n_phases).map(|t| (of_phase(t), Some(t))).filter(|(images, _)| !images.is_empty()).unzip()
+            }
+        };
+        Ok(R2Data {
+            half,
+            attenuation,
+            pixel: dataset.reference_view().rays.anchor[1].length(),
+            width: dataset.width,
+            height: dataset.height,
+            n_phases: n_phases as usize,
+            views: training.iter().map(|f| SplatView::new(&dataset.views[f.view].rays, units)).collect(),
+            images,
+            images_of_set,
+            phase_of_set,
+        })
+    }
+
+    /// Images of `size` (columns, rows) in the volume of world units, each set of a phase of its own: for tests.
+    #[cfg(test)]
+    pub(crate) fn of_images(
+        [width, height]: [usize; 2],
+        views: Vec<SplatView>,
+        images: Vec<f32>,
+        images_of_set: Vec<Vec<usize>>,
+    ) -> R2Data {
+        let n_phases = images_of_set.len();
+        let phase_of_set = (0..n_phases as u32).map(Some).collect();
+        R2Data {
+            half: 1.0,
+            attenuation: 1.0,
+            pixel: 1.0,
+            width,
+            height,
+            n_phases,
+            views,
+            images,
+            images_of_set,
+            phase_of_set,
+        }
+    }
+
+    /// Pixels of an image.
+    pub fn n_pixels(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// Sets of Gaussians.
+    pub fn n_sets(&self) -> usize {
+        self.images_of_set.len()
+    }
+
+    /// What a set is called in messages.
+    pub fn name_of_set(&self, set: usize) -> String {
+        self.phase_of_set[set].map_or("all phases".into(), |phase| format!("phase {phase}"))
+    }
+
+    /// The field of stored Gaussians after `step` iterations, in the units that Gaussians are drawn and exported in.
+    pub fn field(&self, rows: &[R2Gaussian], bounds: ScaleBounds, step: u32) -> Gaussians {
+        let pixels = self.half / self.pixel;
+        let convert = |g: &R2Gaussian, phase: u32| Gaussian {
+            position: (g.centre() * pixels).as_vec3().to_array(),
+            log_density: g.attenuation().ln() as f32,
+            log_scale: g.scales(bounds).to_array().map(|scale| (scale * pixels).ln() as f32),
+            phase,
+            rotation: g.rotation,
+        };
+        let all_phases = 0..self.n_phases as u32;
+        let rows = match self.phase_of_set.first() {
+            Some(None) => all_phases.flat_map(|phase| rows.iter().map(move |g| convert(g, phase))).collect(),
+            _ => rows.iter().filter_map(|g| Some(convert(g, self.phase_of_set[g.set as usize]?))).collect(),
+        };
+        Gaussians {
+            units: Units { pixel: self.pixel, strongest: self.pixel * self.attenuation },
+            n_phases: self.n_phases,
+            setup: GaussianSetup {
+                n_phases: self.n_phases as u32,
+                cut: DRAWN_CUT,
+                least_scale: (bounds.least * pixels * (1.0 - SLACK)) as f32,
+                greatest_scale: (bounds.greatest * pixels * (1.0 + SLACK)) as f32,
+                ..GaussianSetup::default()
+            },
+            rows,
+            step,
+            is_crowd: true,
+        }
+    }
+}

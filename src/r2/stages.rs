@@ -1,0 +1,195 @@
+//! The stages of a fit as R2-Gaussian does it, what they bind, and one iteration of all sets, top to bottom:
+//!
+//! r2_project -> gaussian_splat -> ssim_rows -> ssim_columns -> ssim_rows_back -> r2_residual -> gaussian_moments ->
+//! r2_voxel_splat -> r2_voxel_tv -> r2_voxel_moments -> r2_update -> gaussian_report
+
+use crate::error::Result;
+use crate::gaussians::stages::SplatStage;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{Groups, Recording};
+use crate::kernels::dispatch::{BufferSet, buffer_set, dispatch_finding};
+use crate::kernels::layout::{GaussianSetup, R2Setup};
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::stages::{Build, Stage};
+use crate::r2::particles::R2ParticleBuffers;
+
+/// Pipelines of a fit.
+pub struct R2Kernels {
+    /// How each Gaussian is seen.
+    pub project: Stage<push::R2Project>,
+    /// Pictures.
+    pub splat: SplatStage<push::GaussianSplat>,
+    /// SSIM, first pass.
+    pub ssim_rows: Stage<push::SsimRows>,
+    /// SSIM, second pass, and losses.
+    pub ssim_columns: Stage<push::SsimColumns>,
+    /// SSIM's gradient, first pass.
+    pub ssim_rows_back: Stage<push::SsimRowsBack>,
+    /// SSIM's gradient, second pass, and that of the loss.
+    pub residual: Stage<push::R2Residual>,
+    /// What gradients need of the pictures.
+    pub moments: SplatStage<push::GaussianMoments>,
+    /// Attenuation at the boxes' voxels.
+    pub voxel_splat: SplatStage<push::R2VoxelSplat>,
+    /// Total variation.
+    pub voxel_tv: Stage<push::R2VoxelTv>,
+    /// What gradients need of the voxels.
+    pub voxel_moments: SplatStage<push::R2VoxelMoments>,
+    /// Gradients, density control's statistic, and the optimiser.
+    pub update: Stage<push::R2Update>,
+    /// Loss and step count.
+    pub report: Stage<push::GaussianReport>,
+}
+
+impl R2Kernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<R2Kernels> {
+        let plain = Build::default();
+        let exchanges = Build { exchanges: true, ..plain };
+        Ok(R2Kernels {
+            project: plain.stage(gpu)?,
+            splat: SplatStage::new(gpu)?,
+            ssim_rows: plain.stage(gpu)?,
+            ssim_columns: exchanges.stage(gpu)?,
+            ssim_rows_back: plain.stage(gpu)?,
+            residual: plain.stage(gpu)?,
+            moments: SplatStage::new(gpu)?,
+            voxel_splat: SplatStage::new(gpu)?,
+            voxel_tv: exchanges.stage(gpu)?,
+            voxel_moments: SplatStage::new(gpu)?,
+            update: plain.stage(gpu)?,
+            report: exchanges.stage(gpu)?,
+        })
+    }
+}
+
+buffer_set! {
+    /// What a fit goes by and what it counts, but for the Gaussians.
+    pub struct R2Buffers {
+        /// [`GaussianSetup`].
+        gaussian_setup,
+        /// [`R2Setup`].
+        r2_setup,
+        /// [`crate::kernels::layout::GaussianView`] of each image.
+        gaussian_views,
+        /// `[iteration][set]`: [`crate::kernels::layout::R2Turn`]s.
+        r2_turns,
+        /// [`crate::kernels::layout::R2Schedule`]s.
+        r2_schedule,
+        /// Iterations done.
+        gaussian_step,
+        /// `[image][pixel]`: line integrals to be shown.
+        r2_targets,
+        /// `[set][pixel]`: pictures in fixed point.
+        splat_images,
+        /// `[set][pixel]`: gradient of the loss.
+        splat_image_gradient,
+        /// `[set][pixel]`: SSIM's sums along rows.
+        ssim_row_sums,
+        /// `[set][pixel]`: one more of them.
+        ssim_row_products,
+        /// `[set][pixel]`: factors of SSIM's gradient, and its value.
+        ssim_factors,
+        /// `[set][pixel]`: the factors' sums along rows.
+        ssim_row_factors,
+        /// `[set][voxel]`: attenuation in fixed point.
+        r2_voxel_sums,
+        /// `[set][voxel]`: gradient of the loss.
+        r2_voxel_gradient,
+        /// Partial sums of the loss.
+        gaussian_loss_parts,
+        /// Losses of the last iterations.
+        gaussian_ring,
+    }
+}
+
+/// Partial sums of the loss of a picture.
+pub fn picture_parts(n_pixels: u32) -> u32 {
+    n_pixels.div_ceil(push::SsimColumns::LOCAL_SIZE)
+}
+
+/// Partial sums of the total variation of a box.
+pub fn box_parts(box_side: u32) -> u32 {
+    box_side.pow(3).div_ceil(push::R2VoxelTv::LOCAL_SIZE)
+}
+
+/// A recording of stages on `n` Gaussians.
+pub struct R2Pass<'a> {
+    /// Where stages go.
+    pub recording: &'a mut Recording,
+    /// The stages.
+    pub kernels: &'a R2Kernels,
+    /// What the fit goes by.
+    pub buffers: &'a R2Buffers,
+    /// The Gaussians.
+    pub particles: &'a R2ParticleBuffers,
+    /// Constants on the host.
+    pub setup: &'a GaussianSetup,
+    /// Those of this method.
+    pub r2: &'a R2Setup,
+    /// Gaussians of all sets.
+    pub n: u32,
+}
+
+impl R2Pass<'_> {
+    fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
+        let (buffers, particles) = (self.buffers, self.particles);
+        let find = |name| buffers.find(name).or_else(|| particles.find(name));
+        dispatch_finding(self.recording, stage, groups, &[], find, push)
+    }
+
+    /// Workgroups of one invocation per pixel and set.
+    fn pixels<P: PushConstants>(&self, stage: &Stage<P>) -> Groups<'static> {
+        let n_pixels = self.setup.width * self.setup.height;
+        Groups::Direct([n_pixels.div_ceil(stage.local_size()), self.r2.n_sets, 1])
+    }
+
+    /// Records the pictures that the views of this iteration take.
+    fn pictures(&mut self) -> Result<()> {
+        let (kernels, n) = (self.kernels, self.n);
+        self.recording.fill(&self.buffers.splat_images, 0);
+        self.run(&kernels.project, kernels.project.groups_for(n), push::R2Project { n_gaussians: n })?;
+        self.run(&kernels.splat.stage, kernels.splat.groups_for(n), push::GaussianSplat { n_splats: n })
+    }
+
+    /// Records the loss of the pictures, its gradient, and what gradients of Gaussians need of that.
+    fn compare_pictures(&mut self) -> Result<()> {
+        let (kernels, n) = (self.kernels, self.n);
+        self.run(&kernels.ssim_rows, self.pixels(&kernels.ssim_rows), push::SsimRows {})?;
+        self.run(&kernels.ssim_columns, self.pixels(&kernels.ssim_columns), push::SsimColumns {})?;
+        self.run(&kernels.ssim_rows_back, self.pixels(&kernels.ssim_rows_back), push::SsimRowsBack {})?;
+        self.run(&kernels.residual, self.pixels(&kernels.residual), push::R2Residual {})?;
+        self.run(&kernels.moments.stage, kernels.moments.groups_for(n), push::GaussianMoments { n_splats: n })
+    }
+
+    /// Records the total variation of this iteration's boxes, and what gradients need of it.
+    fn smooth_voxels(&mut self) -> Result<()> {
+        let (kernels, n, r2) = (self.kernels, self.n, self.r2);
+        self.recording.fill(&self.buffers.r2_voxel_sums, 0);
+        let splat = &kernels.voxel_splat;
+        self.run(&splat.stage, splat.groups_for(n), push::R2VoxelSplat { n_gaussians: n })?;
+        let groups = Groups::Direct([box_parts(r2.box_side), r2.n_sets, 1]);
+        let first_part = picture_parts(self.setup.width * self.setup.height) * r2.n_sets;
+        self.run(&kernels.voxel_tv, groups, push::R2VoxelTv { first_part })?;
+        let moments = &kernels.voxel_moments;
+        self.run(&moments.stage, moments.groups_for(n), push::R2VoxelMoments { n_gaussians: n })
+    }
+}
+
+/// Records one iteration.
+///
+/// # Errors
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_step(pass: &mut R2Pass<'_>) -> Result<()> {
+    let (kernels, n) = (pass.kernels, pass.n);
+    pass.pictures()?;
+    pass.compare_pictures()?;
+    if pass.r2.tv_weight > 0.0 {
+        pass.smooth_voxels()?;
+    }
+    pass.run(&kernels.update, kernels.update.groups_for(n), push::R2Update { n_gaussians: n })?;
+    pass.run(&kernels.report, Groups::Direct([1, 1, 1]), push::GaussianReport {})
+}

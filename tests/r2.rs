@@ -1,0 +1,482 @@
+//! R2-Gaussian (the preset `r2-gaussian`): stages equal their twins, the twins PyTorch and finite differences; runs fit
+//! what Gaussians can show, repeat and resume bit by bit across density control; each phase sees its own images alone.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+#[path = "common/golden_file.rs"]
+mod golden_file;
+
+use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
+use glam::DVec3;
+use golden_file::Golden;
+use nertca_vk::config::{Config, Preset};
+use nertca_vk::error::Error;
+use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::layout::{R2Gaussian, R2Turn};
+use nertca_vk::model::checkpoint::Checkpoint;
+use nertca_vk::model::gaussians::MovingGaussians;
+use nertca_vk::model::r2::R2State;
+use nertca_vk::plan::Plan;
+use nertca_vk::r2::data::R2Data;
+use nertca_vk::r2::densify::densified;
+use nertca_vk::r2::fdk::back_projection;
+use nertca_vk::r2::parameters::{ScaleBounds, round};
+use nertca_vk::r2::setup::turns;
+use nertca_vk::r2::start::first_rows;
+use nertca_vk::reference::gaussians::{N_PARAMS, Params};
+use nertca_vk::reference::r2::{self as reference, params};
+use nertca_vk::render::renderer::Renderer;
+use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use nertca_vk::selftest::gaussians::{TENSORS, numbers, of_rows};
+use nertca_vk::selftest::r2::{compare, hard_case, small_config, twin};
+use nertca_vk::train::r2::R2Trainer;
+use nertca_vk::train::trainer::Trainer;
+
+fn config(settings: &[&str]) -> Config {
+    small_config(settings).unwrap()
+}
+
+#[test]
+fn every_stage_of_an_iteration_matches() {
+    let gpu = gpu();
+    expect_agreement(|findings| compare(&gpu, findings));
+    expect_silence(gpu);
+}
+
+fn with_sets(rows: &[R2Gaussian]) -> Vec<(Params, usize)> {
+    rows.iter().map(|g| (params(g), g.set as usize)).collect()
+}
+
+#[test]
+fn twin_gradient_is_the_derivative_of_the_twin_loss() {
+    let gpu = gpu();
+    let config = config(&["r2.tv_moves_centres=true", "r2.tv=3", "r2.tv_box=9"]);
+    let (data, rows) = hard_case(&config).unwrap();
+    let fit = R2Trainer::with(&gpu, data, &config, &R2State::fresh(rows.clone()), 0).unwrap();
+    let shown = &turns(fit.data(), &config)[..fit.data().n_sets()];
+    let mut all = with_sets(&rows);
+    // Wide enough for several voxels; those that are far away or hardly there come last.
+    all.iter_mut().for_each(|(p, _)| (4..7).for_each(|k| p[k] += 0.4));
+    let n = fit.data().n_sets() as f64;
+    let (_, gradient) = twin(fit.data(), fit.setups(), shown, &all);
+    let largest = gradient.iter().flatten().fold(0f64, |m, g| m.max(g.abs()));
+    let mut compared = 0;
+    for i in [0, 1, 2, 3, 4, 8, 9, 10, 11, 12] {
+        for (k, want) in gradient[i].iter().enumerate() {
+            let loss = |h: f64| {
+                let mut moved = all.clone();
+                moved[i].0[k] += h;
+                twin(fit.data(), fit.setups(), shown, &moved).0
+            };
+            let h = 1e-6;
+            // The loss told is the mean over the sets.
+            let difference = n * (loss(h) - loss(-h)) / (2.0 * h);
+            let error = (difference - want).abs();
+            assert!(error <= 1e-4 * want.abs() + 1e-6 * largest, "Gaussian {i}, {k}: {difference} against {want}");
+            compared += usize::from(want.abs() > 1e-4 * largest);
+        }
+    }
+    assert!(compared > 60, "{compared}");
+    drop(fit);
+    expect_silence(gpu);
+}
+
+#[test]
+fn the_gradient_of_ssim_is_its_derivative() {
+    let (width, height) = (13, 9);
+    let wave = |k: f64| (0..width * height).map(|i| 0.5 + 0.4 * (k * i as f64).sin()).collect::<Vec<f64>>();
+    let (x, y) = (wave(0.31), wave(0.47));
+    let (_, gradient) = reference::picture_loss(&x, &y, width, 0.25);
+    for (p, want) in gradient.iter().enumerate() {
+        let loss = |h: f64| {
+            let mut moved = x.clone();
+            moved[p] += h;
+            reference::picture_loss(&moved, &y, width, 0.25).0
+        };
+        let difference = (loss(1e-6) - loss(-1e-6)) / 2e-6;
+        assert!((difference - want).abs() < 1e-7, "{p}: {difference} against {want}");
+    }
+    assert!((reference::picture_loss(&y, &y, width, 0.25).0).abs() < 1e-15);
+}
+
+/// Images of a C-arm, `(primary, secondary)` degrees each, all of one phase unless said otherwise.
+fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(usize, &View) -> Vec<f32>) -> Dataset {
+    let view = |angles: &[f64; 2]| {
+        let geometry = Geometry::CArm(CArm {
+            primary_deg: angles[0],
+            secondary_deg: angles[1],
+            sid_mm: 1000.0,
+            sod_mm: 620.0,
+            pixel_mm: [1.5, 1.8],
+            offset_mm: [0.0; 2],
+            table_mm: [0.0; 3],
+        });
+        View::new(geometry, [width, height]).unwrap()
+    };
+    let views: Vec<View> = angles.iter().map(view).collect();
+    let frame = |(v, view): (usize, &View)| Frame {
+        name: format!("v{v}"),
+        view: v,
+        phase: 0,
+        split: Split::Train,
+        integrals: image(v, view),
+        mask: None,
+        after_phase: 0.0,
+        heart_shift_mm: [0.0; 3],
+    };
+    Dataset {
+        path: "test".into(),
+        layout: Layout::Native,
+        frames: views.iter().enumerate().map(frame).collect(),
+        views,
+        width,
+        height,
+        n_phases: 1,
+        notes: Vec::new(),
+        depth_range: (-0.5, 0.5),
+        hidden: Default::default(),
+        vessel_attenuation: None,
+    }
+}
+
+fn data_of(dataset: &Dataset, config: &Config) -> R2Data {
+    Plan::new(config, dataset).unwrap().r2.unwrap()
+}
+
+#[test]
+fn golden_values_of_pytorch() {
+    let gpu = gpu();
+    let golden = Golden::open("r2", "tools/reference_r2.py");
+    let number = |key: &str| golden.case[key].as_f64().unwrap();
+    let f32s = |name: &str| golden.get(name).iter().map(|v| *v as f32).collect::<Vec<f32>>();
+    let angles = [0, 1].map(|v| [0, 1].map(|k| golden.case["angles"][v][k].as_f64().unwrap()));
+    let half = number("half_mm") / 100.0;
+    // Densities are per half side there.
+    let image = |v: usize, _: &View| f32s(&format!("image/{v}")).iter().map(|y| y * half as f32).collect();
+    let dataset = dataset(&angles, [number("width_px") as usize, number("height_px") as usize], image);
+    let settings = [
+        format!("train.iterations={}", number("iterations")),
+        format!("r2.half_extent_mm={}", number("half_mm")),
+        format!("r2.voxels={}", number("voxels")),
+        format!("r2.tv_box={}", number("tv_box")),
+        "r2.tv_moves_centres=true".into(),
+    ];
+    let config = config(&settings.iter().map(String::as_str).collect::<Vec<_>>());
+    let rows = |prefix: &str| -> Vec<R2Gaussian> {
+        let get = |name: &str| f32s(&format!("{prefix}/{name}"));
+        let (position, scale, rotation, density) = (get("position"), get("scale"), get("rotation"), get("density"));
+        let row = |i: usize| R2Gaussian {
+            position: position[3 * i..][..3].try_into().unwrap(),
+            density: density[i],
+            scale: scale[3 * i..][..3].try_into().unwrap(),
+            set: 0,
+            rotation: rotation[4 * i..][..4].try_into().unwrap(),
+        };
+        (0..density.len()).map(row).collect()
+    };
+    let start = rows("start");
+    let state = R2State::fresh(start.clone());
+    let mut fit = R2Trainer::with(&gpu, data_of(&dataset, &config), &config, &state, 0).unwrap();
+    let (shown, corner) = (golden.case["shown"].as_array().unwrap(), f32s("corner"));
+    let turn = |(step, image): (usize, &serde_json::Value)| R2Turn {
+        corner: corner[3 * step..][..3].try_into().unwrap(),
+        image: image.as_u64().unwrap() as u32,
+    };
+    let turns: Vec<R2Turn> = shown.iter().enumerate().map(turn).collect();
+    gpu.upload(&fit.buffers().r2_turns, 0, &turns).unwrap();
+    let (loss, gradient) = twin(fit.data(), fit.setups(), &turns[..1], &with_sets(&start));
+    let want_loss: f64 = golden.get("terms").iter().sum();
+    assert!((loss / want_loss - 1.0).abs() < 1e-6, "{loss} against {want_loss}");
+    let got = fit.advance(1).unwrap()[0];
+    assert!((got / want_loss - 1.0).abs() < 1e-4, "{got} against {want_loss}");
+    let pixels: Vec<i32> = gpu.download(&fit.buffers().splat_images, 0, dataset.n_pixels()).unwrap();
+    let picture: Vec<f32> = pixels.iter().map(|v| *v as f32 / fit.setups().0.fixed_point).collect();
+    let (error, at) = relative_error(&picture, &golden.get("picture"));
+    assert!(error < 1e-4, "picture[{at}]: {error:.1e}");
+    let on_device = of_rows(&gpu.download(&fit.particles().gaussian_gradient, 0, start.len()).unwrap());
+    let updates = number("updates") as u32;
+    while fit.step() < updates {
+        fit.advance(updates).unwrap();
+    }
+    let last: Vec<Params> = fit.state().unwrap().rows.iter().map(params).collect();
+    for (name, range) in TENSORS {
+        let compare = |who: &str, all: &[Params], want: &str, tolerance: f64| {
+            let want = golden.get(&format!("{want}/{name}"));
+            let got: Vec<f32> = numbers(all, range.clone()).iter().map(|v| *v as f32).collect();
+            let (error, at) = relative_error(&got, &want);
+            println!("{who} {name} {error:.1e}");
+            assert!(error < tolerance, "{who} {name}[{at}]: {} against {} ({error:.1e})", got[at], want[at]);
+        };
+        compare("twin gradient", &gradient, "gradient", 2e-5);
+        compare("device gradient", &on_device, "gradient", 1e-4);
+        compare("device after ten updates", &last, "final", 1e-3);
+    }
+    drop(fit);
+    expect_silence(gpu);
+}
+
+const SIDES: &[[f64; 2]] = &[[-30.0, 25.0], [60.0, -20.0], [5.0, 8.0]];
+
+/// A few round Gaussians in a volume of 20 mm, and images of them in closed form.
+fn phantom_of_gaussians(settings: &[&str]) -> (Dataset, Config, Vec<R2Gaussian>) {
+    let all = [&["r2.half_extent_mm=20", "r2.normalise=false", "train.iterations=300"], settings].concat();
+    let config = config(&all);
+    let bounds = ScaleBounds::of(&config.r2);
+    let rows: Vec<R2Gaussian> = [(DVec3::new(0.1, -0.2, 0.05), 0.9, 0.12), (DVec3::new(-0.15, 0.1, -0.1), 0.6, 0.2)]
+        .iter()
+        .map(|(x, density, scale)| round(*x, *density, *scale, bounds, 0))
+        .collect();
+    let image = |_: usize, view: &View| {
+        let pixel = |p: usize| {
+            let (anchor, direction) = view.rays.pixel((p % 33) as f64, (p / 33) as f64);
+            let (along, half) = (direction.normalize(), 0.2);
+            let of = |g: &R2Gaussian| {
+                let (to, scale) = (anchor - half * g.centre(), half * g.scales(bounds).x);
+                let across = to - along * to.dot(along);
+                let peak = g.attenuation() * std::f64::consts::TAU.sqrt() * scale;
+                peak * (-0.5 * across.length_squared() / scale.powi(2)).exp()
+            };
+            rows.iter().map(of).sum::<f64>() as f32
+        };
+        (0..33 * 27).map(pixel).collect()
+    };
+    (dataset(SIDES, [33, 27], image), config, rows)
+}
+
+#[test]
+fn gaussians_are_seen_and_drawn_as_the_closed_form_has_them() {
+    let gpu = gpu();
+    let (dataset, config, rows) = phantom_of_gaussians(&[]);
+    let peak = dataset.frames[0].integrals.iter().fold(0f32, |m, v| m.max(*v));
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let mut saved = trainer.checkpoint().unwrap();
+    let fit = R2Trainer::with(&gpu, data_of(&dataset, &config), &config, &R2State::fresh(rows), 0).unwrap();
+    saved.model.moving = Some(MovingGaussians::PerPhase(fit.model().unwrap()));
+    let renderer = Renderer::new(&gpu, &saved.model, tuning(&gpu)).unwrap();
+    for (frame, view) in dataset.frames.iter().zip(&dataset.views) {
+        let drawn = renderer.render(&view.rays, 33, 27, 0).unwrap();
+        // What the cut leaves out, at its largest.
+        let off = drawn.dynamic_integral.iter().zip(&frame.integrals).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(off < 1e-3 * peak, "{off} of {peak}");
+        assert!(drawn.static_integral.iter().all(|v| *v == 0.0) && drawn.static_max.iter().all(|v| *v == 0.0));
+        let most = drawn.total_max.iter().fold(0f32, |m, v| m.max(*v));
+        // The denser one's peak, between pixels, and a little of the other.
+        assert!((0.93..0.98).contains(&most), "{most}");
+    }
+    // Nor does the fit see anything else: what is left of its loss is the affine picture's.
+    let turns = turns(fit.data(), &config);
+    let (loss, _) = twin(fit.data(), fit.setups(), &turns[..1], &with_sets(&fit.state().unwrap().rows));
+    let nothing: Vec<(Params, usize)> = Vec::new();
+    let (empty, _) = twin(fit.data(), fit.setups(), &turns[..1], &nothing);
+    assert!(loss < 0.03 * empty, "{loss} of {empty}");
+    drop((trainer, renderer, fit));
+    expect_silence(gpu);
+}
+
+#[test]
+fn a_fit_finds_what_gaussians_can_show() {
+    let gpu = gpu();
+    let (dataset, config, _) = phantom_of_gaussians(&[
+        "r2.init=random",
+        "r2.count=40",
+        "r2.density_rate=0.05",
+        "r2.position_rate=3e-3",
+        "r2.scale_rate=0.02",
+        "r2.tv=0",
+    ]);
+    let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
+    let losses = run(&mut trainer, 300);
+    let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
+    let (first, last) = (mean(&losses[..9]), mean(&losses[291..]));
+    assert!(last < 0.1 * first, "{first} to {last}");
+    drop(trainer);
+    expect_silence(gpu);
+}
+
+#[test]
+fn clones_show_the_same_picture_and_split_ones_another() {
+    let (dataset, config, rows) = phantom_of_gaussians(&[]);
+    let gpu = gpu();
+    let fit = R2Trainer::with(&gpu, data_of(&dataset, &config), &config, &R2State::fresh(rows.clone()), 0).unwrap();
+    let picture = |rows: &[R2Gaussian]| {
+        let mut picture = vec![0.0; 33 * 27];
+        for g in rows {
+            let seen = reference::project(&params(g), &fit.data().views[0], fit.setups().0).unwrap();
+            seen.splat(fit.setups().0, &mut picture);
+        }
+        picture
+    };
+    let mut state = R2State::fresh(rows.clone());
+    state.statistics = vec![[1.0, 1.0]; rows.len()];
+    let after = |limit: f64| {
+        let r2 = nertca_vk::config::sections::R2 { size_limit: limit, ..config.r2.clone() };
+        densified(&state, 1, &r2, 1, 600)
+    };
+    let (before, cloned, split) = (picture(&rows), picture(&after(1.0).rows), picture(&after(0.0).rows));
+    let peak = before.iter().fold(0f64, |m, v| m.max(*v));
+    let off = |other: &[f64]| before.iter().zip(other).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(after(1.0).rows.len() == 4 && off(&cloned) < 1e-6 * peak, "{}", off(&cloned));
+    assert!(after(0.0).rows.len() == 4 && off(&split) > 0.05 * peak, "{}", off(&split));
+    drop(fit);
+    expect_silence(gpu);
+}
+
+/// Short runs with density control on the way, of which much comes.
+fn short(static_data: &str) -> Config {
+    let data = format!("r2.static_data={static_data}");
+    config(&[
+        &data,
+        "train.iterations=60",
+        "r2.densify_every=10",
+        "r2.densify_from=5",
+        "r2.densify_until=45",
+        "r2.densify_gradient=1e-7",
+        "r2.candidate=0.01",
+        "r2.size_limit=0.15",
+    ])
+}
+
+fn start(gpu: &Gpu, config: &Config, dataset: &Dataset) -> Trainer {
+    Trainer::new(gpu, Plan::new(config, dataset).unwrap(), dataset, tuning(gpu)).unwrap()
+}
+
+#[test]
+fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
+    let gpu = gpu();
+    let dataset = uneven_dataset(13, 11);
+    for static_data in ["per-phase", "pooled"] {
+        let config = short(static_data);
+        let mut whole = start(&gpu, &config, &dataset);
+        let losses = run(&mut whole, 60);
+        // Not where a submit ends, and where density control has just been.
+        for stop in [27, 30] {
+            let mut parts = start(&gpu, &config, &dataset);
+            let mut again = run(&mut parts, stop);
+            let saved = parts.checkpoint().unwrap();
+            let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
+            assert_eq!((&read.r2, &read.model.moving), (&saved.r2, &saved.model.moving));
+            let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
+            let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
+            assert_eq!(resumed.step(), stop);
+            again.extend(run(&mut resumed, 60));
+            assert_eq!(losses, again, "{static_data}, stopped at {stop}");
+            let (want, got) = (whole.checkpoint().unwrap(), resumed.checkpoint().unwrap());
+            assert!(want.r2 == got.r2 && want.model.moving == got.model.moving, "{static_data}, {stop}");
+        }
+        let state = whole.checkpoint().unwrap().r2.unwrap();
+        let first = first_rows(&data_of(&dataset, &config), &config.r2, config.seed).0.len();
+        assert!(state.rows.len() > first, "{} after {first}", state.rows.len());
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn each_phase_sees_its_own_images_alone_unless_all_are_pooled() {
+    let gpu = gpu();
+    let dataset = small_dataset(13, 11);
+    let mut other = dataset.clone();
+    let changed = other.frames.iter_mut().filter(|f| f.phase == 1);
+    changed.for_each(|f| f.integrals.iter_mut().for_each(|v| *v *= 0.5));
+    for static_data in ["per-phase", "pooled"] {
+        let config = short(static_data);
+        let [fields, others] = [&dataset, &other].map(|dataset| {
+            let mut trainer = start(&gpu, &config, dataset);
+            run(&mut trainer, 8);
+            let field = trainer.model().unwrap().moving.unwrap();
+            [0, 1, 2].map(|phase| field.at(phase))
+        });
+        let same: Vec<bool> = fields.iter().zip(&others).map(|(a, b)| a == b).collect();
+        let numbers = |phase: usize| fields[phase].iter().map(|g| (g.position, g.log_density)).collect::<Vec<_>>();
+        if static_data == "pooled" {
+            assert_eq!(same, [false; 3]);
+            assert_eq!(numbers(0), numbers(2), "one field for all phases");
+        } else {
+            assert_eq!(same, [true, false, true]);
+            assert_ne!(numbers(0), numbers(2));
+        }
+    }
+    expect_silence(gpu);
+}
+
+#[test]
+fn a_back_projection_from_all_around_is_the_object() {
+    let n_views = 90;
+    let angles: Vec<[f64; 2]> =
+        (0..n_views).map(|i| [360.0 * f64::from(i) / f64::from(n_views) - 180.0, 0.0]).collect();
+    let config = config(&["r2.half_extent_mm=20", "r2.normalise=false"]);
+    // One Gaussian off the middle, wide against the pixels.
+    let (at, scale, peak) = (DVec3::new(0.03, -0.04, 0.0), 0.035, 1.7);
+    let image = |_: usize, view: &View| {
+        let pixel = |p: usize| {
+            let (anchor, direction) = view.rays.pixel((p % 81) as f64, (p / 81) as f64);
+            let along = direction.normalize();
+            let across = (anchor - at) - along * (anchor - at).dot(along);
+            (peak * std::f64::consts::TAU.sqrt() * scale * (-0.5 * (across.length() / scale).powi(2)).exp()) as f32
+        };
+        (0..81 * 61).map(pixel).collect()
+    };
+    let data = data_of(&dataset(&angles, [81, 61], image), &config);
+    let side = 40;
+    let volume = back_projection(&data, 0, side);
+    let centre = |k: usize| 0.2 * ((2 * k + 1) as f64 / side as f64 - 1.0);
+    let mut worst = 0f64;
+    for (k, value) in volume.iter().enumerate() {
+        let x = DVec3::new(centre(k % side), centre(k / side % side), centre(k / side / side));
+        // The middle plane is exact but for sampling, planes beside it nearly.
+        if x.z.abs() < 0.02 && x.length() < 0.12 {
+            let want = peak * (-0.5 * (x - at).length_squared() / scale.powi(2)).exp();
+            worst = worst.max((f64::from(*value) - want).abs() / peak);
+        }
+    }
+    assert!(worst < 0.03, "{worst}");
+}
+
+#[test]
+fn a_start_without_candidates_is_said() {
+    let dataset = small_dataset(13, 11);
+    let of = |settings: &[&str]| {
+        let config = config(settings);
+        first_rows(&data_of(&dataset, &config), &config.r2, 1)
+    };
+    let (rows, notes) = of(&["r2.candidate=900"]);
+    assert_eq!((rows.len(), notes.len()), (180, 3), "{notes:?}");
+    assert!(notes[1].contains("phase 1") && notes[1].contains("at 0 voxels"), "{notes:?}");
+    let (random, silent) = of(&["r2.init=random"]);
+    assert!(silent.is_empty() && random == rows);
+    let (from_images, silent) = of(&["r2.candidate=0.01"]);
+    assert!(silent.is_empty() && from_images != rows && from_images.len() == 180, "{silent:?}");
+}
+
+#[test]
+fn what_cannot_be_fitted_is_refused() {
+    let gpu = gpu();
+    let mut dataset = small_dataset(13, 11);
+    let refused = |dataset: &Dataset| match Plan::new(&config(&[]), dataset).map(|_| ()) {
+        Err(Error::Config { problem, .. }) => problem,
+        other => panic!("{other:?}"),
+    };
+    dataset.frames[2].integrals[15] = f32::NAN;
+    let problem = refused(&dataset);
+    assert!(problem.contains("column 2, row 1"), "{problem}");
+    let mut sizes = small_dataset(13, 11);
+    sizes.views[0].size = [12, 11];
+    assert!(refused(&sizes).contains("one size"));
+    // All too weak.
+    let config = config(&["r2.weakest=1000", "r2.densify_every=2", "r2.densify_from=0", "r2.densify_until=30"]);
+    let mut trainer = start(&gpu, &config, &small_dataset(13, 11));
+    let error = (0..9).find_map(|_| trainer.advance(9).err()).unwrap().to_string();
+    assert!(error.contains("phase 0 is left"), "{error}");
+    drop(trainer);
+    expect_silence(gpu);
+}
+
+#[test]
+fn presets_and_notes_say_what_the_method_is() {
+    let config = Config::preset(Preset::R2Gaussian);
+    assert_eq!((config.gaussian_iterations(), config.train.iterations, N_PARAMS), (30_000, 30_000, 11));
+    let plan = Plan::new(&config, &uneven_dataset(13, 11)).unwrap();
+    let says = |part: &str| assert!(plan.notes.iter().any(|note| note.contains(part)), "{part}: {:?}", plan.notes);
+    says("a static method");
+    says("count as taken at the nearest phase");
+}
