@@ -4,6 +4,7 @@
 // Gaussian.
 #include "inc/r2.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { R2Setup r2_setup; };
@@ -18,7 +19,7 @@ layout(binding = 6) writeonly buffer B6 { Splat splats[]; };
 layout(binding = 7) writeonly buffer B7 { int image_of_splat[]; };
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = invocation();
     if (i >= push.n_gaussians) return;
     R2Gaussian g = r2_gaussians[i];
     R2Turn turn = r2_turns[gaussian_step * r2_setup.n_sets + g.set];

@@ -5,6 +5,7 @@
 // Gaussian.
 #include "inc/r2.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { R2Setup r2_setup; };
@@ -48,7 +49,7 @@ vec4 step_of(uint at, vec4 g, vec4 rate, R2Schedule now) {
 }
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = invocation();
     if (i >= push.n_gaussians) return;
     R2Schedule now = r2_schedule[gaussian_step];
     R2Gaussian g = r2_gaussians[i];

@@ -240,13 +240,14 @@ fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
              (r2.static_data = \"per-phase\")"
         ),
         StaticData::Pooled => format!(
-            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} mm, is shown \
-             at each (r2.static_data = \"pooled\")"
+            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} mm, \
+             is shown at each (r2.static_data = \"pooled\")"
         ),
     });
     if config.r2.normalise && dataset.vessel_attenuation.is_none() {
         notes.push(
-            "the dataset states no attenuation of vessels: densities are per 100 mm, and what R2-Gaussian fixes of them may not fit"
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and what R2-Gaussian fixes of them may \
+             not fit"
                 .into(),
         );
     }

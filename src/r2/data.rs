@@ -10,6 +10,9 @@ use crate::model::gaussians::{Gaussians, Units};
 use crate::r2::parameters::ScaleBounds;
 use crate::scan::dataset::Dataset;
 
+/// Line integrals of images, in units of the drawn field, which hold eight times as much.
+const DRAWN_RANGE: f64 = 256.0;
+
 /// Standard deviations at which Gaussians end where they are drawn: of what is fitted, whose squares reach three of the
 /// longest, next to nothing is beyond.
 const DRAWN_CUT: f32 = 4.0;
@@ -64,11 +67,13 @@ impl R2Data {
         }
         let n_phases = dataset.n_phases;
         let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
+        let unseen: Vec<u32> = (0..n_phases).filter(|phase| of_phase(*phase).is_empty()).collect();
+        if settings.static_data == StaticData::PerPhase && !unseen.is_empty() {
+            return refuse(format!("no image shows the phases {unseen:?}: take r2.static_data = \"pooled\""));
+        }
         let (images_of_set, phase_of_set) = match settings.static_data {
             StaticData::Pooled => (vec![(0..training.len()).collect()], vec![None]),
-            StaticData::PerPhase => {
-                (0..n_phases).map(|t| (of_phase(t), Some(t))).filter(|(images, _)| !images.is_empty()).unzip()
-            }
+            StaticData::PerPhase => (0..n_phases).map(|t| (of_phase(t), Some(t))).unzip(),
         };
         Ok(R2Data {
             half,
@@ -123,12 +128,19 @@ impl R2Data {
         self.phase_of_set[set].map_or("all phases".into(), |phase| format!("phase {phase}"))
     }
 
+    /// How many times the attenuation of a density of 1 that of a drawn one is: so much that pictures, sums of integers, hold the
+    /// images' greatest line integral many times.
+    fn drawn_scale(&self) -> f64 {
+        let greatest = self.images.iter().copied().fold(0f32, f32::max);
+        (f64::from(greatest) * self.half / self.pixel / DRAWN_RANGE).max(1.0)
+    }
+
     /// The field of stored Gaussians after `step` iterations, in the units that Gaussians are drawn and exported in.
     pub fn field(&self, rows: &[R2Gaussian], bounds: ScaleBounds, step: u32) -> Gaussians {
-        let pixels = self.half / self.pixel;
+        let (pixels, scale) = (self.half / self.pixel, self.drawn_scale());
         let convert = |g: &R2Gaussian, phase: u32| Gaussian {
             position: (g.centre() * pixels).as_vec3().to_array(),
-            log_density: g.attenuation().ln() as f32,
+            log_density: (g.attenuation() / scale).ln() as f32,
             log_scale: g.scales(bounds).to_array().map(|scale| (scale * pixels).ln() as f32),
             phase,
             rotation: g.rotation,
@@ -139,7 +151,7 @@ impl R2Data {
             _ => rows.iter().filter_map(|g| Some(convert(g, self.phase_of_set[g.set as usize]?))).collect(),
         };
         Gaussians {
-            units: Units { pixel: self.pixel, strongest: self.pixel * self.attenuation },
+            units: Units { pixel: self.pixel, strongest: self.pixel * self.attenuation * scale },
             n_phases: self.n_phases,
             setup: GaussianSetup {
                 n_phases: self.n_phases as u32,
@@ -151,6 +163,26 @@ impl R2Data {
             rows,
             step,
             is_crowd: true,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn large_line_integrals_fit_the_drawn_field() {
+        let bounds = ScaleBounds { least: 0.001, greatest: 1.0 };
+        let gaussian = R2Gaussian { density: 1.0, ..R2Gaussian::default() };
+        let density = gaussian.attenuation();
+        for (integral, largest_units) in [(2.0f32, 200.0), (30.0, DRAWN_RANGE)] {
+            let images = R2Data::of_images([1, 1], Vec::new(), vec![integral], vec![vec![0]]);
+            // A hundred pixels to half the volume.
+            let field = R2Data { pixel: 0.01, ..images }.field(&[gaussian], bounds, 0);
+            assert!((f64::from(integral) / field.units.strongest - largest_units).abs() < 1e-3 * largest_units);
+            let drawn = f64::from(field.rows[0].log_density).exp() * field.units.attenuation();
+            assert!((drawn / density - 1.0).abs() < 1e-6, "{drawn} for {density}");
         }
     }
 }

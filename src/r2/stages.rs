@@ -151,7 +151,7 @@ impl R2Pass<'_> {
     fn pictures(&mut self) -> Result<()> {
         let (kernels, n) = (self.kernels, self.n);
         self.recording.fill(&self.buffers.splat_images, 0);
-        self.run(&kernels.project, kernels.project.groups_for(n), push::R2Project { n_gaussians: n })?;
+        self.run(&kernels.project, kernels.project.groups_over(n), push::R2Project { n_gaussians: n })?;
         self.run(&kernels.splat.stage, kernels.splat.groups_for(n), push::GaussianSplat { n_splats: n })
     }
 
@@ -190,6 +190,6 @@ pub fn record_step(pass: &mut R2Pass<'_>) -> Result<()> {
     if pass.r2.tv_weight > 0.0 {
         pass.smooth_voxels()?;
     }
-    pass.run(&kernels.update, kernels.update.groups_for(n), push::R2Update { n_gaussians: n })?;
+    pass.run(&kernels.update, kernels.update.groups_over(n), push::R2Update { n_gaussians: n })?;
     pass.run(&kernels.report, Groups::Direct([1, 1, 1]), push::GaussianReport {})
 }

@@ -329,10 +329,11 @@ impl Moving {
     /// As [`MovingFit::advance`].
     pub(super) fn advance(&mut self, until: u32, end: u32) -> Result<Vec<f64>> {
         let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
+        let before = fit.step();
         let losses = fit.advance(until.min(end))?;
         self.shows_earlier &= !fit.is_presentable(end);
         let is_r2 = matches!(fit, MovingFit::R2(_));
-        let is_shown = !is_r2 || fit.step() >= until.min(end) || fit.step().is_multiple_of(R2_SHOWN_EVERY);
+        let is_shown = !is_r2 || fit.step() >= until.min(end) || fit.step() / R2_SHOWN_EVERY > before / R2_SHOWN_EVERY;
         if self.shows_earlier || !is_shown {
             return Ok(losses);
         }

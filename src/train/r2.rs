@@ -7,7 +7,7 @@ use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::dispatch::Binding;
-use crate::kernels::layout::{GaussianSetup, R2Setup};
+use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Setup};
 use crate::model::gaussians::Gaussians;
 use crate::model::r2::R2State;
 use crate::r2::data::R2Data;
@@ -41,7 +41,14 @@ impl R2Trainer {
     /// # Errors
     /// [`Error::Config`] for impossible settings; device errors.
     pub fn new(gpu: &Gpu, data: R2Data, config: &Config) -> Result<(R2Trainer, Vec<String>)> {
-        let (rows, notes) = first_rows(&data, &config.r2, config.seed);
+        let (rows, mut notes) = first_rows(&data, &config.r2, config.seed);
+        let most = most_of_set(gpu, &data);
+        if most < config.r2.most {
+            notes.push(format!(
+                "at most {most} Gaussians a set instead of r2.most = {}: a buffer holds no more on this device",
+                config.r2.most
+            ));
+        }
         Ok((Self::with(gpu, data, config, &R2State::fresh(rows), 0)?, notes))
     }
 
@@ -51,6 +58,9 @@ impl R2Trainer {
     /// As [`R2Trainer::new`].
     pub fn with(gpu: &Gpu, data: R2Data, config: &Config, state: &R2State, step: u32) -> Result<R2Trainer> {
         config.check()?;
+        let mut config = config.clone();
+        config.r2.most = config.r2.most.min(most_of_set(gpu, &data));
+        let config = &config;
         let n = check_count(state, &data)?;
         let (setup, r2) = (gaussian_setup(&data, config), r2_setup(&data, &config.r2));
         let kernels = R2Kernels::new(gpu)?;
@@ -173,6 +183,11 @@ impl R2Trainer {
     pub fn work(&self) -> Result<GaussianWork> {
         GaussianWork::of(&self.gpu, &self.setup, (&self.particles.splats, &self.particles.image_of_splat), self.n)
     }
+}
+
+/// Gaussians of a set, at most, so that those of all fit the device's buffers.
+fn most_of_set(gpu: &Gpu, data: &R2Data) -> u32 {
+    gpu.info().max_storage_buffer_range / size_of::<R2Gaussian>() as u32 / data.n_sets() as u32
 }
 
 /// Their number; a set without any cannot be fitted.
