@@ -462,6 +462,16 @@ fn what_cannot_be_fitted_is_refused() {
     let mut sizes = small_dataset(13, 11);
     sizes.views[0].size = [12, 11];
     assert!(refused(&sizes).contains("one size"));
+    // A checkpoint that is damaged.
+    let saved = start(&gpu, &config(&[]), &small_dataset(13, 11)).checkpoint().unwrap();
+    let damaged = |damage: &dyn Fn(&mut R2State)| {
+        let mut other = saved.clone();
+        damage(other.r2.as_mut().unwrap());
+        Checkpoint::from_bytes(&other.to_bytes().unwrap(), "checkpoint".as_ref()).err().map(|e| e.to_string())
+    };
+    assert_eq!(damaged(&|_| ()), None);
+    assert!(damaged(&|state| state.rows[3].set = 3).unwrap().contains("r2.set"));
+    assert!(damaged(&|state| state.second[3][5] = f32::NAN).unwrap().contains("r2.adam.v"));
     // All too weak.
     let config = config(&["r2.weakest=1000", "r2.densify_every=2", "r2.densify_from=0", "r2.densify_until=30"]);
     let mut trainer = start(&gpu, &config, &small_dataset(13, 11));

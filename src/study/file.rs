@@ -278,3 +278,21 @@ fn published(
     }
     Ok(published)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shortened_runs_keep_the_shares_of_density_control_but_not_every_iteration() {
+        let preset = Config::preset(Preset::R2Gaussian);
+        let of = |iterations: u32, key: &str| {
+            let all = scaled(&preset, iterations, &["r2.densify_until"]);
+            all.iter().find_map(|setting| setting.strip_prefix(key)?.strip_prefix('=').map(str::to_owned))
+        };
+        let value = |text: &str| Some(text.to_owned());
+        assert_eq!((of(6000, "r2.densify_every"), of(6000, "r2.densify_from")), (value("20"), value("100")));
+        assert_eq!((of(1000, "r2.densify_every"), of(1000, "r2.densify_from")), (value("10"), value("17")));
+        assert_eq!((of(1000, "r2.densify_until"), of(1000, "train.iterations")), (None, value("1000")));
+    }
+}
