@@ -21,7 +21,7 @@ const CHIPS: [(&str, bool); 7] = [
     ("amd:gfx1201", true),
     ("intel:bmg", false),
 ];
-const PRESETS: [&str; 3] = ["fast", "fast-mlp", "paper"];
+const PRESETS: [&str; 4] = ["fast", "fast-mlp", "paper", "r2-gaussian"];
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))

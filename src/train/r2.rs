@@ -162,7 +162,8 @@ impl R2Trainer {
     /// # Errors
     /// [`Error::Internal`] when the fit is over; device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        if self.step >= self.config.train.iterations {
+        // The schedule has a row more than iterations, for this.
+        if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
         }
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of R2-Gaussian", MAX_PASSES)?;
