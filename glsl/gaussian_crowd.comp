@@ -2,8 +2,8 @@
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 // The largest attenuation along each ray where far more Gaussians overlap than gaussian_rays keeps peaks of, and where
-// there is no still field: their sum at regular depths, then uphill from the largest, from where narrow ones
-// between these add up to most, and from the strongest Gaussian, over all of them each time. One workgroup per tile of 8 x 8 pixels, one invocation per ray.
+// there is no still field: their sum at regular depths, then uphill from the largest and from the three strongest
+// Gaussians, which may lie between these depths, over all of them each time. One workgroup per tile of 8 x 8 pixels, one invocation per ray.
 //   ray_out[ray].dynamic_max, total_max
 // Twin: reference::blobs.
 #include "inc/layout.glsl"
@@ -25,12 +25,7 @@ const uint CLIMBS = 12u;
 // Standard deviations along the ray beyond which a Gaussian adds nothing that counts.
 const float REACH = 4.0;
 
-// What Gaussians add at a depth.
-float plain[DEPTHS];
-// The same where none counts as narrower than half a step, so that those between two depths are found, and that times where
-// they peak.
 float sums[DEPTHS];
-float moments[DEPTHS];
 
 // Marks which of the Gaussians from `begin` on are near the tile; then `near_blobs` holds for all lanes.
 void mark_from(uint begin, Tile tile) {
@@ -38,66 +33,48 @@ void mark_from(uint begin, Tile tile) {
     mark_near(at < push.n_blobs && is_near(blobs[push.first_blob + min(at, push.n_blobs - 1u)], tile));
 }
 
-// Where the highest of the peaks that are lower than `below` is; DEPTHS if there is none.
-uint highest_peak(float below) {
-    uint best = DEPTHS;
-    float highest = 0.0;
-    for (uint k = 0u; k < DEPTHS; k++) {
-        float beside = max(k > 0u ? sums[k - 1u] : 0.0, k + 1u < DEPTHS ? sums[k + 1u] : 0.0);
-        if (sums[k] >= beside && sums[k] < below && sums[k] > highest) {
-            best = k;
-            highest = sums[k];
-        }
+// Keeps the three strongest Gaussians of a ray, strongest first: `heights` and where they peak.
+void keep_strongest(float height, float at, inout vec3 heights, inout vec3 places) {
+    if (height <= heights.z) return;
+    if (height > heights.x) {
+        heights = vec3(height, heights.xy);
+        places = vec3(at, places.xy);
+    } else if (height > heights.y) {
+        heights = vec3(heights.x, height, heights.y);
+        places = vec3(places.x, at, places.y);
+    } else {
+        heights.z = height;
+        places.z = at;
     }
-    return best;
 }
 
 void main() {
     TileRay own = ray_of_lane();
     Tile tile = tile_of(own.ray);
     float first = setup.dynamic_near, step = (setup.dynamic_far - setup.dynamic_near) / float(DEPTHS - 1u);
-    float sharpest = 4.0 / (step * step);
-    float strongest = 0.0, strongest_at = first;
-    for (uint k = 0u; k < DEPTHS; k++) {
-        plain[k] = 0.0;
-        sums[k] = 0.0;
-        moments[k] = 0.0;
-    }
+    vec3 heights = vec3(0.0), places = vec3(first);
+    for (uint k = 0u; k < DEPTHS; k++) sums[k] = 0.0;
     for (uint begin = 0u; begin < push.n_blobs; begin += 64u) {
         mark_from(begin, tile);
         for (uint word = 0u; word < 2u; word++) {
             for (uint bits = near_blobs[word]; bits != 0u; bits &= bits - 1u) {
                 Profile p = profile_of(blobs[push.first_blob + begin + 32u * word + uint(findLSB(bits))], own.ray);
                 if (p.height == 0.0) continue;
-                if (p.height > strongest) {
-                    strongest = p.height;
-                    strongest_at = p.at;
-                }
-                float steepness = min(p.steepness, sharpest);
-                float half_width = REACH * inversesqrt(steepness);
+                keep_strongest(p.height, p.at, heights, places);
+                float half_width = REACH * inversesqrt(p.steepness);
                 float low = clamp(ceil((p.at - half_width - first) / step), 0.0, float(DEPTHS));
                 float high = clamp(floor((p.at + half_width - first) / step), -1.0, float(DEPTHS) - 1.0);
                 for (int k = int(low); k <= int(high); k++) {
                     float d = first + float(k) * step - p.at;
-                    float part = p.height * exp(-0.5 * steepness * d * d);
-                    plain[k] += p.height * exp(-0.5 * p.steepness * d * d);
-                    sums[k] += part;
-                    moments[k] += part * p.at;
+                    sums[k] += p.height * exp(-0.5 * p.steepness * d * d);
                 }
             }
         }
     }
     uint best = 0u;
     for (uint k = 1u; k < DEPTHS; k++)
-        if (plain[k] > plain[best]) best = k;
-    vec4 depth = vec4(first + float(best) * step, vec3(strongest_at));
-    float below = 1e30;
-    [[unroll]] for (uint start = 1u; start < 3u; start++) {
-        uint peak = highest_peak(below);
-        if (peak == DEPTHS) break;
-        below = sums[peak];
-        depth[start] = moments[peak] / below;
-    }
+        if (sums[k] > sums[best]) best = k;
+    vec4 depth = vec4(first + float(best) * step, places);
     float largest = 0.0;
     for (uint climb = 0u; climb < CLIMBS; climb++) {
         vec4 value = vec4(0.0), pull = vec4(0.0), weight = vec4(0.0);
