@@ -319,12 +319,13 @@ impl Trainer {
         if self.in_flight.is_empty() {
             self.last_completion = Instant::now();
         }
+        // The network's iterations are others than those before it starts: when these are done, they are tried anew.
+        let starts = self.plan.config.dynamic.delay;
         while let Some(single) = &self.single {
-            if self.submitted >= until || self.in_flight.len() >= self.submits_in_flight() {
+            let is_starting = self.submitted == starts && self.completed < starts;
+            if self.submitted >= until || is_starting || self.in_flight.len() >= self.submits_in_flight() {
                 break;
             }
-            // The network's iterations are others than those before it starts: they are tried anew.
-            let starts = self.plan.config.dynamic.delay;
             let stop = if self.submitted < starts { until.min(starts) } else { until };
             let fits = |(_, n): &&(Commands, u32)| !self.pace.is_trying() && stop - self.submitted >= *n;
             let (commands, n) = match self.several.as_ref().filter(fits) {
@@ -333,15 +334,15 @@ impl Trainer {
             };
             self.in_flight.push_back((commands.submit()?, n));
             self.submitted += n;
-            if self.submitted == starts {
-                self.pace.restart();
-            }
         }
         let Some((ticket, n)) = self.in_flight.pop_front() else { return Ok(Vec::new()) };
         self.gpu.wait(ticket)?;
         self.completed += n;
         self.pace.note(n, self.last_completion.elapsed().as_secs_f64());
         self.last_completion = Instant::now();
+        if self.completed == starts {
+            self.pace.restart();
+        }
         self.read_losses()
     }
 
