@@ -35,6 +35,8 @@ pub struct DeviceInfo {
     pub matrix_subgroup: u32,
     /// Whether shaders can ask for a size of their subgroups.
     pub asks_for_subgroups: bool,
+    /// Subgroups of a workgroup whose size is asked for.
+    pub max_workgroup_subgroups: u32,
     /// Shared memory of a workgroup, bytes.
     pub max_shared_memory: u32,
     /// Invocations of a workgroup.
@@ -134,6 +136,8 @@ struct SubgroupSizes {
     range: (u32, u32),
     /// Whether compute shaders can ask for one between these.
     can_ask: bool,
+    /// Most subgroups of a workgroup that asks for their size.
+    most: u32,
     /// Whether workgroups can be asked to consist of full ones.
     full: bool,
     /// Whether lanes exchange values.
@@ -166,6 +170,7 @@ impl SubgroupSizes {
             default: subgroup.subgroup_size,
             range: (sizes.min_subgroup_size, sizes.max_subgroup_size),
             can_ask,
+            most: sizes.max_compute_workgroup_subgroups,
             full: size.subgroup_size_control == vk::TRUE && size.compute_full_subgroups == vk::TRUE,
             exchanges: subgroup.supported_stages.contains(compute)
                 && subgroup.supported_operations.contains(vk::SubgroupFeatureFlags::SHUFFLE),
@@ -334,6 +339,7 @@ pub(super) fn describe(
         small_subgroups: sizes.small(),
         matrix_subgroup: matrix_subgroup.unwrap_or(subgroup.subgroup_size),
         asks_for_subgroups: sizes.can_ask,
+        max_workgroup_subgroups: sizes.most,
         max_shared_memory: limits.max_compute_shared_memory_size,
         max_workgroup_invocations: limits.max_compute_work_group_invocations,
         max_workgroup_count: limits.max_compute_work_group_count[0],

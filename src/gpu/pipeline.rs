@@ -120,7 +120,10 @@ impl Gpu {
         spec: &[(&str, u32)],
     ) -> Result<Pipeline> {
         let info = self.info();
-        if ![info.full_subgroups, info.small_subgroups].contains(&Some(size)) || !local_size.is_multiple_of(size) {
+        if ![info.full_subgroups, info.small_subgroups].contains(&Some(size))
+            || !local_size.is_multiple_of(size)
+            || local_size / size > info.max_workgroup_subgroups
+        {
             let problem = format!("{local_size} invocations are no full subgroups of {size}");
             return Err(Error::Internal(format!("kernel {}: {problem}", code.name)));
         }

@@ -88,7 +88,8 @@ pub struct Build<'a> {
 /// Invocations of the subgroups that a workgroup of so many `lanes` consists of, if they are full and exchange values.
 pub fn full_subgroup(gpu: &Gpu, lanes: u32) -> Option<u32> {
     let info = gpu.info();
-    [info.full_subgroups, info.small_subgroups].into_iter().flatten().find(|size| lanes.is_multiple_of(*size))
+    let fits = |size: &u32| lanes.is_multiple_of(*size) && lanes / size <= info.max_workgroup_subgroups;
+    [info.full_subgroups, info.small_subgroups].into_iter().flatten().find(fits)
 }
 
 /// Suffix of variants whose lanes exchange values.

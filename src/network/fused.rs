@@ -66,7 +66,7 @@ impl Shape {
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
         let unfit = |what: String| Error::config("dynamic.width", width, what);
-        let most = (info.max_workgroup_invocations / info.matrix_subgroup).min(8);
+        let most = (info.max_workgroup_invocations / info.matrix_subgroup).min(info.max_workgroup_subgroups).min(8);
         let subgroups = (1..=most).rev().find(|s| (width / n).is_multiple_of(*s)).unwrap_or(1);
         if subgroups * info.matrix_subgroup < width / 8 {
             return Err(unfit("is too wide for the matrix kernels on this device".into()));
