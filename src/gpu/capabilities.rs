@@ -407,7 +407,8 @@ mod tests {
 
     #[test]
     fn subgroups_are_of_a_size_that_the_device_has() {
-        let sizes = |default, range| SubgroupSizes { default, range, can_ask: true, full: true, exchanges: true };
+        let sizes =
+            |default, range| SubgroupSizes { default, range, can_ask: true, most: 32, full: true, exchanges: true };
         let fixed = |default, range| SubgroupSizes { can_ask: false, ..sizes(default, range) };
         let chosen = |sizes: SubgroupSizes| (sizes.full(), sizes.small(), sizes.for_matrices());
         // NVIDIA; AMD's chips of either generation, as Mesa's drivers tell; Intel; llvmpipe.
