@@ -3,7 +3,7 @@
 // The whole network for a tile of samples, in shared memory and registers: encoding, hidden layers, output,
 // activation. Bias and latent of a layer that sees the input are columns of its weights, one per phase, picked by the shares
 // of the phases behind the encoding, so that their gradients come out of the weight gradient.
-//   features16[s][encoded], activations16_i[s][width]: f16, kept for the backward pass if `keep`;
+//   features16[s][encoded], activations16_i[s][width]: f16, kept for the backward pass where it does not compute them again;
 //   sample_sigma[s] = (sigma_s, d sigma_s / d feature).
 //   weights16: per layer [width][encoded] if it sees the input, then [width][width] unless it is the first; at last
 //   the output weights, n rows of which the first counts.
@@ -15,7 +15,8 @@
 layout(constant_id = 7) const uint encoded = 80u;     // numbers of encoding and shares of phases, padded
 layout(constant_id = 8) const uint layers = 4u;       // hidden layers
 layout(constant_id = 9) const uint skip = 0u;         // layer (from 0) that sees the input again; 0: none
-layout(constant_id = 10) const uint keep = 1u;
+layout(constant_id = 10) const uint keep_features = 1u;
+layout(constant_id = 11) const uint keep_from = 0u;   // first layer whose activations are kept; `layers`: none
 layout(push_constant) uniform Push { uint out_bias; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
@@ -30,7 +31,7 @@ layout(binding = 9) readonly buffer B9 { float params[]; };
 layout(binding = 10) writeonly buffer B10 { uvec4 features16[]; };
 layout(binding = 11) writeonly buffer B11 { uvec4 activations16[]; };
 layout(binding = 12) writeonly buffer B12 { vec2 sample_sigma[]; };
-#include "inc/encoding.glsl"
+#include "inc/encode_tile.glsl"
 
 const uint width8 = width / 8u;
 const uint encoded8 = encoded / 8u;
@@ -46,35 +47,12 @@ const uint column_tiles = width / n / subgroups;
 shared uvec4 tile16[shared_size];
 shared float output_tile[tile * n];
 
-// Number i of a sample's input: encoding, then the shares of phases, then zeros.
-float input_number(uint i, vec3 x, Ray ray, float window) {
-    if (i < 3u) return x[i];
-    uint band = (i - 3u) / 6u;
-    if (band < setup.n_bands) {
-        uint part = (i - 3u) % 6u;
-        float angle = reduce_angle(vec3(x[part % 3u] * float(1u << band))).x;
-        return clamp(window - float(band), 0.0, 1.0) * (part < 3u ? sin(angle) : cos(angle));
-    }
-    return phase_share(ray, i - 3u - 6u * setup.n_bands);
-}
-
 // One invocation writes eight numbers of a sample at a time.
 void encode_tile(uint first) {
-    float window = schedule[state.step].window;
     for (uint e = gl_LocalInvocationIndex; e < tile * encoded8; e += gl_WorkGroupSize.x) {
-        uint row = e / encoded8;
-        uint s = first + row;
-        uvec4 packed = uvec4(0u);
-        if (s < live.count) {
-            vec3 x = encoded_point(sample_points[s].xyz);
-            Ray ray = rays[ray_of(sample_rays[s])];
-            for (uint pair = 0u; pair < 4u; pair++) {
-                uint i = 8u * (e % encoded8) + 2u * pair;
-                packed[pair] = pack2(vec2(input_number(i, x, ray, window), input_number(i + 1u, x, ray, window)));
-            }
-        }
-        tile16[encoded_at + row * encoded_stride + e % encoded8] = packed;
-        if (keep != 0u) features16[first * encoded8 + e] = packed;
+        uvec4 numbers = encoded_numbers(first + e / encoded8, e % encoded8);
+        tile16[encoded_at + e / encoded8 * encoded_stride + e % encoded8] = numbers;
+        if (keep_features != 0u) features16[first * encoded8 + e] = numbers;
     }
 }
 
@@ -123,8 +101,8 @@ void main() {
                 SUM16 rectified = SUM16(sum);
                 uint column = (column0 + c * n) / 8u;
                 coopMatStore(rectified, tile16, r * m * hidden_stride + column, hidden_stride, ROWS);
-                if (keep != 0u) {
-                    uint at = layer * setup.sample_capacity + first + r * m;
+                if (layer >= keep_from) {
+                    uint at = (layer - keep_from) * setup.sample_capacity + first + r * m;
                     coopMatStore(rectified, activations16, at * width8 + column, width8, ROWS);
                 }
             }

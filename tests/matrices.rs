@@ -29,8 +29,10 @@ fn matrices() -> Option<(Gpu, Tuning)> {
 }
 
 /// As a CPU gets them; then loops unrolled as on a GPU, with large tiles.
-const CPU: MatrixTuning = MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false };
-const GPU: MatrixTuning = MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true };
+const CPU: MatrixTuning =
+    MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false, backward_sums: u32::MAX, recompute: false };
+const GPU: MatrixTuning =
+    MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true, backward_sums: 64, recompute: true };
 const GPU_CASE: Case = Case {
     preset: Preset::FastMlp,
     settings: &["dynamic.width=32", "dynamic.layers=3", "dynamic.bands=4", "train.rays=60"],

@@ -27,7 +27,7 @@ use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-const OF_MATRICES: [&str; 3] = ["mlp_fused_bwd", "mlp_fused_fwd", "mlp_pack"];
+const OF_MATRICES: [&str; 4] = ["mlp_fused_bwd", "mlp_fused_bwd_first", "mlp_fused_fwd", "mlp_pack"];
 
 fn json(arguments: &[&str]) -> Value {
     let output = program().args(arguments).output().unwrap();

@@ -51,6 +51,11 @@ pub struct MatrixTuning {
     pub largest_tile: u32,
     /// Unroll the loops over the inner dimension: operands stay in registers, compilation takes longer.
     pub unroll: bool,
+    /// f32 sums of weight gradients that an invocation of the backward passes keeps, at most; workgroups become larger
+    /// before there are more.
+    pub backward_sums: u32,
+    /// Compute the encoding and the first layer again in the backward pass instead of keeping them: less memory moves.
+    pub recompute: bool,
 }
 
 /// Sizes and variants chosen for a device, with the reasons.
@@ -118,12 +123,26 @@ impl Tuning {
             Some(s) => (Layers::Matrices, format!("matrix layers, {}x{}x{}: f16 operands, f32 sums", s.m, s.n, s.k)),
         };
         reasons.push(why);
+        let on_gpu = |workgroups| MatrixTuning {
+            workgroups,
+            largest_tile: 128,
+            unroll: true,
+            backward_sums: 64,
+            recompute: true,
+        };
         let matrices = match info.multiprocessors {
             // Unrolled, a CPU driver compiles these kernels for minutes.
-            _ if info.is_cpu() => MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false },
-            0 => MatrixTuning { workgroups: workgroups_untold(info.kind), largest_tile: 128, unroll: true },
+            // Unrolled, a CPU driver compiles these kernels for minutes; sums are in memory, and the encoding is dear.
+            _ if info.is_cpu() => MatrixTuning {
+                workgroups: 4,
+                largest_tile: 32,
+                unroll: false,
+                backward_sums: u32::MAX,
+                recompute: false,
+            },
+            0 => on_gpu(workgroups_untold(info.kind)),
             // Two workgroups per multiprocessor.
-            n => MatrixTuning { workgroups: 2 * n, largest_tile: 128, unroll: true },
+            n => on_gpu(2 * n),
         };
         // Some kilobytes per sample must fit beside all else.
         let chunk_samples = match info.kind {

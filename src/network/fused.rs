@@ -1,5 +1,5 @@
-//! The network on cooperative matrices: f16 operands, f32 sums, f32 master parameters. One pass forward, one or two
-//! per layer backward.
+//! The network on cooperative matrices: f16 operands, f32 sums, f32 master parameters. One pass forward, one for two layers
+//! backward.
 //!
 //! A layer that sees the input has one weight matrix on `[encoding, one-hot phase, zeros]`: the columns of the phases
 //! hold bias and latent contribution, so that their gradient, summed per phase, is part of the weight gradient.
@@ -7,12 +7,15 @@
 //! Gradients are multiplied by a loss scale (`state.loss_scale`) before they become f16 and divided by it after the sums.
 //! A sum that is not finite skips the update and halves the scale; many good ones double it (`report`).
 
+mod shape;
+mod span;
+
 use crate::error::{Error, Result};
 use crate::gpu::buffer::{Buffer, Memory};
-use crate::gpu::capabilities::{DeviceInfo, MatrixShape};
+use crate::gpu::capabilities::MatrixShape;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
-use crate::kernels::constants::{NOWHERE, PHASE_BIAS};
+use crate::kernels::constants::NOWHERE;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;
@@ -20,187 +23,11 @@ use crate::kernels::stages::{Build, Stage};
 use crate::kernels::tuning::Tuning;
 use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
-use crate::network::ledger::{Ledger, StageWork, add};
+use crate::network::fused::shape::Shape;
+use crate::network::fused::span::{Part, Span, spans, work};
+use crate::network::ledger::Ledger;
 use crate::network::pass::Pass;
-use crate::network::{
-    F16_BYTES, GradientBuffers, PartialSums, Path, Purpose, SAMPLE_BYTES, Tiles, built_for_rendering,
-};
-
-/// Shared memory beside the tiles, bytes.
-const SHARED_RESERVE: u32 = 512;
-
-/// Positions of one hidden layer in the packed weights, which are also those of its gradient in the partial sums.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct PackedLayer {
-    /// `[width][encoded]`.
-    encoded: Option<usize>,
-    /// `[width][width]`.
-    hidden: Option<usize>,
-    /// `[width]`, in the partial sums only.
-    bias: Option<usize>,
-}
-
-/// Sizes and positions, from the network's shape and the device's limits.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct Shape {
-    matrix: MatrixShape,
-    subgroups: u32,
-    fwd_tile: u32,
-    bwd_tile: u32,
-    /// Columns of the weights on the encoding: numbers, phases, padding.
-    encoded: usize,
-    layers: Vec<PackedLayer>,
-    /// Output weights: `n` rows of `[width]` in the packed weights, the first of them in the partial sums.
-    out_weights: usize,
-    weights_len: usize,
-    /// Output bias in the partial sums.
-    out_bias: usize,
-    partials_len: usize,
-}
-
-impl Shape {
-    /// # Errors
-    /// [`Error::Config`] when the network does not fit the device's shared memory or workgroups.
-    fn new(info: &DeviceInfo, matrix: MatrixShape, largest: u32, params: &NetworkMap) -> Result<Shape> {
-        let MatrixShape { m, n, k } = matrix;
-        let width = params.width as u32;
-        let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
-        let unfit = |what: String| Error::config("dynamic.width", width, what);
-        let most = (info.max_workgroup_invocations / info.matrix_subgroup).min(info.max_workgroup_subgroups).min(8);
-        let subgroups = (1..=most).rev().find(|s| (width / n).is_multiple_of(*s)).unwrap_or(1);
-        if subgroups * info.matrix_subgroup < width / 8 {
-            return Err(unfit("is too wide for the matrix kernels on this device".into()));
-        }
-        let skips = params.layers.iter().skip(1).any(|l| l.encoded.is_some());
-        let budget = info.max_shared_memory - SHARED_RESERVE;
-        let tile_within = |largest: u32, bytes: &dyn Fn(u32) -> u32| {
-            let tiles = [128, 64, 32, 16].into_iter().filter(|t| *t <= largest && t % m == 0 && t % k == 0);
-            tiles.into_iter().find(|t| bytes(*t) <= budget)
-        };
-        let row = |columns: u32| 16 * (columns / 8 + 1);
-        let (hidden_row, encoded_row) = (row(width), row(encoded as u32));
-        let rows = if skips { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
-        let fwd_tile = tile_within(largest, &|t| t * (rows + 4 * n));
-        let scratch = 2 * 16 * subgroups * info.matrix_subgroup;
-        let bwd_tile =
-            tile_within(largest.min(64), &|t| (t * hidden_row).max(scratch) + t * (hidden_row.max(encoded_row) + 4));
-        let (Some(fwd_tile), Some(bwd_tile)) = (fwd_tile, bwd_tile) else {
-            return Err(unfit(format!("needs more than the {} KiB of shared memory", info.max_shared_memory >> 10)));
-        };
-        let mut next = 0;
-        let mut take = |len: usize| {
-            next += len;
-            next - len
-        };
-        let mut layers: Vec<PackedLayer> = params
-            .layers
-            .iter()
-            .map(|layer| PackedLayer {
-                encoded: layer.encoded.map(|_| take(params.width * encoded)),
-                hidden: layer.hidden.map(|_| take(params.width * params.width)),
-                bias: None,
-            })
-            .collect();
-        let out_weights = take(params.width * n as usize);
-        let weights_len = take(0);
-        for (packed, layer) in layers.iter_mut().zip(&params.layers) {
-            packed.bias = layer.latent.is_none().then(|| take(params.width));
-        }
-        let out_bias = take(16);
-        let partials_len = take(0);
-        Ok(Shape {
-            matrix,
-            subgroups,
-            fwd_tile,
-            bwd_tile,
-            encoded,
-            layers,
-            out_weights,
-            weights_len,
-            out_bias,
-            partials_len,
-        })
-    }
-
-    /// Where each packed weight, then each row of biases, comes from.
-    fn pack_source(&self, params: &NetworkMap) -> Vec<u32> {
-        let mut source = vec![NOWHERE; self.weights_len];
-        let width = params.width;
-        let phase_bias =
-            |layer: usize, phase: usize, j: usize| PHASE_BIAS | ((layer * params.phases + phase) * width + j) as u32;
-        for (l, (packed, layer)) in self.layers.iter().zip(&params.layers).enumerate() {
-            for j in 0..width {
-                if let (Some(to), Some(from)) = (packed.encoded, layer.encoded) {
-                    let row = &mut source[to + j * self.encoded..][..self.encoded];
-                    for (c, s) in row[..params.encoded_len].iter_mut().enumerate() {
-                        *s = (from + j * 4 * params.encode_groups + c) as u32;
-                    }
-                    // Without latents a bias is a bias, the same at all phases.
-                    let columns = if layer.latent.is_some() { params.phases } else { 0 };
-                    for (phase, s) in row[params.encoded_len..][..columns].iter_mut().enumerate() {
-                        *s = phase_bias(l, phase, j);
-                    }
-                }
-                if let (Some(to), Some(from)) = (packed.hidden, layer.hidden) {
-                    for c in 0..width {
-                        source[to + j * width + c] = (from + j * width + c) as u32;
-                    }
-                }
-            }
-        }
-        for j in 0..width {
-            source[self.out_weights + j] = (params.out_weights + j) as u32;
-        }
-        for layer in &params.layers {
-            for _ in 0..self.matrix.m {
-                source.extend((0..width).map(|j| match layer.latent {
-                    Some(_) => NOWHERE,
-                    None => (layer.bias + j) as u32,
-                }));
-            }
-        }
-        source
-    }
-
-    /// Where the gradient of each network parameter lies in the partial sums.
-    fn gradient_source(&self, params: &NetworkMap) -> Vec<u32> {
-        let mut source = vec![NOWHERE; params.len];
-        let width = params.width;
-        let mut put = |at: usize, from: usize| source[at - params.first] = from as u32;
-        for (packed, layer) in self.layers.iter().zip(&params.layers) {
-            for j in 0..width {
-                if let (Some(from), Some(to)) = (packed.encoded, layer.encoded) {
-                    for c in 0..params.encoded_len {
-                        put(to + j * 4 * params.encode_groups + c, from + j * self.encoded + c);
-                    }
-                }
-                if let (Some(from), Some(to)) = (packed.hidden, layer.hidden) {
-                    (0..width).for_each(|c| put(to + j * width + c, from + j * width + c));
-                }
-                if let Some(from) = packed.bias {
-                    put(layer.bias + j, from + j);
-                }
-            }
-        }
-        (0..width).for_each(|j| put(params.out_weights + j, self.out_weights + j));
-        put(params.out_bias, self.out_bias);
-        source
-    }
-
-    /// Where the sum of dz over each phase, `[layer][phase][neuron]`, lies in the partial sums.
-    fn phase_source(&self, params: &NetworkMap) -> Vec<u32> {
-        let mut source = Vec::new();
-        for packed in &self.layers {
-            for phase in 0..params.phases {
-                source.extend((0..params.width).map(|j| match packed.encoded {
-                    Some(from) => (from + j * self.encoded + params.encoded_len + phase) as u32,
-                    None => NOWHERE,
-                }));
-            }
-        }
-        source
-    }
-}
+use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
 
 /// Kernels and buffers of the fused network.
 pub(super) struct FusedNetwork {
@@ -231,22 +58,29 @@ buffer_set! {
 
 /// What the backward pass needs besides.
 struct FusedTraining {
-    kernels: BackwardKernels,
-    /// Gradients at the neurons of even and odd layers.
+    passes: Vec<BackwardPass>,
+    /// dz at the neurons of one layer, and of the next that a pass leaves.
     dz16: [Buffer; 2],
     /// Where the sum of dz over each phase lies in the partial sums.
     phase_source: Buffer,
 }
 
-struct BackwardKernels {
-    /// Through the last hidden layer, whose dz it forms.
-    last: Stage<push::MlpFusedBwd>,
-    /// Through the others.
-    hidden: Stage<push::MlpFusedBwd>,
-    /// Weights on the encoding.
-    encoded: Stage<push::MlpFusedBwd>,
-    /// Weights of the last hidden layer on the encoding.
-    last_encoded: Stage<push::MlpFusedBwd>,
+/// A pass through the layers of a span.
+struct BackwardPass {
+    span: Span,
+    stage: BackwardStage,
+    /// Which of the two buffers has its dz.
+    reads: usize,
+    /// Whether the upper part is the first to see its layer's dz, and sums what depends on that alone.
+    sums_dz: bool,
+}
+
+/// The kernel of a backward pass.
+enum BackwardStage {
+    /// Reads what the layers saw.
+    Kept(Stage<push::MlpFusedBwd>),
+    /// Through the first two layers: computes the encoding and the first layer again.
+    Recomputed(Stage<push::MlpFusedBwdFirst>),
 }
 
 /// Builds the passes on matrices.
@@ -254,51 +88,88 @@ struct Builder<'a> {
     gpu: &'a Gpu,
     shape: &'a Shape,
     params: &'a NetworkMap,
-    build: Build<'a>,
+    /// Unrolled or not, they compute the same.
+    unroll: bool,
 }
 
 impl Builder<'_> {
-    fn new<'a>(gpu: &'a Gpu, tuning: &Tuning, shape: &'a Shape, params: &'a NetworkMap) -> Builder<'a> {
-        let build = Build {
-            // Unrolled or not, they compute the same.
-            variant: if tuning.matrices.unroll { "_unrolled" } else { "" },
-            lanes: Some(shape.subgroups * gpu.info().matrix_subgroup),
-            matrices: true,
-            ..Build::default()
-        };
-        Builder { gpu, shape, params, build }
+    fn common(&self, tile: u32, subgroups: u32) -> [(&'static str, u32); 6] {
+        let MatrixShape { m, n, k } = self.shape.matrix;
+        [("m", m), ("n", n), ("k", k), ("tile", tile), ("subgroups", subgroups), ("width", self.params.width as u32)]
     }
 
-    fn common(&self, tile: u32) -> [(&'static str, u32); 6] {
-        let MatrixShape { m, n, k } = self.shape.matrix;
-        let (subgroups, width) = (self.shape.subgroups, self.params.width as u32);
-        [("m", m), ("n", n), ("k", k), ("tile", tile), ("subgroups", subgroups), ("width", width)]
+    fn build<'c>(&self, subgroups: u32, constants: &'c [(&'static str, u32)]) -> Build<'c> {
+        let lanes = Some(subgroups * self.gpu.info().matrix_subgroup);
+        let variant = if self.unroll { "_unrolled" } else { "" };
+        Build { variant, lanes, constants, matrices: true, ..Build::default() }
     }
 
     fn forward(&self, purpose: Purpose) -> Result<Stage<push::MlpFusedFwd>> {
         let layers = &self.params.layers;
         let skip = layers.iter().skip(1).position(|l| l.encoded.is_some()).map_or(0, |i| i + 1);
-        let mut constants = self.common(self.shape.fwd_tile).to_vec();
+        let keep_from = if purpose == Purpose::Train { self.shape.first_kept() } else { layers.len() };
+        let mut constants = self.common(self.shape.fwd_tile, self.shape.subgroups).to_vec();
         constants.extend([
             ("encoded", self.shape.encoded as u32),
             ("layers", layers.len() as u32),
             ("skip", skip as u32),
-            ("keep", u32::from(purpose == Purpose::Train)),
+            ("keep_features", u32::from(keep_from == 0)),
+            ("keep_from", keep_from as u32),
         ]);
-        Build { constants: &constants, ..self.build }.stage(self.gpu)
+        self.build(self.shape.subgroups, &constants).stage(self.gpu)
     }
 
-    fn backward(&self, columns: usize, with_input: bool, from_output: bool) -> Result<Stage<push::MlpFusedBwd>> {
-        let column_tiles = columns as u32 / self.shape.matrix.n;
-        let halves = if self.shape.subgroups.is_multiple_of(2) && column_tiles.is_multiple_of(2) { 2 } else { 1 };
-        let mut constants = self.common(self.shape.bwd_tile).to_vec();
+    fn columns(&self, part: Part) -> u32 {
+        match part {
+            Part::Hidden(_) => self.params.width as u32,
+            Part::Encoded(_) => self.shape.encoded as u32,
+        }
+    }
+
+    /// Shares of the columns of a weight gradient: those with which subgroups load the fewest operands.
+    fn shares(&self, columns: u32) -> u32 {
+        let (MatrixShape { m, n, .. }, subgroups) = (self.shape.matrix, self.shape.backward.subgroups);
+        let loads = |shares: &u32| (self.params.width as u32 / m).div_ceil(subgroups / shares) + columns / n / shares;
+        let divides = |shares: &u32| subgroups.is_multiple_of(*shares) && (columns / n).is_multiple_of(*shares);
+        [1, 2, 4].into_iter().filter(divides).min_by_key(loads).unwrap_or(1)
+    }
+
+    fn backward(&self, span: Span) -> Result<BackwardStage> {
+        let sizes = self.shape.backward;
+        let columns = self.columns(span.upper);
+        let lower_columns = span.lower.map_or(0, |part| self.columns(part));
+        let lower_shares = if lower_columns > 0 { self.shares(lower_columns) } else { 1 };
+        let mut constants = self.common(sizes.tile, sizes.subgroups).to_vec();
         constants.extend([
-            ("columns", columns as u32),
-            ("with_input", u32::from(with_input)),
-            ("from_output", u32::from(from_output)),
-            ("halves", halves),
+            ("lower_columns", lower_columns),
+            ("shares", self.shares(columns)),
+            ("lower_shares", lower_shares),
         ]);
-        Build { constants: &constants, ..self.build }.stage(self.gpu)
+        if sizes.recompute && span.last() == Part::Encoded(0) {
+            return Ok(BackwardStage::Recomputed(self.build(sizes.subgroups, &constants).stage(self.gpu)?));
+        }
+        let from_output = span.upper.layer() + 1 == self.params.layers.len();
+        constants.extend([
+            ("upper_columns", columns),
+            ("with_input", u32::from(span.with_input())),
+            ("from_output", u32::from(from_output)),
+        ]);
+        Ok(BackwardStage::Kept(self.build(sizes.subgroups, &constants).stage(self.gpu)?))
+    }
+
+    /// The backward passes, from the last layer down.
+    fn passes(&self) -> Result<Vec<BackwardPass>> {
+        let mut built: Vec<BackwardPass> = Vec::new();
+        let mut reads = vec![0; self.params.layers.len()];
+        for span in spans(&self.params.layers) {
+            let layer = span.upper.layer();
+            if span.with_input() {
+                reads[span.last().layer() - 1] = 1 - reads[layer];
+            }
+            let sums_dz = built.iter().all(|pass| pass.span.upper.layer() != layer);
+            built.push(BackwardPass { span, stage: self.backward(span)?, reads: reads[layer], sums_dz });
+        }
+        Ok(built)
     }
 }
 
@@ -317,34 +188,34 @@ impl FusedNetwork {
             let problem = "this device has no cooperative matrices our kernels can use: take f32 or auto";
             Error::config("layers", "matrices", format!("{}: {problem}", info.name))
         })?;
-        let shape = Shape::new(info, matrix, tuning.matrices.largest_tile, params)?;
-        let builder = Builder::new(gpu, tuning, &shape, params);
+        let shape = Shape::new(info, matrix, &tuning.matrices, params)?;
+        let builder = Builder { gpu, shape: &shape, params, unroll: tuning.matrices.unroll };
         let (width, encoded) = (params.width, shape.encoded);
         let capacity = u64::from(setup.sample_capacity);
         let training = match purpose {
             Purpose::Render => None,
             Purpose::Train => Some(FusedTraining {
-                kernels: BackwardKernels {
-                    last: builder.backward(width, true, true)?,
-                    hidden: builder.backward(width, true, false)?,
-                    encoded: builder.backward(encoded, false, false)?,
-                    last_encoded: builder.backward(encoded, false, true)?,
-                },
+                passes: builder.passes()?,
                 dz16: [
-                    gpu.buffer("dz16_even", capacity * width as u64 * 2, Memory::Device)?,
-                    gpu.buffer("dz16_odd", capacity * width as u64 * 2, Memory::Device)?,
+                    gpu.buffer("dz16_a", capacity * width as u64 * 2, Memory::Device)?,
+                    gpu.buffer("dz16_b", capacity * width as u64 * 2, Memory::Device)?,
                 ],
                 phase_source: gpu.buffer_with("phase_source", &shape.phase_source(params))?,
             }),
         };
-        let kept = |per_sample: usize| if training.is_some() { capacity * per_sample as u64 * 2 } else { 16 };
+        let kept = |per_sample: usize| match per_sample {
+            0 => 16,
+            _ if training.is_none() => 16,
+            _ => capacity * per_sample as u64 * 2,
+        };
+        let first_kept = shape.first_kept();
         let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
         let bias_len = params.layers.len() * matrix.m as usize * width;
         let buffers = FusedBuffers {
             weights16: new(Binding::weights16, shape.weights_len as u64 * 2)?,
             bias_rows: new(Binding::bias_rows, bias_len as u64 * 4)?,
-            features16: new(Binding::features16, kept(encoded))?,
-            activations16: new(Binding::activations16, kept(params.layers.len() * width))?,
+            features16: new(Binding::features16, kept(if first_kept == 0 { encoded } else { 0 }))?,
+            activations16: new(Binding::activations16, kept((params.layers.len() - first_kept) * width))?,
             pack_source: gpu.buffer_with("pack_source", &shape.pack_source(params))?,
         };
         Ok(FusedNetwork {
@@ -361,80 +232,78 @@ impl FusedNetwork {
         self.training.as_ref().ok_or_else(built_for_rendering)
     }
 
-    /// Records one or two passes through layer `l`: over the layer below, and over the encoding if it sees that.
-    fn record_layer_backward(&self, pass: &mut Pass<'_>, l: usize, chunk: Chunk) -> Result<()> {
-        let (shape, training, params) = (&self.shape, self.training()?, pass.network.map());
-        let (k, packed) = (&training.kernels, &self.shape.layers[l]);
-        let is_last = l + 1 == params.layers.len();
-        let capacity = pass.setup.sample_capacity;
-        let activations_at = |l: usize| l as u32 * capacity * params.width as u32 / 8;
-        let (on_hidden, on_encoded) = if is_last { (&k.last, &k.last_encoded) } else { (&k.hidden, &k.encoded) };
-        let parts = [
-            (packed.hidden, &self.buffers.activations16, l.checked_sub(1).map_or(0, activations_at), on_hidden),
-            (packed.encoded, &self.buffers.features16, 0, on_encoded),
-        ];
-        let position = |at: Option<usize>| at.map_or(NOWHERE, |at| at as u32);
-        let mut bias = packed.bias;
-        let mut out = is_last.then_some((shape.out_weights, shape.out_bias));
-        let outputs_at = activations_at(l);
-        for (at, input, inputs_at, stage) in parts {
-            let Some(at) = at else { continue };
-            // The first pass over a layer's dz also sums what depends on dz alone.
-            let (out_weights, out_bias) = out.take().unzip();
-            let push = push::MlpFusedBwd {
-                weights_at: at as u32,
-                inputs_at,
-                outputs_at,
-                out_weights_at: shape.out_weights as u32,
-                n_partials: shape.partials_len as u32,
-                weights: at as u32,
-                bias: position(bias.take()),
-                out_weights: position(out_weights),
-                out_bias: position(out_bias),
-                accumulate: chunk.accumulate(),
-            };
-            let bound = [
-                (Binding::inputs16, input.into()),
-                (Binding::outputs16, (&self.buffers.activations16).into()),
-                (Binding::dz16, (&training.dz16[l % 2]).into()),
-                (Binding::dz_in16, (&training.dz16[(l + 1) % 2]).into()),
-            ];
-            pass.run_with(stage, Groups::Direct([self.workgroups, 1, 1]), &bound, push)?;
-        }
-        Ok(())
+    /// Where activations of a layer that is kept begin, in `uvec4`s.
+    fn activations_at(&self, layer: usize, pass: &Pass<'_>) -> u32 {
+        let layer = (layer - self.shape.first_kept()) as u32;
+        layer * pass.setup.sample_capacity * pass.network.map().width as u32 / 8
     }
-}
 
-/// Least work of the passes, with so many columns of weights on the encoding. Forward, encoding and activations are kept;
-/// backward, each pass reads its layer's dz and input, and leaves the dz of the layer below.
-fn work(params: &NetworkMap, encoded: u64, samples: u64) -> Ledger {
-    let width = params.width as u64;
-    let mut ledger = Ledger::new();
-    let mut count = |stage: &str, flop: u64, numbers: u64, bytes: u64| {
-        add(&mut ledger, stage, StageWork::per_item(samples, flop, numbers * F16_BYTES + bytes));
-    };
-    count("mlp_fused_fwd", 2 * width, encoded, SAMPLE_BYTES);
-    for (l, layer) in params.layers.iter().enumerate() {
-        count("mlp_fused_fwd", 0, width, 0);
-        if layer.encoded.is_some() {
-            count("mlp_fused_fwd", 2 * width * params.encoded_len as u64, 0, 0);
-            count("mlp_fused_bwd", 2 * width * params.encoded_len as u64, width + encoded, 0);
-        }
-        if layer.hidden.is_some() {
-            count("mlp_fused_fwd", 2 * width * width, 0, 0);
-            count("mlp_fused_bwd", 4 * width * width, 3 * width, 0);
-        }
-        if l + 1 == params.layers.len() {
-            // The last dz comes from the output, where the loss is.
-            count("mlp_fused_bwd", 4 * width, 0, SAMPLE_BYTES);
+    /// What a part sees: buffer, and where in it.
+    fn inputs(&self, part: Part, pass: &Pass<'_>) -> (&Buffer, u32) {
+        match part {
+            Part::Hidden(layer) => (&self.buffers.activations16, self.activations_at(layer - 1, pass)),
+            Part::Encoded(_) => (&self.buffers.features16, 0),
         }
     }
-    ledger
+
+    /// Records one backward pass.
+    fn record_pass(&self, pass: &mut Pass<'_>, backward: &BackwardPass, chunk: Chunk) -> Result<()> {
+        let (shape, dz16, groups) = (&self.shape, &self.training()?.dz16, Groups::Direct([self.workgroups, 1, 1]));
+        let BackwardPass { span, stage, reads, sums_dz } = backward;
+        let position = |at: Option<usize>| at.map_or(NOWHERE, |at| at as u32);
+        let bias = |part: Part| position(shape.layers[part.layer()].bias);
+        let (weights_at, n_partials) = (position(shape.weights_of(span.upper)), shape.partials_len as u32);
+        let lower_weights_at = position(span.lower.and_then(|part| shape.weights_of(part)));
+        let upper_bias = if *sums_dz { bias(span.upper) } else { NOWHERE };
+        let lower_bias = span.lower.map_or(NOWHERE, bias);
+        let accumulate = chunk.accumulate();
+        let dz = (Binding::dz16, (&dz16[*reads]).into());
+        let stage = match stage {
+            BackwardStage::Kept(stage) => stage,
+            BackwardStage::Recomputed(stage) => {
+                let push = push::MlpFusedBwdFirst {
+                    weights_at,
+                    lower_weights_at,
+                    n_partials,
+                    bias: upper_bias,
+                    lower_bias,
+                    accumulate,
+                };
+                return pass.run_with(stage, groups, &[dz], push);
+            }
+        };
+        let layer = span.upper.layer();
+        let sums_outputs = layer + 1 == shape.layers.len() && *sums_dz;
+        let (inputs, inputs_at) = self.inputs(span.upper, pass);
+        let (lower_inputs, lower_inputs_at) = span.lower.map_or((inputs, 0), |part| self.inputs(part, pass));
+        let push = push::MlpFusedBwd {
+            weights_at,
+            lower_weights_at,
+            inputs_at,
+            lower_inputs_at,
+            outputs_at: self.activations_at(layer, pass),
+            out_weights_at: shape.out_weights as u32,
+            n_partials,
+            bias: upper_bias,
+            lower_bias,
+            out_weights: position(sums_outputs.then_some(shape.out_weights)),
+            out_bias: position(sums_outputs.then_some(shape.out_bias)),
+            accumulate,
+        };
+        let bound = [
+            (Binding::inputs16, inputs.into()),
+            (Binding::lower_inputs16, lower_inputs.into()),
+            (Binding::outputs16, (&self.buffers.activations16).into()),
+            dz,
+            (Binding::dz_in16, (&dz16[1 - *reads]).into()),
+        ];
+        pass.run_with(stage, groups, &bound, push)
+    }
 }
 
 impl Path for FusedNetwork {
     fn work(&self, params: &NetworkMap, samples: u64) -> Ledger {
-        work(params, self.shape.encoded as u64, samples)
+        work(params, self.shape.encoded as u64, samples, self.shape.backward.recompute)
     }
 
     fn find(&self, name: Binding) -> Option<&Buffer> {
@@ -466,7 +335,7 @@ impl Path for FusedNetwork {
     }
 
     fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        (0..pass.network.map().layers.len()).rev().try_for_each(|l| self.record_layer_backward(pass, l, chunk))
+        self.training()?.passes.iter().try_for_each(|backward| self.record_pass(pass, backward, chunk))
     }
 
     /// They are part of the partial sums.
@@ -490,18 +359,44 @@ mod tests {
     use super::*;
     use crate::config::{Config, Preset};
     use crate::model::params::ParamMap;
+    use crate::network::SAMPLE_BYTES;
     use crate::network::cost::NetworkCost;
 
     #[test]
-    fn the_papers_network_moves_four_kilobytes_a_sample() {
+    fn the_papers_network_moves_two_kilobytes_a_sample() {
         let params = ParamMap::new(&Config::preset(Preset::Paper), 10);
+        let cost = NetworkCost::of(&params);
         // 63 numbers and 10 phases, filled up to 80 columns.
-        let (ledger, cost) = (work(&params.moving, 80, 1_000_000_000), NetworkCost::of(&params));
-        let [forward, backward] = ["mlp_fused_fwd", "mlp_fused_bwd"].map(|stage| ledger[stage]);
+        let ledger = |recompute| {
+            let ledger = work(&params.moving, 80, 1_000_000_000, recompute);
+            ["mlp_fused_fwd", "mlp_fused_bwd"].map(|stage| ledger[stage])
+        };
+        let [forward, backward] = ledger(false);
         assert_eq!(forward.gflop as u64, cost.forward);
         assert_eq!(backward.gflop as u64, cost.weights + cost.inputs);
-        // Two bytes of 80 columns and 4 x 128 activations; three passes of 3 x 128 numbers and one of 128 + 80.
+        // Two bytes of 80 columns and 4 x 128 activations; 4 x 128 numbers of the upper two layers, 2 x 128 + 80 of the others.
         assert_eq!(forward.megabytes as u64, 1_000 * (160 + 4 * 256 + SAMPLE_BYTES));
-        assert_eq!(backward.megabytes as u64, 1_000 * (3 * 768 + 256 + 160 + SAMPLE_BYTES));
+        assert_eq!(backward.megabytes as u64, 1_000 * (4 * 256 + 2 * 256 + 160 + SAMPLE_BYTES));
+        let [forward, backward] = ledger(true);
+        assert_eq!(backward.gflop as u64, cost.weights + cost.inputs + 2 * 63 * 128);
+        assert_eq!(forward.megabytes as u64, 1_000 * (3 * 256 + SAMPLE_BYTES));
+        assert_eq!(backward.megabytes as u64, 1_000 * (4 * 256 + 256 + 2 * SAMPLE_BYTES));
+    }
+
+    #[test]
+    fn layers_are_paired_from_the_first_up() {
+        let spans_of = |layers: usize, skip_layer: usize| {
+            let mut config = Config::preset(Preset::Paper);
+            (config.dynamic.layers, config.dynamic.skip_layer) = (layers as u32, skip_layer as u32);
+            let spans = spans(&ParamMap::new(&config, 10).moving.layers);
+            spans.iter().map(|span| (span.upper, span.lower)).collect::<Vec<_>>()
+        };
+        use Part::{Encoded, Hidden};
+        assert_eq!(spans_of(4, 0), [(Hidden(3), Some(Hidden(2))), (Hidden(1), Some(Encoded(0)))]);
+        assert_eq!(spans_of(3, 0), [(Hidden(2), None), (Hidden(1), Some(Encoded(0)))]);
+        assert_eq!(spans_of(1, 0), [(Encoded(0), None)]);
+        // dz of a layer that sees both inputs goes to memory.
+        let skips = spans_of(4, 3);
+        assert_eq!(skips, [(Hidden(3), None), (Hidden(2), None), (Encoded(2), None), (Hidden(1), Some(Encoded(0)))]);
     }
 }

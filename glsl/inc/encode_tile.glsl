@@ -1,0 +1,32 @@
+// A sample's input on matrices: [encoding, shares of the phases, zeros] in f16. What includes this declares `setup`, `schedule`,
+// `state`, `live`, `sample_points`, `sample_rays`, `rays`, and the number of `encoded` numbers, padded.
+#include "inc/encoding.glsl"
+
+const float QUARTER_TURN = 1.5707963267948966;
+
+// Number i of a sample's input: encoding, then the shares of phases, then zeros.
+float input_number(uint i, vec3 x, Ray ray, float window) {
+    if (i < 3u) return x[i];
+    uint band = (i - 3u) / 6u;
+    if (band < setup.n_bands) {
+        uint part = (i - 3u) % 6u;
+        float angle = reduce_angle(vec3(x[part % 3u] * float(1u << band))).x;
+        // Lanes that want a cosine need not wait for those that want a sine.
+        return clamp(window - float(band), 0.0, 1.0) * sin(part < 3u ? angle : angle + QUARTER_TURN);
+    }
+    return phase_share(ray, i - 3u - 6u * setup.n_bands);
+}
+
+// Eight numbers of a sample's input, from 8 q on; zeros behind the last sample.
+uvec4 encoded_numbers(uint s, uint q) {
+    uvec4 packed = uvec4(0u);
+    if (s >= live.count) return packed;
+    float window = schedule[state.step].window;
+    vec3 x = encoded_point(sample_points[s].xyz);
+    Ray ray = rays[ray_of(sample_rays[s])];
+    for (uint pair = 0u; pair < 4u; pair++) {
+        uint i = 8u * q + 2u * pair;
+        packed[pair] = pack2(vec2(input_number(i, x, ray, window), input_number(i + 1u, x, ray, window)));
+    }
+    return packed;
+}

@@ -1,0 +1,92 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Backward through the second hidden layer and the first, like mlp_fused_bwd: the encoding and the first layer's activations
+// are computed again, not read, so that nobody has to keep them.
+//   dz16[s][width]: gradient at the second layer's neurons, times the loss scale.
+//   partials[workgroup][n_partials]: weight gradients [width][width] at `weights_at` and [width][lower_columns] at
+//   `lower_weights_at`, bias gradients at `bias` and `lower_bias`; NOWHERE skips one.
+#include "inc/matrices.glsl"
+#include "inc/layout.glsl"
+#include "inc/positions.glsl"
+#include "inc/sample_rays.glsl"
+#include "inc/phase_share.glsl"
+#define upper_columns width
+layout(constant_id = 7) const uint lower_columns = 80u; // numbers of encoding and shares of phases, padded
+layout(constant_id = 8) const uint shares = 2u;         // of the columns; a divisor of both subgroups and upper_columns / n
+layout(constant_id = 9) const uint lower_shares = 1u;   // the same of lower_columns
+layout(push_constant) uniform Push {
+    uint weights_at; uint lower_weights_at; uint n_partials; uint bias; uint lower_bias; uint accumulate;
+} push;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
+layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
+layout(binding = 3) readonly buffer B3 { LiveSamples live; };
+layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
+layout(binding = 5) readonly buffer B5 { uint sample_rays[]; };
+layout(binding = 6) readonly buffer B6 { Ray rays[]; };
+layout(binding = 7) readonly buffer B7 { uvec4 weights16[]; };
+layout(binding = 8) readonly buffer B8 { float bias_rows[]; };
+layout(binding = 9) readonly buffer B9 { uvec4 dz16[]; };
+layout(binding = 10) buffer B10 { float partials[]; };
+#include "inc/encode_tile.glsl"
+// Activations, then the encoding.
+#define INPUTS_SIZE tile * (input_stride + lower_stride)
+#include "inc/fused_backward.glsl"
+
+const uint encoded_at = tile * input_stride;
+
+void stage(uint first) {
+    uint q = gl_LocalInvocationIndex % width8;
+    uint row0 = gl_LocalInvocationIndex / width8;
+    for (uint row = row0; row < tile && row0 < stage_rows; row += stage_rows) {
+        uvec4 packed = dz16[(first + row) * width8 + q];
+        ADD_DZ(bias_sum, packed)
+        tile_dz[row * dz_stride + q] = packed;
+    }
+    for (uint e = gl_LocalInvocationIndex; e < tile * lower_columns8; e += gl_WorkGroupSize.x) {
+        uint row = e / lower_columns8;
+        tile_in[encoded_at + row * lower_stride + e % lower_columns8] = encoded_numbers(first + row, e % lower_columns8);
+    }
+}
+
+// The first layer's activations, as in the forward pass.
+void activate() {
+    [[unroll]] for (uint c = 0u; c < input_columns; c++) {
+        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
+        [[unroll]] for (uint r = 0u; r < input_rows; r++) {
+            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
+            SUM sum;
+            coopMatLoad(sum, bias_rows, column, width, ROWS);
+            STEPS for (uint step = 0u; step < lower_columns / k; step++) {
+                LEFT inputs;
+                RIGHT weights;
+                coopMatLoad(inputs, tile_in, encoded_at + row * lower_stride + step * k / 8u, lower_stride, ROWS);
+                coopMatLoad(weights, weights16, (push.lower_weights_at + column * lower_columns + step * k) / 8u,
+                            lower_columns8, COLUMNS);
+                sum = coopMatMulAdd(inputs, weights, sum);
+            }
+            [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
+            coopMatStore(SUM16(sum), tile_in, row * input_stride + column / 8u, input_stride, ROWS);
+        }
+    }
+}
+
+void walk_tile(uint first) {
+    stage(first);
+    barrier();
+    activate();
+    barrier();
+    add_weight_gradient(upper_share(), 0u, input_stride);
+    descend();
+    barrier();
+    if (push.lower_bias != NOWHERE) add_lower_bias();
+    add_weight_gradient(lower_share(), encoded_at, lower_stride);
+    barrier();
+}
+
+void main() {
+    clear_sums();
+    uint tiles = tiles_of(live.padded);
+    [[dont_unroll]] for (uint t = gl_WorkGroupID.x; t < tiles; t += gl_NumWorkGroups.x) walk_tile(t * tile);
+    put_sums();
+}

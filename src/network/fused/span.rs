@@ -1,0 +1,118 @@
+//! Which layers a backward pass goes through, and what that moves.
+
+use crate::model::params::{Layer, NetworkMap};
+use crate::network::ledger::{Ledger, StageWork, add};
+use crate::network::{F16_BYTES, SAMPLE_BYTES};
+
+/// A layer's weights on one of its inputs; layers count from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Part {
+    /// On the layer below.
+    Hidden(usize),
+    /// On the encoding.
+    Encoded(usize),
+}
+
+impl Part {
+    pub(super) fn layer(self) -> usize {
+        match self {
+            Part::Hidden(layer) | Part::Encoded(layer) => layer,
+        }
+    }
+}
+
+/// One backward pass. Where it has a lower part, dz of the layer in between stays on the multiprocessor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Span {
+    pub(super) upper: Part,
+    pub(super) lower: Option<Part>,
+}
+
+impl Span {
+    /// The part whose input comes last.
+    pub(super) fn last(self) -> Part {
+        self.lower.unwrap_or(self.upper)
+    }
+
+    /// Whether it leaves dz of a layer below.
+    pub(super) fn with_input(self) -> bool {
+        matches!(self.last(), Part::Hidden(_))
+    }
+}
+
+/// The backward passes in their order, from the last layer down; pairs are made from the first layer up, so that what is left
+/// over is the last layer's.
+pub(super) fn spans(layers: &[Layer]) -> Vec<Span> {
+    let parts = |(l, layer): (usize, &Layer)| {
+        [layer.hidden.map(|_| Part::Hidden(l)), layer.encoded.map(|_| Part::Encoded(l))].into_iter().flatten()
+    };
+    let mut parts: Vec<Part> = layers.iter().enumerate().rev().flat_map(parts).collect();
+    let mut spans = Vec::new();
+    while let Some(last) = parts.pop() {
+        let above = parts.last().copied().filter(|above| joins(layers, *above, last));
+        spans.push(match above {
+            Some(upper) => Span { upper, lower: Some(last) },
+            None => Span { upper: last, lower: None },
+        });
+        if above.is_some() {
+            parts.pop();
+        }
+    }
+    spans.reverse();
+    spans
+}
+
+/// Whether one pass may go through both: a layer that sees both inputs wants its dz twice, hence in memory.
+fn joins(layers: &[Layer], upper: Part, lower: Part) -> bool {
+    let below = &layers[lower.layer()];
+    matches!(upper, Part::Hidden(layer) if layer == lower.layer() + 1)
+        && !(below.hidden.is_some() && below.encoded.is_some())
+}
+
+/// Whether the last pass can compute the encoding and the first layer again: nothing else reads them, and it does not begin
+/// at the output, whose gradient has buffers of its own.
+pub(super) fn recomputes(spans: &[Span]) -> bool {
+    let encoded = |part: Part| matches!(part, Part::Encoded(_));
+    let readers = spans.iter().flat_map(|span| [Some(span.upper), span.lower]).flatten().filter(|part| encoded(*part));
+    spans.len() > 1 && readers.count() == 1 && spans.last().is_some_and(|span| span.lower.is_some_and(encoded))
+}
+
+/// Least work of the passes, with so many columns of weights on the encoding. The forward pass keeps what the backward passes
+/// read; of these each reads its dz, its inputs, and for masks the last layer's activations, and leaves dz of the layer below.
+pub(super) fn work(params: &NetworkMap, encoded: u64, samples: u64, recompute: bool) -> Ledger {
+    let width = params.width as u64;
+    let mut ledger = Ledger::new();
+    let mut count = |stage: &str, flop: u64, numbers: u64, bytes: u64| {
+        add(&mut ledger, stage, StageWork::per_item(samples, flop, numbers * F16_BYTES + bytes));
+    };
+    let first = 2 * width * params.encoded_len as u64;
+    let kept_layers = (params.layers.len() - usize::from(recompute)) as u64;
+    let kept_features = if recompute { 0 } else { encoded };
+    count("mlp_fused_fwd", 2 * width, kept_features + kept_layers * width, SAMPLE_BYTES);
+    let products = |part: Part| match part {
+        Part::Hidden(_) => 2 * width * width,
+        Part::Encoded(_) => first,
+    };
+    let spans = spans(&params.layers);
+    for (i, span) in spans.iter().enumerate() {
+        let recomputed = recompute && i + 1 == spans.len();
+        let read = |part: Part| match part {
+            _ if recomputed => 0,
+            Part::Hidden(_) => width,
+            Part::Encoded(_) => encoded,
+        };
+        for part in [Some(span.upper), span.lower].into_iter().flatten() {
+            count("mlp_fused_fwd", products(part), 0, 0);
+            let gradients = if matches!(part, Part::Hidden(_)) { 2 } else { 1 };
+            count("mlp_fused_bwd", gradients * products(part), read(part), 0);
+        }
+        if recomputed {
+            count("mlp_fused_bwd", first, 0, SAMPLE_BYTES);
+        }
+        let written = if span.with_input() { width } else { 0 };
+        count("mlp_fused_bwd", 0, width + written, 0);
+    }
+    // The last dz comes from the output, where the loss is.
+    count("mlp_fused_bwd", 4 * width, 0, SAMPLE_BYTES);
+    ledger
+}
