@@ -1,26 +1,49 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adds up the partial sums of the network's gradient in a fixed order and takes the loss scale out. One invocation per
-// element of [first, first + count) of `gradient`; a sum that is not finite is flagged in state.overflowed.
-//   source[i]: where element first + i lies in partials[split][n_partials]; NOWHERE: zero.
+// Adds up the partial sums of the network's gradient in a fixed order and takes the loss scale out: of [first, first + count)
+// of `gradient`, then of `phase_sums` sums of dz over a phase. `parts` invocations share out the partial sums of an element. A sum
+// that is not finite is flagged in state.overflowed.
+//   source[i]: where element i lies in partials[split][n_partials]; NOWHERE: zero.
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint first; uint count; uint splits; uint n_partials; } push;
+#include "inc/workgroup.glsl"
+layout(constant_id = 1) const uint parts = 1u;  // a divisor of the workgroup
+layout(push_constant) uniform Push { uint first; uint count; uint phase_sums; uint splits; uint n_partials; } push;
 layout(binding = 0) readonly buffer B0 { uint source[]; };
 layout(binding = 1) readonly buffer B1 { float partials[]; };
 layout(binding = 2) writeonly buffer B2 { float gradient[]; };
-layout(binding = 3) buffer B3 { DeviceState state; };
+layout(binding = 3) writeonly buffer B3 { float phase_dz[]; };
+layout(binding = 4) buffer B4 { DeviceState state; };
+
+shared float part_sums[gl_WorkGroupSize.x];
+
+// Neighbouring invocations have neighbouring elements.
+const uint elements = gl_WorkGroupSize.x / parts;
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
-    if (i >= push.count) return;
-    uint at = source[i];
+    uint element = gl_LocalInvocationIndex % elements;
+    uint i = workgroup() * elements + element;
+    bool is_element = i < push.count + push.phase_sums;
+    uint at = is_element ? source[i] : NOWHERE;
     float sum = 0.0;
     if (at != NOWHERE) {
-        for (uint split = 0u; split < push.splits; split++) sum += partials[split * push.n_partials + at];
+        for (uint split = gl_LocalInvocationIndex / elements; split < push.splits; split += parts) {
+            sum += partials[split * push.n_partials + at];
+        }
     }
+    if (parts > 1u) {
+        part_sums[gl_LocalInvocationIndex] = sum;
+        barrier();
+        if (gl_LocalInvocationIndex >= elements) return;
+        for (uint part = 1u; part < parts; part++) sum += part_sums[part * elements + element];
+    }
+    if (!is_element) return;
     // All bits of the exponent: a compiler may assume that isinf and isnan are false.
     if ((floatBitsToUint(sum) & 0x7f800000u) == 0x7f800000u) state.overflowed = 1u;
-    gradient[push.first + i] = sum / state.loss_scale;
+    if (i < push.count) {
+        gradient[push.first + i] = sum / state.loss_scale;
+    } else {
+        phase_dz[i - push.count] = sum / state.loss_scale;
+    }
 }

@@ -16,7 +16,7 @@
 #include "inc/sample_rays.glsl"
 layout(constant_id = 7) const uint upper_columns = 128u; // inputs of the upper layer
 layout(constant_id = 8) const uint lower_columns = 0u;  // inputs of the lower layer; 0: there is none
-layout(constant_id = 9) const uint shares = 2u;         // of the columns; a divisor of both subgroups and upper_columns / n
+layout(constant_id = 9) const uint shares = 2u;         // of the columns; a divisor of subgroups
 layout(constant_id = 10) const uint lower_shares = 1u;  // the same of lower_columns
 layout(constant_id = 11) const uint with_input = 1u;
 layout(constant_id = 12) const uint from_output = 0u;   // the upper layer is the last
@@ -45,7 +45,8 @@ layout(binding = 14) readonly buffer B14 { float sigma_gradient[]; };
 #include "inc/fused_backward.glsl"
 
 shared float tile_gradient[tile];
-float out_sum[8];
+// Gradient of the output neuron.
+float out_sum[lane_neurons];
 float out_bias_sum;
 
 float sample_gradient(uint s) {
@@ -61,32 +62,49 @@ void stage_output_gradient(uint first) {
     barrier();
 }
 
-// Eight numbers of dz of sample `s`, in row `row` of the tile.
-uvec4 upper_dz(uint s, uint row, uint q) {
-    if (from_output == 0u) return dz16[s * width8 + q];
+// The last layer's activations, where its input comes to lie later.
+void stage_outputs(uint first) {
+    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
+        tile_in[e / width8 * dz_stride + e % width8] = outputs16[push.outputs_at + first * width8 + e];
+    }
+}
+
+void add_outputs() {
+    uint part = gl_LocalInvocationIndex / width;
+    [[unroll]] for (uint i = 0u; i < lane_neurons; i++) {
+        uint neuron = gl_LocalInvocationIndex % width + i * gl_WorkGroupSize.x;
+        if (part >= row_parts || neuron >= width) continue;
+        for (uint row = part; row < tile; row += row_parts) {
+            out_sum[i] += tile_gradient[row] * neuron_of(tile_in[row * dz_stride + neuron / 8u], neuron);
+        }
+    }
+}
+
+// Eight numbers of the last layer's dz of a sample, in a row of the tile.
+uvec4 output_dz(uint row, uint q) {
     uvec4 out_weights = weights16[push.out_weights_at / 8u + q];
-    uvec4 outputs = outputs16[push.outputs_at + s * width8 + q];
+    uvec4 outputs = tile_in[row * dz_stride + q];
     uvec4 packed;
     [[unroll]] for (uint i = 0u; i < 4u; i++) {
-        vec2 h = unpackHalf2x16(outputs[i]);
-        out_sum[2u * i] += tile_gradient[row] * h.x;
-        out_sum[2u * i + 1u] += tile_gradient[row] * h.y;
         vec2 dz = tile_gradient[row] * unpackHalf2x16(out_weights[i]);
-        dz = mix(vec2(0.0), dz, greaterThan(h, vec2(0.0)));
+        dz = mix(vec2(0.0), dz, greaterThan(unpackHalf2x16(outputs[i]), vec2(0.0)));
         largest = max(largest, max(abs(dz.x), abs(dz.y)));
         packed[i] = packHalf2x16(dz);
     }
     return packed;
 }
+
 void stage_dz(uint first) {
-    if (from_output != 0u) stage_output_gradient(first);
-    uint q = gl_LocalInvocationIndex % width8;
-    uint row0 = gl_LocalInvocationIndex / width8;
-    for (uint row = row0; row < tile && row0 < stage_rows; row += stage_rows) {
-        uvec4 packed = upper_dz(first + row, row, q);
-        ADD_DZ(bias_sum, packed)
-        tile_dz[row * dz_stride + q] = packed;
+    if (from_output != 0u) {
+        stage_outputs(first);
+        stage_output_gradient(first);
+        if (push.out_weights != NOWHERE) add_outputs();
     }
+    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
+        uint row = e / width8, q = e % width8;
+        tile_dz[row * dz_stride + q] = from_output != 0u ? output_dz(row, q) : dz16[first * width8 + e];
+    }
+    if (from_output != 0u) barrier();
 }
 
 void stage_inputs(uint first) {
@@ -131,12 +149,13 @@ void walk_tile(uint first) {
     stage_dz(first);
     stage_inputs(first);
     barrier();
+    if (push.bias != NOWHERE) add_dz(bias_sum);
     add_weight_gradient(upper_share(), 0u, input_stride);
     if (lower_columns != 0u) {
         descend();
         stage_lower_inputs(first);
         barrier();
-        if (push.lower_bias != NOWHERE) add_lower_bias();
+        if (push.lower_bias != NOWHERE) add_dz(lower_bias_sum);
         add_weight_gradient(lower_share(), 0u, lower_stride);
     }
     if (with_input != 0u) store_input_gradient(first, lower_columns != 0u ? push.lower_weights_at : push.weights_at);
@@ -145,7 +164,7 @@ void walk_tile(uint first) {
 
 void main() {
     clear_sums();
-    [[unroll]] for (uint i = 0u; i < 8u; i++) out_sum[i] = 0.0;
+    [[unroll]] for (uint i = 0u; i < lane_neurons; i++) out_sum[i] = 0.0;
     out_bias_sum = 0.0;
     uint tiles = tiles_of(live.padded);
     [[dont_unroll]] for (uint t = gl_WorkGroupID.x; t < tiles; t += gl_NumWorkGroups.x) walk_tile(t * tile);

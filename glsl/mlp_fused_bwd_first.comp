@@ -12,7 +12,7 @@
 #include "inc/phase_share.glsl"
 #define upper_columns width
 layout(constant_id = 7) const uint lower_columns = 80u; // numbers of encoding and shares of phases, padded
-layout(constant_id = 8) const uint shares = 2u;         // of the columns; a divisor of both subgroups and upper_columns / n
+layout(constant_id = 8) const uint shares = 2u;         // of the columns; a divisor of subgroups
 layout(constant_id = 9) const uint lower_shares = 1u;   // the same of lower_columns
 layout(push_constant) uniform Push {
     uint weights_at; uint lower_weights_at; uint n_partials; uint bias; uint lower_bias; uint accumulate;
@@ -36,12 +36,8 @@ layout(binding = 10) buffer B10 { float partials[]; };
 const uint encoded_at = tile * input_stride;
 
 void stage(uint first) {
-    uint q = gl_LocalInvocationIndex % width8;
-    uint row0 = gl_LocalInvocationIndex / width8;
-    for (uint row = row0; row < tile && row0 < stage_rows; row += stage_rows) {
-        uvec4 packed = dz16[(first + row) * width8 + q];
-        ADD_DZ(bias_sum, packed)
-        tile_dz[row * dz_stride + q] = packed;
+    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
+        tile_dz[e / width8 * dz_stride + e % width8] = dz16[first * width8 + e];
     }
     for (uint e = gl_LocalInvocationIndex; e < tile * lower_columns8; e += gl_WorkGroupSize.x) {
         uint row = e / lower_columns8;
@@ -57,7 +53,7 @@ void activate() {
             uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
             SUM sum;
             coopMatLoad(sum, bias_rows, column, width, ROWS);
-            STEPS for (uint step = 0u; step < lower_columns / k; step++) {
+            [[dont_unroll]] for (uint step = 0u; step < lower_columns / k; step++) {
                 LEFT inputs;
                 RIGHT weights;
                 coopMatLoad(inputs, tile_in, encoded_at + row * lower_stride + step * k / 8u, lower_stride, ROWS);
@@ -75,11 +71,12 @@ void walk_tile(uint first) {
     stage(first);
     barrier();
     activate();
+    if (push.bias != NOWHERE) add_dz(bias_sum);
     barrier();
     add_weight_gradient(upper_share(), 0u, input_stride);
     descend();
     barrier();
-    if (push.lower_bias != NOWHERE) add_lower_bias();
+    if (push.lower_bias != NOWHERE) add_dz(lower_bias_sum);
     add_weight_gradient(lower_share(), encoded_at, lower_stride);
     barrier();
 }

@@ -13,6 +13,7 @@ pub mod still;
 use crate::error::{Error, Result};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
+use crate::kernels::constants::NOWHERE;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;
@@ -71,8 +72,10 @@ trait Path: Send + Sync {
     /// Least work of the stages that see samples, for so many of them.
     fn work(&self, params: &NetworkMap, samples: u64) -> Ledger;
 
-    /// Records the sums of dz over each phase, unless they are there: `phase_dz`.
-    fn record_phase_sums(&self, pass: &mut Pass<'_>, gradient: &GradientBuffers) -> Result<()>;
+    /// Where in a part the sums of dz over each phase lie, where they are not in `phase_dz` already.
+    fn phase_source(&self, _: &NetworkMap) -> Vec<u32> {
+        Vec::new()
+    }
 }
 
 /// Tiles that the layers are computed in.
@@ -98,7 +101,7 @@ buffer_set! {
     pub struct GradientBuffers {
         /// Sums over parts of the samples, `[part][number]`.
         partials,
-        /// Where in a part the gradient of each network parameter lies.
+        /// Where in a part the gradient of each network parameter lies, then each sum of dz over a phase.
         source,
         /// Sums of dz over each phase, `[layer][phase][neuron]`.
         phase_dz,
@@ -111,8 +114,18 @@ pub struct Network {
     layers: Layers,
     first_loss_scale: f32,
     path: Box<dyn Path>,
-    phase_bias: Buffer,
+    weights: WeightBuffers,
     gradient: Option<GradientBuffers>,
+}
+
+buffer_set! {
+    /// What follows from parameters alone, and where these are.
+    struct WeightBuffers {
+        /// Of each layer its bias and its weights on latents; NOWHERE: it has none.
+        network_layers,
+        /// Bias and latents of each phase, `[layer][phase][neuron]`.
+        phase_bias,
+    }
 }
 
 /// Samples a chunk may have, by the range of one storage buffer.
@@ -137,15 +150,24 @@ impl Network {
             Layers::Matrices => Box::new(FusedNetwork::new(gpu, tuning, setup, params, purpose)?),
         };
         let rows = (params.layers.len() * params.phases * params.width) as u64;
-        let phase_bias = gpu.buffer("phase_bias", rows * 4, Memory::Device)?;
+        let layers: Vec<[u32; 2]> = params
+            .layers
+            .iter()
+            .map(|layer| [layer.bias as u32, layer.latent.map_or(NOWHERE, |at| at as u32)])
+            .collect();
+        let weights = WeightBuffers {
+            network_layers: gpu.buffer_with("network_layers", &layers)?,
+            phase_bias: gpu.buffer("phase_bias", rows * 4, Memory::Device)?,
+        };
         let gradient = match purpose {
             Purpose::Render => None,
             Purpose::Train => {
                 let sums = path.partial_sums(params);
+                let source = [path.gradient_source(params), path.phase_source(params)].concat();
                 let bytes = u64::from(sums.splits) * u64::from(sums.len) * 4;
                 Some(GradientBuffers {
                     partials: gpu.buffer("partials", bytes, Memory::Device)?,
-                    source: gpu.buffer_with("gradient_source", &path.gradient_source(params))?,
+                    source: gpu.buffer_with("gradient_source", &source)?,
                     phase_dz: gpu.buffer("phase_dz", rows * 4, Memory::Device)?,
                 })
             }
@@ -155,7 +177,7 @@ impl Network {
             Layers::Matrices if setup.two_networks != 0 => FIRST_LOSS_SCALE_OF_TWO,
             Layers::Matrices => FIRST_LOSS_SCALE,
         };
-        Ok(Network { map: params.clone(), layers: tuning.layers, first_loss_scale, path, phase_bias, gradient })
+        Ok(Network { map: params.clone(), layers: tuning.layers, first_loss_scale, path, weights, gradient })
     }
 
     /// Where its parameters live.
@@ -189,8 +211,7 @@ impl Network {
     }
 
     fn find(&self, name: Binding) -> Option<&Buffer> {
-        let phase_bias = (name == Binding::phase_bias).then_some(&self.phase_bias);
-        phase_bias.or_else(|| self.path.find(name)).or_else(|| self.gradient.as_ref()?.find(name))
+        self.weights.find(name).or_else(|| self.path.find(name)).or_else(|| self.gradient.as_ref()?.find(name))
     }
 
     /// Records what depends on parameters alone: once per iteration.
@@ -199,16 +220,9 @@ impl Network {
     /// As [`Pass::run`]; so do all that follow.
     pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
         let (stage, params) = (&pass.kernels.mlp_latent_fwd, pass.network.map());
-        for (i, layer) in params.layers.iter().enumerate() {
-            let push = push::MlpLatentFwd {
-                layer: i as u32,
-                bias: layer.bias as u32,
-                latent_weight: layer.latent.unwrap_or(0) as u32,
-                has_latent: u32::from(layer.latent.is_some()),
-                latents: params.latents as u32,
-            };
-            pass.run(stage, stage.groups_for((params.phases * params.width) as u32), push)?;
-        }
+        let push = push::MlpLatentFwd { layers: params.layers.len() as u32, latents: params.latents as u32 };
+        let rows = (params.layers.len() * params.phases * params.width) as u32;
+        pass.run(stage, stage.groups_for(rows), push)?;
         self.path.record_weights(pass)
     }
 
@@ -233,13 +247,16 @@ impl Network {
     /// # Errors
     /// As [`Network::record_weights`].
     pub fn record_gradient(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let Some(gradient) = &self.gradient else { return Err(built_for_rendering()) };
+        if self.gradient.is_none() {
+            return Err(built_for_rendering());
+        }
         let (k, params) = (pass.kernels, pass.network.map());
         let PartialSums { splits, len: n_partials } = self.path.partial_sums(params);
         let (first, count) = (params.first as u32, params.len as u32);
-        let push = push::GradientNetwork { first, count, splits, n_partials };
-        pass.run(&k.gradient_network, k.gradient_network.groups_for(count), push)?;
-        self.path.record_phase_sums(pass, gradient)?;
+        let phase_sums = self.path.phase_source(params).len() as u32;
+        let push = push::GradientNetwork { first, count, phase_sums, splits, n_partials };
+        let lanes = (count + phase_sums) * k.tuning.gradient_parts();
+        pass.run(&k.gradient_network, k.gradient_network.groups_over(lanes), push)?;
         let mut accumulate_latents = 0;
         for (i, layer) in params.layers.iter().enumerate() {
             let Some(latent) = layer.latent else { continue };

@@ -24,7 +24,7 @@ use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages;
-use crate::kernels::tuning::{Layers, Tuning};
+use crate::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use crate::scan::dataset::Dataset;
 use compare::{Findings, Row};
 use serde::Serialize;
@@ -87,14 +87,23 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
         let presets = [Preset::Paper, Preset::PublicCode, Preset::FastMlp, Preset::NerfCa];
         presets.into_iter().try_for_each(|preset| drawing::compare_views(gpu, preset, tuning, findings))
     };
-    vec![
+    let mut parts: Vec<Part<'a>> = vec![
         (name("iterations"), Box::new(iterations)),
         (name("two networks"), Box::new(both)),
         (name("empty cells"), Box::new(move |findings| occupancy::compare(gpu, dataset, tuning, findings))),
         (name("views"), Box::new(views)),
         (name("volumes"), Box::new(move |findings| drawing::compare_volumes(gpu, tuning, findings))),
         (name("equal runs"), Box::new(move |findings| repeats::compare_network(gpu, dataset, tuning, findings))),
-    ]
+    ];
+    if tuning.layers == Layers::Matrices {
+        // What the backward pass computes again, or keeps, is the device's choice: the other way must be right, too.
+        let matrices = MatrixTuning { recompute: !tuning.matrices.recompute, ..tuning.matrices };
+        let other_way = Tuning { matrices, ..tuning.clone() };
+        let case = &iteration::MATRIX_CASES[0];
+        let iteration = move |findings: &mut Findings| iteration::compare(gpu, even, case, &other_way, findings);
+        parts.push((name("iterations the other way"), Box::new(iteration)));
+    }
+    parts
 }
 
 /// The parts about Gaussians and phantoms, which have no choice of layers.

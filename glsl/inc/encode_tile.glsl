@@ -24,7 +24,7 @@ uvec4 encoded_numbers(uint s, uint q) {
     float window = schedule[state.step].window;
     vec3 x = encoded_point(sample_points[s].xyz);
     Ray ray = rays[ray_of(sample_rays[s])];
-    for (uint pair = 0u; pair < 4u; pair++) {
+    [[dont_unroll]] for (uint pair = 0u; pair < 4u; pair++) {
         uint i = 8u * q + 2u * pair;
         packed[pair] = pack2(vec2(input_number(i, x, ray, window), input_number(i + 1u, x, ray, window)));
     }

@@ -14,13 +14,13 @@ const uint column_tiles = width / n;
 // Weight gradient: subgroups are laid out in bands over neurons times shares of the inputs.
 const uint bands = subgroups / shares;
 const uint grad_rows = (width / m + bands - 1u) / bands;
-const uint grad_columns = upper_columns / n / shares;
+const uint grad_columns = (upper_columns / n + shares - 1u) / shares;
 const uint lower_bands = subgroups / lower_shares;
 const uint lower_rows = (width / m + lower_bands - 1u) / lower_bands;
-const uint lower_grad_columns = lower_columns / n / lower_shares;
-// Rows of the last band beyond the neurons: none unless m and n differ. Constants, so that drivers drop the tests.
-const uint overhang = bands * grad_rows * m - width;
-const uint lower_overhang = lower_bands * lower_rows * m - width;
+const uint lower_grad_columns = (lower_columns / n + lower_shares - 1u) / lower_shares;
+// Whether tiles of the last band or share lie beyond the gradient. Constants, so that drivers drop the tests where none does.
+const bool overhangs = bands * grad_rows * m > width || shares * grad_columns * n > upper_columns;
+const bool lower_overhangs = lower_bands * lower_rows * m > width || lower_shares * lower_grad_columns * n > lower_columns;
 const uint most_rows = grad_rows > lower_rows ? grad_rows : lower_rows;
 const uint upper_tiles = grad_rows * grad_columns;
 // Input gradient, which only hidden inputs have: subgroups are dealt columns of tiles, and where there are more of them, shares
@@ -28,42 +28,60 @@ const uint upper_tiles = grad_rows * grad_columns;
 const uint row_shares = subgroups > column_tiles ? subgroups / column_tiles : 1u;
 const uint input_rows = row_tiles / row_shares;
 const uint input_columns = column_tiles * row_shares / subgroups;
-// Staging: an invocation keeps its eight neurons from tile to tile.
-const uint stage_rows = gl_WorkGroupSize.x / width8 > 0u ? gl_WorkGroupSize.x / width8 : 1u;
+// Sums over samples: an invocation has a neuron, or every so many of them, and of the rows one part.
+const uint row_parts = gl_WorkGroupSize.x / width > 0u ? gl_WorkGroupSize.x / width : 1u;
+const uint lane_neurons = (width + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
 const uint scratch = 2u * gl_WorkGroupSize.x;
 shared uvec4 tile_dz[tile * dz_stride > scratch ? tile * dz_stride : scratch];
 shared uvec4 tile_in[INPUTS_SIZE];
 
 SUM weight_gradient[upper_tiles + lower_rows * lower_grad_columns];
-// Sums over the samples of an invocation's eight neurons.
-float bias_sum[8];
-float lower_bias_sum[8];
+float bias_sum[lane_neurons];
+float lower_bias_sum[lane_neurons];
 // Largest gradient in f16: what is larger than any becomes infinite on some devices, the largest there is on others.
 float largest;
 shared uint overflowed;
 
-// Adds eight numbers of dz to a bias gradient.
-#define ADD_DZ(sums, packed)                                  \
-    [[unroll]] for (uint i = 0u; i < 4u; i++) {                \
-        vec2 dz_pair = unpackHalf2x16(packed[i]);              \
-        sums[2u * i] += dz_pair.x;                             \
-        sums[2u * i + 1u] += dz_pair.y;                        \
-    }
+// Of eight neurons' numbers, that of one.
+float neuron_of(uvec4 packed, uint neuron) {
+    vec2 pair = unpackHalf2x16(packed[(neuron & 7u) / 2u]);
+    return (neuron & 1u) == 0u ? pair.x : pair.y;
+}
 
-// The lower layer's dz, once it is in shared memory.
-void add_lower_bias() {
-    uint q = gl_LocalInvocationIndex % width8;
-    uint row0 = gl_LocalInvocationIndex / width8;
-    for (uint row = row0; row < tile && row0 < stage_rows; row += stage_rows) {
-        uvec4 packed = tile_dz[row * dz_stride + q];
-        ADD_DZ(lower_bias_sum, packed)
+// Adds up an invocation's share of the dz in shared memory.
+void add_dz(inout float sums[lane_neurons]) {
+    uint part = gl_LocalInvocationIndex / width;
+    [[unroll]] for (uint i = 0u; i < lane_neurons; i++) {
+        uint neuron = gl_LocalInvocationIndex % width + i * gl_WorkGroupSize.x;
+        if (part >= row_parts || neuron >= width) continue;
+        for (uint row = part; row < tile; row += row_parts) {
+            sums[i] += neuron_of(tile_dz[row * dz_stride + neuron / 8u], neuron);
+        }
     }
 }
 
-// A tile of the gradient to a layer's input, from the dz and the input in shared memory.
+void put(uint at, float value) {
+    partials[at] = value + (push.accumulate != 0u ? partials[at] : 0.0);
+}
+
+// Adds the sums of each invocation over the parts of the rows, in their order.
+void put_neuron_sums(float sums[lane_neurons], uint at) {
+    barrier();
+    tile_dz[gl_LocalInvocationIndex].x = floatBitsToUint(sums[0]);
+    barrier();
+    [[unroll]] for (uint i = 0u; i < lane_neurons; i++) {
+        uint neuron = gl_LocalInvocationIndex + i * gl_WorkGroupSize.x;
+        float total = sums[i];
+        for (uint part = 1u; part < row_parts; part++) total += uintBitsToFloat(tile_dz[part * width + neuron].x);
+        if (neuron < width) put(at + neuron, total);
+    }
+}
+
+// A tile of the gradient to a layer's input, from the dz and the input in shared memory. Beside the sums of two layers, operands of all
+// steps at once would not fit the registers.
 SUM16 input_gradient(uint weights_at, uint row, uint column) {
     SUM sum = SUM(0.0);
-    STEPS for (uint step = 0u; step < width / k; step++) {
+    [[dont_unroll]] for (uint step = 0u; step < width / k; step++) {
         LEFT dz;
         RIGHT weights;
         coopMatLoad(dz, tile_dz, row * dz_stride + step * k / 8u, dz_stride, ROWS);
@@ -105,23 +123,29 @@ struct Share {
     uint first_tile;
     uint rows;
     uint columns;
-    uint overhang;
+    bool overhangs;
     uint row0;
     uint column0;
+    uint width_in;
 };
 
 bool is_row(Share share, uint r) {
-    return share.overhang == 0u || share.row0 + r * m < width;
+    return !share.overhangs || share.row0 + r * m < width;
+}
+
+bool is_tile(Share share, uint r, uint c) {
+    return is_row(share, r) && (!share.overhangs || share.column0 + c * n < share.width_in);
 }
 
 Share upper_share() {
-    return Share(0u, grad_rows, grad_columns, overhang, gl_SubgroupID / shares * grad_rows * m,
-                 gl_SubgroupID % shares * grad_columns * n);
+    return Share(0u, grad_rows, grad_columns, overhangs, gl_SubgroupID / shares * grad_rows * m,
+                 gl_SubgroupID % shares * grad_columns * n, upper_columns);
 }
 
 Share lower_share() {
-    return Share(upper_tiles, lower_rows, lower_grad_columns, lower_overhang,
-                 gl_SubgroupID / lower_shares * lower_rows * m, gl_SubgroupID % lower_shares * lower_grad_columns * n);
+    return Share(upper_tiles, lower_rows, lower_grad_columns, lower_overhangs,
+                 gl_SubgroupID / lower_shares * lower_rows * m, gl_SubgroupID % lower_shares * lower_grad_columns * n,
+                 lower_columns);
 }
 
 void add_weight_gradient(Share share, uint inputs_at, uint stride) {
@@ -134,10 +158,12 @@ void add_weight_gradient(Share share, uint inputs_at, uint stride) {
         }
         [[unroll]] for (uint c = 0u; c < share.columns; c++) {
             RIGHT inputs;
-            coopMatLoad(inputs, tile_in, inputs_at + step * k * stride + (share.column0 + c * n) / 8u, stride, ROWS);
+            if (is_tile(share, 0u, c)) {
+                coopMatLoad(inputs, tile_in, inputs_at + step * k * stride + (share.column0 + c * n) / 8u, stride, ROWS);
+            }
             [[unroll]] for (uint r = 0u; r < share.rows; r++) {
                 uint t = share.first_tile + r * share.columns + c;
-                if (is_row(share, r)) weight_gradient[t] = coopMatMulAdd(dz[r], inputs, weight_gradient[t]);
+                if (is_tile(share, r, c)) weight_gradient[t] = coopMatMulAdd(dz[r], inputs, weight_gradient[t]);
             }
         }
     }
@@ -145,8 +171,8 @@ void add_weight_gradient(Share share, uint inputs_at, uint stride) {
 
 void put_weight_gradient(Share share, uint at, uint stride) {
     [[unroll]] for (uint r = 0u; r < share.rows; r++) {
-        if (is_row(share, r)) {
-            [[unroll]] for (uint c = 0u; c < share.columns; c++) {
+        [[unroll]] for (uint c = 0u; c < share.columns; c++) {
+            if (is_tile(share, r, c)) {
                 uint tile_at = at + (share.row0 + r * m) * stride + share.column0 + c * n;
                 SUM sum = weight_gradient[share.first_tile + r * share.columns + c];
                 // An overflow must show in the sums, for the loss scale to give way.
@@ -162,30 +188,9 @@ void put_weight_gradient(Share share, uint at, uint stride) {
     }
 }
 
-void put(uint at, float value) {
-    partials[at] = value + (push.accumulate != 0u ? partials[at] : 0.0);
-}
-
-// Adds the eight sums of each invocation over the rows of staging, in row order.
-void put_neuron_sums(float sums[8], uint at) {
-    barrier();
-    [[unroll]] for (uint i = 0u; i < 2u; i++) {
-        tile_dz[2u * gl_LocalInvocationIndex + i] =
-            floatBitsToUint(vec4(sums[4u * i], sums[4u * i + 1u], sums[4u * i + 2u], sums[4u * i + 3u]));
-    }
-    barrier();
-    for (uint neuron = gl_LocalInvocationIndex; neuron < width; neuron += gl_WorkGroupSize.x) {
-        float total = 0.0;
-        for (uint row = 0u; row < stage_rows; row++) {
-            total += uintBitsToFloat(tile_dz[2u * (row * width8 + neuron / 8u) + (neuron & 7u) / 4u][neuron & 3u]);
-        }
-        put(at + neuron, total);
-    }
-}
-
 void clear_sums() {
     [[unroll]] for (uint i = 0u; i < upper_tiles + lower_rows * lower_grad_columns; i++) weight_gradient[i] = SUM(0.0);
-    [[unroll]] for (uint i = 0u; i < 8u; i++) {
+    [[unroll]] for (uint i = 0u; i < lane_neurons; i++) {
         bias_sum[i] = 0.0;
         lower_bias_sum[i] = 0.0;
     }

@@ -181,6 +181,7 @@ impl Kernels {
         let vec4 = Build { variant: vec4_variant(&tuning), ..plain };
         let sums = Build { exchanges: true, ..plain };
         let private_lines = [("private_lines", tuning.private_lines(line_params))];
+        let parts = [("parts", tuning.gradient_parts())];
         let loss_scaling = [("loss_scaling", u32::from(tuning.layers == Layers::Matrices))];
         Ok(Kernels {
             batch: plain.stage(gpu)?,
@@ -200,7 +201,7 @@ impl Kernels {
             mlp_latent_fwd: plain.stage(gpu)?,
             mlp_latent_bwd: plain.stage(gpu)?,
             gradient_static: plain.stage(gpu)?,
-            gradient_network: plain.stage(gpu)?,
+            gradient_network: Build { constants: &parts, ..plain }.stage(gpu)?,
             reg_tv: plain.stage(gpu)?,
             adam: plain.stage(gpu)?,
             report: Build { constants: &loss_scaling, ..sums }.stage(gpu)?,

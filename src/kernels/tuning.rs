@@ -96,6 +96,9 @@ fn workgroups_untold(kind: DeviceKind) -> u32 {
     }
 }
 
+/// Partial sums that are too many for one invocation to add up.
+const MANY_SPLITS: u32 = 64;
+
 impl Tuning {
     /// Chooses for a device.
     pub fn for_device(info: &DeviceInfo) -> Tuning {
@@ -175,6 +178,15 @@ impl Tuning {
     /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_bwd`.
     pub(super) fn private_lines(&self, line_params: u32) -> u32 {
         if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
+    }
+
+    /// Invocations that share out the partial sums of a number of the network's gradient.
+    pub(crate) fn gradient_parts(&self) -> u32 {
+        let splits = match self.layers {
+            Layers::F32 => self.splits,
+            Layers::Matrices => self.matrices.workgroups,
+        };
+        if splits < MANY_SPLITS { 1 } else { 8 }
     }
 
     /// This tuning with the layers on another path, for the reason given.

@@ -20,14 +20,14 @@ use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
-use crate::kernels::tuning::Tuning;
+use crate::kernels::tuning::{MatrixTuning, Tuning};
 use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
 use crate::network::fused::shape::Shape;
-use crate::network::fused::span::{Part, Span, spans, work};
+use crate::network::fused::span::{Part, Span, recomputes, spans, work};
 use crate::network::ledger::Ledger;
 use crate::network::pass::Pass;
-use crate::network::{GradientBuffers, PartialSums, Path, Purpose, Tiles, built_for_rendering};
+use crate::network::{PartialSums, Path, Purpose, Tiles, built_for_rendering};
 
 /// Kernels and buffers of the fused network.
 pub(super) struct FusedNetwork {
@@ -61,8 +61,6 @@ struct FusedTraining {
     passes: Vec<BackwardPass>,
     /// dz at the neurons of one layer, and of the next that a pass leaves.
     dz16: [Buffer; 2],
-    /// Where the sum of dz over each phase lies in the partial sums.
-    phase_source: Buffer,
 }
 
 /// A pass through the layers of a span.
@@ -126,12 +124,16 @@ impl Builder<'_> {
         }
     }
 
-    /// Shares of the columns of a weight gradient: those with which subgroups load the fewest operands.
+    /// Shares of the columns of a weight gradient: those with which subgroups keep the fewest tiles, then load the fewest
+    /// operands.
     fn shares(&self, columns: u32) -> u32 {
         let (MatrixShape { m, n, .. }, subgroups) = (self.shape.matrix, self.shape.backward.subgroups);
-        let loads = |shares: &u32| (self.params.width as u32 / m).div_ceil(subgroups / shares) + columns / n / shares;
-        let divides = |shares: &u32| subgroups.is_multiple_of(*shares) && (columns / n).is_multiple_of(*shares);
-        [1, 2, 4].into_iter().filter(divides).min_by_key(loads).unwrap_or(1)
+        let cost = |shares: &u32| {
+            let rows = (self.params.width as u32 / m).div_ceil(subgroups / shares);
+            let columns = (columns / n).div_ceil(*shares);
+            (rows * columns, rows + columns)
+        };
+        [1, 2, 4].into_iter().filter(|shares| subgroups.is_multiple_of(*shares)).min_by_key(cost).unwrap_or(1)
     }
 
     fn backward(&self, span: Span) -> Result<BackwardStage> {
@@ -173,6 +175,11 @@ impl Builder<'_> {
     }
 }
 
+/// Whether the backward passes compute the encoding and the first layer of such a network again.
+pub(crate) fn computes_again(tuning: &MatrixTuning, params: &NetworkMap) -> bool {
+    tuning.recompute && recomputes(&spans(&params.layers))
+}
+
 impl FusedNetwork {
     /// # Errors
     /// [`Error::Config`] when device and network do not fit; errors of [`Gpu::matrix_pipeline`].
@@ -200,7 +207,6 @@ impl FusedNetwork {
                     gpu.buffer("dz16_a", capacity * width as u64 * 2, Memory::Device)?,
                     gpu.buffer("dz16_b", capacity * width as u64 * 2, Memory::Device)?,
                 ],
-                phase_source: gpu.buffer_with("phase_source", &shape.phase_source(params))?,
             }),
         };
         let kept = |per_sample: usize| match per_sample {
@@ -339,18 +345,8 @@ impl Path for FusedNetwork {
     }
 
     /// They are part of the partial sums.
-    fn record_phase_sums(&self, pass: &mut Pass<'_>, gradient: &GradientBuffers) -> Result<()> {
-        let (stage, params, training) = (&pass.kernels.gradient_network, pass.network.map(), self.training()?);
-        let count = (params.layers.len() * params.phases * params.width) as u32;
-        let PartialSums { splits, len: n_partials } = self.partial_sums(params);
-        let bound =
-            [(Binding::source, (&training.phase_source).into()), (Binding::gradient, (&gradient.phase_dz).into())];
-        pass.run_with(
-            stage,
-            stage.groups_for(count),
-            &bound,
-            push::GradientNetwork { first: 0, count, splits, n_partials },
-        )
+    fn phase_source(&self, params: &NetworkMap) -> Vec<u32> {
+        self.shape.phase_source(params)
     }
 }
 

@@ -14,9 +14,7 @@ use crate::model::params::{Layer, NetworkMap};
 use crate::network::chunk::{Chunk, chunk_rays};
 use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
-use crate::network::{
-    F32_BYTES, GradientBuffers, PartialSums, Path, Purpose, SAMPLE_BYTES, Tiles, built_for_rendering,
-};
+use crate::network::{F32_BYTES, PartialSums, Path, Purpose, SAMPLE_BYTES, Tiles, built_for_rendering};
 
 /// Kernels and buffers of the f32 network.
 pub(super) struct LayerNetwork {
@@ -290,10 +288,6 @@ impl Path for LayerNetwork {
                 self.record_phase_sum(pass, i, chunk)?;
             }
         }
-        Ok(())
-    }
-
-    fn record_phase_sums(&self, _: &mut Pass<'_>, _: &GradientBuffers) -> Result<()> {
         Ok(())
     }
 }

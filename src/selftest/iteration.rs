@@ -12,6 +12,7 @@ use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::params::{ParamMap, Tensor};
 use crate::network::chunk::chunks;
+use crate::network::fused::computes_again;
 use crate::network::{FIRST_LOSS_SCALE, FIRST_LOSS_SCALE_OF_TWO};
 use crate::plan::Plan;
 use crate::reference::field::{self, Precision, Shown};
@@ -104,6 +105,9 @@ const OUTPUT_BACKWARD: &[&str] =
     &[push::MlpOutBwd::SHADER, push::MlpOutBwdWeight::SHADER, push::GradientNetwork::SHADER];
 const LAYERS_BACKWARD: &[&str] = &[push::MlpLayerBwdInput::SHADER, push::MlpLayerBwdWeight::SHADER];
 const BACKWARD_ON_MATRICES: &[&str] = &[push::MlpFusedBwd::SHADER, push::GradientNetwork::SHADER];
+/// Where the first layer is computed again.
+const BACKWARD_AGAIN_ON_MATRICES: &[&str] =
+    &[push::MlpFusedBwd::SHADER, push::MlpFusedBwdFirst::SHADER, push::GradientNetwork::SHADER];
 const LATENTS_BACKWARD: &[&str] = &[push::MlpRaySum::SHADER, push::MlpPhaseSum::SHADER, push::MlpLatentBwd::SHADER];
 const LATENTS_BACKWARD_ON_MATRICES: &[&str] = &[push::MlpLatentBwd::SHADER];
 const TOTAL_VARIATION: &[&str] = &[push::RegTv::SHADER];
@@ -148,6 +152,8 @@ struct Twin<'a> {
     rays: Vec<march::Ray>,
     precision: Precision,
     tolerances: Tolerances,
+    /// Whether the backward pass computes the first layer again.
+    computes_again: bool,
 }
 
 /// What the device made in an iteration.
@@ -225,7 +231,7 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
     gpu.upload(&trainer.forward().params, 0, &params)?;
     let mut moments = vec![[0f32; 2]; params.len()];
     for _ in 0..ITERATIONS {
-        compare_stages(gpu, &mut trainer, &params, findings)?;
+        compare_stages(gpu, &mut trainer, &params, tuning, findings)?;
         (params, moments) = compare_update(gpu, &trainer, &params, &moments, findings)?;
     }
     Ok(())
@@ -235,7 +241,13 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
 pub(super) const ITERATIONS: usize = 2;
 
 /// Runs an iteration, which begins with `params`, and compares its stages.
-fn compare_stages(gpu: &Gpu, trainer: &mut Trainer, params: &[f32], findings: &mut Findings) -> Result<()> {
+fn compare_stages(
+    gpu: &Gpu,
+    trainer: &mut Trainer,
+    params: &[f32],
+    tuning: &Tuning,
+    findings: &mut Findings,
+) -> Result<()> {
     let step = trainer.step();
     let loss = one_iteration(trainer)?;
     let seen = Seen::download(gpu, trainer, loss)?;
@@ -243,7 +255,9 @@ fn compare_stages(gpu: &Gpu, trainer: &mut Trainer, params: &[f32], findings: &m
     let precision = precision_of(trainer);
     let plan = trainer.plan();
     let tolerances = Tolerances::of(precision, gpu.info());
-    let twin = Twin { plan, step, params: &params, rays: march::batch(plan, step), precision, tolerances };
+    let computes_again = computes_again(&tuning.matrices, &plan.params.moving);
+    let twin =
+        Twin { plan, step, params: &params, rays: march::batch(plan, step), precision, tolerances, computes_again };
     twin.compare_rays(&seen, findings);
     if let Some(samples) = &seen.samples {
         twin.compare_samples(samples, &seen, findings);
@@ -304,6 +318,15 @@ pub fn sine_factor(info: &DeviceInfo) -> f64 {
 impl Twin<'_> {
     fn on_matrices(&self) -> bool {
         self.precision != Precision::Exact
+    }
+
+    /// The stages that make the gradient of the output neuron, of layers and of latents.
+    fn backward_stages(&self) -> [&'static [&'static str]; 3] {
+        if !self.on_matrices() {
+            return [OUTPUT_BACKWARD, LAYERS_BACKWARD, LATENTS_BACKWARD];
+        }
+        let backward = if self.computes_again { BACKWARD_AGAIN_ON_MATRICES } else { BACKWARD_ON_MATRICES };
+        [backward, backward, LATENTS_BACKWARD_ON_MATRICES]
     }
 
     fn compare_rays(&self, seen: &Seen, findings: &mut Findings) {
@@ -453,7 +476,7 @@ impl Twin<'_> {
             let shown = self.shown(sample);
             march::sample_bwd(self.plan, self.params, shown, &trace, by_integral, self.precision, &mut want);
         }
-        for Part { stages, name, positions } in parts(params, self.on_matrices()) {
+        for Part { stages, name, positions } in parts(params, self.backward_stages()) {
             let (got, want) = (pick(&positions, &seen.gradient), pick(&positions, &want));
             findings.numbers(stages, &name, &got, &want, self.tolerances.gradient);
         }
@@ -509,12 +532,7 @@ struct Part {
 }
 
 /// The network's gradient by the stages that make it: the columns of latents are apart from the weights beside them.
-fn parts(params: &ParamMap, on_matrices: bool) -> Vec<Part> {
-    let [output, layers, latents] = if on_matrices {
-        [BACKWARD_ON_MATRICES, BACKWARD_ON_MATRICES, LATENTS_BACKWARD_ON_MATRICES]
-    } else {
-        [OUTPUT_BACKWARD, LAYERS_BACKWARD, LATENTS_BACKWARD]
-    };
+fn parts(params: &ParamMap, [output, layers, latents]: [&'static [&'static str]; 3]) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut last = Vec::new();
     for tensor in params.tensors().into_iter().filter(|tensor| !is_static(tensor)) {

@@ -5,7 +5,8 @@ use crate::gpu::capabilities::{DeviceInfo, MatrixShape};
 use crate::kernels::constants::{NOWHERE, PHASE_BIAS};
 use crate::kernels::tuning::MatrixTuning;
 use crate::model::params::NetworkMap;
-use crate::network::fused::span::{Part, recomputes, spans};
+use crate::network::fused::computes_again;
+use crate::network::fused::span::Part;
 
 /// Shared memory beside the tiles, bytes.
 const SHARED_RESERVE: u32 = 512;
@@ -102,7 +103,7 @@ impl Shape {
         let skips = params.layers.iter().skip(1).any(|l| l.encoded.is_some());
         let rows = if skips { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
         let fwd_tile = room.tile(tuning.largest_tile, |t| t * (rows + 4 * n));
-        let recompute = tuning.recompute && recomputes(&spans(&params.layers));
+        let recompute = computes_again(tuning, params);
         let inputs_row = if recompute { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
         let backward = |subgroups: u32| {
             let scratch = 2 * 16 * subgroups * info.matrix_subgroup;
