@@ -4,7 +4,7 @@ use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::gaussians::blobs::BlobKernels;
 use crate::gaussians::pictures::into_buffers;
-use crate::gaussians::stages::GaussianKernels;
+use crate::gaussians::stages::{GaussianKernels, SplatStage};
 use crate::gaussians::tree::TreeKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
@@ -15,6 +15,7 @@ use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamMap;
 use crate::network::{Network, Purpose};
 use crate::r2::stages::R2Kernels;
+use crate::x_gaussian::stages::XKernels;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -119,6 +120,12 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
                 R2Kernels::new(gpu)?;
                 // Pictures are drawn by a stage of other fits.
                 Build::default().stage::<push::GaussianProject>(gpu)?;
+            }
+            GaussianForm::X => {
+                XKernels::new(gpu)?;
+                // Which these have at hand, too.
+                Build::default().stage::<push::GaussianProject>(gpu)?;
+                SplatStage::<push::GaussianSplat>::new(gpu)?;
             }
             form => {
                 GaussianKernels::new(gpu)?;

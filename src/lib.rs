@@ -193,6 +193,18 @@ pub mod r2 {
     pub mod start;
 }
 
+/// X-Gaussian, another static method that the paper compares itself with: its data, where it begins, its stages and density
+/// control.
+pub mod x_gaussian {
+    pub mod data;
+    pub mod densify;
+    pub mod particles;
+    pub mod picture;
+    pub mod setup;
+    pub mod stages;
+    pub mod start;
+}
+
 pub mod plan;
 
 /// Drawing a model, for any pose and phase.
@@ -221,6 +233,7 @@ pub mod train {
     pub mod training;
     pub mod tree;
     pub mod tree_start;
+    pub mod x_gaussian;
 }
 
 /// A model for other tools: volumes, surfaces and motion.
@@ -340,6 +353,7 @@ pub mod reference {
     pub mod r2;
     pub mod step;
     pub mod tree;
+    pub mod x_gaussian;
 }
 
 #[cfg(feature = "diagnostics")]

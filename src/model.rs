@@ -13,6 +13,8 @@ mod r2_tensors;
 pub mod scene;
 mod schedule;
 pub mod setup;
+pub mod x_gaussian;
+mod x_tensors;
 
 use crate::config::Config;
 use crate::geometry::CArm;

@@ -88,6 +88,7 @@ fn tree() -> MovingTree {
             rows: (0..6).map(gaussian).collect(),
             step: 1,
             is_crowd: false,
+            intensities: None,
         },
         setup: TreeSetup {
             n_nodes: NODES,
@@ -134,6 +135,7 @@ fn saved(model: Model, path: &Path) -> String {
         stopped: false,
         last_report: Vec::new(),
         r2: None,
+        x: None,
         data_fingerprint: "none".into(),
     };
     checkpoint.write(path).unwrap();

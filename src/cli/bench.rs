@@ -290,7 +290,7 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
     let notes = fits.notes().to_vec();
     drop(fits);
     let whole_fit_s = |iterations: u32| gaussians.preparation_s + 1e-3 * gaussians.median() * f64::from(iterations);
-    if config.is_r2() {
+    if config.has_gaussians_alone() {
         return Ok(Timings {
             paths: notes,
             rays: 0,

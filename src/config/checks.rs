@@ -25,6 +25,7 @@ impl Config {
         self.gaussians.check_ranges()?;
         self.tree.check_ranges()?;
         self.r2.check_ranges()?;
+        self.x.check_ranges()?;
         if self.gaussians.least_scale > self.gaussians.greatest_scale {
             let problem = format!("exceeds gaussians.greatest_scale = {}", self.gaussians.greatest_scale);
             return Err(Error::config("gaussians.least_scale", self.gaussians.least_scale, problem));
@@ -57,7 +58,9 @@ impl Config {
         if self.two_networks() {
             self.check_two_networks()?;
         }
+        self.check_gaussians_alone()?;
         self.check_r2()?;
+        self.check_x()?;
         if m.along_axis && self.gaussians_move() {
             let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
             return Err(Error::config("march.along_axis", true, problem));
@@ -113,10 +116,10 @@ impl Config {
         Ok(())
     }
 
-    /// Refuses what R2-Gaussian cannot do, and a run without a still field where that is not meant.
-    fn check_r2(&self) -> Result<()> {
+    /// Refuses what R2-Gaussian and X-Gaussian cannot do, and a run without a still field where that is not meant.
+    fn check_gaussians_alone(&self) -> Result<()> {
         let form = self.static_field.form;
-        if !self.is_r2() {
+        if !self.has_gaussians_alone() {
             if form == StaticForm::None {
                 let problem = "all other methods have a still field: take \"tensor\", or gaussians.form = \"r2\"";
                 return Err(Error::config("static.form", form.name(), problem));
@@ -124,7 +127,8 @@ impl Config {
             return Ok(());
         }
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
-            Err(Error::config(field, value, format!("does not go with gaussians.form = \"r2\": {instead}")))
+            let form = self.gaussians.form.name();
+            Err(Error::config(field, value, format!("does not go with gaussians.form = \"{form}\": {instead}")))
         };
         if form != StaticForm::None {
             return refuse("static.form", &form.name(), "its Gaussians are the whole object; take \"none\"");
@@ -141,6 +145,14 @@ impl Config {
         if self.loss.dynamic_target != DynamicTarget::Absolute {
             return refuse("loss.dynamic_target", &"temporal", "it is fitted to whole images; take \"absolute\"");
         }
+        Ok(())
+    }
+
+    /// Refuses settings of R2-Gaussian that contradict each other.
+    fn check_r2(&self) -> Result<()> {
+        if !self.is_r2() {
+            return Ok(());
+        }
         let r2 = &self.r2;
         if r2.tv_box > r2.voxels {
             return Err(Error::config("r2.tv_box", r2.tv_box, format!("exceeds r2.voxels = {}", r2.voxels)));
@@ -151,6 +163,28 @@ impl Config {
         }
         if r2.count > r2.most {
             return Err(Error::config("r2.count", r2.count, format!("exceeds r2.most = {}", r2.most)));
+        }
+        Ok(())
+    }
+
+    /// Refuses settings of X-Gaussian that contradict each other.
+    fn check_x(&self) -> Result<()> {
+        if !self.is_x() {
+            return Ok(());
+        }
+        let x = &self.x;
+        if x.interval > x.voxels {
+            return Err(Error::config("x.interval", x.interval, format!("exceeds x.voxels = {}", x.voxels)));
+        }
+        let count = x.voxels.div_ceil(x.interval).pow(3);
+        if count > x.most {
+            let problem =
+                format!("x.voxels = {} and x.interval = {} begin with {count} Gaussians", x.voxels, x.interval);
+            return Err(Error::config("x.most", x.most, problem));
+        }
+        if x.first_opacity < x.weakest {
+            let problem = format!("is below x.weakest = {}: none would stay", x.weakest);
+            return Err(Error::config("x.first_opacity", x.first_opacity, problem));
         }
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! The presets.
 
 use crate::config::sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree, X,
 };
 use crate::config::{
     CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset, R2Start, StaticData, StaticForm,
@@ -17,6 +17,7 @@ impl Config {
             Preset::PublicCode => public_code(paper()),
             Preset::NerfCa => nerf_ca(paper()),
             Preset::R2Gaussian => r2_gaussian(paper()),
+            Preset::XGaussian => x_gaussian(paper()),
         }
     }
 }
@@ -97,6 +98,7 @@ fn paper() -> Config {
         gaussians: gaussians(),
         tree: tree(),
         r2: r2(),
+        x: x(),
     }
 }
 
@@ -279,6 +281,50 @@ fn r2_gaussian(paper: Config) -> Config {
         adam: Adam { beta2: 0.999, epsilon: 1e-15, ..paper.adam },
         gaussians: Gaussians { form: GaussianForm::R2, ..paper.gaussians },
         ..paper
+    }
+}
+
+/// The constants of X-Gaussian's public code for most of its scenes, for a run of 20,000 iterations.
+pub(super) fn x() -> X {
+    X {
+        static_data: StaticData::PerPhase,
+        normalise: true,
+        clamp: 1.0,
+        half_extent_mm: 0.0,
+        voxels: 256,
+        interval: 8,
+        extent_mm: 0.0,
+        first_opacity: 0.1,
+        position_rate: 1.9e-4,
+        position_rate_end: 1.9e-6,
+        intensity_rate: 0.002,
+        degree_every: 1000,
+        opacity_rate: 0.008,
+        scale_rate: 0.005,
+        rotation_rate: 0.001,
+        ssim: 0.2,
+        densify_every: 200,
+        densify_from: 500,
+        densify_until: 8000,
+        densify_gradient: 2.6e-5,
+        size_limit: 0.01,
+        most: 500_000,
+        weakest: 0.005,
+        greatest_scale: 0.1,
+        greatest_radius: 0.0,
+        reset_every: 4000,
+        reset_opacity: 0.01,
+    }
+}
+
+/// X-Gaussian as its public code does it: a static method, fitted to the normalised images of each phase.
+fn x_gaussian(paper: Config) -> Config {
+    let r2 = r2_gaussian(paper);
+    Config {
+        preset: Preset::XGaussian,
+        train: Train { iterations: 20_000, ..r2.train },
+        gaussians: Gaussians { form: GaussianForm::X, ..r2.gaussians },
+        ..r2
     }
 }
 

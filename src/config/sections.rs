@@ -91,7 +91,7 @@ section! {
 section! {
     /// The static field. As a network ("network") it has the dynamic one's layers, and of what is below the learning rate alone.
     StaticField, "static" {
-        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian alone.
+        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian and X-Gaussian.
         #[serde(default)] form: StaticForm,
         /// Cells per axis, D.
         grid: u32 in 2.0 to 512.0,
@@ -414,5 +414,67 @@ section! {
         most: u32 in 1.0 to 1_048_576.0,
         /// Density below which a Gaussian is taken away.
         weakest: f64 in 0.0 to 1e3,
+    }
+}
+
+section! {
+    /// Gaussians as X-Gaussian fits them (`gaussians.form = "x"`), with what its code uses for most of its scenes as defaults.
+    X, "x" {
+        /// Which images a set of Gaussians sees: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one set).
+        static_data: StaticData,
+        /// Divide line integrals by the vessels' attenuation where the dataset states it, before they are clamped.
+        normalise: bool,
+        /// What line integrals are clamped to, from 0 on, before each image is scaled to 0 to 1; 0 = not at all.
+        clamp: f64 in 0.0 to 1e6,
+        /// Half side of the volume, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is less.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Voxels along each side of the volume.
+        voxels: u32 in 1.0 to 2048.0,
+        /// Voxels from the centre where a Gaussian begins to the next, along each axis.
+        interval: u32 in 1.0 to 2048.0,
+        /// Extent of the scene, mm, which rates of positions and bounds of scales count in; 0 = 1.1 times the largest distance of
+        /// a source from the mean of the sources.
+        extent_mm: f64 in 0.0 to 1e6,
+        /// Opacity at the start.
+        first_opacity: f64 in 1e-6 to 0.99,
+        /// Adam's rate of positions at the start, extents; it falls by a constant factor per iteration.
+        position_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of positions at the end.
+        position_rate_end: f64 in 1e-12 to 100.0,
+        /// Adam's rate of colours' first coefficients; those of higher degrees have a twentieth.
+        intensity_rate: f64 in 1e-12 to 100.0,
+        /// Iterations after which colours gain a degree, up to three, which makes intensities faster; 0 = never.
+        degree_every: u32 in 0.0 to 1e6,
+        /// Adam's rate of opacities, before the sigmoid.
+        opacity_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of logarithms of scales.
+        scale_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of quaternions.
+        rotation_rate: f64 in 1e-12 to 100.0,
+        /// Weight of 1 - SSIM; the mean absolute difference has the rest of 1.
+        ssim: f64 in 0.0 to 0.99,
+        /// Iterations after which Gaussians are added and taken away, and again after as many; 0 = never.
+        densify_every: u32 in 0.0 to 1e6,
+        /// Iteration beyond which that begins.
+        densify_from: u32 in 0.0 to 1e6,
+        /// Iteration from which it no longer happens.
+        densify_until: u32 in 0.0 to 1e6,
+        /// Mean gradient of the loss by a centre, in half images, from which a Gaussian is cloned or split.
+        densify_gradient: f64 in 0.0 to 1e6,
+        /// Greatest standard deviation, extents, up to which a Gaussian is cloned, and beyond which it is split.
+        size_limit: f64 in 0.0 to 10.0,
+        /// Most Gaussians of a set.
+        most: u32 in 1.0 to 16_777_216.0,
+        /// Opacity below which a Gaussian is taken away.
+        weakest: f64 in 0.0 to 1.0,
+        /// Greatest standard deviation, extents, beyond which a Gaussian is taken away once opacities have been reset.
+        greatest_scale: f64 in 0.0 to 1e6,
+        /// Radius in a picture, pixels, beyond which a Gaussian is taken away then, too; 0 = whatever it is. The code says 20, but
+        /// forgets radii before it looks at them.
+        greatest_radius: f64 in 0.0 to 1e6,
+        /// Iterations after which opacities are reset, while Gaussians are added; 0 = never.
+        reset_every: u32 in 0.0 to 1e6,
+        /// What larger opacities are reset to.
+        reset_opacity: f64 in 1e-6 to 0.99,
     }
 }

@@ -13,6 +13,8 @@ use crate::model::params::ParamMap;
 use crate::model::r2::R2State;
 use crate::model::r2_tensors;
 use crate::model::scene::Scene;
+use crate::model::x_gaussian::XState;
+use crate::model::x_tensors;
 use glam::DVec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -48,6 +50,8 @@ pub struct Checkpoint {
     pub last_report: Vec<u32>,
     /// State of a fit as R2-Gaussian does it; none of other methods.
     pub r2: Option<R2State>,
+    /// State of a fit as X-Gaussian does it; none of other methods.
+    pub x: Option<XState>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
 }
@@ -177,6 +181,7 @@ impl Checkpoint {
             tensors.extend(gaussian_tensors::tensors(field));
         }
         tensors.extend(self.r2.iter().flat_map(r2_tensors::tensors));
+        tensors.extend(self.x.iter().flat_map(x_tensors::tensors));
         for tensor in model.param_map.tensors() {
             if model.moving.is_some() && tensor.name.starts_with(NETWORK) {
                 continue;
@@ -338,9 +343,10 @@ impl Checkpoint {
             Ok(view) if view.dtype() == Dtype::U32 => to_words(view.data()),
             _ => Vec::new(),
         };
-        let is_r2 = header.config.is_r2();
+        let (is_r2, is_x) = (header.config.is_r2(), header.config.is_x());
         Ok(Checkpoint {
             r2: is_r2.then(|| r2_tensors::read(&tensors, header.phases, path)).transpose()?,
+            x: is_x.then(|| x_tensors::read(&tensors, header.phases, path)).transpose()?,
             occupancy: words(OCCUPANCY),
             last_report: words(LAST_REPORT),
             model: Model {

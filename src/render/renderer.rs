@@ -36,7 +36,7 @@ const FIRST_RAYS: u32 = 4096;
 pub struct Rendering {
     /// Line integral of the static field.
     pub static_integral: Vec<f32>,
-    /// Line integral of the dynamic field.
+    /// Line integral of the dynamic field; of X-Gaussian what it shows instead, from about 0 to 1.
     pub dynamic_integral: Vec<f32>,
     /// Largest attenuation of the static field along the ray.
     pub static_max: Vec<f32>,
@@ -266,6 +266,12 @@ impl Renderer {
         pictures.draw_into(target, rays, size, phase, in_front)
     }
 
+    /// Whether nearer Gaussians hide those behind them, as X-Gaussian's do: in place of line integrals are blended pictures, from
+    /// about 0 to 1, and attenuation is a sum of opacities.
+    pub fn is_blended(&self) -> bool {
+        self.pictures.as_ref().is_some_and(Pictures::are_blended)
+    }
+
     /// Whether Gaussians are the moving field, not a network.
     pub fn gaussians_move(&self) -> bool {
         self.moving.is_some()
@@ -367,6 +373,9 @@ impl Renderer {
             let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
             out.extend(&seen);
             first_pixel += n_rays;
+        }
+        if let Some(pictures) = self.pictures.as_ref().filter(|pictures| pictures.are_blended()) {
+            out.dynamic_integral = pictures.draw(rays, (width, height), taken.phase)?;
         }
         Ok(out)
     }

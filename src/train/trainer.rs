@@ -75,7 +75,7 @@ pub struct Trainer {
 
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
-    let has_gaussians = plan.targets.is_some() || plan.r2.is_some();
+    let has_gaussians = plan.targets.is_some() || plan.r2.is_some() || plan.x.is_some();
     if checkpoint.model.param_map == plan.params && checkpoint.model.moving.is_some() == has_gaussians {
         return Ok(());
     }
@@ -231,7 +231,7 @@ impl Trainer {
             })?;
             recording.finish()
         };
-        let has_still_field = !plan.config.is_r2();
+        let has_still_field = !plan.config.has_gaussians_alone();
         let single = has_still_field.then(record_single).transpose()?;
         let trainer = Trainer {
             pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit),
@@ -250,7 +250,8 @@ impl Trainer {
             reported: step,
             first_loss: None,
             moving,
-            vessel_attenuation: dataset.vessel_attenuation,
+            // X-Gaussian's opacities are no attenuation.
+            vessel_attenuation: dataset.vessel_attenuation.filter(|_| !plan.config.is_x()),
             c_arm: dataset.reference_c_arm(),
             image_size: dataset.reference_view().size,
             data_fingerprint,
@@ -504,9 +505,12 @@ impl Trainer {
         let occupancy = copy(&self.forward.occupancy, 0, occupancy_bytes(&self.plan.setup))?;
         let commands = recording.finish()?;
         let ticket = commands.submit()?;
-        let (mut model, mut r2) = (self.outline(), None);
+        let (mut model, mut r2, mut x) = (self.outline(), None, None);
         if let Some((state, field)) = self.moving.as_ref().map(Moving::r2_state).transpose()?.flatten() {
             (model.moving, r2) = (Some(field), Some(state));
+        }
+        if let Some((state, field)) = self.moving.as_ref().map(Moving::x_state).transpose()?.flatten() {
+            (model.moving, x) = (Some(field), Some(state));
         }
         Ok(Snapshot {
             gpu: self.gpu.clone(),
@@ -521,6 +525,7 @@ impl Trainer {
             scaled: self.network.layers() == Layers::Matrices,
             model,
             r2,
+            x,
             data_fingerprint: self.data_fingerprint.clone(),
         })
     }
