@@ -9,7 +9,7 @@ pub mod sections;
 use crate::choice::Choice;
 use crate::error::{Error, Result};
 use sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train, Tree,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -31,11 +31,20 @@ pub enum Preset {
     NerfCa,
     /// R2-Gaussian, a static method the paper compares itself with: each phase by itself, all of it Gaussians.
     R2Gaussian,
+    /// SAX-NeRF, a static method the paper compares itself with: each phase by itself, a hash grid and a Lineformer.
+    SaxNerf,
 }
 
 impl Choice for Preset {
-    const ALL: &'static [Preset] =
-        &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa, Preset::R2Gaussian];
+    const ALL: &'static [Preset] = &[
+        Preset::Fast,
+        Preset::FastMlp,
+        Preset::Paper,
+        Preset::PublicCode,
+        Preset::NerfCa,
+        Preset::R2Gaussian,
+        Preset::SaxNerf,
+    ];
 
     fn name(self) -> &'static str {
         match self {
@@ -45,6 +54,7 @@ impl Choice for Preset {
             Preset::PublicCode => "public-code",
             Preset::NerfCa => "nerf-ca",
             Preset::R2Gaussian => "r2-gaussian",
+            Preset::SaxNerf => "sax-nerf",
         }
     }
 }
@@ -70,6 +80,29 @@ impl Choice for StaticForm {
             StaticForm::Tensor => "tensor",
             StaticForm::Network => "network",
             StaticForm::None => "none",
+        }
+    }
+}
+
+/// What the dynamic field is where no Gaussians are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DynamicForm {
+    /// A network on encoded coordinates and latents.
+    #[default]
+    Network,
+    /// A hash grid and a Lineformer as SAX-NeRF fits them to whole images, for each phase or for all: no still field beside
+    /// them.
+    Lineformer,
+}
+
+impl Choice for DynamicForm {
+    const ALL: &'static [DynamicForm] = &[DynamicForm::Network, DynamicForm::Lineformer];
+
+    fn name(self) -> &'static str {
+        match self {
+            DynamicForm::Network => "network",
+            DynamicForm::Lineformer => "lineformer",
         }
     }
 }
@@ -235,6 +268,9 @@ pub struct Config {
     /// Gaussians as R2-Gaussian fits them; checkpoints of before have none.
     #[serde(default = "presets::r2")]
     pub r2: R2,
+    /// A hash grid and a Lineformer as SAX-NeRF fits them; checkpoints of before have none.
+    #[serde(default = "presets::sax")]
+    pub sax: Sax,
 }
 
 impl Config {
@@ -293,6 +329,16 @@ impl Config {
     /// Whether the moving field is R2-Gaussian's, which is all there is: the still field is nothing.
     pub fn is_r2(&self) -> bool {
         self.gaussians.form == GaussianForm::R2
+    }
+
+    /// Whether the dynamic field is SAX-NeRF's, which is all there is: the still field is nothing.
+    pub fn is_sax(&self) -> bool {
+        self.dynamic.form == DynamicForm::Lineformer
+    }
+
+    /// Whether the network on encoded coordinates is the moving field.
+    pub fn network_moves(&self) -> bool {
+        !self.gaussians_move() && !self.is_sax()
     }
 
     /// Whether the moving field takes displacements of the heart, frame by frame: a method that sees whole images cannot.
@@ -386,6 +432,8 @@ mod tests {
             ("static.form=none", "static.form"),
             ("gaussians.form=r2", "static.form"),
             ("r2.count=0", "r2.count"),
+            ("dynamic.form=lineformer", "static.form"),
+            ("sax.levels=0", "sax.levels"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
@@ -433,6 +481,29 @@ mod tests {
     }
 
     #[test]
+    fn what_does_not_go_with_sax_nerf_is_named() {
+        for (setting, part) in [
+            ("static.form=tensor", "static.form"),
+            ("dynamic.form=network", "static.form"),
+            ("gaussians.form=r2", "gaussians.form"),
+            ("hull.enabled=true", "hull.enabled"),
+            ("occupancy.enabled=true", "occupancy.enabled"),
+            ("loss.normalise=true", "loss.normalise"),
+            ("loss.dynamic_target=temporal", "loss.dynamic_target"),
+            ("march.along_axis=true", "march.along_axis"),
+            ("sax.levels=3", "sax.levels"),
+            ("sax.samples=7", "sax.samples"),
+            ("sax.base=65536", "sax.base"),
+            ("sax.log2_table=30", "sax.log2_table"),
+            ("sax.window=0", "sax.window"),
+            ("sax.static_data=both", "both"),
+        ] {
+            let message = Config::load(Some(Preset::SaxNerf), None, &[setting.into()]).unwrap_err().to_string();
+            assert!(message.contains(part), "{setting}: {message}");
+        }
+    }
+
+    #[test]
     fn a_printed_configuration_reads_back() {
         for preset in Preset::ALL.iter().copied() {
             let config = Config::preset(preset);
@@ -446,8 +517,10 @@ mod tests {
         let config = Config::preset(Preset::FastMlp);
         let mut table = toml::Table::try_from(&config).unwrap();
         assert!(table.remove("gaussians").is_some() && table.remove("tree").is_some());
-        assert!(table.remove("networks").is_some() && table.remove("r2").is_some());
-        for (section, key) in [("static", "form"), ("march", "along_axis"), ("adam", "decay_share")] {
+        assert!(table.remove("networks").is_some() && table.remove("r2").is_some() && table.remove("sax").is_some());
+        for (section, key) in
+            [("static", "form"), ("dynamic", "form"), ("march", "along_axis"), ("adam", "decay_share")]
+        {
             assert!(table[section].as_table_mut().unwrap().remove(key).is_some());
         }
         assert_eq!(table.try_into::<Config>().unwrap(), config);

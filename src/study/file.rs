@@ -256,6 +256,9 @@ fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
             ("r2.densify_until", preset.r2.densify_until),
         ]);
     }
+    if preset.is_sax() {
+        schedule.push(("sax.rate_falls_at", preset.sax.rate_falls_at));
+    }
     let moved = schedule.into_iter().filter(|(key, _)| !given.contains(key));
     let least = |key: &str| if key == DENSIFY_EVERY { LEAST_BETWEEN_DENSIFYING } else { 0.0 };
     let moved = moved.map(|(key, count)| format!("{key}={}", (share * f64::from(count)).round().max(least(key))));
