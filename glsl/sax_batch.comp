@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Draws the rays of an iteration of one field, all of the image whose turn it is (images go in their order): windows of the
-// image's tiling, then single pixels outside of them that show something; neither twice in an iteration, unless there are
-// fewer. One invocation per ray.
+// Draws the rays of an iteration of one field, all of the image whose turn it is (images go in their order): windows
+// of the image's tiling, then single pixels outside of them that show something; neither twice in an iteration, unless
+// there are fewer. One invocation per ray.
 #include "inc/layout.glsl"
 #include "inc/sax_layout.glsl"
 #include "inc/random.glsl"

@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// The hash grid at samples: two features of each level, between eight entries. One invocation per sample and pair of levels.
+// The hash grid at samples: two features of each level, between eight entries. One invocation per sample and pair of
+// levels.
 //   sax_encoding[pair of levels][sample]
 #include "inc/sax_layout.glsl"
 #include "inc/sax_hash.glsl"

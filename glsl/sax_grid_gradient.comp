@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of the grid's numbers from its sums in fixed point, which it clears for the next field. One invocation per number.
+// Gradient of the grid's numbers from its sums in fixed point, which it clears for the next field. One invocation per
+// number.
 #include "inc/sax_layout.glsl"
 #include "inc/fixed_point.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Attenuation at samples by the Lineformer: rays of `row` samples are cut into pairs from their first on; the last of an odd
-// number is a pair with itself. One invocation per pair.
+// Attenuation at samples by the Lineformer: rays of `row` samples are cut into pairs from their first on; the last of
+// an odd number is a pair with itself. One invocation per pair.
 //   sax_sigma[sample] = scale * density
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

@@ -1,8 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradients of the Lineformer from those of line integrals: by samples' features, and by its own numbers. One invocation per
-// pair of samples, which computes activations anew rather than reading them. A workgroup walks over tiles of 32 pairs and adds
-// up, in shared memory and always in the same order, what they say of the numbers, in a part of its own.
+// Gradients of the Lineformer from those of line integrals: by samples' features, and by its own numbers. One
+// invocation per pair of samples, which computes activations anew rather than reading them. A workgroup walks over
+// tiles of 32 pairs and adds up, in shared memory and always in the same order, what they say of the numbers, in a
+// part of its own.
 //   sax_weight_parts[workgroup][number / 4], sax_encoding_gradient[pair of levels][sample]
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
@@ -38,8 +39,8 @@ void write_right(vec4 x[8]) {
     for (uint i = 0u; i < WIDTH4; i++) right_rows[gl_LocalInvocationID.x * WIDTH4 + i] = x[i];
 }
 
-// Adds the tile's sum of left x right to a matrix of 32 rows that begin at `first`, `stride` apart, and `n` columns, in vec4.
-// A lane has a row of it.
+// Adds the tile's sum of left x right to a matrix of 32 rows that begin at `first`, `stride` apart, and `n` columns,
+// in vec4. A lane has a row of it.
 void add_product(uint first, uint stride, uint n, Pair left, Pair right) {
     uint lane = gl_LocalInvocationID.x;
     vec4 sum[8];

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Samples along rays: points of the unit cube that the grid's box is, at its faces where rays are beyond them, and the path
-// that each stands for. One invocation per sample.
+// Samples along rays: points of the unit cube that the grid's box is, at its faces where rays are beyond them, and the
+// path that each stands for. One invocation per sample.
 #include "inc/layout.glsl"
 #include "inc/sax_layout.glsl"
 #include "inc/random.glsl"

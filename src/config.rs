@@ -3,11 +3,13 @@
 //! Precedence: preset < TOML file < single settings `key=value`.
 
 mod checks;
+mod forms;
 mod presets;
 pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
+pub use forms::DynamicForm;
 use sections::{
     Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train, Tree,
 };
@@ -80,29 +82,6 @@ impl Choice for StaticForm {
             StaticForm::Tensor => "tensor",
             StaticForm::Network => "network",
             StaticForm::None => "none",
-        }
-    }
-}
-
-/// What the dynamic field is where no Gaussians are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum DynamicForm {
-    /// A network on encoded coordinates and latents.
-    #[default]
-    Network,
-    /// A hash grid and a Lineformer as SAX-NeRF fits them to whole images, for each phase or for all: no still field beside
-    /// them.
-    Lineformer,
-}
-
-impl Choice for DynamicForm {
-    const ALL: &'static [DynamicForm] = &[DynamicForm::Network, DynamicForm::Lineformer];
-
-    fn name(self) -> &'static str {
-        match self {
-            DynamicForm::Network => "network",
-            DynamicForm::Lineformer => "lineformer",
         }
     }
 }
@@ -476,29 +455,6 @@ mod tests {
             ("r2.static_data=both", "both"),
         ] {
             let message = Config::load(Some(Preset::R2Gaussian), None, &[setting.into()]).unwrap_err().to_string();
-            assert!(message.contains(part), "{setting}: {message}");
-        }
-    }
-
-    #[test]
-    fn what_does_not_go_with_sax_nerf_is_named() {
-        for (setting, part) in [
-            ("static.form=tensor", "static.form"),
-            ("dynamic.form=network", "static.form"),
-            ("gaussians.form=r2", "gaussians.form"),
-            ("hull.enabled=true", "hull.enabled"),
-            ("occupancy.enabled=true", "occupancy.enabled"),
-            ("loss.normalise=true", "loss.normalise"),
-            ("loss.dynamic_target=temporal", "loss.dynamic_target"),
-            ("march.along_axis=true", "march.along_axis"),
-            ("sax.levels=3", "sax.levels"),
-            ("sax.samples=7", "sax.samples"),
-            ("sax.base=65536", "sax.base"),
-            ("sax.log2_table=30", "sax.log2_table"),
-            ("sax.window=0", "sax.window"),
-            ("sax.static_data=both", "both"),
-        ] {
-            let message = Config::load(Some(Preset::SaxNerf), None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
         }
     }

@@ -288,11 +288,13 @@ fn plan_sax(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resu
     });
     if config.sax.normalise && dataset.vessel_attenuation.is_none() {
         notes.push(
-            "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF shows none above 1".into(),
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF shows none above 1"
+                .into(),
         );
     }
     if !dataset.hidden.is_empty() {
-        notes.push("pixels that show nothing of the patient are fitted like all others: SAX-NeRF knows no masks".into());
+        notes
+            .push("pixels that show nothing of the patient are fitted like all others: SAX-NeRF knows no masks".into());
     }
     if dataset.heart_shifts() {
         notes.push("SAX-NeRF sees all frames of a view alike: displacements of the heart are left out".into());

@@ -1,5 +1,6 @@
-//! SAX-NeRF (the preset `sax-nerf`): stages equal their twins, the twins PyTorch and finite differences; the hash finds its
-//! entries, attention is what it should be; runs fit, repeat and resume bit by bit; each phase sees its own images alone.
+//! SAX-NeRF (the preset `sax-nerf`): stages equal their twins, the twins PyTorch and finite differences; the hash finds
+//! its entries, attention is what it should be; runs fit, repeat and resume bit by bit; each phase sees its own images
+//! alone.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -61,19 +62,14 @@ fn formula(shape: SaxShape) -> Vec<f64> {
 fn golden_values_of_pytorch() {
     let golden = Golden::open("sax", "tools/reference_sax.py");
     let case = |key: &str| golden.case[key].as_u64().unwrap() as usize;
-    let shape = SaxShape {
-        levels: case("levels") as u32,
-        base: case("base") as u32,
-        log2_table: case("log2_table") as u32,
-    };
+    let shape =
+        SaxShape { levels: case("levels") as u32, base: case("base") as u32, log2_table: case("log2_table") as u32 };
     let mut params = formula(shape);
     let (points, paths, targets) = (golden.get("points"), golden.get("paths"), golden.get("targets"));
     let n = case("samples");
     let rays: Vec<SampledRay> = (0..case("rays"))
         .map(|r| SampledRay {
-            points: (r * n..(r + 1) * n)
-                .map(|s| ([0, 1, 2].map(|k| points[3 * s + k] as f32), paths[s]))
-                .collect(),
+            points: (r * n..(r + 1) * n).map(|s| ([0, 1, 2].map(|k| points[3 * s + k] as f32), paths[s])).collect(),
             target: targets[r],
         })
         .collect();
@@ -144,7 +140,12 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
             };
             let difference = (loss(1e-6) - loss(-1e-6)) / 2e-6;
             let error = (difference - gradient[at]).abs();
-            assert!(error < 1e-4 * gradient[at].abs() + 1e-6 * largest, "{}[{i}]: {difference} {}", part.name, gradient[at]);
+            assert!(
+                error < 1e-4 * gradient[at].abs() + 1e-6 * largest,
+                "{}[{i}]: {difference} {}",
+                part.name,
+                gradient[at]
+            );
         }
     }
 }

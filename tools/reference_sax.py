@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Golden values of SAX-NeRF's field and its fit from an independent PyTorch float64 implementation.
 
-Writes tests/golden/sax.safetensors: samples of some rays, and what follows from them and from numbers of a field that a formula
-gives (`number`): densities, loss, gradients, and the numbers after ten Adam updates on the same rays. Nothing here is shared with the engine: layers are torch.nn's,
-attention is softmax over an axis, the hash goes corner by corner through Python integers, gradients come from autograd, updates
-from torch.optim.Adam.
+Writes tests/golden/sax.safetensors: samples of some rays, and what follows from them and from numbers of a field that a
+formula gives (`number`): densities, loss, gradients, and the numbers after ten Adam updates on the same rays. Nothing here is
+shared with the engine: layers are torch.nn's, attention is softmax over an axis, the hash goes corner by corner through Python
+integers, gradients come from autograd, updates from torch.optim.Adam.
 
     python3 tools/reference_sax.py [--out tests/golden]      (needs torch and numpy)
 """

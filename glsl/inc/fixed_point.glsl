@@ -1,8 +1,8 @@
-// Sums in 64-bit fixed point, a pair of words each, low and high: integers add up exactly, so the order of additions does
-// not matter.
+// Sums in 64-bit fixed point, a pair of words each, low and high: integers add up exactly, so the order of additions
+// does not matter.
 
-// A number in 64-bit fixed point, by 2 to the (bits behind the point - 32); the magnitude is split exactly into words, then
-// negated in two's complement.
+// A number in 64-bit fixed point, by 2 to the (bits behind the point - 32); the magnitude is split exactly into words,
+// then negated in two's complement.
 uvec2 to_fixed(float value, float scale_high) {
     float scaled = abs(value) * scale_high;
     float whole = floor(scaled);

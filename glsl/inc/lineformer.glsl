@@ -1,5 +1,5 @@
-// The Lineformer of SAX-NeRF on a pair of neighbouring samples: a layer, one attention block in which the two see each other,
-// a layer on its result beside the input, and a density. Needs `sax_setup` and `vec4 sax_params[]`.
+// The Lineformer of SAX-NeRF on a pair of neighbouring samples: a layer, one attention block in which the two see each
+// other, a layer on its result beside the input, and a density. Needs `sax_setup` and `vec4 sax_params[]`.
 #include "inc/lineformer_layout.glsl"
 
 // 32 numbers of each of the two samples.

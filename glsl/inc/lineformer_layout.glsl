@@ -1,5 +1,5 @@
-// Where the Lineformer's numbers begin, in vec4; matrices are rows of inputs. Those of the input come last, as their number
-// depends on the grid's levels.
+// Where the Lineformer's numbers begin, in vec4; matrices are rows of inputs. Those of the input come last, as their
+// number depends on the grid's levels.
 
 const uint LINEFORMER_NORM1 = 0u;            // scales of the first normalisation, 32, then shifts
 const uint LINEFORMER_QUERY = 16u;           // 32 x 32

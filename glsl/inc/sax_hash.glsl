@@ -5,8 +5,8 @@ struct SaxCell {
     vec3 share;                 // of the upper one along each axis
 };
 
-// Where a point of the unit cube lies in a level. Exact to the last bit, since fine levels have half a million cells: no
-// multiplication may be joined with an addition.
+// Where a point of the unit cube lies in a level. Exact to the last bit, since fine levels have half a million cells:
+// no multiplication may be joined with an addition.
 SaxCell cell_at(SaxLevel level, vec3 unit) {
     precise vec3 scaled = unit * float(level.cells - 1u);
     precise vec3 position = scaled + 0.5;

@@ -1,5 +1,5 @@
-// Structures of SAX-NeRF shared with the host: build.rs makes Rust's from them, comments included. Lengths are world units;
-// attenuations are shares of what vessels attenuate, per world unit.
+// Structures of SAX-NeRF shared with the host: build.rs makes Rust's from them, comments included. Lengths are world
+// units; attenuations are shares of what vessels attenuate, per world unit.
 
 // What stays fixed of a fit, or of what is drawn.
 struct SaxSetup {

@@ -170,7 +170,11 @@ impl Config {
             Err(Error::config(field, value, format!("does not go with dynamic.form = \"lineformer\": {instead}")))
         };
         if self.static_field.form != StaticForm::None {
-            return refuse("static.form", &self.static_field.form.name(), "its field is the whole object; take \"none\"");
+            return refuse(
+                "static.form",
+                &self.static_field.form.name(),
+                "its field is the whole object; take \"none\"",
+            );
         }
         if self.gaussians_move() {
             return refuse("gaussians.form", &self.gaussians.form.name(), "one of both is the field; take \"none\"");
@@ -196,9 +200,40 @@ impl Config {
         }
         let finest = u64::from(sax.base) << (sax.levels - 1);
         if finest > MOST_CELLS {
-            let problem = format!("the finest of {} levels has {finest} cells a side, at most {MOST_CELLS} are told apart", sax.levels);
+            let problem = format!(
+                "the finest of {} levels has {finest} cells a side, at most {MOST_CELLS} are told apart",
+                sax.levels
+            );
             return Err(Error::config("sax.base", sax.base, problem));
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::config::{Config, Preset};
+
+    #[test]
+    fn what_does_not_go_with_sax_nerf_is_named() {
+        for (setting, part) in [
+            ("static.form=tensor", "static.form"),
+            ("dynamic.form=network", "static.form"),
+            ("gaussians.form=r2", "gaussians.form"),
+            ("hull.enabled=true", "hull.enabled"),
+            ("occupancy.enabled=true", "occupancy.enabled"),
+            ("loss.normalise=true", "loss.normalise"),
+            ("loss.dynamic_target=temporal", "loss.dynamic_target"),
+            ("march.along_axis=true", "march.along_axis"),
+            ("sax.levels=3", "sax.levels"),
+            ("sax.samples=7", "sax.samples"),
+            ("sax.base=65536", "sax.base"),
+            ("sax.log2_table=30", "sax.log2_table"),
+            ("sax.window=0", "sax.window"),
+            ("sax.static_data=both", "both"),
+        ] {
+            let message = Config::load(Some(Preset::SaxNerf), None, &[setting.into()]).unwrap_err().to_string();
+            assert!(message.contains(part), "{setting}: {message}");
+        }
     }
 }

@@ -285,8 +285,8 @@ fn r2_gaussian(paper: Config) -> Config {
     }
 }
 
-/// The constants of SAX-NeRF's public code for the chest, whose rate falls after 1500 of 1501 passes over the images: here over
-/// three of them.
+/// The constants of SAX-NeRF's public code for the chest, whose rate falls after 1500 of 1501 passes over the images:
+/// here over three of them.
 pub(super) fn sax() -> Sax {
     Sax {
         static_data: StaticData::PerPhase,
@@ -350,8 +350,8 @@ fn fast(mlp: Config) -> Config {
             ..mlp.train
         },
         march: March { dynamic_samples: 2, ..mlp.march },
-        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does not. Few
-        // iterations take long steps.
+        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does
+        // not. Few iterations take long steps.
         static_field: StaticField { tv: 100.0, lr: 3e-2, lr_end: 3e-3, ..mlp.static_field },
         // The network is never asked; the smallest one takes no memory.
         dynamic: DynamicField {

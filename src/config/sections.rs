@@ -1,8 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{
-    CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm,
-};
+use crate::config::{CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -93,8 +91,8 @@ section! {
 section! {
     /// The static field. As a network ("network") it has the dynamic one's layers, and of what is below the learning rate alone.
     StaticField, "static" {
-        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian and SAX-NeRF
-        /// alone.
+        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian
+        /// and SAX-NeRF alone.
         #[serde(default)] form: StaticForm,
         /// Cells per axis, D.
         grid: u32 in 2.0 to 512.0,
@@ -423,16 +421,16 @@ section! {
 }
 
 section! {
-    /// SAX-NeRF's field (`dynamic.form = "lineformer"`), a hash grid and a Lineformer, with what its code uses as defaults for
-    /// the chest.
+    /// SAX-NeRF's field (`dynamic.form = "lineformer"`), a hash grid and a Lineformer, with what its code uses as
+    /// defaults for the chest.
     Sax, "sax" {
         /// Which images a field sees: "per-phase" (those of its phase; a field per phase) or "pooled" (all; one field).
         static_data: StaticData,
-        /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities, which a sigmoid
-        /// keeps below 1, can be near 1.
+        /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities, which a
+        /// sigmoid keeps below 1, can be near 1.
         normalise: bool,
-        /// Half side of the volume that rays cross, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where
-        /// that is less.
+        /// Half side of the volume that rays cross, mm; 0 = 1.6 radii of the field of view, or the dataset's depth
+        /// range where that is less.
         half_extent_mm: f64 in 0.0 to 1e5,
         /// Half side of the box that the hash grid divides, mm; beyond it, rays see what is at its faces.
         bound_mm: f64 in 1.0 to 1e5,

@@ -364,9 +364,10 @@ impl Checkpoint {
             return Err(bad("sax", "configuration and field are of different methods".into()));
         }
         let at = (header.phases, header.step);
-        let sax = header.sax.as_ref().map(|about| {
-            sax_tensors::read(about, SaxShape::of(&header.config.sax), &tensors, at, path)
-        });
+        let sax = header
+            .sax
+            .as_ref()
+            .map(|about| sax_tensors::read(about, SaxShape::of(&header.config.sax), &tensors, at, path));
         let (sax_field, sax) = sax.transpose()?.unzip();
         Ok(Checkpoint {
             r2: is_r2.then(|| r2_tensors::read(&tensors, header.phases, path)).transpose()?,

@@ -67,12 +67,8 @@ impl SaxShape {
         let level = |l: u32| {
             let cells = self.base << l;
             let corners = (u64::from(cells) + 1).pow(3);
-            let level = SaxLevel {
-                cells,
-                first,
-                entries: corners.min(table) as u32,
-                dense: u32::from(corners <= table),
-            };
+            let level =
+                SaxLevel { cells, first, entries: corners.min(table) as u32, dense: u32::from(corners <= table) };
             first += level.entries;
             level
         };
@@ -191,7 +187,10 @@ mod tests {
         let lineformer: usize = CHEST.parts().iter().filter(|part| part.name != "grid").map(Part::len).sum();
         assert_eq!(lineformer, 32_033);
         let levels = CHEST.grid();
-        assert_eq!(levels[..4].iter().map(|l| l.entries).collect::<Vec<_>>(), [17u32.pow(3), 33u32.pow(3), 65u32.pow(3), 1 << 19]);
+        assert_eq!(
+            levels[..4].iter().map(|l| l.entries).collect::<Vec<_>>(),
+            [17u32.pow(3), 33u32.pow(3), 65u32.pow(3), 1 << 19]
+        );
         assert_eq!((levels[15].cells, levels[2].dense, levels[3].dense), (524_288, 1, 0));
     }
 

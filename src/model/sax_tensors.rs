@@ -64,7 +64,8 @@ pub(super) fn read(
 ) -> Result<(SaxField, SaxState)> {
     let [near, far] = header.depths;
     let is_positive = |v: f64| v.is_finite() && v > 0.0;
-    if !is_positive(header.bound) || !is_positive(header.attenuation) || !is_positive(far - near) || header.samples < 2 {
+    if !is_positive(header.bound) || !is_positive(header.attenuation) || !is_positive(far - near) || header.samples < 2
+    {
         return Err(Error::data(path, "sax", "box, depths, samples and attenuation must be positive and finite"));
     }
     if header.sets != 1 && header.sets != n_phases {

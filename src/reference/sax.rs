@@ -83,8 +83,8 @@ pub fn entry(level: &SaxLevel, corner: [u32; 3]) -> usize {
     level.first as usize + (index % u64::from(level.entries)) as usize
 }
 
-/// The entries around a point of the unit cube, and its share of each. Where it lies is found in f32 as on the device: in fine
-/// levels that decides.
+/// The entries around a point of the unit cube, and its share of each. Where it lies is found in f32 as on the device:
+/// in fine levels that decides.
 pub fn taps(level: &SaxLevel, unit: [f32; 3]) -> Vec<(usize, f64)> {
     let position = unit.map(|x| x * (level.cells - 1) as f32 + 0.5);
     let (corner, share) = (position.map(|x| x as u32), position.map(|x| f64::from(x - x.floor())));
@@ -369,7 +369,12 @@ impl<'a> Lineformer<'a> {
         })
     }
 
-    fn after_attention_bwd(&self, t: &SampleTrace, by_sigma: f64, gradient: &mut [f64]) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+    fn after_attention_bwd(
+        &self,
+        t: &SampleTrace,
+        by_sigma: f64,
+        gradient: &mut [f64],
+    ) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
         let d = by_sigma * t.sigma * (1.0 - t.sigma);
         self.add_gradient("density.bias", &[d], gradient);
         self.add_gradient("density.weight", &map(&t.joint, |x| d * leaky(x)), gradient);

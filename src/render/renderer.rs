@@ -128,7 +128,8 @@ impl Renderer {
         let gpu = gpu.clone();
         let pace = |_| SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
         let paces = std::array::from_fn(pace);
-        let renderer = Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, sax, paces };
+        let renderer =
+            Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, sax, paces };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -138,8 +139,7 @@ impl Renderer {
     /// # Errors
     /// [`Error::Internal`] for other parameters; device errors.
     pub fn set_model(&self, model: &Model) -> Result<()> {
-        let same_method =
-            model.moving.is_some() == self.moving.is_some() && model.sax.is_some() == self.sax.is_some();
+        let same_method = model.moving.is_some() == self.moving.is_some() && model.sax.is_some() == self.sax.is_some();
         if model.param_map != self.param_map || !same_method {
             return Err(Error::Internal("the model has other parameters than the renderer".into()));
         }

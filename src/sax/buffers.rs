@@ -52,8 +52,8 @@ impl SaxMemory {
         let mib = |bytes: u64| bytes.div_ceil(MIB);
         if self.of_field_buffer > largest {
             let problem = format!(
-                "the moments of a field take a buffer of {} MiB, and one of this device holds {} MiB: take fewer entries or \
-                 fewer sax.levels",
+                "the moments of a field take a buffer of {} MiB, and one of this device holds {} MiB: take fewer \
+                 entries or fewer sax.levels",
                 mib(self.of_field_buffer),
                 mib(largest)
             );
@@ -61,8 +61,8 @@ impl SaxMemory {
         }
         if self.of_batch_buffer > largest {
             let problem = format!(
-                "a batch takes a buffer of {} MiB, and one of this device holds {} MiB: take fewer, fewer sax.rays or fewer \
-                 sax.windows",
+                "a batch takes a buffer of {} MiB, and one of this device holds {} MiB: take fewer, fewer sax.rays or \
+                 fewer sax.windows",
                 mib(self.of_batch_buffer),
                 mib(largest)
             );
@@ -70,8 +70,8 @@ impl SaxMemory {
         }
         if self.total > info.device_memory {
             let problem = format!(
-                "{n_sets} fields take {} MiB, and this device has {} MiB: take fewer entries, fewer sax.levels, or one field for \
-                 all phases (sax.static_data = \"pooled\")",
+                "{n_sets} fields take {} MiB, and this device has {} MiB: take fewer entries, fewer sax.levels, or one \
+                 field for all phases (sax.static_data = \"pooled\")",
                 mib(self.total),
                 mib(info.device_memory)
             );
@@ -107,9 +107,16 @@ pub fn sample_buffers(
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer; other device errors.
-pub fn fit_buffers(gpu: &Gpu, data: &SaxData, field: &SaxField, setup: &SaxSetup, config: &Config) -> Result<SaxFitBuffers> {
+pub fn fit_buffers(
+    gpu: &Gpu,
+    data: &SaxData,
+    field: &SaxField,
+    setup: &SaxSetup,
+    config: &Config,
+) -> Result<SaxFitBuffers> {
     let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
-    let [rays, samples, weights, grid] = [setup.n_rays, setup.n_rays * setup.n_samples, setup.n_weights, setup.n_grid].map(u64::from);
+    let [rays, samples, weights, grid] =
+        [setup.n_rays, setup.n_rays * setup.n_samples, setup.n_weights, setup.n_grid].map(u64::from);
     let fit = SaxFitBuffers {
         setup: gpu.buffer_with("setup", &[adam_setup(field.shape, config)])?,
         schedule: gpu.buffer_with("schedule", &schedule(config))?,
@@ -137,7 +144,13 @@ pub fn fit_buffers(gpu: &Gpu, data: &SaxData, field: &SaxField, setup: &SaxSetup
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer; other device errors.
-pub fn set_buffers(gpu: &Gpu, data: &SaxData, field: &SaxField, state: &SaxState, seed: u32) -> Result<Vec<SaxSetBuffers>> {
+pub fn set_buffers(
+    gpu: &Gpu,
+    data: &SaxData,
+    field: &SaxField,
+    state: &SaxState,
+    seed: u32,
+) -> Result<Vec<SaxSetBuffers>> {
     let (_, first_turns) = data.turns();
     let set = |index: usize| {
         Ok(SaxSetBuffers {
@@ -148,4 +161,35 @@ pub fn set_buffers(gpu: &Gpu, data: &SaxData, field: &SaxField, state: &SaxState
         })
     };
     (0..field.n_sets).map(set).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+    use crate::model::sax::SaxShape;
+    use crate::sax::stages::tiles;
+
+    /// What every device holds in a buffer.
+    const LEAST_STORAGE_BUFFER: u64 = 128 << 20;
+
+    #[test]
+    fn the_published_field_fits_the_buffers_of_every_device() {
+        let sax = Config::preset(Preset::SaxNerf).sax;
+        let shape = SaxShape::of(&sax);
+        let n_rays = sax.windows * sax.window * sax.window + sax.rays;
+        let setup = SaxSetup {
+            n_levels: sax.levels,
+            n_samples: sax.samples,
+            n_rays,
+            n_sets: 10,
+            n_weights: shape.n_weights() as u32,
+            n_grid: shape.n_grid() as u32,
+            n_groups: tiles(n_rays * sax.samples).min(512),
+            ..SaxSetup::default()
+        };
+        let memory = SaxMemory::of(&setup);
+        assert!(memory.of_field_buffer < LEAST_STORAGE_BUFFER && memory.of_batch_buffer < LEAST_STORAGE_BUFFER);
+        assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 64, 1999));
+    }
 }

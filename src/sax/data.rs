@@ -1,5 +1,5 @@
-//! A dataset as SAX-NeRF sees it: whole images in its units, which of their pixels show something, and which images each
-//! field is fitted to.
+//! A dataset as SAX-NeRF sees it: whole images in its units, which of their pixels show something, and which images
+//! each field is fitted to.
 
 use crate::config::StaticData;
 use crate::config::sections::Sax;
@@ -42,8 +42,8 @@ impl SaxData {
     /// Brings a dataset into a volume of half a side `half` each way, world units.
     ///
     /// # Errors
-    /// [`Error::Config`] for images of several sizes or smaller than what the windows take, for a pixel that is not a number,
-    /// and for phases that no image shows.
+    /// [`Error::Config`] for images of several sizes or smaller than what the windows take, for a pixel that is not a
+    /// number, and for phases that no image shows.
     pub fn new(dataset: &Dataset, settings: &Sax, half: f64) -> Result<SaxData> {
         let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
         if dataset.sizes().len() > 1 {

@@ -55,8 +55,8 @@ impl SaxDrawing {
         Ok(drawing)
     }
 
-    /// Draws another field of the same sizes from now on; what was recorded before draws the old one. One without numbers
-    /// changes nothing.
+    /// Draws another field of the same sizes from now on; what was recorded before draws the old one. One without
+    /// numbers changes nothing.
     ///
     /// # Errors
     /// As [`SaxDrawing::new`]; [`Error::Internal`] for other sizes.
@@ -92,8 +92,8 @@ impl SaxDrawing {
         self.record(recording, parts, rays, (phase, n_rays), Target::View(ray_out))
     }
 
-    /// Records attenuation per world unit at the cells of `volume`: rows of `row` cells from depth `near` to `far` along
-    /// `rays`.
+    /// Records attenuation per world unit at the cells of `volume`: rows of `row` cells from depth `near` to `far`
+    /// along `rays`.
     ///
     /// # Errors
     /// As [`SaxDrawing::record_rays`]; [`Error::Config`] for a row of more cells than are asked at once.
@@ -109,7 +109,10 @@ impl SaxDrawing {
             return Err(Error::config("grid", row, format!("at most {SAMPLES_AT_ONCE} points along x are accepted")));
         }
         let setup = SaxSetup { near, far, n_samples: row, ..self.setup };
-        let buffers = SaxSampleBuffers { sax_setup: self.gpu.buffer_with("sax_setup of rows", &[setup])?, ..self.buffers.clone() };
+        let buffers = SaxSampleBuffers {
+            sax_setup: self.gpu.buffer_with("sax_setup of rows", &[setup])?,
+            ..self.buffers.clone()
+        };
         self.record(recording, (&buffers, &setup), rays, (phase, n_rows), Target::Cells(volume))
     }
 

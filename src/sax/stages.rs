@@ -239,7 +239,14 @@ impl SaxPass<'_> {
             (Binding::params, (&set.params).into()),
             (Binding::moments, (&set.moments).into()),
         ];
-        dispatch_finding(self.recording, stage, groups, &bound, |name| samples.find(name).or_else(|| fit.find(name)), push)
+        dispatch_finding(
+            self.recording,
+            stage,
+            groups,
+            &bound,
+            |name| samples.find(name).or_else(|| fit.find(name)),
+            push,
+        )
     }
 
     /// Records the line integrals of a batch of a field, and their loss.

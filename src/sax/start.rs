@@ -15,7 +15,8 @@ const MOST_ATTEMPTS: usize = 100;
 /// First numbers of a field whose random numbers go by `seed`.
 pub fn first_params(shape: SaxShape, seed: u32) -> Vec<f32> {
     let mut params = vec![0f32; shape.n_params()];
-    let fan_in_of_bias = |name: &str| if name == "joint.bias" { shape.n_features() + WIDTH } else { shape.n_features() };
+    let fan_in_of_bias =
+        |name: &str| if name == "joint.bias" { shape.n_features() + WIDTH } else { shape.n_features() };
     for (index, part) in shape.parts().into_iter().enumerate() {
         let value = |i: usize| -> f64 {
             let spread = || 2.0 * uniform01(seed, STREAM_INIT, i as u32, index as u32) - 1.0;

@@ -1,4 +1,5 @@
-//! SAX-NeRF: an iteration of its fit, stage by stage, each on what the device made for it; and what is drawn of a field.
+//! SAX-NeRF: an iteration of its fit, stage by stage, each on what the device made for it; and what is drawn of a
+//! field.
 
 use crate::config::{Config, Preset};
 use crate::error::Result;
@@ -108,9 +109,9 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
         findings.begin("sax", case);
         let config = small_config(settings)?;
         let (data, field, state) = hard_case(&config)?;
+        let fit = SaxTrainer::with(gpu, data.clone(), &config, &field, &state)?;
+        Iteration { gpu, config, fit, field: field.clone() }.compare(findings)?;
         compare_drawing(gpu, &data, &field, findings)?;
-        let fit = SaxTrainer::with(gpu, data, &config, &field, &state)?;
-        Iteration { gpu, config, fit, field }.compare(findings)?;
     }
     Ok(())
 }
@@ -190,7 +191,8 @@ impl Iteration<'_> {
         let lines = want.iter().flat_map(|id| {
             let (view, (i, j)) = (view(*id), at(*id));
             [0, 1, 2].map(|k| {
-                f64::from(view.direction00[k]) + i as f64 * f64::from(view.direction_du[k])
+                f64::from(view.direction00[k])
+                    + i as f64 * f64::from(view.direction_du[k])
                     + j as f64 * f64::from(view.direction_dv[k])
             })
         });
@@ -244,8 +246,8 @@ impl Iteration<'_> {
         let mut gradient = vec![0.0; shape.n_weights()];
         let mut by_features = Vec::new();
         for (pair, own) in features.chunks(2 * width).enumerate() {
-            let by_sigma = [2 * pair, 2 * pair + 1]
-                .map(|s| f64::from(made.ray_gradient[s / row]) * f64::from(made.points[s][3]));
+            let by_sigma =
+                [2 * pair, 2 * pair + 1].map(|s| f64::from(made.ray_gradient[s / row]) * f64::from(made.points[s][3]));
             let trace = lineformer.fwd([&own[..width], &own[width..]]);
             by_features.extend(lineformer.bwd(&trace, by_sigma, &mut gradient).concat());
         }

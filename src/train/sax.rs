@@ -64,7 +64,11 @@ impl SaxTrainer {
             || field.params.iter().any(|set| set.len() != n)
             || state.moments.iter().any(|set| set.len() != n)
         {
-            return Err(Error::config("checkpoint", field.n_sets, "its fields of SAX-NeRF are not those of the images"));
+            return Err(Error::config(
+                "checkpoint",
+                field.n_sets,
+                "its fields of SAX-NeRF are not those of the images",
+            ));
         }
         let setup = fit_setup(&outline, &data, &config.sax);
         SaxMemory::of(&setup).check(gpu, config, data.n_sets())?;
@@ -121,8 +125,8 @@ impl SaxTrainer {
         SaxField { step: self.step, ..self.outline.clone() }
     }
 
-    /// Runs a submit's worth of iterations towards `until`; the losses of those done, each the mean over the fields. An empty
-    /// list means the target was reached before.
+    /// Runs a submit's worth of iterations towards `until`; the losses of those done, each the mean over the fields. An
+    /// empty list means the target was reached before.
     ///
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite; device errors.
