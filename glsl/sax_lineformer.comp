@@ -1,5 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
 // Attenuation at samples by the Lineformer: rays of `row` samples are cut into pairs from their first on; the last of
 // an odd number is a pair with itself. One invocation per pair.
 //   sax_sigma[sample] = scale * density
@@ -29,8 +30,8 @@ void main() {
     x = plus(x, plus(vector_at(LINEFORMER_OUT + 256u), times(LINEFORMER_OUT, WIDTH4, WIDTH4, at.seen)));
     Pair normal = affine(LINEFORMER_NORM2, normalised(x, inverse));
     Pair first[4];
-    for (uint slice = 0u; slice < FFN_SLICES; slice++) first[slice] = gelu(expanded(slice, normal));
-    for (uint slice = 0u; slice < FFN_SLICES; slice++)
+    [[dont_unroll]] for (uint slice = 0u; slice < FFN_SLICES; slice++) first[slice] = gelu(expanded(slice, normal));
+    [[dont_unroll]] for (uint slice = 0u; slice < FFN_SLICES; slice++)
         x = plus(x, times(contract_at(slice), FFN_STRIDE, WIDTH4, gelu(mixed(slice, first))));
     vec2 sigma = push.scale * density(leaky(joined(encoding, leaky(x))));
     sax_sigma[push.first_out + s] = sigma.x;

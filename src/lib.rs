@@ -198,6 +198,7 @@ pub mod sax {
     pub mod buffers;
     pub mod data;
     pub mod drawing;
+    pub mod products;
     pub mod setup;
     pub mod stages;
     pub mod start;

@@ -224,7 +224,7 @@ fn dense_levels_have_an_entry_for_each_corner() {
 
 #[test]
 fn a_batch_is_windows_and_pixels_outside_of_them_that_show_something() {
-    for settings in [&[][..], &["sax.windows=40", "sax.rays=300"], &["sax.windows=0", "sax.rays=31"]] {
+    for settings in [&[][..], &["sax.windows=10", "sax.rays=60"], &["sax.windows=0", "sax.rays=31"]] {
         let config = config(settings);
         let (mut data, ..) = hard_case(&config).unwrap();
         // A third of the pixels shows nothing.

@@ -1,5 +1,7 @@
 // The Lineformer of SAX-NeRF on a pair of neighbouring samples: a layer, one attention block in which the two see each
 // other, a layer on its result beside the input, and a density. Needs `sax_setup` and `vec4 sax_params[]`.
+// Loops over rows and slices stay loops: unrolled, each matrix would be thousands of instructions, which drivers compile
+// for minutes. Those over a row's columns are unrolled, so that numbers are found without counting.
 #include "inc/lineformer_layout.glsl"
 
 // 32 numbers of each of the two samples.
@@ -70,9 +72,10 @@ mat4 rows_at(uint first, uint stride) {
 // W x of 32 rows that begin at `first`, `stride` apart, and `n` columns; all of these in vec4.
 Pair times(uint first, uint stride, uint n, Pair x) {
     Pair y;
-    for (uint o = 0u; o < WIDTH4; o++) {
+    [[dont_unroll]] for (uint o = 0u; o < WIDTH4; o++) {
         vec4 a = vec4(0.0), b = vec4(0.0);
-        for (uint i = 0u; i < n; i++) {
+        [[unroll]] for (uint i = 0u; i < WIDTH4; i++) {
+            if (i >= n) continue;
             mat4 rows = rows_at(first + 4u * o * stride + i, stride);
             a += x.a[i] * rows;
             b += x.b[i] * rows;
@@ -86,9 +89,9 @@ Pair times(uint first, uint stride, uint n, Pair x) {
 // W^T d of the same.
 Pair times_transposed(uint first, uint stride, uint n, Pair d) {
     Pair y = nothing();
-    for (uint i = 0u; i < n; i++) {
+    [[dont_unroll]] for (uint i = 0u; i < n; i++) {
         vec4 a = vec4(0.0), b = vec4(0.0);
-        for (uint o = 0u; o < WIDTH4; o++) {
+        [[unroll]] for (uint o = 0u; o < WIDTH4; o++) {
             mat4 rows = rows_at(first + 4u * o * stride + i, stride);
             a += rows * d.a[o];
             b += rows * d.b[o];
@@ -194,7 +197,7 @@ const uint FFN_STRIDE = 32u;
 // The second layer of the feed-forward part before its GELU, 32 numbers of it, from the first after it.
 Pair mixed(uint to, Pair first[4]) {
     Pair sum = nothing();
-    for (uint from = 0u; from < FFN_SLICES; from++)
+    [[dont_unroll]] for (uint from = 0u; from < FFN_SLICES; from++)
         sum = plus(sum, times(mix_at(to, from), FFN_STRIDE, WIDTH4, first[from]));
     return sum;
 }

@@ -15,3 +15,28 @@ const uint LINEFORMER_INPUT_BIAS = 7216u;    // 32
 const uint LINEFORMER_JOINT_BIAS = 7224u;    // 32
 const uint LINEFORMER_DENSITY = 7232u;       // 32, then a bias and nothing
 const uint LINEFORMER_INPUT = 7248u;         // 32 x the grid's features; behind them 32 x (features + 32) of the skip
+
+// Vectors of 32 numbers that a sample leaves in the backward pass, for gradients of the Lineformer's numbers; `BY` are
+// gradients before a layer's activation. Slices of 128 numbers, and scales and shifts, are vectors next to each other.
+const uint SAX_FEATURES = 0u;
+const uint SAX_NORMAL1 = 1u;
+const uint SAX_SEEN = 2u;
+const uint SAX_NORMAL2 = 3u;
+const uint SAX_BLOCK = 4u;
+const uint SAX_FIRST = 5u;       // four
+const uint SAX_SECOND = 9u;      // four
+const uint SAX_BY_INPUT = 13u;
+const uint SAX_BY_QUERY = 14u;
+const uint SAX_BY_KEY = 15u;
+const uint SAX_BY_VALUE = 16u;
+const uint SAX_BY_OUT = 17u;
+const uint SAX_BY_FIRST = 18u;   // four
+const uint SAX_BY_SECOND = 22u;  // four
+const uint SAX_BY_BLOCK = 26u;
+const uint SAX_BY_JOINT = 27u;
+const uint SAX_NORM1 = 28u;      // two
+const uint SAX_NORM2 = 30u;      // two
+const uint SAX_POSITION = 32u;   // of the pair
+const uint SAX_DENSITY = 33u;    // two, of the pair
+const uint SAX_VECTORS = 35u;    // all of them
+const uint SAX_PRODUCTS = 41u;   // gradients: 31 products of two of them, 10 that are sums of one

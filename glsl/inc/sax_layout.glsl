@@ -35,3 +35,12 @@ struct SaxList {
     uint first;                 // place in the list of all images
     uint n;                     // how many
 };
+
+// A gradient of numbers of the Lineformer: the sum over samples of a product of two vectors that they leave, or of one.
+struct SaxProduct {
+    uint left;                  // vector that has a number for each row
+    uint right;                 // vector that has one for each column
+    uint first;                 // where the numbers begin, vec4
+    uint stride;                // from row to row, vec4
+    uint columns;               // vec4; 0: a sum of `left` alone
+};

@@ -11,8 +11,9 @@ use crate::model::sax::{SaxField, SaxState};
 use crate::model::setup::RING_LENGTH;
 use crate::r2::start::seed_of_set;
 use crate::sax::data::SaxData;
+use crate::sax::products::products;
 use crate::sax::setup::{adam_setup, schedule};
-use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers};
+use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers, TILE_BYTES};
 
 const MIB: u64 = 1 << 20;
 
@@ -34,11 +35,12 @@ impl SaxMemory {
         let params = weights + grid;
         let samples = u64::from(setup.n_rays) * u64::from(setup.n_samples);
         let (encoding, parts) = (8 * u64::from(setup.n_levels) * samples, 4 * weights * u64::from(setup.n_groups));
+        let tiles = TILE_BYTES * u64::from(setup.n_groups);
         let of_fields = u64::from(setup.n_sets) * 12 * params + 8 * grid + 4 * params;
         SaxMemory {
             of_field_buffer: 8 * params,
-            of_batch_buffer: encoding.max(parts).max(16 * samples),
-            total: of_fields + 2 * encoding + parts + 20 * samples,
+            of_batch_buffer: encoding.max(parts).max(tiles).max(16 * samples),
+            total: of_fields + 2 * encoding + parts + tiles + 20 * samples,
         }
     }
 
@@ -128,6 +130,8 @@ pub fn fit_buffers(
         rays: new(Binding::rays, size_of::<Ray>() as u64 * rays)?,
         sax_ray_gradient: new(Binding::sax_ray_gradient, 4 * rays)?,
         sax_losses: new(Binding::sax_losses, 4 * rays * u64::from(setup.n_sets))?,
+        sax_products: gpu.buffer_with("sax_products", &products(field.shape))?,
+        sax_tile_vectors: new(Binding::sax_tile_vectors, TILE_BYTES * u64::from(setup.n_groups))?,
         sax_weight_parts: new(Binding::sax_weight_parts, 4 * weights * u64::from(setup.n_groups))?,
         sax_encoding_gradient: new(Binding::sax_encoding_gradient, 8 * u64::from(setup.n_levels) * samples)?,
         sax_grid_sums: new(Binding::sax_grid_sums, 8 * grid)?,
@@ -185,11 +189,11 @@ mod tests {
             n_sets: 10,
             n_weights: shape.n_weights() as u32,
             n_grid: shape.n_grid() as u32,
-            n_groups: tiles(n_rays * sax.samples).min(512),
+            n_groups: tiles(n_rays * sax.samples).min(256),
             ..SaxSetup::default()
         };
         let memory = SaxMemory::of(&setup);
         assert!(memory.of_field_buffer < LEAST_STORAGE_BUFFER && memory.of_batch_buffer < LEAST_STORAGE_BUFFER);
-        assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 64, 1999));
+        assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 70, 2038));
     }
 }

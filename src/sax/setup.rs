@@ -8,8 +8,8 @@ use crate::model::setup::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::sax::data::SaxData;
 use crate::sax::stages::tiles;
 
-/// Workgroups of the Lineformer's backward pass, at most: each has sums of 128 KiB.
-const MOST_GROUPS: u32 = 512;
+/// Workgroups of the Lineformer's backward pass, at most: each has sums of 128 KiB, and what a tile leaves, 280 KiB.
+const MOST_GROUPS: u32 = 256;
 
 /// What does not depend on what is drawn or fitted.
 fn field_setup(field: &SaxField) -> SaxSetup {

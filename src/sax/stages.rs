@@ -9,10 +9,12 @@ use crate::error::Result;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants::SAX_VECTORS;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch_finding};
 use crate::kernels::layout::SaxSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage, along_two_axes};
+use crate::model::sax::WIDTH;
 
 /// Pipelines that ask a field.
 pub struct SaxFieldKernels {
@@ -126,6 +128,10 @@ buffer_set! {
         sax_ray_gradient,
         /// `[field][ray]`: loss.
         sax_losses,
+        /// [`crate::kernels::layout::SaxProduct`]s.
+        sax_products,
+        /// `[workgroup][vector][sample of a tile]`: what these are made of.
+        sax_tile_vectors,
         /// `[workgroup][number]`: gradients.
         sax_weight_parts,
         /// `[pair of levels][sample]`: gradient by features.
@@ -151,6 +157,9 @@ pub struct SaxSetBuffers {
     /// Where its images are among the turns, and how many.
     pub turns: (u32, u32),
 }
+
+/// Bytes of what samples of a tile leave to their workgroup.
+pub const TILE_BYTES: u64 = (SAX_VECTORS * 2 * push::SaxLineformerBwd::LOCAL_SIZE) as u64 * 4 * WIDTH as u64;
 
 /// Tiles of pairs of samples that the Lineformer's backward pass takes.
 pub fn tiles(n_samples: u32) -> u32 {
