@@ -3,13 +3,16 @@
 //! Precedence: preset < TOML file < single settings `key=value`.
 
 mod checks;
+mod forms;
 mod presets;
 pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
+pub use forms::DynamicForm;
 use sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree, X,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
+    Tree, X,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -33,6 +36,8 @@ pub enum Preset {
     R2Gaussian,
     /// X-Gaussian, another such: Gaussians that hide each other, as in Gaussian splatting.
     XGaussian,
+    /// SAX-NeRF, a static method the paper compares itself with: each phase by itself, a hash grid and a Lineformer.
+    SaxNerf,
 }
 
 impl Choice for Preset {
@@ -44,6 +49,7 @@ impl Choice for Preset {
         Preset::NerfCa,
         Preset::R2Gaussian,
         Preset::XGaussian,
+        Preset::SaxNerf,
     ];
 
     fn name(self) -> &'static str {
@@ -55,6 +61,7 @@ impl Choice for Preset {
             Preset::NerfCa => "nerf-ca",
             Preset::R2Gaussian => "r2-gaussian",
             Preset::XGaussian => "x-gaussian",
+            Preset::SaxNerf => "sax-nerf",
         }
     }
 }
@@ -257,6 +264,9 @@ pub struct Config {
     /// Gaussians as X-Gaussian fits them; checkpoints of before have none.
     #[serde(default = "presets::x")]
     pub x: X,
+    /// A hash grid and a Lineformer as SAX-NeRF fits them; checkpoints of before have none.
+    #[serde(default = "presets::sax")]
+    pub sax: Sax,
 }
 
 impl Config {
@@ -325,6 +335,16 @@ impl Config {
     /// Whether Gaussians are all there is, fitted to whole images.
     pub fn has_gaussians_alone(&self) -> bool {
         self.is_r2() || self.is_x()
+    }
+
+    /// Whether the dynamic field is SAX-NeRF's, which is all there is: the still field is nothing.
+    pub fn is_sax(&self) -> bool {
+        self.dynamic.form == DynamicForm::Lineformer
+    }
+
+    /// Whether the network on encoded coordinates is the moving field.
+    pub fn network_moves(&self) -> bool {
+        !self.gaussians_move() && !self.is_sax()
     }
 
     /// Whether the moving field takes displacements of the heart, frame by frame: a method that sees whole images cannot.
@@ -418,6 +438,8 @@ mod tests {
             ("static.form=none", "static.form"),
             ("gaussians.form=r2", "static.form"),
             ("r2.count=0", "r2.count"),
+            ("dynamic.form=lineformer", "static.form"),
+            ("sax.levels=0", "sax.levels"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
@@ -487,9 +509,11 @@ mod tests {
         let config = Config::preset(Preset::FastMlp);
         let mut table = toml::Table::try_from(&config).unwrap();
         assert!(table.remove("gaussians").is_some() && table.remove("tree").is_some());
-        assert!(table.remove("networks").is_some() && table.remove("r2").is_some());
+        assert!(table.remove("networks").is_some() && table.remove("r2").is_some() && table.remove("sax").is_some());
         assert!(table.remove("x").is_some());
-        for (section, key) in [("static", "form"), ("march", "along_axis"), ("adam", "decay_share")] {
+        for (section, key) in
+            [("static", "form"), ("dynamic", "form"), ("march", "along_axis"), ("adam", "decay_share")]
+        {
             assert!(table[section].as_table_mut().unwrap().remove(key).is_some());
         }
         assert_eq!(table.try_into::<Config>().unwrap(), config);

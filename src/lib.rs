@@ -205,6 +205,17 @@ pub mod x_gaussian {
     pub mod start;
 }
 
+/// SAX-NeRF, a static method that the paper compares itself with: its data, where it begins, its stages and drawing.
+pub mod sax {
+    pub mod buffers;
+    pub mod data;
+    pub mod drawing;
+    pub mod products;
+    pub mod setup;
+    pub mod stages;
+    pub mod start;
+}
+
 pub mod plan;
 
 /// Drawing a model, for any pose and phase.
@@ -225,6 +236,7 @@ pub mod train {
     pub mod losses;
     pub mod moving;
     pub mod r2;
+    pub mod sax;
     pub mod snapshot;
     pub mod step;
     mod targets;
@@ -351,6 +363,7 @@ pub mod reference {
     pub mod occupancy;
     pub mod projector;
     pub mod r2;
+    pub mod sax;
     pub mod step;
     pub mod tree;
     pub mod x_gaussian;

@@ -20,7 +20,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::selftest::compare::Findings;
 use nertca_vk::selftest::iteration::F32_CASES;
-use nertca_vk::selftest::{blobs, gaussians, iteration, networks, problems, r2, trees, x_gaussian};
+use nertca_vk::selftest::{blobs, gaussians, iteration, networks, problems, r2, sax, trees, x_gaussian};
 use nertca_vk::train::trainer::Trainer;
 use program::program;
 use serde_json::Value;
@@ -103,7 +103,11 @@ fn one_too_many(words: &mut [u32]) {
     replace(words, LESS, LESS_OR_EQUAL);
 }
 
-/// The last two stores of `gradient_static` clear its sums; in their place, the one before is done again.
+fn difference_for_sum(words: &mut [u32]) {
+    replace(words, ADD, SUBTRACT);
+}
+
+/// The last two stores of `gradient_static` and `sax_grid_gradient` clear their sums; in their place, the one before is done again.
 fn missing_clear(words: &mut [u32]) {
     let stores: Vec<_> = instructions(words).into_iter().filter(|(_, operation, _)| *operation == STORE).collect();
     let [.., (before, _, length), one, other] = stores[..] else { panic!("three stores are needed") };
@@ -177,6 +181,17 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("x_blend_back", wrong_sign, x_gaussian::compare),
         fault("x_update", wrong_sign, x_gaussian::compare),
         fault("x_report", negated, x_gaussian::compare),
+        fault("sax_batch", one_too_many, sax::compare),
+        fault("sax_points", wrong_sign, sax::compare),
+        fault("sax_encode", wrong_sign, sax::compare),
+        fault("sax_lineformer", wrong_sign, sax::compare),
+        fault("sax_loss", wrong_sign, sax::compare),
+        fault("sax_lineformer_bwd", wrong_sign, sax::compare),
+        fault("sax_weight_gradient", difference_for_sum, sax::compare),
+        fault("sax_encode_bwd", wrong_sign, sax::compare),
+        fault("sax_grid_gradient", missing_clear, sax::compare),
+        fault("sax_report", difference_for_sum, sax::compare),
+        fault("sax_view", difference_for_sum, sax::compare),
         fault("gaussian_crowd", wrong_sign, many_gaussians),
     ] {
         shim::begin(shim::Failing::None);
@@ -214,15 +229,15 @@ fn the_inventory_is_what_a_run_builds() {
         (Preset::Fast, 32, "phase"),
         (Preset::R2Gaussian, 13, "r2"),
         (Preset::XGaussian, 13, "x"),
+        (Preset::SaxNerf, 13, "none"),
     ] {
         let settings =
             ["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"];
-        let short = if preset == Preset::R2Gaussian {
-            &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"][..]
-        } else if preset == Preset::XGaussian {
-            &["train.iterations=2", "x.voxels=8", "x.interval=2"][..]
-        } else {
-            &[]
+        let short = match preset {
+            Preset::R2Gaussian => &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"][..],
+            Preset::XGaussian => &["train.iterations=2", "x.voxels=8", "x.interval=2"],
+            Preset::SaxNerf => &["train.iterations=2", "sax.log2_table=8", "sax.windows=2", "sax.window=4"],
+            _ => &[],
         };
         let form = format!("gaussians.form={form}");
         let settings: Vec<String> = settings.iter().chain(short).map(|s| (*s).to_owned()).chain([form]).collect();

@@ -1,10 +1,11 @@
 //! The presets.
 
 use crate::config::sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree, X,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
+    Tree, X,
 };
 use crate::config::{
-    CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset, R2Start, StaticData, StaticForm,
+    CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, GaussianForm, Preset, R2Start, StaticData, StaticForm,
 };
 
 impl Config {
@@ -18,6 +19,7 @@ impl Config {
             Preset::NerfCa => nerf_ca(paper()),
             Preset::R2Gaussian => r2_gaussian(paper()),
             Preset::XGaussian => x_gaussian(paper()),
+            Preset::SaxNerf => sax_nerf(paper()),
         }
     }
 }
@@ -61,6 +63,7 @@ fn paper() -> Config {
             tv_line: 1e-3,
         },
         dynamic: DynamicField {
+            form: DynamicForm::Network,
             layers: 4,
             width: 128,
             skip_layer: 0,
@@ -99,6 +102,7 @@ fn paper() -> Config {
         tree: tree(),
         r2: r2(),
         x: x(),
+        sax: sax(),
     }
 }
 
@@ -328,6 +332,56 @@ fn x_gaussian(paper: Config) -> Config {
     }
 }
 
+/// The constants of SAX-NeRF's public code for the chest, whose rate falls after 1500 of 1501 passes over the images:
+/// here over three of them.
+pub(super) fn sax() -> Sax {
+    Sax {
+        static_data: StaticData::PerPhase,
+        normalise: true,
+        half_extent_mm: 0.0,
+        bound_mm: 300.0,
+        levels: 16,
+        base: 16,
+        log2_table: 19,
+        windows: 16,
+        window: 8,
+        rays: 1024,
+        samples: 256,
+        rate: 1e-3,
+        rate_falls_at: 4500,
+        rate_fall: 0.1,
+    }
+}
+
+/// SAX-NeRF as its public code does it: a static method, fitted to the whole images of each phase.
+fn sax_nerf(paper: Config) -> Config {
+    Config {
+        preset: Preset::SaxNerf,
+        train: Train {
+            iterations: 4503,
+            iterations_per_submit: 10,
+            checkpoint_every: 1500,
+            validate_every: 500,
+            ..paper.train
+        },
+        // Neither field is marched through: the still one is nothing.
+        march: March { static_samples: 2, dynamic_samples: 2, render_samples: 2, ..paper.march },
+        static_field: StaticField { form: StaticForm::None, ..paper.static_field },
+        // The network is never asked; the smallest one takes no memory.
+        dynamic: DynamicField {
+            form: DynamicForm::Lineformer,
+            layers: 1,
+            width: 16,
+            latent: 4,
+            bands: 1,
+            delay: 0,
+            ..paper.dynamic
+        },
+        adam: Adam { beta2: 0.999, ..paper.adam },
+        ..paper
+    }
+}
+
 /// Gaussians in front of the still field of [`fast_mlp`].
 fn fast(mlp: Config) -> Config {
     Config {
@@ -343,8 +397,8 @@ fn fast(mlp: Config) -> Config {
             ..mlp.train
         },
         march: March { dynamic_samples: 2, ..mlp.march },
-        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does not. Few
-        // iterations take long steps.
+        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does
+        // not. Few iterations take long steps.
         static_field: StaticField { tv: 100.0, lr: 3e-2, lr_end: 3e-3, ..mlp.static_field },
         // The network is never asked; the smallest one takes no memory.
         dynamic: DynamicField {

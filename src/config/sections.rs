@@ -1,6 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{CalibrateMode, Decay, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm};
+use crate::config::{CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -91,7 +91,8 @@ section! {
 section! {
     /// The static field. As a network ("network") it has the dynamic one's layers, and of what is below the learning rate alone.
     StaticField, "static" {
-        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian and X-Gaussian.
+        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian,
+        /// X-Gaussian and SAX-NeRF alone.
         #[serde(default)] form: StaticForm,
         /// Cells per axis, D.
         grid: u32 in 2.0 to 512.0,
@@ -119,6 +120,8 @@ section! {
 section! {
     /// The dynamic neural field.
     DynamicField, "dynamic" {
+        /// What it is where no Gaussians are: "network", or "lineformer" (section `sax`, and of this one nothing else).
+        #[serde(default)] form: DynamicForm,
         /// Hidden layers.
         layers: u32 in 1.0 to 16.0,
         /// Neurons per hidden layer, a multiple of 16.
@@ -476,5 +479,39 @@ section! {
         reset_every: u32 in 0.0 to 1e6,
         /// What larger opacities are reset to.
         reset_opacity: f64 in 1e-6 to 0.99,
+    }
+    /// SAX-NeRF's field (`dynamic.form = "lineformer"`), a hash grid and a Lineformer, with what its code uses as
+    /// defaults for the chest.
+    Sax, "sax" {
+        /// Which images a field sees: "per-phase" (those of its phase; a field per phase) or "pooled" (all; one field).
+        static_data: StaticData,
+        /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities, which a
+        /// sigmoid keeps below 1, can be near 1.
+        normalise: bool,
+        /// Half side of the volume that rays cross, mm; 0 = 1.6 radii of the field of view, or the dataset's depth
+        /// range where that is less.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Half side of the box that the hash grid divides, mm; beyond it, rays see what is at its faces.
+        bound_mm: f64 in 1.0 to 1e5,
+        /// Levels of the hash grid, an even number; each has two features.
+        levels: u32 in 2.0 to 16.0,
+        /// Cells along each side of the box in the first level; each further one has twice as many.
+        base: u32 in 1.0 to 65_536.0,
+        /// Logarithm to base 2 of the entries that a level has at most.
+        log2_table: u32 in 4.0 to 24.0,
+        /// Windows of a batch.
+        windows: u32 in 0.0 to 4096.0,
+        /// Side of a window, pixels.
+        window: u32 in 1.0 to 256.0,
+        /// Single rays of a batch, through pixels outside the windows that show something.
+        rays: u32 in 1.0 to 65_535.0,
+        /// Samples of a ray, an even number.
+        samples: u32 in 2.0 to 4096.0,
+        /// Adam's rate.
+        rate: f64 in 1e-12 to 100.0,
+        /// Iteration after which it falls; 0 = it does not.
+        rate_falls_at: u32 in 0.0 to 1e6,
+        /// What it falls to, as a share of itself.
+        rate_fall: f64 in 0.0 to 1.0,
     }
 }

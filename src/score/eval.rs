@@ -345,7 +345,7 @@ pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Op
     let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
     let seen = rendered(renderer, dataset, frame)?;
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
-    let remedy = if renderer.gaussians_move() {
+    let remedy = if !renderer.network_moves() {
         "check geometry, phases and noise of the views"
     } else {
         "check geometry and phases; a smaller hull.dilate_pixels, a lower dynamic.lr or another seed may help"

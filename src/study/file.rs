@@ -266,6 +266,9 @@ fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
             ("x.degree_every", preset.x.degree_every),
         ]);
     }
+    if preset.is_sax() {
+        schedule.push(("sax.rate_falls_at", preset.sax.rate_falls_at));
+    }
     let moved = schedule.into_iter().filter(|(key, _)| !given.contains(key));
     let least =
         |key: &str| if [DENSIFY_EVERY, X_DENSIFY_EVERY].contains(&key) { LEAST_BETWEEN_DENSIFYING } else { 0.0 };

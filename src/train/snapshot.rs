@@ -8,6 +8,7 @@ use crate::kernels::layout::{DeviceState, StepReport};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::r2::R2State;
+use crate::model::sax::SaxState;
 use crate::model::x_gaussian::XState;
 
 /// Bytes of an iteration's report.
@@ -28,6 +29,7 @@ pub struct Snapshot {
     pub(super) model: Model,
     pub(super) r2: Option<R2State>,
     pub(super) x: Option<XState>,
+    pub(super) sax: Option<SaxState>,
     pub(super) data_fingerprint: String,
 }
 
@@ -72,6 +74,7 @@ impl Snapshot {
             last_report,
             r2: self.r2,
             x: self.x,
+            sax: self.sax,
             data_fingerprint: self.data_fingerprint,
         })
     }
