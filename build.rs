@@ -18,9 +18,9 @@ use std::{env, fs};
 type Failure = Box<dyn std::error::Error>;
 
 /// Includes whose structures the host uses, too.
-const SHARED_STRUCTURES: [&str; 3] = ["layout", "gaussian_layout", "r2_layout"];
+const SHARED_STRUCTURES: [&str; 5] = ["layout", "gaussian_layout", "r2_layout", "sax_layout", "x_layout"];
 /// Includes whose integer constants the host uses, too.
-const SHARED_CONSTANTS: [&str; 5] = ["layout", "occupancy", "positions", "random", "sample_rays"];
+const SHARED_CONSTANTS: [&str; 6] = ["layout", "lineformer_layout", "occupancy", "positions", "random", "sample_rays"];
 
 fn main() -> Result<(), Failure> {
     println!("cargo:rerun-if-changed=build");

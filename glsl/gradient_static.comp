@@ -3,6 +3,7 @@
 // Gradient of the static field: fixed-point sums (then cleared for the next iteration) with the total-variation term.
 // One invocation per parameter.
 #include "inc/layout.glsl"
+#include "inc/fixed_point.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(binding = 0) readonly buffer B0 { Setup setup; };
@@ -10,22 +11,11 @@ layout(binding = 1) readonly buffer B1 { float tv_gradient[]; };
 layout(binding = 2) buffer B2 { uint static_gradient[]; };
 layout(binding = 3) writeonly buffer B3 { float gradient[]; };
 
-float from_fixed(uint parameter) {
-    uint low = static_gradient[2u * parameter];
-    uint high = static_gradient[2u * parameter + 1u];
-    bool negative = (high & 0x80000000u) != 0u;
-    if (negative) {
-        low = ~low + 1u;
-        high = ~high + (low == 0u ? 1u : 0u);
-    }
-    float magnitude = (float(high) * 4294967296.0 + float(low)) * exp2(-float(setup.fixed_point_bits));
-    return negative ? -magnitude : magnitude;
-}
-
 void main() {
     uint i = invocation();
     if (i >= setup.static_params) return;
-    gradient[i] = from_fixed(i) + tv_gradient[i];
+    uvec2 sum = uvec2(static_gradient[2u * i], static_gradient[2u * i + 1u]);
+    gradient[i] = from_fixed(sum, setup.fixed_point_bits) + tv_gradient[i];
     static_gradient[2u * i] = 0u;
     static_gradient[2u * i + 1u] = 0u;
 }

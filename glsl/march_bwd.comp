@@ -10,6 +10,7 @@
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
 #include "inc/softplus.glsl"
+#include "inc/fixed_point.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint private_lines = 0u;  // numbers on all lines, or 0: straight to memory
@@ -24,23 +25,8 @@ layout(binding = 5) buffer B5 { uint static_gradient[]; };
 
 shared uint line_sums[2u * private_lines + 1u];
 
-// A number in 64-bit fixed point; the magnitude is split exactly into words, then negated in two's complement.
-uvec2 to_fixed(float value, float scale_high) {
-    float scaled = abs(value) * scale_high;
-    float whole = floor(scaled);
-    uint high = uint(whole);
-    uint low = uint((scaled - whole) * 4294967296.0);
-    if (value < 0.0) {
-        low = ~low + 1u;
-        high = ~high + (low == 0u ? 1u : 0u);
-    }
-    return uvec2(low, high);
-}
-
 void add_to_memory(uint parameter, uvec2 fixed_point) {
-    uint before = atomicAdd(static_gradient[2u * parameter], fixed_point.x);
-    uint high = fixed_point.y + (before + fixed_point.x < before ? 1u : 0u);
-    if (high != 0u) atomicAdd(static_gradient[2u * parameter + 1u], high);
+    ADD_FIXED(static_gradient, parameter, fixed_point);
 }
 
 void add_to_plane(uint texel, vec4 value, float scale_high) {
@@ -57,10 +43,7 @@ void add_to_line(uint texel, vec4 value, float scale_high) {
         if (private_lines == 0u) {
             add_to_memory(4u * texel + c, fixed_point);
         } else {
-            uint at = 2u * (4u * texel + c - first);
-            uint before = atomicAdd(line_sums[at], fixed_point.x);
-            uint high = fixed_point.y + (before + fixed_point.x < before ? 1u : 0u);
-            if (high != 0u) atomicAdd(line_sums[at + 1u], high);
+            ADD_FIXED(line_sums, 4u * texel + c - first, fixed_point);
         }
     }
 }

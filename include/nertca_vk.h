@@ -931,8 +931,8 @@ nertca_status nertca_context_destroy(nertca_context *context);
  *
  * `options` are lines of `key = value` or a JSON object: `phases` (cardiac phases; needed), `depth_half_extent_mm`
  * (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (of filled
- * vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca or r2-gaussian) and every key that
- * `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
+ * vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
+ * x-gaussian or sax-nerf) and every key that `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
  *
  * `*reconstruction` is null on failure. Any thread.
  *

@@ -57,7 +57,8 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
         return Ok(Calibration::none(None));
     }
     if mode == CalibrateMode::Breathing && !config.follows_breath() {
-        let problem = "networks and R2-Gaussian take corrections per view only: choose static, or other Gaussians as the moving field";
+        let problem = "networks, R2-Gaussian, X-Gaussian and SAX-NeRF take corrections per view only: choose static, or \
+                       other Gaussians as the moving field";
         return Err(Error::config("calibrate.mode", "breathing", problem));
     }
     let observed = Observed::new(dataset);

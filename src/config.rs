@@ -3,13 +3,16 @@
 //! Precedence: preset < TOML file < single settings `key=value`.
 
 mod checks;
+mod forms;
 mod presets;
 pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
+pub use forms::DynamicForm;
 use sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
+    Tree, X,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -31,11 +34,23 @@ pub enum Preset {
     NerfCa,
     /// R2-Gaussian, a static method the paper compares itself with: each phase by itself, all of it Gaussians.
     R2Gaussian,
+    /// X-Gaussian, another such: Gaussians that hide each other, as in Gaussian splatting.
+    XGaussian,
+    /// SAX-NeRF, a static method the paper compares itself with: each phase by itself, a hash grid and a Lineformer.
+    SaxNerf,
 }
 
 impl Choice for Preset {
-    const ALL: &'static [Preset] =
-        &[Preset::Fast, Preset::FastMlp, Preset::Paper, Preset::PublicCode, Preset::NerfCa, Preset::R2Gaussian];
+    const ALL: &'static [Preset] = &[
+        Preset::Fast,
+        Preset::FastMlp,
+        Preset::Paper,
+        Preset::PublicCode,
+        Preset::NerfCa,
+        Preset::R2Gaussian,
+        Preset::XGaussian,
+        Preset::SaxNerf,
+    ];
 
     fn name(self) -> &'static str {
         match self {
@@ -45,6 +60,8 @@ impl Choice for Preset {
             Preset::PublicCode => "public-code",
             Preset::NerfCa => "nerf-ca",
             Preset::R2Gaussian => "r2-gaussian",
+            Preset::XGaussian => "x-gaussian",
+            Preset::SaxNerf => "sax-nerf",
         }
     }
 }
@@ -98,11 +115,19 @@ pub enum GaussianForm {
     Auto,
     /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all: no still field beside them.
     R2,
+    /// Static sets as X-Gaussian fits them to normalised images: alone as well, and nearer ones hide those behind them.
+    X,
 }
 
 impl Choice for GaussianForm {
-    const ALL: &'static [GaussianForm] =
-        &[GaussianForm::None, GaussianForm::Phase, GaussianForm::Tree, GaussianForm::Auto, GaussianForm::R2];
+    const ALL: &'static [GaussianForm] = &[
+        GaussianForm::None,
+        GaussianForm::Phase,
+        GaussianForm::Tree,
+        GaussianForm::Auto,
+        GaussianForm::R2,
+        GaussianForm::X,
+    ];
 
     fn name(self) -> &'static str {
         match self {
@@ -111,6 +136,7 @@ impl Choice for GaussianForm {
             GaussianForm::Tree => "tree",
             GaussianForm::Auto => "auto",
             GaussianForm::R2 => "r2",
+            GaussianForm::X => "x",
         }
     }
 }
@@ -235,6 +261,12 @@ pub struct Config {
     /// Gaussians as R2-Gaussian fits them; checkpoints of before have none.
     #[serde(default = "presets::r2")]
     pub r2: R2,
+    /// Gaussians as X-Gaussian fits them; checkpoints of before have none.
+    #[serde(default = "presets::x")]
+    pub x: X,
+    /// A hash grid and a Lineformer as SAX-NeRF fits them; checkpoints of before have none.
+    #[serde(default = "presets::sax")]
+    pub sax: Sax,
 }
 
 impl Config {
@@ -295,16 +327,36 @@ impl Config {
         self.gaussians.form == GaussianForm::R2
     }
 
+    /// Whether the moving field is X-Gaussian's, which is all there is as well.
+    pub fn is_x(&self) -> bool {
+        self.gaussians.form == GaussianForm::X
+    }
+
+    /// Whether Gaussians are all there is, fitted to whole images.
+    pub fn has_gaussians_alone(&self) -> bool {
+        self.is_r2() || self.is_x()
+    }
+
+    /// Whether the dynamic field is SAX-NeRF's, which is all there is: the still field is nothing.
+    pub fn is_sax(&self) -> bool {
+        self.dynamic.form == DynamicForm::Lineformer
+    }
+
+    /// Whether the network on encoded coordinates is the moving field.
+    pub fn network_moves(&self) -> bool {
+        !self.gaussians_move() && !self.is_sax()
+    }
+
     /// Whether the moving field takes displacements of the heart, frame by frame: a method that sees whole images cannot.
     pub fn follows_breath(&self) -> bool {
-        self.gaussians_move() && !self.is_r2()
+        self.gaussians_move() && !self.has_gaussians_alone()
     }
 
     /// Iterations, the first of the run, that go to Gaussians; the still field has the others.
     pub fn gaussian_iterations(&self) -> u32 {
         match self.gaussians.form {
             GaussianForm::None => 0,
-            GaussianForm::R2 => self.train.iterations,
+            GaussianForm::R2 | GaussianForm::X => self.train.iterations,
             _ => self.gaussians.iterations.min(self.train.iterations),
         }
     }
@@ -386,6 +438,8 @@ mod tests {
             ("static.form=none", "static.form"),
             ("gaussians.form=r2", "static.form"),
             ("r2.count=0", "r2.count"),
+            ("dynamic.form=lineformer", "static.form"),
+            ("sax.levels=0", "sax.levels"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
@@ -413,8 +467,8 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_go_with_r2_is_named() {
-        for (setting, part) in [
+    fn what_does_not_go_with_r2_and_x_is_named() {
+        let r2 = [
             ("static.form=tensor", "static.form"),
             ("gaussians.form=phase", "static.form"),
             ("hull.enabled=true", "hull.enabled"),
@@ -426,8 +480,17 @@ mod tests {
             ("r2.least_scale=0.6", "r2.least_scale"),
             ("r2.most=10", "r2.count"),
             ("r2.static_data=both", "both"),
-        ] {
-            let message = Config::load(Some(Preset::R2Gaussian), None, &[setting.into()]).unwrap_err().to_string();
+        ];
+        let x = [
+            ("static.form=tensor", "static.form"),
+            ("hull.enabled=true", "gaussians.form = \"x\""),
+            ("x.interval=300", "x.interval"),
+            ("x.most=10", "x.most"),
+            ("x.first_opacity=0.001", "x.first_opacity"),
+        ];
+        let all = r2.map(|case| (Preset::R2Gaussian, case)).into_iter().chain(x.map(|case| (Preset::XGaussian, case)));
+        for (preset, (setting, part)) in all {
+            let message = Config::load(Some(preset), None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
         }
     }
@@ -446,8 +509,11 @@ mod tests {
         let config = Config::preset(Preset::FastMlp);
         let mut table = toml::Table::try_from(&config).unwrap();
         assert!(table.remove("gaussians").is_some() && table.remove("tree").is_some());
-        assert!(table.remove("networks").is_some() && table.remove("r2").is_some());
-        for (section, key) in [("static", "form"), ("march", "along_axis"), ("adam", "decay_share")] {
+        assert!(table.remove("networks").is_some() && table.remove("r2").is_some() && table.remove("sax").is_some());
+        assert!(table.remove("x").is_some());
+        for (section, key) in
+            [("static", "form"), ("dynamic", "form"), ("march", "along_axis"), ("adam", "decay_share")]
+        {
             assert!(table[section].as_table_mut().unwrap().remove(key).is_some());
         }
         assert_eq!(table.try_into::<Config>().unwrap(), config);

@@ -4,7 +4,7 @@ use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::gaussians::blobs::BlobKernels;
 use crate::gaussians::pictures::into_buffers;
-use crate::gaussians::stages::GaussianKernels;
+use crate::gaussians::stages::{GaussianKernels, SplatStage};
 use crate::gaussians::tree::TreeKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
@@ -15,6 +15,8 @@ use crate::kernels::tuning::Tuning;
 use crate::model::params::ParamMap;
 use crate::network::{Network, Purpose};
 use crate::r2::stages::R2Kernels;
+use crate::sax::stages::SaxKernels;
+use crate::x_gaussian::stages::XKernels;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -103,7 +105,7 @@ const CAPACITY: u32 = 1024;
 /// [`Error::Config`] where the network is not for the device; [`Error::Internal`] for a device without statistics; errors
 /// of [`Gpu::pipeline`].
 pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> Result<Vec<Compiled>> {
-    let tuning = tuning.clone().for_network(!config.gaussians_move());
+    let tuning = tuning.clone().for_network(config.network_moves());
     let params = ParamMap::new(config, n_phases);
     let setup = Setup { sample_capacity: CAPACITY, n_rays: 1, n_dynamic_samples: 1, ..Setup::default() };
     for purpose in [Purpose::Train, Purpose::Render] {
@@ -120,6 +122,12 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
                 // Pictures are drawn by a stage of other fits.
                 Build::default().stage::<push::GaussianProject>(gpu)?;
             }
+            GaussianForm::X => {
+                XKernels::new(gpu)?;
+                // Which these have at hand, too.
+                Build::default().stage::<push::GaussianProject>(gpu)?;
+                SplatStage::<push::GaussianSplat>::new(gpu)?;
+            }
             form => {
                 GaussianKernels::new(gpu)?;
                 if form != GaussianForm::Phase {
@@ -129,6 +137,9 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
         }
         BlobKernels::new(gpu, &tuning)?;
         into_buffers(gpu)?;
+    }
+    if config.is_sax() {
+        SaxKernels::new(gpu)?;
     }
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
     if all.is_empty() {

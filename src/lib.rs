@@ -193,6 +193,29 @@ pub mod r2 {
     pub mod start;
 }
 
+/// X-Gaussian, another static method that the paper compares itself with: its data, where it begins, its stages and density
+/// control.
+pub mod x_gaussian {
+    pub mod data;
+    pub mod densify;
+    pub mod particles;
+    pub mod picture;
+    pub mod setup;
+    pub mod stages;
+    pub mod start;
+}
+
+/// SAX-NeRF, a static method that the paper compares itself with: its data, where it begins, its stages and drawing.
+pub mod sax {
+    pub mod buffers;
+    pub mod data;
+    pub mod drawing;
+    pub mod products;
+    pub mod setup;
+    pub mod stages;
+    pub mod start;
+}
+
 pub mod plan;
 
 /// Drawing a model, for any pose and phase.
@@ -213,6 +236,7 @@ pub mod train {
     pub mod losses;
     pub mod moving;
     pub mod r2;
+    pub mod sax;
     pub mod snapshot;
     pub mod step;
     mod targets;
@@ -221,6 +245,7 @@ pub mod train {
     pub mod training;
     pub mod tree;
     pub mod tree_start;
+    pub mod x_gaussian;
 }
 
 /// A model for other tools: volumes, surfaces and motion.
@@ -338,8 +363,10 @@ pub mod reference {
     pub mod occupancy;
     pub mod projector;
     pub mod r2;
+    pub mod sax;
     pub mod step;
     pub mod tree;
+    pub mod x_gaussian;
 }
 
 #[cfg(feature = "diagnostics")]

@@ -10,15 +10,20 @@ pub mod hull;
 pub mod params;
 pub mod r2;
 mod r2_tensors;
+pub mod sax;
+mod sax_tensors;
 pub mod scene;
 mod schedule;
 pub mod setup;
+pub mod x_gaussian;
+mod x_tensors;
 
 use crate::config::Config;
 use crate::geometry::CArm;
 use crate::model::gaussians::MovingGaussians;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
+use crate::model::sax::SaxField;
 use crate::model::scene::Scene;
 
 /// The fields at one moment of training.
@@ -34,6 +39,8 @@ pub struct Model {
     pub hull: Option<Hull>,
     /// Gaussians, where they are the moving field; else the network is.
     pub moving: Option<MovingGaussians>,
+    /// SAX-NeRF's field, where that is all there is.
+    pub sax: Option<SaxField>,
     /// Parameters, padded as [`ParamMap`] says.
     pub params: Vec<f32>,
     /// Iterations done.
@@ -47,8 +54,9 @@ pub struct Model {
 }
 
 impl Model {
-    /// Whether the moving field has a value between phases: a network or one set of Gaussians that moves, not sets per phase.
+    /// Whether the moving field has a value between phases: a network or one set of Gaussians that moves, not sets per phase
+    /// and not SAX-NeRF's fields.
     pub fn is_continuous(&self) -> bool {
-        self.moving.as_ref().is_none_or(|field| field.tree().is_some())
+        self.sax.is_none() && self.moving.as_ref().is_none_or(|field| field.tree().is_some())
     }
 }

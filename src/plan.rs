@@ -26,7 +26,9 @@ use crate::plan::soft_hull::carve::SoftMotion;
 use crate::plan::start::StartRays;
 use crate::plan::targets::Targets;
 use crate::r2::data::R2Data;
+use crate::sax::data::SaxData;
 use crate::scan::dataset::Dataset;
+use crate::x_gaussian::data::XData;
 
 /// A run, ready to start.
 pub struct Plan {
@@ -59,6 +61,10 @@ pub struct Plan {
     pub targets: Option<Targets>,
     /// What R2-Gaussian's are fitted to, when they are all there is.
     pub r2: Option<R2Data>,
+    /// What X-Gaussian's are fitted to, when they are all there is.
+    pub x: Option<XData>,
+    /// What SAX-NeRF's fields are fitted to, when they are all there is.
+    pub sax: Option<SaxData>,
     /// Weighted loss of the moving field when there is none, where a network moves with a temporal target.
     pub empty_loss: Option<f64>,
     /// Decisions worth telling the user.
@@ -73,9 +79,15 @@ impl Plan {
     pub fn new(config: &Config, dataset: &Dataset) -> Result<Plan> {
         let mut notes = Vec::new();
         let motion = motion::analyse(dataset, &config.hull);
-        let mut r2 = None;
-        let (hull, targets) = if config.is_r2() {
+        let (mut r2, mut x, mut sax) = (None, None, None);
+        let (hull, targets) = if config.is_sax() {
+            sax = Some(plan_sax(config, dataset, &mut notes)?);
+            (None, None)
+        } else if config.is_r2() {
             r2 = Some(plan_r2(config, dataset, &mut notes)?);
+            (None, None)
+        } else if config.is_x() {
+            x = Some(plan_x(config, dataset, &mut notes)?);
             (None, None)
         } else if config.gaussians_move() {
             let (hull, targets) = plan_gaussians(config, dataset, &mut notes)?;
@@ -175,6 +187,8 @@ impl Plan {
             hull,
             targets,
             r2,
+            x,
+            sax,
             empty_loss,
             notes,
         })
@@ -231,7 +245,7 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
 
 /// What R2-Gaussian is fitted to, and what is to be said of that.
 fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
-    let half = scale::volume_half(config, dataset);
+    let half = scale::volume_half(config.r2.half_extent_mm, dataset);
     let data = R2Data::new(dataset, &config.r2, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
     notes.push(match config.r2.static_data {
@@ -258,6 +272,72 @@ fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
     }
     if dataset.heart_shifts() {
         notes.push("R2-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+    }
+    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    Ok(data)
+}
+
+/// What X-Gaussian is fitted to, and what is to be said of that.
+fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
+    let half = scale::volume_half(config.x.half_extent_mm, dataset);
+    let data = XData::new(dataset, &config.x, half)?;
+    let side_mm = 2.0 * half * MM_PER_UNIT;
+    let whose = match config.x.static_data {
+        StaticData::PerPhase => "each phase has Gaussians of its own images (x.static_data = \"per-phase\")",
+        StaticData::Pooled => "one set of the images of all phases is shown at each (x.static_data = \"pooled\")",
+    };
+    notes.push(format!(
+        "X-Gaussian, a static method of Gaussians that hide each other: {whose}, from a cube of {side_mm:.1} mm on, in a scene of \
+         {:.0} mm; its pictures have no unit, and its opacities are no attenuation",
+        data.extent_mm
+    ));
+    if data.clamped > 0.0 {
+        notes.push(format!(
+            "{:.1} % of the images' pixels are beyond x.clamp = {} and count as that",
+            100.0 * data.clamped,
+            config.x.clamp
+        ));
+    }
+    if !dataset.hidden.is_empty() {
+        notes.push(
+            "pixels that show nothing of the patient are fitted like all others: X-Gaussian knows no masks".into(),
+        );
+    }
+    if dataset.heart_shifts() {
+        notes.push("X-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+    }
+    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    Ok(data)
+}
+
+/// What SAX-NeRF is fitted to, and what is to be said of that.
+fn plan_sax(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<SaxData> {
+    let half = scale::volume_half(config.sax.half_extent_mm, dataset);
+    let data = SaxData::new(dataset, &config.sax, half)?;
+    let images = data.images_of_set.iter().map(Vec::len).max().unwrap_or(1);
+    let passes = config.train.iterations as usize / images;
+    notes.push(match config.sax.static_data {
+        StaticData::PerPhase => format!(
+            "SAX-NeRF, a static method: each phase is reconstructed from its own images, of which an iteration sees one: \
+             {passes} passes over them (sax.static_data = \"per-phase\")"
+        ),
+        StaticData::Pooled => format!(
+            "SAX-NeRF, a static method: one reconstruction from the images of all phases, of which an iteration sees one \
+             ({passes} passes over them), is shown at each (sax.static_data = \"pooled\")"
+        ),
+    });
+    if config.sax.normalise && dataset.vessel_attenuation.is_none() {
+        notes.push(
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF shows none above 1"
+                .into(),
+        );
+    }
+    if !dataset.hidden.is_empty() {
+        notes
+            .push("pixels that show nothing of the patient are fitted like all others: SAX-NeRF knows no masks".into());
+    }
+    if dataset.heart_shifts() {
+        notes.push("SAX-NeRF sees all frames of a view alike: displacements of the heart are left out".into());
     }
     notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
     Ok(data)

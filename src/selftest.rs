@@ -3,7 +3,8 @@
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
 //! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
-//!    [`gaussians`], [`trees`], [`mod@r2`] and [`blobs`] about Gaussians; [`projections`] about phantoms
+//!    [`gaussians`], [`trees`], [`mod@r2`], [`x_gaussian`] and [`blobs`] about Gaussians; [`mod@sax`] about SAX-NeRF, [`projections`]
+//!    about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 
 pub mod blobs;
@@ -17,7 +18,9 @@ pub mod problems;
 pub mod projections;
 pub mod r2;
 pub mod repeats;
+pub mod sax;
 pub mod trees;
+pub mod x_gaussian;
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
@@ -111,6 +114,8 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
     vec![
         ("Gaussians per phase".into(), Box::new(move |findings| gaussians::compare(gpu, findings))),
         ("R2-Gaussian".into(), Box::new(move |findings| r2::compare(gpu, findings))),
+        ("X-Gaussian".into(), Box::new(move |findings| x_gaussian::compare(gpu, findings))),
+        ("SAX-NeRF".into(), Box::new(move |findings| sax::compare(gpu, findings))),
         ("a moving tree".into(), Box::new(move |findings| trees::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
         ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_crowd(gpu, tuning, findings))),

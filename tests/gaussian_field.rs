@@ -67,6 +67,8 @@ fn checkpoints_keep_every_bit() {
             stopped: false,
             last_report: Vec::new(),
             r2: None,
+            x: None,
+            sax: None,
             data_fingerprint: "x".into(),
         };
         let bytes = saved.to_bytes().unwrap();
@@ -100,6 +102,8 @@ fn damaged_gaussians_are_refused_by_name() {
             stopped: false,
             last_report: Vec::new(),
             r2: None,
+            x: None,
+            sax: None,
             data_fingerprint: String::new(),
         };
         Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()

@@ -88,6 +88,7 @@ fn tree() -> MovingTree {
             rows: (0..6).map(gaussian).collect(),
             step: 1,
             is_crowd: false,
+            intensities: None,
         },
         setup: TreeSetup {
             n_nodes: NODES,
@@ -113,6 +114,7 @@ fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
         param_map: plan.params,
         hull: None,
         moving,
+        sax: None,
         step: 40,
         vessel_attenuation: None,
         c_arm: dataset.reference_c_arm(),
@@ -134,6 +136,8 @@ fn saved(model: Model, path: &Path) -> String {
         stopped: false,
         last_report: Vec::new(),
         r2: None,
+        x: None,
+        sax: None,
         data_fingerprint: "none".into(),
     };
     checkpoint.write(path).unwrap();

@@ -20,7 +20,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::selftest::compare::Findings;
 use nertca_vk::selftest::iteration::F32_CASES;
-use nertca_vk::selftest::{blobs, gaussians, iteration, networks, problems, r2, trees};
+use nertca_vk::selftest::{blobs, gaussians, iteration, networks, problems, r2, sax, trees, x_gaussian};
 use nertca_vk::train::trainer::Trainer;
 use program::program;
 use serde_json::Value;
@@ -53,6 +53,10 @@ const STORE: u32 = 62;
 const ADD: u32 = 129;
 const SUBTRACT: u32 = 131;
 const MULTIPLY: u32 = 133;
+const WHOLE_ADD: u32 = 128;
+const WHOLE_SUBTRACT: u32 = 130;
+const SHIFT_RIGHT: u32 = 194;
+const SHIFT_LEFT: u32 = 196;
 const LESS: u32 = 176;
 const LESS_OR_EQUAL: u32 = 178;
 
@@ -83,11 +87,27 @@ fn sum_for_product(words: &mut [u32]) {
     replace(words, MULTIPLY, ADD);
 }
 
+fn negated(words: &mut [u32]) {
+    replace(words, ADD, SUBTRACT);
+}
+
+fn differences(words: &mut [u32]) {
+    replace(words, WHOLE_ADD, WHOLE_SUBTRACT);
+}
+
+fn other_digits(words: &mut [u32]) {
+    replace(words, SHIFT_RIGHT, SHIFT_LEFT);
+}
+
 fn one_too_many(words: &mut [u32]) {
     replace(words, LESS, LESS_OR_EQUAL);
 }
 
-/// The last two stores of `gradient_static` clear its sums; in their place, the one before is done again.
+fn difference_for_sum(words: &mut [u32]) {
+    replace(words, ADD, SUBTRACT);
+}
+
+/// The last two stores of `gradient_static` and `sax_grid_gradient` clear their sums; in their place, the one before is done again.
 fn missing_clear(words: &mut [u32]) {
     let stores: Vec<_> = instructions(words).into_iter().filter(|(_, operation, _)| *operation == STORE).collect();
     let [.., (before, _, length), one, other] = stores[..] else { panic!("three stores are needed") };
@@ -152,6 +172,26 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("r2_voxel_tv", one_too_many, r2::compare),
         fault("r2_voxel_moments", wrong_sign, r2::compare),
         fault("r2_update", wrong_sign, r2::compare),
+        fault("x_project", wrong_sign, x_gaussian::compare),
+        fault("x_sort_count", other_digits, x_gaussian::compare),
+        fault("x_sort_scan", differences, x_gaussian::compare),
+        fault("x_sort_move", other_digits, x_gaussian::compare),
+        fault("x_lists", one_too_many, x_gaussian::compare),
+        fault("x_blend", wrong_sign, x_gaussian::compare),
+        fault("x_blend_back", wrong_sign, x_gaussian::compare),
+        fault("x_update", wrong_sign, x_gaussian::compare),
+        fault("x_report", negated, x_gaussian::compare),
+        fault("sax_batch", one_too_many, sax::compare),
+        fault("sax_points", wrong_sign, sax::compare),
+        fault("sax_encode", wrong_sign, sax::compare),
+        fault("sax_lineformer", wrong_sign, sax::compare),
+        fault("sax_loss", wrong_sign, sax::compare),
+        fault("sax_lineformer_bwd", wrong_sign, sax::compare),
+        fault("sax_weight_gradient", difference_for_sum, sax::compare),
+        fault("sax_encode_bwd", wrong_sign, sax::compare),
+        fault("sax_grid_gradient", missing_clear, sax::compare),
+        fault("sax_report", difference_for_sum, sax::compare),
+        fault("sax_view", difference_for_sum, sax::compare),
         fault("gaussian_crowd", wrong_sign, many_gaussians),
     ] {
         shim::begin(shim::Failing::None);
@@ -188,13 +228,16 @@ fn the_inventory_is_what_a_run_builds() {
         (Preset::Fast, 32, "tree"),
         (Preset::Fast, 32, "phase"),
         (Preset::R2Gaussian, 13, "r2"),
+        (Preset::XGaussian, 13, "x"),
+        (Preset::SaxNerf, 13, "none"),
     ] {
         let settings =
             ["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"];
-        let short = if preset == Preset::R2Gaussian {
-            &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"][..]
-        } else {
-            &[]
+        let short = match preset {
+            Preset::R2Gaussian => &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"][..],
+            Preset::XGaussian => &["train.iterations=2", "x.voxels=8", "x.interval=2"],
+            Preset::SaxNerf => &["train.iterations=2", "sax.log2_table=8", "sax.windows=2", "sax.window=4"],
+            _ => &[],
         };
         let form = format!("gaussians.form={form}");
         let settings: Vec<String> = settings.iter().chain(short).map(|s| (*s).to_owned()).chain([form]).collect();

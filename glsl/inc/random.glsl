@@ -28,6 +28,7 @@ const uint STREAM_ACQUISITION = 10u;  // how runs of phantoms are taken
 const uint STREAM_R2_VIEW = 11u;      // order of the images that a set of R2-Gaussian sees
 const uint STREAM_R2_BOX = 12u;       // where the box of voxels is whose total variation counts
 const uint STREAM_R2_CHILD = 13u;     // where a Gaussian that is split leaves its children
+const uint STREAM_SAX_WINDOW = 14u;   // which windows of an image SAX-NeRF sees
 
 // Uniform in [0, 1), 24 bits.
 float uniform01(uint seed, uint stream, uint a, uint b) {

@@ -124,7 +124,7 @@ class Reconstruction:
     """A reconstruction of the beating coronary arteries: its frames, its training, its fields.
 
     phases: cardiac phases; 1 for a still object.
-    preset: "fast", "fast-mlp", "paper", "public-code", "nerf-ca" or "r2-gaussian".
+    preset: "fast", "fast-mlp", "paper", "public-code", "nerf-ca", "r2-gaussian", "x-gaussian" or "sax-nerf".
     depth_half_extent_mm: attenuation is searched within this distance of the isocentre plane; 100 when None.
     vessel_attenuation_per_mm: of filled vessels, where known: sets the Dice threshold.
     settings: every key that `nertca-vk train --print-config` shows, as in `{"train.iterations": 800}`.

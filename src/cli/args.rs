@@ -107,10 +107,10 @@ pub(super) fn pair(text: &str) -> Option<[f64; 2]> {
 /// Hyper-parameters, for every command that trains.
 #[derive(Debug, Args)]
 pub struct ConfigArgs {
-    /// Set of defaults: `fast` (Gaussians move; normalised, tuned), `fast-mlp` (a network does), `paper` (as the paper states it),
-    /// `public-code` (as the authors' code does it), `nerf-ca` (two networks, the method that the paper compares itself with) or
-    /// `r2-gaussian` (static Gaussians for each phase, another such);
-    /// `fast`, unless a configuration file names one.
+    /// Set of defaults: `fast` (Gaussians move; normalised, tuned), `fast-mlp` (a network does), `paper` (as the paper
+    /// states it), `public-code` (as the authors' code does it), `nerf-ca` (two networks, the method that the paper
+    /// compares itself with), `r2-gaussian`, `x-gaussian` or `sax-nerf` (static Gaussians, such as hide each other, or
+    /// static networks, for each phase: three other such); `fast`, unless a configuration file names one.
     #[arg(long, value_parser = choice::<Preset>())]
     pub preset: Option<Preset>,
     /// TOML file with hyper-parameters.

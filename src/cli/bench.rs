@@ -257,7 +257,7 @@ fn internal(error: serde_json::Error) -> Error {
     Error::Internal(error.to_string())
 }
 
-/// Times a run whose moving field is the network.
+/// Times a run whose moving field is the network, or SAX-NeRF's.
 fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
     let delay = config.dynamic.delay.min(config.train.iterations);
     let before = match delay {
@@ -272,8 +272,8 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
     Ok(Timings {
         paths: subject.notes(),
         rays: subject.rays(),
-        network_cost: Some(subject.cost()),
-        work: subject.work(after.live_samples),
+        network_cost: config.network_moves().then(|| subject.cost()),
+        work: if config.network_moves() { subject.work(after.live_samples) } else { Ledger::new() },
         gaussians: None,
         before,
         after: Some(after),
@@ -290,7 +290,7 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
     let notes = fits.notes().to_vec();
     drop(fits);
     let whole_fit_s = |iterations: u32| gaussians.preparation_s + 1e-3 * gaussians.median() * f64::from(iterations);
-    if config.is_r2() {
+    if config.has_gaussians_alone() {
         return Ok(Timings {
             paths: notes,
             rays: 0,

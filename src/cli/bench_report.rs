@@ -148,15 +148,19 @@ pub fn print(report: &Report, kernels: bool) {
     }
 }
 
-/// Form of the Gaussians whose number grows after the iterations that are timed.
-const R2: &str = "r2";
+/// Forms of the Gaussians whose number grows after the iterations that are timed.
+const GROWING: [&str; 2] = ["r2", "x"];
 
 fn print_whole_run(report: &Report) {
     let (time, speedup) = (clock(report.whole_run_s), PAPER_SECONDS / report.whole_run_s);
     if report.of_the_paper {
         out!("whole run: {time} against 37:00 of the paper, extrapolated: {speedup:.3} x as fast");
     } else {
-        let least = if report.gaussians.as_ref().is_some_and(|g| g.form == R2) { "at least " } else { "" };
+        let least = if report.gaussians.as_ref().is_some_and(|g| GROWING.contains(&g.form.as_str())) {
+            "at least "
+        } else {
+            ""
+        };
         out!(
             "whole run: {least}{time}, extrapolated; not the paper's iterations, whose 37:00 say nothing without a Dice (--full)"
         );

@@ -165,6 +165,9 @@ pub fn print_table(evaluation: &Evaluation) {
     if let Some(ceiling) = evaluation.ceiling {
         out!("the true vessels by the same rule: {:.3}; best over thresholds {}", ceiling.dice, best(ceiling.best));
     }
+    if let Some(otsu) = evaluation.dice_otsu {
+        out!("Dice by Otsu's threshold of each image: {otsu:.3}");
+    }
     let published = evaluation.dice_published;
     out!(
         "Dice at the authors' threshold, {:.4e} per mm: {} (dynamic, as in the paper) / {} (total, first image, as in their code)",

@@ -159,6 +159,7 @@ impl Page<'_> {
             div.numbers {
                 div { b { (dice(e.dice.dynamic)) } "Dice, dynamic field" }
                 div { b { (dice(e.dice.total)) } "Dice, both fields" }
+                @if e.dice_otsu.is_some() { div { b { (dice(e.dice_otsu)) } "Dice, Otsu of each image" } }
                 div { b { (format!("{:.1}", e.psnr)) } "PSNR, dB" }
                 div { b { (format!("{:.3}", e.ssim)) } "SSIM" }
             }

@@ -5,6 +5,9 @@ use crate::config::sections::check_range;
 use crate::config::{Config, DynamicTarget, StaticForm};
 use crate::error::{Error, Result};
 
+/// Cells along a side of the hash grid's box that f32 coordinates tell apart.
+const MOST_CELLS: u64 = 1 << 20;
+
 impl Config {
     /// Refuses values no run could use.
     ///
@@ -25,6 +28,8 @@ impl Config {
         self.gaussians.check_ranges()?;
         self.tree.check_ranges()?;
         self.r2.check_ranges()?;
+        self.x.check_ranges()?;
+        self.sax.check_ranges()?;
         if self.gaussians.least_scale > self.gaussians.greatest_scale {
             let problem = format!("exceeds gaussians.greatest_scale = {}", self.gaussians.greatest_scale);
             return Err(Error::config("gaussians.least_scale", self.gaussians.least_scale, problem));
@@ -57,7 +62,10 @@ impl Config {
         if self.two_networks() {
             self.check_two_networks()?;
         }
+        self.check_gaussians_alone()?;
         self.check_r2()?;
+        self.check_x()?;
+        self.check_sax()?;
         if m.along_axis && self.gaussians_move() {
             let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
             return Err(Error::config("march.along_axis", true, problem));
@@ -113,18 +121,20 @@ impl Config {
         Ok(())
     }
 
-    /// Refuses what R2-Gaussian cannot do, and a run without a still field where that is not meant.
-    fn check_r2(&self) -> Result<()> {
+    /// Refuses what R2-Gaussian and X-Gaussian cannot do, and a run without a still field where that is not meant.
+    fn check_gaussians_alone(&self) -> Result<()> {
         let form = self.static_field.form;
-        if !self.is_r2() {
-            if form == StaticForm::None {
-                let problem = "all other methods have a still field: take \"tensor\", or gaussians.form = \"r2\"";
+        if !self.has_gaussians_alone() {
+            if form == StaticForm::None && !self.is_sax() {
+                let problem = "all other methods have a still field: take \"tensor\", or gaussians.form = \"r2\" or dynamic.form = \
+                               \"lineformer\"";
                 return Err(Error::config("static.form", form.name(), problem));
             }
             return Ok(());
         }
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
-            Err(Error::config(field, value, format!("does not go with gaussians.form = \"r2\": {instead}")))
+            let form = self.gaussians.form.name();
+            Err(Error::config(field, value, format!("does not go with gaussians.form = \"{form}\": {instead}")))
         };
         if form != StaticForm::None {
             return refuse("static.form", &form.name(), "its Gaussians are the whole object; take \"none\"");
@@ -141,6 +151,14 @@ impl Config {
         if self.loss.dynamic_target != DynamicTarget::Absolute {
             return refuse("loss.dynamic_target", &"temporal", "it is fitted to whole images; take \"absolute\"");
         }
+        Ok(())
+    }
+
+    /// Refuses settings of R2-Gaussian that contradict each other.
+    fn check_r2(&self) -> Result<()> {
+        if !self.is_r2() {
+            return Ok(());
+        }
         let r2 = &self.r2;
         if r2.tv_box > r2.voxels {
             return Err(Error::config("r2.tv_box", r2.tv_box, format!("exceeds r2.voxels = {}", r2.voxels)));
@@ -153,5 +171,103 @@ impl Config {
             return Err(Error::config("r2.count", r2.count, format!("exceeds r2.most = {}", r2.most)));
         }
         Ok(())
+    }
+
+    /// Refuses settings of X-Gaussian that contradict each other.
+    fn check_x(&self) -> Result<()> {
+        if !self.is_x() {
+            return Ok(());
+        }
+        let x = &self.x;
+        if x.interval > x.voxels {
+            return Err(Error::config("x.interval", x.interval, format!("exceeds x.voxels = {}", x.voxels)));
+        }
+        let count = x.voxels.div_ceil(x.interval).pow(3);
+        if count > x.most {
+            let problem =
+                format!("x.voxels = {} and x.interval = {} begin with {count} Gaussians", x.voxels, x.interval);
+            return Err(Error::config("x.most", x.most, problem));
+        }
+        if x.first_opacity < x.weakest {
+            let problem = format!("is below x.weakest = {}: none would stay", x.weakest);
+            return Err(Error::config("x.first_opacity", x.first_opacity, problem));
+        }
+        Ok(())
+    }
+
+    /// Refuses what SAX-NeRF cannot do.
+    fn check_sax(&self) -> Result<()> {
+        if !self.is_sax() {
+            return Ok(());
+        }
+        let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
+            Err(Error::config(field, value, format!("does not go with dynamic.form = \"lineformer\": {instead}")))
+        };
+        if self.static_field.form != StaticForm::None {
+            return refuse(
+                "static.form",
+                &self.static_field.form.name(),
+                "its field is the whole object; take \"none\"",
+            );
+        }
+        if self.gaussians_move() {
+            return refuse("gaussians.form", &self.gaussians.form.name(), "one of both is the field; take \"none\"");
+        }
+        for (field, is_on) in [
+            ("hull.enabled", self.hull.enabled),
+            ("occupancy.enabled", self.occupancy.enabled),
+            ("loss.normalise", self.loss.normalise),
+            ("march.along_axis", self.march.along_axis),
+        ] {
+            if is_on {
+                return refuse(field, &true, "it knows none; take false");
+            }
+        }
+        if self.loss.dynamic_target != DynamicTarget::Absolute {
+            return refuse("loss.dynamic_target", &"temporal", "it is fitted to whole images; take \"absolute\"");
+        }
+        let sax = &self.sax;
+        for (field, value) in [("sax.levels", sax.levels), ("sax.samples", sax.samples)] {
+            if value % 2 != 0 {
+                return Err(Error::config(field, value, "an even number is needed"));
+            }
+        }
+        let finest = u64::from(sax.base) << (sax.levels - 1);
+        if finest > MOST_CELLS {
+            let problem = format!(
+                "the finest of {} levels has {finest} cells a side, at most {MOST_CELLS} are told apart",
+                sax.levels
+            );
+            return Err(Error::config("sax.base", sax.base, problem));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::config::{Config, Preset};
+
+    #[test]
+    fn what_does_not_go_with_sax_nerf_is_named() {
+        for (setting, part) in [
+            ("static.form=tensor", "static.form"),
+            ("dynamic.form=network", "static.form"),
+            ("gaussians.form=r2", "gaussians.form"),
+            ("hull.enabled=true", "hull.enabled"),
+            ("occupancy.enabled=true", "occupancy.enabled"),
+            ("loss.normalise=true", "loss.normalise"),
+            ("loss.dynamic_target=temporal", "loss.dynamic_target"),
+            ("march.along_axis=true", "march.along_axis"),
+            ("sax.levels=3", "sax.levels"),
+            ("sax.samples=7", "sax.samples"),
+            ("sax.base=65536", "sax.base"),
+            ("sax.log2_table=30", "sax.log2_table"),
+            ("sax.window=0", "sax.window"),
+            ("sax.static_data=both", "both"),
+        ] {
+            let message = Config::load(Some(Preset::SaxNerf), None, &[setting.into()]).unwrap_err().to_string();
+            assert!(message.contains(part), "{setting}: {message}");
+        }
     }
 }

@@ -1,10 +1,11 @@
 //! The presets.
 
 use crate::config::sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, StaticField, Train, Tree,
+    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
+    Tree, X,
 };
 use crate::config::{
-    CalibrateMode, Config, Decay, DynamicTarget, GaussianForm, Preset, R2Start, StaticData, StaticForm,
+    CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, GaussianForm, Preset, R2Start, StaticData, StaticForm,
 };
 
 impl Config {
@@ -17,6 +18,8 @@ impl Config {
             Preset::PublicCode => public_code(paper()),
             Preset::NerfCa => nerf_ca(paper()),
             Preset::R2Gaussian => r2_gaussian(paper()),
+            Preset::XGaussian => x_gaussian(paper()),
+            Preset::SaxNerf => sax_nerf(paper()),
         }
     }
 }
@@ -60,6 +63,7 @@ fn paper() -> Config {
             tv_line: 1e-3,
         },
         dynamic: DynamicField {
+            form: DynamicForm::Network,
             layers: 4,
             width: 128,
             skip_layer: 0,
@@ -97,6 +101,8 @@ fn paper() -> Config {
         gaussians: gaussians(),
         tree: tree(),
         r2: r2(),
+        x: x(),
+        sax: sax(),
     }
 }
 
@@ -282,6 +288,100 @@ fn r2_gaussian(paper: Config) -> Config {
     }
 }
 
+/// The constants of X-Gaussian's public code for most of its scenes, for a run of 20,000 iterations.
+pub(super) fn x() -> X {
+    X {
+        static_data: StaticData::PerPhase,
+        normalise: true,
+        clamp: 1.0,
+        half_extent_mm: 0.0,
+        voxels: 256,
+        interval: 8,
+        extent_mm: 0.0,
+        first_opacity: 0.1,
+        position_rate: 1.9e-4,
+        position_rate_end: 1.9e-6,
+        intensity_rate: 0.002,
+        degree_every: 1000,
+        opacity_rate: 0.008,
+        scale_rate: 0.005,
+        rotation_rate: 0.001,
+        ssim: 0.2,
+        densify_every: 200,
+        densify_from: 500,
+        densify_until: 8000,
+        densify_gradient: 2.6e-5,
+        size_limit: 0.01,
+        most: 500_000,
+        weakest: 0.005,
+        greatest_scale: 0.1,
+        greatest_radius: 0.0,
+        reset_every: 4000,
+        reset_opacity: 0.01,
+    }
+}
+
+/// X-Gaussian as its public code does it: a static method, fitted to the normalised images of each phase.
+fn x_gaussian(paper: Config) -> Config {
+    let r2 = r2_gaussian(paper);
+    Config {
+        preset: Preset::XGaussian,
+        train: Train { iterations: 20_000, ..r2.train },
+        gaussians: Gaussians { form: GaussianForm::X, ..r2.gaussians },
+        ..r2
+    }
+}
+
+/// The constants of SAX-NeRF's public code for the chest, whose rate falls after 1500 of 1501 passes over the images:
+/// here over three of them.
+pub(super) fn sax() -> Sax {
+    Sax {
+        static_data: StaticData::PerPhase,
+        normalise: true,
+        half_extent_mm: 0.0,
+        bound_mm: 300.0,
+        levels: 16,
+        base: 16,
+        log2_table: 19,
+        windows: 16,
+        window: 8,
+        rays: 1024,
+        samples: 256,
+        rate: 1e-3,
+        rate_falls_at: 4500,
+        rate_fall: 0.1,
+    }
+}
+
+/// SAX-NeRF as its public code does it: a static method, fitted to the whole images of each phase.
+fn sax_nerf(paper: Config) -> Config {
+    Config {
+        preset: Preset::SaxNerf,
+        train: Train {
+            iterations: 4503,
+            iterations_per_submit: 10,
+            checkpoint_every: 1500,
+            validate_every: 500,
+            ..paper.train
+        },
+        // Neither field is marched through: the still one is nothing.
+        march: March { static_samples: 2, dynamic_samples: 2, render_samples: 2, ..paper.march },
+        static_field: StaticField { form: StaticForm::None, ..paper.static_field },
+        // The network is never asked; the smallest one takes no memory.
+        dynamic: DynamicField {
+            form: DynamicForm::Lineformer,
+            layers: 1,
+            width: 16,
+            latent: 4,
+            bands: 1,
+            delay: 0,
+            ..paper.dynamic
+        },
+        adam: Adam { beta2: 0.999, ..paper.adam },
+        ..paper
+    }
+}
+
 /// Gaussians in front of the still field of [`fast_mlp`].
 fn fast(mlp: Config) -> Config {
     Config {
@@ -297,8 +397,8 @@ fn fast(mlp: Config) -> Config {
             ..mlp.train
         },
         march: March { dynamic_samples: 2, ..mlp.march },
-        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does not. Few
-        // iterations take long steps.
+        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does
+        // not. Few iterations take long steps.
         static_field: StaticField { tv: 100.0, lr: 3e-2, lr_end: 3e-3, ..mlp.static_field },
         // The network is never asked; the smallest one takes no memory.
         dynamic: DynamicField {

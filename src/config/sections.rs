@@ -1,6 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{CalibrateMode, Decay, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm};
+use crate::config::{CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -91,7 +91,8 @@ section! {
 section! {
     /// The static field. As a network ("network") it has the dynamic one's layers, and of what is below the learning rate alone.
     StaticField, "static" {
-        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian alone.
+        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian,
+        /// X-Gaussian and SAX-NeRF alone.
         #[serde(default)] form: StaticForm,
         /// Cells per axis, D.
         grid: u32 in 2.0 to 512.0,
@@ -119,6 +120,8 @@ section! {
 section! {
     /// The dynamic neural field.
     DynamicField, "dynamic" {
+        /// What it is where no Gaussians are: "network", or "lineformer" (section `sax`, and of this one nothing else).
+        #[serde(default)] form: DynamicForm,
         /// Hidden layers.
         layers: u32 in 1.0 to 16.0,
         /// Neurons per hidden layer, a multiple of 16.
@@ -414,5 +417,101 @@ section! {
         most: u32 in 1.0 to 1_048_576.0,
         /// Density below which a Gaussian is taken away.
         weakest: f64 in 0.0 to 1e3,
+    }
+}
+
+section! {
+    /// Gaussians as X-Gaussian fits them (`gaussians.form = "x"`), with what its code uses for most of its scenes as defaults.
+    X, "x" {
+        /// Which images a set of Gaussians sees: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one set).
+        static_data: StaticData,
+        /// Divide line integrals by the vessels' attenuation where the dataset states it, before they are clamped.
+        normalise: bool,
+        /// What line integrals are clamped to, from 0 on, before each image is scaled to 0 to 1; 0 = not at all.
+        clamp: f64 in 0.0 to 1e6,
+        /// Half side of the volume, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is less.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Voxels along each side of the volume.
+        voxels: u32 in 1.0 to 2048.0,
+        /// Voxels from the centre where a Gaussian begins to the next, along each axis.
+        interval: u32 in 1.0 to 2048.0,
+        /// Extent of the scene, mm, which rates of positions and bounds of scales count in; 0 = 1.1 times the largest distance of
+        /// a source from the mean of the sources.
+        extent_mm: f64 in 0.0 to 1e6,
+        /// Opacity at the start.
+        first_opacity: f64 in 1e-6 to 0.99,
+        /// Adam's rate of positions at the start, extents; it falls by a constant factor per iteration.
+        position_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of positions at the end.
+        position_rate_end: f64 in 1e-12 to 100.0,
+        /// Adam's rate of colours' first coefficients; those of higher degrees have a twentieth.
+        intensity_rate: f64 in 1e-12 to 100.0,
+        /// Iterations after which colours gain a degree, up to three, which makes intensities faster; 0 = never.
+        degree_every: u32 in 0.0 to 1e6,
+        /// Adam's rate of opacities, before the sigmoid.
+        opacity_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of logarithms of scales.
+        scale_rate: f64 in 1e-12 to 100.0,
+        /// Adam's rate of quaternions.
+        rotation_rate: f64 in 1e-12 to 100.0,
+        /// Weight of 1 - SSIM; the mean absolute difference has the rest of 1.
+        ssim: f64 in 0.0 to 0.99,
+        /// Iterations after which Gaussians are added and taken away, and again after as many; 0 = never.
+        densify_every: u32 in 0.0 to 1e6,
+        /// Iteration beyond which that begins.
+        densify_from: u32 in 0.0 to 1e6,
+        /// Iteration from which it no longer happens.
+        densify_until: u32 in 0.0 to 1e6,
+        /// Mean gradient of the loss by a centre, in half images, from which a Gaussian is cloned or split.
+        densify_gradient: f64 in 0.0 to 1e6,
+        /// Greatest standard deviation, extents, up to which a Gaussian is cloned, and beyond which it is split.
+        size_limit: f64 in 0.0 to 10.0,
+        /// Most Gaussians of a set.
+        most: u32 in 1.0 to 16_777_216.0,
+        /// Opacity below which a Gaussian is taken away.
+        weakest: f64 in 0.0 to 1.0,
+        /// Greatest standard deviation, extents, beyond which a Gaussian is taken away once opacities have been reset.
+        greatest_scale: f64 in 0.0 to 1e6,
+        /// Radius in a picture, pixels, beyond which a Gaussian is taken away then, too; 0 = whatever it is. The code says 20, but
+        /// forgets radii before it looks at them.
+        greatest_radius: f64 in 0.0 to 1e6,
+        /// Iterations after which opacities are reset, while Gaussians are added; 0 = never.
+        reset_every: u32 in 0.0 to 1e6,
+        /// What larger opacities are reset to.
+        reset_opacity: f64 in 1e-6 to 0.99,
+    }
+    /// SAX-NeRF's field (`dynamic.form = "lineformer"`), a hash grid and a Lineformer, with what its code uses as
+    /// defaults for the chest.
+    Sax, "sax" {
+        /// Which images a field sees: "per-phase" (those of its phase; a field per phase) or "pooled" (all; one field).
+        static_data: StaticData,
+        /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities, which a
+        /// sigmoid keeps below 1, can be near 1.
+        normalise: bool,
+        /// Half side of the volume that rays cross, mm; 0 = 1.6 radii of the field of view, or the dataset's depth
+        /// range where that is less.
+        half_extent_mm: f64 in 0.0 to 1e5,
+        /// Half side of the box that the hash grid divides, mm; beyond it, rays see what is at its faces.
+        bound_mm: f64 in 1.0 to 1e5,
+        /// Levels of the hash grid, an even number; each has two features.
+        levels: u32 in 2.0 to 16.0,
+        /// Cells along each side of the box in the first level; each further one has twice as many.
+        base: u32 in 1.0 to 65_536.0,
+        /// Logarithm to base 2 of the entries that a level has at most.
+        log2_table: u32 in 4.0 to 24.0,
+        /// Windows of a batch.
+        windows: u32 in 0.0 to 4096.0,
+        /// Side of a window, pixels.
+        window: u32 in 1.0 to 256.0,
+        /// Single rays of a batch, through pixels outside the windows that show something.
+        rays: u32 in 1.0 to 65_535.0,
+        /// Samples of a ray, an even number.
+        samples: u32 in 2.0 to 4096.0,
+        /// Adam's rate.
+        rate: f64 in 1e-12 to 100.0,
+        /// Iteration after which it falls; 0 = it does not.
+        rate_falls_at: u32 in 0.0 to 1e6,
+        /// What it falls to, as a share of itself.
+        rate_fall: f64 in 0.0 to 1.0,
     }
 }

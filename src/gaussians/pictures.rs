@@ -13,6 +13,8 @@ use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, Splat};
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
 use crate::model::gaussians::{MovingGaussians, Units};
+use crate::x_gaussian::picture::{self, BlendedPicture};
+use crate::x_gaussian::stages::XPictureKernels;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -41,12 +43,14 @@ struct Key {
     time: u64,
 }
 
-/// Draws line integrals of a moving field that is made of Gaussians.
+/// Draws line integrals of a moving field that is made of Gaussians; where nearer ones hide those behind them, what they show.
 pub struct Pictures {
     gpu: Gpu,
     project: Stage<push::GaussianProject>,
     splat: SplatStage<push::GaussianSplat>,
     show: Stage<push::GaussianPicture>,
+    /// Where nearer Gaussians hide those behind them.
+    blend: Option<XPictureKernels>,
     state: Mutex<State>,
 }
 
@@ -54,6 +58,13 @@ pub struct Pictures {
 struct State {
     field: MovingGaussians,
     recorded: HashMap<Key, Arc<Picture>>,
+    blended: HashMap<Key, Arc<Mutex<BlendedPicture>>>,
+}
+
+impl State {
+    fn new(field: &MovingGaussians) -> State {
+        State { field: field.clone(), recorded: HashMap::new(), blended: HashMap::new() }
+    }
 }
 
 buffer_set! {
@@ -89,15 +100,16 @@ impl Pictures {
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
     pub fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<Pictures> {
-        let state = Mutex::new(State { field: field.clone(), recorded: HashMap::new() });
+        let state = Mutex::new(State::new(field));
         let project = Build::default().stage(gpu)?;
-        Ok(Pictures { gpu: gpu.clone(), project, splat: SplatStage::new(gpu)?, show: into_buffers(gpu)?, state })
+        let blend = field.rows().intensities.as_ref().map(|_| XPictureKernels::new(gpu)).transpose()?;
+        Ok(Pictures { gpu: gpu.clone(), project, splat: SplatStage::new(gpu)?, show: into_buffers(gpu)?, blend, state })
     }
 
     /// Draws another field from now on.
     pub fn replace(&self, field: &MovingGaussians) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        *state = State { field: field.clone(), recorded: HashMap::new() };
+        *state = State::new(field);
     }
 
     /// Line integrals of a `width` x `height` view at a phase, rows first.
@@ -113,11 +125,15 @@ impl Pictures {
     /// # Errors
     /// Device errors.
     pub fn draw_at(&self, rays: &ViewRays, (width, height): (usize, usize), phases: f64) -> Result<Vec<f32>> {
-        let (units, picture) = self.picture(Key { columns: width, rows: height, time: phases.to_bits() })?;
+        let key = Key { columns: width, rows: height, time: phases.to_bits() };
+        let mut sums = vec![0i32; width * height];
+        if self.blended(key, rays, |picture| picture.read(&mut sums))?.is_some() {
+            return Ok(sums.iter().map(|v| *v as f32 * picture::unit()).collect());
+        }
+        let (units, picture) = self.picture(key)?;
         let _alone = picture.in_use.lock().unwrap_or_else(PoisonError::into_inner);
         picture.buffers.gaussian_views.write(&[SplatView::new(rays, units).to_device()])?;
         self.gpu.wait(picture.commands.submit()?)?;
-        let mut sums = vec![0i32; width * height];
         picture.buffers.splat_images.read(&mut sums)?;
         Ok(sums.iter().map(|v| *v as f32 * line_integral(units)).collect())
     }
@@ -135,18 +151,53 @@ impl Pictures {
         phase: u32,
         in_front: bool,
     ) -> Result<()> {
-        let time = f64::from(phase).to_bits();
-        let (units, picture) = self.picture(Key { columns: width, rows: height, time })?;
+        let key = Key { columns: width, rows: height, time: f64::from(phase).to_bits() };
+        let n_pixels = (width * height) as u32;
+        let into = |sums: &Buffer, unit: f32| {
+            let push = push::GaussianPicture { n_pixels, unit, in_front: u32::from(in_front) };
+            let bound = [(Binding::splat_images, sums.into()), (Binding::image, target.into())];
+            let mut recording = Recording::new(&self.gpu, "picture of Gaussians into a buffer")?;
+            dispatch(&mut recording, &self.show, self.show.groups_over(n_pixels), &bound, push)?;
+            recording.finish()
+        };
+        let show_blended = |sums: &Buffer| self.gpu.wait(into(sums, picture::unit())?.submit()?);
+        if self.blended(key, rays, show_blended)?.is_some() {
+            return Ok(());
+        }
+        let (units, picture) = self.picture(key)?;
         let _alone = picture.in_use.lock().unwrap_or_else(PoisonError::into_inner);
         picture.buffers.gaussian_views.write(&[SplatView::new(rays, units).to_device()])?;
-        let n_pixels = (width * height) as u32;
-        let push = push::GaussianPicture { n_pixels, unit: line_integral(units), in_front: u32::from(in_front) };
-        let bound = [(Binding::splat_images, (&picture.buffers.splat_images).into()), (Binding::image, target.into())];
-        let mut recording = Recording::new(&self.gpu, "picture of Gaussians into a buffer")?;
-        dispatch(&mut recording, &self.show, self.show.groups_over(n_pixels), &bound, push)?;
-        let shown = recording.finish()?;
+        let shown = into(&picture.buffers.splat_images, line_integral(units))?;
         self.gpu.wait(picture.commands.submit()?)?;
         self.gpu.wait(shown.submit()?)
+    }
+
+    /// Draws a view of Gaussians that hide each other, for `take` to take from fixed point; none where line integrals add up.
+    fn blended<T>(&self, key: Key, rays: &ViewRays, take: impl FnOnce(&Buffer) -> Result<T>) -> Result<Option<T>> {
+        let Some(kernels) = &self.blend else { return Ok(None) };
+        let picture = {
+            let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+            if state.blended.len() >= MOST_RECORDED {
+                state.blended.clear();
+            }
+            match state.blended.get(&key) {
+                Some(picture) => picture.clone(),
+                None => {
+                    let (sets, size) = (state.field.rows(), [key.columns, key.rows]);
+                    let phase = f64::from_bits(key.time).round() as usize % sets.n_phases;
+                    let picture = Arc::new(Mutex::new(BlendedPicture::new(&self.gpu, sets, phase, size)?));
+                    state.blended.insert(key, picture.clone());
+                    picture
+                }
+            }
+        };
+        let mut picture = picture.lock().unwrap_or_else(PoisonError::into_inner);
+        take(picture.draw(&self.gpu, kernels, rays)?).map(Some)
+    }
+
+    /// Whether nearer Gaussians hide those behind them: pictures are no line integrals.
+    pub fn are_blended(&self) -> bool {
+        self.blend.is_some()
     }
 
     fn picture(&self, key: Key) -> Result<(Units, Arc<Picture>)> {

@@ -2,6 +2,7 @@
 //! text or `glsl/variants.txt` defines.
 
 include!(concat!(env!("OUT_DIR"), "/constants_layout.rs"));
+include!(concat!(env!("OUT_DIR"), "/constants_lineformer_layout.rs"));
 include!(concat!(env!("OUT_DIR"), "/constants_occupancy.rs"));
 include!(concat!(env!("OUT_DIR"), "/constants_positions.rs"));
 include!(concat!(env!("OUT_DIR"), "/constants_sample_rays.rs"));

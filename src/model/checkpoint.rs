@@ -12,7 +12,11 @@ use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::r2::R2State;
 use crate::model::r2_tensors;
+use crate::model::sax::{SaxShape, SaxState};
+use crate::model::sax_tensors::{self, SaxHeader};
 use crate::model::scene::Scene;
+use crate::model::x_gaussian::XState;
+use crate::model::x_tensors;
 use glam::DVec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -22,6 +26,8 @@ use std::path::{Path, PathBuf};
 const FORMAT: &str = "nertca-checkpoint-2";
 /// Of checkpoints whose moving field is made of Gaussians: they have no network.
 const GAUSSIAN_FORMAT: &str = "nertca-checkpoint-3";
+/// Of checkpoints of SAX-NeRF, which have no network either.
+const SAX_FORMAT: &str = "nertca-checkpoint-4";
 /// What names of the network's tensors begin with.
 const NETWORK: &str = "dynamic.";
 const OCCUPANCY: &str = "occupancy.bits";
@@ -48,6 +54,10 @@ pub struct Checkpoint {
     pub last_report: Vec<u32>,
     /// State of a fit as R2-Gaussian does it; none of other methods.
     pub r2: Option<R2State>,
+    /// State of a fit as X-Gaussian does it; none of other methods.
+    pub x: Option<XState>,
+    /// State of a fit as SAX-NeRF does it; none of other methods.
+    pub sax: Option<SaxState>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
 }
@@ -80,6 +90,8 @@ struct Header {
     hull: Option<HullHeader>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     gaussians: Option<GaussianHeader>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sax: Option<SaxHeader>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -88,6 +100,15 @@ struct HullHeader {
     min: [f64; 3],
     cell: f64,
     n_phases: usize,
+}
+
+/// What a checkpoint's header calls itself.
+fn format_of(has_gaussians: bool, is_sax: bool) -> &'static str {
+    match (has_gaussians, is_sax) {
+        (_, true) => SAX_FORMAT,
+        (true, false) => GAUSSIAN_FORMAT,
+        (false, false) => FORMAT,
+    }
 }
 
 /// Name of the checkpoint of a step.
@@ -177,8 +198,12 @@ impl Checkpoint {
             tensors.extend(gaussian_tensors::tensors(field));
         }
         tensors.extend(self.r2.iter().flat_map(r2_tensors::tensors));
+        tensors.extend(self.x.iter().flat_map(x_tensors::tensors));
+        if let (Some(field), Some(state)) = (&model.sax, &self.sax) {
+            tensors.extend(sax_tensors::tensors(field, state));
+        }
         for tensor in model.param_map.tensors() {
-            if model.moving.is_some() && tensor.name.starts_with(NETWORK) {
+            if (model.moving.is_some() || model.sax.is_some()) && tensor.name.starts_with(NETWORK) {
                 continue;
             }
             let gather = |value: &dyn Fn(usize) -> f32| -> Vec<u8> {
@@ -203,8 +228,9 @@ impl Checkpoint {
             }
         }
         let header = Header {
-            format: if model.moving.is_some() { GAUSSIAN_FORMAT } else { FORMAT }.into(),
+            format: format_of(model.moving.is_some(), model.sax.is_some()).into(),
             gaussians: model.moving.as_ref().map(gaussian_tensors::header),
+            sax: model.sax.as_ref().map(sax_tensors::header),
             config: model.config.clone(),
             scene: model.scene.clone(),
             phases: model.param_map.phases,
@@ -254,9 +280,9 @@ impl Checkpoint {
         let text = metadata.metadata().as_ref().and_then(|m| m.get("nertca")).cloned();
         let text = text.ok_or_else(|| bad("metadata", "is not a checkpoint of this program".into()))?;
         let header: Header = serde_json::from_str(&text).map_err(|e| bad("metadata", e.to_string()))?;
-        let wanted = if header.gaussians.is_some() { GAUSSIAN_FORMAT } else { FORMAT };
-        if header.format != wanted {
-            let problem = format!("`{}`; this version reads `{FORMAT}` and `{GAUSSIAN_FORMAT}`", header.format);
+        if header.format != format_of(header.gaussians.is_some(), header.sax.is_some()) {
+            let known = format!("`{FORMAT}`, `{GAUSSIAN_FORMAT}` and `{SAX_FORMAT}`");
+            let problem = format!("`{}`; this version reads {known}", header.format);
             return Err(bad("format", problem));
         }
         header.config.check()?;
@@ -283,7 +309,7 @@ impl Checkpoint {
         let mut params = vec![0f32; param_map.len];
         let mut moments = vec![[0f32; 2]; param_map.len];
         for tensor in param_map.tensors() {
-            if header.gaussians.is_some() && tensor.name.starts_with(NETWORK) {
+            if (header.gaussians.is_some() || header.sax.is_some()) && tensor.name.starts_with(NETWORK) {
                 continue;
             }
             for prefix in ["", "adam.m.", "adam.v."] {
@@ -338,9 +364,20 @@ impl Checkpoint {
             Ok(view) if view.dtype() == Dtype::U32 => to_words(view.data()),
             _ => Vec::new(),
         };
-        let is_r2 = header.config.is_r2();
+        let (is_r2, is_x) = (header.config.is_r2(), header.config.is_x());
+        if header.sax.is_some() != header.config.is_sax() {
+            return Err(bad("sax", "configuration and field are of different methods".into()));
+        }
+        let at = (header.phases, header.step);
+        let sax = header
+            .sax
+            .as_ref()
+            .map(|about| sax_tensors::read(about, SaxShape::of(&header.config.sax), &tensors, at, path));
+        let (sax_field, sax) = sax.transpose()?.unzip();
         Ok(Checkpoint {
             r2: is_r2.then(|| r2_tensors::read(&tensors, header.phases, path)).transpose()?,
+            x: is_x.then(|| x_tensors::read(&tensors, header.phases, path)).transpose()?,
+            sax,
             occupancy: words(OCCUPANCY),
             last_report: words(LAST_REPORT),
             model: Model {
@@ -349,6 +386,7 @@ impl Checkpoint {
                 param_map,
                 hull,
                 moving,
+                sax: sax_field,
                 params,
                 step: header.step,
                 vessel_attenuation: header.vessel_attenuation,

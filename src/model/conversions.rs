@@ -86,6 +86,7 @@ mod tests {
                 rows: (0..4).map(row).collect(),
                 step: 9,
                 is_crowd: false,
+                intensities: None,
             },
             setup,
             grid: (0..N_PHASES).flat_map(|t| (0..125).map(move |i| pack(displacement(t, node(i))))).collect(),

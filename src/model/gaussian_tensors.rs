@@ -36,6 +36,9 @@ pub(super) struct GaussianHeader {
     /// Whether Gaussians are all there is and overlap by the hundred.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     crowd: bool,
+    /// Whether nearer ones hide those behind them, so that each has an intensity.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    blended: bool,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,6 +54,9 @@ struct GridHeader {
     rest_phase: u32,
 }
 
+/// Name of what blended Gaussians show.
+const INTENSITY: &str = "gaussians.intensity";
+
 pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
     let sets = field.rows();
     GaussianHeader {
@@ -62,6 +68,7 @@ pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
         step: sets.step,
         views: sets.setup.n_views,
         crowd: sets.is_crowd,
+        blended: sets.intensities.is_some(),
         grid: match field {
             MovingGaussians::PerPhase(_) => None,
             MovingGaussians::Tree(tree) => Some(GridHeader {
@@ -87,6 +94,10 @@ pub(super) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
         floats("rotation", 4, &|g| g.rotation.to_vec()),
         floats("log_density", 1, &|g| vec![g.log_density]),
     ];
+    if let Some(intensities) = &field.rows().intensities {
+        let bytes = intensities.iter().flat_map(|v| v.to_le_bytes()).collect();
+        all.push((INTENSITY.into(), Dtype::F32, vec![rows.len()], bytes));
+    }
     match field {
         MovingGaussians::PerPhase(_) => {
             let phases = rows.iter().flat_map(|g| g.phase.to_le_bytes()).collect();
@@ -158,6 +169,7 @@ pub(super) fn read(
         rows: (0..n).map(row).collect(),
         step: header.step,
         is_crowd: header.crowd,
+        intensities: header.blended.then(|| file.floats(INTENSITY, &[Some(n)])).transpose()?,
     };
     let Some(grid) = &header.grid else { return Ok(MovingGaussians::PerPhase(sets)) };
     if !(2..=MOST_NODES).contains(&grid.nodes)

@@ -45,12 +45,20 @@ pub struct Gaussians {
     /// Whether Gaussians are all there is and overlap by the hundred, as R2-Gaussian's do: their largest sum along a ray is
     /// sought among all of them.
     pub is_crowd: bool,
+    /// What each shows where nearer ones hide those behind them, as X-Gaussian's do; none where line integrals add up.
+    pub intensities: Option<Vec<f32>>,
 }
 
 impl Gaussians {
     /// Gaussians of a phase.
     pub fn at(&self, phase: usize) -> impl Iterator<Item = &Gaussian> {
         self.rows.iter().filter(move |g| g.phase as usize == phase)
+    }
+
+    /// Gaussians of a phase, and what each shows; none where line integrals add up.
+    pub fn blended_at(&self, phase: usize) -> Vec<(Gaussian, f32)> {
+        let shown = self.rows.iter().zip(self.intensities.iter().flatten());
+        shown.filter(|(g, _)| g.phase as usize == phase).map(|(g, intensity)| (*g, *intensity)).collect()
     }
 
     /// Refuses parameters that are not finite.
@@ -163,9 +171,10 @@ impl MovingGaussians {
         }
     }
 
-    /// Form of the field: a set of Gaussians per phase, R2-Gaussian's or another, or one for the beat.
+    /// Form of the field: a set of Gaussians per phase, X-Gaussian's, R2-Gaussian's or another, or one for the beat.
     pub fn form(&self) -> GaussianForm {
         match self {
+            MovingGaussians::PerPhase(sets) if sets.intensities.is_some() => GaussianForm::X,
             MovingGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
             MovingGaussians::PerPhase(_) => GaussianForm::Phase,
             MovingGaussians::Tree(_) => GaussianForm::Tree,

@@ -63,12 +63,20 @@ impl Scene {
             scene.hold_all_rays(config, dataset);
         }
         if config.is_r2() {
-            scene.hold_volume(volume_half(config, dataset), seen_half(dataset));
+            scene.hold_volume(volume_half(config.r2.half_extent_mm, dataset), seen_half(dataset));
+        }
+        if config.is_x() {
+            scene.hold_volume(volume_half(config.x.half_extent_mm, dataset), seen_half(dataset));
+        }
+        if config.is_sax() {
+            scene.hold_volume(volume_half(config.sax.half_extent_mm, dataset), seen_half(dataset));
+            // Volumes are kept in units of the attenuation of a density of 1.
+            scene.dynamic_gain = dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0);
         }
         Ok(scene)
     }
 
-    /// Boxes of R2-Gaussian's volume, of half a side each way, and of what the views see of it. The still field is nothing.
+    /// Boxes of a static method's volume, of half a side each way, and of what the views see of it. The still field is nothing.
     fn hold_volume(&mut self, half: f64, seen: f64) {
         (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
         (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
@@ -172,9 +180,9 @@ fn reach(dataset: &Dataset) -> f64 {
     reach * (1.0 + 1e-5)
 }
 
-/// Half side of R2-Gaussian's volume, a cube around the isocentre, world units.
-pub(super) fn volume_half(config: &Config, dataset: &Dataset) -> f64 {
-    box_half(config.r2.half_extent_mm, dataset)
+/// Half side of a static method's volume, a cube around the isocentre, world units, where one is stated or not.
+pub(super) fn volume_half(stated_mm: f64, dataset: &Dataset) -> f64 {
+    box_half(stated_mm, dataset)
 }
 
 fn half_depth(dataset: &Dataset) -> f64 {

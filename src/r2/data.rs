@@ -19,6 +19,28 @@ const DRAWN_CUT: f32 = 4.0;
 /// Bounds of drawn scales are a little wider than what scales can be, so that rounding changes none.
 const SLACK: f64 = 1e-3;
 
+/// Images of each set of a static method, and the phase of each, where it is of one. `key` is what the setting is called.
+///
+/// # Errors
+/// [`Error::Config`] where a phase shall have a set and no image shows it.
+pub(crate) fn sets_of(
+    dataset: &Dataset,
+    static_data: StaticData,
+    key: &str,
+) -> Result<(Vec<Vec<usize>>, Vec<Option<u32>>)> {
+    let (training, n_phases) = (dataset.training(), dataset.n_phases);
+    let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
+    let unseen: Vec<u32> = (0..n_phases).filter(|phase| of_phase(*phase).is_empty()).collect();
+    if static_data == StaticData::PerPhase && !unseen.is_empty() {
+        let problem = format!("no image shows the phases {unseen:?}: take {key} = \"pooled\"");
+        return Err(Error::config("dataset", dataset.path.display(), problem));
+    }
+    Ok(match static_data {
+        StaticData::Pooled => (vec![(0..training.len()).collect()], vec![None]),
+        StaticData::PerPhase => (0..n_phases).map(|t| (of_phase(t), Some(t))).unzip(),
+    })
+}
+
 /// The data in R2-Gaussian's units.
 #[derive(Debug, Clone)]
 pub struct R2Data {
@@ -65,23 +87,14 @@ impl R2Data {
             }
             images.extend(frame.integrals.iter().map(|v| (f64::from(*v) / units.strongest) as f32));
         }
-        let n_phases = dataset.n_phases;
-        let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
-        let unseen: Vec<u32> = (0..n_phases).filter(|phase| of_phase(*phase).is_empty()).collect();
-        if settings.static_data == StaticData::PerPhase && !unseen.is_empty() {
-            return refuse(format!("no image shows the phases {unseen:?}: take r2.static_data = \"pooled\""));
-        }
-        let (images_of_set, phase_of_set) = match settings.static_data {
-            StaticData::Pooled => (vec![(0..training.len()).collect()], vec![None]),
-            StaticData::PerPhase => (0..n_phases).map(|t| (of_phase(t), Some(t))).unzip(),
-        };
+        let (images_of_set, phase_of_set) = sets_of(dataset, settings.static_data, "r2.static_data")?;
         Ok(R2Data {
             half,
             attenuation,
             pixel: dataset.reference_view().rays.anchor[1].length(),
             width: dataset.width,
             height: dataset.height,
-            n_phases: n_phases as usize,
+            n_phases: dataset.n_phases as usize,
             views: training.iter().map(|f| SplatView::new(&dataset.views[f.view].rays, units)).collect(),
             images,
             images_of_set,
@@ -163,6 +176,7 @@ impl R2Data {
             rows,
             step,
             is_crowd: true,
+            intensities: None,
         }
     }
 }

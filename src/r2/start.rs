@@ -79,7 +79,7 @@ fn gaussians(places: &[(DVec3, f64)], bounds: ScaleBounds, set: u32) -> Vec<R2Ga
 
 /// Root of the mean squared distance to the nearest three other points, of each; of the other points where there are
 /// fewer, and the volume's side without any.
-fn spacings(points: &[DVec3]) -> Vec<f64> {
+pub(crate) fn spacings(points: &[DVec3]) -> Vec<f64> {
     let grid = PointGrid::new(points);
     (0..points.len())
         .into_par_iter()

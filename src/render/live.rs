@@ -32,12 +32,14 @@ pub struct Source {
     pub params: Option<Buffer>,
     /// Gaussians of the model, where they are the moving field.
     pub moving: Option<MovingFeed>,
+    /// Numbers of SAX-NeRF's fields on the device, where they are all there is.
+    pub sax: Option<Vec<Buffer>>,
 }
 
 impl Source {
     /// A model that does not change.
     pub fn of(model: &Model) -> Source {
-        Source { outline: model.clone(), params: None, moving: None }
+        Source { outline: model.clone(), params: None, moving: None, sax: None }
     }
 }
 
@@ -63,6 +65,9 @@ impl Live {
     pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
         let model = &source.outline;
         let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
+        if let Some(params) = &source.sax {
+            renderer.follow_sax(params);
+        }
         Ok(Live {
             baked: Baked::for_display(renderer, model, CELL_MM),
             config: model.config.clone(),

@@ -22,6 +22,7 @@ use crate::network::pass::Pass;
 use crate::network::still::StillNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
+use crate::sax::drawing::SaxDrawing;
 use crate::scan::gating::BeatTime;
 use std::time::Instant;
 
@@ -36,7 +37,7 @@ const FIRST_RAYS: u32 = 4096;
 pub struct Rendering {
     /// Line integral of the static field.
     pub static_integral: Vec<f32>,
-    /// Line integral of the dynamic field.
+    /// Line integral of the dynamic field; of X-Gaussian what it shows instead, from about 0 to 1.
     pub dynamic_integral: Vec<f32>,
     /// Largest attenuation of the static field along the ray.
     pub static_max: Vec<f32>,
@@ -88,6 +89,8 @@ pub struct Renderer {
     /// Where Gaussians are the moving field.
     pub(super) moving: Option<Blobs>,
     pictures: Option<Pictures>,
+    /// Where SAX-NeRF's field is all there is.
+    pub(super) sax: Option<SaxDrawing>,
     /// Of rays, without and with the still field, of integrals and of maxima: what one kind takes says nothing of another.
     paces: [SubmitPace; 4],
 }
@@ -98,7 +101,7 @@ impl Renderer {
     /// # Errors
     /// Device errors.
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
-        let tuning = tuning.for_network(model.moving.is_none());
+        let tuning = tuning.for_network(model.moving.is_none() && model.sax.is_none());
         let mut setup = model.scene.setup(&model.config, &model.param_map, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;
@@ -120,11 +123,13 @@ impl Renderer {
         gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
         let moving = model.moving.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
         let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
+        let sax = model.sax.as_ref().map(|field| SaxDrawing::new(gpu, field)).transpose()?;
         let param_map = model.param_map.clone();
         let gpu = gpu.clone();
         let pace = |_| SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
         let paces = std::array::from_fn(pace);
-        let renderer = Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, paces };
+        let renderer =
+            Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, sax, paces };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -134,11 +139,15 @@ impl Renderer {
     /// # Errors
     /// [`Error::Internal`] for other parameters; device errors.
     pub fn set_model(&self, model: &Model) -> Result<()> {
-        if model.param_map != self.param_map || model.moving.is_some() != self.moving.is_some() {
+        let same_method = model.moving.is_some() == self.moving.is_some() && model.sax.is_some() == self.sax.is_some();
+        if model.param_map != self.param_map || !same_method {
             return Err(Error::Internal("the model has other parameters than the renderer".into()));
         }
         if let Some(field) = &model.moving {
             self.set_gaussians(field)?;
+        }
+        if let (Some(field), Some(drawing)) = (&model.sax, &self.sax) {
+            drawing.replace(field)?;
         }
         self.set_params(model)
     }
@@ -154,6 +163,13 @@ impl Renderer {
                 blobs.replace(field)
             }
             _ => Err(Error::Internal("the network is the moving field of this model".into())),
+        }
+    }
+
+    /// Draws numbers of SAX-NeRF's fields that are on the device, as a run leaves them there; nothing of other methods.
+    pub fn follow_sax(&self, params: &[Buffer]) {
+        if let Some(drawing) = &self.sax {
+            drawing.follow(params.to_vec());
         }
     }
 
@@ -266,9 +282,20 @@ impl Renderer {
         pictures.draw_into(target, rays, size, phase, in_front)
     }
 
+    /// Whether nearer Gaussians hide those behind them, as X-Gaussian's do: in place of line integrals are blended pictures, from
+    /// about 0 to 1, and attenuation is a sum of opacities.
+    pub fn is_blended(&self) -> bool {
+        self.pictures.as_ref().is_some_and(Pictures::are_blended)
+    }
+
     /// Whether Gaussians are the moving field, not a network.
     pub fn gaussians_move(&self) -> bool {
         self.moving.is_some()
+    }
+
+    /// Whether the network on encoded coordinates is the moving field.
+    pub fn network_moves(&self) -> bool {
+        self.moving.is_none() && self.sax.is_none()
     }
 
     /// Whether a view of the moving field is drawn from Gaussians as they are, at display rates. The largest value of their
@@ -320,7 +347,8 @@ impl Renderer {
         if phase.fract() != 0.0 {
             let all = Parts { still: true, maxima: true };
             let taken = BeatTime::of(phase, self.setup.n_phases);
-            let blobs = self.moving.as_ref().map(|_| self.between(phase)).transpose()?;
+            let whole_phases = self.moving.is_some() || self.sax.is_some();
+            let blobs = whole_phases.then(|| self.between(phase)).transpose()?;
             return self.draw(rays, (width, height), taken, blobs.as_ref(), all);
         }
         let closes = last == self.setup.n_phases && phase == f64::from(last);
@@ -329,7 +357,7 @@ impl Renderer {
 
     /// The last phase that can be asked for: that of a field that is continuous in time is the first of the next beat.
     fn last_moment(&self) -> u32 {
-        let continuous = self.moving.as_ref().is_none_or(Blobs::move_between_phases);
+        let continuous = self.sax.is_none() && self.moving.as_ref().is_none_or(Blobs::move_between_phases);
         if continuous { self.setup.n_phases } else { self.setup.n_phases - 1 }
     }
 
@@ -355,7 +383,10 @@ impl Renderer {
             let mut recording = Recording::new(&self.gpu, "render")?;
             let push = pose(taken, &self.setup, first_pixel, n_rays, image_width);
             self.buffers.record_pose(&mut recording, &self.kernels, &views, push)?;
-            if parts.still {
+            if let Some(field) = &self.sax {
+                let (rays, out) = (&self.buffers.rays, &self.buffers.ray_out);
+                field.record_rays(&mut recording, rays, out, taken.phase, n_rays)?;
+            } else if parts.still {
                 self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
             }
             if let (Some(kernels), Some(list)) = (&self.moving, blobs) {
@@ -367,6 +398,9 @@ impl Renderer {
             let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
             out.extend(&seen);
             first_pixel += n_rays;
+        }
+        if let Some(pictures) = self.pictures.as_ref().filter(|pictures| pictures.are_blended()) {
+            out.dynamic_integral = pictures.draw(rays, (width, height), taken.phase)?;
         }
         Ok(out)
     }

@@ -5,7 +5,7 @@ use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::Binding;
-use crate::kernels::layout::View;
+use crate::kernels::layout::{Setup, View};
 use crate::kernels::push;
 use crate::model::component::Component;
 use crate::network::forward::ForwardBuffers;
@@ -87,6 +87,7 @@ impl Renderer {
                     let push = push::VolumeStatic { n_rays: n };
                     self.pass(&mut r, &buffers, &setup).run_with(stage, stage.groups_over(n * nx), &bound, push)?;
                 }
+                _ if self.sax.is_some() => self.record_sax(&mut r, &buffers, &setup, (phase, n), &cells)?,
                 (_, Some(blobs), _) => blobs.record_points(&mut r, &buffers, phase, n, nx, &cells)?,
                 (_, None, _) => {
                     r.fill(&cells, 0);
@@ -98,6 +99,20 @@ impl Renderer {
             read.read(out)?;
         }
         Ok(out)
+    }
+
+    /// Records SAX-NeRF's field at the cells of rows along x.
+    fn record_sax(
+        &self,
+        recording: &mut Recording,
+        buffers: &ForwardBuffers,
+        setup: &Setup,
+        rows: (u32, u32),
+        cells: &Buffer,
+    ) -> Result<()> {
+        let Some(field) = &self.sax else { return Ok(()) };
+        let along = (setup.dynamic_near, setup.dynamic_far, setup.n_dynamic_samples);
+        field.record_cells(recording, &buffers.rays, along, rows, cells)
     }
 
     /// Bytes on their way to the device, behind what was recorded so far.

@@ -21,6 +21,8 @@ use std::borrow::Cow;
 pub const VESSEL_SHARE: f64 = 0.2;
 /// Attenuation per world unit from which the authors' public code takes a field for vessel, whatever the data.
 const PUBLISHED_THRESHOLD: f64 = 0.05;
+/// How a Dice threshold is chosen of X-Gaussian, whose opacities are no attenuation.
+const OPACITY_RULE: &str = "the sum of opacities, by the published threshold of 0.05";
 /// How a Dice threshold is chosen where nothing else tells.
 const VESSEL_RULE: &str = "Otsu on the predicted maximum projections, held at their 99.5th percentile";
 /// Share of an image's pixels that may change more than what counts as its strongest change.
@@ -43,6 +45,9 @@ pub struct ImageScore {
     pub dice_dynamic: Option<f64>,
     /// Dice of both fields.
     pub dice_total: Option<f64>,
+    /// Dice of X-Gaussian by Otsu's threshold of this image; none of other methods.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dice_otsu: Option<f64>,
     /// dB.
     pub psnr: f64,
     /// Structural similarity.
@@ -114,6 +119,10 @@ pub struct Evaluation {
     pub best_dice: BestDices,
     /// Dice as the paper and the authors' code take it.
     pub dice_published: PublishedDice,
+    /// Mean Dice of X-Gaussian by Otsu's threshold of each image's own largest sums of opacities, since these have no scale; none
+    /// of other methods.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dice_otsu: Option<f64>,
     /// Mean PSNR, dB.
     pub psnr: f64,
     /// Mean SSIM.
@@ -156,10 +165,16 @@ type Maxima = fn(&Rendering) -> &[f32];
 const DYNAMIC: Maxima = |r| &r.dynamic_max;
 const TOTAL: Maxima = |r| &r.total_max;
 
-/// Threshold on attenuation per world unit for a set of maximum projections.
-fn choose_thresholds(seen: &[Rendering], stated: Option<f64>, given: Option<f64>) -> (f64, f64, &'static str) {
+/// Threshold on attenuation per world unit for a set of maximum projections; `blended` ones are of opacities.
+fn choose_thresholds(
+    seen: &[Rendering],
+    stated: Option<f64>,
+    given: Option<f64>,
+    blended: bool,
+) -> (f64, f64, &'static str) {
     match (given, stated) {
         (Some(t), _) => (t, t, "given"),
+        _ if blended => (PUBLISHED_THRESHOLD, PUBLISHED_THRESHOLD, OPACITY_RULE),
         (None, Some(vessel)) => {
             (VESSEL_SHARE * vessel, VESSEL_SHARE * vessel, "a fifth of the stated vessel attenuation")
         }
@@ -174,11 +189,14 @@ fn choose_thresholds(seen: &[Rendering], stated: Option<f64>, given: Option<f64>
 }
 
 /// Attenuation per mm from which the moving field of a model counts as vessel: [`VESSEL_SHARE`] of the stated one, or
-/// Otsu's threshold of what the field has at phase 0 at the points of a grid.
+/// Otsu's threshold of what the field has at phase 0 at the points of a grid; of X-Gaussian's opacities the published threshold.
 ///
 /// # Errors
 /// Those of [`Renderer::sample_patient`].
 pub fn vessel_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid) -> Result<f64> {
+    if renderer.is_blended() {
+        return Ok(PUBLISHED_THRESHOLD / MM_PER_UNIT);
+    }
     if let Some(attenuation) = model.vessel_attenuation {
         return Ok(VESSEL_SHARE * attenuation / MM_PER_UNIT);
     }
@@ -192,6 +210,11 @@ pub(super) fn overlap(frame: &Frame, values: &[f32], threshold: f64) -> Option<f
     let mask = frame.mask.as_ref()?;
     let predicted: Vec<bool> = values.iter().map(|v| f64::from(*v) > threshold).collect();
     Some(metrics::dice(&predicted, mask))
+}
+
+/// Dice of what exceeds Otsu's threshold of an image's own values; none without a mask.
+fn otsu_dice(frame: &Frame, values: &[f32]) -> Option<f64> {
+    overlap(frame, values, metrics::vessel_threshold(values).into())
 }
 
 /// The mean; none of nothing.
@@ -243,7 +266,9 @@ pub fn evaluate(
     }
     let own: Vec<Cow<'_, Frame>> = frames.iter().map(|frame| dataset.own_frame(frame)).collect();
     let frames: Vec<&Frame> = own.iter().map(Cow::as_ref).collect();
-    let (dynamic_threshold, total_threshold, rule) = choose_thresholds(&seen, dataset.vessel_attenuation, threshold);
+    let blended = renderer.is_blended();
+    let (dynamic_threshold, total_threshold, rule) =
+        choose_thresholds(&seen, dataset.vessel_attenuation, threshold, blended);
     let mut images = Vec::new();
     for (frame, rendering) in frames.iter().zip(&seen) {
         observe(Scoring::Scored { frame, rendering, threshold: dynamic_threshold })?;
@@ -257,6 +282,7 @@ pub fn evaluate(
             phase: frame.phase,
             dice_dynamic: overlap(&rendering.dynamic_max, dynamic_threshold),
             dice_total: overlap(&rendering.total_max, total_threshold),
+            dice_otsu: blended.then(|| otsu_dice(frame, &rendering.dynamic_max)).flatten(),
             psnr: metrics::psnr(&truth, &prediction),
             ssim: metrics::ssim(&truth, &prediction, dataset.views[frame.view].size[0]),
         });
@@ -274,6 +300,7 @@ pub fn evaluate(
         dice_as_stated: None,
         best_dice: BestDices { dynamic: best(DYNAMIC, dynamic_threshold), total: best(TOTAL, total_threshold) },
         dice_published: published_dice(&frames, &seen),
+        dice_otsu: mean(&|i| i.dice_otsu),
         psnr: mean(&|i| Some(i.psnr)).unwrap_or(f64::NAN),
         ssim: mean(&|i| Some(i.ssim)).unwrap_or(f64::NAN),
         threshold: Thresholds {
@@ -311,10 +338,14 @@ fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
 /// # Errors
 /// Device errors.
 pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Option<String>> {
+    // What X-Gaussian shows has no unit that a change could be compared with.
+    if renderer.is_blended() {
+        return Ok(None);
+    }
     let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
     let seen = rendered(renderer, dataset, frame)?;
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
-    let remedy = if renderer.gaussians_move() {
+    let remedy = if !renderer.network_moves() {
         "check geometry, phases and noise of the views"
     } else {
         "check geometry and phases; a smaller hull.dilate_pixels, a lower dynamic.lr or another seed may help"

@@ -260,7 +260,15 @@ fn drawn_set(n: usize, n_phases: u32) -> Gaussians {
         rotation: [7, 8, 9, 10].map(|k| value(i, k) as f32),
     });
     let setup = GaussianSetup { n_phases, cut: 3.2, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() };
-    Gaussians { units: DRAWN_UNITS, n_phases: n_phases as usize, setup, rows: rows.collect(), step: 7, is_crowd: false }
+    Gaussians {
+        units: DRAWN_UNITS,
+        n_phases: n_phases as usize,
+        setup,
+        rows: rows.collect(),
+        step: 7,
+        is_crowd: false,
+        intensities: None,
+    }
 }
 
 /// One set of Gaussians that moves, to be drawn.

@@ -201,7 +201,8 @@ impl Shared {
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.step.store(trainer.step(), Ordering::Release);
         let params = Some(trainer.forward().params.clone());
-        self.publish(Source { outline: trainer.outline(), params, moving: trainer.moving_feed() });
+        let (moving, sax) = (trainer.moving_feed(), trainer.sax_params());
+        self.publish(Source { outline: trainer.outline(), params, moving, sax });
         engine.training = Some(Training::new(trainer));
         Ok(())
     }

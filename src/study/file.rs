@@ -229,6 +229,7 @@ fn method(text: &Text<'_>, section: &MethodSection) -> Result<Method> {
 
 const ITERATIONS: &str = "train.iterations";
 const DENSIFY_EVERY: &str = "r2.densify_every";
+const X_DENSIFY_EVERY: &str = "x.densify_every";
 /// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have
 /// one.
 const LEAST_BETWEEN_DENSIFYING: f64 = 10.0;
@@ -256,8 +257,21 @@ fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
             ("r2.densify_until", preset.r2.densify_until),
         ]);
     }
+    if preset.is_x() {
+        schedule.extend([
+            (X_DENSIFY_EVERY, preset.x.densify_every),
+            ("x.densify_from", preset.x.densify_from),
+            ("x.densify_until", preset.x.densify_until),
+            ("x.reset_every", preset.x.reset_every),
+            ("x.degree_every", preset.x.degree_every),
+        ]);
+    }
+    if preset.is_sax() {
+        schedule.push(("sax.rate_falls_at", preset.sax.rate_falls_at));
+    }
     let moved = schedule.into_iter().filter(|(key, _)| !given.contains(key));
-    let least = |key: &str| if key == DENSIFY_EVERY { LEAST_BETWEEN_DENSIFYING } else { 0.0 };
+    let least =
+        |key: &str| if [DENSIFY_EVERY, X_DENSIFY_EVERY].contains(&key) { LEAST_BETWEEN_DENSIFYING } else { 0.0 };
     let moved = moved.map(|(key, count)| format!("{key}={}", (share * f64::from(count)).round().max(least(key))));
     moved.chain([format!("{ITERATIONS}={iterations}")]).collect()
 }
@@ -294,5 +308,10 @@ mod tests {
         assert_eq!((of(6000, "r2.densify_every"), of(6000, "r2.densify_from")), (value("20"), value("100")));
         assert_eq!((of(1000, "r2.densify_every"), of(1000, "r2.densify_from")), (value("10"), value("17")));
         assert_eq!((of(1000, "r2.densify_until"), of(1000, "train.iterations")), (None, value("1000")));
+        let x = scaled(&Config::preset(Preset::XGaussian), 2000, &[]);
+        for setting in ["x.densify_every=20", "x.densify_from=50", "x.densify_until=800", "x.reset_every=400"] {
+            assert!(x.iter().any(|s| s == setting), "{setting}: {x:?}");
+        }
+        assert!(x.contains(&"x.degree_every=100".to_owned()), "{x:?}");
     }
 }

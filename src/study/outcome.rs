@@ -97,6 +97,9 @@ pub struct RunScores {
     pub dice_paper: Option<f64>,
     /// Dice of both fields in the first image at the authors' threshold, as in their code.
     pub dice_authors: Option<f64>,
+    /// Dice of X-Gaussian by Otsu's threshold of each image.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dice_otsu: Option<f64>,
     /// dB.
     pub psnr: Option<f64>,
     /// Structural similarity.
@@ -131,6 +134,7 @@ impl RunScores {
             dice_best: evaluation.best_dice.dynamic.map(|best| best.dice),
             dice_paper: evaluation.dice_published.paper,
             dice_authors: evaluation.dice_published.authors,
+            dice_otsu: evaluation.dice_otsu,
             psnr: finite(evaluation.psnr),
             ssim: finite(evaluation.ssim),
             chamfer_mm: volume.and_then(|v| v.chamfer_mm),

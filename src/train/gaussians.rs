@@ -236,6 +236,7 @@ impl GaussianTrainer {
             rows: self.gpu.download(&self.particles.gaussians, 0, self.n as usize)?,
             step: self.step,
             is_crowd: false,
+            intensities: None,
         };
         model.check()?;
         Ok(model)

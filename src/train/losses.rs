@@ -73,6 +73,11 @@ impl StepLoss {
         StepLoss { data: loss, dynamic: loss, ..none }
     }
 
+    /// An iteration of SAX-NeRF, whose line integrals are in units of `attenuation`.
+    pub(super) fn of_sax(step: u32, loss: f64, attenuation: f64) -> StepLoss {
+        StepLoss { squared_error: loss * attenuation * attenuation, ..StepLoss::of_gaussians(step, loss) }
+    }
+
     /// The objective.
     pub fn total(&self) -> f64 {
         self.data + self.tv + self.occlusion + self.networks.map_or(0.0, |networks| networks.total())

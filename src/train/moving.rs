@@ -10,6 +10,7 @@ use crate::gpu::record::PassTime;
 use crate::model::checkpoint::Checkpoint;
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
 use crate::model::r2::R2State;
+use crate::model::x_gaussian::XState;
 use crate::plan::Plan;
 use crate::plan::targets::Targets;
 use crate::r2::data::R2Data;
@@ -19,11 +20,13 @@ use crate::train::gaussians::GaussianTrainer;
 use crate::train::r2::R2Trainer;
 use crate::train::tree::TreeTrainer;
 use crate::train::tree_start::TreeStart;
+use crate::train::x_gaussian::XTrainer;
+use crate::x_gaussian::data::XData;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Iterations of R2-Gaussian after which those who draw the field get it anew: of half a million Gaussians per phase that
-/// takes as long as some iterations.
-const R2_SHOWN_EVERY: u32 = 100;
+/// Iterations of R2-Gaussian and X-Gaussian after which those who draw the field get it anew: of half a million Gaussians per
+/// phase that takes as long as some iterations.
+const SHOWN_EVERY: u32 = 100;
 
 /// What Gaussians are fitted to.
 #[derive(Clone)]
@@ -32,13 +35,16 @@ pub(super) enum FitData {
     Targets(Box<Targets>),
     /// Whole images.
     R2(Box<R2Data>),
+    /// Whole images, normalised.
+    X(Box<XData>),
 }
 
 impl FitData {
     /// What a plan has; none where the network moves.
     pub(super) fn take(plan: &mut Plan) -> Option<FitData> {
         let r2 = plan.r2.take().map(|data| FitData::R2(Box::new(data)));
-        r2.or_else(|| plan.targets.take().map(|targets| FitData::Targets(Box::new(targets))))
+        let x = plan.x.take().map(|data| FitData::X(Box::new(data)));
+        r2.or(x).or_else(|| plan.targets.take().map(|targets| FitData::Targets(Box::new(targets))))
     }
 }
 
@@ -52,19 +58,25 @@ pub(super) enum MovingFit {
     Tree(Box<TreeTrainer>),
     /// Static sets as R2-Gaussian fits them.
     R2(Box<R2Trainer>),
+    /// Static sets as X-Gaussian fits them.
+    X(Box<XTrainer>),
 }
 
 impl MovingFit {
     /// Begins a fit, and what is to be said of its beginning.
     ///
     /// # Errors
-    /// As [`R2Trainer::new`], [`GaussianTrainer::new`] and [`TreeStart::new`].
+    /// As [`R2Trainer::new`], [`XTrainer::new`], [`GaussianTrainer::new`] and [`TreeStart::new`].
     pub(super) fn of(gpu: &Gpu, data: FitData, config: &Config) -> Result<(MovingFit, Vec<String>)> {
         Ok(match data {
             FitData::Targets(targets) => (MovingFit::new(gpu, *targets, config)?, Vec::new()),
             FitData::R2(data) => {
                 let (fit, notes) = R2Trainer::new(gpu, *data, config)?;
                 (MovingFit::R2(Box::new(fit)), notes)
+            }
+            FitData::X(data) => {
+                let (fit, notes) = XTrainer::new(gpu, *data, config)?;
+                (MovingFit::X(Box::new(fit)), notes)
             }
         })
     }
@@ -99,7 +111,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(fit) => fit.step() >= end / 2,
             MovingFit::Start(_) => false,
-            MovingFit::Tree(_) | MovingFit::R2(_) => true,
+            MovingFit::Tree(_) | MovingFit::R2(_) | MovingFit::X(_) => true,
         }
     }
 
@@ -110,6 +122,7 @@ impl MovingFit {
             MovingFit::Start(_) => 0,
             MovingFit::Tree(fit) => fit.step(),
             MovingFit::R2(fit) => fit.step(),
+            MovingFit::X(fit) => fit.step(),
         }
     }
 
@@ -117,7 +130,7 @@ impl MovingFit {
     pub(super) fn preparation(&self) -> Option<f64> {
         match self {
             MovingFit::Start(start) => Some(start.share()),
-            MovingFit::PerPhase(_) | MovingFit::Tree(_) | MovingFit::R2(_) => None,
+            MovingFit::PerPhase(_) | MovingFit::Tree(_) | MovingFit::R2(_) | MovingFit::X(_) => None,
         }
     }
 
@@ -136,6 +149,7 @@ impl MovingFit {
             }
             MovingFit::Tree(fit) => fit.advance(until),
             MovingFit::R2(fit) => fit.advance(until),
+            MovingFit::X(fit) => fit.advance(until),
         }
     }
 
@@ -149,6 +163,7 @@ impl MovingFit {
             MovingFit::Start(start) => MovingGaussians::PerPhase(start.field()?),
             MovingFit::Tree(fit) => MovingGaussians::Tree(fit.tree()?),
             MovingFit::R2(fit) => MovingGaussians::PerPhase(fit.model()?),
+            MovingFit::X(fit) => MovingGaussians::PerPhase(fit.model()?),
         })
     }
 
@@ -159,6 +174,7 @@ impl MovingFit {
             MovingFit::Start(start) => start.count(),
             MovingFit::Tree(fit) => fit.count(),
             MovingFit::R2(fit) => fit.count(),
+            MovingFit::X(fit) => fit.count(),
         }
     }
 
@@ -168,6 +184,7 @@ impl MovingFit {
             MovingFit::PerPhase(_) => GaussianForm::Phase,
             MovingFit::Start(_) | MovingFit::Tree(_) => GaussianForm::Tree,
             MovingFit::R2(_) => GaussianForm::R2,
+            MovingFit::X(_) => GaussianForm::X,
         }
     }
 
@@ -181,6 +198,7 @@ impl MovingFit {
             MovingFit::Start(_) => Err(not_begun()),
             MovingFit::Tree(fit) => fit.profile_step(),
             MovingFit::R2(fit) => fit.profile_step(),
+            MovingFit::X(fit) => fit.profile_step(),
         }
     }
 
@@ -194,6 +212,7 @@ impl MovingFit {
             MovingFit::Start(_) => Err(not_begun()),
             MovingFit::Tree(fit) => fit.work(),
             MovingFit::R2(fit) => fit.work(),
+            MovingFit::X(fit) => fit.work(),
         }
     }
 }
@@ -233,6 +252,9 @@ impl Moving {
         config.train.iterations_per_submit = per_submit;
         if let Some(data) = plan.r2.take() {
             return Self::begin_r2(gpu, data, &config, saved, &mut plan.notes).map(Some);
+        }
+        if let Some(data) = plan.x.take() {
+            return Self::begin_x(gpu, data, &config, saved, &mut plan.notes).map(Some);
         }
         let Some(targets) = plan.targets.take() else { return Ok(None) };
         let shot = |frame: &Frame| (dataset.heart_rays(frame), frame.beat_time().phases(dataset.n_phases));
@@ -277,6 +299,37 @@ impl Moving {
         };
         let feed = Arc::new(Mutex::new((0, MovingGaussians::PerPhase(fit.model()?))));
         Ok(Moving { fit: Some(MovingFit::R2(Box::new(fit))), feed, shows_earlier: false, shots: Vec::new() })
+    }
+
+    /// Begins X-Gaussian's fit, or goes on from what was `saved` of one to the same images.
+    fn begin_x(
+        gpu: &Gpu,
+        data: XData,
+        config: &Config,
+        saved: Option<&Checkpoint>,
+        notes: &mut Vec<String>,
+    ) -> Result<Moving> {
+        let fit = match saved.and_then(|saved| Some((saved.x.as_ref()?, saved.model.step))) {
+            Some((state, step)) => XTrainer::with(gpu, data, config, state, step)?,
+            None => {
+                let (fit, more) = XTrainer::new(gpu, data, config)?;
+                notes.extend(more);
+                fit
+            }
+        };
+        let feed = Arc::new(Mutex::new((0, MovingGaussians::PerPhase(fit.model()?))));
+        Ok(Moving { fit: Some(MovingFit::X(Box::new(fit))), feed, shows_earlier: false, shots: Vec::new() })
+    }
+
+    /// The state of X-Gaussian's fit, and the field it stands for; none of other fits.
+    ///
+    /// # Errors
+    /// As [`XTrainer::state`].
+    pub(super) fn x_state(&self) -> Result<Option<(XState, MovingGaussians)>> {
+        let Some(MovingFit::X(fit)) = &self.fit else { return Ok(None) };
+        let state = fit.state()?;
+        let field = MovingGaussians::PerPhase(fit.field_of(&state));
+        Ok(Some((state, field)))
     }
 
     /// The state of R2-Gaussian's fit, and the field it stands for; none of other fits.
@@ -332,14 +385,14 @@ impl Moving {
         let before = fit.step();
         let losses = fit.advance(until.min(end))?;
         self.shows_earlier &= !fit.is_presentable(end);
-        let is_r2 = matches!(fit, MovingFit::R2(_));
-        let is_shown = !is_r2 || fit.step() >= until.min(end) || fit.step() / R2_SHOWN_EVERY > before / R2_SHOWN_EVERY;
+        let is_alone = matches!(fit, MovingFit::R2(_) | MovingFit::X(_));
+        let is_shown = !is_alone || fit.step() >= until.min(end) || fit.step() / SHOWN_EVERY > before / SHOWN_EVERY;
         if self.shows_earlier || !is_shown {
             return Ok(losses);
         }
         let field = fit.field()?;
-        // No still field comes after R2-Gaussian's.
-        if fit.step() >= end && !is_r2 {
+        // No still field comes after R2-Gaussian's and X-Gaussian's.
+        if fit.step() >= end && !is_alone {
             self.fit = None;
         }
         let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);

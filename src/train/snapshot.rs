@@ -8,6 +8,8 @@ use crate::kernels::layout::{DeviceState, StepReport};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::r2::R2State;
+use crate::model::sax::SaxState;
+use crate::model::x_gaussian::XState;
 
 /// Bytes of an iteration's report.
 pub(super) const REPORT_BYTES: u64 = size_of::<StepReport>() as u64;
@@ -26,6 +28,8 @@ pub struct Snapshot {
     pub(super) scaled: bool,
     pub(super) model: Model,
     pub(super) r2: Option<R2State>,
+    pub(super) x: Option<XState>,
+    pub(super) sax: Option<SaxState>,
     pub(super) data_fingerprint: String,
 }
 
@@ -69,6 +73,8 @@ impl Snapshot {
             stopped: stopped != 0,
             last_report,
             r2: self.r2,
+            x: self.x,
+            sax: self.sax,
             data_fingerprint: self.data_fingerprint,
         })
     }

@@ -290,8 +290,8 @@ pub struct GaussianSubject {
     notes: Vec<String>,
 }
 
-/// Iterations of R2-Gaussian that are timed, of thousands that come before its Gaussians become more.
-const R2_TIMED: u32 = 200;
+/// Iterations of R2-Gaussian and X-Gaussian that are timed, of thousands that come before their Gaussians become more.
+const ALONE_TIMED: u32 = 200;
 
 /// Fits at least: one says nothing of how they differ.
 const LEAST_FITS: usize = 3;
@@ -318,15 +318,15 @@ impl GaussianSubject {
         profiled: u32,
     ) -> Result<GaussianSubject> {
         let mut config = config.clone();
-        let (of_fit, is_r2) = (config.gaussians.iterations, config.is_r2());
-        let of_fit = if is_r2 { config.train.iterations.min(R2_TIMED) } else { of_fit };
+        let (of_fit, is_alone) = (config.gaussians.iterations, config.has_gaussians_alone());
+        let of_fit = if is_alone { config.train.iterations.min(ALONE_TIMED) } else { of_fit };
         let timed = match length {
             Length::Iterations(n) => n,
             Length::Seconds(_) => of_fit.saturating_sub(WARM_UP).max(1),
         };
         let least = WARM_UP + timed;
         config.gaussians.iterations = config.gaussians.iterations.max(least) + profiled;
-        if is_r2 {
+        if is_alone {
             config.train.iterations = config.train.iterations.max(least) + profiled;
         }
         let mut plan = Plan::new(&config, dataset)?;

@@ -24,6 +24,7 @@ use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::train::losses::{NetworkLosses, StepLoss};
 use crate::train::moving::Moving;
+use crate::train::sax::SaxTrainer;
 use crate::train::snapshot::{REPORT_BYTES, Snapshot};
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use std::collections::VecDeque;
@@ -55,6 +56,8 @@ pub struct Trainer {
     training: TrainingBuffers,
     /// Gaussians, where they are the moving field.
     moving: Option<Moving>,
+    /// SAX-NeRF's fields, where they are all there is.
+    sax: Option<SaxTrainer>,
     pace: SubmitPace,
     /// When the last submit was done, or the one under way began.
     last_completion: Instant,
@@ -75,11 +78,25 @@ pub struct Trainer {
 
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
-    let has_gaussians = plan.targets.is_some() || plan.r2.is_some();
-    if checkpoint.model.param_map == plan.params && checkpoint.model.moving.is_some() == has_gaussians {
+    let has_gaussians = plan.targets.is_some() || plan.r2.is_some() || plan.x.is_some();
+    let same_method =
+        checkpoint.model.moving.is_some() == has_gaussians && checkpoint.model.sax.is_some() == plan.sax.is_some();
+    if checkpoint.model.param_map == plan.params && same_method {
         return Ok(());
     }
     Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
+}
+
+/// Begins SAX-NeRF's fit to the plan's data, or goes on from what was `saved` of one to the same; none of other methods.
+fn begin_sax(gpu: &Gpu, plan: &mut Plan, saved: Option<&Checkpoint>, per_submit: u32) -> Result<Option<SaxTrainer>> {
+    let Some(data) = plan.sax.take() else { return Ok(None) };
+    let mut config = plan.config.clone();
+    config.train.iterations_per_submit = per_submit;
+    let fit = match saved.and_then(|saved| Some((saved.model.sax.as_ref()?, saved.sax.as_ref()?))) {
+        Some((field, state)) => SaxTrainer::with(gpu, data, &config, field, state)?,
+        None => SaxTrainer::new(gpu, data, &config)?,
+    };
+    Ok(Some(fit))
 }
 
 /// Fingerprint of the training images: of their bits and geometry.
@@ -174,7 +191,7 @@ impl Trainer {
         saved: Option<&Checkpoint>,
         earlier: Option<&MovingGaussians>,
     ) -> Result<Trainer> {
-        let tuning = tuning.for_network(!plan.config.gaussians_move());
+        let tuning = tuning.for_network(plan.config.network_moves());
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params.moving));
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
         let network = Network::new(gpu, &tuning, &plan.setup, &plan.params.moving, Purpose::Train)?;
@@ -213,7 +230,9 @@ impl Trainer {
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
         let earlier = earlier.filter(|_| of_these_data.is_none());
         let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data, earlier, per_submit)?;
-        let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
+        let sax = begin_sax(gpu, &mut plan, of_these_data, per_submit)?;
+        let of_fit = moving.as_ref().and_then(Moving::step).or(sax.as_ref().map(SaxTrainer::step));
+        let step = of_fit.unwrap_or(now.step);
         // The still field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
@@ -231,7 +250,7 @@ impl Trainer {
             })?;
             recording.finish()
         };
-        let has_still_field = !plan.config.is_r2();
+        let has_still_field = !plan.config.has_gaussians_alone() && !plan.config.is_sax();
         let single = has_still_field.then(record_single).transpose()?;
         let trainer = Trainer {
             pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit),
@@ -250,7 +269,9 @@ impl Trainer {
             reported: step,
             first_loss: None,
             moving,
-            vessel_attenuation: dataset.vessel_attenuation,
+            sax,
+            // X-Gaussian's opacities are no attenuation.
+            vessel_attenuation: dataset.vessel_attenuation.filter(|_| !plan.config.is_x()),
             c_arm: dataset.reference_c_arm(),
             image_size: dataset.reference_view().size,
             data_fingerprint,
@@ -314,6 +335,9 @@ impl Trainer {
     pub fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
         if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
             return self.advance_gaussians(until);
+        }
+        if self.sax.is_some() {
+            return self.advance_sax(until);
         }
         self.record_several()?;
         if self.in_flight.is_empty() {
@@ -403,6 +427,22 @@ impl Trainer {
         Ok(losses.into_iter().zip(first + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
     }
 
+    /// Numbers of SAX-NeRF's fields on the device, for those who draw them; none of other methods.
+    pub fn sax_params(&self) -> Option<Vec<Buffer>> {
+        self.sax.as_ref().map(SaxTrainer::params)
+    }
+
+    /// Some iterations of SAX-NeRF.
+    fn advance_sax(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+        let Some(sax) = &mut self.sax else { return Ok(Vec::new()) };
+        let losses = sax.advance(until)?;
+        let (attenuation, first) = (sax.data().attenuation, self.completed);
+        for done in [&mut self.submitted, &mut self.completed, &mut self.reported] {
+            *done = first + losses.len() as u32;
+        }
+        Ok(losses.into_iter().zip(first + 1..).map(|(loss, step)| StepLoss::of_sax(step, loss, attenuation)).collect())
+    }
+
     /// The still field is trained on the images less the moving field.
     fn leave_to_still_field(&self) -> Result<()> {
         let Some(moving) = &self.moving else { return Ok(()) };
@@ -443,8 +483,12 @@ impl Trainer {
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
-        if let Some(moving) = self.moving.as_mut().filter(|_| self.single.is_none()) {
-            let passes = moving.profile_step()?;
+        let of_fit = match (&mut self.moving, &mut self.sax) {
+            (Some(moving), _) if self.single.is_none() => Some(moving.profile_step()?),
+            (_, Some(sax)) => Some(sax.profile_step()?),
+            _ => None,
+        };
+        if let Some(passes) = of_fit {
             self.submitted += 1;
             self.completed += 1;
             self.reported += 1;
@@ -469,6 +513,7 @@ impl Trainer {
             // Gaussians need no hull once they are seeded.
             hull: self.plan.hull.clone().filter(|_| self.moving.is_none()),
             moving: self.moving.as_ref().map(Moving::field),
+            sax: self.sax.as_ref().map(SaxTrainer::outline),
             params: Vec::new(),
             step: self.submitted,
             vessel_attenuation: self.vessel_attenuation,
@@ -504,9 +549,16 @@ impl Trainer {
         let occupancy = copy(&self.forward.occupancy, 0, occupancy_bytes(&self.plan.setup))?;
         let commands = recording.finish()?;
         let ticket = commands.submit()?;
-        let (mut model, mut r2) = (self.outline(), None);
+        let (mut model, mut r2, mut x) = (self.outline(), None, None);
         if let Some((state, field)) = self.moving.as_ref().map(Moving::r2_state).transpose()?.flatten() {
             (model.moving, r2) = (Some(field), Some(state));
+        }
+        if let Some((state, field)) = self.moving.as_ref().map(Moving::x_state).transpose()?.flatten() {
+            (model.moving, x) = (Some(field), Some(state));
+        }
+        let mut sax = None;
+        if let Some((field, state)) = self.sax.as_ref().map(SaxTrainer::state).transpose()? {
+            (model.sax, sax) = (Some(field), Some(state));
         }
         Ok(Snapshot {
             gpu: self.gpu.clone(),
@@ -521,6 +573,8 @@ impl Trainer {
             scaled: self.network.layers() == Layers::Matrices,
             model,
             r2,
+            x,
+            sax,
             data_fingerprint: self.data_fingerprint.clone(),
         })
     }

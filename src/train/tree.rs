@@ -323,6 +323,7 @@ impl TreeTrainer {
             rows: self.gpu.download(&self.particles.gaussians, 0, n)?,
             step: self.step,
             is_crowd: false,
+            intensities: None,
         };
         rest.check()?;
         Ok(MovingTree { rest, setup: tree, grid, own })

@@ -1,0 +1,81 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Pictures of X-Gaussian: at each pixel the sum of c a T over its tile's Gaussians from the nearest on, with c the
+// intensity, a the opacity there and T the light that those in front leave, (1 - a) each. What is less opaque than
+// 1/255 counts as nothing; a pixel ends before less than 1e-4 is left. One workgroup per tile column (x), row (y) and
+// set (z).
+#include "inc/x_gaussian.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { XSetup x_setup; };
+layout(binding = 2) readonly buffer B2 { XGaussian x_gaussians[]; };
+layout(binding = 3) readonly buffer B3 { Splat splats[]; };
+// [set][tile row][tile column]
+layout(binding = 4) readonly buffer B4 { XList x_lists[]; };
+layout(binding = 5) readonly buffer B5 { uint x_list_items[]; };
+// [set][pixel], fixed point: what stages after it read.
+layout(binding = 6) writeonly buffer B6 { int splat_images[]; };
+// [set][pixel]
+layout(binding = 7) writeonly buffer B7 { XEnd x_ends[]; };
+#include "inc/x_tile.glsl"
+
+// Mean, opacity and intensity; conic.
+shared vec4 places[LANES];
+shared vec3 conics[LANES];
+shared uint going;
+
+// The picture's largest value, far beyond what targets have: sums stay integers.
+const float BRIGHTEST = 256.0;
+
+struct Pixel {
+    float shown;
+    float left;
+    uint last;
+    bool ended;
+};
+
+void add(uint j, uint place, vec2 at, inout Pixel pixel) {
+    float alpha = alpha_of(conics[j], places[j].z, at - places[j].xy).alpha;
+    if (alpha == 0.0) return;
+    float left = pixel.left * (1.0 - alpha);
+    if (left < LEAST_LIGHT) {
+        pixel.ended = true;
+        return;
+    }
+    pixel.shown += places[j].w * alpha * pixel.left;
+    pixel.left = left;
+    pixel.last = place + 1u;
+}
+
+void main() {
+    uint lane = gl_LocalInvocationID.x;
+    XList list = x_lists[list_of_workgroup()];
+    Pixel pixels[PIXELS_OF_LANE];
+    for (uint k = 0u; k < PIXELS_OF_LANE; k++) pixels[k] = Pixel(0.0, 1.0, 0u, !is_in_image(pixel_of_lane(k)));
+    for (uint begin = 0u; begin < list.count; begin += LANES) {
+        barrier();
+        if (lane == 0u) going = 0u;
+        if (begin + lane < list.count) {
+            uint i = x_list_items[list.first + begin + lane];
+            places[lane] = vec4(splats[i].mean, splats[i].amplitude, max(x_gaussians[i].intensity, 0.0));
+            conics[lane] = splats[i].conic;
+        }
+        barrier();
+        for (uint k = 0u; k < PIXELS_OF_LANE; k++)
+            if (!pixels[k].ended) atomicOr(going, 1u);
+        barrier();
+        if (going == 0u) break;
+        uint n = min(LANES, list.count - begin);
+        for (uint k = 0u; k < PIXELS_OF_LANE; k++) {
+            vec2 at = vec2(pixel_of_lane(k));
+            for (uint j = 0u; j < n && !pixels[k].ended; j++) add(j, begin + j, at, pixels[k]);
+        }
+    }
+    for (uint k = 0u; k < PIXELS_OF_LANE; k++) {
+        uvec2 pixel = pixel_of_lane(k);
+        if (!is_in_image(pixel)) continue;
+        float shown = min(pixels[k].shown, BRIGHTEST);
+        splat_images[place_of(pixel)] = int(roundEven(shown * gaussian_setup.fixed_point));
+        x_ends[place_of(pixel)] = XEnd(pixels[k].left, pixels[k].last);
+    }
+}

@@ -1,0 +1,108 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// What the gradient of each Gaussian in a tile's list needs of the tile's pixels, from the last to the first. With g
+// the gradient by the picture, T the light in front of a Gaussian, a its opacity, c its intensity and B what is seen
+// behind it, h = g T (c - B) a where a follows the parameters: sums of h, h (du, dv), h (du^2, du dv, dv^2), and of g T
+// a. One workgroup per tile column (x), row (y) and set (z).
+#include "inc/x_gaussian.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { XSetup x_setup; };
+layout(binding = 2) readonly buffer B2 { XGaussian x_gaussians[]; };
+layout(binding = 3) readonly buffer B3 { Splat splats[]; };
+layout(binding = 4) readonly buffer B4 { XSpan x_spans[]; };
+// [set][tile row][tile column]
+layout(binding = 5) readonly buffer B5 { XList x_lists[]; };
+layout(binding = 6) readonly buffer B6 { uint x_list_items[]; };
+// [set][pixel]
+layout(binding = 7) readonly buffer B7 { XEnd x_ends[]; };
+layout(binding = 8) readonly buffer B8 { float splat_image_gradient[]; };
+// [entry][7]
+layout(binding = 9) writeonly buffer B9 { float x_entries[]; };
+#include "inc/x_tile.glsl"
+
+// Gaussians whose sums are taken at once.
+const uint BATCH = 8u;
+const uint SUMS = 7u;
+// From the numbers of one sum to those of the next: banks of memory take turns.
+const uint SUM_STRIDE = LANES + 1u;
+
+// [Gaussian][sum][lane]
+shared float parts[BATCH * SUMS * SUM_STRIDE];
+// Mean, opacity and intensity; conic; where sums go.
+shared vec4 places[BATCH];
+shared vec3 conics[BATCH];
+shared uint entries[BATCH];
+
+struct Pixel {
+    vec2 at;
+    float gradient;
+    float light;
+    float behind;
+    uint last;
+};
+
+Pixel pixel_to_go_back(uint k) {
+    uvec2 pixel = pixel_of_lane(k);
+    if (!is_in_image(pixel)) return Pixel(vec2(0.0), 0.0, 1.0, 0.0, 0u);
+    uint place = place_of(pixel);
+    float gradient = x_setup.absolute_weight * splat_image_gradient[place];
+    return Pixel(vec2(pixel), gradient, x_ends[place].left, 0.0, x_ends[place].last);
+}
+
+uint entry_of(uint i) {
+    XSpan span = x_spans[i];
+    uvec2 from_first = gl_WorkGroupID.xy - uvec2(span.first & 0xffffu, span.first >> 16);
+    return span.first_entry + from_first.y * columns_and_rows(span).x + from_first.x;
+}
+
+// Goes from behind the `j`-th Gaussian of the batch to before it.
+void pass(uint j, inout Pixel pixel, inout float sums[SUMS]) {
+    vec2 d = pixel.at - places[j].xy;
+    XAlpha here = alpha_of(conics[j], places[j].z, d);
+    if (here.alpha == 0.0) return;
+    float intensity = places[j].w;
+    pixel.light /= 1.0 - here.alpha;
+    float by_alpha = pixel.gradient * pixel.light * (intensity - pixel.behind);
+    pixel.behind = mix(pixel.behind, intensity, here.alpha);
+    sums[6] += pixel.gradient * pixel.light * here.alpha;
+    if (!here.follows) return;
+    float h = by_alpha * here.alpha;
+    sums[0] += h;
+    sums[1] += h * d.x;
+    sums[2] += h * d.y;
+    sums[3] += h * d.x * d.x;
+    sums[4] += h * d.x * d.y;
+    sums[5] += h * d.y * d.y;
+}
+
+void main() {
+    uint lane = gl_LocalInvocationID.x;
+    XList list = x_lists[list_of_workgroup()];
+    Pixel pixels[PIXELS_OF_LANE];
+    for (uint k = 0u; k < PIXELS_OF_LANE; k++) pixels[k] = pixel_to_go_back(k);
+    for (uint batch = (list.count + BATCH - 1u) / BATCH; batch-- > 0u;) {
+        uint begin = batch * BATCH, n = min(BATCH, list.count - begin);
+        if (lane < n) {
+            uint i = x_list_items[list.first + begin + lane];
+            places[lane] = vec4(splats[i].mean, splats[i].amplitude, max(x_gaussians[i].intensity, 0.0));
+            conics[lane] = splats[i].conic;
+            entries[lane] = entry_of(i);
+        }
+        barrier();
+        for (uint j = n; j-- > 0u;) {
+            float sums[SUMS];
+            for (uint s = 0u; s < SUMS; s++) sums[s] = 0.0;
+            for (uint k = 0u; k < PIXELS_OF_LANE; k++)
+                if (begin + j < pixels[k].last) pass(j, pixels[k], sums);
+            for (uint s = 0u; s < SUMS; s++) parts[(j * SUMS + s) * SUM_STRIDE + lane] = sums[s];
+        }
+        barrier();
+        if (lane < n * SUMS) {
+            float sum = 0.0;
+            for (uint k = 0u; k < LANES; k++) sum += parts[lane * SUM_STRIDE + k];
+            x_entries[entries[lane / SUMS] * SUMS + lane % SUMS] = sum;
+        }
+        barrier();
+    }
+}

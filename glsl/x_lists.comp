@@ -1,0 +1,69 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Each tile's Gaussians, nearest first: those of its set, which are in that order, that may show in it. Nothing is
+// listed where not all have a place. One workgroup per tile column (x), row (y) and set (z).
+#include "inc/x_gaussian.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(binding = 0) readonly buffer B0 { XSetup x_setup; };
+layout(binding = 1) readonly buffer B1 { XSet x_sets[]; };
+// By set and depth.
+layout(binding = 2) readonly buffer B2 { XKey x_keys[]; };
+layout(binding = 3) readonly buffer B3 { XSpan x_spans[]; };
+// [set][tile row][tile column]
+layout(binding = 4) readonly buffer B4 { uint x_tile_counts[]; };
+layout(binding = 5) buffer B5 { XCounts x_counts; };
+// [set][tile row][tile column]
+layout(binding = 6) writeonly buffer B6 { XList x_lists[]; };
+layout(binding = 7) writeonly buffer B7 { uint x_list_items[]; };
+
+// Gaussians that a lane looks at before all tell what they found.
+const uint GAUSSIANS_OF_LANE = 16u;
+
+shared uint found_by[gl_WorkGroupSize.x];
+shared uint first;
+
+bool holds(XSpan span, uvec2 tile) {
+    uvec2 begin = uvec2(span.first & 0xffffu, span.first >> 16), end = uvec2(span.end & 0xffffu, span.end >> 16);
+    return all(lessThanEqual(begin, tile)) && all(lessThan(tile, end));
+}
+
+// Which of the Gaussians from `begin` to before `end` may show, a bit each.
+uint found_from(uint begin, uint end, uvec2 tile) {
+    uint found = 0u;
+    for (uint k = 0u; k < GAUSSIANS_OF_LANE && begin + k < end; k++) {
+        XKey key = x_keys[begin + k];
+        if (key.depth != UNSEEN && holds(x_spans[key.index], tile)) found |= 1u << k;
+    }
+    return found;
+}
+
+void main() {
+    uint lane = gl_LocalInvocationID.x, set = gl_WorkGroupID.z;
+    uvec2 tile = gl_WorkGroupID.xy;
+    uint at = (set * x_setup.tile_rows + tile.y) * x_setup.tile_columns + tile.x;
+    uint count = x_counts.entries <= x_setup.capacity ? x_tile_counts[at] : 0u;
+    if (lane == 0u) {
+        // Where lists lie does not change what is shown.
+        first = atomicAdd(x_counts.listed, count);
+        x_lists[at] = XList(first, count);
+    }
+    barrier();
+    if (count == 0u) return;
+    uint begin = x_sets[set].first, end = begin + x_sets[set].count, next = first;
+    while (next < first + count && begin < end) {
+        uint found = found_from(begin + lane * GAUSSIANS_OF_LANE, end, tile);
+        found_by[lane] = bitCount(found);
+        barrier();
+        uint place = next;
+        for (uint k = 0u; k < gl_WorkGroupSize.x; k++) {
+            if (k < lane) place += found_by[k];
+            next += found_by[k];
+        }
+        for (; found != 0u; found &= found - 1u) {
+            x_list_items[place] = x_keys[begin + lane * GAUSSIANS_OF_LANE + uint(findLSB(found))].index;
+            place += 1u;
+        }
+        begin += GAUSSIANS_OF_LANE * gl_WorkGroupSize.x;
+        barrier();
+    }
+}

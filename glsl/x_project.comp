@@ -1,0 +1,64 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// How each Gaussian of X-Gaussian is seen by the view that its set looks at in this iteration: its splat, the tiles of
+// 16 x 16 pixels that it may show in, how deep it is, and where its gradients go. Tiles count their Gaussians. One
+// invocation per Gaussian.
+#include "inc/x_gaussian.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
+layout(push_constant) uniform Push { uint n_gaussians; } push;
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { XSetup x_setup; };
+// Of each image.
+layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
+layout(binding = 3) readonly buffer B3 { XGaussian x_gaussians[]; };
+// The set of each.
+layout(binding = 4) readonly buffer B4 { uint x_set_of[]; };
+// [iteration][set]
+layout(binding = 5) readonly buffer B5 { R2Turn r2_turns[]; };
+layout(binding = 6) readonly buffer B6 { uint gaussian_step; };
+layout(binding = 7) writeonly buffer B7 { Splat splats[]; };
+layout(binding = 8) writeonly buffer B8 { XSpan x_spans[]; };
+layout(binding = 9) writeonly buffer B9 { XKey x_keys[]; };
+// [set][tile row][tile column]
+layout(binding = 10) buffer B10 { uint x_tile_counts[]; };
+layout(binding = 11) buffer B11 { XCounts x_counts; };
+
+shared uint n_entries[gl_WorkGroupSize.x];
+shared uint first_of_all;
+
+// Counts a Gaussian in the tiles from .xy to before .zw; how many these are.
+uint count_in(uvec4 tiles, uint set) {
+    for (uint row = tiles.y; row < tiles.w; row++)
+        for (uint column = tiles.x; column < tiles.z; column++)
+            atomicAdd(x_tile_counts[(set * x_setup.tile_rows + row) * x_setup.tile_columns + column], 1u);
+    return (tiles.z - tiles.x) * (tiles.w - tiles.y);
+}
+
+void main() {
+    uint i = invocation(), lane = gl_LocalInvocationID.x;
+    bool exists = i < push.n_gaussians;
+    uvec4 tiles = uvec4(0u);
+    uint depth = UNSEEN, own = 0u;
+    if (exists) {
+        uint set = x_set_of[i];
+        GaussianView view = gaussian_views[r2_turns[gaussian_step * x_setup.n_sets + set].image];
+        XProjection p = project_x(x_gaussians[i], view, gaussian_setup, x_setup);
+        splats[i] = p.splat;
+        tiles = tiles_of(p.splat, x_setup);
+        own = count_in(tiles, set);
+        if (own > 0u) depth = floatBitsToUint(p.depth);
+        x_keys[i] = XKey(depth, i);
+    }
+    n_entries[lane] = own;
+    barrier();
+    uint before = 0u, all = 0u;
+    for (uint k = 0u; k < gl_WorkGroupSize.x; k++) {
+        if (k < lane) before += n_entries[k];
+        all += n_entries[k];
+    }
+    // Whoever comes first gets the first places: where gradients lie does not change them.
+    if (lane == 0u) first_of_all = atomicAdd(x_counts.entries, all);
+    barrier();
+    if (exists) x_spans[i] = XSpan(tiles.x | tiles.y << 16, tiles.z | tiles.w << 16, first_of_all + before);
+}

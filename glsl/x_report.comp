@@ -1,0 +1,31 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Loss of the iteration into a ring, and the iteration's count; neither where lists had no room, of which the host
+// hears. One workgroup.
+#include "inc/gaussian_layout.glsl"
+#include "inc/x_layout.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/reduce.glsl"
+layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) readonly buffer B1 { XSetup x_setup; };
+layout(binding = 2) readonly buffer B2 { XCounts x_counts; };
+layout(binding = 3) readonly buffer B3 { float gaussian_loss_parts[]; };
+layout(binding = 4) buffer B4 { uint gaussian_step; };
+layout(binding = 5) writeonly buffer B5 { float gaussian_ring[]; };
+layout(binding = 6) writeonly buffer B6 { XStatus x_status; };
+
+void main() {
+    float sum = 0.0;
+    for (uint k = gl_LocalInvocationID.x; k < gaussian_setup.n_loss_parts; k += gl_WorkGroupSize.x)
+        sum += gaussian_loss_parts[k];
+    float total = workgroup_sum(sum);
+    if (gl_LocalInvocationID.x != 0u) return;
+    uint step = gaussian_step;
+    if (x_counts.entries <= x_setup.capacity) {
+        gaussian_ring[step % gaussian_setup.ring_length] = total;
+        step += 1u;
+    }
+    gaussian_step = step;
+    x_status.entries = x_counts.entries;
+    x_status.step = step;
+}

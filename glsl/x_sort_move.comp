@@ -1,0 +1,36 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+// Sort by four bits, last pass: keys go where they belong, those of equal digits in the order they had. One workgroup
+// per block of 1024 keys.
+#include "inc/x_layout.glsl"
+layout(local_size_x = 64, local_size_x_id = 0) in;
+#include "inc/workgroup.glsl"
+layout(push_constant) uniform Push { uint n_keys; uint n_blocks; uint shift; } push;
+layout(binding = 0) readonly buffer B0 { XKey x_keys[]; };
+layout(binding = 1) readonly buffer B1 { uint x_set_of[]; };
+// [digit][block]: sums of what is before.
+layout(binding = 2) readonly buffer B2 { uint x_sort_counts[]; };
+layout(binding = 3) writeonly buffer B3 { XKey x_keys_moved[]; };
+#include "inc/x_sort.glsl"
+
+void main() {
+    uint digit = gl_LocalInvocationID.x;
+    count_digits();
+    if (workgroup() >= push.n_blocks) return;
+    if (digit < DIGITS) {
+        uint place = x_sort_counts[digit * push.n_blocks + workgroup()];
+        for (uint k = digit * gl_WorkGroupSize.x; k < (digit + 1u) * gl_WorkGroupSize.x; k++) {
+            uint count = of_lanes[k];
+            of_lanes[k] = place;
+            place += count;
+        }
+    }
+    barrier();
+    uvec2 own = keys_of_lane();
+    for (uint i = own.x; i < own.y; i++) {
+        XKey key = x_keys[i];
+        uint at = digit_of(key) * gl_WorkGroupSize.x + gl_LocalInvocationID.x;
+        x_keys_moved[of_lanes[at]] = key;
+        of_lanes[at] += 1u;
+    }
+}

@@ -1,0 +1,101 @@
+//! SAX-NeRF's field and the state of its fit in a checkpoint: tensors under documented names.
+
+use crate::error::{Error, Result};
+use crate::model::gaussian_tensors::{File, FileTensor};
+use crate::model::sax::{Part, SaxField, SaxShape, SaxState};
+use safetensors::tensor::{Dtype, SafeTensors};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// What tensors and configuration do not tell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct SaxHeader {
+    /// Half side of the box of the grid, world units (100 mm).
+    bound: f64,
+    /// First and last depth along rays, world units from the isocentre.
+    depths: [f64; 2],
+    /// Samples of a ray.
+    samples: u32,
+    /// Attenuation per world unit where the density is 1.
+    attenuation: f64,
+    /// Fields: one for each phase, or one for all.
+    sets: usize,
+}
+
+pub(super) fn header(field: &SaxField) -> SaxHeader {
+    SaxHeader {
+        bound: field.bound,
+        depths: field.depths,
+        samples: field.samples,
+        attenuation: field.attenuation,
+        sets: field.n_sets,
+    }
+}
+
+/// Where a tensor of a part's numbers is found, and its shape for so many sets.
+fn described(prefix: &str, part: &Part, n_sets: usize) -> (String, Vec<usize>) {
+    (format!("sax.{prefix}{}", part.name), [&[n_sets], &part.shape[..]].concat())
+}
+
+pub(super) fn tensors(field: &SaxField, state: &SaxState) -> Vec<FileTensor> {
+    let mut all = Vec::new();
+    for part in field.shape.parts() {
+        let range = part.first..part.first + part.len();
+        let values = field.params.iter().flat_map(|set| &set[range.clone()]);
+        let moments = |k: usize| state.moments.iter().flat_map(|set| &set[range.clone()]).map(move |m| m[k]);
+        let mut add = |prefix: &str, bytes: Vec<u8>| {
+            let (name, shape) = described(prefix, &part, field.n_sets);
+            all.push((name, Dtype::F32, shape, bytes));
+        };
+        add("", values.flat_map(|v| v.to_le_bytes()).collect());
+        add("adam.m.", moments(0).flat_map(f32::to_le_bytes).collect());
+        add("adam.v.", moments(1).flat_map(f32::to_le_bytes).collect());
+    }
+    all
+}
+
+/// Reads what [`header`] and [`tensors`] describe, of a run on so many phases.
+pub(super) fn read(
+    header: &SaxHeader,
+    shape: SaxShape,
+    tensors: &SafeTensors<'_>,
+    (n_phases, step): (usize, u32),
+    path: &Path,
+) -> Result<(SaxField, SaxState)> {
+    let [near, far] = header.depths;
+    let is_positive = |v: f64| v.is_finite() && v > 0.0;
+    if !is_positive(header.bound) || !is_positive(header.attenuation) || !is_positive(far - near) || header.samples < 2
+    {
+        return Err(Error::data(path, "sax", "box, depths, samples and attenuation must be positive and finite"));
+    }
+    if header.sets != 1 && header.sets != n_phases {
+        return Err(Error::data(path, "sax.sets", format!("{} of {n_phases} phases", header.sets)));
+    }
+    let file = File { tensors, path };
+    let n_sets = header.sets;
+    // Of a damaged file nothing is reserved that it does not hold.
+    let parts = shape.parts();
+    let of_part = |prefix: &str, part: &Part| -> Result<Vec<f32>> {
+        let (name, shape) = described(prefix, part, n_sets);
+        file.floats(&name, &shape.iter().map(|n| Some(*n)).collect::<Vec<_>>())
+    };
+    let grid = parts.iter().find(|part| part.name == "grid");
+    grid.map(|part| of_part("", part)).transpose()?;
+    let mut params = vec![vec![0f32; shape.n_params()]; n_sets];
+    let mut moments = vec![vec![[0f32; 2]; shape.n_params()]; n_sets];
+    for part in &parts {
+        let range = part.first..part.first + part.len();
+        let values = of_part("", part)?;
+        for (set, values) in params.iter_mut().zip(values.chunks_exact(part.len())) {
+            set[range.clone()].copy_from_slice(values);
+        }
+        for (k, prefix) in ["adam.m.", "adam.v."].into_iter().enumerate() {
+            let values = of_part(prefix, part)?;
+            for (set, values) in moments.iter_mut().zip(values.chunks_exact(part.len())) {
+                set[range.clone()].iter_mut().zip(values).for_each(|(moment, value)| moment[k] = *value);
+            }
+        }
+    }
+    let SaxHeader { bound, depths, samples, attenuation, .. } = *header;
+    Ok((SaxField { shape, bound, depths, samples, attenuation, n_sets, params, step }, SaxState { moments }))
+}

@@ -1,0 +1,147 @@
+//! The state of a fit as X-Gaussian does it, plain data: stored Gaussians and what the fit knows of each.
+
+use crate::error::{Error, Result};
+use crate::kernels::layout::{XGaussian, XStatistics};
+use glam::{DMat3, DQuat, DVec3};
+
+impl XGaussian {
+    /// Opacity at the centre.
+    pub fn shown_opacity(&self) -> f64 {
+        1.0 / (1.0 + (-f64::from(self.opacity)).exp())
+    }
+
+    /// The opacity's logarithm, true to the last digits of those near 1, too.
+    pub fn log_opacity(&self) -> f64 {
+        -(-f64::from(self.opacity)).exp().ln_1p()
+    }
+
+    /// Centre.
+    pub fn centre(&self) -> DVec3 {
+        DVec3::from_array(self.position.map(f64::from))
+    }
+
+    /// Standard deviations along its axes.
+    pub fn scales(&self) -> DVec3 {
+        DVec3::from_array(self.log_scale.map(|log| f64::from(log).exp()))
+    }
+
+    /// Its axes, as columns.
+    pub fn axes(&self) -> DMat3 {
+        let [w, x, y, z] = self.rotation.map(f64::from);
+        DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
+    }
+}
+
+/// What is stored of an opacity between 0 and 1, given by its logarithm.
+pub fn stored_opacity(log_opacity: f64) -> f64 {
+    log_opacity - (-log_opacity.exp_m1()).ln()
+}
+
+/// Stored Gaussians with the optimiser's moments and what density control goes by: with the iteration's number, all
+/// that a fit goes on from.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct XState {
+    /// Parameters.
+    pub rows: Vec<XGaussian>,
+    /// The set of each.
+    pub sets: Vec<u32>,
+    /// First moments of Adam: position and opacity, scale and intensity, rotation.
+    pub first: Vec<[f32; 12]>,
+    /// Second moments, laid out alike.
+    pub second: Vec<[f32; 12]>,
+    /// Since density control came last.
+    pub statistics: Vec<XStatistics>,
+}
+
+/// Place of the opacity among the moments of a Gaussian.
+const OPACITY: usize = 3;
+
+fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
+    let mut marks = keep.iter();
+    values.retain(|_| marks.next().is_some_and(|keep| *keep));
+}
+
+impl XState {
+    /// Gaussians that were never updated, and the set of each.
+    pub fn fresh(rows: Vec<XGaussian>, sets: Vec<u32>) -> XState {
+        let n = rows.len();
+        let statistics = vec![XStatistics::default(); n];
+        XState { rows, sets, first: vec![[0.0; 12]; n], second: vec![[0.0; 12]; n], statistics }
+    }
+
+    /// Keeps those marked in `keep`, one mark per Gaussian.
+    pub fn retain(&mut self, keep: &[bool]) {
+        retain_marked(&mut self.rows, keep);
+        retain_marked(&mut self.sets, keep);
+        retain_marked(&mut self.first, keep);
+        retain_marked(&mut self.second, keep);
+        retain_marked(&mut self.statistics, keep);
+    }
+
+    /// Adds Gaussians that were never updated, and the set of each.
+    pub fn append(&mut self, rows: Vec<XGaussian>, sets: Vec<u32>) {
+        let fresh = XState::fresh(rows, sets);
+        self.rows.extend(fresh.rows);
+        self.sets.extend(fresh.sets);
+        self.first.extend(fresh.first);
+        self.second.extend(fresh.second);
+        self.statistics.extend(fresh.statistics);
+    }
+
+    /// Makes no Gaussian more opaque than `most`; the optimiser forgets what it knew of opacities.
+    pub fn reset_opacities(&mut self, most: f64) {
+        let most = stored_opacity(most.ln()) as f32;
+        self.rows.iter_mut().for_each(|g| g.opacity = g.opacity.min(most));
+        self.first.iter_mut().chain(&mut self.second).for_each(|moments| moments[OPACITY] = 0.0);
+    }
+
+    /// Gaussians of each of so many sets.
+    pub fn counts(&self, n_sets: usize) -> Vec<u32> {
+        let mut counts = vec![0; n_sets];
+        self.sets.iter().for_each(|set| counts[*set as usize] += 1);
+        counts
+    }
+
+    /// Refuses parameters that are not finite.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] with the first of them.
+    pub fn check(&self, step: u32) -> Result<()> {
+        let numbers =
+            |g: &XGaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.opacity, g.intensity]);
+        match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
+            Some(bad) => {
+                let quantity = "parameter of a Gaussian";
+                Err(Error::Diverged { step: step.into(), quantity, value: bad.into() })
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn opacities_come_back_from_what_is_stored() {
+        for opacity in [1e-6f64, 0.005, 0.1, 0.5, 0.99] {
+            let g = XGaussian { opacity: stored_opacity(opacity.ln()) as f32, ..XGaussian::default() };
+            assert!((g.shown_opacity() / opacity - 1.0).abs() < 1e-5, "{opacity}");
+            assert!((g.log_opacity() - opacity.ln()).abs() < 1e-5, "{opacity}");
+        }
+        // Nearly opaque ones are told apart.
+        assert!((stored_opacity(f64::from(-1e-8f32)) - 18.42).abs() < 0.01);
+    }
+
+    #[test]
+    fn reset_opacities_are_forgotten() {
+        let row = |opacity: f32| XGaussian { opacity, ..XGaussian::default() };
+        let mut state = XState::fresh(vec![row(2.0), row(-7.0)], vec![0, 0]);
+        state.first[0] = [1.0; 12];
+        state.reset_opacities(0.01);
+        assert!((state.rows[0].shown_opacity() - 0.01).abs() < 1e-7);
+        assert_eq!(state.rows[1].opacity, -7.0);
+        assert_eq!((state.first[0][3], state.first[0][2], state.first[0][7]), (0.0, 1.0, 1.0));
+    }
+}

@@ -1,0 +1,199 @@
+//! What a fit takes of a device, and whether the device has it.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::gpu::buffer::Memory;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::Recording;
+use crate::kernels::dispatch::Binding;
+use crate::kernels::layout::{DeviceState, Ray, SaxSetup};
+use crate::model::sax::{SaxField, SaxState};
+use crate::model::setup::RING_LENGTH;
+use crate::r2::start::seed_of_set;
+use crate::sax::data::SaxData;
+use crate::sax::products::products;
+use crate::sax::setup::{adam_setup, schedule};
+use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers, TILE_BYTES};
+
+const MIB: u64 = 1 << 20;
+
+/// Bytes that a fit takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SaxMemory {
+    /// Of the largest buffer of a field: moments, or sums of the grid's gradient.
+    pub of_field_buffer: u64,
+    /// Of the largest buffer of a batch.
+    pub of_batch_buffer: u64,
+    /// In all, images left out.
+    pub total: u64,
+}
+
+impl SaxMemory {
+    /// What fields of `setup` and their batches take.
+    pub fn of(setup: &SaxSetup) -> SaxMemory {
+        let (weights, grid) = (u64::from(setup.n_weights), u64::from(setup.n_grid));
+        let params = weights + grid;
+        let samples = u64::from(setup.n_rays) * u64::from(setup.n_samples);
+        let (encoding, parts) = (8 * u64::from(setup.n_levels) * samples, 4 * weights * u64::from(setup.n_groups));
+        let tiles = TILE_BYTES * u64::from(setup.n_groups);
+        let of_fields = u64::from(setup.n_sets) * 12 * params + 8 * grid + 4 * params;
+        SaxMemory {
+            of_field_buffer: 8 * params,
+            of_batch_buffer: encoding.max(parts).max(tiles).max(16 * samples),
+            total: of_fields + 2 * encoding + parts + tiles + 20 * samples,
+        }
+    }
+
+    /// Refuses a device that has too little.
+    ///
+    /// # Errors
+    /// [`Error::Config`] naming what to lower.
+    pub fn check(&self, gpu: &Gpu, config: &Config, n_sets: usize) -> Result<()> {
+        let (sax, info) = (&config.sax, gpu.info());
+        let largest = u64::from(info.max_storage_buffer_range);
+        let mib = |bytes: u64| bytes.div_ceil(MIB);
+        if self.of_field_buffer > largest {
+            let problem = format!(
+                "the moments of a field take a buffer of {} MiB, and one of this device holds {} MiB: take fewer \
+                 entries or fewer sax.levels",
+                mib(self.of_field_buffer),
+                mib(largest)
+            );
+            return Err(Error::config("sax.log2_table", sax.log2_table, problem));
+        }
+        if self.of_batch_buffer > largest {
+            let problem = format!(
+                "a batch takes a buffer of {} MiB, and one of this device holds {} MiB: take fewer, fewer sax.rays or \
+                 fewer sax.windows",
+                mib(self.of_batch_buffer),
+                mib(largest)
+            );
+            return Err(Error::config("sax.samples", sax.samples, problem));
+        }
+        if self.total > info.device_memory {
+            let problem = format!(
+                "{n_sets} fields take {} MiB, and this device has {} MiB: take fewer entries, fewer sax.levels, or one \
+                 field for all phases (sax.static_data = \"pooled\")",
+                mib(self.total),
+                mib(info.device_memory)
+            );
+            return Err(Error::config("sax.log2_table", sax.log2_table, problem));
+        }
+        Ok(())
+    }
+}
+
+/// Buffers that asking a field takes for so many samples at once.
+///
+/// # Errors
+/// [`Error::OutOfMemory`] naming the buffer.
+pub fn sample_buffers(
+    gpu: &Gpu,
+    field: &SaxField,
+    setup: &SaxSetup,
+    n_samples: u64,
+    step: u32,
+) -> Result<SaxSampleBuffers> {
+    let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
+    Ok(SaxSampleBuffers {
+        sax_setup: gpu.buffer_with("sax_setup", &[*setup])?,
+        sax_levels: gpu.buffer_with("sax_levels", &field.shape.grid())?,
+        state: gpu.buffer_with("state", &[DeviceState { step, ..DeviceState::default() }])?,
+        sax_points: new(Binding::sax_points, 16 * n_samples)?,
+        sax_encoding: new(Binding::sax_encoding, 8 * u64::from(setup.n_levels) * n_samples)?,
+        sax_sigma: new(Binding::sax_sigma, 4 * n_samples)?,
+    })
+}
+
+/// Buffers of a fit.
+///
+/// # Errors
+/// [`Error::OutOfMemory`] naming the buffer; other device errors.
+pub fn fit_buffers(
+    gpu: &Gpu,
+    data: &SaxData,
+    field: &SaxField,
+    setup: &SaxSetup,
+    config: &Config,
+) -> Result<SaxFitBuffers> {
+    let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
+    let [rays, samples, weights, grid] =
+        [setup.n_rays, setup.n_rays * setup.n_samples, setup.n_weights, setup.n_grid].map(u64::from);
+    let fit = SaxFitBuffers {
+        setup: gpu.buffer_with("setup", &[adam_setup(field.shape, config)])?,
+        schedule: gpu.buffer_with("schedule", &schedule(config))?,
+        sax_turns: gpu.buffer_with("sax_turns", &data.turns().0)?,
+        sax_views: gpu.buffer_with("sax_views", &data.views)?,
+        sax_lists: gpu.buffer_with("sax_lists", &data.lists)?,
+        sax_listed: gpu.buffer_with("sax_listed", &data.listed)?,
+        sax_images: gpu.buffer_with("sax_images", &data.images)?,
+        rays: new(Binding::rays, size_of::<Ray>() as u64 * rays)?,
+        sax_ray_gradient: new(Binding::sax_ray_gradient, 4 * rays)?,
+        sax_losses: new(Binding::sax_losses, 4 * rays * u64::from(setup.n_sets))?,
+        sax_products: gpu.buffer_with("sax_products", &products(field.shape))?,
+        sax_tile_vectors: new(Binding::sax_tile_vectors, TILE_BYTES * u64::from(setup.n_groups))?,
+        sax_weight_parts: new(Binding::sax_weight_parts, 4 * weights * u64::from(setup.n_groups))?,
+        sax_encoding_gradient: new(Binding::sax_encoding_gradient, 8 * u64::from(setup.n_levels) * samples)?,
+        sax_grid_sums: new(Binding::sax_grid_sums, 8 * grid)?,
+        gradient: new(Binding::gradient, 4 * (weights + grid))?,
+        sax_ring: gpu.buffer("sax_ring", 4 * u64::from(RING_LENGTH), Memory::Readback)?,
+    };
+    let mut recording = Recording::new(gpu, "clear the grid's sums")?;
+    recording.fill(&fit.sax_grid_sums, 0);
+    gpu.wait(recording.finish()?.submit()?)?;
+    Ok(fit)
+}
+
+/// Fields on the device.
+///
+/// # Errors
+/// [`Error::OutOfMemory`] naming the buffer; other device errors.
+pub fn set_buffers(
+    gpu: &Gpu,
+    data: &SaxData,
+    field: &SaxField,
+    state: &SaxState,
+    seed: u32,
+) -> Result<Vec<SaxSetBuffers>> {
+    let (_, first_turns) = data.turns();
+    let set = |index: usize| {
+        Ok(SaxSetBuffers {
+            params: gpu.buffer_with(&format!("sax_params of {index}"), &field.params[index])?,
+            moments: gpu.buffer_with(&format!("moments of {index}"), &state.moments[index])?,
+            seed: seed_of_set(seed, index),
+            turns: (first_turns[index], data.images_of_set[index].len() as u32),
+        })
+    };
+    (0..field.n_sets).map(set).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+    use crate::model::sax::SaxShape;
+    use crate::sax::stages::tiles;
+
+    /// What every device holds in a buffer.
+    const LEAST_STORAGE_BUFFER: u64 = 128 << 20;
+
+    #[test]
+    fn the_published_field_fits_the_buffers_of_every_device() {
+        let sax = Config::preset(Preset::SaxNerf).sax;
+        let shape = SaxShape::of(&sax);
+        let n_rays = sax.windows * sax.window * sax.window + sax.rays;
+        let setup = SaxSetup {
+            n_levels: sax.levels,
+            n_samples: sax.samples,
+            n_rays,
+            n_sets: 10,
+            n_weights: shape.n_weights() as u32,
+            n_grid: shape.n_grid() as u32,
+            n_groups: tiles(n_rays * sax.samples).min(256),
+            ..SaxSetup::default()
+        };
+        let memory = SaxMemory::of(&setup);
+        assert!(memory.of_field_buffer < LEAST_STORAGE_BUFFER && memory.of_batch_buffer < LEAST_STORAGE_BUFFER);
+        assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 70, 2038));
+    }
+}

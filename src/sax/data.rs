@@ -1,0 +1,136 @@
+//! A dataset as SAX-NeRF sees it: whole images in its units, which of their pixels show something, and which images
+//! each field is fitted to.
+
+use crate::config::StaticData;
+use crate::config::sections::Sax;
+use crate::error::{Error, Result};
+use crate::geometry::MM_PER_UNIT;
+use crate::kernels::layout::{SaxList, View};
+use crate::scan::dataset::Dataset;
+
+/// Beyond the volume's corners rays go on for so much, mm.
+const TOLERANCE_MM: f64 = 5.0;
+
+/// The data in SAX-NeRF's units.
+#[derive(Debug, Clone)]
+pub struct SaxData {
+    /// Half a side of the volume, world units.
+    pub half: f64,
+    /// First and last depth along rays, world units from the isocentre.
+    pub depths: [f64; 2],
+    /// Attenuation per world unit of a density of 1.
+    pub attenuation: f64,
+    /// Columns of an image.
+    pub width: usize,
+    /// Rows of an image.
+    pub height: usize,
+    /// Cardiac phases.
+    pub n_phases: usize,
+    /// Rays of each image.
+    pub views: Vec<View>,
+    /// `[image][pixel]`: line integrals of the density.
+    pub images: Vec<f32>,
+    /// Where each image's pixels are in `listed`.
+    pub lists: Vec<SaxList>,
+    /// Pixels that show something; all of an image that shows nothing.
+    pub listed: Vec<u32>,
+    /// Images of each set.
+    pub images_of_set: Vec<Vec<usize>>,
+}
+
+impl SaxData {
+    /// Brings a dataset into a volume of half a side `half` each way, world units.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for images of several sizes or smaller than what the windows take, for a pixel that is not a
+    /// number, and for phases that no image shows.
+    pub fn new(dataset: &Dataset, settings: &Sax, half: f64) -> Result<SaxData> {
+        let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
+        if dataset.sizes().len() > 1 {
+            return refuse("SAX-NeRF takes images of one size; these differ: take the preset fast".into());
+        }
+        check_windows(settings, [dataset.width, dataset.height])?;
+        let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
+        let (training, n_pixels) = (dataset.training(), dataset.n_pixels());
+        let mut data = SaxData {
+            half,
+            depths: depths(half),
+            attenuation,
+            width: dataset.width,
+            height: dataset.height,
+            n_phases: dataset.n_phases as usize,
+            views: training.iter().map(|frame| View::of(&dataset.views[frame.view].rays)).collect(),
+            images: Vec::with_capacity(training.len() * n_pixels),
+            lists: Vec::new(),
+            listed: Vec::new(),
+            images_of_set: Vec::new(),
+        };
+        for frame in training {
+            if let Some(p) = frame.integrals.iter().position(|v| !v.is_finite()) {
+                let (column, row) = (p % dataset.width, p / dataset.width);
+                return refuse(format!("{}: column {column}, row {row} is not a finite number", frame.name));
+            }
+            data.add_image(frame.integrals.iter().map(|v| (f64::from(*v) / attenuation) as f32).collect());
+        }
+        let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
+        data.images_of_set = match settings.static_data {
+            StaticData::Pooled => vec![(0..training.len()).collect()],
+            StaticData::PerPhase => (0..dataset.n_phases).map(of_phase).collect(),
+        };
+        let unseen: Vec<usize> =
+            (0..data.images_of_set.len()).filter(|set| data.images_of_set[*set].is_empty()).collect();
+        match unseen.is_empty() {
+            true => Ok(data),
+            false => refuse(format!("no image shows the phases {unseen:?}: take sax.static_data = \"pooled\"")),
+        }
+    }
+
+    fn add_image(&mut self, image: Vec<f32>) {
+        let first = self.listed.len() as u32;
+        let n_pixels = image.len() as u32;
+        self.listed.extend((0..n_pixels).filter(|p| image[*p as usize] > 0.0));
+        if self.listed.len() as u32 == first {
+            self.listed.extend(0..n_pixels);
+        }
+        self.lists.push(SaxList { first, n: self.listed.len() as u32 - first });
+        self.images.extend(image);
+    }
+
+    /// Pixels of an image.
+    pub fn n_pixels(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// Fields, each fitted by itself.
+    pub fn n_sets(&self) -> usize {
+        self.images_of_set.len()
+    }
+
+    /// Images of all sets in their order, and where each set's begin.
+    pub fn turns(&self) -> (Vec<u32>, Vec<u32>) {
+        let turns = self.images_of_set.iter().flatten().map(|image| *image as u32).collect();
+        let mut first = 0;
+        let begin = |images: &Vec<usize>| {
+            first += images.len() as u32;
+            first - images.len() as u32
+        };
+        (turns, self.images_of_set.iter().map(begin).collect())
+    }
+}
+
+/// First and last depth of rays: as far as the corners of the volume's slices are from its axis, and a little more.
+fn depths(half: f64) -> [f64; 2] {
+    let far = half * 2f64.sqrt() + TOLERANCE_MM / MM_PER_UNIT;
+    [-far, far]
+}
+
+/// Refuses windows that images do not have room for.
+fn check_windows(settings: &Sax, [width, height]: [usize; 2]) -> Result<()> {
+    let side = settings.window as usize;
+    let room = (width / side) * (height / side);
+    if settings.windows as usize > room {
+        let problem = format!("images of {width} x {height} pixels have room for {room} windows of {side} x {side}");
+        return Err(Error::config("sax.windows", settings.windows, problem));
+    }
+    Ok(())
+}

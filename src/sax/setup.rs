@@ -1,0 +1,115 @@
+//! Constants and rates of a fit as SAX-NeRF does it.
+
+use crate::config::Config;
+use crate::config::sections::Sax;
+use crate::kernels::layout::{SaxSetup, Schedule, Setup};
+use crate::model::sax::{SaxField, SaxShape};
+use crate::model::setup::{FIXED_POINT_BITS, RING_LENGTH};
+use crate::sax::data::SaxData;
+use crate::sax::stages::tiles;
+
+/// Workgroups of the Lineformer's backward pass, at most: each has sums of 128 KiB, and what a tile leaves, 280 KiB.
+const MOST_GROUPS: u32 = 256;
+
+/// What does not depend on what is drawn or fitted.
+fn field_setup(field: &SaxField) -> SaxSetup {
+    SaxSetup {
+        n_levels: field.shape.levels,
+        bound: field.bound as f32,
+        near: field.depths[0] as f32,
+        far: field.depths[1] as f32,
+        n_samples: field.samples,
+        n_weights: field.shape.n_weights() as u32,
+        n_grid: field.shape.n_grid() as u32,
+        n_sets: field.n_sets as u32,
+        fixed_point_bits: FIXED_POINT_BITS,
+        ring_length: RING_LENGTH,
+        ..SaxSetup::default()
+    }
+}
+
+/// Rays of a batch.
+pub fn n_rays(settings: &Sax) -> u32 {
+    settings.windows * settings.window * settings.window + settings.rays
+}
+
+/// Constants of a fit.
+pub fn fit_setup(field: &SaxField, data: &SaxData, settings: &Sax) -> SaxSetup {
+    let rays = n_rays(settings);
+    SaxSetup {
+        jitter: 1,
+        n_rays: rays,
+        n_windows: settings.windows,
+        window: settings.window,
+        width: data.width as u32,
+        height: data.height as u32,
+        n_groups: tiles(rays * settings.samples).min(MOST_GROUPS),
+        ..field_setup(field)
+    }
+}
+
+/// Constants of drawing: regular depths.
+pub fn drawing_setup(field: &SaxField) -> SaxSetup {
+    SaxSetup { jitter: 0, ..field_setup(field) }
+}
+
+/// What the optimiser reads: all numbers of a field count as those of a still one.
+pub fn adam_setup(shape: SaxShape, config: &Config) -> Setup {
+    let n = shape.n_params() as u32;
+    Setup {
+        static_params: n,
+        n_params: n,
+        beta1: config.adam.beta1 as f32,
+        beta2: config.adam.beta2 as f32,
+        epsilon: config.adam.epsilon as f32,
+        ..Setup::default()
+    }
+}
+
+/// One row per iteration and one more, which is there to be timed.
+pub fn schedule(config: &Config) -> Vec<Schedule> {
+    let (sax, adam) = (&config.sax, &config.adam);
+    let row = |step: u32| {
+        let bias = |beta: f64| (1.0 - beta.powf(f64::from(step + 1))) as f32;
+        let has_fallen = sax.rate_falls_at > 0 && step >= sax.rate_falls_at;
+        Schedule {
+            static_lr: (sax.rate * if has_fallen { sax.rate_fall } else { 1.0 }) as f32,
+            bias_correction1: bias(adam.beta1),
+            bias_correction2: bias(adam.beta2),
+            ..Schedule::default()
+        }
+    };
+    (0..=config.train.iterations).map(row).collect()
+}
+
+/// The field that a fit of `data` begins with, without its numbers.
+pub fn outline(data: &SaxData, settings: &Sax, step: u32) -> SaxField {
+    SaxField {
+        shape: SaxShape::of(settings),
+        bound: settings.bound_mm / crate::geometry::MM_PER_UNIT,
+        depths: data.depths,
+        samples: settings.samples,
+        attenuation: data.attenuation,
+        n_sets: data.n_sets(),
+        params: Vec::new(),
+        step,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+
+    #[test]
+    fn the_rate_falls_once_and_biases_count_updates() {
+        let config = Config::preset(Preset::SaxNerf);
+        let rows = schedule(&config);
+        assert_eq!(rows.len(), 4504);
+        assert_eq!((rows[0].static_lr, rows[4499].static_lr), (1e-3, 1e-3));
+        assert!((rows[4500].static_lr / 1e-4 - 1.0).abs() < 1e-6);
+        assert!((rows[0].bias_correction1 - 0.1).abs() < 1e-7);
+        assert!((f64::from(rows[999].bias_correction2) - (1.0 - 0.999f64.powi(1000))).abs() < 1e-6);
+        assert_eq!(n_rays(&config.sax), 2048);
+    }
+}

@@ -1,0 +1,338 @@
+//! The stages of SAX-NeRF, what they bind, and one iteration, top to bottom. Each field has, one after the other,
+//!
+//! sax_batch -> sax_points -> sax_encode -> sax_lineformer -> sax_loss -> sax_lineformer_bwd -> sax_weight_gradient ->
+//! sax_encode_bwd -> sax_grid_gradient -> adam
+//!
+//! in buffers that all share but for its numbers; then comes sax_report.
+
+use crate::error::Result;
+use crate::gpu::buffer::Buffer;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants::SAX_VECTORS;
+use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch_finding};
+use crate::kernels::layout::SaxSetup;
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::stages::{Build, Stage, along_two_axes};
+use crate::model::sax::WIDTH;
+
+/// Pipelines that ask a field.
+pub struct SaxFieldKernels {
+    /// Samples along rays.
+    pub points: Stage<push::SaxPoints>,
+    /// Features of samples.
+    pub encode: Stage<push::SaxEncode>,
+    /// Their attenuation.
+    pub lineformer: Stage<push::SaxLineformer>,
+    /// What rays see.
+    pub view: Stage<push::SaxView>,
+}
+
+impl SaxFieldKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<SaxFieldKernels> {
+        let plain = Build::default();
+        Ok(SaxFieldKernels {
+            points: plain.stage(gpu)?,
+            encode: plain.stage(gpu)?,
+            lineformer: plain.stage(gpu)?,
+            view: plain.stage(gpu)?,
+        })
+    }
+}
+
+/// Pipelines of a fit.
+pub struct SaxKernels {
+    /// Those that ask the field.
+    pub field: SaxFieldKernels,
+    /// Draws rays.
+    pub batch: Stage<push::SaxBatch>,
+    /// Residuals.
+    pub loss: Stage<push::SaxLoss>,
+    /// Gradients by features and by each workgroup's samples.
+    pub lineformer_bwd: Stage<push::SaxLineformerBwd>,
+    /// Gradient of the Lineformer's numbers.
+    pub weight_gradient: Stage<push::SaxWeightGradient>,
+    /// Scatter to the grid.
+    pub encode_bwd: Stage<push::SaxEncodeBwd>,
+    /// Gradient of the grid.
+    pub grid_gradient: Stage<push::SaxGridGradient>,
+    /// The optimiser.
+    pub adam: Stage<push::Adam>,
+    /// Loss and step count.
+    pub report: Stage<push::SaxReport>,
+}
+
+impl SaxKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<SaxKernels> {
+        let plain = Build::default();
+        Ok(SaxKernels {
+            field: SaxFieldKernels::new(gpu)?,
+            batch: plain.stage(gpu)?,
+            loss: plain.stage(gpu)?,
+            lineformer_bwd: plain.stage(gpu)?,
+            weight_gradient: plain.stage(gpu)?,
+            encode_bwd: plain.stage(gpu)?,
+            grid_gradient: plain.stage(gpu)?,
+            adam: plain.stage(gpu)?,
+            report: plain.stage(gpu)?,
+        })
+    }
+}
+
+buffer_set! {
+    /// What asking a field takes, but for its numbers.
+    pub struct SaxSampleBuffers {
+        /// [`SaxSetup`].
+        sax_setup,
+        /// [`crate::kernels::layout::SaxLevel`]s.
+        sax_levels,
+        /// [`crate::kernels::layout::DeviceState`]: iterations done.
+        state,
+        /// `[ray][sample]`: points of the unit cube, and the paths they stand for.
+        sax_points,
+        /// `[pair of levels][sample]`: features.
+        sax_encoding,
+        /// `[ray][sample]`: attenuation.
+        sax_sigma,
+    }
+}
+
+buffer_set! {
+    /// What a fit goes by and what it counts, beside [`SaxSampleBuffers`].
+    pub struct SaxFitBuffers {
+        /// [`crate::kernels::layout::Setup`], of which the optimiser reads its own.
+        setup,
+        /// [`crate::kernels::layout::Schedule`]s.
+        schedule,
+        /// `[turn]`: images of the fields, in their order.
+        sax_turns,
+        /// [`crate::kernels::layout::View`] of each image.
+        sax_views,
+        /// [`crate::kernels::layout::SaxList`] of each image.
+        sax_lists,
+        /// Pixels that show something.
+        sax_listed,
+        /// `[image][pixel]`: line integrals to be shown.
+        sax_images,
+        /// [`crate::kernels::layout::Ray`]s of a batch.
+        rays,
+        /// `[ray]`: gradient of the loss.
+        sax_ray_gradient,
+        /// `[field][ray]`: loss.
+        sax_losses,
+        /// [`crate::kernels::layout::SaxProduct`]s.
+        sax_products,
+        /// `[workgroup][vector][sample of a tile]`: what these are made of.
+        sax_tile_vectors,
+        /// `[workgroup][number]`: gradients.
+        sax_weight_parts,
+        /// `[pair of levels][sample]`: gradient by features.
+        sax_encoding_gradient,
+        /// `[number]`: sums of the grid's gradient in fixed point.
+        sax_grid_sums,
+        /// `[number]`: gradient of a field.
+        gradient,
+        /// Losses of the last iterations.
+        sax_ring,
+    }
+}
+
+/// Numbers of a field on the device, and their moments.
+#[derive(Clone)]
+pub struct SaxSetBuffers {
+    /// The numbers.
+    pub params: Buffer,
+    /// First and second moments.
+    pub moments: Buffer,
+    /// Seed of its random numbers.
+    pub seed: u32,
+    /// Where its images are among the turns, and how many.
+    pub turns: (u32, u32),
+}
+
+/// Bytes of what samples of a tile leave to their workgroup.
+pub const TILE_BYTES: u64 = (SAX_VECTORS * 2 * push::SaxLineformerBwd::LOCAL_SIZE) as u64 * 4 * WIDTH as u64;
+
+/// Tiles of pairs of samples that the Lineformer's backward pass takes.
+pub fn tiles(n_samples: u32) -> u32 {
+    (n_samples / 2).div_ceil(push::SaxLineformerBwd::LOCAL_SIZE)
+}
+
+/// Asks a field: records what makes attenuations of the rays that `find` binds.
+pub struct SaxSampling<'a> {
+    /// The stages.
+    pub kernels: &'a SaxFieldKernels,
+    /// What they work with.
+    pub buffers: &'a SaxSampleBuffers,
+    /// Constants on the host.
+    pub setup: &'a SaxSetup,
+    /// Numbers of the field.
+    pub params: &'a Buffer,
+    /// Rays.
+    pub rays: &'a Buffer,
+}
+
+impl SaxSampling<'_> {
+    fn run<P: PushConstants>(
+        &self,
+        recording: &mut Recording,
+        stage: &Stage<P>,
+        groups: Groups<'_>,
+        push: P,
+        out: Option<&Buffer>,
+    ) -> Result<()> {
+        let mut bound = vec![(Binding::sax_params, self.params.into()), (Binding::rays, self.rays.into())];
+        bound.extend(out.map(|out| (Binding::sax_sigma, out.into())));
+        dispatch_finding(recording, stage, groups, &bound, |name| self.buffers.find(name), push)
+    }
+
+    /// Records attenuation at the samples of `n_rays` rays from `first_ray` on, times `scale`: into `out` from number
+    /// `first_out` on, or into the buffers' own.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+    pub fn record(
+        &self,
+        recording: &mut Recording,
+        (seed, first_ray, n_rays): (u32, u32, u32),
+        scale: f32,
+        out: Option<(&Buffer, u32)>,
+    ) -> Result<()> {
+        let (kernels, row) = (self.kernels, self.setup.n_samples);
+        let n_samples = n_rays * row;
+        let push = push::SaxPoints { seed, first_ray, n_rays };
+        self.run(recording, &kernels.points, kernels.points.groups_over(n_samples), push, None)?;
+        let groups = kernels.encode.groups_over(n_samples * (self.setup.n_levels / 2));
+        self.run(recording, &kernels.encode, groups, push::SaxEncode { n_samples }, None)?;
+        let groups = kernels.lineformer.groups_over(n_rays * row.div_ceil(2));
+        let push = push::SaxLineformer { n_rays, row, first_out: out.map_or(0, |(_, first)| first), scale };
+        self.run(recording, &kernels.lineformer, groups, push, out.map(|(buffer, _)| buffer))
+    }
+}
+
+/// A recording of a fit's stages.
+pub struct SaxPass<'a> {
+    /// Where stages go.
+    pub recording: &'a mut Recording,
+    /// The stages.
+    pub kernels: &'a SaxKernels,
+    /// What samples take.
+    pub samples: &'a SaxSampleBuffers,
+    /// What the fit goes by.
+    pub fit: &'a SaxFitBuffers,
+    /// The fields.
+    pub sets: &'a [SaxSetBuffers],
+    /// Constants on the host.
+    pub setup: &'a SaxSetup,
+}
+
+impl SaxPass<'_> {
+    fn run<P: PushConstants>(
+        &mut self,
+        set: &SaxSetBuffers,
+        stage: &Stage<P>,
+        groups: Groups<'_>,
+        push: P,
+    ) -> Result<()> {
+        let (samples, fit) = (self.samples, self.fit);
+        let bound = [
+            (Binding::sax_params, (&set.params).into()),
+            (Binding::params, (&set.params).into()),
+            (Binding::moments, (&set.moments).into()),
+        ];
+        dispatch_finding(
+            self.recording,
+            stage,
+            groups,
+            &bound,
+            |name| samples.find(name).or_else(|| fit.find(name)),
+            push,
+        )
+    }
+
+    /// Records the line integrals of a batch of a field, and their loss.
+    fn forward(&mut self, index: u32, set: &SaxSetBuffers) -> Result<()> {
+        let (kernels, n_rays) = (self.kernels, self.setup.n_rays);
+        let (first_turn, n_turns) = set.turns;
+        let push = push::SaxBatch { seed: set.seed, first_turn, n_turns };
+        self.run(set, &kernels.batch, kernels.batch.groups_for(n_rays), push)?;
+        let sampling = SaxSampling {
+            kernels: &kernels.field,
+            buffers: self.samples,
+            setup: self.setup,
+            params: &set.params,
+            rays: &self.fit.rays,
+        };
+        sampling.record(self.recording, (set.seed, 0, n_rays), 1.0, None)?;
+        let push = push::SaxLoss { first_loss: index * n_rays };
+        self.run(set, &kernels.loss, Groups::Direct([n_rays, 1, 1]), push)
+    }
+
+    /// Records the gradient of that loss by the Lineformer's numbers and by features.
+    fn backward(&mut self, set: &SaxSetBuffers) -> Result<()> {
+        let (kernels, setup) = (self.kernels, self.setup);
+        let groups = Groups::Direct([setup.n_groups, 1, 1]);
+        self.run(set, &kernels.lineformer_bwd, groups, push::SaxLineformerBwd {})?;
+        let weights = &kernels.weight_gradient;
+        self.run(set, weights, weights.groups_over(setup.n_weights), push::SaxWeightGradient {})
+    }
+
+    /// Records what the gradient by features says of the grid, as sums in fixed point.
+    ///
+    /// # Errors
+    /// As [`record_step`].
+    pub fn scatter(&mut self, set: &SaxSetBuffers) -> Result<()> {
+        let (kernels, n_samples) = (self.kernels, self.setup.n_rays * self.setup.n_samples);
+        let groups = kernels.encode_bwd.groups_over(n_samples * (self.setup.n_levels / 2));
+        self.run(set, &kernels.encode_bwd, groups, push::SaxEncodeBwd { n_samples })
+    }
+
+    /// Records the gradient of the grid from these sums, which are zero after it, and the update of all numbers.
+    fn update(&mut self, set: &SaxSetBuffers) -> Result<()> {
+        let (kernels, setup) = (self.kernels, self.setup);
+        let grid = &kernels.grid_gradient;
+        self.run(set, grid, grid.groups_over(setup.n_grid), push::SaxGridGradient {})?;
+        let n_params = setup.n_weights + setup.n_grid;
+        self.run(set, &kernels.adam, kernels.adam.groups_over(n_params), push::Adam {})
+    }
+}
+
+/// Records one iteration: an image of each field.
+///
+/// # Errors
+/// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+pub fn record_step(pass: &mut SaxPass<'_>) -> Result<()> {
+    let sets = pass.sets;
+    for (index, set) in (0..).zip(sets) {
+        pass.forward(index, set)?;
+        pass.backward(set)?;
+        pass.scatter(set)?;
+        pass.update(set)?;
+    }
+    let report = &pass.kernels.report;
+    pass.run(&sets[0], report, Groups::Direct([1, 1, 1]), push::SaxReport {})
+}
+
+/// Records what `n_rays` rays of a view from `first_ray` on see, from the attenuations at their samples.
+///
+/// # Errors
+/// As [`record_step`].
+pub fn record_view(
+    recording: &mut Recording,
+    sampling: &SaxSampling<'_>,
+    ray_out: &Buffer,
+    (first_ray, n_rays): (u32, u32),
+) -> Result<()> {
+    let stage = &sampling.kernels.view;
+    let bound = [(Binding::ray_out, ray_out.into())];
+    let push = push::SaxView { first_ray, n_rays };
+    dispatch_finding(recording, stage, along_two_axes(n_rays), &bound, |name| sampling.buffers.find(name), push)
+}

@@ -1,0 +1,177 @@
+//! Fits the fields of SAX-NeRF, all of them in lockstep: an image of each per iteration.
+
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::gpu::buffer::Buffer;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{PassTime, Recording};
+use crate::kernels::layout::SaxSetup;
+use crate::model::sax::{SaxField, SaxState, check_params};
+use crate::r2::start::seed_of_set;
+use crate::sax::buffers::{SaxMemory, fit_buffers, sample_buffers, set_buffers};
+use crate::sax::data::SaxData;
+use crate::sax::setup::{fit_setup, outline};
+use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step};
+use crate::sax::start::first_params;
+use crate::train::gaussians::{Iterations, pass_times};
+use crate::train::targets::losses;
+
+/// Passes of an iteration of a field, at most, and of all fields together.
+const MAX_PASSES: u32 = 16;
+
+/// A run on a device.
+pub struct SaxTrainer {
+    gpu: Gpu,
+    data: SaxData,
+    config: Config,
+    /// The field without its numbers.
+    outline: SaxField,
+    setup: SaxSetup,
+    kernels: SaxKernels,
+    samples: SaxSampleBuffers,
+    fit: SaxFitBuffers,
+    sets: Vec<SaxSetBuffers>,
+    iterations: Iterations,
+    step: u32,
+}
+
+impl SaxTrainer {
+    /// Begins with random numbers.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for impossible settings, and for a device that has too little memory; device errors.
+    pub fn new(gpu: &Gpu, data: SaxData, config: &Config) -> Result<SaxTrainer> {
+        let outline = outline(&data, &config.sax, 0);
+        // Before random numbers by the million are drawn.
+        SaxMemory::of(&fit_setup(&outline, &data, &config.sax)).check(gpu, config, data.n_sets())?;
+        let shape = outline.shape;
+        let params = (0..data.n_sets()).map(|set| first_params(shape, seed_of_set(config.seed, set))).collect();
+        let moments = vec![vec![[0.0; 2]; shape.n_params()]; data.n_sets()];
+        Self::with(gpu, data, config, &SaxField { params, ..outline }, &SaxState { moments })
+    }
+
+    /// Goes on from a field and the state of its fit, after as many iterations as the field says.
+    ///
+    /// # Errors
+    /// As [`SaxTrainer::new`], and for a field of other sizes.
+    pub fn with(gpu: &Gpu, data: SaxData, config: &Config, field: &SaxField, state: &SaxState) -> Result<SaxTrainer> {
+        config.check()?;
+        let outline = outline(&data, &config.sax, field.step);
+        let n = outline.shape.n_params();
+        if field.shape != outline.shape
+            || field.params.len() != data.n_sets()
+            || state.moments.len() != data.n_sets()
+            || field.params.iter().any(|set| set.len() != n)
+            || state.moments.iter().any(|set| set.len() != n)
+        {
+            return Err(Error::config(
+                "checkpoint",
+                field.n_sets,
+                "its fields of SAX-NeRF are not those of the images",
+            ));
+        }
+        let setup = fit_setup(&outline, &data, &config.sax);
+        SaxMemory::of(&setup).check(gpu, config, data.n_sets())?;
+        let kernels = SaxKernels::new(gpu)?;
+        let n_samples = u64::from(setup.n_rays) * u64::from(setup.n_samples);
+        let samples = sample_buffers(gpu, &outline, &setup, n_samples, field.step)?;
+        let fit = fit_buffers(gpu, &data, &outline, &setup, config)?;
+        let sets = set_buffers(gpu, &data, field, state, config.seed)?;
+        let iterations = Iterations::record(gpu, config.train.iterations_per_submit, |iterations| {
+            let mut recording = Recording::new(gpu, &format!("{iterations} iterations of SAX-NeRF"))?;
+            for _ in 0..iterations {
+                let recording = &mut recording;
+                let (kernels, samples, fit) = (&kernels, &samples, &fit);
+                record_step(&mut SaxPass { recording, kernels, samples, fit, sets: &sets, setup: &setup })?;
+            }
+            recording.finish()
+        })?;
+        let (gpu, config, step) = (gpu.clone(), config.clone(), field.step);
+        Ok(SaxTrainer { gpu, data, config, outline, setup, kernels, samples, fit, sets, iterations, step })
+    }
+
+    /// Iterations done.
+    pub fn step(&self) -> u32 {
+        self.step
+    }
+
+    /// What the run is fitted to.
+    pub fn data(&self) -> &SaxData {
+        &self.data
+    }
+
+    /// Constants of the run.
+    pub fn setup(&self) -> &SaxSetup {
+        &self.setup
+    }
+
+    /// Buffers of samples and of the fit, for tests.
+    pub fn buffers(&self) -> (&SaxSampleBuffers, &SaxFitBuffers) {
+        (&self.samples, &self.fit)
+    }
+
+    /// The fields on the device, for tests.
+    pub fn sets(&self) -> &[SaxSetBuffers] {
+        &self.sets
+    }
+
+    /// Numbers of the fields on the device, for those who draw them.
+    pub fn params(&self) -> Vec<Buffer> {
+        self.sets.iter().map(|set| set.params.clone()).collect()
+    }
+
+    /// The field without its numbers.
+    pub fn outline(&self) -> SaxField {
+        SaxField { step: self.step, ..self.outline.clone() }
+    }
+
+    /// Runs a submit's worth of iterations towards `until`; the losses of those done, each the mean over the fields. An
+    /// empty list means the target was reached before.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] on a loss that is not finite; device errors.
+    pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        let until = until.min(self.config.train.iterations);
+        if self.step >= until {
+            return Ok(Vec::new());
+        }
+        let first = self.step;
+        self.step += self.iterations.run(&self.gpu, first, until)?;
+        losses(&self.fit.sax_ring, first..self.step)
+    }
+
+    /// The fields after the iterations done, and what a resumed run goes on from beside them.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when a number is not finite; device errors.
+    pub fn state(&self) -> Result<(SaxField, SaxState)> {
+        let n = self.outline.shape.n_params();
+        let params: Vec<Vec<f32>> =
+            self.sets.iter().map(|set| self.gpu.download(&set.params, 0, n)).collect::<Result<_>>()?;
+        check_params(&params, self.step)?;
+        let moments = self.sets.iter().map(|set| self.gpu.download(&set.moments, 0, n)).collect::<Result<_>>()?;
+        Ok((SaxField { params, ..self.outline() }, SaxState { moments }))
+    }
+
+    /// Runs one iteration with a timestamp around each pass.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when the fit is over; device errors.
+    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        // The schedule has a row more than iterations, for this.
+        if self.step > self.config.train.iterations {
+            return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
+        }
+        let max_passes = MAX_PASSES * (self.setup.n_sets + 1);
+        let mut recording = Recording::timed(&self.gpu, "profiled iteration of SAX-NeRF", max_passes)?;
+        record_step(&mut self.pass(&mut recording))?;
+        self.step += 1;
+        pass_times(&self.gpu, recording)
+    }
+
+    /// Where stages of this fit are recorded.
+    pub fn pass<'a>(&'a self, recording: &'a mut Recording) -> SaxPass<'a> {
+        let (kernels, samples, fit) = (&self.kernels, &self.samples, &self.fit);
+        SaxPass { recording, kernels, samples, fit, sets: &self.sets, setup: &self.setup }
+    }
+}

@@ -1,0 +1,79 @@
+//! SAX-NeRF from outside: the program trains, resumes, scores, draws, exports and times it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "common/program.rs"]
+mod program;
+
+use program::program;
+use serde_json::Value;
+
+#[track_caller]
+fn ok(args: &[&str]) -> String {
+    let out = program().arg("--validate").args(args).output().unwrap();
+    assert!(out.status.success(), "{args:?}: {}", String::from_utf8_lossy(&out.stderr));
+    String::from_utf8(out.stdout).unwrap()
+}
+
+#[test]
+fn the_program_trains_resumes_scores_draws_exports_and_times() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
+    let (data, whole, parts) = (path("data"), path("whole"), path("parts"));
+    ok(&["phantom", &data, "--size", "24", "--phases", "3", "--views", "3", "--no-volumes"]);
+    let mut settings = vec!["--preset", "sax-nerf"];
+    for setting in [
+        "train.iterations=40",
+        "train.validate_every=20",
+        "train.checkpoint_every=20",
+        "sax.levels=4",
+        "sax.log2_table=10",
+        "sax.windows=2",
+        "sax.window=4",
+        "sax.rays=32",
+        "sax.samples=16",
+        "sax.rate_falls_at=35",
+    ] {
+        settings.extend(["--set", setting]);
+    }
+    let said = ok(&[&["train", &data, "-o", &whole, "--json"], &settings[..]].concat());
+    assert!(said.contains("a static method") && said.contains("\"validation\""), "{said}");
+    ok(&[&["train", &data, "-o", &parts, "--stop-at", "13", "--no-eval"], &settings[..]].concat());
+    ok(&["train", &data, "-o", &parts, "--resume", "--no-eval"]);
+    let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000040.safetensors")).unwrap();
+    assert!(bytes(&whole) == bytes(&parts), "a resumed run comes to the same bits");
+    let score: Value = serde_json::from_str(&ok(&["eval", &whole, "--json"])).unwrap();
+    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
+    let info: Value = serde_json::from_str(&ok(&["info", &whole, "--json"])).unwrap();
+    assert_eq!(
+        (&info["config"]["dynamic"]["form"], &info["config"]["static"]["form"], &info["sax"]["fields"]),
+        (&"lineformer".into(), &"none".into(), &3.into())
+    );
+    ok(&["render", &whole, "--phase", "1", "-o", &path("view.png")]);
+    for projection in ["mip", "drr"] {
+        let file = path(&format!("{projection}.png"));
+        ok(&[
+            "render",
+            &whole,
+            "--baked",
+            "--projection",
+            projection,
+            "--component",
+            "dynamic",
+            "--phase",
+            "1",
+            "-o",
+            &file,
+        ]);
+    }
+    ok(&["export", &whole, "--component", "dynamic", "--spacing", "3", "-o", &path("vessels.nrrd")]);
+    let bench = [&["bench", &data, "--kernels", "--iterations", "2", "--repeats", "2"], &settings[..]].concat();
+    let said = ok(&bench);
+    assert!(
+        said.contains("sax_lineformer_bwd") && said.contains("sax_encode") && !said.contains("march_fwd"),
+        "{said}"
+    );
+    let kernels: Value = serde_json::from_str(&ok(&["kernels", "--preset", "sax-nerf", "--json"])).unwrap();
+    let listed: Vec<&str> =
+        kernels["kernels"].as_array().unwrap().iter().map(|k| k["kernel"].as_str().unwrap()).collect();
+    assert!(listed.contains(&"sax_encode_bwd") && !listed.iter().any(|k| k.starts_with("gaussian_")), "{listed:?}");
+}

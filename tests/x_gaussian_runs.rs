@@ -1,0 +1,71 @@
+//! X-Gaussian from outside: the program trains, resumes, scores, draws, exports and times it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "common/program.rs"]
+mod program;
+
+use program::program;
+use serde_json::Value;
+
+#[track_caller]
+fn ok(args: &[&str]) -> String {
+    let out = program().arg("--validate").args(args).output().unwrap();
+    assert!(out.status.success(), "{args:?}: {}", String::from_utf8_lossy(&out.stderr));
+    String::from_utf8(out.stdout).unwrap()
+}
+
+#[test]
+fn the_program_trains_resumes_scores_draws_exports_and_times() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
+    let (data, whole, parts) = (path("data"), path("whole"), path("parts"));
+    ok(&["phantom", &data, "--size", "24", "--phases", "3", "--views", "3", "--no-volumes"]);
+    let mut settings = vec!["--preset", "x-gaussian"];
+    for setting in [
+        "train.iterations=40",
+        "train.validate_every=20",
+        "train.checkpoint_every=20",
+        "x.voxels=8",
+        "x.interval=2",
+        "x.densify_every=8",
+        "x.densify_from=4",
+        "x.densify_until=30",
+        "x.reset_every=20",
+    ] {
+        settings.extend(["--set", setting]);
+    }
+    let said = ok(&[&["train", &data, "-o", &whole, "--json"], &settings[..]].concat());
+    assert!(said.contains("a static method") && said.contains("\"validation\""), "{said}");
+    ok(&[&["train", &data, "-o", &parts, "--stop-at", "13", "--no-eval"], &settings[..]].concat());
+    ok(&["train", &data, "-o", &parts, "--resume", "--no-eval"]);
+    let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000040.safetensors")).unwrap();
+    assert!(bytes(&whole) == bytes(&parts), "a resumed run comes to the same bits");
+    let score: Value = serde_json::from_str(&ok(&["eval", &whole, "--json"])).unwrap();
+    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
+    assert_eq!(score["dice"]["dynamic"], score["dice_published"]["paper"], "the published threshold");
+    assert!(score["threshold"]["rule"].as_str().unwrap().contains("opacities"), "{score}");
+    // Each image by a threshold of its own.
+    let images = score["images"].as_array().unwrap();
+    let otsu: Vec<f64> = images.iter().map(|image| image["dice_otsu"].as_f64().unwrap()).collect();
+    let mean = otsu.iter().sum::<f64>() / otsu.len() as f64;
+    assert!((score["dice_otsu"].as_f64().unwrap() - mean).abs() < 1e-12);
+    assert!(ok(&["eval", &whole]).contains("Dice by Otsu's threshold of each image"));
+    let info: Value = serde_json::from_str(&ok(&["info", &whole, "--json"])).unwrap();
+    assert_eq!(
+        (&info["config"]["gaussians"]["form"], &info["config"]["static"]["form"]),
+        (&"x".into(), &"none".into())
+    );
+    ok(&["render", &whole, "--phase", "1", "-o", &path("view.png")]);
+    let mip = ["--baked", "--projection", "mip", "--component", "dynamic", "--phase", "1", "-o", &path("mip.png")];
+    ok(&[&["render", &whole], &mip[..]].concat());
+    let drr = ["--baked", "--component", "dynamic", "--phase", "1", "-o", &path("drr.png")];
+    ok(&[&["render", &whole], &drr[..]].concat());
+    ok(&["export", &whole, "--component", "dynamic", "--spacing", "3", "-o", &path("vessels.nrrd")]);
+    let bench = [&["bench", &data, "--kernels", "--iterations", "2", "--repeats", "2"], &settings[..]].concat();
+    let said = ok(&bench);
+    assert!(said.contains("form x") && said.contains("x_blend_back") && !said.contains("still field"), "{said}");
+    let kernels: Value = serde_json::from_str(&ok(&["kernels", "--preset", "x-gaussian", "--json"])).unwrap();
+    let listed: Vec<&str> =
+        kernels["kernels"].as_array().unwrap().iter().map(|k| k["kernel"].as_str().unwrap()).collect();
+    assert!(listed.contains(&"x_update") && !listed.iter().any(|k| k.starts_with("r2_voxel")), "{listed:?}");
+}
