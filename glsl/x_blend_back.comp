@@ -33,6 +33,8 @@ shared float parts[BATCH * SUMS * SUM_STRIDE];
 shared vec4 places[BATCH];
 shared vec3 conics[BATCH];
 shared uint entries[BATCH];
+// One more than the place of the last Gaussian that shows anywhere in the tile.
+shared uint last_shown;
 
 struct Pixel {
     vec2 at;
@@ -54,6 +56,14 @@ uint entry_of(uint i) {
     XSpan span = x_spans[i];
     uvec2 from_first = gl_WorkGroupID.xy - uvec2(span.first & 0xffffu, span.first >> 16);
     return span.first_entry + from_first.y * columns_and_rows(span).x + from_first.x;
+}
+
+// Gaussians behind all that shows have no part in it.
+void clear_hidden(XList list) {
+    for (uint k = last_shown + gl_LocalInvocationID.x; k < list.count; k += LANES) {
+        uint entry = entry_of(x_list_items[list.first + k]);
+        for (uint s = 0u; s < SUMS; s++) x_entries[entry * SUMS + s] = 0.0;
+    }
 }
 
 // Goes from behind the `j`-th Gaussian of the batch to before it.
@@ -79,10 +89,17 @@ void pass(uint j, inout Pixel pixel, inout float sums[SUMS]) {
 void main() {
     uint lane = gl_LocalInvocationID.x;
     XList list = x_lists[list_of_workgroup()];
+    if (lane == 0u) last_shown = 0u;
+    barrier();
     Pixel pixels[PIXELS_OF_LANE];
-    for (uint k = 0u; k < PIXELS_OF_LANE; k++) pixels[k] = pixel_to_go_back(k);
-    for (uint batch = (list.count + BATCH - 1u) / BATCH; batch-- > 0u;) {
-        uint begin = batch * BATCH, n = min(BATCH, list.count - begin);
+    for (uint k = 0u; k < PIXELS_OF_LANE; k++) {
+        pixels[k] = pixel_to_go_back(k);
+        atomicMax(last_shown, pixels[k].last);
+    }
+    barrier();
+    clear_hidden(list);
+    for (uint batch = (last_shown + BATCH - 1u) / BATCH; batch-- > 0u;) {
+        uint begin = batch * BATCH, n = min(BATCH, last_shown - begin);
         if (lane < n) {
             uint i = x_list_items[list.first + begin + lane];
             places[lane] = vec4(splats[i].mean, splats[i].amplitude, max(x_gaussians[i].intensity, 0.0));

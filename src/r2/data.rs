@@ -19,15 +19,14 @@ const DRAWN_CUT: f32 = 4.0;
 /// Bounds of drawn scales are a little wider than what scales can be, so that rounding changes none.
 const SLACK: f64 = 1e-3;
 
-/// Images of each set of a static method, and the phase of each, where it is of one. `key` is what the setting is called.
+/// Images of each set of a static method, and the phase of each, where it is of one.
+pub(crate) type Sets = (Vec<Vec<usize>>, Vec<Option<u32>>);
+
+/// Sets of a static method. `key` is what the setting is called.
 ///
 /// # Errors
 /// [`Error::Config`] where a phase shall have a set and no image shows it.
-pub(crate) fn sets_of(
-    dataset: &Dataset,
-    static_data: StaticData,
-    key: &str,
-) -> Result<(Vec<Vec<usize>>, Vec<Option<u32>>)> {
+pub(crate) fn sets_of(dataset: &Dataset, static_data: StaticData, key: &str) -> Result<Sets> {
     let (training, n_phases) = (dataset.training(), dataset.n_phases);
     let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
     let unseen: Vec<u32> = (0..n_phases).filter(|phase| of_phase(*phase).is_empty()).collect();
