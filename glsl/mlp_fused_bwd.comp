@@ -40,8 +40,8 @@ layout(binding = 12) writeonly buffer B12 { uvec4 dz_in16[]; };
 layout(binding = 13) buffer B13 { float partials[]; };
 layout(binding = 14) readonly buffer B14 { float sigma_gradient[]; };
 #include "inc/sample_gradient.glsl"
-// The lower layer's input takes the place of the upper's, which is done with by then.
-#define INPUTS_SIZE tile * (input_stride > lower_stride ? input_stride : lower_stride)
+// The last layer's activations, the upper layer's input, and the lower's take each other's places.
+#define INPUTS_SIZE tile * (longest_stride > dz_stride ? longest_stride : dz_stride)
 #include "inc/fused_backward.glsl"
 
 shared float tile_gradient[tile];

@@ -9,6 +9,7 @@ const uint lower_columns8 = lower_columns / 8u;
 const uint dz_stride = width8 + 1u;
 const uint input_stride = upper_columns8 + 1u;
 const uint lower_stride = lower_columns8 + 1u;
+const uint longest_stride = input_stride > lower_stride ? input_stride : lower_stride;
 const uint row_tiles = tile / m;
 const uint column_tiles = width / n;
 // Weight gradient: subgroups are laid out in bands over neurons times shares of the inputs.

@@ -480,6 +480,9 @@ section! {
         /// What larger opacities are reset to.
         reset_opacity: f64 in 1e-6 to 0.99,
     }
+}
+
+section! {
     /// SAX-NeRF's field (`dynamic.form = "lineformer"`), a hash grid and a Lineformer, with what its code uses as
     /// defaults for the chest.
     Sax, "sax" {
