@@ -44,6 +44,8 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
     assert_eq!(score["dice"]["dynamic"], score["dice_published"]["paper"], "the published threshold");
     assert!(score["threshold"]["rule"].as_str().unwrap().contains("opacities"), "{score}");
+    // Compared with images that go from 0 to 1, as it shows them.
+    assert!((3.0..60.0).contains(&score["psnr"].as_f64().unwrap()), "{}", score["psnr"]);
     // Each image by a threshold of its own.
     let images = score["images"].as_array().unwrap();
     let otsu: Vec<f64> = images.iter().map(|image| image["dice_otsu"].as_f64().unwrap()).collect();

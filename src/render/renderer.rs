@@ -45,6 +45,8 @@ pub struct Rendering {
     pub dynamic_max: Vec<f32>,
     /// Largest sum of both along the ray.
     pub total_max: Vec<f32>,
+    /// Whether there is no line integral, but what X-Gaussian shows.
+    pub is_blended: bool,
 }
 
 impl Rendering {
@@ -401,6 +403,7 @@ impl Renderer {
         }
         if let Some(pictures) = self.pictures.as_ref().filter(|pictures| pictures.are_blended()) {
             out.dynamic_integral = pictures.draw(rays, (width, height), taken.phase)?;
+            out.is_blended = true;
         }
         Ok(out)
     }

@@ -273,7 +273,8 @@ pub fn evaluate(
     for (frame, rendering) in frames.iter().zip(&seen) {
         observe(Scoring::Scored { frame, rendering, threshold: dynamic_threshold })?;
         let overlap = |values: &[f32], threshold: f64| overlap(frame, values, threshold);
-        let (truth, prediction) = metrics::normalised(&frame.integrals, &rendering.total_integral());
+        let compared = if blended { metrics::normalised_to_shown } else { metrics::normalised };
+        let (truth, prediction) = compared(&frame.integrals, &rendering.total_integral());
         let angles = dataset.views[frame.view].geometry.angles_deg();
         images.push(ImageScore {
             name: frame.name.clone(),

@@ -22,6 +22,12 @@ pub fn normalised(truth: &[f32], prediction: &[f32]) -> (Vec<f64>, Vec<f64>) {
     (truth.iter().map(scale).collect(), prediction.iter().map(scale).collect())
 }
 
+/// The true image brought to its own range, and what X-Gaussian shows, which is meant to be that, held from 0 to 1.
+pub fn normalised_to_shown(truth: &[f32], shown: &[f32]) -> (Vec<f64>, Vec<f64>) {
+    let (truth, _) = normalised(truth, &[]);
+    (truth, shown.iter().map(|v| f64::from(*v).clamp(0.0, 1.0)).collect())
+}
+
 /// Peak signal-to-noise ratio in dB for data of range 1.
 pub fn psnr(truth: &[f64], prediction: &[f64]) -> f64 {
     let mse = truth.iter().zip(prediction).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / truth.len() as f64;
@@ -144,6 +150,13 @@ pub fn best_dice(images: &[(&[f32], &[bool])], used: f32) -> Option<(f64, f32)> 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_shown_is_compared_with_the_true_image_in_its_own_range() {
+        let (truth, shown) = normalised_to_shown(&[0.2, 0.3, 0.4], &[-0.1, 0.5, 1.7]);
+        let off = truth.iter().zip(&shown).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        assert!(off < 1e-6, "{truth:?} {shown:?}");
+    }
 
     #[test]
     fn dice_of_halves() {

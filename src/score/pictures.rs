@@ -11,6 +11,8 @@ use std::path::Path;
 /// Smallest side of a panel; smaller images are enlarged by a whole factor.
 const PANEL_PIXELS: usize = 200;
 const GAP: usize = 4;
+/// Of images that go from 0 to 1.
+const NORMALISED: Window = Window { low: 0.0, high: 1.0 };
 
 /// Window of line integrals shown: `low` is white, `high` black.
 #[derive(Debug, Clone, Copy)]
@@ -89,7 +91,7 @@ pub fn write_comparison(path: &Path, frame: &Frame, seen: &Rendering, threshold:
     );
     let picture = beside(&[
         grey(&frame.integrals, window),
-        grey(&seen.total_integral(), window),
+        grey(&seen.total_integral(), if seen.is_blended { NORMALISED } else { window }),
         grey(&seen.static_integral, window),
         grey(&seen.dynamic_integral, Window { low: 0.0, ..Window::of(&seen.dynamic_integral) }),
         overlay,
