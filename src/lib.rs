@@ -199,6 +199,7 @@ pub mod sax {
     pub mod data;
     pub mod drawing;
     pub mod products;
+    pub mod program;
     pub mod setup;
     pub mod stages;
     pub mod start;
