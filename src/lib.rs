@@ -211,6 +211,7 @@ pub mod sax {
     pub mod data;
     pub mod drawing;
     pub mod products;
+    pub mod program;
     pub mod setup;
     pub mod stages;
     pub mod start;

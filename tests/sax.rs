@@ -273,14 +273,14 @@ fn runs_fit_their_images_and_repeat_and_resume_bit_by_bit() {
     let dataset = uneven_dataset(13, 11);
     for static_data in ["per-phase", "pooled"] {
         let data = format!("sax.static_data={static_data}");
-        let config = config(&[&data, "train.iterations=60", "sax.rate_falls_at=50", "sax.rate=5e-3"]);
+        let config = config(&[&data, "train.iterations=24", "sax.rate_falls_at=20", "sax.rate=1e-2"]);
         let mut whole = start(&gpu, &config, &dataset);
-        let losses = run(&mut whole, 60);
+        let losses = run(&mut whole, 24);
         let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
-        let (first, last) = (mean(&losses[..4]), mean(&losses[56..]));
-        assert!(last < 0.3 * first, "{static_data}: {first} to {last}");
+        let (first, last) = (mean(&losses[..4]), mean(&losses[20..]));
+        assert!(last < 0.6 * first, "{static_data}: {first} to {last}");
         // Not where a submit ends.
-        let stop = 27;
+        let stop = 11;
         let mut parts = start(&gpu, &config, &dataset);
         let mut again = run(&mut parts, stop);
         let saved = parts.checkpoint().unwrap();
@@ -289,7 +289,7 @@ fn runs_fit_their_images_and_repeat_and_resume_bit_by_bit() {
         let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
         let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
         assert_eq!(resumed.step(), stop);
-        again.extend(run(&mut resumed, 60));
+        again.extend(run(&mut resumed, 24));
         assert_eq!(losses, again, "{static_data}");
         let (want, got) = (whole.checkpoint().unwrap(), resumed.checkpoint().unwrap());
         assert!(want.sax == got.sax && want.model.sax == got.model.sax, "{static_data}");
@@ -308,7 +308,7 @@ fn each_phase_sees_its_own_images_alone_unless_all_are_pooled() {
         let config = config(&[&format!("sax.static_data={static_data}")]);
         [&dataset, &other].map(|dataset| {
             let mut trainer = start(&gpu, &config, dataset);
-            run(&mut trainer, 12);
+            run(&mut trainer, 3);
             trainer.model().unwrap().sax.unwrap()
         })
     };
@@ -327,7 +327,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
     let mut trainer = start(&gpu, &config(&[]), &dataset);
-    run(&mut trainer, 5);
+    run(&mut trainer, 2);
     let model = trainer.model().unwrap();
     assert!(!model.is_continuous());
     let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
@@ -350,7 +350,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
         assert!(short.iter().zip(long).all(|(a, b)| (a - b).abs() < 1e-5 * a.abs()), "{short:?} {long:?}");
     }
     // Another state of the same run, and numbers that lie on the device.
-    run(&mut trainer, 9);
+    run(&mut trainer, 4);
     let later = trainer.model().unwrap();
     renderer.set_model(&later).unwrap();
     let after = renderer.render(rays, 13, 11, 1).unwrap();

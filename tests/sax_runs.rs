@@ -22,24 +22,24 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     ok(&["phantom", &data, "--size", "24", "--phases", "3", "--views", "3", "--no-volumes"]);
     let mut settings = vec!["--preset", "sax-nerf"];
     for setting in [
-        "train.iterations=40",
-        "train.validate_every=20",
-        "train.checkpoint_every=20",
+        "train.iterations=12",
+        "train.validate_every=6",
+        "train.checkpoint_every=6",
         "sax.levels=4",
         "sax.log2_table=10",
-        "sax.windows=2",
+        "sax.windows=1",
         "sax.window=4",
-        "sax.rays=32",
-        "sax.samples=16",
-        "sax.rate_falls_at=35",
+        "sax.rays=16",
+        "sax.samples=8",
+        "sax.rate_falls_at=10",
     ] {
         settings.extend(["--set", setting]);
     }
     let said = ok(&[&["train", &data, "-o", &whole, "--json"], &settings[..]].concat());
     assert!(said.contains("a static method") && said.contains("\"validation\""), "{said}");
-    ok(&[&["train", &data, "-o", &parts, "--stop-at", "13", "--no-eval"], &settings[..]].concat());
+    ok(&[&["train", &data, "-o", &parts, "--stop-at", "5", "--no-eval"], &settings[..]].concat());
     ok(&["train", &data, "-o", &parts, "--resume", "--no-eval"]);
-    let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000040.safetensors")).unwrap();
+    let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000012.safetensors")).unwrap();
     assert!(bytes(&whole) == bytes(&parts), "a resumed run comes to the same bits");
     let score: Value = serde_json::from_str(&ok(&["eval", &whole, "--json"])).unwrap();
     assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");

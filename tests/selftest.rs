@@ -187,6 +187,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("sax_lineformer", wrong_sign, sax::compare),
         fault("sax_loss", wrong_sign, sax::compare),
         fault("sax_lineformer_bwd", wrong_sign, sax::compare),
+        fault("sax_products", difference_for_sum, sax::compare),
         fault("sax_weight_gradient", difference_for_sum, sax::compare),
         fault("sax_encode_bwd", wrong_sign, sax::compare),
         fault("sax_grid_gradient", missing_clear, sax::compare),

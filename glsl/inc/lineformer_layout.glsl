@@ -40,3 +40,33 @@ const uint SAX_POSITION = 32u;   // of the pair
 const uint SAX_DENSITY = 33u;    // two, of the pair
 const uint SAX_VECTORS = 35u;    // all of them
 const uint SAX_PRODUCTS = 41u;   // gradients: 31 products of two of them, 10 that are sums of one
+
+// Vectors that a pair keeps to itself in either pass.
+const uint SAX_X1 = 35u;         // after the first layer
+const uint SAX_X2 = 36u;         // after the attention
+const uint SAX_X3 = 37u;         // after the layer on both
+const uint SAX_BEFORE_FIRST = 38u;   // four, before their GELU
+const uint SAX_BEFORE_SECOND = 42u;  // four
+const uint SAX_QUERY = 46u;
+const uint SAX_KEY = 47u;
+const uint SAX_VALUE = 48u;
+const uint SAX_BY_NORMAL = 49u;
+const uint SAX_BY_SEEN = 50u;
+const uint SAX_BY_FEATURES = 51u;
+const uint SAX_ALL_VECTORS = 52u;    // those that are left come first
+
+// What a step of the Lineformer does with vectors.
+const uint SAX_SET = 0u;         // to = numbers at `first`
+const uint SAX_ADD = 1u;         // to += from
+const uint SAX_TIMES = 2u;       // to += W from
+const uint SAX_BACK = 3u;        // to += W^T from
+const uint SAX_LEAKY = 4u;       // to = leaky(to)
+const uint SAX_GELU = 5u;        // to = gelu(from)
+const uint SAX_NORM = 6u;        // to = from, normalised, by the scales and shifts at `first`
+const uint SAX_ATTEND = 7u;      // what both samples see of each other
+const uint SAX_BACK_LEAKY = 8u;  // to through the activation whose result is from
+const uint SAX_BACK_GELU = 9u;   // to through the GELU of from
+const uint SAX_BACK_NORM = 10u;  // to += BY_NORMAL through the normalisation of from; its scales and shifts are left
+const uint SAX_BACK_ATTEND = 11u;
+const uint SAX_BACK_DENSITY = 12u;
+const uint SAX_CLEAR = 13u;      // to = 0

@@ -20,6 +20,8 @@ struct SaxSetup {
     uint n_groups;              // workgroups of the Lineformer's backward pass
     uint fixed_point_bits;      // behind the point, of the grid's gradient
     uint ring_length;           // iterations whose losses are kept
+    uint n_forward_steps;       // steps of the Lineformer's forward pass
+    uint n_steps;               // those, then the backward pass's
 };
 
 // A level of the hash grid.
@@ -43,4 +45,14 @@ struct SaxProduct {
     uint first;                 // where the numbers begin, vec4
     uint stride;                // from row to row, vec4
     uint columns;               // vec4; 0: a sum of `left` alone
+};
+
+// A step of the Lineformer, which both passes take one by one.
+struct SaxStep {
+    uint kind;                  // what it does
+    uint to;                    // vector that it changes
+    uint from;                  // vector that it reads
+    uint first;                 // numbers that it takes, vec4
+    uint stride;                // from row to row of a matrix, vec4
+    uint columns;               // of a matrix, vec4; of a normalisation, the vector that its scales are left as
 };

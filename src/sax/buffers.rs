@@ -12,6 +12,7 @@ use crate::model::setup::RING_LENGTH;
 use crate::r2::start::seed_of_set;
 use crate::sax::data::SaxData;
 use crate::sax::products::products;
+use crate::sax::program::{backward, forward};
 use crate::sax::setup::{adam_setup, schedule};
 use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers, TILE_BYTES};
 
@@ -97,6 +98,7 @@ pub fn sample_buffers(
     let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
     Ok(SaxSampleBuffers {
         sax_setup: gpu.buffer_with("sax_setup", &[*setup])?,
+        sax_steps: gpu.buffer_with("sax_steps", &[forward(field.shape), backward(field.shape)].concat())?,
         sax_levels: gpu.buffer_with("sax_levels", &field.shape.grid())?,
         state: gpu.buffer_with("state", &[DeviceState { step, ..DeviceState::default() }])?,
         sax_points: new(Binding::sax_points, 16 * n_samples)?,

@@ -6,9 +6,10 @@ use crate::kernels::layout::{SaxSetup, Schedule, Setup};
 use crate::model::sax::{SaxField, SaxShape};
 use crate::model::setup::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::sax::data::SaxData;
+use crate::sax::program::{backward, forward};
 use crate::sax::stages::tiles;
 
-/// Workgroups of the Lineformer's backward pass, at most: each has sums of 128 KiB, and what a tile leaves, 280 KiB.
+/// Tiles of the Lineformer's backward pass at once: each has sums of 128 KiB, and leaves vectors of 280 KiB.
 const MOST_GROUPS: u32 = 256;
 
 /// What does not depend on what is drawn or fitted.
@@ -24,6 +25,8 @@ fn field_setup(field: &SaxField) -> SaxSetup {
         n_sets: field.n_sets as u32,
         fixed_point_bits: FIXED_POINT_BITS,
         ring_length: RING_LENGTH,
+        n_forward_steps: forward(field.shape).len() as u32,
+        n_steps: (forward(field.shape).len() + backward(field.shape).len()) as u32,
         ..SaxSetup::default()
     }
 }

@@ -1,7 +1,7 @@
 //! The stages of SAX-NeRF, what they bind, and one iteration, top to bottom. Each field has, one after the other,
 //!
-//! sax_batch -> sax_points -> sax_encode -> sax_lineformer -> sax_loss -> sax_lineformer_bwd -> sax_weight_gradient ->
-//! sax_encode_bwd -> sax_grid_gradient -> adam
+//! sax_batch -> sax_points -> sax_encode -> sax_lineformer -> sax_loss -> sax_lineformer_bwd -> sax_products ->
+//! sax_weight_gradient -> sax_encode_bwd -> sax_grid_gradient -> adam
 //!
 //! in buffers that all share but for its numbers; then comes sax_report.
 
@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
-use crate::kernels::constants::SAX_VECTORS;
+use crate::kernels::constants::{SAX_PRODUCTS, SAX_VECTORS};
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch_finding};
 use crate::kernels::layout::SaxSetup;
 use crate::kernels::push::{self, PushConstants};
@@ -54,6 +54,8 @@ pub struct SaxKernels {
     pub loss: Stage<push::SaxLoss>,
     /// Gradients by features and by each workgroup's samples.
     pub lineformer_bwd: Stage<push::SaxLineformerBwd>,
+    /// What each tile of samples says of the Lineformer's numbers.
+    pub products: Stage<push::SaxProducts>,
     /// Gradient of the Lineformer's numbers.
     pub weight_gradient: Stage<push::SaxWeightGradient>,
     /// Scatter to the grid.
@@ -78,6 +80,7 @@ impl SaxKernels {
             batch: plain.stage(gpu)?,
             loss: plain.stage(gpu)?,
             lineformer_bwd: plain.stage(gpu)?,
+            products: plain.stage(gpu)?,
             weight_gradient: plain.stage(gpu)?,
             encode_bwd: plain.stage(gpu)?,
             grid_gradient: plain.stage(gpu)?,
@@ -94,6 +97,8 @@ buffer_set! {
         sax_setup,
         /// [`crate::kernels::layout::SaxLevel`]s.
         sax_levels,
+        /// [`crate::kernels::layout::SaxStep`]s of the Lineformer.
+        sax_steps,
         /// [`crate::kernels::layout::DeviceState`]: iterations done.
         state,
         /// `[ray][sample]`: points of the unit cube, and the paths they stand for.
@@ -279,8 +284,14 @@ impl SaxPass<'_> {
     /// Records the gradient of that loss by the Lineformer's numbers and by features.
     fn backward(&mut self, set: &SaxSetBuffers) -> Result<()> {
         let (kernels, setup) = (self.kernels, self.setup);
-        let groups = Groups::Direct([setup.n_groups, 1, 1]);
-        self.run(set, &kernels.lineformer_bwd, groups, push::SaxLineformerBwd {})?;
+        let n_tiles = tiles(setup.n_rays * setup.n_samples);
+        for first_tile in (0..n_tiles).step_by(setup.n_groups as usize) {
+            let n = setup.n_groups.min(n_tiles - first_tile);
+            let groups = Groups::Direct([n, 1, 1]);
+            self.run(set, &kernels.lineformer_bwd, groups, push::SaxLineformerBwd { first_tile })?;
+            let groups = Groups::Direct([n, SAX_PRODUCTS, 1]);
+            self.run(set, &kernels.products, groups, push::SaxProducts { first_tile })?;
+        }
         let weights = &kernels.weight_gradient;
         self.run(set, weights, weights.groups_over(setup.n_weights), push::SaxWeightGradient {})
     }

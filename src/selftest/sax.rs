@@ -27,6 +27,7 @@ const ENCODE: &[&str] = &[push::SaxEncode::SHADER];
 const LINEFORMER: &[&str] = &[push::SaxLineformer::SHADER];
 const LOSS: &[&str] = &[push::SaxLoss::SHADER];
 const LINEFORMER_BWD: &[&str] = &[push::SaxLineformerBwd::SHADER];
+const PRODUCTS: &[&str] = &[push::SaxProducts::SHADER];
 const WEIGHT_GRADIENT: &[&str] = &[push::SaxWeightGradient::SHADER];
 const ENCODE_BWD: &[&str] = &[push::SaxEncodeBwd::SHADER];
 const GRID_GRADIENT: &[&str] = &[push::SaxGridGradient::SHADER];
@@ -54,10 +55,10 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "sax.levels=6",
         "sax.base=3",
         "sax.log2_table=9",
-        "sax.windows=3",
+        "sax.windows=2",
         "sax.window=4",
-        "sax.rays=23",
-        "sax.samples=10",
+        "sax.rays=13",
+        "sax.samples=6",
         "sax.bound_mm=60",
         "sax.rate_falls_at=30",
     ];
@@ -104,7 +105,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     for (case, settings) in [
         ("fields of 3 phases, 33 x 27 pixels, 6 levels", &[][..]),
         // Windows take whole rows, and points go beyond the box.
-        ("one field, 4 levels, clamped", &["sax.static_data=pooled", "sax.levels=4", "sax.window=9", "sax.bound_mm=7"]),
+        ("one field, 4 levels, clamped", &["sax.static_data=pooled", "sax.levels=4", "sax.window=5", "sax.bound_mm=7"]),
     ] {
         findings.begin("sax", case);
         let config = small_config(settings)?;
@@ -260,7 +261,7 @@ impl Iteration<'_> {
         for part in shape.parts().iter().filter(|part| part.name != "grid") {
             let range = part.first..part.first + part.len();
             let got: Vec<f32> = sums[range.clone()].iter().map(|v| *v as f32).collect();
-            findings.numbers(LINEFORMER_BWD, part.name, &got, &gradient[range], GRADIENTS);
+            findings.numbers(PRODUCTS, part.name, &got, &gradient[range], GRADIENTS);
         }
         let got = self.floats(&self.fit.buffers().1.gradient, n)?;
         findings.numbers(WEIGHT_GRADIENT, "gradient by the Lineformer's numbers", &got, &sums, NUMBERS);

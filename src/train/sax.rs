@@ -11,12 +11,12 @@ use crate::r2::start::seed_of_set;
 use crate::sax::buffers::{SaxMemory, fit_buffers, sample_buffers, set_buffers};
 use crate::sax::data::SaxData;
 use crate::sax::setup::{fit_setup, outline};
-use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step};
+use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step, tiles};
 use crate::sax::start::first_params;
 use crate::train::gaussians::{Iterations, pass_times};
 use crate::train::targets::losses;
 
-/// Passes of an iteration of a field, at most, and of all fields together.
+/// Passes of an iteration of a field, and of all fields together, but for those over its tiles.
 const MAX_PASSES: u32 = 16;
 
 /// A run on a device.
@@ -162,7 +162,8 @@ impl SaxTrainer {
         if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
         }
-        let max_passes = MAX_PASSES * (self.setup.n_sets + 1);
+        let rounds = tiles(self.setup.n_rays * self.setup.n_samples).div_ceil(self.setup.n_groups);
+        let max_passes = (MAX_PASSES + 2 * rounds) * (self.setup.n_sets + 1);
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of SAX-NeRF", max_passes)?;
         record_step(&mut self.pass(&mut recording))?;
         self.step += 1;
