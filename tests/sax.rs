@@ -19,7 +19,9 @@ use nertca_vk::model::sax::{SaxField, SaxShape, SaxState};
 use nertca_vk::plan::Plan;
 use nertca_vk::r2::start::seed_of_set;
 use nertca_vk::reference::sax::{self as reference, Lineformer, SampledRay, entry, objective};
+use nertca_vk::render::baked::Baked;
 use nertca_vk::render::grid::Grid;
+use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::sax::setup::{fit_setup, outline};
 use nertca_vk::scan::dataset::Dataset;
@@ -27,6 +29,7 @@ use nertca_vk::selftest::sax::{compare, f64s, hard_case, small_config};
 use nertca_vk::train::sax::SaxTrainer;
 use nertca_vk::train::trainer::Trainer;
 use std::collections::HashSet;
+use std::sync::Arc;
 
 fn config(settings: &[&str]) -> Config {
     small_config(settings).unwrap()
@@ -358,7 +361,14 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     renderer.set_model(&model).unwrap();
     renderer.follow_sax(&trainer.sax_params().unwrap());
     assert_eq!(renderer.render(rays, 13, 11, 1).unwrap().dynamic_integral, after.dynamic_integral);
-    drop((renderer, trainer));
+    let baked = Baked::new(Arc::new(renderer), 12).unwrap();
+    let quantity = Quantity { projection: Projection::Mip, component: Component::Dynamic };
+    let peaks = baked.render(rays, 13, 11, 1, quantity).unwrap();
+    let largest = |values: &[f32]| values.iter().fold(0f32, |m, v| m.max(*v));
+    assert!(
+        largest(&peaks) > 0.5 * largest(&after.dynamic_max) && largest(&peaks) < 1.01 * largest(&after.dynamic_max)
+    );
+    drop((baked, trainer));
     expect_silence(gpu);
 }
 
@@ -370,7 +380,7 @@ fn what_cannot_be_fitted_is_refused() {
         Err(Error::Config { problem, field, .. }) => format!("{field}: {problem}"),
         other => panic!("{other:?}"),
     };
-    let problem = refused(&dataset, &["sax.window=6"]);
+    let problem = refused(&dataset, &["sax.window=6", "sax.windows=3"]);
     assert!(problem.contains("sax.windows") && problem.contains("room for 2 windows"), "{problem}");
     dataset.frames[2].integrals[15] = f32::NAN;
     assert!(refused(&dataset, &[]).contains("column 2, row 1"));
