@@ -5,6 +5,7 @@
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
+#include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint first_loss; } push;
 layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
@@ -14,7 +15,8 @@ layout(binding = 4) writeonly buffer B4 { float sax_ray_gradient[]; };
 layout(binding = 5) writeonly buffer B5 { float sax_losses[]; };  // [field][ray]
 
 void main() {
-    uint r = gl_WorkGroupID.x, n = sax_setup.n_samples;
+    uint r = workgroup(), n = sax_setup.n_samples;
+    if (r >= sax_setup.n_rays) return;
     float sum = 0.0;
     for (uint k = gl_LocalInvocationID.x; k < n; k += gl_WorkGroupSize.x)
         sum += sax_sigma[r * n + k] * sax_points[r * n + k].w;

@@ -410,6 +410,13 @@ mod tests {
     use super::*;
 
     #[test]
+    fn more_first_gaussians_than_there_is_room_for_are_refused_however_many() {
+        let mut config = Config::preset(Preset::XGaussian);
+        (config.x.voxels, config.x.interval) = (2048, 1);
+        assert!(config.check().unwrap_err().to_string().contains("x.most"));
+    }
+
+    #[test]
     fn settings_override_files_override_presets() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("c.toml");

@@ -21,7 +21,7 @@ const CHIPS: [(&str, bool); 7] = [
     ("amd:gfx1201", true),
     ("intel:bmg", false),
 ];
-const PRESETS: [&str; 4] = ["fast", "fast-mlp", "paper", "r2-gaussian"];
+const PRESETS: [&str; 6] = ["fast", "fast-mlp", "paper", "r2-gaussian", "x-gaussian", "sax-nerf"];
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))

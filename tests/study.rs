@@ -127,7 +127,9 @@ fn our_studies_can_be_run() {
         std::fs::write(data.path().join("anatomy").join(file), b"stands in for it").unwrap();
     }
     let studies = Path::new(SMOKE).parent().unwrap();
-    for (name, runs) in [("smoke", 24), ("table1", 198), ("table2", 30), ("time", 21), ("degradations", 204)] {
+    let expected =
+        [("smoke", 24), ("table1", 198), ("scaled-table1", 126), ("table2", 30), ("time", 21), ("degradations", 204)];
+    for (name, runs) in expected {
         let file = studies.join(name).with_extension("toml");
         let listed = ok(&["list", text(&file), "--data", text(data.path())]);
         let names: BTreeSet<&str> = listed.lines().collect();

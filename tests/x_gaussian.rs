@@ -331,7 +331,7 @@ fn lists_that_outgrow_their_room_get_more_and_nothing_is_lost() {
         assert!(got.2 > capacity, "{}", got.2);
     }
     // A device that has no buffer so large.
-    let error = nertca_vk::x_gaussian::picture::more_capacity(1001, 1000).unwrap_err().to_string();
+    let error = nertca_vk::x_gaussian::picture::more_capacity(1001, 1000, ("x.most", 7)).unwrap_err().to_string();
     assert!(error.contains("1001") && error.contains("x.interval"), "{error}");
     expect_silence(gpu);
 }

@@ -23,6 +23,7 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, evaluate_model};
+use nertca_vk::sax::setup::n_rays;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::train::timing::{GaussianSubject, GaussianTiming, Length, Pace, Passes, Subject, Timing};
 use nertca_vk::train::trainer::Trainer;
@@ -271,7 +272,7 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
             + after.median() * f64::from(config.train.iterations - delay));
     Ok(Timings {
         paths: subject.notes(),
-        rays: subject.rays(),
+        rays: if config.is_sax() { n_rays(&config.sax) } else { subject.rays() },
         network_cost: config.network_moves().then(|| subject.cost()),
         work: if config.network_moves() { subject.work(after.live_samples) } else { Ledger::new() },
         gaussians: None,

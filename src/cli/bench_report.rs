@@ -276,8 +276,13 @@ fn print_gaussians(report: &Report, gaussians: &GaussianTiming) {
 
 fn print_network(report: &Report, after: &Timing) {
     let ms = after.median();
-    print_times("with the network", &after.ms, ms, after.host_cpu_share);
+    let samples_are_live = report.network_cost.is_some();
+    let what = if samples_are_live { "with the network" } else { "iteration" };
+    print_times(what, &after.ms, ms, after.host_cpu_share);
     print_conditions(after.iterations, Some(after.learned), after.readings.as_ref());
+    if !samples_are_live {
+        return;
+    }
     let live = after.live_samples;
     out!(
         "  {live} live samples: {:.3e} samples/s, {:.4} TFLOP/s over whole iterations",

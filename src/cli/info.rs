@@ -77,9 +77,9 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
 fn describe_sax(field: &SaxField) -> serde_json::Value {
     serde_json::json!({
         "fields": field.n_sets,
-        "parameters": field.n_sets * field.shape.n_params(),
+        "parameters": field.n_sets * field.shape.n_meant(),
         "grid": field.shape.n_grid(),
-        "lineformer": field.shape.n_weights(),
+        "lineformer": field.shape.n_meant() - field.shape.n_grid(),
         "samples": field.samples,
     })
 }

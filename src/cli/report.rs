@@ -65,7 +65,7 @@ impl Report<'_> {
             facts.push(("Gaussians".into(), gaussians_of(field)));
         }
         if let Some(field) = &model.sax {
-            let numbers = field.shape.n_params();
+            let numbers = field.shape.n_meant();
             facts.push(("SAX-NeRF".into(), format!("{} fields of {numbers} numbers each", field.n_sets)));
         }
         if let Some(started) = latest("started") {

@@ -182,8 +182,8 @@ impl Config {
         if x.interval > x.voxels {
             return Err(Error::config("x.interval", x.interval, format!("exceeds x.voxels = {}", x.voxels)));
         }
-        let count = x.voxels.div_ceil(x.interval).pow(3);
-        if count > x.most {
+        let count = u64::from(x.voxels.div_ceil(x.interval)).pow(3);
+        if count > u64::from(x.most) {
             let problem =
                 format!("x.voxels = {} and x.interval = {} begin with {count} Gaussians", x.voxels, x.interval);
             return Err(Error::config("x.most", x.most, problem));

@@ -134,7 +134,6 @@ impl Tuning {
             recompute: true,
         };
         let matrices = match info.multiprocessors {
-            // Unrolled, a CPU driver compiles these kernels for minutes.
             // Unrolled, a CPU driver compiles these kernels for minutes; sums are in memory, and the encoding is dear.
             _ if info.is_cpu() => MatrixTuning {
                 workgroups: 4,

@@ -91,6 +91,11 @@ impl SaxShape {
         self.n_weights() + self.n_grid()
     }
 
+    /// Numbers of the field without those that fill up rows of four and mean nothing.
+    pub fn n_meant(&self) -> usize {
+        self.parts().iter().map(Part::len).sum()
+    }
+
     /// What the numbers are, in their order.
     pub fn parts(&self) -> Vec<Part> {
         let input = self.n_features();

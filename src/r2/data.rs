@@ -8,7 +8,7 @@ use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{Gaussian, GaussianSetup, R2Gaussian};
 use crate::model::gaussians::{Gaussians, Units};
 use crate::r2::parameters::ScaleBounds;
-use crate::scan::dataset::Dataset;
+use crate::scan::dataset::{Dataset, Frame};
 
 /// Line integrals of images, in units of the drawn field, which hold eight times as much.
 const DRAWN_RANGE: f64 = 256.0;
@@ -38,6 +38,17 @@ pub(crate) fn sets_of(dataset: &Dataset, static_data: StaticData, key: &str) -> 
         StaticData::Pooled => (vec![(0..training.len()).collect()], vec![None]),
         StaticData::PerPhase => (0..n_phases).map(|t| (of_phase(t), Some(t))).unzip(),
     })
+}
+
+/// Refuses an image with pixels that are no number, which would spread to all others.
+///
+/// # Errors
+/// [`Error::Config`] naming the image and the pixel.
+pub(crate) fn check_finite(dataset: &Dataset, frame: &Frame) -> Result<()> {
+    let Some(p) = frame.integrals.iter().position(|v| !v.is_finite()) else { return Ok(()) };
+    let (column, row) = (p % dataset.width, p / dataset.width);
+    let problem = format!("{}: column {column}, row {row} is not a finite number", frame.name);
+    Err(Error::config("dataset", dataset.path.display(), problem))
 }
 
 /// The data in R2-Gaussian's units.
@@ -80,10 +91,7 @@ impl R2Data {
         let training = dataset.training();
         let mut images = Vec::with_capacity(training.len() * dataset.n_pixels());
         for frame in training {
-            if let Some(p) = frame.integrals.iter().position(|v| !v.is_finite()) {
-                let (column, row) = (p % dataset.width, p / dataset.width);
-                return refuse(format!("{}: column {column}, row {row} is not a finite number", frame.name));
-            }
+            check_finite(dataset, frame)?;
             images.extend(frame.integrals.iter().map(|v| (f64::from(*v) / units.strongest) as f32));
         }
         let (images_of_set, phase_of_set) = sets_of(dataset, settings.static_data, "r2.static_data")?;

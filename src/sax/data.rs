@@ -1,11 +1,11 @@
 //! A dataset as SAX-NeRF sees it: whole images in its units, which of their pixels show something, and which images
 //! each field is fitted to.
 
-use crate::config::StaticData;
 use crate::config::sections::Sax;
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{SaxList, View};
+use crate::r2::data::{check_finite, sets_of};
 use crate::scan::dataset::Dataset;
 
 /// Beyond the volume's corners rays go on for so much, mm.
@@ -66,23 +66,11 @@ impl SaxData {
             images_of_set: Vec::new(),
         };
         for frame in training {
-            if let Some(p) = frame.integrals.iter().position(|v| !v.is_finite()) {
-                let (column, row) = (p % dataset.width, p / dataset.width);
-                return refuse(format!("{}: column {column}, row {row} is not a finite number", frame.name));
-            }
+            check_finite(dataset, frame)?;
             data.add_image(frame.integrals.iter().map(|v| (f64::from(*v) / attenuation) as f32).collect());
         }
-        let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
-        data.images_of_set = match settings.static_data {
-            StaticData::Pooled => vec![(0..training.len()).collect()],
-            StaticData::PerPhase => (0..dataset.n_phases).map(of_phase).collect(),
-        };
-        let unseen: Vec<usize> =
-            (0..data.images_of_set.len()).filter(|set| data.images_of_set[*set].is_empty()).collect();
-        match unseen.is_empty() {
-            true => Ok(data),
-            false => refuse(format!("no image shows the phases {unseen:?}: take sax.static_data = \"pooled\"")),
-        }
+        (data.images_of_set, _) = sets_of(dataset, settings.static_data, "sax.static_data")?;
+        Ok(data)
     }
 
     fn add_image(&mut self, image: Vec<f32>) {

@@ -278,7 +278,7 @@ impl SaxPass<'_> {
         };
         sampling.record(self.recording, (set.seed, 0, n_rays), 1.0, None)?;
         let push = push::SaxLoss { first_loss: index * n_rays };
-        self.run(set, &kernels.loss, Groups::Direct([n_rays, 1, 1]), push)
+        self.run(set, &kernels.loss, along_two_axes(n_rays), push)
     }
 
     /// Records the gradient of that loss by the Lineformer's numbers and by features.

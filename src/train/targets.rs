@@ -90,7 +90,7 @@ pub(super) fn losses(ring_buffer: &Buffer, steps: Range<u32>) -> Result<Vec<f64>
     match losses.iter().position(|l| !l.is_finite()) {
         Some(at) => {
             let step = u64::from(steps.start) + at as u64 + 1;
-            Err(Error::Diverged { step, quantity: "loss of the Gaussians", value: losses[at] })
+            Err(Error::Diverged { step, quantity: "loss", value: losses[at] })
         }
         None => Ok(losses),
     }

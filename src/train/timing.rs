@@ -188,6 +188,7 @@ impl Subject {
         dynamic.lr_end *= SLOWLY;
         still.lr_end *= SLOWLY;
         (dynamic.lr, still.lr) = (dynamic.lr_end, still.lr_end);
+        config.sax.rate *= SLOWLY;
         // As few Gaussians' iterations as can be, which leave the still field the same work.
         config.gaussians.iterations = 1;
         config.tree = Tree { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.tree };

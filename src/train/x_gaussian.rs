@@ -75,7 +75,7 @@ impl XTrainer {
         config.check()?;
         let mut config = config.clone();
         config.x.most = config.x.most.min(most_of_set(gpu, &data));
-        let n = check_count(state, &data)?;
+        let n = check_count(state, &data, config.x.weakest)?;
         let setup = gaussian_setup(&data, &config);
         let capacity = first_capacity(n, capacity_limit(gpu));
         let x = x_setup(&config.x, data.n_sets() as u32, [setup.width, setup.height], capacity);
@@ -157,7 +157,11 @@ impl XTrainer {
         self.step = status[0].step;
         let had_room = status[0].entries <= self.x.capacity;
         if !had_room {
-            self.set_capacity(more_capacity(status[0].entries, capacity_limit(&self.gpu))?)?;
+            self.set_capacity(more_capacity(
+                status[0].entries,
+                capacity_limit(&self.gpu),
+                ("x.most", self.config.x.most.into()),
+            )?)?;
         }
         Ok(had_room)
     }
@@ -216,7 +220,7 @@ impl XTrainer {
         if resets(x, self.step) {
             state.reset_opacities(x.reset_opacity);
         }
-        check_count(&state, &self.data)?;
+        check_count(&state, &self.data, self.config.x.weakest)?;
         self.seen = XSeenBuffers::new(&self.gpu, &state.rows, &state.sets, self.data.n_sets(), self.x.capacity)?;
         self.learning = XLearningBuffers::new(&self.gpu, &state, self.x.capacity)?;
         self.sets = state.sets;
@@ -296,7 +300,7 @@ fn capacity_limit(gpu: &Gpu) -> u32 {
 }
 
 /// Their number; a set without any cannot be fitted.
-fn check_count(state: &XState, data: &XData) -> Result<u32> {
+fn check_count(state: &XState, data: &XData, weakest: f64) -> Result<u32> {
     if let Some(bad) = state.sets.iter().find(|set| **set as usize >= data.n_sets()) {
         return Err(Error::config("checkpoint", bad, "its sets of Gaussians are not those of the images"));
     }
@@ -305,7 +309,7 @@ fn check_count(state: &XState, data: &XData) -> Result<u32> {
             "no Gaussian of {} is left: x.weakest is too high, or the images show nothing",
             data.name_of_set(empty)
         );
-        return Err(Error::config("x.weakest", 0, problem));
+        return Err(Error::config("x.weakest", weakest, problem));
     }
     u32::try_from(state.rows.len()).map_err(|_| Error::config("x.most", state.rows.len(), "too many Gaussians"))
 }

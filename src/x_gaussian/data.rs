@@ -8,7 +8,7 @@ use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{Gaussians, Units};
 use crate::model::x_gaussian::XState;
-use crate::r2::data::sets_of;
+use crate::r2::data::{check_finite, sets_of};
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
@@ -83,10 +83,7 @@ impl XData {
         let training = dataset.training();
         let (mut images, mut beyond) = (Vec::with_capacity(training.len() * dataset.n_pixels()), 0);
         for frame in training {
-            if let Some(p) = frame.integrals.iter().position(|v| !v.is_finite()) {
-                let (column, row) = (p % dataset.width, p / dataset.width);
-                return refuse(format!("{}: column {column}, row {row} is not a finite number", frame.name));
-            }
+            check_finite(dataset, frame)?;
             let in_units = frame.integrals.iter().map(|v| f64::from(*v) / unit);
             beyond += in_units.clone().filter(|v| *v > greatest).count();
             let low = if settings.clamp > 0.0 { 0.0 } else { f64::NEG_INFINITY };

@@ -44,7 +44,7 @@ pub fn densified(before: &XState, n_sets: usize, settings: &X, extent_mm: f64, (
         let of = |i: &usize| split(&before.rows[*i], |axis| deviate(seed, step, *i, 3 * child + axis));
         after.append(split_ones.iter().map(of).collect(), sets(&split_ones));
     }
-    let large_ones_go = step > settings.reset_every;
+    let large_ones_go = settings.reset_every > 0 && step > settings.reset_every;
     let stays = |(g, statistics): (&XGaussian, &XStatistics)| {
         let too_wide = g.scales().max_element() > settings.greatest_scale * extent_mm;
         let too_large = settings.greatest_radius > 0.0 && f64::from(statistics.radius) > settings.greatest_radius;
@@ -158,6 +158,7 @@ mod tests {
         };
         assert_eq!(left(&settings(), 600), [0.0, 2.0]);
         assert_eq!(left(&settings(), 4200), [0.0]);
+        assert_eq!(left(&X { reset_every: 0, ..settings() }, 4200), [0.0, 2.0], "nothing is ever reset");
         assert_eq!(left(&X { greatest_radius: 20.0, ..settings() }, 600), [0.0, 2.0]);
         assert!(left(&X { greatest_radius: 20.0, ..settings() }, 4200).is_empty());
         let full = X { most: 2, ..settings() };

@@ -28,17 +28,18 @@ pub fn first_capacity(n: u32, limit: u32) -> u32 {
     (FIRST_ENTRIES * n.max(256)).min(limit)
 }
 
-/// Room for lists that need more than there was.
+/// Room for lists that need more than there was. `asked` is the setting or size that they follow from, and its value.
 ///
 /// # Errors
 /// [`Error::Config`] where the device has no buffer so large.
-pub fn more_capacity(needed: u32, limit: u32) -> Result<u32> {
+pub fn more_capacity(needed: u32, limit: u32, asked: (&str, u64)) -> Result<u32> {
     if needed > limit {
         let problem = format!(
             "the Gaussians cover {needed} tiles of 16 x 16 pixels, and a buffer of this device has room for {limit}: take \
-             a larger x.interval, or x.static_data = \"pooled\""
+             smaller pictures, a larger x.interval, or x.static_data = \"pooled\""
         );
-        return Err(Error::config("x.most", needed, problem));
+        let (field, value) = asked;
+        return Err(Error::config(field, value, problem));
     }
     Ok(needed.saturating_add(needed / MORE_ROOM).min(limit))
 }
@@ -132,7 +133,8 @@ impl BlendedPicture {
             if counts[0].entries <= self.x.capacity {
                 return Ok(&self.scene.splat_images);
             }
-            self.x.capacity = more_capacity(counts[0].entries, capacity_limit(gpu))?;
+            let columns = u64::from(self.x.tile_columns * TILE);
+            self.x.capacity = more_capacity(counts[0].entries, capacity_limit(gpu), ("size", columns))?;
             gpu.upload(&self.scene.x_setup, 0, &[self.x])?;
             self.seen.make_room(gpu, self.x.capacity)?;
         }
