@@ -87,10 +87,6 @@ fn sum_for_product(words: &mut [u32]) {
     replace(words, MULTIPLY, ADD);
 }
 
-fn negated(words: &mut [u32]) {
-    replace(words, ADD, SUBTRACT);
-}
-
 fn differences(words: &mut [u32]) {
     replace(words, WHOLE_ADD, WHOLE_SUBTRACT);
 }
@@ -99,6 +95,7 @@ fn other_digits(words: &mut [u32]) {
     replace(words, SHIFT_RIGHT, SHIFT_LEFT);
 }
 
+/// Not for stages that add up a workgroup: they would read shared memory that nobody has written, at times NaN.
 fn one_too_many(words: &mut [u32]) {
     replace(words, LESS, LESS_OR_EQUAL);
 }
@@ -157,19 +154,19 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("gaussian_moments", wrong_sign, gaussians::compare),
         fault("gaussian_update", wrong_sign, gaussians::compare),
         fault("tree_grid_gradient", wrong_sign, trees::compare),
-        fault("march_fwd", one_too_many, an_iteration),
+        fault("march_fwd", sum_for_product, an_iteration),
         fault("gradient_static", missing_clear, an_iteration),
         fault("mlp_latent_bwd", sum_for_product, an_iteration),
         fault("adam", wrong_sign, an_iteration),
-        fault("march_fwd_samples", one_too_many, two_networks),
+        fault("march_fwd_samples", difference_for_sum, two_networks),
         fault("loss_samples", wrong_sign, two_networks),
-        fault("loss_samples", one_too_many, two_networks),
+        fault("loss_samples", sum_for_product, two_networks),
         fault("r2_project", wrong_sign, r2::compare),
         fault("ssim_rows", sum_for_product, r2::compare),
         fault("ssim_columns", wrong_sign, r2::compare),
         fault("r2_residual", wrong_sign, r2::compare),
         fault("r2_voxel_splat", wrong_sign, r2::compare),
-        fault("r2_voxel_tv", one_too_many, r2::compare),
+        fault("r2_voxel_tv", sum_for_product, r2::compare),
         fault("r2_voxel_moments", wrong_sign, r2::compare),
         fault("r2_update", wrong_sign, r2::compare),
         fault("x_project", wrong_sign, x_gaussian::compare),
@@ -180,7 +177,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("x_blend", wrong_sign, x_gaussian::compare),
         fault("x_blend_back", wrong_sign, x_gaussian::compare),
         fault("x_update", wrong_sign, x_gaussian::compare),
-        fault("x_report", negated, x_gaussian::compare),
+        fault("x_report", difference_for_sum, x_gaussian::compare),
         fault("sax_batch", one_too_many, sax::compare),
         fault("sax_points", wrong_sign, sax::compare),
         fault("sax_encode", wrong_sign, sax::compare),
@@ -199,14 +196,14 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         let open = || Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap();
         let first_failure = || {
             let mut findings = Findings::default();
-            compare(&open(), &mut findings).unwrap();
+            compare(&open(), &mut findings).unwrap_or_else(|error| panic!("{stage}: {error}"));
             findings.rows().iter().find(|row| !row.is_ok()).map(|row| row.stages.clone())
         };
         assert_eq!(first_failure(), None, "without a fault");
         let words = code(&open(), stage);
         let mut faulty = words.clone();
         plant(&mut faulty);
-        assert_ne!(words, faulty, "{stage} has no such instruction");
+        assert!(words != faulty, "{stage} has no such instruction");
         shim::plant(words, faulty);
         let found = first_failure().unwrap_or_else(|| panic!("the fault in {stage} was not seen"));
         println!("{stage}: {found:?}");
