@@ -1,20 +1,23 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Closes an iteration: sums the losses into a ring the host reads now and then, adapts the loss scale, and counts
-// the step.
+// the step. On the way, a slice of the next epoch's occupancy is cleared: all of it within one epoch.
 //   ring[step % ring_length]: what the iteration came to; once learning has ended, what the last one came to.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint loss_scaling = 0u;
+layout(push_constant) uniform Push { uint n_tv_parts; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { vec4 ray_loss[]; };
-layout(binding = 3) readonly buffer B3 { float tv_value[]; };
+layout(binding = 3) readonly buffer B3 { float tv_parts[]; };
 layout(binding = 4) readonly buffer B4 { LiveSamples live; };
 layout(binding = 5) buffer B5 { StepReport ring[]; };
 layout(binding = 6) readonly buffer B6 { vec4 ray_regularisers[]; };
 layout(binding = 7) readonly buffer B7 { Schedule schedule[]; };
+layout(binding = 8) writeonly buffer B8 { uint occupancy[]; };
 #include "inc/reduce.glsl"
+#include "inc/occupancy.glsl"
 
 const uint GOOD_UPDATES_TO_GROW = 500u;
 const float LARGEST_SCALE = 16777216.0;
@@ -44,8 +47,18 @@ StepReport with_regularisers(StepReport result, vec4 regularisers) {
     return result;
 }
 
+void clear_occupancy() {
+    uint words = occupancy_words();
+    uint slice = (words + OCCUPANCY_EPOCH - 1u) / OCCUPANCY_EPOCH;
+    uint first = state.step % OCCUPANCY_EPOCH * slice;
+    uint next = (state.step / OCCUPANCY_EPOCH + 1u) % OCCUPANCY_EPOCHS;
+    for (uint word = first + gl_LocalInvocationID.x; word < min(first + slice, words); word += gl_WorkGroupSize.x)
+        occupancy[next * words + word] = 0u;
+}
+
 void main() {
     uint lane = gl_LocalInvocationID.x;
+    if (setup.occupancy_cells != 0u) clear_occupancy();
     bool two_networks = setup.two_networks != 0u;
     vec4 losses = vec4(0.0);
     vec4 regularisers = vec4(0.0);
@@ -54,8 +67,7 @@ void main() {
         if (two_networks) regularisers += ray_regularisers[r];
     }
     float tv = 0.0;
-    uint n_tv = two_networks ? 0u : setup.static_params;
-    for (uint i = lane; i < n_tv; i += gl_WorkGroupSize.x) tv += tv_value[i];
+    for (uint i = lane; i < push.n_tv_parts; i += gl_WorkGroupSize.x) tv += tv_parts[i];
     float data = workgroup_sum(losses.x);
     float dynamic_data = workgroup_sum(losses.y);
     float occlusion = workgroup_sum(losses.z);

@@ -60,7 +60,7 @@ trait Path: Send + Sync {
     /// Where in a part of the samples' sums the gradient of each network parameter lies.
     fn gradient_source(&self, params: &NetworkMap) -> Vec<u32>;
 
-    /// Records what depends on parameters alone; `phase_bias` is there.
+    /// Records what depends on parameters alone.
     fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()>;
 
     /// Records the network over the live samples: `sample_sigma`.
@@ -119,12 +119,10 @@ pub struct Network {
 }
 
 buffer_set! {
-    /// What follows from parameters alone, and where these are.
+    /// Where parameters are.
     struct WeightBuffers {
         /// Of each layer its bias and its weights on latents; NOWHERE: it has none.
         network_layers,
-        /// Bias and latents of each phase, `[layer][phase][neuron]`.
-        phase_bias,
     }
 }
 
@@ -155,10 +153,7 @@ impl Network {
             .iter()
             .map(|layer| [layer.bias as u32, layer.latent.map_or(NOWHERE, |at| at as u32)])
             .collect();
-        let weights = WeightBuffers {
-            network_layers: gpu.buffer_with("network_layers", &layers)?,
-            phase_bias: gpu.buffer("phase_bias", rows * 4, Memory::Device)?,
-        };
+        let weights = WeightBuffers { network_layers: gpu.buffer_with("network_layers", &layers)? };
         let gradient = match purpose {
             Purpose::Render => None,
             Purpose::Train => {
@@ -219,10 +214,6 @@ impl Network {
     /// # Errors
     /// As [`Pass::run`]; so do all that follow.
     pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let (stage, params) = (&pass.kernels.mlp_latent_fwd, pass.network.map());
-        let push = push::MlpLatentFwd { layers: params.layers.len() as u32, latents: params.latents as u32 };
-        let rows = (params.layers.len() * params.phases * params.width) as u32;
-        pass.run(stage, stage.groups_for(rows), push)?;
         self.path.record_weights(pass)
     }
 

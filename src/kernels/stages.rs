@@ -137,34 +137,22 @@ pub struct Kernels {
     pub march_scan: Stage<push::MarchScan>,
     /// Writes live samples.
     pub march_emit: Stage<push::MarchEmit>,
-    /// Notes which cells are empty.
-    pub occupancy_mark: Stage<push::OccupancyMark>,
-    /// Prepares the next epoch's notes.
-    pub occupancy_clear: Stage<push::OccupancyClear>,
-    /// Line integrals.
-    pub march_fwd: Stage<push::MarchFwd>,
+    /// Line integrals, residuals and their gradients, and the scatter to planes and lines.
+    pub march_loss: Stage<push::MarchLoss>,
     /// Line integrals and maxima, for rendering.
-    pub march_fwd_maxima: Stage<push::MarchFwd>,
+    pub march_fwd: Stage<push::MarchFwd>,
     /// Cells of the dynamic field.
     pub volume_dynamic: Stage<push::VolumeDynamic>,
     /// Cells of the static field.
     pub volume_static: Stage<push::VolumeStatic>,
     /// Line integrals and maxima of baked volumes.
     pub baked_march: Stage<push::BakedMarch>,
-    /// Residuals and their gradients.
-    pub loss: Stage<push::Loss>,
-    /// Scatter to planes and lines.
-    pub march_bwd: Stage<push::MarchBwd>,
-    /// Bias and latent, one row per phase.
-    pub mlp_latent_fwd: Stage<push::MlpLatentFwd>,
     /// Gradients of biases, latent weights and latents.
     pub mlp_latent_bwd: Stage<push::MlpLatentBwd>,
-    /// Gradient of the static field.
+    /// Gradient of the static field, with its total variation.
     pub gradient_static: Stage<push::GradientStatic>,
     /// Gradient of the network.
     pub gradient_network: Stage<push::GradientNetwork>,
-    /// Total variation.
-    pub reg_tv: Stage<push::RegTv>,
     /// The optimiser.
     pub adam: Stage<push::Adam>,
     /// Losses, loss scale and step count.
@@ -189,20 +177,14 @@ impl Kernels {
             march_count: plain.stage(gpu)?,
             march_scan: plain.stage(gpu)?,
             march_emit: plain.stage(gpu)?,
-            occupancy_mark: plain.stage(gpu)?,
-            occupancy_clear: plain.stage(gpu)?,
+            march_loss: Build { constants: &private_lines, exchanges: true, ..vec4 }.stage(gpu)?,
             march_fwd: Build { exchanges: true, ..vec4 }.stage(gpu)?,
-            march_fwd_maxima: Build { constants: &[("with_maxima", 1)], exchanges: true, ..vec4 }.stage(gpu)?,
             volume_dynamic: plain.stage(gpu)?,
             volume_static: vec4.stage(gpu)?,
             baked_march: plain.stage(gpu)?,
-            loss: plain.stage(gpu)?,
-            march_bwd: Build { constants: &private_lines, ..vec4 }.stage(gpu)?,
-            mlp_latent_fwd: plain.stage(gpu)?,
             mlp_latent_bwd: plain.stage(gpu)?,
-            gradient_static: plain.stage(gpu)?,
+            gradient_static: sums.stage(gpu)?,
             gradient_network: Build { constants: &parts, ..plain }.stage(gpu)?,
-            reg_tv: plain.stage(gpu)?,
             adam: plain.stage(gpu)?,
             report: Build { constants: &loss_scaling, ..sums }.stage(gpu)?,
             tuning,
@@ -233,6 +215,8 @@ impl StillKernels {
 pub struct LayerKernels {
     /// Choices they were built with.
     pub tuning: Tuning,
+    /// Bias and latent, one row per phase.
+    pub mlp_latent_fwd: Stage<push::MlpLatentFwd>,
     /// Positional encoding.
     pub encode: Stage<push::Encode>,
     /// One hidden layer.
@@ -264,6 +248,7 @@ impl LayerKernels {
         let layer = Build { variant: layer_variant(&tuning), lanes: Some(tuning.layer_lanes), ..plain };
         let weight_lanes = Some(tuning.weight_lanes);
         Ok(LayerKernels {
+            mlp_latent_fwd: plain.stage(gpu)?,
             encode: plain.stage(gpu)?,
             mlp_layer_fwd: layer.stage(gpu)?,
             mlp_out_fwd: vec4.stage(gpu)?,

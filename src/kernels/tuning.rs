@@ -174,7 +174,7 @@ impl Tuning {
         }
     }
 
-    /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_bwd`.
+    /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_loss`.
     pub(super) fn private_lines(&self, line_params: u32) -> u32 {
         if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
     }

@@ -18,6 +18,11 @@ impl Chunk {
         Groups::Direct([self.n_rays, 1, 1])
     }
 
+    /// Whether it ends a batch of `n_rays`.
+    pub fn is_last(self, n_rays: u32) -> bool {
+        self.first_ray + self.n_rays == n_rays
+    }
+
     /// 1 for all chunks of a batch but the first: sums add to what that one wrote.
     pub fn accumulate(self) -> u32 {
         u32::from(self.first_ray > 0)

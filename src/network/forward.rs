@@ -208,7 +208,7 @@ impl Pass<'_> {
             match self.still {
                 None => {
                     let push = push::MarchFwd { first_ray, n_rays };
-                    self.run(&self.kernels.march_fwd_maxima, chunk.per_ray(), push)?;
+                    self.run(&self.kernels.march_fwd, chunk.per_ray(), push)?;
                 }
                 Some(still) => still.record_integrals(self, chunk, true)?,
             }

@@ -328,11 +328,13 @@ impl Path for FusedNetwork {
         self.shape.gradient_source(params)
     }
 
-    /// f16 copies of the weights.
+    /// f16 copies of the weights, bias and latent of each phase among them.
     fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
         let n_pairs = (self.shape.weights_len / 2) as u32;
-        let n_bias = pass.network.map().layers.len() as u32 * self.shape.matrix.m * pass.network.map().width as u32;
-        pass.run(&self.mlp_pack, self.mlp_pack.groups_for(n_pairs + n_bias), push::MlpPack { n_pairs, n_bias })
+        let params = pass.network.map();
+        let n_bias = params.layers.len() as u32 * self.shape.matrix.m * params.width as u32;
+        let push = push::MlpPack { n_pairs, n_bias, latents: params.latents as u32 };
+        pass.run(&self.mlp_pack, self.mlp_pack.groups_for(n_pairs + n_bias), push)
     }
 
     fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {

@@ -32,6 +32,8 @@ buffer_set! {
         sample_times,
         /// Encoding of each live sample.
         features,
+        /// Bias and latents of each phase, `[layer][phase][neuron]`.
+        phase_bias,
     }
 }
 
@@ -61,6 +63,7 @@ impl LayerNetwork {
         purpose: Purpose,
     ) -> Result<LayerNetwork> {
         let capacity = u64::from(setup.sample_capacity);
+        let rows = (params.layers.len() * params.phases * params.width) as u64;
         let neurons_bytes = capacity * params.width as u64 * 4;
         let operand = |name: &str, bytes: u64| gpu.operand_buffer(name, bytes, tuning.operands);
         let training = match purpose {
@@ -81,6 +84,7 @@ impl LayerNetwork {
             buffers: LayerBuffers {
                 sample_times: gpu.buffer("sample_times", capacity * size_of::<SampleTime>() as u64, Memory::Device)?,
                 features: operand("features", capacity * params.encode_groups as u64 * 16)?,
+                phase_bias: gpu.buffer("phase_bias", rows * F32_BYTES, Memory::Device)?,
             },
             activations: (0..params.layers.len())
                 .map(|i| operand(&format!("activations_{i}"), neurons_bytes))
@@ -242,8 +246,11 @@ impl Path for LayerNetwork {
         (0..params.len as u32).collect()
     }
 
-    fn record_weights(&self, _: &mut Pass<'_>) -> Result<()> {
-        Ok(())
+    fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
+        let (stage, params) = (&self.kernels.mlp_latent_fwd, pass.network.map());
+        let push = push::MlpLatentFwd { layers: params.layers.len() as u32, latents: params.latents as u32 };
+        let rows = (params.layers.len() * params.phases * params.width) as u32;
+        pass.run(stage, stage.groups_for(rows), push)
     }
 
     /// `encode`, `mlp_layer_fwd` of each layer and `mlp_out_fwd`.

@@ -163,7 +163,7 @@ pub fn statics(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: b
     out
 }
 
-/// Marches one ray (twin of `march_count`..`march_fwd`).
+/// Marches one ray (twin of `march_count`..`march_emit`, `march_fwd` and `march_loss`).
 pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool, precision: Precision) -> March {
     let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
     let row = plan.schedule[step as usize];
@@ -187,7 +187,7 @@ pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool,
     out
 }
 
-/// Adds the gradient of a ray, given dL/dS and dL/dD of its integrals (twin of `march_bwd`, `mlp_*_bwd`).
+/// Adds the gradient of a ray, given dL/dS and dL/dD of its integrals (twin of `march_loss`, `mlp_*_bwd`).
 pub fn bwd(
     plan: &Plan,
     params: &[f64],

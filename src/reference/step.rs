@@ -59,7 +59,7 @@ pub struct RayLoss {
     pub gradient: [f64; 2],
 }
 
-/// Losses of ray `r` of `n_rays`, whose integrals are S and D (twin of `loss`).
+/// Losses of ray `r` of `n_rays`, whose integrals are S and D (twin of `march_loss`).
 pub fn ray_loss(plan: &Plan, r: usize, n_rays: usize, ray: &Ray, [s_integral, d]: [f64; 2]) -> RayLoss {
     let s = &plan.setup;
     let temporal = s.temporal_target != 0;
@@ -104,7 +104,7 @@ pub fn loss_and_gradient(
     (losses, gradient)
 }
 
-/// Value of the total variation; adds its gradient (twin of `reg_tv`; method, section 4).
+/// Value of the total variation; adds its gradient (twin of `gradient_static`; method, section 4).
 pub fn total_variation(plan: &Plan, params: &[f64], gradient: &mut [f64]) -> f64 {
     let (s, p) = (&plan.setup, &plan.params);
     let (d, ranks) = (p.grid, p.ranks);

@@ -21,6 +21,7 @@ use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::problems::small_config;
 use crate::train::losses::StepLoss;
+use crate::train::step::tv_parts;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
@@ -97,10 +98,9 @@ const RAYS: &[&str] = &[push::Batch::SHADER];
 const SAMPLES: &[&str] = &[push::MarchCount::SHADER, push::MarchScan::SHADER, push::MarchEmit::SHADER];
 const FORWARD: &[&str] =
     &[push::MlpLatentFwd::SHADER, push::Encode::SHADER, push::MlpLayerFwd::SHADER, push::MlpOutFwd::SHADER];
-const FORWARD_ON_MATRICES: &[&str] = &[push::MlpLatentFwd::SHADER, push::MlpPack::SHADER, push::MlpFusedFwd::SHADER];
-const INTEGRALS: &[&str] = &[push::MarchFwd::SHADER];
-const LOSS: &[&str] = &[push::Loss::SHADER];
-const SCATTER: &[&str] = &[push::MarchBwd::SHADER, push::GradientStatic::SHADER];
+const FORWARD_ON_MATRICES: &[&str] = &[push::MlpPack::SHADER, push::MlpFusedFwd::SHADER];
+const LOSS: &[&str] = &[push::MarchLoss::SHADER];
+const STATIC_GRADIENT: &[&str] = &[push::MarchLoss::SHADER, push::GradientStatic::SHADER];
 const OUTPUT_BACKWARD: &[&str] =
     &[push::MlpOutBwd::SHADER, push::MlpOutBwdWeight::SHADER, push::GradientNetwork::SHADER];
 const LAYERS_BACKWARD: &[&str] = &[push::MlpLayerBwdInput::SHADER, push::MlpLayerBwdWeight::SHADER];
@@ -110,7 +110,7 @@ const BACKWARD_AGAIN_ON_MATRICES: &[&str] =
     &[push::MlpFusedBwd::SHADER, push::MlpFusedBwdFirst::SHADER, push::GradientNetwork::SHADER];
 const LATENTS_BACKWARD: &[&str] = &[push::MlpRaySum::SHADER, push::MlpPhaseSum::SHADER, push::MlpLatentBwd::SHADER];
 const LATENTS_BACKWARD_ON_MATRICES: &[&str] = &[push::MlpLatentBwd::SHADER];
-const TOTAL_VARIATION: &[&str] = &[push::RegTv::SHADER];
+const TOTAL_VARIATION: &[&str] = &[push::GradientStatic::SHADER];
 const ADAM: &[&str] = &[push::Adam::SHADER];
 const REPORT: &[&str] = &[push::Report::SHADER];
 /// All stages of an iteration at once.
@@ -163,8 +163,7 @@ struct Seen {
     ray_out: Vec<RayOut>,
     ray_gradient: Vec<[f32; 2]>,
     ray_loss: Vec<[f32; 4]>,
-    tv_gradient: Vec<f32>,
-    tv_value: Vec<f32>,
+    tv_parts: Vec<f32>,
     gradient: Vec<f32>,
     /// Live samples, where one chunk holds all.
     samples: Option<Vec<Sample>>,
@@ -191,11 +190,14 @@ impl Seen {
             ray_out: gpu.download(&forward.ray_out, 0, n)?,
             ray_gradient: gpu.download(&training.ray_gradient, 0, n)?,
             ray_loss: gpu.download(&training.ray_loss, 0, n)?,
-            tv_gradient: gpu.download(&training.tv_gradient, 0, plan.params.static_len)?,
-            tv_value: gpu.download(&training.tv_value, 0, plan.params.static_len)?,
+            tv_parts: gpu.download(&training.tv_parts, 0, tv_parts(&plan.params) as usize)?,
             gradient: gpu.download(&training.gradient, 0, plan.params.len)?,
             samples: one_chunk.then(|| samples(gpu, trainer, loss.live_samples as usize)).transpose()?,
         })
+    }
+
+    fn total_variation(&self) -> f64 {
+        self.tv_parts.iter().map(|part| f64::from(*part)).sum()
     }
 }
 
@@ -266,7 +268,7 @@ fn compare_stages(
     twin.compare_integrals(&seen, findings);
     twin.compare_loss(&seen, findings);
     twin.compare_total_variation(&seen, findings);
-    twin.compare_scatter(&seen, findings);
+    twin.compare_static_gradient(&seen, findings);
     if let Some(samples) = &seen.samples {
         twin.compare_backward(samples, &seen, findings);
     }
@@ -401,7 +403,7 @@ impl Twin<'_> {
         let statics = |r: usize| self.march_statics(r).static_integral;
         let want: Vec<f64> = (0..self.rays.len()).map(statics).collect();
         let got: Vec<f32> = seen.ray_out.iter().map(|out| out.static_integral).collect();
-        findings.numbers(INTEGRALS, "static integral", &got, &want, F32_SUMS);
+        findings.numbers(LOSS, "static integral", &got, &want, F32_SUMS);
         let Some(samples) = &seen.samples else { return };
         let (mut dynamics, mut near) = (vec![0.0; self.rays.len()], vec![0.0; self.rays.len()]);
         for sample in samples.iter().filter(|sample| sample.ray < self.rays.len()) {
@@ -410,10 +412,10 @@ impl Twin<'_> {
             near[sample.ray] += if sample.near { part } else { 0.0 };
         }
         let got: Vec<f32> = seen.ray_out.iter().map(|out| out.dynamic_integral).collect();
-        findings.numbers(INTEGRALS, "dynamic integral", &got, &dynamics, F32_SUMS);
+        findings.numbers(LOSS, "dynamic integral", &got, &dynamics, F32_SUMS);
         if self.plan.setup.occlusion_weight > 0.0 {
             let got: Vec<f32> = seen.ray_out.iter().map(|out| out.occlusion).collect();
-            findings.numbers(INTEGRALS, "occlusion", &got, &near, F32_SUMS);
+            findings.numbers(LOSS, "occlusion", &got, &near, F32_SUMS);
         }
     }
 
@@ -441,16 +443,12 @@ impl Twin<'_> {
     }
 
     fn compare_total_variation(&self, seen: &Seen, findings: &mut Findings) {
-        let mut gradient = vec![0.0; self.plan.params.len];
-        let value = step::total_variation(self.plan, self.params, &mut gradient);
-        let statics = &gradient[..self.plan.params.static_len];
-        findings.numbers(TOTAL_VARIATION, "gradient", &seen.tv_gradient, statics, F32_SUMS);
-        let sum: f64 = seen.tv_value.iter().map(|v| f64::from(*v)).sum();
-        findings.add(TOTAL_VARIATION, "value", relative(sum, value), IN_F32.loss);
+        let value = step::total_variation(self.plan, self.params, &mut vec![0.0; self.plan.params.len]);
+        findings.add(TOTAL_VARIATION, "value", relative(seen.total_variation(), value), IN_F32.loss);
     }
 
-    /// Gradient of the static field by the device's ray gradients, total variation aside.
-    fn compare_scatter(&self, seen: &Seen, findings: &mut Findings) {
+    /// Gradient of the static field by the device's ray gradients, and by the total variation.
+    fn compare_static_gradient(&self, seen: &Seen, findings: &mut Findings) {
         let params = &self.plan.params;
         let mut want = vec![0.0; params.len];
         for (r, ray) in self.rays.iter().enumerate() {
@@ -458,10 +456,10 @@ impl Twin<'_> {
             let statics = self.march_statics(r);
             march::bwd(self.plan, self.params, ray, &statics, by_integrals, self.precision, &mut want);
         }
-        let got: Vec<f32> = seen.gradient.iter().zip(&seen.tv_gradient).map(|(all, tv)| all - tv).collect();
+        step::total_variation(self.plan, self.params, &mut want);
         for tensor in params.tensors().iter().filter(|tensor| is_static(tensor)) {
-            let (got, want) = (pick(&tensor.positions, &got), pick(&tensor.positions, &want));
-            findings.numbers(SCATTER, &tensor.name, &got, &want, F32_SUMS);
+            let (got, want) = (pick(&tensor.positions, &seen.gradient), pick(&tensor.positions, &want));
+            findings.numbers(STATIC_GRADIENT, &tensor.name, &got, &want, F32_SUMS);
         }
     }
 
@@ -485,13 +483,12 @@ impl Twin<'_> {
     /// Sums of what the device's rays came to.
     fn compare_report(&self, seen: &Seen, findings: &mut Findings) {
         let sum = |k: usize| seen.ray_loss.iter().map(|loss| f64::from(loss[k])).sum::<f64>();
-        let tv: f64 = seen.tv_value.iter().map(|v| f64::from(*v)).sum();
         let occlusion = f64::from(self.plan.setup.occlusion_weight) * sum(2);
         let loss = &seen.loss;
         for (name, got, want) in [
             ("data", loss.data, sum(0)),
             ("dynamic data", loss.dynamic, sum(1)),
-            ("total variation", loss.tv, tv),
+            ("total variation", loss.tv, seen.total_variation()),
             ("occlusion", loss.occlusion, occlusion),
             ("squared error", loss.squared_error, sum(3)),
         ] {

@@ -17,7 +17,7 @@ use crate::train::losses::StepLoss;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
-const NOTES: &[&str] = &[push::OccupancyMark::SHADER, push::OccupancyClear::SHADER];
+const NOTES: &[&str] = &[push::MarchLoss::SHADER, push::Report::SHADER];
 const HEEDED: &[&str] = &["empty cells are left out"];
 
 /// The iteration whose samples are compared with those that the notes let live; notes are heeded from iteration 100 on.

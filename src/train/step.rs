@@ -1,10 +1,10 @@
 //! One training iteration, top to bottom:
 //!
-//! batch -> march_count -> march_scan -> march_emit -> network forward -> march_fwd -> loss
-//! -> march_bwd, network backward -> reg_tv -> gradient_* -> adam -> report
+//! batch -> march_count -> march_scan -> march_emit -> network forward -> march_loss -> gradient_static, network backward
+//! -> gradient_network -> adam -> report
 //!
-//! Where the still field is a network, too, `march_fwd_samples` and `loss_samples` take the places of `march_fwd` and `loss`, and its
-//! passes those of `march_bwd` and `reg_tv`.
+//! Where the still field is a network, too, `march_fwd_samples`, `loss_samples` and its backward passes take the place of
+//! `march_loss`, and its gradient that of `gradient_static`.
 //!
 //! Nothing here waits for the host: counters, schedules and random numbers live on the device.
 
@@ -12,11 +12,11 @@ use crate::error::Result;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
-use crate::kernels::constants::OCCUPANCY_EPOCH;
 use crate::kernels::dispatch::{Binding, buffer_set};
 use crate::kernels::layout::StepReport;
-use crate::kernels::push;
+use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
+use crate::model::params::ParamMap;
 use crate::network::Network;
 use crate::network::chunk::{Chunk, chunks};
 use crate::network::forward::ForwardBuffers;
@@ -50,10 +50,8 @@ buffer_set! {
         sigma_gradient,
         /// Gradient of the static field in 64-bit fixed point.
         static_gradient,
-        /// Gradient of the total variation.
-        tv_gradient,
-        /// Total variation of each static parameter.
-        tv_value,
+        /// Total variation, a part per workgroup of `gradient_static`.
+        tv_parts,
         /// Gradient of all parameters.
         gradient,
         /// First and second moment of each parameter's gradient.
@@ -88,8 +86,7 @@ impl TrainingBuffers {
             ray_regularisers: new(Binding::ray_regularisers, if_two(n_rays * 16))?,
             sigma_gradient: new(Binding::sigma_gradient, if_two(u64::from(plan.setup.sample_capacity) * 4))?,
             static_gradient: new(Binding::static_gradient, static_len * 8)?,
-            tv_gradient: new(Binding::tv_gradient, static_len * 4)?,
-            tv_value: new(Binding::tv_value, static_len * 4)?,
+            tv_parts: new(Binding::tv_parts, u64::from(tv_parts(&plan.params).max(1)) * 4)?,
             gradient: new(Binding::gradient, len * 4)?,
             moments: new(Binding::moments, len * 8)?,
         })
@@ -139,29 +136,30 @@ pub fn clear<'a>(
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
 pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
-    let (k, network, buffers, setup) = (pass.kernels, pass.network, pass.buffers, pass.setup);
+    let (k, network, setup) = (pass.kernels, pass.network, pass.setup);
     pass.run(&k.batch, k.batch.groups_for(setup.n_rays), push::Batch {})?;
     pass.weights()?;
     for chunk in chunks(setup, setup.n_rays) {
         pass.samples(chunk)?;
         pass.fields()?;
-        if setup.occupancy_cells > 0 {
-            pass.run(&k.occupancy_mark, buffers.per_sample(), push::OccupancyMark {})?;
-        }
         record_losses(pass, chunk)?;
+        if chunk.is_last(setup.n_rays) {
+            // Before the network's backward passes, beside which it may run: they write none of what it does.
+            record_static_gradient(pass)?;
+        }
         network.record_backward(pass, chunk)?;
     }
-    record_static_gradient(pass)?;
     network.record_gradient(pass)?;
-    if setup.occupancy_cells > 0 {
-        let slice = (setup.occupancy_words() as u32).div_ceil(OCCUPANCY_EPOCH);
-        pass.run(&k.occupancy_clear, k.occupancy_clear.groups_for(slice), push::OccupancyClear {})?;
-    }
     pass.run(&k.adam, k.adam.groups_over(setup.n_params), push::Adam {})?;
-    pass.run(&k.report, Groups::Direct([1, 1, 1]), push::Report {})
+    pass.run(&k.report, Groups::Direct([1, 1, 1]), push::Report { n_tv_parts: tv_parts(pass.params) })
 }
 
-/// Records integrals and losses of a chunk, and the backward pass of the static field.
+/// Parts that the total variation comes in, one per workgroup of `gradient_static`; none where the still field is a network.
+pub fn tv_parts(params: &ParamMap) -> u32 {
+    if params.still.is_some() { 0 } else { (params.static_len as u32).div_ceil(push::GradientStatic::LOCAL_SIZE) }
+}
+
+/// Records integrals and losses of a chunk, and the backward pass of the static field up to sums over its samples.
 fn record_losses(pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
     let (k, Chunk { first_ray, n_rays }) = (pass.kernels, chunk);
     if let Some(still) = pass.still {
@@ -169,9 +167,7 @@ fn record_losses(pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         still.record_losses(pass, chunk)?;
         return still.record_backward(pass, chunk);
     }
-    pass.run(&k.march_fwd, chunk.per_ray(), push::MarchFwd { first_ray, n_rays })?;
-    pass.run(&k.loss, k.loss.groups_for(n_rays), push::Loss { first_ray, n_rays })?;
-    pass.run(&k.march_bwd, chunk.per_ray(), push::MarchBwd { first_ray, n_rays })
+    pass.run(&k.march_loss, chunk.per_ray(), push::MarchLoss { first_ray, n_rays })
 }
 
 /// Records the gradient of the static field's parameters.
@@ -180,7 +176,6 @@ fn record_static_gradient(pass: &mut Pass<'_>) -> Result<()> {
     if let Some(still) = pass.still {
         return still.record_gradient(pass);
     }
-    let static_len = params.static_len as u32;
-    pass.run(&k.reg_tv, k.reg_tv.groups_over(static_len), push::RegTv { ranks: params.ranks as u32 })?;
-    pass.run(&k.gradient_static, k.gradient_static.groups_over(static_len), push::GradientStatic {})
+    let groups = k.gradient_static.groups_over(params.static_len as u32);
+    pass.run(&k.gradient_static, groups, push::GradientStatic { ranks: params.ranks as u32 })
 }

@@ -1,0 +1,150 @@
+#version 450
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
+// A ray of a batch from its samples to the gradient, one workgroup per ray:
+//   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term;
+//   ray_gradient[ray], ray_loss[ray]: its loss by them (inc/ray_loss.glsl);
+//   static_gradient[2 * parameter] = low, high word of dL/d sigma_l scattered to planes and lines.
+// Where samples of the dynamic field were empty is noted on the way (inc/occupancy.glsl).
+//
+// The scatter is summed as 64-bit fixed point in pairs of 32-bit integer atomics, which is exact and hence independent of
+// order. Every sample of every ray meets the few texels of the lines: with `private_lines` a workgroup sums its own in shared
+// memory first, so that they reach memory once per ray.
+#include "inc/layout.glsl"
+#include "inc/random.glsl"
+#include "inc/depths.glsl"
+#include "inc/softplus.glsl"
+#include "inc/sample_rays.glsl"
+#include "inc/fixed_point.glsl"
+#include "inc/operands.glsl"
+layout(local_size_x = 32, local_size_x_id = 0) in;
+layout(constant_id = 1) const uint private_lines = 0u;  // numbers on all lines, or 0: straight to memory
+layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
+layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 1) readonly buffer B1 { DeviceState state; };
+layout(binding = 2) readonly buffer B2 { Ray rays[]; };
+layout(binding = 3) readonly buffer B3 { uint ray_start[]; };
+layout(binding = 4) readonly buffer B4 { vec4 sample_points[]; };
+layout(binding = 5) readonly buffer B5 { uint sample_rays[]; };
+layout(binding = 6) readonly buffer B6 { vec2 sample_sigma[]; };
+READ_VEC4(7, B7, static_params);
+layout(binding = 8) writeonly buffer B8 { RayOut ray_out[]; };
+layout(binding = 9) writeonly buffer B9 { vec2 ray_gradient[]; };
+layout(binding = 10) writeonly buffer B10 { vec4 ray_loss[]; };
+layout(binding = 11) buffer B11 { uint static_gradient[]; };
+layout(binding = 12) buffer B12 { uint occupancy[]; };
+#include "inc/tensor_vm.glsl"
+#include "inc/reduce.glsl"
+#include "inc/static_rays.glsl"
+#include "inc/static_samples.glsl"
+#include "inc/ray_loss.glsl"
+#include "inc/occupancy.glsl"
+
+shared uint line_sums[2u * private_lines + 1u];
+
+void note_cell(uint entry, uint bits) {
+    uint epoch = state.step / OCCUPANCY_EPOCH;
+    uint word = (epoch % OCCUPANCY_EPOCHS) * occupancy_words() + entry / CELLS_PER_WORD;
+    atomicOr(occupancy[word], bits << (2u * (entry % CELLS_PER_WORD)));
+}
+
+// Notes for the cell of a live sample, at the phases that it shows, that it was seen, and whether it was occupied: of a phase
+// that it shows little of, only that it was occupied.
+void note_sample(vec3 x, Ray ray, float sigma) {
+    bool full = sigma > setup.occupancy_threshold;
+    uint bits = SEEN | (full ? OCCUPIED : 0u);
+    note_cell(occupancy_entry(x, ray.phase), bits);
+    if (ray.beyond_share >= LITTLE_SHOWN || full && ray.beyond_share > 0.0) note_cell(occupancy_entry(x, ray.beyond), bits);
+}
+
+RayOut integrals(uint r, Ray ray) {
+    uint lane = gl_LocalInvocationID.x;
+    float static_sum = 0.0;
+    uint n_static = skips_static(r) ? 0u : setup.n_static_samples;
+    for (uint k = lane; k < n_static; k += gl_WorkGroupSize.x) {
+        StaticSample here = static_sample(k, ray);
+        if (static_inside(here.x)) static_sum += static_attenuation(here.x) * here.path_length;
+    }
+    float dynamic_sum = 0.0;
+    float occlusion = 0.0;
+    uint end = ray_start[gl_WorkGroupID.x + 1u];
+    for (uint s = ray_start[gl_WorkGroupID.x] + lane; s < end; s += gl_WorkGroupSize.x) {
+        vec4 point = sample_points[s];
+        float sigma = sample_sigma[s].x;
+        dynamic_sum += sigma * point.w;
+        if (is_near(sample_rays[s])) occlusion += sigma * point.w;
+        if (setup.occupancy_cells != 0u) note_sample(point.xyz, ray, sigma);
+    }
+    vec4 sums = workgroup_sum(vec4(static_sum, dynamic_sum, occlusion, 0.0));
+    return RayOut(sums.x, sums.y, sums.z, 0.0, 0.0, 0.0);
+}
+
+void add_to_memory(uint parameter, uvec2 fixed_point) {
+    ADD_FIXED(static_gradient, parameter, fixed_point);
+}
+
+void add_to_plane(uint texel, vec4 value, float scale_high) {
+    [[unroll]] for (uint c = 0u; c < 4u; c++) {
+        if (value[c] != 0.0) add_to_memory(4u * texel + c, to_fixed(value[c], scale_high));
+    }
+}
+
+void add_to_line(uint texel, vec4 value, float scale_high) {
+    uint first = setup.static_params - private_lines;
+    [[unroll]] for (uint c = 0u; c < 4u; c++) {
+        if (value[c] == 0.0) continue;
+        uvec2 fixed_point = to_fixed(value[c], scale_high);
+        if (private_lines == 0u) {
+            add_to_memory(4u * texel + c, fixed_point);
+        } else {
+            ADD_FIXED(line_sums, 4u * texel + c - first, fixed_point);
+        }
+    }
+}
+
+// Scatters the gradient by the ray's static integral.
+void scatter(Ray ray, float gradient) {
+    uint lane = gl_LocalInvocationID.x;
+    for (uint i = lane; i < 2u * private_lines; i += gl_WorkGroupSize.x) line_sums[i] = 0u;
+    barrier();
+    float scale_high = exp2(float(setup.fixed_point_bits) - 32.0);
+    for (uint k = lane; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {
+        StaticSample here = static_sample(k, ray);
+        if (!static_inside(here.x)) continue;
+        float slope = setup.static_gain * sigmoid(vm_feature(here.x) + setup.static_shift);
+        float at_feature = gradient * here.path_length * slope;
+        vec3 coordinate = vm_coordinate(here.x);
+        for (uint mode = 0u; mode < 3u; mode++) {
+            VmTaps taps = vm_taps(coordinate, mode);
+            for (uint c = 0u; c < setup.rank4; c++) {
+                vec4 to_plane = at_feature * vm_line(taps, c);
+                vec4 to_line = at_feature * vm_plane(taps, c);
+                [[unroll]] for (uint t = 0u; t < 4u; t++) {
+                    add_to_plane(taps.plane[t] * setup.rank4 + c, taps.plane_weight[t] * to_plane, scale_high);
+                }
+                [[unroll]] for (uint t = 0u; t < 2u; t++) {
+                    add_to_line(taps.line[t] * setup.rank4 + c, taps.line_weight[t] * to_line, scale_high);
+                }
+            }
+        }
+    }
+    barrier();
+    for (uint i = lane; i < private_lines; i += gl_WorkGroupSize.x) {
+        uvec2 sum = uvec2(line_sums[2u * i], line_sums[2u * i + 1u]);
+        if (sum != uvec2(0u)) add_to_memory(setup.static_params - private_lines + i, sum);
+    }
+}
+
+void main() {
+    uint r = push.first_ray + gl_WorkGroupID.x;
+    Ray ray = rays[r];
+    RayOut seen = integrals(r, ray);
+    RayLoss loss = loss_of(r, ray, seen);
+    if (gl_LocalInvocationID.x == 0u) {
+        ray_out[r] = seen;
+        ray_gradient[r] = loss.gradient;
+        ray_loss[r] = loss.terms;
+    }
+    // Rays that leave the static field out have none, too.
+    if (loss.gradient.x != 0.0) scatter(ray, loss.gradient.x);
+}
