@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What rays see: integrals and maxima, one workgroup per ray. Training takes march_loss.
-//   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term, maxima along the ray.
+// What rays see: integrals and, on demand, maxima, one workgroup per ray. Training takes march_loss.
+//   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term, maxima along the ray or 0.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
@@ -9,7 +9,7 @@
 #include "inc/sample_rays.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
+layout(push_constant) uniform Push { uint first_ray; uint n_rays; uint with_maxima; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
@@ -47,16 +47,16 @@ void main() {
         float sigma = sample_sigma[s].x;
         dynamic_sum += sigma * point.w;
         if (is_near(sample_rays[s])) occlusion += sigma * point.w;
+        if (push.with_maxima == 0u) continue;
         dynamic_max = max(dynamic_max, sigma);
         total_max = max(total_max, sigma + (static_inside(point.xyz) ? static_attenuation(point.xyz) : 0.0));
     }
     vec4 sums = workgroup_sum(vec4(static_sum, dynamic_sum, occlusion, 0.0));
-    RayOut result;
-    result.static_integral = sums.x;
-    result.dynamic_integral = sums.y;
-    result.occlusion = sums.z;
-    result.static_max = workgroup_max(static_max);
-    result.dynamic_max = workgroup_max(dynamic_max);
-    result.total_max = max(workgroup_max(total_max), result.static_max);
+    RayOut result = RayOut(sums.x, sums.y, sums.z, 0.0, 0.0, 0.0);
+    if (push.with_maxima != 0u) {
+        result.static_max = workgroup_max(static_max);
+        result.dynamic_max = workgroup_max(dynamic_max);
+        result.total_max = max(workgroup_max(total_max), result.static_max);
+    }
     if (lane == 0u) ray_out[r] = result;
 }

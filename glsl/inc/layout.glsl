@@ -159,6 +159,14 @@ struct View {
     vec4 direction_dv;          // its change from row to row
 };
 
+// What a rendering is of, beside its view.
+struct Pose {
+    uint first_pixel;           // of those that are drawn at once
+    uint phase;                 // cardiac phase nearest to the time that is shown
+    uint beyond;                // phase on the other side of that time
+    float beyond_share;         // what is shown of that phase: 0 to 0.5
+};
+
 // One training image.
 struct Frame {
     uint view;                  // of the training views

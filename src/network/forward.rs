@@ -58,6 +58,14 @@ buffer_set! {
     }
 }
 
+/// What a rendering is of.
+pub struct PoseBuffers {
+    /// One [`crate::kernels::layout::View`].
+    pub views: Buffer,
+    /// A [`crate::kernels::layout::Pose`].
+    pub pose: Buffer,
+}
+
 impl ForwardBuffers {
     /// Buffers for batches of `n_rays`; parameters are left undefined.
     ///
@@ -102,7 +110,7 @@ impl ForwardBuffers {
         })
     }
 
-    /// Records the rays of `push.n_rays` pixels of a view.
+    /// Records the rays of `push.n_rays` pixels of a pose.
     ///
     /// # Errors
     /// [`Error::Internal`] when stage and buffers do not fit.
@@ -110,11 +118,15 @@ impl ForwardBuffers {
         &self,
         recording: &mut Recording,
         kernels: &Kernels,
-        views: &Buffer,
+        of: &PoseBuffers,
         push: push::PoseRays,
     ) -> Result<()> {
         let stage = &kernels.pose_rays;
-        let bound = [(Binding::views, views.into()), (Binding::rays, (&self.rays).into())];
+        let bound = [
+            (Binding::views, (&of.views).into()),
+            (Binding::pose, (&of.pose).into()),
+            (Binding::rays, (&self.rays).into()),
+        ];
         dispatch(recording, stage, stage.groups_for(push.n_rays), &bound, push)
     }
 
@@ -192,11 +204,11 @@ impl Pass<'_> {
         self.still.map_or(Ok(()), |still| still.record_forward(self))
     }
 
-    /// Records a rendering of `n_rays` rays already in `rays`: integrals and maxima land in `ray_out`.
+    /// Records a rendering of `n_rays` rays already in `rays`: integrals and, on demand, maxima land in `ray_out`.
     ///
     /// # Errors
     /// [`Error::Internal`] for jittered depths; else as [`Pass::run`].
-    pub fn render(&mut self, n_rays: u32) -> Result<()> {
+    pub fn render(&mut self, n_rays: u32, maxima: bool) -> Result<()> {
         if self.setup.jitter != 0 {
             return Err(Error::Internal("rendering wants regular depths".into()));
         }
@@ -207,10 +219,10 @@ impl Pass<'_> {
             let Chunk { first_ray, n_rays } = chunk;
             match self.still {
                 None => {
-                    let push = push::MarchFwd { first_ray, n_rays };
+                    let push = push::MarchFwd { first_ray, n_rays, with_maxima: u32::from(maxima) };
                     self.run(&self.kernels.march_fwd, chunk.per_ray(), push)?;
                 }
-                Some(still) => still.record_integrals(self, chunk, true)?,
+                Some(still) => still.record_integrals(self, chunk, maxima)?,
             }
         }
         Ok(())

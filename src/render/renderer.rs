@@ -8,7 +8,7 @@ use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::pace::SubmitPace;
 use crate::gpu::record::{Commands, MOST_GROUPS, Recording};
-use crate::kernels::layout::{DeviceState, RayOut, Schedule, Setup, View};
+use crate::kernels::layout::{DeviceState, Pose, RayOut, Schedule, Setup, View};
 use crate::kernels::push;
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
@@ -17,13 +17,17 @@ use crate::model::component::Component;
 use crate::model::gaussians::MovingGaussians;
 use crate::model::params::ParamMap;
 use crate::model::setup::sample_capacity;
-use crate::network::forward::ForwardBuffers;
+use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
 use crate::network::still::StillNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
 use crate::sax::drawing::SaxDrawing;
 use crate::scan::gating::BeatTime;
+use bytemuck::Zeroable;
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 /// Pixels rendered by one submit, which has a workgroup for each.
@@ -95,6 +99,7 @@ pub struct Renderer {
     pub(super) sax: Option<SaxDrawing>,
     /// Of rays, without and with the still field, of integrals and of maxima: what one kind takes says nothing of another.
     paces: [SubmitPace; 4],
+    drawn: Mutex<Drawn>,
 }
 
 impl Renderer {
@@ -130,8 +135,9 @@ impl Renderer {
         let gpu = gpu.clone();
         let pace = |_| SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
         let paces = std::array::from_fn(pace);
+        let drawn = Mutex::default();
         let renderer =
-            Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, sax, paces };
+            Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, sax, paces, drawn };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -372,55 +378,127 @@ impl Renderer {
         blobs: Option<&BlobList>,
         parts: Parts,
     ) -> Result<Rendering> {
-        let views = self.gpu.buffer_with("views", &[View::of(rays)])?;
-        let pixels = (width * height) as u32;
-        let image_width = width as u32;
+        let (pixels, image_width) = ((width * height) as u32, width as u32);
         let pace = &self.paces[usize::from(parts.still) + 2 * usize::from(parts.maxima)];
+        // One view at a time: its rays and what they see have one place on the device.
+        let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
         let (mut out, mut first_pixel) = (Rendering::default(), 0);
         while first_pixel < pixels {
-            // Whole rows, which tiles of pixels are made of.
-            let at_once = (pace.items() / image_width * image_width).max(RAYS_PER_SUBMIT.min(image_width));
-            let n_rays = at_once.min(pixels - first_pixel);
+            let n_rays = rays_at_once(pace, image_width).min(pixels - first_pixel);
             let begin = Instant::now();
-            let mut recording = Recording::new(&self.gpu, "render")?;
-            let push = pose(taken, &self.setup, first_pixel, n_rays, image_width);
-            self.buffers.record_pose(&mut recording, &self.kernels, &views, push)?;
-            if let Some(field) = &self.sax {
-                let (rays, out) = (&self.buffers.rays, &self.buffers.ray_out);
-                field.record_rays(&mut recording, rays, out, taken.phase, n_rays)?;
-            } else if parts.still {
-                self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays)?;
-            }
-            if let (Some(kernels), Some(list)) = (&self.moving, blobs) {
-                let row = image_width.min(n_rays);
-                kernels.record_rays(&mut recording, &self.buffers, list, n_rays, row, parts.maxima)?;
-            }
-            self.gpu.wait(recording.finish()?.submit()?)?;
+            let strip = drawn.strip(self, Strip { n_rays, image_width, parts }, taken, blobs)?;
+            strip.of.views.write(&[View::of(rays)])?;
+            strip.of.pose.write(&[pose(taken, &self.setup, first_pixel)])?;
+            self.gpu.wait(strip.commands.submit()?)?;
+            let mut seen = vec![RayOut::zeroed(); n_rays as usize];
+            strip.seen.read(&mut seen)?;
             pace.note(n_rays, begin.elapsed().as_secs_f64());
-            let seen: Vec<RayOut> = self.gpu.download(&self.buffers.ray_out, 0, n_rays as usize)?;
             out.extend(&seen);
             first_pixel += n_rays;
         }
+        drop(drawn);
         if let Some(pictures) = self.pictures.as_ref().filter(|pictures| pictures.are_blended()) {
             out.dynamic_integral = pictures.draw(rays, (width, height), taken.phase)?;
             out.is_blended = true;
         }
         Ok(out)
     }
+
+    /// Records what draws a strip.
+    fn record_strip(&self, strip: Strip, taken: BeatTime, blobs: Option<&BlobList>) -> Result<RecordedStrip> {
+        let Strip { n_rays, image_width, parts } = strip;
+        let bytes = u64::from(n_rays) * size_of::<RayOut>() as u64;
+        let of = PoseBuffers {
+            views: self.gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?,
+            pose: self.gpu.buffer("pose", size_of::<Pose>() as u64, Memory::Upload)?,
+        };
+        let seen = self.gpu.buffer("ray_out read-back", bytes, Memory::Readback)?;
+        let mut recording = Recording::new(&self.gpu, "render")?;
+        let push = push::PoseRays { n_rays, image_width, along_axis: self.setup.along_axis };
+        self.buffers.record_pose(&mut recording, &self.kernels, &of, push)?;
+        if let Some(field) = &self.sax {
+            let (rays, out) = (&self.buffers.rays, &self.buffers.ray_out);
+            field.record_rays(&mut recording, rays, out, taken.phase, n_rays)?;
+        } else if parts.still {
+            self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays, parts.maxima)?;
+        }
+        if let (Some(kernels), Some(list)) = (&self.moving, blobs) {
+            let row = image_width.min(n_rays);
+            kernels.record_rays(&mut recording, &self.buffers, list, n_rays, row, parts.maxima)?;
+        }
+        recording.copy(&self.buffers.ray_out, 0, &seen, 0, bytes)?;
+        Ok(RecordedStrip { commands: recording.finish()?, of, seen })
+    }
 }
 
-/// Rays of the pixels of a view, from `first_pixel` on, as they were at a time.
-pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32, n_rays: u32, image_width: u32) -> push::PoseRays {
-    let (phase, beyond, beyond_share) = (taken.phase, taken.beyond(setup.n_phases), taken.after_phase.abs() as f32);
-    let along_axis = setup.along_axis;
-    push::PoseRays { first_pixel, n_rays, phase, beyond, beyond_share, image_width, view: 0, along_axis }
+/// Rays of a strip: whole rows, which tiles of pixels are made of, and of these a power of two, so that strips that were recorded
+/// serve again.
+fn rays_at_once(pace: &SubmitPace, image_width: u32) -> u32 {
+    let rows = (pace.items() / image_width).max(1);
+    (1 << rows.ilog2()) * image_width.min(RAYS_PER_SUBMIT)
+}
+
+/// A part of a view that is drawn by one submit.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+struct Strip {
+    n_rays: u32,
+    image_width: u32,
+    parts: Parts,
+}
+
+/// Commands that draw a strip of any view, and where these say what of.
+struct RecordedStrip {
+    commands: Commands,
+    of: PoseBuffers,
+    /// What its rays saw.
+    seen: Buffer,
+}
+
+/// Strips kept recorded; a display in use has far fewer.
+const MOST_RECORDED: usize = 16;
+
+/// Strips drawn so far.
+#[derive(Default)]
+struct Drawn {
+    /// Of fields that are networks, whose commands are the same at all times.
+    recorded: HashMap<Strip, RecordedStrip>,
+    /// Of another field: the last.
+    once: Option<RecordedStrip>,
+}
+
+impl Drawn {
+    /// What draws a strip at a time: recorded before, or now.
+    fn strip(
+        &mut self,
+        renderer: &Renderer,
+        strip: Strip,
+        taken: BeatTime,
+        blobs: Option<&BlobList>,
+    ) -> Result<&RecordedStrip> {
+        if !renderer.network_moves() {
+            return Ok(self.once.insert(renderer.record_strip(strip, taken, blobs)?));
+        }
+        if self.recorded.len() >= MOST_RECORDED && !self.recorded.contains_key(&strip) {
+            self.recorded.clear();
+        }
+        match self.recorded.entry(strip) {
+            Entry::Occupied(there) => Ok(there.into_mut()),
+            Entry::Vacant(free) => Ok(free.insert(renderer.record_strip(strip, taken, blobs)?)),
+        }
+    }
+}
+
+/// What rays from `first_pixel` on show of a time.
+pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32) -> Pose {
+    let (beyond, beyond_share) = (taken.beyond(setup.n_phases), taken.after_phase.abs() as f32);
+    Pose { first_pixel, phase: taken.phase, beyond, beyond_share }
 }
 
 /// What of a rendering is wanted; the rest is undefined.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 struct Parts {
     /// The still field.
     still: bool,
-    /// Maxima of Gaussians.
+    /// Maxima along rays.
     maxima: bool,
 }

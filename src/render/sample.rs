@@ -8,7 +8,7 @@ use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{Setup, View};
 use crate::kernels::push;
 use crate::model::component::Component;
-use crate::network::forward::ForwardBuffers;
+use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
 use crate::network::still::still_setup;
 use crate::render::grid::{Grid, PatientGrid};
@@ -70,11 +70,15 @@ impl Renderer {
             let n = rows_at_once.min(rows - first);
             // One submit, the constants included: behind a run in training, each would wait its turn.
             let mut r = Recording::new(&self.gpu, "sample")?;
-            let views = self.constants(&mut r, "views", bytemuck::bytes_of(&view))?;
+            let pose = pose(BeatTime::at_phase(phase), &setup, first);
+            let of = PoseBuffers {
+                views: self.constants(&mut r, "views", bytemuck::bytes_of(&view))?,
+                pose: self.constants(&mut r, "pose", bytemuck::bytes_of(&pose))?,
+            };
             let setup_buffer = self.constants(&mut r, "setup", bytemuck::bytes_of(&setup))?;
             let buffers = ForwardBuffers { setup: setup_buffer, ..self.buffers.clone() };
-            let push = pose(BeatTime::at_phase(phase), &setup, first, n, ny);
-            buffers.record_pose(&mut r, &self.kernels, &views, push)?;
+            let push = push::PoseRays { n_rays: n, image_width: ny, along_axis: setup.along_axis };
+            buffers.record_pose(&mut r, &self.kernels, &of, push)?;
             match (field, &self.moving, still) {
                 (Component::Static, _, Some(still)) => {
                     r.fill(&cells, 0);
