@@ -1,57 +1,84 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// What tiles of samples say of the Lineformer's numbers: products of vectors that samples left, added up in the samples'
-// order, to what the tiles of dispatches before said. One workgroup per tile (x) and product (y).
-//   sax_weight_parts[place of the tile][number / 4]
+// What a chunk of samples says of the Lineformer's numbers: products of their vectors, added up in the samples' order, to what
+// chunks before said. A lane has INPUTS of a product's columns at once, all rows of each; rows are uniform loads. One workgroup
+// per part of the samples (x) and product (y).
+//   sax_weight_parts[part][number]
+#include "inc/operands.glsl"
 #include "inc/sax_layout.glsl"
-#include "inc/lineformer_layout.glsl"
-layout(local_size_x = 32, local_size_x_id = 0) in;
-layout(push_constant) uniform Push { uint first_tile; } push;
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
-layout(binding = 1) readonly buffer B1 { SaxProduct sax_products[]; };
-layout(binding = 2) readonly buffer B2 { vec4 sax_tile_vectors[]; };
-layout(binding = 3) buffer B3 { vec4 sax_weight_parts[]; };
-#include "inc/sax_tiles.glsl"
+#ifndef INPUTS
+#define INPUTS 2u
+#endif
+layout(local_size_x = 16, local_size_x_id = 0) in;
+// `first_feature` and `feature_stride` as of `sax_times`; a part has `part_samples`.
+layout(push_constant) uniform Push {
+    uint n_samples; uint capacity; uint first_feature; uint feature_stride; uint part_samples; uint adds;
+} push;
+READ_VEC4(0, B0, sax_encoding);
+READ_VEC4(1, B1, sax_operands);
+layout(binding = 2) readonly buffer B2 { SaxSetup sax_setup; };
+layout(binding = 3) readonly buffer B3 { SaxProduct sax_products[]; };
+layout(binding = 4) buffer B4 { float sax_weight_parts[]; };
+#include "inc/lineformer.glsl"
 
-void keep(uint at, vec4 sum) {
-    uint place = gl_WorkGroupID.x * (sax_setup.n_weights / 4u) + at;
-    sax_weight_parts[place] = push.first_tile == 0u ? sum : sax_weight_parts[place] + sum;
+uint begin;
+uint end;
+
+void keep(uint number, float sum) {
+    uint place = gl_WorkGroupID.x * sax_setup.n_weights + number;
+    sax_weight_parts[place] = sum + (push.adds != 0u ? sax_weight_parts[place] : 0.0);
 }
 
-// Four rows and two columns, in vec4, of a product.
-void add_product(SaxProduct product) {
-    uint lane = gl_LocalInvocationID.x, column = 2u * (lane % 4u);
-    uint left = vector_place(gl_WorkGroupID.x, product.left) + lane / 4u;
-    uint right = vector_place(gl_WorkGroupID.x, product.right) + column;
-    mat4 sum0 = mat4(0.0), sum1 = mat4(0.0);
-    [[dont_unroll]] for (uint s = 0u; s < TILE_SAMPLES; s++) {
-        vec4 factors = sax_tile_vectors[left + s * 8u];
-        sum0 += outerProduct(sax_tile_vectors[right + s * 8u], factors);
-        sum1 += outerProduct(sax_tile_vectors[right + s * 8u + 1u], factors);
+float column_of(SaxProduct product, uint k, uint s) {
+    if (product.right == SAX_FEATURES)
+        return FETCH(sax_encoding, k / 4u * push.feature_stride + push.first_feature + s)[k % 4u];
+    return operand(product.right, k / 4u, s)[k % 4u];
+}
+
+// Columns from `first` on, one and one more a workgroup further.
+void add_product(SaxProduct product, uint first) {
+    vec4 sums[WIDTH4][INPUTS];
+    [[unroll]] for (uint j = 0u; j < WIDTH4; j++) {
+        [[unroll]] for (uint i = 0u; i < INPUTS; i++) sums[j][i] = vec4(0.0);
     }
-    uint place = product.first + lane / 4u * 4u * product.stride + column;
-    [[dont_unroll]] for (uint row = 0u; row < 4u; row++) {
-        if (column < product.columns) keep(place + row * product.stride, sum0[row]);
-        if (column + 1u < product.columns) keep(place + row * product.stride + 1u, sum1[row]);
+    uint columns[INPUTS];
+    [[unroll]] for (uint i = 0u; i < INPUTS; i++) columns[i] = first + i * gl_WorkGroupSize.x;
+    [[dont_unroll]] for (uint s = begin; s < end; s++) {
+        float x[INPUTS];
+        [[unroll]] for (uint i = 0u; i < INPUTS; i++) x[i] = column_of(product, min(columns[i], 4u * product.columns - 1u), s);
+        [[unroll]] for (uint j = 0u; j < WIDTH4; j++) {
+            vec4 d = operand(product.left, j, s);
+            [[unroll]] for (uint i = 0u; i < INPUTS; i++) sums[j][i] += d * x[i];
+        }
+    }
+    [[unroll]] for (uint i = 0u; i < INPUTS; i++) {
+        if (columns[i] >= 4u * product.columns) continue;
+        [[unroll]] for (uint j = 0u; j < WIDTH4; j++) {
+            [[unroll]] for (uint c = 0u; c < 4u; c++)
+                keep(4u * (product.first + (4u * j + c) * product.stride) + columns[i], sums[j][i][c]);
+        }
     }
 }
 
 // The sum of a vector.
 void add_vector(SaxProduct product) {
-    uint lane = gl_LocalInvocationID.x;
-    if (lane >= 8u) return;
-    vec4 sum = vec4(0.0);
-    [[dont_unroll]] for (uint s = 0u; s < TILE_SAMPLES; s++)
-        sum += sax_tile_vectors[vector_place(gl_WorkGroupID.x, product.left) + s * 8u + lane];
-    keep(product.first + lane, sum);
+    for (uint i = gl_LocalInvocationID.x; i < WIDTH4; i += gl_WorkGroupSize.x) {
+        vec4 sum = vec4(0.0);
+        for (uint s = begin; s < end; s++) sum += operand(product.left, i, s);
+        [[unroll]] for (uint c = 0u; c < 4u; c++) keep(4u * (product.first + i) + c, sum[c]);
+    }
 }
 
 void main() {
+    begin = min(gl_WorkGroupID.x * push.part_samples, push.n_samples);
+    end = min(begin + push.part_samples, push.n_samples);
     SaxProduct product = sax_products[gl_WorkGroupID.y];
-    if (product.columns > 0u) {
-        add_product(product);
-    } else {
+    if (product.columns == 0u) {
         add_vector(product);
+        return;
     }
+    uint at_once = INPUTS * gl_WorkGroupSize.x;
+    for (uint first = 0u; first < 4u * product.columns; first += at_once)
+        add_product(product, first + gl_LocalInvocationID.x);
 }

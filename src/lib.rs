@@ -210,8 +210,8 @@ pub mod sax {
     pub mod buffers;
     pub mod data;
     pub mod drawing;
+    pub mod lineformer;
     pub mod products;
-    pub mod program;
     pub mod setup;
     pub mod stages;
     pub mod start;

@@ -94,7 +94,7 @@ fn a_cluster_would_get_the_jobs() {
     for run in ["xcat-3v.paper.s1", "xcat-4v.fast.s2"] {
         assert!(told.contains(&format!("study one {STUDIES}/smoke.toml {run} -o out")), "{run}: {told}");
     }
-    assert_eq!(told.matches("rule run:").count(), 16, "{told}");
-    assert_eq!(told.matches("Group job runs").count(), 4, "four runs make a job: {told}");
+    assert_eq!(told.matches("rule run:").count(), 24, "{told}");
+    assert_eq!(told.matches("Group job runs").count(), 6, "four runs make a job: {told}");
     assert!(told.contains("gpu=1") && told.contains("runtime=240"), "{told}");
 }

@@ -128,7 +128,7 @@ fn our_studies_can_be_run() {
     }
     let studies = Path::new(SMOKE).parent().unwrap();
     let expected =
-        [("smoke", 16), ("table1", 198), ("scaled-table1", 126), ("table2", 30), ("time", 21), ("degradations", 204)];
+        [("smoke", 24), ("table1", 198), ("scaled-table1", 126), ("table2", 30), ("time", 21), ("degradations", 204)];
     for (name, runs) in expected {
         let file = studies.join(name).with_extension("toml");
         let listed = ok(&["list", text(&file), "--data", text(data.path())]);

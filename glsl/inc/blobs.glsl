@@ -9,6 +9,13 @@ vec3 blob_times(Blob b, vec3 v) {
                 b.mixed.y * v.x + b.mixed.z * v.y + b.diagonal.z * v.z);
 }
 
+// At least as much as any length grows when it is divided by the Gaussian's deviations.
+float stretch_of(Blob b) {
+    vec3 mixed = abs(b.mixed);
+    vec3 sums = b.diagonal + vec3(mixed.x + mixed.y, mixed.x + mixed.z, mixed.y + mixed.z);
+    return sqrt(max(sums.x, max(sums.y, sums.z)));
+}
+
 // Says for the Gaussian of this lane whether it is near; then `near_blobs` holds for all lanes.
 void mark_near(bool near) {
     uint lane = gl_LocalInvocationID.x;

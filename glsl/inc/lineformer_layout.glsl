@@ -16,57 +16,47 @@ const uint LINEFORMER_JOINT_BIAS = 7224u;    // 32
 const uint LINEFORMER_DENSITY = 7232u;       // 32, then a bias and nothing
 const uint LINEFORMER_INPUT = 7248u;         // 32 x the grid's features; behind them 32 x (features + 32) of the skip
 
-// Vectors of 32 numbers that a sample leaves in the backward pass, for gradients of the Lineformer's numbers; `BY` are
-// gradients before a layer's activation. Slices of 128 numbers, and scales and shifts, are vectors next to each other.
-const uint SAX_FEATURES = 0u;
+// Vectors of 32 numbers that each sample of a chunk has; more numbers are vectors next to each other. First those of the
+// forward pass.
+const uint SAX_X1 = 0u;              // after the first layer
 const uint SAX_NORMAL1 = 1u;
-const uint SAX_SEEN = 2u;
-const uint SAX_NORMAL2 = 3u;
-const uint SAX_BLOCK = 4u;
-const uint SAX_FIRST = 5u;       // four
-const uint SAX_SECOND = 9u;      // four
-const uint SAX_BY_INPUT = 13u;
-const uint SAX_BY_QUERY = 14u;
-const uint SAX_BY_KEY = 15u;
-const uint SAX_BY_VALUE = 16u;
-const uint SAX_BY_OUT = 17u;
-const uint SAX_BY_FIRST = 18u;   // four
-const uint SAX_BY_SECOND = 22u;  // four
-const uint SAX_BY_BLOCK = 26u;
-const uint SAX_BY_JOINT = 27u;
-const uint SAX_NORM1 = 28u;      // two
-const uint SAX_NORM2 = 30u;      // two
-const uint SAX_POSITION = 32u;   // of the pair
-const uint SAX_DENSITY = 33u;    // two, of the pair
-const uint SAX_VECTORS = 35u;    // all of them
-const uint SAX_PRODUCTS = 41u;   // gradients: 31 products of two of them, 10 that are sums of one
+const uint SAX_QUERY = 2u;           // then keys and values
+const uint SAX_KEY = 3u;
+const uint SAX_VALUE = 4u;
+const uint SAX_SEEN = 5u;
+const uint SAX_X2 = 6u;              // after the attention
+const uint SAX_NORMAL2 = 7u;
+const uint SAX_BEFORE_FIRST = 8u;    // four, before their GELU
+const uint SAX_FIRST = 12u;          // four
+const uint SAX_BEFORE_SECOND = 16u;  // four
+const uint SAX_SECOND = 20u;         // four
+const uint SAX_BLOCK = 24u;
+const uint SAX_X3 = 25u;             // after the layer on both
+const uint SAX_FORWARD_VECTORS = 26u;
 
-// Vectors that a pair keeps to itself in either pass.
-const uint SAX_X1 = 35u;         // after the first layer
-const uint SAX_X2 = 36u;         // after the attention
-const uint SAX_X3 = 37u;         // after the layer on both
-const uint SAX_BEFORE_FIRST = 38u;   // four, before their GELU
-const uint SAX_BEFORE_SECOND = 42u;  // four
-const uint SAX_QUERY = 46u;
-const uint SAX_KEY = 47u;
-const uint SAX_VALUE = 48u;
-const uint SAX_BY_NORMAL = 49u;
-const uint SAX_BY_SEEN = 50u;
-const uint SAX_BY_FEATURES = 51u;
-const uint SAX_ALL_VECTORS = 52u;    // those that are left come first
+// Those of the backward pass; `BY` are gradients before a layer's activation.
+const uint SAX_BY_INPUT = 26u;
+const uint SAX_BY_QUERY = 27u;       // then by keys and values
+const uint SAX_BY_KEY = 28u;
+const uint SAX_BY_VALUE = 29u;
+const uint SAX_BY_OUT = 30u;
+const uint SAX_BY_FIRST = 31u;       // four
+const uint SAX_BY_SECOND = 35u;      // four
+const uint SAX_BY_BLOCK = 39u;
+const uint SAX_BY_JOINT = 40u;
+const uint SAX_NORM1 = 41u;          // two: by scales and shifts
+const uint SAX_NORM2 = 43u;          // two
+const uint SAX_POSITION = 45u;
+const uint SAX_DENSITY = 46u;        // two
+const uint SAX_BY_NORMAL = 48u;
+const uint SAX_BY_SEEN = 49u;
+const uint SAX_VECTORS = 50u;        // all of them
 
-// What a step of the Lineformer does with vectors.
-const uint SAX_SET = 0u;         // to = numbers at `first`
-const uint SAX_ADD = 1u;         // to += from
-const uint SAX_TIMES = 2u;       // to += W from
-const uint SAX_BACK = 3u;        // to += W^T from
-const uint SAX_LEAKY = 4u;       // to = leaky(to)
-const uint SAX_GELU = 5u;        // to = gelu(from)
-const uint SAX_NORM = 6u;        // to = from, normalised, by the scales and shifts at `first`
-const uint SAX_ATTEND = 7u;      // what both samples see of each other
-const uint SAX_BACK_LEAKY = 8u;  // to through the activation whose result is from
-const uint SAX_BACK_GELU = 9u;   // to through the GELU of from
-const uint SAX_BACK_NORM = 10u;  // to += BY_NORMAL through the normalisation of from; its scales and shifts are left
-const uint SAX_BACK_ATTEND = 11u;
-const uint SAX_BACK_DENSITY = 12u;
-const uint SAX_CLEAR = 13u;      // to = 0
+const uint SAX_FEATURES = 255u;      // no vector, but the features of the grid
+const uint SAX_NONE = 254u;          // no vector
+const uint SAX_PRODUCTS = 41u;       // gradients: 31 products of two vectors, 10 that are sums of one
+
+// What follows a product.
+const uint SAX_PLAIN = 0u;
+const uint SAX_LEAKY = 1u;
+const uint SAX_GELU = 2u;            // the result is left twice: before, and after

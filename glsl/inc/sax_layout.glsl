@@ -17,11 +17,9 @@ struct SaxSetup {
     uint n_sets;                // fields, each fitted by itself
     uint n_weights;             // numbers of the Lineformer, which come before those of the grid
     uint n_grid;                // numbers of the grid
-    uint n_groups;              // workgroups of the Lineformer's backward pass
+    uint n_groups;              // parts that a chunk of samples is cut into for sums of the Lineformer's gradients
     uint fixed_point_bits;      // behind the point, of the grid's gradient
     uint ring_length;           // iterations whose losses are kept
-    uint n_forward_steps;       // steps of the Lineformer's forward pass
-    uint n_steps;               // those, then the backward pass's
 };
 
 // A level of the hash grid.
@@ -45,14 +43,4 @@ struct SaxProduct {
     uint first;                 // where the numbers begin, vec4
     uint stride;                // from row to row, vec4
     uint columns;               // vec4; 0: a sum of `left` alone
-};
-
-// A step of the Lineformer, which both passes take one by one.
-struct SaxStep {
-    uint kind;                  // what it does
-    uint to;                    // vector that it changes
-    uint from;                  // vector that it reads
-    uint first;                 // numbers that it takes, vec4
-    uint stride;                // from row to row of a matrix, vec4
-    uint columns;               // of a matrix, vec4; of a normalisation, the vector that its scales are left as
 };

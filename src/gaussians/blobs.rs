@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
+use crate::kernels::constants::gaussian_points::ROWS;
 use crate::kernels::dispatch::{Binding, BufferSet, dispatch_finding};
 use crate::kernels::layout::{Blob, Gaussian, GaussianSetup};
 use crate::kernels::push::{self, GaussianRays};
@@ -191,7 +192,8 @@ impl Blobs {
         Ok(())
     }
 
-    /// Records the field at the cells of `volume`: rows of `row_cells` along the rays `rows` in `buffers`.
+    /// Records the field at the cells of `volume`: rows of `row_cells` along the rays `rows` in `buffers`. With an `away` other
+    /// than zero, world units, what it is at most (above zero) or at least (below) anywhere so near to them.
     ///
     /// # Errors
     /// As [`Blobs::record_rays`].
@@ -200,19 +202,20 @@ impl Blobs {
         recording: &mut Recording,
         buffers: &dyn BufferSet,
         phase: u32,
-        n_rows: u32,
-        row_cells: u32,
+        (n_rows, row_cells): (u32, u32),
+        away: f32,
         volume: &Buffer,
     ) -> Result<()> {
         // Groups along y are limited to 65535 on every device.
-        const MOST_ROWS: u32 = 65_535;
+        const MOST_ROWS: u32 = 65_535 * ROWS;
         let BlobList { blobs, range } = self.at(phase)?;
         let bound = [(Binding::blobs, (&blobs).into()), (Binding::volume, volume.into())];
         let points = &self.kernels.points;
         for first_row in (0..n_rows).step_by(MOST_ROWS as usize) {
             let rows = MOST_ROWS.min(n_rows - first_row);
-            let push = push::GaussianPoints { first_row, first_blob: range.start, n_blobs: range.len() as u32 };
-            let groups = Groups::Direct([row_cells.div_ceil(points.local_size()), rows, 1]);
+            let (first_blob, n_blobs) = (range.start, range.len() as u32);
+            let push = push::GaussianPoints { first_row, n_rows, first_blob, n_blobs, away };
+            let groups = Groups::Direct([row_cells.div_ceil(points.local_size()), rows.div_ceil(ROWS), 1]);
             dispatch_finding(recording, points, groups, &bound, |name| buffers.find(name), push)?;
         }
         Ok(())

@@ -198,11 +198,7 @@ impl Tuning {
 
     /// The plainest path where the network is never asked.
     pub fn for_network(self, asked: bool) -> Tuning {
-        if asked {
-            self
-        } else {
-            self.with_layers(Layers::F32, "no layers: Gaussians move instead of the network".into())
-        }
+        if asked { self } else { self.with_layers(Layers::F32, "no layers: the network is not asked".into()) }
     }
 
     /// Samples one workgroup of the layer kernels covers.

@@ -29,14 +29,15 @@ impl Renderer {
         self.check_phase(phase)?;
         let mut sum = vec![0f32; grid.len()];
         for field in component.fields() {
-            let cells = self.sample_field(*field, phase, grid)?;
+            let cells = self.sample_field(*field, phase, grid, 0.0)?;
             sum.iter_mut().zip(cells).for_each(|(sum, cell)| *sum += cell);
         }
         Ok(sum)
     }
 
-    /// A single field at the points of a grid.
-    fn sample_field(&self, field: Component, phase: u32, grid: &Grid) -> Result<Vec<f32>> {
+    /// A single field at the points of a grid; of Gaussians with an `away` other than zero, world units, what it is at most (above
+    /// zero) or at least (below) anywhere so near to the points.
+    fn sample_field(&self, field: Component, phase: u32, grid: &Grid, away: f32) -> Result<Vec<f32>> {
         let [nx, ny, nz] = grid.size;
         if nx < 2 || nx > self.largest_row() {
             return Err(Error::config("grid", nx, format!("2 to {} points along x are accepted", self.largest_row())));
@@ -92,7 +93,7 @@ impl Renderer {
                     self.pass(&mut r, &buffers, &setup).run_with(stage, stage.groups_over(n * nx), &bound, push)?;
                 }
                 _ if self.sax.is_some() => self.record_sax(&mut r, &buffers, &setup, (phase, n), &cells)?,
-                (_, Some(blobs), _) => blobs.record_points(&mut r, &buffers, phase, n, nx, &cells)?,
+                (_, Some(blobs), _) => blobs.record_points(&mut r, &buffers, phase, (n, nx), away, &cells)?,
                 (_, None, _) => {
                     r.fill(&cells, 0);
                     self.pass(&mut r, &buffers, &setup).volume(n, &cells)?;
@@ -134,26 +135,56 @@ impl Renderer {
     /// [`Error::Config`] for an impossible grid or phase; device errors.
     pub fn sample_patient(&self, component: Component, phase: u32, grid: &PatientGrid) -> Result<Vec<f32>> {
         grid.check()?;
-        let swap = |v: DVec3| DVec3::new(v.y, v.x, v.z);
-        let [nl, np, ns] = grid.size;
-        // A row of the world's grid, along posterior, has two points or more.
-        let rows = Grid {
-            origin: world_from_lps_mm(grid.origin_mm),
-            spacing: swap(grid.spacing_mm) / MM_PER_UNIT,
-            size: [np.max(2), nl, ns],
-        };
-        let mut out = vec![0f32; (nl * np) as usize * ns as usize];
+        let mut out = vec![0f32; grid.size.iter().map(|n| *n as usize).product()];
         for field in component.fields() {
-            let cells = self.sample(*field, phase, &rows)?;
-            let (row, plane) = (rows.size[0] as usize, (rows.size[0] * nl) as usize);
-            for (slice, out) in out.chunks_mut((nl * np) as usize).enumerate() {
-                for (p, out) in out.chunks_mut(nl as usize).enumerate() {
-                    for (l, out) in out.iter_mut().enumerate() {
-                        *out += cells[slice * plane + l * row + p] / MM_PER_UNIT as f32;
-                    }
-                }
-            }
+            let cells = self.sample(*field, phase, &rows_of(grid))?;
+            add_per_mm(&mut out, &cells, grid);
         }
         Ok(out)
+    }
+
+    /// Attenuation per mm that the moving field has at least and at most anywhere within `away_mm` of the points of a grid; none
+    /// where it is not made of Gaussians, of which alone that is known.
+    ///
+    /// # Errors
+    /// As [`Renderer::sample_patient`].
+    pub fn bound_patient(&self, phase: u32, grid: &PatientGrid, away_mm: f64) -> Result<Option<[Vec<f32>; 2]>> {
+        if self.moving.is_none() {
+            return Ok(None);
+        }
+        grid.check()?;
+        self.check_phase(phase)?;
+        let bound = |away_mm: f64| -> Result<Vec<f32>> {
+            let away = (away_mm / MM_PER_UNIT) as f32;
+            let cells = self.sample_field(Component::Dynamic, phase, &rows_of(grid), away)?;
+            let mut out = vec![0f32; grid.size.iter().map(|n| *n as usize).product()];
+            add_per_mm(&mut out, &cells, grid);
+            Ok(out)
+        };
+        Ok(Some([bound(-away_mm)?, bound(away_mm)?]))
+    }
+}
+
+/// A grid of the patient as one of the world, whose rows are along posterior and have two points or more.
+fn rows_of(grid: &PatientGrid) -> Grid {
+    let swap = |v: DVec3| DVec3::new(v.y, v.x, v.z);
+    let [nl, np, ns] = grid.size;
+    Grid {
+        origin: world_from_lps_mm(grid.origin_mm),
+        spacing: swap(grid.spacing_mm) / MM_PER_UNIT,
+        size: [np.max(2), nl, ns],
+    }
+}
+
+/// Adds what such rows hold, per world unit, to the points of the patient's grid, per mm.
+fn add_per_mm(out: &mut [f32], cells: &[f32], grid: &PatientGrid) {
+    let [nl, np, _] = grid.size.map(|n| n as usize);
+    let row = np.max(2);
+    for (slice, out) in out.chunks_mut(nl * np).enumerate() {
+        for (p, out) in out.chunks_mut(nl).enumerate() {
+            for (l, out) in out.iter_mut().enumerate() {
+                *out += cells[slice * row * nl + l * row + p] / MM_PER_UNIT as f32;
+            }
+        }
     }
 }

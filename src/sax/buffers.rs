@@ -2,19 +2,21 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::gpu::buffer::Memory;
+use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
+use crate::kernels::constants::{SAX_FORWARD_VECTORS, SAX_VECTORS};
 use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{DeviceState, Ray, SaxSetup};
+use crate::kernels::tuning::Tuning;
 use crate::model::sax::{SaxField, SaxState};
 use crate::model::setup::RING_LENGTH;
 use crate::r2::start::seed_of_set;
 use crate::sax::data::SaxData;
+use crate::sax::lineformer::{capacity, vector_bytes};
 use crate::sax::products::products;
-use crate::sax::program::{backward, forward};
 use crate::sax::setup::{adam_setup, schedule};
-use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers, TILE_BYTES};
+use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers};
 
 const MIB: u64 = 1 << 20;
 
@@ -36,12 +38,12 @@ impl SaxMemory {
         let params = weights + grid;
         let samples = u64::from(setup.n_rays) * u64::from(setup.n_samples);
         let (encoding, parts) = (8 * u64::from(setup.n_levels) * samples, 4 * weights * u64::from(setup.n_groups));
-        let tiles = TILE_BYTES * u64::from(setup.n_groups);
+        let vectors = vector_bytes(SAX_VECTORS, capacity(setup.n_rays * setup.n_samples));
         let of_fields = u64::from(setup.n_sets) * 12 * params + 8 * grid + 4 * params;
         SaxMemory {
             of_field_buffer: 8 * params,
-            of_batch_buffer: encoding.max(parts).max(tiles).max(16 * samples),
-            total: of_fields + 2 * encoding + parts + tiles + 20 * samples,
+            of_batch_buffer: encoding.max(parts).max(vectors).max(16 * samples),
+            total: of_fields + 2 * encoding + parts + vectors + 20 * samples,
         }
     }
 
@@ -84,6 +86,15 @@ impl SaxMemory {
     }
 }
 
+/// What samples are for: how many vectors of the Lineformer they take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Passes {
+    /// Forward alone.
+    Drawing,
+    /// Forward and back.
+    Fitting,
+}
+
 /// Buffers that asking a field takes for so many samples at once.
 ///
 /// # Errors
@@ -92,19 +103,36 @@ pub fn sample_buffers(
     gpu: &Gpu,
     field: &SaxField,
     setup: &SaxSetup,
-    n_samples: u64,
-    step: u32,
+    n_samples: u32,
+    passes: Passes,
 ) -> Result<SaxSampleBuffers> {
     let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
+    let operands = Tuning::for_device(gpu.info()).operands;
+    let n = u64::from(n_samples);
+    let n_vectors = if passes == Passes::Fitting { SAX_VECTORS } else { SAX_FORWARD_VECTORS };
+    let bytes = vector_bytes(n_vectors, capacity(n_samples));
+    let vectors = gpu.operand_buffer(Binding::sax_vectors.name(), bytes, operands)?;
+    let encoding_bytes = 8 * u64::from(setup.n_levels) * n;
     Ok(SaxSampleBuffers {
         sax_setup: gpu.buffer_with("sax_setup", &[*setup])?,
-        sax_steps: gpu.buffer_with("sax_steps", &[forward(field.shape), backward(field.shape)].concat())?,
         sax_levels: gpu.buffer_with("sax_levels", &field.shape.grid())?,
-        state: gpu.buffer_with("state", &[DeviceState { step, ..DeviceState::default() }])?,
-        sax_points: new(Binding::sax_points, 16 * n_samples)?,
-        sax_encoding: new(Binding::sax_encoding, 8 * u64::from(setup.n_levels) * n_samples)?,
-        sax_sigma: new(Binding::sax_sigma, 4 * n_samples)?,
+        state: gpu.buffer_with("state", &[DeviceState { step: field.step, ..DeviceState::default() }])?,
+        sax_points: new(Binding::sax_points, 16 * n)?,
+        sax_encoding: gpu.operand_buffer(Binding::sax_encoding.name(), encoding_bytes, operands)?,
+        sax_sigma: new(Binding::sax_sigma, 4 * n)?,
+        sax_vectors: vectors.clone(),
+        sax_operands: vectors,
     })
+}
+
+/// A field's numbers on the device.
+///
+/// # Errors
+/// [`Error::OutOfMemory`] naming the buffer; other device errors.
+pub fn params_buffer(gpu: &Gpu, name: &str, params: &[f32]) -> Result<Buffer> {
+    let buffer = gpu.operand_buffer(name, 4 * params.len() as u64, Tuning::for_device(gpu.info()).operands)?;
+    gpu.upload(&buffer, 0, params)?;
+    Ok(buffer)
 }
 
 /// Buffers of a fit.
@@ -133,7 +161,6 @@ pub fn fit_buffers(
         sax_ray_gradient: new(Binding::sax_ray_gradient, 4 * rays)?,
         sax_losses: new(Binding::sax_losses, 4 * rays * u64::from(setup.n_sets))?,
         sax_products: gpu.buffer_with("sax_products", &products(field.shape))?,
-        sax_tile_vectors: new(Binding::sax_tile_vectors, TILE_BYTES * u64::from(setup.n_groups))?,
         sax_weight_parts: new(Binding::sax_weight_parts, 4 * weights * u64::from(setup.n_groups))?,
         sax_encoding_gradient: new(Binding::sax_encoding_gradient, 8 * u64::from(setup.n_levels) * samples)?,
         sax_grid_sums: new(Binding::sax_grid_sums, 8 * grid)?,
@@ -160,7 +187,7 @@ pub fn set_buffers(
     let (_, first_turns) = data.turns();
     let set = |index: usize| {
         Ok(SaxSetBuffers {
-            params: gpu.buffer_with(&format!("sax_params of {index}"), &field.params[index])?,
+            params: params_buffer(gpu, &format!("sax_params of {index}"), &field.params[index])?,
             moments: gpu.buffer_with(&format!("moments of {index}"), &state.moments[index])?,
             seed: seed_of_set(seed, index),
             turns: (first_turns[index], data.images_of_set[index].len() as u32),
@@ -174,7 +201,7 @@ mod tests {
     use super::*;
     use crate::config::Preset;
     use crate::model::sax::SaxShape;
-    use crate::sax::stages::tiles;
+    use crate::sax::setup::n_parts;
 
     /// What every device holds in a buffer.
     const LEAST_STORAGE_BUFFER: u64 = 128 << 20;
@@ -191,7 +218,7 @@ mod tests {
             n_sets: 10,
             n_weights: shape.n_weights() as u32,
             n_grid: shape.n_grid() as u32,
-            n_groups: tiles(n_rays * sax.samples).min(256),
+            n_groups: n_parts(n_rays, sax.samples),
             ..SaxSetup::default()
         };
         let memory = SaxMemory::of(&setup);

@@ -6,7 +6,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::layout::SaxSetup;
 use crate::model::sax::SaxField;
-use crate::sax::buffers::sample_buffers;
+use crate::sax::buffers::{Passes, params_buffer, sample_buffers};
 use crate::sax::setup::drawing_setup;
 use crate::sax::stages::{SaxFieldKernels, SaxSampleBuffers, SaxSampling, record_view};
 use std::sync::{Mutex, PoisonError};
@@ -41,12 +41,12 @@ impl SaxDrawing {
     /// [`Error::OutOfMemory`]; other device errors.
     pub fn new(gpu: &Gpu, field: &SaxField) -> Result<SaxDrawing> {
         let setup = drawing_setup(field);
-        let at_once = u64::from(SAMPLES_AT_ONCE.max(field.samples));
-        let outline = SaxField { params: Vec::new(), ..field.clone() };
+        let at_once = SAMPLES_AT_ONCE.max(field.samples);
+        let outline = SaxField { params: Vec::new(), step: 0, ..field.clone() };
         let drawing = SaxDrawing {
             gpu: gpu.clone(),
             kernels: SaxFieldKernels::new(gpu)?,
-            buffers: sample_buffers(gpu, &outline, &setup, at_once, 0)?,
+            buffers: sample_buffers(gpu, &outline, &setup, at_once, Passes::Drawing)?,
             field: outline,
             setup,
             params: Mutex::new(Vec::new()),
@@ -65,7 +65,7 @@ impl SaxDrawing {
             return Err(Error::Internal("the field has other sizes than the one that is drawn".into()));
         }
         if !field.params.is_empty() {
-            let upload = |set: &Vec<f32>| self.gpu.buffer_with("sax_params that are drawn", set);
+            let upload = |set: &Vec<f32>| params_buffer(&self.gpu, "sax_params that are drawn", set);
             self.follow(field.params.iter().map(upload).collect::<Result<_>>()?);
         }
         Ok(())
@@ -127,7 +127,7 @@ impl SaxDrawing {
         let all = self.params.lock().unwrap_or_else(PoisonError::into_inner).clone();
         let missing = || Error::Internal(format!("no numbers of SAX-NeRF's field at phase {phase}"));
         let params = all.get(self.field.set_of(phase)).ok_or_else(missing)?;
-        let sampling = SaxSampling { kernels: &self.kernels, buffers, setup, params, rays };
+        let sampling = SaxSampling { kernels: &self.kernels, buffers, setup, shape: self.field.shape, params, rays };
         let attenuation = self.field.attenuation as f32;
         let at_once = (SAMPLES_AT_ONCE / setup.n_samples).max(1);
         for first in (0..n_rays).step_by(at_once as usize) {

@@ -6,11 +6,7 @@ use crate::kernels::layout::{SaxSetup, Schedule, Setup};
 use crate::model::sax::{SaxField, SaxShape};
 use crate::model::setup::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::sax::data::SaxData;
-use crate::sax::program::{backward, forward};
-use crate::sax::stages::tiles;
-
-/// Tiles of the Lineformer's backward pass at once: each has sums of 128 KiB, and leaves vectors of 280 KiB.
-const MOST_GROUPS: u32 = 256;
+use crate::sax::lineformer::{PART_SAMPLES, chunks};
 
 /// What does not depend on what is drawn or fitted.
 fn field_setup(field: &SaxField) -> SaxSetup {
@@ -25,8 +21,6 @@ fn field_setup(field: &SaxField) -> SaxSetup {
         n_sets: field.n_sets as u32,
         fixed_point_bits: FIXED_POINT_BITS,
         ring_length: RING_LENGTH,
-        n_forward_steps: forward(field.shape).len() as u32,
-        n_steps: (forward(field.shape).len() + backward(field.shape).len()) as u32,
         ..SaxSetup::default()
     }
 }
@@ -34,6 +28,11 @@ fn field_setup(field: &SaxField) -> SaxSetup {
 /// Rays of a batch.
 pub fn n_rays(settings: &Sax) -> u32 {
     settings.windows * settings.window * settings.window + settings.rays
+}
+
+/// Parts that a chunk of samples is cut into for sums.
+pub fn n_parts(n_rays: u32, n_samples: u32) -> u32 {
+    chunks(n_rays, n_samples).iter().map(|chunk| chunk.n.div_ceil(PART_SAMPLES)).max().unwrap_or(1)
 }
 
 /// Constants of a fit.
@@ -46,7 +45,7 @@ pub fn fit_setup(field: &SaxField, data: &SaxData, settings: &Sax) -> SaxSetup {
         window: settings.window,
         width: data.width as u32,
         height: data.height as u32,
-        n_groups: tiles(rays * settings.samples).min(MOST_GROUPS),
+        n_groups: n_parts(rays, settings.samples),
         ..field_setup(field)
     }
 }

@@ -1,6 +1,6 @@
 //! The stages of SAX-NeRF, what they bind, and one iteration, top to bottom. Each field has, one after the other,
 //!
-//! sax_batch -> sax_points -> sax_encode -> sax_lineformer -> sax_loss -> sax_lineformer_bwd -> sax_products ->
+//! sax_batch -> sax_points -> sax_encode -> the Lineformer's layers -> sax_loss -> back through them -> sax_products ->
 //! sax_weight_gradient -> sax_encode_bwd -> sax_grid_gradient -> adam
 //!
 //! in buffers that all share but for its numbers; then comes sax_report.
@@ -9,12 +9,14 @@ use crate::error::Result;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
-use crate::kernels::constants::{SAX_PRODUCTS, SAX_VECTORS};
+use crate::kernels::constants::{sax_times, sax_times_texel};
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch_finding};
 use crate::kernels::layout::SaxSetup;
 use crate::kernels::push::{self, PushConstants};
-use crate::kernels::stages::{Build, Stage, along_two_axes};
-use crate::model::sax::WIDTH;
+use crate::kernels::stages::{Build, Stage, along_two_axes, vec4_variant};
+use crate::kernels::tuning::Tuning;
+use crate::model::sax::SaxShape;
+use crate::sax::lineformer::{Lineformer, LineformerBackKernels, LineformerKernels, Recorder, capacity, chunks};
 
 /// Pipelines that ask a field.
 pub struct SaxFieldKernels {
@@ -23,7 +25,9 @@ pub struct SaxFieldKernels {
     /// Features of samples.
     pub encode: Stage<push::SaxEncode>,
     /// Their attenuation.
-    pub lineformer: Stage<push::SaxLineformer>,
+    pub lineformer: LineformerKernels,
+    /// Samples that a lane of its layers has.
+    lane_samples: u32,
     /// What rays see.
     pub view: Stage<push::SaxView>,
 }
@@ -38,10 +42,17 @@ impl SaxFieldKernels {
         Ok(SaxFieldKernels {
             points: plain.stage(gpu)?,
             encode: plain.stage(gpu)?,
-            lineformer: plain.stage(gpu)?,
+            lineformer: LineformerKernels::new(gpu)?,
+            lane_samples: lane_samples(gpu),
             view: plain.stage(gpu)?,
         })
     }
+}
+
+/// Samples that a lane of the tiled stages has on a device; both directions are compiled alike.
+fn lane_samples(gpu: &Gpu) -> u32 {
+    let is_plain = vec4_variant(&Tuning::for_device(gpu.info())).is_empty();
+    if is_plain { sax_times::SAMPLES } else { sax_times_texel::SAMPLES }
 }
 
 /// Pipelines of a fit.
@@ -52,10 +63,8 @@ pub struct SaxKernels {
     pub batch: Stage<push::SaxBatch>,
     /// Residuals.
     pub loss: Stage<push::SaxLoss>,
-    /// Gradients by features and by each workgroup's samples.
-    pub lineformer_bwd: Stage<push::SaxLineformerBwd>,
-    /// What each tile of samples says of the Lineformer's numbers.
-    pub products: Stage<push::SaxProducts>,
+    /// Gradients by features, and what samples say of the Lineformer's numbers.
+    pub lineformer_bwd: LineformerBackKernels,
     /// Gradient of the Lineformer's numbers.
     pub weight_gradient: Stage<push::SaxWeightGradient>,
     /// Scatter to the grid.
@@ -79,8 +88,7 @@ impl SaxKernels {
             field: SaxFieldKernels::new(gpu)?,
             batch: plain.stage(gpu)?,
             loss: plain.stage(gpu)?,
-            lineformer_bwd: plain.stage(gpu)?,
-            products: plain.stage(gpu)?,
+            lineformer_bwd: LineformerBackKernels::new(gpu)?,
             weight_gradient: plain.stage(gpu)?,
             encode_bwd: plain.stage(gpu)?,
             grid_gradient: plain.stage(gpu)?,
@@ -97,8 +105,6 @@ buffer_set! {
         sax_setup,
         /// [`crate::kernels::layout::SaxLevel`]s.
         sax_levels,
-        /// [`crate::kernels::layout::SaxStep`]s of the Lineformer.
-        sax_steps,
         /// [`crate::kernels::layout::DeviceState`]: iterations done.
         state,
         /// `[ray][sample]`: points of the unit cube, and the paths they stand for.
@@ -107,6 +113,10 @@ buffer_set! {
         sax_encoding,
         /// `[ray][sample]`: attenuation.
         sax_sigma,
+        /// `[vector][number / 4][sample of a chunk]`: what layers make.
+        sax_vectors,
+        /// The same, to be read.
+        sax_operands,
     }
 }
 
@@ -135,9 +145,7 @@ buffer_set! {
         sax_losses,
         /// [`crate::kernels::layout::SaxProduct`]s.
         sax_products,
-        /// `[workgroup][vector][sample of a tile]`: what these are made of.
-        sax_tile_vectors,
-        /// `[workgroup][number]`: gradients.
+        /// `[part of a chunk][number]`: gradients.
         sax_weight_parts,
         /// `[pair of levels][sample]`: gradient by features.
         sax_encoding_gradient,
@@ -163,14 +171,6 @@ pub struct SaxSetBuffers {
     pub turns: (u32, u32),
 }
 
-/// Bytes of what samples of a tile leave to their workgroup.
-pub const TILE_BYTES: u64 = (SAX_VECTORS * 2 * push::SaxLineformerBwd::LOCAL_SIZE) as u64 * 4 * WIDTH as u64;
-
-/// Tiles of pairs of samples that the Lineformer's backward pass takes.
-pub fn tiles(n_samples: u32) -> u32 {
-    (n_samples / 2).div_ceil(push::SaxLineformerBwd::LOCAL_SIZE)
-}
-
 /// Asks a field: records what makes attenuations of the rays that `find` binds.
 pub struct SaxSampling<'a> {
     /// The stages.
@@ -179,6 +179,8 @@ pub struct SaxSampling<'a> {
     pub buffers: &'a SaxSampleBuffers,
     /// Constants on the host.
     pub setup: &'a SaxSetup,
+    /// Sizes of the field.
+    pub shape: SaxShape,
     /// Numbers of the field.
     pub params: &'a Buffer,
     /// Rays.
@@ -217,9 +219,32 @@ impl SaxSampling<'_> {
         self.run(recording, &kernels.points, kernels.points.groups_over(n_samples), push, None)?;
         let groups = kernels.encode.groups_over(n_samples * (self.setup.n_levels / 2));
         self.run(recording, &kernels.encode, groups, push::SaxEncode { n_samples }, None)?;
-        let groups = kernels.lineformer.groups_over(n_rays * row.div_ceil(2));
-        let push = push::SaxLineformer { n_rays, row, first_out: out.map_or(0, |(_, first)| first), scale };
-        self.run(recording, &kernels.lineformer, groups, push, out.map(|(buffer, _)| buffer))
+        let (target, first_out) = (out.map(|(buffer, _)| buffer), out.map_or(0, |(_, first)| first));
+        for chunk in chunks(n_rays, row) {
+            let lineformer =
+                Lineformer { shape: self.shape, capacity: capacity(n_samples), n_all: n_samples, row, chunk };
+            let mut run = Sampled { sampling: self, recording, out: target };
+            lineformer.layers(&mut run, &kernels.lineformer)?;
+            lineformer.density(&mut run, &kernels.lineformer, first_out + chunk.first, scale)?;
+        }
+        Ok(())
+    }
+}
+
+/// Where the Lineformer's layers of a field that is asked are recorded.
+struct Sampled<'a, 'b> {
+    sampling: &'b SaxSampling<'a>,
+    recording: &'b mut Recording,
+    out: Option<&'b Buffer>,
+}
+
+impl Recorder for Sampled<'_, '_> {
+    fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
+        self.sampling.run(self.recording, stage, groups, push, self.out)
+    }
+
+    fn lane_samples(&self) -> u32 {
+        self.sampling.kernels.lane_samples
     }
 }
 
@@ -235,6 +260,8 @@ pub struct SaxPass<'a> {
     pub fit: &'a SaxFitBuffers,
     /// The fields.
     pub sets: &'a [SaxSetBuffers],
+    /// Sizes of a field.
+    pub shape: SaxShape,
     /// Constants on the host.
     pub setup: &'a SaxSetup,
 }
@@ -273,6 +300,7 @@ impl SaxPass<'_> {
             kernels: &kernels.field,
             buffers: self.samples,
             setup: self.setup,
+            shape: self.shape,
             params: &set.params,
             rays: &self.fit.rays,
         };
@@ -283,14 +311,18 @@ impl SaxPass<'_> {
 
     /// Records the gradient of that loss by the Lineformer's numbers and by features.
     fn backward(&mut self, set: &SaxSetBuffers) -> Result<()> {
-        let (kernels, setup) = (self.kernels, self.setup);
-        let n_tiles = tiles(setup.n_rays * setup.n_samples);
-        for first_tile in (0..n_tiles).step_by(setup.n_groups as usize) {
-            let n = setup.n_groups.min(n_tiles - first_tile);
-            let groups = Groups::Direct([n, 1, 1]);
-            self.run(set, &kernels.lineformer_bwd, groups, push::SaxLineformerBwd { first_tile })?;
-            let groups = Groups::Direct([n, SAX_PRODUCTS, 1]);
-            self.run(set, &kernels.products, groups, push::SaxProducts { first_tile })?;
+        let (kernels, setup, shape) = (self.kernels, self.setup, self.shape);
+        let (row, n_all) = (setup.n_samples, setup.n_rays * setup.n_samples);
+        let all = chunks(setup.n_rays, row);
+        for (index, chunk) in all.iter().enumerate() {
+            let lineformer = Lineformer { shape, capacity: capacity(n_all), n_all, row, chunk: *chunk };
+            let mut run = Fitted { pass: &mut *self, set };
+            if all.len() > 1 {
+                // The vectors are another chunk's.
+                lineformer.layers(&mut run, &kernels.field.lineformer)?;
+            }
+            lineformer.backward(&mut run, &kernels.lineformer_bwd)?;
+            lineformer.products(&mut run, &kernels.lineformer_bwd, setup.n_groups, index > 0)?;
         }
         let weights = &kernels.weight_gradient;
         self.run(set, weights, weights.groups_over(setup.n_weights), push::SaxWeightGradient {})
@@ -313,6 +345,22 @@ impl SaxPass<'_> {
         self.run(set, grid, grid.groups_over(setup.n_grid), push::SaxGridGradient {})?;
         let n_params = setup.n_weights + setup.n_grid;
         self.run(set, &kernels.adam, kernels.adam.groups_over(n_params), push::Adam {})
+    }
+}
+
+/// Where the Lineformer's layers of a fit are recorded.
+struct Fitted<'a, 'b> {
+    pass: &'b mut SaxPass<'a>,
+    set: &'b SaxSetBuffers,
+}
+
+impl Recorder for Fitted<'_, '_> {
+    fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
+        self.pass.run(self.set, stage, groups, push)
+    }
+
+    fn lane_samples(&self) -> u32 {
+        self.pass.kernels.field.lane_samples
     }
 }
 

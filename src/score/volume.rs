@@ -307,7 +307,8 @@ pub(super) fn on_one_grid(
     let own = Corners::of(&truth.grid).grown(FAR_MM.max(FAR_PIXELS * field.pixel_mm));
     let reach = coarse.reach(field.threshold_per_mm).map_or(own, |reach| own.joined(reach));
     let (grid, true_vessels) = truth.reaching(reach, file)?;
-    let ours = vessels(field, coarse, &grid)?;
+    let size = grid.size.map(|n| n as usize);
+    let ours = Mask { size, spacing_mm: grid.spacing_mm, inside: field.vessels(coarse, &grid)? };
     Ok((grid, [true_vessels, ours]))
 }
 
@@ -326,17 +327,6 @@ fn scores(
         mass_beyond_2_pixels: mass.and_then(|m| m.share(m.far_pixels)),
         mass_beyond_2_mm: mass.and_then(|m| m.share(m.far_mm)),
     })
-}
-
-/// Points of a grid at which a field is vessel.
-fn vessels(field: &MovingField<'_>, coarse: &CoarseField, grid: &PatientGrid) -> Result<Mask> {
-    let size = grid.size.map(|n| n as usize);
-    let mut inside = vec![false; size.iter().product()];
-    field.rows(&field.boxes(coarse), grid, |first, values| {
-        let inside = inside[first..].iter_mut().zip(values);
-        inside.for_each(|(inside, value)| *inside = f64::from(*value) > field.threshold_per_mm);
-    })?;
-    Ok(Mask { size, spacing_mm: grid.spacing_mm, inside })
 }
 
 #[cfg(test)]

@@ -8,16 +8,19 @@ use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::SaxSetup;
 use crate::model::sax::{SaxField, SaxState, check_params};
 use crate::r2::start::seed_of_set;
-use crate::sax::buffers::{SaxMemory, fit_buffers, sample_buffers, set_buffers};
+use crate::sax::buffers::{Passes, SaxMemory, fit_buffers, sample_buffers, set_buffers};
 use crate::sax::data::SaxData;
+use crate::sax::lineformer::chunks;
 use crate::sax::setup::{fit_setup, outline};
-use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step, tiles};
+use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step};
 use crate::sax::start::first_params;
 use crate::train::gaussians::{Iterations, pass_times};
 use crate::train::targets::losses;
 
-/// Passes of an iteration of a field, and of all fields together, but for those over its tiles.
+/// Passes of an iteration of a field, and of all fields together, but for those over its chunks of samples.
 const MAX_PASSES: u32 = 16;
+/// Passes over a chunk: forward, and forward and back.
+const CHUNK_PASSES: u32 = 40;
 
 /// A run on a device.
 pub struct SaxTrainer {
@@ -73,8 +76,7 @@ impl SaxTrainer {
         let setup = fit_setup(&outline, &data, &config.sax);
         SaxMemory::of(&setup).check(gpu, config, data.n_sets())?;
         let kernels = SaxKernels::new(gpu)?;
-        let n_samples = u64::from(setup.n_rays) * u64::from(setup.n_samples);
-        let samples = sample_buffers(gpu, &outline, &setup, n_samples, field.step)?;
+        let samples = sample_buffers(gpu, &outline, &setup, setup.n_rays * setup.n_samples, Passes::Fitting)?;
         let fit = fit_buffers(gpu, &data, &outline, &setup, config)?;
         let sets = set_buffers(gpu, &data, field, state, config.seed)?;
         let iterations = Iterations::record(gpu, config.train.iterations_per_submit, |iterations| {
@@ -82,7 +84,8 @@ impl SaxTrainer {
             for _ in 0..iterations {
                 let recording = &mut recording;
                 let (kernels, samples, fit) = (&kernels, &samples, &fit);
-                record_step(&mut SaxPass { recording, kernels, samples, fit, sets: &sets, setup: &setup })?;
+                let shape = outline.shape;
+                record_step(&mut SaxPass { recording, kernels, samples, fit, sets: &sets, shape, setup: &setup })?;
             }
             recording.finish()
         })?;
@@ -162,8 +165,8 @@ impl SaxTrainer {
         if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
         }
-        let rounds = tiles(self.setup.n_rays * self.setup.n_samples).div_ceil(self.setup.n_groups);
-        let max_passes = (MAX_PASSES + 2 * rounds) * (self.setup.n_sets + 1);
+        let n_chunks = chunks(self.setup.n_rays, self.setup.n_samples).len() as u32;
+        let max_passes = (MAX_PASSES + CHUNK_PASSES * n_chunks) * (self.setup.n_sets + 1);
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of SAX-NeRF", max_passes)?;
         record_step(&mut self.pass(&mut recording))?;
         self.step += 1;
@@ -173,6 +176,7 @@ impl SaxTrainer {
     /// Where stages of this fit are recorded.
     pub fn pass<'a>(&'a self, recording: &'a mut Recording) -> SaxPass<'a> {
         let (kernels, samples, fit) = (&self.kernels, &self.samples, &self.fit);
-        SaxPass { recording, kernels, samples, fit, sets: &self.sets, setup: &self.setup }
+        let shape = self.outline.shape;
+        SaxPass { recording, kernels, samples, fit, sets: &self.sets, shape, setup: &self.setup }
     }
 }

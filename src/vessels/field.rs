@@ -19,6 +19,8 @@ const COARSE_POINTS: f64 = 192.0;
 const FAINT: f64 = 0.25;
 /// Voxels of a block that is sampled at once, along left, posterior (a group of the device) and superior.
 const BLOCK: [u32; 3] = [8, 64, 8];
+/// Voxels along each side of the cubes that a block is made of, for which bounds are asked.
+const CUBE: u32 = 8;
 
 /// The first and the last point of a box, patient mm.
 #[derive(Debug, Clone, Copy)]
@@ -75,9 +77,49 @@ impl MovingField<'_> {
 
     /// Hands on the field at the points of a grid that are in some boxes, per mm, a row along left at a time with the index of
     /// its first point. Elsewhere it is not looked at.
-    pub(crate) fn rows(&self, boxes: &[Corners], grid: &PatientGrid, mut put: impl FnMut(usize, &[f32])) -> Result<()> {
+    pub(crate) fn rows(&self, boxes: &[Corners], grid: &PatientGrid, put: impl FnMut(usize, &[f32])) -> Result<()> {
+        self.sample(blocks(boxes, grid), grid, put)
+    }
+
+    /// Points of a grid at which the field is vessel. Where Gaussians tell that all or nothing of a block is, it is not looked at;
+    /// of other fields, what is faint at the coarse points around is not.
+    pub(crate) fn vessels(&self, coarse: &CoarseField, grid: &PatientGrid) -> Result<Vec<bool>> {
+        let mut inside = vec![false; grid.size.iter().map(|n| *n as usize).product()];
+        let blocks = match self.renderer.bound_patient(self.phase, &cubes(grid), cube_reach_mm(grid))? {
+            Some(bounds) => self.undecided(grid, bounds, &mut inside),
+            None => blocks(&self.boxes(coarse), grid),
+        };
+        self.sample(blocks, grid, |first, values| {
+            let inside = inside[first..].iter_mut().zip(values);
+            inside.for_each(|(inside, value)| *inside = f64::from(*value) > self.threshold_per_mm);
+        })?;
+        Ok(inside)
+    }
+
+    /// Blocks of which bounds on cubes do not tell; marks those that are vessel as a whole.
+    fn undecided(&self, grid: &PatientGrid, [least, most]: [Vec<f32>; 2], inside: &mut [bool]) -> Vec<Block> {
+        let above = |bounds: Vec<f32>| bounds.into_iter().map(|v| f64::from(v) > self.threshold_per_mm).collect();
+        let (surely, maybe): (Vec<bool>, Vec<bool>) = (above(least), above(most));
+        let [nx, ny, _] = cubes(grid).size.map(|n| n as usize);
+        let mut undecided = Vec::new();
+        for place in all_blocks(grid) {
+            let block = block_at(place, grid);
+            let [x, y, z] = block.first.map(|i| i as usize / CUBE as usize);
+            let along_y = block.grid.size[1].div_ceil(CUBE) as usize;
+            let cubes: Vec<usize> = (0..along_y).map(|k| (z * ny + y + k) * nx + x).collect();
+            if cubes.iter().all(|cube| surely[*cube]) {
+                fill(inside, grid, &block);
+            } else if cubes.iter().any(|cube| maybe[*cube]) {
+                undecided.push(block);
+            }
+        }
+        undecided
+    }
+
+    /// Hands on the field at the points of a grid that are in some blocks as [`MovingField::rows`] does.
+    fn sample(&self, blocks: Vec<Block>, grid: &PatientGrid, mut put: impl FnMut(usize, &[f32])) -> Result<()> {
         let [nx, ny, _] = grid.size.map(|n| n as usize);
-        for block in blocks(boxes, grid) {
+        for block in blocks {
             let [x, y, z] = block.first.map(|i| i as usize);
             let [columns, rows, _] = block.grid.size.map(|n| n as usize);
             let values = self.renderer.sample_patient(Component::Dynamic, self.phase, &block.grid)?;
@@ -126,6 +168,45 @@ impl CoarseField {
     }
 }
 
+/// Middles of the cubes that a grid is made of.
+fn cubes(grid: &PatientGrid) -> PatientGrid {
+    let to_middle = 0.5 * (f64::from(CUBE) - 1.0);
+    PatientGrid {
+        origin_mm: grid.origin_mm + to_middle * grid.spacing_mm,
+        spacing_mm: f64::from(CUBE) * grid.spacing_mm,
+        size: grid.size.map(|n| n.div_ceil(CUBE)),
+    }
+}
+
+/// Distance of the corners of a cube from its middle, and a little for rounding, mm.
+fn cube_reach_mm(grid: &PatientGrid) -> f64 {
+    0.5 * f64::from(CUBE) * grid.spacing_mm.length()
+}
+
+/// Marks the points of a block.
+fn fill(inside: &mut [bool], grid: &PatientGrid, block: &Block) {
+    let [nx, ny, _] = grid.size.map(|n| n as usize);
+    let [x, y, z] = block.first.map(|i| i as usize);
+    let [columns, rows, slices] = block.grid.size.map(|n| n as usize);
+    for row in 0..rows * slices {
+        inside[((z + row / rows) * ny + y + row % rows) * nx + x..][..columns].fill(true);
+    }
+}
+
+/// Places of all blocks of a grid.
+fn all_blocks(grid: &PatientGrid) -> impl Iterator<Item = [u32; 3]> {
+    let [nx, ny, nz]: [u32; 3] = std::array::from_fn(|axis| grid.size[axis].div_ceil(BLOCK[axis]));
+    (0..nz).flat_map(move |z| (0..ny).flat_map(move |y| (0..nx).map(move |x| [z, y, x])))
+}
+
+/// The block at a place: along superior, posterior and left.
+fn block_at([z, y, x]: [u32; 3], grid: &PatientGrid) -> Block {
+    let first = [x * BLOCK[0], y * BLOCK[1], z * BLOCK[2]];
+    let steps = DVec3::from_array(first.map(f64::from));
+    let size = std::array::from_fn(|axis| BLOCK[axis].min(grid.size[axis] - first[axis]));
+    Block { first, grid: PatientGrid { origin_mm: grid.origin_mm + steps * grid.spacing_mm, size, ..*grid } }
+}
+
 /// Blocks of a grid that some boxes reach into.
 fn blocks(boxes: &[Corners], grid: &PatientGrid) -> Vec<Block> {
     let in_blocks = |point_mm: DVec3| {
@@ -143,13 +224,7 @@ fn blocks(boxes: &[Corners], grid: &PatientGrid) -> Vec<Block> {
             }
         }
     }
-    let block = |[z, y, x]: [u32; 3]| {
-        let first = [x * BLOCK[0], y * BLOCK[1], z * BLOCK[2]];
-        let steps = DVec3::from_array(first.map(f64::from));
-        let size = std::array::from_fn(|axis| BLOCK[axis].min(grid.size[axis] - first[axis]));
-        Block { first, grid: PatientGrid { origin_mm: grid.origin_mm + steps * grid.spacing_mm, size, ..*grid } }
-    };
-    wanted.into_iter().map(block).collect()
+    wanted.into_iter().map(|place| block_at(place, grid)).collect()
 }
 
 #[cfg(test)]

@@ -1,0 +1,381 @@
+//! The Lineformer, layer by layer, on a chunk of samples: forward to attenuation, and back to the features' gradient.
+//!
+//! Vectors of 32 numbers of all samples of a chunk lie in one buffer (`inc/lineformer_layout.glsl` has their list); features stay
+//! where the grid's stages have them.
+
+use crate::error::Result;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::Groups;
+use crate::kernels::constants as at;
+use crate::kernels::push::{self, PushConstants, SaxTimes, SaxTimesBack};
+use crate::kernels::stages::{Build, Stage, vec4_variant};
+use crate::kernels::tuning::Tuning;
+use crate::model::sax::{SaxShape, WIDTH};
+
+/// Numbers of a vec4, a vector in vec4, and a matrix of 32 x 32.
+const LANES: u32 = 4;
+const WIDTH4: u32 = WIDTH as u32 / LANES;
+const SQUARE: u32 = WIDTH as u32 * WIDTH4;
+/// Vectors of the feed-forward part.
+const WIDE: u32 = 4;
+
+/// Most samples of a chunk: with all vectors of a backward pass 105 MiB, below what a buffer of every device holds.
+pub const MOST_SAMPLES: u32 = 16_384;
+/// Samples that one workgroup adds up of a gradient.
+pub const PART_SAMPLES: u32 = 512;
+/// Strides that are no power of two spare caches from collisions.
+const PADDING: u32 = 8;
+
+/// Room for the vectors of a chunk of so many samples.
+pub fn capacity(n_samples: u32) -> u32 {
+    n_samples.min(MOST_SAMPLES) + PADDING
+}
+
+/// Bytes of so many vectors of a chunk.
+pub fn vector_bytes(n_vectors: u32, capacity: u32) -> u64 {
+    u64::from(n_vectors) * u64::from(capacity) * 4 * WIDTH as u64
+}
+
+/// Samples of all that a chunk is of: where it begins, how many they are, and how far along its ray the first one is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Chunk {
+    /// Among the samples whose features there are.
+    pub first: u32,
+    /// How many.
+    pub n: u32,
+    /// Place of the first along its ray.
+    pub along: u32,
+}
+
+/// Chunks of `n_rays` rays of `row` samples, of at most [`MOST_SAMPLES`]: whole rays, or even parts of one, so that pairs stay
+/// together.
+pub fn chunks(n_rays: u32, row: u32) -> Vec<Chunk> {
+    if row > MOST_SAMPLES {
+        let of_ray = |ray: u32| {
+            let part = move |along: u32| Chunk { first: ray * row + along, n: MOST_SAMPLES.min(row - along), along };
+            (0..row).step_by(MOST_SAMPLES as usize).map(part)
+        };
+        return (0..n_rays).flat_map(of_ray).collect();
+    }
+    let rays = MOST_SAMPLES / row;
+    let chunk = |ray: u32| Chunk { first: ray * row, n: rays.min(n_rays - ray) * row, along: 0 };
+    (0..n_rays).step_by(rays as usize).map(chunk).collect()
+}
+
+/// Pipelines of the forward pass.
+pub struct LineformerKernels {
+    times: Stage<push::SaxTimes>,
+    norm: Stage<push::SaxNorm>,
+    attend: Stage<push::SaxAttend>,
+    density: Stage<push::SaxDensity>,
+}
+
+/// Pipelines of the backward pass.
+pub struct LineformerBackKernels {
+    times: Stage<push::SaxTimesBack>,
+    norm: Stage<push::SaxNormBack>,
+    attend: Stage<push::SaxAttendBack>,
+    density: Stage<push::SaxDensityBack>,
+    products: Stage<push::SaxProducts>,
+}
+
+/// How stages of a device are built: those on samples, and those on numbers.
+fn builds(gpu: &Gpu) -> (Build<'static>, Build<'static>) {
+    let tuning = Tuning::for_device(gpu.info());
+    let plain = Build { variant: vec4_variant(&tuning), ..Build::default() };
+    (Build { lanes: Some(tuning.layer_lanes), ..plain }, Build { lanes: Some(tuning.weight_lanes), ..plain })
+}
+
+impl LineformerKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<LineformerKernels> {
+        let (samples, _) = builds(gpu);
+        Ok(LineformerKernels {
+            times: samples.stage(gpu)?,
+            norm: samples.stage(gpu)?,
+            attend: samples.stage(gpu)?,
+            density: samples.stage(gpu)?,
+        })
+    }
+}
+
+impl LineformerBackKernels {
+    /// Builds the pipelines.
+    ///
+    /// # Errors
+    /// Errors of [`Gpu::pipeline`].
+    pub fn new(gpu: &Gpu) -> Result<LineformerBackKernels> {
+        let (samples, numbers) = builds(gpu);
+        Ok(LineformerBackKernels {
+            times: samples.stage(gpu)?,
+            norm: samples.stage(gpu)?,
+            attend: samples.stage(gpu)?,
+            density: samples.stage(gpu)?,
+            products: numbers.stage(gpu)?,
+        })
+    }
+}
+
+/// Records a stage with what is bound beside its vectors.
+pub trait Recorder {
+    /// Records a dispatch.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
+    fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()>;
+
+    /// Samples that a lane of these tiled stages has, as they were compiled for this device.
+    fn lane_samples(&self) -> u32;
+}
+
+/// The Lineformer on a chunk of samples.
+#[derive(Debug, Clone, Copy)]
+pub struct Lineformer {
+    /// Sizes.
+    pub shape: SaxShape,
+    /// Room of the vectors' buffer.
+    pub capacity: u32,
+    /// Samples whose features there are.
+    pub n_all: u32,
+    /// Samples of a ray.
+    pub row: u32,
+    /// The chunk.
+    pub chunk: Chunk,
+}
+
+/// A matrix: where its numbers begin, and from row to row, vec4.
+#[derive(Clone, Copy)]
+struct Matrix {
+    first: u32,
+    stride: u32,
+}
+
+impl Lineformer {
+    fn features4(&self) -> u32 {
+        self.shape.n_features() as u32 / LANES
+    }
+
+    /// The first layer's, and that of the layer on both.
+    fn outer(&self) -> [Matrix; 2] {
+        let input = self.features4();
+        let joint = at::LINEFORMER_INPUT + WIDTH as u32 * input;
+        [Matrix { first: at::LINEFORMER_INPUT, stride: input }, Matrix { first: joint, stride: input + WIDTH4 }]
+    }
+
+    /// A product of vectors, without features, bias or activation.
+    fn times(&self, to: u32, from: u32, columns: u32, weights: u32) -> SaxTimes {
+        SaxTimes {
+            n_samples: self.chunk.n,
+            capacity: self.capacity,
+            features4: 0,
+            first_feature: self.chunk.first,
+            feature_stride: self.n_all,
+            from,
+            columns,
+            weights,
+            bias: 0,
+            has_bias: 0,
+            added: at::SAX_NONE,
+            to,
+            activation: at::SAX_PLAIN,
+            activated: at::SAX_NONE,
+        }
+    }
+
+    fn run_times(&self, run: &mut impl Recorder, stage: &Stage<SaxTimes>, vectors: u32, push: SaxTimes) -> Result<()> {
+        let samples = stage.local_size() * run.lane_samples();
+        let rows = vectors * WIDTH as u32 / at::sax_times::OUTPUTS;
+        run.run(stage, Groups::Direct([self.chunk.n.div_ceil(samples), rows, 1]), push)
+    }
+
+    fn each<P: PushConstants>(&self, run: &mut impl Recorder, stage: &Stage<P>, push: P) -> Result<()> {
+        run.run(stage, stage.groups_for(self.chunk.n), push)
+    }
+
+    /// Records the layers up to the last but one.
+    ///
+    /// # Errors
+    /// As [`Recorder::run`].
+    pub fn layers(&self, run: &mut impl Recorder, kernels: &LineformerKernels) -> Result<()> {
+        let (n_samples, capacity) = (self.chunk.n, self.capacity);
+        let (times, norm) = (&kernels.times, &kernels.norm);
+        let [input, joint] = self.outer();
+        let features4 = self.features4();
+        let with = |bias: u32, push: SaxTimes| SaxTimes { bias, has_bias: 1, ..push };
+        let push = with(at::LINEFORMER_INPUT_BIAS, self.times(at::SAX_X1, at::SAX_NONE, 0, input.first));
+        self.run_times(run, times, 1, SaxTimes { features4, activation: at::SAX_LEAKY, ..push })?;
+        let (from, to, scales) = (at::SAX_X1, at::SAX_NORMAL1, at::LINEFORMER_NORM1);
+        self.each(run, norm, push::SaxNorm { n_samples, capacity, from, to, scales })?;
+        self.run_times(run, times, 3, self.times(at::SAX_QUERY, at::SAX_NORMAL1, WIDTH4, at::LINEFORMER_QUERY))?;
+        let push = push::SaxAttend { n_samples, capacity, first: self.chunk.along, row: self.row };
+        self.each(run, &kernels.attend, push)?;
+        let push = with(at::LINEFORMER_OUT + SQUARE, self.times(at::SAX_X2, at::SAX_SEEN, WIDTH4, at::LINEFORMER_OUT));
+        self.run_times(run, times, 1, SaxTimes { added: at::SAX_X1, ..push })?;
+        let (from, to, scales) = (at::SAX_X2, at::SAX_NORMAL2, at::LINEFORMER_NORM2);
+        self.each(run, norm, push::SaxNorm { n_samples, capacity, from, to, scales })?;
+        let gelu = |activated: u32, push: SaxTimes| SaxTimes { activation: at::SAX_GELU, activated, ..push };
+        let push = self.times(at::SAX_BEFORE_FIRST, at::SAX_NORMAL2, WIDTH4, at::LINEFORMER_EXPAND);
+        self.run_times(run, times, WIDE, gelu(at::SAX_FIRST, push))?;
+        let push = self.times(at::SAX_BEFORE_SECOND, at::SAX_FIRST, WIDE * WIDTH4, at::LINEFORMER_MIX);
+        self.run_times(run, times, WIDE, gelu(at::SAX_SECOND, push))?;
+        let push = self.times(at::SAX_BLOCK, at::SAX_SECOND, WIDE * WIDTH4, at::LINEFORMER_CONTRACT);
+        self.run_times(run, times, 1, SaxTimes { added: at::SAX_X2, activation: at::SAX_LEAKY, ..push })?;
+        let push = with(at::LINEFORMER_JOINT_BIAS, self.times(at::SAX_X3, at::SAX_BLOCK, WIDTH4, joint.first));
+        self.run_times(run, times, 1, SaxTimes { features4, activation: at::SAX_LEAKY, ..push })
+    }
+
+    /// Records attenuation, times `scale`, from these layers' results.
+    ///
+    /// # Errors
+    /// As [`Recorder::run`].
+    pub fn density(
+        &self,
+        run: &mut impl Recorder,
+        kernels: &LineformerKernels,
+        first_out: u32,
+        scale: f32,
+    ) -> Result<()> {
+        let push = push::SaxDensity { n_samples: self.chunk.n, capacity: self.capacity, first_out, scale };
+        self.each(run, &kernels.density, push)
+    }
+
+    /// A product with a transposed matrix, without an activation.
+    fn back(&self, to: u32, columns: u32, (from, rows4): (u32, u32), matrix: Matrix) -> SaxTimesBack {
+        SaxTimesBack {
+            n_samples: self.chunk.n,
+            capacity: self.capacity,
+            first_feature: self.chunk.first,
+            feature_stride: self.n_all,
+            from,
+            rows4,
+            weights: matrix.first,
+            stride: matrix.stride,
+            other: from,
+            other_rows4: 0,
+            other_weights: matrix.first,
+            other_stride: matrix.stride,
+            to,
+            columns,
+            activation: at::SAX_PLAIN,
+            slope_of: at::SAX_NONE,
+        }
+    }
+
+    fn run_back(&self, run: &mut impl Recorder, stage: &Stage<SaxTimesBack>, push: SaxTimesBack) -> Result<()> {
+        let samples = stage.local_size() * run.lane_samples();
+        let tiles = push.columns.div_ceil(at::sax_times_back::GROUPS);
+        run.run(stage, Groups::Direct([self.chunk.n.div_ceil(samples), tiles, 1]), push)
+    }
+
+    /// Records the way back to the features, from what [`Lineformer::layers`] left.
+    ///
+    /// # Errors
+    /// As [`Recorder::run`].
+    pub fn backward(&self, run: &mut impl Recorder, kernels: &LineformerBackKernels) -> Result<()> {
+        let (n_samples, capacity) = (self.chunk.n, self.capacity);
+        let (times, wide) = (&kernels.times, WIDE * WIDTH4);
+        let [input, joint] = self.outer();
+        let matrix = |first: u32, stride: u32| Matrix { first, stride };
+        let through =
+            |activation: u32, slope_of: u32, push: SaxTimesBack| SaxTimesBack { activation, slope_of, ..push };
+        let push = push::SaxDensityBack { n_samples, capacity, first: self.chunk.first };
+        self.each(run, &kernels.density, push)?;
+        let of_block = matrix(joint.first + self.features4(), joint.stride);
+        let push = self.back(at::SAX_BY_BLOCK, WIDTH4, (at::SAX_BY_JOINT, WIDTH4), of_block);
+        self.run_back(run, times, through(at::SAX_LEAKY, at::SAX_BLOCK, push))?;
+        let contract = matrix(at::LINEFORMER_CONTRACT, wide);
+        let push = self.back(at::SAX_BY_SECOND, wide, (at::SAX_BY_BLOCK, WIDTH4), contract);
+        self.run_back(run, times, through(at::SAX_GELU, at::SAX_BEFORE_SECOND, push))?;
+        let push = self.back(at::SAX_BY_FIRST, wide, (at::SAX_BY_SECOND, wide), matrix(at::LINEFORMER_MIX, wide));
+        self.run_back(run, times, through(at::SAX_GELU, at::SAX_BEFORE_FIRST, push))?;
+        let expand = matrix(at::LINEFORMER_EXPAND, WIDTH4);
+        self.run_back(run, times, self.back(at::SAX_BY_NORMAL, WIDTH4, (at::SAX_BY_FIRST, wide), expand))?;
+        let push = push::SaxNormBack {
+            n_samples,
+            capacity,
+            from: at::SAX_X2,
+            added: at::SAX_BY_BLOCK,
+            to: at::SAX_BY_OUT,
+            scales: at::LINEFORMER_NORM2,
+            left: at::SAX_NORM2,
+            activation: at::SAX_PLAIN,
+        };
+        self.each(run, &kernels.norm, push)?;
+        let out = matrix(at::LINEFORMER_OUT, WIDTH4);
+        self.run_back(run, times, self.back(at::SAX_BY_SEEN, WIDTH4, (at::SAX_BY_OUT, WIDTH4), out))?;
+        let push = push::SaxAttendBack { n_samples, capacity, first: self.chunk.along, row: self.row };
+        self.each(run, &kernels.attend, push)?;
+        let query_key_value = (at::SAX_BY_QUERY, 3 * WIDTH4);
+        let push = self.back(at::SAX_BY_NORMAL, WIDTH4, query_key_value, matrix(at::LINEFORMER_QUERY, WIDTH4));
+        self.run_back(run, times, push)?;
+        let push = push::SaxNormBack {
+            n_samples,
+            capacity,
+            from: at::SAX_X1,
+            added: at::SAX_BY_OUT,
+            to: at::SAX_BY_INPUT,
+            scales: at::LINEFORMER_NORM1,
+            left: at::SAX_NORM1,
+            activation: at::SAX_LEAKY,
+        };
+        self.each(run, &kernels.norm, push)?;
+        let push = self.back(at::SAX_FEATURES, self.features4(), (at::SAX_BY_JOINT, WIDTH4), joint);
+        let push = SaxTimesBack {
+            other: at::SAX_BY_INPUT,
+            other_rows4: WIDTH4,
+            other_weights: input.first,
+            other_stride: input.stride,
+            ..push
+        };
+        self.run_back(run, times, push)
+    }
+
+    /// Records what the chunk says of the Lineformer's numbers, in `n_parts` parts: after what chunks before said, or instead.
+    ///
+    /// # Errors
+    /// As [`Recorder::run`].
+    pub fn products(
+        &self,
+        run: &mut impl Recorder,
+        kernels: &LineformerBackKernels,
+        n_parts: u32,
+        adds: bool,
+    ) -> Result<()> {
+        let push = push::SaxProducts {
+            n_samples: self.chunk.n,
+            capacity: self.capacity,
+            first_feature: self.chunk.first,
+            feature_stride: self.n_all,
+            part_samples: PART_SAMPLES,
+            adds: u32::from(adds),
+        };
+        run.run(&kernels.products, Groups::Direct([n_parts, at::SAX_PRODUCTS, 1]), push)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_hold_all_samples_once_and_no_pair_apart() {
+        for (n_rays, row) in [(3, 7), (5000, 33), (2, 40_001), (1, MOST_SAMPLES), (400, 256)] {
+            let all = chunks(n_rays, row);
+            let mut next = 0;
+            for chunk in &all {
+                assert_eq!((chunk.first, chunk.along), (next, next % row));
+                assert!(chunk.n > 0 && chunk.n <= MOST_SAMPLES && chunk.along % 2 == 0);
+                next += chunk.n;
+            }
+            assert_eq!(next, n_rays * row);
+        }
+    }
+
+    #[test]
+    fn vectors_of_a_chunk_fit_a_buffer_of_every_device() {
+        assert!(vector_bytes(at::SAX_VECTORS, capacity(u32::MAX)) < 128 << 20);
+    }
+}
