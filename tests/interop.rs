@@ -176,7 +176,8 @@ fn datasets_convert_both_ways() {
 fn the_report_needs_nothing_but_itself() {
     let (_, _, run) = trained();
     let page = std::fs::read_to_string(run.join("report.html")).unwrap();
-    for part in ["<svg", "37 minutes", "Dice", "data:image/png;base64,", "march_loss", "type=\"radio\"", "Configuration"]
+    for part in
+        ["<svg", "37 minutes", "Dice", "data:image/png;base64,", "march_loss", "type=\"radio\"", "Configuration"]
     {
         assert!(page.contains(part), "{part}");
     }

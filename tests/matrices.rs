@@ -4,13 +4,19 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
+#[path = "common/faults.rs"]
+mod faults;
+mod shim;
 
 use common::{expect_agreement, expect_silence, gpu, run, small_config, small_dataset, uneven_dataset};
+use faults::{fault, sum_for_product};
 use nertca_vk::config::Preset;
+use nertca_vk::error::Result;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
+use nertca_vk::selftest::compare::Findings;
 use nertca_vk::selftest::drawing;
 use nertca_vk::selftest::iteration::{self, Case, MATRIX_CASES, MATRIX_CASES_BETWEEN_PHASES};
 use nertca_vk::train::calibrate::{self, Verdict};
@@ -50,6 +56,29 @@ fn every_stage_of_an_iteration_matches() {
         expect_agreement(|findings| iteration::compare(&gpu, dataset, case, &path, findings));
     }
     expect_silence(gpu);
+}
+
+/// An iteration whose backward passes compute the first layer again or, of a CPU, keep it.
+fn an_iteration(gpu: &Gpu, recompute: bool, findings: &mut Findings) -> Result<()> {
+    let tuning = Tuning::for_device(gpu.info()).with_layers(Layers::Matrices, String::new());
+    let path = Tuning { matrices: MatrixTuning { recompute, ..CPU }, ..tuning };
+    iteration::compare(gpu, &small_dataset(13, 11), &MATRIX_CASES[0], &path, findings)
+}
+
+#[test]
+fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
+    if matrices().is_none() {
+        return;
+    }
+    let kept: faults::Compare = |gpu, findings| an_iteration(gpu, false, findings);
+    let again: faults::Compare = |gpu, findings| an_iteration(gpu, true, findings);
+    faults::expect_found(&[
+        fault("mlp_pack", sum_for_product, kept),
+        fault("mlp_fused_fwd", sum_for_product, kept),
+        fault("mlp_fused_bwd", sum_for_product, kept),
+        fault("mlp_fused_bwd_first", sum_for_product, again),
+        fault("gradient_network", faults::difference_for_sum, kept),
+    ]);
 }
 
 #[test]

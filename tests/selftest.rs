@@ -3,18 +3,21 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
+#[path = "common/faults.rs"]
+mod faults;
 #[path = "common/program.rs"]
 mod program;
 mod shim;
 
 use common::{small_dataset, tuning};
+use faults::{
+    difference_for_sum, differences, fault, missing_clear, one_too_many, other_digits, sum_for_product, wrong_sign,
+};
 use nertca_vk::config::{Config, Preset, sections::Train};
 use nertca_vk::error::Result;
-use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::gpu::statistics::PipelineStatistics;
 use nertca_vk::inventory::{self, Compiled};
-use nertca_vk::kernels::stages::kernel_code;
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
@@ -49,78 +52,6 @@ fn the_program_compares_every_stage_and_passes() {
     assert_eq!(untested, if has_matrices { &[] } else { &OF_MATRICES[..] }, "a stage without a comparison");
 }
 
-const CONSTANT: u32 = 43;
-const STORE: u32 = 62;
-const ADD: u32 = 129;
-const SUBTRACT: u32 = 131;
-const MULTIPLY: u32 = 133;
-const WHOLE_ADD: u32 = 128;
-const WHOLE_SUBTRACT: u32 = 130;
-const SHIFT_RIGHT: u32 = 194;
-const SHIFT_LEFT: u32 = 196;
-const LESS: u32 = 176;
-const LESS_OR_EQUAL: u32 = 178;
-
-/// Instructions of SPIR-V by position: operation and length in words.
-fn instructions(words: &[u32]) -> Vec<(usize, u32, usize)> {
-    const HEADER: usize = 5;
-    let (mut at, mut found) = (HEADER, Vec::new());
-    while at < words.len() {
-        let length = (words[at] >> 16) as usize;
-        found.push((at, words[at] & 0xffff, length));
-        at += length;
-    }
-    found
-}
-
-/// Replaces an operation by another of the same shape, everywhere.
-fn replace(words: &mut [u32], from: u32, to: u32) {
-    for (at, ..) in instructions(words).into_iter().filter(|(_, operation, _)| *operation == from) {
-        words[at] = words[at] & 0xffff_0000 | to;
-    }
-}
-
-fn wrong_sign(words: &mut [u32]) {
-    replace(words, SUBTRACT, ADD);
-}
-
-fn sum_for_product(words: &mut [u32]) {
-    replace(words, MULTIPLY, ADD);
-}
-
-fn differences(words: &mut [u32]) {
-    replace(words, WHOLE_ADD, WHOLE_SUBTRACT);
-}
-
-fn other_digits(words: &mut [u32]) {
-    replace(words, SHIFT_RIGHT, SHIFT_LEFT);
-}
-
-/// Not for stages that add up a workgroup: they would read shared memory that nobody has written, at times NaN.
-fn one_too_many(words: &mut [u32]) {
-    replace(words, LESS, LESS_OR_EQUAL);
-}
-
-fn difference_for_sum(words: &mut [u32]) {
-    replace(words, ADD, SUBTRACT);
-}
-
-/// Stores of zero are left out.
-fn missing_clear(words: &mut [u32]) {
-    const NOTHING: u32 = 1 << 16;
-    let all = instructions(words);
-    let zeros: Vec<u32> =
-        all.iter().filter(|i| i.1 == CONSTANT && words[i.0 + 3] == 0).map(|i| words[i.0 + 2]).collect();
-    for (at, _, length) in all.into_iter().filter(|(_, operation, _)| *operation == STORE) {
-        if zeros.contains(&words[at + 2]) {
-            words[at..at + length].fill(NOTHING);
-        }
-    }
-}
-
-/// The comparison that a fault is to be found by.
-type Compare = fn(&Gpu, &mut Findings) -> Result<()>;
-
 fn an_iteration(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let tuning = Tuning::for_device(gpu.info()).with_layers(Layers::F32, String::new());
     iteration::compare(gpu, &small_dataset(13, 11), &F32_CASES[2], &tuning, findings)
@@ -135,26 +66,10 @@ fn many_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     blobs::compare_crowd(gpu, &Tuning::for_device(gpu.info()), findings)
 }
 
-/// A fault in the code of a stage.
-struct Fault {
-    stage: &'static str,
-    plant: fn(&mut [u32]),
-    compare: Compare,
-}
-
-/// The code that the device gets of a stage.
-fn code(gpu: &Gpu, stage: &str) -> Vec<u32> {
-    let variant = |name: &str, taken: bool| kernel_code(&format!("{stage}_{name}")).ok().filter(|_| taken);
-    let texel = variant("texel", tuning(gpu).operands == Operands::Texel);
-    let taken = texel.or_else(|| variant("subgroup", gpu.info().full_subgroups.is_some()));
-    bytemuck::pod_collect_to_vec(taken.unwrap_or_else(|| kernel_code(stage).unwrap()).spirv)
-}
-
 /// Faults in the code of shaders as the driver gets it: each is found in the row of its stage, and in no row before.
 #[test]
 fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
-    let fault = |stage, plant, compare| Fault { stage, plant, compare };
-    for Fault { stage, plant, compare } in [
+    faults::expect_found(&[
         fault("gaussian_moments", wrong_sign, gaussians::compare),
         fault("gaussian_update", wrong_sign, gaussians::compare),
         fault("tree_grid_gradient", wrong_sign, trees::compare),
@@ -202,25 +117,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("sax_report", difference_for_sum, sax::compare),
         fault("sax_view", difference_for_sum, sax::compare),
         fault("gaussian_crowd", wrong_sign, many_gaussians),
-    ] {
-        shim::begin(shim::Failing::None);
-        let open = || Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap();
-        let first_failure = || {
-            let mut findings = Findings::default();
-            compare(&open(), &mut findings).unwrap_or_else(|error| panic!("{stage}: {error}"));
-            findings.rows().iter().find(|row| !row.is_ok()).map(|row| row.stages.clone())
-        };
-        assert_eq!(first_failure(), None, "without a fault");
-        let words = code(&open(), stage);
-        let mut faulty = words.clone();
-        plant(&mut faulty);
-        assert!(words != faulty, "{stage} has no such instruction");
-        shim::plant(words, faulty);
-        let found = first_failure().unwrap_or_else(|| panic!("the fault in {stage} was not seen"));
-        println!("{stage}: {found:?}");
-        assert!(found.contains(&stage), "the fault in {stage} was seen in {found:?}");
-    }
-    shim::begin(shim::Failing::None);
+    ]);
 }
 
 /// Kernels with their constants.

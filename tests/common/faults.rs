@@ -1,0 +1,124 @@
+//! Faults planted in the code of shaders as the driver gets it, to be found by comparisons with the f64 twins.
+#![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
+
+use crate::common::tuning;
+use crate::shim;
+use nertca_vk::error::Result;
+use nertca_vk::gpu::buffer::Operands;
+use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::kernels::stages::kernel_code;
+use nertca_vk::selftest::compare::Findings;
+
+const CONSTANT: u32 = 43;
+const STORE: u32 = 62;
+const ADD: u32 = 129;
+const SUBTRACT: u32 = 131;
+const MULTIPLY: u32 = 133;
+const WHOLE_ADD: u32 = 128;
+const WHOLE_SUBTRACT: u32 = 130;
+const SHIFT_RIGHT: u32 = 194;
+const SHIFT_LEFT: u32 = 196;
+const LESS: u32 = 176;
+const LESS_OR_EQUAL: u32 = 178;
+
+/// Instructions of SPIR-V by position: operation and length in words.
+fn instructions(words: &[u32]) -> Vec<(usize, u32, usize)> {
+    const HEADER: usize = 5;
+    let (mut at, mut found) = (HEADER, Vec::new());
+    while at < words.len() {
+        let length = (words[at] >> 16) as usize;
+        found.push((at, words[at] & 0xffff, length));
+        at += length;
+    }
+    found
+}
+
+/// Replaces an operation by another of the same shape, everywhere.
+fn replace(words: &mut [u32], from: u32, to: u32) {
+    for (at, ..) in instructions(words).into_iter().filter(|(_, operation, _)| *operation == from) {
+        words[at] = words[at] & 0xffff_0000 | to;
+    }
+}
+
+pub fn wrong_sign(words: &mut [u32]) {
+    replace(words, SUBTRACT, ADD);
+}
+
+pub fn sum_for_product(words: &mut [u32]) {
+    replace(words, MULTIPLY, ADD);
+}
+
+pub fn differences(words: &mut [u32]) {
+    replace(words, WHOLE_ADD, WHOLE_SUBTRACT);
+}
+
+pub fn other_digits(words: &mut [u32]) {
+    replace(words, SHIFT_RIGHT, SHIFT_LEFT);
+}
+
+/// Not for stages that add up a workgroup: they would read shared memory that nobody has written, at times NaN.
+pub fn one_too_many(words: &mut [u32]) {
+    replace(words, LESS, LESS_OR_EQUAL);
+}
+
+pub fn difference_for_sum(words: &mut [u32]) {
+    replace(words, ADD, SUBTRACT);
+}
+
+/// Stores of zero are left out.
+pub fn missing_clear(words: &mut [u32]) {
+    const NOTHING: u32 = 1 << 16;
+    let all = instructions(words);
+    let zeros: Vec<u32> =
+        all.iter().filter(|i| i.1 == CONSTANT && words[i.0 + 3] == 0).map(|i| words[i.0 + 2]).collect();
+    for (at, _, length) in all.into_iter().filter(|(_, operation, _)| *operation == STORE) {
+        if zeros.contains(&words[at + 2]) {
+            words[at..at + length].fill(NOTHING);
+        }
+    }
+}
+
+/// The comparison that a fault is to be found by.
+pub type Compare = fn(&Gpu, &mut Findings) -> Result<()>;
+
+/// A fault in the code of a stage.
+pub struct Fault {
+    stage: &'static str,
+    plant: fn(&mut [u32]),
+    compare: Compare,
+}
+
+pub fn fault(stage: &'static str, plant: fn(&mut [u32]), compare: Compare) -> Fault {
+    Fault { stage, plant, compare }
+}
+
+/// The code that the device gets of a stage.
+fn code(gpu: &Gpu, stage: &str) -> Vec<u32> {
+    let variant = |name: &str, taken: bool| kernel_code(&format!("{stage}_{name}")).ok().filter(|_| taken);
+    let texel = variant("texel", tuning(gpu).operands == Operands::Texel);
+    let taken = texel.or_else(|| variant("subgroup", gpu.info().full_subgroups.is_some()));
+    bytemuck::pod_collect_to_vec(taken.unwrap_or_else(|| kernel_code(stage).unwrap()).spirv)
+}
+
+/// Expects that nothing is found without a fault, and that each is found in the row of its stage before all others.
+pub fn expect_found(faults: &[Fault]) {
+    for Fault { stage, plant, compare } in faults {
+        shim::begin(shim::Failing::None);
+        let open = || Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap();
+        let first_failure = || {
+            let mut findings = Findings::default();
+            compare(&open(), &mut findings).unwrap_or_else(|error| panic!("{stage}: {error}"));
+            findings.rows().iter().find(|row| !row.is_ok()).map(|row| row.stages.clone())
+        };
+        assert_eq!(first_failure(), None, "without a fault");
+        let words = code(&open(), stage);
+        let mut faulty = words.clone();
+        plant(&mut faulty);
+        assert!(words != faulty, "{stage} has no such instruction");
+        shim::plant(words, faulty);
+        let found = first_failure().unwrap_or_else(|| panic!("the fault in {stage} was not seen"));
+        println!("{stage}: {found:?}");
+        assert!(found.contains(stage), "the fault in {stage} was seen in {found:?}");
+    }
+    shim::begin(shim::Failing::None);
+}
