@@ -4,6 +4,7 @@
 mod common;
 
 use common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
+use glam::DVec3;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset, sections};
 use nertca_vk::error::Error;
@@ -11,8 +12,10 @@ use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
+use nertca_vk::model::component::Component;
 use nertca_vk::model::gaussians::{Gaussians, MovingGaussians};
 use nertca_vk::plan::Plan;
+use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
@@ -49,6 +52,32 @@ fn integrals_and_maxima_match_their_twin() {
 fn cells_match_their_twin() {
     let gpu = gpu();
     expect_agreement(|findings| blobs::compare_cells(&gpu, &tuning(&gpu), findings));
+    expect_silence(gpu);
+}
+
+#[test]
+fn bounds_hold_all_around_their_points() {
+    let gpu = gpu();
+    let dataset = common::small_dataset(13, 11);
+    // Four fine points, 1 mm apart, along each side of the cube around a coarse one.
+    let coarse = PatientGrid { origin_mm: DVec3::splat(-16.0), spacing_mm: DVec3::splat(4.0), size: [8; 3] };
+    let fine = PatientGrid { origin_mm: DVec3::splat(-17.5), spacing_mm: DVec3::ONE, size: [32; 3] };
+    let away_mm = 1.5 * 3f64.sqrt();
+    for field in drawn_fields() {
+        let renderer = Renderer::new(&gpu, &model(&gpu, &dataset, field), tuning(&gpu)).unwrap();
+        let values = renderer.sample_patient(Component::Dynamic, 1, &fine).unwrap();
+        let [least, most] = renderer.bound_patient(1, &coarse, away_mm).unwrap().unwrap();
+        let largest = values.iter().copied().fold(0.0, f32::max);
+        for (i, value) in values.iter().enumerate() {
+            let [x, y, z] = [i % 32 / 4, i / 32 % 32 / 4, i / 1024 / 4];
+            let at = (z * 8 + y) * 8 + x;
+            let rounding = 1e-5 * largest;
+            assert!(least[at] <= value + rounding, "{i}: at least {} instead of {value}", least[at]);
+            assert!(most[at] >= value - rounding, "{i}: at most {} instead of {value}", most[at]);
+        }
+        // They tell something.
+        assert!(least.iter().any(|v| *v > 0.01 * largest) && most.iter().any(|v| *v == 0.0), "{least:?} {most:?}");
+    }
     expect_silence(gpu);
 }
 

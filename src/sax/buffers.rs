@@ -223,6 +223,6 @@ mod tests {
         };
         let memory = SaxMemory::of(&setup);
         assert!(memory.of_field_buffer < LEAST_STORAGE_BUFFER && memory.of_batch_buffer < LEAST_STORAGE_BUFFER);
-        assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 70, 2038));
+        assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 100, 2041));
     }
 }
