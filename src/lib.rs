@@ -39,7 +39,7 @@
 //! #     degradations: Default::default(),
 //! #     layout: nertca_vk::scan::dataset::Layout::Native,
 //! #     anatomy: None,
-//! #     volumes: false,
+//! #     volumes_every: None,
 //! # };
 //! # nertca_vk::phantom::dataset::make(&gpu, &options, &data, |_, _, _| ())?;
 //! let dataset = Dataset::open(&data)?;

@@ -94,7 +94,7 @@ fn options(degradations: Degradations, anatomy: Option<Anatomy>) -> PhantomOptio
         degradations,
         layout: Layout::Native,
         anatomy,
-        volumes: false,
+        volumes_every: None,
     }
 }
 

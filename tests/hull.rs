@@ -19,6 +19,7 @@ use nertca_vk::plan::motion;
 use nertca_vk::plan::scale::dynamic_half;
 use nertca_vk::raster::{Image, dilate};
 use nertca_vk::scan::dataset::{Dataset, Layout};
+use std::num::NonZeroU32;
 
 const PHASES: u32 = 8;
 const RESOLUTION: usize = 96;
@@ -41,7 +42,7 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,
-        volumes: true,
+        volumes_every: Some(NonZeroU32::MIN),
     };
     make(gpu, &options, &out, |_, _, _| ()).unwrap();
     let vessels = (0..PHASES)

@@ -212,6 +212,29 @@ fn both_layouts_hold_the_same_data() {
 }
 
 #[test]
+fn volumes_are_of_the_phases_asked_for() {
+    let directory = tempfile::tempdir().unwrap();
+    let phantom = ["--size", "20", "--phases", "5", "--views", "3"];
+    for (asked, expected) in [(&[][..], vec![0, 1, 2, 3, 4]), (&["--volumes-every", "2"], vec![0, 2, 4])] {
+        let out = directory.path().join(expected.len().to_string());
+        ok(&[&["phantom", text(&out)], &phantom[..], asked].concat());
+        let there = |kind: &str| -> Vec<u32> {
+            (0..5).filter(|phase| out.join(format!("volumes/{kind}-{phase:02}.nrrd")).is_file()).collect()
+        };
+        assert_eq!((there("vessels"), there("background")), (expected.clone(), expected));
+        // The tree is that of all phases.
+        let tree: Value = serde_json::from_slice(&std::fs::read(out.join("volumes/tree.json")).unwrap()).unwrap();
+        assert!(tree.to_string().len() > 100, "{tree}");
+    }
+    let out = directory.path().join("none");
+    for (contrary, part) in
+        [(&["--volumes-every", "0"][..], "0"), (&["--no-volumes", "--volumes-every", "2"], "--no-volumes")]
+    {
+        fails(&[&["phantom", text(&out)], &phantom[..], contrary].concat(), 2, &[part]);
+    }
+}
+
+#[test]
 fn real_anatomy_makes_a_dataset() {
     let Some(anatomy) = shared::shared("anatomy") else { return };
     let directory = tempfile::tempdir().unwrap();

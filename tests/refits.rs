@@ -36,7 +36,7 @@ fn phantom(gpu: &Gpu) -> (tempfile::TempDir, Dataset) {
         seed: 1,
         degradations: Degradations::default(),
         layout: Layout::Native,
-        volumes: false,
+        volumes_every: None,
     };
     make(gpu, &options, &directory.path().join("data"), |_, _, _| ()).unwrap();
     let dataset = Dataset::open(&directory.path().join("data")).unwrap();

@@ -99,6 +99,7 @@ fn faults_have_their_line() {
         ("name = \"a\"", "name = \"a\"\nphantom = { photons = 1e5, detector_photons = 1e5 }", "line 9", "not both"),
         ("name = \"a\"", "name = \"a\"\nphantom = { breathing = { mm = 3 } }", "line 9", "mm"),
         ("name = \"a\"", "name = \"a\"\nphantom = { collimated_share = 2 }", "line 9", "collimated_share"),
+        ("name = \"a\"", "name = \"a\"\nphantom = { volumes = false, volumes_every = 2 }", "line 9", "volumes_every"),
         ("seeds = [1]", "seeds = [1]\npublished = \"values.toml\"", "line 3", "values.toml"),
         ("seeds = [1]", "seeds = [1]\ntable = { columns = [\"views\", \"views\"] }", "line 3", "each once"),
         ("seeds = [1]", "seeds = [1]\ntable = { scores = [\"dicee\"] }", "line 3", "dicee"),

@@ -134,7 +134,7 @@ fn default_phantom(gpu: &Gpu, scratch: &Path) -> Result<Dataset> {
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,
-        volumes: false,
+        volumes_every: None,
     };
     make(gpu, &options, &directory, |_, _, _| {})?;
     Dataset::open(&directory)

@@ -83,7 +83,7 @@ pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
             c_arms: args.c_arm.options(),
             iodine_per_mm: args.iodine,
         }),
-        volumes: !args.no_volumes,
+        volumes_every: (!args.no_volumes).then_some(args.volumes_every),
     };
     tell_of_times(options.layout, &options.degradations);
     make(&gpu, &options, &args.out, bar())?;

@@ -11,6 +11,7 @@ use nertca_vk::phantom::noise::Photons;
 use nertca_vk::phantom::views::{Angles, CArmOptions, PixelPitch, ViewAngles};
 use nertca_vk::scan::dataset::Layout;
 use nertca_vk::scan::gating::BeatScaling;
+use std::num::NonZeroU32;
 use std::path::PathBuf;
 
 /// `phantom`.
@@ -52,6 +53,9 @@ pub struct PhantomArgs {
     /// Do not write the voxel volumes (`volumes/*.nrrd`).
     #[arg(long)]
     pub no_volumes: bool,
+    /// Write the voxel volumes of the first of every so many phases: 3D scores take as much less time.
+    #[arg(long, value_name = "N", default_value = "1", conflicts_with = "no_volumes")]
+    pub volumes_every: NonZeroU32,
     /// A catheter of 2 mm (6F) in the aorta of the training views: its tip, in the ostium, goes with the heart, its other
     /// end is still; not part of the masks.
     #[arg(long, help_heading = DEGRADATIONS)]

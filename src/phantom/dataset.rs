@@ -23,6 +23,7 @@ use crate::scan::writer::{About, Writer};
 use crate::score::volume::VOLUMES;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
 /// A vessel-only line integral above this share of a 1 mm vessel's marks a vessel pixel.
@@ -70,8 +71,8 @@ pub struct PhantomOptions {
     pub layout: Layout,
     /// Real anatomy instead of the procedural one.
     pub anatomy: Option<Anatomy>,
-    /// Also write the voxel volumes.
-    pub volumes: bool,
+    /// Also write the voxel volumes of the first of every so many phases; of none where this is none.
+    pub volumes_every: Option<NonZeroU32>,
 }
 
 /// A tree and a CT from files.
@@ -134,8 +135,8 @@ struct Shooting<'a> {
     seed: u32,
     degradations: &'a Degradations,
     layout: Layout,
-    /// Also write the voxel volumes.
-    volumes: bool,
+    /// Also write the voxel volumes of the first of every so many phases.
+    volumes_every: Option<NonZeroU32>,
 }
 
 /// Makes a phantom dataset in `out`.
@@ -152,7 +153,7 @@ pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl 
         seed: options.seed,
         degradations: &options.degradations,
         layout: options.layout,
-        volumes: options.volumes,
+        volumes_every: options.volumes_every,
     };
     shooting.check(out)?;
     let projector = Projector::new(gpu, options.size, options.size)?;
@@ -181,7 +182,7 @@ pub fn project_volumes(
         seed: options.seed,
         degradations: &options.degradations,
         layout: options.layout,
-        volumes: false,
+        volumes_every: None,
     };
     shooting.check(out)?;
     if options.vessel_per_mm.is_some_and(|v| !(v.is_finite() && v > 0.0)) {
@@ -393,7 +394,7 @@ fn shoot(
     }
     for phase in 0..stage.phases {
         progress("projections", u64::from(phase), u64::from(stage.phases));
-        if shooting.volumes {
+        if shooting.volumes_every.is_some_and(|every| phase % every == 0) {
             let fraction = Shot::at_phase(phase, stage.phases).fraction;
             stage.subject.write_volumes(&out.join(VOLUMES), phase, fraction)?;
         }
@@ -430,7 +431,7 @@ fn shoot(
     }
     progress("projections", u64::from(stage.phases), u64::from(stage.phases));
     truth.write(out)?;
-    if shooting.volumes {
+    if shooting.volumes_every.is_some() {
         let at = |phase| stage.subject.vessel_tree(Shot::at_phase(phase, stage.phases).fraction);
         let trees: Vec<Tree> = (0..stage.phases).filter_map(at).collect();
         if let Some(file) = TreeFile::of(&trees) {

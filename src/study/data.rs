@@ -12,6 +12,7 @@ use crate::scan::dataset::Layout;
 use crate::study::COMMIT;
 use crate::study::text::Places;
 use serde::{Deserialize, Serialize};
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -51,6 +52,8 @@ pub struct PhantomSection {
     iodine_per_mm: Option<f64>,
     /// Whether the true vessels are written as volumes, for scores in 3D.
     volumes: Option<bool>,
+    /// The first of every so many phases has its volume.
+    volumes_every: Option<NonZeroU32>,
     catheter: Option<bool>,
     geometry_error: Option<GeometryError>,
     breathing: Option<Breathing>,
@@ -80,6 +83,7 @@ impl PhantomSection {
             background: self.background.or(common.background),
             iodine_per_mm: self.iodine_per_mm.or(common.iodine_per_mm),
             volumes: self.volumes.or(common.volumes),
+            volumes_every: self.volumes_every.or(common.volumes_every),
             catheter: self.catheter.or(common.catheter),
             geometry_error: self.geometry_error.or(common.geometry_error),
             breathing: self.breathing.or(common.breathing),
@@ -216,6 +220,9 @@ pub(super) fn phantoms(
 ) -> std::result::Result<Vec<DataSet>, String> {
     let anatomy = section.anatomy(places)?;
     let degradations = section.degradations()?;
+    if section.volumes == Some(false) && section.volumes_every.is_some() {
+        return Err("`volumes_every` says which volumes are written, `volumes` that none is: either".into());
+    }
     let numbers = section.views.clone().unwrap_or_else(|| vec![USUAL_VIEWS]);
     if let Some(i) = (1..numbers.len()).find(|i| numbers[..*i].contains(&numbers[*i])) {
         return Err(format!("views: {} stands twice", numbers[i]));
@@ -239,7 +246,7 @@ pub(super) fn phantoms(
             degradations: degradations.clone(),
             layout: Layout::Native,
             anatomy: anatomy.clone(),
-            volumes: section.volumes.unwrap_or(true),
+            volumes_every: section.volumes.unwrap_or(true).then_some(section.volumes_every.unwrap_or(NonZeroU32::MIN)),
         };
         Ok(DataSet {
             id: format!("{name}-{views}v"),

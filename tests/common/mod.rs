@@ -22,6 +22,7 @@ pub use nertca_vk::selftest::compare::relative_error;
 use nertca_vk::selftest::compare::{Findings, Row};
 use nertca_vk::selftest::problems;
 use nertca_vk::train::trainer::Trainer;
+use std::num::NonZeroU32;
 use std::path::Path;
 
 /// A device with validation on. A missing driver or layer fails the test: it is never skipped.
@@ -90,7 +91,7 @@ pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset 
         degradations: Degradations::default(),
         layout: Layout::Native,
         anatomy: None,
-        volumes: true,
+        volumes_every: Some(NonZeroU32::MIN),
     };
     make(gpu, &options, directory, |_, _, _| ()).unwrap();
     Dataset::open(directory).unwrap()
