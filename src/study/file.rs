@@ -11,7 +11,7 @@ use crate::study::published::Published;
 use crate::study::scores::Score;
 use crate::study::text::{Places, Text};
 use serde::Deserialize;
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 use toml::Spanned;
 
@@ -63,6 +63,9 @@ struct MethodSection {
     iterations: Option<Spanned<u32>>,
     #[serde(default)]
     set: Vec<Spanned<String>>,
+    /// Further settings on data sets, by their names.
+    #[serde(default)]
+    on: BTreeMap<Spanned<String>, Vec<Spanned<String>>>,
     published: Option<Spanned<String>>,
 }
 
@@ -97,7 +100,7 @@ pub fn read(file: &Path, data_directory: Option<&Path>) -> Result<Study> {
     let mut methods = Vec::new();
     for section in &read.method {
         check_name(&text, &section.name, &mut names, "method")?;
-        methods.push(method(&text, section)?);
+        methods.push(method(&text, section, &read.data)?);
     }
     let published = read.published.as_ref().map(|path| published(&text, &places, path, &read.method)).transpose()?;
     for (what, none) in [("[[data]]", data.is_empty()), ("[[method]]", methods.is_empty())] {
@@ -187,10 +190,37 @@ fn data_sets(
     }
 }
 
-fn method(text: &Text<'_>, section: &MethodSection) -> Result<Method> {
+fn method(text: &Text<'_>, section: &MethodSection, data: &[DataSection]) -> Result<Method> {
+    let name = section.name.get_ref();
+    let preset = Config::preset(section.preset);
+    let mut config_on = BTreeMap::new();
+    for (set, settings) in &section.on {
+        if !data.iter().any(|data| data.name.get_ref() == set.get_ref()) {
+            let problem = format!("method `{name}`: `on.{}`: the study has no such data set", set.get_ref());
+            return Err(text.fault(&set.span(), problem));
+        }
+        config_on.insert(set.get_ref().clone(), configuration(text, section, &preset, settings)?);
+    }
+    Ok(Method {
+        name: name.clone(),
+        label: section.label.clone().unwrap_or_else(|| name.clone()),
+        preset_iterations: preset.train.iterations,
+        config: configuration(text, section, &preset, &[])?,
+        config_on,
+        published: section.published.as_ref().map(|published| published.get_ref().clone()),
+    })
+}
+
+/// A method's configuration with `further` settings beside its own.
+fn configuration(
+    text: &Text<'_>,
+    section: &MethodSection,
+    preset: &Config,
+    further: &[Spanned<String>],
+) -> Result<Config> {
     let name = section.name.get_ref();
     let mut given: Vec<&str> = Vec::new();
-    for setting in &section.set {
+    for setting in section.set.iter().chain(further) {
         let fault = |problem: String| text.fault(&setting.span(), format!("method `{name}`: {problem}"));
         let key = setting.get_ref().split('=').next().unwrap_or_default().trim();
         if let Some((_, owner)) = OWNED.iter().find(|(owned, _)| *owned == key) {
@@ -204,26 +234,19 @@ fn method(text: &Text<'_>, section: &MethodSection) -> Result<Method> {
         }
         given.push(key);
     }
-    let preset = Config::preset(section.preset);
-    let mut settings: Vec<String> = section.set.iter().map(|setting| setting.get_ref().clone()).collect();
+    let own = || section.set.iter().chain(further);
+    let mut settings: Vec<String> = own().map(|setting| setting.get_ref().clone()).collect();
     if let Some(iterations) = &section.iterations {
-        settings.extend(scaled(&preset, *iterations.get_ref(), &given));
+        settings.extend(scaled(preset, *iterations.get_ref(), &given));
     }
-    let config = Config::load(Some(section.preset), None, &settings).map_err(|e| {
+    Config::load(Some(section.preset), None, &settings).map_err(|e| {
         let alone = |setting: &&Spanned<String>| {
             Config::load(Some(section.preset), None, std::slice::from_ref(setting.get_ref())).is_err()
         };
-        let to_blame = section.set.iter().find(alone).map(Spanned::span);
+        let to_blame = own().find(alone).map(Spanned::span);
         let length = || section.iterations.as_ref().map(Spanned::span);
         let at = to_blame.or_else(length).unwrap_or_else(|| section.name.span());
         text.fault(&at, format!("method `{name}`: {e}"))
-    })?;
-    Ok(Method {
-        name: name.clone(),
-        label: section.label.clone().unwrap_or_else(|| name.clone()),
-        preset_iterations: preset.train.iterations,
-        config,
-        published: section.published.as_ref().map(|published| published.get_ref().clone()),
     })
 }
 

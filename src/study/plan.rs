@@ -8,6 +8,7 @@ use crate::study::data::DataSet;
 use crate::study::layout::TableLayout;
 use crate::study::published::Published;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// A study that can be run.
 #[derive(Debug, Clone)]
@@ -35,6 +36,8 @@ pub struct Method {
     pub label: String,
     /// Its configuration, but for the seed.
     pub config: Config,
+    /// Its configuration on data sets, by their names in the file, where that is another.
+    pub config_on: BTreeMap<String, Config>,
     /// Length of the preset's own run.
     pub preset_iterations: u32,
     /// Whose published values stand beside it.
@@ -104,7 +107,8 @@ impl Study {
 
     /// The configuration of a run.
     pub fn config(&self, run: &Run) -> Config {
-        Config { seed: run.seed, ..self.methods[run.method].config.clone() }
+        let (method, data) = (&self.methods[run.method], &self.data[run.data].name);
+        Config { seed: run.seed, ..method.config_on.get(data).unwrap_or(&method.config).clone() }
     }
 
     /// What a run is made of.
