@@ -83,6 +83,9 @@ fn faults_have_their_line() {
         ("name = \"a\"", "name = \"a\"\n[[data]]\nname = \"a\"", "line 10", "another data set"),
         ("\"train.rays=64\"", "\"train.rays=64\", \"train.rays = 65\"", "line 13", "set twice"),
         ("\"train.rays=64\"", "\"seed=3\"", "line 13", "`seeds`"),
+        ("iterations = 12", "on = { a = [\"train.rays=65\"] }", "line 12", "set twice"),
+        ("iterations = 12", "on = { b = [\"train.chunk_samples=65536\"] }", "line 12", "on.b"),
+        ("iterations = 12", "on = { a = [\"train.rayz=64\"] }", "line 12", "train.rayz"),
         ("\"train.rays=64\"", "\"preset=fast\"", "line 13", "`preset`"),
         ("\"train.rays=64\"", "\"train.iterations=64\"", "line 13", "contradicts"),
         ("\"train.rays=64\"", "\"train.rayz=64\"", "line 13", "train.rayz"),
@@ -128,8 +131,15 @@ fn our_studies_can_be_run() {
         std::fs::write(data.path().join("anatomy").join(file), b"stands in for it").unwrap();
     }
     let studies = Path::new(SMOKE).parent().unwrap();
-    let expected =
-        [("smoke", 24), ("table1", 198), ("scaled-table1", 126), ("table2", 30), ("time", 21), ("degradations", 204)];
+    let expected = [
+        ("smoke", 24),
+        ("table1", 198),
+        ("scaled-table1", 126),
+        ("table2", 30),
+        ("scaled-table2", 30),
+        ("time", 21),
+        ("degradations", 204),
+    ];
     for (name, runs) in expected {
         let file = studies.join(name).with_extension("toml");
         let listed = ok(&["list", text(&file), "--data", text(data.path())]);
@@ -162,6 +172,27 @@ fn what_changed_runs_again_and_nothing_else() {
     assert_eq!(events.matches("run_begun").count(), 1);
     assert_eq!(result("a-3v.m.s1"), before[0]);
     assert_ne!(result("a-3v.n.s1"), before[1]);
+    // What another program made counts where that is asked for.
+    let file_of = |id: &str| out.join("runs").join(id).join("result.json");
+    let mut other: Value = serde_json::from_slice(&result("a-3v.m.s1")).unwrap();
+    other["fingerprint"]["commit"] = "of another day".into();
+    std::fs::write(file_of("a-3v.m.s1"), other.to_string()).unwrap();
+    assert_eq!(all("waiting"), ["a-3v.m.s1"]);
+    let begun = |more: &[&str]| {
+        let args = [&["run", text(&file), "-o", text(&out), "--json"], more].concat();
+        ok(&args).matches("run_begun").count()
+    };
+    assert_eq!(begun(&["--any-commit"]), 0);
+    assert_eq!(begun(&[]), 1);
+    // Settings of a data set alone.
+    written(
+        directory.path(),
+        &TINY.replacen("iterations = 12", "iterations = 12\non = { a = [\"static.tv=0.5\"] }", 1),
+    );
+    assert_eq!(all("waiting"), ["a-3v.m.s1"]);
+    assert_eq!(begun(&["--any-commit"]), 1, "another configuration");
+    let config = std::fs::read_to_string(out.join("runs/a-3v.m.s1/config.toml")).unwrap();
+    assert!(config.contains("tv = 0.5"), "{config}");
     // Another data set under the same name.
     written(directory.path(), &TINY.replace("phases = 3", "phases = 4"));
     assert_eq!(all("scored"), Vec::<String>::new());

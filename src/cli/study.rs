@@ -76,6 +76,9 @@ pub struct DoingArgs {
     /// Also do runs again that failed.
     #[arg(long)]
     pub retry_failed: bool,
+    /// Results of other commits of this program count as done, where data and configuration are those of the study.
+    #[arg(long)]
+    pub any_commit: bool,
     /// One JSON object per line on stdout instead of progress.
     #[arg(long)]
     pub json: bool,
@@ -148,6 +151,7 @@ fn at_work<T>(
         tune: &|gpu, config, dataset| cli.training_tuning(gpu, config, dataset),
         cancel: &cancel,
         retry_failed: args.retry_failed,
+        any_commit: args.any_commit,
     };
     if args.json { work(&study, &place, &mut print_json) } else { work(&study, &place, &mut show()) }
 }

@@ -50,6 +50,8 @@ pub struct Workplace<'a> {
     pub cancel: &'a AtomicBool,
     /// Runs that failed are done again.
     pub retry_failed: bool,
+    /// Results of other commits of the program count as done, where data and configuration are the same.
+    pub any_commit: bool,
 }
 
 /// Comparison of truth and prediction in the first unseen image, in a run directory.
@@ -72,7 +74,11 @@ impl Workplace<'_> {
     /// # Errors
     /// As [`Outcome::read`].
     pub fn done(&self, study: &Study, run: &Run) -> Result<Option<Outcome>> {
-        let outcome = Outcome::of(study, self.directory, run)?;
+        let outcome = if self.any_commit {
+            Outcome::of_any_commit(study, self.directory, run)?
+        } else {
+            Outcome::of(study, self.directory, run)?
+        };
         Ok(outcome.filter(|outcome| outcome.failure.is_none() || !self.retry_failed))
     }
 
