@@ -126,8 +126,8 @@ void store_input_gradient(uint first, uint weights_at) {
         uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
         [[unroll]] for (uint r = 0u; r < input_rows; r++) {
             uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            SUM16 gradient = input_gradient(weights_at, row, column);
-            coopMatStore(gradient, dz_in16, (first + row) * width8 + column / 8u, width8, ROWS);
+            GRADIENT gradient = input_gradient(weights_at, row, column);
+            STORE_F16(gradient, dz_in16, (first + row) * width8 + column / 8u, width8);
         }
     }
 }

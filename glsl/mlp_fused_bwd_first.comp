@@ -62,7 +62,7 @@ void activate() {
                 sum = coopMatMulAdd(inputs, weights, sum);
             }
             [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
-            coopMatStore(SUM16(sum), tile_in, row * input_stride + column / 8u, input_stride, ROWS);
+            STORE_F16(sum, tile_in, row * input_stride + column / 8u, input_stride);
         }
     }
 }

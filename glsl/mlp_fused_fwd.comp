@@ -98,12 +98,11 @@ void main() {
             [[unroll]] for (uint c = 0u; c < column_tiles; c++) {
                 SUM sum = sums[r * column_tiles + c];
                 [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
-                SUM16 rectified = SUM16(sum);
                 uint column = (column0 + c * n) / 8u;
-                coopMatStore(rectified, tile16, r * m * hidden_stride + column, hidden_stride, ROWS);
+                STORE_F16(sum, tile16, r * m * hidden_stride + column, hidden_stride);
                 if (layer >= keep_from) {
                     uint at = (layer - keep_from) * setup.sample_capacity + first + r * m;
-                    coopMatStore(rectified, activations16, at * width8 + column, width8, ROWS);
+                    STORE_F16(sum, activations16, at * width8 + column, width8);
                 }
             }
         }

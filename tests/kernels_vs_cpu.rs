@@ -65,6 +65,7 @@ fn paths() -> [Tuning; 3] {
             unroll: false,
             backward_sums: u32::MAX,
             recompute: false,
+            f16_sums: true,
         },
         private_line_bytes,
         chunk_samples: 1 << 16,

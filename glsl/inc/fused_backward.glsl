@@ -78,9 +78,36 @@ void put_neuron_sums(float sums[lane_neurons], uint at) {
     }
 }
 
+// A tile of the gradient to a layer's input where that was on, whose f16 numbers begin at `on_at` in shared memory.
+#ifdef F32_SUMS
+GRADIENT where_on(SUM sum, uint on_at) {
+    share_sums(sum);
+    for (uint e = gl_SubgroupInvocationID; e < m * n; e += gl_SubgroupSize) {
+        uint row = e / n, column = e % n, at = gl_SubgroupID * m * n + e;
+        bool on = neuron_of(tile_in[on_at + row * dz_stride + column / 8u], column) > 0.0;
+        sum_tile[at] = on ? sum_tile[at] : 0.0;
+        largest = max(largest, abs(sum_tile[at]));
+    }
+    subgroupBarrier();
+    coopMatLoad(sum, sum_tile, gl_SubgroupID * m * n, n, ROWS);
+    return sum;
+}
+#else
+// Element order may differ between component types, so the mask is applied between equal types.
+GRADIENT where_on(SUM sum, uint on_at) {
+    SUM16 gradient = SUM16(sum), on;
+    coopMatLoad(on, tile_in, on_at, dz_stride, ROWS);
+    [[unroll]] for (uint i = 0u; i < gradient.length(); i++) {
+        gradient[i] = on[i] > float16_t(0.0) ? gradient[i] : float16_t(0.0);
+        largest = max(largest, abs(float(gradient[i])));
+    }
+    return gradient;
+}
+#endif
+
 // A tile of the gradient to a layer's input, from the dz and the input in shared memory. Beside the sums of two layers, operands of all
 // steps at once would not fit the registers.
-SUM16 input_gradient(uint weights_at, uint row, uint column) {
+GRADIENT input_gradient(uint weights_at, uint row, uint column) {
     SUM sum = SUM(0.0);
     [[dont_unroll]] for (uint step = 0u; step < width / k; step++) {
         LEFT dz;
@@ -89,19 +116,12 @@ SUM16 input_gradient(uint weights_at, uint row, uint column) {
         coopMatLoad(weights, weights16, (weights_at + step * k * width + column) / 8u, width8, ROWS);
         sum = coopMatMulAdd(dz, weights, sum);
     }
-    // Element order may differ between component types, so the mask is applied between equal types.
-    SUM16 gradient = SUM16(sum), on;
-    coopMatLoad(on, tile_in, row * dz_stride + column / 8u, dz_stride, ROWS);
-    [[unroll]] for (uint i = 0u; i < gradient.length(); i++) {
-        gradient[i] = on[i] > float16_t(0.0) ? gradient[i] : float16_t(0.0);
-        largest = max(largest, abs(float(gradient[i])));
-    }
-    return gradient;
+    return where_on(sum, row * dz_stride + column / 8u);
 }
 
 // The gradient to the upper layer's input takes the place of its dz: it is the lower layer's.
 void descend() {
-    SUM16 gradient[input_rows * input_columns];
+    GRADIENT gradient[input_rows * input_columns];
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
         uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
         [[unroll]] for (uint r = 0u; r < input_rows; r++) {
@@ -114,7 +134,7 @@ void descend() {
         uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
         [[unroll]] for (uint r = 0u; r < input_rows; r++) {
             uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            coopMatStore(gradient[c * input_rows + r], tile_dz, row * dz_stride + column / 8u, dz_stride, ROWS);
+            STORE_F16(gradient[c * input_rows + r], tile_dz, row * dz_stride + column / 8u, dz_stride);
         }
     }
 }
