@@ -103,10 +103,11 @@ impl Shape {
             let sums = if tuning.f16_sums { 0 } else { subgroups * m * n * 4 };
             Room { m, k, bytes: info.max_shared_memory.saturating_sub(SHARED_RESERVE + sums) }
         };
-        let (hidden_row, encoded_row) = (row_bytes(width), row_bytes(encoded as u32));
+        // The output's n sums come to lie in a row of the last layer's activations.
+        let (hidden_row, encoded_row) = (row_bytes(width).max(4 * n), row_bytes(encoded as u32));
         let skips = params.layers.iter().skip(1).any(|l| l.encoded.is_some());
         let rows = if skips { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
-        let fwd_tile = room(subgroups).tile(tuning.largest_tile, |t| t * (rows + 4 * n));
+        let fwd_tile = room(subgroups).tile(tuning.largest_tile, |t| t * rows);
         let recompute = computes_again(tuning, params);
         let inputs_row = if recompute { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
         let backward = |subgroups: u32| {
