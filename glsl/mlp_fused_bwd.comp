@@ -123,11 +123,11 @@ void stage_lower_inputs(uint first) {
 
 void store_input_gradient(uint first, uint weights_at) {
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
-        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
+        GRADIENT gradient[input_rows];
+        input_gradient(weights_at, gradient_column(c), gradient);
         [[unroll]] for (uint r = 0u; r < input_rows; r++) {
-            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            GRADIENT gradient = input_gradient(weights_at, row, column);
-            STORE_F16(gradient, dz_in16, (first + row) * width8 + column / 8u, width8);
+            uint at = (first + gradient_row(r)) * width8 + gradient_column(c) / 8u;
+            STORE_F16(gradient[r], dz_in16, at, width8);
         }
     }
 }

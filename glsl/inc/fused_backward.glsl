@@ -78,6 +78,15 @@ void put_neuron_sums(float sums[lane_neurons], uint at) {
     }
 }
 
+// Where the tiles of an input gradient lie that a subgroup has.
+uint gradient_row(uint r) {
+    return (gl_SubgroupID / column_tiles + r * row_shares) * m;
+}
+
+uint gradient_column(uint c) {
+    return (gl_SubgroupID % column_tiles + c * subgroups) * n;
+}
+
 // A tile of the gradient to a layer's input where that was on, whose f16 numbers begin at `on_at` in shared memory.
 #ifdef F32_SUMS
 GRADIENT where_on(SUM sum, uint on_at) {
@@ -105,36 +114,38 @@ GRADIENT where_on(SUM sum, uint on_at) {
 }
 #endif
 
-// A tile of the gradient to a layer's input, from the dz and the input in shared memory. Beside the sums of two layers, operands of all
-// steps at once would not fit the registers.
-GRADIENT input_gradient(uint weights_at, uint row, uint column) {
-    SUM sum = SUM(0.0);
+// The gradient to a layer's input in a subgroup's tiles of a column, from the dz and the input in shared memory. Weights are read once for
+// all rows; beside the sums of two layers, operands of all steps at once would not fit the registers.
+void input_gradient(uint weights_at, uint column, out GRADIENT gradient[input_rows]) {
+    SUM sums[input_rows];
+    [[unroll]] for (uint r = 0u; r < input_rows; r++) sums[r] = SUM(0.0);
     [[dont_unroll]] for (uint step = 0u; step < width / k; step++) {
-        LEFT dz;
         RIGHT weights;
-        coopMatLoad(dz, tile_dz, row * dz_stride + step * k / 8u, dz_stride, ROWS);
         coopMatLoad(weights, weights16, (weights_at + step * k * width + column) / 8u, width8, ROWS);
-        sum = coopMatMulAdd(dz, weights, sum);
+        [[unroll]] for (uint r = 0u; r < input_rows; r++) {
+            LEFT dz;
+            coopMatLoad(dz, tile_dz, gradient_row(r) * dz_stride + step * k / 8u, dz_stride, ROWS);
+            sums[r] = coopMatMulAdd(dz, weights, sums[r]);
+        }
     }
-    return where_on(sum, row * dz_stride + column / 8u);
+    [[unroll]] for (uint r = 0u; r < input_rows; r++) {
+        gradient[r] = where_on(sums[r], gradient_row(r) * dz_stride + column / 8u);
+    }
 }
 
 // The gradient to the upper layer's input takes the place of its dz: it is the lower layer's.
 void descend() {
-    GRADIENT gradient[input_rows * input_columns];
+    GRADIENT gradients[input_columns * input_rows];
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
-        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
-        [[unroll]] for (uint r = 0u; r < input_rows; r++) {
-            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            gradient[c * input_rows + r] = input_gradient(push.weights_at, row, column);
-        }
+        GRADIENT gradient[input_rows];
+        input_gradient(push.weights_at, gradient_column(c), gradient);
+        [[unroll]] for (uint r = 0u; r < input_rows; r++) gradients[c * input_rows + r] = gradient[r];
     }
     barrier();
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
-        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
         [[unroll]] for (uint r = 0u; r < input_rows; r++) {
-            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            STORE_F16(gradient[c * input_rows + r], tile_dz, row * dz_stride + column / 8u, dz_stride);
+            uint at = gradient_row(r) * dz_stride + gradient_column(c) / 8u;
+            STORE_F16(gradients[c * input_rows + r], tile_dz, at, dz_stride);
         }
     }
 }
