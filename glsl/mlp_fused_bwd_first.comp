@@ -36,13 +36,13 @@ layout(binding = 10) buffer B10 { float partials[]; };
 const uint encoded_at = tile * input_stride;
 
 void stage(uint first) {
-    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
-        tile_dz[e / width8 * dz_stride + e % width8] = dz16[first * width8 + e];
-    }
+    uvec4 dz[PARTS(dz_size)];
+    FETCH(dz, dz16, first * width8, dz_size);
     for (uint e = gl_LocalInvocationIndex; e < tile * lower_columns8; e += gl_WorkGroupSize.x) {
         uint row = e / lower_columns8;
         tile_in[encoded_at + row * lower_stride + e % lower_columns8] = encoded_numbers(first + row, e % lower_columns8);
     }
+    PLACE(dz, tile_dz, width8, dz_stride, dz_size);
 }
 
 // The first layer's activations, as in the forward pass.

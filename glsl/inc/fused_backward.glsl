@@ -43,6 +43,24 @@ float lower_bias_sum[lane_neurons];
 float largest;
 shared uint overflowed;
 
+// Copies of rows to shared memory in parts, of which an invocation has one of each: all of its loads are under way before the first is
+// waited for, where a loop would wait for each of them.
+#define PARTS(size) ((size) > 0u ? ((size) - 1u) / gl_WorkGroupSize.x + 1u : 1u)
+#define IN_PART(e, size) ((size) > 0u && (size) % gl_WorkGroupSize.x == 0u || e < (size))
+#define FETCH(parts, rows, at, size) \
+    [[unroll]] for (uint i = 0u; i < PARTS(size); i++) { \
+        uint e = gl_LocalInvocationIndex + i * gl_WorkGroupSize.x; \
+        if (IN_PART(e, size)) parts[i] = rows[(at) + e]; \
+    }
+#define PLACE(parts, rows, columns8, stride, size) \
+    [[unroll]] for (uint i = 0u; i < PARTS(size); i++) { \
+        uint e = gl_LocalInvocationIndex + i * gl_WorkGroupSize.x; \
+        if (IN_PART(e, size)) rows[e / (columns8) * (stride) + e % (columns8)] = parts[i]; \
+    }
+const uint dz_size = tile * width8;
+const uint input_size = tile * upper_columns8;
+const uint lower_size = tile * lower_columns8;
+
 // Of eight neurons' numbers, that of one.
 float neuron_of(uvec4 packed, uint neuron) {
     vec2 pair = unpackHalf2x16(packed[(neuron & 7u) / 2u]);
