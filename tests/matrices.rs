@@ -99,6 +99,20 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
 }
 
 #[test]
+fn an_iteration_waits_where_it_must() {
+    let Some((gpu, tuning)) = matrices() else { return };
+    let dataset = small_dataset(13, 11);
+    let barriers =
+        [("fast-mlp", true), ("fast-mlp", false), ("public-code", false), ("nerf-ca", true)].map(|(preset, again)| {
+            let tuning = Tuning { matrices: MatrixTuning { recompute: again, ..CPU }, ..tuning.clone() };
+            let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
+            Trainer::new(&gpu, plan, &dataset, tuning).unwrap().barriers().unwrap()
+        });
+    assert_eq!(barriers, [12, 12, 16, 17]);
+    expect_silence(gpu);
+}
+
+#[test]
 fn shaders_for_devices_without_f16_sums_have_none() {
     const FLOAT_TYPE: u32 = 22;
     const CONSTANT: u32 = 43;
