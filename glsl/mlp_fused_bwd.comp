@@ -62,13 +62,6 @@ void stage_output_gradient(uint first) {
     barrier();
 }
 
-// The last layer's activations, where its input comes to lie later.
-void stage_outputs(uint first) {
-    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
-        tile_in[e / width8 * dz_stride + e % width8] = outputs16[push.outputs_at + first * width8 + e];
-    }
-}
-
 void add_outputs() {
     uint part = gl_LocalInvocationIndex / width;
     [[unroll]] for (uint i = 0u; i < lane_neurons; i++) {
@@ -94,40 +87,42 @@ uvec4 output_dz(uint row, uint q) {
     return packed;
 }
 
-void stage_dz(uint first) {
+// Forms the last layer's dz from its activations, which lie where its input comes to lie later.
+void form_dz(uint first) {
+    stage_output_gradient(first);
+    if (push.out_weights != NOWHERE) add_outputs();
+    [[unroll]] for (uint i = 0u; i < PARTS(dz_size); i++) {
+        uint e = gl_LocalInvocationIndex + i * gl_WorkGroupSize.x;
+        if (IN_PART(e, dz_size)) tile_dz[e / width8 * dz_stride + e % width8] = output_dz(e / width8, e % width8);
+    }
+    barrier();
+}
+
+void stage(uint first) {
+    uvec4 dz[PARTS(dz_size)];
+    uvec4 inputs[PARTS(input_size)];
     if (from_output != 0u) {
-        stage_outputs(first);
-        stage_output_gradient(first);
-        if (push.out_weights != NOWHERE) add_outputs();
+        FETCH(dz, outputs16, push.outputs_at + first * width8, dz_size);
+    } else {
+        FETCH(dz, dz16, first * width8, dz_size);
     }
-    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
-        uint row = e / width8, q = e % width8;
-        tile_dz[row * dz_stride + q] = from_output != 0u ? output_dz(row, q) : dz16[first * width8 + e];
+    FETCH(inputs, inputs16, push.inputs_at + first * upper_columns8, input_size);
+    if (from_output != 0u) {
+        PLACE(dz, tile_in, width8, dz_stride, dz_size);
+        form_dz(first);
+    } else {
+        PLACE(dz, tile_dz, width8, dz_stride, dz_size);
     }
-    if (from_output != 0u) barrier();
-}
-
-void stage_inputs(uint first) {
-    for (uint e = gl_LocalInvocationIndex; e < tile * upper_columns8; e += gl_WorkGroupSize.x) {
-        tile_in[e / upper_columns8 * input_stride + e % upper_columns8] =
-            inputs16[push.inputs_at + first * upper_columns8 + e];
-    }
-}
-
-void stage_lower_inputs(uint first) {
-    for (uint e = gl_LocalInvocationIndex; e < tile * lower_columns8; e += gl_WorkGroupSize.x) {
-        tile_in[e / lower_columns8 * lower_stride + e % lower_columns8] =
-            lower_inputs16[push.lower_inputs_at + first * lower_columns8 + e];
-    }
+    PLACE(inputs, tile_in, upper_columns8, input_stride, input_size);
 }
 
 void store_input_gradient(uint first, uint weights_at) {
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
-        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
+        GRADIENT gradient[input_rows];
+        input_gradient(weights_at, gradient_column(c), gradient);
         [[unroll]] for (uint r = 0u; r < input_rows; r++) {
-            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            SUM16 gradient = input_gradient(weights_at, row, column);
-            coopMatStore(gradient, dz_in16, (first + row) * width8 + column / 8u, width8, ROWS);
+            uint at = (first + gradient_row(r)) * width8 + gradient_column(c) / 8u;
+            STORE_F16(gradient[r], dz_in16, at, width8);
         }
     }
 }
@@ -146,14 +141,15 @@ void put_output_sums() {
 }
 
 void walk_tile(uint first) {
-    stage_dz(first);
-    stage_inputs(first);
+    stage(first);
     barrier();
     if (push.bias != NOWHERE) add_dz(bias_sum);
     add_weight_gradient(upper_share(), 0u, input_stride);
     if (lower_columns != 0u) {
         descend();
-        stage_lower_inputs(first);
+        uvec4 inputs[PARTS(lower_size)];
+        FETCH(inputs, lower_inputs16, push.lower_inputs_at + first * lower_columns8, lower_size);
+        PLACE(inputs, tile_in, lower_columns8, lower_stride, lower_size);
         barrier();
         if (push.lower_bias != NOWHERE) add_dz(lower_bias_sum);
         add_weight_gradient(lower_share(), 0u, lower_stride);

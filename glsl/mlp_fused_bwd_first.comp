@@ -36,33 +36,36 @@ layout(binding = 10) buffer B10 { float partials[]; };
 const uint encoded_at = tile * input_stride;
 
 void stage(uint first) {
-    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
-        tile_dz[e / width8 * dz_stride + e % width8] = dz16[first * width8 + e];
-    }
+    uvec4 dz[PARTS(dz_size)];
+    FETCH(dz, dz16, first * width8, dz_size);
     for (uint e = gl_LocalInvocationIndex; e < tile * lower_columns8; e += gl_WorkGroupSize.x) {
         uint row = e / lower_columns8;
         tile_in[encoded_at + row * lower_stride + e % lower_columns8] = encoded_numbers(first + row, e % lower_columns8);
     }
+    PLACE(dz, tile_dz, width8, dz_stride, dz_size);
 }
 
 // The first layer's activations, as in the forward pass.
 void activate() {
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
-        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
-        [[unroll]] for (uint r = 0u; r < input_rows; r++) {
-            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            SUM sum;
-            coopMatLoad(sum, bias_rows, column, width, ROWS);
-            [[dont_unroll]] for (uint step = 0u; step < lower_columns / k; step++) {
+        uint column = gradient_column(c);
+        SUM sums[input_rows];
+        [[unroll]] for (uint r = 0u; r < input_rows; r++) coopMatLoad(sums[r], bias_rows, column, width, ROWS);
+        [[dont_unroll]] for (uint step = 0u; step < lower_columns / k; step++) {
+            RIGHT weights;
+            coopMatLoad(weights, weights16, (push.lower_weights_at + column * lower_columns + step * k) / 8u,
+                        lower_columns8, COLUMNS);
+            [[unroll]] for (uint r = 0u; r < input_rows; r++) {
                 LEFT inputs;
-                RIGHT weights;
-                coopMatLoad(inputs, tile_in, encoded_at + row * lower_stride + step * k / 8u, lower_stride, ROWS);
-                coopMatLoad(weights, weights16, (push.lower_weights_at + column * lower_columns + step * k) / 8u,
-                            lower_columns8, COLUMNS);
-                sum = coopMatMulAdd(inputs, weights, sum);
+                uint at = encoded_at + gradient_row(r) * lower_stride + step * k / 8u;
+                coopMatLoad(inputs, tile_in, at, lower_stride, ROWS);
+                sums[r] = coopMatMulAdd(inputs, weights, sums[r]);
             }
+        }
+        [[unroll]] for (uint r = 0u; r < input_rows; r++) {
+            SUM sum = sums[r];
             [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
-            coopMatStore(SUM16(sum), tile_in, row * input_stride + column / 8u, input_stride, ROWS);
+            STORE_F16(sum, tile_in, gradient_row(r) * input_stride + column / 8u, input_stride);
         }
     }
 }

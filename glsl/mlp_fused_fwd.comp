@@ -35,8 +35,8 @@ layout(binding = 12) writeonly buffer B12 { vec2 sample_sigma[]; };
 
 const uint width8 = width / 8u;
 const uint encoded8 = encoded / 8u;
-// One more uvec4 a row keeps rows off the same banks.
-const uint hidden_stride = width8 + 1u;
+// One more uvec4 a row keeps rows off the same banks. A row has room for the n sums that take its place in the end.
+const uint hidden_stride = width8 + 1u > n / 4u ? width8 + 1u : n / 4u;
 const uint encoded_stride = encoded8 + 1u;
 // Without a skip layer nothing needs the encoding after the first layer, which may overwrite it.
 const uint encoded_at = skip > 0u ? tile * hidden_stride : 0u;
@@ -45,7 +45,6 @@ const uint shared_size = skip > 0u ? encoded_at + tile * encoded_stride
 const uint row_tiles = tile / m;
 const uint column_tiles = width / n / subgroups;
 shared uvec4 tile16[shared_size];
-shared float output_tile[tile * n];
 
 // One invocation writes eight numbers of a sample at a time.
 void encode_tile(uint first) {
@@ -98,18 +97,17 @@ void main() {
             [[unroll]] for (uint c = 0u; c < column_tiles; c++) {
                 SUM sum = sums[r * column_tiles + c];
                 [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
-                SUM16 rectified = SUM16(sum);
                 uint column = (column0 + c * n) / 8u;
-                coopMatStore(rectified, tile16, r * m * hidden_stride + column, hidden_stride, ROWS);
+                STORE_F16(sum, tile16, r * m * hidden_stride + column, hidden_stride);
                 if (layer >= keep_from) {
                     uint at = (layer - keep_from) * setup.sample_capacity + first + r * m;
-                    coopMatStore(rectified, activations16, at * width8 + column, width8, ROWS);
+                    STORE_F16(sum, activations16, at * width8 + column, width8);
                 }
             }
         }
         barrier();
     }
-    // The output neuron: row tiles are shared out among subgroups.
+    // The output neuron: row tiles are shared out among subgroups, which alone see their rows from here on.
     for (uint r = gl_SubgroupID; r < row_tiles; r += subgroups) {
         SUM sum = SUM(0.0);
         STEPS for (uint step = 0u; step < width / k; step++) {
@@ -119,11 +117,12 @@ void main() {
             coopMatLoad(weights, weights16, (weights_at + step * k) / 8u, width8, COLUMNS);
             sum = coopMatMulAdd(inputs, weights, sum);
         }
-        coopMatStore(sum, output_tile, r * m * n, n, ROWS);
+        subgroupBarrier();
+        coopMatStore(sum, tile16, r * m * hidden_stride, hidden_stride, ROWS);
     }
     barrier();
     for (uint row = gl_LocalInvocationIndex; row < tile; row += gl_WorkGroupSize.x) {
-        float x = output_tile[row * n] + params[push.out_bias] + setup.dynamic_shift;
+        float x = uintBitsToFloat(tile16[row * hidden_stride].x) + params[push.out_bias] + setup.dynamic_shift;
         sample_sigma[first + row] = setup.dynamic_gain * vec2(softplus(x), sigmoid(x));
     }
 }

@@ -4,7 +4,8 @@
 mod common;
 
 use common::{expect_agreement, expect_silence, gpu, small_config, small_dataset, tuning, uneven_dataset};
-use nertca_vk::gpu::buffer::Operands;
+use nertca_vk::gpu::buffer::{Memory, Operands};
+use nertca_vk::gpu::record::Recording;
 use nertca_vk::kernels::layout::Ray;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
@@ -13,6 +14,48 @@ use nertca_vk::reference::{march, step};
 use nertca_vk::selftest::iteration::{self, F32_CASES};
 use nertca_vk::selftest::occupancy;
 use nertca_vk::train::trainer::Trainer;
+
+#[test]
+fn barriers_follow_from_what_commands_touch() {
+    let gpu = gpu();
+    let buffer = |name| gpu.buffer(name, 64, Memory::Device).unwrap();
+    let (a, b, c) = (buffer("a"), buffer("b"), buffer("c"));
+    let waits = |commands: &dyn Fn(&mut Recording)| {
+        let mut recording = Recording::new(&gpu, "commands").unwrap();
+        commands(&mut recording);
+        recording.finish().unwrap().barriers()
+    };
+    assert_eq!(waits(&|_| ()), 1, "for what was submitted before");
+    let [from_a_to_b, from_a_to_c, from_b_to_c] =
+        [(&a, &b), (&a, &c), (&b, &c)].map(|(from, to)| move |r: &mut Recording| r.copy(from, 0, to, 0, 64).unwrap());
+    let fill = |r: &mut Recording| r.fill(&a, 1);
+    let both = |first: &dyn Fn(&mut Recording), second: &dyn Fn(&mut Recording)| {
+        waits(&|r| {
+            first(r);
+            second(r);
+        })
+    };
+    assert_eq!(both(&from_a_to_b, &from_a_to_c), 1, "reads do not wait for reads");
+    assert_eq!(both(&fill, &from_b_to_c), 1, "nor for what they do not touch");
+    assert_eq!(both(&fill, &from_a_to_b), 2, "reads wait for writes");
+    assert_eq!(both(&from_a_to_b, &fill), 2, "writes for reads");
+    assert_eq!(both(&from_a_to_c, &from_b_to_c), 2, "and for writes");
+    drop((a, b, c));
+    expect_silence(gpu);
+}
+
+#[test]
+fn an_iteration_waits_where_it_must() {
+    let gpu = gpu();
+    let tuning = tuning(&gpu).with_layers(Layers::F32, String::new());
+    let dataset = small_dataset(13, 11);
+    let barriers = ["fast-mlp", "public-code", "nerf-ca"].map(|preset| {
+        let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
+        Trainer::new(&gpu, plan, &dataset, tuning.clone()).unwrap().barriers().unwrap()
+    });
+    assert_eq!(barriers, [21, 25, 36]);
+    expect_silence(gpu);
+}
 
 #[test]
 fn rays_and_depths_match() {
@@ -65,6 +108,7 @@ fn paths() -> [Tuning; 3] {
             unroll: false,
             backward_sums: u32::MAX,
             recompute: false,
+            f16_sums: true,
         },
         private_line_bytes,
         chunk_samples: 1 << 16,

@@ -9,11 +9,12 @@ mod faults;
 mod shim;
 
 use common::{expect_agreement, expect_silence, gpu, run, small_config, small_dataset, uneven_dataset};
-use faults::{fault, sum_for_product};
+use faults::{fault, instructions, less_for_greater, sum_for_product};
 use nertca_vk::config::Preset;
 use nertca_vk::error::Result;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
+use nertca_vk::kernels::stages::kernel_code;
 use nertca_vk::kernels::tuning::{Layers, MatrixTuning, Tuning};
 use nertca_vk::plan::Plan;
 use nertca_vk::selftest::compare::Findings;
@@ -35,10 +36,18 @@ fn matrices() -> Option<(Gpu, Tuning)> {
 }
 
 /// As a CPU gets them; then loops unrolled as on a GPU, with large tiles.
-const CPU: MatrixTuning =
-    MatrixTuning { workgroups: 4, largest_tile: 32, unroll: false, backward_sums: u32::MAX, recompute: false };
+const CPU: MatrixTuning = MatrixTuning {
+    workgroups: 4,
+    largest_tile: 32,
+    unroll: false,
+    backward_sums: u32::MAX,
+    recompute: false,
+    f16_sums: true,
+};
 const GPU: MatrixTuning =
-    MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true, backward_sums: 64, recompute: true };
+    MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true, backward_sums: 64, recompute: true, f16_sums: true };
+/// As a GPU without f16 sums gets them.
+const F32_SUMS: MatrixTuning = MatrixTuning { f16_sums: false, ..GPU };
 const GPU_CASE: Case = Case {
     preset: Preset::FastMlp,
     settings: &["dynamic.width=32", "dynamic.layers=3", "dynamic.bands=4", "train.rays=60"],
@@ -48,7 +57,8 @@ const GPU_CASE: Case = Case {
 fn every_stage_of_an_iteration_matches() {
     let Some((gpu, tuning)) = matrices() else { return };
     let (even, uneven) = (small_dataset(13, 11), uneven_dataset(13, 11));
-    let at_phases = MATRIX_CASES.iter().map(|case| (&even, case, CPU)).chain([(&even, &GPU_CASE, GPU)]);
+    let as_gpus = [(&even, &GPU_CASE, GPU), (&even, &GPU_CASE, F32_SUMS), (&even, &MATRIX_CASES[0], F32_SUMS)];
+    let at_phases = MATRIX_CASES.iter().map(|case| (&even, case, CPU)).chain(as_gpus);
     for (dataset, case, matrices) in
         at_phases.chain(MATRIX_CASES_BETWEEN_PHASES.iter().map(|case| (&uneven, case, CPU)))
     {
@@ -59,9 +69,9 @@ fn every_stage_of_an_iteration_matches() {
 }
 
 /// An iteration whose backward passes compute the first layer again or, of a CPU, keep it.
-fn an_iteration(gpu: &Gpu, recompute: bool, findings: &mut Findings) -> Result<()> {
+fn an_iteration(gpu: &Gpu, matrices: MatrixTuning, findings: &mut Findings) -> Result<()> {
     let tuning = Tuning::for_device(gpu.info()).with_layers(Layers::Matrices, String::new());
-    let path = Tuning { matrices: MatrixTuning { recompute, ..CPU }, ..tuning };
+    let path = Tuning { matrices, ..tuning };
     iteration::compare(gpu, &small_dataset(13, 11), &MATRIX_CASES[0], &path, findings)
 }
 
@@ -70,15 +80,57 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
     if matrices().is_none() {
         return;
     }
-    let kept: faults::Compare = |gpu, findings| an_iteration(gpu, false, findings);
-    let again: faults::Compare = |gpu, findings| an_iteration(gpu, true, findings);
+    let kept: faults::Compare = |gpu, findings| an_iteration(gpu, CPU, findings);
+    let again: faults::Compare = |gpu, findings| an_iteration(gpu, MatrixTuning { recompute: true, ..CPU }, findings);
+    let kept_in_f32: faults::Compare =
+        |gpu, findings| an_iteration(gpu, MatrixTuning { f16_sums: false, ..CPU }, findings);
+    let again_in_f32: faults::Compare =
+        |gpu, findings| an_iteration(gpu, MatrixTuning { f16_sums: false, recompute: true, ..CPU }, findings);
     faults::expect_found(&[
         fault("mlp_pack", sum_for_product, kept),
         fault("mlp_fused_fwd", sum_for_product, kept),
         fault("mlp_fused_bwd", sum_for_product, kept),
         fault("mlp_fused_bwd_first", sum_for_product, again),
+        fault("mlp_fused_fwd", sum_for_product, kept_in_f32).in_variant("f32_sums"),
+        fault("mlp_fused_bwd", less_for_greater, kept_in_f32).in_variant("f32_sums"),
+        fault("mlp_fused_bwd_first", less_for_greater, again_in_f32).in_variant("f32_sums"),
         fault("gradient_network", faults::difference_for_sum, kept),
     ]);
+}
+
+#[test]
+fn an_iteration_waits_where_it_must() {
+    let Some((gpu, tuning)) = matrices() else { return };
+    let dataset = small_dataset(13, 11);
+    let barriers =
+        [("fast-mlp", true), ("fast-mlp", false), ("public-code", false), ("nerf-ca", true)].map(|(preset, again)| {
+            let tuning = Tuning { matrices: MatrixTuning { recompute: again, ..CPU }, ..tuning.clone() };
+            let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
+            Trainer::new(&gpu, plan, &dataset, tuning).unwrap().barriers().unwrap()
+        });
+    assert_eq!(barriers, [12, 12, 16, 17]);
+    expect_silence(gpu);
+}
+
+#[test]
+fn shaders_for_devices_without_f16_sums_have_none() {
+    const FLOAT_TYPE: u32 = 22;
+    const CONSTANT: u32 = 43;
+    const MATRIX_TYPE: u32 = 4456;
+    const ACCUMULATOR: u32 = 2;
+    let of_f16 = |name: &str| {
+        let words: Vec<u32> = bytemuck::pod_collect_to_vec(kernel_code(name).unwrap().spirv);
+        let all = instructions(&words);
+        let are = |kind| all.iter().filter(move |i| i.1 == kind).map(|i| &words[i.0 + 1..i.0 + i.2]);
+        let half: Vec<u32> = are(FLOAT_TYPE).filter(|float| float[1] == 16).map(|float| float[0]).collect();
+        let uses: Vec<u32> = are(CONSTANT).filter(|c| c[2] == ACCUMULATOR).map(|c| c[1]).collect();
+        let matrices: Vec<_> = are(MATRIX_TYPE).filter(|matrix| half.contains(&matrix[1])).collect();
+        (matrices.len(), matrices.iter().filter(|matrix| uses.contains(&matrix[5])).count())
+    };
+    for shader in ["mlp_fused_fwd", "mlp_fused_bwd", "mlp_fused_bwd_first"] {
+        assert_eq!(of_f16(&format!("{shader}_unrolled")), (3, 1), "{shader}: left, right, sums");
+        assert_eq!(of_f16(&format!("{shader}_f32_sums")), (2, 0), "{shader}: left, right");
+    }
 }
 
 #[test]

@@ -43,6 +43,24 @@ float lower_bias_sum[lane_neurons];
 float largest;
 shared uint overflowed;
 
+// Copies of rows to shared memory in parts, of which an invocation has one of each: all of its loads are under way before the first is
+// waited for, where a loop would wait for each of them.
+#define PARTS(size) ((size) > 0u ? ((size) - 1u) / gl_WorkGroupSize.x + 1u : 1u)
+#define IN_PART(e, size) ((size) > 0u && (size) % gl_WorkGroupSize.x == 0u || e < (size))
+#define FETCH(parts, rows, at, size) \
+    [[unroll]] for (uint i = 0u; i < PARTS(size); i++) { \
+        uint e = gl_LocalInvocationIndex + i * gl_WorkGroupSize.x; \
+        if (IN_PART(e, size)) parts[i] = rows[(at) + e]; \
+    }
+#define PLACE(parts, rows, columns8, stride, size) \
+    [[unroll]] for (uint i = 0u; i < PARTS(size); i++) { \
+        uint e = gl_LocalInvocationIndex + i * gl_WorkGroupSize.x; \
+        if (IN_PART(e, size)) rows[e / (columns8) * (stride) + e % (columns8)] = parts[i]; \
+    }
+const uint dz_size = tile * width8;
+const uint input_size = tile * upper_columns8;
+const uint lower_size = tile * lower_columns8;
+
 // Of eight neurons' numbers, that of one.
 float neuron_of(uvec4 packed, uint neuron) {
     vec2 pair = unpackHalf2x16(packed[(neuron & 7u) / 2u]);
@@ -78,43 +96,74 @@ void put_neuron_sums(float sums[lane_neurons], uint at) {
     }
 }
 
-// A tile of the gradient to a layer's input, from the dz and the input in shared memory. Beside the sums of two layers, operands of all
-// steps at once would not fit the registers.
-SUM16 input_gradient(uint weights_at, uint row, uint column) {
-    SUM sum = SUM(0.0);
-    [[dont_unroll]] for (uint step = 0u; step < width / k; step++) {
-        LEFT dz;
-        RIGHT weights;
-        coopMatLoad(dz, tile_dz, row * dz_stride + step * k / 8u, dz_stride, ROWS);
-        coopMatLoad(weights, weights16, (weights_at + step * k * width + column) / 8u, width8, ROWS);
-        sum = coopMatMulAdd(dz, weights, sum);
+// Where the tiles of an input gradient lie that a subgroup has.
+uint gradient_row(uint r) {
+    return (gl_SubgroupID / column_tiles + r * row_shares) * m;
+}
+
+uint gradient_column(uint c) {
+    return (gl_SubgroupID % column_tiles + c * subgroups) * n;
+}
+
+// A tile of the gradient to a layer's input where that was on, whose f16 numbers begin at `on_at` in shared memory.
+#ifdef F32_SUMS
+GRADIENT where_on(SUM sum, uint on_at) {
+    share_sums(sum);
+    for (uint e = gl_SubgroupInvocationID; e < m * n; e += gl_SubgroupSize) {
+        uint row = e / n, column = e % n, at = gl_SubgroupID * m * n + e;
+        bool on = neuron_of(tile_in[on_at + row * dz_stride + column / 8u], column) > 0.0;
+        sum_tile[at] = on ? sum_tile[at] : 0.0;
+        largest = max(largest, abs(sum_tile[at]));
     }
-    // Element order may differ between component types, so the mask is applied between equal types.
+    subgroupBarrier();
+    coopMatLoad(sum, sum_tile, gl_SubgroupID * m * n, n, ROWS);
+    return sum;
+}
+#else
+// Element order may differ between component types, so the mask is applied between equal types.
+GRADIENT where_on(SUM sum, uint on_at) {
     SUM16 gradient = SUM16(sum), on;
-    coopMatLoad(on, tile_in, row * dz_stride + column / 8u, dz_stride, ROWS);
+    coopMatLoad(on, tile_in, on_at, dz_stride, ROWS);
     [[unroll]] for (uint i = 0u; i < gradient.length(); i++) {
         gradient[i] = on[i] > float16_t(0.0) ? gradient[i] : float16_t(0.0);
         largest = max(largest, abs(float(gradient[i])));
     }
     return gradient;
 }
+#endif
+
+// The gradient to a layer's input in a subgroup's tiles of a column, from the dz and the input in shared memory. Weights are read once for
+// all rows; beside the sums of two layers, operands of all steps at once would not fit the registers.
+void input_gradient(uint weights_at, uint column, out GRADIENT gradient[input_rows]) {
+    SUM sums[input_rows];
+    [[unroll]] for (uint r = 0u; r < input_rows; r++) sums[r] = SUM(0.0);
+    [[dont_unroll]] for (uint step = 0u; step < width / k; step++) {
+        RIGHT weights;
+        coopMatLoad(weights, weights16, (weights_at + step * k * width + column) / 8u, width8, ROWS);
+        [[unroll]] for (uint r = 0u; r < input_rows; r++) {
+            LEFT dz;
+            coopMatLoad(dz, tile_dz, gradient_row(r) * dz_stride + step * k / 8u, dz_stride, ROWS);
+            sums[r] = coopMatMulAdd(dz, weights, sums[r]);
+        }
+    }
+    [[unroll]] for (uint r = 0u; r < input_rows; r++) {
+        gradient[r] = where_on(sums[r], gradient_row(r) * dz_stride + column / 8u);
+    }
+}
 
 // The gradient to the upper layer's input takes the place of its dz: it is the lower layer's.
 void descend() {
-    SUM16 gradient[input_rows * input_columns];
+    GRADIENT gradients[input_columns * input_rows];
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
-        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
-        [[unroll]] for (uint r = 0u; r < input_rows; r++) {
-            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            gradient[c * input_rows + r] = input_gradient(push.weights_at, row, column);
-        }
+        GRADIENT gradient[input_rows];
+        input_gradient(push.weights_at, gradient_column(c), gradient);
+        [[unroll]] for (uint r = 0u; r < input_rows; r++) gradients[c * input_rows + r] = gradient[r];
     }
     barrier();
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
-        uint column = (gl_SubgroupID % column_tiles + c * subgroups) * n;
         [[unroll]] for (uint r = 0u; r < input_rows; r++) {
-            uint row = (gl_SubgroupID / column_tiles + r * row_shares) * m;
-            coopMatStore(gradient[c * input_rows + r], tile_dz, row * dz_stride + column / 8u, dz_stride, ROWS);
+            uint at = gradient_row(r) * dz_stride + gradient_column(c) / 8u;
+            STORE_F16(gradients[c * input_rows + r], tile_dz, at, dz_stride);
         }
     }
 }

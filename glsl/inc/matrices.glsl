@@ -29,6 +29,39 @@ layout(constant_id = 6) const uint width = 128u;      // neurons of a hidden lay
 // Largest f16; activations saturate rather than overflow.
 const float LARGEST = 65504.0;
 
+// Sums become f16 in registers, and go to an array of uvec4 in rows; where a device has no matrices of f16 sums, which cannot
+// even be declared then, by way of shared memory.
+#ifdef F32_SUMS
+#define GRADIENT SUM
+shared float sum_tile[subgroups * m * n];
+
+void share_sums(SUM sum) {
+    subgroupBarrier();
+    coopMatStore(sum, sum_tile, gl_SubgroupID * m * n, n, ROWS);
+    subgroupBarrier();
+}
+
+// Eight neighbours in a row of the sums that were shared last, of which there are n / 8 to a row.
+uvec4 shared_sums(uint e) {
+    uint at = gl_SubgroupID * m * n + 8u * e;
+    uvec4 packed;
+    [[unroll]] for (uint i = 0u; i < 4u; i++) {
+        packed[i] = packHalf2x16(vec2(sum_tile[at + 2u * i], sum_tile[at + 2u * i + 1u]));
+    }
+    return packed;
+}
+
+#define STORE_F16(sum, rows, at, stride) { \
+    share_sums(sum); \
+    for (uint e = gl_SubgroupInvocationID; e < m * n / 8u; e += gl_SubgroupSize) { \
+        rows[(at) + e / (n / 8u) * (stride) + e % (n / 8u)] = shared_sums(e); \
+    } \
+}
+#else
+#define GRADIENT SUM16
+#define STORE_F16(sum, rows, at, stride) coopMatStore(SUM16(sum), rows, at, stride, ROWS)
+#endif
+
 uint pack2(vec2 pair) {
     return packHalf2x16(clamp(pair, vec2(-LARGEST), vec2(LARGEST)));
 }

@@ -83,7 +83,7 @@ pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     Ok(Peaks { f32_tflops, matrix_tflops, copy_gb_per_s, by_timestamps: info.timestamp_period_ns > 0.0 })
 }
 
-fn matrix_peak(gpu: &Gpu, MatrixShape { m, n, k }: MatrixShape) -> Result<f64> {
+fn matrix_peak(gpu: &Gpu, MatrixShape { m, n, k, .. }: MatrixShape) -> Result<f64> {
     let info = gpu.info();
     let subgroups = 8;
     let (groups, steps): (u32, u32) = if info.is_cpu() { (4, 2000) } else { (4096, 2048) };

@@ -181,6 +181,7 @@ fn measure(
         whole_run_s: timings.whole_run_s,
         passes_ms: timings.passes.iter().map(|(name, pass)| (name.clone(), pass.ms)).collect(),
         passes_per_iteration: timings.passes.into_iter().map(|(name, pass)| (name, pass.count)).collect(),
+        barriers_per_iteration: timings.barriers,
         work: timings.work,
         frame_rates,
         full,
@@ -251,6 +252,7 @@ struct Timings {
     after: Option<Timing>,
     whole_run_s: f64,
     passes: Passes,
+    barriers: Option<u32>,
     work: Ledger,
 }
 
@@ -279,6 +281,7 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
         before,
         after: Some(after),
         whole_run_s,
+        barriers: subject.barriers(),
         passes: subject.passes(args.profiled())?,
     })
 }
@@ -301,6 +304,7 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
             before: None,
             after: None,
             passes,
+            barriers: None,
             work: Ledger::new(),
         });
     }
@@ -318,6 +322,7 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
         after: None,
         whole_run_s,
         passes,
+        barriers: still.barriers(),
         // Of the still field alone, whose stages have none but for the optimiser; the network, which nobody asks, sees no sample.
         work: Ledger::new(),
     })

@@ -45,6 +45,9 @@ pub struct Report {
     /// Passes of each stage in an iteration; none in reports of before.
     #[serde(default)]
     pub passes_per_iteration: BTreeMap<String, f64>,
+    /// Barriers of an iteration, of the still field's after Gaussians; none where there is none, and in reports of before.
+    #[serde(default)]
+    pub barriers_per_iteration: Option<u32>,
     /// Least work of stages in an iteration; none where Gaussians move, and in reports of before.
     #[serde(default)]
     pub work: Ledger,
@@ -209,6 +212,9 @@ fn print_passes(report: &Report) {
         None => medians.into_iter().flatten().sum(),
     };
     out!("{:32} {count:5.0} {sum:9.3}   (iterations, with overlap: {iterations:.3} ms)", "all of them");
+    if let Some(barriers) = report.barriers_per_iteration {
+        out!("  {barriers} barriers between those of an iteration of the network or the still field");
+    }
     let samples = report.after.as_ref().map_or(0, |after| after.live_samples);
     if let (Some(bytes), true) = (bytes_per_sample(report, samples), samples > 0) {
         out!("  {bytes:.0} bytes of memory per live sample, forward and backward");

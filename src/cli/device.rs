@@ -26,7 +26,7 @@ impl Cli {
         let tuning = Tuning::for_device(gpu.info());
         let Some(layers) = self.layers else {
             return match cache_dir().and_then(|cache| calibrate::recall(&cache, gpu.info(), config)) {
-                Some(verdict) if tuning.layers == Layers::Matrices => verdict.apply(tuning),
+                Some(verdict) if Tuning::has_choice(gpu.info()) => verdict.apply(tuning),
                 _ => tuning,
             };
         };
@@ -40,7 +40,7 @@ impl Cli {
     /// The tuning of [`Cli::tuning`], after timing both paths where that is still to be done.
     pub fn training_tuning(&self, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<Tuning> {
         let tuning = Tuning::for_device(gpu.info());
-        let either = self.layers.is_none() && tuning.layers == Layers::Matrices && config.network_moves();
+        let either = self.layers.is_none() && Tuning::has_choice(gpu.info()) && config.network_moves();
         let cache = cache_dir().filter(|_| either);
         let Some(cache) = cache.filter(|cache| calibrate::recall(cache, gpu.info(), config).is_none()) else {
             return Ok(self.tuning(gpu, config));

@@ -122,6 +122,9 @@ pub struct MatrixShape {
     pub n: u32,
     /// Columns of the left operand.
     pub k: u32,
+    /// Whether the device has matrices of f16 sums of that shape, too: numbers become f16 in registers then, else by way of
+    /// shared memory.
+    pub f16_sums: bool,
 }
 
 fn c_chars(text: &[std::ffi::c_char]) -> String {
@@ -230,24 +233,29 @@ fn matrix_shapes(
     // SAFETY: the caller checked that this device of the instance offers the extension.
     let found = unsafe { loader.get_physical_device_cooperative_matrix_properties(physical) }
         .map_err(|code| format!("vkGetPhysicalDeviceCooperativeMatrixPropertiesKHR failed: {code}"))?;
+    Ok(usable_shapes(&found))
+}
+
+/// Of the products that a device lists, the shapes of those that our kernels can use, the best first.
+fn usable_shapes(found: &[vk::CooperativeMatrixPropertiesKHR<'_>]) -> Vec<MatrixShape> {
     let (f16, f32) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
-    let mut shapes: Vec<MatrixShape> = found
-        .iter()
-        .filter(|p| p.scope == vk::ScopeKHR::SUBGROUP && p.a_type == f16 && p.b_type == f16)
-        .filter(|p| p.c_type == f32 && p.result_type == f32)
-        // The mask of the backward pass is an f16 sum of the same shape, and rows are handled eight f16 at a time.
-        .filter(|p| {
-            [p.m_size, p.n_size, p.k_size].iter().all(|size| size % 8 == 0)
-                && found
-                    .iter()
-                    .any(|q| q.c_type == f16 && (q.m_size, q.n_size, q.k_size) == (p.m_size, p.n_size, p.k_size))
+    let size = |p: &vk::CooperativeMatrixPropertiesKHR<'_>| (p.m_size, p.n_size, p.k_size);
+    let of_subgroups = || found.iter().filter(|p| p.scope == vk::ScopeKHR::SUBGROUP);
+    let mut shapes: Vec<MatrixShape> = of_subgroups()
+        .filter(|p| p.a_type == f16 && p.b_type == f16 && p.c_type == f32 && p.result_type == f32)
+        .map(|p| MatrixShape {
+            m: p.m_size,
+            n: p.n_size,
+            k: p.k_size,
+            f16_sums: of_subgroups().any(|q| q.c_type == f16 && size(p) == size(q)),
         })
-        .map(|p| MatrixShape { m: p.m_size, n: p.n_size, k: p.k_size })
         .collect();
-    // Widths are multiples of 16; among shapes that fit them the largest product reuses its operands most.
-    shapes.retain(|s| 16 % s.m == 0 && 16 % s.n == 0 && 16 % s.k == 0);
-    shapes.sort_by_key(|s| std::cmp::Reverse((s.m * s.n * s.k, s.m)));
-    Ok(shapes)
+    // Rows are handled eight f16 at a time, and widths are multiples of 16.
+    let fits = |size: u32| size.is_multiple_of(8) && 16 % size == 0;
+    shapes.retain(|s| [s.m, s.n, s.k].into_iter().all(fits));
+    // The largest product reuses its operands most; the way through shared memory is the longer one.
+    shapes.sort_by_key(|s| std::cmp::Reverse((s.f16_sums, s.m * s.n * s.k, s.m)));
+    shapes
 }
 
 pub(super) fn describe(
@@ -421,6 +429,33 @@ mod tests {
         assert_eq!(chosen(fixed(32, (32, 32))), (Some(32), None, Some(32)));
         assert_eq!(chosen(fixed(64, (32, 64))), (Some(64), None, None));
         assert_eq!(SubgroupSizes { full: false, ..sizes(32, (32, 32)) }.full(), None);
+    }
+
+    #[test]
+    fn shapes_without_f16_sums_come_last() {
+        use vk::ComponentTypeKHR as Type;
+        let product = |[m_size, n_size, k_size]: [u32; 3], operands, sums| vk::CooperativeMatrixPropertiesKHR {
+            m_size,
+            n_size,
+            k_size,
+            a_type: operands,
+            b_type: operands,
+            c_type: sums,
+            result_type: sums,
+            scope: vk::ScopeKHR::SUBGROUP,
+            ..Default::default()
+        };
+        let (half, single) = (Type::FLOAT16, Type::FLOAT32);
+        let taken =
+            |found: &[_]| usable_shapes(found).iter().map(|s| ([s.m, s.n, s.k], s.f16_sums)).collect::<Vec<_>>();
+        let (large, small) = ([16, 16, 16], [8, 8, 16]);
+        // Intel's first chips with matrices; a shape of either kind; what our kernels cannot use.
+        assert_eq!(taken(&[product(small, half, single)]), [(small, false)]);
+        let both = [product(large, half, single), product(small, half, half), product(small, half, single)];
+        assert_eq!(taken(&both), [(small, true), (large, false)]);
+        let workgroup = vk::CooperativeMatrixPropertiesKHR { scope: vk::ScopeKHR::WORKGROUP, ..both[1] };
+        assert_eq!(taken(&[both[2], workgroup]), [(small, false)]);
+        assert_eq!(taken(&[product([16, 8, 4], half, single), product(large, Type::SINT8, Type::SINT32)]), []);
     }
 
     #[test]

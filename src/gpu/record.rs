@@ -68,6 +68,7 @@ pub struct Commands {
     descriptor_pools: Vec<vk::DescriptorPool>,
     queries: vk::QueryPool,
     passes: Vec<&'static str>,
+    barriers: u32,
     buffers: Vec<Buffer>,
     images: Vec<Image3d>,
     pipelines: Vec<Arc<Pipeline>>,
@@ -145,6 +146,7 @@ impl Recording {
             descriptor_pools: Vec::new(),
             queries: vk::QueryPool::null(),
             passes: Vec::new(),
+            barriers: 0,
             buffers: Vec::new(),
             images: Vec::new(),
             pipelines: Vec::new(),
@@ -201,6 +203,7 @@ impl Recording {
                 &[],
             );
         }
+        self.commands.barriers += 1;
         self.read.clear();
         self.written.clear();
     }
@@ -511,6 +514,11 @@ impl Commands {
         shared.last_submitted.store(value, Ordering::Release);
         self.last_submit.store(value, Ordering::Release);
         Ok(Ticket(value))
+    }
+
+    /// Barriers at which commands wait for earlier ones, that at the beginning among them.
+    pub fn barriers(&self) -> u32 {
+        self.barriers
     }
 
     /// Device time of each pass of the last submit, which must be complete. Empty without timestamps.

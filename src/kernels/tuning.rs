@@ -56,6 +56,8 @@ pub struct MatrixTuning {
     pub backward_sums: u32,
     /// Compute the encoding and the first layer again in the backward pass instead of keeping them: less memory moves.
     pub recompute: bool,
+    /// Make numbers f16 in registers, for which a device must have matrices of f16 sums.
+    pub f16_sums: bool,
 }
 
 /// Sizes and variants chosen for a device, with the reasons.
@@ -123,15 +125,20 @@ impl Tuning {
             Some(_) if info.is_cpu() => {
                 (Layers::F32, "f32 layers: a CPU emulates cooperative matrices, several times slower".to_owned())
             }
+            Some(s) if !s.f16_sums => {
+                (Layers::F32, "f32 layers: cooperative matrices without f16 sums go by way of shared memory".to_owned())
+            }
             Some(s) => (Layers::Matrices, format!("matrix layers, {}x{}x{}: f16 operands, f32 sums", s.m, s.n, s.k)),
         };
         reasons.push(why);
+        let f16_sums = info.matrices.first().is_some_and(|s| s.f16_sums);
         let on_gpu = |workgroups| MatrixTuning {
             workgroups,
             largest_tile: 128,
             unroll: true,
             backward_sums: 64,
             recompute: true,
+            f16_sums,
         };
         let matrices = match info.multiprocessors {
             // Unrolled, a CPU driver compiles these kernels for minutes; sums are in memory, and the encoding is dear.
@@ -141,6 +148,7 @@ impl Tuning {
                 unroll: false,
                 backward_sums: u32::MAX,
                 recompute: false,
+                f16_sums,
             },
             0 => on_gpu(workgroups_untold(info.kind)),
             // Two workgroups per multiprocessor.
@@ -172,6 +180,11 @@ impl Tuning {
             overlap,
             reasons,
         }
+    }
+
+    /// Whether matrices may be faster on a device, so that timing both paths is worth its time.
+    pub fn has_choice(info: &DeviceInfo) -> bool {
+        !info.is_cpu() && !info.matrices.is_empty()
     }
 
     /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_loss`.

@@ -86,20 +86,28 @@ struct Builder<'a> {
     gpu: &'a Gpu,
     shape: &'a Shape,
     params: &'a NetworkMap,
-    /// Unrolled or not, they compute the same.
-    unroll: bool,
+    /// Suffix of the kernels' variant: unrolled or not, with f16 sums or without, they compute the same.
+    variant: &'static str,
+}
+
+/// Where there are no f16 sums, loops are unrolled: only GPUs lack them.
+fn variant(tuning: &MatrixTuning) -> &'static str {
+    match (tuning.f16_sums, tuning.unroll) {
+        (true, true) => "_unrolled",
+        (true, false) => "",
+        (false, _) => "_f32_sums",
+    }
 }
 
 impl Builder<'_> {
     fn common(&self, tile: u32, subgroups: u32) -> [(&'static str, u32); 6] {
-        let MatrixShape { m, n, k } = self.shape.matrix;
+        let MatrixShape { m, n, k, .. } = self.shape.matrix;
         [("m", m), ("n", n), ("k", k), ("tile", tile), ("subgroups", subgroups), ("width", self.params.width as u32)]
     }
 
     fn build<'c>(&self, subgroups: u32, constants: &'c [(&'static str, u32)]) -> Build<'c> {
         let lanes = Some(subgroups * self.gpu.info().matrix_subgroup);
-        let variant = if self.unroll { "_unrolled" } else { "" };
-        Build { variant, lanes, constants, matrices: true, ..Build::default() }
+        Build { variant: self.variant, lanes, constants, matrices: true, ..Build::default() }
     }
 
     fn forward(&self, purpose: Purpose) -> Result<Stage<push::MlpFusedFwd>> {
@@ -196,7 +204,7 @@ impl FusedNetwork {
             Error::config("layers", "matrices", format!("{}: {problem}", info.name))
         })?;
         let shape = Shape::new(info, matrix, &tuning.matrices, params)?;
-        let builder = Builder { gpu, shape: &shape, params, unroll: tuning.matrices.unroll };
+        let builder = Builder { gpu, shape: &shape, params, variant: variant(&tuning.matrices) };
         let (width, encoded) = (params.width, shape.encoded);
         let capacity = u64::from(setup.sample_capacity);
         let training = match purpose {

@@ -102,26 +102,33 @@ impl LayerNetwork {
         self.training.as_ref().ok_or_else(built_for_rendering)
     }
 
-    /// Records the gradient at the output neuron and of its weights, and dz of the last layer.
-    fn record_output_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+    /// Records the gradient at the output neuron, and dz of the last layer.
+    fn record_output_backward(&self, pass: &mut Pass<'_>) -> Result<()> {
         let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
-        let capacity = pass.setup.sample_capacity;
         let groups = params.width as u32 / 4;
         let last = params.layers.len() - 1;
         let activations = (Binding::activations, (&self.activations[last]).into());
         let dz = (Binding::dz, (&training.dz[last % 2]).into());
-        let push = push::MlpOutBwd { groups, weights4: params.out_weights as u32 / 4, capacity };
-        pass.run_with(&k.mlp_out_bwd, pass.buffers.per_sample(), &[activations, dz], push)?;
+        let push =
+            push::MlpOutBwd { groups, weights4: params.out_weights as u32 / 4, capacity: pass.setup.sample_capacity };
+        pass.run_with(&k.mlp_out_bwd, pass.buffers.per_sample(), &[activations, dz], push)
+    }
+
+    /// Records the gradient of the output neuron's weights.
+    fn record_output_weight_gradient(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        let (k, params) = (&self.kernels, pass.network.map());
+        let activations = (Binding::activations, self.below(params.layers.len()).into());
         let PartialSums { splits, len: n_partials } = self.partial_sums(params);
         let push = push::MlpOutBwdWeight {
             weights: in_partials(params, params.out_weights),
             bias: in_partials(params, params.out_bias),
-            capacity,
+            capacity: pass.setup.sample_capacity,
             splits,
             n_partials,
             accumulate: chunk.accumulate(),
         };
-        pass.run_with(&k.mlp_out_bwd_weight, Groups::Direct([groups, splits, 1]), &[activations], push)
+        let groups = Groups::Direct([params.width as u32 / 4, splits, 1]);
+        pass.run_with(&k.mlp_out_bwd_weight, groups, &[activations], push)
     }
 
     /// Records dz of the layer below `i`, which has one.
@@ -284,7 +291,7 @@ impl Path for LayerNetwork {
 
     /// `partials` and `phase_dz`.
     fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        self.record_output_backward(pass, chunk)?;
+        self.record_output_backward(pass)?;
         for (i, layer) in pass.network.map().layers.iter().enumerate().rev() {
             if let (Some(weights), true) = (layer.hidden, i > 0) {
                 // The input gradient goes first: nothing below writes what it reads, so the three may overlap.
@@ -295,7 +302,8 @@ impl Path for LayerNetwork {
                 self.record_phase_sum(pass, i, chunk)?;
             }
         }
-        Ok(())
+        // Beside the first layer's sums over phases: those of weights share a buffer, so that each waits for the one before.
+        self.record_output_weight_gradient(pass, chunk)
     }
 }
 

@@ -143,11 +143,15 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
         pass.samples(chunk)?;
         pass.fields()?;
         record_losses(pass, chunk)?;
-        if chunk.is_last(setup.n_rays) {
+        if chunk.is_last(setup.n_rays) && pass.still.is_none() {
             // Before the network's backward passes, beside which it may run: they write none of what it does.
             record_static_gradient(pass)?;
         }
         network.record_backward(pass, chunk)?;
+    }
+    if let Some(still) = pass.still {
+        // After the moving network's backward passes, which begin beside its last one.
+        still.record_gradient(pass)?;
     }
     network.record_gradient(pass)?;
     pass.run(&k.adam, k.adam.groups_over(setup.n_params), push::Adam {})?;
@@ -170,12 +174,9 @@ fn record_losses(pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
     pass.run(&k.march_loss, chunk.per_ray(), push::MarchLoss { first_ray, n_rays })
 }
 
-/// Records the gradient of the static field's parameters.
+/// Records the gradient of the tensor field's parameters.
 fn record_static_gradient(pass: &mut Pass<'_>) -> Result<()> {
     let (k, params) = (pass.kernels, pass.params);
-    if let Some(still) = pass.still {
-        return still.record_gradient(pass);
-    }
     let groups = k.gradient_static.groups_over(params.static_len as u32);
     pass.run(&k.gradient_static, groups, push::GradientStatic { ranks: params.ranks as u32 })
 }

@@ -211,6 +211,11 @@ impl Subject {
         self.n_rays
     }
 
+    /// Barriers of an iteration; none where a Lineformer is all there is.
+    pub fn barriers(&self) -> Option<u32> {
+        self.trainer.barriers()
+    }
+
     /// Operations of the network per sample.
     pub fn cost(&self) -> NetworkCost {
         self.cost

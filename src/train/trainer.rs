@@ -314,6 +314,11 @@ impl Trainer {
         self.still.as_ref()
     }
 
+    /// Barriers of an iteration; none where Gaussians, or a Lineformer, are all there is.
+    pub fn barriers(&self) -> Option<u32> {
+        self.single.as_ref().map(Commands::barriers)
+    }
+
     /// Least work of an iteration's stages with so many live samples. What of the still tensor field is looked up stays in caches,
     /// so its stages over samples are not among them.
     pub fn work(&self, live_samples: u64) -> Ledger {

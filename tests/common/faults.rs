@@ -14,6 +14,8 @@ const STORE: u32 = 62;
 const ADD: u32 = 129;
 const SUBTRACT: u32 = 131;
 const MULTIPLY: u32 = 133;
+const GREATER: u32 = 186;
+const SMALLER: u32 = 184;
 const WHOLE_ADD: u32 = 128;
 const WHOLE_SUBTRACT: u32 = 130;
 const SHIFT_RIGHT: u32 = 194;
@@ -22,7 +24,7 @@ const LESS: u32 = 176;
 const LESS_OR_EQUAL: u32 = 178;
 
 /// Instructions of SPIR-V by position: operation and length in words.
-fn instructions(words: &[u32]) -> Vec<(usize, u32, usize)> {
+pub fn instructions(words: &[u32]) -> Vec<(usize, u32, usize)> {
     const HEADER: usize = 5;
     let (mut at, mut found) = (HEADER, Vec::new());
     while at < words.len() {
@@ -46,6 +48,10 @@ pub fn wrong_sign(words: &mut [u32]) {
 
 pub fn sum_for_product(words: &mut [u32]) {
     replace(words, MULTIPLY, ADD);
+}
+
+pub fn less_for_greater(words: &mut [u32]) {
+    replace(words, GREATER, SMALLER);
 }
 
 pub fn differences(words: &mut [u32]) {
@@ -84,25 +90,34 @@ pub type Compare = fn(&Gpu, &mut Findings) -> Result<()>;
 /// A fault in the code of a stage.
 pub struct Fault {
     stage: &'static str,
+    variant: Option<&'static str>,
     plant: fn(&mut [u32]),
     compare: Compare,
 }
 
 pub fn fault(stage: &'static str, plant: fn(&mut [u32]), compare: Compare) -> Fault {
-    Fault { stage, plant, compare }
+    Fault { stage, variant: None, plant, compare }
 }
 
-/// The code that the device gets of a stage.
-fn code(gpu: &Gpu, stage: &str) -> Vec<u32> {
+impl Fault {
+    /// The same in another variant of the shader than the device would get by itself.
+    pub fn in_variant(self, name: &'static str) -> Fault {
+        Fault { variant: Some(name), ..self }
+    }
+}
+
+/// The code that the device gets of a stage, in that variant if one is asked for.
+fn code(gpu: &Gpu, stage: &str, variant_asked: Option<&str>) -> Vec<u32> {
     let variant = |name: &str, taken: bool| kernel_code(&format!("{stage}_{name}")).ok().filter(|_| taken);
     let texel = variant("texel", tuning(gpu).operands == Operands::Texel);
-    let taken = texel.or_else(|| variant("subgroup", gpu.info().full_subgroups.is_some()));
+    let asked = variant_asked.map(|name| kernel_code(&format!("{stage}_{name}")).unwrap());
+    let taken = asked.or(texel).or_else(|| variant("subgroup", gpu.info().full_subgroups.is_some()));
     bytemuck::pod_collect_to_vec(taken.unwrap_or_else(|| kernel_code(stage).unwrap()).spirv)
 }
 
 /// Expects that nothing is found without a fault, and that each is found in the row of its stage before all others.
 pub fn expect_found(faults: &[Fault]) {
-    for Fault { stage, plant, compare } in faults {
+    for Fault { stage, variant, plant, compare } in faults {
         shim::begin(shim::Failing::None);
         let open = || Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap();
         let first_failure = || {
@@ -111,7 +126,7 @@ pub fn expect_found(faults: &[Fault]) {
             findings.rows().iter().find(|row| !row.is_ok()).map(|row| row.stages.clone())
         };
         assert_eq!(first_failure(), None, "without a fault");
-        let words = code(&open(), stage);
+        let words = code(&open(), stage, *variant);
         let mut faulty = words.clone();
         plant(&mut faulty);
         assert!(words != faulty, "{stage} has no such instruction");

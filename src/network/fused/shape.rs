@@ -89,7 +89,7 @@ impl Shape {
         tuning: &MatrixTuning,
         params: &NetworkMap,
     ) -> Result<Shape> {
-        let MatrixShape { m, n, k } = matrix;
+        let MatrixShape { m, n, k, .. } = matrix;
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
         let unfit = |what: String| Error::config("dynamic.width", width, what);
@@ -98,17 +98,22 @@ impl Shape {
         if subgroups * info.matrix_subgroup < width / 8 {
             return Err(unfit("is too wide for the matrix kernels on this device".into()));
         }
-        let room = Room { m, k, bytes: info.max_shared_memory - SHARED_RESERVE };
-        let (hidden_row, encoded_row) = (row_bytes(width), row_bytes(encoded as u32));
+        // Without f16 sums, each subgroup has a tile of sums beside the tiles of samples.
+        let room = |subgroups: u32| {
+            let sums = if tuning.f16_sums { 0 } else { subgroups * m * n * 4 };
+            Room { m, k, bytes: info.max_shared_memory.saturating_sub(SHARED_RESERVE + sums) }
+        };
+        // The output's n sums come to lie in a row of the last layer's activations.
+        let (hidden_row, encoded_row) = (row_bytes(width).max(4 * n), row_bytes(encoded as u32));
         let skips = params.layers.iter().skip(1).any(|l| l.encoded.is_some());
         let rows = if skips { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
-        let fwd_tile = room.tile(tuning.largest_tile, |t| t * (rows + 4 * n));
+        let fwd_tile = room(subgroups).tile(tuning.largest_tile, |t| t * rows);
         let recompute = computes_again(tuning, params);
         let inputs_row = if recompute { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
         let backward = |subgroups: u32| {
             let scratch = 2 * 16 * subgroups * info.matrix_subgroup;
             let bytes = |t: u32| (t * hidden_row).max(scratch) + t * (inputs_row + 4);
-            let tile = room.tile(tuning.largest_tile.min(LARGEST_BACKWARD_TILE), bytes)?;
+            let tile = room(subgroups).tile(tuning.largest_tile.min(LARGEST_BACKWARD_TILE), bytes)?;
             Some(Backward { subgroups, tile, recompute })
         };
         // Subgroups beyond the tiles across a layer share out the rows of its input gradient.
