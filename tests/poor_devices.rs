@@ -17,7 +17,7 @@ use nertca_vk::kernels::stages::{Build, Stage};
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::selftest::{drawing, gaussians, repeats, trees};
+use nertca_vk::selftest::{drawing, gaussians, repeats, sax, trees};
 use nertca_vk::train::trainer::Trainer;
 use shim::Poor;
 
@@ -34,6 +34,7 @@ const LEAST: Poor = Poor {
         limits.max_storage_buffer_range = 1 << 27;
         limits.max_texel_buffer_elements = 1 << 16;
     },
+    free_memory: None,
 };
 
 fn open(poor: Poor) -> Result<Gpu, Error> {
@@ -74,6 +75,31 @@ fn what_cannot_be_done_without_is_said() {
         panic!("kernels bind more than four")
     };
     assert!(why.contains("storage buffers, the device allows 4"), "{why}");
+}
+
+#[test]
+fn memory_that_others_hold_is_told_before_a_fit_takes_any() {
+    let free = 8 << 20;
+    let taken = Poor { extensions: true, features: true, timestamps: true, limits: |_| (), free_memory: Some(free) };
+    let gpu = open(taken).unwrap();
+    let info = gpu.info();
+    let Some(told) = info.free_memory else {
+        assert!(info.mesa_major.is_none_or(|version| version < 24), "newer lavapipe tells of its memory's budget");
+        println!("{} does not tell how much of its memory is free: nothing was tried", info.name);
+        return;
+    };
+    assert_eq!((told, gpu.memory().free), (free, Some(free)));
+    let dataset = small_dataset(13, 11);
+    let begin = |settings: &[&str]| {
+        let plan = Plan::new(&sax::small_config(settings).unwrap(), &dataset).unwrap();
+        Trainer::new(&gpu, plan, &dataset, Tuning::for_device(gpu.info())).map(|_| ())
+    };
+    let error = begin(&["sax.levels=8", "sax.base=16", "sax.log2_table=16"]).unwrap_err();
+    assert!(matches!(error, Error::OutOfMemory { may_pass: true, .. }), "{error}");
+    let (text, whole) = (error.to_string(), format!("{} MiB, of which 8 MiB are free", info.device_memory >> 20));
+    assert!(text.contains("3 fields") && text.contains(&whole) && text.contains("sax.log2_table"), "{text}");
+    begin(&[]).unwrap();
+    expect_silence(gpu);
 }
 
 #[test]

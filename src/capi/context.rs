@@ -292,13 +292,14 @@ pub unsafe extern "C" fn nertca_context_describe(
             "validation_messages": context.gpu.as_ref().map(Gpu::validation_messages),
             "deterministic": context.deterministic,
         });
+            "free_memory": context.gpu.as_ref().and_then(|gpu| gpu.memory().free),
         // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&described.to_string(), text, size, length) }
     })
 }
 
 /// All Vulkan devices of this machine, usable or not, as a JSON list; `text`, `size` and `length` as for
-/// `nertca_last_error`. Any thread.
+/// `nertca_last_error`, but what it says of free memory may be longer at the next call. Any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.

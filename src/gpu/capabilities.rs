@@ -1,5 +1,6 @@
 //! What a device is and can do: the capability table, and the faults of drivers that shape it.
 
+use super::memory::DeviceMemory;
 use ash::{ext, khr, nv, vk};
 use serde::Serialize;
 use std::ffi::CStr;
@@ -57,6 +58,9 @@ pub struct DeviceInfo {
     pub timestamp_bits: u32,
     /// Device-local memory, bytes: the largest heap.
     pub device_memory: u64,
+    /// What this process could take of it when the device was looked at, bytes; none where the device does not tell
+    /// (`VK_EXT_memory_budget`). [`super::device::Gpu::memory`] asks anew.
+    pub free_memory: Option<u64>,
     /// Whether shaders can read buffers through their addresses.
     pub buffer_device_address: bool,
     /// Shapes of cooperative matrices with f16 operands and f32 sums at subgroup scope; empty when the device lacks
@@ -283,8 +287,7 @@ pub(super) fn describe(
     // SAFETY: the chain lives until the call returns; it holds an extension's structure only where the device has it, and
     // that of Vulkan 1.2 is ignored by older devices.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    // SAFETY: callers take `physical` from this instance.
-    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
+    let memory = DeviceMemory::of(instance, physical, has(ext::memory_budget::NAME));
     let limits = properties.limits;
     let version = properties.api_version;
     // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives,
@@ -351,12 +354,8 @@ pub(super) fn describe(
         max_push_constants: limits.max_push_constants_size,
         timestamp_period_ns: if timestamp_bits > 0 { limits.timestamp_period } else { 0.0 },
         timestamp_bits,
-        device_memory: memory.memory_heaps[..memory.memory_heap_count as usize]
-            .iter()
-            .filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
-            .map(|h| h.size)
-            .max()
-            .unwrap_or_default(),
+        device_memory: memory.bytes,
+        free_memory: memory.free,
         buffer_device_address: f12.buffer_device_address == vk::TRUE,
         matrices,
         multiprocessors: multiprocessors.shader_sm_count,

@@ -4,8 +4,9 @@
 use super::capabilities::{DeviceInfo, DeviceKind, compute_family, family_at};
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
+use super::memory::DeviceMemory;
 use super::statistics::StatisticsKeeper;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, SMALLER_BATCHES};
 use ash::{ext, khr, vk};
 use gpu_allocator::AllocationSizes;
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
@@ -82,9 +83,8 @@ pub(super) struct Shared {
     pub(super) info: DeviceInfo,
     /// Shaders that were recorded so far.
     pub(super) recorded: Mutex<BTreeSet<&'static str>>,
-    #[cfg_attr(not(unix), allow(dead_code, reason = "memory is shared on Unix only"))]
     pub(super) physical: vk::PhysicalDevice,
-    memory: Memory,
+    taken: Taken,
     queue_lock: Option<Box<dyn QueueLock>>,
     cache_file: Option<std::path::PathBuf>,
     pub(super) statistics: Option<StatisticsKeeper>,
@@ -118,7 +118,7 @@ impl Drop for Device {
 }
 
 /// Bytes of buffers and images.
-struct Memory {
+struct Taken {
     in_use: AtomicU64,
     limit: u64,
 }
@@ -288,7 +288,7 @@ impl Parts {
             info,
             recorded: Mutex::default(),
             physical,
-            memory: Memory { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) },
+            taken: Taken { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) },
             queue_lock,
             cache_file,
             statistics,
@@ -334,7 +334,8 @@ impl Gpu {
     /// Of the options, only the pipeline cache and the memory limit apply.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] when the device lacks what the engine needs.
+    /// [`Error::NoDevice`] when the device lacks what the engine needs; [`Error::Config`] for features it cannot have been made
+    /// with.
     ///
     /// # Safety
     /// The handles must be valid and belong together; the device must have been made with what `adoption` says, and
@@ -400,7 +401,7 @@ impl Gpu {
 
     /// Bytes of buffers and images alive at the moment.
     pub fn memory_in_use(&self) -> u64 {
-        self.shared.memory.in_use.load(Ordering::Relaxed)
+        self.shared.taken.in_use.load(Ordering::Relaxed)
     }
 
     /// Writes the pipeline cache to disk so that the next start compiles nothing.
@@ -440,22 +441,22 @@ impl Shared {
 
     /// Counts `bytes` that are about to be allocated.
     pub(super) fn reserve(&self, object: &str, bytes: u64) -> Result<()> {
-        let before = self.memory.in_use.fetch_add(bytes, Ordering::Relaxed);
-        if before.saturating_add(bytes) <= self.memory.limit {
+        let before = self.taken.in_use.fetch_add(bytes, Ordering::Relaxed);
+        if before.saturating_add(bytes) <= self.taken.limit {
             return Ok(());
         }
         self.release(bytes);
         Err(Error::OutOfMemory {
             object: object.into(),
             bytes,
-            detail: format!("{before} bytes of the limit of {} are in use", self.memory.limit),
+            detail: format!("{before} bytes of the limit of {} are in use", self.taken.limit),
             may_pass: false,
         })
     }
 
     /// Gives back what [`Shared::reserve`] counted.
     pub(super) fn release(&self, bytes: u64) {
-        self.memory.in_use.fetch_sub(bytes, Ordering::Relaxed);
+        self.taken.in_use.fetch_sub(bytes, Ordering::Relaxed);
     }
 
     pub(super) fn track(&self) {
@@ -488,9 +489,26 @@ impl Drop for Shared {
             // A lost device has nothing left to wait for.
             let _ = self.wait(submitted);
         }
+            instead: SMALLER_BATCHES,
         // SAFETY: pipelines and recordings, which use the two, hold an `Arc` of this struct, so none is left; nothing of
         // ours is on the queue once the wait returns. The device goes after this, with the fields.
         unsafe {
+    /// The device's memory as it is now.
+    pub(super) fn memory(&self) -> DeviceMemory {
+        DeviceMemory::of(&self.device.instance, self.physical, self.info.free_memory.is_some())
+    }
+
+    /// What an allocator says when there is no memory left for an object.
+    pub(super) fn no_memory(&self, object: &str, bytes: u64, why: &impl std::fmt::Display) -> Error {
+        Error::OutOfMemory {
+            object: object.into(),
+            bytes,
+            detail: format!("{why}; {} has {}", self.info.name, self.memory()),
+            may_pass: true,
+            instead: SMALLER_BATCHES,
+        }
+    }
+
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
             self.device.destroy_semaphore(self.timeline, None);
         }

@@ -63,6 +63,8 @@ pub struct Poor {
     pub timestamps: bool,
     /// Lowers limits.
     pub limits: fn(&mut vk::PhysicalDeviceLimits),
+    /// Bytes of each heap that others leave, where the device tells of that.
+    pub free_memory: Option<u64>,
 }
 
 thread_local! {
@@ -442,6 +444,25 @@ unsafe extern "system" fn vkGetPhysicalDeviceQueueFamilyProperties(
     device: vk::PhysicalDevice,
     count: *mut u32,
     out: *mut vk::QueueFamilyProperties,
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkGetPhysicalDeviceMemoryProperties2(
+    device: vk::PhysicalDevice,
+    out: *mut vk::PhysicalDeviceMemoryProperties2<'_>,
+) {
+    let real: vk::PFN_vkGetPhysicalDeviceMemoryProperties2 =
+        unsafe { std::mem::transmute(device.real(c"vkGetPhysicalDeviceMemoryProperties2")) };
+    unsafe { real(device, out) };
+    let Some(free) = with(|state| state.poor).and_then(|poor| poor.free_memory) else { return };
+    let mut next = unsafe { (*out).p_next }.cast::<vk::BaseOutStructure<'_>>();
+    while let Some(structure) = unsafe { next.as_mut() } {
+        if structure.s_type == vk::StructureType::PHYSICAL_DEVICE_MEMORY_BUDGET_PROPERTIES_EXT {
+            let told = unsafe { &mut *next.cast::<vk::PhysicalDeviceMemoryBudgetPropertiesEXT<'_>>() };
+            told.heap_budget = told.heap_usage.map(|usage| usage + free);
+        }
+        next = structure.p_next;
+    }
+}
+
 ) {
     let real: vk::PFN_vkGetPhysicalDeviceQueueFamilyProperties =
         unsafe { std::mem::transmute(device.real(c"vkGetPhysicalDeviceQueueFamilyProperties")) };
@@ -653,6 +674,7 @@ fn special(name: &str) -> Option<*const ()> {
         "vkDestroyInstance" => vkDestroyInstance as *const (),
         "vkDestroyDevice" => vkDestroyDevice as *const (),
         "vkCreateComputePipelines" => vkCreateComputePipelines as *const (),
+        "vkGetPhysicalDeviceMemoryProperties2" => vkGetPhysicalDeviceMemoryProperties2 as *const (),
         "vkCreateShaderModule" => vkCreateShaderModule as *const (),
         "vkCreateBuffer" => vkCreateBuffer as *const (),
         "vkMapMemory" => vkMapMemory as *const (),
