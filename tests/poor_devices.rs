@@ -5,11 +5,12 @@
 mod common;
 mod shim;
 
+use ash::vk;
 use common::{expect_agreement, expect_silence, run, small_config, small_dataset, tuning};
 use nertca_vk::bench::peaks::peaks;
 use nertca_vk::config::Preset;
 use nertca_vk::error::Error;
-use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::gpu::device::{Adoption, DeviceOptions, Gpu};
 use nertca_vk::gpu::record::{Groups, Recording};
 use nertca_vk::kernels::dispatch::{Binding, dispatch};
 use nertca_vk::kernels::push;
@@ -75,6 +76,56 @@ fn what_cannot_be_done_without_is_said() {
         panic!("kernels bind more than four")
     };
     assert!(why.contains("storage buffers, the device allows 4"), "{why}");
+}
+
+/// Adopts a device that a host made of `poor`, with nothing but timeline semaphores, and says was made with features.
+fn adopt(poor: Poor, subgroup_size_control: bool, cooperative_matrix: bool) -> Result<(), Error> {
+    shim::impoverish(poor);
+    let entry = shim::entry();
+    let application = vk::ApplicationInfo::default().api_version(vk::API_VERSION_1_2);
+    let queues = [vk::DeviceQueueCreateInfo::default().queue_priorities(&[1.0])];
+    let mut features = vk::PhysicalDeviceVulkan12Features::default().timeline_semaphore(true);
+    let instance = vk::InstanceCreateInfo::default().application_info(&application);
+    let device = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut features);
+    // SAFETY: the create infos live until the calls return; device and instance are destroyed last, and once.
+    unsafe {
+        let instance = entry.create_instance(&instance, None).unwrap();
+        let physical_device = instance.enumerate_physical_devices().unwrap()[0];
+        let device = instance.create_device(physical_device, &device, None).unwrap();
+        let adoption = Adoption {
+            get_instance_proc_addr: Some(entry.static_fn().get_instance_proc_addr),
+            instance: instance.handle(),
+            physical_device,
+            device: device.handle(),
+            queue: device.get_device_queue(0, 0),
+            queue_family: 0,
+            buffer_device_address: false,
+            external_memory_fd: false,
+            subgroup_size_control,
+            cooperative_matrix,
+            queue_lock: None,
+        };
+        let adopted = Gpu::adopt(adoption, &DeviceOptions::default()).map(drop);
+        device.destroy_device(None);
+        instance.destroy_instance(None);
+        adopted
+    }
+}
+
+#[test]
+fn features_that_a_device_cannot_have_been_made_with_are_refused() {
+    adopt(LEAST, false, false).unwrap();
+    let refused = |poor, claims: (bool, bool)| match adopt(poor, claims.0, claims.1) {
+        Err(Error::Config { field, problem, .. }) => format!("{field}: {problem}"),
+        other => panic!("{other:?}"),
+    };
+    let said = refused(LEAST, (true, false));
+    assert!(said.starts_with("subgroup_size_control: ") && said.contains("subgroupSizeControl, comp"), "{said}");
+    // One that lacks a single thing of those that matrices need, or several.
+    let said = refused(Poor { extensions: true, ..LEAST }, (true, true));
+    assert!(said.starts_with("cooperative_matrix: ") && said.contains("shaderFloat16"), "{said}");
+    let said = refused(LEAST, (false, true));
+    assert!(said.contains("needs subgroup_size_control"), "{said}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The choice of a device, adoption of someone else's, and what all objects made from one share: queue, allocator,
 //! timeline, debug names.
 
-use super::capabilities::{DeviceInfo, DeviceKind, compute_family, family_at};
+use super::capabilities::{DeviceInfo, DeviceKind, KernelFeatures, compute_family, family_at};
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
 use super::memory::DeviceMemory;
@@ -52,8 +52,35 @@ pub struct Adoption {
     pub buffer_device_address: bool,
     /// The device was made with `VK_KHR_external_memory_fd`.
     pub external_memory_fd: bool,
+    /// The device was made with the features `subgroupSizeControl` and `computeFullSubgroups`, of
+    /// `VK_EXT_subgroup_size_control` or Vulkan 1.3.
+    pub subgroup_size_control: bool,
+    /// The device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, and with `shaderFloat16`,
+    /// `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`; and with what `subgroup_size_control` stands for.
+    pub cooperative_matrix: bool,
     /// Held around every use of the queue; `None` when the queue is ours alone.
     pub queue_lock: Option<Box<dyn QueueLock>>,
+}
+
+impl Adoption {
+    /// Refuses features that no device of this kind was made with: kernels that use them would have undefined results.
+    fn check_features(&self, device: &str, offered: &KernelFeatures) -> Result<()> {
+        let claims = [
+            ("subgroup_size_control", self.subgroup_size_control, &offered.subgroups[..]),
+            ("cooperative_matrix", self.cooperative_matrix, &offered.matrices[..]),
+        ];
+        for (field, is_claimed, features) in claims {
+            let lacking: Vec<&str> = features.iter().filter(|(_, offered)| !offered).map(|(name, _)| *name).collect();
+            if is_claimed && !lacking.is_empty() {
+                let problem = format!(
+                    "{device} does not offer {}, so the device was not made with it: leave the field out",
+                    lacking.join(", ")
+                );
+                return Err(Error::config(field, is_claimed, problem));
+            }
+        }
+        Ok(())
+    }
 }
 
 /// Keeps several users of one queue apart.
@@ -341,6 +368,10 @@ impl Gpu {
     /// The handles must be valid and belong together; the device must have been made with what `adoption` says, and
     /// the queue be used by others only while they hold the lock.
     pub unsafe fn adopt(adoption: Adoption, options: &DeviceOptions) -> Result<Gpu> {
+        if adoption.cooperative_matrix && !adoption.subgroup_size_control {
+            let problem = "needs subgroup_size_control as well: kernels on matrices ask for full subgroups";
+            return Err(Error::config("cooperative_matrix", true, problem));
+        }
         let loader = adoption.get_instance_proc_addr.map(|function| {
             // SAFETY: the caller vouches that the function is that of the loader all handles come from.
             unsafe { Loader::new(function) }
@@ -351,6 +382,9 @@ impl Gpu {
         if let Some(why) = &info.unusable {
             return Err(Error::NoDevice(format!("{}: {why}", info.name)));
         }
+        let offered = KernelFeatures::offered(&instance, adoption.physical_device)
+            .map_err(Error::vulkan("vkEnumerateDeviceExtensionProperties", &info.name))?;
+        adoption.check_features(&info.name, &offered)?;
         // SAFETY: the caller vouches that the device is valid and was made from this instance.
         let raw = unsafe { ash::Device::load(instance.fp_v1_0(), adoption.device) };
         // SAFETY: the device is the caller's, as in the line above; the name ends with a zero.
@@ -366,8 +400,12 @@ impl Gpu {
             info.timestamp_period_ns = 0.0;
         }
         info.external_memory_fd &= adoption.external_memory_fd;
-        info.matrices.clear();
-        (info.full_subgroups, info.small_subgroups) = (None, None);
+        if !adoption.cooperative_matrix {
+            info.matrices.clear();
+        }
+        if !adoption.subgroup_size_control {
+            (info.full_subgroups, info.small_subgroups) = (None, None);
+        }
         let parts = Parts {
             physical: adoption.physical_device,
             info,
@@ -451,7 +489,24 @@ impl Shared {
             bytes,
             detail: format!("{before} bytes of the limit of {} are in use", self.taken.limit),
             may_pass: false,
+            instead: SMALLER_BATCHES,
         })
+    }
+
+    /// The device's memory as it is now.
+    pub(super) fn memory(&self) -> DeviceMemory {
+        DeviceMemory::of(&self.device.instance, self.physical, self.info.free_memory.is_some())
+    }
+
+    /// What an allocator says when there is no memory left for an object.
+    pub(super) fn no_memory(&self, object: &str, bytes: u64, why: &impl std::fmt::Display) -> Error {
+        Error::OutOfMemory {
+            object: object.into(),
+            bytes,
+            detail: format!("{why}; {} has {}", self.info.name, self.memory()),
+            may_pass: true,
+            instead: SMALLER_BATCHES,
+        }
     }
 
     /// Gives back what [`Shared::reserve`] counted.
@@ -489,26 +544,9 @@ impl Drop for Shared {
             // A lost device has nothing left to wait for.
             let _ = self.wait(submitted);
         }
-            instead: SMALLER_BATCHES,
         // SAFETY: pipelines and recordings, which use the two, hold an `Arc` of this struct, so none is left; nothing of
         // ours is on the queue once the wait returns. The device goes after this, with the fields.
         unsafe {
-    /// The device's memory as it is now.
-    pub(super) fn memory(&self) -> DeviceMemory {
-        DeviceMemory::of(&self.device.instance, self.physical, self.info.free_memory.is_some())
-    }
-
-    /// What an allocator says when there is no memory left for an object.
-    pub(super) fn no_memory(&self, object: &str, bytes: u64, why: &impl std::fmt::Display) -> Error {
-        Error::OutOfMemory {
-            object: object.into(),
-            bytes,
-            detail: format!("{why}; {} has {}", self.info.name, self.memory()),
-            may_pass: true,
-            instead: SMALLER_BATCHES,
-        }
-    }
-
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
             self.device.destroy_semaphore(self.timeline, None);
         }

@@ -143,6 +143,11 @@ pub fn loader() -> Loader {
     unsafe { Loader::new(get_instance_proc_addr) }
 }
 
+/// The same, for a host that makes a device itself.
+pub fn entry() -> ash::Entry {
+    unsafe { ash::Entry::from_static_fn(ash::StaticFn { get_instance_proc_addr }) }
+}
+
 type Void = unsafe extern "system" fn();
 type Callbacks = *const vk::AllocationCallbacks<'static>;
 
@@ -440,11 +445,6 @@ unsafe extern "system" fn vkGetPhysicalDeviceFeatures2(
 }
 
 #[allow(non_snake_case)]
-unsafe extern "system" fn vkGetPhysicalDeviceQueueFamilyProperties(
-    device: vk::PhysicalDevice,
-    count: *mut u32,
-    out: *mut vk::QueueFamilyProperties,
-#[allow(non_snake_case)]
 unsafe extern "system" fn vkGetPhysicalDeviceMemoryProperties2(
     device: vk::PhysicalDevice,
     out: *mut vk::PhysicalDeviceMemoryProperties2<'_>,
@@ -463,6 +463,11 @@ unsafe extern "system" fn vkGetPhysicalDeviceMemoryProperties2(
     }
 }
 
+#[allow(non_snake_case)]
+unsafe extern "system" fn vkGetPhysicalDeviceQueueFamilyProperties(
+    device: vk::PhysicalDevice,
+    count: *mut u32,
+    out: *mut vk::QueueFamilyProperties,
 ) {
     let real: vk::PFN_vkGetPhysicalDeviceQueueFamilyProperties =
         unsafe { std::mem::transmute(device.real(c"vkGetPhysicalDeviceQueueFamilyProperties")) };
@@ -669,12 +674,12 @@ fn special(name: &str) -> Option<*const ()> {
         "vkEnumerateDeviceExtensionProperties" => vkEnumerateDeviceExtensionProperties as *const (),
         "vkGetPhysicalDeviceProperties2" => vkGetPhysicalDeviceProperties2 as *const (),
         "vkGetPhysicalDeviceFeatures2" => vkGetPhysicalDeviceFeatures2 as *const (),
+        "vkGetPhysicalDeviceMemoryProperties2" => vkGetPhysicalDeviceMemoryProperties2 as *const (),
         "vkGetPhysicalDeviceQueueFamilyProperties" => vkGetPhysicalDeviceQueueFamilyProperties as *const (),
         "vkCreateInstance" => vkCreateInstance as *const (),
         "vkDestroyInstance" => vkDestroyInstance as *const (),
         "vkDestroyDevice" => vkDestroyDevice as *const (),
         "vkCreateComputePipelines" => vkCreateComputePipelines as *const (),
-        "vkGetPhysicalDeviceMemoryProperties2" => vkGetPhysicalDeviceMemoryProperties2 as *const (),
         "vkCreateShaderModule" => vkCreateShaderModule as *const (),
         "vkCreateBuffer" => vkCreateBuffer as *const (),
         "vkMapMemory" => vkMapMemory as *const (),
