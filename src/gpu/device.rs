@@ -5,6 +5,7 @@ use super::capabilities::{DeviceInfo, DeviceKind, KernelFeatures, compute_family
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
 use super::memory::DeviceMemory;
+use super::pace::Looks;
 use super::statistics::StatisticsKeeper;
 use crate::error::{Error, Result, SMALLER_BATCHES};
 use ash::{ext, khr, vk};
@@ -108,6 +109,7 @@ pub(super) struct Shared {
     pub(super) last_submitted: AtomicU64,
     pub(super) live_objects: AtomicU64,
     pub(super) info: DeviceInfo,
+    looks: Looks,
     /// Shaders that were recorded so far.
     pub(super) recorded: Mutex<BTreeSet<&'static str>>,
     pub(super) physical: vk::PhysicalDevice,
@@ -313,6 +315,7 @@ impl Parts {
             last_submitted: AtomicU64::new(0),
             live_objects: AtomicU64::new(0),
             info,
+            looks: Looks::default(),
             recorded: Mutex::default(),
             physical,
             taken: Taken { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) },
@@ -420,6 +423,11 @@ impl Gpu {
     /// What this device is and can do.
     pub fn info(&self) -> &DeviceInfo {
         &self.shared.info
+    }
+
+    /// Where those who want a picture of what is computed here say so.
+    pub fn looks(&self) -> &Looks {
+        &self.shared.looks
     }
 
     /// Errors and warnings of the validation layer so far; empty without validation.
