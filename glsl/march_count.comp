@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Finds and counts the live dynamic samples of each ray of a chunk.
+// Finds and counts the live dynamic samples of each ray of a chunk; what it writes of a ray lies at the ray's place in the batch.
 //   lane_masks: which depths are live;  lane_offsets[ray][lane] = live samples of the lanes before;
 //   ray_counts[ray] = live samples of the ray.
 #include "inc/march_samples.glsl"
@@ -23,8 +23,8 @@ bool searched(vec3 x, Ray ray) {
 
 void main() {
     uint lane = gl_LocalInvocationID.x;
-    uint r = gl_WorkGroupID.x;
-    Ray ray = rays[push.first_ray + r];
+    uint r = push.first_ray + gl_WorkGroupID.x;
+    Ray ray = rays[r];
     uint begin = lane * run_length();
     uint end = min(begin + run_length(), setup.n_dynamic_samples);
     uint live = 0u;

@@ -14,19 +14,19 @@ layout(binding = 8) writeonly buffer B8 { uint sample_rays[]; };
 void main() {
     if (live.count == 0u) return;
     uint lane = gl_LocalInvocationID.x;
-    uint r = gl_WorkGroupID.x;
-    uint slot = ray_start[r] + lane_offsets[r * gl_WorkGroupSize.x + lane];
+    uint r = push.first_ray + gl_WorkGroupID.x;
+    uint slot = ray_start[gl_WorkGroupID.x] + lane_offsets[r * gl_WorkGroupSize.x + lane];
     for (uint word = 0u; word < mask_words(); word++) {
         uint mask = lane_masks[(r * gl_WorkGroupSize.x + lane) * mask_words() + word];
         if (mask == 0u) continue;
-        Ray ray = rays[push.first_ray + r];
+        Ray ray = rays[r];
         for (; mask != 0u; mask &= mask - 1u) {
             uint k = lane * run_length() + 32u * word + uint(findLSB(mask));
             float depth = dynamic_depth(k, ray);
             float dl = path_length(depth, k, setup.n_dynamic_samples, setup.dynamic_near, setup.dynamic_far,
                                    setup.jitter, setup.seed, state.step, depth_stream(ray), ray.norm);
             sample_points[slot] = vec4(ray.anchor + depth * ray.direction, dl);
-            sample_rays[slot] = sample_ray(push.first_ray + r, depth < setup.occlusion_depth);
+            sample_rays[slot] = sample_ray(r, depth < setup.occlusion_depth);
             slot++;
         }
     }

@@ -3,11 +3,11 @@
 // Turns the counts of a chunk into offsets (exclusive prefix sum over rays, one workgroup) and writes the
 // indirect arguments of all passes over live samples. While the dynamic field is delayed, and when learning has ended, nothing
 // is live.
-//   ray_counts[n_rays] -> ray_start[n_rays + 1];  live: how many.
+//   ray_counts of the chunk's rays -> ray_start[n_rays + 1];  live: how many.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
-    uint n_rays; uint tile_samples; uint forward_rows; uint backward_rows; uint accumulate;
+    uint first_ray; uint n_rays; uint tile_samples; uint forward_rows; uint backward_rows; uint accumulate;
 } push;
 layout(binding = 0) readonly buffer B0 { DeviceState state; };
 layout(binding = 1) readonly buffer B1 { Schedule schedule[]; };
@@ -25,7 +25,7 @@ void main() {
     uint begin = min(lane * per, push.n_rays);
     uint end = min(begin + per, push.n_rays);
     uint sum = 0u;
-    for (uint r = begin; r < end; r++) sum += ray_counts[r];
+    for (uint r = begin; r < end; r++) sum += ray_counts[push.first_ray + r];
     totals[lane] = sum * active_now;
     barrier();
     if (lane == 0u) {
@@ -49,6 +49,6 @@ void main() {
     uint running = totals[lane];
     for (uint r = begin; r < end; r++) {
         ray_start[r] = running;
-        running += ray_counts[r] * active_now;
+        running += ray_counts[push.first_ray + r] * active_now;
     }
 }

@@ -277,6 +277,17 @@ typedef struct {
    * Handed to `lock` and `unlock`.
    */
   void *user;
+  /**
+   * Non-zero when the device was made with the features `subgroupSizeControl` and `computeFullSubgroups` (of
+   * `VK_EXT_subgroup_size_control`, or of Vulkan 1.3): sums then go by shuffles, as on a device of the library's own.
+   */
+  uint32_t subgroup_size_control;
+  /**
+   * Non-zero when the device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, and with
+   * `shaderFloat16`, `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`: networks then go by matrices, where the
+   * library has kernels for the device's. Needs `subgroup_size_control` as well.
+   */
+  uint32_t cooperative_matrix;
 } nertca_vulkan;
 
 /**
@@ -897,16 +908,20 @@ nertca_status nertca_context_adopt(const nertca_vulkan *vulkan,
                                    nertca_context **context);
 
 /**
- * The device and the paths chosen for it, as JSON; `text`, `size` and `length` as for `nertca_last_error`. Any thread.
+ * The device and the paths chosen for it, as JSON; `text`, `size` and `length` as for `nertca_last_error`, but what it says of
+ * memory may be longer at the next call. Any thread.
  *
  * # Safety
  * `text` must hold `size` bytes; `length` must be writable or null.
  */
-nertca_status nertca_context_describe(nertca_context *context, char *text, size_t size, size_t *length);
+nertca_status nertca_context_describe(nertca_context *context,
+                                      char *text,
+                                      size_t size,
+                                      size_t *length);
 
 /**
  * All Vulkan devices of this machine, usable or not, as a JSON list; `text`, `size` and `length` as for
- * `nertca_last_error`. Any thread.
+ * `nertca_last_error`, but what it says of free memory may be longer at the next call. Any thread.
  *
  * # Safety
  * `text` must hold `size` bytes; `length` must be writable or null.

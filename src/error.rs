@@ -5,6 +5,9 @@ use std::path::{Path, PathBuf};
 /// Result of every fallible function of this crate.
 pub type Result<T> = std::result::Result<T, Error>;
 
+/// What takes less memory of most runs; see [`Error::OutOfMemory`].
+pub const SMALLER_BATCHES: &str = "a smaller train.chunk_samples or train.rays";
+
 /// What went wrong, where, and what to try.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -63,10 +66,7 @@ pub enum Error {
         pass: String,
     },
     /// Memory ran out.
-    #[error(
-        "out of memory: {object} needs {bytes} bytes ({detail}). Try a smaller \
-         train.chunk_samples or train.rays, or another device"
-    )]
+    #[error("out of memory: {object} needs {bytes} bytes ({detail}). Try {instead}, or another device")]
     OutOfMemory {
         /// Debug name of the buffer.
         object: String,
@@ -76,6 +76,8 @@ pub enum Error {
         detail: String,
         /// Whether it may fit later: no limit stands against it, others hold the memory.
         may_pass: bool,
+        /// What needs less.
+        instead: &'static str,
     },
     /// The optimisation produced a value that is not finite, or exploded.
     #[error(
@@ -127,7 +129,8 @@ impl Error {
         move |code| match code {
             ash::vk::Result::ERROR_DEVICE_LOST => Error::DeviceLost { pass: object },
             ash::vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | ash::vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
-                Error::OutOfMemory { object, bytes: 0, detail: format!("{call}: {code}"), may_pass: true }
+                let (detail, instead) = (format!("{call}: {code}"), SMALLER_BATCHES);
+                Error::OutOfMemory { object, bytes: 0, detail, may_pass: true, instead }
             }
             code => Error::Vulkan { call, object, code },
         }

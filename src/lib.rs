@@ -92,6 +92,7 @@ pub mod gpu {
     pub mod image;
     pub mod instance;
     mod lock;
+    pub mod memory;
     pub mod pace;
     pub mod pipeline;
     pub mod record;

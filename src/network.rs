@@ -269,6 +269,7 @@ impl Network {
     pub fn scan(&self, chunk: Chunk) -> push::MarchScan {
         let tiles = self.path.tiles(&self.map);
         push::MarchScan {
+            first_ray: chunk.first_ray,
             n_rays: chunk.n_rays,
             tile_samples: tiles.samples,
             forward_rows: tiles.forward,

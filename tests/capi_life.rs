@@ -1,9 +1,8 @@
-//! What the C ABI promises: formats, gating, determinism, limits, sharing a device, many threads.
+//! What the C ABI promises: formats, gating, determinism, limits, many threads.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 mod capi;
 
-use ash::vk::{self, Handle};
 use capi::scene::*;
 use nertca_vk::capi::calibration::*;
 use nertca_vk::capi::context::*;
@@ -16,16 +15,8 @@ use nertca_vk::capi::types::*;
 use nertca_vk::scan::gating::{SYSTOLE_S, SYSTOLE_SHARE};
 use std::ffi::{CString, c_char, c_void};
 use std::ptr::{null, null_mut};
-use std::sync::atomic::{AtomicI64, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
-
-#[track_caller]
-fn train(reconstruction: *mut nertca_reconstruction, iterations: u32) -> u32 {
-    let mut done = 0;
-    let status = unsafe { nertca_reconstruction_train(reconstruction, iterations, None, null_mut(), &mut done) };
-    ok(status, reconstruction);
-    done
-}
 
 fn bytes_of(reconstruction: *mut nertca_reconstruction) -> Vec<u8> {
     let mut length = 0;
@@ -48,14 +39,6 @@ fn bytes_of(reconstruction: *mut nertca_reconstruction) -> Vec<u8> {
 fn load(reconstruction: *mut nertca_reconstruction, bytes: &[u8]) {
     let status = unsafe { nertca_reconstruction_load_memory(reconstruction, bytes.as_ptr().cast(), bytes.len()) };
     ok(status, reconstruction);
-}
-
-#[track_caller]
-fn drawn(reconstruction: *mut nertca_reconstruction, view: &nertca_view) -> Vec<f32> {
-    let mut pixels = vec![f32::NAN; (view.width * view.height) as usize];
-    ok(unsafe { nertca_reconstruction_render(reconstruction, view, &image(&mut pixels)) }, reconstruction);
-    assert!(pixels.iter().all(|p| p.is_finite()));
-    pixels
 }
 
 fn exact(phase: u32, component: u32) -> nertca_view {
@@ -617,174 +600,6 @@ fn each_context_has_its_own_log() {
     }
     assert!(counts[0].load(Ordering::Relaxed) > before);
     assert_eq!(counts[1].load(Ordering::Relaxed), 0);
-}
-
-static LOCKED: AtomicI64 = AtomicI64::new(0);
-static UNLOCKED: AtomicI64 = AtomicI64::new(0);
-
-unsafe extern "C" fn lock(_: *mut c_void) {
-    LOCKED.fetch_add(1, Ordering::SeqCst);
-}
-
-unsafe extern "C" fn unlock(_: *mut c_void) {
-    assert_eq!(LOCKED.load(Ordering::SeqCst), UNLOCKED.fetch_add(1, Ordering::SeqCst) + 1, "one holder at a time");
-}
-
-/// A Vulkan application with a device of its own, under the validation layers.
-struct Application {
-    entry: ash::Entry,
-    instance: ash::Instance,
-    physical: vk::PhysicalDevice,
-    device: ash::Device,
-    exports: bool,
-    messages: Box<std::sync::Mutex<Vec<String>>>,
-    debug: (ash::ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT),
-}
-
-unsafe extern "system" fn heard(
-    _: vk::DebugUtilsMessageSeverityFlagsEXT,
-    _: vk::DebugUtilsMessageTypeFlagsEXT,
-    data: *const vk::DebugUtilsMessengerCallbackDataEXT<'_>,
-    user: *mut c_void,
-) -> vk::Bool32 {
-    let text = unsafe { (*data).message_as_c_str() }.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
-    unsafe { &*user.cast::<std::sync::Mutex<Vec<String>>>() }.lock().unwrap().push(text);
-    vk::FALSE
-}
-
-impl Application {
-    fn new() -> Application {
-        unsafe {
-            let entry = ash::Entry::load().unwrap();
-            let info = vk::ApplicationInfo::default().api_version(vk::API_VERSION_1_2);
-            let layers = [c"VK_LAYER_KHRONOS_validation".as_ptr()];
-            let extensions = [ash::ext::debug_utils::NAME.as_ptr()];
-            let create = vk::InstanceCreateInfo::default()
-                .application_info(&info)
-                .enabled_layer_names(&layers)
-                .enabled_extension_names(&extensions);
-            let instance = entry.create_instance(&create, None).unwrap();
-            let messages = Box::new(std::sync::Mutex::new(Vec::new()));
-            let debug = ash::ext::debug_utils::Instance::new(&entry, &instance);
-            let create = vk::DebugUtilsMessengerCreateInfoEXT::default()
-                .message_severity(vk::DebugUtilsMessageSeverityFlagsEXT::ERROR)
-                .message_type(vk::DebugUtilsMessageTypeFlagsEXT::VALIDATION)
-                .pfn_user_callback(Some(heard))
-                .user_data(std::ptr::from_ref(&*messages).cast_mut().cast());
-            let messenger = debug.create_debug_utils_messenger(&create, None).unwrap();
-            let physical = instance.enumerate_physical_devices().unwrap()[0];
-            let known = instance.enumerate_device_extension_properties(physical).unwrap();
-            let export = ash::khr::external_memory_fd::NAME;
-            let exports = known.iter().any(|e| e.extension_name_as_c_str() == Ok(export));
-            let names = if exports { vec![export.as_ptr()] } else { Vec::new() };
-            let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(0).queue_priorities(&[1.0])];
-            let mut features = vk::PhysicalDeviceVulkan12Features::default().timeline_semaphore(true);
-            let create = vk::DeviceCreateInfo::default()
-                .queue_create_infos(&queues)
-                .enabled_extension_names(&names)
-                .push_next(&mut features);
-            let device = instance.create_device(physical, &create, None).unwrap();
-            Application { entry, instance, physical, device, exports, messages, debug: (debug, messenger) }
-        }
-    }
-
-    fn describe(&self) -> nertca_vulkan {
-        let raw = |handle: u64| std::ptr::with_exposed_provenance_mut(handle as usize);
-        nertca_vulkan {
-            size: size_of::<nertca_vulkan>(),
-            get_instance_proc_addr: self.entry.static_fn().get_instance_proc_addr as *const c_void,
-            instance: raw(self.instance.handle().as_raw()),
-            physical_device: raw(self.physical.as_raw()),
-            device: raw(self.device.handle().as_raw()),
-            queue: raw(unsafe { self.device.get_device_queue(0, 0) }.as_raw()),
-            queue_family: 0,
-            external_memory_fd: self.exports.into(),
-            lock: Some(lock),
-            unlock: Some(unlock),
-            ..zeroed()
-        }
-    }
-
-    fn close(self) {
-        unsafe {
-            // Ours to destroy: the library left it alone, and nothing of its own in it.
-            self.device.device_wait_idle().unwrap();
-            self.device.destroy_device(None);
-            self.debug.0.destroy_debug_utils_messenger(self.debug.1, None);
-            self.instance.destroy_instance(None);
-        }
-        assert_eq!(*self.messages.lock().unwrap(), Vec::<String>::new());
-    }
-
-    /// Bytes of a descriptor's memory, imported as another API would.
-    fn import(&self, fd: i32, bytes: u64) -> Vec<f32> {
-        unsafe {
-            let opaque = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
-            let mut external = vk::ExternalMemoryBufferCreateInfo::default().handle_types(opaque);
-            let usage = vk::BufferUsageFlags::TRANSFER_SRC
-                | vk::BufferUsageFlags::STORAGE_BUFFER
-                | vk::BufferUsageFlags::TRANSFER_DST;
-            let create = vk::BufferCreateInfo::default().size(bytes).usage(usage).push_next(&mut external);
-            let buffer = self.device.create_buffer(&create, None).unwrap();
-            let needs = self.device.get_buffer_memory_requirements(buffer);
-            let types = self.instance.get_physical_device_memory_properties(self.physical);
-            let kind = (0..types.memory_type_count)
-                .find(|i| {
-                    needs.memory_type_bits >> i & 1 == 1
-                        && types.memory_types[*i as usize]
-                            .property_flags
-                            .contains(vk::MemoryPropertyFlags::DEVICE_LOCAL | vk::MemoryPropertyFlags::HOST_VISIBLE)
-                })
-                .unwrap();
-            let mut import = vk::ImportMemoryFdInfoKHR::default().handle_type(opaque).fd(fd);
-            let mut dedicated = vk::MemoryDedicatedAllocateInfo::default().buffer(buffer);
-            let allocate = vk::MemoryAllocateInfo::default()
-                .allocation_size(needs.size)
-                .memory_type_index(kind)
-                .push_next(&mut import)
-                .push_next(&mut dedicated);
-            let memory = self.device.allocate_memory(&allocate, None).unwrap();
-            self.device.bind_buffer_memory(buffer, memory, 0).unwrap();
-            let mapped = self.device.map_memory(memory, 0, bytes, vk::MemoryMapFlags::empty()).unwrap();
-            let values = std::slice::from_raw_parts(mapped.cast::<f32>(), bytes as usize / 4).to_vec();
-            self.device.unmap_memory(memory);
-            self.device.destroy_buffer(buffer, None);
-            self.device.free_memory(memory, None);
-            values
-        }
-    }
-}
-
-#[test]
-fn a_device_is_shared_with_its_owner() {
-    let application = Application::new();
-    let mut context = null_mut();
-    ok(unsafe { nertca_context_adopt(&application.describe(), null(), null(), &mut context) }, null::<c_void>());
-    let made = reconstruction(context, SMALL);
-    add_frames(made, 0..3);
-    train(made, 3);
-    let ours = drawn(made, &view(1));
-    if application.exports {
-        let bytes = u64::from(SIZE * SIZE * 4);
-        let (mut buffer, mut fd, mut size) = (null_mut(), -1, 0);
-        ok(unsafe { nertca_buffer_create(context, bytes, &mut buffer) }, context);
-        ok(unsafe { nertca_reconstruction_render_buffer(made, &view(1), buffer) }, made);
-        ok(unsafe { nertca_buffer_export_fd(buffer, &mut fd, &mut size) }, buffer);
-        assert!(size >= bytes);
-        let theirs = application.import(fd, size);
-        assert_eq!(theirs[..ours.len()], ours, "what was drawn, in memory of another API");
-        // Freed here, it stays theirs: a second descriptor outlives the buffer.
-        ok(unsafe { nertca_buffer_export_fd(buffer, &mut fd, null_mut()) }, buffer);
-        assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_ERROR_BUSY);
-        ok(nertca_buffer_destroy(buffer), buffer);
-        assert_eq!(application.import(fd, size)[..ours.len()], ours);
-    } else {
-        println!("no VK_KHR_external_memory_fd here: sharing memory was not tested");
-    }
-    close(context, &[made]);
-    assert!(LOCKED.load(Ordering::SeqCst) > 5);
-    assert_eq!(LOCKED.load(Ordering::SeqCst), UNLOCKED.load(Ordering::SeqCst));
-    application.close();
 }
 
 #[test]

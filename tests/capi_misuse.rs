@@ -171,6 +171,10 @@ fn contexts(b: &Bench) {
             _ => (theirs.queue, theirs.lock) = (somewhere, Some(nothing as _)),
         }
     }
+    (theirs.lock, theirs.cooperative_matrix) = (None, 1);
+    b.refuses(adopt, NERTCA_ERROR_ARGUMENT, "cooperative_matrix", unsafe {
+        nertca_context_adopt(&theirs, null(), null(), &mut out)
+    });
 
     b.handles("nertca_context_describe", stale_context(), b.bare.cast(), |h| unsafe {
         nertca_context_describe(h, null_mut(), 0, &mut 0)

@@ -3,22 +3,26 @@
 
 mod common;
 
-use common::gpu;
+use common::{expect_silence, gpu, run, small_config, small_dataset, tuning};
 use glam::DVec3;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::geometry::world_from_lps_mm;
 use nertca_vk::gpu::device::Gpu;
+use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::hull::Hull;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::projector::Projector;
 use nertca_vk::phantom::views::ViewAngles;
+use nertca_vk::plan::Plan;
 use nertca_vk::plan::carve::carve;
 use nertca_vk::plan::motion;
 use nertca_vk::plan::scale::dynamic_half;
 use nertca_vk::raster::{Image, dilate};
+use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::train::trainer::Trainer;
 use std::num::NonZeroU32;
 
 const PHASES: u32 = 8;
@@ -193,4 +197,37 @@ fn carving_by_exact_shadows_loses_nothing() {
         assert!(hull.share() < 0.05, "{}", hull.share());
     }
     common::expect_silence(gpu);
+}
+
+#[test]
+fn what_a_hull_leaves_is_drawn_the_same_in_any_chunks() {
+    let (gpu, dataset) = (gpu(), small_dataset(52, 44));
+    let hull = [
+        "hull.enabled=true",
+        "hull.max_share=1",
+        "hull.resolution=24",
+        "hull.dilate_pixels=3",
+        "train.chunk_samples=65536",
+    ];
+    let plan = Plan::new(&small_config("fast-mlp", &hull), &dataset).unwrap();
+    let share = plan.hull.as_ref().map_or(1.0, Hull::share);
+    assert!(share > 0.0 && share < 0.9, "a hull that keeps {share} of the box");
+    let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
+    run(&mut trainer, 12);
+    let model = trainer.model().unwrap();
+    let see = |chunk_samples, side| {
+        let path = Tuning { chunk_samples, ..tuning(&gpu) };
+        let renderer = Renderer::new(&gpu, &model, path).unwrap();
+        let drawn = [0, 1, 2].map(|phase| renderer.render(&dataset.views[1].rays, side, side, phase).unwrap());
+        drawn.map(|seen| [seen.static_integral, seen.dynamic_integral, seen.dynamic_max, seen.total_max])
+    };
+    // All rays in a chunk even if each of their samples were live; counted, and packed into few; into many.
+    let whole = see(65_536, 60);
+    // One sample at least of each pixel that shows something: more than the least of these chunks takes.
+    let shown = |dynamic: &[f32]| dynamic.iter().filter(|value| **value > 0.0).count();
+    let shown: Vec<usize> = whole.iter().map(|[_, dynamic, ..]| shown(dynamic)).collect();
+    assert!(shown.iter().all(|n| (129..60 * 60).contains(n)), "{shown:?} pixels, hull {share}");
+    assert!(whole == see(8192, 60) && whole == see(256, 60) && whole == see(128, 60));
+    drop(trainer);
+    expect_silence(gpu);
 }

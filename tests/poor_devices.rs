@@ -5,11 +5,12 @@
 mod common;
 mod shim;
 
+use ash::vk;
 use common::{expect_agreement, expect_silence, run, small_config, small_dataset, tuning};
 use nertca_vk::bench::peaks::peaks;
 use nertca_vk::config::Preset;
 use nertca_vk::error::Error;
-use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::gpu::device::{Adoption, DeviceOptions, Gpu};
 use nertca_vk::gpu::record::{Groups, Recording};
 use nertca_vk::kernels::dispatch::{Binding, dispatch};
 use nertca_vk::kernels::push;
@@ -17,7 +18,7 @@ use nertca_vk::kernels::stages::{Build, Stage};
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::selftest::{drawing, gaussians, repeats, trees};
+use nertca_vk::selftest::{drawing, gaussians, repeats, sax, trees};
 use nertca_vk::train::trainer::Trainer;
 use shim::Poor;
 
@@ -34,6 +35,7 @@ const LEAST: Poor = Poor {
         limits.max_storage_buffer_range = 1 << 27;
         limits.max_texel_buffer_elements = 1 << 16;
     },
+    free_memory: None,
 };
 
 fn open(poor: Poor) -> Result<Gpu, Error> {
@@ -74,6 +76,81 @@ fn what_cannot_be_done_without_is_said() {
         panic!("kernels bind more than four")
     };
     assert!(why.contains("storage buffers, the device allows 4"), "{why}");
+}
+
+/// Adopts a device that a host made of `poor`, with nothing but timeline semaphores, and says was made with features.
+fn adopt(poor: Poor, subgroup_size_control: bool, cooperative_matrix: bool) -> Result<(), Error> {
+    shim::impoverish(poor);
+    let entry = shim::entry();
+    let application = vk::ApplicationInfo::default().api_version(vk::API_VERSION_1_2);
+    let queues = [vk::DeviceQueueCreateInfo::default().queue_priorities(&[1.0])];
+    let mut features = vk::PhysicalDeviceVulkan12Features::default().timeline_semaphore(true);
+    let instance = vk::InstanceCreateInfo::default().application_info(&application);
+    let device = vk::DeviceCreateInfo::default().queue_create_infos(&queues).push_next(&mut features);
+    // SAFETY: the create infos live until the calls return; device and instance are destroyed last, and once.
+    unsafe {
+        let instance = entry.create_instance(&instance, None).unwrap();
+        let physical_device = instance.enumerate_physical_devices().unwrap()[0];
+        let device = instance.create_device(physical_device, &device, None).unwrap();
+        let adoption = Adoption {
+            get_instance_proc_addr: Some(entry.static_fn().get_instance_proc_addr),
+            instance: instance.handle(),
+            physical_device,
+            device: device.handle(),
+            queue: device.get_device_queue(0, 0),
+            queue_family: 0,
+            buffer_device_address: false,
+            external_memory_fd: false,
+            subgroup_size_control,
+            cooperative_matrix,
+            queue_lock: None,
+        };
+        let adopted = Gpu::adopt(adoption, &DeviceOptions::default()).map(drop);
+        device.destroy_device(None);
+        instance.destroy_instance(None);
+        adopted
+    }
+}
+
+#[test]
+fn features_that_a_device_cannot_have_been_made_with_are_refused() {
+    adopt(LEAST, false, false).unwrap();
+    let refused = |poor, claims: (bool, bool)| match adopt(poor, claims.0, claims.1) {
+        Err(Error::Config { field, problem, .. }) => format!("{field}: {problem}"),
+        other => panic!("{other:?}"),
+    };
+    let said = refused(LEAST, (true, false));
+    assert!(said.starts_with("subgroup_size_control: ") && said.contains("subgroupSizeControl, comp"), "{said}");
+    // One that lacks a single thing of those that matrices need, or several.
+    let said = refused(Poor { extensions: true, ..LEAST }, (true, true));
+    assert!(said.starts_with("cooperative_matrix: ") && said.contains("shaderFloat16"), "{said}");
+    let said = refused(LEAST, (false, true));
+    assert!(said.contains("needs subgroup_size_control"), "{said}");
+}
+
+#[test]
+fn memory_that_others_hold_is_told_before_a_fit_takes_any() {
+    let free = 8 << 20;
+    let taken = Poor { extensions: true, features: true, timestamps: true, limits: |_| (), free_memory: Some(free) };
+    let gpu = open(taken).unwrap();
+    let info = gpu.info();
+    let Some(told) = info.free_memory else {
+        assert!(info.mesa_major.is_none_or(|version| version < 24), "newer lavapipe tells of its memory's budget");
+        println!("{} does not tell how much of its memory is free: nothing was tried", info.name);
+        return;
+    };
+    assert_eq!((told, gpu.memory().free), (free, Some(free)));
+    let dataset = small_dataset(13, 11);
+    let begin = |settings: &[&str]| {
+        let plan = Plan::new(&sax::small_config(settings).unwrap(), &dataset).unwrap();
+        Trainer::new(&gpu, plan, &dataset, Tuning::for_device(gpu.info())).map(|_| ())
+    };
+    let error = begin(&["sax.levels=8", "sax.base=16", "sax.log2_table=16"]).unwrap_err();
+    assert!(matches!(error, Error::OutOfMemory { may_pass: true, .. }), "{error}");
+    let (text, whole) = (error.to_string(), format!("{} MiB, of which 8 MiB are free", info.device_memory >> 20));
+    assert!(text.contains("3 fields") && text.contains(&whole) && text.contains("sax.log2_table"), "{text}");
+    begin(&[]).unwrap();
+    expect_silence(gpu);
 }
 
 #[test]
@@ -125,6 +202,10 @@ fn short_submits_change_nothing_but_their_length() {
     assert_eq!((again, same), (params.clone(), seen.clone()));
     let (at_once, n, again, same) = train(Some(1e9));
     assert_eq!((at_once, n), (vec![1, 1, 1, 4, 4], 13), "three are tried, then there is time for all");
+    assert_eq!((&again, &same), (&params, &seen));
+    // Somebody looks: how many go into a submit then depends on the device's speed, what comes of them does not.
+    gpu.looks().note();
+    let (_, _, again, same) = train(Some(1e9));
     assert_eq!((again, same), (params, seen));
     expect_silence(gpu);
 }

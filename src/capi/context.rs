@@ -265,6 +265,8 @@ pub unsafe extern "C" fn nertca_context_adopt(
             queue_family: theirs.queue_family,
             buffer_device_address: theirs.buffer_device_address != 0,
             external_memory_fd: theirs.external_memory_fd != 0,
+            subgroup_size_control: theirs.subgroup_size_control != 0,
+            cooperative_matrix: theirs.cooperative_matrix != 0,
             queue_lock,
         };
         // SAFETY: the header asks for valid handles that were made as the fields of `vulkan` say, and the same of the
@@ -273,7 +275,8 @@ pub unsafe extern "C" fn nertca_context_adopt(
     })
 }
 
-/// The device and the paths chosen for it, as JSON; `text`, `size` and `length` as for `nertca_last_error`. Any thread.
+/// The device and the paths chosen for it, as JSON; `text`, `size` and `length` as for `nertca_last_error`, but what it says of
+/// memory may be longer at the next call. Any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.
@@ -289,6 +292,7 @@ pub unsafe extern "C" fn nertca_context_describe(
             "device": context.gpu.as_ref().map(Gpu::info),
             "tuning": context.tuning,
             "memory_in_use": context.gpu.as_ref().map(Gpu::memory_in_use),
+            "free_memory": context.gpu.as_ref().and_then(|gpu| gpu.memory().free),
             "validation_messages": context.gpu.as_ref().map(Gpu::validation_messages),
             "deterministic": context.deterministic,
         });
@@ -298,7 +302,7 @@ pub unsafe extern "C" fn nertca_context_describe(
 }
 
 /// All Vulkan devices of this machine, usable or not, as a JSON list; `text`, `size` and `length` as for
-/// `nertca_last_error`. Any thread.
+/// `nertca_last_error`, but what it says of free memory may be longer at the next call. Any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.

@@ -100,6 +100,13 @@ pub struct nertca_vulkan {
     pub unlock: Option<unsafe extern "C" fn(user: *mut c_void)>,
     /// Handed to `lock` and `unlock`.
     pub user: *mut c_void,
+    /// Non-zero when the device was made with the features `subgroupSizeControl` and `computeFullSubgroups` (of
+    /// `VK_EXT_subgroup_size_control`, or of Vulkan 1.3): sums then go by shuffles, as on a device of the library's own.
+    pub subgroup_size_control: u32,
+    /// Non-zero when the device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, and with
+    /// `shaderFloat16`, `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`: networks then go by matrices, where the
+    /// library has kernels for the device's. Needs `subgroup_size_control` as well.
+    pub cooperative_matrix: u32,
 }
 
 /// How an image is taken. Patient coordinates are left, posterior, superior (LPS), mm, from the isocentre.
@@ -390,8 +397,14 @@ macro_rules! versioned {
         }
     )* };
 }
-versioned!(nertca_log nertca_vulkan nertca_geometry nertca_frame nertca_view nertca_image nertca_grid nertca_progress
-       nertca_correction nertca_tree);
+versioned!(nertca_log nertca_geometry nertca_frame nertca_view nertca_image nertca_grid nertca_progress nertca_correction
+       nertca_tree);
+
+// SAFETY: integers, pointers and optional function pointers after a `usize`.
+unsafe impl Versioned for nertca_vulkan {
+    const NAME: &'static str = "nertca_vulkan";
+    const FIRST: usize = std::mem::offset_of!(nertca_vulkan, subgroup_size_control);
+}
 
 // SAFETY: integers and floats after a `usize`.
 unsafe impl Versioned for nertca_scores {

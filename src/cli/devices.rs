@@ -6,6 +6,7 @@ use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
 use nertca_vk::gpu::details::{DeviceDetails, list_details};
 use nertca_vk::gpu::device::list_devices;
+use nertca_vk::gpu::memory::DeviceMemory;
 use nertca_vk::kernels::tuning::Tuning;
 use serde::Serialize;
 
@@ -43,13 +44,13 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
             out!("{}: {} ({}, {})", info.index, info.name, info.kind, info.driver);
             out!("   uuid {}  Vulkan {}", info.uuid, info.api_version);
             out!(
-                "   subgroup {}  shared memory {} KiB  workgroup {}  storage buffer {} MiB  memory {} MiB",
+                "   subgroup {}  shared memory {} KiB  workgroup {}  storage buffer {} MiB",
                 info.subgroup_size,
                 info.max_shared_memory >> 10,
                 info.max_workgroup_invocations,
-                info.max_storage_buffer_range >> 20,
-                info.device_memory >> 20
+                info.max_storage_buffer_range >> 20
             );
+            out!("   memory {}", DeviceMemory { bytes: info.device_memory, free: info.free_memory });
             out!(
                 "   cooperative matrices {}  float16 {}  float atomics {}",
                 match info.matrices.first() {

@@ -1,6 +1,6 @@
 //! How the program ends: exit codes, and what to type after an error.
 
-use nertca_vk::error::Error;
+use nertca_vk::error::{Error, SMALLER_BATCHES};
 
 /// A command or an option is not usable.
 const USAGE: u8 = 2;
@@ -30,7 +30,7 @@ pub fn hint(error: &Error) -> Option<&'static str> {
             "a run that was training goes on from its last checkpoint with --resume; \
              --set train.iterations_per_submit=N and --device choose smaller submits and another device",
         ),
-        Error::OutOfMemory { .. } => {
+        Error::OutOfMemory { instead: SMALLER_BATCHES, .. } => {
             Some("--set train.chunk_samples=N, --set train.rays=N and --device need less or offer more")
         }
         Error::Diverged { .. } => Some("learning rates are set with --set dynamic.lr=X and --set static.lr=X"),
@@ -44,12 +44,18 @@ mod tests {
 
     #[test]
     fn schedulers_can_tell_what_to_try_again() {
-        let memory = |may_pass| Error::OutOfMemory { object: "rays".into(), bytes: 1, detail: String::new(), may_pass };
+        let memory_for = |may_pass, instead| {
+            let (object, detail) = ("rays".into(), String::new());
+            Error::OutOfMemory { object, bytes: 1, detail, may_pass, instead }
+        };
+        let memory = |may_pass| memory_for(may_pass, SMALLER_BATCHES);
         let lost = Error::DeviceLost { pass: "training".into() };
         assert_eq!((code(&lost), code(&memory(true))), (TRY_AGAIN, 75));
         assert_eq!(code(&Error::Busy("another process".into())), TRY_AGAIN);
         assert_eq!(code(&memory(false)), 1, "a limit of the device stays where it is");
         assert_eq!(code(&Error::config("phase", 77, "")), USAGE);
         assert!(hint(&lost).is_some_and(|hint| hint.contains("--resume")));
+        assert!(hint(&memory(true)).is_some_and(|hint| hint.contains("train.rays")));
+        assert_eq!(hint(&memory_for(true, "fewer fields")), None, "rays would not help");
     }
 }

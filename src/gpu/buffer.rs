@@ -2,7 +2,7 @@
 
 use super::device::{Gpu, Shared};
 use super::lock::lock;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, SMALLER_BATCHES};
 use ash::vk;
 use bytemuck::Pod;
 use gpu_allocator::MemoryLocation;
@@ -105,7 +105,10 @@ impl Gpu {
 
     fn check_limits(&self, name: &str, bytes: u64, texel: bool) -> Result<()> {
         let info = self.info();
-        let beyond = |detail: String| Err(Error::OutOfMemory { object: name.into(), bytes, detail, may_pass: false });
+        let beyond = |detail: String| {
+            let (object, may_pass, instead) = (name.into(), false, SMALLER_BATCHES);
+            Err(Error::OutOfMemory { object, bytes, detail, may_pass, instead })
+        };
         if bytes > u64::from(info.max_storage_buffer_range) {
             let most = info.max_storage_buffer_range;
             return beyond(format!("one buffer of {} is limited to {most} bytes", info.name));
@@ -197,12 +200,7 @@ impl Inner {
                 linear: true,
                 allocation_scheme: AllocationScheme::GpuAllocatorManaged,
             })
-            .map_err(|e| Error::OutOfMemory {
-                object: self.name.clone(),
-                bytes: self.bytes,
-                detail: e.to_string(),
-                may_pass: true,
-            })?;
+            .map_err(|e| self.gpu.no_memory(&self.name, self.bytes, &e))?;
         // SAFETY: the handle is only bound to; the allocation, which `self` keeps, goes on owning it.
         let (memory, offset) = (unsafe { allocation.memory() }, allocation.offset());
         self.backing = Backing::Block(Mutex::new(allocation));

@@ -1,5 +1,6 @@
 //! What a device is and can do: the capability table, and the faults of drivers that shape it.
 
+use super::memory::DeviceMemory;
 use ash::{ext, khr, nv, vk};
 use serde::Serialize;
 use std::ffi::CStr;
@@ -57,6 +58,9 @@ pub struct DeviceInfo {
     pub timestamp_bits: u32,
     /// Device-local memory, bytes: the largest heap.
     pub device_memory: u64,
+    /// What this process could take of it when the device was looked at, bytes; none where the device does not tell
+    /// (`VK_EXT_memory_budget`). [`super::device::Gpu::memory`] asks anew.
+    pub free_memory: Option<u64>,
     /// Whether shaders can read buffers through their addresses.
     pub buffer_device_address: bool,
     /// Shapes of cooperative matrices with f16 operands and f32 sums at subgroup scope; empty when the device lacks
@@ -131,6 +135,63 @@ fn c_chars(text: &[std::ffi::c_char]) -> String {
     text.iter().take_while(|c| **c != 0).map(|c| char::from(*c as u8)).collect()
 }
 
+/// Features that kernels need beyond what every device has, by Vulkan's names, and whether a device offers them.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct KernelFeatures {
+    /// Of kernels whose workgroups consist of full subgroups of a size.
+    pub subgroups: [(&'static str, bool); 2],
+    /// Of kernels on cooperative matrices, which need those as well.
+    pub matrices: [(&'static str, bool); 4],
+}
+
+impl KernelFeatures {
+    pub fn of(instance: &ash::Instance, physical: vk::PhysicalDevice, has: impl Fn(&CStr) -> bool) -> KernelFeatures {
+        let mut matrix = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
+        let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
+        let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
+        let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut f12);
+        if has(khr::cooperative_matrix::NAME) {
+            features = features.push_next(&mut matrix);
+        }
+        if has(ext::subgroup_size_control::NAME) {
+            features = features.push_next(&mut size);
+        }
+        // SAFETY: the device offers the extensions whose structures are chained; these live until the call returns, and that of
+        // Vulkan 1.2 is ignored by older devices.
+        unsafe { instance.get_physical_device_features2(physical, &mut features) };
+        let on = |feature: vk::Bool32| feature == vk::TRUE;
+        KernelFeatures {
+            subgroups: [
+                ("subgroupSizeControl", on(size.subgroup_size_control)),
+                ("computeFullSubgroups", on(size.compute_full_subgroups)),
+            ],
+            matrices: [
+                ("cooperativeMatrix", on(matrix.cooperative_matrix)),
+                ("shaderFloat16", on(f12.shader_float16)),
+                ("vulkanMemoryModel", on(f12.vulkan_memory_model)),
+                // Integer atomics of other kernels have device scope.
+                ("vulkanMemoryModelDeviceScope", on(f12.vulkan_memory_model_device_scope)),
+            ],
+        }
+    }
+
+    /// Those of a physical device.
+    pub fn offered(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Result<KernelFeatures, vk::Result> {
+        // SAFETY: callers take `physical` from this instance.
+        let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }?;
+        Ok(KernelFeatures::of(instance, physical, |name| is_among(&extensions, name)))
+    }
+
+    /// Whether kernels on matrices have all they need.
+    fn take_matrices(&self) -> bool {
+        self.subgroups.iter().chain(&self.matrices).all(|(_, offered)| *offered)
+    }
+}
+
+fn is_among(extensions: &[vk::ExtensionProperties], name: &CStr) -> bool {
+    extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name))
+}
+
 /// Sizes that a shader's subgroups can have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct SubgroupSizes {
@@ -200,35 +261,13 @@ impl SubgroupSizes {
     }
 }
 
-/// Device extensions the matrix kernels need.
-const MATRIX_EXTENSIONS: [&CStr; 2] = [khr::cooperative_matrix::NAME, ext::subgroup_size_control::NAME];
-
-/// Matrix shapes our kernels can use on a device with [`MATRIX_EXTENSIONS`], most work per product first; or why they
+/// Matrix shapes our kernels can use on a device with their [`KernelFeatures`], most work per product first; or why they
 /// cannot be told.
 fn matrix_shapes(
     entry: &ash::Entry,
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
 ) -> Result<Vec<MatrixShape>, String> {
-    let mut matrix = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
-    let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default();
-    let mut f12 = vk::PhysicalDeviceVulkan12Features::default();
-    let mut features =
-        vk::PhysicalDeviceFeatures2::default().push_next(&mut matrix).push_next(&mut size).push_next(&mut f12);
-    // SAFETY: the device offers the extensions whose structures are chained; these live until the call returns.
-    unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    let needed = [
-        matrix.cooperative_matrix,
-        size.subgroup_size_control,
-        size.compute_full_subgroups,
-        f12.shader_float16,
-        f12.vulkan_memory_model,
-        // Integer atomics of other kernels have device scope.
-        f12.vulkan_memory_model_device_scope,
-    ];
-    if needed.contains(&vk::FALSE) {
-        return Ok(Vec::new());
-    }
     let loader = khr::cooperative_matrix::Instance::new(entry, instance);
     // SAFETY: the caller checked that this device of the instance offers the extension.
     let found = unsafe { loader.get_physical_device_cooperative_matrix_properties(physical) }
@@ -273,7 +312,7 @@ pub(super) fn describe(
         Ok(extensions) => (extensions, None),
         Err(code) => (Vec::new(), Some(format!("vkEnumerateDeviceExtensionProperties failed: {code}"))),
     };
-    let has = |name: &CStr| extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name));
+    let has = |name: &CStr| is_among(&extensions, name);
     let mut props =
         vk::PhysicalDeviceProperties2::default().push_next(&mut driver).push_next(&mut ids).push_next(&mut subgroup);
     if has(nv::shader_sm_builtins::NAME) {
@@ -291,8 +330,7 @@ pub(super) fn describe(
     // SAFETY: the chain lives until the call returns; it holds an extension's structure only where the device has it, and
     // that of Vulkan 1.2 is ignored by older devices.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    // SAFETY: callers take `physical` from this instance.
-    let memory = unsafe { instance.get_physical_device_memory_properties(physical) };
+    let memory = DeviceMemory::of(instance, physical, has(ext::memory_budget::NAME));
     let limits = properties.limits;
     let version = properties.api_version;
     // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives,
@@ -300,8 +338,8 @@ pub(super) fn describe(
     let crashes = driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8;
     let sizes = SubgroupSizes::of(instance, physical, has(ext::subgroup_size_control::NAME));
     let matrix_subgroup = sizes.for_matrices();
-    let lacks = |name: &&CStr| !has(name);
-    let matrices = if crashes || matrix_subgroup.is_none() || MATRIX_EXTENSIONS.iter().any(lacks) {
+    let takes_matrices = KernelFeatures::of(instance, physical, has).take_matrices();
+    let matrices = if crashes || matrix_subgroup.is_none() || !takes_matrices {
         Vec::new()
     } else {
         matrix_shapes(entry, instance, physical).unwrap_or_else(|why| {
@@ -359,12 +397,8 @@ pub(super) fn describe(
         max_push_constants: limits.max_push_constants_size,
         timestamp_period_ns: if timestamp_bits > 0 { limits.timestamp_period } else { 0.0 },
         timestamp_bits,
-        device_memory: memory.memory_heaps[..memory.memory_heap_count as usize]
-            .iter()
-            .filter(|h| h.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL))
-            .map(|h| h.size)
-            .max()
-            .unwrap_or_default(),
+        device_memory: memory.bytes,
+        free_memory: memory.free,
         buffer_device_address: f12.buffer_device_address == vk::TRUE,
         matrices,
         multiprocessors: multiprocessors.shader_sm_count,

@@ -1,11 +1,13 @@
 //! The choice of a device, adoption of someone else's, and what all objects made from one share: queue, allocator,
 //! timeline, debug names.
 
-use super::capabilities::{DeviceInfo, DeviceKind, compute_family, family_at};
+use super::capabilities::{DeviceInfo, DeviceKind, KernelFeatures, compute_family, family_at};
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
 use super::lock::lock;
+use super::memory::DeviceMemory;
+use super::pace::Looks;
 use super::statistics::StatisticsKeeper;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, SMALLER_BATCHES};
 use ash::{ext, khr, vk};
 use gpu_allocator::AllocationSizes;
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
@@ -51,8 +53,35 @@ pub struct Adoption {
     pub buffer_device_address: bool,
     /// The device was made with `VK_KHR_external_memory_fd`.
     pub external_memory_fd: bool,
+    /// The device was made with the features `subgroupSizeControl` and `computeFullSubgroups`, of
+    /// `VK_EXT_subgroup_size_control` or Vulkan 1.3.
+    pub subgroup_size_control: bool,
+    /// The device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, and with `shaderFloat16`,
+    /// `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`; and with what `subgroup_size_control` stands for.
+    pub cooperative_matrix: bool,
     /// Held around every use of the queue; `None` when the queue is ours alone.
     pub queue_lock: Option<Box<dyn QueueLock>>,
+}
+
+impl Adoption {
+    /// Refuses features that no device of this kind was made with: kernels that use them would have undefined results.
+    fn check_features(&self, device: &str, offered: &KernelFeatures) -> Result<()> {
+        let claims = [
+            ("subgroup_size_control", self.subgroup_size_control, &offered.subgroups[..]),
+            ("cooperative_matrix", self.cooperative_matrix, &offered.matrices[..]),
+        ];
+        for (field, is_claimed, features) in claims {
+            let lacking: Vec<&str> = features.iter().filter(|(_, offered)| !offered).map(|(name, _)| *name).collect();
+            if is_claimed && !lacking.is_empty() {
+                let problem = format!(
+                    "{device} does not offer {}, so the device was not made with it: leave the field out",
+                    lacking.join(", ")
+                );
+                return Err(Error::config(field, is_claimed, problem));
+            }
+        }
+        Ok(())
+    }
 }
 
 /// Keeps several users of one queue apart.
@@ -80,11 +109,11 @@ pub(super) struct Shared {
     pub(super) last_submitted: AtomicU64,
     pub(super) live_objects: AtomicU64,
     pub(super) info: DeviceInfo,
+    looks: Looks,
     /// Shaders that were recorded so far.
     pub(super) recorded: Mutex<BTreeSet<&'static str>>,
-    #[cfg_attr(not(unix), allow(dead_code, reason = "memory is shared on Unix only"))]
     pub(super) physical: vk::PhysicalDevice,
-    memory: Memory,
+    taken: Taken,
     queue_lock: Option<Box<dyn QueueLock>>,
     cache_file: Option<std::path::PathBuf>,
     pub(super) statistics: Option<StatisticsKeeper>,
@@ -118,7 +147,7 @@ impl Drop for Device {
 }
 
 /// Bytes of buffers and images.
-struct Memory {
+struct Taken {
     in_use: AtomicU64,
     limit: u64,
 }
@@ -286,9 +315,10 @@ impl Parts {
             last_submitted: AtomicU64::new(0),
             live_objects: AtomicU64::new(0),
             info,
+            looks: Looks::default(),
             recorded: Mutex::default(),
             physical,
-            memory: Memory { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) },
+            taken: Taken { in_use: AtomicU64::new(0), limit: options.memory_limit.unwrap_or(u64::MAX) },
             queue_lock,
             cache_file,
             statistics,
@@ -334,12 +364,17 @@ impl Gpu {
     /// Of the options, only the pipeline cache and the memory limit apply.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] when the device lacks what the engine needs.
+    /// [`Error::NoDevice`] when the device lacks what the engine needs; [`Error::Config`] for features it cannot have been made
+    /// with.
     ///
     /// # Safety
     /// The handles must be valid and belong together; the device must have been made with what `adoption` says, and
     /// the queue be used by others only while they hold the lock.
     pub unsafe fn adopt(adoption: Adoption, options: &DeviceOptions) -> Result<Gpu> {
+        if adoption.cooperative_matrix && !adoption.subgroup_size_control {
+            let problem = "needs subgroup_size_control as well: kernels on matrices ask for full subgroups";
+            return Err(Error::config("cooperative_matrix", true, problem));
+        }
         let loader = adoption.get_instance_proc_addr.map(|function| {
             // SAFETY: the caller vouches that the function is that of the loader all handles come from.
             unsafe { Loader::new(function) }
@@ -350,6 +385,9 @@ impl Gpu {
         if let Some(why) = &info.unusable {
             return Err(Error::NoDevice(format!("{}: {why}", info.name)));
         }
+        let offered = KernelFeatures::offered(&instance, adoption.physical_device)
+            .map_err(Error::vulkan("vkEnumerateDeviceExtensionProperties", &info.name))?;
+        adoption.check_features(&info.name, &offered)?;
         // SAFETY: the caller vouches that the device is valid and was made from this instance.
         let raw = unsafe { ash::Device::load(instance.fp_v1_0(), adoption.device) };
         // SAFETY: the device is the caller's, as in the line above; the name ends with a zero.
@@ -365,8 +403,12 @@ impl Gpu {
             info.timestamp_period_ns = 0.0;
         }
         info.external_memory_fd &= adoption.external_memory_fd;
-        info.matrices.clear();
-        (info.full_subgroups, info.small_subgroups) = (None, None);
+        if !adoption.cooperative_matrix {
+            info.matrices.clear();
+        }
+        if !adoption.subgroup_size_control {
+            (info.full_subgroups, info.small_subgroups) = (None, None);
+        }
         let parts = Parts {
             physical: adoption.physical_device,
             info,
@@ -381,6 +423,11 @@ impl Gpu {
     /// What this device is and can do.
     pub fn info(&self) -> &DeviceInfo {
         &self.shared.info
+    }
+
+    /// Where those who want a picture of what is computed here say so.
+    pub fn looks(&self) -> &Looks {
+        &self.shared.looks
     }
 
     /// Errors and warnings of the validation layer so far; empty without validation.
@@ -400,7 +447,7 @@ impl Gpu {
 
     /// Bytes of buffers and images alive at the moment.
     pub fn memory_in_use(&self) -> u64 {
-        self.shared.memory.in_use.load(Ordering::Relaxed)
+        self.shared.taken.in_use.load(Ordering::Relaxed)
     }
 
     /// Writes the pipeline cache to disk so that the next start compiles nothing.
@@ -440,22 +487,39 @@ impl Shared {
 
     /// Counts `bytes` that are about to be allocated.
     pub(super) fn reserve(&self, object: &str, bytes: u64) -> Result<()> {
-        let before = self.memory.in_use.fetch_add(bytes, Ordering::Relaxed);
-        if before.saturating_add(bytes) <= self.memory.limit {
+        let before = self.taken.in_use.fetch_add(bytes, Ordering::Relaxed);
+        if before.saturating_add(bytes) <= self.taken.limit {
             return Ok(());
         }
         self.release(bytes);
         Err(Error::OutOfMemory {
             object: object.into(),
             bytes,
-            detail: format!("{before} bytes of the limit of {} are in use", self.memory.limit),
+            detail: format!("{before} bytes of the limit of {} are in use", self.taken.limit),
             may_pass: false,
+            instead: SMALLER_BATCHES,
         })
+    }
+
+    /// The device's memory as it is now.
+    pub(super) fn memory(&self) -> DeviceMemory {
+        DeviceMemory::of(&self.device.instance, self.physical, self.info.free_memory.is_some())
+    }
+
+    /// What an allocator says when there is no memory left for an object.
+    pub(super) fn no_memory(&self, object: &str, bytes: u64, why: &impl std::fmt::Display) -> Error {
+        Error::OutOfMemory {
+            object: object.into(),
+            bytes,
+            detail: format!("{why}; {} has {}", self.info.name, self.memory()),
+            may_pass: true,
+            instead: SMALLER_BATCHES,
+        }
     }
 
     /// Gives back what [`Shared::reserve`] counted.
     pub(super) fn release(&self, bytes: u64) {
-        self.memory.in_use.fetch_sub(bytes, Ordering::Relaxed);
+        self.taken.in_use.fetch_sub(bytes, Ordering::Relaxed);
     }
 
     pub(super) fn track(&self) {

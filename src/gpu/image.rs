@@ -93,12 +93,7 @@ impl Inner {
                 linear: false,
                 allocation_scheme: AllocationScheme::GpuAllocatorManaged,
             })
-            .map_err(|e| Error::OutOfMemory {
-                object: self.name.clone(),
-                bytes: requirements.size,
-                detail: e.to_string(),
-                may_pass: true,
-            })?;
+            .map_err(|e| self.gpu.no_memory(&self.name, requirements.size, &e))?;
         // SAFETY: the handle is only bound to; the allocation, which `self` keeps, goes on owning it.
         let (memory, offset) = (unsafe { allocation.memory() }, allocation.offset());
         self.allocation = Some(allocation);

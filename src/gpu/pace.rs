@@ -1,17 +1,50 @@
 //! How much goes into a submit: as much as no watchdog minds.
 
 use super::capabilities::DeviceInfo;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 /// Longest submit, seconds: systems reset devices that are busy for two, and what draws the screen waits behind each.
 pub const LONGEST_SUBMIT_S: f64 = 0.1;
+/// Longest submit of a run in training while someone looks at it, seconds. A picture waits for the two that are under way, which
+/// then take little more than a display shows one of its pictures, at sixty a second.
+pub const LONGEST_SUBMIT_LOOKED_AT_S: f64 = 0.01;
+/// Someone who asked for a picture so long ago may ask for the next one: who turns a view or plays a beat asks several times
+/// a second.
+const LOOKS_LAST: Duration = Duration::from_secs(1);
 /// Submits that are remembered: where the least of them took long, it was not for waiting behind others.
 const REMEMBERED: usize = 3;
+
+/// When somebody last asked for a picture that waits behind what a device computes. Clones tell of the same.
+#[derive(Debug, Clone, Default)]
+pub struct Looks(Arc<Mutex<Option<Instant>>>);
+
+impl Looks {
+    /// Somebody asks for a picture.
+    pub fn note(&self) {
+        self.note_at(Instant::now());
+    }
+
+    fn note_at(&self, when: Instant) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(when);
+    }
+
+    /// Whether somebody is likely to ask for another.
+    fn are_recent(&self) -> bool {
+        is_recent(*self.0.lock().unwrap_or_else(PoisonError::into_inner), Instant::now())
+    }
+}
+
+fn is_recent(last: Option<Instant>, now: Instant) -> bool {
+    last.is_some_and(|last| now.saturating_duration_since(last) < LOOKS_LAST)
+}
 
 /// How many items, iterations or rays, a submit takes on a device: what its last submits say.
 #[derive(Debug)]
 pub struct SubmitPace {
     longest_s: Option<f64>,
+    /// Of those whose pictures wait behind these submits.
+    looks: Option<Looks>,
     first: u32,
     most: u32,
     /// Seconds per item of the last submits, newest last.
@@ -26,7 +59,12 @@ pub fn longest_submit_s(info: &DeviceInfo) -> Option<f64> {
 impl SubmitPace {
     /// Begins with `first` items to a submit, and never takes more than `most`; without a longest submit it takes these at once.
     pub fn new(longest_s: Option<f64>, first: u32, most: u32) -> SubmitPace {
-        SubmitPace { longest_s, first: first.min(most), most, seen: Mutex::default() }
+        SubmitPace { longest_s, looks: None, first: first.min(most), most, seen: Mutex::default() }
+    }
+
+    /// The same, but submits are short while somebody looks.
+    pub fn giving_way_to(self, looks: &Looks) -> SubmitPace {
+        SubmitPace { looks: Some(looks.clone()), ..self }
     }
 
     /// Whether too few submits are known.
@@ -36,7 +74,10 @@ impl SubmitPace {
 
     /// Items of the next submit, at least one.
     pub fn items(&self) -> u32 {
-        let Some(longest_s) = self.longest_s else { return self.most };
+        let Some(mut longest_s) = self.longest_s else { return self.most };
+        if self.looks.as_ref().is_some_and(Looks::are_recent) {
+            longest_s = longest_s.min(LONGEST_SUBMIT_LOOKED_AT_S);
+        }
         if self.is_trying() {
             return self.first;
         }
@@ -83,6 +124,27 @@ mod tests {
         assert_eq!(pace.items(), 1000);
         pace.restart();
         assert_eq!((pace.items(), pace.is_trying()), (4, true));
+    }
+
+    #[test]
+    fn submits_are_short_while_somebody_looks() {
+        let hour = Duration::from_secs(3600);
+        let looks = Looks::default();
+        let pace = |longest_s, seconds| {
+            let pace = SubmitPace::new(longest_s, 1, 1000).giving_way_to(&looks);
+            (0..REMEMBERED).for_each(|_| pace.note(1, seconds));
+            pace
+        };
+        let (quick, slow, shorter, unwatched) =
+            (pace(Some(0.1), 0.002), pace(Some(0.1), 0.02), pace(Some(0.001), 0.0005), pace(None, 0.002));
+        let items = || [&quick, &slow, &shorter, &unwatched].map(SubmitPace::items);
+        assert_eq!(items(), [50, 5, 2, 1000]);
+        // Later than any clock of this test.
+        looks.note_at(Instant::now() + hour);
+        assert_eq!(items(), [5, 1, 2, 1000], "a hundredth of a second, or an iteration, which is not divided");
+        let (now, moment) = (Instant::now() + hour, Duration::from_millis(1));
+        assert!(!is_recent(None, now) && is_recent(Some(now), now));
+        assert!(is_recent(Some(now + moment - LOOKS_LAST), now) && !is_recent(Some(now - LOOKS_LAST), now));
     }
 
     #[test]

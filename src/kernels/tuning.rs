@@ -154,7 +154,8 @@ impl Tuning {
             // Two workgroups per multiprocessor.
             n => on_gpu(2 * n),
         };
-        // Some kilobytes per sample must fit beside all else.
+        // Some kilobytes per sample must fit beside all else. By what there is, not by what is free now: sums of a batch in other
+        // chunks are rounded otherwise, and runs on one device repeat bit by bit.
         let chunk_samples = match info.kind {
             DeviceKind::Cpu => 1 << 17,
             _ => (info.device_memory >> 14).clamp(1 << 16, 1 << 19) as u32,

@@ -84,6 +84,7 @@ impl ForwardBuffers {
         let n_rays = u64::from(n_rays);
         let lanes = n_rays * u64::from(MARCH_LANES);
         let capacity = u64::from(setup.sample_capacity);
+        let lane_words = u64::from(setup.n_dynamic_samples.div_ceil(MARCH_LANES).div_ceil(u32::BITS));
         let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
         let params = gpu.operand_buffer("params", params.len as u64 * 4, tuning.operands)?;
         Ok(ForwardBuffers {
@@ -96,8 +97,8 @@ impl ForwardBuffers {
             params,
             rays: new(Binding::rays, n_rays * size_of::<Ray>() as u64)?,
             ray_out: new(Binding::ray_out, n_rays * size_of::<RayOut>() as u64)?,
-            // A bit per sample, each lane's rounded up to words.
-            lane_masks: new(Binding::lane_masks, (capacity / 32 + lanes) * 4)?,
+            // A bit per sample of each ray, live or not, each lane's rounded up to words.
+            lane_masks: new(Binding::lane_masks, lanes * lane_words * 4)?,
             lane_offsets: new(Binding::lane_offsets, lanes * 4)?,
             ray_counts: new(Binding::ray_counts, n_rays * 4)?,
             ray_start: new(Binding::ray_start, (n_rays + 1) * 4)?,
@@ -163,9 +164,23 @@ impl Pass<'_> {
     /// # Errors
     /// As [`Pass::run`].
     pub fn samples(&mut self, chunk: Chunk) -> Result<()> {
+        self.count(chunk)?;
+        self.place(chunk)
+    }
+
+    /// Records which samples of a chunk's rays are live, and how many of each ray.
+    ///
+    /// # Errors
+    /// As [`Pass::run`].
+    pub fn count(&mut self, chunk: Chunk) -> Result<()> {
+        let Chunk { first_ray, n_rays } = chunk;
+        self.run(&self.kernels.march_count, chunk.per_ray(), push::MarchCount { first_ray, n_rays })
+    }
+
+    /// Records offsets and indirect arguments, and points, of a chunk whose samples were counted.
+    fn place(&mut self, chunk: Chunk) -> Result<()> {
         let k = self.kernels;
         let Chunk { first_ray, n_rays } = chunk;
-        self.run(&k.march_count, chunk.per_ray(), push::MarchCount { first_ray, n_rays })?;
         self.run(&k.march_scan, Groups::Direct([1, 1, 1]), self.network.scan(chunk))?;
         self.run(&k.march_emit, chunk.per_ray(), push::MarchEmit { first_ray, n_rays })
     }
@@ -214,17 +229,31 @@ impl Pass<'_> {
         }
         self.weights()?;
         for chunk in chunks(self.setup, n_rays) {
-            self.samples(chunk)?;
-            self.fields()?;
-            let Chunk { first_ray, n_rays } = chunk;
-            match self.still {
-                None => {
-                    let push = push::MarchFwd { first_ray, n_rays, with_maxima: u32::from(maxima) };
-                    self.run(&self.kernels.march_fwd, chunk.per_ray(), push)?;
-                }
-                Some(still) => still.record_integrals(self, chunk, maxima)?,
-            }
+            self.count(chunk)?;
+            self.render_chunk(chunk, maxima)?;
         }
         Ok(())
+    }
+
+    /// Records a rendering as [`Pass::render`] does, of rays whose samples were counted, in chunks that have room for them.
+    ///
+    /// # Errors
+    /// As [`Pass::run`].
+    pub fn render_counted(&mut self, chunks: &[Chunk], maxima: bool) -> Result<()> {
+        self.weights()?;
+        chunks.iter().try_for_each(|chunk| self.render_chunk(*chunk, maxima))
+    }
+
+    fn render_chunk(&mut self, chunk: Chunk, maxima: bool) -> Result<()> {
+        self.place(chunk)?;
+        self.fields()?;
+        let Chunk { first_ray, n_rays } = chunk;
+        match self.still {
+            None => {
+                let push = push::MarchFwd { first_ray, n_rays, with_maxima: u32::from(maxima) };
+                self.run(&self.kernels.march_fwd, chunk.per_ray(), push)
+            }
+            Some(still) => still.record_integrals(self, chunk, maxima),
+        }
     }
 }

@@ -17,6 +17,7 @@ use crate::model::component::Component;
 use crate::model::gaussians::MovingGaussians;
 use crate::model::params::ParamMap;
 use crate::model::setup::sample_capacity;
+use crate::network::chunk::{Chunk, chunk_rays, chunk_samples, packed};
 use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
 use crate::network::still::StillNetwork;
@@ -390,6 +391,13 @@ impl Renderer {
             strip.of.views.write(&[View::of(rays)])?;
             strip.of.pose.write(&[pose(taken, &self.setup, first_pixel)])?;
             self.gpu.wait(strip.commands.submit()?)?;
+            if let Some(counts) = &strip.counts {
+                let mut live = vec![0; n_rays as usize];
+                counts.read(&mut live)?;
+                let commands =
+                    self.record_counted(&packed(&live, chunk_samples(&self.setup))?, n_rays, parts, &strip.seen)?;
+                self.gpu.wait(commands.submit()?)?;
+            }
             let mut seen = vec![RayOut::zeroed(); n_rays as usize];
             strip.seen.read(&mut seen)?;
             pace.note(n_rays, begin.elapsed().as_secs_f64());
@@ -404,7 +412,21 @@ impl Renderer {
         Ok(out)
     }
 
-    /// Records what draws a strip.
+    /// Whether the live samples of so many rays are counted before they are drawn, since a hull leaves out most of them: then many
+    /// more rays go into a chunk than if all might be live. Without it the host is not asked on the way.
+    fn counts_first(&self, n_rays: u32) -> bool {
+        self.network_moves() && self.setup.hull_enabled != 0 && chunk_rays(&self.setup) < n_rays
+    }
+
+    /// Records what draws a strip whose samples were counted, in chunks that have room for them.
+    fn record_counted(&self, chunks: &[Chunk], n_rays: u32, parts: Parts, seen: &Buffer) -> Result<Commands> {
+        let mut recording = Recording::new(&self.gpu, "render counted")?;
+        self.pass(&mut recording, &self.buffers, &self.setup).render_counted(chunks, parts.maxima)?;
+        recording.copy(&self.buffers.ray_out, 0, seen, 0, u64::from(n_rays) * size_of::<RayOut>() as u64)?;
+        recording.finish()
+    }
+
+    /// Records what draws a strip, or counts its samples.
     fn record_strip(&self, strip: Strip, taken: BeatTime, blobs: Option<&BlobList>) -> Result<RecordedStrip> {
         let Strip { n_rays, image_width, parts } = strip;
         let bytes = u64::from(n_rays) * size_of::<RayOut>() as u64;
@@ -416,6 +438,13 @@ impl Renderer {
         let mut recording = Recording::new(&self.gpu, "render")?;
         let push = push::PoseRays { n_rays, image_width, along_axis: self.setup.along_axis };
         self.buffers.record_pose(&mut recording, &self.kernels, &of, push)?;
+        if self.counts_first(n_rays) {
+            let bytes = u64::from(n_rays) * size_of::<u32>() as u64;
+            let counts = self.gpu.buffer("ray_counts read-back", bytes, Memory::Readback)?;
+            self.pass(&mut recording, &self.buffers, &self.setup).count(Chunk { first_ray: 0, n_rays })?;
+            recording.copy(&self.buffers.ray_counts, 0, &counts, 0, bytes)?;
+            return Ok(RecordedStrip { commands: recording.finish()?, of, counts: Some(counts), seen });
+        }
         if let Some(field) = &self.sax {
             let (rays, out) = (&self.buffers.rays, &self.buffers.ray_out);
             field.record_rays(&mut recording, rays, out, taken.phase, n_rays)?;
@@ -427,7 +456,7 @@ impl Renderer {
             kernels.record_rays(&mut recording, &self.buffers, list, n_rays, row, parts.maxima)?;
         }
         recording.copy(&self.buffers.ray_out, 0, &seen, 0, bytes)?;
-        Ok(RecordedStrip { commands: recording.finish()?, of, seen })
+        Ok(RecordedStrip { commands: recording.finish()?, of, counts: None, seen })
     }
 }
 
@@ -450,6 +479,8 @@ struct Strip {
 struct RecordedStrip {
     commands: Commands,
     of: PoseBuffers,
+    /// Live samples of its rays, where all that the commands do is to count them.
+    counts: Option<Buffer>,
     /// What its rays saw.
     seen: Buffer,
 }

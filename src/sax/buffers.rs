@@ -4,6 +4,7 @@ use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
+use crate::gpu::memory::DeviceMemory;
 use crate::gpu::record::Recording;
 use crate::kernels::constants::{SAX_FORWARD_VECTORS, SAX_VECTORS};
 use crate::kernels::dispatch::Binding;
@@ -47,10 +48,10 @@ impl SaxMemory {
         }
     }
 
-    /// Refuses a device that has too little.
+    /// Refuses a device that has too little, or too little that is free.
     ///
     /// # Errors
-    /// [`Error::Config`] naming what to lower.
+    /// [`Error::Config`] naming what to lower; [`Error::OutOfMemory`] where others hold what there is.
     pub fn check(&self, gpu: &Gpu, config: &Config, n_sets: usize) -> Result<()> {
         let (sax, info) = (&config.sax, gpu.info());
         let largest = u64::from(info.max_storage_buffer_range);
@@ -73,16 +74,29 @@ impl SaxMemory {
             );
             return Err(Error::config("sax.samples", sax.samples, problem));
         }
-        if self.total > info.device_memory {
+        self.check_total(&info.name, gpu.memory(), sax.log2_table, n_sets)
+    }
+
+    fn check_total(&self, device: &str, memory: DeviceMemory, log2_table: u32, n_sets: usize) -> Result<()> {
+        if self.total > memory.bytes {
             let problem = format!(
-                "{n_sets} fields take {} MiB, and this device has {} MiB: take fewer entries, fewer sax.levels, or one \
+                "{n_sets} fields take {} MiB, and this device has {memory}: take fewer entries, fewer sax.levels, or one \
                  field for all phases (sax.static_data = \"pooled\")",
-                mib(self.total),
-                mib(info.device_memory)
+                self.total.div_ceil(MIB)
             );
-            return Err(Error::config("sax.log2_table", sax.log2_table, problem));
+            return Err(Error::config("sax.log2_table", log2_table, problem));
         }
-        Ok(())
+        match memory.free {
+            Some(free) if self.total > free => Err(Error::OutOfMemory {
+                object: format!("a fit of {n_sets} fields"),
+                bytes: self.total,
+                detail: format!("{device} has {memory}"),
+                may_pass: true,
+                instead: "again when others have given memory back, a smaller sax.log2_table, fewer sax.levels, one field \
+                          for all phases (sax.static_data = \"pooled\")",
+            }),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -224,5 +238,22 @@ mod tests {
         let memory = SaxMemory::of(&setup);
         assert!(memory.of_field_buffer < LEAST_STORAGE_BUFFER && memory.of_batch_buffer < LEAST_STORAGE_BUFFER);
         assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 100, 2041));
+    }
+
+    #[test]
+    fn what_others_hold_may_be_given_back_and_what_is_not_there_may_not() {
+        let fit = SaxMemory { of_field_buffer: MIB, of_batch_buffer: MIB, total: 100 * MIB };
+        let check = |bytes, free: Option<u64>| {
+            let memory = DeviceMemory { bytes: bytes * MIB, free: free.map(|free| free * MIB) };
+            fit.check_total("a device", memory, 19, 10)
+        };
+        assert!(check(100, None).is_ok() && check(100, Some(100)).is_ok());
+        let Err(Error::Config { problem, .. }) = check(99, Some(99)) else { panic!("there is too little") };
+        assert!(problem.contains("10 fields take 100 MiB") && problem.contains("99 MiB, of which 99 MiB"), "{problem}");
+        let short = check(8192, Some(99)).unwrap_err();
+        assert!(matches!(short, Error::OutOfMemory { may_pass: true, .. }));
+        let text = short.to_string();
+        assert!(text.contains("8192 MiB, of which 99 MiB are free") && text.contains("sax.log2_table"), "{text}");
+        assert!(!text.contains("train.rays"), "{text}");
     }
 }

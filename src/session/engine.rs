@@ -133,6 +133,7 @@ impl Shared {
 
     pub(super) fn with_viewer<T>(&self, draw: impl FnOnce(&mut Live, u32) -> Result<T>) -> Result<T> {
         let (gpu, tuning) = self.device()?;
+        gpu.looks().note();
         let mut viewer = lock(&self.viewer);
         let step = self.step.load(Ordering::Acquire);
         let (generation, source) = {

@@ -43,7 +43,7 @@ pub(super) struct Iterations {
 impl Iterations {
     /// Records them, as many to a submit and one by one, by a function that records so many.
     pub(super) fn record(gpu: &Gpu, per_submit: u32, make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
-        let pace = SubmitPace::new(longest_submit_s(gpu.info()), 1, per_submit);
+        let pace = SubmitPace::new(longest_submit_s(gpu.info()), 1, per_submit).giving_way_to(gpu.looks());
         Ok(Iterations { several: make(per_submit)?, n_several: per_submit, single: make(1)?, pace })
     }
 

@@ -253,7 +253,7 @@ impl Trainer {
         let has_still_field = !plan.config.has_gaussians_alone() && !plan.config.is_sax();
         let single = has_still_field.then(record_single).transpose()?;
         let trainer = Trainer {
-            pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit),
+            pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit).giving_way_to(gpu.looks()),
             gpu: gpu.clone(),
             kernels,
             network,

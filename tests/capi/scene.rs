@@ -3,8 +3,10 @@
 #![allow(clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 use nertca_vk::capi::context::*;
+use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
+use nertca_vk::capi::training::*;
 use nertca_vk::capi::types::*;
 use std::ffi::{CStr, CString, c_void};
 use std::ptr::{null, null_mut};
@@ -127,15 +129,37 @@ pub fn image(pixels: &mut [f32]) -> nertca_image {
     }
 }
 
+/// Trains in this thread; how many iterations were done.
+#[track_caller]
+pub fn train(reconstruction: *mut nertca_reconstruction, iterations: u32) -> u32 {
+    let mut done = 0;
+    let status = unsafe { nertca_reconstruction_train(reconstruction, iterations, None, null_mut(), &mut done) };
+    ok(status, reconstruction);
+    done
+}
+
+/// A view as it is drawn.
+#[track_caller]
+pub fn drawn(reconstruction: *mut nertca_reconstruction, view: &nertca_view) -> Vec<f32> {
+    let mut pixels = vec![f32::NAN; (view.width * view.height) as usize];
+    ok(unsafe { nertca_reconstruction_render(reconstruction, view, &image(&mut pixels)) }, reconstruction);
+    assert!(pixels.iter().all(|p| p.is_finite()));
+    pixels
+}
+
+/// What a context says of itself.
+pub fn described(context: *mut nertca_context) -> serde_json::Value {
+    let mut text = vec![0; 1 << 16];
+    ok(unsafe { nertca_context_describe(context, text.as_mut_ptr(), text.len(), null_mut()) }, context);
+    serde_json::from_str(unsafe { CStr::from_ptr(text.as_ptr()) }.to_str().unwrap()).unwrap()
+}
+
 /// Destroys a reconstruction and its context; nothing may be left, and the validation layers must have been silent.
 pub fn close(context: *mut nertca_context, reconstructions: &[*mut nertca_reconstruction]) {
     for reconstruction in reconstructions {
         ok(unsafe { nertca_reconstruction_destroy(*reconstruction) }, *reconstruction);
     }
-    let mut text = vec![0; 1 << 16];
-    ok(unsafe { nertca_context_describe(context, text.as_mut_ptr(), text.len(), null_mut()) }, context);
-    let described: serde_json::Value =
-        serde_json::from_str(unsafe { CStr::from_ptr(text.as_ptr()) }.to_str().unwrap()).unwrap();
+    let described = described(context);
     if !described["device"].is_null() {
         assert_eq!(described["validation_messages"], serde_json::json!([]));
         assert_eq!(described["memory_in_use"], 0, "device memory was not freed");

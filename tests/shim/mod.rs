@@ -63,6 +63,8 @@ pub struct Poor {
     pub timestamps: bool,
     /// Lowers limits.
     pub limits: fn(&mut vk::PhysicalDeviceLimits),
+    /// Bytes of each heap that others leave, where the device tells of that.
+    pub free_memory: Option<u64>,
 }
 
 thread_local! {
@@ -139,6 +141,11 @@ pub fn plant(code: Vec<u32>, faulty: Vec<u32>) {
 /// The loader to open a device with.
 pub fn loader() -> Loader {
     unsafe { Loader::new(get_instance_proc_addr) }
+}
+
+/// The same, for a host that makes a device itself.
+pub fn entry() -> ash::Entry {
+    unsafe { ash::Entry::from_static_fn(ash::StaticFn { get_instance_proc_addr }) }
 }
 
 type Void = unsafe extern "system" fn();
@@ -438,6 +445,25 @@ unsafe extern "system" fn vkGetPhysicalDeviceFeatures2(
 }
 
 #[allow(non_snake_case)]
+unsafe extern "system" fn vkGetPhysicalDeviceMemoryProperties2(
+    device: vk::PhysicalDevice,
+    out: *mut vk::PhysicalDeviceMemoryProperties2<'_>,
+) {
+    let real: vk::PFN_vkGetPhysicalDeviceMemoryProperties2 =
+        unsafe { std::mem::transmute(device.real(c"vkGetPhysicalDeviceMemoryProperties2")) };
+    unsafe { real(device, out) };
+    let Some(free) = with(|state| state.poor).and_then(|poor| poor.free_memory) else { return };
+    let mut next = unsafe { (*out).p_next }.cast::<vk::BaseOutStructure<'_>>();
+    while let Some(structure) = unsafe { next.as_mut() } {
+        if structure.s_type == vk::StructureType::PHYSICAL_DEVICE_MEMORY_BUDGET_PROPERTIES_EXT {
+            let told = unsafe { &mut *next.cast::<vk::PhysicalDeviceMemoryBudgetPropertiesEXT<'_>>() };
+            told.heap_budget = told.heap_usage.map(|usage| usage + free);
+        }
+        next = structure.p_next;
+    }
+}
+
+#[allow(non_snake_case)]
 unsafe extern "system" fn vkGetPhysicalDeviceQueueFamilyProperties(
     device: vk::PhysicalDevice,
     count: *mut u32,
@@ -648,6 +674,7 @@ fn special(name: &str) -> Option<*const ()> {
         "vkEnumerateDeviceExtensionProperties" => vkEnumerateDeviceExtensionProperties as *const (),
         "vkGetPhysicalDeviceProperties2" => vkGetPhysicalDeviceProperties2 as *const (),
         "vkGetPhysicalDeviceFeatures2" => vkGetPhysicalDeviceFeatures2 as *const (),
+        "vkGetPhysicalDeviceMemoryProperties2" => vkGetPhysicalDeviceMemoryProperties2 as *const (),
         "vkGetPhysicalDeviceQueueFamilyProperties" => vkGetPhysicalDeviceQueueFamilyProperties as *const (),
         "vkCreateInstance" => vkCreateInstance as *const (),
         "vkDestroyInstance" => vkDestroyInstance as *const (),
