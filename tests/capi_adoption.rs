@@ -160,7 +160,6 @@ impl Application {
             user: std::ptr::from_ref(&*self.uses).cast_mut().cast(),
             subgroup_size_control: (self.with != With::Least).into(),
             cooperative_matrix: (self.with == With::Matrices).into(),
-            ..zeroed()
         }
     }
 
