@@ -166,6 +166,15 @@ impl XTrainer {
         Ok(had_room)
     }
 
+    /// A device that does not count the iterations it was asked for would be asked for them for ever.
+    fn counts_wrongly(&self, first: u32, stop: u32) -> Error {
+        let (device, step) = (&self.gpu.info().name, self.step);
+        Error::NoDevice(format!(
+            "{device} was to go from iteration {first} on, to {stop} at most, and says it is at {step}; `nertca-vk selftest` \
+             tells which stages it computes wrongly"
+        ))
+    }
+
     fn run(&mut self, stop: u32) -> Result<()> {
         loop {
             if self.iterations.is_none() {
@@ -176,9 +185,13 @@ impl XTrainer {
             if let Some(iterations) = &self.iterations {
                 iterations.run(&self.gpu, first, stop)?;
             }
+            let had_room = self.had_room()?;
             // Of several, the first may have had room.
-            if self.had_room()? || self.step > first {
+            if (first + 1..=stop).contains(&self.step) {
                 return Ok(());
+            }
+            if had_room {
+                return Err(self.counts_wrongly(first, stop));
             }
         }
     }
@@ -187,8 +200,8 @@ impl XTrainer {
     /// losses of the iterations done, each the mean over the sets. An empty list means the target was reached before.
     ///
     /// # Errors
-    /// [`Error::Diverged`] on a loss that is not finite; [`Error::Config`] where no buffer holds the tiles' lists; device
-    /// errors.
+    /// [`Error::Diverged`] on a loss that is not finite; [`Error::Config`] where no buffer holds the tiles' lists;
+    /// [`Error::NoDevice`] of a device that does not count its iterations; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
         let until = until.min(self.config.train.iterations);
         if self.step >= until {
