@@ -164,7 +164,8 @@ fn what_changed_runs_again_and_nothing_else() {
     let before = [result("a-3v.m.s1"), result("a-3v.n.s1")];
     let events = ok(&["run", text(&file), "-o", text(&out), "--json"]);
     assert!(events.contains("\"ended\"") && !events.contains("run_begun"), "{events}");
-    written(directory.path(), &TINY.replace("train.rays=32", "train.rays=48"));
+    let changed = TINY.replace("train.rays=32", "train.rays=48");
+    written(directory.path(), &changed);
     assert_eq!(all("waiting"), ["a-3v.n.s1"]);
     // What is of the study as it was is no result of the study as it is.
     assert!(ok(&["table", text(&file), "-o", text(&out)]).contains("1 results in this directory"));
@@ -185,10 +186,8 @@ fn what_changed_runs_again_and_nothing_else() {
     assert_eq!(begun(&["--any-commit"]), 0);
     assert_eq!(begun(&[]), 1);
     // Settings of a data set alone.
-    written(
-        directory.path(),
-        &TINY.replacen("iterations = 12", "iterations = 12\non = { a = [\"static.tv=0.5\"] }", 1),
-    );
+    let of_its_own = "iterations = 12\non = { a = [\"static.tv=0.5\"] }";
+    written(directory.path(), &changed.replacen("iterations = 12", of_its_own, 1));
     assert_eq!(all("waiting"), ["a-3v.m.s1"]);
     assert_eq!(begun(&["--any-commit"]), 1, "another configuration");
     let config = std::fs::read_to_string(out.join("runs/a-3v.m.s1/config.toml")).unwrap();
