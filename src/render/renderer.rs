@@ -302,6 +302,11 @@ impl Renderer {
         self.moving.is_some()
     }
 
+    /// Whether a motion hull says where the moving field may be.
+    pub fn has_hull(&self) -> bool {
+        self.setup.hull_enabled != 0
+    }
+
     /// Whether the network on encoded coordinates is the moving field.
     pub fn network_moves(&self) -> bool {
         self.moving.is_none() && self.sax.is_none()
@@ -415,7 +420,7 @@ impl Renderer {
     /// Whether the live samples of so many rays are counted before they are drawn, since a hull leaves out most of them: then many
     /// more rays go into a chunk than if all might be live. Without it the host is not asked on the way.
     fn counts_first(&self, n_rays: u32) -> bool {
-        self.network_moves() && self.setup.hull_enabled != 0 && chunk_rays(&self.setup) < n_rays
+        self.network_moves() && self.has_hull() && chunk_rays(&self.setup) < n_rays
     }
 
     /// Records what draws a strip whose samples were counted, in chunks that have room for them.

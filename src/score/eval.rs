@@ -346,15 +346,23 @@ pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Op
     let Some((frame, change)) = strongest_change(dataset) else { return Ok(None) };
     let seen = rendered(renderer, dataset, frame)?;
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
-    let remedy = if !renderer.network_moves() {
-        "check geometry, phases and noise of the views"
-    } else {
-        "check geometry and phases; a smaller hull.dilate_pixels, a lower dynamic.lr or another seed may help"
+    let why = match (renderer.network_moves(), renderer.has_hull()) {
+        (true, false) => {
+            "The run may be too short, or dynamic.lr too high: a longer one, a lower rate or another seed may help; check \
+             geometry and phases, too"
+        }
+        (true, true) => {
+            "Views may disagree by more than the motion hull allows: check geometry and phases; a smaller hull.dilate_pixels, a \
+             lower dynamic.lr or another seed may help"
+        }
+        (false, _) => {
+            "Views may disagree by more than the motion hull allows: check geometry, phases and noise of the views"
+        }
     };
     Ok((strongest < DEAD_SHARE * change).then(|| {
         format!(
             "The moving field has died: its line integrals reach {strongest:.2e} where the images change by {change:.2e}. \
-             Dice says nothing here. Views may disagree by more than the motion hull allows: {remedy}."
+             Dice says nothing here. {why}."
         )
     }))
 }
