@@ -215,7 +215,7 @@ fn list(args: &ListArgs) -> Result<()> {
             }),
         };
         let (data, method) = (study.data[run.data].id.as_str(), &study.methods[run.method]);
-        let (iterations, fingerprint) = (method.config.train.iterations, study.fingerprint(run)?);
+        let (iterations, fingerprint) = (study.config(run).train.iterations, study.fingerprint(run)?);
         listed.push(Listed { run, data, method: &method.name, iterations, fingerprint, state });
     }
     if args.json {
