@@ -7,15 +7,15 @@
 //   static_gradient[2 * parameter] = low, high word of dL/d sigma_l scattered to planes and lines.
 // Where samples of the dynamic field were empty is noted on the way (inc/occupancy.glsl).
 //
-// The scatter is summed as 64-bit fixed point in pairs of 32-bit integer atomics, which is exact and hence independent of
-// order. Every sample of every ray meets the few texels of the lines: with `private_lines` a workgroup sums its own in shared
+// The scatter is summed as 64-bit fixed point in integer atomics, pairs of 32 bits or whole, which is exact and hence
+// independent of order. Every sample of every ray meets the few texels of the lines: with `private_lines` a workgroup sums its own in shared
 // memory first, so that they reach memory once per ray.
+#include "inc/fixed_point.glsl"
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
 #include "inc/softplus.glsl"
 #include "inc/sample_rays.glsl"
-#include "inc/fixed_point.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint private_lines = 0u;  // numbers on all lines, or 0: straight to memory
@@ -31,7 +31,7 @@ READ_VEC4(7, B7, static_params);
 layout(binding = 8) writeonly buffer B8 { RayOut ray_out[]; };
 layout(binding = 9) writeonly buffer B9 { vec2 ray_gradient[]; };
 layout(binding = 10) writeonly buffer B10 { vec4 ray_loss[]; };
-layout(binding = 11) buffer B11 { uint static_gradient[]; };
+FIXED_SUMS(11, B11, static_gradient);
 layout(binding = 12) buffer B12 { uint occupancy[]; };
 #include "inc/tensor_vm.glsl"
 #include "inc/reduce.glsl"
@@ -80,7 +80,7 @@ RayOut integrals(uint r, Ray ray) {
 }
 
 void add_to_memory(uint parameter, uvec2 fixed_point) {
-    ADD_FIXED(static_gradient, parameter, fixed_point);
+    ADD_FIXED_TO_MEMORY(static_gradient, parameter, fixed_point);
 }
 
 void add_to_plane(uint texel, vec4 value, float scale_high) {

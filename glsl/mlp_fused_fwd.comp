@@ -72,6 +72,14 @@ void multiply(uint input_at, uint input_stride, uint weights_at, uint depth, uin
     }
 }
 
+// From the tile, where whole rows lie: fragments of matrices would be stored a few bytes at a time.
+void keep_activations(uint kept, uint first) {
+    uint at = (kept * setup.sample_capacity + first) * width8;
+    for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
+        activations16[at + e] = tile16[e / width8 * hidden_stride + e % width8];
+    }
+}
+
 void main() {
     uint first = gl_WorkGroupID.x * tile;
     uint column0 = gl_SubgroupID * (width / subgroups);
@@ -99,14 +107,12 @@ void main() {
                 [[unroll]] for (uint i = 0u; i < sum.length(); i++) sum[i] = clamp(sum[i], 0.0, LARGEST);
                 uint column = (column0 + c * n) / 8u;
                 STORE_F16(sum, tile16, r * m * hidden_stride + column, hidden_stride);
-                if (layer >= keep_from) {
-                    uint at = (layer - keep_from) * setup.sample_capacity + first + r * m;
-                    STORE_F16(sum, activations16, at * width8 + column, width8);
-                }
             }
         }
         barrier();
+        if (layer >= keep_from) keep_activations(layer - keep_from, first);
     }
+    if (keep_from < layers) barrier();
     // The output neuron: row tiles are shared out among subgroups, which alone see their rows from here on.
     for (uint r = gl_SubgroupID; r < row_tiles; r += subgroups) {
         SUM sum = SUM(0.0);

@@ -3,9 +3,9 @@
 // Scatters the gradient by samples' features to the grid's entries, in 64-bit fixed point. One invocation per sample
 // and pair of levels.
 //   sax_grid_sums[2 * number] = low, high word
+#include "inc/fixed_point.glsl"
 #include "inc/sax_layout.glsl"
 #include "inc/sax_hash.glsl"
-#include "inc/fixed_point.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_samples; } push;
@@ -13,7 +13,7 @@ layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { SaxLevel sax_levels[]; };
 layout(binding = 2) readonly buffer B2 { vec4 sax_points[]; };
 layout(binding = 3) readonly buffer B3 { vec4 sax_encoding_gradient[]; };
-layout(binding = 4) buffer B4 { uint sax_grid_sums[]; };
+FIXED_SUMS(4, B4, sax_grid_sums);
 
 void scatter(SaxLevel level, vec3 unit, vec2 gradient) {
     float scale_high = exp2(float(sax_setup.fixed_point_bits) - 32.0);
@@ -22,8 +22,8 @@ void scatter(SaxLevel level, vec3 unit, vec2 gradient) {
         float share;
         uint entry = tap(level, cell, corner, share);
         vec2 part = share * gradient;
-        if (part.x != 0.0) ADD_FIXED(sax_grid_sums, 2u * entry, to_fixed(part.x, scale_high));
-        if (part.y != 0.0) ADD_FIXED(sax_grid_sums, 2u * entry + 1u, to_fixed(part.y, scale_high));
+        if (part.x != 0.0) ADD_FIXED_TO_MEMORY(sax_grid_sums, 2u * entry, to_fixed(part.x, scale_high));
+        if (part.y != 0.0) ADD_FIXED_TO_MEMORY(sax_grid_sums, 2u * entry + 1u, to_fixed(part.y, scale_high));
     }
 }
 

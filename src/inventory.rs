@@ -114,7 +114,9 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     if params.still.is_some() {
         StillKernels::new(gpu)?;
     }
-    Kernels::new(gpu, tuning.clone(), params.line_len() as u32)?;
+    for samples in [config.march.static_samples, config.march.render_samples] {
+        Kernels::new(gpu, tuning.clone(), params.line_len() as u32, samples)?;
+    }
     if config.gaussians_move() {
         match config.gaussians.form {
             GaussianForm::R2 => {

@@ -96,7 +96,7 @@ fn rays_and_depths_match() {
 /// Both families of kernels: operands through texel buffers with small workgroups, as an old lavapipe gets
 /// them, and through storage buffers with large ones, as GPUs do.
 fn paths() -> [Tuning; 3] {
-    let f32_layers = |operands, layer_lanes, weight_lanes, splits, private_line_bytes| Tuning {
+    let f32_layers = |operands, layer_lanes, weight_lanes, splits, march_lanes, private_line_bytes| Tuning {
         layers: Layers::F32,
         operands,
         layer_lanes,
@@ -110,6 +110,7 @@ fn paths() -> [Tuning; 3] {
             recompute: false,
             f16_sums: true,
         },
+        march_lanes,
         private_line_bytes,
         chunk_samples: 1 << 16,
         iterations_per_submit: None,
@@ -118,9 +119,9 @@ fn paths() -> [Tuning; 3] {
         reasons: Vec::new(),
     };
     [
-        f32_layers(Operands::Texel, 8, 8, 4, 0),
-        f32_layers(Operands::Storage, 64, 32, 16, 16384),
-        f32_layers(Operands::Address, 8, 4, 3, 0),
+        f32_layers(Operands::Texel, 8, 8, 4, 32, 0),
+        f32_layers(Operands::Storage, 64, 32, 16, 16, 16384),
+        f32_layers(Operands::Address, 8, 4, 3, 32, 0),
     ]
 }
 

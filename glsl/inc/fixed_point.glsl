@@ -1,5 +1,15 @@
 // Sums in 64-bit fixed point, a pair of words each, low and high: integers add up exactly, so the order of additions
-// does not matter.
+// does not matter. With INT64, what adds to memory takes a pair for one integer, for devices that add these atomically: the
+// same bits come out. To be included before what is no directive: an extension precedes all else.
+#ifdef INT64
+#extension GL_EXT_shader_explicit_arithmetic_types_int64 : require
+#extension GL_EXT_shader_atomic_int64 : require
+#define FIXED_SUMS(SLOT, BLOCK, NAME) layout(binding = SLOT) buffer BLOCK { uint64_t NAME[]; }
+#define ADD_FIXED_TO_MEMORY(SUMS, AT, VALUE) atomicAdd(SUMS[AT], packUint2x32(VALUE))
+#else
+#define FIXED_SUMS(SLOT, BLOCK, NAME) layout(binding = SLOT) buffer BLOCK { uint NAME[]; }
+#define ADD_FIXED_TO_MEMORY(SUMS, AT, VALUE) ADD_FIXED(SUMS, AT, VALUE)
+#endif
 
 // A number in 64-bit fixed point, by 2 to the (bits behind the point - 32); the magnitude is split exactly into words,
 // then negated in two's complement.

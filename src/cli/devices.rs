@@ -52,13 +52,14 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
             );
             out!("   memory {}", DeviceMemory { bytes: info.device_memory, free: info.free_memory });
             out!(
-                "   cooperative matrices {}  float16 {}  float atomics {}",
+                "   cooperative matrices {}  float16 {}  float atomics {}  64-bit integer atomics {}",
                 match info.matrices.first() {
                     Some(s) => format!("{}x{}x{}", s.m, s.n, s.k),
                     None => "none".to_owned(),
                 },
                 info.float16,
-                info.float_atomics
+                info.float_atomics,
+                info.int64_atomics
             );
             match &info.unusable {
                 Some(why) => out!("   not usable: {why}"),

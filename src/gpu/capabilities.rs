@@ -72,6 +72,8 @@ pub struct DeviceInfo {
     pub float16: bool,
     /// Whether the device offers float atomics on buffers.
     pub float_atomics: bool,
+    /// Whether the device adds 64-bit integers in buffers atomically (`shaderInt64`, `shaderBufferInt64Atomics`).
+    pub int64_atomics: bool,
     /// Whether memory can be exported as file descriptors (`VK_KHR_external_memory_fd`).
     pub external_memory_fd: bool,
     /// Whether the driver tells of the pipelines it compiles (`VK_KHR_pipeline_executable_properties`).
@@ -330,6 +332,7 @@ pub(super) fn describe(
     // SAFETY: the chain lives until the call returns; it holds an extension's structure only where the device has it, and
     // that of Vulkan 1.2 is ignored by older devices.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
+    let int64_atomics = features.features.shader_int64 == vk::TRUE && f12.shader_buffer_int64_atomics == vk::TRUE;
     let memory = DeviceMemory::of(instance, physical, has(ext::memory_budget::NAME));
     let limits = properties.limits;
     let version = properties.api_version;
@@ -404,6 +407,7 @@ pub(super) fn describe(
         multiprocessors: multiprocessors.shader_sm_count,
         float16: f12.shader_float16 == vk::TRUE,
         float_atomics: has(ext::shader_atomic_float::NAME),
+        int64_atomics,
         external_memory_fd: has(khr::external_memory_fd::NAME),
         pipeline_statistics: has(khr::pipeline_executable_properties::NAME)
             && statistics.pipeline_executable_info == vk::TRUE,

@@ -33,6 +33,8 @@ pub struct DeviceOptions {
     pub statistics: bool,
     /// Do without operations across a subgroup, as on a device that lacks them.
     pub without_subgroups: bool,
+    /// Do without atomic operations on 64-bit integers, as on a device that lacks them.
+    pub without_int64_atomics: bool,
 }
 
 /// A device that someone else made and goes on owning; see [`Gpu::adopt`].
@@ -236,7 +238,9 @@ impl Device {
             [vk::DeviceQueueCreateInfo::default().queue_family_index(queue_family).queue_priorities(&priorities)];
         let mut f12 = vk::PhysicalDeviceVulkan12Features::default()
             .timeline_semaphore(true)
-            .buffer_device_address(info.buffer_device_address);
+            .buffer_device_address(info.buffer_device_address)
+            .shader_buffer_int64_atomics(info.int64_atomics);
+        let features = vk::PhysicalDeviceFeatures::default().shader_int64(info.int64_atomics);
         let mut matrix = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
         let mut size = vk::PhysicalDeviceSubgroupSizeControlFeatures::default()
             .subgroup_size_control(true)
@@ -250,7 +254,7 @@ impl Device {
         if info.portability_subset {
             extensions.push(khr::portability_subset::NAME.as_ptr());
         }
-        let mut create = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+        let mut create = vk::DeviceCreateInfo::default().queue_create_infos(&queues).enabled_features(&features);
         if !info.matrices.is_empty() {
             f12 = f12.shader_float16(true).vulkan_memory_model(true).vulkan_memory_model_device_scope(true);
             extensions.push(khr::cooperative_matrix::NAME.as_ptr());
@@ -351,6 +355,7 @@ impl Gpu {
         if options.without_subgroups {
             (info.full_subgroups, info.small_subgroups) = (None, None);
         }
+        info.int64_atomics &= !options.without_int64_atomics;
         let queue_family = compute_family(&instance, physical)
             .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?
             .index;
@@ -403,6 +408,8 @@ impl Gpu {
             info.timestamp_period_ns = 0.0;
         }
         info.external_memory_fd &= adoption.external_memory_fd;
+        // Pairs of 32 bits add up to the same sums.
+        info.int64_atomics = false;
         if !adoption.cooperative_matrix {
             info.matrices.clear();
         }

@@ -83,6 +83,8 @@ pub struct Build<'a> {
     pub matrices: bool,
     /// Whether the shader also has a variant whose lanes exchange values within full subgroups: it is taken where they can.
     pub exchanges: bool,
+    /// Whether the shader also has variants that add 64-bit integers to memory: they are taken where the device can.
+    pub int64: bool,
 }
 
 /// Invocations of the subgroups that a workgroup of so many `lanes` consists of, if they are full and exchange values.
@@ -94,6 +96,8 @@ pub fn full_subgroup(gpu: &Gpu, lanes: u32) -> Option<u32> {
 
 /// Suffix of variants whose lanes exchange values.
 const EXCHANGING: &str = "_subgroup";
+/// Suffix of variants that add 64-bit integers to memory, behind that of [`EXCHANGING`].
+const INT64: &str = "_int64";
 
 impl Build<'_> {
     /// Builds the stage.
@@ -104,9 +108,11 @@ impl Build<'_> {
         // Not every device takes workgroups as large as some shaders would like; these work with any power of two.
         let lanes = self.lanes.unwrap_or(P::LOCAL_SIZE.min(power_of_two_below(gpu.info().max_workgroup_invocations)));
         // Operands through texel buffers are for drivers that are old and slow at all else.
-        let subgroup = full_subgroup(gpu, lanes).filter(|_| self.exchanges && self.variant.is_empty());
+        let is_plain = self.variant.is_empty();
+        let subgroup = full_subgroup(gpu, lanes).filter(|_| self.exchanges && is_plain);
         let variant = if subgroup.is_some() { EXCHANGING } else { self.variant };
-        let code = kernel_code(&format!("{}{variant}", P::SHADER))?;
+        let integers = if self.int64 && is_plain && gpu.info().int64_atomics { INT64 } else { "" };
+        let code = kernel_code(&format!("{}{variant}{integers}", P::SHADER))?;
         let pipeline = if self.matrices {
             gpu.matrix_pipeline(code, lanes, self.constants)?
         } else if let Some(size) = subgroup {
@@ -160,14 +166,16 @@ pub struct Kernels {
 }
 
 impl Kernels {
-    /// Builds the pipelines; `line_params` are the numbers on the lines of the static field.
+    /// Builds the pipelines for a static field with `line_params` numbers on its lines, which is looked at in `static_samples` on each
+    /// ray.
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn new(gpu: &Gpu, tuning: Tuning, line_params: u32) -> Result<Kernels> {
+    pub fn new(gpu: &Gpu, tuning: Tuning, line_params: u32, static_samples: u32) -> Result<Kernels> {
         let plain = Build::default();
         let vec4 = Build { variant: vec4_variant(&tuning), ..plain };
         let sums = Build { exchanges: true, ..plain };
+        let lanes = Some(tuning.lanes_per_ray(static_samples));
         let private_lines = [("private_lines", tuning.private_lines(line_params))];
         let parts = [("parts", tuning.gradient_parts())];
         let loss_scaling = [("loss_scaling", u32::from(tuning.layers == Layers::Matrices))];
@@ -177,8 +185,8 @@ impl Kernels {
             march_count: plain.stage(gpu)?,
             march_scan: plain.stage(gpu)?,
             march_emit: plain.stage(gpu)?,
-            march_loss: Build { constants: &private_lines, exchanges: true, ..vec4 }.stage(gpu)?,
-            march_fwd: Build { exchanges: true, ..vec4 }.stage(gpu)?,
+            march_loss: Build { constants: &private_lines, lanes, exchanges: true, int64: true, ..vec4 }.stage(gpu)?,
+            march_fwd: Build { lanes, exchanges: true, ..vec4 }.stage(gpu)?,
             volume_dynamic: plain.stage(gpu)?,
             volume_static: vec4.stage(gpu)?,
             baked_march: plain.stage(gpu)?,

@@ -5,6 +5,7 @@ use crate::gpu::buffer::Operands;
 use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
 use crate::gpu::pace::longest_submit_s;
 use crate::kernels::constants;
+use crate::kernels::push::{MarchFwd, MarchLoss, PushConstants};
 use serde::Serialize;
 
 /// The register tile of three kernels that work together, from what their text defines.
@@ -75,6 +76,8 @@ pub struct Tuning {
     pub splits: u32,
     /// Sizes of the passes on matrices.
     pub matrices: MatrixTuning,
+    /// Invocations that share a ray where each gets one of its samples at least; else as few as the shaders say.
+    pub march_lanes: u32,
     /// Shared memory in which a workgroup may sum the static field's lines before they go to memory, bytes.
     pub private_line_bytes: u32,
     /// Samples handled at once, at most; the configuration may ask for fewer.
@@ -97,6 +100,8 @@ fn workgroups_untold(kind: DeviceKind) -> u32 {
         _ => 264,
     }
 }
+
+const _: () = assert!(MarchFwd::LOCAL_SIZE == MarchLoss::LOCAL_SIZE);
 
 /// Partial sums that are too many for one invocation to add up.
 const MANY_SPLITS: u32 = 64;
@@ -161,12 +166,14 @@ impl Tuning {
             _ => (info.device_memory >> 14).clamp(1 << 16, 1 << 19) as u32,
         };
         let overlap = !info.is_cpu();
+        // Workgroups on a multiprocessor are few, so that one subgroup in each leaves it half empty.
+        let march_lanes = if info.is_cpu() { MarchLoss::LOCAL_SIZE } else { 2 * MarchLoss::LOCAL_SIZE };
         // Shared memory is no faster on a CPU.
         let private_line_bytes = if info.is_cpu() { 0 } else { info.max_shared_memory / 2 };
-        reasons.push(match private_line_bytes {
-            0 => "static gradients through 32-bit integer atomics: exact sums, no float atomics needed".into(),
-            _ => "static gradients through 32-bit integer atomics, lines in shared memory first: exact sums".into(),
-        });
+        // Kernels that read through texel buffers have no variants.
+        let bits = if info.int64_atomics && operands != Operands::Texel { 64 } else { 32 };
+        let lines = if private_line_bytes == 0 { "" } else { ", lines in shared memory first" };
+        reasons.push(format!("static gradients through {bits}-bit integer atomics{lines}: exact sums"));
         Tuning {
             layers,
             operands,
@@ -174,6 +181,7 @@ impl Tuning {
             weight_lanes,
             splits,
             matrices,
+            march_lanes,
             private_line_bytes,
             chunk_samples,
             iterations_per_submit: None,
@@ -191,6 +199,11 @@ impl Tuning {
     /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_loss`.
     pub(super) fn private_lines(&self, line_params: u32) -> u32 {
         if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
+    }
+
+    /// Invocations that share a ray of so many samples; `local_size_x` of `march_loss` and `march_fwd`.
+    pub(super) fn lanes_per_ray(&self, n_samples: u32) -> u32 {
+        if n_samples < self.march_lanes { MarchLoss::LOCAL_SIZE } else { self.march_lanes }
     }
 
     /// Invocations that share out the partial sums of a number of the network's gradient.

@@ -120,7 +120,7 @@ impl Renderer {
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.param_map.moving));
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
         let network = Network::new(gpu, &tuning, &setup, &model.param_map.moving, Purpose::Render)?;
-        let kernels = Kernels::new(gpu, tuning, model.param_map.line_len() as u32)?;
+        let kernels = Kernels::new(gpu, tuning, model.param_map.line_len() as u32, setup.n_static_samples)?;
         let schedule = gpu.buffer("schedule", size_of::<Schedule>() as u64, Memory::Upload)?;
         let (tuning, param_map, hull) = (&kernels.tuning, &model.param_map, model.hull.as_ref());
         let buffers = ForwardBuffers::new(gpu, tuning, &setup, param_map, RAYS_PER_SUBMIT, schedule, hull)?;

@@ -90,7 +90,7 @@ impl SaxKernels {
             loss: plain.stage(gpu)?,
             lineformer_bwd: LineformerBackKernels::new(gpu)?,
             weight_gradient: plain.stage(gpu)?,
-            encode_bwd: plain.stage(gpu)?,
+            encode_bwd: Build { int64: true, ..plain }.stage(gpu)?,
             grid_gradient: plain.stage(gpu)?,
             adam: plain.stage(gpu)?,
             report: plain.stage(gpu)?,

@@ -195,7 +195,7 @@ impl Trainer {
         let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &plan.params.moving));
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
         let network = Network::new(gpu, &tuning, &plan.setup, &plan.params.moving, Purpose::Train)?;
-        let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32)?;
+        let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32, plan.setup.n_static_samples)?;
         let (forward, training) = (forward_buffers(gpu, &kernels.tuning, &plan)?, TrainingBuffers::new(gpu, &plan)?);
         let still = plan.params.still.as_ref();
         let still =

@@ -108,11 +108,20 @@ impl Fault {
 
 /// The code that the device gets of a stage, in that variant if one is asked for.
 fn code(gpu: &Gpu, stage: &str, variant_asked: Option<&str>) -> Vec<u32> {
-    let variant = |name: &str, taken: bool| kernel_code(&format!("{stage}_{name}")).ok().filter(|_| taken);
-    let texel = variant("texel", tuning(gpu).operands == Operands::Texel);
-    let asked = variant_asked.map(|name| kernel_code(&format!("{stage}_{name}")).unwrap());
-    let taken = asked.or(texel).or_else(|| variant("subgroup", gpu.info().full_subgroups.is_some()));
-    bytemuck::pod_collect_to_vec(taken.unwrap_or_else(|| kernel_code(stage).unwrap()).spirv)
+    let named = |variant: &str| kernel_code(&format!("{stage}{variant}"));
+    if let Some(name) = variant_asked {
+        return bytemuck::pod_collect_to_vec(named(&format!("_{name}")).unwrap().spirv);
+    }
+    let (exchanges, int64) = (gpu.info().full_subgroups.is_some(), gpu.info().int64_atomics);
+    let variants = [
+        ("_texel", tuning(gpu).operands == Operands::Texel),
+        ("_subgroup_int64", exchanges && int64),
+        ("_subgroup", exchanges),
+        ("_int64", int64),
+        ("", true),
+    ];
+    let taken = variants.iter().filter(|(_, taken)| *taken).find_map(|(variant, _)| named(variant).ok());
+    bytemuck::pod_collect_to_vec(taken.unwrap().spirv)
 }
 
 /// Expects that nothing is found without a fault, and that each is found in the row of its stage before all others.
