@@ -3,6 +3,7 @@
 // How each Gaussian of R2-Gaussian is seen by the view that its set looks at in this iteration. One invocation per
 // Gaussian.
 #include "inc/r2.glsl"
+#include "inc/r2_chord.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_gaussians; } push;
@@ -23,6 +24,9 @@ void main() {
     if (i >= push.n_gaussians) return;
     R2Gaussian g = r2_gaussians[i];
     R2Turn turn = r2_turns[gaussian_step * r2_setup.n_sets + g.set];
-    splats[i] = project_r2(g, gaussian_views[turn.image], gaussian_setup).splat;
+    GaussianView view = gaussian_views[turn.image];
+    R2Projection p = project_r2(g, view, gaussian_setup);
+    if (r2_setup.exact != 0u && p.depth > 0.0) p.splat.half_box = chord_box(p, view, gaussian_setup);
+    splats[i] = p.splat;
     image_of_splat[i] = int(g.set);
 }

@@ -13,6 +13,7 @@ layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
 layout(binding = 4) readonly buffer B4 { R2Schedule r2_schedule[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
+// Two per Gaussian of gaussian_moments, or three of r2_chord_moments.
 layout(binding = 6) readonly buffer B6 { vec4 splat_moments[]; };
 layout(binding = 7) readonly buffer B7 { vec4 r2_voxel_moments[]; };
 layout(binding = 8) buffer B8 { R2Gaussian r2_gaussians[]; };
@@ -23,18 +24,39 @@ layout(binding = 10) buffer B10 { vec4 gaussian_adam_second[]; };
 layout(binding = 11) writeonly buffer B11 { vec4 gaussian_gradient[]; };
 // Per Gaussian: the sum over iterations of the gradient by its centre, in half images, and how often it was seen.
 layout(binding = 12) buffer B12 { vec2 r2_statistics[]; };
+layout(binding = 13) readonly buffer B13 { Splat splats[]; };
 
-// Adds the gradient of total variation.
-void add_voxels(uint i, R2Gaussian g, R2Projection p, inout GaussianGradient sum) {
-    vec4 linear = r2_voxel_moments[3u * i];
-    vec3 square = r2_voxel_moments[3u * i + 1u].xyz, mixed = r2_voxel_moments[3u * i + 2u].xyz;
-    if (r2_setup.tv_moves_centres != 0u) sum.position += p.axes * (linear.xyz / p.scale);
+// Adds the gradient of what Gaussians add at points or along rays: sums of h times (c, 1), and times the squares and the mixed
+// products of what is told along their axes.
+void add_along_axes(vec4 linear, vec3 square, vec3 mixed, R2Gaussian g, R2Projection p, inout GaussianGradient sum) {
+    sum.position += p.axes * (linear.xyz / p.scale);
     sum.log_density += linear.w;
     sum.log_scale += square;
     mat3 second = mat3(square.x, mixed.x, mixed.y, mixed.x, square.y, mixed.z, mixed.y, mixed.z, square.z);
     mat3 d_axes;
     for (int k = 0; k < 3; k++) d_axes[k] = -(p.axes * (p.scale * second[k])) / p.scale[k];
     sum.rotation += rotation_gradient(g.rotation, d_axes);
+}
+
+// Adds the gradient of total variation.
+void add_voxels(uint i, R2Gaussian g, R2Projection p, inout GaussianGradient sum) {
+    vec4 linear = r2_voxel_moments[3u * i];
+    if (r2_setup.tv_moves_centres == 0u) linear.xyz = vec3(0.0);
+    add_along_axes(linear, r2_voxel_moments[3u * i + 1u].xyz, r2_voxel_moments[3u * i + 2u].xyz, g, p, sum);
+}
+
+// Adds the gradient of the picture; gives that by the centre's column and row.
+vec2 add_picture(uint i, R2Gaussian g, R2Projection p, GaussianView view, inout GaussianGradient sum) {
+    if (r2_setup.exact != 0u) {
+        vec4 linear = splat_moments[3u * i];
+        add_along_axes(linear, splat_moments[3u * i + 1u].xyz, splat_moments[3u * i + 2u].xyz, g, p, sum);
+        vec3 by_centre = p.axes * (linear.xyz / p.scale);
+        return p.depth * vec2(dot(view.du.xyz, by_centre), dot(view.dv.xyz, by_centre));
+    }
+    vec3 linear = splat_moments[2u * i].xyz;
+    sum = gradient_r2(g, p, view, linear, splat_moments[2u * i + 1u].xyz);
+    vec3 conic = p.splat.conic;
+    return vec2(dot(conic.xy, linear.yz), dot(conic.yz, linear.yz));
 }
 
 vec4 step_of(uint at, vec4 g, vec4 rate, R2Schedule now) {
@@ -56,12 +78,9 @@ void main() {
     GaussianView view = gaussian_views[r2_turns[gaussian_step * r2_setup.n_sets + g.set].image];
     R2Projection p = project_r2(g, view, gaussian_setup);
     GaussianGradient sum = no_gradient();
-    if (n_pixels(pixels_of(p.splat, gaussian_setup)) > 0u) {
-        vec3 linear = splat_moments[2u * i].xyz, square = splat_moments[2u * i + 1u].xyz;
-        sum = gradient_r2(g, p, view, linear, square);
+    if (n_pixels(pixels_of(splats[i], gaussian_setup)) > 0u) {
         vec2 half_image = 0.5 * vec2(float(gaussian_setup.width), float(gaussian_setup.height));
-        vec3 conic = p.splat.conic;
-        vec2 pull = half_image * vec2(dot(conic.xy, linear.yz), dot(conic.yz, linear.yz));
+        vec2 pull = half_image * add_picture(i, g, p, view, sum);
         r2_statistics[i] += vec2(length(pull), 1.0);
     }
     if (r2_setup.tv_weight > 0.0) add_voxels(i, g, p, sum);

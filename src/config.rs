@@ -183,6 +183,28 @@ impl Choice for R2Start {
     }
 }
 
+/// What a pixel sees of a Gaussian of R2-Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum R2Integral {
+    /// The line integral of the Gaussian's affine picture around its centre, as published.
+    #[default]
+    Affine,
+    /// The line integral along the pixel's own ray.
+    Exact,
+}
+
+impl Choice for R2Integral {
+    const ALL: &'static [R2Integral] = &[R2Integral::Affine, R2Integral::Exact];
+
+    fn name(self) -> &'static str {
+        match self {
+            R2Integral::Affine => "affine",
+            R2Integral::Exact => "exact",
+        }
+    }
+}
+
 /// What is corrected of the views' stated geometry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

@@ -120,7 +120,7 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     if config.gaussians_move() {
         match config.gaussians.form {
             GaussianForm::R2 => {
-                R2Kernels::new(gpu)?;
+                R2Kernels::new(gpu, config.r2.integral)?;
                 // Pictures are drawn by a stage of other fits.
                 Build::default().stage::<push::GaussianProject>(gpu)?;
             }

@@ -365,6 +365,7 @@ pub mod reference {
     pub mod occupancy;
     pub mod projector;
     pub mod r2;
+    pub mod r2_chords;
     pub mod sax;
     pub mod step;
     pub mod tree;

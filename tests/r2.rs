@@ -7,7 +7,7 @@ mod common;
 mod golden_file;
 
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
-use glam::DVec3;
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
@@ -21,17 +21,19 @@ use nertca_vk::plan::Plan;
 use nertca_vk::r2::data::R2Data;
 use nertca_vk::r2::densify::densified;
 use nertca_vk::r2::fdk::back_projection;
-use nertca_vk::r2::parameters::{ScaleBounds, round};
-use nertca_vk::r2::setup::turns;
+use nertca_vk::r2::parameters::{ScaleBounds, round, softplus};
+use nertca_vk::r2::setup::{gaussian_setup, turns};
 use nertca_vk::r2::start::first_rows;
 use nertca_vk::reference::gaussians::{N_PARAMS, Params};
 use nertca_vk::reference::r2::{self as reference, params};
+use nertca_vk::reference::r2_chords::Chords;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use nertca_vk::selftest::gaussians::{TENSORS, numbers, of_rows};
 use nertca_vk::selftest::r2::{compare, hard_case, small_config, twin};
 use nertca_vk::train::r2::R2Trainer;
 use nertca_vk::train::trainer::Trainer;
+use std::collections::BTreeSet;
 
 fn config(settings: &[&str]) -> Config {
     small_config(settings).unwrap()
@@ -50,11 +52,16 @@ fn with_sets(rows: &[R2Gaussian]) -> Vec<(Params, usize)> {
 
 #[test]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
+    for integral in ["r2.integral=affine", "r2.integral=exact"] {
+        expect_derivatives(&config(&["r2.tv_moves_centres=true", "r2.tv=3", "r2.tv_box=9", integral]));
+    }
+}
+
+fn expect_derivatives(config: &Config) {
     let gpu = gpu();
-    let config = config(&["r2.tv_moves_centres=true", "r2.tv=3", "r2.tv_box=9"]);
-    let (data, rows) = hard_case(&config).unwrap();
-    let fit = R2Trainer::with(&gpu, data, &config, &R2State::fresh(rows.clone()), 0).unwrap();
-    let shown = &turns(fit.data(), &config)[..fit.data().n_sets()];
+    let (data, rows) = hard_case(config).unwrap();
+    let fit = R2Trainer::with(&gpu, data, config, &R2State::fresh(rows.clone()), 0).unwrap();
+    let shown = &turns(fit.data(), config)[..fit.data().n_sets()];
     let mut all = with_sets(&rows);
     // Wide enough for several voxels; those that are far away or hardly there come last.
     all.iter_mut().for_each(|(p, _)| (4..7).for_each(|k| p[k] += 0.4));
@@ -98,6 +105,57 @@ fn the_gradient_of_ssim_is_its_derivative() {
         assert!((difference - want).abs() < 1e-7, "{p}: {difference} against {want}");
     }
     assert!((reference::picture_loss(&y, &y, width, 0.25).0).abs() < 1e-15);
+}
+
+/// Sums along rays, and the outline of what is nearer than the cut, of Gaussians long and short.
+#[test]
+fn exact_line_integrals_are_sums_along_rays() {
+    let config = config(&["r2.integral=exact"]);
+    let (data, rows) = hard_case(&config).unwrap();
+    let (setup, bounds) = (gaussian_setup(&data, &config), ScaleBounds::of(&config.r2));
+    let view = &data.views[0];
+    let mut compared = 0;
+    for g in [&rows[0], &rows[1], &rows[3], &rows[4]] {
+        let p = params(g);
+        let scale = DVec3::new(p[4], p[5], p[6]).map(|stored| bounds.scale(stored));
+        let axes = DMat3::from_quat(DQuat::from_xyzw(p[8], p[9], p[10], p[7]).normalize());
+        let whitened = |x: DVec3| axes.transpose() * x / scale;
+        let [centre, widest] = [DVec3::new(p[0], p[1], p[2]), DVec3::splat(scale.max_element())];
+        let seen = Chords::of(&p, view, &setup).unwrap();
+        let mut picture = vec![0.0; data.n_pixels()];
+        seen.splat(&setup, &mut picture);
+        let inside: BTreeSet<usize> = seen.pixels(&setup).map(|(pixel, _)| pixel).collect();
+        for pixel in 0..data.n_pixels() {
+            let ray = view.ray((pixel % data.width) as f64, (pixel / data.width) as f64);
+            let (a, b) = (whitened(view.source - centre), whitened(ray));
+            let middle = -a.dot(b) / b.length_squared();
+            let nearest = (a + middle * b).length();
+            assert!(inside.contains(&pixel) || nearest > f64::from(setup.cut), "{pixel} is left out");
+            if !inside.contains(&pixel) || !pixel.is_multiple_of(7) {
+                continue;
+            }
+            let steps = 4000;
+            let step = 16.0 * widest.x / f64::from(steps);
+            let at = |k: i32| a + (middle + step * f64::from(k - steps / 2)) * b;
+            let sum: f64 = (0..=steps).map(|k| f64::exp(-0.5 * at(k).length_squared())).sum();
+            let want = softplus(p[3]) * sum * step * ray.length();
+            assert!((picture[pixel] - want).abs() <= 1e-9 * softplus(p[3]), "{pixel}: {} {want}", picture[pixel]);
+            compared += 1;
+        }
+        // No wider than it must be: some ray along each side of the box is as near as the cut.
+        for (half, along) in [(seen.half_box.x, DVec2::X), (seen.half_box.y, DVec2::Y)] {
+            let side =
+                |sign: f64| (-4000..=4000).map(move |k| sign * half * along + f64::from(k) * 0.02 * along.perp());
+            let offsets = side(1.0).chain(side(-1.0));
+            let near = |d: DVec2| {
+                let (a, b) = (whitened(view.source - centre), whitened(view.ray(seen.mean.x + d.x, seen.mean.y + d.y)));
+                (a - a.dot(b) / b.length_squared() * b).length()
+            };
+            let least = offsets.map(near).fold(f64::INFINITY, f64::min);
+            assert!((least - f64::from(setup.cut)).abs() < 1e-3, "{least} at the box's side");
+        }
+    }
+    assert!(compared > 20, "{compared}");
 }
 
 /// Images of a C-arm, `(primary, secondary)` degrees each, all of one phase unless said otherwise.
@@ -146,8 +204,13 @@ fn data_of(dataset: &Dataset, config: &Config) -> R2Data {
 
 #[test]
 fn golden_values_of_pytorch() {
+    expect_golden("r2", "affine");
+    expect_golden("r2_exact", "exact");
+}
+
+fn expect_golden(file: &str, integral: &str) {
     let gpu = gpu();
-    let golden = Golden::open("r2", "tools/reference_r2.py");
+    let golden = Golden::open(file, "tools/reference_r2.py");
     let number = |key: &str| golden.case[key].as_f64().unwrap();
     let f32s = |name: &str| golden.get(name).iter().map(|v| *v as f32).collect::<Vec<f32>>();
     let angles = [0, 1].map(|v| [0, 1].map(|k| golden.case["angles"][v][k].as_f64().unwrap()));
@@ -160,6 +223,7 @@ fn golden_values_of_pytorch() {
         format!("r2.half_extent_mm={}", number("half_mm")),
         format!("r2.voxels={}", number("voxels")),
         format!("r2.tv_box={}", number("tv_box")),
+        format!("r2.integral={integral}"),
         "r2.tv_moves_centres=true".into(),
     ];
     let config = config(&settings.iter().map(String::as_str).collect::<Vec<_>>());

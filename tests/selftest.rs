@@ -89,6 +89,8 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("r2_voxel_tv", sum_for_product, r2::compare),
         fault("r2_voxel_moments", wrong_sign, r2::compare),
         fault("r2_update", wrong_sign, r2::compare),
+        fault("r2_chord_splat", wrong_sign, r2::compare),
+        fault("r2_chord_moments", wrong_sign, r2::compare),
         fault("x_project", wrong_sign, x_gaussian::compare),
         fault("x_sort_count", other_digits, x_gaussian::compare),
         fault("x_sort_scan", differences, x_gaussian::compare),

@@ -173,7 +173,7 @@ def main():
     value = loss(seen, bounds)
     value.backward()
     tensors = {f"start/{k}": v.numpy() for k, v in start.items()}
-    tensors |= {f"gradient/{k}": v.grad.numpy() for k, v in p.items()}
+    tensors |= {f"gradient/{k}": v.grad.clone().numpy() for k, v in p.items()}
     tensors["loss"] = np.array([float(value)])
     for (view, phase), (low, high, weight) in bounds.items():
         key = f"{view}/{phase}"

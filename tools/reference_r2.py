@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Golden values of R2-Gaussian's fit from an independent PyTorch float64 implementation.
 
-Writes tests/golden/r2.safetensors: two images, Gaussians as they are stored, and what follows from them: picture, the three
-terms of the loss, all gradients, and the parameters after ten Adam updates that see the images in turn. Nothing here is shared
-with the engine: pictures come from 3 x 3 matrices in the camera's frame, SSIM from conv2d, total variation from a grid of
-voxels, gradients from autograd, updates from torch.optim.Adam.
+Writes tests/golden/r2.safetensors, and r2_exact.safetensors with exact line integrals: two images, Gaussians as they are stored, and
+what follows from them: picture, the three terms of the loss, all gradients, and the parameters after ten Adam updates that see the
+images in turn. Nothing here is shared with the engine: pictures come from 3 x 3 matrices in the camera's frame, SSIM from conv2d,
+total variation from a grid of voxels, gradients from autograd, updates from torch.optim.Adam.
 
     python3 tools/reference_r2.py [--out tests/golden]      (needs torch and numpy)
 """
@@ -86,6 +86,53 @@ def picture(p, angles):
     return total
 
 
+def half_box(t, covariance, mean, focal):
+    """Largest distances of a column and a row from the centre's whose plane with the source touches the ellipsoid at 3 deviations."""
+    half = []
+    for k in range(2):
+        # Planes focal x - (u - middle) z = 0, of which that through the centre has u = mean.
+        middle = ((W if k == 0 else H) - 1) / 2
+        through = np.zeros(3)
+        through[k], through[2] = focal[k], -(mean[k] - middle)
+        turn = np.array([0.0, 0.0, -1.0])
+        a, b, c = (9 * v @ covariance @ w for v, w in [(through, through), (through, turn), (turn, turn)])
+        half.append(np.abs(np.roots([t[2] ** 2 - c, -2 * b, -a])).max())
+    return half
+
+
+def exact_picture(p, angles):
+    """Each pixel's own ray past each Gaussian, in closed form; for each Gaussian one ray is held against a sum along it."""
+    camera = Camera(angles)
+    rows, columns = torch.meshgrid(torch.arange(H).double(), torch.arange(W).double(), indexing="ij")
+    fu, fv = camera.focal
+    d = torch.stack([(columns - (W - 1) / 2) / fu, (rows - (H - 1) / 2) / fv, torch.ones(H, W)], -1)
+    covariance = camera.r.T @ covariances(p) @ camera.r
+    t = p["position"] @ camera.r + torch.tensor([0.0, 0.0, camera.sod])
+    density = torch.nn.functional.softplus(p["density"])
+    total = torch.zeros(H, W)
+    for i in range(len(density)):
+        inverse = torch.linalg.inv(covariance[i])
+        dd = torch.einsum("hwj,jk,hwk->hw", d, inverse, d)
+        dt = torch.einsum("hwj,jk,k->hw", d, inverse, t[i])
+        nearest = t[i] @ inverse @ t[i] - dt**2 / dd
+        value = density[i] * d.norm(dim=-1) * torch.sqrt(2 * math.pi / dd) * torch.exp(-0.5 * nearest)
+        mean = [(f * t[i, k] / t[i, 2] + (n - 1) / 2).item() for k, (f, n) in enumerate([(fu, W), (fv, H)])]
+        half = half_box(t[i].detach().numpy(), covariance[i].detach().numpy(), mean, camera.focal)
+        inside = ((columns - mean[0]).abs() <= half[0]) & ((rows - mean[1]).abs() <= half[1])
+        total = total + torch.where(inside, value, torch.zeros(()))
+        check_along_ray(d[i % H, i % W], t[i], inverse, density[i], value[i % H, i % W])
+    return total
+
+
+@torch.no_grad()
+def check_along_ray(d, t, inverse, density, value):
+    reach = 10 * 2 * CASE["greatest_scale"]
+    depths = torch.linspace(t[2].item() - reach, t[2].item() + reach, 400_001)
+    x = depths[:, None] * d - t
+    total = (density * torch.exp(-0.5 * torch.einsum("sj,jk,sk->s", x, inverse, x))).sum() * (depths[1] - depths[0]) * d.norm()
+    assert abs(total - value) <= 1e-9 * density, (total, value)
+
+
 def ssim(x, y):
     g = torch.exp(-torch.arange(-5, 6).double() ** 2 / (2 * 1.5**2))
     window = torch.outer(g, g)[None, None] / g.sum() ** 2
@@ -116,8 +163,8 @@ def variation(v):
     return (v.diff(dim=0).abs().sum() + v.diff(dim=1).abs().sum() + v.diff(dim=2).abs().sum()) / (3 * (n - 1) * n * n)
 
 
-def terms(p, y, angles, corner):
-    x = picture(p, angles)
+def terms(see, p, y, angles, corner):
+    x = see(p, angles)
     return (x - y).abs().mean(), CASE["ssim"] * (1 - ssim(x, y)), CASE["tv"] * variation(voxels(p, corner)), x
 
 
@@ -125,6 +172,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", default="tests/golden", type=pathlib.Path)
     out = parser.parse_args().out
+    for name, see in [("r2", picture), ("r2_exact", exact_picture)]:
+        write(out / f"{name}.safetensors", golden(see), {"case": json.dumps(CASE)})
+
+
+def golden(see):
     rng = np.random.default_rng(11)
     n = CASE["gaussians"]
     f32 = lambda a: torch.tensor(np.asarray(a, np.float32).astype(np.float64))
@@ -140,10 +192,10 @@ def main():
     room = 2 - 2.0 / CASE["voxels"] * CASE["tv_box"]
     corners = f32(0.6 * (rng.uniform(0, room, (len(shown), 3)) - room / 2) - CASE["tv_box"] / CASE["voxels"])
     p = {k: torch.nn.Parameter(v.clone()) for k, v in start.items()}
-    parts = terms(p, images[shown[0]], CASE["angles"][shown[0]], corners[0])
+    parts = terms(see, p, images[shown[0]], CASE["angles"][shown[0]], corners[0])
     sum(parts[:3]).backward()
     tensors = {f"start/{k}": v.numpy() for k, v in start.items()}
-    tensors |= {f"gradient/{k}": v.grad.numpy() for k, v in p.items()}
+    tensors |= {f"gradient/{k}": v.grad.clone().numpy() for k, v in p.items()}
     tensors |= {f"image/{k}": image.numpy() for k, image in enumerate(images)}
     tensors["corner"] = corners.numpy()
     tensors["terms"] = np.array([part.item() for part in parts[:3]])
@@ -156,10 +208,9 @@ def main():
             group["lr"] = first * (last / first) ** ((step + 1) / CASE["iterations"])
         adam.zero_grad()
         image = shown[step]
-        sum(terms(p, images[image], CASE["angles"][image], corners[step])[:3]).backward()
+        sum(terms(see, p, images[image], CASE["angles"][image], corners[step])[:3]).backward()
         adam.step()
-    tensors |= {f"final/{k}": v.detach().numpy() for k, v in p.items()}
-    write(out / "r2.safetensors", tensors, {"case": json.dumps(CASE)})
+    return tensors | {f"final/{k}": v.detach().numpy() for k, v in p.items()}
 
 
 if __name__ == "__main__":

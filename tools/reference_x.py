@@ -130,7 +130,7 @@ def main():
     parts = terms(p, images[shown[0]], CASE["angles"][shown[0]])
     sum(parts[:2]).backward()
     tensors = {f"start/{k}": v.numpy() for k, v in start.items()}
-    tensors |= {f"gradient/{k}": v.grad.numpy() for k, v in p.items()}
+    tensors |= {f"gradient/{k}": v.grad.clone().numpy() for k, v in p.items()}
     tensors |= {f"image/{k}": image.numpy() for k, image in enumerate(images)}
     tensors["terms"] = np.array([part.item() for part in parts[:2]])
     tensors["picture"] = parts[2].detach().numpy()

@@ -19,6 +19,7 @@ struct R2Setup {
     float ssim_weight;          // weight of 1 - SSIM
     float tv_weight;            // weight of total variation
     uint tv_moves_centres;      // 1: the gradient of total variation moves Gaussians, too
+    uint exact;                 // 1: line integrals are those along pixels' own rays, not of the affine picture
 };
 
 // One row per iteration.

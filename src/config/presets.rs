@@ -5,7 +5,8 @@ use crate::config::sections::{
     Tree, X,
 };
 use crate::config::{
-    CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, GaussianForm, Preset, R2Start, StaticData, StaticForm,
+    CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, GaussianForm, Preset, R2Integral, R2Start, StaticData,
+    StaticForm,
 };
 
 impl Config {
@@ -235,6 +236,7 @@ pub(super) fn r2() -> R2 {
     R2 {
         static_data: StaticData::PerPhase,
         init: R2Start::Fdk,
+        integral: R2Integral::Affine,
         normalise: true,
         half_extent_mm: 0.0,
         voxels: 256,

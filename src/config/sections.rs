@@ -1,6 +1,8 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
-use crate::config::{CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, R2Start, StaticData, StaticForm};
+use crate::config::{
+    CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, R2Integral, R2Start, StaticData, StaticForm,
+};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -361,6 +363,9 @@ section! {
         static_data: StaticData,
         /// Where the fit begins: "fdk" (at voxels of a filtered back-projection) or "random".
         init: R2Start,
+        /// What a pixel sees of a Gaussian: "affine" (as published: exact for the Gaussian's affine picture around its centre) or
+        /// "exact" (along the pixel's own ray).
+        #[serde(default)] integral: R2Integral,
         /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities are near 1.
         normalise: bool,
         /// Half side of the volume, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is

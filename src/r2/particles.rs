@@ -24,7 +24,7 @@ buffer_set! {
         splats,
         /// Picture that each splat belongs to.
         image_of_splat,
-        /// What the gradient needs of each splat's pixels, two vec4.
+        /// What the gradient needs of each splat's pixels, two vec4, or three where line integrals are exact.
         splat_moments,
         /// What the gradient needs of the voxels near each Gaussian, three vec4.
         r2_voxel_moments,
@@ -47,7 +47,7 @@ impl R2ParticleBuffers {
             r2_statistics: gpu.buffer_with("r2_statistics", &state.statistics)?,
             splats: new(Binding::splats, size_of::<Splat>() as u64 * n)?,
             image_of_splat: new(Binding::image_of_splat, 4 * n)?,
-            splat_moments: new(Binding::splat_moments, 32 * n)?,
+            splat_moments: new(Binding::splat_moments, 48 * n)?,
             r2_voxel_moments: new(Binding::r2_voxel_moments, 48 * n)?,
         })
     }

@@ -1,7 +1,7 @@
 //! Constants, rates and turns of a fit as R2-Gaussian does it.
 
-use crate::config::Config;
 use crate::config::sections::R2;
+use crate::config::{Config, R2Integral};
 use crate::gaussians::stages::RING_LENGTH;
 use crate::kernels::layout::{GaussianSetup, R2Schedule, R2Setup, R2Turn};
 use crate::r2::data::R2Data;
@@ -53,6 +53,7 @@ pub fn r2_setup(data: &R2Data, settings: &R2) -> R2Setup {
         ssim_weight: settings.ssim as f32,
         tv_weight: settings.tv as f32,
         tv_moves_centres: u32::from(settings.tv_moves_centres),
+        exact: u32::from(settings.integral == R2Integral::Exact),
     }
 }
 

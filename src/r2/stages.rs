@@ -2,7 +2,10 @@
 //!
 //! r2_project -> gaussian_splat -> ssim_rows -> ssim_columns -> ssim_rows_back -> r2_residual -> gaussian_moments ->
 //! r2_voxel_splat -> r2_voxel_tv -> r2_voxel_moments -> r2_update -> gaussian_report
+//!
+//! Where line integrals are exact, r2_chord_splat and r2_chord_moments take the places of gaussian_splat and gaussian_moments.
 
+use crate::config::R2Integral;
 use crate::error::Result;
 use crate::gaussians::stages::SplatStage;
 use crate::gpu::device::Gpu;
@@ -13,12 +16,43 @@ use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::r2::particles::R2ParticleBuffers;
 
+/// Pipelines that ask what pixels see of Gaussians.
+pub enum R2PictureKernels {
+    /// [`R2Integral::Affine`].
+    Affine {
+        /// Pictures.
+        splat: SplatStage<push::GaussianSplat>,
+        /// What gradients need of them.
+        moments: SplatStage<push::GaussianMoments>,
+    },
+    /// [`R2Integral::Exact`].
+    Exact {
+        /// Pictures.
+        splat: SplatStage<push::R2ChordSplat>,
+        /// What gradients need of them.
+        moments: SplatStage<push::R2ChordMoments>,
+    },
+}
+
+impl R2PictureKernels {
+    fn new(gpu: &Gpu, integral: R2Integral) -> Result<R2PictureKernels> {
+        Ok(match integral {
+            R2Integral::Affine => {
+                R2PictureKernels::Affine { splat: SplatStage::new(gpu)?, moments: SplatStage::new(gpu)? }
+            }
+            R2Integral::Exact => {
+                R2PictureKernels::Exact { splat: SplatStage::new(gpu)?, moments: SplatStage::new(gpu)? }
+            }
+        })
+    }
+}
+
 /// Pipelines of a fit.
 pub struct R2Kernels {
     /// How each Gaussian is seen.
     pub project: Stage<push::R2Project>,
-    /// Pictures.
-    pub splat: SplatStage<push::GaussianSplat>,
+    /// Pictures, and what gradients need of them.
+    pub pictures: R2PictureKernels,
     /// SSIM, first pass.
     pub ssim_rows: Stage<push::SsimRows>,
     /// SSIM, second pass, and losses.
@@ -27,8 +61,6 @@ pub struct R2Kernels {
     pub ssim_rows_back: Stage<push::SsimRowsBack>,
     /// SSIM's gradient, second pass, and that of the loss.
     pub residual: Stage<push::R2Residual>,
-    /// What gradients need of the pictures.
-    pub moments: SplatStage<push::GaussianMoments>,
     /// Attenuation at the boxes' voxels.
     pub voxel_splat: SplatStage<push::R2VoxelSplat>,
     /// Total variation.
@@ -46,17 +78,16 @@ impl R2Kernels {
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn new(gpu: &Gpu) -> Result<R2Kernels> {
+    pub fn new(gpu: &Gpu, integral: R2Integral) -> Result<R2Kernels> {
         let plain = Build::default();
         let exchanges = Build { exchanges: true, ..plain };
         Ok(R2Kernels {
             project: plain.stage(gpu)?,
-            splat: SplatStage::new(gpu)?,
+            pictures: R2PictureKernels::new(gpu, integral)?,
             ssim_rows: plain.stage(gpu)?,
             ssim_columns: exchanges.stage(gpu)?,
             ssim_rows_back: plain.stage(gpu)?,
             residual: plain.stage(gpu)?,
-            moments: SplatStage::new(gpu)?,
             voxel_splat: SplatStage::new(gpu)?,
             voxel_tv: exchanges.stage(gpu)?,
             voxel_moments: SplatStage::new(gpu)?,
@@ -152,7 +183,14 @@ impl R2Pass<'_> {
         let (kernels, n) = (self.kernels, self.n);
         self.recording.fill(&self.buffers.splat_images, 0);
         self.run(&kernels.project, kernels.project.groups_over(n), push::R2Project { n_gaussians: n })?;
-        self.run(&kernels.splat.stage, kernels.splat.groups_for(n), push::GaussianSplat { n_splats: n })
+        match &kernels.pictures {
+            R2PictureKernels::Affine { splat, .. } => {
+                self.run(&splat.stage, splat.groups_for(n), push::GaussianSplat { n_splats: n })
+            }
+            R2PictureKernels::Exact { splat, .. } => {
+                self.run(&splat.stage, splat.groups_for(n), push::R2ChordSplat { n_gaussians: n })
+            }
+        }
     }
 
     /// Records the loss of the pictures, its gradient, and what gradients of Gaussians need of that.
@@ -162,7 +200,14 @@ impl R2Pass<'_> {
         self.run(&kernels.ssim_columns, self.pixels(&kernels.ssim_columns), push::SsimColumns {})?;
         self.run(&kernels.ssim_rows_back, self.pixels(&kernels.ssim_rows_back), push::SsimRowsBack {})?;
         self.run(&kernels.residual, self.pixels(&kernels.residual), push::R2Residual {})?;
-        self.run(&kernels.moments.stage, kernels.moments.groups_for(n), push::GaussianMoments { n_splats: n })
+        match &kernels.pictures {
+            R2PictureKernels::Affine { moments, .. } => {
+                self.run(&moments.stage, moments.groups_for(n), push::GaussianMoments { n_splats: n })
+            }
+            R2PictureKernels::Exact { moments, .. } => {
+                self.run(&moments.stage, moments.groups_for(n), push::R2ChordMoments { n_gaussians: n })
+            }
+        }
     }
 
     /// Records the total variation of this iteration's boxes, and what gradients need of it.

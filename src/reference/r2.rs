@@ -4,6 +4,7 @@ use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Schedule, R2Setup};
 use crate::r2::parameters::{ScaleBounds, softplus};
 use crate::reference::gaussians::{N_PARAMS, Params, axes, rotation_gradient};
+use crate::reference::r2_chords::{self, Chords};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
 /// Where slopes end to follow the centre, half images from the image's middle.
@@ -21,7 +22,7 @@ pub fn params(g: &R2Gaussian) -> Params {
     out
 }
 
-fn position(p: &Params) -> DVec3 {
+pub(super) fn position(p: &Params) -> DVec3 {
     DVec3::new(p[0], p[1], p[2])
 }
 
@@ -29,7 +30,7 @@ fn bounds(setup: &GaussianSetup) -> ScaleBounds {
     ScaleBounds { least: setup.least_scale.into(), greatest: setup.greatest_scale.into() }
 }
 
-fn scale(p: &Params, setup: &GaussianSetup) -> DVec3 {
+pub(super) fn scale(p: &Params, setup: &GaussianSetup) -> DVec3 {
     DVec3::new(p[4], p[5], p[6]).map(|stored| bounds(setup).scale(stored))
 }
 
@@ -104,17 +105,25 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Pr
     })
 }
 
+/// Index and offset from the middle of every pixel of a box with these half sides.
+pub(super) fn pixels_within(
+    middle: DVec2,
+    half: DVec2,
+    setup: &GaussianSetup,
+) -> impl Iterator<Item = (usize, DVec2)> + use<> {
+    let (width, height) = (i64::from(setup.width), i64::from(setup.height));
+    let (first, last) = ((middle - half).ceil(), (middle + half).floor());
+    let along = |first: f64, last: f64, n: i64| first.max(0.0) as i64..(last.max(-1.0) as i64 + 1).min(n);
+    let (columns, rows) = (along(first.x, last.x, width), along(first.y, last.y, height));
+    rows.flat_map(move |y| {
+        columns.clone().map(move |x| ((y * width + x) as usize, DVec2::new(x as f64, y as f64) - middle))
+    })
+}
+
 impl Projection {
     /// Index and offset from the centre of every pixel of the square.
     pub fn pixels(&self, setup: &GaussianSetup) -> impl Iterator<Item = (usize, DVec2)> + use<> {
-        let (width, height) = (i64::from(setup.width), i64::from(setup.height));
-        let mean = self.mean;
-        let (first, last) = ((mean - self.radius).ceil(), (mean + self.radius).floor());
-        let along = |first: f64, last: f64, n: i64| first.max(0.0) as i64..(last.max(-1.0) as i64 + 1).min(n);
-        let (columns, rows) = (along(first.x, last.x, width), along(first.y, last.y, height));
-        rows.flat_map(move |y| {
-            columns.clone().map(move |x| ((y * width + x) as usize, DVec2::new(x as f64, y as f64) - mean))
-        })
+        pixels_within(self.mean, DVec2::splat(self.radius), setup)
     }
 
     fn value(&self, d: DVec2) -> f64 {
@@ -312,15 +321,95 @@ impl VoxelBox<'_> {
 
     /// Gradient by position, the logarithms of density and scales, and the quaternion, from these moments. Centres are
     /// left where they are unless the setting says otherwise.
-    pub fn gradient(&self, p: &Params, [h, x, y, z, xx, yy, zz, xy, xz, yz]: [f64; 10]) -> Params {
-        let (axes, scale) = (axes(p), scale(p, self.setup));
-        let moves = if self.r2.tv_moves_centres != 0 { 1.0 } else { 0.0 };
-        let d_position = moves * (axes * (DVec3::new(x, y, z) / scale));
-        let second = [DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz)];
-        let column = |k: usize| -(axes * (scale * second[k])) / scale[k];
-        let d_rotation = rotation_gradient(p, DMat3::from_cols(column(0), column(1), column(2)));
-        together(d_position, h, DVec3::new(xx, yy, zz), d_rotation)
+    pub fn gradient(&self, p: &Params, moments: [f64; 10]) -> Params {
+        let mut sum = along_axes_gradient(p, self.setup, moments);
+        if self.r2.tv_moves_centres == 0 {
+            sum[..3].fill(0.0);
+        }
+        sum
     }
+}
+
+/// Gradient by position, the logarithms of density and scales, and the quaternion, from sums of h, h times a way along the axes, and h
+/// times products of ways along them.
+pub(super) fn along_axes_gradient(
+    p: &Params,
+    setup: &GaussianSetup,
+    [h, x, y, z, xx, yy, zz, xy, xz, yz]: [f64; 10],
+) -> Params {
+    let (axes, scale) = (axes(p), scale(p, setup));
+    let d_position = axes * (DVec3::new(x, y, z) / scale);
+    let second = [DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz)];
+    let column = |k: usize| -(axes * (scale * second[k])) / scale[k];
+    let d_rotation = rotation_gradient(p, DMat3::from_cols(column(0), column(1), column(2)));
+    together(d_position, h, DVec3::new(xx, yy, zz), d_rotation)
+}
+
+/// What a view sees of a Gaussian, by either kind of line integral.
+#[derive(Debug, Clone)]
+pub enum Sight {
+    /// Its affine picture.
+    Affine(Projection),
+    /// Pixels' own rays past it.
+    Exact(Chords),
+}
+
+impl Sight {
+    /// How a view sees a Gaussian; `None` behind the source.
+    pub fn of(p: &Params, view: &SplatView, setup: &GaussianSetup, r2: &R2Setup) -> Option<Sight> {
+        match r2.exact {
+            0 => project(p, view, setup).map(Sight::Affine),
+            _ => Chords::of(p, view, setup).map(Sight::Exact),
+        }
+    }
+
+    /// Index and offset from the centre of every pixel of its box.
+    pub fn pixels(&self, setup: &GaussianSetup) -> Box<dyn Iterator<Item = (usize, DVec2)>> {
+        match self {
+            Sight::Affine(seen) => Box::new(seen.pixels(setup)),
+            Sight::Exact(seen) => Box::new(seen.pixels(setup)),
+        }
+    }
+
+    /// Adds the Gaussian to a picture.
+    pub fn splat(&self, setup: &GaussianSetup, picture: &mut [f64]) {
+        match self {
+            Sight::Affine(seen) => seen.splat(setup, picture),
+            Sight::Exact(seen) => seen.splat(setup, picture),
+        }
+    }
+
+    /// [`Projection::moments`] and four zeros, or [`Chords::moments`].
+    pub fn moments(&self, setup: &GaussianSetup, gradient: &[f64]) -> [f64; 10] {
+        match self {
+            Sight::Affine(seen) => {
+                let [h, u, v, uu, uv, vv] = seen.moments(setup, gradient);
+                [h, u, v, uu, uv, vv, 0.0, 0.0, 0.0, 0.0]
+            }
+            Sight::Exact(seen) => seen.moments(setup, gradient),
+        }
+    }
+
+    /// Gradient by position, the logarithms of density and scales, and the quaternion, from these moments.
+    pub fn gradient(&self, p: &Params, view: &SplatView, setup: &GaussianSetup, moments: [f64; 10]) -> Params {
+        match self {
+            Sight::Affine(_) => gradient(p, view, setup, plane(moments)),
+            Sight::Exact(_) => r2_chords::gradient(p, setup, moments),
+        }
+    }
+
+    /// Length of the gradient by the centre in the image, in half images.
+    pub fn pull(&self, setup: &GaussianSetup, moments: [f64; 10]) -> f64 {
+        match self {
+            Sight::Affine(seen) => seen.pull(setup, plane(moments)),
+            Sight::Exact(seen) => seen.pull(setup, moments),
+        }
+    }
+}
+
+/// The moments of an affine picture.
+fn plane([h, u, v, uu, uv, vv, ..]: [f64; 10]) -> [f64; 6] {
+    [h, u, v, uu, uv, vv]
 }
 
 /// Adam's state of one Gaussian.

@@ -13,7 +13,7 @@ use crate::r2::data::R2Data;
 use crate::r2::setup::{schedule, turns};
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::gaussians::{N_PARAMS, Params};
-use crate::reference::r2::{self as reference, AdamState, Projection, VoxelBox, params};
+use crate::reference::r2::{self as reference, AdamState, Projection, Sight, VoxelBox, params};
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::gaussians::{TENSORS, f32s, numbers, of_rows};
 use crate::selftest::problems::small_dataset;
@@ -27,6 +27,8 @@ const SSIM_COLUMNS: &[&str] = &[push::SsimColumns::SHADER];
 const SSIM_ROWS_BACK: &[&str] = &[push::SsimRowsBack::SHADER];
 const RESIDUAL: &[&str] = &[push::R2Residual::SHADER];
 const MOMENTS: &[&str] = &[push::GaussianMoments::SHADER];
+const CHORD_SPLAT: &[&str] = &[push::R2ChordSplat::SHADER];
+const CHORD_MOMENTS: &[&str] = &[push::R2ChordMoments::SHADER];
 const VOXEL_SPLAT: &[&str] = &[push::R2VoxelSplat::SHADER];
 const VOXEL_TV: &[&str] = &[push::R2VoxelTv::SHADER];
 const VOXEL_MOMENTS: &[&str] = &[push::R2VoxelMoments::SHADER];
@@ -115,18 +117,18 @@ impl<'a> Turn<'a> {
         self.data.images[self.image * n..][..n].iter().map(|v| f64::from(*v)).collect()
     }
 
-    fn project(&self, p: &Params) -> Option<Projection> {
-        reference::project(p, &self.data.views[self.image], self.voxels.setup)
+    fn see(&self, p: &Params) -> Option<Sight> {
+        Sight::of(p, &self.data.views[self.image], self.voxels.setup, self.voxels.r2)
     }
 
     /// Gradient of what is stored from moments in the view and in the box, and how the image pulls, where it sees the
     /// Gaussian.
-    fn gradient(&self, p: &Params, of_picture: [f64; 6], of_voxels: [f64; 10]) -> (Params, Option<f64>) {
+    fn gradient(&self, p: &Params, of_picture: [f64; 10], of_voxels: [f64; 10]) -> (Params, Option<f64>) {
         let setup = self.voxels.setup;
-        let seen = self.project(p).filter(|seen| seen.pixels(setup).next().is_some());
+        let seen = self.see(p).filter(|seen| seen.pixels(setup).next().is_some());
         let mut sum = self.voxels.gradient(p, of_voxels);
         let pull = seen.map(|seen| {
-            let one = reference::gradient(p, &self.data.views[self.image], setup, of_picture);
+            let one = seen.gradient(p, &self.data.views[self.image], setup, of_picture);
             sum.iter_mut().zip(one).for_each(|(sum, g)| *sum += g);
             seen.pull(setup, of_picture)
         });
@@ -147,14 +149,14 @@ pub fn twin(
         let turn = Turn::new(data, setups, turn);
         let (mut picture, mut voxels) = (vec![0.0; data.n_pixels()], vec![0.0; turn.voxels.len()]);
         for (p, _) in all.iter().filter(|(_, of)| *of == set) {
-            turn.project(p).inspect(|seen| seen.splat(setup, &mut picture));
+            turn.see(p).inspect(|seen| seen.splat(setup, &mut picture));
             turn.voxels.splat(p, &mut voxels);
         }
         let (loss, by_pixel) = reference::picture_loss(&picture, &turn.target(), data.width, r2.ssim_weight.into());
         let (variation, by_voxel) = turn.voxels.variation(&voxels);
         total += loss + variation;
         for (at, (p, _)) in all.iter().enumerate().filter(|(_, (_, of))| *of == set) {
-            let moments = turn.project(p).map_or([0.0; 6], |seen| seen.moments(setup, &by_pixel));
+            let moments = turn.see(p).map_or([0.0; 10], |seen| seen.moments(setup, &by_pixel));
             gradients[at] = turn.gradient(p, moments, turn.voxels.moments(p, &by_voxel)).0;
         }
     }
@@ -166,11 +168,12 @@ pub fn twin(
 /// # Errors
 /// Device errors.
 pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
-    for (case, settings) in [
-        ("77 Gaussians of 3 phases, 33 x 27 pixels", &["r2.tv_moves_centres=true"][..]),
-        ("77 Gaussians, all phases together", &["r2.static_data=pooled", "r2.tv=0.7"]),
+    for (path, case, settings) in [
+        ("r2", "77 Gaussians of 3 phases, 33 x 27 pixels", &["r2.tv_moves_centres=true"][..]),
+        ("r2", "77 Gaussians, all phases together", &["r2.static_data=pooled", "r2.tv=0.7"]),
+        ("r2 exact", "77 Gaussians of 3 phases, 33 x 27 pixels", &["r2.integral=exact"]),
     ] {
-        findings.begin("r2", case);
+        findings.begin(path, case);
         let config = small_config(settings)?;
         let (data, rows) = hard_case(&config)?;
         let fit = R2Trainer::with(gpu, data, &config, &R2State::fresh(rows.clone()), 0)?;
@@ -200,7 +203,7 @@ impl Iteration<'_> {
             .map(|turn| Turn::new(self.fit.data(), self.fit.setups(), turn))
             .collect();
         let all: Vec<(Params, usize)> = self.rows.iter().map(|g| (params(g), g.set as usize)).collect();
-        let seen: Vec<Option<Projection>> = all.iter().map(|(p, set)| shown[*set].project(p)).collect();
+        let seen: Vec<Option<Sight>> = all.iter().map(|(p, set)| shown[*set].see(p)).collect();
         self.compare_splats(&seen, findings)?;
         let of_pictures = self.compare_pictures(&shown, &all, &seen, findings)?;
         let (of_voxels, variation) = self.compare_voxels(&shown, &all, findings)?;
@@ -212,7 +215,7 @@ impl Iteration<'_> {
         Ok(())
     }
 
-    fn compare_splats(&self, seen: &[Option<Projection>], findings: &mut Findings) -> Result<()> {
+    fn compare_splats(&self, seen: &[Option<Sight>], findings: &mut Findings) -> Result<()> {
         let (particles, setup) = (self.fit.particles(), self.fit.setups().0);
         let splats: Vec<Splat> = self.gpu.download(&particles.splats, 0, seen.len())?;
         let pictures: Vec<i32> = self.gpu.download(&particles.image_of_splat, 0, seen.len())?;
@@ -238,7 +241,7 @@ impl Iteration<'_> {
         &self,
         shown: &[Turn<'_>],
         all: &[(Params, usize)],
-        seen: &[Option<Projection>],
+        seen: &[Option<Sight>],
         findings: &mut Findings,
     ) -> Result<OfPictures> {
         let (buffers, data, (setup, r2)) = (self.fit.buffers(), self.fit.data(), self.fit.setups());
@@ -249,7 +252,7 @@ impl Iteration<'_> {
         let factors: Vec<[f32; 4]> = self.gpu.download(&buffers.ssim_factors, 0, shown.len() * stride)?;
         let row_factors: Vec<[f32; 4]> = self.gpu.download(&buffers.ssim_row_factors, 0, shown.len() * stride)?;
         let slopes = self.floats(&buffers.splat_image_gradient, shown.len() * stride)?;
-        let mut of = OfPictures { loss: 0.0, moments: vec![[0.0; 6]; all.len()] };
+        let mut of = OfPictures { loss: 0.0, moments: vec![[0.0; 10]; all.len()] };
         for (set, turn) in shown.iter().enumerate() {
             let here = set * stride..set * stride + n;
             let picture: Vec<f64> =
@@ -257,7 +260,8 @@ impl Iteration<'_> {
             let mut want = vec![0.0; n];
             let own = all.iter().zip(seen).filter(|((_, of), _)| *of == set);
             own.filter_map(|(_, seen)| seen.as_ref()).for_each(|seen| seen.splat(setup, &mut want));
-            findings.numbers(SPLAT, "pictures", &f32s(&picture), &want, NUMBERS);
+            let stage = if r2.exact == 0 { SPLAT } else { CHORD_SPLAT };
+            findings.numbers(stage, "pictures", &f32s(&picture), &want, NUMBERS);
             let (x, y) = (&picture, &turn.target());
             let times = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<f64>>();
             for (k, image) in [x.clone(), y.clone(), times(x, x), times(y, y)].iter().enumerate() {
@@ -283,15 +287,21 @@ impl Iteration<'_> {
             findings.numbers(RESIDUAL, "gradient of the pictures", got, &want, NUMBERS);
             let by_pixel: Vec<f64> = got.iter().map(|v| f64::from(*v)).collect();
             for (i, ((_, _), seen)) in all.iter().zip(seen).enumerate().filter(|(_, ((_, of), _))| *of == set) {
-                of.moments[i] = seen.as_ref().map_or([0.0; 6], |seen| seen.moments(setup, &by_pixel));
+                of.moments[i] = seen.as_ref().map_or([0.0; 10], |seen| seen.moments(setup, &by_pixel));
             }
         }
-        let got: Vec<[f32; 8]> = self.gpu.download(&self.fit.particles().splat_moments, 0, all.len())?;
-        let got: Vec<[f32; 6]> = got.iter().map(|r| [0, 1, 2, 4, 5, 6].map(|k| r[k])).collect();
-        for (range, name) in [(0..1, "sums of h"), (1..3, "sums of h d"), (3..6, "sums of h d d")] {
+        let got = self.picture_moments(all.len())?;
+        let (stage, names) = match r2.exact {
+            0 => (MOMENTS, &[(0..1, "sums of h"), (1..3, "sums of h d"), (3..6, "sums of h d d")][..]),
+            _ => (
+                CHORD_MOMENTS,
+                &[(0..1, "sums of h"), (1..4, "sums of h c"), (4..7, "sums of squares"), (7..10, "mixed")][..],
+            ),
+        };
+        for (range, name) in names {
             let device: Vec<f32> = got.iter().flat_map(|m| m[range.clone()].to_vec()).collect();
             let want: Vec<f64> = of.moments.iter().flat_map(|m| m[range.clone()].to_vec()).collect();
-            findings.numbers(MOMENTS, name, &device, &want, NUMBERS);
+            findings.numbers(stage, name, &device, &want, NUMBERS);
         }
         of.moments = got.iter().map(|m| m.map(f64::from)).collect();
         Ok(of)
@@ -324,14 +334,29 @@ impl Iteration<'_> {
                 want_moments[i] = turn.voxels.moments(p, &by_voxel);
             }
         }
-        let got: Vec<[f32; 12]> = self.gpu.download(&self.fit.particles().r2_voxel_moments, 0, all.len())?;
-        let got: Vec<[f32; 10]> = got.iter().map(|r| [3, 0, 1, 2, 4, 5, 6, 8, 9, 10].map(|k| r[k])).collect();
+        let got = self.moments_along_axes(&self.fit.particles().r2_voxel_moments, all.len())?;
         for (range, name) in [(0..1, "sums of h"), (1..4, "sums of h c"), (4..7, "sums of h c^2"), (7..10, "mixed")] {
             let device: Vec<f32> = got.iter().flat_map(|m| m[range.clone()].to_vec()).collect();
             let want: Vec<f64> = want_moments.iter().flat_map(|m| m[range.clone()].to_vec()).collect();
             findings.numbers(VOXEL_MOMENTS, name, &device, &want, NUMBERS);
         }
         Ok((got.iter().map(|m| m.map(f64::from)).collect(), variation))
+    }
+
+    /// Of the pictures, as [`Sight::moments`] has them.
+    fn picture_moments(&self, n: usize) -> Result<Vec<[f32; 10]>> {
+        let moments = &self.fit.particles().splat_moments;
+        if self.fit.setups().1.exact != 0 {
+            return self.moments_along_axes(moments, n);
+        }
+        let rows: Vec<[f32; 8]> = self.gpu.download(moments, 0, n)?;
+        let ordered = |r: &[f32; 8]| [r[0], r[1], r[2], r[4], r[5], r[6], 0.0, 0.0, 0.0, 0.0];
+        Ok(rows.iter().map(ordered).collect())
+    }
+
+    fn moments_along_axes(&self, moments: &Buffer, n: usize) -> Result<Vec<[f32; 10]>> {
+        let rows: Vec<[f32; 12]> = self.gpu.download(moments, 0, n)?;
+        Ok(rows.iter().map(|r| [3, 0, 1, 2, 4, 5, 6, 8, 9, 10].map(|k| r[k])).collect())
     }
 
     fn compare_update(&self, want: &[(Params, Option<f64>)], findings: &mut Findings) -> Result<()> {
@@ -358,11 +383,22 @@ struct OfPictures {
     /// By the twin.
     loss: f64,
     /// The device's.
-    moments: Vec<[f64; 6]>,
+    moments: Vec<[f64; 10]>,
 }
 
 /// How far a splat is from where the twin has it: in pixels, or as a share of its own size.
-fn splat_error(got: &Splat, want: &Projection) -> f64 {
+fn splat_error(got: &Splat, want: &Sight) -> f64 {
+    match want {
+        Sight::Affine(want) => affine_error(got, want),
+        Sight::Exact(want) => {
+            let mean = [0, 1].map(|k| (f64::from(got.mean[k]) - want.mean[k]).abs());
+            let half = [0, 1].map(|k| (f64::from(got.half_box[k]) / want.half_box[k] - 1.0).abs());
+            worst_of(mean.into_iter().chain(half))
+        }
+    }
+}
+
+fn affine_error(got: &Splat, want: &Projection) -> f64 {
     let conic = [want.conic.x_axis.x, want.conic.x_axis.y, want.conic.y_axis.y];
     let largest = conic.iter().fold(0f64, |most, c| most.max(c.abs()));
     let mean = [0, 1].map(|k| (f64::from(got.mean[k]) - want.mean[k]).abs());
@@ -370,8 +406,11 @@ fn splat_error(got: &Splat, want: &Projection) -> f64 {
     let radius = got.half_box.map(|half| if f64::from(half) == want.radius { 0.0 } else { f64::INFINITY });
     let amplitude = (f64::from(got.amplitude) / want.amplitude - 1.0).abs();
     let conic = got.conic.iter().zip(conic).map(|(got, want)| (f64::from(*got) - want).abs() / largest);
-    let all = mean.into_iter().chain(radius).chain(conic).chain([amplitude]);
-    all.fold(0.0, |worst, error| if error.is_nan() { f64::INFINITY } else { worst.max(error) })
+    worst_of(mean.into_iter().chain(radius).chain(conic).chain([amplitude]))
+}
+
+fn worst_of(errors: impl Iterator<Item = f64>) -> f64 {
+    errors.fold(0.0, |worst, error| if error.is_nan() { f64::INFINITY } else { worst.max(error) })
 }
 
 fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {

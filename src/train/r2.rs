@@ -63,7 +63,7 @@ impl R2Trainer {
         let config = &config;
         let n = check_count(state, &data)?;
         let (setup, r2) = (gaussian_setup(&data, config), r2_setup(&data, &config.r2));
-        let kernels = R2Kernels::new(gpu)?;
+        let kernels = R2Kernels::new(gpu, config.r2.integral)?;
         let buffers = buffers(gpu, &data, config, (&setup, &r2), step)?;
         let particles = R2ParticleBuffers::new(gpu, state)?;
         let per_submit = config.train.iterations_per_submit;
