@@ -238,6 +238,7 @@ pub mod train {
     pub mod losses;
     pub mod moving;
     pub mod r2;
+    pub(crate) mod ring;
     pub mod sax;
     pub mod snapshot;
     pub mod step;

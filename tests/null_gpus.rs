@@ -109,3 +109,36 @@ fn the_self_test_fails_in_words_on_devices_that_compute_nothing() {
         assert!(answer["ok"] == Value::Bool(false) && rows.len() > 40 && passed.len() < 4, "{chip}: {passed:?}");
     }
 }
+
+#[test]
+#[ignore = "downloads Mesa's drivers: run by `tools/test --packages`"]
+fn training_fails_in_words_on_devices_that_compute_nothing() {
+    const NO_DEVICE: i32 = 3;
+    const DEVICE_LOST: i32 = 75;
+    let home = tempfile::tempdir().unwrap();
+    let data = home.path().join("data");
+    let made = program().arg("phantom").arg(&data).args(["--size", "40", "--phases", "3"]).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let small = [
+        "r2.voxels=24",
+        "r2.tv_box=8",
+        "r2.count=200",
+        "sax.windows=1",
+        "sax.window=4",
+        "sax.rays=8",
+        "sax.samples=16",
+    ];
+    for (chip, _) in CHIPS {
+        for preset in [&PRESETS[..], &["nerf-ca"]].concat() {
+            let run = home.path().join(format!("{}-{preset}", chip.replace(':', "-")));
+            let of_preset = small.iter().filter(|s| preset.starts_with(s.split('.').next().unwrap_or_default()));
+            let settings = of_preset.flat_map(|s| ["--set", s]);
+            let mut arguments = vec!["train", data.to_str().unwrap(), "-o", run.to_str().unwrap(), "--preset", preset];
+            arguments.extend(settings.chain(["--set", "train.iterations=20"]));
+            let output = on(chip, &arguments);
+            let words = String::from_utf8_lossy(&output.stderr);
+            let fails = matches!(output.status.code(), Some(NO_DEVICE | DEVICE_LOST));
+            assert!(fails && words.lines().any(|line| line.starts_with("nertca-vk: ")), "{chip} {preset}: {words}");
+        }
+    }
+}

@@ -13,8 +13,6 @@ use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage, along_two_axes, full_subgroup};
 use std::ops::Range;
 
-/// Losses kept on the device.
-pub const RING_LENGTH: u32 = 1024;
 /// Bits behind the point of the integer sums: images hold up to 2048 times the strongest change, in steps of 1e-6.
 pub const FIXED_POINT_BITS: i32 = 20;
 

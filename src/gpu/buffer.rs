@@ -300,7 +300,7 @@ impl Buffer {
         }
     }
 
-    /// Writes to the start of an [`Memory::Upload`] buffer.
+    /// Writes to the start of an [`Memory::Upload`] or [`Memory::Readback`] buffer.
     ///
     /// # Errors
     /// [`Error::Internal`] when the buffer is not mapped or too small.

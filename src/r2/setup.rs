@@ -2,8 +2,8 @@
 
 use crate::config::sections::R2;
 use crate::config::{Config, R2Integral};
-use crate::gaussians::stages::RING_LENGTH;
 use crate::kernels::layout::{GaussianSetup, R2Schedule, R2Setup, R2Turn};
+use crate::model::setup::RING_LENGTH;
 use crate::r2::data::R2Data;
 use crate::r2::densify::densifies;
 use crate::r2::parameters::ScaleBounds;

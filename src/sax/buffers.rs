@@ -11,13 +11,13 @@ use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{DeviceState, Ray, SaxSetup};
 use crate::kernels::tuning::Tuning;
 use crate::model::sax::{SaxField, SaxState};
-use crate::model::setup::RING_LENGTH;
 use crate::r2::start::seed_of_set;
 use crate::sax::data::SaxData;
 use crate::sax::lineformer::{capacity, vector_bytes};
 use crate::sax::products::products;
 use crate::sax::setup::{adam_setup, schedule};
 use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers};
+use crate::train::ring::ring;
 
 const MIB: u64 = 1 << 20;
 
@@ -179,7 +179,7 @@ pub fn fit_buffers(
         sax_encoding_gradient: new(Binding::sax_encoding_gradient, 8 * u64::from(setup.n_levels) * samples)?,
         sax_grid_sums: new(Binding::sax_grid_sums, 8 * grid)?,
         gradient: new(Binding::gradient, 4 * (weights + grid))?,
-        sax_ring: gpu.buffer("sax_ring", 4 * u64::from(RING_LENGTH), Memory::Readback)?,
+        sax_ring: ring(gpu, "sax_ring")?,
     };
     let mut recording = Recording::new(gpu, "clear the grid's sums")?;
     recording.fill(&fit.sax_grid_sums, 0);

@@ -13,7 +13,8 @@ use crate::model::gaussians::{Gaussians, amplitude, dense};
 use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
-use crate::train::targets::{losses, renew_bounds, take_images, target_buffers};
+use crate::train::ring::losses;
+use crate::train::targets::{renew_bounds, take_images, target_buffers};
 use std::time::Instant;
 
 /// A run on a device.
@@ -165,7 +166,7 @@ impl GaussianTrainer {
         if fit::parts_from_strays(&self.settings, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.buffers.gaussian_ring, first..self.step)
+        losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step)
     }
 
     /// Estimates the still background anew from what the Gaussians leave of the images, and with it the bounds of the

@@ -18,7 +18,7 @@ use crate::r2::setup::{gaussian_setup, r2_setup, schedule, turns};
 use crate::r2::stages::{R2Buffers, R2Kernels, R2Pass, record_step};
 use crate::r2::start::first_rows;
 use crate::train::gaussians::{Iterations, MAX_PASSES, pass_times};
-use crate::train::targets::losses;
+use crate::train::ring::{losses, ring};
 
 /// A run on a device.
 pub struct R2Trainer {
@@ -115,7 +115,7 @@ impl R2Trainer {
         let first = self.step;
         let stop = (first + 1..until).find(|step| densifies(&self.config.r2, *step)).unwrap_or(until);
         self.step += self.iterations.run(&self.gpu, first, stop)?;
-        let losses = losses(&self.buffers.gaussian_ring, first..self.step)?;
+        let losses = losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step)?;
         if densifies(&self.config.r2, self.step) {
             self.densify()?;
         }
@@ -243,7 +243,7 @@ fn buffers(
         r2_voxel_sums: new(Binding::r2_voxel_sums, voxels)?,
         r2_voxel_gradient: new(Binding::r2_voxel_gradient, voxels)?,
         gaussian_loss_parts: new(Binding::gaussian_loss_parts, setup.n_loss_parts.into())?,
-        gaussian_ring: gpu.buffer("gaussian_ring", 4 * u64::from(setup.ring_length), Memory::Readback)?,
+        gaussian_ring: ring(gpu, "gaussian_ring")?,
     })
 }
 

@@ -15,7 +15,7 @@ use crate::sax::setup::{fit_setup, outline};
 use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step};
 use crate::sax::start::first_params;
 use crate::train::gaussians::{Iterations, pass_times};
-use crate::train::targets::losses;
+use crate::train::ring::losses;
 
 /// Passes of an iteration of a field, and of all fields together, but for those over its chunks of samples.
 const MAX_PASSES: u32 = 16;
@@ -140,7 +140,7 @@ impl SaxTrainer {
         }
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, until)?;
-        losses(&self.fit.sax_ring, first..self.step)
+        losses(&self.gpu, &self.fit.sax_ring, first..self.step)
     }
 
     /// The fields after the iterations done, and what a resumed run goes on from beside them.

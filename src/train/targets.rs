@@ -1,15 +1,15 @@
 //! Targets of Gaussians on the device, and what is read back of a fit.
 
-use crate::error::{Error, Result};
-use crate::gaussians::stages::{RING_LENGTH, TargetBuffers};
-use crate::gpu::buffer::{Buffer, Memory};
+use crate::error::Result;
+use crate::gaussians::stages::TargetBuffers;
+use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{GaussianSchedule, GaussianSetup, GaussianView};
 use crate::plan::remainder::{self, Bounds};
 use crate::plan::targets::Targets;
-use std::ops::Range;
+use crate::train::ring::ring;
 
 /// Targets, schedule and counters of a fit that has not begun.
 pub(super) fn target_buffers(
@@ -35,7 +35,7 @@ pub(super) fn target_buffers(
         splat_image_gradient: new(Binding::splat_image_gradient, n_values, Memory::Device)?,
         gaussian_loss_parts: new(Binding::gaussian_loss_parts, setup.n_loss_parts.into(), Memory::Device)?,
         gaussian_step: gpu.buffer_with("gaussian_step", &[0u32])?,
-        gaussian_ring: new(Binding::gaussian_ring, RING_LENGTH.into(), Memory::Readback)?,
+        gaussian_ring: ring(gpu, "gaussian_ring")?,
     };
     clear_images(gpu, &buffers)?;
     Ok(buffers)
@@ -80,18 +80,4 @@ pub(super) fn take_images(
     clear_images(gpu, buffers)?;
     let pixels = sums.chunks(stride).flat_map(|image| &image[..targets.n_pixels()]);
     Ok(pixels.map(|v| *v as f32 / setup.fixed_point).collect())
-}
-
-/// The losses of some iterations.
-pub(super) fn losses(ring_buffer: &Buffer, steps: Range<u32>) -> Result<Vec<f64>> {
-    let mut ring = vec![0f32; RING_LENGTH as usize];
-    ring_buffer.read(&mut ring)?;
-    let losses: Vec<f64> = steps.clone().map(|s| f64::from(ring[(s % RING_LENGTH) as usize])).collect();
-    match losses.iter().position(|l| !l.is_finite()) {
-        Some(at) => {
-            let step = u64::from(steps.start) + at as u64 + 1;
-            Err(Error::Diverged { step, quantity: "loss", value: losses[at] })
-        }
-        None => Ok(losses),
-    }
 }

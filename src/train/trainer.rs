@@ -24,6 +24,7 @@ use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::train::losses::{NetworkLosses, StepLoss};
 use crate::train::moving::Moving;
+use crate::train::ring::tells_nothing;
 use crate::train::sax::SaxTrainer;
 use crate::train::snapshot::{REPORT_BYTES, Snapshot};
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
@@ -462,6 +463,9 @@ impl Trainer {
         while self.reported < self.completed {
             let report = ring[(self.reported % RING_LENGTH) as usize];
             self.reported += 1;
+            if report.step != self.reported {
+                return Err(tells_nothing(&self.gpu, self.reported));
+            }
             let loss = StepLoss {
                 step: self.reported,
                 data: report.data.into(),

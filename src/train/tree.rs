@@ -10,7 +10,6 @@ use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, Tr
 use crate::gaussians::tree::{record_guess, record_images, record_step, record_track};
 use crate::gaussians::view::SplatView;
 use crate::gaussians::work::GaussianWork;
-use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, TreeSetup};
@@ -20,7 +19,8 @@ use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
 use crate::train::gaussians::{Iterations, MAX_PASSES, check_count, pass_times, strong};
-use crate::train::targets::{losses, padded, renew_bounds, take_images, target_buffers};
+use crate::train::ring::{losses, ring};
+use crate::train::targets::{padded, renew_bounds, take_images, target_buffers};
 use crate::train::tree_start::TreeStart;
 use glam::DVec3;
 
@@ -77,11 +77,7 @@ impl Fit {
             bound_high: gpu.buffer_with("bound_high of tracking", &blurred(&targets.high))?,
             gaussian_schedule: gpu.buffer_with("gaussian_schedule of tracking", &fit::track_schedule(settings))?,
             gaussian_step: gpu.buffer_with("gaussian_step of tracking", &[0u32])?,
-            gaussian_ring: gpu.buffer(
-                "gaussian_ring of tracking",
-                self.targets.gaussian_ring.bytes(),
-                Memory::Readback,
-            )?,
+            gaussian_ring: ring(gpu, "gaussian_ring of tracking")?,
             ..self.targets.clone()
         };
         Ok(Fit { setup, tree, targets: buffers, grid: self.grid.under(gpu, &tree)? })
@@ -237,7 +233,7 @@ impl TreeTrainer {
         if fit::parts_from_strays(&self.config.gaussians, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.joint.targets.gaussian_ring, first..self.step)
+        losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step)
     }
 
     /// Drops weak Gaussians and places new ones where data are missing at half the phases. Once in a run, on the host, as

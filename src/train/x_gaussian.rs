@@ -11,7 +11,7 @@ use crate::kernels::layout::{GaussianSetup, R2Setup, XCounts, XEnd, XGaussian, X
 use crate::model::gaussians::Gaussians;
 use crate::model::x_gaussian::XState;
 use crate::train::gaussians::{Iterations, pass_times};
-use crate::train::targets::losses;
+use crate::train::ring::{counts_wrongly, losses, ring};
 use crate::x_gaussian::data::XData;
 use crate::x_gaussian::densify::{densified, densifies, resets};
 use crate::x_gaussian::particles::{XLearningBuffers, XSeenBuffers, download};
@@ -168,11 +168,11 @@ impl XTrainer {
 
     /// A device that does not count the iterations it was asked for would be asked for them for ever.
     fn counts_wrongly(&self, first: u32, stop: u32) -> Error {
-        let (device, step) = (&self.gpu.info().name, self.step);
-        Error::NoDevice(format!(
-            "{device} was to go from iteration {first} on, to {stop} at most, and says it is at {step}; `nertca-vk selftest` \
-             tells which stages it computes wrongly"
-        ))
+        let step = self.step;
+        counts_wrongly(
+            &self.gpu,
+            &format!("was to go from iteration {first} on, to {stop} at most, and says it is at {step}"),
+        )
     }
 
     fn run(&mut self, stop: u32) -> Result<()> {
@@ -210,7 +210,7 @@ impl XTrainer {
         let first = self.step;
         let stop = (first + 1..until).find(|step| self.changes(*step)).unwrap_or(until);
         self.run(stop)?;
-        let losses = losses(&self.fit.gaussian_ring, first..self.step)?;
+        let losses = losses(&self.gpu, &self.fit.gaussian_ring, first..self.step)?;
         self.control_density()?;
         Ok(losses)
     }
@@ -368,7 +368,7 @@ fn fit_buffers(gpu: &Gpu, data: &XData, config: &Config, setup: &GaussianSetup) 
         ssim_factors: new(Binding::ssim_factors, 4 * pixels)?,
         ssim_row_factors: new(Binding::ssim_row_factors, 4 * pixels)?,
         gaussian_loss_parts: new(Binding::gaussian_loss_parts, setup.n_loss_parts.into())?,
-        gaussian_ring: gpu.buffer("gaussian_ring", 4 * u64::from(setup.ring_length), Memory::Readback)?,
+        gaussian_ring: ring(gpu, "gaussian_ring")?,
         x_status: gpu.buffer("x_status", size_of::<XStatus>() as u64, Memory::Readback)?,
     })
 }

@@ -2,8 +2,8 @@
 
 use crate::config::Config;
 use crate::config::sections::X;
-use crate::gaussians::stages::RING_LENGTH;
 use crate::kernels::layout::{GaussianSetup, R2Setup, R2Turn, XSchedule, XSetup};
+use crate::model::setup::RING_LENGTH;
 use crate::r2::stages::picture_parts;
 use crate::r2::start::seed_of_set;
 use crate::random::{STREAM_R2_VIEW, permute};

@@ -84,6 +84,14 @@ pub fn missing_clear(words: &mut [u32]) {
     }
 }
 
+/// Nothing is stored.
+pub fn no_stores(words: &mut [u32]) {
+    const NOTHING: u32 = 1 << 16;
+    for (at, _, length) in instructions(words).into_iter().filter(|(_, operation, _)| *operation == STORE) {
+        words[at..at + length].fill(NOTHING);
+    }
+}
+
 /// The comparison that a fault is to be found by.
 pub type Compare = fn(&Gpu, &mut Findings) -> Result<()>;
 
@@ -107,7 +115,7 @@ impl Fault {
 }
 
 /// The code that the device gets of a stage, in that variant if one is asked for.
-fn code(gpu: &Gpu, stage: &str, variant_asked: Option<&str>) -> Vec<u32> {
+pub fn code(gpu: &Gpu, stage: &str, variant_asked: Option<&str>) -> Vec<u32> {
     let named = |variant: &str| kernel_code(&format!("{stage}{variant}"));
     if let Some(name) = variant_asked {
         return bytemuck::pod_collect_to_vec(named(&format!("_{name}")).unwrap().spirv);

@@ -1,0 +1,44 @@
+//! Rings of losses: the device writes one per iteration, the host reads those of a submit.
+
+use crate::error::{Error, Result};
+use crate::gpu::buffer::{Buffer, Memory};
+use crate::gpu::device::Gpu;
+use crate::model::setup::RING_LENGTH;
+use std::ops::Range;
+
+/// In the place of a loss that no device has written: not a number, and none that arithmetic comes to.
+const UNTOLD: u32 = 0x7fc0_dead;
+
+/// A ring that tells nothing yet.
+pub(crate) fn ring(gpu: &Gpu, name: &str) -> Result<Buffer> {
+    let buffer = gpu.buffer(name, 4 * u64::from(RING_LENGTH), Memory::Readback)?;
+    buffer.write(&[UNTOLD; RING_LENGTH as usize])?;
+    Ok(buffer)
+}
+
+/// The losses of some iterations.
+pub(super) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>) -> Result<Vec<f64>> {
+    let mut told = vec![0f32; RING_LENGTH as usize];
+    ring.read(&mut told)?;
+    let loss = |step: u32| {
+        let loss = told[(step % RING_LENGTH) as usize];
+        if loss.to_bits() == UNTOLD {
+            return Err(tells_nothing(gpu, step + 1));
+        }
+        if !loss.is_finite() {
+            return Err(Error::Diverged { step: u64::from(step) + 1, quantity: "loss", value: loss.into() });
+        }
+        Ok(f64::from(loss))
+    };
+    steps.map(loss).collect()
+}
+
+/// Of a device that ends its submits and has done nothing.
+pub(super) fn tells_nothing(gpu: &Gpu, step: u32) -> Error {
+    counts_wrongly(gpu, &format!("was to do iteration {step} and tells nothing of it"))
+}
+
+/// Of a device that does not do, or does not count, the iterations it was asked for.
+pub(super) fn counts_wrongly(gpu: &Gpu, what: &str) -> Error {
+    Error::NoDevice(format!("{} {what}; `nertca-vk selftest` tells which stages it computes wrongly", gpu.info().name))
+}
