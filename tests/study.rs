@@ -331,3 +331,28 @@ fn ctrl_c_saves() {
     assert_eq!(first["event"], "started");
     assert!(first["step"].as_u64().unwrap() > 0, "it goes on: {first}");
 }
+
+/// Results in the repository stay results of its studies, and its tables are theirs: a new setting must not make others of them.
+#[test]
+fn kept_results_are_of_their_studies_and_make_their_tables() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("studies");
+    for name in ["scaled-table1", "scaled-table2"] {
+        let (kept, home) = (root.join("measured").join(name), tempfile::tempdir().unwrap());
+        let file = root.join(format!("{name}.toml"));
+        let mut results = 0;
+        for run in std::fs::read_dir(kept.join("runs")).unwrap() {
+            let run = run.unwrap().path();
+            let copy = home.path().join("runs").join(run.file_name().unwrap());
+            std::fs::create_dir_all(&copy).unwrap();
+            std::fs::copy(run.join("result.json"), copy.join("result.json")).unwrap();
+            results += 1;
+        }
+        let said = output(&["table", text(&file), "-o", text(home.path())]);
+        let words = String::from_utf8_lossy(&said.stderr);
+        assert!(said.status.success() && !words.contains("left out"), "{name}, {results} results: {words}");
+        for table in ["table.md", "table.csv", "table.tex"] {
+            let [made, there] = [home.path(), &kept].map(|dir| std::fs::read_to_string(dir.join(table)).unwrap());
+            assert!(made == there, "{name}/{table} is not what its results make");
+        }
+    }
+}

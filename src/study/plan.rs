@@ -118,8 +118,47 @@ impl Study {
     pub fn fingerprint(&self, run: &Run) -> Result<RunFingerprint> {
         Ok(RunFingerprint {
             data: self.data[run.data].fingerprint(run.seed),
-            configuration: Fingerprint::of(self.config(run).to_toml()?.as_bytes()).hex(),
+            configuration: Fingerprint::of(as_before(&self.config(run).to_toml()?).as_bytes()).hex(),
             commit: COMMIT.to_owned(),
         })
+    }
+}
+/// Settings, by section, that have come since results are kept, as they are written where they say what was done before.
+const NEW_AND_AS_BEFORE: [(&str, &str); 1] = [("[r2]", "integral = \"affine\"")];
+
+/// A configuration as a program wrote it that did not know the newer settings, where they change nothing: results of it are still its
+/// own.
+fn as_before(configuration: &str) -> String {
+    let mut section = "";
+    let mut kept = String::with_capacity(configuration.len());
+    for line in configuration.split_inclusive('\n') {
+        let text = line.trim_end();
+        if text.starts_with('[') {
+            section = text;
+        }
+        if !NEW_AND_AS_BEFORE.contains(&(section, text)) {
+            kept.push_str(line);
+        }
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+
+    #[test]
+    fn newer_settings_count_where_they_change_something() {
+        let of = |settings: &[&str]| {
+            let settings: Vec<String> = settings.iter().map(|s| (*s).to_owned()).collect();
+            Config::load(Some(Preset::R2Gaussian), None, &settings).unwrap().to_toml().unwrap()
+        };
+        let (affine, exact) = (of(&["r2.integral=affine"]), of(&["r2.integral=exact"]));
+        assert_eq!(as_before(&affine).lines().count() + 1, affine.lines().count());
+        assert_eq!(as_before(&exact), exact);
+        // Of other sections, the same words are something else.
+        let other = "[x]\nintegral = \"affine\"\n";
+        assert_eq!(as_before(other), other);
     }
 }
