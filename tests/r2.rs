@@ -125,7 +125,7 @@ fn exact_line_integrals_are_sums_along_rays() {
         let mut picture = vec![0.0; data.n_pixels()];
         seen.splat(&setup, &mut picture);
         let inside: BTreeSet<usize> = seen.pixels(&setup).map(|(pixel, _)| pixel).collect();
-        for pixel in 0..data.n_pixels() {
+        for (pixel, got) in picture.iter().enumerate() {
             let ray = view.ray((pixel % data.width) as f64, (pixel / data.width) as f64);
             let (a, b) = (whitened(view.source - centre), whitened(ray));
             let middle = -a.dot(b) / b.length_squared();
@@ -139,7 +139,7 @@ fn exact_line_integrals_are_sums_along_rays() {
             let at = |k: i32| a + (middle + step * f64::from(k - steps / 2)) * b;
             let sum: f64 = (0..=steps).map(|k| f64::exp(-0.5 * at(k).length_squared())).sum();
             let want = softplus(p[3]) * sum * step * ray.length();
-            assert!((picture[pixel] - want).abs() <= 1e-9 * softplus(p[3]), "{pixel}: {} {want}", picture[pixel]);
+            assert!((got - want).abs() <= 1e-9 * softplus(p[3]), "{pixel}: {got} {want}");
             compared += 1;
         }
         // No wider than it must be: some ray along each side of the box is as near as the cut.
