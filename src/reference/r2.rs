@@ -4,7 +4,7 @@ use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Schedule, R2Setup};
 use crate::r2::parameters::{ScaleBounds, softplus};
 use crate::reference::gaussians::{N_PARAMS, Params, axes, rotation_gradient};
-use crate::reference::r2_chords::{self, Chords};
+use crate::reference::r2_chords::Chords;
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
 /// Where slopes end to follow the centre, half images from the image's middle.
@@ -332,11 +332,7 @@ impl VoxelBox<'_> {
 
 /// Gradient by position, the logarithms of density and scales, and the quaternion, from sums of h, h times a way along the axes, and h
 /// times products of ways along them.
-pub(super) fn along_axes_gradient(
-    p: &Params,
-    setup: &GaussianSetup,
-    [h, x, y, z, xx, yy, zz, xy, xz, yz]: [f64; 10],
-) -> Params {
+fn along_axes_gradient(p: &Params, setup: &GaussianSetup, [h, x, y, z, xx, yy, zz, xy, xz, yz]: [f64; 10]) -> Params {
     let (axes, scale) = (axes(p), scale(p, setup));
     let d_position = axes * (DVec3::new(x, y, z) / scale);
     let second = [DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz)];
@@ -394,7 +390,7 @@ impl Sight {
     pub fn gradient(&self, p: &Params, view: &SplatView, setup: &GaussianSetup, moments: [f64; 10]) -> Params {
         match self {
             Sight::Affine(_) => gradient(p, view, setup, plane(moments)),
-            Sight::Exact(_) => r2_chords::gradient(p, setup, moments),
+            Sight::Exact(_) => along_axes_gradient(p, setup, moments),
         }
     }
 

@@ -5,7 +5,7 @@ use crate::gaussians::view::SplatView;
 use crate::kernels::layout::GaussianSetup;
 use crate::r2::parameters::softplus;
 use crate::reference::gaussians::{Params, axes};
-use crate::reference::r2::{along_axes_gradient, pixels_within, position, scale};
+use crate::reference::r2::{pixels_within, position, scale};
 use glam::{DMat3, DVec2, DVec3};
 
 /// A Gaussian before a view, and the box of pixels whose rays come as near as the cut.
@@ -91,11 +91,6 @@ impl Chords {
         let by_pixel = self.depth * DVec2::new(self.along[1].dot(linear), self.along[2].dot(linear));
         (0.5 * DVec2::new(setup.width.into(), setup.height.into()) * by_pixel).length()
     }
-}
-
-/// Gradient by position, the logarithms of density and scales, and the quaternion, from the moments in a view.
-pub fn gradient(p: &Params, setup: &GaussianSetup, moments: [f64; 10]) -> Params {
-    along_axes_gradient(p, setup, moments)
 }
 
 /// Half sides of the box around the centre's pixel that holds all rays which come as near as the cut: roots of the outline's equation
