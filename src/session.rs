@@ -61,6 +61,13 @@ pub enum State {
     Failed,
 }
 
+impl State {
+    /// Whether training in the background goes on, or will again.
+    fn in_background(self) -> bool {
+        matches!(self, State::Running | State::Paused | State::Waiting)
+    }
+}
+
 /// How far training is.
 #[derive(Debug, Clone, Copy)]
 pub struct Progress {
@@ -250,10 +257,9 @@ impl Session {
     ///
     /// # Errors
     /// [`Error::Busy`] when it trains already; [`Error::NoDevice`].
-    pub fn start(&self, mut observe: Box<dyn FnMut(&Progress) -> bool + Send>) -> Result<()> {
+    pub fn start(&self, observe: Box<dyn FnMut(&Progress) -> bool + Send>) -> Result<()> {
         self.not_from_observer()?;
         let _alone = self.alone()?;
-        let mut worker = lock(&self.worker);
         self.shared.device()?;
         let shared = self.shared.clone();
         shared.stop.store(false, Ordering::Release);
@@ -266,8 +272,13 @@ impl Session {
         let spawned = std::thread::Builder::new().name(TRAINING_THREAD.into()).spawn(move || {
             tracing::dispatcher::with_default(&dispatch, || {
                 lock(&shared.control).worker = Some(std::thread::current().id());
-                let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| shared.work(&mut *observe)))
-                    .unwrap_or_else(|_| Err(Error::Internal("training panicked".into())));
+                // The observer goes before training is said to have ended: nothing of its owner's is used after that.
+                let work = std::panic::AssertUnwindSafe(|| {
+                    let mut observe = observe;
+                    shared.work(&mut *observe)
+                });
+                let outcome =
+                    std::panic::catch_unwind(work).unwrap_or_else(|_| Err(Error::Internal("training panicked".into())));
                 let mut control = lock(&shared.control);
                 control.worker = None;
                 match outcome {
@@ -282,7 +293,7 @@ impl Session {
             });
         });
         match spawned {
-            Ok(handle) => *worker = Some(handle),
+            Ok(handle) => *lock(&self.worker) = Some(handle),
             Err(e) => {
                 lock(&self.shared.control).state = State::Idle;
                 return Err(Error::Internal(format!("starting a thread: {e}")));
@@ -313,13 +324,17 @@ impl Session {
         self.shared.stop.store(true, Ordering::Release);
         drop(lock(&self.shared.control));
         self.shared.changed.notify_all();
-        // Taken out first: nobody else is to wait for the lock while this waits for the worker.
-        let handle = lock(&self.worker).take();
-        if let Some(handle) = handle {
+        self.join();
+        Ok(())
+    }
+
+    /// Waits for the thread that trains; for all who do so at the same time.
+    fn join(&self) {
+        let mut worker = lock(&self.worker);
+        if let Some(handle) = worker.take() {
             // A panic of the worker has become its failure.
             let _ = handle.join();
         }
-        Ok(())
     }
 
     /// The right to train, or to change what is trained; refused while someone else has it.
@@ -331,9 +346,11 @@ impl Session {
                 return Err(Error::Busy("the session is training in another call".into()));
             }
         };
-        if lock(&self.worker).as_ref().is_some_and(|w| !w.is_finished()) {
+        // By what the session says, as those who waited for the end go by it: the thread may take a moment longer.
+        if self.state().in_background() {
             return Err(Error::Busy("the session is training in the background already".into()));
         }
+        self.join();
         Ok(blocking)
     }
 
@@ -350,7 +367,7 @@ impl Session {
         let until = Instant::now() + limit;
         let mut control = lock(&self.shared.control);
         loop {
-            if !matches!(control.state, State::Running | State::Waiting | State::Paused) {
+            if !control.state.in_background() {
                 return true;
             }
             let Some(left) = until.checked_duration_since(Instant::now()).filter(|d| !d.is_zero()) else {
