@@ -3,7 +3,7 @@
 // Adam in f32. One invocation per parameter; the dynamic field rests while it is delayed, and all
 // moments restart where the schedule re-creates the optimiser.
 #include "inc/layout.glsl"
-layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(local_size_x = 128, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };

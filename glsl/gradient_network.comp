@@ -6,7 +6,7 @@
 //   source[i]: where element i lies in partials[split][n_partials]; NOWHERE: zero.
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
-layout(local_size_x = 64, local_size_x_id = 0) in;
+layout(local_size_x = 128, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(constant_id = 1) const uint parts = 1u;  // a divisor of the workgroup
 layout(push_constant) uniform Push { uint first; uint count; uint phase_sums; uint splits; uint n_partials; } push;

@@ -12,7 +12,7 @@ layout(binding = 7) writeonly buffer B7 { uint ray_counts[]; };
 #include "inc/dynamic_box.glsl"
 #include "inc/occupied.glsl"
 
-shared uint counts[gl_WorkGroupSize.x];
+PREFIX(live_before, counts, ray_lanes)
 
 // Whether the field is evaluated at a point of a ray: where it may exist at one of the phases that the ray shows.
 bool searched(vec3 x, Ray ray) {
@@ -22,11 +22,11 @@ bool searched(vec3 x, Ray ray) {
 }
 
 void main() {
-    uint lane = gl_LocalInvocationID.x;
-    uint r = push.first_ray + gl_WorkGroupID.x;
+    uint lane = ray_lane();
+    uint r = push.first_ray + ray_of_chunk();
     Ray ray = rays[r];
     uint begin = lane * run_length();
-    uint end = min(begin + run_length(), setup.n_dynamic_samples);
+    uint end = has_ray() ? min(begin + run_length(), setup.n_dynamic_samples) : begin;
     uint live = 0u;
     for (uint word = 0u; word < mask_words(); word++) {
         uint mask = 0u;
@@ -35,13 +35,11 @@ void main() {
             vec3 x = ray.anchor + dynamic_depth(k, ray) * ray.direction;
             if (searched(x, ray)) mask |= 1u << (k - first);
         }
-        lane_masks[(r * gl_WorkGroupSize.x + lane) * mask_words() + word] = mask;
+        if (has_ray()) lane_masks[(r * ray_lanes + lane) * mask_words() + word] = mask;
         live += bitCount(mask);
     }
-    counts[lane] = live;
-    barrier();
-    uint before = 0u;
-    for (uint l = 0u; l < lane; l++) before += counts[l];
-    lane_offsets[r * gl_WorkGroupSize.x + lane] = before;
-    if (lane == gl_WorkGroupSize.x - 1u) ray_counts[r] = before + live;
+    uint before = live_before(live);
+    if (!has_ray()) return;
+    lane_offsets[r * ray_lanes + lane] = before;
+    if (lane == ray_lanes - 1u) ray_counts[r] = before + live;
 }

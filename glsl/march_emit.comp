@@ -12,12 +12,12 @@ layout(binding = 7) writeonly buffer B7 { vec4 sample_points[]; };
 layout(binding = 8) writeonly buffer B8 { uint sample_rays[]; };
 
 void main() {
-    if (live.count == 0u) return;
-    uint lane = gl_LocalInvocationID.x;
-    uint r = push.first_ray + gl_WorkGroupID.x;
-    uint slot = ray_start[gl_WorkGroupID.x] + lane_offsets[r * gl_WorkGroupSize.x + lane];
+    if (live.count == 0u || !has_ray()) return;
+    uint lane = ray_lane();
+    uint r = push.first_ray + ray_of_chunk();
+    uint slot = ray_start[ray_of_chunk()] + lane_offsets[r * ray_lanes + lane];
     for (uint word = 0u; word < mask_words(); word++) {
-        uint mask = lane_masks[(r * gl_WorkGroupSize.x + lane) * mask_words() + word];
+        uint mask = lane_masks[(r * ray_lanes + lane) * mask_words() + word];
         if (mask == 0u) continue;
         Ray ray = rays[r];
         for (; mask != 0u; mask &= mask - 1u) {

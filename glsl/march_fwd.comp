@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What rays see: integrals and, on demand, maxima, one workgroup per ray. Training takes march_loss.
+// What rays see: integrals and, on demand, maxima. Training takes march_loss.
 //   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term, maxima along the ray or 0.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
@@ -20,16 +20,19 @@ layout(binding = 6) readonly buffer B6 { vec2 sample_sigma[]; };
 READ_VEC4(7, B7, static_params);
 layout(binding = 8) writeonly buffer B8 { RayOut ray_out[]; };
 #include "inc/tensor_vm.glsl"
-#include "inc/reduce.glsl"
+#include "inc/march_rays.glsl"
 #include "inc/static_samples.glsl"
 
+REDUCE(vec4, ray_sum, sum_scratch, SUM_OF, ray_lanes)
+REDUCE(float, ray_max, max_scratch, max, ray_lanes)
+
 void main() {
-    uint lane = gl_LocalInvocationID.x;
-    uint r = push.first_ray + gl_WorkGroupID.x;
+    uint lane = ray_lane();
+    uint r = push.first_ray + ray_of_chunk();
     Ray ray = rays[r];
     float static_sum = 0.0;
     float static_max = 0.0;
-    for (uint k = lane; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {
+    for (uint k = lane; k < setup.n_static_samples; k += ray_lanes) {
         StaticSample here = static_sample(k, ray);
         if (static_inside(here.x)) {
             float sigma = static_attenuation(here.x);
@@ -41,8 +44,8 @@ void main() {
     float occlusion = 0.0;
     float dynamic_max = 0.0;
     float total_max = 0.0;
-    uint end = ray_start[gl_WorkGroupID.x + 1u];
-    for (uint s = ray_start[gl_WorkGroupID.x] + lane; s < end; s += gl_WorkGroupSize.x) {
+    uint end = ray_start[ray_of_chunk() + 1u];
+    for (uint s = ray_start[ray_of_chunk()] + lane; s < end; s += ray_lanes) {
         vec4 point = sample_points[s];
         float sigma = sample_sigma[s].x;
         dynamic_sum += sigma * point.w;
@@ -51,12 +54,12 @@ void main() {
         dynamic_max = max(dynamic_max, sigma);
         total_max = max(total_max, sigma + (static_inside(point.xyz) ? static_attenuation(point.xyz) : 0.0));
     }
-    vec4 sums = workgroup_sum(vec4(static_sum, dynamic_sum, occlusion, 0.0));
+    vec4 sums = ray_sum(vec4(static_sum, dynamic_sum, occlusion, 0.0));
     RayOut result = RayOut(sums.x, sums.y, sums.z, 0.0, 0.0, 0.0);
     if (push.with_maxima != 0u) {
-        result.static_max = workgroup_max(static_max);
-        result.dynamic_max = workgroup_max(dynamic_max);
-        result.total_max = max(workgroup_max(total_max), result.static_max);
+        result.static_max = ray_max(static_max);
+        result.dynamic_max = ray_max(dynamic_max);
+        result.total_max = max(ray_max(total_max), result.static_max);
     }
-    if (lane == 0u) ray_out[r] = result;
+    if (lane == 0u && has_ray()) ray_out[r] = result;
 }

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// A ray of a batch from its samples to the gradient, one workgroup per ray:
+// A ray of a batch from its samples to the gradient:
 //   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term;
 //   ray_gradient[ray], ray_loss[ray]: its loss by them (inc/ray_loss.glsl);
 //   static_gradient[2 * parameter] = low, high word of dL/d sigma_l scattered to planes and lines.
@@ -9,7 +9,7 @@
 //
 // The scatter is summed as 64-bit fixed point in integer atomics, pairs of 32 bits or whole, which is exact and hence
 // independent of order. Every sample of every ray meets the few texels of the lines: with `private_lines` a workgroup sums its own in shared
-// memory first, so that they reach memory once per ray.
+// memory first, so that they reach memory once for its rays.
 #include "inc/fixed_point.glsl"
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
@@ -34,13 +34,16 @@ layout(binding = 10) writeonly buffer B10 { vec4 ray_loss[]; };
 FIXED_SUMS(11, B11, static_gradient);
 layout(binding = 12) buffer B12 { uint occupancy[]; };
 #include "inc/tensor_vm.glsl"
-#include "inc/reduce.glsl"
+#include "inc/march_rays.glsl"
 #include "inc/static_rays.glsl"
 #include "inc/static_samples.glsl"
 #include "inc/ray_loss.glsl"
 #include "inc/occupancy.glsl"
 
+REDUCE(vec4, ray_sum, sum_scratch, SUM_OF, ray_lanes)
+
 shared uint line_sums[2u * private_lines + 1u];
+shared uint rays_that_scatter[rays_of_workgroup];
 
 void note_cell(uint entry, uint bits) {
     uint epoch = state.step / OCCUPANCY_EPOCH;
@@ -58,24 +61,24 @@ void note_sample(vec3 x, Ray ray, float sigma) {
 }
 
 RayOut integrals(uint r, Ray ray) {
-    uint lane = gl_LocalInvocationID.x;
+    uint lane = ray_lane();
     float static_sum = 0.0;
     uint n_static = skips_static(r) ? 0u : setup.n_static_samples;
-    for (uint k = lane; k < n_static; k += gl_WorkGroupSize.x) {
+    for (uint k = lane; k < n_static; k += ray_lanes) {
         StaticSample here = static_sample(k, ray);
         if (static_inside(here.x)) static_sum += static_attenuation(here.x) * here.path_length;
     }
     float dynamic_sum = 0.0;
     float occlusion = 0.0;
-    uint end = ray_start[gl_WorkGroupID.x + 1u];
-    for (uint s = ray_start[gl_WorkGroupID.x] + lane; s < end; s += gl_WorkGroupSize.x) {
+    uint end = ray_start[ray_of_chunk() + 1u];
+    for (uint s = ray_start[ray_of_chunk()] + lane; s < end; s += ray_lanes) {
         vec4 point = sample_points[s];
         float sigma = sample_sigma[s].x;
         dynamic_sum += sigma * point.w;
         if (is_near(sample_rays[s])) occlusion += sigma * point.w;
         if (setup.occupancy_cells != 0u) note_sample(point.xyz, ray, sigma);
     }
-    vec4 sums = workgroup_sum(vec4(static_sum, dynamic_sum, occlusion, 0.0));
+    vec4 sums = ray_sum(vec4(static_sum, dynamic_sum, occlusion, 0.0));
     return RayOut(sums.x, sums.y, sums.z, 0.0, 0.0, 0.0);
 }
 
@@ -102,13 +105,24 @@ void add_to_line(uint texel, vec4 value, float scale_high) {
     }
 }
 
-// Scatters the gradient by the ray's static integral.
+// Whether any ray of the workgroup has something to scatter; the same for all lanes.
+bool any_scatters(bool scatters) {
+    if (rays_of_workgroup == 1u) return scatters;
+    if (ray_lane() == 0u) rays_that_scatter[ray_of_workgroup()] = uint(scatters);
+    barrier();
+    uint any = 0u;
+    for (uint i = 0u; i < rays_of_workgroup; i++) any |= rays_that_scatter[i];
+    return any != 0u;
+}
+
+// Scatters the gradient by the ray's static integral. All lanes of the workgroup take part, those without a gradient, too.
 void scatter(Ray ray, float gradient) {
     uint lane = gl_LocalInvocationID.x;
     for (uint i = lane; i < 2u * private_lines; i += gl_WorkGroupSize.x) line_sums[i] = 0u;
     barrier();
     float scale_high = exp2(float(setup.fixed_point_bits) - 32.0);
-    for (uint k = lane; k < setup.n_static_samples; k += gl_WorkGroupSize.x) {
+    uint n_static = gradient == 0.0 ? 0u : setup.n_static_samples;
+    for (uint k = ray_lane(); k < n_static; k += ray_lanes) {
         StaticSample here = static_sample(k, ray);
         if (!static_inside(here.x)) continue;
         float slope = setup.static_gain * sigmoid(vm_feature(here.x) + setup.static_shift);
@@ -136,15 +150,16 @@ void scatter(Ray ray, float gradient) {
 }
 
 void main() {
-    uint r = push.first_ray + gl_WorkGroupID.x;
+    uint r = push.first_ray + ray_of_chunk();
     Ray ray = rays[r];
     RayOut seen = integrals(r, ray);
     RayLoss loss = loss_of(r, ray, seen);
-    if (gl_LocalInvocationID.x == 0u) {
+    if (ray_lane() == 0u && has_ray()) {
         ray_out[r] = seen;
         ray_gradient[r] = loss.gradient;
         ray_loss[r] = loss.terms;
     }
     // Rays that leave the static field out have none, too.
-    if (loss.gradient.x != 0.0) scatter(ray, loss.gradient.x);
+    float gradient = has_ray() ? loss.gradient.x : 0.0;
+    if (any_scatters(gradient != 0.0)) scatter(ray, gradient);
 }

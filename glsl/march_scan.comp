@@ -16,37 +16,31 @@ layout(binding = 3) writeonly buffer B3 { uint ray_start[]; };
 layout(binding = 4) buffer B4 { LiveSamples live; };
 layout(binding = 5) writeonly buffer B5 { IndirectArguments arguments; };
 
-shared uint totals[gl_WorkGroupSize.x];
+#include "inc/combine.glsl"
+
+PREFIX(samples_before, totals, gl_WorkGroupSize.x)
 
 void main() {
-    uint lane = gl_LocalInvocationID.x;
+    uint lane = workgroup_lane();
     uint active_now = state.stopped != 0u ? 0u : schedule[state.step].dynamic_active;
     uint per = (push.n_rays + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
     uint begin = min(lane * per, push.n_rays);
     uint end = min(begin + per, push.n_rays);
     uint sum = 0u;
     for (uint r = begin; r < end; r++) sum += ray_counts[push.first_ray + r];
-    totals[lane] = sum * active_now;
-    barrier();
-    if (lane == 0u) {
-        uint running = 0u;
-        for (uint i = 0u; i < gl_WorkGroupSize.x; i++) {
-            uint here = totals[i];
-            totals[i] = running;
-            running += here;
-        }
-        uint padded = (running + SAMPLE_GROUP - 1u) / SAMPLE_GROUP * SAMPLE_GROUP;
-        live.count = running;
+    uint running = samples_before(sum * active_now);
+    if (lane == gl_WorkGroupSize.x - 1u) {
+        uint count = running + sum * active_now;
+        uint padded = (count + SAMPLE_GROUP - 1u) / SAMPLE_GROUP * SAMPLE_GROUP;
+        live.count = count;
         live.padded = padded;
-        live.of_iteration = running + (push.accumulate != 0u ? live.of_iteration : 0u);
-        ray_start[push.n_rays] = running;
+        live.of_iteration = count + (push.accumulate != 0u ? live.of_iteration : 0u);
+        ray_start[push.n_rays] = count;
         uint tiles = (padded + push.tile_samples - 1u) / push.tile_samples;
         arguments.samples = DispatchSize(padded / SAMPLE_GROUP, 1u, 1u);
         arguments.forward_tiles = DispatchSize(tiles, push.forward_rows, 1u);
         arguments.backward_tiles = DispatchSize(tiles, push.backward_rows, 1u);
     }
-    barrier();
-    uint running = totals[lane];
     for (uint r = begin; r < end; r++) {
         ray_start[r] = running;
         running += ray_counts[push.first_ray + r] * active_now;

@@ -111,6 +111,7 @@ fn paths() -> [Tuning; 3] {
             f16_sums: true,
         },
         march_lanes,
+        ray_lanes: 32,
         private_line_bytes,
         chunk_samples: 1 << 16,
         iterations_per_submit: None,
@@ -120,7 +121,7 @@ fn paths() -> [Tuning; 3] {
     };
     [
         f32_layers(Operands::Texel, 8, 8, 4, 32, 0),
-        f32_layers(Operands::Storage, 64, 32, 16, 16, 16384),
+        f32_layers(Operands::Storage, 64, 32, 16, 64, 16384),
         f32_layers(Operands::Address, 8, 4, 3, 32, 0),
     ]
 }

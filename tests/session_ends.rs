@@ -45,7 +45,7 @@ fn who_waited_for_the_end_may_start_and_train_at_once() {
     let dataset = small_dataset(8, 8);
     let options = SessionOptions {
         config: small_config("fast-mlp", &["train.iterations=1000"]),
-        phases: dataset.n_phases as u32,
+        phases: dataset.n_phases,
         depth_half_extent_mm: 100.0,
         vessel_attenuation_per_mm: None,
         deterministic: true,

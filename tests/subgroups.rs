@@ -16,9 +16,18 @@ fn open(without_subgroups: bool) -> Gpu {
         .unwrap()
 }
 
-/// Workgroups of the layers' sums as a GPU has them, of full subgroups, with operands whose kernels have both variants.
-fn as_on_a_gpu(gpu: &Gpu) -> Tuning {
-    Tuning { operands: Operands::Storage, layer_lanes: 64, weight_lanes: 64, splits: 3, ..tuning(gpu) }
+/// Workgroups of the layers' sums and of several rays as a GPU has them, of full subgroups, with operands whose kernels have both
+/// variants. A ray has `ray_lanes`.
+fn as_on_a_gpu(gpu: &Gpu, ray_lanes: u32) -> Tuning {
+    // More than the cases have samples of the static field.
+    let march_lanes = 32.max(4 * ray_lanes);
+    let sums = Tuning { layer_lanes: 64, weight_lanes: 64, splits: 3, ..tuning(gpu) };
+    Tuning { operands: Operands::Storage, march_lanes, ray_lanes, ..sums }
+}
+
+/// Invocations of a ray: several subgroups, and half a one, as AMD's subgroups of 64 are shared by rays of 32.
+fn ray_lanes(gpu: &Gpu) -> [u32; 2] {
+    [32, gpu.info().subgroup_size.min(32) / 2]
 }
 
 #[test]
@@ -30,14 +39,17 @@ fn every_stage_matches_with_and_without_subgroups() {
             println!("{} has no shuffles in full subgroups: nothing is compared with them", gpu.info().name);
             continue;
         }
-        let (dataset, path) = (uneven_dataset(13, 11), as_on_a_gpu(&gpu));
-        expect_agreement(|findings| {
-            F32_CASES.iter().try_for_each(|case| iteration::compare(&gpu, &dataset, case, &path, findings))
-        });
+        let dataset = uneven_dataset(13, 11);
+        let paths = ray_lanes(&gpu).map(|lanes| as_on_a_gpu(&gpu, lanes));
+        for path in &paths {
+            expect_agreement(|findings| {
+                F32_CASES.iter().try_for_each(|case| iteration::compare(&gpu, &dataset, case, path, findings))
+            });
+        }
         expect_agreement(|findings| gaussians::compare(&gpu, findings));
         expect_agreement(|findings| trees::compare(&gpu, findings));
         expect_agreement(|findings| repeats::compare_gaussians(&gpu, findings));
-        expect_agreement(|findings| repeats::compare_network(&gpu, &dataset, &path, findings));
+        expect_agreement(|findings| repeats::compare_network(&gpu, &dataset, &paths[0], findings));
         let built = gpu.pipeline_statistics();
         assert!(built.iter().any(|kernel| kernel.kernel.starts_with("gaussian_moments")));
         assert_eq!(built.iter().any(|kernel| kernel.kernel.ends_with("_subgroup")), !without);

@@ -1,5 +1,5 @@
-// Shared by march_count and march_emit: one workgroup per ray, each lane owns a run of consecutive depths, so that live
-// samples come out in depth order. lane_masks[ray][lane][word]: one bit per depth of the run.
+// Shared by march_count and march_emit: each lane of a ray owns a run of consecutive depths, so that live samples come out in
+// depth order. lane_masks[ray][lane][word]: one bit per depth of the run.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
@@ -8,8 +8,10 @@ layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
 layout(binding = 0) readonly buffer B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
+#include "inc/march_rays.glsl"
+
 uint run_length() {
-    return (setup.n_dynamic_samples + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
+    return (setup.n_dynamic_samples + ray_lanes - 1u) / ray_lanes;
 }
 
 // Words of a lane's mask.

@@ -14,10 +14,6 @@ use std::sync::Arc;
 
 include!(concat!(env!("OUT_DIR"), "/table.rs"));
 
-/// Lanes that share the depths of a ray in `march_count` and `march_emit`.
-pub const MARCH_LANES: u32 = push::MarchCount::LOCAL_SIZE;
-const _: () = assert!(push::MarchEmit::LOCAL_SIZE == MARCH_LANES);
-
 /// Finds a compiled kernel by its name, variants included.
 ///
 /// # Errors
@@ -133,6 +129,10 @@ fn power_of_two_below(n: u32) -> u32 {
 pub struct Kernels {
     /// Choices they were built with.
     pub tuning: Tuning,
+    /// Rays of a workgroup of `march_count` and `march_emit`.
+    pub rays_counted: u32,
+    /// Rays of a workgroup of `march_loss` and `march_fwd`.
+    pub rays_marched: u32,
     /// Draws the rays of an iteration.
     pub batch: Stage<push::Batch>,
     /// Rays of a pose, for rendering.
@@ -175,18 +175,21 @@ impl Kernels {
         let plain = Build::default();
         let vec4 = Build { variant: vec4_variant(&tuning), ..plain };
         let sums = Build { exchanges: true, ..plain };
-        let lanes = Some(tuning.lanes_per_ray(static_samples));
-        let private_lines = [("private_lines", tuning.private_lines(line_params))];
+        let (counted, marched) = (tuning.rays_of(tuning.ray_lanes), tuning.rays_with(static_samples));
+        let (count_rays, march_rays) = (counted.constant(), marched.constant());
+        let counting = Build { lanes: counted.workgroup(), constants: &count_rays, ..plain };
+        let marching = Build { lanes: marched.workgroup(), constants: &march_rays, exchanges: true, ..vec4 };
+        let loss = [march_rays[0], ("private_lines", tuning.private_lines(line_params))];
         let parts = [("parts", tuning.gradient_parts())];
         let loss_scaling = [("loss_scaling", u32::from(tuning.layers == Layers::Matrices))];
         Ok(Kernels {
             batch: plain.stage(gpu)?,
             pose_rays: plain.stage(gpu)?,
-            march_count: plain.stage(gpu)?,
-            march_scan: plain.stage(gpu)?,
-            march_emit: plain.stage(gpu)?,
-            march_loss: Build { constants: &private_lines, lanes, exchanges: true, int64: true, ..vec4 }.stage(gpu)?,
-            march_fwd: Build { lanes, exchanges: true, ..vec4 }.stage(gpu)?,
+            march_count: Build { exchanges: true, ..counting }.stage(gpu)?,
+            march_scan: sums.stage(gpu)?,
+            march_emit: counting.stage(gpu)?,
+            march_loss: Build { constants: &loss, int64: true, ..marching }.stage(gpu)?,
+            march_fwd: marching.stage(gpu)?,
             volume_dynamic: plain.stage(gpu)?,
             volume_static: vec4.stage(gpu)?,
             baked_march: plain.stage(gpu)?,
@@ -195,6 +198,8 @@ impl Kernels {
             gradient_network: Build { constants: &parts, ..plain }.stage(gpu)?,
             adam: plain.stage(gpu)?,
             report: Build { constants: &loss_scaling, ..sums }.stage(gpu)?,
+            rays_counted: counted.rays,
+            rays_marched: marched.rays,
             tuning,
         })
     }

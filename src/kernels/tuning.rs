@@ -5,7 +5,7 @@ use crate::gpu::buffer::Operands;
 use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
 use crate::gpu::pace::longest_submit_s;
 use crate::kernels::constants;
-use crate::kernels::push::{MarchFwd, MarchLoss, PushConstants};
+use crate::kernels::push::{MarchLoss, PushConstants};
 use serde::Serialize;
 
 /// The register tile of three kernels that work together, from what their text defines.
@@ -61,6 +61,27 @@ pub struct MatrixTuning {
     pub f16_sums: bool,
 }
 
+/// Rays of a workgroup.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct RayLanes {
+    /// Invocations that share a ray.
+    pub(super) lanes: u32,
+    /// How many.
+    pub(super) rays: u32,
+}
+
+impl RayLanes {
+    /// Invocations of a workgroup, as a stage is built with them.
+    pub(super) fn workgroup(self) -> Option<u32> {
+        Some(self.lanes * self.rays)
+    }
+
+    /// The constant by which shaders know the rays of a workgroup.
+    pub(super) fn constant(self) -> [(&'static str, u32); 1] {
+        [("rays_of_workgroup", self.rays)]
+    }
+}
+
 /// Sizes and variants chosen for a device, with the reasons.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Tuning {
@@ -76,8 +97,11 @@ pub struct Tuning {
     pub splits: u32,
     /// Sizes of the passes on matrices.
     pub matrices: MatrixTuning,
-    /// Invocations that share a ray where each gets one of its samples at least; else as few as the shaders say.
+    /// Invocations of a workgroup of the kernels that march along rays: all share a ray where each gets one of its samples at least;
+    /// else a ray has `ray_lanes`, and a workgroup as many rays as that makes.
     pub march_lanes: u32,
+    /// Invocations that share a ray of few samples, and in any case the depths among which live samples are sought.
+    pub ray_lanes: u32,
     /// Shared memory in which a workgroup may sum the static field's lines before they go to memory, bytes.
     pub private_line_bytes: u32,
     /// Samples handled at once, at most; the configuration may ask for fewer.
@@ -100,8 +124,6 @@ fn workgroups_untold(kind: DeviceKind) -> u32 {
         _ => 264,
     }
 }
-
-const _: () = assert!(MarchFwd::LOCAL_SIZE == MarchLoss::LOCAL_SIZE);
 
 /// Partial sums that are too many for one invocation to add up.
 const MANY_SPLITS: u32 = 64;
@@ -166,8 +188,9 @@ impl Tuning {
             _ => (info.device_memory >> 14).clamp(1 << 16, 1 << 19) as u32,
         };
         let overlap = !info.is_cpu();
-        // Workgroups on a multiprocessor are few, so that one subgroup in each leaves it half empty.
-        let march_lanes = if info.is_cpu() { MarchLoss::LOCAL_SIZE } else { 2 * MarchLoss::LOCAL_SIZE };
+        // Workgroups on a multiprocessor are few, so that one subgroup in each leaves it two thirds empty.
+        let ray_lanes = MarchLoss::LOCAL_SIZE;
+        let march_lanes = if info.is_cpu() { ray_lanes } else { 2 * ray_lanes };
         // Shared memory is no faster on a CPU.
         let private_line_bytes = if info.is_cpu() { 0 } else { info.max_shared_memory / 2 };
         // Kernels that read through texel buffers have no variants.
@@ -182,6 +205,7 @@ impl Tuning {
             splits,
             matrices,
             march_lanes,
+            ray_lanes,
             private_line_bytes,
             chunk_samples,
             iterations_per_submit: None,
@@ -201,9 +225,14 @@ impl Tuning {
         if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
     }
 
-    /// Invocations that share a ray of so many samples; `local_size_x` of `march_loss` and `march_fwd`.
-    pub(super) fn lanes_per_ray(&self, n_samples: u32) -> u32 {
-        if n_samples < self.march_lanes { MarchLoss::LOCAL_SIZE } else { self.march_lanes }
+    /// How `march_loss` and `march_fwd` share out rays of so many samples of the static field.
+    pub(super) fn rays_with(&self, n_samples: u32) -> RayLanes {
+        self.rays_of(if n_samples < self.march_lanes { self.ray_lanes } else { self.march_lanes })
+    }
+
+    /// How kernels that give so many lanes to a ray share out rays.
+    pub(super) fn rays_of(&self, lanes: u32) -> RayLanes {
+        RayLanes { lanes, rays: (self.march_lanes / lanes).max(1) }
     }
 
     /// Invocations that share out the partial sums of a number of the network's gradient.

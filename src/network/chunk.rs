@@ -16,7 +16,12 @@ pub struct Chunk {
 impl Chunk {
     /// One workgroup per ray.
     pub fn per_ray(self) -> Groups<'static> {
-        Groups::Direct([self.n_rays, 1, 1])
+        self.workgroups(1)
+    }
+
+    /// Workgroups of so many rays each.
+    pub fn workgroups(self, rays_each: u32) -> Groups<'static> {
+        Groups::Direct([self.n_rays.div_ceil(rays_each), 1, 1])
     }
 
     /// Whether it ends a batch of `n_rays`.

@@ -8,7 +8,7 @@ use crate::kernels::constants::OCCUPANCY_EPOCHS;
 use crate::kernels::dispatch::{Binding, buffer_set, dispatch};
 use crate::kernels::layout::{DeviceState, DispatchSize, IndirectArguments, LiveSamples, Ray, RayOut, Setup};
 use crate::kernels::push;
-use crate::kernels::stages::{Kernels, MARCH_LANES};
+use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
@@ -82,9 +82,9 @@ impl ForwardBuffers {
     ) -> Result<ForwardBuffers> {
         // Samplers of volumes may have fewer samples a ray and more rays a chunk than `setup` says.
         let n_rays = u64::from(n_rays);
-        let lanes = n_rays * u64::from(MARCH_LANES);
+        let lanes = n_rays * u64::from(tuning.ray_lanes);
         let capacity = u64::from(setup.sample_capacity);
-        let lane_words = u64::from(setup.n_dynamic_samples.div_ceil(MARCH_LANES).div_ceil(u32::BITS));
+        let lane_words = u64::from(setup.n_dynamic_samples.div_ceil(tuning.ray_lanes).div_ceil(u32::BITS));
         let new = |name: Binding, bytes: u64| gpu.buffer(name.name(), bytes, Memory::Device);
         let params = gpu.operand_buffer("params", params.len as u64 * 4, tuning.operands)?;
         Ok(ForwardBuffers {
@@ -174,7 +174,11 @@ impl Pass<'_> {
     /// As [`Pass::run`].
     pub fn count(&mut self, chunk: Chunk) -> Result<()> {
         let Chunk { first_ray, n_rays } = chunk;
-        self.run(&self.kernels.march_count, chunk.per_ray(), push::MarchCount { first_ray, n_rays })
+        self.run(
+            &self.kernels.march_count,
+            chunk.workgroups(self.kernels.rays_counted),
+            push::MarchCount { first_ray, n_rays },
+        )
     }
 
     /// Records offsets and indirect arguments, and points, of a chunk whose samples were counted.
@@ -182,7 +186,7 @@ impl Pass<'_> {
         let k = self.kernels;
         let Chunk { first_ray, n_rays } = chunk;
         self.run(&k.march_scan, Groups::Direct([1, 1, 1]), self.network.scan(chunk))?;
-        self.run(&k.march_emit, chunk.per_ray(), push::MarchEmit { first_ray, n_rays })
+        self.run(&k.march_emit, chunk.workgroups(k.rays_counted), push::MarchEmit { first_ray, n_rays })
     }
 
     /// Records the dynamic field at the live samples of `n_rays` rays already in `rays`, put into the rows of `volume`.
@@ -251,7 +255,7 @@ impl Pass<'_> {
         match self.still {
             None => {
                 let push = push::MarchFwd { first_ray, n_rays, with_maxima: u32::from(maxima) };
-                self.run(&self.kernels.march_fwd, chunk.per_ray(), push)
+                self.run(&self.kernels.march_fwd, chunk.workgroups(self.kernels.rays_marched), push)
             }
             Some(still) => still.record_integrals(self, chunk, maxima),
         }

@@ -171,7 +171,7 @@ fn record_losses(pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         still.record_losses(pass, chunk)?;
         return still.record_backward(pass, chunk);
     }
-    pass.run(&k.march_loss, chunk.per_ray(), push::MarchLoss { first_ray, n_rays })
+    pass.run(&k.march_loss, chunk.workgroups(k.rays_marched), push::MarchLoss { first_ray, n_rays })
 }
 
 /// Records the gradient of the tensor field's parameters.
