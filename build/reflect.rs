@@ -181,6 +181,13 @@ impl<'a> Spirv<'a> {
                     reads: self.member_decoration(pointee, 0, Decoration::NonReadable).is_none(),
                     writes: self.member_decoration(pointee, 0, Decoration::NonWritable).is_none(),
                 }),
+                StorageClass::Uniform => bindings.push(Binding {
+                    slot,
+                    name: self.members.get(&(pointee, 0)).ok_or("uniform buffer without a member name")?.to_string(),
+                    kind: "Uniform",
+                    reads: true,
+                    writes: false,
+                }),
                 StorageClass::UniformConstant => bindings.push(Binding {
                     slot,
                     name: self.names.get(&variable).ok_or("texel buffer or sampler without a name")?.to_string(),
@@ -201,7 +208,7 @@ impl<'a> Spirv<'a> {
             Some(Operand::Dim(Dim::DimBuffer)) => Ok("Texel"),
             // A combined image and sampler: the image's type is one step further.
             _ if self.types.get(&sampler).is_some_and(|t| t.class.opcode == Op::TypeSampledImage) => Ok("Volume"),
-            _ => Err("only storage buffers, texel buffers and 3D samplers are supported".into()),
+            _ => Err("only buffers, texel buffers and 3D samplers are supported".into()),
         }
     }
 

@@ -5,7 +5,7 @@
 #include "inc/layout.glsl"
 layout(local_size_x = 128, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
 layout(binding = 3) readonly buffer B3 { float gradient[]; };

@@ -9,7 +9,7 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
     uint n_pixels; uint image_width; uint with_static; uint with_dynamic; uint maximum;
 } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { View views[]; };
 layout(binding = 2) uniform sampler3D static_volume;
 layout(binding = 3) uniform sampler3D dynamic_volume;

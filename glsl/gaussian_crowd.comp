@@ -11,7 +11,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
 layout(push_constant) uniform Push { uint n_rays; uint image_width; uint first_blob; uint n_blobs; } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
 layout(binding = 2) readonly buffer B2 { Blob blobs[]; };
 layout(binding = 3) buffer B3 { RayOut ray_out[]; };

@@ -7,7 +7,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/splat_lanes.glsl"
 layout(push_constant) uniform Push { uint n_splats; } push;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { Splat splats[]; };
 layout(binding = 2) readonly buffer B2 { int image_of_splat[]; };
 layout(binding = 3) readonly buffer B3 { float splat_image_gradient[]; };

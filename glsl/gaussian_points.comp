@@ -16,7 +16,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 // away: world units; above 0 for what the sum is at most so near, below for what it is at least.
 layout(push_constant) uniform Push { uint first_row; uint n_rows; uint first_blob; uint n_blobs; float away; } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
 layout(binding = 2) readonly buffer B2 { Blob blobs[]; };
 layout(binding = 3) writeonly buffer B3 { float volume[]; };

@@ -4,7 +4,7 @@
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { float gaussian_loss_parts[]; };
 layout(binding = 2) buffer B2 { uint gaussian_step; };
 layout(binding = 3) writeonly buffer B3 { float gaussian_ring[]; };

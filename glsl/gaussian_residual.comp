@@ -13,7 +13,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
 layout(push_constant) uniform Push { uint first_quad; uint n_quads; } push;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) buffer B1 { ivec4 splat_images[]; };
 // Bounds of D, as images.
 layout(binding = 2) readonly buffer B2 { vec4 bound_low[]; };

@@ -5,7 +5,7 @@
 #include "inc/gaussian_gradient.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; } push;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { GaussianView gaussian_views[]; };
 layout(binding = 2) readonly buffer B2 { int image_of_view[]; };
 layout(binding = 3) readonly buffer B3 { vec4 splat_moments[]; };

@@ -24,7 +24,7 @@ layout(push_constant) uniform Push {
     uint weights_at; uint lower_weights_at; uint inputs_at; uint lower_inputs_at; uint outputs_at; uint out_weights_at;
     uint n_partials; uint bias; uint lower_bias; uint out_weights; uint out_bias; uint accumulate;
 } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { LiveSamples live; };
 layout(binding = 3) readonly buffer B3 { vec4 sample_points[]; };

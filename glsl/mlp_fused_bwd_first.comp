@@ -17,7 +17,7 @@ layout(constant_id = 9) const uint lower_shares = 1u;   // the same of lower_col
 layout(push_constant) uniform Push {
     uint weights_at; uint lower_weights_at; uint n_partials; uint bias; uint lower_bias; uint accumulate;
 } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
 layout(binding = 3) readonly buffer B3 { LiveSamples live; };

@@ -18,7 +18,7 @@ layout(constant_id = 9) const uint skip = 0u;         // layer (from 0) that see
 layout(constant_id = 10) const uint keep_features = 1u;
 layout(constant_id = 11) const uint keep_from = 0u;   // first layer whose activations are kept; `layers`: none
 layout(push_constant) uniform Push { uint out_bias; } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Schedule schedule[]; };
 layout(binding = 3) readonly buffer B3 { LiveSamples live; };

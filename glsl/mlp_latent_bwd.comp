@@ -8,7 +8,7 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
     uint layer; uint bias; uint latent_weight; uint latents; uint accumulate_latents;
 } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { float params[]; };
 layout(binding = 2) readonly buffer B2 { float phase_dz[]; };
 layout(binding = 3) buffer B3 { float gradient[]; };

@@ -8,7 +8,7 @@
 #include "inc/positions.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_pairs; uint n_bias; uint latents; } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { float params[]; };
 layout(binding = 2) readonly buffer B2 { uvec2 network_layers[]; };
 layout(binding = 3) readonly buffer B3 { uint pack_source[]; };

@@ -8,8 +8,8 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/splat_lanes.glsl"
 layout(push_constant) uniform Push { uint n_gaussians; } push;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) readonly buffer B1 { R2Setup r2_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { R2Gaussian r2_gaussians[]; };
 layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
 layout(binding = 4) readonly buffer B4 { uint gaussian_step; };

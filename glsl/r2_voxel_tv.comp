@@ -7,8 +7,8 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
 layout(push_constant) uniform Push { uint first_part; } push;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) readonly buffer B1 { R2Setup r2_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 // [set][z][y][x], fixed point.
 layout(binding = 2) readonly buffer B2 { int r2_voxel_sums[]; };
 // Alike.

@@ -7,7 +7,7 @@
 layout(local_size_x = 256, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint loss_scaling = 0u;
 layout(push_constant) uniform Push { uint n_tv_parts; } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { vec4 ray_loss[]; };
 layout(binding = 3) readonly buffer B3 { float tv_parts[]; };

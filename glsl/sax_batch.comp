@@ -9,7 +9,7 @@
 #include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint seed; uint first_turn; uint n_turns; } push;
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { uint sax_turns[]; };     // images of the fields, in their order
 layout(binding = 3) readonly buffer B3 { View sax_views[]; };     // of each image

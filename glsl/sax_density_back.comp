@@ -10,7 +10,7 @@ layout(push_constant) uniform Push { uint n_samples; uint capacity; uint first; 
 READ_VEC4(0, B0, sax_params);
 READ_VEC4(1, B1, sax_operands);
 layout(binding = 2) writeonly buffer B2 { vec4 sax_vectors[]; };
-layout(binding = 3) readonly buffer B3 { SaxSetup sax_setup; };
+layout(binding = 3) uniform B3 { SaxSetup sax_setup; };
 layout(binding = 4) readonly buffer B4 { vec4 sax_points[]; };
 layout(binding = 5) readonly buffer B5 { float sax_ray_gradient[]; };
 layout(binding = 6) readonly buffer B6 { float sax_sigma[]; };

@@ -9,7 +9,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_samples; } push;
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { SaxLevel sax_levels[]; };
 layout(binding = 2) readonly buffer B2 { vec4 sax_points[]; };
 layout(binding = 3) readonly buffer B3 { vec4 sax_encoding_gradient[]; };

@@ -6,7 +6,7 @@
 #include "inc/fixed_point.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) buffer B1 { uint sax_grid_sums[]; };
 layout(binding = 2) writeonly buffer B2 { float gradient[]; };  // the Lineformer's, then the grid's
 

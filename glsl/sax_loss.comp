@@ -7,7 +7,7 @@ layout(local_size_x = 32, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint first_loss; } push;
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
 layout(binding = 2) readonly buffer B2 { vec4 sax_points[]; };
 layout(binding = 3) readonly buffer B3 { float sax_sigma[]; };

@@ -9,7 +9,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint seed; uint first_ray; uint n_rays; } push;
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 layout(binding = 3) writeonly buffer B3 { vec4 sax_points[]; };  // [ray][sample]

@@ -17,7 +17,7 @@ layout(push_constant) uniform Push {
 } push;
 READ_VEC4(0, B0, sax_encoding);
 READ_VEC4(1, B1, sax_operands);
-layout(binding = 2) readonly buffer B2 { SaxSetup sax_setup; };
+layout(binding = 2) uniform B2 { SaxSetup sax_setup; };
 layout(binding = 3) readonly buffer B3 { SaxProduct sax_products[]; };
 layout(binding = 4) buffer B4 { float sax_weight_parts[]; };
 #include "inc/lineformer.glsl"

@@ -5,7 +5,7 @@
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { float sax_losses[]; };
 layout(binding = 2) buffer B2 { DeviceState state; };
 layout(binding = 3) writeonly buffer B3 { float sax_ring[]; };

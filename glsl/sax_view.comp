@@ -7,7 +7,7 @@ layout(local_size_x = 32, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 #include "inc/reduce.glsl"
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { vec4 sax_points[]; };
 layout(binding = 2) readonly buffer B2 { float sax_sigma[]; };
 layout(binding = 3) writeonly buffer B3 { RayOut ray_out[]; };

@@ -4,7 +4,7 @@
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
-layout(binding = 0) readonly buffer B0 { SaxSetup sax_setup; };
+layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { float sax_weight_parts[]; };  // [workgroup][number]
 layout(binding = 2) writeonly buffer B2 { float gradient[]; };
 

@@ -6,8 +6,8 @@
 #include "inc/r2_layout.glsl"
 #include "inc/ssim.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) readonly buffer B1 { R2Setup r2_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { R2Turn r2_turns[]; };
 layout(binding = 3) readonly buffer B3 { uint gaussian_step; };
 // [set][pixel], fixed point.

@@ -5,7 +5,7 @@
 #include "inc/gaussian_layout.glsl"
 #include "inc/ssim.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 // [set][pixel]: P, Q, T and another number.
 layout(binding = 1) readonly buffer B1 { vec4 ssim_factors[]; };
 // [set][pixel]: of P, Q, T; then nothing.

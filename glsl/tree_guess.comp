@@ -5,7 +5,7 @@
 #include "inc/gaussian_tree.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint phase; uint before; uint before_that; } push;
-layout(binding = 0) readonly buffer B0 { TreeSetup tree_setup; };
+layout(binding = 0) uniform B0 { TreeSetup tree_setup; };
 layout(binding = 1) buffer B1 { vec4 motion_grid[]; };
 
 void main() {

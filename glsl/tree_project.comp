@@ -6,8 +6,8 @@
 #include "inc/gaussian_tree.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; } push;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) readonly buffer B1 { TreeSetup tree_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) uniform B1 { TreeSetup tree_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { Gaussian gaussians[]; };
 // [phase][node]: displacement; none at the phase of rest.

@@ -5,7 +5,7 @@
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { LiveSamples live; };
 layout(binding = 2) readonly buffer B2 { vec4 sample_points[]; };
 layout(binding = 3) readonly buffer B3 { uint sample_rays[]; };

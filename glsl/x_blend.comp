@@ -6,8 +6,8 @@
 // set (z).
 #include "inc/x_gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) readonly buffer B1 { XSetup x_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) uniform B1 { XSetup x_setup; };
 layout(binding = 2) readonly buffer B2 { XGaussian x_gaussians[]; };
 layout(binding = 3) readonly buffer B3 { Splat splats[]; };
 // [set][tile row][tile column]

@@ -4,7 +4,7 @@
 // listed where not all have a place. One workgroup per tile column (x), row (y) and set (z).
 #include "inc/x_gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-layout(binding = 0) readonly buffer B0 { XSetup x_setup; };
+layout(binding = 0) uniform B0 { XSetup x_setup; };
 layout(binding = 1) readonly buffer B1 { XSet x_sets[]; };
 // By set and depth.
 layout(binding = 2) readonly buffer B2 { XKey x_keys[]; };

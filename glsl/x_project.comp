@@ -7,8 +7,8 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_gaussians; } push;
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) readonly buffer B1 { XSetup x_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) uniform B1 { XSetup x_setup; };
 // Of each image.
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { XGaussian x_gaussians[]; };

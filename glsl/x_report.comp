@@ -6,8 +6,8 @@
 #include "inc/x_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
-layout(binding = 0) readonly buffer B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) readonly buffer B1 { XSetup x_setup; };
+layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
+layout(binding = 1) uniform B1 { XSetup x_setup; };
 layout(binding = 2) readonly buffer B2 { XCounts x_counts; };
 layout(binding = 3) readonly buffer B3 { float gaussian_loss_parts[]; };
 layout(binding = 4) buffer B4 { uint gaussian_step; };

@@ -41,7 +41,7 @@ fn record_idle(
         .iter()
         .map(|b| {
             let bound = match b.kind {
-                BindingKind::Storage => Bound::Buffer(&objects.addressed),
+                BindingKind::Storage | BindingKind::Uniform => Bound::Buffer(&objects.addressed),
                 BindingKind::Texel => Bound::Buffer(&objects.texels),
                 BindingKind::Volume => Bound::Image(&objects.image),
             };
@@ -70,7 +70,7 @@ fn use_device(gpu: &Gpu) -> Result<()> {
     let objects = Objects {
         numbers: gpu.buffer_with("numbers", &numbers)?,
         texels: gpu.operand_buffer("texels", 256, Operands::Texel)?,
-        addressed: gpu.operand_buffer("addressed", 256, Operands::Address)?,
+        addressed: gpu.operand_buffer("addressed", 512, Operands::Address)?,
         image: gpu.image_3d("image", [4, 3, 2])?,
     };
     drop(objects.image.fill(&[half::f16::ONE; 24])?);

@@ -5,7 +5,7 @@
 #include "inc/depths.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
-layout(binding = 0) readonly buffer B0 { Setup setup; };
+layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 #include "inc/march_rays.glsl"

@@ -29,6 +29,8 @@ pub struct KernelCode {
 pub enum BindingKind {
     /// A storage buffer.
     Storage,
+    /// A buffer of few numbers that stay the same during a dispatch.
+    Uniform,
     /// A buffer read through a texel-buffer view.
     Texel,
     /// A 3D image with its sampler.
@@ -251,6 +253,7 @@ impl Gpu {
 pub(super) fn descriptor_type(binding: &BindingCode) -> vk::DescriptorType {
     match binding.kind {
         BindingKind::Storage => vk::DescriptorType::STORAGE_BUFFER,
+        BindingKind::Uniform => vk::DescriptorType::UNIFORM_BUFFER,
         BindingKind::Texel => vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
         BindingKind::Volume => vk::DescriptorType::COMBINED_IMAGE_SAMPLER,
     }

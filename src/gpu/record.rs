@@ -77,7 +77,7 @@ pub struct Commands {
 
 /// What a slot of a descriptor set refers to.
 enum Descriptor {
-    Storage(vk::DescriptorBufferInfo),
+    Buffer(vk::DescriptorBufferInfo),
     Texel(vk::BufferView),
     Image(vk::DescriptorImageInfo),
 }
@@ -85,9 +85,10 @@ enum Descriptor {
 impl Descriptor {
     fn of(pipeline: &Pipeline, binding: &BindingCode, what: &Bound<'_>) -> Result<Descriptor> {
         let name = match (binding.kind, what) {
-            (BindingKind::Storage, Bound::Buffer(b)) => {
+            (BindingKind::Uniform, Bound::Buffer(b)) if b.bytes() > LARGEST_UNIFORM => b.name(),
+            (BindingKind::Storage | BindingKind::Uniform, Bound::Buffer(b)) => {
                 let whole = vk::DescriptorBufferInfo::default().buffer(b.raw()).range(vk::WHOLE_SIZE);
-                return Ok(Descriptor::Storage(whole));
+                return Ok(Descriptor::Buffer(whole));
             }
             (BindingKind::Texel, Bound::Buffer(b)) => match b.texel_view() {
                 Some(view) => return Ok(Descriptor::Texel(view)),
@@ -107,13 +108,15 @@ impl Descriptor {
             .dst_binding(binding.slot)
             .descriptor_type(descriptor_type(binding));
         match self {
-            Descriptor::Storage(info) => write.buffer_info(std::slice::from_ref(info)),
+            Descriptor::Buffer(info) => write.buffer_info(std::slice::from_ref(info)),
             Descriptor::Texel(view) => write.texel_buffer_view(std::slice::from_ref(view)),
             Descriptor::Image(info) => write.image_info(std::slice::from_ref(info)),
         }
     }
 }
 
+/// Bytes of a uniform buffer that every device takes.
+const LARGEST_UNIFORM: u64 = 16384;
 const SETS_PER_POOL: u32 = 64;
 const MAX_BINDINGS: u32 = 16;
 
@@ -184,6 +187,7 @@ impl Recording {
 
     fn barrier(&mut self) {
         let access = vk::AccessFlags::SHADER_READ
+            | vk::AccessFlags::UNIFORM_READ
             | vk::AccessFlags::SHADER_WRITE
             | vk::AccessFlags::TRANSFER_READ
             | vk::AccessFlags::TRANSFER_WRITE;
@@ -383,6 +387,7 @@ impl Recording {
         }
         let sizes = [
             vk::DescriptorType::STORAGE_BUFFER,
+            vk::DescriptorType::UNIFORM_BUFFER,
             vk::DescriptorType::UNIFORM_TEXEL_BUFFER,
             vk::DescriptorType::COMBINED_IMAGE_SAMPLER,
         ]
