@@ -35,19 +35,15 @@ fn matrices() -> Option<(Gpu, Tuning)> {
     Some((gpu, tuning))
 }
 
-/// As a CPU gets them; then loops unrolled as on a GPU, with large tiles.
-const CPU: MatrixTuning = MatrixTuning {
-    workgroups: 4,
-    largest_tile: 32,
-    unroll: false,
-    backward_sums: u32::MAX,
-    recompute: false,
-    f16_sums: true,
-};
-const GPU: MatrixTuning =
-    MatrixTuning { workgroups: 3, largest_tile: 128, unroll: true, backward_sums: 64, recompute: true, f16_sums: true };
-/// As a GPU without f16 sums gets them.
-const F32_SUMS: MatrixTuning = MatrixTuning { f16_sums: false, ..GPU };
+/// As GPUs get them, with fewer workgroups than tiles.
+const NVIDIA: MatrixTuning = MatrixTuning { workgroups: 3, ..MatrixTuning::NVIDIA };
+const AMD: MatrixTuning = MatrixTuning { workgroups: 3, ..MatrixTuning::AMD };
+const INTEL: MatrixTuning = MatrixTuning { workgroups: 3, ..MatrixTuning::INTEL };
+/// As GPUs without f16 sums get them, of Intel and, if there are, of others.
+const INTEL_F32_SUMS: MatrixTuning = MatrixTuning { f16_sums: false, ..INTEL };
+const F32_SUMS: MatrixTuning = MatrixTuning { f16_sums: false, ..NVIDIA };
+/// Layer by layer backward, in loops that compile sooner.
+const SINGLY: MatrixTuning = MatrixTuning { pairs: false, ..MatrixTuning::CPU };
 const GPU_CASE: Case = Case {
     preset: Preset::FastMlp,
     settings: &["dynamic.width=32", "dynamic.layers=3", "dynamic.bands=4", "train.rays=60"],
@@ -57,10 +53,12 @@ const GPU_CASE: Case = Case {
 fn every_stage_of_an_iteration_matches() {
     let Some((gpu, tuning)) = matrices() else { return };
     let (even, uneven) = (small_dataset(13, 11), uneven_dataset(13, 11));
-    let as_gpus = [(&even, &GPU_CASE, GPU), (&even, &GPU_CASE, F32_SUMS), (&even, &MATRIX_CASES[0], F32_SUMS)];
-    let at_phases = MATRIX_CASES.iter().map(|case| (&even, case, CPU)).chain(as_gpus);
+    let of_gpus = [NVIDIA, AMD, INTEL, F32_SUMS, INTEL_F32_SUMS];
+    let as_gpus = of_gpus.map(|matrices| (&even, &GPU_CASE, matrices));
+    let as_gpus = as_gpus.into_iter().chain([(&even, &MATRIX_CASES[0], F32_SUMS), (&even, &MATRIX_CASES[1], SINGLY)]);
+    let at_phases = MATRIX_CASES.iter().map(|case| (&even, case, MatrixTuning::CPU)).chain(as_gpus);
     for (dataset, case, matrices) in
-        at_phases.chain(MATRIX_CASES_BETWEEN_PHASES.iter().map(|case| (&uneven, case, CPU)))
+        at_phases.chain(MATRIX_CASES_BETWEEN_PHASES.iter().map(|case| (&uneven, case, MatrixTuning::CPU)))
     {
         let path = Tuning { matrices, ..tuning.clone() };
         expect_agreement(|findings| iteration::compare(&gpu, dataset, case, &path, findings));
@@ -80,12 +78,14 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
     if matrices().is_none() {
         return;
     }
-    let kept: faults::Compare = |gpu, findings| an_iteration(gpu, CPU, findings);
-    let again: faults::Compare = |gpu, findings| an_iteration(gpu, MatrixTuning { recompute: true, ..CPU }, findings);
+    let kept: faults::Compare = |gpu, findings| an_iteration(gpu, MatrixTuning::CPU, findings);
+    let again: faults::Compare =
+        |gpu, findings| an_iteration(gpu, MatrixTuning { recompute: true, ..MatrixTuning::CPU }, findings);
     let kept_in_f32: faults::Compare =
-        |gpu, findings| an_iteration(gpu, MatrixTuning { f16_sums: false, ..CPU }, findings);
-    let again_in_f32: faults::Compare =
-        |gpu, findings| an_iteration(gpu, MatrixTuning { f16_sums: false, recompute: true, ..CPU }, findings);
+        |gpu, findings| an_iteration(gpu, MatrixTuning { f16_sums: false, ..MatrixTuning::CPU }, findings);
+    let again_in_f32: faults::Compare = |gpu, findings| {
+        an_iteration(gpu, MatrixTuning { f16_sums: false, recompute: true, ..MatrixTuning::CPU }, findings)
+    };
     faults::expect_found(&[
         fault("mlp_pack", sum_for_product, kept),
         fault("mlp_fused_fwd", sum_for_product, kept),
@@ -104,7 +104,7 @@ fn an_iteration_waits_where_it_must() {
     let dataset = small_dataset(13, 11);
     let barriers =
         [("fast-mlp", true), ("fast-mlp", false), ("public-code", false), ("nerf-ca", true)].map(|(preset, again)| {
-            let tuning = Tuning { matrices: MatrixTuning { recompute: again, ..CPU }, ..tuning.clone() };
+            let tuning = Tuning { matrices: MatrixTuning { recompute: again, ..MatrixTuning::CPU }, ..tuning.clone() };
             let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
             Trainer::new(&gpu, plan, &dataset, tuning).unwrap().barriers().unwrap()
         });

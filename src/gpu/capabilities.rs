@@ -15,6 +15,8 @@ pub struct DeviceInfo {
     pub name: String,
     /// What kind of processor it is.
     pub kind: DeviceKind,
+    /// Who made it.
+    pub vendor: Vendor,
     /// Device UUID, hexadecimal.
     pub uuid: String,
     /// Driver name and version text.
@@ -82,6 +84,32 @@ pub struct DeviceInfo {
     pub portability_subset: bool,
     /// Why this device cannot be used, if so.
     pub unusable: Option<String>,
+}
+
+/// Makers of devices for which sizes of kernels are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Vendor {
+    /// AMD.
+    Amd,
+    /// Intel.
+    Intel,
+    /// NVIDIA.
+    Nvidia,
+    /// Any other, among them drivers that compute on a CPU.
+    Other,
+}
+
+impl Vendor {
+    /// By its PCI id.
+    fn of(id: u32) -> Vendor {
+        match id {
+            0x1002 => Vendor::Amd,
+            0x8086 => Vendor::Intel,
+            0x10de => Vendor::Nvidia,
+            _ => Vendor::Other,
+        }
+    }
 }
 
 impl DeviceInfo {
@@ -373,6 +401,7 @@ pub(super) fn describe(
             vk::PhysicalDeviceType::CPU => DeviceKind::Cpu,
             _ => DeviceKind::Other,
         },
+        vendor: Vendor::of(properties.vendor_id),
         uuid: ids.device_uuid.iter().map(|b| format!("{b:02x}")).collect(),
         mesa_major: driver_info.strip_prefix("Mesa ").and_then(|v| v.split('.').next()).and_then(|v| v.parse().ok()),
         driver: format!("{} {}", c_chars(&driver.driver_name), driver_info),

@@ -2,7 +2,7 @@
 
 use crate::choice::Choice;
 use crate::gpu::buffer::Operands;
-use crate::gpu::capabilities::{DeviceInfo, DeviceKind};
+use crate::gpu::capabilities::{DeviceInfo, DeviceKind, Vendor};
 use crate::gpu::pace::longest_submit_s;
 use crate::kernels::constants;
 use crate::kernels::push::{MarchLoss, PushConstants};
@@ -50,12 +50,18 @@ pub struct MatrixTuning {
     pub workgroups: u32,
     /// Samples of a workgroup's tile, at most; shared memory may allow fewer.
     pub largest_tile: u32,
-    /// Unroll the loops over the inner dimension: operands stay in registers, compilation takes longer.
-    pub unroll: bool,
+    /// Unroll the forward pass's loops over the inner dimension: operands stay in registers, compilation takes longer.
+    pub unroll_forward: bool,
+    /// The same of the backward passes.
+    pub unroll_backward: bool,
+    /// Go backward through two layers at once where two follow each other: less memory moves, with twice the sums.
+    pub pairs: bool,
     /// f32 sums of weight gradients that an invocation of the backward passes keeps, at most; workgroups become larger
     /// before there are more.
     pub backward_sums: u32,
-    /// Compute the encoding and the first layer again in the backward pass instead of keeping them: less memory moves.
+    /// Invocations of a backward workgroup, at most.
+    pub backward_lanes: u32,
+    /// Compute the encoding and the first layer again in the backward pass of a pair instead of keeping them: less memory moves.
     pub recompute: bool,
     /// Make numbers f16 in registers, for which a device must have matrices of f16 sums.
     pub f16_sums: bool,
@@ -79,6 +85,67 @@ impl RayLanes {
     /// The constant by which shaders know the rays of a workgroup.
     pub(super) fn constant(self) -> [(&'static str, u32); 1] {
         [("rays_of_workgroup", self.rays)]
+    }
+}
+
+impl MatrixTuning {
+    /// As a CPU takes them. Unrolled, a driver compiles these kernels for minutes; sums are in memory, and the encoding is dear.
+    pub const CPU: MatrixTuning = MatrixTuning {
+        workgroups: 4,
+        largest_tile: 32,
+        unroll_forward: false,
+        unroll_backward: false,
+        pairs: true,
+        backward_sums: u32::MAX,
+        backward_lanes: 512,
+        recompute: false,
+        f16_sums: true,
+    };
+
+    /// As NVIDIA's GPUs take them, and others of which nothing is known. What differs for the next two is by their compilers'
+    /// numbers (docs/performance.md).
+    pub const NVIDIA: MatrixTuning = MatrixTuning {
+        workgroups: 264,
+        largest_tile: 128,
+        unroll_forward: true,
+        unroll_backward: true,
+        pairs: true,
+        backward_sums: 64,
+        backward_lanes: 512,
+        recompute: true,
+        f16_sums: true,
+    };
+
+    /// As AMD's GPUs take them: unrolled, the forward pass has twice the instructions.
+    pub const AMD: MatrixTuning = MatrixTuning { unroll_forward: false, ..MatrixTuning::NVIDIA };
+
+    /// As Intel's GPUs take them: registers are few, and spilling costs more than memory that moves.
+    pub const INTEL: MatrixTuning = MatrixTuning {
+        largest_tile: 64,
+        unroll_forward: false,
+        pairs: false,
+        backward_sums: 16,
+        backward_lanes: 1024,
+        recompute: false,
+        ..MatrixTuning::NVIDIA
+    };
+
+    /// Chooses for a device.
+    fn for_device(info: &DeviceInfo) -> MatrixTuning {
+        if info.is_cpu() {
+            return MatrixTuning::CPU;
+        }
+        let sizes = match info.vendor {
+            Vendor::Amd => MatrixTuning::AMD,
+            Vendor::Intel => MatrixTuning::INTEL,
+            Vendor::Nvidia | Vendor::Other => MatrixTuning::NVIDIA,
+        };
+        let workgroups = match info.multiprocessors {
+            0 => workgroups_untold(info.kind),
+            // Two workgroups per multiprocessor.
+            n => 2 * n,
+        };
+        MatrixTuning { workgroups, ..sizes }
     }
 }
 
@@ -159,28 +226,7 @@ impl Tuning {
         };
         reasons.push(why);
         let f16_sums = info.matrices.first().is_some_and(|s| s.f16_sums);
-        let on_gpu = |workgroups| MatrixTuning {
-            workgroups,
-            largest_tile: 128,
-            unroll: true,
-            backward_sums: 64,
-            recompute: true,
-            f16_sums,
-        };
-        let matrices = match info.multiprocessors {
-            // Unrolled, a CPU driver compiles these kernels for minutes; sums are in memory, and the encoding is dear.
-            _ if info.is_cpu() => MatrixTuning {
-                workgroups: 4,
-                largest_tile: 32,
-                unroll: false,
-                backward_sums: u32::MAX,
-                recompute: false,
-                f16_sums,
-            },
-            0 => on_gpu(workgroups_untold(info.kind)),
-            // Two workgroups per multiprocessor.
-            n => on_gpu(2 * n),
-        };
+        let matrices = MatrixTuning { f16_sums, ..MatrixTuning::for_device(info) };
         // Some kilobytes per sample must fit beside all else. By what there is, not by what is free now: sums of a batch in other
         // chunks are rounded otherwise, and runs on one device repeat bit by bit.
         let chunk_samples = match info.kind {

@@ -86,13 +86,13 @@ struct Builder<'a> {
     gpu: &'a Gpu,
     shape: &'a Shape,
     params: &'a NetworkMap,
-    /// Suffix of the kernels' variant: unrolled or not, with f16 sums or without, they compute the same.
-    variant: &'static str,
+    tuning: &'a MatrixTuning,
 }
 
-/// Where there are no f16 sums, loops are unrolled: only GPUs lack them.
-fn variant(tuning: &MatrixTuning) -> &'static str {
-    match (tuning.f16_sums, tuning.unroll) {
+/// Suffix of a kernel's variant: unrolled or not, with f16 sums or without, they compute the same. Where there are no f16 sums, there
+/// is only one.
+fn variant(f16_sums: bool, unroll: bool) -> &'static str {
+    match (f16_sums, unroll) {
         (true, true) => "_unrolled",
         (true, false) => "",
         (false, _) => "_f32_sums",
@@ -105,9 +105,9 @@ impl Builder<'_> {
         [("m", m), ("n", n), ("k", k), ("tile", tile), ("subgroups", subgroups), ("width", self.params.width as u32)]
     }
 
-    fn build<'c>(&self, subgroups: u32, constants: &'c [(&'static str, u32)]) -> Build<'c> {
+    fn build<'c>(&self, subgroups: u32, unroll: bool, constants: &'c [(&'static str, u32)]) -> Build<'c> {
         let lanes = Some(subgroups * self.gpu.info().matrix_subgroup);
-        Build { variant: self.variant, lanes, constants, matrices: true, ..Build::default() }
+        Build { variant: variant(self.tuning.f16_sums, unroll), lanes, constants, matrices: true, ..Build::default() }
     }
 
     fn forward(&self, purpose: Purpose) -> Result<Stage<push::MlpFusedFwd>> {
@@ -122,7 +122,7 @@ impl Builder<'_> {
             ("keep_features", u32::from(keep_from == 0)),
             ("keep_from", keep_from as u32),
         ]);
-        self.build(self.shape.subgroups, &constants).stage(self.gpu)
+        self.build(self.shape.subgroups, self.tuning.unroll_forward, &constants).stage(self.gpu)
     }
 
     fn columns(&self, part: Part) -> u32 {
@@ -156,7 +156,9 @@ impl Builder<'_> {
             ("lower_shares", lower_shares),
         ]);
         if sizes.recompute && span.last() == Part::Encoded(0) {
-            return Ok(BackwardStage::Recomputed(self.build(sizes.subgroups, &constants).stage(self.gpu)?));
+            return Ok(BackwardStage::Recomputed(
+                self.build(sizes.subgroups, self.tuning.unroll_backward, &constants).stage(self.gpu)?,
+            ));
         }
         let from_output = span.upper.layer() + 1 == self.params.layers.len();
         constants.extend([
@@ -164,14 +166,14 @@ impl Builder<'_> {
             ("with_input", u32::from(span.with_input())),
             ("from_output", u32::from(from_output)),
         ]);
-        Ok(BackwardStage::Kept(self.build(sizes.subgroups, &constants).stage(self.gpu)?))
+        Ok(BackwardStage::Kept(self.build(sizes.subgroups, self.tuning.unroll_backward, &constants).stage(self.gpu)?))
     }
 
     /// The backward passes, from the last layer down.
     fn passes(&self) -> Result<Vec<BackwardPass>> {
         let mut built: Vec<BackwardPass> = Vec::new();
         let mut reads = vec![0; self.params.layers.len()];
-        for span in spans(&self.params.layers) {
+        for span in spans(&self.params.layers, self.shape.backward.pairs) {
             let layer = span.upper.layer();
             if span.with_input() {
                 reads[span.last().layer() - 1] = 1 - reads[layer];
@@ -185,7 +187,7 @@ impl Builder<'_> {
 
 /// Whether the backward passes compute the encoding and the first layer of such a network again.
 pub(crate) fn computes_again(tuning: &MatrixTuning, params: &NetworkMap) -> bool {
-    tuning.recompute && recomputes(&spans(&params.layers))
+    tuning.recompute && recomputes(&spans(&params.layers, tuning.pairs))
 }
 
 impl FusedNetwork {
@@ -204,7 +206,7 @@ impl FusedNetwork {
             Error::config("layers", "matrices", format!("{}: {problem}", info.name))
         })?;
         let shape = Shape::new(info, matrix, &tuning.matrices, params)?;
-        let builder = Builder { gpu, shape: &shape, params, variant: variant(&tuning.matrices) };
+        let builder = Builder { gpu, shape: &shape, params, tuning: &tuning.matrices };
         let (width, encoded) = (params.width, shape.encoded);
         let capacity = u64::from(setup.sample_capacity);
         let training = match purpose {
@@ -317,7 +319,7 @@ impl FusedNetwork {
 
 impl Path for FusedNetwork {
     fn work(&self, params: &NetworkMap, samples: u64) -> Ledger {
-        work(params, self.shape.encoded as u64, samples, self.shape.backward.recompute)
+        work(params, self.shape.encoded as u64, samples, self.shape.backward)
     }
 
     fn find(&self, name: Binding) -> Option<&Buffer> {
@@ -367,42 +369,49 @@ mod tests {
     use crate::model::params::ParamMap;
     use crate::network::SAMPLE_BYTES;
     use crate::network::cost::NetworkCost;
+    use crate::network::fused::shape::Backward;
 
     #[test]
     fn the_papers_network_moves_two_kilobytes_a_sample() {
         let params = ParamMap::new(&Config::preset(Preset::Paper), 10);
         let cost = NetworkCost::of(&params);
         // 63 numbers and 10 phases, filled up to 80 columns.
-        let ledger = |recompute| {
-            let ledger = work(&params.moving, 80, 1_000_000_000, recompute);
+        let ledger = |pairs, recompute| {
+            let backward = Backward { subgroups: 8, tile: 64, pairs, recompute };
+            let ledger = work(&params.moving, 80, 1_000_000_000, backward);
             ["mlp_fused_fwd", "mlp_fused_bwd"].map(|stage| ledger[stage])
         };
-        let [forward, backward] = ledger(false);
+        let [forward, backward] = ledger(true, false);
         assert_eq!(forward.gflop as u64, cost.forward);
         assert_eq!(backward.gflop as u64, cost.weights + cost.inputs);
         // Two bytes of 80 columns and 4 x 128 activations; 4 x 128 numbers of the upper two layers, 2 x 128 + 80 of the others.
         assert_eq!(forward.megabytes as u64, 1_000 * (160 + 4 * 256 + SAMPLE_BYTES));
         assert_eq!(backward.megabytes as u64, 1_000 * (4 * 256 + 2 * 256 + 160 + SAMPLE_BYTES));
-        let [forward, backward] = ledger(true);
+        let [forward, backward] = ledger(true, true);
         assert_eq!(backward.gflop as u64, cost.weights + cost.inputs + 2 * 63 * 128);
         assert_eq!(forward.megabytes as u64, 1_000 * (3 * 256 + SAMPLE_BYTES));
         assert_eq!(backward.megabytes as u64, 1_000 * (4 * 256 + 256 + 2 * SAMPLE_BYTES));
+        // Layer by layer: inputs and dz of each of three, and dz of the layer below; of the first layer, no dz below.
+        let [_, backward] = ledger(false, false);
+        assert_eq!(backward.gflop as u64, cost.weights + cost.inputs);
+        assert_eq!(backward.megabytes as u64, 1_000 * (3 * 768 + 416 + SAMPLE_BYTES));
     }
 
     #[test]
     fn layers_are_paired_from_the_first_up() {
-        let spans_of = |layers: usize, skip_layer: usize| {
+        let spans_of = |layers: usize, skip_layer: usize, pairs: bool| {
             let mut config = Config::preset(Preset::Paper);
             (config.dynamic.layers, config.dynamic.skip_layer) = (layers as u32, skip_layer as u32);
-            let spans = spans(&ParamMap::new(&config, 10).moving.layers);
+            let spans = spans(&ParamMap::new(&config, 10).moving.layers, pairs);
             spans.iter().map(|span| (span.upper, span.lower)).collect::<Vec<_>>()
         };
         use Part::{Encoded, Hidden};
-        assert_eq!(spans_of(4, 0), [(Hidden(3), Some(Hidden(2))), (Hidden(1), Some(Encoded(0)))]);
-        assert_eq!(spans_of(3, 0), [(Hidden(2), None), (Hidden(1), Some(Encoded(0)))]);
-        assert_eq!(spans_of(1, 0), [(Encoded(0), None)]);
+        assert_eq!(spans_of(4, 0, true), [(Hidden(3), Some(Hidden(2))), (Hidden(1), Some(Encoded(0)))]);
+        assert_eq!(spans_of(3, 0, true), [(Hidden(2), None), (Hidden(1), Some(Encoded(0)))]);
+        assert_eq!(spans_of(1, 0, true), [(Encoded(0), None)]);
         // dz of a layer that sees both inputs goes to memory.
-        let skips = spans_of(4, 3);
+        let skips = spans_of(4, 3, true);
         assert_eq!(skips, [(Hidden(3), None), (Hidden(2), None), (Encoded(2), None), (Hidden(1), Some(Encoded(0)))]);
+        assert_eq!(spans_of(3, 0, false), [(Hidden(2), None), (Hidden(1), None), (Encoded(0), None)]);
     }
 }

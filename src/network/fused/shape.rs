@@ -50,14 +50,14 @@ pub(super) struct Backward {
     pub(super) subgroups: u32,
     /// Samples of a tile.
     pub(super) tile: u32,
+    /// Whether a pass goes through two layers at once where it can.
+    pub(super) pairs: bool,
     /// Whether the encoding and the first layer's activations are computed again instead of read.
     pub(super) recompute: bool,
 }
 
 /// Largest backward tile: further samples would lengthen a workgroup's wait at its barriers.
 const LARGEST_BACKWARD_TILE: u32 = 64;
-/// Invocations of the largest backward workgroup.
-const MOST_BACKWARD_LANES: u32 = 512;
 
 /// Sizes and positions, from the network's shape and the device's limits.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -114,15 +114,16 @@ impl Shape {
             let scratch = 2 * 16 * subgroups * info.matrix_subgroup;
             let bytes = |t: u32| (t * hidden_row).max(scratch) + t * (inputs_row + 4);
             let tile = room(subgroups).tile(tuning.largest_tile.min(LARGEST_BACKWARD_TILE), bytes)?;
-            Some(Backward { subgroups, tile, recompute })
+            Some(Backward { subgroups, tile, pairs: tuning.pairs, recompute })
         };
         // Subgroups beyond the tiles across a layer share out the rows of its input gradient.
-        let few_sums = |b: &Backward| 2 * width * width <= tuning.backward_sums * b.subgroups * info.matrix_subgroup;
+        let sums = if tuning.pairs { 2 } else { 1 } * width * width;
+        let few_sums = |b: &Backward| sums <= tuning.backward_sums * b.subgroups * info.matrix_subgroup;
         let fits = |b: &Backward| {
             let columns = width / n;
             let row_shares = b.subgroups / columns.min(b.subgroups);
             b.subgroups <= most
-                && b.subgroups * info.matrix_subgroup <= MOST_BACKWARD_LANES.max(subgroups * info.matrix_subgroup)
+                && b.subgroups * info.matrix_subgroup <= tuning.backward_lanes.max(subgroups * info.matrix_subgroup)
                 && (b.subgroups <= columns || b.subgroups.is_multiple_of(columns))
                 && (b.tile / m).is_multiple_of(row_shares)
         };

@@ -1,6 +1,7 @@
 //! Which layers a backward pass goes through, and what that moves.
 
 use crate::model::params::{Layer, NetworkMap};
+use crate::network::fused::shape::Backward;
 use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::{F16_BYTES, SAMPLE_BYTES};
 
@@ -40,16 +41,16 @@ impl Span {
     }
 }
 
-/// The backward passes in their order, from the last layer down; pairs are made from the first layer up, so that what is left
-/// over is the last layer's.
-pub(super) fn spans(layers: &[Layer]) -> Vec<Span> {
+/// The backward passes in their order, from the last layer down; with `pairs`, two layers to a pass where that can be, made from the
+/// first layer up, so that what is left over is the last layer's.
+pub(super) fn spans(layers: &[Layer], pairs: bool) -> Vec<Span> {
     let parts = |(l, layer): (usize, &Layer)| {
         [layer.hidden.map(|_| Part::Hidden(l)), layer.encoded.map(|_| Part::Encoded(l))].into_iter().flatten()
     };
     let mut parts: Vec<Part> = layers.iter().enumerate().rev().flat_map(parts).collect();
     let mut spans = Vec::new();
     while let Some(last) = parts.pop() {
-        let above = parts.last().copied().filter(|above| joins(layers, *above, last));
+        let above = parts.last().copied().filter(|above| pairs && joins(layers, *above, last));
         spans.push(match above {
             Some(upper) => Span { upper, lower: Some(last) },
             None => Span { upper: last, lower: None },
@@ -77,9 +78,10 @@ pub(super) fn recomputes(spans: &[Span]) -> bool {
     spans.len() > 1 && readers.count() == 1 && spans.last().is_some_and(|span| span.lower.is_some_and(encoded))
 }
 
-/// Least work of the passes, with so many columns of weights on the encoding. The forward pass keeps what the backward passes
+/// Least work of the passes, of such backward ones, with so many columns of weights on the encoding. The forward pass keeps what the backward passes
 /// read; of these each reads its dz, its inputs, and for masks the last layer's activations, and leaves dz of the layer below.
-pub(super) fn work(params: &NetworkMap, encoded: u64, samples: u64, recompute: bool) -> Ledger {
+pub(super) fn work(params: &NetworkMap, encoded: u64, samples: u64, backward: Backward) -> Ledger {
+    let Backward { pairs, recompute, .. } = backward;
     let width = params.width as u64;
     let mut ledger = Ledger::new();
     let mut count = |stage: &str, flop: u64, numbers: u64, bytes: u64| {
@@ -93,7 +95,7 @@ pub(super) fn work(params: &NetworkMap, encoded: u64, samples: u64, recompute: b
         Part::Hidden(_) => 2 * width * width,
         Part::Encoded(_) => first,
     };
-    let spans = spans(&params.layers);
+    let spans = spans(&params.layers, pairs);
     for (i, span) in spans.iter().enumerate() {
         let recomputed = recompute && i + 1 == spans.len();
         let read = |part: Part| match part {
