@@ -11,7 +11,8 @@ mod shim;
 
 use common::{small_dataset, tuning};
 use faults::{
-    difference_for_sum, differences, fault, missing_clear, one_too_many, other_digits, sum_for_product, wrong_sign,
+    difference_for_sum, differences, fault, missing_clear, no_stores, one_too_many, other_digits, sum_for_product,
+    wrong_sign,
 };
 use nertca_vk::config::{Config, Preset, sections::Train};
 use nertca_vk::error::Result;
@@ -72,7 +73,11 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
     faults::expect_found(&[
         fault("gaussian_moments", wrong_sign, gaussians::compare),
         fault("gaussian_update", wrong_sign, gaussians::compare),
+        fault("gaussian_report", no_stores, gaussians::compare),
         fault("tree_grid_gradient", wrong_sign, trees::compare),
+        fault("march_count", difference_for_sum, an_iteration),
+        fault("march_scan", differences, an_iteration),
+        fault("march_emit", difference_for_sum, an_iteration),
         fault("march_loss", sum_for_product, an_iteration),
         fault("gradient_static", wrong_sign, an_iteration),
         fault("gradient_static", missing_clear, an_iteration),
@@ -100,6 +105,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("x_blend_back", wrong_sign, x_gaussian::compare),
         fault("x_update", wrong_sign, x_gaussian::compare),
         fault("x_report", difference_for_sum, x_gaussian::compare),
+        fault("x_report", no_stores, x_gaussian::compare),
         fault("sax_batch", one_too_many, sax::compare),
         fault("sax_points", wrong_sign, sax::compare),
         fault("sax_encode", wrong_sign, sax::compare),
@@ -117,6 +123,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("sax_encode_bwd", wrong_sign, sax::compare),
         fault("sax_grid_gradient", missing_clear, sax::compare),
         fault("sax_report", difference_for_sum, sax::compare),
+        fault("sax_report", no_stores, sax::compare),
         fault("sax_view", difference_for_sum, sax::compare),
         fault("gaussian_crowd", wrong_sign, many_gaussians),
     ]);

@@ -10,7 +10,7 @@ use crate::kernels::push::{self, PushConstants};
 use crate::plan::fit;
 use crate::plan::targets::Targets;
 use crate::reference::gaussians::{self as reference, AdamState, N_PARAMS, Params, Projection, params};
-use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::problems::{hard_case, with_gaussians};
 use crate::train::gaussians::GaussianTrainer;
 
@@ -210,7 +210,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
         .collect();
     compare_splats(gpu, trainer.particles(), &setup, PROJECT, &seen, findings)?;
     findings.numbers(SPLAT, "images", &images, &twin_images(&targets, &setup, &all), NUMBERS);
-    let loss = trainer.advance(1)?.first().copied().unwrap_or(f64::NAN);
+    let loss = told(trainer.advance(1))?.first().copied().unwrap_or(f64::NAN);
     let buffers = (trainer.target_buffers(), trainer.particles());
     let (twin_loss, moments) = compare_backward(gpu, (&targets, &setup), buffers, &images, &seen, findings)?;
     // Gradients of the parameters by the device's moments.

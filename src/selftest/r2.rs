@@ -14,7 +14,7 @@ use crate::r2::setup::{schedule, turns};
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::gaussians::{N_PARAMS, Params};
 use crate::reference::r2::{self as reference, AdamState, Projection, Sight, VoxelBox, params};
-use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{TENSORS, f32s, numbers, of_rows};
 use crate::selftest::problems::small_dataset;
 use crate::train::r2::R2Trainer;
@@ -196,7 +196,7 @@ impl Iteration<'_> {
     }
 
     fn compare(mut self, findings: &mut Findings) -> Result<()> {
-        let loss = self.fit.advance(1)?.first().copied().unwrap_or(f64::NAN);
+        let loss = told(self.fit.advance(1))?.first().copied().unwrap_or(f64::NAN);
         let all_turns = turns(self.fit.data(), &self.config);
         let shown: Vec<Turn<'_>> = all_turns[..self.fit.data().n_sets()]
             .iter()

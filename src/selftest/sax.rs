@@ -17,7 +17,7 @@ use crate::sax::data::SaxData;
 use crate::sax::drawing::SaxDrawing;
 use crate::sax::setup::{drawing_setup, outline, schedule};
 use crate::sax::start::first_params;
-use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::problems::small_dataset;
 use crate::train::sax::SaxTrainer;
 
@@ -155,7 +155,7 @@ impl Iteration<'_> {
     }
 
     fn compare(mut self, findings: &mut Findings) -> Result<()> {
-        let loss = self.fit.advance(1)?.first().copied().unwrap_or(f64::NAN);
+        let loss = told(self.fit.advance(1))?.first().copied().unwrap_or(f64::NAN);
         let made = self.made()?;
         self.compare_batch(&made, findings);
         self.compare_samples(&made, findings);

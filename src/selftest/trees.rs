@@ -12,7 +12,7 @@ use crate::kernels::stages::{Build, Stage};
 use crate::plan::targets::Targets;
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
 use crate::reference::tree::{TreeParams, loss_and_gradient, phases_shown, shown};
-use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{
     LOSS, NUMBERS, REPORT, SPLAT, Seen, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
 };
@@ -70,7 +70,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
         shown.iter().map(|s| s.as_ref().map(|(_, image, moved)| (*image, project((*image, moved))))).collect();
     compare_splats(gpu, trainer.particles(), &setup, PROJECT, &seen, findings)?;
     findings.numbers(SPLAT, "images", &images, &drawn(&targets, &setup, &seen), NUMBERS);
-    let loss = trainer.advance(1)?.first().copied().unwrap_or(f64::NAN);
+    let loss = told(trainer.advance(1))?.first().copied().unwrap_or(f64::NAN);
     let buffers = (trainer.target_buffers(), trainer.particles());
     let (twin_loss, moments) = compare_backward(gpu, (&targets, &setup), buffers, &images, &seen, findings)?;
     // By the device's moments: gradients of each Gaussian, and of its place at each phase.

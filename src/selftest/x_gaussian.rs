@@ -12,7 +12,7 @@ use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::r2::picture_loss;
 use crate::reference::x_gaussian::{self as reference, AdamState, Blot, N_PARAMS, Params, Projection, Sums, params};
-use crate::selftest::compare::{Findings, Tolerance};
+use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::f32s;
 use crate::selftest::problems::small_dataset;
 use crate::train::x_gaussian::XTrainer;
@@ -181,7 +181,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
         let config = small_config(settings)?;
         let (data, state) = hard_case(&config)?;
         let mut fit = XTrainer::with(gpu, data, &config, &state, 0)?;
-        let loss = fit.advance(1)?.first().copied().unwrap_or(f64::NAN);
+        let loss = told(fit.advance(1))?.first().copied().unwrap_or(f64::NAN);
         let shown = turns(fit.data(), &config)[..fit.data().n_sets()].to_vec();
         Iteration { gpu, fit: &fit, state: &state, shown }.compare(loss, findings)?;
     }
