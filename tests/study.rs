@@ -179,6 +179,8 @@ fn what_changed_runs_again_and_nothing_else() {
     other["fingerprint"]["commit"] = "of another day".into();
     std::fs::write(file_of("a-3v.m.s1"), other.to_string()).unwrap();
     assert_eq!(all("waiting"), ["a-3v.m.s1"]);
+    let listed = ok(&["list", text(&file), "-o", text(&out), "--any-commit"]);
+    assert!(listed.lines().count() == 2 && listed.lines().all(|line| line.starts_with("scored ")), "{listed}");
     let begun = |more: &[&str]| {
         let args = [&["run", text(&file), "-o", text(&out), "--json"], more].concat();
         ok(&args).matches("run_begun").count()

@@ -112,6 +112,9 @@ pub struct ListArgs {
     /// Directory of the study's runs, to say which have their result.
     #[arg(short, long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Results of other commits of this program count, as `study run --any-commit` counts them.
+    #[arg(long, requires = "out")]
+    pub any_commit: bool,
     /// JSON instead of lines.
     #[arg(long)]
     pub json: bool,
@@ -208,11 +211,14 @@ fn list(args: &ListArgs) -> Result<()> {
     for run in &runs {
         let state = match &args.out {
             None => None,
-            Some(directory) => Some(match Outcome::of(&study, directory, run)? {
-                None => "waiting",
-                Some(outcome) if outcome.failure.is_some() => "failed",
-                Some(_) => "scored",
-            }),
+            Some(directory) => {
+                let of = if args.any_commit { Outcome::of_any_commit } else { Outcome::of };
+                Some(match of(&study, directory, run)? {
+                    None => "waiting",
+                    Some(outcome) if outcome.failure.is_some() => "failed",
+                    Some(_) => "scored",
+                })
+            }
         };
         let (data, method) = (study.data[run.data].id.as_str(), &study.methods[run.method]);
         let (iterations, fingerprint) = (study.config(run).train.iterations, study.fingerprint(run)?);

@@ -6,14 +6,28 @@ use crate::gpu::device::Gpu;
 use crate::kernels::layout::{GaussianSetup, Splat};
 use serde::{Deserialize, Serialize};
 
-/// Operations per pair of a splat and a pixel of its box, forward and backward; an exponential counts as one.
-const FLOP_PER_PAIR: u64 = 52;
+/// How Gaussians are seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SplatCost {
+    /// Operations per pair of a splat and a pixel of its box, forward and backward; an exponential counts as one.
+    flop_per_pair: u64,
+    /// Bytes of what the gradient needs of a splat's pixels.
+    moment_bytes: u64,
+}
+
+impl SplatCost {
+    /// As ellipses: `gaussian_splat`, `gaussian_moments`.
+    pub const AFFINE: SplatCost = SplatCost { flop_per_pair: 52, moment_bytes: 32 };
+    /// Along the ray of each pixel: `r2_chord_splat`, `r2_chord_moments`.
+    pub const CHORD: SplatCost = SplatCost { flop_per_pair: 173, moment_bytes: 48 };
+}
+
 /// Bytes per pair: a sum read and written, a gradient read.
 const BYTES_PER_PAIR: u64 = 12;
 /// Bytes per pixel of the images: its sum read and cleared, two bounds and a weight read, a gradient written.
 const BYTES_PER_PIXEL: u64 = 24;
-/// Bytes per splat: written and read twice, its image as often, and its moments written and read.
-const BYTES_PER_SPLAT: u64 = 3 * (size_of::<Splat>() as u64 + 4) + 2 * 32;
+/// Bytes per splat: written and read twice, its image as often; its moments, which are written and read, come on top.
+const BYTES_PER_SPLAT: u64 = 3 * (size_of::<Splat>() as u64 + 4);
 
 /// Work of one iteration over all images. Parameters, gradients and the optimiser are not counted.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -49,6 +63,7 @@ impl GaussianWork {
         setup: &GaussianSetup,
         (splats, image_of_splat): (&Buffer, &Buffer),
         n_splats: u32,
+        cost: SplatCost,
     ) -> Result<GaussianWork> {
         let splats: Vec<Splat> = gpu.download(splats, 0, n_splats as usize)?;
         let images: Vec<i32> = gpu.download(image_of_splat, 0, n_splats as usize)?;
@@ -56,8 +71,10 @@ impl GaussianWork {
         let pairs = seen.map(|(splat, _)| pixels(splat, setup)).sum::<u64>();
         let image_pixels = u64::from(setup.n_images) * u64::from(setup.image_stride);
         let splats = u64::from(n_splats);
-        let bytes = pairs * BYTES_PER_PAIR + image_pixels * BYTES_PER_PIXEL + splats * BYTES_PER_SPLAT;
-        let gflop = (pairs * FLOP_PER_PAIR) as f64 * 1e-9;
+        let bytes = pairs * BYTES_PER_PAIR
+            + image_pixels * BYTES_PER_PIXEL
+            + splats * (BYTES_PER_SPLAT + 2 * cost.moment_bytes);
+        let gflop = (pairs * cost.flop_per_pair) as f64 * 1e-9;
         Ok(GaussianWork { splats, pairs, gflop, megabytes: bytes as f64 * 1e-6 })
     }
 }

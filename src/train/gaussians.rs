@@ -4,7 +4,7 @@ use crate::config::{Config, sections};
 use crate::error::{Error, Result};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers, record_images, record_step};
-use crate::gaussians::work::GaussianWork;
+use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::pace::{SubmitPace, longest_submit_s};
 use crate::gpu::record::{Commands, PassTime, Recording};
@@ -260,7 +260,7 @@ impl GaussianTrainer {
     /// Device errors.
     pub fn work(&self) -> Result<GaussianWork> {
         let splats = (&self.particles.splats, &self.particles.image_of_splat);
-        GaussianWork::of(&self.gpu, &self.setup, splats, self.n * self.setup.n_views)
+        GaussianWork::of(&self.gpu, &self.setup, splats, self.n * self.setup.n_views, SplatCost::AFFINE)
     }
 }
 

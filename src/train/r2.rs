@@ -1,8 +1,8 @@
 //! Fits Gaussians as R2-Gaussian does: all sets at once, one view each per iteration, and density control on the host.
 
-use crate::config::Config;
+use crate::config::{Config, R2Integral};
 use crate::error::{Error, Result};
-use crate::gaussians::work::GaussianWork;
+use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
@@ -182,7 +182,12 @@ impl R2Trainer {
     /// # Errors
     /// Device errors.
     pub fn work(&self) -> Result<GaussianWork> {
-        GaussianWork::of(&self.gpu, &self.setup, (&self.particles.splats, &self.particles.image_of_splat), self.n)
+        let splats = (&self.particles.splats, &self.particles.image_of_splat);
+        let cost = match self.config.r2.integral {
+            R2Integral::Affine => SplatCost::AFFINE,
+            R2Integral::Exact => SplatCost::CHORD,
+        };
+        GaussianWork::of(&self.gpu, &self.setup, splats, self.n, cost)
     }
 }
 

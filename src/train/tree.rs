@@ -9,7 +9,7 @@ use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
 use crate::gaussians::tree::{record_guess, record_images, record_step, record_track};
 use crate::gaussians::view::SplatView;
-use crate::gaussians::work::GaussianWork;
+use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, TreeSetup};
@@ -344,7 +344,7 @@ impl TreeTrainer {
     pub fn work(&self) -> Result<GaussianWork> {
         let setup = &self.joint.setup;
         let splats = (&self.particles.splats, &self.particles.image_of_splat);
-        GaussianWork::of(&self.gpu, setup, splats, self.n * setup.n_views * setup.n_phases)
+        GaussianWork::of(&self.gpu, setup, splats, self.n * setup.n_views * setup.n_phases, SplatCost::AFFINE)
     }
 }
 
