@@ -40,7 +40,7 @@ void main() {
     }
     if (!is_element) return;
     // All bits of the exponent: a compiler may assume that isinf and isnan are false.
-    if ((floatBitsToUint(sum) & 0x7f800000u) == 0x7f800000u) state.overflowed = 1u;
+    if ((floatBitsToUint(sum) & 0x7f800000u) == 0x7f800000u) atomicOr(state.overflowed, 1u);
     if (i < push.count) {
         gradient[push.first + i] = sum / state.loss_scale;
     } else {

@@ -1,12 +1,13 @@
 // Windowed positional encoding (paper section 2.3): [x, y, z, then per band k: a_k sin(2^k (x,y,z)), a_k cos(...)].
 // Needs `setup`.
 
-// Vulkan's sin is exact only near 0: subtract the nearest multiple of 2 pi in three parts.
+// Vulkan's sin is exact only near 0: subtract the nearest multiple of 2 pi in three parts, of which n times the first two are exact. To be
+// done as written: compilers may add the parts up first.
 vec3 reduce_angle(vec3 a) {
     vec3 n = round(a * 0.15915494309189535);
-    a -= n * 6.28125;
-    a -= n * 0.0019350051879882812;
-    return a - n * 3.01991598e-7;
+    precise vec3 less = a - n * 6.28125;
+    precise vec3 still_less = less - n * 0.0019350051879882812;
+    return still_less - n * 3.01991598e-7;
 }
 
 vec3 encoded_point(vec3 x) {

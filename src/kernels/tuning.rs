@@ -141,7 +141,7 @@ impl MatrixTuning {
             Vendor::Nvidia | Vendor::Other => MatrixTuning::NVIDIA,
         };
         let workgroups = match info.multiprocessors {
-            0 => workgroups_untold(info.kind),
+            0 => workgroups_untold(info),
             // Two workgroups per multiprocessor.
             n => 2 * n,
         };
@@ -185,9 +185,11 @@ pub struct Tuning {
 
 /// Workgroups that keep a device busy whose number of multiprocessors the driver does not tell: too many write and add up sums of
 /// their own for nothing.
-fn workgroups_untold(kind: DeviceKind) -> u32 {
-    match kind {
-        DeviceKind::Integrated => 32,
+fn workgroups_untold(info: &DeviceInfo) -> u32 {
+    match (info.kind, info.vendor) {
+        (DeviceKind::Integrated, _) => 32,
+        // Two for each of 32 cores, which the largest have.
+        (_, Vendor::Intel) => 64,
         _ => 264,
     }
 }
