@@ -12,7 +12,7 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"
 layout(constant_id = 1) const uint with_maxima = 0u;
 layout(push_constant) uniform Push { uint n_rays; uint image_width; uint first_blob; uint n_blobs; } push;
-layout(binding = 0) uniform B0 { Setup setup; };
+layout(binding = 0) SETUP B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
 layout(binding = 2) readonly buffer B2 { Blob blobs[]; };
 READ_VEC4(3, B3, static_params);

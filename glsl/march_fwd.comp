@@ -10,7 +10,7 @@
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; uint with_maxima; } push;
-layout(binding = 0) uniform B0 { Setup setup; };
+layout(binding = 0) SETUP B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 layout(binding = 3) readonly buffer B3 { uint ray_start[]; };

@@ -20,7 +20,7 @@
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint private_lines = 0u;  // numbers on all lines, or 0: straight to memory
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
-layout(binding = 0) uniform B0 { Setup setup; };
+layout(binding = 0) SETUP B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 layout(binding = 3) readonly buffer B3 { uint ray_start[]; };

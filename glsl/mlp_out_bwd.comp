@@ -7,7 +7,7 @@
 #include "inc/operands.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint groups; uint weights4; uint capacity; } push;
-layout(binding = 0) uniform B0 { Setup setup; };
+layout(binding = 0) SETUP B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { LiveSamples live; };
 layout(binding = 2) readonly buffer B2 { vec4 sample_points[]; };
 layout(binding = 3) readonly buffer B3 { uint sample_rays[]; };

@@ -6,7 +6,7 @@
 #include "inc/softplus.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint groups; uint weights4; uint bias; uint capacity; } push;
-layout(binding = 0) uniform B0 { Setup setup; };
+layout(binding = 0) SETUP B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { LiveSamples live; };
 READ_VEC4(2, B2, activations);
 READ_VEC4(3, B3, params);

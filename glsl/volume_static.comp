@@ -10,7 +10,7 @@
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_rays; } push;
-layout(binding = 0) uniform B0 { Setup setup; };
+layout(binding = 0) SETUP B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };
 READ_VEC4(2, B2, static_params);
 layout(binding = 3) writeonly buffer B3 { float volume[]; };
