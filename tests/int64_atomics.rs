@@ -63,7 +63,8 @@ fn sums_have_the_same_bits_by_either_kind_of_atomics() {
     for without_subgroups in [false, true] {
         let [whole, pairs] = [false, true].map(|without| open(without_subgroups, without));
         if !whole.info().int64_atomics {
-            assert!(!whole.info().is_llvmpipe, "lavapipe adds 64-bit integers");
+            let crashes = whole.info().subgroup_size > 8;
+            assert!(!whole.info().is_llvmpipe || crashes, "lavapipe adds 64-bit integers, in subgroups of up to 8");
             println!("{} adds no 64-bit integers: nothing is compared with them", whole.info().name);
             return;
         }

@@ -256,7 +256,7 @@ uint tiles_of(uint padded) {
 // After the last tile: what a workgroup has summed.
 void put_sums() {
     barrier();
-    if (largest >= LARGEST) atomicOr(overflowed, 1u);
+    if (largest >= LARGEST) overflowed = 1u;
     barrier();
     uint mine = gl_WorkGroupID.x * push.n_partials;
     put_weight_gradient(upper_share(), mine + push.weights_at, upper_columns);

@@ -74,7 +74,8 @@ pub struct DeviceInfo {
     pub float16: bool,
     /// Whether the device offers float atomics on buffers.
     pub float_atomics: bool,
-    /// Whether the device adds 64-bit integers in buffers atomically (`shaderInt64`, `shaderBufferInt64Atomics`).
+    /// Whether the device adds 64-bit integers in buffers atomically (`shaderInt64`, `shaderBufferInt64Atomics`), and does not
+    /// crash then.
     pub int64_atomics: bool,
     /// Whether memory can be exported as file descriptors (`VK_KHR_external_memory_fd`).
     pub external_memory_fd: bool,
@@ -360,13 +361,14 @@ pub(super) fn describe(
     // SAFETY: the chain lives until the call returns; it holds an extension's structure only where the device has it, and
     // that of Vulkan 1.2 is ignored by older devices.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    let int64_atomics = features.features.shader_int64 == vk::TRUE && f12.shader_buffer_int64_atomics == vk::TRUE;
+    // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives, the simplest
+    // product of matrices crashes the process, and so do atomics on 64-bit integers.
+    let crashes = driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8;
+    let adds_int64 = features.features.shader_int64 == vk::TRUE && f12.shader_buffer_int64_atomics == vk::TRUE;
+    let int64_atomics = adds_int64 && !crashes;
     let memory = DeviceMemory::of(instance, physical, has(ext::memory_budget::NAME));
     let limits = properties.limits;
     let version = properties.api_version;
-    // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives,
-    // the simplest product crashes the process.
-    let crashes = driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8;
     let sizes = SubgroupSizes::of(instance, physical, has(ext::subgroup_size_control::NAME));
     let matrix_subgroup = sizes.for_matrices();
     let takes_matrices = KernelFeatures::of(instance, physical, has).take_matrices();
