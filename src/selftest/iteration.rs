@@ -49,7 +49,7 @@ impl Case {
     /// Its plan.
     ///
     /// # Errors
-    /// [`Error::Config`] for a setting that is not usable.
+    /// [`crate::error::Error::Config`] for a setting that is not usable.
     pub fn plan(&self, dataset: &Dataset) -> Result<Plan> {
         let settings = [STEADY, self.settings].concat();
         let mut plan = Plan::new(&small_config(self.preset, &settings)?, dataset)?;
@@ -220,7 +220,7 @@ pub(super) fn samples(gpu: &Gpu, trainer: &Trainer, live: usize) -> Result<Vec<S
 /// Compares the stages of the first iterations of a case, on the path of `tuning`.
 ///
 /// # Errors
-/// Device errors; [`Error::Config`] where the path is not for the device.
+/// Device errors; [`crate::error::Error::Config`] where the path is not for the device.
 pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), &case.name());
     let plan = case.plan(dataset)?;
