@@ -261,6 +261,8 @@ impl Session {
         self.not_from_observer()?;
         let _alone = self.alone()?;
         self.shared.device()?;
+        // A `stop` meanwhile comes before all of this, or after it.
+        let mut worker = lock(&self.worker);
         let shared = self.shared.clone();
         shared.stop.store(false, Ordering::Release);
         shared.pause.store(false, Ordering::Release);
@@ -293,7 +295,7 @@ impl Session {
             });
         });
         match spawned {
-            Ok(handle) => *lock(&self.worker) = Some(handle),
+            Ok(handle) => *worker = Some(handle),
             Err(e) => {
                 lock(&self.shared.control).state = State::Idle;
                 return Err(Error::Internal(format!("starting a thread: {e}")));
@@ -321,20 +323,12 @@ impl Session {
     /// [`Error::Busy`] from the observer itself, which ends training by its result instead.
     pub fn stop(&self) -> Result<()> {
         self.not_from_observer()?;
+        let worker = lock(&self.worker);
         self.shared.stop.store(true, Ordering::Release);
         drop(lock(&self.shared.control));
         self.shared.changed.notify_all();
-        self.join();
+        join(worker);
         Ok(())
-    }
-
-    /// Waits for the thread that trains; for all who do so at the same time.
-    fn join(&self) {
-        let mut worker = lock(&self.worker);
-        if let Some(handle) = worker.take() {
-            // A panic of the worker has become its failure.
-            let _ = handle.join();
-        }
     }
 
     /// The right to train, or to change what is trained; refused while someone else has it.
@@ -350,7 +344,7 @@ impl Session {
         if self.state().in_background() {
             return Err(Error::Busy("the session is training in the background already".into()));
         }
-        self.join();
+        join(lock(&self.worker));
         Ok(blocking)
     }
 
@@ -467,6 +461,14 @@ impl Session {
         lock(&self.shared.control).state = State::Idle;
         engine.saved = Some(checkpoint);
         Ok(())
+    }
+}
+
+/// Waits for the thread that trains; others who would wait for it, too, have the lock after that.
+fn join(mut worker: MutexGuard<'_, Option<JoinHandle<()>>>) {
+    if let Some(handle) = worker.take() {
+        // A panic of the worker has become its failure.
+        let _ = handle.join();
     }
 }
 
