@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adam in f32. One invocation per parameter; the dynamic field rests while it is delayed, and all
-// moments restart where the schedule re-creates the optimiser.
+// Adam in f32. One invocation per parameter. The dynamic field's parameters stay while it is delayed. Moments are zero
+// before an update where the schedule says so, for each field by itself.
 #include "inc/layout.glsl"
 layout(local_size_x = 128, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
@@ -22,11 +22,11 @@ void main() {
     bool of_network = !is_static || setup.two_networks != 0u;
     if (of_network && (now.dynamic_active == 0u || state.overflowed != 0u)) return;
     float g = gradient[i];
-    vec2 moment = now.reset != 0u ? vec2(0.0) : moments[i];
+    FieldUpdate update = is_static ? now.static_update : now.dynamic_update;
+    vec2 moment = update.restart != 0u ? vec2(0.0) : moments[i];
     moment.x = setup.beta1 * moment.x + (1.0 - setup.beta1) * g;
     moment.y = setup.beta2 * moment.y + (1.0 - setup.beta2) * g * g;
     moments[i] = moment;
-    float rate = is_static ? now.static_lr : now.dynamic_lr;
-    float denominator = sqrt(moment.y) / sqrt(now.bias_correction2) + setup.epsilon;
-    params[i] -= rate / now.bias_correction1 * moment.x / denominator;
+    float denominator = sqrt(moment.y) / sqrt(update.bias_correction2) + setup.epsilon;
+    params[i] -= update.rate / update.bias_correction1 * moment.x / denominator;
 }

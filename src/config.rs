@@ -4,12 +4,13 @@
 
 mod checks;
 mod forms;
+mod length;
 mod presets;
 pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
-pub use forms::DynamicForm;
+pub use forms::{DynamicForm, OcclusionRegion};
 use sections::{
     Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
     Tree, X,
@@ -95,9 +96,9 @@ impl Choice for StaticForm {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Decay {
-    /// A straight line over the run.
+    /// A straight line that ends with the run.
     Linear,
-    /// A constant factor per step.
+    /// A constant factor per iteration, which takes as many iterations as the run has from start to end.
     Exponential,
 }
 
@@ -314,8 +315,20 @@ impl Config {
                     .map_err(|e| Error::config("preset", value, e.message().to_owned()))?,
             ),
         };
-        let base = Config::preset(preset.or(named).unwrap_or_default());
-        let mut table = toml::Table::try_from(&base).map_err(|e| Error::Internal(e.to_string()))?;
+        Config::preset(preset.or(named).unwrap_or_default()).overlaid(overlay, settings)
+    }
+
+    /// Returns this configuration with `key=value` settings.
+    ///
+    /// # Errors
+    /// [`Error::Config`] naming the key.
+    pub fn with(&self, settings: &[String]) -> Result<Config> {
+        self.overlaid(toml::Table::new(), settings)
+    }
+
+    /// Lays a table of a file, then settings, over this configuration, whose preset stays.
+    fn overlaid(&self, overlay: toml::Table, settings: &[String]) -> Result<Config> {
+        let mut table = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
         let keep = table.get("preset").cloned();
         merge(&mut table, overlay, "")?;
         for setting in settings {

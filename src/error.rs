@@ -79,10 +79,9 @@ pub enum Error {
         /// What needs less.
         instead: &'static str,
     },
-    /// The optimisation produced a value that is not finite, or exploded.
+    /// The optimisation produced a value that is not finite, or a loss at which the configuration ends a run.
     #[error(
-        "training diverged at iteration {step}: {quantity} = {value}. The last good checkpoint is kept. \
-         Try a lower learning rate (dynamic.lr, static.lr) or the `fast` preset"
+        "training diverged at iteration {step}: {quantity} = {value}. The last good checkpoint is kept. Try {advice}"
     )]
     Diverged {
         /// Iteration at which it was seen.
@@ -91,6 +90,8 @@ pub enum Error {
         quantity: &'static str,
         /// Its value.
         value: f64,
+        /// Settings of the method that make its steps smaller.
+        advice: &'static str,
     },
     /// What was asked for cannot be done while something else goes on.
     #[error("busy: {0}")]

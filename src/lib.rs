@@ -234,6 +234,7 @@ pub mod render {
 pub mod train {
     pub mod calibrate;
     mod carried;
+    pub mod dry_run;
     pub mod gaussians;
     pub mod losses;
     pub mod moving;

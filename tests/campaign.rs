@@ -35,6 +35,10 @@ fn a_campaign_keeps_each_step_and_goes_on() {
         assert_eq!(steps[name]["result"]["same"], true, "{name}");
         assert_eq!(steps[name]["result"]["iterations"], 4, "{name}");
     }
+    for preset in ["paper", "public-code", "fast-mlp", "fast", "nerf-ca"] {
+        let done = &steps[format!("schedule of {preset}")]["result"];
+        assert!(!done["events"].as_array().unwrap().is_empty(), "{preset}: {done}");
+    }
     let page = std::fs::read_to_string(out.join("campaign.md")).unwrap();
     assert!(page.contains("| fast repeats, bit by bit | yes, 4 iterations |") && page.contains("rehearsal"), "{page}");
     assert!(page.contains("| `paper` | not run |"), "other parts were not asked for: {page}");

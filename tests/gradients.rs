@@ -113,7 +113,8 @@ fn temporal_residual_is_flat_between_its_bounds() {
     let plan = plan("fast-mlp", &["loss.robust=0"]);
     let params = start(&plan);
     let mut ray = march::ray(&plan, 40);
-    let seen = march::fwd(&plan, &params, 0, &ray, true, Precision::Exact).dynamic_integral;
+    let seen =
+        march::fwd(&plan, &params, 0, &ray, march::NearPart::Depth(0.0), true, Precision::Exact).dynamic_integral;
     let gradient_with = |ray: &march::Ray| {
         let (_, g) = step::loss_and_gradient(&plan, &params, 0, std::slice::from_ref(ray), Precision::Exact);
         g[plan.params.moving.out_bias]
@@ -170,8 +171,9 @@ fn line_integrals_and_their_backward_pass_are_adjoint() {
     let moved: Vec<f64> = params.iter().zip(&direction).map(|(p, d)| p + d).collect();
     let (mut left, mut gradient) = ([0.0; 2], vec![0.0; p.len]);
     for (index, ray) in rays.iter().enumerate() {
-        let seen = march::fwd(&plan, &params, 1, ray, true, Precision::Exact);
-        let then = march::fwd(&plan, &moved, 1, ray, true, Precision::Exact);
+        let near = march::NearPart::of(&plan, 1, &rays);
+        let seen = march::fwd(&plan, &params, 1, ray, near, true, Precision::Exact);
+        let then = march::fwd(&plan, &moved, 1, ray, near, true, Precision::Exact);
         let r = [random(1, index), random(2, index)];
         for (a, b) in seen.statics.iter().zip(&then.statics) {
             let slope = f64::from(s.static_gain) * field::sigmoid(a.feature + f64::from(s.static_shift));

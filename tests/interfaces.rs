@@ -457,7 +457,8 @@ fn measurements_and_baked_views() {
     let quick = ["--preset", "fast-mlp", "--warm-up", "0", "--iterations", "2", "--repeats", "3"];
     let full = [&["bench", text(&data), "--full", "--json", text(&file), "--set", "dynamic.delay=5"], SHORT, &quick];
     let said = ok(&full.concat());
-    for part in ["before the network starts", "peaks: f32", "37:00", "really run", "network passes alone"] {
+    for part in ["before the network starts", "peaks: f32", "37:00", "really run", "network passes alone", "dry run: "]
+    {
         assert!(said.contains(part), "`{part}` is missing: {said}");
     }
     let report: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();

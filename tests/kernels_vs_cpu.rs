@@ -84,7 +84,8 @@ fn rays_and_depths_match() {
         }
         assert!((f64::from(g.temporal_low) - w.temporal[0]).abs() < 1e-6);
         assert!((f64::from(g.temporal_high) - w.temporal[1]).abs() < 1e-6);
-        live += march::fwd(plan, &params, 0, w, false, Precision::Exact).dynamics.len();
+        let near = march::NearPart::of(plan, 0, &want);
+        live += march::fwd(plan, &params, 0, w, near, false, Precision::Exact).dynamics.len();
     }
     assert!(live > 20, "the case must have live samples, has {live}");
     // A sample on a cell face may fall either way in f32.

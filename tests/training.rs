@@ -122,6 +122,7 @@ fn a_cancelled_run_is_saved_and_a_diverging_one_keeps_its_checkpoint() {
             "static.lr=100",
             "static.lr_end=100",
             "static.init_std=3",
+            "train.stop_at_loss_ratio=1e6",
         ],
     );
     let outcome = reconstruct(&gpu, &config, &dataset, &options, &mut |_| {});

@@ -2,7 +2,7 @@
 """Golden values from an independent PyTorch float64 implementation of the method.
 
 Writes tests/golden/<preset>.safetensors: a small dataset, initial parameters, losses and all gradients of
-the first and a later iteration, and the parameters after ten Adam updates across the delay of the dynamic
+the first and of later iterations, and the parameters after ten Adam updates across the delay of the dynamic
 field. Nothing here is shared with the engine: geometry, ray order, depths, fields (torch's grid_sample and
 matrix products), losses, autograd and torch.optim.Adam are all this script's own.
 
@@ -24,7 +24,7 @@ U32 = 0xFFFFFFFF
 COMMON = dict(
     seed=5, width_px=7, height_px=6, phases=3, rays=21, static_samples=20, dynamic_samples=20, grid=6, ranks=3,
     mlp_width=16, latent=8, iterations=40, delay=4, window_iterations=12, depth=0.9, tv_plane=1e-2, tv_line=1e-3,
-    betas=(0.9, 0.99), occlusion_share=0.2, after_phases=(0.0,), decay_share=1.0,
+    betas=(0.9, 0.99), occlusion_share=0.2, occlusion_region="depth-range", after_phases=(0.0,), decay_share=1.0,
 )
 PRESETS = {
     "paper": dict(
@@ -35,6 +35,7 @@ PRESETS = {
     ),
     "public-code": dict(
         layers=5, skip=4, bands=10, window_start=0.0, per_ray=False, temporal=False, decay="exponential",
+        occlusion_region="last-ray",
         static_lr=(2e-2, 2e-3), dynamic_lr=(1e-2, 1e-3), tv=1e-2, occlusion=1e-3, eps=1e-6, n_motion=0,
         scene=dict(static_half=0.5, dynamic_half=1.0, static_gain=1.0, static_shift=-4.0, dynamic_gain=1.0,
                    dynamic_shift=-3.0, static_weight=1.0, dynamic_weight=1.0, robust_scale=0.0, centre=(0.0, 0.0, 0.0), scale=1.0),
@@ -56,6 +57,10 @@ PRESETS = {
     ),
 }
 TWO_NETWORKS = "nerf-ca"
+
+
+def constants(name):
+    return COMMON | PRESETS[name] | dict(two_networks=name == TWO_NETWORKS)
 
 
 # -- counter-based random numbers -----------------------------------------------------------------------------
@@ -302,6 +307,13 @@ def losses_of_two_networks(c, frames, p, step):
     return terms | dict(dynamic=terms["data"], tv=0.0, live=float(n * c["dynamic_samples"]))
 
 
+def near_end_by_last_ray(c, frames, step):
+    """Path length within which samples of all rays are near: a share of that of the batch's last ray."""
+    frame, pixel, ray_id = batch(c, frames, step)[-1]
+    norm = float(np.linalg.norm(pixel_ray(c, frames[frame][0], pixel)[1]))
+    return c["occlusion_share"] * depths(c, c["dynamic_samples"], -c["depth"], c["depth"], step, ray_id, norm)[1].sum()
+
+
 def losses(c, frames, p, step):
     if c["two_networks"]:
         return losses_of_two_networks(c, frames, p, step)
@@ -310,6 +322,7 @@ def losses(c, frames, p, step):
     since = max(step - c["delay"], 0)
     window = min(c["window_start"] + (c["bands"] - c["window_start"]) * since / c["window_iterations"], c["bands"])
     near_limit = -depth + 2 * depth * c["occlusion_share"]
+    near_end = near_end_by_last_ray(c, frames, step)
     n_motion = c["n_motion"]
     s_int, d_int, target, bounds, occlusion, live = [], [], [], [], 0.0, 0
     for r, (frame, pixel, ray_id) in enumerate(batch(c, frames, step)):
@@ -338,7 +351,8 @@ def losses(c, frames, p, step):
             f = network(c, p, torch.tensor(x[inside]), time, window, scene)
             mass = scene["dynamic_gain"] * torch.nn.functional.softplus(f + scene["dynamic_shift"])
             mass = mass * torch.tensor(dl[inside])
-            occlusion = occlusion + (mass * torch.tensor((t[inside] < near_limit).astype(float))).sum()
+            near = np.cumsum(dl) < near_end if c["occlusion_region"] == "last-ray" else t < near_limit
+            occlusion = occlusion + (mass * torch.tensor(near[inside].astype(float))).sum()
             d_int.append(mass.sum())
         else:
             d_int.append(torch.zeros(()))
@@ -364,8 +378,13 @@ def losses(c, frames, p, step):
 
 
 def rate(c, name, step):
+    """Learning rate of an iteration. Both start again after the first iteration with a delayed dynamic field."""
     start, end = c[name]
-    x = min(step / c["iterations"] / c["decay_share"], 1.0)
+    length, restart = c["iterations"] * c["decay_share"], 0 if c["two_networks"] else c["delay"] + 1
+    if step >= restart:
+        x = min((step - restart) / (length - restart if c["decay"] == "linear" else length), 1.0)
+    else:
+        x = 0.0 if name == "dynamic_lr" else step / length
     return start + (end - start) * x if c["decay"] == "linear" else start * (end / start) ** x
 
 
@@ -391,8 +410,6 @@ def run(c):
         out |= {f"background/{view}/low": torch.tensor(low), f"background/{view}/high": torch.tensor(high)}
     adam = optimiser(c, p)
     for step in range(10):
-        if step == c["delay"] and not c["two_networks"]:
-            adam = optimiser(c, p)
         terms = losses(c, frames, p, step)
         adam.zero_grad()
         sum(terms[name] for name in OBJECTIVE if name in terms).backward()
@@ -408,6 +425,9 @@ def run(c):
                 if k.startswith("dynamic"):
                     v.grad = None
         adam.step()
+        if step == c["delay"] and not c["two_networks"]:
+            # After the dynamic field's first step, as the authors do it.
+            adam = optimiser(c, p)
     return out | {f"final/{k}": v.detach().clone() for k, v in p.items()}
 
 
@@ -430,8 +450,7 @@ def main():
     out = args.out
     out.mkdir(parents=True, exist_ok=True)
     for name in args.preset or PRESETS:
-        c = COMMON | PRESETS[name]
-        c["two_networks"] = name == TWO_NETWORKS
+        c = constants(name)
         case = c | dict(preset=name, angles=ANGLES, arm=ARM)
         write_safetensors(out / f"{name}.safetensors", run(c), dict(case=json.dumps(case), torch=torch.__version__))
         print(out / f"{name}.safetensors")

@@ -48,6 +48,7 @@ struct Setup {
     uint temporal_target;       // 1: the dynamic field is driven by temporal differences
     float occlusion_weight;     // of the integral of samples that are near
     float occlusion_depth;      // samples nearer than this are penalised
+    float occlusion_share;      // share of the batch's last ray within which samples are penalised instead; 0: by depth
     uint occupancy_cells;       // cells per axis of the occupancy learned while training; 0: none
     uint occupancy_start;       // iterations before it is heeded
     float occupancy_threshold;  // attenuation up to which a sample is empty
@@ -73,15 +74,20 @@ struct Setup {
     float stop_below;           // entropy that has vanished
 };
 
-// One row per iteration, made on the host from the schedules.
-struct Schedule {
-    float static_lr;            // learning rate of the static field
-    float dynamic_lr;           // learning rate of the dynamic field
-    float window;               // open frequency bands, may be fractional
-    uint dynamic_active;        // 0: the dynamic field is delayed
-    uint reset;                 // optimiser state is re-created before this iteration
+// How Adam updates the parameters of a field in an iteration, which is update t since its moments were zero.
+struct FieldUpdate {
+    float rate;                 // learning rate
+    uint restart;               // 1: moments are zero before this update
     float bias_correction1;     // 1 - beta1^t
     float bias_correction2;     // 1 - beta2^t
+};
+
+// One row per iteration, made on the host from the schedules.
+struct Schedule {
+    FieldUpdate static_update;  // of the static field
+    FieldUpdate dynamic_update; // of the dynamic field
+    float window;               // open frequency bands, may be fractional
+    uint dynamic_active;        // 0: the dynamic field is delayed
     float favour_static;        // weight of the entropy of the fields' shares at samples
     float ray_entropy;          // weight of the entropy of the dynamic field along rays
     float near_integral;        // weight of the dynamic field's integral over near samples, two networks

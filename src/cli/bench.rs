@@ -25,6 +25,7 @@ use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, evaluate_model};
 use nertca_vk::sax::setup::n_rays;
 use nertca_vk::scan::dataset::{Dataset, Layout};
+use nertca_vk::train::dry_run::{DryRun, dry_run};
 use nertca_vk::train::timing::{GaussianSubject, GaussianTiming, Length, Pace, Passes, Subject, Timing};
 use nertca_vk::train::trainer::Trainer;
 use std::path::{Path, PathBuf};
@@ -51,9 +52,12 @@ pub struct BenchArgs {
     /// Timed repeats.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=10))]
     pub repeats: u32,
-    /// Also run the whole reconstruction, with time-to-Dice.
+    /// Also run the whole reconstruction, with time-to-Dice; a dry run comes before everything else.
     #[arg(long)]
     pub full: bool,
+    /// Only go through all events of the schedule (delay, open window, density control) in a short run of full-size batches.
+    #[arg(long, conflicts_with_all = ["full", "kernels", "render", "compare"])]
+    pub dry_run: bool,
     /// List the time of each pass.
     #[arg(long)]
     pub kernels: bool,
@@ -105,16 +109,39 @@ pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
         Some(path) => Dataset::open(path)?,
         None => default_phantom(&gpu, scratch.path())?,
     };
+    if args.dry_run {
+        let done = dry_run_of(cli, &gpu, &config, &dataset)?;
+        if let Some(file) = &args.json {
+            write_json(file, &done)?;
+        }
+        return cli.close_device(&gpu);
+    }
     let report = measure(cli, args, &gpu, &config, &dataset, scratch.path())?;
     print(&report, args.kernels);
     if let Some(other) = compared {
         compare(&report, &other);
     }
     if let Some(file) = &args.json {
-        let text = nertca_vk::files::pretty_json(&report)?;
-        nertca_vk::files::write_atomic(file, text.as_bytes())?;
+        write_json(file, &report)?;
     }
     cli.close_device(&gpu)
+}
+
+fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
+    nertca_vk::files::write_atomic(file, nertca_vk::files::pretty_json(value)?.as_bytes())
+}
+
+/// A dry run, with a line that says what it went through.
+fn dry_run_of(cli: &Cli, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<DryRun> {
+    let done = dry_run(gpu, config, dataset, &cli.training_tuning(gpu, config, dataset)?)?;
+    out!(
+        "dry run: {} iterations through the schedule's events at {:?} in {:.1} s, loss {:.3e} after the last",
+        done.iterations,
+        done.events,
+        done.seconds,
+        done.last_loss
+    );
+    Ok(done)
 }
 
 fn read_report(file: &Path) -> Result<Report> {
@@ -148,6 +175,7 @@ fn measure(
     dataset: &Dataset,
     scratch: &Path,
 ) -> Result<Report> {
+    let dry_run = args.full.then(|| dry_run_of(cli, gpu, config, dataset)).transpose()?;
     let tuning = cli.training_tuning(gpu, config, dataset)?;
     let timings = match config.gaussians_move() {
         true => time_gaussians(args, gpu, config, dataset, &tuning)?,
@@ -185,6 +213,7 @@ fn measure(
         work: timings.work,
         frame_rates,
         full,
+        dry_run,
         left_out: LEFT_OUT.into(),
         tuning: serde_json::to_value(&tuning).map_err(internal)?,
         host: Host::this(),

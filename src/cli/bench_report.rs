@@ -6,6 +6,7 @@ use nertca_vk::bench::peaks::Peaks;
 use nertca_vk::bench::sensors::{Readings, Span, host_processor};
 use nertca_vk::network::cost::NetworkCost;
 use nertca_vk::network::ledger::{Ledger, StageWork, of_pass};
+use nertca_vk::train::dry_run::DryRun;
 use nertca_vk::train::timing::{GaussianTiming, Timing};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -42,6 +43,9 @@ pub struct Report {
     pub frame_rates: Vec<FrameRate>,
     /// The whole run, really run.
     pub full: Option<FullRun>,
+    /// The dry run before a whole one; none in reports of before.
+    #[serde(default)]
+    pub dry_run: Option<DryRun>,
     /// Passes of each stage in an iteration; none in reports of before.
     #[serde(default)]
     pub passes_per_iteration: BTreeMap<String, f64>,

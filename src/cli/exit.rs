@@ -33,7 +33,7 @@ pub fn hint(error: &Error) -> Option<&'static str> {
         Error::OutOfMemory { instead: SMALLER_BATCHES, .. } => {
             Some("--set train.chunk_samples=N, --set train.rays=N and --device need less or offer more")
         }
-        Error::Diverged { .. } => Some("learning rates are set with --set dynamic.lr=X and --set static.lr=X"),
+        Error::Diverged { .. } => Some("settings are given as --set key=value; --print-config prints today's values"),
         _ => None,
     }
 }

@@ -3,6 +3,7 @@
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::run::events::Event;
+use nertca_vk::train::losses::LargeLoss;
 use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -63,6 +64,9 @@ pub fn show_progress() -> impl FnMut(&Event) {
                 "loss {:.3e}  {psnr}  {iterations_per_s:.1} it/s  {left_s:.0} s left",
                 loss.total()
             ));
+        }
+        Event::LargeLoss { step, loss, ratio } => {
+            say(&bar, format!("warning: {}", LargeLoss { step: *step, loss: *loss, ratio: *ratio }));
         }
         Event::Validation { step, train_s, dice_dynamic, psnr, ssim, .. } => {
             let dice = dice_dynamic.map_or("-".into(), |d| format!("{d:.3}"));

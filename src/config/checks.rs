@@ -2,7 +2,7 @@
 
 use crate::choice::Choice;
 use crate::config::sections::check_range;
-use crate::config::{Config, DynamicTarget, StaticForm};
+use crate::config::{Config, DynamicTarget, OcclusionRegion, StaticForm};
 use crate::error::{Error, Result};
 
 /// Cells along a side of the hash grid's box that f32 coordinates tell apart.
@@ -106,6 +106,13 @@ impl Config {
                 let instead = "take 0 (networks.near_integral weighs what is near, networks.delay and ramp say when)";
                 return refuse(field, &value, instead);
             }
+        }
+        if self.dynamic.occlusion_region != OcclusionRegion::DepthRange {
+            return refuse(
+                "dynamic.occlusion_region",
+                &"last-ray",
+                "it is that of dynamic.occlusion; take \"depth-range\"",
+            );
         }
         let preset = Config::preset(self.preset);
         for (field, value, unused) in [

@@ -1,4 +1,4 @@
-//! What a field may be made of.
+//! Choices about the fields: what they are made of, and where they are penalised.
 
 use crate::choice::Choice;
 use serde::{Deserialize, Serialize};
@@ -22,6 +22,29 @@ impl Choice for DynamicForm {
         match self {
             DynamicForm::Network => "network",
             DynamicForm::Lineformer => "lineformer",
+        }
+    }
+}
+
+/// Region of the rays in which occlusion minimisation penalises the dynamic field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OcclusionRegion {
+    /// Depths within the stated share of the depth range, counted from the source.
+    #[default]
+    DepthRange,
+    /// Samples whose path length from the first depth, their own included, is less than the stated share of the path length of
+    /// the batch's last ray, as NerT-CA's public code has it (`compute_occl_loss`).
+    LastRay,
+}
+
+impl Choice for OcclusionRegion {
+    const ALL: &'static [OcclusionRegion] = &[OcclusionRegion::DepthRange, OcclusionRegion::LastRay];
+
+    fn name(self) -> &'static str {
+        match self {
+            OcclusionRegion::DepthRange => "depth-range",
+            OcclusionRegion::LastRay => "last-ray",
         }
     }
 }

@@ -5,8 +5,8 @@ use crate::config::sections::{
     Tree, X,
 };
 use crate::config::{
-    CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, GaussianForm, Preset, R2Integral, R2Start, StaticData,
-    StaticForm,
+    CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, Preset, R2Integral,
+    R2Start, StaticData, StaticForm,
 };
 
 impl Config {
@@ -39,6 +39,7 @@ fn paper() -> Config {
             checkpoint_every: 1000,
             validate_every: 1000,
             validate_images: 8,
+            stop_at_loss_ratio: 0.0,
         },
         calibrate: uncalibrated(),
         march: March {
@@ -83,6 +84,7 @@ fn paper() -> Config {
             least_slope: 0.0,
             occlusion: 1e-8,
             occlusion_share: 0.2,
+            occlusion_region: OcclusionRegion::DepthRange,
         },
         loss: Loss { normalise: false, dynamic_target: DynamicTarget::Absolute, robust: 0.0 },
         hull: Hull {
@@ -164,7 +166,13 @@ fn public_code(paper: Config) -> Config {
         preset: Preset::PublicCode,
         march: March { per_ray_depths: false, ..paper.march },
         static_field: StaticField { lr: 2e-2, lr_end: 2e-3, decay: Decay::Exponential, ..paper.static_field },
-        dynamic: DynamicField { layers: 5, skip_layer: 4, decay: Decay::Exponential, ..paper.dynamic },
+        dynamic: DynamicField {
+            layers: 5,
+            skip_layer: 4,
+            decay: Decay::Exponential,
+            occlusion_region: OcclusionRegion::LastRay,
+            ..paper.dynamic
+        },
         ..paper
     }
 }

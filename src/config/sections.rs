@@ -1,7 +1,8 @@
 //! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
 
 use crate::config::{
-    CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, R2Integral, R2Start, StaticData, StaticForm,
+    CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
+    StaticForm,
 };
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -59,6 +60,9 @@ section! {
         validate_every: u32,
         /// Validation images used during training; evenly spread over all of them.
         validate_images: u32,
+        /// Loss, as a multiple of the first one of a start, at which a run stops as diverged; 0 = never. A loss that is not finite
+        /// always stops it, and one of 1e6 times the first is warned of.
+        #[serde(default)] stop_at_loss_ratio: f64 in 0.0 to 1e30,
     }
 }
 
@@ -142,7 +146,7 @@ section! {
         half_extent_mm: f64 in 0.0 to 1e5,
         /// Encode coordinates relative to the field's box instead of world units.
         encode_box: bool,
-        /// Iterations before the field starts; the optimiser is re-created then.
+        /// Iterations before the field starts. After the first one with it, both fields' moments and learning rates start again.
         delay: u32,
         /// Learning rate at the start.
         lr: f64 in 0.0 to 100.0,
@@ -160,6 +164,9 @@ section! {
         occlusion: f64 in 0.0 to 1e6,
         /// Share of the depth range, from the source, it covers; with two networks, that `networks.near_integral` does.
         occlusion_share: f64 in 0.0 to 1.0,
+        /// How the region of occlusion minimisation is found: "depth-range" (that share of the depth range) or "last-ray" (that
+        /// share of the path length of the batch's last ray).
+        #[serde(default)] occlusion_region: OcclusionRegion,
     }
 }
 

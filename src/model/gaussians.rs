@@ -8,6 +8,10 @@ use glam::DVec3;
 use serde::Serialize;
 use std::sync::{Arc, Mutex};
 
+/// Settings that make the steps of a fit smaller.
+pub const SMALLER_STEPS: &str = "lower rates of section `gaussians`: gaussians.position_rate, gaussians.scale_rate, gaussians.rotation_rate, \
+     gaussians.density_rate";
+
 /// What turns world units and line integrals into the Gaussians' own, and back.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Units {
@@ -70,7 +74,8 @@ impl Gaussians {
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
             Some(bad) => {
                 let step = u64::from(self.step);
-                Err(Error::Diverged { step, quantity: "parameter of a Gaussian", value: f64::from(bad) })
+                let (quantity, value) = ("parameter of a Gaussian", f64::from(bad));
+                Err(Error::Diverged { step, quantity, value, advice: SMALLER_STEPS })
             }
             None => Ok(()),
         }

@@ -3,6 +3,10 @@
 use crate::error::{Error, Result};
 use crate::kernels::layout::R2Gaussian;
 
+/// Settings that make the steps of a fit smaller.
+pub const SMALLER_STEPS: &str =
+    "lower rates of section `r2`: r2.position_rate, r2.density_rate, r2.scale_rate, r2.rotation_rate";
+
 /// Stored Gaussians with the optimiser's moments and what density control goes by: with the iteration's number, all
 /// that a fit goes on from.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -55,7 +59,7 @@ impl R2State {
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
             Some(bad) => {
                 let quantity = "parameter of a Gaussian";
-                Err(Error::Diverged { step: step.into(), quantity, value: bad.into() })
+                Err(Error::Diverged { step: step.into(), quantity, value: bad.into(), advice: SMALLER_STEPS })
             }
             None => Ok(()),
         }

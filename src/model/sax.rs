@@ -166,15 +166,21 @@ pub struct SaxState {
     pub moments: Vec<Vec<[f32; 2]>>,
 }
 
+/// Settings that make the steps of a fit smaller.
+pub const SMALLER_STEPS: &str = "a lower sax.rate";
+
 /// Refuses numbers that are not finite.
 ///
 /// # Errors
 /// [`Error::Diverged`] with the first of them.
 pub fn check_params(params: &[Vec<f32>], step: u32) -> Result<()> {
     match params.iter().flatten().find(|v| !v.is_finite()) {
-        Some(bad) => {
-            Err(Error::Diverged { step: step.into(), quantity: "parameter of SAX-NeRF", value: f64::from(*bad) })
-        }
+        Some(bad) => Err(Error::Diverged {
+            step: step.into(),
+            quantity: "parameter of SAX-NeRF",
+            value: f64::from(*bad),
+            advice: SMALLER_STEPS,
+        }),
         None => Ok(()),
     }
 }

@@ -9,29 +9,75 @@ impl Config {
         (0..=self.train.iterations).map(|step| self.schedule(step)).collect()
     }
 
-    /// The schedule's row for `step` (from 0).
+    /// Returns the schedule's row for iteration `step` (from 0).
     pub fn schedule(&self, step: u32) -> layout::Schedule {
         let d = &self.dynamic;
-        let progress = (f64::from(step) / f64::from(self.train.iterations) / self.adam.decay_share).min(1.0);
-        let weights = self.network_weights(step);
-        let active = step >= d.delay && !self.gaussians_move();
-        let since_delay = step.saturating_sub(d.delay);
-        let restarted = active && d.delay > 0;
-        // The still field begins where Gaussians end.
-        let since_begin = step.saturating_sub(self.gaussian_iterations());
-        let updates = if restarted { since_delay } else { since_begin } + 1;
-        let opened = f64::from(since_delay) / f64::from(d.window_iterations.max(1));
+        let opened = f64::from(step.saturating_sub(d.delay)) / f64::from(d.window_iterations.max(1));
         let bands = f64::from(d.bands);
         layout::Schedule {
-            static_lr: rate(self.static_field.lr, self.static_field.lr_end, self.static_field.decay, progress) as f32,
-            dynamic_lr: rate(d.lr, d.lr_end, d.decay, progress) as f32,
+            static_update: self.static_update(step),
+            dynamic_update: self.dynamic_update(step),
             window: (d.window_start + (bands - d.window_start) * opened).min(bands) as f32,
-            dynamic_active: u32::from(active),
-            reset: u32::from(updates == 1),
-            bias_correction1: (1.0 - self.adam.beta1.powi(updates as i32)) as f32,
-            bias_correction2: (1.0 - self.adam.beta2.powi(updates as i32)) as f32,
-            ..weights
+            dynamic_active: u32::from(step >= d.delay && !self.gaussians_move()),
+            ..self.network_weights(step)
         }
+    }
+
+    /// Returns the first iteration after which moments and learning rates of both fields have started again; none where the dynamic
+    /// field is there from the start. The authors' code makes its optimiser anew at the end of the first iteration with the dynamic
+    /// field (`run_hybrid.py`, where `n_iter == model_delay`), not before it.
+    pub(crate) fn restart(&self) -> Option<u32> {
+        (self.dynamic.delay > 0 && !self.gaussians_move()).then(|| self.dynamic.delay.saturating_add(1))
+    }
+
+    /// Adam's update of the static field.
+    fn static_update(&self, step: u32) -> layout::FieldUpdate {
+        let f = &self.static_field;
+        // Where Gaussians move, the static field begins where they end.
+        let begin = match self.restart() {
+            Some(restart) if step >= restart => restart,
+            _ => self.gaussian_iterations(),
+        };
+        let rates = Rates { start: f.lr, end: f.lr_end, decay: f.decay };
+        self.update(rates.at(self.progress(f.decay, step)), step.saturating_sub(begin) + 1)
+    }
+
+    /// Adam's update of the dynamic field. The one at the delay uses the optimiser that the static field has had so far, so that the
+    /// update after it is a first one again.
+    fn dynamic_update(&self, step: u32) -> layout::FieldUpdate {
+        let d = &self.dynamic;
+        let (begin, progress) = match self.restart() {
+            Some(restart) if step < restart => (restart - 1, 0.0),
+            Some(restart) => (restart, self.progress(d.decay, step)),
+            None => (0, self.progress(d.decay, step)),
+        };
+        let rates = Rates { start: d.lr, end: d.lr_end, decay: d.decay };
+        self.update(rates.at(progress), step.saturating_sub(begin) + 1)
+    }
+
+    /// Adam's update number `updates` (from 1) since its moments were zero.
+    fn update(&self, rate: f64, updates: u32) -> layout::FieldUpdate {
+        let correction = |beta: f64| (1.0 - beta.powi(updates as i32)) as f32;
+        layout::FieldUpdate {
+            rate: rate as f32,
+            restart: u32::from(updates == 1),
+            bias_correction1: correction(self.adam.beta1),
+            bias_correction2: correction(self.adam.beta2),
+        }
+    }
+
+    /// Returns how far learning rates have gone from start (0) to end (1). After the restart a straight line reaches its end with
+    /// the run, as the paper states it, and a factor per iteration stays what it was, as the code has it.
+    fn progress(&self, decay: Decay, step: u32) -> f64 {
+        let whole = f64::from(self.train.iterations) * self.adam.decay_share;
+        let Some(restart) = self.restart().filter(|restart| step >= *restart) else {
+            return (f64::from(step) / whole).min(1.0);
+        };
+        let length = match decay {
+            Decay::Linear => (whole - f64::from(restart)).max(1.0),
+            Decay::Exponential => whole,
+        };
+        (f64::from(step - restart) / length).min(1.0)
     }
 
     /// Weights of the losses that two networks have.
@@ -57,11 +103,23 @@ impl Config {
     }
 }
 
-fn rate(start: f64, end: f64, decay: Decay, progress: f64) -> f64 {
-    match decay {
-        Decay::Linear => start + (end - start) * progress,
-        Decay::Exponential if start > 0.0 && end > 0.0 => start * (end / start).powf(progress),
-        Decay::Exponential => start,
+/// How a learning rate goes from start to end.
+#[derive(Clone, Copy)]
+struct Rates {
+    start: f64,
+    end: f64,
+    decay: Decay,
+}
+
+impl Rates {
+    /// Returns the rate at a progress from 0 to 1.
+    fn at(self, progress: f64) -> f64 {
+        let Rates { start, end, decay } = self;
+        match decay {
+            Decay::Linear => start + (end - start) * progress,
+            Decay::Exponential if start > 0.0 && end > 0.0 => start * (end / start).powf(progress),
+            Decay::Exponential => start,
+        }
     }
 }
 
@@ -70,27 +128,62 @@ mod tests {
     use super::*;
     use crate::config::Preset;
 
-    #[test]
-    fn paper_schedule_has_its_delay_window_and_reset() {
-        let config = Config::preset(Preset::Paper);
-        assert_eq!(config.schedule(0).reset, 1);
-        assert_eq!(config.schedule(1499).dynamic_active, 0);
-        let start = config.schedule(1500);
-        assert_eq!((start.dynamic_active, start.reset, start.window), (1, 1, 0.0));
-        assert!((start.bias_correction1 - 0.1).abs() < 1e-7);
-        assert_eq!(config.schedule(1501).reset, 0);
-        assert!((config.schedule(1500 + 7500).window - 5.0).abs() < 1e-6);
-        assert_eq!(config.schedule(29_999).window, 10.0);
-        assert!((config.schedule(15_000).static_lr - 0.0055).abs() < 1e-9);
+    fn close(got: f32, want: f64) {
+        assert!((f64::from(got) - want).abs() <= 1e-6 * want, "{got} {want}");
     }
+
+    /// What `run_hybrid.py` of the authors does: update number of each field and its rate as a power of the factor per iteration.
+    #[test]
+    fn the_delay_of_the_public_code_is_that_of_its_authors() {
+        let config = Config::preset(Preset::PublicCode);
+        let factor = 0.1f64.powf(1.0 / 30_000.0);
+        let correction = |updates: i32| 1.0 - 0.99f64.powi(updates);
+        for (step, restarts, static_powers, static_updates, dynamic_powers, dynamic_updates) in [
+            (0, [1, 0], 0, 1, 0, 1),
+            (1499, [0, 0], 1499, 1500, 0, 1),
+            // One step of the dynamic field with the old optimiser, then both begin again.
+            (1500, [0, 1], 1500, 1501, 0, 1),
+            (1501, [1, 1], 0, 1, 0, 1),
+            (1502, [0, 0], 1, 2, 1, 2),
+            (29_999, [0, 0], 28_498, 28_499, 28_498, 28_499),
+        ] {
+            let row = config.schedule(step);
+            assert_eq!(row.dynamic_active, u32::from(step >= 1500));
+            close(row.static_update.rate, 0.02 * factor.powi(static_powers));
+            close(row.static_update.bias_correction2, correction(static_updates));
+            assert_eq!(row.static_update.restart, restarts[0], "{step}");
+            if row.dynamic_active != 0 {
+                close(row.dynamic_update.rate, 0.1 * factor.powi(dynamic_powers));
+                close(row.dynamic_update.bias_correction2, correction(dynamic_updates));
+                assert_eq!(row.dynamic_update.restart, restarts[1], "{step}");
+            }
+        }
+    }
+
+    #[test]
+    fn paper_schedule_has_its_delay_window_and_restart_and_ends_where_the_paper_says() {
+        let config = Config::preset(Preset::Paper);
+        let (before, start, restart) = (config.schedule(1499), config.schedule(1500), config.schedule(1501));
+        assert_eq!((before.dynamic_active, start.dynamic_active, start.window), (0, 1, 0.0));
+        close(before.static_update.rate, 0.01 - 0.009 * 1499.0 / 30_000.0);
+        close(start.dynamic_update.rate, 0.1);
+        close(restart.static_update.rate, 0.01);
+        close(restart.dynamic_update.rate, 0.1);
+        close(restart.dynamic_update.bias_correction1, 0.1);
+        close(config.schedule(1500 + 7500).window, 5.0);
+        assert_eq!(config.schedule(29_999).window, 10.0);
+        let end = config.schedule(30_000);
+        close(end.static_update.rate, 1e-3);
+        close(end.dynamic_update.rate, 1e-2);
+    }
+
     #[test]
     fn nerf_ca_schedule_is_that_of_its_code() {
         let config = Config::preset(Preset::NerfCa);
-        let close = |got: f32, want: f64| assert!((f64::from(got) - want).abs() <= 1e-6 * want, "{got} {want}");
         let [start, delayed, half, late] = [0, 40_000, 90_000, 160_000].map(|step| config.schedule(step));
-        assert_eq!((start.window, start.dynamic_active, start.reset), (1.0, 1, 1));
+        assert_eq!((start.window, start.dynamic_active, start.dynamic_update.restart), (1.0, 1, 1));
         assert_eq!((start.favour_static, start.near_integral), (0.0, 0.0));
-        close(start.static_lr, 1e-3);
+        close(start.static_update.rate, 1e-3);
         close(start.ray_entropy, 1e-10);
         close(start.static_size, 1e-8);
         close(delayed.favour_static, 1e-12);
@@ -101,10 +194,10 @@ mod tests {
         close(half.near_integral, 0.5 * (1e-8 + 1e-4));
         // p = 1 + 12 it / 150,000.
         close(half.window, 8.2);
-        close(config.schedule(75_000).dynamic_lr, 0.5 * (1e-3 + 1e-5));
+        close(config.schedule(75_000).dynamic_update.rate, 0.5 * (1e-3 + 1e-5));
         assert_eq!(late.window, 12.0);
         for (got, want) in [
-            (late.dynamic_lr, 1e-5),
+            (late.dynamic_update.rate, 1e-5),
             (late.ray_entropy, 1e-8),
             (late.favour_static, 1e-10),
             (late.near_integral, 1e-4),

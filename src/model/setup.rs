@@ -1,7 +1,7 @@
 //! The constants that shaders read, from a model.
 
 use crate::config::sections::Networks;
-use crate::config::{Config, DynamicTarget};
+use crate::config::{Config, DynamicTarget, OcclusionRegion};
 use crate::kernels::layout::Setup;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
@@ -62,6 +62,10 @@ impl Scene {
         setup.temporal_target = u32::from(config.loss.dynamic_target == DynamicTarget::Temporal);
         setup.occlusion_weight = config.dynamic.occlusion as f32;
         setup.occlusion_depth = (near + (far - near) * config.dynamic.occlusion_share) as f32;
+        setup.occlusion_share = match config.dynamic.occlusion_region {
+            OcclusionRegion::DepthRange => 0.0,
+            OcclusionRegion::LastRay => config.dynamic.occlusion_share as f32,
+        };
         setup.tv_plane = (config.static_field.tv * config.static_field.tv_plane) as f32;
         setup.tv_line = (config.static_field.tv * config.static_field.tv_line) as f32;
     }

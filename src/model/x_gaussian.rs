@@ -4,6 +4,10 @@ use crate::error::{Error, Result};
 use crate::kernels::layout::{XGaussian, XStatistics};
 use glam::{DMat3, DQuat, DVec3};
 
+/// Settings that make the steps of a fit smaller.
+pub const SMALLER_STEPS: &str =
+    "lower rates of section `x`: x.position_rate, x.intensity_rate, x.opacity_rate, x.scale_rate, x.rotation_rate";
+
 impl XGaussian {
     /// Opacity at the centre.
     pub fn shown_opacity(&self) -> f64 {
@@ -112,7 +116,7 @@ impl XState {
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
             Some(bad) => {
                 let quantity = "parameter of a Gaussian";
-                Err(Error::Diverged { step: step.into(), quantity, value: bad.into() })
+                Err(Error::Diverged { step: step.into(), quantity, value: bad.into(), advice: SMALLER_STEPS })
             }
             None => Ok(()),
         }

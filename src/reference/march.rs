@@ -90,6 +90,43 @@ pub fn depths(s: &Setup, n: u32, near: f32, far: f32, step: u32, ray: &Ray) -> V
     (0..n as usize).map(|k| (at[k], if k + 1 < n as usize { at[k + 1] - at[k] } else { 1e-10 } * norm)).collect()
 }
 
+/// Near part of rays, whose samples are subject to occlusion minimisation.
+#[derive(Debug, Clone, Copy)]
+pub enum NearPart {
+    /// Samples at depths below this, world units.
+    Depth(f64),
+    /// Samples that end below this path length from the first depth, world units.
+    Path(f64),
+}
+
+impl NearPart {
+    /// Returns the near part of the rays of a batch at iteration `step`.
+    pub fn of(plan: &Plan, step: u32, batch: &[Ray]) -> NearPart {
+        let s = &plan.setup;
+        let share = f64::from(s.occlusion_share);
+        match batch.last().filter(|_| share > 0.0) {
+            None => NearPart::Depth(s.occlusion_depth.into()),
+            Some(last) => {
+                let at = depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, last);
+                NearPart::Path(share * at.iter().map(|(_, dl)| dl).sum::<f64>())
+            }
+        }
+    }
+
+    /// Tells which of a ray's samples are near, given their depths and path lengths.
+    fn marks(self, samples: &[(f64, f64)]) -> Vec<bool> {
+        let mut path = 0.0;
+        let mark = |(t, dl): &(f64, f64)| {
+            path += dl;
+            match self {
+                NearPart::Depth(limit) => *t < limit,
+                NearPart::Path(limit) => path < limit,
+            }
+        };
+        samples.iter().map(mark).collect()
+    }
+}
+
 /// Whether the dynamic field may exist at a point at a phase: its box and, if used, the hull.
 pub fn dynamic_inside(plan: &Plan, x: DVec3, phase: usize) -> bool {
     let s = &plan.setup;
@@ -164,14 +201,23 @@ pub fn statics(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: b
 }
 
 /// Marches one ray (twin of `march_count`..`march_emit`, `march_fwd` and `march_loss`).
-pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool, precision: Precision) -> March {
+pub fn fwd(
+    plan: &Plan,
+    params: &[f64],
+    step: u32,
+    ray: &Ray,
+    near_part: NearPart,
+    with_static: bool,
+    precision: Precision,
+) -> March {
     let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
     let row = plan.schedule[step as usize];
     let mut out = statics(plan, params, step, ray, with_static);
     if row.dynamic_active == 0 {
         return out;
     }
-    for (t, dl) in depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray) {
+    let samples = depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray);
+    for ((t, dl), near) in samples.iter().copied().zip(near_part.marks(&samples)) {
         let x = ray.anchor + t * ray.direction;
         if !searched(plan, x, ray, |_| true) {
             continue;
@@ -179,7 +225,6 @@ pub fn fwd(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool,
         let trace =
             field::network_fwd(&p.moving, params, &field::encode(s, row.window.into(), x), ray.shown, precision);
         let sigma = f64::from(s.dynamic_gain) * field::softplus(trace.feature + f64::from(s.dynamic_shift));
-        let near = t < f64::from(s.occlusion_depth);
         out.dynamic_integral += sigma * dl;
         out.occlusion += if near { sigma * dl } else { 0.0 };
         out.dynamics.push(DynamicSample { x, dl, near, trace });

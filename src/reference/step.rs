@@ -2,7 +2,7 @@
 
 use crate::plan::Plan;
 use crate::reference::field::Precision;
-use crate::reference::march::{self, Ray};
+use crate::reference::march::{self, NearPart, Ray};
 use crate::reference::networks;
 
 /// Losses of an iteration; see `report`.
@@ -91,8 +91,9 @@ pub fn loss_and_gradient(
     let s = &plan.setup;
     let mut gradient = vec![0.0; plan.params.len];
     let mut losses = Losses::default();
+    let near_part = NearPart::of(plan, step, rays);
     for (r, ray) in rays.iter().enumerate() {
-        let seen = march::fwd(plan, params, step, ray, !skips_static(plan, r), precision);
+        let seen = march::fwd(plan, params, step, ray, near_part, !skips_static(plan, r), precision);
         let loss = ray_loss(plan, r, rays.len(), ray, [seen.static_integral, seen.dynamic_integral]);
         losses.data += loss.data;
         losses.dynamic += loss.dynamic;
@@ -147,13 +148,13 @@ pub fn adam(plan: &Plan, step: u32, gradient: &[f64], params: &mut [f64], moment
             continue;
         }
         let m = &mut moments[i];
-        if row.reset != 0 {
+        let update = if is_static { row.static_update } else { row.dynamic_update };
+        if update.restart != 0 {
             *m = [0.0; 2];
         }
         m[0] = beta1 * m[0] + (1.0 - beta1) * g;
         m[1] = beta2 * m[1] + (1.0 - beta2) * g * g;
-        let rate = f64::from(if is_static { row.static_lr } else { row.dynamic_lr });
-        let denominator = (m[1] / f64::from(row.bias_correction2)).sqrt() + f64::from(s.epsilon);
-        params[i] -= rate / f64::from(row.bias_correction1) * m[0] / denominator;
+        let denominator = (m[1] / f64::from(update.bias_correction2)).sqrt() + f64::from(s.epsilon);
+        params[i] -= f64::from(update.rate) / f64::from(update.bias_correction1) * m[0] / denominator;
     }
 }

@@ -113,6 +113,8 @@ impl Renderer {
         let mut setup = model.scene.setup(&model.config, &model.param_map, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;
+        // Nothing is penalised, and a rendering has no batch whose last ray could decide.
+        setup.occlusion_share = 0.0;
         setup.n_static_samples = model.config.march.render_samples;
         if model.moving.is_none() {
             setup.n_dynamic_samples = model.config.march.render_samples;

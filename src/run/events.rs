@@ -45,6 +45,15 @@ pub enum Event {
         /// Estimated seconds to the end.
         left_s: f64,
     },
+    /// A loss far above the first one; training goes on.
+    LargeLoss {
+        /// Iterations done after it.
+        step: u32,
+        /// The loss.
+        loss: f64,
+        /// The loss over the first one of this start.
+        ratio: f64,
+    },
     /// Metrics on some unseen images.
     Validation {
         /// Iterations done.

@@ -22,6 +22,7 @@ use crate::scan::dataset::Dataset;
 use crate::score::calibrated::{carried_by, in_calibrated_frame};
 use crate::score::distance::Distance;
 use crate::score::eval;
+use crate::train::losses::LargeLoss;
 use crate::train::trainer::Trainer;
 use crate::train::training::{Progress, Training};
 use std::path::Path;
@@ -244,6 +245,9 @@ impl<'a> Loop<'a> {
 
     /// Tells of every few iterations, and the last.
     fn report(&mut self, progress: Vec<Progress>) -> Result<()> {
+        if let Some(LargeLoss { step, loss, ratio }) = self.training.trainer_mut().take_large_loss() {
+            (self.tell)(Event::LargeLoss { step, loss, ratio })?;
+        }
         for p in progress {
             if p.loss.step.is_multiple_of(REPORT_EVERY) || p.loss.step == self.end {
                 let empty = self.training.trainer().plan().empty_loss;

@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::config::sections::Sax;
-use crate::kernels::layout::{SaxSetup, Schedule, Setup};
+use crate::kernels::layout::{FieldUpdate, SaxSetup, Schedule, Setup};
 use crate::model::sax::{SaxField, SaxShape};
 use crate::model::setup::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::sax::data::SaxData;
@@ -74,12 +74,13 @@ pub fn schedule(config: &Config) -> Vec<Schedule> {
     let row = |step: u32| {
         let bias = |beta: f64| (1.0 - beta.powf(f64::from(step + 1))) as f32;
         let has_fallen = sax.rate_falls_at > 0 && step >= sax.rate_falls_at;
-        Schedule {
-            static_lr: (sax.rate * if has_fallen { sax.rate_fall } else { 1.0 }) as f32,
+        let static_update = FieldUpdate {
+            rate: (sax.rate * if has_fallen { sax.rate_fall } else { 1.0 }) as f32,
+            restart: 0,
             bias_correction1: bias(adam.beta1),
             bias_correction2: bias(adam.beta2),
-            ..Schedule::default()
-        }
+        };
+        Schedule { static_update, ..Schedule::default() }
     };
     (0..=config.train.iterations).map(row).collect()
 }
@@ -108,10 +109,10 @@ mod tests {
         let config = Config::preset(Preset::SaxNerf);
         let rows = schedule(&config);
         assert_eq!(rows.len(), 4504);
-        assert_eq!((rows[0].static_lr, rows[4499].static_lr), (1e-3, 1e-3));
-        assert!((rows[4500].static_lr / 1e-4 - 1.0).abs() < 1e-6);
-        assert!((rows[0].bias_correction1 - 0.1).abs() < 1e-7);
-        assert!((f64::from(rows[999].bias_correction2) - (1.0 - 0.999f64.powi(1000))).abs() < 1e-6);
+        assert_eq!((rows[0].static_update.rate, rows[4499].static_update.rate), (1e-3, 1e-3));
+        assert!((rows[4500].static_update.rate / 1e-4 - 1.0).abs() < 1e-6);
+        assert!((rows[0].static_update.bias_correction1 - 0.1).abs() < 1e-7);
+        assert!((f64::from(rows[999].static_update.bias_correction2) - (1.0 - 0.999f64.powi(1000))).abs() < 1e-6);
         assert_eq!(n_rays(&config.sax), 2048);
     }
 }

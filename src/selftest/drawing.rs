@@ -101,7 +101,8 @@ pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut 
             largest.push(want.largest[1]);
             continue;
         }
-        let want = march::fwd(&trained.plan, &trained.params, ITERATIONS, &ray, true, trained.precision);
+        let no_near_part = march::NearPart::Depth(f64::NEG_INFINITY);
+        let want = march::fwd(&trained.plan, &trained.params, ITERATIONS, &ray, no_near_part, true, trained.precision);
         statics.push(want.static_integral);
         dynamics.push(want.dynamic_integral);
         largest.push(want.dynamics.iter().map(|x| trained.attenuation(x.trace.feature)).fold(0.0, f64::max));

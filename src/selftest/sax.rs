@@ -277,7 +277,7 @@ impl Iteration<'_> {
         let gradient = f64s(&self.floats(&self.fit.buffers().1.gradient, n)?);
         let after = f64s(&self.floats(&self.fit.sets()[self.last_set()].params, n)?);
         let moved: Vec<f32> = after.iter().zip(&self.params()).map(|(a, b)| (a - b) as f32).collect();
-        let step = |g: &f64| -f64::from(row.static_lr) * g / (g.abs() + adam.epsilon);
+        let step = |g: &f64| -f64::from(row.static_update.rate) * g / (g.abs() + adam.epsilon);
         // Numbers are near 1 and steps are 0.001 of that.
         findings.numbers(
             ADAM,

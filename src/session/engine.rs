@@ -223,6 +223,9 @@ impl Shared {
         let before = training.trainer().step();
         let progress = training.advance(end)?;
         let trainer = training.trainer_mut();
+        if let Some(large) = trainer.take_large_loss() {
+            tracing::warn!("{large}");
+        }
         self.step.store(trainer.submitted(), Ordering::Release);
         let config = &trainer.plan().config;
         let every = config.train.checkpoint_every;

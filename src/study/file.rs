@@ -251,51 +251,10 @@ fn configuration(
 }
 
 const ITERATIONS: &str = "train.iterations";
-const DENSIFY_EVERY: &str = "r2.densify_every";
-const X_DENSIFY_EVERY: &str = "x.densify_every";
-/// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have
-/// one.
-const LEAST_BETWEEN_DENSIFYING: f64 = 10.0;
-
-/// Settings of a run of another length: what the preset counts in iterations of the networks' schedule, and of density
-/// control, keeps its share of the run, but for what was `given`.
+/// Settings of a run of another length: the schedule keeps its shares of the run, but for what was `given`.
 fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
-    let share = f64::from(iterations) / f64::from(preset.train.iterations);
-    let mut schedule = vec![
-        ("dynamic.delay", preset.dynamic.delay),
-        ("dynamic.window_iterations", preset.dynamic.window_iterations),
-        ("occupancy.start", preset.occupancy.start),
-    ];
-    if preset.two_networks() {
-        schedule.extend([
-            ("networks.delay", preset.networks.delay),
-            ("networks.ramp", preset.networks.ramp),
-            ("networks.stop_after", preset.networks.stop_after),
-        ]);
-    }
-    if preset.is_r2() {
-        schedule.extend([
-            (DENSIFY_EVERY, preset.r2.densify_every),
-            ("r2.densify_from", preset.r2.densify_from),
-            ("r2.densify_until", preset.r2.densify_until),
-        ]);
-    }
-    if preset.is_x() {
-        schedule.extend([
-            (X_DENSIFY_EVERY, preset.x.densify_every),
-            ("x.densify_from", preset.x.densify_from),
-            ("x.densify_until", preset.x.densify_until),
-            ("x.reset_every", preset.x.reset_every),
-            ("x.degree_every", preset.x.degree_every),
-        ]);
-    }
-    if preset.is_sax() {
-        schedule.push(("sax.rate_falls_at", preset.sax.rate_falls_at));
-    }
-    let moved = schedule.into_iter().filter(|(key, _)| !given.contains(key));
-    let least =
-        |key: &str| if [DENSIFY_EVERY, X_DENSIFY_EVERY].contains(&key) { LEAST_BETWEEN_DENSIFYING } else { 0.0 };
-    let moved = moved.map(|(key, count)| format!("{key}={}", (share * f64::from(count)).round().max(least(key))));
+    let moved = preset.schedule_of_length(iterations).into_iter().filter(|(key, _)| !given.contains(key));
+    let moved = moved.map(|(key, count)| format!("{key}={count}"));
     moved.chain([format!("{ITERATIONS}={iterations}")]).collect()
 }
 

@@ -9,7 +9,7 @@ use crate::gpu::device::Gpu;
 use crate::gpu::pace::{SubmitPace, longest_submit_s};
 use crate::gpu::record::{Commands, PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
-use crate::model::gaussians::{Gaussians, amplitude, dense};
+use crate::model::gaussians::{Gaussians, SMALLER_STEPS, amplitude, dense};
 use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
@@ -166,7 +166,7 @@ impl GaussianTrainer {
         if fit::parts_from_strays(&self.settings, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step)
+        losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
 
     /// Estimates the still background anew from what the Gaussians leave of the images, and with it the bounds of the

@@ -1,5 +1,6 @@
 //! What an iteration tells of itself.
 
+use crate::error::{Error, Result};
 use crate::kernels::layout::StepReport;
 use serde::Serialize;
 
@@ -84,6 +85,65 @@ impl StepLoss {
     }
 }
 
+/// A loss this many times the first one is warned of.
+const LARGE: f64 = 1e6;
+/// Settings that make the steps of fields smaller that rays are marched through.
+pub(super) const SMALLER_STEPS: &str = "a lower static.lr or dynamic.lr, or a longer dynamic.delay";
+
+/// A loss far above the first one. Published learning rates give one when the dynamic field starts, and training goes on from it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LargeLoss {
+    /// Iterations done after it.
+    pub step: u32,
+    /// The loss.
+    pub loss: f64,
+    /// The loss over the first one of this start.
+    pub ratio: f64,
+}
+
+impl std::fmt::Display for LargeLoss {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let LargeLoss { step, loss, ratio } = self;
+        write!(
+            f,
+            "the loss of iteration {step} is {loss:.3e}, {ratio:.0e} times the first one; training goes on \
+             (train.stop_at_loss_ratio ends it at such a loss)"
+        )
+    }
+}
+
+/// Watches the losses of a run for those that end it and for the first one that is large.
+pub(super) struct LossWatch {
+    stop_at_ratio: f64,
+    first: Option<f64>,
+    has_warned: bool,
+}
+
+impl LossWatch {
+    /// Watches a run that ends at a loss `stop_at_ratio` times the first one; 0: at none that is finite.
+    pub(super) fn new(stop_at_ratio: f64) -> LossWatch {
+        LossWatch { stop_at_ratio, first: None, has_warned: false }
+    }
+
+    /// Takes in the next loss; returns the first one that is large.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] for a loss that is not finite, or at which the run is to end.
+    pub(super) fn see(&mut self, loss: &StepLoss) -> Result<Option<LargeLoss>> {
+        let value = loss.total();
+        let ratio = value / self.first.get_or_insert(value).max(1e-12);
+        if !value.is_finite() || (self.stop_at_ratio > 0.0 && ratio > self.stop_at_ratio) {
+            let (step, quantity) = (u64::from(loss.step), "loss");
+            return Err(Error::Diverged { step, quantity, value, advice: SMALLER_STEPS });
+        }
+        if ratio <= LARGE || self.has_warned {
+            return Ok(None);
+        }
+        self.has_warned = true;
+        Ok(Some(LargeLoss { step: loss.step, loss: value, ratio }))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -105,5 +165,23 @@ mod tests {
         assert_eq!(loss.total(), 1.625);
         let networks = NetworkLosses { favour_static: 2.0, ray_entropy: 4.0, static_size: 8.0, stopped: false };
         assert_eq!(StepLoss { networks: Some(networks), ..loss }.total(), 15.625);
+    }
+
+    #[test]
+    fn large_losses_are_warned_of_once_and_end_a_run_only_where_that_is_set() {
+        let loss = |step, data| StepLoss { tv: 0.0, ..StepLoss::of_gaussians(step, data) };
+        let mut watch = LossWatch::new(0.0);
+        assert_eq!(watch.see(&loss(1, 2e-3)).unwrap(), None);
+        assert_eq!(watch.see(&loss(2, 1e3)).unwrap(), None);
+        let warned = watch.see(&loss(3, 4e3)).unwrap().unwrap();
+        assert_eq!((warned.step, warned.loss), (3, 4e3));
+        assert!(warned.to_string().contains("iteration 3") && warned.to_string().contains("2e6 times"), "{warned}");
+        assert_eq!(watch.see(&loss(4, 8e30)).unwrap(), None, "once");
+        assert!(matches!(watch.see(&loss(5, f64::INFINITY)), Err(Error::Diverged { step: 5, .. })));
+
+        let mut watch = LossWatch::new(100.0);
+        assert_eq!(watch.see(&loss(1, 1.0)).unwrap(), None);
+        assert_eq!(watch.see(&loss(2, 99.0)).unwrap(), None);
+        assert!(matches!(watch.see(&loss(3, 101.0)), Err(Error::Diverged { step: 3, .. })));
     }
 }

@@ -9,7 +9,7 @@ use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Setup};
 use crate::model::gaussians::Gaussians;
-use crate::model::r2::R2State;
+use crate::model::r2::{R2State, SMALLER_STEPS};
 use crate::r2::data::R2Data;
 use crate::r2::densify::{densified, densifies};
 use crate::r2::parameters::ScaleBounds;
@@ -115,7 +115,7 @@ impl R2Trainer {
         let first = self.step;
         let stop = (first + 1..until).find(|step| densifies(&self.config.r2, *step)).unwrap_or(until);
         self.step += self.iterations.run(&self.gpu, first, stop)?;
-        let losses = losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step)?;
+        let losses = losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step, SMALLER_STEPS)?;
         if densifies(&self.config.r2, self.step) {
             self.densify()?;
         }

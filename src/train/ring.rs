@@ -16,8 +16,8 @@ pub(crate) fn ring(gpu: &Gpu, name: &str) -> Result<Buffer> {
     Ok(buffer)
 }
 
-/// The losses of some iterations.
-pub(super) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>) -> Result<Vec<f64>> {
+/// Returns the losses of some iterations. The error of one that is not finite gives the `advice`.
+pub(super) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>, advice: &'static str) -> Result<Vec<f64>> {
     let mut told = vec![0f32; RING_LENGTH as usize];
     ring.read(&mut told)?;
     let loss = |step: u32| {
@@ -26,7 +26,7 @@ pub(super) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>) -> Result<Vec<
             return Err(tells_nothing(gpu, step + 1));
         }
         if !loss.is_finite() {
-            return Err(Error::Diverged { step: u64::from(step) + 1, quantity: "loss", value: loss.into() });
+            return Err(Error::Diverged { step: u64::from(step) + 1, quantity: "loss", value: loss.into(), advice });
         }
         Ok(f64::from(loss))
     };

@@ -6,7 +6,7 @@ use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::SaxSetup;
-use crate::model::sax::{SaxField, SaxState, check_params};
+use crate::model::sax::{SMALLER_STEPS, SaxField, SaxState, check_params};
 use crate::r2::start::seed_of_set;
 use crate::sax::buffers::{Passes, SaxMemory, fit_buffers, sample_buffers, set_buffers};
 use crate::sax::data::SaxData;
@@ -140,7 +140,7 @@ impl SaxTrainer {
         }
         let first = self.step;
         self.step += self.iterations.run(&self.gpu, first, until)?;
-        losses(&self.gpu, &self.fit.sax_ring, first..self.step)
+        losses(&self.gpu, &self.fit.sax_ring, first..self.step, SMALLER_STEPS)
     }
 
     /// The fields after the iterations done, and what a resumed run goes on from beside them.

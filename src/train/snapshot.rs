@@ -10,6 +10,7 @@ use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::r2::R2State;
 use crate::model::sax::SaxState;
 use crate::model::x_gaussian::XState;
+use crate::train::losses::SMALLER_STEPS;
 
 /// Bytes of an iteration's report.
 pub(super) const REPORT_BYTES: u64 = size_of::<StepReport>() as u64;
@@ -50,7 +51,7 @@ impl Snapshot {
         self.params.read(&mut params)?;
         if let Some(bad) = params.iter().find(|p| !p.is_finite()) {
             let (step, value) = (u64::from(self.model.step), f64::from(*bad));
-            return Err(Error::Diverged { step, quantity: "parameter", value });
+            return Err(Error::Diverged { step, quantity: "parameter", value, advice: SMALLER_STEPS });
         }
         self.model.params = params;
         let mut moments = vec![[0f32; 2]; n];

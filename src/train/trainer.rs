@@ -22,7 +22,7 @@ use crate::network::still::StillNetwork;
 use crate::network::{F32_BYTES, Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
-use crate::train::losses::{NetworkLosses, StepLoss};
+use crate::train::losses::{LargeLoss, LossWatch, NetworkLosses, StepLoss};
 use crate::train::moving::Moving;
 use crate::train::ring::tells_nothing;
 use crate::train::sax::SaxTrainer;
@@ -30,9 +30,6 @@ use crate::train::snapshot::{REPORT_BYTES, Snapshot};
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use std::collections::VecDeque;
 use std::time::Instant;
-
-/// A loss this many times the first one means the run exploded.
-const EXPLOSION: f64 = 1e6;
 
 /// Where the ring has the report of the last of `step` iterations, bytes.
 fn last_report_at(step: u32) -> u64 {
@@ -70,7 +67,8 @@ pub struct Trainer {
     submitted: u32,
     completed: u32,
     reported: u32,
-    first_loss: Option<f64>,
+    watch: LossWatch,
+    large_loss: Option<LargeLoss>,
     vessel_attenuation: Option<f64>,
     c_arm: CArm,
     image_size: [usize; 2],
@@ -268,7 +266,8 @@ impl Trainer {
             submitted: step,
             completed: step,
             reported: step,
-            first_loss: None,
+            watch: LossWatch::new(plan.config.train.stop_at_loss_ratio),
+            large_loss: None,
             moving,
             sax,
             // X-Gaussian's opacities are no attenuation.
@@ -337,7 +336,7 @@ impl Trainer {
     /// is still being prepared.
     ///
     /// # Errors
-    /// [`Error::Diverged`] on a loss that is not finite or exploded; device errors.
+    /// [`Error::Diverged`] on a loss that is not finite, or at which the configuration ends a run; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
         if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
             return self.advance_gaussians(until);
@@ -477,13 +476,17 @@ impl Trainer {
                 loss_scale: report.loss_scale.into(),
                 networks: self.still.as_ref().map(|_| NetworkLosses::of(&report)),
             };
-            let first = *self.first_loss.get_or_insert(loss.total());
-            if !loss.total().is_finite() || loss.total() > EXPLOSION * first.max(1e-12) {
-                return Err(Error::Diverged { step: u64::from(loss.step), quantity: "loss", value: loss.total() });
+            if let Some(large) = self.watch.see(&loss)? {
+                self.large_loss = Some(large);
             }
             losses.push(loss);
         }
         Ok(losses)
+    }
+
+    /// Returns the first loss that was far above the first one of this start, once: for a warning.
+    pub fn take_large_loss(&mut self) -> Option<LargeLoss> {
+        self.large_loss.take()
     }
 
     /// Runs one iteration with a timestamp around each pass.

@@ -6,7 +6,7 @@ use crate::train::losses::StepLoss;
 use crate::train::trainer::Trainer;
 use std::time::Instant;
 
-/// Weight of the newest squared error in the smoothed one.
+/// Weight of the newest squared error, by its logarithm, in the smoothed one.
 const SMOOTHING: f64 = 0.05;
 
 /// Losses of an iteration, and how fast iterations go.
@@ -29,7 +29,8 @@ pub struct Training {
     trainer: Trainer,
     /// Span of the line integrals of the training images.
     image_range: f64,
-    smoothed_mse: Option<f64>,
+    /// Logarithm of the squared error, smoothed: one of a loss that is large for a moment is forgotten in as many iterations as any.
+    smoothed_log_mse: Option<f64>,
     clock: Clock,
     train_s: f64,
 }
@@ -46,7 +47,7 @@ impl Training {
         let (low, high) = trainer.plan().images.iter().fold((f32::INFINITY, f32::NEG_INFINITY), span);
         let clock = Clock { begin: Instant::now(), first_step: trainer.step() };
         let image_range = if high > low { f64::from(high - low) } else { 1.0 };
-        Training { trainer, image_range, smoothed_mse: None, clock, train_s: 0.0 }
+        Training { trainer, image_range, smoothed_log_mse: None, clock, train_s: 0.0 }
     }
 
     /// The trainer.
@@ -100,14 +101,16 @@ impl Training {
 
     fn progress(&mut self, loss: StepLoss) -> Progress {
         let newest = loss.squared_error;
-        let smoothed = self.smoothed_mse.map_or(newest, |mse| (1.0 - SMOOTHING) * mse + SMOOTHING * newest);
+        let log = newest.max(f64::MIN_POSITIVE).ln();
+        let smoothed = self.smoothed_log_mse.map_or(log, |before| (1.0 - SMOOTHING) * before + SMOOTHING * log);
         // Gaussians have none.
-        self.smoothed_mse = Some(smoothed).filter(|mse| mse.is_finite());
+        let smoothed = if newest.is_nan() { f64::NAN } else { smoothed };
+        self.smoothed_log_mse = Some(smoothed).filter(|log| log.is_finite());
         let elapsed_s = self.elapsed_s();
         Progress {
             loss,
             psnr_db: self.psnr_db(newest),
-            smoothed_psnr_db: self.psnr_db(smoothed),
+            smoothed_psnr_db: self.psnr_db(smoothed.exp()),
             iterations_per_s: f64::from(loss.step - self.clock.first_step) / elapsed_s.max(1e-9),
             elapsed_s,
         }

@@ -13,7 +13,7 @@ use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, TreeSetup};
-use crate::model::gaussians::{Gaussians, MovingTree, dense};
+use crate::model::gaussians::{Gaussians, MovingTree, SMALLER_STEPS, dense};
 use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
@@ -233,7 +233,7 @@ impl TreeTrainer {
         if fit::parts_from_strays(&self.config.gaussians, self.step) {
             self.drop_strays()?;
         }
-        losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step)
+        losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
 
     /// Drops weak Gaussians and places new ones where data are missing at half the phases. Once in a run, on the host, as
@@ -310,7 +310,8 @@ impl TreeTrainer {
         let own: Vec<[f32; 4]> = self.gpu.download(&self.own.own_motion, 0, n * tree.n_basis as usize)?;
         if let Some(bad) = grid.iter().chain(&own).flatten().find(|v| !v.is_finite()) {
             let step = u64::from(self.step);
-            return Err(Error::Diverged { step, quantity: "motion of the tree", value: f64::from(*bad) });
+            let (quantity, value) = ("motion of the tree", f64::from(*bad));
+            return Err(Error::Diverged { step, quantity, value, advice: "lower tree.grid_rate and tree.own_rate" });
         }
         let rest = Gaussians {
             units: self.targets.units,

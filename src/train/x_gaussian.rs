@@ -9,7 +9,7 @@ use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{GaussianSetup, R2Setup, XCounts, XEnd, XGaussian, XList, XSetup, XStatus};
 use crate::model::gaussians::Gaussians;
-use crate::model::x_gaussian::XState;
+use crate::model::x_gaussian::{SMALLER_STEPS, XState};
 use crate::train::gaussians::{Iterations, pass_times};
 use crate::train::ring::{counts_wrongly, losses, ring};
 use crate::x_gaussian::data::XData;
@@ -210,7 +210,7 @@ impl XTrainer {
         let first = self.step;
         let stop = (first + 1..until).find(|step| self.changes(*step)).unwrap_or(until);
         self.run(stop)?;
-        let losses = losses(&self.gpu, &self.fit.gaussian_ring, first..self.step)?;
+        let losses = losses(&self.gpu, &self.fit.gaussian_ring, first..self.step, SMALLER_STEPS)?;
         self.control_density()?;
         Ok(losses)
     }

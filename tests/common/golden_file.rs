@@ -1,4 +1,5 @@
 //! Golden values of an independent script: float64 tensors with a description of the case.
+#![allow(dead_code, reason = "each test file uses its part")]
 
 use safetensors::SafeTensors;
 use serde_json::Value;
@@ -18,6 +19,11 @@ impl Golden {
         let (_, metadata) = SafeTensors::read_metadata(&bytes).unwrap();
         let case = serde_json::from_str(&metadata.metadata().as_ref().unwrap()["case"]).unwrap();
         Golden { bytes, case }
+    }
+
+    /// Tells whether there is a tensor of this name.
+    pub fn has(&self, name: &str) -> bool {
+        SafeTensors::deserialize(&self.bytes).unwrap().tensor(name).is_ok()
     }
 
     /// The values of a tensor.

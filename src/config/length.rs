@@ -1,0 +1,118 @@
+//! Runs of another length: schedules that keep their shares of the run, and the iterations at which they change something.
+
+use crate::config::Config;
+use crate::error::Result;
+
+/// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have one.
+const LEAST_BETWEEN_DENSIFYING: u32 = 10;
+
+impl Config {
+    /// Returns the settings, with their keys, that keep the schedule's shares of a run of so many iterations.
+    pub fn schedule_of_length(&self, iterations: u32) -> Vec<(&'static str, u32)> {
+        let share = f64::from(iterations) / f64::from(self.train.iterations);
+        let of = |count: u32| (share * f64::from(count)).round() as u32;
+        let densifying = |count: u32| if count == 0 { 0 } else { of(count).max(LEAST_BETWEEN_DENSIFYING) };
+        let mut schedule = vec![
+            ("dynamic.delay", of(self.dynamic.delay)),
+            ("dynamic.window_iterations", of(self.dynamic.window_iterations)),
+            ("occupancy.start", of(self.occupancy.start)),
+        ];
+        if self.two_networks() {
+            schedule.extend([
+                ("networks.delay", of(self.networks.delay)),
+                ("networks.ramp", of(self.networks.ramp)),
+                ("networks.stop_after", of(self.networks.stop_after)),
+            ]);
+        }
+        if self.is_r2() {
+            schedule.extend([
+                ("r2.densify_every", densifying(self.r2.densify_every)),
+                ("r2.densify_from", of(self.r2.densify_from)),
+                ("r2.densify_until", of(self.r2.densify_until)),
+            ]);
+        }
+        if self.is_x() {
+            schedule.extend([
+                ("x.densify_every", densifying(self.x.densify_every)),
+                ("x.densify_from", of(self.x.densify_from)),
+                ("x.densify_until", of(self.x.densify_until)),
+                ("x.reset_every", of(self.x.reset_every)),
+                ("x.degree_every", of(self.x.degree_every)),
+            ]);
+        }
+        if self.is_sax() {
+            schedule.push(("sax.rate_falls_at", of(self.sax.rate_falls_at)));
+        }
+        schedule
+    }
+
+    /// Returns this configuration for a run of so many iterations, with a schedule that keeps its shares.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Config`] when a run of that length is refused.
+    pub fn of_length(&self, iterations: u32) -> Result<Config> {
+        let mut config = self.clone();
+        config.train.iterations = iterations;
+        let schedule = self.schedule_of_length(iterations);
+        let settings: Vec<String> = schedule.iter().map(|(key, count)| format!("{key}={count}")).collect();
+        config.with(&settings)
+    }
+
+    /// Returns the iterations at which the schedule changes something that a run must get past, in their order.
+    pub fn schedule_events(&self) -> Vec<u32> {
+        let mut events = Vec::new();
+        if self.network_moves() {
+            events.extend(self.restart().map(|restart| restart - 1));
+            events.extend(self.restart());
+            events.push(self.dynamic.delay.saturating_add(self.dynamic.window_iterations));
+        }
+        if self.two_networks() {
+            let n = &self.networks;
+            events.extend([n.delay, n.delay.saturating_add(n.ramp), n.stop_after]);
+        }
+        if self.is_r2() {
+            events.extend([self.r2.densify_from, self.r2.densify_until]);
+        }
+        if self.is_x() {
+            events.extend([self.x.degree_every, self.x.densify_from, self.x.reset_every, self.x.densify_until]);
+        }
+        if self.is_sax() {
+            events.push(self.sax.rate_falls_at);
+        }
+        if self.occupancy.enabled {
+            events.push(self.dynamic.delay.saturating_add(self.occupancy.start));
+        }
+        // The static field begins where Gaussians end.
+        if self.gaussians_move() {
+            events.push(self.gaussian_iterations());
+        }
+        events.retain(|event| (1..self.train.iterations).contains(event));
+        events.sort_unstable();
+        events.dedup();
+        events
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Preset;
+
+    #[test]
+    fn a_run_of_another_length_keeps_its_events_in_their_order() {
+        for (preset, length, events) in [
+            (Preset::Paper, 30_000, vec![1500, 1501, 16_500]),
+            (Preset::Paper, 20, vec![1, 2, 11]),
+            (Preset::PublicCode, 3000, vec![150, 151, 1650]),
+            (Preset::NerfCa, 200, vec![40, 138, 140, 150]),
+            (Preset::FastMlp, 120, vec![26, 60]),
+            (Preset::R2Gaussian, 600, vec![10, 300]),
+            (Preset::XGaussian, 400, vec![10, 20, 80, 160]),
+            (Preset::SaxNerf, 9006, vec![9000]),
+        ] {
+            let config = Config::preset(preset).of_length(length).unwrap();
+            assert_eq!((config.train.iterations, config.schedule_events()), (length, events), "{preset:?}");
+        }
+        assert_eq!(Config::preset(Preset::Fast).schedule_events(), [120]);
+    }
+}
