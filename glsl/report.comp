@@ -19,16 +19,26 @@ layout(binding = 8) writeonly buffer B8 { uint occupancy[]; };
 #include "inc/reduce.glsl"
 #include "inc/occupancy.glsl"
 
-const uint GOOD_UPDATES_TO_GROW = 500u;
+const float OVERFLOW_FACTOR = 0.0625;
+const uint UPDATES_TO_RETURN = 20u;
+const uint UPDATES_TO_GROW = 500u;
 const float LARGEST_SCALE = 16777216.0;
 
+// Overflows lower the scale at once. It returns quickly to half of the scale that overflowed first, since gradients that were large
+// for a few iterations, as when the dynamic field starts, would otherwise leave the later ones among f16's subnormals for thousands.
 void adapt_scale(float scale) {
-    bool overflowed = state.overflowed != 0u;
-    uint good = overflowed ? 0u : state.good_updates + 1u;
-    if (overflowed) scale = max(0.5 * scale, 1.0);
-    if (good == GOOD_UPDATES_TO_GROW) {
-        scale = min(2.0 * scale, LARGEST_SCALE);
+    uint good = state.good_updates;
+    if (state.overflowed != 0u) {
+        bool in_a_row = good == 0u && state.return_scale > 0.0;
+        if (!in_a_row) state.return_scale = 0.5 * scale;
+        scale = max(OVERFLOW_FACTOR * scale, 1.0);
         good = 0u;
+    } else {
+        good += 1u;
+        if (good > (scale < state.return_scale ? UPDATES_TO_RETURN : UPDATES_TO_GROW)) {
+            scale = min(2.0 * scale, LARGEST_SCALE);
+            good = 1u;
+        }
     }
     state.loss_scale = scale;
     state.overflowed = 0u;

@@ -163,13 +163,13 @@ fn training_repeats_bit_by_bit_resumes_and_follows_f32() {
 }
 
 #[test]
-fn an_overflow_skips_the_update_and_halves_the_scale() {
+fn an_overflow_skips_the_update_and_lowers_the_scale_for_a_while() {
     let Some((gpu, tuning)) = matrices() else { return };
     let dataset = small_dataset(13, 11);
-    let plan = Plan::new(&small_config("fast-mlp", &[]), &dataset).unwrap();
+    let plan = Plan::new(&small_config("fast-mlp", &["train.iterations=100"]), &dataset).unwrap();
     let (before, first) = (plan.params.initial(&plan.config), plan.params.static_len);
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning).unwrap();
-    let huge = DeviceState { step: 0, loss_scale: 2f32.powi(60), overflowed: 0, good_updates: 7, stopped: 0 };
+    let huge = DeviceState { loss_scale: 2f32.powi(60), good_updates: 7, ..DeviceState::default() };
     gpu.upload(&trainer.forward().state, 0, &[huge]).unwrap();
     trainer.advance(1).unwrap();
     let after = trainer.model().unwrap().params;
@@ -178,12 +178,29 @@ fn an_overflow_skips_the_update_and_halves_the_scale() {
     let state = |trainer: &Trainer| -> DeviceState { gpu.download(&trainer.forward().state, 0, 1).unwrap()[0] };
     assert_eq!(
         state(&trainer),
-        DeviceState { step: 1, loss_scale: 2f32.powi(59), overflowed: 0, good_updates: 0, stopped: 0 }
+        DeviceState { step: 1, loss_scale: 2f32.powi(56), return_scale: 2f32.powi(59), ..DeviceState::default() }
     );
-    // Back and back until gradients fit; then the network moves again.
-    run(&mut trainer, 40);
-    assert!(state(&trainer).good_updates > 0, "{:?}", state(&trainer));
+    // Back and back until gradients fit; then the network moves again, and the scale remembers where it came from.
+    let mut last = state(&trainer);
+    while last.good_updates == 0 {
+        let until = trainer.step() + 1;
+        run(&mut trainer, until);
+        assert!(until < 20, "{:?}", state(&trainer));
+        last = state(&trainer);
+    }
+    assert_eq!(last.return_scale, 2f32.powi(59), "overflows in a row are one");
     assert_ne!(before[first..], trainer.model().unwrap().params[first..]);
+
+    // A scale below the one it returns to grows after 20 good updates, one above it after 500.
+    let set = DeviceState { loss_scale: 2f32.powi(6), good_updates: 1, return_scale: 2f32.powi(10), ..last };
+    gpu.upload(&trainer.forward().state, 0, &[set]).unwrap();
+    let until = last.step + 20;
+    run(&mut trainer, until);
+    assert_eq!((state(&trainer).loss_scale, state(&trainer).good_updates), (2f32.powi(7), 1));
+    let set = DeviceState { loss_scale: 2f32.powi(10), good_updates: 1, ..state(&trainer) };
+    gpu.upload(&trainer.forward().state, 0, &[set]).unwrap();
+    run(&mut trainer, until + 20);
+    assert_eq!((state(&trainer).loss_scale, state(&trainer).good_updates), (2f32.powi(10), 21));
     drop(trainer);
     expect_silence(gpu);
 }

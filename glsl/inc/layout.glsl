@@ -99,7 +99,8 @@ struct DeviceState {
     uint step;                  // iterations done
     float loss_scale;           // factor on gradients in f16; 1 on the f32 path
     uint overflowed;            // 1 while the gradient of an iteration is not finite
-    uint good_updates;          // updates since the scale changed
+    uint good_updates;          // updates since the scale changed, that of a growth counted
+    float return_scale;         // scale that is returned to quickly after overflows; 0: none yet
     uint stopped;               // 1: learning has ended
 };
 

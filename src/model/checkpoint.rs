@@ -67,8 +67,11 @@ pub struct Checkpoint {
 pub struct LossScale {
     /// The factor.
     pub scale: f32,
-    /// Updates since it changed.
+    /// Updates since it changed, that of a growth counted.
     pub good_updates: u32,
+    /// Scale that is returned to quickly after overflows; 0 = none yet, as in checkpoints of before.
+    #[serde(default)]
+    pub return_scale: f32,
 }
 
 #[derive(Serialize, Deserialize)]

@@ -60,7 +60,7 @@ impl Snapshot {
         self.state.read(&mut state)?;
         let mut occupancy = vec![0u32; self.occupancy_words];
         self.occupancy.read(&mut occupancy)?;
-        let [DeviceState { loss_scale: scale, good_updates, stopped, .. }] = state;
+        let [DeviceState { loss_scale: scale, good_updates, return_scale, stopped, .. }] = state;
         let mut last_report = Vec::new();
         if stopped != 0 {
             last_report.resize(REPORT_BYTES as usize / 4, 0u32);
@@ -70,7 +70,7 @@ impl Snapshot {
             model: self.model,
             moments,
             occupancy,
-            loss_scale: self.scaled.then_some(LossScale { scale, good_updates }),
+            loss_scale: self.scaled.then_some(LossScale { scale, good_updates, return_scale }),
             stopped: stopped != 0,
             last_report,
             r2: self.r2,

@@ -220,8 +220,9 @@ impl Trainer {
                 gpu.upload(&forward.occupancy, 0, &saved.occupancy)?;
             }
             // A run may change from one path to the other; f32 needs no scale.
-            if let (Some(LossScale { scale, good_updates }), Layers::Matrices) = (saved.loss_scale, network.layers()) {
-                (now.loss_scale, now.good_updates) = (scale, good_updates);
+            if let (Some(saved), Layers::Matrices) = (saved.loss_scale, network.layers()) {
+                let LossScale { scale, good_updates, return_scale } = saved;
+                (now.loss_scale, now.good_updates, now.return_scale) = (scale, good_updates, return_scale);
             }
         }
         let data_fingerprint = data_fingerprint(dataset);
