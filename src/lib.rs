@@ -168,6 +168,7 @@ pub mod evidence {
 pub mod calibrate;
 pub mod check;
 
+pub mod fitting;
 pub mod model;
 pub mod network;
 
@@ -236,10 +237,8 @@ pub mod train {
     mod carried;
     pub mod dry_run;
     pub mod gaussians;
-    pub mod losses;
     pub mod moving;
     pub mod r2;
-    pub(crate) mod ring;
     pub mod sax;
     pub mod snapshot;
     pub mod step;

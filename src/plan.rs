@@ -15,6 +15,7 @@ pub mod targets;
 
 use crate::config::{Config, DynamicTarget, GaussianForm, StaticData};
 use crate::error::{Error, Result};
+use crate::fitting::extent::{between_phases, volume_half};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{self, Setup};
 use crate::model::hull::Hull;
@@ -245,7 +246,7 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
 
 /// What R2-Gaussian is fitted to, and what is to be said of that.
 fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
-    let half = scale::volume_half(config.r2.half_extent_mm, dataset);
+    let half = volume_half(config.r2.half_extent_mm, dataset);
     let data = R2Data::new(dataset, &config.r2, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
     notes.push(match config.r2.static_data {
@@ -279,7 +280,7 @@ fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
 
 /// What X-Gaussian is fitted to, and what is to be said of that.
 fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
-    let half = scale::volume_half(config.x.half_extent_mm, dataset);
+    let half = volume_half(config.x.half_extent_mm, dataset);
     let data = XData::new(dataset, &config.x, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
     let whose = match config.x.static_data {
@@ -312,7 +313,7 @@ fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result
 
 /// What SAX-NeRF is fitted to, and what is to be said of that.
 fn plan_sax(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<SaxData> {
-    let half = scale::volume_half(config.sax.half_extent_mm, dataset);
+    let half = volume_half(config.sax.half_extent_mm, dataset);
     let data = SaxData::new(dataset, &config.sax, half)?;
     let images = data.images_of_set.iter().map(Vec::len).max().unwrap_or(1);
     let passes = config.train.iterations as usize / images;
@@ -341,12 +342,6 @@ fn plan_sax(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resu
     }
     notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
     Ok(data)
-}
-
-/// What is said of frames that were taken between two phases, and of their `fate`.
-fn between_phases(dataset: &Dataset, fate: &str) -> Option<String> {
-    let n = dataset.training().iter().filter(|f| f.after_phase != 0.0).count();
-    (n > 0).then(|| format!("{n} of {} frames were taken between two phases and {fate}", dataset.training().len()))
 }
 
 /// What is said of frames that Gaussians are not fitted to: those of views that have one phase alone.

@@ -11,6 +11,7 @@ mod truth;
 
 use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
+use crate::fitting::losses::StepLoss;
 use crate::geometry::{Geometry, ViewRays};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -22,7 +23,6 @@ use crate::render::live::Source;
 use crate::render::quantity::Quantity;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::gating::RPeaks;
-use crate::train::losses::StepLoss;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;

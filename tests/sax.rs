@@ -11,13 +11,13 @@ use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_d
 use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
+use nertca_vk::fitting::sets::seed_of_set;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::SaxLevel;
 use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::model::component::Component;
 use nertca_vk::model::sax::{SaxField, SaxShape, SaxState};
 use nertca_vk::plan::Plan;
-use nertca_vk::r2::start::seed_of_set;
 use nertca_vk::reference::sax::{self as reference, Lineformer, SampledRay, entry, objective};
 use nertca_vk::render::baked::Baked;
 use nertca_vk::render::grid::Grid;

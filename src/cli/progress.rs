@@ -2,8 +2,8 @@
 
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
+use nertca_vk::fitting::losses::LargeLoss;
 use nertca_vk::run::events::Event;
-use nertca_vk::train::losses::LargeLoss;
 use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

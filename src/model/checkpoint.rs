@@ -5,9 +5,10 @@
 use crate::config::{Config, StaticForm};
 use crate::error::{Error, Result};
 use crate::files;
+use crate::fitting::tensors::FileTensor;
 use crate::geometry::CArm;
 use crate::model::Model;
-use crate::model::gaussian_tensors::{self, FileTensor, GaussianHeader};
+use crate::model::gaussian_tensors::{self, GaussianHeader};
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::r2::R2State;

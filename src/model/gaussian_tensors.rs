@@ -1,6 +1,7 @@
 //! Gaussians in a checkpoint: tensors under documented names, and what the header says of them.
 
 use crate::error::{Error, Result};
+use crate::fitting::tensors::{File, FileTensor};
 use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
 use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units, inverse_step};
 use safetensors::tensor::{Dtype, SafeTensors};
@@ -10,9 +11,6 @@ use std::path::Path;
 /// Most nodes along an axis of a tree's grid, and most numbers per axis of own motion: no run comes near.
 const MOST_NODES: u32 = 512;
 const MOST_BASIS: u32 = 256;
-
-/// A tensor on its way into a file: name, type, shape, bytes.
-pub(super) type FileTensor = (String, Dtype, Vec<usize>, Vec<u8>);
 
 /// What tensors do not tell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -198,38 +196,4 @@ pub(super) fn read(
         own: vectors("gaussians.motion.own", &[Some(n), Some(grid.basis as usize), Some(3)])?,
         rest: sets,
     }))
-}
-
-/// Where tensors are read from.
-pub(super) struct File<'a> {
-    pub(super) tensors: &'a SafeTensors<'a>,
-    pub(super) path: &'a Path,
-}
-
-impl File<'_> {
-    /// The bytes of a tensor of a type and shape; `None` stands for any length.
-    fn bytes(&self, name: &str, dtype: Dtype, shape: &[Option<usize>]) -> Result<&[u8]> {
-        let bad = |problem: String| Error::data(self.path, name, problem);
-        let view = self.tensors.tensor(name).map_err(|e| bad(e.to_string()))?;
-        let fits = view.shape().len() == shape.len()
-            && view.shape().iter().zip(shape).all(|(is, wanted)| wanted.is_none_or(|wanted| *is == wanted));
-        if view.dtype() != dtype || !fits {
-            return Err(bad(format!("{:?} {:?} where {dtype:?} {shape:?} is needed", view.dtype(), view.shape())));
-        }
-        Ok(view.data())
-    }
-
-    pub(super) fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
-        let bytes = self.bytes(name, Dtype::F32, shape)?.chunks_exact(4);
-        let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
-        match values.iter().all(|v| v.is_finite()) {
-            true => Ok(values),
-            false => Err(Error::data(self.path, name, "holds a value that is not finite")),
-        }
-    }
-
-    pub(super) fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
-        let bytes = self.bytes(name, Dtype::U32, &[Some(n)])?.chunks_exact(4);
-        Ok(bytes.map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect())
-    }
 }

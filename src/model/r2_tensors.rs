@@ -1,8 +1,8 @@
 //! The state of a fit as R2-Gaussian does it in a checkpoint: tensors under documented names.
 
 use crate::error::{Error, Result};
+use crate::fitting::tensors::{File, FileTensor};
 use crate::kernels::layout::R2Gaussian;
-use crate::model::gaussian_tensors::{File, FileTensor};
 use crate::model::r2::R2State;
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::Path;

@@ -1,7 +1,7 @@
 //! SAX-NeRF's field and the state of its fit in a checkpoint: tensors under documented names.
 
 use crate::error::{Error, Result};
-use crate::model::gaussian_tensors::{File, FileTensor};
+use crate::fitting::tensors::{File, FileTensor};
 use crate::model::sax::{Part, SaxField, SaxShape, SaxState};
 use safetensors::tensor::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};

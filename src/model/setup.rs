@@ -2,15 +2,11 @@
 
 use crate::config::sections::Networks;
 use crate::config::{Config, DynamicTarget, OcclusionRegion};
+use crate::fitting::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::kernels::layout::Setup;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
-
-/// Iterations whose losses the device keeps for the host.
-pub const RING_LENGTH: u32 = 1024;
-/// Scale of the static gradient's 64-bit sums: resolves 1e-15, holds +-8192.
-pub const FIXED_POINT_BITS: u32 = 50;
 
 impl Scene {
     /// Constants for the shaders; those of a training set (ray counts, image size) stay 0.

@@ -1,8 +1,8 @@
 //! The state of a fit as X-Gaussian does it in a checkpoint: tensors under documented names.
 
 use crate::error::{Error, Result};
+use crate::fitting::tensors::{File, FileTensor};
 use crate::kernels::layout::{XGaussian, XStatistics};
-use crate::model::gaussian_tensors::{File, FileTensor};
 use crate::model::x_gaussian::XState;
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::Path;

@@ -2,6 +2,7 @@
 
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
+use crate::fitting::extent::{box_half, field_of_view, seen_half, volume_half};
 use crate::geometry::MM_PER_UNIT;
 use crate::model::hull::Hull;
 use crate::model::scene::Scene;
@@ -9,9 +10,6 @@ use crate::plan::motion::ViewMotion;
 use crate::raster::percentile;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
-
-/// Half side of the still field's box, radii of the field of view, at most.
-const STATIC_FIELDS_OF_VIEW: f64 = 1.6;
 
 impl Scene {
     /// Chooses scales and boxes for a dataset.
@@ -139,29 +137,10 @@ impl Scene {
     }
 }
 
-/// Radius around the isocentre that the views see, world units.
-fn field_of_view(dataset: &Dataset) -> f64 {
-    let mut radius = 0f64;
-    for view in dataset.training_views() {
-        let [w, h] = dataset.views[view].size.map(|n| n as f64 - 0.5);
-        for (i, j) in [(-0.5, -0.5), (w, -0.5), (-0.5, h), (w, h)] {
-            radius = radius.max(dataset.views[view].rays.pixel(i, j).0.length());
-        }
-    }
-    radius
-}
-
 /// Half side of the box of the still field, world units: what is far outside the field of view is seen by one view at a time,
 /// and a box that holds it spends the field on it.
 fn static_half(config: &Config, dataset: &Dataset) -> f64 {
     box_half(config.static_field.half_extent_mm, dataset)
-}
-
-fn box_half(stated_mm: f64, dataset: &Dataset) -> f64 {
-    if stated_mm > 0.0 {
-        return stated_mm / MM_PER_UNIT;
-    }
-    half_depth(dataset).min(STATIC_FIELDS_OF_VIEW * field_of_view(dataset))
 }
 
 /// Radius of the least ball around the isocentre that holds all rays of the views over the depth range, and a little more, so that
@@ -180,23 +159,9 @@ fn reach(dataset: &Dataset) -> f64 {
     reach * (1.0 + 1e-5)
 }
 
-/// Half side of a static method's volume, a cube around the isocentre, world units, where one is stated or not.
-pub(super) fn volume_half(stated_mm: f64, dataset: &Dataset) -> f64 {
-    box_half(stated_mm, dataset)
-}
-
-fn half_depth(dataset: &Dataset) -> f64 {
-    dataset.depth_range.0.abs().max(dataset.depth_range.1.abs())
-}
-
 /// Half side of the box the dynamic field is searched in, world units.
 pub fn dynamic_half(config: &Config, dataset: &Dataset) -> f64 {
     if config.dynamic.half_extent_mm > 0.0 { config.dynamic.half_extent_mm / MM_PER_UNIT } else { seen_half(dataset) }
-}
-
-/// Half side of the box of what the views see, within the depth range, world units.
-fn seen_half(dataset: &Dataset) -> f64 {
-    field_of_view(dataset).min(half_depth(dataset))
 }
 
 #[cfg(test)]

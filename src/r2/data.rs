@@ -1,14 +1,14 @@
 //! A dataset as R2-Gaussian sees it: a cube around the isocentre from -1 to 1, whole images in its units, and which
 //! images each set of Gaussians is fitted to.
 
-use crate::config::StaticData;
 use crate::config::sections::R2;
 use crate::error::{Error, Result};
+use crate::fitting::sets::{check_finite, sets_of};
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{Gaussian, GaussianSetup, R2Gaussian};
 use crate::model::gaussians::{Gaussians, Units};
 use crate::r2::parameters::ScaleBounds;
-use crate::scan::dataset::{Dataset, Frame};
+use crate::scan::dataset::Dataset;
 
 /// Line integrals of images, in units of the drawn field, which hold eight times as much.
 const DRAWN_RANGE: f64 = 256.0;
@@ -18,38 +18,6 @@ const DRAWN_RANGE: f64 = 256.0;
 const DRAWN_CUT: f32 = 4.0;
 /// Bounds of drawn scales are a little wider than what scales can be, so that rounding changes none.
 const SLACK: f64 = 1e-3;
-
-/// Images of each set of a static method, and the phase of each, where it is of one.
-pub(crate) type Sets = (Vec<Vec<usize>>, Vec<Option<u32>>);
-
-/// Sets of a static method. `key` is what the setting is called.
-///
-/// # Errors
-/// [`Error::Config`] where a phase shall have a set and no image shows it.
-pub(crate) fn sets_of(dataset: &Dataset, static_data: StaticData, key: &str) -> Result<Sets> {
-    let (training, n_phases) = (dataset.training(), dataset.n_phases);
-    let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
-    let unseen: Vec<u32> = (0..n_phases).filter(|phase| of_phase(*phase).is_empty()).collect();
-    if static_data == StaticData::PerPhase && !unseen.is_empty() {
-        let problem = format!("no image shows the phases {unseen:?}: take {key} = \"pooled\"");
-        return Err(Error::config("dataset", dataset.path.display(), problem));
-    }
-    Ok(match static_data {
-        StaticData::Pooled => (vec![(0..training.len()).collect()], vec![None]),
-        StaticData::PerPhase => (0..n_phases).map(|t| (of_phase(t), Some(t))).unzip(),
-    })
-}
-
-/// Refuses an image with pixels that are no number, which would spread to all others.
-///
-/// # Errors
-/// [`Error::Config`] naming the image and the pixel.
-pub(crate) fn check_finite(dataset: &Dataset, frame: &Frame) -> Result<()> {
-    let Some(p) = frame.integrals.iter().position(|v| !v.is_finite()) else { return Ok(()) };
-    let (column, row) = (p % dataset.width, p / dataset.width);
-    let problem = format!("{}: column {column}, row {row} is not a finite number", frame.name);
-    Err(Error::config("dataset", dataset.path.display(), problem))
-}
 
 /// The data in R2-Gaussian's units.
 #[derive(Debug, Clone)]

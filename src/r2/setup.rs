@@ -2,13 +2,13 @@
 
 use crate::config::sections::R2;
 use crate::config::{Config, R2Integral};
+use crate::fitting::RING_LENGTH;
+use crate::fitting::sets::seed_of_set;
 use crate::kernels::layout::{GaussianSetup, R2Schedule, R2Setup, R2Turn};
-use crate::model::setup::RING_LENGTH;
 use crate::r2::data::R2Data;
 use crate::r2::densify::densifies;
 use crate::r2::parameters::ScaleBounds;
 use crate::r2::stages::{box_parts, picture_parts};
-use crate::r2::start::seed_of_set;
 use crate::random::{STREAM_R2_BOX, STREAM_R2_VIEW, permute, uniform01};
 
 /// Standard deviations along its longest axis that half the square has in which a Gaussian is seen.

@@ -2,6 +2,7 @@
 
 use crate::config::R2Start;
 use crate::config::sections::R2;
+use crate::fitting::sets::seed_of_set;
 use crate::kernels::layout::R2Gaussian;
 use crate::r2::data::R2Data;
 use crate::r2::fdk::back_projection;
@@ -56,11 +57,6 @@ fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f
         (voxel * index - 1.0, settings.density_share * f64::from(volume[k]))
     });
     (drawn.collect(), None)
-}
-
-/// A seed for each set.
-pub fn seed_of_set(seed: u32, set: usize) -> u32 {
-    seed.wrapping_add((set as u32).wrapping_mul(0x9e37_79b9))
 }
 
 /// Uniform in the volume, densities from 0 to 1.

@@ -1,7 +1,7 @@
 //! What a run tells its observer.
 
+use crate::fitting::losses::StepLoss;
 use crate::gpu::record::PassTime;
-use crate::train::losses::StepLoss;
 use serde::Serialize;
 use std::path::PathBuf;
 

@@ -2,6 +2,8 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
+use crate::fitting::ring::ring;
+use crate::fitting::sets::seed_of_set;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::memory::DeviceMemory;
@@ -11,13 +13,11 @@ use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{DeviceState, Ray, SaxSetup};
 use crate::kernels::tuning::Tuning;
 use crate::model::sax::{SaxField, SaxState};
-use crate::r2::start::seed_of_set;
 use crate::sax::data::SaxData;
 use crate::sax::lineformer::{capacity, vector_bytes};
 use crate::sax::products::products;
 use crate::sax::setup::{adam_setup, schedule};
 use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers};
-use crate::train::ring::ring;
 
 const MIB: u64 = 1 << 20;
 

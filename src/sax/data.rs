@@ -3,9 +3,9 @@
 
 use crate::config::sections::Sax;
 use crate::error::{Error, Result};
+use crate::fitting::sets::{check_finite, sets_of};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{SaxList, View};
-use crate::r2::data::{check_finite, sets_of};
 use crate::scan::dataset::Dataset;
 
 /// Beyond the volume's corners rays go on for so much, mm.

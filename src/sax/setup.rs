@@ -2,9 +2,9 @@
 
 use crate::config::Config;
 use crate::config::sections::Sax;
+use crate::fitting::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::kernels::layout::{FieldUpdate, SaxSetup, Schedule, Setup};
 use crate::model::sax::{SaxField, SaxShape};
-use crate::model::setup::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::sax::data::SaxData;
 use crate::sax::lineformer::{PART_SAMPLES, chunks};
 

@@ -4,6 +4,7 @@
 use crate::choice::Choice;
 use crate::config::Preset;
 use crate::error::Result;
+use crate::fitting::losses::{NetworkLosses, StepLoss};
 use crate::gpu::capabilities::DeviceInfo;
 use crate::gpu::device::Gpu;
 use crate::kernels::constants::NEAR_SAMPLE;
@@ -20,7 +21,6 @@ use crate::reference::{march, step};
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::problems::small_config;
-use crate::train::losses::{NetworkLosses, StepLoss};
 use crate::train::step::tv_parts;
 use crate::train::trainer::Trainer;
 use glam::DVec3;

@@ -2,6 +2,7 @@
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
+use crate::fitting::losses::{NetworkLosses, StepLoss};
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{Ray, RayOut};
 use crate::kernels::push::{self, PushConstants};
@@ -17,7 +18,6 @@ use crate::selftest::iteration::{
     Case, F32_SUMS, ITERATIONS, Sample, Tolerances, compare_update, one_iteration, path_name, pick, precision_of,
     relative, samples,
 };
-use crate::train::losses::{NetworkLosses, StepLoss};
 use crate::train::trainer::Trainer;
 
 /// Settings with which each loss of two networks shows beside the others.

@@ -2,6 +2,7 @@
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
+use crate::fitting::losses::StepLoss;
 use crate::gpu::device::Gpu;
 use crate::kernels::constants::{CELLS_PER_WORD, NEAR_SAMPLE, OCCUPANCY_EPOCH, OCCUPIED, SEEN};
 use crate::kernels::layout::Ray;
@@ -13,7 +14,6 @@ use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
 use crate::selftest::iteration::path_name;
 use crate::selftest::problems::small_config;
-use crate::train::losses::StepLoss;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 

@@ -3,6 +3,7 @@
 
 use crate::config::{Config, Preset};
 use crate::error::Result;
+use crate::fitting::sets::seed_of_set;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
@@ -10,7 +11,6 @@ use crate::kernels::layout::{Ray, RayOut, SaxLevel, SaxSetup};
 use crate::kernels::push::{self, PushConstants};
 use crate::model::sax::{SaxField, SaxState};
 use crate::plan::Plan;
-use crate::r2::start::seed_of_set;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::sax::{self as reference, Lineformer};
 use crate::sax::data::SaxData;

@@ -2,20 +2,19 @@
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
+use crate::fitting::iterations::{Iterations, pass_times};
+use crate::fitting::ring::losses;
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers, record_images, record_step};
 use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
-use crate::gpu::pace::{SubmitPace, longest_submit_s};
-use crate::gpu::record::{Commands, PassTime, Recording};
+use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{Gaussians, SMALLER_STEPS, amplitude, dense};
 use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
-use crate::train::ring::losses;
 use crate::train::targets::{renew_bounds, take_images, target_buffers};
-use std::time::Instant;
 
 /// A run on a device.
 pub struct GaussianTrainer {
@@ -31,32 +30,6 @@ pub struct GaussianTrainer {
     n: u32,
     iterations: Iterations,
     step: u32,
-}
-
-/// Recorded iterations.
-pub(super) struct Iterations {
-    several: Commands,
-    n_several: u32,
-    single: Commands,
-    pace: SubmitPace,
-}
-
-impl Iterations {
-    /// Records them, as many to a submit and one by one, by a function that records so many.
-    pub(super) fn record(gpu: &Gpu, per_submit: u32, make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
-        let pace = SubmitPace::new(longest_submit_s(gpu.info()), 1, per_submit).giving_way_to(gpu.looks());
-        Ok(Iterations { several: make(per_submit)?, n_several: per_submit, single: make(1)?, pace })
-    }
-
-    /// Runs some, at most up to `stop`; how many.
-    pub(super) fn run(&self, gpu: &Gpu, step: u32, stop: u32) -> Result<u32> {
-        let several = stop - step >= self.n_several && self.pace.items() >= self.n_several;
-        let (commands, n) = if several { (&self.several, self.n_several) } else { (&self.single, 1) };
-        let begin = Instant::now();
-        gpu.wait(commands.submit()?)?;
-        self.pace.note(n, begin.elapsed().as_secs_f64());
-        Ok(n)
-    }
 }
 
 impl GaussianTrainer {
@@ -266,13 +239,6 @@ impl GaussianTrainer {
 
 /// Most passes of an iteration that is timed.
 pub(super) const MAX_PASSES: u32 = 64;
-
-/// Runs a recording and tells the time of its passes.
-pub(super) fn pass_times(gpu: &Gpu, recording: Recording) -> Result<Vec<PassTime>> {
-    let commands = recording.finish()?;
-    gpu.wait(commands.submit()?)?;
-    commands.pass_times()
-}
 
 /// Which Gaussians show more than the weakest that is kept.
 pub(super) fn strong(rows: &[Gaussian], setup: &GaussianSetup, weakest: f64) -> Vec<bool> {

@@ -2,6 +2,8 @@
 
 use crate::config::{Config, R2Integral};
 use crate::error::{Error, Result};
+use crate::fitting::iterations::{Iterations, pass_times};
+use crate::fitting::ring::{losses, ring};
 use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
@@ -17,8 +19,7 @@ use crate::r2::particles::R2ParticleBuffers;
 use crate::r2::setup::{gaussian_setup, r2_setup, schedule, turns};
 use crate::r2::stages::{R2Buffers, R2Kernels, R2Pass, record_step};
 use crate::r2::start::first_rows;
-use crate::train::gaussians::{Iterations, MAX_PASSES, pass_times};
-use crate::train::ring::{losses, ring};
+use crate::train::gaussians::MAX_PASSES;
 
 /// A run on a device.
 pub struct R2Trainer {

@@ -2,20 +2,20 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
+use crate::fitting::iterations::{Iterations, pass_times};
+use crate::fitting::ring::losses;
+use crate::fitting::sets::seed_of_set;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::SaxSetup;
 use crate::model::sax::{SMALLER_STEPS, SaxField, SaxState, check_params};
-use crate::r2::start::seed_of_set;
 use crate::sax::buffers::{Passes, SaxMemory, fit_buffers, sample_buffers, set_buffers};
 use crate::sax::data::SaxData;
 use crate::sax::lineformer::chunks;
 use crate::sax::setup::{fit_setup, outline};
 use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step};
 use crate::sax::start::first_params;
-use crate::train::gaussians::{Iterations, pass_times};
-use crate::train::ring::losses;
 
 /// Passes of an iteration of a field, and of all fields together, but for those over its chunks of samples.
 const MAX_PASSES: u32 = 16;

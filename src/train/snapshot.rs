@@ -1,6 +1,7 @@
 //! A run's state on its way to the host, beside the iterations that follow.
 
 use crate::error::{Error, Result};
+use crate::fitting::losses::SMALLER_STEPS;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Commands, Ticket};
@@ -10,7 +11,6 @@ use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::r2::R2State;
 use crate::model::sax::SaxState;
 use crate::model::x_gaussian::XState;
-use crate::train::losses::SMALLER_STEPS;
 
 /// Bytes of an iteration's report.
 pub(super) const REPORT_BYTES: u64 = size_of::<StepReport>() as u64;

@@ -1,6 +1,7 @@
 //! Targets of Gaussians on the device, and what is read back of a fit.
 
 use crate::error::Result;
+use crate::fitting::ring::ring;
 use crate::gaussians::stages::TargetBuffers;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
@@ -9,7 +10,6 @@ use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{GaussianSchedule, GaussianSetup, GaussianView};
 use crate::plan::remainder::{self, Bounds};
 use crate::plan::targets::Targets;
-use crate::train::ring::ring;
 
 /// Targets, schedule and counters of a fit that has not begun.
 pub(super) fn target_buffers(

@@ -3,6 +3,9 @@
 
 use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
+use crate::fitting::RING_LENGTH;
+use crate::fitting::losses::{LargeLoss, LossWatch, NetworkLosses, StepLoss};
+use crate::fitting::ring::tells_nothing;
 use crate::geometry::CArm;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
@@ -14,7 +17,7 @@ use crate::kernels::tuning::{Layers, Tuning};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::gaussians::{MovingFeed, MovingGaussians};
-use crate::model::setup::{RING_LENGTH, sample_capacity};
+use crate::model::setup::sample_capacity;
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
@@ -22,9 +25,7 @@ use crate::network::still::StillNetwork;
 use crate::network::{F32_BYTES, Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
-use crate::train::losses::{LargeLoss, LossWatch, NetworkLosses, StepLoss};
 use crate::train::moving::Moving;
-use crate::train::ring::tells_nothing;
 use crate::train::sax::SaxTrainer;
 use crate::train::snapshot::{REPORT_BYTES, Snapshot};
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};

@@ -2,7 +2,7 @@
 //! directory, [`crate::session`] in memory.
 
 use crate::error::Result;
-use crate::train::losses::StepLoss;
+use crate::fitting::losses::StepLoss;
 use crate::train::trainer::Trainer;
 use std::time::Instant;
 

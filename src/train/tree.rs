@@ -4,6 +4,8 @@
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
 use crate::evidence::background::blur;
+use crate::fitting::iterations::{Iterations, pass_times};
+use crate::fitting::ring::{losses, ring};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
 use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
@@ -18,8 +20,7 @@ use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
-use crate::train::gaussians::{Iterations, MAX_PASSES, check_count, pass_times, strong};
-use crate::train::ring::{losses, ring};
+use crate::train::gaussians::{MAX_PASSES, check_count, strong};
 use crate::train::targets::{padded, renew_bounds, take_images, target_buffers};
 use crate::train::tree_start::TreeStart;
 use glam::DVec3;

@@ -2,6 +2,8 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
+use crate::fitting::iterations::{Iterations, pass_times};
+use crate::fitting::ring::{counts_wrongly, losses, ring};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::buffer::Memory;
 use crate::gpu::device::Gpu;
@@ -10,8 +12,6 @@ use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{GaussianSetup, R2Setup, XCounts, XEnd, XGaussian, XList, XSetup, XStatus};
 use crate::model::gaussians::Gaussians;
 use crate::model::x_gaussian::{SMALLER_STEPS, XState};
-use crate::train::gaussians::{Iterations, pass_times};
-use crate::train::ring::{counts_wrongly, losses, ring};
 use crate::x_gaussian::data::XData;
 use crate::x_gaussian::densify::{densified, densifies, resets};
 use crate::x_gaussian::particles::{XLearningBuffers, XSeenBuffers, download};

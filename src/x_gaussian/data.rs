@@ -3,12 +3,12 @@
 
 use crate::config::sections::X;
 use crate::error::{Error, Result};
+use crate::fitting::sets::{check_finite, sets_of};
 use crate::gaussians::view::SplatView;
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{Gaussians, Units};
 use crate::model::x_gaussian::XState;
-use crate::r2::data::{check_finite, sets_of};
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 

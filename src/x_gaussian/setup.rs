@@ -2,10 +2,10 @@
 
 use crate::config::Config;
 use crate::config::sections::X;
+use crate::fitting::RING_LENGTH;
+use crate::fitting::sets::seed_of_set;
 use crate::kernels::layout::{GaussianSetup, R2Setup, R2Turn, XSchedule, XSetup};
-use crate::model::setup::RING_LENGTH;
 use crate::r2::stages::picture_parts;
-use crate::r2::start::seed_of_set;
 use crate::random::{STREAM_R2_VIEW, permute};
 use crate::x_gaussian::data::XData;
 use crate::x_gaussian::densify::{densifies, resets};

@@ -4,11 +4,11 @@
 
 use crate::golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::fitting::losses::StepLoss;
 use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::model::scene::Scene;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use nertca_vk::train::losses::StepLoss;
 
 impl Golden {
     pub fn number(&self, key: &str) -> f64 {

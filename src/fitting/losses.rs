@@ -42,7 +42,7 @@ pub struct NetworkLosses {
 }
 
 impl NetworkLosses {
-    pub(super) fn of(report: &StepReport) -> NetworkLosses {
+    pub(crate) fn of(report: &StepReport) -> NetworkLosses {
         NetworkLosses {
             favour_static: report.favour_static.into(),
             ray_entropy: report.ray_entropy.into(),
@@ -59,7 +59,7 @@ impl NetworkLosses {
 
 impl StepLoss {
     /// An iteration of Gaussians, which are fitted to bounds and not to line integrals.
-    pub(super) fn of_gaussians(step: u32, loss: f64) -> StepLoss {
+    pub(crate) fn of_gaussians(step: u32, loss: f64) -> StepLoss {
         let none = StepLoss {
             step,
             data: 0.0,
@@ -75,7 +75,7 @@ impl StepLoss {
     }
 
     /// An iteration of SAX-NeRF, whose line integrals are in units of `attenuation`.
-    pub(super) fn of_sax(step: u32, loss: f64, attenuation: f64) -> StepLoss {
+    pub(crate) fn of_sax(step: u32, loss: f64, attenuation: f64) -> StepLoss {
         StepLoss { squared_error: loss * attenuation * attenuation, ..StepLoss::of_gaussians(step, loss) }
     }
 
@@ -88,7 +88,7 @@ impl StepLoss {
 /// A loss this many times the first one is warned of.
 const LARGE: f64 = 1e6;
 /// Settings that make the steps of fields smaller that rays are marched through.
-pub(super) const SMALLER_STEPS: &str = "a lower static.lr or dynamic.lr, or a longer dynamic.delay";
+pub(crate) const SMALLER_STEPS: &str = "a lower static.lr or dynamic.lr, or a longer dynamic.delay";
 
 /// A loss far above the first one. Published learning rates give one when the dynamic field starts, and training goes on from it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -113,7 +113,7 @@ impl std::fmt::Display for LargeLoss {
 }
 
 /// Watches the losses of a run for those that end it and for the first one that is large.
-pub(super) struct LossWatch {
+pub(crate) struct LossWatch {
     stop_at_ratio: f64,
     first: Option<f64>,
     has_warned: bool,
@@ -121,7 +121,7 @@ pub(super) struct LossWatch {
 
 impl LossWatch {
     /// Watches a run that ends at a loss `stop_at_ratio` times the first one; 0: at none that is finite.
-    pub(super) fn new(stop_at_ratio: f64) -> LossWatch {
+    pub(crate) fn new(stop_at_ratio: f64) -> LossWatch {
         LossWatch { stop_at_ratio, first: None, has_warned: false }
     }
 
@@ -129,7 +129,7 @@ impl LossWatch {
     ///
     /// # Errors
     /// [`Error::Diverged`] for a loss that is not finite, or at which the run is to end.
-    pub(super) fn see(&mut self, loss: &StepLoss) -> Result<Option<LargeLoss>> {
+    pub(crate) fn see(&mut self, loss: &StepLoss) -> Result<Option<LargeLoss>> {
         let value = loss.total();
         let ratio = value / self.first.get_or_insert(value).max(1e-12);
         if !value.is_finite() || (self.stop_at_ratio > 0.0 && ratio > self.stop_at_ratio) {

@@ -1,9 +1,9 @@
 //! Rings of losses: the device writes one per iteration, the host reads those of a submit.
 
 use crate::error::{Error, Result};
+use crate::fitting::RING_LENGTH;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
-use crate::model::setup::RING_LENGTH;
 use std::ops::Range;
 
 /// In the place of a loss that no device has written: not a number, and none that arithmetic comes to.
@@ -17,7 +17,7 @@ pub(crate) fn ring(gpu: &Gpu, name: &str) -> Result<Buffer> {
 }
 
 /// Returns the losses of some iterations. The error of one that is not finite gives the `advice`.
-pub(super) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>, advice: &'static str) -> Result<Vec<f64>> {
+pub(crate) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>, advice: &'static str) -> Result<Vec<f64>> {
     let mut told = vec![0f32; RING_LENGTH as usize];
     ring.read(&mut told)?;
     let loss = |step: u32| {
@@ -34,11 +34,11 @@ pub(super) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>, advice: &'stat
 }
 
 /// Of a device that ends its submits and has done nothing.
-pub(super) fn tells_nothing(gpu: &Gpu, step: u32) -> Error {
+pub(crate) fn tells_nothing(gpu: &Gpu, step: u32) -> Error {
     counts_wrongly(gpu, &format!("was to do iteration {step} and tells nothing of it"))
 }
 
 /// Of a device that does not do, or does not count, the iterations it was asked for.
-pub(super) fn counts_wrongly(gpu: &Gpu, what: &str) -> Error {
+pub(crate) fn counts_wrongly(gpu: &Gpu, what: &str) -> Error {
     Error::NoDevice(format!("{} {what}; `nertca-vk selftest` tells which stages it computes wrongly", gpu.info().name))
 }

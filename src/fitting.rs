@@ -1,0 +1,14 @@
+//! What the fits of all methods share: traits of fits and fields, recorded iterations, losses, sets of static methods, tensors of
+//! checkpoints. It knows no method.
+
+pub(crate) mod extent;
+pub(crate) mod iterations;
+pub mod losses;
+pub(crate) mod ring;
+pub mod sets;
+pub(crate) mod tensors;
+
+/// Iterations whose losses the device keeps for the host.
+pub const RING_LENGTH: u32 = 1024;
+/// Scale of the static gradient's 64-bit sums: resolves 1e-15, holds +-8192.
+pub const FIXED_POINT_BITS: u32 = 50;

@@ -1,0 +1,42 @@
+//! Tensors of a checkpoint file on their way out and in.
+
+use crate::error::{Error, Result};
+use safetensors::tensor::{Dtype, SafeTensors};
+use std::path::Path;
+
+/// A tensor on its way into a file: name, type, shape, bytes.
+pub(crate) type FileTensor = (String, Dtype, Vec<usize>, Vec<u8>);
+
+/// A checkpoint file that is read.
+pub(crate) struct File<'a> {
+    pub(crate) tensors: &'a SafeTensors<'a>,
+    pub(crate) path: &'a Path,
+}
+
+impl File<'_> {
+    /// The bytes of a tensor of a type and shape; `None` stands for any length.
+    pub(crate) fn bytes(&self, name: &str, dtype: Dtype, shape: &[Option<usize>]) -> Result<&[u8]> {
+        let bad = |problem: String| Error::data(self.path, name, problem);
+        let view = self.tensors.tensor(name).map_err(|e| bad(e.to_string()))?;
+        let fits = view.shape().len() == shape.len()
+            && view.shape().iter().zip(shape).all(|(is, wanted)| wanted.is_none_or(|wanted| *is == wanted));
+        if view.dtype() != dtype || !fits {
+            return Err(bad(format!("{:?} {:?} where {dtype:?} {shape:?} is needed", view.dtype(), view.shape())));
+        }
+        Ok(view.data())
+    }
+
+    pub(crate) fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
+        let bytes = self.bytes(name, Dtype::F32, shape)?.chunks_exact(4);
+        let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
+        match values.iter().all(|v| v.is_finite()) {
+            true => Ok(values),
+            false => Err(Error::data(self.path, name, "holds a value that is not finite")),
+        }
+    }
+
+    pub(crate) fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
+        let bytes = self.bytes(name, Dtype::U32, &[Some(n)])?.chunks_exact(4);
+        Ok(bytes.map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect())
+    }
+}
