@@ -2,11 +2,13 @@
 //! checkpoints. It knows no method.
 
 pub(crate) mod extent;
+pub mod field;
+pub mod fit;
 pub(crate) mod iterations;
 pub mod losses;
 pub(crate) mod ring;
 pub mod sets;
-pub(crate) mod tensors;
+pub mod tensors;
 
 /// Iterations whose losses the device keeps for the host.
 pub const RING_LENGTH: u32 = 1024;

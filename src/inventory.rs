@@ -12,10 +12,10 @@ use crate::kernels::layout::Setup;
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Kernels, StillKernels};
 use crate::kernels::tuning::Tuning;
+use crate::methods;
 use crate::model::params::ParamMap;
 use crate::network::{Network, Purpose};
 use crate::r2::stages::R2Kernels;
-use crate::sax::stages::SaxKernels;
 use crate::x_gaussian::stages::XKernels;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -140,8 +140,8 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
         BlobKernels::new(gpu, &tuning)?;
         into_buffers(gpu)?;
     }
-    if config.is_sax() {
-        SaxKernels::new(gpu)?;
+    if let Some(method) = methods::of(config) {
+        method.make_pipelines(gpu)?;
     }
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
     if all.is_empty() {

@@ -169,6 +169,7 @@ pub mod calibrate;
 pub mod check;
 
 pub mod fitting;
+pub mod methods;
 pub mod model;
 pub mod network;
 
@@ -207,18 +208,6 @@ pub mod x_gaussian {
     pub mod start;
 }
 
-/// SAX-NeRF, a static method that the paper compares itself with: its data, where it begins, its stages and drawing.
-pub mod sax {
-    pub mod buffers;
-    pub mod data;
-    pub mod drawing;
-    pub mod lineformer;
-    pub mod products;
-    pub mod setup;
-    pub mod stages;
-    pub mod start;
-}
-
 pub mod plan;
 
 /// Drawing a model, for any pose and phase.
@@ -239,7 +228,6 @@ pub mod train {
     pub mod gaussians;
     pub mod moving;
     pub mod r2;
-    pub mod sax;
     pub mod snapshot;
     pub mod step;
     mod targets;

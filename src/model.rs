@@ -10,8 +10,6 @@ pub mod hull;
 pub mod params;
 pub mod r2;
 mod r2_tensors;
-pub mod sax;
-mod sax_tensors;
 pub mod scene;
 mod schedule;
 pub mod setup;
@@ -19,12 +17,13 @@ pub mod x_gaussian;
 mod x_tensors;
 
 use crate::config::Config;
+use crate::fitting::field::Field;
 use crate::geometry::CArm;
 use crate::model::gaussians::MovingGaussians;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
-use crate::model::sax::SaxField;
 use crate::model::scene::Scene;
+use std::sync::Arc;
 
 /// The fields at one moment of training.
 #[derive(Debug, Clone)]
@@ -39,8 +38,8 @@ pub struct Model {
     pub hull: Option<Hull>,
     /// Gaussians, where they are the moving field; else the network is.
     pub moving: Option<MovingGaussians>,
-    /// SAX-NeRF's field, where that is all there is.
-    pub sax: Option<SaxField>,
+    /// Field of a method with a room of its own ([`crate::methods`]), which is all there is then.
+    pub field: Option<Arc<dyn Field>>,
     /// Parameters, padded as [`ParamMap`] says.
     pub params: Vec<f32>,
     /// Iterations done.
@@ -54,9 +53,9 @@ pub struct Model {
 }
 
 impl Model {
-    /// Whether the moving field has a value between phases: a network or one set of Gaussians that moves, not sets per phase
-    /// and not SAX-NeRF's fields.
+    /// Tells whether the dynamic field has a value between phases: a network or one set of Gaussians that moves. Sets per phase and
+    /// fields of methods with a room of their own have none.
     pub fn is_continuous(&self) -> bool {
-        self.sax.is_none() && self.moving.as_ref().is_none_or(|field| field.tree().is_some())
+        self.field.is_none() && self.moving.as_ref().is_none_or(|field| field.tree().is_some())
     }
 }

@@ -16,8 +16,10 @@ pub mod targets;
 use crate::config::{Config, DynamicTarget, GaussianForm, StaticData};
 use crate::error::{Error, Result};
 use crate::fitting::extent::{between_phases, volume_half};
+use crate::fitting::fit::FitData;
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{self, Setup};
+use crate::methods;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
@@ -27,7 +29,6 @@ use crate::plan::soft_hull::carve::SoftMotion;
 use crate::plan::start::StartRays;
 use crate::plan::targets::Targets;
 use crate::r2::data::R2Data;
-use crate::sax::data::SaxData;
 use crate::scan::dataset::Dataset;
 use crate::x_gaussian::data::XData;
 
@@ -64,8 +65,8 @@ pub struct Plan {
     pub r2: Option<R2Data>,
     /// What X-Gaussian's are fitted to, when they are all there is.
     pub x: Option<XData>,
-    /// What SAX-NeRF's fields are fitted to, when they are all there is.
-    pub sax: Option<SaxData>,
+    /// Data of a method with a room of its own ([`crate::methods`]); none of others.
+    pub fit: Option<Box<dyn FitData>>,
     /// Weighted loss of the moving field when there is none, where a network moves with a temporal target.
     pub empty_loss: Option<f64>,
     /// Decisions worth telling the user.
@@ -80,9 +81,9 @@ impl Plan {
     pub fn new(config: &Config, dataset: &Dataset) -> Result<Plan> {
         let mut notes = Vec::new();
         let motion = motion::analyse(dataset, &config.hull);
-        let (mut r2, mut x, mut sax) = (None, None, None);
-        let (hull, targets) = if config.is_sax() {
-            sax = Some(plan_sax(config, dataset, &mut notes)?);
+        let (mut r2, mut x, mut fit) = (None, None, None);
+        let (hull, targets) = if let Some(method) = methods::of(config) {
+            fit = Some(method.plan(config, dataset, &mut notes)?);
             (None, None)
         } else if config.is_r2() {
             r2 = Some(plan_r2(config, dataset, &mut notes)?);
@@ -189,7 +190,7 @@ impl Plan {
             targets,
             r2,
             x,
-            sax,
+            fit,
             empty_loss,
             notes,
         })
@@ -306,39 +307,6 @@ fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result
     }
     if dataset.heart_shifts() {
         notes.push("X-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
-    }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
-    Ok(data)
-}
-
-/// What SAX-NeRF is fitted to, and what is to be said of that.
-fn plan_sax(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<SaxData> {
-    let half = volume_half(config.sax.half_extent_mm, dataset);
-    let data = SaxData::new(dataset, &config.sax, half)?;
-    let images = data.images_of_set.iter().map(Vec::len).max().unwrap_or(1);
-    let passes = config.train.iterations as usize / images;
-    notes.push(match config.sax.static_data {
-        StaticData::PerPhase => format!(
-            "SAX-NeRF, a static method: each phase is reconstructed from its own images, of which an iteration sees one: \
-             {passes} passes over them (sax.static_data = \"per-phase\")"
-        ),
-        StaticData::Pooled => format!(
-            "SAX-NeRF, a static method: one reconstruction from the images of all phases, of which an iteration sees one \
-             ({passes} passes over them), is shown at each (sax.static_data = \"pooled\")"
-        ),
-    });
-    if config.sax.normalise && dataset.vessel_attenuation.is_none() {
-        notes.push(
-            "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF shows none above 1"
-                .into(),
-        );
-    }
-    if !dataset.hidden.is_empty() {
-        notes
-            .push("pixels that show nothing of the patient are fitted like all others: SAX-NeRF knows no masks".into());
-    }
-    if dataset.heart_shifts() {
-        notes.push("SAX-NeRF sees all frames of a view alike: displacements of the heart are left out".into());
     }
     notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
     Ok(data)

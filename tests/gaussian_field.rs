@@ -101,7 +101,7 @@ fn checkpoints_keep_every_bit() {
             last_report: Vec::new(),
             r2: None,
             x: None,
-            sax: None,
+            fit: None,
             data_fingerprint: "x".into(),
         };
         let bytes = saved.to_bytes().unwrap();
@@ -136,7 +136,7 @@ fn damaged_gaussians_are_refused_by_name() {
             last_report: Vec::new(),
             r2: None,
             x: None,
-            sax: None,
+            fit: None,
             data_fingerprint: String::new(),
         };
         Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()

@@ -114,7 +114,7 @@ fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
         param_map: plan.params,
         hull: None,
         moving,
-        sax: None,
+        field: None,
         step: 40,
         vessel_attenuation: None,
         c_arm: dataset.reference_c_arm(),
@@ -137,7 +137,7 @@ fn saved(model: Model, path: &Path) -> String {
         last_report: Vec::new(),
         r2: None,
         x: None,
-        sax: None,
+        fit: None,
         data_fingerprint: "none".into(),
     };
     checkpoint.write(path).unwrap();

@@ -14,19 +14,21 @@ use nertca_vk::error::Error;
 use nertca_vk::fitting::sets::seed_of_set;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::SaxLevel;
+use nertca_vk::methods::sax_nerf::data::SaxData;
+use nertca_vk::methods::sax_nerf::field::{SaxField, SaxShape, SaxState};
+use nertca_vk::methods::sax_nerf::setup::{fit_setup, outline};
+use nertca_vk::methods::sax_nerf::trainer::SaxTrainer;
+use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::model::component::Component;
-use nertca_vk::model::sax::{SaxField, SaxShape, SaxState};
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::sax::{self as reference, Lineformer, SampledRay, entry, objective};
 use nertca_vk::render::baked::Baked;
 use nertca_vk::render::grid::Grid;
 use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::sax::setup::{fit_setup, outline};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::selftest::sax::{compare, f64s, hard_case, small_config};
-use nertca_vk::train::sax::SaxTrainer;
 use nertca_vk::train::trainer::Trainer;
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -266,6 +268,23 @@ fn a_batch_is_windows_and_pixels_outside_of_them_that_show_something() {
     }
 }
 
+/// Field of a model, as SAX-NeRF's own type.
+fn field_of(model: &Model) -> SaxField {
+    model.field.as_ref().unwrap().as_any().downcast_ref::<SaxField>().unwrap().clone()
+}
+
+/// State of a fit in a checkpoint, as SAX-NeRF's own type.
+fn state_of(checkpoint: &Checkpoint) -> SaxState {
+    checkpoint.fit.as_ref().unwrap().as_any().downcast_ref::<SaxState>().unwrap().clone()
+}
+
+/// Changes the field of a checkpoint.
+fn change_field(checkpoint: &mut Checkpoint, change: impl FnOnce(&mut SaxField)) {
+    let mut field = field_of(&checkpoint.model);
+    change(&mut field);
+    checkpoint.model.field = Some(Arc::new(field));
+}
+
 fn start(gpu: &Gpu, config: &Config, dataset: &Dataset) -> Trainer {
     Trainer::new(gpu, Plan::new(config, dataset).unwrap(), dataset, tuning(gpu)).unwrap()
 }
@@ -288,14 +307,14 @@ fn runs_fit_their_images_and_repeat_and_resume_bit_by_bit() {
         let mut again = run(&mut parts, stop);
         let saved = parts.checkpoint().unwrap();
         let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
-        assert_eq!((&read.sax, &read.model.sax), (&saved.sax, &saved.model.sax));
+        assert_eq!((state_of(&read), field_of(&read.model)), (state_of(&saved), field_of(&saved.model)));
         let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
         let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
         assert_eq!(resumed.step(), stop);
         again.extend(run(&mut resumed, 24));
         assert_eq!(losses, again, "{static_data}");
         let (want, got) = (whole.checkpoint().unwrap(), resumed.checkpoint().unwrap());
-        assert!(want.sax == got.sax && want.model.sax == got.model.sax, "{static_data}");
+        assert!(state_of(&want) == state_of(&got) && field_of(&want.model) == field_of(&got.model), "{static_data}");
     }
     expect_silence(gpu);
 }
@@ -312,7 +331,7 @@ fn each_phase_sees_its_own_images_alone_unless_all_are_pooled() {
         [&dataset, &other].map(|dataset| {
             let mut trainer = start(&gpu, &config, dataset);
             run(&mut trainer, 3);
-            trainer.model().unwrap().sax.unwrap()
+            field_of(&trainer.model().unwrap())
         })
     };
     let same = |[a, b]: &[SaxField; 2]| a.params.iter().zip(&b.params).map(|(a, b)| a == b).collect::<Vec<_>>();
@@ -359,7 +378,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     let after = renderer.render(rays, 13, 11, 1).unwrap();
     assert_ne!(after.dynamic_integral, seen.dynamic_integral);
     renderer.set_model(&model).unwrap();
-    renderer.follow_sax(&trainer.sax_params().unwrap());
+    renderer.follow_fit(&trainer.fit_params().unwrap());
     assert_eq!(renderer.render(rays, 13, 11, 1).unwrap().dynamic_integral, after.dynamic_integral);
     let baked = Baked::new(Arc::new(renderer), 12).unwrap();
     let quantity = Quantity { projection: Projection::Mip, component: Component::Dynamic };
@@ -410,13 +429,22 @@ fn what_cannot_be_fitted_is_refused() {
     };
     assert_eq!(damaged(&|_| ()), None);
     let grid = SaxShape::of(&saved.model.config.sax).n_weights();
-    assert!(damaged(&|c| c.model.sax.as_mut().unwrap().params[1][grid] = f32::NAN).unwrap().contains("sax.grid"));
-    assert!(damaged(&|c| c.sax.as_mut().unwrap().moments[2][0][1] = f32::NAN).unwrap().contains("sax.adam.v.norm1"));
-    assert!(damaged(&|c| c.model.sax.as_mut().unwrap().bound = -1.0).unwrap().contains("must be positive"));
+    assert!(damaged(&|c| change_field(c, |field| field.params[1][grid] = f32::NAN)).unwrap().contains("sax.grid"));
+    assert!(
+        damaged(&|c| {
+            let mut state = state_of(c);
+            state.moments[2][0][1] = f32::NAN;
+            c.fit = Some(Arc::new(state));
+        })
+        .unwrap()
+        .contains("sax.adam.v.norm1")
+    );
+    assert!(damaged(&|c| change_field(c, |field| field.bound = -1.0)).unwrap().contains("must be positive"));
     assert!(damaged(&|c| c.model.config.sax.levels = 4).unwrap().contains("sax.grid"));
-    let other = SaxState { moments: saved.sax.clone().unwrap().moments[..2].to_vec() };
-    let (field, config) = (saved.model.sax.clone().unwrap(), config(&[]));
-    let data = Plan::new(&config, &dataset).unwrap().sax.unwrap();
+    let other = SaxState { moments: state_of(&saved).moments[..2].to_vec() };
+    let (field, config) = (field_of(&saved.model), config(&[]));
+    let planned = Plan::new(&config, &dataset).unwrap().fit.unwrap();
+    let data = planned.as_any().downcast_ref::<SaxData>().unwrap().clone();
     let error = SaxTrainer::with(&gpu, data, &config, &field, &other).map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("checkpoint"), "{error}");
     expect_silence(gpu);
@@ -432,6 +460,7 @@ fn presets_and_notes_say_what_the_method_is() {
     says("a static method");
     says("passes over them");
     says("count as taken at the nearest phase");
-    let params = f64s(&nertca_vk::sax::start::first_params(SaxShape { levels: 2, base: 2, log2_table: 5 }, 1));
+    let params =
+        f64s(&nertca_vk::methods::sax_nerf::start::first_params(SaxShape { levels: 2, base: 2, log2_table: 5 }, 1));
     assert!(params.iter().all(|v| v.abs() <= 2.0));
 }

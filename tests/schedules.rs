@@ -9,7 +9,7 @@ use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::plan::Plan;
-use nertca_vk::train::dry_run::{dry_run, shortened};
+use nertca_vk::train::dry_run::dry_run;
 use nertca_vk::train::trainer::Trainer;
 
 /// Iterations after the last event.
@@ -78,7 +78,7 @@ fn every_preset_trains_past_the_last_event_of_its_schedule() {
             _ => vec!["march.dynamic_samples=32", "march.static_samples=32", "dynamic.width=16"],
         });
         let settings: Vec<String> = settings.into_iter().map(String::from).collect();
-        let mut config = shortened(&Config::load(Some(*preset), None, &settings).unwrap()).unwrap();
+        let mut config = Config::load(Some(*preset), None, &settings).unwrap().of_dry_run().unwrap();
         let last = *config.schedule_events().last().unwrap();
         config.train.iterations = config.train.iterations.max(last + AFTER);
         let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();

@@ -11,6 +11,7 @@ use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::methods;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::network::cost::NetworkCost;
@@ -23,7 +24,6 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::run::events::Event;
 use nertca_vk::run::reconstruct::{RunOptions, reconstruct};
 use nertca_vk::run::score::{ScoreOptions, evaluate_model};
-use nertca_vk::sax::setup::n_rays;
 use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::train::dry_run::{DryRun, dry_run};
 use nertca_vk::train::timing::{GaussianSubject, GaussianTiming, Length, Pace, Passes, Subject, Timing};
@@ -289,7 +289,7 @@ fn internal(error: serde_json::Error) -> Error {
     Error::Internal(error.to_string())
 }
 
-/// Times a run whose moving field is the network, or SAX-NeRF's.
+/// Times a run whose dynamic field is a network, or whose method has a room of its own.
 fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
     let delay = config.dynamic.delay.min(config.train.iterations);
     let before = match delay {
@@ -303,7 +303,7 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
             + after.median() * f64::from(config.train.iterations - delay));
     Ok(Timings {
         paths: subject.notes(),
-        rays: if config.is_sax() { n_rays(&config.sax) } else { subject.rays() },
+        rays: methods::of(config).map_or_else(|| subject.rays(), |method| method.rays_per_iteration(config)),
         network_cost: config.network_moves().then(|| subject.cost()),
         work: if config.network_moves() { subject.work(after.live_samples) } else { Ledger::new() },
         gaussians: None,

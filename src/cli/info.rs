@@ -8,7 +8,6 @@ use nertca_vk::files::pretty_json;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::model::gaussians::MovingGaussians;
-use nertca_vk::model::sax::SaxField;
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
 use nertca_vk::score::pictures::Window;
 use std::path::{Path, PathBuf};
@@ -59,7 +58,7 @@ pub fn info(args: &InfoArgs) -> Result<()> {
 fn describe_run(path: &Path) -> Result<serde_json::Value> {
     let file = checkpoint::newest(path)?;
     let model = Checkpoint::read(&file)?.model;
-    Ok(serde_json::json!({
+    let mut described = serde_json::json!({
         "kind": "run",
         "checkpoint": file,
         "step": model.step,
@@ -68,20 +67,13 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
         "phases": model.param_map.phases,
         "hull_share": model.hull.as_ref().map(|h| h.share()),
         "gaussians": model.moving.as_ref().map(describe_gaussians),
-        "sax": model.sax.as_ref().map(describe_sax),
         "scene": model.scene,
         "config": model.config,
-    }))
-}
-
-fn describe_sax(field: &SaxField) -> serde_json::Value {
-    serde_json::json!({
-        "fields": field.n_sets,
-        "parameters": field.n_sets * field.shape.n_meant(),
-        "grid": field.shape.n_grid(),
-        "lineformer": field.shape.n_meant() - field.shape.n_grid(),
-        "samples": field.samples,
-    })
+    });
+    if let Some(field) = &model.field {
+        described[field.key()] = field.describe();
+    }
+    Ok(described)
 }
 
 fn describe_gaussians(field: &MovingGaussians) -> serde_json::Value {

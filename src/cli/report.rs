@@ -64,10 +64,7 @@ impl Report<'_> {
         if let Some(field) = &model.moving {
             facts.push(("Gaussians".into(), gaussians_of(field)));
         }
-        if let Some(field) = &model.sax {
-            let numbers = field.shape.n_meant();
-            facts.push(("SAX-NeRF".into(), format!("{} fields of {numbers} numbers each", field.n_sets)));
-        }
+        facts.extend(model.field.as_ref().map(|field| field.fact()));
         if let Some(started) = latest("started") {
             facts.push(("trained on".into(), started["device"].as_str().unwrap_or_default().to_owned()));
             let notes = started["notes"].as_array().into_iter().flatten().filter_map(|n| n.as_str());

@@ -6,6 +6,13 @@ use crate::error::Result;
 /// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have one.
 const LEAST_BETWEEN_DENSIFYING: u32 = 10;
 
+/// Iterations of a dry run: enough for every event of the presets to have iterations before and after it.
+const DRY_RUN: u32 = 20;
+/// Iterations of a dry run with density control, which comes every ten iterations at most.
+const DRY_RUN_WITH_DENSIFYING: u32 = 60;
+/// Iterations of a dry run after its last event, at least.
+const AFTER_THE_LAST: u32 = 4;
+
 impl Config {
     /// Returns the settings, with their keys, that keep the schedule's shares of a run of so many iterations.
     pub fn schedule_of_length(&self, iterations: u32) -> Vec<(&'static str, u32)> {
@@ -56,6 +63,29 @@ impl Config {
         let schedule = self.schedule_of_length(iterations);
         let settings: Vec<String> = schedule.iter().map(|(key, count)| format!("{key}={count}")).collect();
         config.with(&settings)
+    }
+
+    /// Returns the configuration of a dry run (`train::dry_run`): its schedule keeps its order, and its batches their sizes.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Config`] when so short a run is refused.
+    pub fn of_dry_run(&self) -> Result<Config> {
+        let iterations = if self.has_gaussians_alone() { DRY_RUN_WITH_DENSIFYING } else { DRY_RUN };
+        if self.train.iterations <= iterations {
+            return Ok(self.clone());
+        }
+        let mut short = self.of_length(iterations)?;
+        if short.follows_breath() {
+            // A fit of Gaussians has a length of its own, of which nothing is a share of the run.
+            short.train.iterations = short.gaussians.iterations.saturating_add(iterations).min(self.train.iterations);
+        }
+        if short.is_sax() {
+            // Its only event lies within the last iterations of the publication.
+            short.sax.rate_falls_at = short.sax.rate_falls_at.min(iterations / 2);
+        }
+        let last = short.schedule_events().last().copied().unwrap_or(0);
+        short.train.iterations = short.train.iterations.max(last.saturating_add(AFTER_THE_LAST));
+        Ok(short)
     }
 
     /// Returns the iterations at which the schedule changes something that a run must get past, in their order.

@@ -74,8 +74,8 @@ impl StepLoss {
         StepLoss { data: loss, dynamic: loss, ..none }
     }
 
-    /// An iteration of SAX-NeRF, whose line integrals are in units of `attenuation`.
-    pub(crate) fn of_sax(step: u32, loss: f64, attenuation: f64) -> StepLoss {
+    /// Losses of an iteration on whole images, whose line integrals are in units of `attenuation`.
+    pub(crate) fn of_images(step: u32, loss: f64, attenuation: f64) -> StepLoss {
         StepLoss { squared_error: loss * attenuation * attenuation, ..StepLoss::of_gaussians(step, loss) }
     }
 

@@ -5,17 +5,22 @@ use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::Path;
 
 /// A tensor on its way into a file: name, type, shape, bytes.
-pub(crate) type FileTensor = (String, Dtype, Vec<usize>, Vec<u8>);
+pub type FileTensor = (String, Dtype, Vec<usize>, Vec<u8>);
 
 /// A checkpoint file that is read.
-pub(crate) struct File<'a> {
-    pub(crate) tensors: &'a SafeTensors<'a>,
-    pub(crate) path: &'a Path,
+pub struct File<'a> {
+    /// Its tensors.
+    pub tensors: &'a SafeTensors<'a>,
+    /// Its path, for messages.
+    pub path: &'a Path,
 }
 
 impl File<'_> {
     /// The bytes of a tensor of a type and shape; `None` stands for any length.
-    pub(crate) fn bytes(&self, name: &str, dtype: Dtype, shape: &[Option<usize>]) -> Result<&[u8]> {
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming the tensor that is missing or of another type or shape.
+    pub fn bytes(&self, name: &str, dtype: Dtype, shape: &[Option<usize>]) -> Result<&[u8]> {
         let bad = |problem: String| Error::data(self.path, name, problem);
         let view = self.tensors.tensor(name).map_err(|e| bad(e.to_string()))?;
         let fits = view.shape().len() == shape.len()
@@ -26,7 +31,11 @@ impl File<'_> {
         Ok(view.data())
     }
 
-    pub(crate) fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
+    /// Returns the finite numbers of an f32 tensor of a shape; `None` stands for any length.
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming the tensor that is missing, of another type or shape, or not finite.
+    pub fn floats(&self, name: &str, shape: &[Option<usize>]) -> Result<Vec<f32>> {
         let bytes = self.bytes(name, Dtype::F32, shape)?.chunks_exact(4);
         let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
         match values.iter().all(|v| v.is_finite()) {
@@ -35,7 +44,11 @@ impl File<'_> {
         }
     }
 
-    pub(crate) fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
+    /// Returns the words of a u32 tensor of `n` elements.
+    ///
+    /// # Errors
+    /// [`Error::Data`] naming the tensor that is missing or of another type or shape.
+    pub fn words(&self, name: &str, n: usize) -> Result<Vec<u32>> {
         let bytes = self.bytes(name, Dtype::U32, &[Some(n)])?.chunks_exact(4);
         Ok(bytes.map(|w| u32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect())
     }

@@ -5,16 +5,16 @@
 use crate::config::{Config, StaticForm};
 use crate::error::{Error, Result};
 use crate::files;
-use crate::fitting::tensors::FileTensor;
+use crate::fitting::fit::{FitState, SavedAt, SavedFit};
+use crate::fitting::tensors::{File, FileTensor};
 use crate::geometry::CArm;
+use crate::methods;
 use crate::model::Model;
 use crate::model::gaussian_tensors::{self, GaussianHeader};
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::r2::R2State;
 use crate::model::r2_tensors;
-use crate::model::sax::{SaxShape, SaxState};
-use crate::model::sax_tensors::{self, SaxHeader};
 use crate::model::scene::Scene;
 use crate::model::x_gaussian::XState;
 use crate::model::x_tensors;
@@ -23,12 +23,11 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 const FORMAT: &str = "nertca-checkpoint-2";
 /// Of checkpoints whose moving field is made of Gaussians: they have no network.
 const GAUSSIAN_FORMAT: &str = "nertca-checkpoint-3";
-/// Of checkpoints of SAX-NeRF, which have no network either.
-const SAX_FORMAT: &str = "nertca-checkpoint-4";
 /// What names of the network's tensors begin with.
 const NETWORK: &str = "dynamic.";
 const OCCUPANCY: &str = "occupancy.bits";
@@ -57,8 +56,8 @@ pub struct Checkpoint {
     pub r2: Option<R2State>,
     /// State of a fit as X-Gaussian does it; none of other methods.
     pub x: Option<XState>,
-    /// State of a fit as SAX-NeRF does it; none of other methods.
-    pub sax: Option<SaxState>,
+    /// State of the fit of a method with a room of its own, beside [`Model::field`]; none of other methods.
+    pub fit: Option<Arc<dyn FitState>>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
 }
@@ -94,8 +93,6 @@ struct Header {
     hull: Option<HullHeader>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     gaussians: Option<GaussianHeader>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    sax: Option<SaxHeader>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -106,13 +103,18 @@ struct HullHeader {
     n_phases: usize,
 }
 
-/// What a checkpoint's header calls itself.
-fn format_of(has_gaussians: bool, is_sax: bool) -> &'static str {
-    match (has_gaussians, is_sax) {
-        (_, true) => SAX_FORMAT,
-        (true, false) => GAUSSIAN_FORMAT,
-        (false, false) => FORMAT,
+/// Returns the format that a checkpoint's header states.
+fn format_of(config: &Config) -> &'static str {
+    match methods::of(config) {
+        Some(method) => method.checkpoint_format(),
+        None if config.gaussians_move() => GAUSSIAN_FORMAT,
+        None => FORMAT,
     }
+}
+
+/// Adds a section under `key` at the end of a header's JSON object.
+fn with_section(header: &str, key: &str, section: &str) -> String {
+    format!("{},\"{key}\":{section}}}", header.strip_suffix('}').unwrap_or(header))
 }
 
 /// Name of the checkpoint of a step.
@@ -203,11 +205,11 @@ impl Checkpoint {
         }
         tensors.extend(self.r2.iter().flat_map(r2_tensors::tensors));
         tensors.extend(self.x.iter().flat_map(x_tensors::tensors));
-        if let (Some(field), Some(state)) = (&model.sax, &self.sax) {
-            tensors.extend(sax_tensors::tensors(field, state));
+        if let (Some(field), Some(state)) = (&model.field, &self.fit) {
+            tensors.extend(state.tensors(field.as_ref())?);
         }
         for tensor in model.param_map.tensors() {
-            if (model.moving.is_some() || model.sax.is_some()) && tensor.name.starts_with(NETWORK) {
+            if (model.moving.is_some() || model.field.is_some()) && tensor.name.starts_with(NETWORK) {
                 continue;
             }
             let gather = |value: &dyn Fn(usize) -> f32| -> Vec<u8> {
@@ -232,9 +234,8 @@ impl Checkpoint {
             }
         }
         let header = Header {
-            format: format_of(model.moving.is_some(), model.sax.is_some()).into(),
+            format: format_of(&model.config).into(),
             gaussians: model.moving.as_ref().map(gaussian_tensors::header),
-            sax: model.sax.as_ref().map(sax_tensors::header),
             config: model.config.clone(),
             scene: model.scene.clone(),
             phases: model.param_map.phases,
@@ -253,7 +254,10 @@ impl Checkpoint {
                 n_phases: h.n_phases,
             }),
         };
-        let header = serde_json::to_string(&header).map_err(|e| Error::Internal(e.to_string()))?;
+        let mut header = serde_json::to_string(&header).map_err(|e| Error::Internal(e.to_string()))?;
+        if let Some(field) = &model.field {
+            header = with_section(&header, field.key(), &field.header()?);
+        }
         let views = tensors
             .iter()
             .map(|(name, dtype, shape, bytes)| {
@@ -284,12 +288,24 @@ impl Checkpoint {
         let text = metadata.metadata().as_ref().and_then(|m| m.get("nertca")).cloned();
         let text = text.ok_or_else(|| bad("metadata", "is not a checkpoint of this program".into()))?;
         let header: Header = serde_json::from_str(&text).map_err(|e| bad("metadata", e.to_string()))?;
-        if header.format != format_of(header.gaussians.is_some(), header.sax.is_some()) {
-            let known = format!("`{FORMAT}`, `{GAUSSIAN_FORMAT}` and `{SAX_FORMAT}`");
-            let problem = format!("`{}`; this version reads {known}", header.format);
+        let formats = methods::METHODS.iter().map(|method| method.checkpoint_format());
+        let known: Vec<&str> = [FORMAT, GAUSSIAN_FORMAT].into_iter().chain(formats).collect();
+        if !known.contains(&header.format.as_str()) {
+            let problem = format!("`{}`; this version reads {}", header.format, known.join(", "));
             return Err(bad("format", problem));
         }
+        if header.format != format_of(&header.config) {
+            let problem = format!("`{}` where the configuration needs `{}`", header.format, format_of(&header.config));
+            return Err(bad("format", problem));
+        }
+        if header.gaussians.is_some() != (header.format == GAUSSIAN_FORMAT) {
+            return Err(bad(
+                "gaussians",
+                format!("the header of a `{}` has them, or lacks them, by mistake", header.format),
+            ));
+        }
         header.config.check()?;
+        let method = methods::of(&header.config);
         if let Some(LossScale { scale, .. }) = header.loss_scale.filter(|s| !(s.scale.is_finite() && s.scale >= 1.0)) {
             return Err(bad("loss_scale", format!("{scale} where at least 1 is needed")));
         }
@@ -313,7 +329,7 @@ impl Checkpoint {
         let mut params = vec![0f32; param_map.len];
         let mut moments = vec![[0f32; 2]; param_map.len];
         for tensor in param_map.tensors() {
-            if (header.gaussians.is_some() || header.sax.is_some()) && tensor.name.starts_with(NETWORK) {
+            if (header.gaussians.is_some() || method.is_some()) && tensor.name.starts_with(NETWORK) {
                 continue;
             }
             for prefix in ["", "adam.m.", "adam.v."] {
@@ -369,19 +385,21 @@ impl Checkpoint {
             _ => Vec::new(),
         };
         let (is_r2, is_x) = (header.config.is_r2(), header.config.is_x());
-        if header.sax.is_some() != header.config.is_sax() {
-            return Err(bad("sax", "configuration and field are of different methods".into()));
-        }
-        let at = (header.phases, header.step);
-        let sax = header
-            .sax
-            .as_ref()
-            .map(|about| sax_tensors::read(about, SaxShape::of(&header.config.sax), &tensors, at, path));
-        let (sax_field, sax) = sax.transpose()?.unzip();
+        let fit = match method {
+            None => None,
+            Some(method) => {
+                let sections: serde_json::Value =
+                    serde_json::from_str(&text).map_err(|e| bad("metadata", e.to_string()))?;
+                let about = &sections[method.key()];
+                let at = SavedAt { n_phases: header.phases, step: header.step };
+                Some(method.read(about, &header.config, at, &File { tensors: &tensors, path })?)
+            }
+        };
+        let (field, fit) = fit.map(|SavedFit { field, state }| (field, state)).unzip();
         Ok(Checkpoint {
             r2: is_r2.then(|| r2_tensors::read(&tensors, header.phases, path)).transpose()?,
             x: is_x.then(|| x_tensors::read(&tensors, header.phases, path)).transpose()?,
-            sax,
+            fit,
             occupancy: words(OCCUPANCY),
             last_report: words(LAST_REPORT),
             model: Model {
@@ -390,7 +408,7 @@ impl Checkpoint {
                 param_map,
                 hull,
                 moving,
-                sax: sax_field,
+                field,
                 params,
                 step: header.step,
                 vessel_attenuation: header.vessel_attenuation,

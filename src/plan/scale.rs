@@ -4,6 +4,7 @@ use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
 use crate::fitting::extent::{box_half, field_of_view, seen_half, volume_half};
 use crate::geometry::MM_PER_UNIT;
+use crate::methods;
 use crate::model::hull::Hull;
 use crate::model::scene::Scene;
 use crate::plan::motion::ViewMotion;
@@ -66,10 +67,10 @@ impl Scene {
         if config.is_x() {
             scene.hold_volume(volume_half(config.x.half_extent_mm, dataset), seen_half(dataset));
         }
-        if config.is_sax() {
-            scene.hold_volume(volume_half(config.sax.half_extent_mm, dataset), seen_half(dataset));
-            // Volumes are kept in units of the attenuation of a density of 1.
-            scene.dynamic_gain = dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0);
+        if let Some(method) = methods::of(config) {
+            let volume = method.volume(config, dataset);
+            scene.hold_volume(volume.half, seen_half(dataset));
+            scene.dynamic_gain = volume.attenuation;
         }
         Ok(scene)
     }

@@ -1,9 +1,9 @@
 //! f64 twins of the stages of SAX-NeRF: plain loops, no device.
 
 use crate::kernels::layout::{SaxLevel, SaxSetup};
-use crate::model::sax::{FEATURES, SaxShape, WIDTH};
+use crate::methods::sax_nerf::data::SaxData;
+use crate::methods::sax_nerf::field::{FEATURES, SaxShape, WIDTH};
 use crate::random::{STREAM_DEPTH, STREAM_RAY, STREAM_SAX_WINDOW, permute, uniform01};
-use crate::sax::data::SaxData;
 use std::collections::HashSet;
 use std::ops::Range;
 

@@ -32,14 +32,14 @@ pub struct Source {
     pub params: Option<Buffer>,
     /// Gaussians of the model, where they are the moving field.
     pub moving: Option<MovingFeed>,
-    /// Numbers of SAX-NeRF's fields on the device, where they are all there is.
-    pub sax: Option<Vec<Buffer>>,
+    /// Numbers on the device of the field of a method with a room of its own.
+    pub fit: Option<Vec<Buffer>>,
 }
 
 impl Source {
     /// A model that does not change.
     pub fn of(model: &Model) -> Source {
-        Source { outline: model.clone(), params: None, moving: None, sax: None }
+        Source { outline: model.clone(), params: None, moving: None, fit: None }
     }
 }
 
@@ -65,8 +65,8 @@ impl Live {
     pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
         let model = &source.outline;
         let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
-        if let Some(params) = &source.sax {
-            renderer.follow_sax(params);
+        if let Some(params) = &source.fit {
+            renderer.follow_fit(params);
         }
         Ok(Live {
             baked: Baked::for_display(renderer, model, CELL_MM),

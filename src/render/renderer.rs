@@ -1,6 +1,7 @@
 //! Projections of a reconstruction for any pose and phase, through the kernels that train it.
 
 use crate::error::{Error, Result};
+use crate::fitting::field::FieldDrawing;
 use crate::gaussians::blobs::{BlobList, Blobs};
 use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
@@ -23,7 +24,6 @@ use crate::network::pass::Pass;
 use crate::network::still::StillNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
-use crate::sax::drawing::SaxDrawing;
 use crate::scan::gating::BeatTime;
 use bytemuck::Zeroable;
 use std::collections::HashMap;
@@ -96,8 +96,8 @@ pub struct Renderer {
     /// Where Gaussians are the moving field.
     pub(super) moving: Option<Blobs>,
     pictures: Option<Pictures>,
-    /// Where SAX-NeRF's field is all there is.
-    pub(super) sax: Option<SaxDrawing>,
+    /// Field of a method with a room of its own, which is all there is then.
+    pub(super) field: Option<Box<dyn FieldDrawing>>,
     /// Of rays, without and with the still field, of integrals and of maxima: what one kind takes says nothing of another.
     paces: [SubmitPace; 4],
     drawn: Mutex<Drawn>,
@@ -109,7 +109,7 @@ impl Renderer {
     /// # Errors
     /// Device errors.
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
-        let tuning = tuning.for_network(model.moving.is_none() && model.sax.is_none());
+        let tuning = tuning.for_network(model.moving.is_none() && model.field.is_none());
         let mut setup = model.scene.setup(&model.config, &model.param_map, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;
@@ -133,14 +133,14 @@ impl Renderer {
         gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
         let moving = model.moving.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
         let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
-        let sax = model.sax.as_ref().map(|field| SaxDrawing::new(gpu, field)).transpose()?;
+        let field = model.field.as_ref().map(|field| field.drawing(gpu)).transpose()?;
         let param_map = model.param_map.clone();
         let gpu = gpu.clone();
         let pace = |_| SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
         let paces = std::array::from_fn(pace);
         let drawn = Mutex::default();
         let renderer =
-            Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, sax, paces, drawn };
+            Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, field, paces, drawn };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -150,15 +150,16 @@ impl Renderer {
     /// # Errors
     /// [`Error::Internal`] for other parameters; device errors.
     pub fn set_model(&self, model: &Model) -> Result<()> {
-        let same_method = model.moving.is_some() == self.moving.is_some() && model.sax.is_some() == self.sax.is_some();
+        let same_method =
+            model.moving.is_some() == self.moving.is_some() && model.field.is_some() == self.field.is_some();
         if model.param_map != self.param_map || !same_method {
             return Err(Error::Internal("the model has other parameters than the renderer".into()));
         }
         if let Some(field) = &model.moving {
             self.set_gaussians(field)?;
         }
-        if let (Some(field), Some(drawing)) = (&model.sax, &self.sax) {
-            drawing.replace(field)?;
+        if let (Some(field), Some(drawing)) = (&model.field, &self.field) {
+            drawing.replace(field.as_ref())?;
         }
         self.set_params(model)
     }
@@ -177,9 +178,9 @@ impl Renderer {
         }
     }
 
-    /// Draws numbers of SAX-NeRF's fields that are on the device, as a run leaves them there; nothing of other methods.
-    pub fn follow_sax(&self, params: &[Buffer]) {
-        if let Some(drawing) = &self.sax {
+    /// Draws numbers that are on the device, of the field of a method with a room of its own; nothing of other methods.
+    pub fn follow_fit(&self, params: &[Buffer]) {
+        if let Some(drawing) = &self.field {
             drawing.follow(params.to_vec());
         }
     }
@@ -311,7 +312,7 @@ impl Renderer {
 
     /// Whether the network on encoded coordinates is the moving field.
     pub fn network_moves(&self) -> bool {
-        self.moving.is_none() && self.sax.is_none()
+        self.moving.is_none() && self.field.is_none()
     }
 
     /// Whether a view of the moving field is drawn from Gaussians as they are, at display rates. The largest value of their
@@ -363,7 +364,7 @@ impl Renderer {
         if phase.fract() != 0.0 {
             let all = Parts { still: true, maxima: true };
             let taken = BeatTime::of(phase, self.setup.n_phases);
-            let whole_phases = self.moving.is_some() || self.sax.is_some();
+            let whole_phases = self.moving.is_some() || self.field.is_some();
             let blobs = whole_phases.then(|| self.between(phase)).transpose()?;
             return self.draw(rays, (width, height), taken, blobs.as_ref(), all);
         }
@@ -373,7 +374,7 @@ impl Renderer {
 
     /// The last phase that can be asked for: that of a field that is continuous in time is the first of the next beat.
     fn last_moment(&self) -> u32 {
-        let continuous = self.sax.is_none() && self.moving.as_ref().is_none_or(Blobs::move_between_phases);
+        let continuous = self.field.is_none() && self.moving.as_ref().is_none_or(Blobs::move_between_phases);
         if continuous { self.setup.n_phases } else { self.setup.n_phases - 1 }
     }
 
@@ -452,7 +453,7 @@ impl Renderer {
             recording.copy(&self.buffers.ray_counts, 0, &counts, 0, bytes)?;
             return Ok(RecordedStrip { commands: recording.finish()?, of, counts: Some(counts), seen });
         }
-        if let Some(field) = &self.sax {
+        if let Some(field) = &self.field {
             let (rays, out) = (&self.buffers.rays, &self.buffers.ray_out);
             field.record_rays(&mut recording, rays, out, taken.phase, n_rays)?;
         } else if parts.still {

@@ -1,6 +1,7 @@
 //! Fields sampled on a regular grid.
 
 use crate::error::{Error, Result};
+use crate::fitting::field::Row;
 use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::record::Recording;
@@ -92,7 +93,7 @@ impl Renderer {
                     let push = push::VolumeStatic { n_rays: n };
                     self.pass(&mut r, &buffers, &setup).run_with(stage, stage.groups_over(n * nx), &bound, push)?;
                 }
-                _ if self.sax.is_some() => self.record_sax(&mut r, &buffers, &setup, (phase, n), &cells)?,
+                _ if self.field.is_some() => self.record_field(&mut r, &buffers, &setup, (phase, n), &cells)?,
                 (_, Some(blobs), _) => blobs.record_points(&mut r, &buffers, phase, (n, nx), away, &cells)?,
                 (_, None, _) => {
                     r.fill(&cells, 0);
@@ -106,18 +107,18 @@ impl Renderer {
         Ok(out)
     }
 
-    /// Records SAX-NeRF's field at the cells of rows along x.
-    fn record_sax(
+    /// Records the field of a method with a room of its own at the cells of rows along x.
+    fn record_field(
         &self,
         recording: &mut Recording,
         buffers: &ForwardBuffers,
         setup: &Setup,
-        rows: (u32, u32),
+        (phase, n_rows): (u32, u32),
         cells: &Buffer,
     ) -> Result<()> {
-        let Some(field) = &self.sax else { return Ok(()) };
-        let along = (setup.dynamic_near, setup.dynamic_far, setup.n_dynamic_samples);
-        field.record_cells(recording, &buffers.rays, along, rows, cells)
+        let Some(field) = &self.field else { return Ok(()) };
+        let row = Row { near: setup.dynamic_near, far: setup.dynamic_far, cells: setup.n_dynamic_samples };
+        field.record_cells(recording, &buffers.rays, row, phase, n_rows, cells)
     }
 
     /// Bytes on their way to the device, behind what was recorded so far.

@@ -3,23 +3,24 @@
 
 use crate::config::{Config, Preset};
 use crate::error::Result;
+use crate::fitting::field::{FieldDrawing, Row};
 use crate::fitting::sets::seed_of_set;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::layout::{Ray, RayOut, SaxLevel, SaxSetup};
 use crate::kernels::push::{self, PushConstants};
-use crate::model::sax::{SaxField, SaxState};
+use crate::methods::sax_nerf::data::SaxData;
+use crate::methods::sax_nerf::drawing::SaxDrawing;
+use crate::methods::sax_nerf::field::{SaxField, SaxState};
+use crate::methods::sax_nerf::setup::{drawing_setup, outline, schedule};
+use crate::methods::sax_nerf::start::first_params;
+use crate::methods::sax_nerf::trainer::SaxTrainer;
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::sax::{self as reference, Lineformer};
-use crate::sax::data::SaxData;
-use crate::sax::drawing::SaxDrawing;
-use crate::sax::setup::{drawing_setup, outline, schedule};
-use crate::sax::start::first_params;
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::problems::small_dataset;
-use crate::train::sax::SaxTrainer;
 
 const BATCH: &[&str] = &[push::SaxBatch::SHADER];
 const POINTS: &[&str] = &[push::SaxPoints::SHADER];
@@ -75,7 +76,8 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
 pub fn hard_case(config: &Config) -> Result<(SaxData, SaxField, SaxState)> {
     let dataset = small_dataset(33, 27, 3)?;
     let missing = || crate::error::Error::Internal("the plan has no data of SAX-NeRF".into());
-    let data = Plan::new(config, &dataset)?.sax.ok_or_else(missing)?;
+    let planned = Plan::new(config, &dataset)?.fit;
+    let data = planned.as_ref().and_then(|data| data.as_any().downcast_ref::<SaxData>()).ok_or_else(missing)?.clone();
     let outline = outline(&data, &config.sax, 0);
     let parts = outline.shape.parts();
     let params = |set: usize| {
@@ -363,7 +365,8 @@ fn compare_drawing(gpu: &Gpu, data: &SaxData, field: &SaxField, findings: &mut F
     let cells = gpu.buffer("volume", 4 * (n * row) as u64, Memory::Device)?;
     let mut recording = Recording::new(gpu, "views of SAX-NeRF")?;
     drawing.record_rays(&mut recording, &on_device, &out, PHASE, n as u32)?;
-    drawing.record_cells(&mut recording, &on_device, (-0.04, 0.05, row as u32), (PHASE, n as u32), &cells)?;
+    let cells_of_row = Row { near: -0.04, far: 0.05, cells: row as u32 };
+    drawing.record_cells(&mut recording, &on_device, cells_of_row, PHASE, n as u32, &cells)?;
     gpu.wait(recording.finish()?.submit()?)?;
     let seen: Vec<RayOut> = gpu.download(&out, 0, n)?;
     let want = drawn(field, &drawing_setup(field), &rays, PHASE);

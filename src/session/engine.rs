@@ -202,8 +202,8 @@ impl Shared {
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.step.store(trainer.step(), Ordering::Release);
         let params = Some(trainer.forward().params.clone());
-        let (moving, sax) = (trainer.moving_feed(), trainer.sax_params());
-        self.publish(Source { outline: trainer.outline(), params, moving, sax });
+        let (moving, fit) = (trainer.moving_feed(), trainer.fit_params());
+        self.publish(Source { outline: trainer.outline(), params, moving, fit });
         engine.training = Some(Training::new(trainer));
         Ok(())
     }

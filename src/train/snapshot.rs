@@ -1,6 +1,7 @@
 //! A run's state on its way to the host, beside the iterations that follow.
 
 use crate::error::{Error, Result};
+use crate::fitting::fit::FitState;
 use crate::fitting::losses::SMALLER_STEPS;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -9,8 +10,8 @@ use crate::kernels::layout::{DeviceState, StepReport};
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
 use crate::model::r2::R2State;
-use crate::model::sax::SaxState;
 use crate::model::x_gaussian::XState;
+use std::sync::Arc;
 
 /// Bytes of an iteration's report.
 pub(super) const REPORT_BYTES: u64 = size_of::<StepReport>() as u64;
@@ -30,7 +31,7 @@ pub struct Snapshot {
     pub(super) model: Model,
     pub(super) r2: Option<R2State>,
     pub(super) x: Option<XState>,
-    pub(super) sax: Option<SaxState>,
+    pub(super) fit: Option<Arc<dyn FitState>>,
     pub(super) data_fingerprint: String,
 }
 
@@ -75,7 +76,7 @@ impl Snapshot {
             last_report,
             r2: self.r2,
             x: self.x,
-            sax: self.sax,
+            fit: self.fit,
             data_fingerprint: self.data_fingerprint,
         })
     }

@@ -9,6 +9,7 @@ use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::kernels::tuning::Tuning;
+use crate::methods;
 use crate::network::cost::NetworkCost;
 use crate::network::ledger::Ledger;
 use crate::plan::Plan;
@@ -188,7 +189,9 @@ impl Subject {
         dynamic.lr_end *= SLOWLY;
         still.lr_end *= SLOWLY;
         (dynamic.lr, still.lr) = (dynamic.lr_end, still.lr_end);
-        config.sax.rate *= SLOWLY;
+        if let Some(method) = methods::of(&config) {
+            method.lower_rates(&mut config, SLOWLY);
+        }
         // As few Gaussians' iterations as can be, which leave the still field the same work.
         config.gaussians.iterations = 1;
         config.tree = Tree { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.tree };

@@ -4,6 +4,7 @@
 use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
 use crate::fitting::RING_LENGTH;
+use crate::fitting::fit::{Fit, SavedFit};
 use crate::fitting::losses::{LargeLoss, LossWatch, NetworkLosses, StepLoss};
 use crate::fitting::ring::tells_nothing;
 use crate::geometry::CArm;
@@ -26,7 +27,6 @@ use crate::network::{F32_BYTES, Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::train::moving::Moving;
-use crate::train::sax::SaxTrainer;
 use crate::train::snapshot::{REPORT_BYTES, Snapshot};
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use std::collections::VecDeque;
@@ -55,8 +55,8 @@ pub struct Trainer {
     training: TrainingBuffers,
     /// Gaussians, where they are the moving field.
     moving: Option<Moving>,
-    /// SAX-NeRF's fields, where they are all there is.
-    sax: Option<SaxTrainer>,
+    /// Fit of a method with a room of its own, which is all there is then.
+    fit: Option<Box<dyn Fit>>,
     pace: SubmitPace,
     /// When the last submit was done, or the one under way began.
     last_completion: Instant,
@@ -80,23 +80,21 @@ pub struct Trainer {
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
     let has_gaussians = plan.targets.is_some() || plan.r2.is_some() || plan.x.is_some();
     let same_method =
-        checkpoint.model.moving.is_some() == has_gaussians && checkpoint.model.sax.is_some() == plan.sax.is_some();
+        checkpoint.model.moving.is_some() == has_gaussians && checkpoint.model.field.is_some() == plan.fit.is_some();
     if checkpoint.model.param_map == plan.params && same_method {
         return Ok(());
     }
     Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
 }
 
-/// Begins SAX-NeRF's fit to the plan's data, or goes on from what was `saved` of one to the same; none of other methods.
-fn begin_sax(gpu: &Gpu, plan: &mut Plan, saved: Option<&Checkpoint>, per_submit: u32) -> Result<Option<SaxTrainer>> {
-    let Some(data) = plan.sax.take() else { return Ok(None) };
+/// Begins the fit of a method with a room of its own to the plan's data, or goes on from what was `saved` of one to the same data;
+/// none of other methods.
+fn begin_fit(gpu: &Gpu, plan: &mut Plan, saved: Option<&Checkpoint>, per_submit: u32) -> Result<Option<Box<dyn Fit>>> {
+    let Some(data) = plan.fit.take() else { return Ok(None) };
     let mut config = plan.config.clone();
     config.train.iterations_per_submit = per_submit;
-    let fit = match saved.and_then(|saved| Some((saved.model.sax.as_ref()?, saved.sax.as_ref()?))) {
-        Some((field, state)) => SaxTrainer::with(gpu, data, &config, field, state)?,
-        None => SaxTrainer::new(gpu, data, &config)?,
-    };
-    Ok(Some(fit))
+    let state = |saved: &Checkpoint| Some(SavedFit { field: saved.model.field.clone()?, state: saved.fit.clone()? });
+    data.begin(gpu, &config, saved.and_then(state).as_ref()).map(Some)
 }
 
 /// Fingerprint of the training images: of their bits and geometry.
@@ -231,8 +229,8 @@ impl Trainer {
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
         let earlier = earlier.filter(|_| of_these_data.is_none());
         let moving = Moving::begin(gpu, &mut plan, dataset, of_these_data, earlier, per_submit)?;
-        let sax = begin_sax(gpu, &mut plan, of_these_data, per_submit)?;
-        let of_fit = moving.as_ref().and_then(Moving::step).or(sax.as_ref().map(SaxTrainer::step));
+        let fit = begin_fit(gpu, &mut plan, of_these_data, per_submit)?;
+        let of_fit = moving.as_ref().and_then(Moving::step).or(fit.as_ref().map(|fit| fit.step()));
         let step = of_fit.unwrap_or(now.step);
         // The still field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
@@ -251,7 +249,7 @@ impl Trainer {
             })?;
             recording.finish()
         };
-        let has_still_field = !plan.config.has_gaussians_alone() && !plan.config.is_sax();
+        let has_still_field = !plan.config.has_gaussians_alone() && fit.is_none();
         let single = has_still_field.then(record_single).transpose()?;
         let trainer = Trainer {
             pace: SubmitPace::new(kernels.tuning.longest_submit_s, 1, per_submit).giving_way_to(gpu.looks()),
@@ -271,7 +269,7 @@ impl Trainer {
             watch: LossWatch::new(plan.config.train.stop_at_loss_ratio),
             large_loss: None,
             moving,
-            sax,
+            fit,
             // X-Gaussian's opacities are no attenuation.
             vessel_attenuation: dataset.vessel_attenuation.filter(|_| !plan.config.is_x()),
             c_arm: dataset.reference_c_arm(),
@@ -316,7 +314,7 @@ impl Trainer {
         self.still.as_ref()
     }
 
-    /// Barriers of an iteration; none where Gaussians, or a Lineformer, are all there is.
+    /// Barriers of an iteration; none where no rays are marched through fields.
     pub fn barriers(&self) -> Option<u32> {
         self.single.as_ref().map(Commands::barriers)
     }
@@ -343,8 +341,8 @@ impl Trainer {
         if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
             return self.advance_gaussians(until);
         }
-        if self.sax.is_some() {
-            return self.advance_sax(until);
+        if self.fit.is_some() {
+            return self.advance_fit(until);
         }
         self.record_several()?;
         if self.in_flight.is_empty() {
@@ -434,20 +432,24 @@ impl Trainer {
         Ok(losses.into_iter().zip(first + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
     }
 
-    /// Numbers of SAX-NeRF's fields on the device, for those who draw them; none of other methods.
-    pub fn sax_params(&self) -> Option<Vec<Buffer>> {
-        self.sax.as_ref().map(SaxTrainer::params)
+    /// Numbers on the device of the field of a method with a room of its own, for those who draw it; none of other methods.
+    pub fn fit_params(&self) -> Option<Vec<Buffer>> {
+        self.fit.as_ref().map(|fit| fit.params())
     }
 
-    /// Some iterations of SAX-NeRF.
-    fn advance_sax(&mut self, until: u32) -> Result<Vec<StepLoss>> {
-        let Some(sax) = &mut self.sax else { return Ok(Vec::new()) };
-        let losses = sax.advance(until)?;
-        let (attenuation, first) = (sax.data().attenuation, self.completed);
+    /// Runs some iterations of the fit of a method with a room of its own.
+    fn advance_fit(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+        let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
+        let losses = fit.advance(until)?;
+        self.count(losses.len() as u32);
+        Ok(losses)
+    }
+
+    /// Counts iterations that are submitted, done and reported at once.
+    fn count(&mut self, iterations: u32) {
         for done in [&mut self.submitted, &mut self.completed, &mut self.reported] {
-            *done = first + losses.len() as u32;
+            *done += iterations;
         }
-        Ok(losses.into_iter().zip(first + 1..).map(|(loss, step)| StepLoss::of_sax(step, loss, attenuation)).collect())
     }
 
     /// The still field is trained on the images less the moving field.
@@ -497,24 +499,20 @@ impl Trainer {
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         const MAX_PASSES: u32 = 4096;
-        let of_fit = match (&mut self.moving, &mut self.sax) {
+        let of_fit = match (&mut self.moving, &mut self.fit) {
             (Some(moving), _) if self.single.is_none() => Some(moving.profile_step()?),
-            (_, Some(sax)) => Some(sax.profile_step()?),
+            (_, Some(fit)) => Some(fit.profile_step()?),
             _ => None,
         };
         if let Some(passes) = of_fit {
-            self.submitted += 1;
-            self.completed += 1;
-            self.reported += 1;
+            self.count(1);
             return Ok(passes);
         }
         let mut recording = Recording::timed(&self.gpu, "profiled iteration", MAX_PASSES)?;
         record_step(&mut self.pass(&mut recording))?;
         let commands = recording.finish()?;
         self.gpu.wait(commands.submit()?)?;
-        self.submitted += 1;
-        self.completed += 1;
-        self.reported += 1;
+        self.count(1);
         commands.pass_times()
     }
 
@@ -527,7 +525,7 @@ impl Trainer {
             // Gaussians need no hull once they are seeded.
             hull: self.plan.hull.clone().filter(|_| self.moving.is_none()),
             moving: self.moving.as_ref().map(Moving::field),
-            sax: self.sax.as_ref().map(SaxTrainer::outline),
+            field: self.fit.as_ref().map(|fit| fit.outline()),
             params: Vec::new(),
             step: self.submitted,
             vessel_attenuation: self.vessel_attenuation,
@@ -570,9 +568,9 @@ impl Trainer {
         if let Some((state, field)) = self.moving.as_ref().map(Moving::x_state).transpose()?.flatten() {
             (model.moving, x) = (Some(field), Some(state));
         }
-        let mut sax = None;
-        if let Some((field, state)) = self.sax.as_ref().map(SaxTrainer::state).transpose()? {
-            (model.sax, sax) = (Some(field), Some(state));
+        let mut fit = None;
+        if let Some(SavedFit { field, state }) = self.fit.as_ref().map(|fit| fit.state()).transpose()? {
+            (model.field, fit) = (Some(field), Some(state));
         }
         Ok(Snapshot {
             gpu: self.gpu.clone(),
@@ -588,7 +586,7 @@ impl Trainer {
             model,
             r2,
             x,
-            sax,
+            fit,
             data_fingerprint: self.data_fingerprint.clone(),
         })
     }

@@ -10,7 +10,7 @@ use crate::kernels::constants as at;
 use crate::kernels::push::{self, PushConstants, SaxTimes, SaxTimesBack};
 use crate::kernels::stages::{Build, Stage, vec4_variant};
 use crate::kernels::tuning::Tuning;
-use crate::model::sax::{SaxShape, WIDTH};
+use crate::methods::sax_nerf::field::{SaxShape, WIDTH};
 
 /// Numbers of a vec4, a vector in vec4, and a matrix of 32 x 32.
 const LANES: u32 = 4;

@@ -1,6 +1,6 @@
 //! Where a fit begins: random numbers, as PyTorch begins with them.
 
-use crate::model::sax::{SaxShape, WIDTH};
+use crate::methods::sax_nerf::field::{SaxShape, WIDTH};
 use crate::random::{STREAM_INIT, normal, uniform01};
 use rayon::prelude::*;
 

@@ -4,9 +4,9 @@ use crate::config::Config;
 use crate::config::sections::Sax;
 use crate::fitting::{FIXED_POINT_BITS, RING_LENGTH};
 use crate::kernels::layout::{FieldUpdate, SaxSetup, Schedule, Setup};
-use crate::model::sax::{SaxField, SaxShape};
-use crate::sax::data::SaxData;
-use crate::sax::lineformer::{PART_SAMPLES, chunks};
+use crate::methods::sax_nerf::data::SaxData;
+use crate::methods::sax_nerf::field::{SaxField, SaxShape};
+use crate::methods::sax_nerf::lineformer::{PART_SAMPLES, chunks};
 
 /// What does not depend on what is drawn or fitted.
 fn field_setup(field: &SaxField) -> SaxSetup {

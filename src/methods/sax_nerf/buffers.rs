@@ -12,12 +12,12 @@ use crate::kernels::constants::{SAX_FORWARD_VECTORS, SAX_VECTORS};
 use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{DeviceState, Ray, SaxSetup};
 use crate::kernels::tuning::Tuning;
-use crate::model::sax::{SaxField, SaxState};
-use crate::sax::data::SaxData;
-use crate::sax::lineformer::{capacity, vector_bytes};
-use crate::sax::products::products;
-use crate::sax::setup::{adam_setup, schedule};
-use crate::sax::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers};
+use crate::methods::sax_nerf::data::SaxData;
+use crate::methods::sax_nerf::field::{SaxField, SaxState};
+use crate::methods::sax_nerf::lineformer::{capacity, vector_bytes};
+use crate::methods::sax_nerf::products::products;
+use crate::methods::sax_nerf::setup::{adam_setup, schedule};
+use crate::methods::sax_nerf::stages::{SaxFitBuffers, SaxSampleBuffers, SaxSetBuffers};
 
 const MIB: u64 = 1 << 20;
 
@@ -214,8 +214,8 @@ pub fn set_buffers(
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::model::sax::SaxShape;
-    use crate::sax::setup::n_parts;
+    use crate::methods::sax_nerf::field::SaxShape;
+    use crate::methods::sax_nerf::setup::n_parts;
 
     /// What every device holds in a buffer.
     const LEAST_STORAGE_BUFFER: u64 = 128 << 20;

@@ -1,14 +1,15 @@
 //! SAX-NeRF's field as it is drawn: along rays, and at the cells of volumes.
 
 use crate::error::{Error, Result};
+use crate::fitting::field::{Field, FieldDrawing, Row};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::layout::SaxSetup;
-use crate::model::sax::SaxField;
-use crate::sax::buffers::{Passes, params_buffer, sample_buffers};
-use crate::sax::setup::drawing_setup;
-use crate::sax::stages::{SaxFieldKernels, SaxSampleBuffers, SaxSampling, record_view};
+use crate::methods::sax_nerf::buffers::{Passes, params_buffer, sample_buffers};
+use crate::methods::sax_nerf::field::SaxField;
+use crate::methods::sax_nerf::setup::drawing_setup;
+use crate::methods::sax_nerf::stages::{SaxFieldKernels, SaxSampleBuffers, SaxSampling, record_view};
 use std::sync::{Mutex, PoisonError};
 
 /// Samples asked at once: 16 MiB of features where there are 16 levels.
@@ -35,7 +36,7 @@ enum Target<'a> {
 }
 
 impl SaxDrawing {
-    /// Puts a field on the device; numbers that it lacks come by [`SaxDrawing::follow`].
+    /// Puts a field on the device; numbers that it lacks come by [`FieldDrawing::follow`].
     ///
     /// # Errors
     /// [`Error::OutOfMemory`]; other device errors.
@@ -51,69 +52,23 @@ impl SaxDrawing {
             setup,
             params: Mutex::new(Vec::new()),
         };
-        drawing.replace(field)?;
+        drawing.replace_field(field)?;
         Ok(drawing)
     }
 
-    /// Draws another field of the same sizes from now on; what was recorded before draws the old one. One without
-    /// numbers changes nothing.
-    ///
-    /// # Errors
-    /// As [`SaxDrawing::new`]; [`Error::Internal`] for other sizes.
-    pub fn replace(&self, field: &SaxField) -> Result<()> {
+    fn replace_field(&self, field: &SaxField) -> Result<()> {
         if field.shape != self.field.shape || field.n_sets != self.field.n_sets {
             return Err(Error::Internal("the field has other sizes than the one that is drawn".into()));
         }
         if !field.params.is_empty() {
             let upload = |set: &Vec<f32>| params_buffer(&self.gpu, "sax_params that are drawn", set);
-            self.follow(field.params.iter().map(upload).collect::<Result<_>>()?);
+            self.set_params(field.params.iter().map(upload).collect::<Result<_>>()?);
         }
         Ok(())
     }
 
-    /// Draws numbers that are on the device, as a run leaves them there.
-    pub fn follow(&self, params: Vec<Buffer>) {
+    fn set_params(&self, params: Vec<Buffer>) {
         *self.params.lock().unwrap_or_else(PoisonError::into_inner) = params;
-    }
-
-    /// Records what `n_rays` of `rays` see at a phase.
-    ///
-    /// # Errors
-    /// [`Error::Internal`] when stages and buffers do not fit, or there are no numbers yet.
-    pub fn record_rays(
-        &self,
-        recording: &mut Recording,
-        rays: &Buffer,
-        ray_out: &Buffer,
-        phase: u32,
-        n_rays: u32,
-    ) -> Result<()> {
-        let parts = (&self.buffers, &self.setup);
-        self.record(recording, parts, rays, (phase, n_rays), Target::View(ray_out))
-    }
-
-    /// Records attenuation per world unit at the cells of `volume`: rows of `row` cells from depth `near` to `far`
-    /// along `rays`.
-    ///
-    /// # Errors
-    /// As [`SaxDrawing::record_rays`]; [`Error::Config`] for a row of more cells than are asked at once.
-    pub fn record_cells(
-        &self,
-        recording: &mut Recording,
-        rays: &Buffer,
-        (near, far, row): (f32, f32, u32),
-        (phase, n_rows): (u32, u32),
-        volume: &Buffer,
-    ) -> Result<()> {
-        if row > SAMPLES_AT_ONCE {
-            return Err(Error::config("grid", row, format!("at most {SAMPLES_AT_ONCE} points along x are accepted")));
-        }
-        let setup = SaxSetup { near, far, n_samples: row, ..self.setup };
-        let buffers = SaxSampleBuffers {
-            sax_setup: self.gpu.buffer_with("sax_setup of rows", &[setup])?,
-            ..self.buffers.clone()
-        };
-        self.record(recording, (&buffers, &setup), rays, (phase, n_rows), Target::Cells(volume))
     }
 
     fn record(
@@ -142,5 +97,50 @@ impl SaxDrawing {
             }
         }
         Ok(())
+    }
+}
+
+impl FieldDrawing for SaxDrawing {
+    fn replace(&self, field: &dyn Field) -> Result<()> {
+        match field.as_any().downcast_ref::<SaxField>() {
+            Some(field) => self.replace_field(field),
+            None => Err(Error::Internal("a field of another method than the one that is drawn".into())),
+        }
+    }
+
+    fn follow(&self, params: Vec<Buffer>) {
+        self.set_params(params);
+    }
+
+    fn record_rays(
+        &self,
+        recording: &mut Recording,
+        rays: &Buffer,
+        ray_out: &Buffer,
+        phase: u32,
+        n_rays: u32,
+    ) -> Result<()> {
+        let parts = (&self.buffers, &self.setup);
+        self.record(recording, parts, rays, (phase, n_rays), Target::View(ray_out))
+    }
+
+    fn record_cells(
+        &self,
+        recording: &mut Recording,
+        rays: &Buffer,
+        Row { near, far, cells }: Row,
+        phase: u32,
+        n_rows: u32,
+        volume: &Buffer,
+    ) -> Result<()> {
+        if cells > SAMPLES_AT_ONCE {
+            return Err(Error::config("grid", cells, format!("at most {SAMPLES_AT_ONCE} points along x are accepted")));
+        }
+        let setup = SaxSetup { near, far, n_samples: cells, ..self.setup };
+        let buffers = SaxSampleBuffers {
+            sax_setup: self.gpu.buffer_with("sax_setup of rows", &[setup])?,
+            ..self.buffers.clone()
+        };
+        self.record(recording, (&buffers, &setup), rays, (phase, n_rows), Target::Cells(volume))
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::kernels::constants as at;
 use crate::kernels::layout::SaxProduct;
-use crate::model::sax::{SaxShape, WIDTH};
+use crate::methods::sax_nerf::field::{SaxShape, WIDTH};
 
 /// Numbers of a vec4.
 const LANES: u32 = 4;

@@ -2,20 +2,26 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
+use crate::fitting::field::Field;
+use crate::fitting::fit::{Fit, SavedFit};
 use crate::fitting::iterations::{Iterations, pass_times};
+use crate::fitting::losses::StepLoss;
 use crate::fitting::ring::losses;
 use crate::fitting::sets::seed_of_set;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
 use crate::kernels::layout::SaxSetup;
-use crate::model::sax::{SMALLER_STEPS, SaxField, SaxState, check_params};
-use crate::sax::buffers::{Passes, SaxMemory, fit_buffers, sample_buffers, set_buffers};
-use crate::sax::data::SaxData;
-use crate::sax::lineformer::chunks;
-use crate::sax::setup::{fit_setup, outline};
-use crate::sax::stages::{SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step};
-use crate::sax::start::first_params;
+use crate::methods::sax_nerf::buffers::{Passes, SaxMemory, fit_buffers, sample_buffers, set_buffers};
+use crate::methods::sax_nerf::data::SaxData;
+use crate::methods::sax_nerf::field::{SMALLER_STEPS, SaxField, SaxState, check_params};
+use crate::methods::sax_nerf::lineformer::chunks;
+use crate::methods::sax_nerf::setup::{fit_setup, outline};
+use crate::methods::sax_nerf::stages::{
+    SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step,
+};
+use crate::methods::sax_nerf::start::first_params;
+use std::sync::Arc;
 
 /// Passes of an iteration of a field, and of all fields together, but for those over its chunks of samples.
 const MAX_PASSES: u32 = 16;
@@ -178,5 +184,35 @@ impl SaxTrainer {
         let (kernels, samples, fit) = (&self.kernels, &self.samples, &self.fit);
         let shape = self.outline.shape;
         SaxPass { recording, kernels, samples, fit, sets: &self.sets, shape, setup: &self.setup }
+    }
+}
+
+impl Fit for SaxTrainer {
+    fn step(&self) -> u32 {
+        self.step
+    }
+
+    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+        let first = self.step + 1;
+        let losses = SaxTrainer::advance(self, until)?;
+        let attenuation = self.data.attenuation;
+        Ok(losses.into_iter().zip(first..).map(|(loss, step)| StepLoss::of_images(step, loss, attenuation)).collect())
+    }
+
+    fn outline(&self) -> Arc<dyn Field> {
+        Arc::new(SaxTrainer::outline(self))
+    }
+
+    fn params(&self) -> Vec<Buffer> {
+        SaxTrainer::params(self)
+    }
+
+    fn state(&self) -> Result<SavedFit> {
+        let (field, state) = SaxTrainer::state(self)?;
+        Ok(SavedFit { field: Arc::new(field), state: Arc::new(state) })
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        SaxTrainer::profile_step(self)
     }
 }

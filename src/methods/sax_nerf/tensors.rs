@@ -1,11 +1,11 @@
 //! SAX-NeRF's field and the state of its fit in a checkpoint: tensors under documented names.
 
 use crate::error::{Error, Result};
+use crate::fitting::fit::SavedAt;
 use crate::fitting::tensors::{File, FileTensor};
-use crate::model::sax::{Part, SaxField, SaxShape, SaxState};
-use safetensors::tensor::{Dtype, SafeTensors};
+use crate::methods::sax_nerf::field::{Part, SaxField, SaxShape, SaxState};
+use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
-use std::path::Path;
 
 /// What tensors and configuration do not tell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -22,6 +22,7 @@ pub(super) struct SaxHeader {
     sets: usize,
 }
 
+/// Returns what the header of a checkpoint says of a field.
 pub(super) fn header(field: &SaxField) -> SaxHeader {
     SaxHeader {
         bound: field.bound,
@@ -37,6 +38,7 @@ fn described(prefix: &str, part: &Part, n_sets: usize) -> (String, Vec<usize>) {
     (format!("sax.{prefix}{}", part.name), [&[n_sets], &part.shape[..]].concat())
 }
 
+/// Returns field and state as tensors.
 pub(super) fn tensors(field: &SaxField, state: &SaxState) -> Vec<FileTensor> {
     let mut all = Vec::new();
     for part in field.shape.parts() {
@@ -58,10 +60,10 @@ pub(super) fn tensors(field: &SaxField, state: &SaxState) -> Vec<FileTensor> {
 pub(super) fn read(
     header: &SaxHeader,
     shape: SaxShape,
-    tensors: &SafeTensors<'_>,
-    (n_phases, step): (usize, u32),
-    path: &Path,
+    file: &File<'_>,
+    SavedAt { n_phases, step }: SavedAt,
 ) -> Result<(SaxField, SaxState)> {
+    let path = file.path;
     let [near, far] = header.depths;
     let is_positive = |v: f64| v.is_finite() && v > 0.0;
     if !is_positive(header.bound) || !is_positive(header.attenuation) || !is_positive(far - near) || header.samples < 2
@@ -71,7 +73,6 @@ pub(super) fn read(
     if header.sets != 1 && header.sets != n_phases {
         return Err(Error::data(path, "sax.sets", format!("{} of {n_phases} phases", header.sets)));
     }
-    let file = File { tensors, path };
     let n_sets = header.sets;
     // Of a damaged file nothing is reserved that it does not hold.
     let parts = shape.parts();

@@ -15,8 +15,10 @@ use crate::kernels::layout::SaxSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage, along_two_axes, vec4_variant};
 use crate::kernels::tuning::Tuning;
-use crate::model::sax::SaxShape;
-use crate::sax::lineformer::{Lineformer, LineformerBackKernels, LineformerKernels, Recorder, capacity, chunks};
+use crate::methods::sax_nerf::field::SaxShape;
+use crate::methods::sax_nerf::lineformer::{
+    Lineformer, LineformerBackKernels, LineformerKernels, Recorder, capacity, chunks,
+};
 
 /// Pipelines that ask a field.
 pub struct SaxFieldKernels {

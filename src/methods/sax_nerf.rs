@@ -1,0 +1,131 @@
+//! SAX-NeRF (Cai et al. 2024), a static baseline of the paper: a hash grid and a Lineformer, fitted to whole images of each phase,
+//! or of all.
+
+pub mod buffers;
+pub mod data;
+pub mod drawing;
+pub mod field;
+pub mod lineformer;
+pub mod products;
+pub mod setup;
+pub mod stages;
+pub mod start;
+mod tensors;
+pub mod trainer;
+
+use crate::config::{Config, StaticData};
+use crate::error::{Error, Result};
+use crate::fitting::extent::{between_phases, volume_half};
+use crate::fitting::fit::{FieldVolume, Fit, FitData, Method, SavedAt, SavedFit};
+use crate::fitting::tensors::File;
+use crate::gpu::device::Gpu;
+use crate::scan::dataset::Dataset;
+use data::SaxData;
+use field::{SaxField, SaxShape, SaxState};
+use stages::SaxKernels;
+use std::any::Any;
+use std::sync::Arc;
+use trainer::SaxTrainer;
+
+/// Key of the settings, and of the field in headers of checkpoints.
+const KEY: &str = "sax";
+
+/// The method, for the registry.
+pub struct SaxNerf;
+
+impl Method for SaxNerf {
+    fn key(&self) -> &'static str {
+        KEY
+    }
+
+    fn checkpoint_format(&self) -> &'static str {
+        "nertca-checkpoint-4"
+    }
+
+    fn is_chosen(&self, config: &Config) -> bool {
+        config.is_sax()
+    }
+
+    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<Box<dyn FitData>> {
+        let data = SaxData::new(dataset, &config.sax, self.volume(config, dataset).half)?;
+        notes.extend(notes_of(config, dataset, &data));
+        Ok(Box::new(data))
+    }
+
+    fn volume(&self, config: &Config, dataset: &Dataset) -> FieldVolume {
+        FieldVolume {
+            half: volume_half(config.sax.half_extent_mm, dataset),
+            // Volumes are kept in units of the attenuation of a density of 1.
+            attenuation: dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0),
+        }
+    }
+
+    fn read(&self, about: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+        let bad = |e: serde_json::Error| Error::data(file.path, KEY, e.to_string());
+        let about = serde_json::from_value(about.clone()).map_err(bad)?;
+        let (field, state) = tensors::read(&about, SaxShape::of(&config.sax), file, at)?;
+        Ok(SavedFit { field: Arc::new(field), state: Arc::new(state) })
+    }
+
+    fn rays_per_iteration(&self, config: &Config) -> u32 {
+        setup::n_rays(&config.sax)
+    }
+
+    fn lower_rates(&self, config: &mut Config, factor: f64) {
+        config.sax.rate *= factor;
+    }
+
+    fn make_pipelines(&self, gpu: &Gpu) -> Result<()> {
+        SaxKernels::new(gpu).map(|_| ())
+    }
+}
+
+/// Decisions about the data that are worth telling the user.
+fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
+    let images = data.images_of_set.iter().map(Vec::len).max().unwrap_or(1);
+    let passes = config.train.iterations as usize / images;
+    let mut notes = vec![match config.sax.static_data {
+        StaticData::PerPhase => format!(
+            "SAX-NeRF, a static method: each phase is reconstructed from its own images, of which an iteration sees one: \
+             {passes} passes over them (sax.static_data = \"per-phase\")"
+        ),
+        StaticData::Pooled => format!(
+            "SAX-NeRF, a static method: one reconstruction from the images of all phases, of which an iteration sees one \
+             ({passes} passes over them), is shown at each (sax.static_data = \"pooled\")"
+        ),
+    }];
+    if config.sax.normalise && dataset.vessel_attenuation.is_none() {
+        notes.push(
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF shows none above 1"
+                .into(),
+        );
+    }
+    if !dataset.hidden.is_empty() {
+        notes
+            .push("pixels that show nothing of the patient are fitted like all others: SAX-NeRF knows no masks".into());
+    }
+    if dataset.heart_shifts() {
+        notes.push("SAX-NeRF sees all frames of a view alike: displacements of the heart are left out".into());
+    }
+    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    notes
+}
+
+impl FitData for SaxData {
+    fn begin(self: Box<Self>, gpu: &Gpu, config: &Config, saved: Option<&SavedFit>) -> Result<Box<dyn Fit>> {
+        let own = |saved: &SavedFit| -> Option<(SaxField, SaxState)> {
+            Some((
+                saved.field.as_any().downcast_ref::<SaxField>()?.clone(),
+                saved.state.as_any().downcast_ref::<SaxState>()?.clone(),
+            ))
+        };
+        Ok(match saved.and_then(own) {
+            Some((field, state)) => Box::new(SaxTrainer::with(gpu, *self, config, &field, &state)?),
+            None => Box::new(SaxTrainer::new(gpu, *self, config)?),
+        })
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+}
