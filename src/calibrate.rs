@@ -1,9 +1,10 @@
-//! Self-calibration: brings views that disagree together, from the angiograms alone (method, robustness of geometry).
+//! Self-calibration: makes inconsistent views consistent with each other, from the angiograms alone (method, robustness of
+//! geometry).
 //!
-//! What moves in one view must add up, plane by plane through both sources, to what moves in another ([`profiles`]). A
-//! correction of two angles and a translation per view, and of a displacement of the heart per frame where it breathes, is
-//! found by Gauss-Newton on that ([`solve`]), less what no image tells ([`gauge`]), and kept where it predicts phases it has
-//! not seen ([`choose`]).
+//! The change over the beat in one view must add up, in every plane through both sources, to the change in another view
+//! ([`profiles`]). Gauss-Newton on the difference ([`solve`]) finds two angles and a translation per view and, where the
+//! heart breathes, a displacement of the heart per frame. The component that no image determines is removed ([`gauge`]),
+//! and a correction is kept only if it predicts phases it was not fitted to ([`choose`]).
 
 pub mod choose;
 pub mod correction;
@@ -29,28 +30,31 @@ use observed::Observed;
 use pose::Poses;
 use solve::{ANGLE_DEG, BREATHING_MM, DEPTH_MM, IN_PLANE_MM};
 
-/// Corrections beyond so many standard deviations of what is expected are not believed.
+/// Corrections beyond this many standard deviations of the expected errors are rejected.
 const BOUND: f64 = 4.0;
-/// Where vessels are cut off, profiles differ whatever the geometry, and the same way at all phases. There, a correction must leave
-/// at most this share of the squared residual; blades alone leave .80 and more of it where views are where they are said to be.
+/// Where vessels are cut off, profiles differ whatever the geometry, and in the same way at all phases. A correction must
+/// then leave at most this share of the squared residual. Collimator blades alone leave 0.80 or more of it when the stated
+/// geometry is right.
 const LARGE_GAIN_LEAVES: f64 = 0.65;
-/// And the other views must not explain fewer vessel pixels than as stated by more than this share: a correction that only brought
-/// ends of vessels together made it .11.
+/// In addition, the share of vessel pixels that the other views explain must not drop below the stated one by more than
+/// this: a correction that only brought ends of vessels together lowered it by 0.11.
 const LESS_EXPLAINED: f64 = 0.02;
-/// Where the other views explain this share of the vessel pixels as stated, what profiles differ by is what is cut off: blades alone
-/// have left .63 of the squared residual, too, of views that explained each other by .97.
+/// From this explained share of the vessel pixels, at the stated geometry, the differences of the profiles are attributed
+/// to cut-off vessels: blades alone have left 0.63 of the squared residual in views that explained 0.97 of each other.
 const WELL_EXPLAINED: f64 = 0.96;
-/// Or it must leave at most this share of the vessel pixels that the other views do not explain as stated.
+/// Alternatively, the correction must leave at most this share of the vessel pixels that the other views do not explain at
+/// the stated geometry.
 const LEFT_UNEXPLAINED: f64 = 0.75;
-/// Changes over the beat below this share of the images' range are rounding.
+/// Changes over the beat below this share of the images' range are rounding errors.
 const LEAST_CHANGE: f64 = 1e-5;
-/// Half side of the cube that stands for the heart where corrections are compared, as a share of the field of view's half.
+/// Half side of the cube that represents the heart when corrections are compared, as a share of half the field of view.
 const HEART_SHARE: f64 = 0.5;
 
 /// Calibrates the training views of a dataset as the configuration asks.
 ///
 /// # Errors
-/// [`Error::Config`] when breathing is asked for where the network moves, which takes corrections per view only.
+/// [`Error::Config`] when breathing is requested for a method that takes corrections per view only, such as a dynamic
+/// network.
 pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
     let mode = config.calibrate.mode;
     if mode == CalibrateMode::Off {
@@ -77,7 +81,7 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
     Ok(Calibrator { dataset, observed: &observed, notes }.choose(&candidates))
 }
 
-/// What a view shows of vessels at a phase, and what of it the other views explain before and after a correction.
+/// Vessel pixels of a view at one phase, and the part that the other views explain before and after a correction.
 pub struct Silhouettes {
     /// Index into the dataset's views.
     pub view: usize,
@@ -85,7 +89,7 @@ pub struct Silhouettes {
     pub phase: u32,
     /// Columns of the images.
     pub width: usize,
-    /// Above the still background.
+    /// Images above the static background.
     pub seen: Vec<f32>,
     /// Pixels that show vessels.
     pub shown: Vec<bool>,
@@ -93,7 +97,7 @@ pub struct Silhouettes {
     pub explained: [Vec<bool>; 2],
 }
 
-/// Silhouettes of each training view at the phase that shows most of the vessels.
+/// Returns the silhouettes of each training view at the phase that shows the most vessel pixels.
 pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
     let before = Observed::new(dataset);
     let (after, heart) = before.by_geometry_of(corrected);
@@ -118,7 +122,7 @@ pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
     (0..before.views.len()).filter_map(of_view).collect()
 }
 
-/// Why nothing can be told of how the views agree.
+/// Returns the reason why the agreement of the views cannot be determined, if there is one.
 fn nothing_to_tell(dataset: &Dataset, observed: &Observed) -> Option<String> {
     if dataset.heart_shifts() {
         return Some("frames state displacements of the heart already".into());
@@ -133,7 +137,7 @@ fn nothing_to_tell(dataset: &Dataset, observed: &Observed) -> Option<String> {
     (observed.change < LEAST_CHANGE).then(|| "nothing moves in the images: their phases are all alike".into())
 }
 
-/// What to try, the least first.
+/// Returns the corrections to try, the smallest first.
 fn candidates(mode: CalibrateMode, frames: bool, notes: &mut Vec<String>) -> Vec<Correction> {
     match mode {
         CalibrateMode::Off => vec![Correction::Stated],
@@ -160,7 +164,7 @@ impl Calibrator<'_> {
         }
         let tried: Vec<Validated> = candidates.iter().map(|c| validate(self.observed, *c)).collect();
         let residuals: Vec<f64> = tried.iter().map(|t| t.residual).collect();
-        // Displacements of frames take up what is cut off more than positions of views do.
+        // Displacements of frames compensate for cut-off vessels more than positions of views do.
         let gain = |k: usize| match candidates[k] {
             Correction::Breathing if !self.observed.cut_off().is_empty() => choose::LARGE_GAIN,
             _ => choose::LEAST_GAIN,
@@ -181,7 +185,8 @@ impl Calibrator<'_> {
         self.accept(candidates[chosen], &poses, Some(repeatability), shares)
     }
 
-    /// Too few phases to keep some back: what helps those there are must help a lot.
+    /// Chooses where there are too few phases to keep some back for a test: a correction must then reduce the residual a
+    /// lot.
     fn without_validation(mut self, candidates: &[Correction]) -> Calibration {
         const LARGE: f64 = 0.5;
         self.notes.push(format!(
@@ -284,7 +289,7 @@ impl Calibrator<'_> {
         (0..self.observed.views.len()).flat_map(of_view).collect()
     }
 
-    /// Points that stand for the heart: the corners and the middle of a cube.
+    /// Points that represent the heart: the corners and the centre of a cube.
     fn points(&self) -> Vec<DVec3> {
         let rays = &self.observed.stands[0].rays;
         let [width, height] = self.observed.sizes[0].map(|n| n as f64);
@@ -294,7 +299,7 @@ impl Calibrator<'_> {
         corners.chain([DVec3::ZERO]).collect()
     }
 
-    /// Frames by two sets of poses, in the dataset's pixels; of one view, or of all.
+    /// Rays of the frames at two sets of poses, in binned pixels; of one view, or of all.
     fn frame_rays(&self, a: &Poses, b: &Poses, of: Option<usize>) -> Vec<FrameRays> {
         let mut frames = Vec::new();
         for (slot, stand) in self.observed.stands.iter().enumerate().filter(|(slot, _)| of.is_none_or(|o| o == *slot)) {
@@ -306,22 +311,22 @@ impl Calibrator<'_> {
         frames
     }
 
-    /// What moves all views alike from one set of poses to another.
+    /// Motion common to all views from one set of poses to another.
     fn motion(&self, a: &Poses, b: &Poses) -> RigidMotion {
         let breathes = [a, b].iter().any(|p| p.heart.iter().flatten().any(|s| *s != DVec3::ZERO));
         common_motion(&self.frame_rays(a, b, None), &self.points(), self.observed.n_phases(), breathes)
     }
 
-    /// Root mean square of how far images of the heart by two sets of poses are apart, less what moves all views alike, in
-    /// the dataset's pixels.
+    /// Root mean square distance between the images of the heart at two sets of poses, without the motion common to all
+    /// views, in the dataset's pixels.
     fn distance_px(&self, a: &Poses, b: &Poses) -> f64 {
         let frames = self.frame_rays(a, b, None);
         self.motion(a, b).remainder_px(&frames, &self.points()) * self.observed.factor as f64
     }
 }
 
-/// Whether a correction takes away what vessels that are cut off cannot have caused, by the residuals (shares of the profiles)
-/// or the explained pixels before and after it.
+/// Tells whether a correction removes differences that cut-off vessels cannot have caused, judged by the residuals (shares
+/// of the profiles) or by the explained pixels before and after it.
 fn helps_clearly(correction: Correction, tried: &[(Correction, f64)], explained: [f64; 2]) -> bool {
     let residual = |of: Correction| tried.iter().find(|(c, _)| *c == of).map_or(f64::NAN, |(_, share)| share * share);
     let closer = residual(correction) <= LARGE_GAIN_LEAVES * residual(Correction::Stated);
@@ -329,7 +334,7 @@ fn helps_clearly(correction: Correction, tried: &[(Correction, f64)], explained:
         || 1.0 - explained[1] <= LEFT_UNEXPLAINED * (1.0 - explained[0])
 }
 
-/// Which correction exceeds what is to be believed.
+/// Names the first correction that exceeds the accepted bounds.
 fn out_of_bounds(observed: &Observed, poses: &Poses) -> Option<String> {
     for (slot, pose) in poses.views.iter().enumerate() {
         let view = observed.views[slot];
@@ -367,7 +372,7 @@ fn in_words(tried: &[(Correction, f64)]) -> String {
 }
 
 impl Calibration {
-    /// Says what was done, view by view.
+    /// Adds a description of the correction, view by view, to the notes.
     fn describe(&mut self) {
         let known = self.repeatability_px.map_or(String::new(), |px| format!(", repeatable to {px:.2} px"));
         let kind = match self.correction {

@@ -1,9 +1,9 @@
-//! Tells whether a dataset makes sense before anything is trained on it: do its views show one object, and if not, which of
-//! the usual mistakes makes them?
+//! Checks a dataset before training: whether its views show one object, and if not, which of the usual mistakes explains
+//! it.
 //!
-//! Views are judged by what moves in them ([`mod@agreement`]), which takes neither labels nor a reconstruction. When they
-//! disagree, the data are tried without each of the usual [`mistakes`]; the one without which they agree is named. What no
-//! set of views tells is which of a patient and the mirrored patient it shows.
+//! Views are compared by their changes over the beat ([`mod@agreement`]), which needs neither labels nor a reconstruction.
+//! When they disagree, each of the usual [`mistakes`] is undone in turn, and those after whose correction the views agree
+//! are named. No set of views can distinguish a patient from the mirrored patient.
 
 pub mod agreement;
 pub mod mistakes;
@@ -17,70 +17,70 @@ use agreement::{Agreement, Comparison, Look, agreement};
 use mistakes::{MISTAKES, Mistake, PhaseMistake, exchanged};
 use serde::Serialize;
 
-/// Without the mistake, views must disagree less than this share of what they do with it.
+/// Maximum disagreement of the views without the mistake, as a share of the disagreement with it.
 const CLEARLY_BETTER: f64 = 0.6;
-/// And less than this altogether: half of it is what unrelated views have.
+/// Maximum disagreement without the mistake: half the disagreement of unrelated views.
 const AGREES: f64 = 0.3;
-/// Explanations that are no worse than so many times the best are named, too.
+/// Explanations whose residual is at most this many times that of the best are named, too.
 const AS_GOOD: f64 = 1.25;
-/// Views that disagree more than this, with the coarsest look, show different things.
+/// Views whose disagreement at the coarse look exceeds this show different objects.
 const DISAGREES: f64 = 0.3;
-/// Share of a view's changes next to its edges from which vessels are likely to be cut off.
+/// Share of a view's changes next to its edges above which vessels are likely to be cut off.
 const CUT_OFF: f64 = 0.05;
-/// Noise, as a share of the strongest change, from which thin vessels are lost.
+/// Noise, as a share of the strongest change, above which thin vessels are lost.
 const NOISY: f64 = 0.2;
 
-/// What is seen of one view.
+/// Result for one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CheckedView {
     /// Index into [`Dataset::views`].
     pub view: usize,
     /// Primary and secondary angle, degrees, where stated.
     pub angles_deg: Option<(f64, f64)>,
-    /// Phases it has.
+    /// Number of its phases.
     pub phases: usize,
     /// Noise of a pixel, as a share of the strongest change.
     pub noise: f64,
-    /// Size, root mean square over the phases, of what moves besides vessels and is wide, as a share of the strongest change of
-    /// what is narrow; none where nothing does.
+    /// Root mean square, over the phases, of the wide motion other than that of vessels, as a share of the strongest change
+    /// of narrow structures; `None` where there is none.
     pub wide_motion: Option<f64>,
     /// Share of all change that is next to the edges of the image.
     pub at_edges: f64,
 }
 
-/// What is to be said of a dataset.
+/// Result for a dataset.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Check {
     /// Training views with at least two phases.
     pub views: Vec<CheckedView>,
-    /// How well they agree; none where no two of them can be compared.
+    /// Agreement of the views; `None` where no two of them can be compared.
     pub agreement: Option<Agreement>,
-    /// Mistakes without which they agree, likeliest first, and how to undo them: one of them was made. Empty when the data
-    /// are sound, or wrong in a way that is not among the usual ones.
+    /// Advice on the mistakes that explain a disagreement, likeliest first: one of them was made. Empty when the data are
+    /// sound, or wrong in a way that is not among the usual ones.
     pub mistakes: Vec<String>,
-    /// What else to look at.
+    /// Further points to look at.
     pub warnings: Vec<String>,
 }
 
 impl Check {
-    /// Whether views agree and no mistake was found.
+    /// Tells whether the views agree and no mistake was found.
     pub fn sound(&self) -> bool {
         self.mistakes.is_empty() && self.agreement.as_ref().is_some_and(|a| a.coarse <= DISAGREES)
     }
 }
 
-/// A mistake, and what the views show without it.
+/// A mistake, and the views without it.
 struct Explanation {
     advice: String,
     views: Views,
-    /// What the fine look leaves.
+    /// Residual of the fine look.
     fine: f64,
 }
 
-/// Looks at a dataset.
+/// Checks a dataset.
 ///
 /// # Errors
-/// [`Error::Config`] when fewer than two training views have two phases, since nothing is known of motion then.
+/// [`Error::Config`] when fewer than two training views have two phases, since motion is then unknown.
 pub fn check(dataset: &Dataset) -> Result<Check> {
     let observed = Observed::new(dataset);
     if observed.views.len() < 2 {
@@ -150,7 +150,7 @@ fn view_warnings(views: &[CheckedView]) -> Vec<String> {
     warnings
 }
 
-/// Third moment of the changes over time: vessels darken few pixels by much at a time, so it is positive.
+/// Third moment of the changes over time. It is positive, since vessels darken few pixels strongly at a time.
 fn darkens(views: &Views) -> f64 {
     let mut moment = 0.0;
     for view in &views.views {
@@ -163,7 +163,7 @@ fn darkens(views: &Views) -> f64 {
     moment
 }
 
-/// Ways in which vessels come to brighten instead of to darken.
+/// Mistakes that make vessels brighten instead of darken.
 const INVERTING: [Mistake; 2] = [Mistake::LogTwice, Mistake::LogMissing];
 
 fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<Explanation> {
@@ -206,8 +206,8 @@ fn advice_on_phases(mistake: PhaseMistake, view: usize) -> String {
     format!("view {view} is late by {} phases: subtract them from its phases, cyclically", mistake.late)
 }
 
-/// Those that explain why views disagree, best first; by the coarse look where the fine one finds none. Where vessels
-/// brighten, the best is one whatever else agrees.
+/// Advice on the explanations of a disagreement, best first, by the coarse look where the fine one finds none. Where
+/// vessels brighten, the best explanation is named even if the views agree as stated.
 fn named(stated: &Agreement, explanations: &[Explanation], inverted: bool) -> Vec<String> {
     let fine: Vec<f64> = explanations.iter().map(|e| e.fine).collect();
     let by_fine = best_of(explanations, &fine, if inverted { f64::INFINITY } else { stated.fine });
@@ -218,7 +218,7 @@ fn named(stated: &Agreement, explanations: &[Explanation], inverted: bool) -> Ve
     best_of(explanations, &coarse, stated.coarse)
 }
 
-/// Explanations with the least residuals, if these are clearly less than as stated.
+/// Advice on the explanations with the minimum residuals, if these are clearly smaller than the stated one.
 fn best_of(explanations: &[Explanation], residuals: &[f64], stated: f64) -> Vec<String> {
     let mut order: Vec<usize> = (0..residuals.len()).collect();
     order.sort_by(|a, b| residuals[*a].total_cmp(&residuals[*b]));

@@ -1,4 +1,4 @@
-//! Frames that were taken between two phases: read, written, refused, and handed to the fit.
+//! Frames taken between two phases: reading, writing, refusal, and use in the fit.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod common;
@@ -16,7 +16,7 @@ use nertca_vk::selftest::problems::drawn_fields;
 use serde_json::Value;
 use std::path::Path;
 
-/// A written dataset of three phases; the time of its first frame is `phase`.
+/// Writes a dataset of three phases in which the time of the first frame is `phase`.
 fn with_first_frame_at(directory: &Path, phase: Value) {
     writer::convert(&common::small_dataset(8, 8), Layout::Native, directory).unwrap();
     let file = directory.join("dataset.json");

@@ -1,4 +1,5 @@
-//! Scores of views that disagree, through the program: the reconstruction is compared where it is, and as stated beside.
+//! Scores of views that disagree, through the program: the comparison is made in the frame of the reconstruction, and as
+//! stated.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/known_tree.rs"]
@@ -15,13 +16,13 @@ use nertca_vk::score::calibrated::{carried_by, in_calibrated_frame};
 use serde_json::Value;
 use std::path::Path;
 
-/// Share of the true centreline that is found and of ours that is true, whichever is less.
+/// The minimum of the share of the true centreline that is found and the share of the reconstructed one that is true.
 fn within_1_mm(scores: &Value) -> f64 {
     let share = |name: &str| scores[name].as_f64().unwrap_or_else(|| panic!("{name} in {scores}"));
     share("true_centreline_found").min(share("our_centreline_true"))
 }
 
-/// Phases of a beat that tell how its views were taken.
+/// Phases of a beat, enough to find the true geometry of the views.
 const PHASES: usize = 8;
 
 fn evaluation(run: &Path) -> Value {
@@ -48,7 +49,7 @@ fn scores_in_3d_are_made_where_the_reconstruction_is() {
         assert_eq!(said.matches("\nas stated ").count(), 2, "{said}");
         let page = std::fs::read_to_string(run.join("report.html")).unwrap();
         assert_eq!(page.matches("<td>as stated</td>").count(), 2);
-        // On the way, distances are those of the same frame: the end of systole is phase 3 of 8.
+        // During training, distances are in the frame of the reconstruction as well: the end of systole is phase 3 of 8.
         let log = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
         let lines = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
         let told: Vec<Value> = lines.filter(|line| line["event"] == "validation").collect();
@@ -74,7 +75,7 @@ fn views_that_agree_are_scored_as_stated() {
     }
 }
 
-/// Angles of the second scored view are those of the first trained one, and in dataset.json they are one view.
+/// The angles of the second scored view are those of the first trained one, and in dataset.json they are one view.
 #[test]
 fn a_view_may_be_trained_and_scored() {
     let directory = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! Views that disagree are brought together from the angiograms alone.
+//! Self-calibration of views that disagree, from the angiograms alone.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -34,7 +34,7 @@ fn error_px(shot: &Shot, dataset: &Dataset) -> f64 {
     shot.error_px(&|view, phase| dataset.heart_rays_at(view, phase as u32))
 }
 
-/// What automatic calibration makes of a shot, and the error that remains, pixels.
+/// Calibrates a shot, and returns the calibration and the remaining error, pixels.
 fn calibrated(shot: &Shot, mode: &str) -> (Calibration, f64) {
     let begin = Instant::now();
     let calibration = calibrate(&shot.dataset, &config(mode)).unwrap();
@@ -81,7 +81,8 @@ fn views_are_brought_together() {
     assert_eq!(failures, Vec::<String>::new());
 }
 
-/// Puts blades before the images of the first views, each on another side, which hide about `share` of the columns or rows.
+/// Places blades in front of the images of the first views, each on another side, which hide about `share` of the columns
+/// or rows.
 fn with_blades(shot: &mut Shot, views: usize, share: f64) {
     let (width, height) = (shot.dataset.width, shot.dataset.height);
     let depth = (share * width as f64) as usize;
@@ -125,7 +126,7 @@ fn blades_do_not_pull_views_apart() {
     assert_eq!(failures, Vec::<String>::new());
 }
 
-/// Dice of the moving field at unseen views, by the default preset.
+/// Dice of the dynamic field at unseen views, with the default preset.
 fn dice(gpu: &Gpu, dataset: &Dataset) -> f64 {
     let config = config("off");
     let iterations = config.gaussian_iterations();
@@ -231,7 +232,7 @@ fn a_session_tells_how_it_sees_its_frames() {
         };
         session.add_frame(new).unwrap();
     }
-    // Corners of the heart, as pixels of a frame.
+    // Corners of the heart, projected to pixels of a frame.
     let corners = (0..8).map(|k| DVec3::new((k & 1) as f64, (k >> 1 & 1) as f64, (k >> 2) as f64) * 0.1 - 0.05);
     let corners: Vec<DVec3> = corners.collect();
     let farthest = |frame: usize, rays: &ViewRays| {
@@ -257,13 +258,13 @@ fn a_session_tells_how_it_sees_its_frames() {
         assert!(away < 1e-9, "frame {index} as corrected: {away} px");
         assert!(farthest(index, &shot.dataset.views[f.view].rays).1 > 0.5, "frame {index} was moved");
     }
-    // What is stated anew is what counts, until training takes it in.
+    // A newly stated geometry is valid until training adopts it.
     let other = shot.dataset.views[training[0].view].geometry.corrected([1.0, 0.0], DVec3::ZERO);
     session.set_geometry(0, other.clone()).unwrap();
     let (correction, away) = farthest(0, &other.rays(shot.dataset.width, shot.dataset.height).unwrap());
     assert!(correction == Correction::Stated && away < 1e-9, "{correction:?}, {away} px");
     assert_eq!(farthest(1, &corrected.heart_rays(&corrected.training()[1])).0, Correction::Breathing);
-    // What a checkpoint was corrected by is not known.
+    // The correction of a checkpoint is not known.
     session.load(session.checkpoint().unwrap()).unwrap();
     assert_eq!(farthest(1, &shot.dataset.views[training[1].view].rays).0, Correction::Stated);
     let none = session.corrected_frame(training.len()).unwrap_err().to_string();

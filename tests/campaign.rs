@@ -1,4 +1,4 @@
-//! `tools/gpu-campaign` as far as it can be tried without a GPU: its first part, as small as it goes.
+//! `tools/gpu-campaign` as far as it can be tested without a GPU: its first part, in the smallest size.
 #![cfg(unix)]
 #![allow(missing_docs, clippy::unwrap_used)]
 
@@ -22,7 +22,7 @@ fn part(out: &Path) -> Value {
 fn a_campaign_keeps_each_step_and_goes_on() {
     let dir = tempfile::tempdir().unwrap();
     let (program, out) = (env!("CARGO_BIN_EXE_nertca-vk"), dir.path().join("campaign"));
-    // No time at all: nothing is begun, and it says that something is left.
+    // With no time, nothing is started, and the program reports that parts remain.
     let none = campaign(program, &out, &["--minutes", "0"]);
     assert_eq!(none.status.code(), Some(75), "{}", String::from_utf8_lossy(&none.stderr));
     assert!(!out.join("part1.json").exists());
@@ -43,13 +43,13 @@ fn a_campaign_keeps_each_step_and_goes_on() {
     assert!(page.contains("| fast repeats, bit by bit | yes, 4 iterations |") && page.contains("rehearsal"), "{page}");
     assert!(page.contains("| `paper` | not run |"), "other parts were not asked for: {page}");
 
-    // What is there is not done again; what is not, is.
+    // Existing results are kept, missing ones are computed.
     let mut fewer = steps.clone();
     fewer.as_object_mut().unwrap().remove("devices");
     std::fs::write(out.join("part1.json"), fewer.to_string()).unwrap();
     let again = String::from_utf8(campaign(program, &out, &[]).stdout).unwrap();
     assert!(again.contains("part 1: devices") && !again.contains("part 1: selftest"), "{again}");
-    // Results of something else are not gone on with.
+    // Results of a different program are not continued.
     let mut of: Value = serde_json::from_slice(&std::fs::read(out.join("of.json")).unwrap()).unwrap();
     of["rehearsal"] = false.into();
     std::fs::write(out.join("of.json"), of.to_string()).unwrap();
@@ -63,7 +63,7 @@ fn a_campaign_keeps_each_step_and_goes_on() {
 #[test]
 fn steps_that_fail_are_rows_that_say_why() {
     let dir = tempfile::tempdir().unwrap();
-    // It lists devices and says its version, and fails at all else.
+    // The program lists devices and prints its version, and fails at everything else.
     let program = dir.path().join("program");
     let text =
         "#!/bin/sh\ncase $1 in devices) echo '[]';; --version) echo 1;; *) echo no such stage >&2; exit 3;; esac\n";

@@ -1,5 +1,5 @@
-//! Nothing is read that was not written, and nothing is written beside its buffer: every buffer of a training run and of
-//! renderings starts out with a loud pattern and has canaries behind it.
+//! Nothing is read that was not written, and nothing is written outside its buffer: every buffer of a training run and of
+//! renderings is filled with a conspicuous pattern and followed by canaries.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -19,26 +19,26 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::train::trainer::Trainer;
 use std::sync::Arc;
 
-/// NaN as f32, as either f16 half, and far out of range as an index.
+/// Pattern that is NaN as f32 and as either f16 half, and far out of range as an index.
 const NOT_A_NUMBER: u32 = 0xffc1_ffc1;
-/// Large but finite as f32 and f16, since a maximum with NaN may hide it.
+/// Pattern that is large but finite as f32 and f16, since a maximum with NaN may hide NaN.
 const LARGE: u32 = 0x7bff_7bff;
 
-/// A CPU driver, whose memory the host can reach.
+/// Opens a CPU driver, whose memory the host can access.
 fn gpu() -> Gpu {
     let select = Some("llvmpipe".to_owned());
     Gpu::open(&DeviceOptions { select, validation: true, loader: Some(shim::loader()), ..DeviceOptions::default() })
         .expect("this test needs Mesa's CPU driver (Debian: mesa-vulkan-drivers) and vulkan-validationlayers")
 }
 
-/// All parameters of Gaussians, and of the grid that moves them.
+/// All parameters of Gaussians and of the grid that moves them.
 fn parameters(field: &MovingGaussians) -> Vec<f32> {
     let of = |g: &Gaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.log_density]);
     let moves = field.tree().map_or(Vec::new(), |tree| [&tree.grid[..], &tree.own].concat());
     field.rows().rows.iter().flat_map(of).chain(moves.into_iter().flatten()).collect()
 }
 
-/// Trains a little and draws, in memory that starts out as `word`; everything that came of it, as bits.
+/// Trains briefly and renders, in memory that is filled with `word`; returns the bits of all results.
 fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning) -> Tuning) -> Vec<u32> {
     shim::begin_poison(word);
     let gpu = gpu();
@@ -77,7 +77,7 @@ fn expect_the_same(preset: &str, settings: &[&str], choose: &dyn Fn(Tuning) -> T
     assert!(one == other, "results depend on what memory held before");
 }
 
-/// Several chunks, a hull, empty cells that are learned.
+/// Several chunks, a hull, and empty cells that are learned.
 const FULL: &[&str] = &[
     "train.chunk_samples=1024",
     "train.rays=90",

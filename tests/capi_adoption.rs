@@ -1,4 +1,4 @@
-//! Devices that an application made and shares: its queue, its memory, and the features it made them with.
+//! Devices that an application creates and shares: its queue, its memory, and the features enabled in them.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 mod capi;
@@ -13,7 +13,7 @@ use std::ffi::{CString, c_void};
 use std::ptr::{null, null_mut};
 use std::sync::atomic::{AtomicI64, Ordering};
 
-/// How often an application's queue was taken, and given back.
+/// Number of times that an application's queue was locked and unlocked.
 #[derive(Default)]
 struct Uses {
     locked: AtomicI64,
@@ -33,18 +33,18 @@ unsafe extern "C" fn unlock(uses: *mut c_void) {
     );
 }
 
-/// What an application makes its device with.
+/// Features with which an application creates its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum With {
-    /// Timeline semaphores alone.
+    /// Timeline semaphores only.
     Least,
-    /// Full subgroups of a size that is asked for, too, and addresses of buffers.
+    /// Full subgroups of a requested size and buffer addresses as well.
     Subgroups,
-    /// All that kernels on matrices need besides.
+    /// Everything that matrix kernels need as well.
     Matrices,
 }
 
-/// A Vulkan application with a device of its own, under the validation layers.
+/// A Vulkan application with its own device, under the validation layers.
 struct Application {
     entry: ash::Entry,
     instance: ash::Instance,
@@ -70,7 +70,7 @@ unsafe extern "system" fn heard(
 }
 
 impl Application {
-    /// An application whose device is made so; none where the physical device does not offer it.
+    /// Creates an application with such a device; `None` where the physical device does not offer it.
     fn new(with: With) -> Option<Application> {
         unsafe {
             let entry = ash::Entry::load().unwrap();
@@ -165,7 +165,7 @@ impl Application {
 
     fn close(self) {
         unsafe {
-            // Ours to destroy: the library left it alone, and nothing of its own in it.
+            // The application destroys the device, which the library has not destroyed and in which it has left no objects.
             self.device.device_wait_idle().unwrap();
             self.device.destroy_device(None);
             self.debug.0.destroy_debug_utils_messenger(self.debug.1, None);
@@ -174,7 +174,7 @@ impl Application {
         assert_eq!(*self.messages.lock().unwrap(), Vec::<String>::new());
     }
 
-    /// Bytes of a descriptor's memory, imported as another API would.
+    /// Reads the memory of a descriptor, imported as another API would.
     fn import(&self, fd: i32, bytes: u64) -> Vec<f32> {
         unsafe {
             let opaque = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
@@ -219,7 +219,7 @@ fn adopted(vulkan: &nertca_vulkan, options: &str) -> *mut nertca_context {
     context
 }
 
-/// What adopting a device says when it is refused.
+/// Returns the message when the adoption of a device is refused.
 fn refused(vulkan: &nertca_vulkan) -> String {
     let mut context = null_mut();
     let status = unsafe { nertca_context_adopt(vulkan, null(), null(), &mut context) };
@@ -227,7 +227,7 @@ fn refused(vulkan: &nertca_vulkan) -> String {
     last_error(null::<c_void>())
 }
 
-/// The vessels after a short training of a network, and how it was computed.
+/// Returns the vessels after a short training of a network, and a description of the context.
 fn trained(context: *mut nertca_context) -> (Vec<f32>, serde_json::Value) {
     let made = reconstruction(context, &format!("preset = fast-mlp\n{SMALL}"));
     add_frames(made, 0..3);
@@ -262,13 +262,13 @@ fn a_device_made_with_subgroups_and_matrices_computes_as_ours_does() {
 fn what_is_not_said_is_not_used() {
     let least = Application::new(With::Least).unwrap();
     let mut vulkan = least.describe();
-    // A caller of the version before; what lies behind its struct is not looked at.
+    // A caller of the previous version: memory behind its struct is not read.
     vulkan.size = std::mem::offset_of!(nertca_vulkan, subgroup_size_control);
     (vulkan.subgroup_size_control, vulkan.cooperative_matrix) = (77, 77);
     let (_, described) = trained(adopted(&vulkan, ""));
     assert!(described["device"]["full_subgroups"].is_null());
     assert_eq!(described["device"]["matrices"], serde_json::json!([]));
-    // Claims that cannot be true.
+    // These claims cannot be true.
     let vulkan = nertca_vulkan { cooperative_matrix: 1, ..least.describe() };
     assert!(refused(&vulkan).contains("needs subgroup_size_control"), "{}", refused(&vulkan));
     if Application::new(With::Matrices).map(Application::close).is_none() {
@@ -295,7 +295,7 @@ fn a_device_is_shared_with_its_owner() {
         assert!(size >= bytes);
         let theirs = application.import(fd, size);
         assert_eq!(theirs[..ours.len()], ours, "what was drawn, in memory of another API");
-        // Freed here, it stays theirs: a second descriptor outlives the buffer.
+        // The memory stays valid after the buffer is freed: a second descriptor outlives the buffer.
         ok(unsafe { nertca_buffer_export_fd(buffer, &mut fd, null_mut()) }, buffer);
         assert_eq!(unsafe { nertca_context_destroy(context) }, NERTCA_ERROR_BUSY);
         ok(nertca_buffer_destroy(buffer), buffer);

@@ -1,5 +1,5 @@
-//! The examples are built as their users would build them and run on the device at hand: with gcc and clang, under the
-//! address and undefined-behaviour sanitizers, under valgrind; in C++ and in Python.
+//! The examples are built as users would build them and run on the available device: with gcc and clang, under the address
+//! and undefined-behaviour sanitizers, under valgrind; in C++ and in Python.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod capi;
@@ -54,14 +54,14 @@ fn embed_reconstructs_what_it_was_given() {
 fn live_draws_while_it_trains() {
     let dir = tempfile::tempdir().unwrap();
     let binary = compile("gcc", &["-std=c99"], &example("c/live.c"), dir.path());
-    // It ends badly, and says why, where no pictures come, training stands still, or pictures do not follow it.
+    // The example fails with a message if there are no pictures, if training stops, or if pictures do not follow training.
     let said = String::from_utf8(run(Command::new(binary).args(["12", "20", "validation = true"])).stdout).unwrap();
     assert!(said.contains("12 pictures of 200 x 200 while training"), "{said}");
     assert!(number_after(&said, "\ntraining: ") > 0.0 && number_after(&said, "median ") > 0.0, "{said}");
 }
 
-/// Lavapipe's manifest and library. Leaks are looked for on this one driver: a loader opens and closes every driver and
-/// layer of a machine, and what those lose would be reported as an unknown module's.
+/// Manifest and library of lavapipe. Leaks are checked on this one driver only: a loader opens and closes every driver and
+/// layer of a machine, and their leaks would be reported for an unknown module.
 fn lavapipe() -> (PathBuf, PathBuf) {
     let directories = ["/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d"];
     let manifest = directories
@@ -72,14 +72,14 @@ fn lavapipe() -> (PathBuf, PathBuf) {
         .unwrap_or_else(|| panic!("lavapipe (Debian: mesa-vulkan-drivers) is needed in one of {directories:?}"));
     let content: serde_json::Value = serde_json::from_slice(&std::fs::read(&manifest).unwrap()).unwrap();
     let library = Path::new(content["ICD"]["library_path"].as_str().unwrap());
-    // With a directory, it is relative to the manifest; a bare name is looked for where libraries are.
+    // A path with a directory is relative to the manifest; a bare name is searched in the library directories.
     let beside = library.components().count() > 1;
     let library = if beside { manifest.parent().unwrap().join(library) } else { library.to_path_buf() };
     (manifest, library)
 }
 
-/// The driver compiles at run time and keeps what it likes: leaks are looked for in what the example and the library
-/// allocate, not there.
+/// The driver compiles at run time and keeps memory: leaks are checked in the allocations of the example and of the library
+/// only.
 fn run_sanitized(compiler: &str, dir: &Path) {
     let keep = root().join("tests/capi/keep_driver.c");
     let flags = ["-std=c99", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"];
@@ -107,7 +107,7 @@ fn embed_is_clean_under_sanitizers() {
 #[test]
 fn embed_is_clean_under_valgrind() {
     let dir = tempfile::tempdir().unwrap();
-    // valgrind cannot run every instruction a driver may compile for this machine, so this one stays without a device.
+    // valgrind cannot run every instruction that a driver may compile for this machine, so this program uses no device.
     let source = dir.path().join("without_device.c");
     std::fs::write(
         &source,

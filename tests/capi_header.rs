@@ -1,5 +1,5 @@
-//! The header is what the sources say, is clean in C and C++, and changes of the ABI are seen: `tests/capi/abi.txt` holds
-//! every exported symbol, constant and struct layout. `tools/bless` rewrites both files.
+//! The header agrees with the sources, compiles without warnings in C and C++, and changes of the ABI are detected:
+//! `tests/capi/abi.txt` holds every exported symbol, constant and struct layout. `tools/bless` rewrites both files.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod capi;
@@ -8,7 +8,7 @@ use capi::{compile, library, root};
 use std::fmt::Write as _;
 use std::process::Command;
 
-/// Compares a committed file with what it should be, or rewrites it when asked to.
+/// Compares a committed file with its expected content, or rewrites it on request.
 fn expect_file(path: &str, wanted: &str) {
     let file = root().join(path);
     if std::env::var_os("NERTCA_BLESS").is_some() {
@@ -60,7 +60,7 @@ fn the_header_is_clean_in_c_and_cpp() {
                 .arg(root().join("include").join(header))
                 .output()
                 .unwrap_or_else(|e| panic!("{compiler}: {e}"));
-            // Compiling a header by itself is what is meant here.
+            // The header is compiled as a main file on purpose.
             let said = String::from_utf8_lossy(&outcome.stderr).replace("#pragma once in main file", "");
             assert!(outcome.status.success(), "{compiler} {header}: {said}");
         }
@@ -82,7 +82,7 @@ fn the_abi_is_what_it_was() {
         .filter_map(|l| l.strip_prefix("#define NERTCA_")?.split(' ').next())
         .filter(|n| *n != "VK_H")
         .collect();
-    // Sizes and offsets, as a C compiler sees them.
+    // Sizes and offsets as computed by a C compiler.
     let mut program = String::from("#include \"nertca_vk.h\"\n#include <stdio.h>\nint main(void) {\n");
     for name in constants {
         writeln!(program, "printf(\"NERTCA_{name} %d\\n\", (int)NERTCA_{name});").unwrap();

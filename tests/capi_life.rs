@@ -1,4 +1,4 @@
-//! What the C ABI promises: formats, gating, determinism, limits, many threads.
+//! Guarantees of the C ABI: formats, gating, determinism, limits, many threads.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 mod capi;
@@ -25,7 +25,7 @@ fn bytes_of(reconstruction: *mut nertca_reconstruction) -> Vec<u8> {
         let mut bytes = vec![0u8; length];
         let to = bytes.as_mut_ptr().cast();
         let status = unsafe { nertca_reconstruction_save_memory(reconstruction, to, bytes.len(), &mut length) };
-        // Training went on in between, and its state has grown.
+        // Training has continued in between, and its state has grown.
         if status == NERTCA_ERROR_BUFFER {
             assert!(length > bytes.len(), "{length} bytes are needed, {} were given", bytes.len());
             continue;
@@ -50,7 +50,7 @@ fn far(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b).abs() / scale).fold(0.0, f32::max)
 }
 
-/// Makes the frame of a view and phase and hands it on, while its pixels live.
+/// Creates the frame of a view and phase and passes it on while its pixels are alive.
 type Prepare<'a> = dyn Fn(usize, u32, &mut dyn FnMut(&nertca_frame)) + 'a;
 
 #[test]
@@ -77,7 +77,7 @@ fn pixel_formats_strides_and_intensities_mean_the_same() {
         add(&nertca_frame { scale: 1e-4, ..frame(view, phase, &pixels) });
     });
     let shorts = checkpoint(&|view, phase, add| {
-        // Rows 7 pixels further apart than they are long.
+        // Rows are 7 pixels longer than the image's width.
         let mut padded = Vec::new();
         for row in codes(view, phase).chunks(SIZE as usize) {
             padded.extend_from_slice(row);
@@ -116,7 +116,7 @@ fn pixel_formats_strides_and_intensities_mean_the_same() {
 #[test]
 fn a_reconstruction_lives_from_frames_to_scores() {
     let context = context("validation = true");
-    // A hull and smooth fields, so that vessels come out in few iterations.
+    // A hull and smooth fields make vessels appear within few iterations.
     let settings = SMALL
         .replace("hull.enabled = false", "hull.resolution = 48\nhull.noise_sigmas = 0\nhull.dilate_pixels = 1")
         .replace(
@@ -137,7 +137,7 @@ fn a_reconstruction_lives_from_frames_to_scores() {
     assert_eq!(train(made, 40), 40);
     assert_eq!(train(made, 40), 20, "the run has 60 iterations");
     assert_eq!(train(made, 40), 0);
-    // Live quality is what the fields say, but for its cells; both come from the same parameters.
+    // Live quality shows the fields, except for the resolution of its cells; both use the same parameters.
     for component in [NERTCA_COMPONENT_TOTAL, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_DYNAMIC] {
         let live = drawn(made, &nertca_view { component, ..view(2) });
         let fields = drawn(made, &exact(2, component));
@@ -148,7 +148,7 @@ fn a_reconstruction_lives_from_frames_to_scores() {
     let parts = [NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_DYNAMIC].map(|c| drawn(made, &exact(2, c)));
     let sum: Vec<f32> = parts[0].iter().zip(&parts[1]).map(|(s, d)| s + d).collect();
     assert!(far(&total, &sum) < 1e-5);
-    // 8 bits, with a stride that leaves what is between rows alone.
+    // An 8-bit image with a stride; the bytes between rows are left unchanged.
     let apart = SIZE as usize + 5;
     let mut codes = vec![77u8; apart * SIZE as usize];
     let (low, high) = (0.0, f64::from(total.iter().fold(0f32, |m, v| m.max(*v))));
@@ -168,8 +168,8 @@ fn a_reconstruction_lives_from_frames_to_scores() {
             assert!((f64::from(*code) - 255.0 * f64::from(*value) / high).abs() <= 1.0);
         }
     }
-    // The volume integrates to the picture: sums over left of a straight look from the patient's left, almost parallel.
-    // Fine enough for sums of Gaussians, which are sharper than a cell of a coarse grid.
+    // The volume's integral equals the picture: sums over left, for an almost parallel view from the patient's left. The
+    // grid is fine enough for sums of Gaussians, which are sharper than a cell of a coarse grid.
     let n = 96u32;
     let grid = nertca_grid {
         size: size_of::<nertca_grid>(),
@@ -208,7 +208,7 @@ fn a_reconstruction_lives_from_frames_to_scores() {
     let volume: f32 = mean(&|p, s| summed(p, s), &|_, _| 1.0);
     assert!(all > 0.5, "there is something to see: {all}");
     assert!((volume / all - 1.0).abs() < 0.1, "sum of the volume {volume}, of the picture {all}");
-    // Centres of mass: posterior against columns, superior against rows.
+    // The centres of mass are compared: posterior with columns, superior with rows.
     let half = (n - 1) as f32 / 2.0;
     let across = mean(&|i, j| picture[j * n as usize + i], &|i, _| i as f32 - half) / all;
     let down = mean(&|i, j| picture[j * n as usize + i], &|_, j| j as f32 - half) / all;
@@ -252,7 +252,7 @@ fn saved_and_continued_is_as_if_never_stopped_and_runs_repeat() {
     assert_eq!(bytes_of(resumed), straight, "as if never stopped");
     ok(unsafe { nertca_reconstruction_save(resumed, path.as_ptr()) }, resumed);
 
-    // What a deterministic context refuses.
+    // These calls are refused by a deterministic context.
     ok(unsafe { nertca_reconstruction_start(resumed, None, null_mut()) }, resumed);
     let more = pixels(0, 0);
     let status = unsafe { nertca_reconstruction_add_frame(resumed, &frame(0, 0, &more)) };
@@ -294,7 +294,7 @@ fn geometry_is_told_and_can_be_known_better_later() {
     train(given, 3);
     let (a, b) = (drawn(corrected, &exact(1, NERTCA_COMPONENT_TOTAL)), drawn(given, &exact(1, NERTCA_COMPONENT_TOTAL)));
     assert_eq!(a, b, "frames whose geometry was stated anew");
-    // The matrix is the geometry: a C-arm drawn by one is drawn as by the other.
+    // The matrix describes the geometry: rendering by it equals rendering by the C-arm.
     let seen = correction(corrected, 4);
     assert_eq!((seen.kind, seen.heart_shift_mm), (NERTCA_CORRECTION_STATED, [0.0; 3]));
     let by_angles = nertca_view { geometry: geometry(1), ..exact(1, NERTCA_COMPONENT_TOTAL) };
@@ -306,7 +306,7 @@ fn geometry_is_told_and_can_be_known_better_later() {
     close(context, &[corrected, given]);
 }
 
-/// The corner of an image that a small detector beside its middle sees, and its geometry.
+/// The corner of an image that a small off-centre detector sees, and its geometry.
 fn corner_of(view: usize, phase: u32, [columns, rows]: [u32; 2]) -> (Vec<f32>, nertca_geometry) {
     let first = SIZE - columns;
     let kept = |p: &usize| *p as u32 % SIZE >= first && (*p as u32 / SIZE) < rows;
@@ -336,7 +336,7 @@ fn frames_of_different_sizes_go_together() {
         };
         ok(unsafe { nertca_reconstruction_add_frame(to, &frame) }, to);
     };
-    // Of no known phase, and larger than all that is trained on at first.
+    // A frame without a known phase, and larger than all first training images.
     let image = pixels(0, 0);
     let stamped = nertca_frame { phase: -1, time_s: 1.0, ..frame(0, 0, &image) };
     ok(unsafe { nertca_reconstruction_add_frame(mixed, &stamped) }, mixed);
@@ -346,12 +346,12 @@ fn frames_of_different_sizes_go_together() {
         (0..3).for_each(|view| add(whole, view, phase, large, train_on));
     }
     train(mixed, 5);
-    // Larger ones come later; a small one is scored.
+    // Larger images are added later; a small one is scored.
     (0..PHASES).for_each(|phase| add(mixed, 2, phase, large, train_on));
     add(mixed, 2, 1, small, score);
     train(mixed, 40);
     train(whole, 40);
-    // A cropped frame is seen where it was, three columns further to the left.
+    // A cropped frame keeps its place, three columns further to the left.
     let (seen, was) = (correction(mixed, 2).matrix, correction(whole, 1).matrix);
     let scale = was.iter().flatten().fold(0f64, |m, v| m.max(v.abs()));
     for k in 0..4 {
@@ -379,7 +379,7 @@ fn time_stamps_and_r_peaks_give_phases() {
     for view in 0..3 {
         for phase in 0..PHASES {
             let pixels = pixels(view, phase);
-            // In the middle of the phase, and of different beats: 0.8 s long, the second R-peak at 1.0 s.
+            // The time is the middle of the phase, in different beats of 0.8 s, with the second R-peak at 1.0 s.
             let share = (f64::from(phase) + 0.5) / f64::from(PHASES);
             let since_r_s = if share < SYSTOLE_SHARE {
                 SYSTOLE_S * share / SYSTOLE_SHARE
@@ -403,7 +403,7 @@ fn time_stamps_and_r_peaks_give_phases() {
     close(context, &[stamped, given]);
 }
 
-/// Waits for something that must come, however busy the machine is; whoever waits this long waits in vain.
+/// Waits for an expected event on a possibly busy machine; exceeding the limit is a failure.
 #[track_caller]
 fn wait_until(what: &str, come: impl Fn() -> bool) {
     const PATIENCE: Duration = Duration::from_secs(900);
@@ -442,7 +442,7 @@ fn frames_come_in_while_training_goes_on() {
     close(context, &[live]);
 }
 
-/// A handle that threads may share, as the header says they may.
+/// A handle shared between threads, as the header permits.
 #[derive(Clone, Copy)]
 struct Shared(*mut nertca_reconstruction);
 unsafe impl Send for Shared {}
@@ -494,9 +494,9 @@ fn threads_draw_save_and_cancel_while_two_reconstructions_train() {
                     }
                 });
             }
-            // Once something was trained, there is something to draw for good.
+            // After the first iteration, rendering always succeeds.
             wait_until("training", || both.iter().all(|r| progress(*r).step > 0));
-            // Ended at a different moment every time: by the callback, or by a stop.
+            // Training ends at a different moment every time, by the callback or by a stop.
             pauses = pauses.wrapping_mul(6_364_136_223_846_793_005) % 997;
             std::thread::sleep(Duration::from_millis(20 + pauses % 150));
             limits.iter().for_each(|limit| limit.store(0, Ordering::Relaxed));
@@ -513,7 +513,7 @@ fn threads_draw_save_and_cancel_while_two_reconstructions_train() {
         }
     }
     assert_eq!(drawings.load(Ordering::Relaxed), ROUNDS * 4 * PHASES);
-    // Destroying one that trains stops it first.
+    // Destroying a reconstruction in training stops it first.
     ok(unsafe { nertca_reconstruction_start(both[0], None, null_mut()) }, both[0]);
     close(context, &both);
 }

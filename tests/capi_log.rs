@@ -1,5 +1,5 @@
-//! Every context of a process gets its own messages, whoever came by first. One test, alone in its process: what a process
-//! remembers of its log statements is what it is about.
+//! Every context of a process gets its own messages, whichever came first. This is one test, alone in its process, because
+//! it concerns the process's cached log statements.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 #![allow(clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
@@ -21,7 +21,7 @@ unsafe extern "C" fn hear(_: u32, text: *const c_char, user: *mut c_void) {
     heard.lock().unwrap().push(unsafe { CStr::from_ptr(text) }.to_string_lossy().into_owned());
 }
 
-/// A context whose end is told of: its pipelines cannot be kept in a directory that cannot be.
+/// Opens a context whose end is logged: its pipeline cache cannot be written to an impossible directory.
 fn open(log: Option<&Heard>) -> *mut nertca_context {
     let log = log.map(|heard| nertca_log {
         size: size_of::<nertca_log>(),
@@ -49,14 +49,14 @@ fn expect_one(heard: &Heard) {
 
 #[test]
 fn a_context_without_a_log_silences_no_other() {
-    // The only log there is, when a thread without one is the first to have something to say.
+    // This is the only log, while a thread without one logs first.
     let first = Heard::default();
     let listening = open(Some(&first));
     std::thread::scope(|scope| scope.spawn(|| close(open(None))).join().unwrap());
     close(listening);
     expect_one(&first);
 
-    // In whatever order threads with and without a log come by.
+    // Threads with and without a log arrive in any order.
     for _ in 0..6 {
         let heard: [Heard; 2] = Default::default();
         let together = Barrier::new(4);

@@ -1,4 +1,4 @@
-//! Every function of the C ABI, every argument, wrong in every way that can be told: a status and a text, never worse.
+//! Every function of the C ABI with every detectable error in every argument: the result is a status and a message.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 mod capi;
@@ -19,7 +19,7 @@ use std::collections::BTreeSet;
 use std::ffi::{CString, c_char, c_void};
 use std::ptr::{null, null_mut, without_provenance_mut};
 
-/// What the cases work on, and which functions they covered.
+/// Objects that the cases use, and the functions they have covered.
 struct Bench {
     context: *mut nertca_context,
     bare: *mut nertca_reconstruction,
@@ -29,7 +29,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// A call that must fail with a status, whose text names `part`.
+    /// Checks a call that must fail with a status and a message that names `part`.
     #[track_caller]
     fn refuses(&self, function: &str, wanted: nertca_status, part: &str, got: nertca_status) {
         self.covered.borrow_mut().insert(function.to_owned());
@@ -392,7 +392,7 @@ fn checkpoints(b: &Bench) {
     );
     whole.truncate(length);
     b.refuses(read, NERTCA_ERROR_DATA, "memory", load_bytes(b.bare, &whole[..length / 2]));
-    // A truncated header, and numbers that are not finite.
+    // A truncated header, and values that are not finite.
     b.refuses(read, NERTCA_ERROR_DATA, "memory", load_bytes(b.bare, &whole[8..]));
     let last = whole.len() - 4;
     let header = u64::from_le_bytes(whole[..8].try_into().unwrap()) as usize;
@@ -642,7 +642,7 @@ fn buffers(b: &Bench) {
 }
 
 fn texts(b: &Bench) {
-    // Each of these is asked for with every wrong room.
+    // Each of these is called with every wrong buffer size.
     type Ask<'a> = Box<dyn Fn(*mut c_char, usize, *mut usize) -> nertca_status + 'a>;
     let asks: [(&str, Ask<'_>); 4] = [
         ("nertca_devices", Box::new(|t, s, l| unsafe { nertca_devices(t, s, l) })),

@@ -1,6 +1,7 @@
-//! Random sequences of calls, with random arguments and handles that are alive, stale, foreign or made up: nothing
-//! crashes, nothing leaks, the validation layers stay silent. `NERTCA_RANDOM_SEQUENCES` and
-//! `NERTCA_RANDOM_DEVICE_SEQUENCES` set how many; a failure names its seed, and `NERTCA_RANDOM_SEED` repeats it.
+//! Random sequences of calls, with random arguments and handles that are alive, stale, foreign or invented: nothing
+//! crashes, nothing leaks, and the validation layers report nothing. `NERTCA_RANDOM_SEQUENCES` and
+//! `NERTCA_RANDOM_DEVICE_SEQUENCES` set the numbers of sequences; a failure names its seed, and `NERTCA_RANDOM_SEED`
+//! repeats it.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
 mod capi;
@@ -33,7 +34,7 @@ impl Random {
         (self.next() % n as u64) as usize
     }
 
-    /// One of the choices, or sometimes anything.
+    /// Returns one of the choices.
     fn pick<T: Copy>(&mut self, choices: &[T]) -> T {
         choices[self.below(choices.len())]
     }
@@ -44,14 +45,14 @@ impl Random {
     }
 }
 
-/// What a sequence has made so far, alive or not.
+/// Objects that a sequence has created so far, alive or not.
 struct Pool {
     random: Random,
     contexts: Vec<*mut nertca_context>,
     reconstructions: Vec<*mut nertca_reconstruction>,
     buffers: Vec<*mut nertca_buffer>,
     device: bool,
-    /// Kept from sequence to sequence, since opening a device takes long; a sequence may destroy it.
+    /// Context kept from sequence to sequence, since opening a device takes long; a sequence may destroy it.
     base: Option<*mut nertca_context>,
     statuses: [u32; 32],
 }
@@ -83,7 +84,7 @@ impl Pool {
         self.handle(&all)
     }
 
-    /// A geometry that is mostly good.
+    /// A geometry that is mostly valid.
     fn geometry(&mut self) -> nertca_geometry {
         let mut g = geometry(self.random.below(3));
         match self.random.below(12) {
@@ -169,7 +170,7 @@ impl Pool {
                     9 => frame.i0 = self.random.number(),
                     _ => (),
                 }
-                // What the caller vouches for must hold.
+                // The caller's guarantees must hold.
                 frame.pixels_bytes = frame.pixels_bytes.min(size_of_val(&data[..]));
                 if frame.size > size_of::<nertca_frame>() {
                     frame.size = size_of::<nertca_frame>();
@@ -228,7 +229,7 @@ impl Pool {
                 unsafe { nertca_reconstruction_evaluate(self.reconstruction(), threshold, &mut scores) }
             }
             22 => {
-                // From one into another, now and then damaged.
+                // Copies a state from one into another, sometimes damaged.
                 let (from, to) = (self.reconstruction(), self.reconstruction());
                 let mut length = 0;
                 let mut status = unsafe { nertca_reconstruction_save_memory(from, null_mut(), 0, &mut length) };
@@ -295,7 +296,7 @@ impl Pool {
             assert_ne!(status, NERTCA_ERROR_INTERNAL, "{}", last_error(null::<u8>()));
             self.statuses[-status as usize] += 1;
         }
-        // Everything alive can be destroyed, in the order the header asks for.
+        // All living objects can be destroyed, in the order that the header requires.
         for r in std::mem::take(&mut self.reconstructions) {
             let status = unsafe { nertca_reconstruction_destroy(r) };
             assert!([NERTCA_OK, NERTCA_ERROR_HANDLE].contains(&status), "{}", last_error(r));
@@ -327,7 +328,7 @@ fn sequences(device: bool, count: u64, steps: usize) {
     for seed in given.map_or(0..count, |seed| seed..seed + 1) {
         pool.random = Random(seed.wrapping_mul(0x1234_5678_9abc_def1));
         let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-            // Most sequences want something to work on.
+            // Most sequences need an object to work on.
             let options = if device { "validation = true" } else { "device = none" };
             let alive = |base: &*mut nertca_context| unsafe {
                 nertca_context_describe(*base, null_mut(), 0, &mut 0) == NERTCA_OK

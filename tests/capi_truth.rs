@@ -1,4 +1,4 @@
-//! Scores against the true vessels through the C ABI are those that `eval` makes of the same run.
+//! Scores against the true vessels through the C ABI equal those of `eval` for the same run.
 #![allow(
     missing_docs,
     clippy::unwrap_used,
@@ -63,7 +63,7 @@ fn add_frames(to: *mut nertca_reconstruction, dataset: &Dataset) {
     }
 }
 
-/// Voxels that reach half of the vessels' attenuation, on their grid.
+/// Voxels with at least half of the vessels' attenuation, on their grid.
 fn true_vessels(data: &Path, phase: u32, vessel_per_mm: f64) -> (nertca_grid, Vec<u8>) {
     let volume = Volume::read(&truth_file(&data.join(VOLUMES), phase), &VolumeHints::default()).unwrap();
     let axes = volume.index_to_lps.matrix3;
@@ -78,7 +78,7 @@ fn true_vessels(data: &Path, phase: u32, vessel_per_mm: f64) -> (nertca_grid, Ve
     (grid, volume.values.iter().map(|v| u8::from(f64::from(*v) > 0.5 * vessel_per_mm)).collect())
 }
 
-/// The arrays of a tree over the beat.
+/// Arrays of a tree over the beat.
 #[derive(Default)]
 struct Lines {
     branch_phase: Vec<u32>,
@@ -187,13 +187,13 @@ fn scores_in_3d_are_those_of_eval() {
         close_to(name, value, "tree", key);
     }
 
-    // A caller of the version before: what it knows is told, and what lies behind it is left alone.
+    // A caller of the previous version: the fields it knows are set, and the memory behind them is left unchanged.
     let known = std::mem::offset_of!(nertca_scores, volume_phases);
     let mut shorter = nertca_scores { size: known, chamfer_mm: 77.0, ..zeroed() };
     ok(unsafe { nertca_reconstruction_evaluate(made, 0.0, &mut shorter) }, made);
     assert_eq!((shorter.size, shorter.psnr_db, shorter.chamfer_mm), (known, found.psnr_db, 77.0));
 
-    // Phases and trees are forgotten, too.
+    // Phases and trees can be removed as well.
     let (grid, vessels) = true_vessels(&data, 3, vessel_per_mm);
     ok(unsafe { nertca_reconstruction_set_true_vessels(made, &grid, null(), 0) }, made);
     let none = nertca_tree { size: size_of::<nertca_tree>(), ..zeroed() };
@@ -201,7 +201,7 @@ fn scores_in_3d_are_those_of_eval() {
     let fewer = scores(made);
     assert_eq!((fewer.volume_phases, fewer.tree_phases), (PHASES - 1, 0));
 
-    // What cannot be is named.
+    // Errors name invalid arguments.
     let set_vessels = |grid: &nertca_grid, bytes: usize, at: *const u8| unsafe {
         nertca_reconstruction_set_true_vessels(made, grid, at, bytes)
     };

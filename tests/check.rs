@@ -1,4 +1,5 @@
-//! Datasets with one of the usual mistakes are told from sound ones. The mistakes are made here, by loops of their own.
+//! Datasets with one of the usual mistakes are distinguished from sound ones. The mistakes are made here by independent
+//! loops.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use glam::DVec3;
@@ -11,7 +12,7 @@ use std::f64::consts::TAU;
 const PHASES: u32 = 8;
 const SIZE: usize = 100;
 
-/// What is not perfect, though no mistake.
+/// Imperfections that are no mistakes.
 #[derive(Debug, Clone, Copy, Default)]
 struct Flaws {
     seed: u32,
@@ -78,7 +79,7 @@ fn angiograms(n_views: usize, flaws: Flaws) -> Dataset {
     }
 }
 
-/// Centres and radii of a vessel at a moment of the beat, 100 mm: fast and strong contraction, slow return.
+/// Centres and radii of a vessel at a moment of the beat, 100 mm: fast and strong contraction, slow relaxation.
 fn blobs(seed: u32, moment: f64) -> Vec<(DVec3, f64)> {
     let of = |k: u32| uniform01(seed, STREAM_PHOTON, 7, k);
     let beat = if moment < 0.35 { (TAU * moment / 1.4).sin() } else { (TAU * (1.0 - moment) / 2.6).sin() };
@@ -179,7 +180,7 @@ fn views_that_have_nothing_to_do_with_each_other_are_told() {
     let (mut mixed, other) =
         (angiograms(3, Flaws { seed: 1, ..Flaws::default() }), angiograms(3, Flaws { seed: 9, ..Flaws::default() }));
     for (frame, stranger) in mixed.frames.iter_mut().zip(other.frames).filter(|(f, _)| f.view > 0) {
-        // Two of them, one turned, so that no single mistake explains it.
+        // Two views are foreign, one of them rotated, so that no single mistake explains the disagreement.
         frame.integrals = stranger.integrals;
         if frame.view == 2 {
             frame.integrals.reverse();

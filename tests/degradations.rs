@@ -1,5 +1,5 @@
-//! Degraded phantoms: each factor changes what it should and nothing else, and `truth.json` says by how much. What the
-//! truth says is put to the test with pictures made from volumes directly.
+//! Degraded phantoms: each factor has its intended effect and no other, and `truth.json` states its size. The truth is
+//! tested with images made directly from volumes.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -67,12 +67,12 @@ impl Set {
         }
     }
 
-    /// The truth of the same image.
+    /// Truth of the image with this name.
     fn same_truth(&self, truth: &TrueFrame) -> &TrueFrame {
         self.truth.frames.iter().find(|t| t.image == truth.image).unwrap()
     }
 
-    /// The image of the same name.
+    /// Image with this name.
     fn same<'a>(&'a self, frame: &Frame) -> &'a Frame {
         self.dataset.frames.iter().find(|f| f.name == frame.name).unwrap()
     }
@@ -111,7 +111,7 @@ fn c_arms() -> CArmOptions {
     CArmOptions { sod_mm: vec![750.0], sid_mm: vec![1100.0], pixel, offset_mm: vec![[0.0; 2]] }
 }
 
-/// Files of a patient: a tree that beats, and a CT.
+/// Files of a patient: a beating tree, and a CT.
 struct Files {
     directory: TempDir,
 }
@@ -119,7 +119,7 @@ struct Files {
 impl Files {
     fn new() -> Files {
         let directory = tempfile::tempdir().unwrap();
-        // Two vessels that leave each other; RAS mm.
+        // Two vessels that share their origin; RAS mm.
         let phase = |p: usize| {
             let beat = 8.0 * (std::f64::consts::PI * p as f64 / 10.0).sin().powi(2);
             let vessel = |side: f64| {
@@ -136,7 +136,7 @@ impl Files {
             "points_mm": (0..10).map(phase).collect::<Vec<_>>(),
         });
         std::fs::write(directory.path().join("tree.json"), tree.to_string()).unwrap();
-        // A chest in Hounsfield units: soft, with bands that tell heights apart.
+        // A chest in Hounsfield units: soft tissue, with bands that distinguish heights.
         let n = 40;
         let bands = |i: usize| if (i / (n * n)) % 5 < 2 { 150.0 } else { -50.0 };
         let ct = Volume::centred([n; 3], 5.0, DVec3::ZERO, (0..n * n * n).map(bands).collect());
@@ -163,7 +163,7 @@ impl Files {
     }
 }
 
-/// Pictures of volumes, without any of the ways of datasets.
+/// Images of volumes, computed independently of the dataset code.
 struct Pictures {
     projector: Projector,
 }
@@ -180,7 +180,7 @@ impl Pictures {
     }
 }
 
-/// The vessels of the procedural phantom, and what is around them, at a fraction of its beat.
+/// Vessels of the procedural phantom, and their surroundings, at a fraction of its beat.
 fn thorax_at(fraction: f64, phases: u32) -> (Volume, [Volume; 2]) {
     const SCALE: f64 = 0.37;
     let tissues = Tissues::XCAT;
@@ -198,7 +198,7 @@ fn thorax_at(fraction: f64, phases: u32) -> (Volume, [Volume; 2]) {
     (vessels, [still, moving])
 }
 
-/// The procedural phantom as it is seen at a fraction of its beat.
+/// Image of the procedural phantom at a fraction of its beat.
 fn thorax_image(pictures: &Pictures, c_arm: &CArm, fraction: f64) -> Vec<f32> {
     let (vessels, [still, moving]) = thorax_at(fraction, PHASES);
     let mut image = pictures.of(still, c_arm);
@@ -208,7 +208,7 @@ fn thorax_image(pictures: &Pictures, c_arm: &CArm, fraction: f64) -> Vec<f32> {
     image
 }
 
-/// Largest difference as a share of the largest value.
+/// Maximum difference as a share of the maximum value.
 fn difference(a: &[f32], b: &[f32]) -> f32 {
     let most = b.iter().fold(0f32, |m, v| m.max(v.abs()));
     a.iter().zip(b).fold(0f32, |m, (a, b)| m.max((a - b).abs())) / most
@@ -286,14 +286,14 @@ fn the_heart_breathes_by_what_the_truth_says() {
     let mut first_shifts = Vec::new();
     for (frame, truth) in bare.frames() {
         let [posterior, left, superior] = truth.heart_shift_mm;
-        // A patient that the table has carried is seen where one that breathed is.
+        // A patient moved by the table appears in the same place as one moved by breathing.
         let c_arm = CArm { table_mm: [left, posterior, superior], ..truth.geometry.clone() };
         let still = tree.at(truth.beat_phase / f64::from(PHASES));
         let wanted = pictures.of(voxels::vessels(&still, bounds, IODINE, 0.5), &c_arm);
         let off = difference(&frame.integrals, &wanted);
         assert!(off < 0.02, "{}: {off}", frame.name);
         assert_eq!(truth.geometry, bare.stated(frame));
-        // The same heart stands before a chest that stays, or breathes.
+        // The chest adds the same to images with and without breathing, as long as it is static itself.
         let before = |set: &Set, other: &Set| -> Vec<f32> {
             let (a, b) = (set.same(frame), other.same(frame));
             a.integrals.iter().zip(&b.integrals).map(|(a, b)| a - b).collect()
@@ -310,7 +310,7 @@ fn the_heart_breathes_by_what_the_truth_says() {
         if truth.phase == 0 {
             first_shifts.push(superior);
         }
-        // A breath of 3 seconds while phases are taken.
+        // A breath takes 3 seconds while phases are acquired.
         let begin = bare.training().find(|(_, t)| t.view == truth.view && t.phase == 0).unwrap().1;
         let angle = |s: f64| (s / 3.0).clamp(-1.0, 1.0).asin();
         let turned = std::f64::consts::TAU * truth.time_s / 3.0;
@@ -340,7 +340,7 @@ fn photons_make_the_noise_of_their_counts() {
             assert_eq!((&frame.mask, truth), (&exact.mask, clean.same_truth(truth)));
             let open = at_detector.map_or(1e5, |photons| unattenuated(&exact.integrals, photons));
             for (value, integral) in frame.integrals.iter().zip(&exact.integrals) {
-                // Counts of n photons vary by their root, their logarithm by one over it.
+                // Counts of n photons have a standard deviation of sqrt(n), their logarithm one of 1 / sqrt(n).
                 squares += f64::from(value - integral).powi(2) * open * (-f64::from(*integral)).exp();
                 n += 1.0;
             }
@@ -372,7 +372,7 @@ fn contrast_varies_by_the_gains_of_the_truth() {
         |gains: &[f32]| gains.iter().fold(f32::MIN, |m, g| m.max(*g)) - gains.iter().fold(f32::MAX, |m, g| m.min(*g));
     let first: Vec<f32> = (0..TRAINING).map(|view| of(view).next().unwrap()).collect();
     assert!(spread(&first) > 0.03 && spread(&of(0).collect::<Vec<_>>()) > 0.01, "{gains:?}");
-    // What stands around the vessels keeps its attenuation.
+    // The surroundings of the vessels keep their attenuation.
     let pictures = Pictures::new(&gpu);
     for (frame, truth) in chest.training().take(TRAINING) {
         let vessels = pictures.of(thorax_at(f64::from(truth.phase) / f64::from(PHASES), PHASES).0, &truth.geometry);
@@ -389,7 +389,7 @@ fn contrast_varies_by_the_gains_of_the_truth() {
 fn contrast_flows_in_with_the_time_of_a_run() {
     let gpu = gpu();
     let files = Files::new();
-    // Regular phases are equal parts of a second.
+    // Regular phases are equal parts of one second.
     let (full, flowing) = (
         files.patient(&gpu, false, Degradations::default()),
         files.patient(&gpu, false, Degradations { inflow_s: 0.5, ..Degradations::default() }),
@@ -432,14 +432,14 @@ fn images_show_the_heart_at_the_time_they_are_taken() {
             assert!(off < 1e-12);
             continue;
         }
-        // Half a phase of sampling, and systoles of 280 to 340 ms where gating takes 310.
+        // The tolerance is half a phase of sampling, and systoles of 280 to 340 ms where gating assumes 310.
         assert!(off < 0.75, "{}: {off} phases", frame.name);
         between += usize::from(off > 0.02);
         let images = 15.0 * truth.time_s;
         assert!((images - images.round()).abs() < 1e-9 && truth.time_s <= 3.0 * 60.0 / 50.0);
     }
     assert!(between > PHASES as usize, "images fall between phases");
-    // Linear gating of a slow heart gives late phases to what happens early.
+    // Linear gating of a slow heart assigns late phases to early events.
     let worst = |set: &Set, view| {
         let frames = set.training().filter(|(_, t)| t.view == view);
         let off = |t: &TrueFrame| (t.beat_phase - f64::from(t.phase) + 2.5).rem_euclid(5.0) - 2.5;
@@ -454,7 +454,7 @@ fn images_show_the_heart_at_the_time_they_are_taken() {
         worst(&linear, 0),
         worst(&two_segment, 0)
     );
-    // Few images leave phases out, in the views of fast hearts first.
+    // With few images some phases are missing, first in the views of fast hearts.
     let few = files.patient(&gpu, false, rhythm(2.0, 1, BeatScaling::TwoSegment));
     let seen = |view| few.training().filter(|(_, t)| t.view == view).count();
     assert!((1..=3).contains(&seen(0)) && (1..=2).contains(&seen(2)), "{} {}", seen(0), seen(2));
@@ -463,7 +463,7 @@ fn images_show_the_heart_at_the_time_they_are_taken() {
     expect_silence(gpu);
 }
 
-/// What is hidden is found when a dataset is read, with the pixels beside it and no others.
+/// Checks that hidden pixels are found when a dataset is read, with the pixels beside them and no others.
 fn found_hidden(dataset: &Dataset, view: usize, hidden: &[bool]) {
     let found: Vec<bool> = (0..PIXELS).map(|p| !dataset.shows(view, p)).collect();
     assert!(found.iter().zip(hidden).all(|(found, hidden)| *found || !hidden), "all of it");
@@ -550,17 +550,17 @@ fn a_catheter_leads_to_the_ostium() {
     expect_silence(gpu);
 }
 
-/// Attenuation of the block that vessels lie in, 1/mm.
+/// Attenuation of the block that contains the vessels, 1/mm.
 const BLOCK: f32 = 0.01;
 
-/// The vessels of a phase, in voxels of 1 mm.
+/// Vessels of a phase, in voxels of 1 mm.
 fn vessels_of(files: &Files, phase: u32) -> Volume {
     let tree = TreeFile::read(&files.tree()).unwrap();
     let bounds = Bounds::over_the_beat(PHASES, |fraction| tree.at(fraction));
     voxels::vessels(&tree.at(f64::from(phase) / f64::from(PHASES)), bounds, IODINE, 1.0)
 }
 
-/// Files of volumes with vessels in a block, one per phase.
+/// Writes volumes with vessels in a block, one per phase.
 fn volumes(directory: &Path, files: &Files) -> Vec<PathBuf> {
     let write = |phase: u32| {
         let mut volume = vessels_of(files, phase);
@@ -600,7 +600,7 @@ fn volumes_are_degraded_like_phantoms() {
     for (frame, truth) in breathed.frames() {
         assert_eq!(truth.heart_shift_mm, breathing_patient.same_truth(truth).heart_shift_mm, "one seed, one breath");
         assert_eq!(truth.split == Split::Validation, truth.heart_shift_mm == [0.0; 3]);
-        // The block stays, the vessels go.
+        // The block is static, the vessels move.
         let [posterior, left, superior] = truth.heart_shift_mm;
         let c_arm = CArm { table_mm: [left, posterior, superior], ..truth.geometry.clone() };
         let vessels = vessels_of(&files, truth.phase);
@@ -611,7 +611,7 @@ fn volumes_are_degraded_like_phantoms() {
         assert!(off < 0.02, "{}: {off}", frame.name);
     }
     drop(pictures);
-    // Between phases the nearest volume is shown, and the truth says which.
+    // Between phases the nearest volume is shown, and the truth states which one.
     for (frame, truth) in project(rhythm(15.0, 3, BeatScaling::TwoSegment)).training() {
         let shown = truth.beat_phase.round();
         assert!((truth.beat_phase - shown).abs() < 1e-9);

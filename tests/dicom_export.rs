@@ -1,4 +1,4 @@
-//! Rendered views as DICOM: pydicom opens them, and our own import reads the same line integrals from the same angles.
+//! Rendered views as DICOM: pydicom opens them, and the project's import reads the same line integrals and angles.
 #![cfg(feature = "dicom")]
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
@@ -27,7 +27,7 @@ fn a_rendered_beat_is_an_angiogram() {
     let at = |name: &str| directory.path().join(name);
     let (data, trained) = (at("data"), at("run"));
     run(&["phantom", text(&data), "--size", "40", "--phases", &PHASES.to_string(), "--no-volumes"], true);
-    // As stated: calibration may move the table, of which a file says nothing.
+    // Without calibration, which may move the table; a file does not state that.
     let few = [
         "--set",
         "train.iterations=40",
@@ -52,7 +52,7 @@ fn a_rendered_beat_is_an_angiogram() {
     print!("{}", String::from_utf8_lossy(&outcome.stdout));
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
 
-    // Our own import: a phase for each frame.
+    // Import by the project: a phase for each frame.
     let (list, imported) = (at("phases.txt"), at("imported"));
     std::fs::write(&list, (0..PHASES).map(|phase| format!("{phase}\n")).collect::<String>()).unwrap();
     let (phases, frames) = (PHASES.to_string(), format!("1-{PHASES}"));
@@ -62,7 +62,7 @@ fn a_rendered_beat_is_an_angiogram() {
     assert_eq!((read.frames.len(), written.shape.as_slice()), (PHASES, &[PHASES, 40, 40][..]));
     for (frame, integrals) in read.frames.iter().zip(written.values.chunks(40 * 40)) {
         for (got, want) in frame.integrals.iter().zip(integrals) {
-            // Half a grey value of as many as are left.
+            // Half a grey value, as a share of the transmitted intensity.
             let tolerance = 0.51 / 65535.0 * want.exp() + 1e-6;
             assert!((got - want).abs() < tolerance, "phase {}: {got} for {want}", frame.phase);
         }
@@ -73,7 +73,7 @@ fn a_rendered_beat_is_an_angiogram() {
     assert_eq!((c_arm.sid_mm, c_arm.sod_mm), (model.sid_mm, model.sod_mm));
     assert!((0..2).all(|k| (c_arm.pixel_mm[k] / model.pixel_mm[k] - 1.0).abs() < 1e-9), "{c_arm:?}");
 
-    // Each file is one of its own.
+    // Each file has unique identifiers.
     let [beat, still] = [beat, still].map(|file| dicom_object::open_file(file).unwrap());
     for tag in [tags::STUDY_INSTANCE_UID, tags::SERIES_INSTANCE_UID, tags::SOP_INSTANCE_UID] {
         let [of_beat, of_still] = [&beat, &still].map(|file| file.element(tag).unwrap().to_str().unwrap());

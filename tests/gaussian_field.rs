@@ -1,4 +1,4 @@
-//! Gaussians as a model's moving field: drawing against f64, checkpoints, whole runs.
+//! Gaussians as a model's dynamic field: rendering against f64, checkpoints, whole runs.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -26,7 +26,7 @@ use nertca_vk::train::trainer::Trainer;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A model of a dataset whose moving field is `field`.
+/// Creates a model of a dataset with the dynamic field `field`.
 fn model(gpu: &Gpu, dataset: &Dataset, field: MovingGaussians) -> Model {
     blobs::model(gpu, dataset, field, &tuning(gpu)).unwrap()
 }
@@ -39,7 +39,7 @@ fn integrals_and_maxima_match_their_twin() {
     for field in drawn_fields() {
         let renderer = Renderer::new(&gpu, &model(&gpu, &dataset, field), tuning(&gpu)).unwrap();
         let seen = renderer.render(&dataset.views[1].rays, 37, 29, 2).unwrap();
-        // The still field is nearly flat, so the sum's largest value is nearly the sum of largest values.
+        // The static field is nearly flat, so the maximum of the sum is nearly the sum of the maxima.
         for ((total, still), moving) in seen.total_max.iter().zip(&seen.static_max).zip(&seen.dynamic_max) {
             assert!(*total >= still.max(*moving) * 0.999 && *total <= (still + moving) * 1.001);
         }
@@ -59,7 +59,7 @@ fn cells_match_their_twin() {
 fn bounds_hold_all_around_their_points() {
     let gpu = gpu();
     let dataset = common::small_dataset(13, 11);
-    // Four fine points along each side of the cube around a coarse one.
+    // Four fine points along each side of the cube around a coarse point.
     let (step, n) = (0.125, 96);
     let first = -0.5 * step * f64::from(n);
     let (origin_mm, spacing_mm) = (DVec3::splat(first), DVec3::splat(step));
@@ -79,7 +79,7 @@ fn bounds_hold_all_around_their_points() {
             assert!(least[at] <= value + rounding, "{i}: at least {} instead of {value}", least[at]);
             assert!(most[at] >= value - rounding, "{i}: at most {} instead of {value}", most[at]);
         }
-        // They tell something.
+        // The bounds are informative.
         assert!(least.iter().any(|v| *v > 0.01 * largest) && most.contains(&0.0), "nothing is told");
     }
     expect_silence(gpu);
@@ -147,7 +147,7 @@ fn damaged_gaussians_are_refused_by_name() {
     expect_silence(gpu);
 }
 
-/// A run short enough for tests: 20 iterations of Gaussians, 12 of the still field.
+/// A run short enough for tests: 20 iterations of Gaussians, 12 of the static field.
 fn short_run(form: &str) -> Config {
     let settings = [
         "train.iterations=32",
@@ -159,7 +159,7 @@ fn short_run(form: &str) -> Config {
         "gaussians.count=120",
         "tree.warm_iterations=12",
         "tree.track_iterations=4",
-        // As smooth as the preset asks for, the still field learns too little in so few iterations to be seen.
+        // With the preset's smoothness, the static field learns too little to be visible in so few iterations.
         "static.tv=1",
     ];
     let mut all: Vec<String> = settings.map(String::from).to_vec();
@@ -258,7 +258,7 @@ fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
     let losses = run(&mut trainer, 32);
     assert_eq!(losses.len(), 32);
     assert!(losses.iter().all(|l| l.is_finite() && *l > 0.0), "{losses:?}");
-    // Schedules and losses are found by the device's count.
+    // Schedules and losses are indexed by the device's count.
     let state: Vec<DeviceState> = gpu.download(&trainer.forward().state, 0, 1).unwrap();
     assert_eq!(state[0].step, 32);
     drop(trainer);

@@ -1,4 +1,4 @@
-//! Runs whose moving field is made of Gaussians, from outside: their page and their measurements.
+//! Runs with a dynamic field of Gaussians, through the program: their page and their measurements.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "common/program.rs"]
@@ -47,7 +47,7 @@ fn ok(args: &[&str]) -> String {
     String::from_utf8(out.stdout).unwrap()
 }
 
-/// A phantom, made once.
+/// A phantom, created once.
 fn data() -> &'static str {
     static DATA: OnceLock<(tempfile::TempDir, String)> = OnceLock::new();
     let (_, data) = DATA.get_or_init(|| {
@@ -92,7 +92,7 @@ fn read(file: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap()
 }
 
-/// Three short repeats at once.
+/// Three short repeats.
 const TIMES: [&str; 6] = ["--warm-up", "0", "--iterations", "2", "--repeats", "3"];
 
 #[test]
@@ -125,15 +125,15 @@ fn gaussians_are_measured_as_they_run() {
         + gaussians["preparation_s"].as_f64().unwrap();
     assert!((report["whole_run_s"].as_f64().unwrap() - whole).abs() < 1e-9);
     assert_eq!((&gaussians["iterations"], &report["before"]["iterations"]), (&json!(2), &json!(2)));
-    // Passes of both parts, and none of the network's or of tracking.
+    // Passes of both parts, and none of the network or of tracking.
     let passes = report["passes_ms"].as_object().unwrap();
     for name in ["tree_project", "gaussian_splat", "gaussian_residual", "gaussian_moments", "tree_grid_update", "adam"]
     {
-        // Of whichever variant the device takes.
+        // The variant depends on the device.
         assert!(passes.iter().any(|(pass, ms)| pass.starts_with(name) && ms.as_f64().unwrap() > 0.0), "{name}");
     }
     assert!(!passes.contains_key("tree_guess") && !passes.contains_key("gaussian_update"));
-    // A tree's two rounds over splats: once per iteration each.
+    // A tree has two rounds over splats, each once per iteration.
     assert_eq!(report["passes_per_iteration"]["tree_grid_update"], 1.0);
     assert_eq!(report["passes_per_iteration"].as_object().unwrap().len(), passes.len());
     // A report of a version without Gaussians.

@@ -35,7 +35,7 @@ use nertca_vk::train::gaussians::GaussianTrainer;
 use nertca_vk::train::tree::TreeTrainer;
 use std::time::Instant;
 
-/// The defaults.
+/// The default configuration.
 fn config() -> Config {
     Config::preset(Preset::Fast)
 }
@@ -63,7 +63,7 @@ fn exact_integrals_are_those_of_quadrature() {
             let (u, v) = (u + 0.6, v - 0.9);
             let (ray, exact) = (view.ray(u, v), reference::exact_integral(&p, &setup, view, u, v));
             let closest = (DVec3::new(p[0], p[1], p[2]) - view.source).dot(ray.normalize());
-            // Trapezoids of a Gaussian converge faster than any power of the step.
+            // The trapezoidal rule for a Gaussian converges faster than any power of the step.
             let h = 0.02;
             let at = |k: i32| view.source + ray.normalize() * (closest + h * f64::from(k));
             let sum: f64 = (-2000..=2000).map(|k| h * reference::density(&p, &setup, at(k))).sum();
@@ -98,10 +98,10 @@ fn the_affine_projection_is_as_good_as_the_cut() {
 #[test]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     let targets = targets(17, 14, 2);
-    // A cut that no pixel crosses.
+    // With this cut no pixel crosses the boundary.
     let setup = GaussianSetup { cut: 12.0, ..fit::gaussian_setup(&targets, &config().gaussians) };
     let mut all = with_phases(&random_gaussians(9, 2, 5.0, 3));
-    // One scale beyond its bound has no gradient.
+    // A scale beyond its bound has no gradient.
     all[0].0[4] = 2.0;
     let (_, _, gradient) = twin(&targets, &setup, &all);
     assert_eq!(gradient[0][4], 0.0);
@@ -125,7 +125,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
 fn every_stage_of_an_iteration_matches() {
     let gpu = gpu();
     expect_agreement(|findings| gaussians::compare(&gpu, findings));
-    // Out of every view.
+    // This Gaussian is outside every view.
     let (targets, rows) = hard_case();
     let mut trainer = GaussianTrainer::with(&gpu, targets, &config(), &Particles::fresh(rows.clone())).unwrap();
     trainer.advance(1).unwrap();
@@ -162,7 +162,7 @@ impl Golden {
         self.case[key].as_u64().unwrap() as usize
     }
 
-    /// Views and images as the script has them; the same C-arm as [`c_arm`].
+    /// Views and images of the script, with the C-arm of [`c_arm`].
     fn targets(&self) -> Targets {
         let (width, height) = (self.size("width_px"), self.size("height_px"));
         let n_phases = self.size("phases");
@@ -214,7 +214,7 @@ fn golden_values_of_pytorch() {
     let mut trainer = GaussianTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
     let (images, loss, gradient) = twin(&targets, trainer.setup(), &with_phases(&rows));
     let want_loss = golden.get("loss")[0];
-    // Constants are f32 in the twin, f64 there.
+    // Constants are f32 in the twin, and f64 in the script.
     assert!((loss - want_loss).abs() < 1e-6 * want_loss, "{loss} against {want_loss}");
     let pixels = targets.n_pixels();
     for phase in 0..targets.n_phases {
@@ -274,7 +274,7 @@ fn impossible_runs_are_refused_in_words() {
     expect_silence(gpu);
 }
 
-/// Everything of a fit, by the settings.
+/// Runs a complete fit with the settings.
 fn fit_of(gpu: &Gpu, dataset: &Dataset, config: &Config, form: Train) -> Result<Gaussians> {
     let targets = Targets::new(dataset, &SoftMotion::new(dataset, 0.3, 32), &config.gaussians)?;
     form(gpu, targets, config)
@@ -349,7 +349,7 @@ fn train_tree(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussians>
     Ok(trainer.tree()?.expand())
 }
 
-/// Mean Dice over the validation images: largest attenuation along the ray, at least a fifth of the vessel's.
+/// Mean Dice over the validation images, where the maximum attenuation along the ray is at least a fifth of the vessel's.
 fn dice(model: &Gaussians, dataset: &Dataset) -> f64 {
     let level = VESSEL_SHARE * dataset.vessel_attenuation.unwrap();
     let of = |frame: &Frame| {
@@ -361,9 +361,10 @@ fn dice(model: &Gaussians, dataset: &Dataset) -> f64 {
     dataset.validation().iter().map(of).sum::<f64>() / dataset.validation().len() as f64
 }
 
-/// Least Dice of a set per phase, with 4 and 3 views; measured 0.846 and 0.763, at least 0.840 and 0.753 with two other seeds.
+/// Minimum Dice of a set per phase, with 4 and 3 views; measured 0.846 and 0.763, at least 0.840 and 0.753 with two other
+/// seeds.
 const PHASE_DICE: [f64; 2] = [0.82, 0.73];
-/// Least Dice of a tree; measured 0.846 and 0.813, at least 0.853 and 0.775 with two other seeds.
+/// Minimum Dice of a tree; measured 0.846 and 0.813, at least 0.853 and 0.775 with two other seeds.
 const TREE_DICE: [f64; 2] = [0.82, 0.74];
 
 type Train = fn(&Gpu, Targets, &Config) -> Result<Gaussians>;
@@ -391,7 +392,8 @@ fn the_default_phantom_is_reconstructed() {
     expect_silence(gpu);
 }
 
-/// Both forms on the datasets whose folders `GAUSSIANS_DATA` names, separated by colons: the table of docs/performance.md.
+/// Runs both forms on the datasets whose folders `GAUSSIANS_DATA` names, separated by colons, for the table of
+/// docs/performance.md.
 #[test]
 #[ignore = "a measurement, of folders named by GAUSSIANS_DATA"]
 fn forms_on_data() {
@@ -448,7 +450,7 @@ fn maxima_are_those_of_the_field() {
     for (pixel, value) in seen.iter().enumerate().step_by(13) {
         let ray = view.ray((pixel % 33) as f64, (pixel / 33) as f64);
         let middle = view.project(DVec3::ZERO).0;
-        // Brute force: all Gaussians, small steps.
+        // The expected value is found by brute force, from all Gaussians and with small steps.
         let at = |k: i32| view.source + ray * (middle + 0.05 * f64::from(k));
         let sum = |x: DVec3| field.iter().map(|p| reference::density(p, &setup, x)).sum::<f64>();
         let want = (-600..=600).map(|k| sum(at(k))).fold(0.0, f64::max) * units().attenuation();

@@ -1,4 +1,4 @@
-//! The engine against golden values of an independent PyTorch float64 implementation (`tools/reference.py`):
+//! Comparison of the engine with golden values of an independent PyTorch float64 implementation (`tools/reference.py`):
 //! losses and gradients of three iterations and the parameters after ten updates, for each preset.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -53,7 +53,7 @@ fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
     gpu.upload(&trainer.forward().params, 0, &initial).unwrap();
     let compared = [0u32, golden.number("delay") as u32, golden.number("delay") as u32 + 3];
     for step in 0..10 {
-        // Comparing a gradient at parameters that already differ by rounding would mix two things, so the
+        // At parameters that already differ by rounding, a comparison of gradients would mix two effects, so the
         // reference's parameters are loaded where gradients are compared.
         if compared.contains(&step) {
             let params = gather(golden, trainer.plan(), &format!("params{step}"));
@@ -68,7 +68,7 @@ fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
             assert_eq!(losses.live as f64, golden.get(&format!("loss{step}/live"))[0], "{name} step {step}");
             for (term, value) in terms_of_twin(&losses).into_iter().take(if two_networks { 6 } else { 3 }) {
                 let want = golden.get(&format!("loss{step}/{term}"))[0];
-                // Set-up constants are f32 in twin and engine alike; the reference's are f64.
+                // Setup constants are f32 in twin and engine; the reference's are f64.
                 assert!((value - want).abs() <= 2e-6 * want.abs() + 1e-15, "twin {name} {step} {term}: {value} {want}");
             }
             compare(&gradient.iter().map(|v| *v as f32).collect::<Vec<_>>(), &reference, trainer.plan(), 2e-5, name);
@@ -118,8 +118,8 @@ fn fast_mlp() {
     check(Preset::FastMlp, "fast");
 }
 
-/// NeRF-CA. Its plan is taken as it is: the rays that change, their weights, and boxes that leave no point of a ray out are checked
-/// as well.
+/// NeRF-CA, with its own plan: the changing rays, their weights, and boxes that include all points of a ray are checked as
+/// well.
 #[test]
 fn nerf_ca() {
     let golden = Golden::open("nerf-ca", "tools/reference.py");

@@ -1,5 +1,6 @@
-//! Whole trainings against those of an independent PyTorch implementation in float64 (`tools/reference_training.py`): losses and all
-//! parameters after some of 300 iterations, across the delay of the dynamic field.
+//! Comparison of whole trainings with those of an independent PyTorch implementation in float64
+//! (`tools/reference_training.py`): losses and all parameters after some of 300 iterations, across the delay of the dynamic
+//! field.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -18,11 +19,11 @@ use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::plan::Plan;
 use nertca_vk::train::trainer::Trainer;
 
-/// Differences may be so many times the spread of the script's own float32 runs. The engine sums in other orders than these, and has
-/// other sines and exponentials.
+/// Maximum difference, in multiples of the spread of the script's own float32 runs. The engine sums in other orders, and
+/// has other sines and exponentials.
 const SPREADS: f64 = 4.0;
 
-/// Largest difference so far, in spreads, and what differs.
+/// Maximum difference so far, in spreads, and its key.
 #[derive(Default)]
 struct Worst {
     spreads: f64,
@@ -35,7 +36,7 @@ impl Worst {
         assert_eq!(got.len(), want.len(), "{key}");
         let length = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
         let off = length(&mut got.iter().zip(want).map(|(g, w)| g - w)) / length(&mut want.iter().copied()).max(1e-300);
-        // A difference that is not a number is the worst.
+        // A difference that is not a number counts as the maximum.
         let spreads = off / spread;
         if spreads.is_nan() || spreads > self.spreads {
             *self = Worst { spreads, key: key.into() };
@@ -61,7 +62,7 @@ impl Worst {
     }
 }
 
-/// Trains as the golden case did, with the plan's schedule.
+/// Trains like the golden case, with the plan's schedule.
 fn train(gpu: &Gpu, golden: &Golden, plan: Plan) -> Worst {
     let tuning = Tuning { layers: Layers::F32, ..tuning(gpu) };
     let mut trainer = Trainer::new(gpu, plan, &golden.dataset(), tuning).unwrap();
@@ -93,7 +94,7 @@ fn has_term(golden: &Golden, iteration: u32, term: &str) -> bool {
     term != "tv" || golden.has(&format!("{iteration}/loss/tv"))
 }
 
-/// Fails unless the engine trains as the script did, or where a fault in the schedule does not show.
+/// Fails unless the engine trains like the script, and unless each fault in the schedule is detected.
 fn check(golden: &Golden, plan: impl Fn() -> Plan, faults: &[(&str, Fault)]) {
     let gpu = gpu();
     let Worst { spreads, key } = train(&gpu, golden, plan());
@@ -110,7 +111,7 @@ fn check(golden: &Golden, plan: impl Fn() -> Plan, faults: &[(&str, Fault)]) {
 /// Changes the schedule of a run with a delay.
 type Fault = fn(&mut [Schedule], usize);
 
-/// Rates go on after the delay from where they were.
+/// Fault: rates continue after the delay instead of restarting.
 fn rates_go_on(schedule: &mut [Schedule], delay: usize) {
     let before = schedule[delay].static_update.rate / schedule[delay + 1].static_update.rate;
     for row in &mut schedule[delay + 1..] {
@@ -119,18 +120,18 @@ fn rates_go_on(schedule: &mut [Schedule], delay: usize) {
     }
 }
 
-/// Moments of before the delay are kept.
+/// Fault: moments from before the delay are kept.
 fn moments_are_kept(schedule: &mut [Schedule], delay: usize) {
     schedule[delay + 1].static_update.restart = 0;
     schedule[delay + 1].dynamic_update.restart = 0;
 }
 
-/// The dynamic field takes no step before moments and rates start again.
+/// Fault: the dynamic field takes no step before moments and rates restart.
 fn a_step_is_missing(schedule: &mut [Schedule], delay: usize) {
     schedule[delay].dynamic_update.rate = 0.0;
 }
 
-/// Weights of losses come an iteration late.
+/// Fault: weights of losses are an iteration late.
 fn weights_come_late(schedule: &mut [Schedule], _: usize) {
     for step in (1..schedule.len()).rev() {
         schedule[step].favour_static = schedule[step - 1].favour_static;

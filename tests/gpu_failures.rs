@@ -1,5 +1,5 @@
-//! Every Vulkan call that can fail is made to, one after the other, in a session that uses each kind of device object:
-//! the outcome is an error that says which call it was, and nothing is left behind.
+//! Every Vulkan call that can fail is made to fail, one after the other, in a session that uses each kind of device object:
+//! the result is an error that names the call, and no objects are left.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod shim;
@@ -18,7 +18,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use tracing::field::{Field, Visit};
 use tracing::{Event, Metadata, Subscriber};
 
-/// Kernels with all kinds of bindings, recorded without a workgroup: it is the objects that matter.
+/// Kernels with all kinds of bindings, recorded without a workgroup, because only their objects matter.
 const IDLE_KERNELS: [&str; 3] = ["mlp_out_fwd_texel", "mlp_layer_fwd_address", "baked_march"];
 
 /// Device objects of every kind.
@@ -29,7 +29,7 @@ struct Objects {
     image: Image3d,
 }
 
-/// Whatever `push` bytes a kernel wants, zeros.
+/// Records a kernel with as many zero `push` bytes as it needs.
 fn record_idle(
     recording: &mut Recording,
     pipeline: &Arc<Pipeline>,
@@ -60,10 +60,10 @@ fn record_idle(
     with_words!(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27 28)
 }
 
-/// Waits whose failure [`use_device`] hears of: that of the upload, its own, that of the download.
+/// Number of waits whose failure [`use_device`] reports: those of the upload, of its own submit and of the download.
 const TELLING_WAITS: usize = 3;
 
-/// Uses every kind of device object, and leaves `gpu` with none.
+/// Uses every kind of device object, and destroys all of them.
 fn use_device(gpu: &Gpu) -> Result<()> {
     let numbers: Vec<u32> = (0..64).collect();
     let info = gpu.info();
@@ -97,7 +97,7 @@ fn use_device(gpu: &Gpu) -> Result<()> {
     gpu.save_pipeline_cache()
 }
 
-/// A session on a device of its own. `cache` is where it keeps its pipelines.
+/// Runs a session on its own device; `cache` is the directory of its pipelines.
 fn session(cache: &Path) -> Result<()> {
     let options = DeviceOptions {
         validation: true,
@@ -111,7 +111,7 @@ fn session(cache: &Path) -> Result<()> {
     outcome
 }
 
-/// What the validation layer says, also while the device goes away.
+/// Messages of the validation layer, including those during the destruction of the device.
 #[derive(Clone, Default)]
 struct Heard(Arc<Mutex<Vec<String>>>);
 
@@ -147,7 +147,7 @@ impl Subscriber for Heard {
     fn exit(&self, _: &tracing::span::Id) {}
 }
 
-/// Runs a session in which calls fail; what it came to, and what was left of it or said about it.
+/// Runs a session in which calls fail; returns its result, the remaining objects and the messages.
 fn run(cache: &Path, heard: &Heard, failing: Failing) -> (Result<()>, Outcome, Vec<String>) {
     shim::begin(failing);
     let outcome = session(cache);
@@ -157,8 +157,8 @@ fn run(cache: &Path, heard: &Heard, failing: Failing) -> (Result<()>, Outcome, V
     (outcome, seen, faults)
 }
 
-/// Whether an error names the call that failed, or is one of the allocator or of the choice of a device, which have words
-/// of their own.
+/// Tells whether an error names the call that failed, or is an error of the allocator or of the device selection, which
+/// have their own texts.
 fn tells(error: &Error, call: &str) -> bool {
     let text = error.to_string();
     match call {
@@ -175,7 +175,7 @@ fn nothing_is_left_when_a_call_fails() {
     let (cache, heard) = (tempfile::tempdir().unwrap(), Heard::default());
     let _listening = tracing::subscriber::set_default(heard.clone());
     let mut calls = 0;
-    // The first session compiles its pipelines; with the cache, those that follow are one like another.
+    // The first session compiles its pipelines; with the cache, all following sessions are equal.
     for _ in 0..2 {
         let (outcome, seen, faults) = run(cache.path(), &heard, Failing::None);
         outcome.unwrap();
@@ -199,9 +199,9 @@ fn nothing_is_left_when_a_call_fails() {
                     told_waits += usize::from(call == "vkWaitSemaphores" && matches!(failing, Failing::Once(..)));
                 }
                 Err(error) => faults.push(format!("{call}, {failing:?}: {error}")),
-                // The allocator tries another kind of memory where one is full.
+                // The allocator tries another memory type where one is full.
                 Ok(()) if ["vkAllocateMemory", "vkMapMemory"].contains(&call) => {}
-                // What is dropped waits once more, and cannot tell.
+                // Destructors wait once more and cannot report an error.
                 Ok(()) if call == "vkWaitSemaphores" => {}
                 Ok(()) => faults.push(format!("{call}, {failing:?}: no error")),
             }
@@ -214,7 +214,7 @@ fn nothing_is_left_when_a_call_fails() {
 #[test]
 fn memory_that_could_not_be_bound_is_used_again() {
     shim::begin(Failing::None);
-    // Blocks of a few MiB.
+    // Limits memory blocks to a few MiB.
     let options =
         DeviceOptions { memory_limit: Some(64 << 20), loader: Some(shim::loader()), ..DeviceOptions::default() };
     let gpu = Gpu::open(&options).unwrap();

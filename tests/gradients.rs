@@ -1,4 +1,4 @@
-//! The f64 twins against finite differences, and adjoint identities. Together with `kernels_vs_cpu.rs` this
+//! Comparison of the f64 twins with finite differences, and adjoint identities. Together with `kernels_vs_cpu.rs` this
 //! closes the chain from the shaders to the definition of a derivative.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -24,7 +24,8 @@ fn start(plan: &Plan) -> Vec<f64> {
     params
 }
 
-/// A field that has fallen asleep hears those rays that ask for more, and no louder those that ask for less.
+/// A field that has vanished reacts to rays that require more attenuation, and not more strongly to those that require
+/// less.
 #[test]
 fn a_sleeping_field_is_called_back() {
     let asleep = ["dynamic.best_start=false", "dynamic.normalised_shift=-14"];
@@ -32,7 +33,7 @@ fn a_sleeping_field_is_called_back() {
         let slope = format!("dynamic.least_slope={least_slope}");
         let mut plan = plan("fast-mlp", &[asleep[0], asleep[1], &slope]);
         if !more {
-            // No ray asks for more than nothing.
+            // No ray requires positive attenuation.
             plan.images.iter_mut().for_each(|value| *value = -1.0);
         }
         let rays = march::batch(&plan, 0);
@@ -52,12 +53,12 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     for (preset, settings) in [
         ("paper", &["dynamic.occlusion=1e-3", "loss.normalise=true"][..]),
         ("public-code", &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
-        // A least slope is not that of the loss.
+        // A minimum slope differs from that of the loss, so it is switched off.
         ("fast-mlp", &["dynamic.least_slope=0", "loss.dynamic_target=absolute"]),
         ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0"]),
         ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0.3"]),
         ("nerf-ca", LARGE),
-        // Fields of next to nothing, whose entropies count all the same; the near part of rays alone.
+        // Almost vanishing fields whose entropies still count; the near part of rays alone.
         (
             "nerf-ca",
             &[
@@ -78,10 +79,10 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
         let (_, gradient) = step::loss_and_gradient(&plan, &params, 3, &rays, Precision::Exact);
         let temporal = plan.setup.temporal_target != 0;
         for tensor in plan.params.tensors() {
-            // With a temporal target S learns from what D leaves, D taken as given: the two fields descend
+            // With a temporal target S is fitted to the residual of D, with D taken as constant: the two fields minimise
             // different objectives, and each is checked against its own.
             let is_static = tensor.name.starts_with("static");
-            // A few elements of each tensor, those with the largest gradient among a stride.
+            // A few elements of each tensor, with the largest gradient among a stride.
             let mut at: Vec<usize> = tensor.positions.iter().map(|p| *p as usize).collect();
             at.sort_by(|a, b| gradient[*b].abs().total_cmp(&gradient[*a].abs()));
             for &i in at.iter().step_by((at.len() / 3).max(1)).take(3) {
@@ -95,7 +96,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
                 let h = 1e-7;
                 let difference = (loss(params[i] + h) - loss(params[i] - h)) / (2.0 * h);
                 let error = (difference - gradient[i]).abs();
-                // The loss's own last digits over the step.
+                // Rounding errors of the loss, divided by the step.
                 let rounding = 1e-8 * (1.0 + loss(params[i]));
                 assert!(
                     error <= 1e-4 * gradient[i].abs() + rounding,
@@ -137,7 +138,7 @@ fn lookup_and_scatter_are_adjoint() {
     (0..p.static_len).for_each(|i| fixed[i] = random(0, i as u32));
     let lines = p.line(0, 0, 0)..p.static_len;
     for part in [0..lines.start, lines] {
-        // Direction only in one factor, so that the feature is linear along it.
+        // The direction changes one factor only, so that the feature is linear along it.
         let mut direction = vec![0.0; p.len];
         part.clone().for_each(|i| direction[i] = random(1, i as u32));
         let mut moved = fixed.clone();

@@ -1,4 +1,4 @@
-//! The motion hull against the phantom's truth, without noise: no vessel that moves is carved away.
+//! Comparison of the motion hull with the phantom's truth, without noise: no moving vessel is carved away.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -28,7 +28,7 @@ use std::num::NonZeroU32;
 const PHASES: u32 = 8;
 const RESOLUTION: usize = 96;
 
-/// A phantom with its vessels' voxels.
+/// A phantom with the voxels of its vessels.
 struct Phantom {
     dataset: Dataset,
     vessels: Vec<Volume>,
@@ -58,7 +58,7 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
     Phantom { dataset: Dataset::open(&out).unwrap(), vessels }
 }
 
-/// Voxels that are vessel through and through, in world units: those at the wall hold less contrast.
+/// Voxels that are entirely vessel, in world units; those at the wall have less contrast.
 fn inside_vessels(volume: &Volume) -> Vec<DVec3> {
     let most = volume.values.iter().copied().fold(0.0, f32::max);
     let [nx, ny, _] = volume.size;
@@ -74,7 +74,7 @@ fn inside_vessels(volume: &Volume) -> Vec<DVec3> {
     .collect()
 }
 
-/// Whether every training view has a pixel for a point.
+/// Tells whether every training view has a pixel for a point.
 fn seen_by_all(point: DVec3, dataset: &Dataset) -> bool {
     let (width, height) = (dataset.width as f64, dataset.height as f64);
     dataset.training_views().iter().all(|view| {
@@ -85,7 +85,7 @@ fn seen_by_all(point: DVec3, dataset: &Dataset) -> bool {
     })
 }
 
-/// Whether a kept cell lies within half a cell of a point along each axis: carving looks at the middles of cells.
+/// Tells whether a kept cell lies within half a cell of a point along each axis, since carving tests the centres of cells.
 fn kept_nearby(hull: &Hull, point: DVec3, phase: usize) -> bool {
     let steps = [-0.5, 0.0, 0.5].map(|s| s * hull.cell);
     steps
@@ -93,8 +93,8 @@ fn kept_nearby(hull: &Hull, point: DVec3, phase: usize) -> bool {
         .any(|x| steps.iter().any(|y| steps.iter().any(|z| hull.contains_point(point + DVec3::new(*x, *y, *z), phase))))
 }
 
-/// How much of the strongest change in its view each pixel of each training view changes through vessels alone, from where
-/// they cover it least to a phase.
+/// Change of each pixel of each training view by vessels alone, from its minimum to each phase, as a share of the strongest
+/// change in its view.
 fn changes(gpu: &Gpu, phantom: &Phantom) -> Vec<Vec<Vec<f32>>> {
     let dataset = &phantom.dataset;
     let projector = Projector::new(gpu, dataset.width, dataset.height).unwrap();
@@ -117,8 +117,8 @@ fn changes(gpu: &Gpu, phantom: &Phantom) -> Vec<Vec<Vec<f32>>> {
         .collect()
 }
 
-/// Vessel voxels that every view sees and that change each view's pixel by at least `visible`; and how many of them a hull
-/// has lost.
+/// Number of vessel voxels that every view sees and that change each view's pixel by at least `visible`, and the number of
+/// them outside a hull.
 fn lost(phantom: &Phantom, changes: &[Vec<Vec<f32>>], hull: &Hull, half: f64, visible: f32) -> (usize, usize) {
     let dataset = &phantom.dataset;
     let shows = |phase: usize, point: DVec3| {
@@ -139,10 +139,10 @@ fn lost(phantom: &Phantom, changes: &[Vec<Vec<f32>>], hull: &Hull, half: f64, vi
     (all, lost)
 }
 
-/// Changes this large in every view are never taken for noise, and larger ones at a single phase.
+/// Changes of this size in every view are never taken for noise over the beat; at a single phase the limit is larger.
 const VISIBLE_OVER_THE_BEAT: f32 = 0.1;
 const VISIBLE_AT_A_PHASE: f32 = 0.2;
-/// Of all vessels, also those as thin as a pixel and those that hardly move, at most this share goes. Measured: 0.028 with
+/// Maximum lost share of all vessels, including those as thin as a pixel and those that hardly move. Measured: 0.028 with
 /// three views and 0.009 with four for hulls per phase, 0.011 and 0.001 for those of the whole beat.
 const MOST_LOST: f64 = 0.04;
 
@@ -170,7 +170,7 @@ fn no_vessel_that_moves_is_carved_away() {
     common::expect_silence(gpu);
 }
 
-/// With the vessels' own shadows for motion, nothing is left to chance.
+/// With the vessels' exact shadows as motion, no vessel may be lost.
 #[test]
 fn carving_by_exact_shadows_loses_nothing() {
     let gpu = gpu();
@@ -182,7 +182,7 @@ fn carving_by_exact_shadows_loses_nothing() {
     for m in &mut motion {
         for (phase, moving) in m.moving_at.iter_mut().enumerate() {
             let frame = dataset.training().iter().find(|f| f.view == m.view && f.phase as usize == phase).unwrap();
-            // The mask samples shadows at the middles of pixels; a pixel that is only touched is beside one of these.
+            // The mask samples shadows at the centres of pixels; a pixel that is only touched is beside one of these.
             let values = frame.mask.as_ref().unwrap().iter().map(|m| f32::from(u8::from(*m))).collect();
             let shadow = Image { width: dataset.width, height: dataset.height, values };
             *moving = dilate(&shadow, 1).values.iter().map(|v| *v > 0.0).collect();
@@ -221,9 +221,10 @@ fn what_a_hull_leaves_is_drawn_the_same_in_any_chunks() {
         let drawn = [0, 1, 2].map(|phase| renderer.render(&dataset.views[1].rays, side, side, phase).unwrap());
         drawn.map(|seen| [seen.static_integral, seen.dynamic_integral, seen.dynamic_max, seen.total_max])
     };
-    // All rays in a chunk even if each of their samples were live; counted, and packed into few; into many.
+    // The first run has all rays in one chunk even if all samples were live; the others are counted, and packed into few
+    // and into many chunks.
     let whole = see(65_536, 60);
-    // One sample at least of each pixel that shows something: more than the least of these chunks takes.
+    // There is at least one sample for each pixel that shows something, which is more than the smallest chunks hold.
     let shown = |dynamic: &[f32]| dynamic.iter().filter(|value| **value > 0.0).count();
     let shown: Vec<usize> = whole.iter().map(|[_, dynamic, ..]| shown(dynamic)).collect();
     assert!(shown.iter().all(|n| (129..60 * 60).contains(n)), "{shown:?} pixels, hull {share}");

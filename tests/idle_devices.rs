@@ -1,4 +1,4 @@
-//! A device that ends its submits and tells nothing of the iterations in them: every trainer says so at once.
+//! A device that completes its submits but reports no iterations: every trainer detects this at once.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -19,7 +19,7 @@ fn open() -> Gpu {
     Gpu::open(&DeviceOptions { loader: Some(shim::loader()), ..DeviceOptions::default() }).unwrap()
 }
 
-/// Trains three iterations, on a device whose `stage` stores nothing if one is named.
+/// Trains three iterations on a device whose `stage`, if one is named, stores nothing.
 fn train(config: &Config, silent_stage: Option<&str>) -> Result<u32, Error> {
     shim::begin(shim::Failing::None);
     let (gpu, dataset) = (open(), small_dataset(32, 27));

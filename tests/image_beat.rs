@@ -1,5 +1,5 @@
-//! The beat found in images of a real coronary artery that follows a real heart (`../shared/data`, where it is at hand), seen
-//! through breath, contrast that comes, and noise.
+//! Detection of the beat in images of a real coronary artery that follows a real heart (`../shared/data`, if present),
+//! under breathing, inflow of contrast, and noise.
 #![cfg(feature = "dicom")]
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -37,13 +37,13 @@ impl Tree {
     }
 }
 
-/// How a run was taken.
+/// Acquisition of a run.
 #[derive(Clone, Copy)]
 struct Taken {
     beats_per_min: f64,
     frames_per_s: f64,
     images: usize,
-    /// Of the first R-peak, as a share of a beat.
+    /// Time of the first R-peak, as a share of a beat.
     r_peak: f64,
 }
 
@@ -61,7 +61,7 @@ fn images(tree: &Tree, rays: &ViewRays, taken: Taken) -> (Vec<Image>, Vec<f64>) 
                 image.values[y * SIZE + x] = image.values[y * SIZE + x].max((contrast * 0.2 * radius) as f32);
             }
         }
-        // A chest's slopes, and noise.
+        // Adds a chest's gradient, and noise.
         for (p, value) in image.values.iter_mut().enumerate() {
             let noise = normal(1, STREAM_PHOTON, index as u32, p as u32);
             *value += 2.0 + 0.01 * (p / SIZE) as f32 + NOISE * noise as f32;

@@ -1,4 +1,4 @@
-//! Images of different sizes in one dataset: a view that was cropped is the same view, and what was cut away is nothing.
+//! Images of different sizes in one dataset: a cropped view keeps its geometry, and the removed part is not used.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod common;
@@ -19,7 +19,7 @@ use std::path::Path;
 
 const SIZE: usize = 100;
 
-/// What is kept of the images of a view: first column and row, columns and rows.
+/// Part of a view's images that is kept: first column and row, columns and rows.
 #[derive(Clone, Copy)]
 struct Window {
     view: usize,
@@ -31,7 +31,7 @@ struct Window {
 const CROPPED: [Window; 2] =
     [Window { view: 1, first: [12, 9], size: [80, 86] }, Window { view: 5, first: [20, 5], size: [61, 73] }];
 
-/// Cuts a file of 32-bit floats as numpy keeps them, rows first, without any reader of the library.
+/// Crops a numpy file of 32-bit floats, rows first, without any reader of the library.
 fn crop_npy(file: &Path, w: &Window) {
     let bytes = std::fs::read(file).unwrap();
     let header = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
@@ -54,7 +54,7 @@ fn crop_png(file: &Path, w: &Window) {
     image::open(file).unwrap().crop_imm(x, y, width, height).save(file).unwrap();
 }
 
-/// The same dataset with some views cut, and what is said of their detectors with them.
+/// Returns a copy of the dataset with some views cropped, and the geometry of their detectors adapted.
 fn cropped(full: &Dataset, to: &Path, windows: &[Window]) -> Dataset {
     for folder in ["images", "masks"] {
         std::fs::create_dir_all(to.join(folder)).unwrap();
@@ -69,7 +69,7 @@ fn cropped(full: &Dataset, to: &Path, windows: &[Window]) -> Dataset {
         crop_npy(&to.join(&files[0]), w);
         crop_png(&to.join(&files[1]), w);
         for axis in 0..2 {
-            // How far the middle of what is kept is from the middle of all, on the detector.
+            // Distance on the detector between the centres of the kept part and of the whole image.
             let moved = w.first[axis] as f64 + 0.5 * w.size[axis] as f64 - 0.5 * SIZE as f64;
             let pixel_mm = frame["geometry"]["pixel_mm"][axis].as_f64().unwrap();
             let offset_mm = frame["geometry"]["offset_mm"][axis].as_f64().unwrap();
@@ -80,7 +80,7 @@ fn cropped(full: &Dataset, to: &Path, windows: &[Window]) -> Dataset {
     Dataset::open(to).unwrap()
 }
 
-/// Index of the view that a phantom calls `number`.
+/// Index of the view with the phantom's number `number`.
 fn view(dataset: &Dataset, number: usize) -> usize {
     dataset.frames.iter().find(|f| f.name.contains(&format!("view{number}-"))).unwrap().view
 }
@@ -127,7 +127,7 @@ fn a_cropped_view_has_the_rays_and_pixels_it_had() {
         let beyond = is.mask.as_ref().unwrap().iter().filter(|m| **m).count() - mask.iter().filter(|m| **m).count();
         assert_eq!(beyond, 0, "nothing of a mask is beyond its image");
     }
-    // It makes as much sense, and is written as it was.
+    // The cropped dataset passes the check, and is written unchanged.
     assert!(check(&cut).unwrap().sound());
     let again = directory.path().join("again");
     convert(&cut, Layout::Native, &again).unwrap();
@@ -143,7 +143,7 @@ fn a_cropped_view_has_the_rays_and_pixels_it_had() {
     expect_silence(gpu);
 }
 
-/// What `check` tries turns images on their side, whose canvas then is another.
+/// One mistake tried by `check` turns images on their side, which changes the canvas.
 #[test]
 fn unseen_images_of_another_shape_change_no_check() {
     let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
@@ -167,7 +167,7 @@ fn a_reconstruction_of_cropped_views_is_as_good_and_scored_on_what_they_show() {
     let full = phantom(&gpu, &directory.path().join("full"), SIZE, 4);
     let cut = cropped(&full, &directory.path().join("cut"), &CROPPED);
     let (of_full, of_cut) = (trained(&gpu, &full), trained(&gpu, &cut));
-    // Of the same model, images that were left alone score the same, and cut ones as they do by hand.
+    // With one model, uncropped images have equal scores, and cropped ones the scores computed by hand.
     let (a, b) = (scored(&gpu, &of_full, &full), scored(&gpu, &of_full, &cut));
     let renderer = Renderer::new(&gpu, &of_full, tuning(&gpu)).unwrap();
     let unseen = &CROPPED[1];
@@ -197,7 +197,7 @@ fn a_reconstruction_of_cropped_views_is_as_good_and_scored_on_what_they_show() {
             b.psnr,
             b.dice_dynamic.unwrap()
         );
-        // Rays of a cropped view are the same to f64, and to some digits of the f32 they are drawn by.
+        // Rays of a cropped view are equal in f64, and to some digits in the f32 used for rendering.
         assert!((b.psnr - psnr).abs() < 0.02 && (b.dice_dynamic.unwrap() - dice).abs() < 0.005, "{}", b.name);
         assert!((b.psnr - a.psnr).abs() > 0.05, "what was cut away would have counted");
     }

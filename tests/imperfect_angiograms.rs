@@ -1,5 +1,5 @@
-//! Angiograms as a cath lab makes them, through the program: each imperfection alone must cost little. docs/performance.md has the
-//! full table, on real anatomy.
+//! Realistic angiograms, through the program: each imperfection alone must reduce Dice only slightly. docs/performance.md
+//! has the full table, on real anatomy.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/program.rs"]
@@ -9,7 +9,7 @@ use program::program;
 use serde_json::Value;
 use std::path::Path;
 
-/// What is done to the angiograms of a phantom at 0.37 of a heart's size, and the most Dice it may cost.
+/// Imperfections of the angiograms of a phantom at 0.37 of a heart's size, and the maximum loss of Dice.
 const IMPERFECTIONS: [(&str, &[&str], f64); 6] = [
     ("views that disagree", &["--geometry-error", "0.5,0.7"], 0.08),
     ("breathing", &["--breathing", "1"], 0.08),
@@ -69,7 +69,7 @@ fn frames_between_phases_are_fitted_at_their_own_time() {
     let [data, run, again] = ["data", "run", "again"].map(|name| dir.path().join(name));
     phantom(&data, &UNEQUAL_BEATS);
     let own_time = trained_dice(&data, &run);
-    // The same images as if each had been taken at its nearest phase.
+    // The images are treated as if each had been taken at its nearest phase.
     let manifest = data.join("dataset.json");
     let mut dataset = read(&manifest);
     let mut between = 0;

@@ -1,4 +1,4 @@
-//! Which frames of a clinical run are taken: the longest stretch in which vessels are filled with contrast.
+//! Selection of the frames of a clinical run: the longest stretch in which vessels are filled with contrast.
 #![cfg(feature = "dicom")]
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -13,7 +13,7 @@ use nertca_vk::scan::gating::BeatScaling;
 use std::ops::RangeInclusive;
 use std::path::Path;
 
-/// A run with a frame for each share of full contrast: a bar, by so much darker than what is around it.
+/// Writes a run with a frame for each share of full contrast: a bar, darker than its surroundings in proportion.
 fn run(path: &Path, contrast: &[f64]) {
     let pixels: Vec<u8> = contrast
         .iter()
@@ -32,7 +32,7 @@ fn run(path: &Path, contrast: &[f64]) {
     });
 }
 
-/// All else as little as can be asked for.
+/// Options with minimum values for everything else.
 fn options(gating: Gating, phases: u32) -> ImportOptions {
     ImportOptions {
         phases,
@@ -45,7 +45,7 @@ fn options(gating: Gating, phases: u32) -> ImportOptions {
     }
 }
 
-/// Imports frames, each as a phase of its own; what the user is told, and how many there are.
+/// Imports frames, each as a phase of its own; returns the messages and the number of frames.
 fn import(contrast: &[f64], phases: u32, frames: Option<RangeInclusive<usize>>) -> (String, usize) {
     let directory = tempfile::tempdir().unwrap();
     let (file, out) = (directory.path().join("run.dcm"), directory.path().join("data"));
@@ -57,7 +57,7 @@ fn import(contrast: &[f64], phases: u32, frames: Option<RangeInclusive<usize>>) 
 
 #[test]
 fn the_longest_filled_stretch_is_taken() {
-    // Contrast flows in and out, comes back for a moment, and is gone.
+    // Contrast flows in and out, returns briefly, and vanishes.
     let (told, frames) = import(&[0.0, 0.3, 0.8, 1.0, 1.0, 0.9, 0.3, 1.0, 0.0], 4, None);
     assert!(told.contains("frames 3 to 6 of 9 are filled with contrast"), "{told}");
     assert_eq!(frames, 4);
@@ -117,7 +117,7 @@ fn frames_of_a_run_keep_their_own_time() {
         let near = |(a, b): (&(u32, f64), &(u32, f64))| a.0 == b.0 && (a.1 - b.1).abs() < 1e-6;
         assert!(found.len() == wanted.len() && found.iter().zip(wanted).all(near), "{found:?}");
     };
-    // 60 beats per minute, a frame each 0.1 s: phases are 0.25 s long, and their middles at 0.125 s, 0.375 s, 0.625 s.
+    // At 60 beats per minute and one frame per 0.1 s, phases are 0.25 s long, with middles at 0.125 s, 0.375 s and 0.625 s.
     let steady = import(Gating::HeartRate(60.0), 4).unwrap();
     same(&steady, &[(0, -0.1), (1, -0.1), (2, -0.3)]);
     let listed = import(Gating::Phases(vec![0.0, 0.4, 1.25, 2.0, 2.25, 3.5, 3.75]), 4).unwrap();

@@ -1,4 +1,4 @@
-//! Contrast that arrives while images are taken: phase 0 shows nothing, and what is reconstructed rests at a later phase.
+//! Contrast that arrives during the acquisition: phase 0 shows nothing, and the reconstruction rests at a later phase.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "common/program.rs"]
@@ -13,7 +13,8 @@ use said::{run, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-/// Phases of a second in which contrast reaches the ends of the vessels after 0.4 s: from phase 4 on they are full.
+/// Number of phases of one second, in which contrast reaches the ends of the vessels after 0.4 s: from phase 4 they are
+/// full.
 const PHASES: usize = 10;
 const FULL_FROM: usize = 4;
 
@@ -24,7 +25,7 @@ fn phantom(directory: &Path, extra: &[&str]) -> PathBuf {
     data
 }
 
-/// The phase at which Gaussians of a form rest, and what a run says.
+/// Phase at which Gaussians of a form rest, and the notes of the plan.
 fn rest_phase(data: &Path, form: &str) -> (usize, Vec<String>) {
     let config = Config::load(Some(Preset::Fast), None, &[format!("gaussians.form={form}")]).unwrap();
     let plan = Plan::new(&config, &Dataset::open(data).unwrap()).unwrap();
@@ -54,7 +55,7 @@ fn a_tree_rests_where_vessels_are_full() {
             .collect();
         dice.iter().sum::<f64>() / dice.len() as f64
     };
-    // From phase 0 on it is .1 and .2.
+    // With phase 0 as the phase of rest the values are 0.1 and 0.2.
     let (full, filling) = (mean_dice(&|phase| phase > FULL_FROM), mean_dice(&|phase| phase < FULL_FROM));
     assert!(full > 0.8 && filling > 0.4, "{full} where vessels are full, {filling} where they are being filled");
 }

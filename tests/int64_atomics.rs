@@ -1,5 +1,5 @@
-//! Kernels that add 64-bit integers to memory, and their counterparts for devices that add pairs of 32 bits: both agree with the
-//! f64 twins, and runs come to the same bits.
+//! Kernels that add 64-bit integers to memory, and their counterparts for devices that add pairs of 32 bits: both agree
+//! with the f64 twins, and runs have equal bits.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -31,7 +31,8 @@ fn open(without_subgroups: bool, without_int64_atomics: bool) -> Gpu {
     Gpu::open(&options).unwrap()
 }
 
-/// Operands whose kernels have both variants, several lanes to a ray, and lines in memory or in shared memory first.
+/// Tuning with operands whose kernels have both variants, several lanes per ray, and lines in memory or first in shared
+/// memory.
 fn as_on_a_gpu(gpu: &Gpu, private_line_bytes: u32) -> Tuning {
     let layers = Tuning::for_device(gpu.info()).with_layers(Layers::F32, String::new());
     Tuning { operands: Operands::Storage, march_lanes: 16, private_line_bytes, ..layers }
@@ -48,7 +49,7 @@ fn bits_of_a_run(gpu: &Gpu, private_line_bytes: u32) -> Vec<u64> {
     losses.iter().map(|l| l.to_bits()).chain(params.iter().map(|p| u64::from(p.to_bits()))).collect()
 }
 
-/// The same of SAX-NeRF, whose grid is scattered to alike.
+/// Bits of losses and parameters of SAX-NeRF, whose grid is scattered to in the same way.
 fn bits_of_a_grid(gpu: &Gpu) -> Vec<u64> {
     let dataset = small_dataset(13, 11);
     let plan = Plan::new(&sax::small_config(&[]).unwrap(), &dataset).unwrap();

@@ -1,4 +1,4 @@
-//! The command line from outside: a whole life on a tiny phantom, exit codes, and input nobody should send.
+//! The command line: a complete workflow on a tiny phantom, exit codes, and invalid input.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "common/program.rs"]
@@ -27,7 +27,7 @@ fn ok(args: &[&str]) -> String {
     String::from_utf8(out.stdout).unwrap()
 }
 
-/// Expects `code` and an error on stderr that names all `parts`; never a panic.
+/// Expects exit code `code` and an error on stderr that names all `parts`, without a panic.
 fn fails(args: &[&str], code: i32, parts: &[&str]) {
     let out = nertca(args);
     let stderr = String::from_utf8_lossy(&out.stderr);
@@ -71,7 +71,7 @@ fn a_whole_life() {
     let kinds: Vec<_> = events.iter().map(|e| e["event"].as_str().unwrap()).collect();
     assert_eq!(kinds[0], "started");
     assert!(kinds.contains(&"validation") && kinds.contains(&"saved"));
-    // Training is over before the unseen images are scored, one by one: twelve as the calibrated views have them, and as stated.
+    // After training the unseen images are scored one by one: twelve in the frame of the calibration, and twelve as stated.
     let finished = kinds.iter().position(|kind| *kind == "finished").unwrap();
     let scored: Vec<_> = events[finished + 1..].iter().map(|e| (&e["event"], e["images"].as_u64(), &e["of"])).collect();
     let wanted: Vec<_> = (0..=24).map(|n| (json!("evaluation"), Some(n), json!(24))).collect();
@@ -120,7 +120,7 @@ fn a_whole_life() {
     );
 }
 
-/// Renders a run in every format: pictures, numbers and animations say the same.
+/// Renders a run in every format: pictures, values and animations agree.
 fn renders_show_the_fields(directory: &Path, run: &Path) {
     let render = |file: &str, extra: &[&str]| {
         let out = directory.join(file);
@@ -132,7 +132,7 @@ fn renders_show_the_fields(directory: &Path, run: &Path) {
     assert_eq!(still.shape, [24, 24]);
     let (low, high) = still.values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
     assert!(low >= 0.0 && high > low, "{low} to {high}");
-    // Dark is much: the picture is the numbers, enlarged nine times.
+    // Dark pixels have high values: the picture shows the values, enlarged nine times.
     let picture = image::open(render("a.png", &["--component", "static"])).unwrap().to_luma8();
     assert_eq!(picture.dimensions(), (216, 216));
     for (i, value) in still.values.iter().enumerate() {
@@ -140,7 +140,7 @@ fn renders_show_the_fields(directory: &Path, run: &Path) {
         let wanted = 255.0 * (1.0 - (value - low) / (high - low));
         assert!((f32::from(code) - wanted).abs() <= 1.0, "pixel {i}: {code}, not {wanted}");
     }
-    // All phases, and one of them alone.
+    // All phases, and a single one.
     let every = read("every.npy", &["--phase", "all", "--projection", "mip", "--component", "dynamic"]);
     let one = read("one.npy", &["--phase", "2", "--projection", "mip", "--component", "dynamic"]);
     assert_eq!(every.shape, [3, 24, 24]);
@@ -194,7 +194,7 @@ fn both_layouts_hold_the_same_data() {
     let size = ["--size", "20", "--phases", "2", "--views", "3", "--no-volumes"];
     ok(&[&["phantom", text(&native)], &size[..]].concat());
     ok(&[&["phantom", text(&authors), "--layout", "nerfca"], &size[..]].concat());
-    // Stale absolute paths, as copied datasets have them.
+    // Copied datasets have outdated absolute paths.
     let list = authors.join("train-0.json");
     let moved = std::fs::read_to_string(&list).unwrap().replace("\"train-view", "\"/gone/elsewhere/train-view");
     std::fs::write(&list, moved).unwrap();
@@ -222,7 +222,7 @@ fn volumes_are_of_the_phases_asked_for() {
             (0..5).filter(|phase| out.join(format!("volumes/{kind}-{phase:02}.nrrd")).is_file()).collect()
         };
         assert_eq!((there("vessels"), there("background")), (expected.clone(), expected));
-        // The tree is that of all phases.
+        // The tree has all phases.
         let tree: Value = serde_json::from_slice(&std::fs::read(out.join("volumes/tree.json")).unwrap()).unwrap();
         assert!(tree.to_string().len() > 100, "{tree}");
     }
@@ -293,7 +293,7 @@ fn volumes_are_projected_in_every_format() {
     );
 }
 
-/// A valid two-frame dataset, changed by `spoil` before it is opened by the program.
+/// Writes a valid two-frame dataset, changed by `spoil` before the program opens it.
 fn spoiled(directory: &Path, name: &str, spoil: impl FnOnce(&Path, &mut Value)) -> PathBuf {
     let data = directory.join(name);
     let frame = |phase: u32| {
@@ -389,7 +389,7 @@ fn malformed_datasets_are_named_file_and_field() {
         let data = spoiled(directory.path(), name, spoil);
         fails(&["info", text(&data)], 1, parts);
     }
-    // The unspoiled one is fine, so the cases fail for their own reasons.
+    // The unspoiled dataset is valid, so each case fails for its own reason.
     ok(&["info", text(&spoiled(directory.path(), "fine", |_, _| {}))]);
     fails(&["info", text(&directory.path().join("absent"))], 1, &["absent"]);
     fails(&["info", text(directory.path())], 1, &["dataset.json", "general.json"]);
@@ -408,7 +408,7 @@ fn usage_errors_have_their_exit_codes() {
     assert!(ok(&["completions", "bash"]).contains("nertca-vk"));
     let devices: Value = serde_json::from_str(&ok(&["devices", "--json"])).unwrap();
     assert!(devices[0]["paths"]["reasons"].is_array() && devices[0]["uuid"].is_string());
-    // What a report of a fault needs besides.
+    // Further details for the report of a fault.
     let details = &devices[0]["details"];
     assert_eq!(details["subgroups"]["default_size"], devices[0]["subgroup_size"]);
     assert_eq!(details["max_workgroup_count"][0], devices[0]["max_workgroup_count"]);
@@ -466,7 +466,7 @@ fn measurements_and_baked_views() {
     assert!(report["peaks"]["f32_tflops"].as_f64().unwrap() > 0.0);
     assert_eq!(report["config"]["train"]["rays"], 64);
     assert_eq!((&report["tuning"]["layers"], &report["after"]["iterations"]), (&"f32".into(), &2.into()));
-    // Four iterations to begin with, and one to see how long they take.
+    // Four iterations at the start, and one that measures their duration.
     assert_eq!(report["after"]["learned"], 5);
     assert!(
         said.contains("left out: ") && said.contains("repeats of 2 iterations, after 5 iterations of learning"),
@@ -486,7 +486,7 @@ fn measurements_and_baked_views() {
     assert_eq!(report["network_cost"]["forward"], forward);
     assert_eq!(report["network_cost"]["weights"], forward);
     assert_eq!(report["network_cost"]["inputs"], 2 * (3 * 16 * 16 + 16));
-    // What is no number is null, which can be read again.
+    // A value that is not a number is written as null, which can be read again.
     let mut unscored = report.clone();
     unscored["full"]["psnr"] = Value::Null;
     std::fs::write(&file, unscored.to_string()).unwrap();
@@ -523,7 +523,7 @@ fn matrices_are_refused_where_there_are_none() {
     fails(&asked.concat(), 2, &["cooperative matrices", "f32"]);
 }
 
-/// Starts a training whose lines of JSON are read as they come.
+/// Starts a training, and returns its lines of JSON as they arrive.
 #[cfg(unix)]
 fn training(data: &Path, run: &Path, extra: &[&str]) -> (std::process::Child, impl Iterator<Item = Value> + use<>) {
     let mut child = program()
@@ -548,7 +548,7 @@ fn scoring_stops_when_told_and_can_be_left_for_later() {
     let data = directory.path().join("forty images");
     ok(&["phantom", text(&data), "--size", "64", "--phases", "10", "--views", "3", "--no-volumes"]);
     let run = directory.path().join("run");
-    // Forty images that take their time.
+    // Forty images that take long to render.
     let slow = [SHORT, &["--set", "train.validate_every=0", "--set", "march.render_samples=2048"]].concat();
     for name in ["-TERM", "-INT"] {
         let (mut child, mut lines) = training(&data, &run, &[&slow[..], &["--force"]].concat());
@@ -587,7 +587,7 @@ fn a_run_killed_at_random_ends_in_the_same_file() {
         [&settings[..], &["--set", "train.iterations_per_submit=1", "--set", "dynamic.delay=5", "--no-eval"]].concat();
     let (whole, killed) = (directory.path().join("whole"), directory.path().join("killed"));
     ok(&[&["train", text(&data), "-o", text(&whole)], &settings[..]].concat());
-    // Killed after so many lines, again and again, until it is through; the moments come from a fixed seed.
+    // The run is killed repeatedly after a random number of lines until it completes; the numbers come from a fixed seed.
     let mut random = 0x2545_f491_4f6c_dd1du64;
     let mut kills = 0;
     let last = killed.join("checkpoint-0000030.safetensors");
@@ -606,11 +606,11 @@ fn a_run_killed_at_random_ends_in_the_same_file() {
         if last.is_file() {
             break;
         }
-        // As a kill in the middle of a checkpoint leaves it.
+        // A kill during the writing of a checkpoint leaves such a file.
         std::fs::write(killed.join(".partial-abcdef"), b"half").unwrap();
     }
     ok(&["train", text(&data), "-o", text(&killed), "--resume", "--no-eval"]);
-    // A machine may be so busy that the run ends before it is killed.
+    // On a busy machine the run may end before it is killed.
     if kills < 3 {
         eprintln!("only {kills} kills came in time: little was tested");
     }
@@ -654,7 +654,7 @@ fn views_and_detectors_are_the_user_s() {
         ]
     );
     assert_eq!((dataset.training().len(), dataset.validation().len()), (2, 1));
-    // The cube is 64 mm wide: a detector shifted by two pixels sees it two pixels further on the other side.
+    // The cube is 64 mm wide: on a detector shifted by two pixels it appears two pixels further to the other side.
     let centre = |frame: &nertca_vk::scan::dataset::Frame| {
         let mass: f32 = frame.integrals.iter().sum();
         frame.integrals.iter().enumerate().map(|(i, v)| (i % 16) as f32 * v).sum::<f32>() / mass
@@ -667,7 +667,7 @@ fn views_and_detectors_are_the_user_s() {
     assert!(dataset.validation().is_empty());
     let [moved, middle] = [0, 1].map(|i| centre(&dataset.frames[i]));
     assert!((middle - 7.5).abs() < 0.05 && (moved - 5.5).abs() < 0.05, "{moved} and {middle}");
-    // Refused before anything is written.
+    // Refused before any file is written.
     let nowhere = directory.path().join("nowhere");
     let refuse = |extra: &[&str], part: &str| {
         let project = ["project", text(&file), "--spacing", "4,4,4", "--out", text(&nowhere)];

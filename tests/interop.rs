@@ -1,5 +1,5 @@
-//! Files other tools read and write: exports opened by them, datasets converted, DICOM nobody should send, the page and
-//! the viewer.
+//! Interoperability with other tools: exports opened by them, datasets converted, invalid DICOM files, the page and the
+//! viewer.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/dicom.rs"]
@@ -45,7 +45,7 @@ fn fails(args: &[&str], code: i32, parts: &[&str]) {
     parts.iter().for_each(|part| assert!(stderr.contains(part), "{args:?} does not name `{part}`: {stderr}"));
 }
 
-/// A small run, made once: data and run directory.
+/// A small run, created once: data and run directory.
 fn trained() -> &'static (tempfile::TempDir, PathBuf, PathBuf) {
     static RUN: OnceLock<(tempfile::TempDir, PathBuf, PathBuf)> = OnceLock::new();
     RUN.get_or_init(|| {
@@ -85,7 +85,7 @@ fn exports_open_in_the_tools_people_use() {
     ok(&[&mesh[..], &["-o", text(&to("beat.glb"))]].concat());
     std::fs::copy(run.join("checkpoint-0000150.safetensors"), to("checkpoint.safetensors")).unwrap();
     std::fs::copy(run.join("report/evaluation.json"), to("evaluation.json")).unwrap();
-    // What the files must say is asked of the library itself.
+    // The expected content of the files is computed by the library itself.
     let model = nertca_vk::model::checkpoint::Checkpoint::read(&to("checkpoint.safetensors")).unwrap().model;
     let grid =
         nertca_vk::export::volumes::grid_over(&model.scene, nertca_vk::model::component::Component::Dynamic, 1.5)
@@ -114,7 +114,7 @@ fn compressed_exports_hold_the_same() {
     export("named.nii.gz", &["--format", "nifti"]);
     export("zipped.seq.nrrd", &["--compress"]);
     export("zipped.nrrd", &["--compress", "--phase", "1"]);
-    // What others read, we read.
+    // Files that others read are also read by the library.
     let volume = |name: &str| {
         let hints = nertca_vk::formats::volume::VolumeHints::default();
         nertca_vk::formats::volume::Volume::read(&out.join(name), &hints).unwrap()
@@ -182,7 +182,7 @@ fn the_report_needs_nothing_but_itself() {
         assert!(page.contains(part), "{part}");
     }
     for outside in ["<script", "http://", "https://", "<link", "@import"] {
-        // SVG names its own language by an address nobody visits.
+        // SVG is identified by an address that is never requested.
         let rest = page.replace("http://www.w3.org/2000/svg", "");
         assert!(!rest.contains(outside), "{outside}");
     }
@@ -190,7 +190,7 @@ fn the_report_needs_nothing_but_itself() {
     assert!(run.join("eval.html").is_file());
 }
 
-/// Status and body of a request.
+/// Status and body of the response to a request.
 fn ask(port: u16, path: &str, headers: &str) -> (u16, Vec<u8>) {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
     write!(stream, "GET {path} HTTP/1.1\r\n{headers}Connection: close\r\n\r\n").unwrap();
@@ -224,7 +224,7 @@ fn the_viewer_answers_its_own_page_alone() {
     let (white, dark) = (|v: &u8| *v > 250, |v: &u8| *v < 200);
     assert!(picture.iter().filter(|v| white(v)).count() > picture.len() / 2, "vessels are few");
     assert!(picture.iter().filter(|v| dark(v)).count() > 8, "there are vessels");
-    // Others are turned away.
+    // Requests from others are refused.
     for (path, headers) in [
         ("/".to_owned(), host.clone()),
         ("/?token=00000000000000000000000000000000".into(), host.clone()),
@@ -252,7 +252,7 @@ fn the_viewer_answers_its_own_page_alone() {
     server.wait().unwrap();
 }
 
-/// The page in a headless browser: it draws vessels.
+/// Opens the page in a headless browser: it draws vessels.
 fn browse(url: &str, dir: &Path) {
     let shot = dir.join("view.png");
     Command::new("chromium")
@@ -264,7 +264,7 @@ fn browse(url: &str, dir: &Path) {
         .output()
         .unwrap_or_else(|e| panic!("chromium is needed to look at the viewer with: {e}"));
     let picture = image::open(&shot).unwrap().to_luma8();
-    // Left is the picture: white with dark vessels in its middle.
+    // The picture is on the left: white with dark vessels in its centre.
     let stage: Vec<u8> =
         (100..500).flat_map(|y| (100..500).map(move |x| (x, y))).map(|(x, y)| picture[(x, y)].0[0]).collect();
     let (white, dark) = (stage.iter().filter(|v| **v > 230).count(), stage.iter().filter(|v| **v < 160).count());
@@ -294,7 +294,7 @@ fn dicom_runs_get_phases_and_lose_their_patient() {
         args.concat().iter().map(|s| (*s).to_owned()).collect::<Vec<_>>()
     };
     let run = |args: &[String]| nertca(&args.iter().map(String::as_str).collect::<Vec<_>>());
-    // 100 beats per minute: 0.6 s, six frames of 0.1 s.
+    // At 100 beats per minute a beat has 0.6 s, which is six frames of 0.1 s.
     let evenly = ["--phases", "6", "--heart-rate", "100", "--beat-scaling", "linear"];
     assert!(run(&import(&evenly)).status.success());
     let dataset = nertca_vk::scan::dataset::Dataset::open(&out).unwrap();
@@ -303,7 +303,7 @@ fn dicom_runs_get_phases_and_lose_their_patient() {
     let row = &frame.integrals[30 * 64..31 * 64];
     let darkest = (0..64).max_by(|a, b| row[*a].total_cmp(&row[*b])).unwrap();
     assert!((25..=27).contains(&darkest), "the bar of the third frame is at column 26, not {darkest}");
-    // A list of phases does the same.
+    // A list of phases gives the same result.
     let list = dir.path().join("phases.txt");
     std::fs::write(&list, "# one per frame\n0\n1\n2\n3\n4\n5\n").unwrap();
     let again = dir.path().join("again");
@@ -315,7 +315,7 @@ fn dicom_runs_get_phases_and_lose_their_patient() {
     }
     let manifest = std::fs::read_to_string(out.join("dataset.json")).unwrap();
     assert!(!manifest.contains("SECRET"));
-    // Without an ECG or a choice, it says what to give.
+    // Without an ECG or a choice, the message says what is needed.
     let none = run(&import(&["--phases", "6"]));
     assert!(String::from_utf8_lossy(&none.stderr).contains("a heart rate"));
 }
@@ -327,7 +327,7 @@ fn dicom_nobody_should_send_is_refused_by_name() {
     let refuse = |name: &str, part: &str, options: &[&str]| {
         let file = dir.path().join(name);
         let args = ["import", "dicom", text(&file), "-o", text(&out), "--still"];
-        // The file is at fault, or what was asked of it.
+        // Either the file or the options are at fault.
         let code = if options.is_empty() { 1 } else { 2 };
         fails(&[&args[..], options].concat(), code, &[part]);
         assert!(!out.exists(), "{name}: something was written");
@@ -359,7 +359,7 @@ fn dicom_nobody_should_send_is_refused_by_name() {
     ];
     for (name, part, change) in cases {
         angiogram(&dir.path().join(name), change);
-        // What can be given is not missing from the file's fault alone, but the file is named all the same.
+        // The missing value could also be given as an option, but the message names the file nevertheless.
         let args = ["import", "dicom", text(&dir.path().join(name)), "-o", text(&out), "--still"].map(str::to_owned);
         fails(&args.iter().map(String::as_str).collect::<Vec<_>>(), 1, &[part, name]);
         assert!(!out.exists(), "{name}: something was written");
@@ -381,7 +381,7 @@ fn dicom_nobody_should_send_is_refused_by_name() {
     fails(&["import", "dicom", text(dir.path()), "-o", text(&out), "--still"], 1, &["size"]);
 }
 
-/// Where a square of a colour is whose pixels are nearly all of it: its middle.
+/// Centre of a square of a colour, in which nearly all pixels have the colour.
 fn square_of(picture: &image::RgbImage, colour: image::Rgb<u8>, [left, top]: [u32; 2], side: u32) -> Option<[f64; 2]> {
     const HALF: i64 = 5;
     let has = |x: i64, y: i64| picture.get_pixel_checked(x as u32, y as u32) == Some(&colour);
@@ -402,7 +402,7 @@ fn the_picture_of_a_geometry_has_sources_where_they_are() {
     let picture = image::open(&file).unwrap().to_rgb8();
     let field = picture.width() / 2;
     let dataset = nertca_vk::scan::dataset::Dataset::open(data).unwrap();
-    // Colours of the lines that name views: the first coloured pixel of each row of letters.
+    // Colours of the lines with the names of views: the first coloured pixel of each row of letters.
     let mut colours: Vec<image::Rgb<u8>> = Vec::new();
     for y in 0..field {
         let coloured = |p: &image::Rgb<u8>| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 60;
@@ -414,7 +414,8 @@ fn the_picture_of_a_geometry_has_sources_where_they_are() {
     for (view, colour) in dataset.training_views().into_iter().zip(colours) {
         let nertca_vk::geometry::Geometry::CArm(c_arm) = &dataset.views[view].geometry else { panic!("a C-arm") };
         let (a, b) = (c_arm.primary_deg.to_radians(), c_arm.secondary_deg.to_radians());
-        // Against the beam, which goes to the detector: LAO to the left, cranial to the head.
+        // The source is opposite to the direction of the beam, which points to the detector: LAO to the left, cranial to
+        // the head.
         let source = [-a.sin() * b.cos(), a.cos() * b.cos(), -b.sin()].map(|v| v * c_arm.sod_mm);
         let [left, posterior, superior] = source;
         for (at, wanted) in [([0, 0], [left, posterior]), ([0, 1], [left, -superior]), ([1, 1], [posterior, -superior])]
@@ -429,7 +430,7 @@ fn the_picture_of_a_geometry_has_sources_where_they_are() {
             per_mm.push(far / length);
         }
     }
-    // Some hide behind others.
+    // Some sources hide behind others.
     assert!(per_mm.len() >= 7, "sources are seen: {}", per_mm.len());
     assert!(per_mm.iter().all(|scale| (scale / per_mm[0] - 1.0).abs() < 0.03), "one scale: {per_mm:?}");
     fails(&["info", text(run), "--picture", text(&file)], 2, &["--picture", "dataset"]);

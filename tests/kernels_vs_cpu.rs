@@ -1,4 +1,4 @@
-//! Every training kernel against its f64 twin, through whole iterations on the device, with validation on.
+//! Comparison of every training kernel with its f64 twin, through whole iterations on the device, with validation.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -88,14 +88,14 @@ fn rays_and_depths_match() {
         live += march::fwd(plan, &params, 0, w, near, false, Precision::Exact).dynamics.len();
     }
     assert!(live > 20, "the case must have live samples, has {live}");
-    // A sample on a cell face may fall either way in f32.
+    // A sample on a cell face may belong to either cell in f32.
     assert!((losses[0].live_samples as i64 - live as i64).abs() <= 2, "{} live, twin {live}", losses[0].live_samples);
     drop(trainer);
     expect_silence(gpu);
 }
 
-/// Both families of kernels: operands through texel buffers with small workgroups, as an old lavapipe gets
-/// them, and through storage buffers with large ones, as GPUs do.
+/// Both families of kernels: operands through texel buffers with small workgroups, as for an old lavapipe, and through
+/// storage buffers with large ones, as for GPUs.
 fn paths() -> [Tuning; 3] {
     let f32_layers = |operands, layer_lanes, weight_lanes, splits, march_lanes, private_line_bytes| Tuning {
         layers: Layers::F32,
@@ -144,8 +144,8 @@ fn ten_updates_across_the_delay_match() {
     let gpu = gpu();
     let dataset = uneven_dataset(9, 8);
     for preset in ["paper", "public-code", "fast-mlp"] {
-        // Starts at the sixth iteration; the optimiser is re-created there. A softer shift than -10 lets
-        // the network move, so that the comparison sees it.
+        // The dynamic field starts at the sixth iteration, where the optimiser is re-created. A softer shift than -10 lets
+        // the network change, so that the comparison is sensitive to it.
         let settings =
             ["dynamic.delay=5", "dynamic.lr=1e-3", "dynamic.lr_end=1e-4", "adam.epsilon=1e-6", "loss.normalise=true"];
         let plan = Plan::new(&small_config(preset, &settings), &dataset).unwrap();
@@ -168,7 +168,7 @@ fn ten_updates_across_the_delay_match() {
         assert!(moved(0..split) > 1e-3 && moved(split..params.len()) > 1e-3, "{preset}: both fields must move");
         let mut far = 0;
         for (g, w) in got.iter().zip(&params) {
-            // Adam divides by the gradient's size, so a tiny gradient's rounding shows in full; few may.
+            // Adam divides by the gradient's size, so rounding errors of tiny gradients appear in full; only few may.
             far += usize::from((f64::from(*g) - w).abs() > 1e-4 * w.abs().max(1e-2));
         }
         assert!(far * 200 <= got.len(), "{preset}: {far} of {} parameters differ", got.len());
@@ -176,7 +176,8 @@ fn ten_updates_across_the_delay_match() {
     expect_silence(gpu);
 }
 
-/// Behind a blade nothing is drawn: the twin's rays, and none of them hidden, whether they meet the hull or not.
+/// Behind a blade no rays are drawn: the device draws the twin's rays, none of them hidden, whether they meet the hull or
+/// not.
 #[test]
 fn hidden_pixels_are_never_drawn() {
     let gpu = gpu();

@@ -1,7 +1,6 @@
-//! Parsers of ours on damaged files: an error or a value, never a panic or a huge allocation; a parser that never ends is
-//! one that this never returns from.
-//! `NERTCA_MALFORMED_INPUTS` sets how many inputs each parser gets; a failure names its seed, and
-//! `NERTCA_MALFORMED_SEED` repeats it.
+//! The project's parsers on damaged files: the result is an error or a value, never a panic or a huge allocation; if a
+//! parser does not terminate, neither does this test. `NERTCA_MALFORMED_INPUTS` sets the number of inputs for each parser;
+//! a failure names its seed, and `NERTCA_MALFORMED_SEED` repeats it.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod common;
@@ -23,7 +22,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// Refuses what no damaged file of a few kilobytes may ask for.
+/// Allocator that records the largest allocation, which must stay small for damaged files of a few kilobytes.
 struct Bounded;
 
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
@@ -36,7 +35,7 @@ unsafe impl GlobalAlloc for Bounded {
         unsafe { System.alloc(layout) }
     }
 
-    // Memory that is zero by itself costs nothing until it is written, and then it was asked for by `alloc`, or grew.
+    // Zeroed memory costs nothing until it is written, and is then counted by `alloc` or `realloc`.
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         // SAFETY: as the caller vouches.
         unsafe { System.alloc_zeroed(layout) }
@@ -69,7 +68,7 @@ impl Random {
     }
 }
 
-/// Damages the beginning of a file most, where headers are.
+/// Damages mostly the beginning of a file, where headers are.
 fn damage(seed: &[u8], random: &mut Random) -> Vec<u8> {
     let mut bytes = seed.to_vec();
     for _ in 0..=random.below(4) {
@@ -109,7 +108,7 @@ fn damage(seed: &[u8], random: &mut Random) -> Vec<u8> {
                 let to = random.below(bytes.len());
                 bytes.splice(to..to, part);
             }
-            // A digit becomes another, or one more.
+            // A digit is replaced by another, or one is added.
             6 | 7 => {
                 let digits: Vec<usize> = (0..reach).filter(|i| bytes[*i].is_ascii_digit()).collect();
                 if let Some(i) = digits.get(random.below(digits.len())) {
@@ -126,13 +125,13 @@ fn damage(seed: &[u8], random: &mut Random) -> Vec<u8> {
 }
 
 fn scratch() -> tempfile::TempDir {
-    // Memory is kinder to a million small files than a disk.
+    // A memory file system is faster than a disk for a million small files.
     tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap()
 }
 
-/// Feeds damaged copies of the seeds, as a file called `name`, to a parser.
+/// Passes damaged copies of the seeds, as a file called `name`, to a parser.
 fn feed(name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
-    // One parser at a time: the largest allocation is everybody's.
+    // Only one parser runs at a time, because the largest allocation is recorded for all of them.
     static ALONE: Mutex<()> = Mutex::new(());
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let number = |variable| std::env::var(variable).ok().map(|n| n.parse::<u64>().unwrap());
@@ -164,7 +163,7 @@ fn feed(name: &str, seeds: &[Vec<u8>], parse: impl Fn(&Path) -> bool) {
     assert!(only.is_some() || accepted < count, "no damage was noticed");
 }
 
-/// Keeps an input to look at; where.
+/// Keeps an input for inspection, and returns its path.
 fn keep(name: &str, bytes: &[u8]) -> String {
     let path = std::env::temp_dir().join(format!("malformed-{name}"));
     std::fs::write(&path, bytes).unwrap();
@@ -211,7 +210,7 @@ fn npy_volumes_and_images() {
     feed("i.npy", &[std::fs::read(&square).unwrap()], |p| images::read_image(p).is_ok());
 }
 
-/// A dataset on disk, small.
+/// Writes a small dataset.
 fn dataset(layout: nertca_vk::scan::dataset::Layout) -> (tempfile::TempDir, PathBuf) {
     let dir = scratch();
     let out = dir.path().join("data");

@@ -1,5 +1,5 @@
-//! The network on cooperative matrices against the f64 twin and the f32 path, with validation on. `tools/test` runs
-//! this on the newest lavapipe; on a device without matrices it says so and checks nothing, unless
+//! Comparison of the network on cooperative matrices with the f64 twin and the f32 path, with validation. `tools/test` runs
+//! this on the newest lavapipe; on a device without matrices it reports that and checks nothing, unless
 //! `NERTCA_MATRICES=require`.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -35,14 +35,14 @@ fn matrices() -> Option<(Gpu, Tuning)> {
     Some((gpu, tuning))
 }
 
-/// As GPUs get them, with fewer workgroups than tiles.
+/// Tunings of GPUs, with fewer workgroups than tiles.
 const NVIDIA: MatrixTuning = MatrixTuning { workgroups: 3, ..MatrixTuning::NVIDIA };
 const AMD: MatrixTuning = MatrixTuning { workgroups: 3, ..MatrixTuning::AMD };
 const INTEL: MatrixTuning = MatrixTuning { workgroups: 3, ..MatrixTuning::INTEL };
-/// As GPUs without f16 sums get them, of Intel and, if there are, of others.
+/// Tunings of GPUs without f16 sums: of Intel and, if there are any, of others.
 const INTEL_F32_SUMS: MatrixTuning = MatrixTuning { f16_sums: false, ..INTEL };
 const F32_SUMS: MatrixTuning = MatrixTuning { f16_sums: false, ..NVIDIA };
-/// Layer by layer backward, in loops that compile sooner.
+/// Backward pass layer by layer, in loops that compile faster.
 const SINGLY: MatrixTuning = MatrixTuning { pairs: false, ..MatrixTuning::CPU };
 const GPU_CASE: Case = Case {
     preset: Preset::FastMlp,
@@ -66,7 +66,7 @@ fn every_stage_of_an_iteration_matches() {
     expect_silence(gpu);
 }
 
-/// An iteration whose backward passes compute the first layer again or, of a CPU, keep it.
+/// Compares an iteration whose backward passes recompute the first layer or, on a CPU, keep it.
 fn an_iteration(gpu: &Gpu, matrices: MatrixTuning, findings: &mut Findings) -> Result<()> {
     let tuning = Tuning::for_device(gpu.info()).with_layers(Layers::Matrices, String::new());
     let path = Tuning { matrices, ..tuning };
@@ -180,7 +180,7 @@ fn an_overflow_skips_the_update_and_lowers_the_scale_for_a_while() {
         state(&trainer),
         DeviceState { step: 1, loss_scale: 2f32.powi(56), return_scale: 2f32.powi(59), ..DeviceState::default() }
     );
-    // Back and back until gradients fit; then the network moves again, and the scale remembers where it came from.
+    // The scale is reduced until gradients fit; then the network changes again, and the scale to return to is kept.
     let mut last = state(&trainer);
     while last.good_updates == 0 {
         let until = trainer.step() + 1;
@@ -191,7 +191,7 @@ fn an_overflow_skips_the_update_and_lowers_the_scale_for_a_while() {
     assert_eq!(last.return_scale, 2f32.powi(59), "overflows in a row are one");
     assert_ne!(before[first..], trainer.model().unwrap().params[first..]);
 
-    // A scale below the one it returns to grows after 20 good updates, one above it after 500.
+    // A scale below the one to return to grows after 20 good updates, one above it after 500.
     let set = DeviceState { loss_scale: 2f32.powi(6), good_updates: 1, return_scale: 2f32.powi(10), ..last };
     gpu.upload(&trainer.forward().state, 0, &[set]).unwrap();
     let until = last.step + 20;

@@ -1,4 +1,4 @@
-//! A beat that is known between phases: pictures at any moment, and motion that other tools read.
+//! Motion known between phases: images at any moment, and motion files that other tools read.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -30,10 +30,10 @@ const NODES: u32 = 5;
 const HALF_SIDE: f64 = 44.0;
 /// Columns and rows of the pictures.
 const SIZE: [usize; 2] = [19, 15];
-/// The phase at which Gaussians are where their positions say.
+/// Phase at which Gaussians are at their stored positions.
 const REST: usize = 1;
 
-/// What the grid adds to a point at each phase: linear in the point, so that a grid holds it exactly.
+/// Displacement of a point by the grid at each phase: linear in the point, so that a grid represents it exactly.
 fn displacement(x: DVec3, phase: usize) -> DVec3 {
     let turn =
         DMat3::from_cols(DVec3::new(0.06, 0.02, -0.03), DVec3::new(-0.05, 0.04, 0.01), DVec3::new(0.02, -0.04, 0.03));
@@ -55,7 +55,7 @@ fn rest(i: usize) -> DVec3 {
     DVec3::new(wave(0.9), wave(1.7), wave(2.9))
 }
 
-/// Where Gaussian `i` is, without the library.
+/// Position of Gaussian `i`, computed without the library.
 fn place(i: usize, phase: f64) -> DVec3 {
     let (before, share) = (phase as usize % PHASES, phase.fract());
     let x = rest(i);
@@ -83,7 +83,7 @@ fn tree() -> MovingTree {
         rest: Gaussians {
             units: UNITS,
             n_phases: PHASES,
-            // So far out that what is cut away does not count.
+            // The cut is so far out that the truncated part is negligible.
             setup: GaussianSetup { cut: 6.0, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() },
             rows: (0..6).map(gaussian).collect(),
             step: 1,
@@ -103,7 +103,7 @@ fn tree() -> MovingTree {
     }
 }
 
-/// A model that was never trained, with a moving field.
+/// An untrained model with a dynamic field.
 fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
     let dataset = small_dataset(SIZE[0], SIZE[1]);
     let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
@@ -193,7 +193,7 @@ fn any_moment_of_the_beat_can_be_rendered() {
         assert!(want.iter().copied().fold(0.0, f64::max) > 0.1, "the case must show something");
         assert_eq!(seen.static_integral, whole(0).static_integral, "the static field stands still");
     }
-    // Whole phases are what they were, also after moments between them; the beat closes.
+    // Whole phases are unchanged, also after moments between them; the beat is periodic.
     for phase in 0..PHASES {
         assert_eq!(at(phase as f64).dynamic_integral, whole(phase as u32).dynamic_integral);
         assert_eq!(at(phase as f64).total_max, whole(phase as u32).total_max);
@@ -203,12 +203,12 @@ fn any_moment_of_the_beat_can_be_rendered() {
         let error = renderer.render_at(rays, width, height, bad).unwrap_err().to_string();
         assert!(error.contains("0 to 3"), "{bad}: {error}");
     }
-    // Another field is drawn from the next picture on, between phases as well.
+    // After a change, the new field is rendered from the next picture, also between phases.
     let mut other = tree();
     other.rest.rows.iter_mut().for_each(|g| g.log_density = -30.0);
     renderer.set_gaussians(&MovingGaussians::Tree(other)).unwrap();
     assert!(at(0.5).dynamic_integral.iter().all(|v| *v < 1e-9));
-    // Fields that know whole phases alone say so.
+    // Fields that are known at whole phases only give an error.
     renderer.set_gaussians(&MovingGaussians::PerPhase(tree().expand())).unwrap();
     assert_eq!(at(2.0).dynamic_integral, whole(2).dynamic_integral);
     let between = renderer.render_at(rays, width, height, 0.5).unwrap_err().to_string();
@@ -271,7 +271,7 @@ fn the_program_renders_between_phases() {
     assert!(between != first && between != last, "what the network shows is at neither phase");
 }
 
-/// LPS mm of what is along (posterior, left, superior) in pixels.
+/// LPS mm of a vector along (posterior, left, superior) in pixels.
 fn lps_mm(x: DVec3) -> [f64; 3] {
     [x.y, x.x, x.z].map(|v| v * UNITS.pixel * 100.0)
 }
@@ -288,7 +288,7 @@ fn motion_opens_in_other_tools() {
     assert_eq!(export("field.vtk", &[]).lines().count(), PHASES);
     export("one.vtk", &["--phase", "1"]);
     export("lines.vtk", &["--trajectories"]);
-    // What the files must say is asked of the tree, at places that are no nodes.
+    // The expected content of the files is computed from the tree, at positions between nodes.
     let tree = tree();
     let places: Vec<DVec3> = (0..7).map(|i| 3.5 * rest(i)).collect();
     assert!(places.iter().all(|x| x.abs().max_element() < HALF_SIDE));
@@ -350,7 +350,7 @@ fn a_run_of_gaussians_is_described() {
     let info: Value = serde_json::from_str(&ok(&["info", &run, "--json"])).unwrap();
     let told = &info["gaussians"];
     assert_eq!((&told["form"], &told["count"], &told["rest_phase"]), (&json!("tree"), &json!(6), &json!(REST)));
-    // 11 numbers a Gaussian, two vectors of own motion, and the grid.
+    // There are 11 values per Gaussian, two vectors of own motion, and the grid.
     assert_eq!(told["bytes"], 4 * (6 * 11 + 6 * 2 * 3 + PHASES * 125 * 3));
     for phase in 0..PHASES {
         let mm: Vec<f64> =

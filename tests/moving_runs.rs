@@ -1,5 +1,5 @@
-//! Runs during which the C-arm turns or the table moves, as pydicom writes them: frames of one place are a view, others are views of
-//! their own, and what can be made of those is said.
+//! Runs during which the C-arm rotates or the table moves, as written by pydicom: frames of one pose are a view, others are
+//! views of their own, and the program reports what they can be used for.
 #![cfg(feature = "dicom")]
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
@@ -17,7 +17,7 @@ use said::{run, text};
 use std::path::{Path, PathBuf};
 
 const PHASES: usize = 6;
-/// Frames of the run that turns, by 10 degrees each.
+/// Frames of the rotating run, 10 degrees apart.
 const TURNING: usize = 12;
 
 fn c_arms(data: &Path) -> Vec<CArm> {
@@ -28,7 +28,7 @@ fn c_arms(data: &Path) -> Vec<CArm> {
     Dataset::open(data).unwrap().views.iter().map(|view| c_arm(&view.geometry)).collect()
 }
 
-/// Views that a dataset has, and how many frames of each.
+/// Number of frames of each view of a dataset.
 fn frames_of_views(data: &Path) -> Vec<usize> {
     let dataset = Dataset::open(data).unwrap();
     (0..dataset.views.len()).map(|view| dataset.frames.iter().filter(|f| f.view == view).count()).collect()
@@ -56,7 +56,7 @@ fn frames_are_of_as_many_views_as_there_were_places() {
         (run(&args, true), out)
     };
 
-    // Each frame of a run that turns is a view, which looks from where the C-arm was.
+    // Each frame of a rotating run is a view with the C-arm's pose.
     let (told, turning) = import("turning", &["turning.dcm"], TURNING);
     assert!(told.contains("its 12 frames are of 12 views") && told.contains("12 views of 48 x 48 pixels"), "{told}");
     assert_eq!(frames_of_views(&turning), [1; TURNING]);
@@ -70,12 +70,13 @@ fn frames_are_of_as_many_views_as_there_were_places() {
     let few = ["--set", "train.iterations=8", "--set", "train.rays=64", "--no-eval"];
     run(&[&["train", text(&turning), "-o", text(&at("paper")), "--preset", "paper"], &few[..]].concat(), true);
 
-    // What the table does within a twentieth of a pixel is nothing.
+    // Table motion within a twentieth of a pixel is ignored.
     let (told, trembling) = import("trembling", &["trembling.dcm"], PHASES);
     assert!(!told.contains("moves"), "{told}");
     assert_eq!(frames_of_views(&trembling), [PHASES]);
 
-    // A table that rests and then moves: the frames before are one view. The others say nothing of vessels, and the run says so.
+    // A table that rests and then moves: the frames before are one view. The other frames contain no information on
+    // vessels, and the run reports that.
     let (told, panned) = import("panned", &["panned.dcm", "other.dcm"], PHASES);
     assert!(told.contains("panned: the C-arm or the table moves: its 6 frames are of 4 views"), "{told}");
     let mut counts = frames_of_views(&panned);

@@ -1,5 +1,5 @@
-//! The authors' layout against files that numpy wrote, following their loader (`tests/python/make_nerfca_golden.py`):
-//! exact line integrals of a few balls on a detector that is wider than high.
+//! The authors' layout, compared with files written by numpy according to their loader
+//! (`tests/python/make_nerfca_golden.py`): exact line integrals of a few balls on a detector that is wider than high.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 use glam::DVec3;
@@ -34,7 +34,7 @@ impl Ball {
 #[derive(Deserialize)]
 struct Balls {
     still: Vec<Ball>,
-    /// One per phase.
+    /// Balls of the vessel, one per phase.
     vessel: Vec<Ball>,
 }
 
@@ -77,7 +77,7 @@ fn what_is_written_is_what_the_authors_write() {
     }
 }
 
-/// A copy of the golden dataset, to change.
+/// A copy of the golden dataset that can be changed.
 fn copied() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     for entry in std::fs::read_dir(golden()).unwrap() {

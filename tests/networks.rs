@@ -1,5 +1,5 @@
-//! Two networks as the fields (the preset `nerf-ca`): every stage equals its twin, runs learn, repeat and resume bit by bit, and
-//! learning ends where an entropy vanishes. On cooperative matrices as well, where a device has them.
+//! Two networks as the fields (the preset `nerf-ca`): every stage equals its twin, runs learn, repeat and resume with equal
+//! bits, and learning ends where an entropy vanishes. On cooperative matrices as well, where a device has them.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -26,7 +26,7 @@ use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
 
-/// The paths that a device has: as an old lavapipe gets them, as GPUs do, and matrices where there are some.
+/// Paths of a device: as for an old lavapipe, as for GPUs, and matrices where available.
 fn paths(gpu: &Gpu) -> Vec<Tuning> {
     let f32_layers = |operands, lanes| Tuning {
         operands,
@@ -70,7 +70,7 @@ fn views_and_volumes_equal_the_twin() {
     expect_silence(gpu);
 }
 
-/// A configuration that learns in little time, and its weights of losses go their way in it.
+/// A configuration that learns quickly and contains all changes of the loss weights.
 fn quick(settings: &[&str]) -> Config {
     let quick = [
         "networks.gain=0.5",
@@ -94,7 +94,7 @@ fn resume(gpu: &Gpu, config: &Config, dataset: &Dataset, saved: &Checkpoint) -> 
     Trainer::resume(gpu, plan, dataset, tuning(gpu), saved).unwrap()
 }
 
-/// What a checkpoint holds after it was a file.
+/// Writes a checkpoint to bytes and reads it back.
 fn through_a_file(saved: &Checkpoint) -> Checkpoint {
     Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap()
 }
@@ -116,7 +116,7 @@ fn runs_learn_repeat_and_resume_bit_by_bit() {
     assert!(want.model.params == got.model.params && want.moments == got.moments);
     let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
     assert!(mean(&losses[100..]) < 0.3 * mean(&losses[..5]), "{:?} {:?}", &losses[..5], &losses[115..]);
-    // Both fields learn, and what is drawn of them is what was trained.
+    // Both fields learn, and rendering shows the trained parameters.
     let split = want.model.param_map.static_len;
     let first = whole.plan().params.initial(&config);
     let moved = |range: std::ops::Range<usize>| range.filter(|i| want.model.params[*i] != first[*i]).count();
@@ -129,7 +129,7 @@ fn runs_learn_repeat_and_resume_bit_by_bit() {
 fn learning_ends_where_an_entropy_vanishes() {
     let gpu = gpu();
     let dataset = small_dataset(13, 11);
-    // Any entropy is below this one.
+    // Any entropy is below this threshold.
     let config = quick(&["networks.stop_after=30", "networks.stop_below=1", "networks.gain=0.01"]);
     let to_the_end = |trainer: &mut Trainer| {
         let mut losses = Vec::new();
@@ -141,7 +141,7 @@ fn learning_ends_where_an_entropy_vanishes() {
     let mut whole = start(&gpu, &config, &dataset);
     let losses = to_the_end(&mut whole);
     let stopped: Vec<_> = losses.iter().map(|loss| (loss.networks.unwrap().stopped, loss.total())).collect();
-    // The iteration that finds it is the last to learn; all that follow tell of it.
+    // The iteration that detects it is the last to learn; all following ones report it.
     assert_eq!(stopped.iter().position(|(stopped, _)| *stopped), Some(30));
     assert!(stopped[30..].iter().all(|after| *after == stopped[30]));
     let mut until = start(&gpu, &config, &dataset);
@@ -152,7 +152,7 @@ fn learning_ends_where_an_entropy_vanishes() {
     let mut resumed = resume(&gpu, &config, &dataset, &then);
     assert_eq!(to_the_end(&mut resumed), losses[31..], "what a resumed run says differs");
     assert_eq!(then.model.params, resumed.model().unwrap().params);
-    // Saved long after learning ended, and before the run went on.
+    // The first is saved long after learning ended, the second before the run continues.
     let at_the_end = whole.checkpoint().unwrap().last_report;
     assert!(!at_the_end.is_empty() && at_the_end == resumed.checkpoint().unwrap().last_report);
     let at_once = resume(&gpu, &config, &dataset, &then).checkpoint().unwrap();
@@ -165,7 +165,7 @@ fn learning_ends_where_an_entropy_vanishes() {
     expect_silence(gpu);
 }
 
-/// Fields that are one number everywhere, which both images and volumes must show.
+/// Fields that are constant everywhere, which images and volumes must show.
 #[test]
 fn fields_of_one_number_are_drawn_as_such() {
     let gpu = gpu();
@@ -179,7 +179,7 @@ fn fields_of_one_number_are_drawn_as_such() {
     let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
     let view = renderer.render(&dataset.views[1].rays, 13, 11, 1).unwrap();
     let attenuation = |feature: f32| 0.5 * (1.0 + feature.exp()).ln();
-    // Depths go over 1.8 world units, along the axis.
+    // Depths extend over 1.8 world units along the axis.
     for (got, feature) in [(&view.static_integral, still), (&view.dynamic_integral, moving)] {
         assert!(got.iter().all(|v| (v / (1.8 * attenuation(feature)) - 1.0).abs() < 1e-4), "{:?}", &got[..3]);
     }
@@ -206,7 +206,7 @@ fn fields_of_one_number_are_drawn_as_such() {
     expect_silence(gpu);
 }
 
-/// What the program says, with validation on; it must succeed.
+/// Output of the program, with validation; it must succeed.
 fn ok(arguments: &[&str]) -> String {
     let output = program().arg("--validate").args(arguments).output().unwrap();
     assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));

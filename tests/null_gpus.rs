@@ -1,5 +1,5 @@
-//! The kernels as Mesa's compilers make them for GPUs that are not there, beside what they were: tests/golden/kernels, a file for
-//! each chip, which `NERTCA_BLESS=1` writes anew.
+//! Kernels as compiled by Mesa for GPUs that are not present, compared with the stored results: tests/golden/kernels, a
+//! file per chip, which `NERTCA_BLESS=1` rewrites.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "common/program.rs"]
@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::process::{Command, Output};
 
-/// Chips, and whether nothing may spill there: Intel's matrix kernels do, as their compiler unrolls them.
+/// Chips, and whether register spilling is forbidden: Intel's matrix kernels spill, because their compiler unrolls them.
 const CHIPS: [(&str, bool); 7] = [
     ("nvidia:ga102", true),
     ("nvidia:ad102", true),
@@ -27,7 +27,7 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The program on a chip.
+/// Runs the program for a chip.
 fn on(chip: &str, arguments: &[&str]) -> Output {
     let plain = program();
     let mut command = Command::new(root().join("tools/null-gpu"));
@@ -38,7 +38,7 @@ fn on(chip: &str, arguments: &[&str]) -> Output {
     command.output().unwrap()
 }
 
-/// What `kernels --json` prints of a preset on a chip.
+/// Output of `kernels --json` for a preset on a chip.
 fn listed(chip: &str, preset: &str) -> Value {
     let output = on(chip, &["kernels", "--json", "--preset", preset]);
     assert!(output.status.success(), "{chip} {preset}: {}", String::from_utf8_lossy(&output.stderr));
@@ -49,7 +49,7 @@ fn kernels(answer: &Value) -> Vec<Compiled> {
     serde_json::from_value(answer["kernels"].clone()).unwrap()
 }
 
-/// As `kernels --json`, a kernel a line.
+/// Writes the output of `kernels --json`, one kernel per line.
 fn write(file: &PathBuf, answer: &Value, all: &[Compiled]) {
     let rows: Vec<String> = all.iter().map(|kernel| serde_json::to_string(kernel).unwrap()).collect();
     let head = |key: &str| serde_json::to_string(&answer[key]).unwrap();

@@ -1,4 +1,4 @@
-//! The archive of `tools/package` works wherever it is unpacked: for pkg-config, for CMake, and as a program.
+//! The archive of `tools/package` works in any directory: for pkg-config, for CMake, and as a program.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 use std::path::{Path, PathBuf};
@@ -17,9 +17,9 @@ fn run(command: &mut Command) -> String {
     said
 }
 
-/// The archive's content, in a directory that nobody knew of when it was made.
+/// Unpacks the archive into a directory that was unknown when it was made.
 fn unpacked(scratch: &Path) -> PathBuf {
-    // Where this test was built: target/release/deps/package-0123456789abcdef.
+    // Directory of this test's build: target/release/deps/package-0123456789abcdef.
     let target = std::env::current_exe().unwrap().ancestors().nth(3).unwrap().to_path_buf();
     let tool = root().join("tools/package");
     let said = run(Command::new(tool).arg(scratch.join("made")).env("CARGO_TARGET_DIR", target));
@@ -54,7 +54,7 @@ fn the_archive_works_wherever_it_is_unpacked() {
         assert!(!sections.contains(".debug_info") && !sections.contains(".symtab"), "{binary}: {sections}");
     }
 
-    // pkg-config; a shell splits its flags, and keeps what it escaped.
+    // With pkg-config, a shell splits the flags and keeps escaped characters.
     let program = scratch.path().join("by-pkg-config");
     let script = r#"eval "cc '$1' -o '$2' $(pkg-config --cflags --libs nertca_vk) -lm""#;
     let source = root().join("examples/c/embed.c");

@@ -1,5 +1,5 @@
-//! Devices that have no more than Vulkan 1.2 asks of any: no extension, no timestamps, the least limits we can do with. The
-//! driver is the real one, which a loader in between makes look poor.
+//! Devices that offer only what Vulkan 1.2 requires: no extensions, no timestamps, minimum limits. The driver is real, and
+//! a loader in between hides its features.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -22,7 +22,7 @@ use nertca_vk::selftest::{drawing, gaussians, repeats, sax, trees};
 use nertca_vk::train::trainer::Trainer;
 use shim::Poor;
 
-/// The least that Vulkan 1.2 asks for, but for the storage buffers of a kernel.
+/// Minimum requirements of Vulkan 1.2, except for the storage buffers of a kernel.
 const LEAST: Poor = Poor {
     extensions: false,
     features: false,
@@ -56,7 +56,7 @@ fn the_least_of_devices_computes_what_others_do() {
     expect_agreement(|findings| trees::compare(&gpu, findings));
     expect_agreement(|findings| repeats::compare_network(&gpu, &dataset, &path, findings));
     expect_agreement(|findings| drawing::compare_views(&gpu, Preset::FastMlp, &path, findings));
-    // Nothing times passes, and peaks are timed by the host.
+    // Passes are not timed, and peaks are timed by the host.
     let config = small_config("fast-mlp", &[]);
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, path).unwrap();
     assert!(trainer.profile_step().unwrap().is_empty());
@@ -78,7 +78,7 @@ fn what_cannot_be_done_without_is_said() {
     assert!(why.contains("storage buffers, the device allows 4"), "{why}");
 }
 
-/// Adopts a device that a host made of `poor`, with nothing but timeline semaphores, and says was made with features.
+/// Adopts a device created from `poor` with only timeline semaphores, which claims to have features.
 fn adopt(poor: Poor, subgroup_size_control: bool, cooperative_matrix: bool) -> Result<(), Error> {
     shim::impoverish(poor);
     let entry = shim::entry();
@@ -121,7 +121,7 @@ fn features_that_a_device_cannot_have_been_made_with_are_refused() {
     };
     let said = refused(LEAST, (true, false));
     assert!(said.starts_with("subgroup_size_control: ") && said.contains("subgroupSizeControl, comp"), "{said}");
-    // One that lacks a single thing of those that matrices need, or several.
+    // Devices that lack one of the features needed for matrices, or several.
     let said = refused(Poor { extensions: true, ..LEAST }, (true, true));
     assert!(said.starts_with("cooperative_matrix: ") && said.contains("shaderFloat16"), "{said}");
     let said = refused(LEAST, (false, true));
@@ -157,7 +157,7 @@ fn memory_that_others_hold_is_told_before_a_fit_takes_any() {
 fn more_workgroups_than_an_axis_takes_lie_along_two() {
     let gpu = open(LEAST).unwrap();
     let n = 70_001u32;
-    // One invocation to a workgroup, so that few are many.
+    // One invocation per workgroup gives many workgroups for few values.
     let stage: Stage<push::GaussianPicture> = Build { lanes: Some(1), ..Build::default() }.stage(&gpu).unwrap();
     let sums: Vec<i32> = (0..n as i32).collect();
     let splat_images = gpu.buffer_with("sums", &sums).unwrap();
@@ -170,7 +170,7 @@ fn more_workgroups_than_an_axis_takes_lie_along_two() {
     let seen: Vec<f32> = gpu.download(&image, 0, n as usize + 8).unwrap();
     let wanted = |i: usize| if i < n as usize { 0.5 * i as f32 } else { -1.0 };
     assert!(seen.iter().enumerate().all(|(i, v)| *v == wanted(i)));
-    // Along one axis they are refused before the driver sees them.
+    // Along one axis they are refused before the driver receives them.
     let mut recording = Recording::new(&gpu, "too large").unwrap();
     let refused = dispatch(&mut recording, &stage, Groups::Direct([n, 1, 1]), &bound, push).unwrap_err();
     assert!(refused.to_string().contains("70001 x 1 x 1 workgroups"), "{refused}");
@@ -186,7 +186,7 @@ fn short_submits_change_nothing_but_their_length() {
     let train = |longest_submit_s: Option<f64>| {
         let path = Tuning { longest_submit_s, ..tuning(&gpu) };
         let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, path.clone()).unwrap();
-        // As many losses come back at once as a submit had iterations.
+        // One call returns as many losses as a submit had iterations.
         let at_once: Vec<usize> = (0..5).map(|_| trainer.advance(20).unwrap().len()).collect();
         let losses = run(&mut trainer, 24);
         let model = trainer.model().unwrap();
@@ -203,7 +203,7 @@ fn short_submits_change_nothing_but_their_length() {
     let (at_once, n, again, same) = train(Some(1e9));
     assert_eq!((at_once, n), (vec![1, 1, 1, 4, 4], 13), "three are tried, then there is time for all");
     assert_eq!((&again, &same), (&params, &seen));
-    // Somebody looks: how many go into a submit then depends on the device's speed, what comes of them does not.
+    // With an observer, the number of iterations per submit depends on the device's speed, but the results do not.
     gpu.looks().note();
     let (_, _, again, same) = train(Some(1e9));
     assert_eq!((again, same), (params, seen));

@@ -1,4 +1,4 @@
-//! The device's projector against the f64 one.
+//! Comparison of the device's projector with the f64 one.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;

@@ -1,5 +1,6 @@
-//! R2-Gaussian (the preset `r2-gaussian`): stages equal their twins, the twins PyTorch and finite differences; runs fit
-//! what Gaussians can show, repeat and resume bit by bit across density control; each phase sees its own images alone.
+//! R2-Gaussian (the preset `r2-gaussian`): stages equal their twins, and the twins agree with PyTorch and finite
+//! differences; runs fit images of Gaussians, repeat and resume with equal bits across density control; each phase uses its
+//! own images only.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -63,7 +64,7 @@ fn expect_derivatives(config: &Config) {
     let fit = R2Trainer::with(&gpu, data, config, &R2State::fresh(rows.clone()), 0).unwrap();
     let shown = &turns(fit.data(), config)[..fit.data().n_sets()];
     let mut all = with_sets(&rows);
-    // Wide enough for several voxels; those that are far away or hardly there come last.
+    // Gaussians are wide enough for several voxels; those far away or almost transparent come last.
     all.iter_mut().for_each(|(p, _)| (4..7).for_each(|k| p[k] += 0.4));
     let n = fit.data().n_sets() as f64;
     let (_, gradient) = twin(fit.data(), fit.setups(), shown, &all);
@@ -77,7 +78,7 @@ fn expect_derivatives(config: &Config) {
                 twin(fit.data(), fit.setups(), shown, &moved).0
             };
             let h = 1e-6;
-            // The loss told is the mean over the sets.
+            // The reported loss is the mean over the sets.
             let difference = n * (loss(h) - loss(-h)) / (2.0 * h);
             let error = (difference - want).abs();
             assert!(error <= 1e-4 * want.abs() + 1e-6 * largest, "Gaussian {i}, {k}: {difference} against {want}");
@@ -107,7 +108,7 @@ fn the_gradient_of_ssim_is_its_derivative() {
     assert!((reference::picture_loss(&y, &y, width, 0.25).0).abs() < 1e-15);
 }
 
-/// Sums along rays, and the outline of what is nearer than the cut, of Gaussians long and short.
+/// Compares sums along rays, and the outline of the region within the cut, for long and short Gaussians.
 #[test]
 fn exact_line_integrals_are_sums_along_rays() {
     let config = config(&["r2.integral=exact"]);
@@ -142,7 +143,7 @@ fn exact_line_integrals_are_sums_along_rays() {
             assert!((got - want).abs() <= 1e-9 * softplus(p[3]), "{pixel}: {got} {want}");
             compared += 1;
         }
-        // No wider than it must be: some ray along each side of the box is as near as the cut.
+        // The box is no wider than necessary: a ray along each side of it passes within the cut.
         for (half, along) in [(seen.half_box.x, DVec2::X), (seen.half_box.y, DVec2::Y)] {
             let side =
                 |sign: f64| (-4000..=4000).map(move |k| sign * half * along + f64::from(k) * 0.02 * along.perp());
@@ -158,7 +159,7 @@ fn exact_line_integrals_are_sums_along_rays() {
     assert!(compared > 20, "{compared}");
 }
 
-/// Images of a C-arm, `(primary, secondary)` degrees each, all of one phase unless said otherwise.
+/// Images of a C-arm, `(primary, secondary)` degrees each, all of one phase unless stated otherwise.
 fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(usize, &View) -> Vec<f32>) -> Dataset {
     let view = |angles: &[f64; 2]| {
         let geometry = Geometry::CArm(CArm {
@@ -215,7 +216,7 @@ fn expect_golden(file: &str, integral: &str) {
     let f32s = |name: &str| golden.get(name).iter().map(|v| *v as f32).collect::<Vec<f32>>();
     let angles = [0, 1].map(|v| [0, 1].map(|k| golden.case["angles"][v][k].as_f64().unwrap()));
     let half = number("half_mm") / 100.0;
-    // Densities are per half side there.
+    // Densities in the script are per half side.
     let image = |v: usize, _: &View| f32s(&format!("image/{v}")).iter().map(|y| y * half as f32).collect();
     let dataset = dataset(&angles, [number("width_px") as usize, number("height_px") as usize], image);
     let settings = [
@@ -282,7 +283,7 @@ fn expect_golden(file: &str, integral: &str) {
 
 const SIDES: &[[f64; 2]] = &[[-30.0, 25.0], [60.0, -20.0], [5.0, 8.0]];
 
-/// A few round Gaussians in a volume of 20 mm, and images of them in closed form.
+/// A few round Gaussians in a volume of 20 mm, and exact images of them.
 fn phantom_of_gaussians(settings: &[&str]) -> (Dataset, Config, Vec<R2Gaussian>) {
     let all = [&["r2.half_extent_mm=20", "r2.normalise=false", "train.iterations=300"], settings].concat();
     let config = config(&all);
@@ -320,15 +321,15 @@ fn gaussians_are_seen_and_drawn_as_the_closed_form_has_them() {
     let renderer = Renderer::new(&gpu, &saved.model, tuning(&gpu)).unwrap();
     for (frame, view) in dataset.frames.iter().zip(&dataset.views) {
         let drawn = renderer.render(&view.rays, 33, 27, 0).unwrap();
-        // What the cut leaves out, at its largest.
+        // The maximum error is due to the cut.
         let off = drawn.dynamic_integral.iter().zip(&frame.integrals).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 1e-3 * peak, "{off} of {peak}");
         assert!(drawn.static_integral.iter().all(|v| *v == 0.0) && drawn.static_max.iter().all(|v| *v == 0.0));
         let most = drawn.total_max.iter().fold(0f32, |m, v| m.max(*v));
-        // The denser one's peak, between pixels, and a little of the other.
+        // The peak of the denser Gaussian between pixels, plus a small contribution of the other.
         assert!((0.93..0.98).contains(&most), "{most}");
     }
-    // Nor does the fit see anything else: what is left of its loss is the affine picture's.
+    // The fit agrees: its remaining loss is due to the affine approximation.
     let turns = turns(fit.data(), &config);
     let (loss, _) = twin(fit.data(), fit.setups(), &turns[..1], &with_sets(&fit.state().unwrap().rows));
     let nothing: Vec<(Params, usize)> = Vec::new();
@@ -386,7 +387,7 @@ fn clones_show_the_same_picture_and_split_ones_another() {
     expect_silence(gpu);
 }
 
-/// Short runs with density control on the way, of which much comes.
+/// A short configuration with strong effects of density control.
 fn short(static_data: &str) -> Config {
     let data = format!("r2.static_data={static_data}");
     config(&[
@@ -413,7 +414,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
         let config = short(static_data);
         let mut whole = start(&gpu, &config, &dataset);
         let losses = run(&mut whole, 60);
-        // Not where a submit ends, and where density control has just been.
+        // One stop is not at the end of a submit, the other is just after density control.
         for stop in [27, 30] {
             let mut parts = start(&gpu, &config, &dataset);
             let mut again = run(&mut parts, stop);
@@ -469,7 +470,7 @@ fn a_back_projection_from_all_around_is_the_object() {
     let angles: Vec<[f64; 2]> =
         (0..n_views).map(|i| [360.0 * f64::from(i) / f64::from(n_views) - 180.0, 0.0]).collect();
     let config = config(&["r2.half_extent_mm=20", "r2.normalise=false"]);
-    // One Gaussian off the middle, wide against the pixels.
+    // One Gaussian off centre, wide compared with the pixels.
     let (at, scale, peak) = (DVec3::new(0.03, -0.04, 0.0), 0.035, 1.7);
     let image = |_: usize, view: &View| {
         let pixel = |p: usize| {
@@ -487,7 +488,7 @@ fn a_back_projection_from_all_around_is_the_object() {
     let mut worst = 0f64;
     for (k, value) in volume.iter().enumerate() {
         let x = DVec3::new(centre(k % side), centre(k / side % side), centre(k / side / side));
-        // The middle plane is exact but for sampling, planes beside it nearly.
+        // The central plane is exact except for sampling, neighbouring planes nearly.
         if x.z.abs() < 0.02 && x.length() < 0.12 {
             let want = peak * (-0.5 * (x - at).length_squared() / scale.powi(2)).exp();
             worst = worst.max((f64::from(*value) - want).abs() / peak);
@@ -526,7 +527,7 @@ fn what_cannot_be_fitted_is_refused() {
     let mut sizes = small_dataset(13, 11);
     sizes.views[0].size = [12, 11];
     assert!(refused(&sizes).contains("one size"));
-    // A checkpoint that is damaged.
+    // A damaged checkpoint is refused.
     let saved = start(&gpu, &config(&[]), &small_dataset(13, 11)).checkpoint().unwrap();
     let damaged = |damage: &dyn Fn(&mut R2State)| {
         let mut other = saved.clone();
@@ -536,7 +537,7 @@ fn what_cannot_be_fitted_is_refused() {
     assert_eq!(damaged(&|_| ()), None);
     assert!(damaged(&|state| state.rows[3].set = 3).unwrap().contains("r2.set"));
     assert!(damaged(&|state| state.second[3][5] = f32::NAN).unwrap().contains("r2.adam.v"));
-    // All too weak.
+    // All Gaussians are too weak.
     let config = config(&["r2.weakest=1000", "r2.densify_every=2", "r2.densify_from=0", "r2.densify_until=30"]);
     let mut trainer = start(&gpu, &config, &small_dataset(13, 11));
     let error = (0..9).find_map(|_| trainer.advance(9).err()).unwrap().to_string();

@@ -1,4 +1,4 @@
-//! R2-Gaussian from outside: the program trains, resumes, scores, draws, exports and times it.
+//! R2-Gaussian through the program: training, resuming, scoring, rendering, export and timing.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "common/program.rs"]

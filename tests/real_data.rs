@@ -1,5 +1,5 @@
-//! The four real angiography runs of a still coronary phantom, where they are at hand (`NERTCA_DATA`, or `../shared/data`
-//! beside the project): imported, reconstructed, and laid over themselves.
+//! The four real angiography runs of a static coronary phantom, if present (`NERTCA_DATA`, or `../shared/data` beside the
+//! project): imported, reconstructed, and compared with the reconstruction.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/shared.rs"]
@@ -45,7 +45,7 @@ fn runs_become_a_dataset_without_a_patient() {
     assert_eq!((dataset.views.len(), dataset.n_phases, dataset.width), (4, 2, 249));
     let angles: Vec<_> = dataset.views.iter().map(|v| v.geometry.angles_deg().unwrap()).collect();
     assert_eq!(angles, [(31.3, 0.1), (-27.3, -0.1), (-0.8, -23.2), (0.1, 28.7)]);
-    // The phantom's "patient" is called PHANTOM; nothing of it may be found.
+    // The phantom's "patient" is called PHANTOM; this name must not appear in any file.
     for entry in std::fs::read_dir(dir.path().join("images")).unwrap().chain(std::fs::read_dir(dir.path()).unwrap()) {
         let path = entry.unwrap().path();
         if path.is_file() {
@@ -125,7 +125,7 @@ fn the_reconstruction_lies_on_the_vessels_it_was_made_from() {
         };
         let (real, seen) = (line(&real), line(&seen));
         assert!(real.len() > 150 && seen.len() > 150, "view {view}: {} and {} points", real.len(), seen.len());
-        // In pixels of the detector, of which the images average two by two.
+        // Distances are in pixels of the detector; the images average two by two.
         let (there, back) = (2.0 * median_distance(&seen, &real), 2.0 * median_distance(&real, &seen));
         println!("view {view}: reconstruction to vessels {there:.2} px, vessels to reconstruction {back:.2} px");
         assert!(there <= 2.0 && back <= 2.0, "view {view}: {there} and {back} pixels");

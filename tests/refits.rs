@@ -1,5 +1,5 @@
-//! Frames that come while a session trains: the Gaussians go on from those so far, or are fitted anew, and what is shown
-//! meanwhile is never worse than what was there.
+//! Frames that arrive while a session trains: the fit of the Gaussians is continued or restarted, and the rendering
+//! meanwhile is never worse than before.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -21,7 +21,7 @@ use nertca_vk::session::{Moment, NewFrame, Session, SessionOptions};
 use nertca_vk::train::trainer::Trainer;
 
 const PHASES: u32 = 10;
-/// Iterations of Gaussians, of which a fit that goes on has the first third behind it.
+/// Iterations of Gaussians; a continued fit skips the first third.
 const GAUSSIAN_ITERATIONS: u32 = 120;
 const CARRIED: u32 = 40;
 
@@ -76,7 +76,7 @@ fn add(session: &Session, dataset: &Dataset, wanted: impl Fn(&Frame) -> bool) {
     }
 }
 
-/// Trains to the end of the run; iterations done.
+/// Trains to the end of the run, and returns the number of iterations.
 fn train(session: &Session) -> u32 {
     session.train(u32::MAX, &mut |_| true).unwrap()
 }
@@ -85,7 +85,7 @@ fn field(session: &Session) -> MovingGaussians {
     session.checkpoint().unwrap().model.moving.unwrap()
 }
 
-/// Dice of the moving field on unseen images.
+/// Dice of the dynamic field on unseen images.
 fn dice(gpu: &Gpu, session: &Session, dataset: &Dataset) -> f64 {
     let model = session.checkpoint().unwrap().model;
     let renderer = Renderer::new(gpu, &model, tuning(gpu)).unwrap();
@@ -103,7 +103,7 @@ fn gaussians_go_on_where_they_explain_what_is_new() {
     let (wanted, anew) = (dice(&gpu, &at_once, &dataset), field(&at_once));
     drop(at_once);
 
-    // The last two phases lie between those that are known.
+    // The last two phases lie between known ones.
     let (early, late) = (|f: &Frame| f.phase < 8, |f: &Frame| f.phase >= 8);
     let grown = session(&gpu, &dataset);
     add(&grown, &dataset, early);
@@ -122,7 +122,7 @@ fn gaussians_go_on_where_they_explain_what_is_new() {
     assert_eq!(field(&loaded), field(&grown), "also across save and load");
     drop((grown, loaded));
 
-    // Half of the beat, and another view, are news.
+    // Half of the beat, or another view, is new information that restarts the fit.
     for late in [&(|f: &Frame| f.phase > 4) as &dyn Fn(&Frame) -> bool, &|f: &Frame| f.view == 3] {
         let grown = session(&gpu, &dataset);
         add(&grown, &dataset, |f| !late(f));
@@ -134,7 +134,7 @@ fn gaussians_go_on_where_they_explain_what_is_new() {
     expect_silence(gpu);
 }
 
-/// A run that is over before a fit would go on, or is half done.
+/// A run that ends before a fit would continue, or in the middle of one.
 #[test]
 fn short_runs_take_in_frames_as_well() {
     const ITERATIONS: u32 = 30;

@@ -1,6 +1,5 @@
-//! SAX-NeRF (the preset `sax-nerf`): stages equal their twins, the twins PyTorch and finite differences; the hash finds
-//! its entries, attention is what it should be; runs fit, repeat and resume bit by bit; each phase sees its own images
-//! alone.
+//! SAX-NeRF (the preset `sax-nerf`): stages equal their twins, and the twins agree with PyTorch and finite differences; the
+//! hash and the attention are correct; runs fit, repeat and resume with equal bits; each phase uses its own images only.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -44,7 +43,7 @@ fn every_stage_of_an_iteration_matches() {
     expect_silence(gpu);
 }
 
-/// Numbers of a field from the formula of the script, which has parts in the same order.
+/// Parameters of a field by the script's formula, which has the parts in the same order.
 fn formula(shape: SaxShape) -> Vec<f64> {
     let mut params = vec![0.0; shape.n_params()];
     for (index, part) in shape.parts().iter().enumerate() {
@@ -167,7 +166,7 @@ fn samples_that_are_alike_share_what_they_see_evenly() {
     params[range("attention.position")].fill(0.0);
     let features: Vec<f64> = (0..8).map(|i| 0.1 * f64::from(i)).collect();
     let other: Vec<f64> = features.iter().map(|x| 0.4 - x).collect();
-    // Keys that are all alike: each sample sees the mean of both values.
+    // If all keys are equal, each sample receives the mean of both values.
     let mut same_keys = params.clone();
     let keys = range("attention.key_value");
     same_keys[keys.start..keys.start + 32 * 32].fill(0.0);
@@ -177,13 +176,13 @@ fn samples_that_are_alike_share_what_they_see_evenly() {
         assert!(seen.iter().zip(&mean).all(|(seen, mean)| (seen - mean).abs() < 1e-12), "{seen:?} {mean:?}");
     }
     assert!(trace.values()[0] != trace.values()[1]);
-    // With keys of their own they do not.
+    // With different keys the samples differ.
     let trace = Lineformer::new(shape, &params).fwd([&features, &other]);
     let off: f64 = trace.seen()[0].iter().zip(trace.seen()[1]).map(|(a, b)| (a - b).abs()).sum();
     assert!(off > 1e-3, "{off}");
 }
 
-/// The entry by the words of 32 bits that the published hash has.
+/// Index of an entry by the published hash in 32-bit words.
 fn entry_in_words(level: &SaxLevel, corner: [u32; 3]) -> usize {
     let side = level.cells + 1;
     let index = match level.dense {
@@ -232,7 +231,7 @@ fn a_batch_is_windows_and_pixels_outside_of_them_that_show_something() {
     for settings in [&[][..], &["sax.windows=10", "sax.rays=60"], &["sax.windows=0", "sax.rays=31"]] {
         let config = config(settings);
         let (mut data, ..) = hard_case(&config).unwrap();
-        // A third of the pixels shows nothing.
+        // A third of the pixels is empty.
         let images: Vec<f32> = data.images.iter().enumerate().map(|(i, v)| if i % 3 == 0 { 0.0 } else { *v }).collect();
         data.images = images;
         data.listed.retain(|p| p % 3 != 0);
@@ -301,7 +300,7 @@ fn runs_fit_their_images_and_repeat_and_resume_bit_by_bit() {
         let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
         let (first, last) = (mean(&losses[..4]), mean(&losses[20..]));
         assert!(last < 0.6 * first, "{static_data}: {first} to {last}");
-        // Not where a submit ends.
+        // The stop is not at the end of a submit.
         let stop = 11;
         let mut parts = start(&gpu, &config, &dataset);
         let mut again = run(&mut parts, stop);
@@ -362,7 +361,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     let error = renderer.render_at(rays, 13, 11, 0.5).unwrap_err().to_string();
     assert!(error.contains("between two phases"), "{error}");
     assert!(renderer.render_at(rays, 13, 11, 3.0).is_err(), "the beat does not close");
-    // What lies on a ray of cells is what lies on a longer one: pairs begin at the same places.
+    // Short and long rows of cells have equal values, because pairs begin at the same positions.
     let corner = glam::DVec3::splat(-0.03);
     let grid = |size| Grid { origin: corner, spacing: glam::DVec3::splat(0.01), size };
     let short = renderer.sample(Component::Dynamic, 1, &grid([4, 3, 2])).unwrap();
@@ -371,7 +370,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
         let (short, long) = (&short[4 * row..4 * row + 4], &long[6 * row..6 * row + 4]);
         assert!(short.iter().zip(long).all(|(a, b)| (a - b).abs() < 1e-5 * a.abs()), "{short:?} {long:?}");
     }
-    // Another state of the same run, and numbers that lie on the device.
+    // Another state of the run, from a checkpoint and from the device.
     run(&mut trainer, 4);
     let later = trainer.model().unwrap();
     renderer.set_model(&later).unwrap();
@@ -406,7 +405,7 @@ fn what_cannot_be_fitted_is_refused() {
     let mut sizes = small_dataset(13, 11);
     sizes.views[0].size = [12, 11];
     assert!(refused(&sizes, &[]).contains("one size"));
-    // A field that no buffer of the device holds, and a batch.
+    // A field, and a batch, too large for the device's buffers.
     let dataset = small_dataset(13, 11);
     let largest = u64::from(gpu.info().max_storage_buffer_range);
     if largest < 1 << 30 {
@@ -420,7 +419,7 @@ fn what_cannot_be_fitted_is_refused() {
         let error = too_large(&["sax.samples=4096", "sax.rays=65535"]);
         assert!(error.contains("sax.samples") && error.contains("sax.rays"), "{error}");
     }
-    // A checkpoint that is damaged, and one of other fields.
+    // A damaged checkpoint, and one of other fields.
     let saved = start(&gpu, &config(&[]), &dataset).checkpoint().unwrap();
     let damaged = |damage: &dyn Fn(&mut Checkpoint)| {
         let mut other = saved.clone();

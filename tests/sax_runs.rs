@@ -1,4 +1,4 @@
-//! SAX-NeRF from outside: the program trains, resumes, scores, draws, exports and times it.
+//! SAX-NeRF through the program: training, resuming, scoring, rendering, export and timing.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "common/program.rs"]

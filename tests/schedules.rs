@@ -36,14 +36,14 @@ fn the_published_configuration_in_small_goes_through_its_delay_and_on() {
         let before = run(&mut trainer, 150);
         assert_eq!(trainer.take_large_loss(), None, "{preset:?}");
         let after = run(&mut trainer, 150 + AFTER);
-        // The published rates throw both fields about at the delay, by orders of magnitude, and training survives it.
+        // At the delay, the published rates change both fields by orders of magnitude; training must survive this.
         let large = trainer.take_large_loss().expect("a large loss at the delay");
         assert!((151..170).contains(&large.step) && large.ratio > 1e6, "{preset:?}: {large:?}");
         assert_eq!((before.len(), after.len()), (150, AFTER as usize));
         assert!(after.iter().all(|loss| loss.is_finite()), "{preset:?}: {after:?}");
         trainer.checkpoint().unwrap();
 
-        // Those who want it stop there.
+        // On request, training stops there.
         let stops = config.with(&["train.stop_at_loss_ratio=1e6".into()]).unwrap();
         let mut trainer = Trainer::new(&gpu, Plan::new(&stops, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
         run(&mut trainer, 150);

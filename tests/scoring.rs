@@ -1,4 +1,4 @@
-//! Scoring that is watched, stopped, and warns of a dead field.
+//! Scoring that is observed, cancelled, and warns of a vanished field.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod common;
@@ -13,7 +13,7 @@ use nertca_vk::scan::dataset::{Dataset, Split};
 use nertca_vk::train::trainer::Trainer;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A dataset of which one view is for validation: three images.
+/// A dataset with one validation view of three images.
 fn dataset() -> Dataset {
     let mut dataset = small_dataset(16, 12);
     for frame in dataset.frames.iter_mut().filter(|f| f.view == 2) {
@@ -24,7 +24,7 @@ fn dataset() -> Dataset {
     dataset
 }
 
-/// An untrained model whose moving field attenuates by softplus(`bias`) in its own units.
+/// An untrained model whose dynamic field attenuates by softplus(`bias`) in its own units.
 fn model(gpu: &nertca_vk::gpu::device::Gpu, dataset: &Dataset, bias: f32) -> Model {
     let plan = Plan::new(&small_config("fast-mlp", &[]), dataset).unwrap();
     let mut model = Trainer::new(gpu, plan, dataset, tuning(gpu)).unwrap().model().unwrap();
@@ -50,7 +50,7 @@ fn scoring_ends_after_the_image_under_way() {
     assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
     assert_eq!(heard, [(0, 3), (1, 3), (2, 3)]);
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0, "half an evaluation leaves no pictures");
-    // Left alone, it goes through, and animations need no image twice.
+    // Without a cancel it completes, and animations reuse the rendered images.
     stop.store(false, Ordering::Relaxed);
     let mut heard = 0;
     let scores = evaluate_model(&gpu, &tuning(&gpu), &model, &dataset, &options, &mut |_| heard += 1).unwrap();

@@ -1,5 +1,5 @@
-//! The self-test on the driver at hand: it passes, compares every stage that the driver can run, and names the stage that a
-//! fault is in.
+//! The self-test on the available driver: it passes, compares every stage that the driver can run, and names the stage that
+//! contains a fault.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -67,7 +67,7 @@ fn many_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     blobs::compare_crowd(gpu, &Tuning::for_device(gpu.info()), findings)
 }
 
-/// Faults in the code of shaders as the driver gets it: each is found in the row of its stage, and in no row before.
+/// Faults in the shader code that the driver receives: each is found in the row of its stage, and in no earlier row.
 #[test]
 fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
     faults::expect_found(&[
@@ -129,7 +129,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
     ]);
 }
 
-/// Kernels with their constants.
+/// Names of kernels with their constants.
 fn builds<'a>(all: impl IntoIterator<Item = &'a PipelineStatistics>) -> BTreeSet<String> {
     all.into_iter().map(|pipeline| Compiled::of(pipeline).name()).collect()
 }
@@ -187,7 +187,7 @@ fn kernels_are_listed_and_compared() {
     };
     let same = compare(&listed, &file);
     assert!(same.status.success() && same.stderr.is_empty(), "{}", String::from_utf8_lossy(&same.stderr));
-    // A constant that has changed is another build.
+    // A changed constant gives another build.
     let mut other = listed.clone();
     other["kernels"][0]["lanes"] = 7.into();
     let words = String::from_utf8(compare(&other, &file).stderr).unwrap();

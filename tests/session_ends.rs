@@ -1,5 +1,5 @@
-//! Training in the background that has ended, for those who waited for it: everything may begin anew at once, however
-//! long its thread takes to leave.
+//! The end of training in the background, as seen by waiting threads: training may restart at once, however long its thread
+//! takes to exit.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -12,10 +12,10 @@ use std::time::Duration;
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Metadata, Subscriber};
 
-/// How long a thread stays after training has ended, by the log it lets go of last.
+/// Time that a thread stays after training has ended, caused by the log that it drops last.
 const LINGERS: Duration = Duration::from_millis(300);
 
-/// A log that takes its time when it goes.
+/// A log whose destruction takes time.
 struct SlowToGo(Arc<AtomicBool>);
 
 impl Subscriber for SlowToGo {
@@ -65,7 +65,7 @@ fn who_waited_for_the_end_may_start_and_train_at_once() {
     }
     for again in [start, train] {
         let gone = Arc::new(AtomicBool::new(false));
-        // The thread keeps the log of who starts it, and is the last to have it.
+        // The thread keeps the log of its creator, and drops it last.
         tracing::subscriber::with_default(SlowToGo(gone.clone()), || session.start(Box::new(|_| false)).unwrap());
         ended(&session);
         again(&session);

@@ -1,4 +1,4 @@
-//! Studies as jobs of Snakemake: the same table, also after Snakemake and its jobs were killed.
+//! Studies as jobs of Snakemake: the table is the same, also after Snakemake and its jobs were killed.
 #![cfg(unix)]
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
@@ -17,13 +17,13 @@ use std::time::Duration;
 
 const STUDIES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/studies");
 
-/// Snakemake on the smoke study, whose files it leaves in a directory.
+/// Command that runs Snakemake on the smoke study, with its files in a directory.
 fn snakemake(directory: &Path, more: &[&str]) -> Command {
     let mut command = python();
     command.args(["-m", "snakemake", "--snakefile"]).arg(format!("{STUDIES}/Snakefile")).args(more);
     command.args(["--config", &format!("study={STUDIES}/smoke.toml"), "out=out"]);
     command.arg(concat!("program=", env!("CARGO_BIN_EXE_nertca-vk")));
-    // Its own notes, and the caches of the program.
+    // The directory also holds Snakemake's own notes and the program's caches.
     command.current_dir(directory).env("XDG_CACHE_HOME", directory.join("cache")).env_remove("NERTCA_DATA");
     command
 }
@@ -36,7 +36,7 @@ fn results(out: &Path) -> BTreeMap<String, Vec<u8>> {
     read.map(|(name, bytes)| (name.into_string().unwrap(), bytes)).collect()
 }
 
-/// A table, but for seconds and what follows from them.
+/// Table rows without seconds and values derived from them.
 fn timeless(out: &Path) -> Vec<String> {
     let csv = std::fs::read_to_string(out.join("table.csv")).unwrap();
     let timed = |line: &str| line.contains(",minutes,") || line.contains(",fps,");
@@ -47,7 +47,7 @@ fn timeless(out: &Path) -> Vec<String> {
 fn ok(command: &mut Command) -> String {
     let out = command.output().unwrap();
     assert!(out.status.success(), "{command:?}: {}", String::from_utf8_lossy(&out.stderr));
-    // Snakemake tells what it does on stderr.
+    // Snakemake reports its actions on stderr.
     String::from_utf8_lossy(&[out.stdout, out.stderr].concat()).into_owned()
 }
 
@@ -59,7 +59,7 @@ fn a_killed_study_comes_to_the_same_table() {
     for what in ["run", "table"] {
         ok(program().args(["study", what]).arg(format!("{STUDIES}/smoke.toml")).arg("--out").arg(&alone));
     }
-    // In a group of their own, so that jobs die with their master.
+    // The process group is separate, so that jobs are killed together with Snakemake.
     let mut killed = snakemake(directory.path(), &HERE).process_group(0).spawn().unwrap();
     let done = loop {
         let done = results(&out);

@@ -1,4 +1,4 @@
-//! The soft hull on phantoms with truth: how much of the vessels it keeps, how little of the box, at four noise levels.
+//! The soft hull on phantoms with a known truth: the kept share of the vessels and of the box, at four noise levels.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -13,16 +13,16 @@ use std::path::Path;
 use std::time::Instant;
 
 const RESOLUTION: usize = 112;
-/// Half side of the phantom's box, world units: where the corners of its images meet the isocentre plane.
+/// Half side of the phantom's box, world units: the position where the corners of its images meet the isocentre plane.
 const HALF: f64 = 0.2546;
 
-/// Where a phase's vessels are: cells of the hull's grid with the number of vessel voxels in them, and the share of
-/// those voxels that lie in thin vessels.
+/// Vessels of a phase: cells of the hull's grid with the number of vessel voxels in them, and the share of these voxels
+/// that lie in thin vessels.
 struct Truth {
     cells: HashMap<u32, (f64, f64)>,
 }
 
-/// Voxels at least half full, and whether a ball of `radius` voxels around them leaves the vessel on all sides.
+/// Finds voxels at least half full, and classifies them as thick or thin.
 fn truth(directory: &Path, phase: usize, hull: &SoftHull) -> Truth {
     let path = directory.join(format!("volumes/vessels-{phase:02}.nrrd"));
     let volume = Volume::read(&path, &VolumeHints::default()).unwrap();
@@ -43,7 +43,7 @@ fn truth(directory: &Path, phase: usize, hull: &SoftHull) -> Truth {
     Truth { cells }
 }
 
-/// Voxels within an opening by a ball of three voxels: vessels of about 0.9 mm and more across.
+/// Voxels within an opening by a ball of three voxels: vessels of about 0.9 mm or more in diameter.
 fn thick(full: &[bool], size: [usize; 3]) -> Vec<bool> {
     const RADIUS: isize = 3;
     let range = -RADIUS..=RADIUS;
@@ -97,7 +97,7 @@ fn score(directory: &Path, hull: &SoftHull) -> Score {
     Score { recall: kept / all, thin: kept_thin / thin, share_percent: 100.0 * hull.share(), precision: right / cells }
 }
 
-/// The strongest vessel's line integral: 99.5th percentile over pixels of the mask's largest change.
+/// Line integral of the strongest vessel: 99.5th percentile over pixels of the mask's maximum change.
 fn strongest(motion: &SoftMotion) -> f64 {
     motion.views.iter().map(|v| f64::from(v.background.strongest)).fold(0.0, f64::max)
 }
@@ -108,7 +108,7 @@ fn vessels_are_kept_and_little_else_at_four_noise_levels() {
     let directory = tempfile::tempdir().unwrap();
     let clean = phantom(&gpu, directory.path(), 100, 4);
     let s = strongest(&SoftMotion::new(&clean, HALF, 32));
-    // Noise as a share of the strongest vessel; least recall of all and of thin vessels; largest share of the box, %.
+    // Noise as a share of the strongest vessel; minimum recall of all and of thin vessels; maximum share of the box, %.
     let four = [(0.0, 0.94, 0.90, 0.5), (0.01, 0.93, 0.88, 0.4), (0.03, 0.91, 0.84, 0.4), (0.1, 0.85, 0.67, 0.5)];
     let three = [(0.0, 0.95, 0.92, 0.8), (0.01, 0.93, 0.89, 0.65), (0.03, 0.93, 0.87, 0.7), (0.1, 0.86, 0.70, 1.0)];
     let mut failures = Vec::new();
@@ -148,12 +148,12 @@ fn noise_alone_leaves_next_to_nothing() {
 
 #[test]
 fn degenerate_scenes_are_answered() {
-    // A single phase per view: nothing can be known of motion.
+    // With a single phase per view, motion is unknown.
     let mut dataset = common::small_dataset(16, 16);
     dataset.frames.retain(|f| f.phase == 0);
     let motion = SoftMotion::new(&dataset, 0.2, 16);
     assert!(motion.views.is_empty() && motion.hull.share() == 0.0);
-    // Nothing moves, and there is no noise: no NaN, nothing kept.
+    // Nothing moves, and there is no noise: no NaN results, and nothing is kept.
     let mut dataset = common::small_dataset(16, 16);
     dataset.frames.iter_mut().for_each(|f| f.integrals.fill(1.0));
     let motion = SoftMotion::new(&dataset, 0.2, 16);
@@ -171,7 +171,7 @@ fn the_hull_as_bits_is_the_same_hull() {
     for (phase, cells) in soft.cells.iter().enumerate() {
         assert!(cells.iter().all(|c| hull.contains_point(soft.centre(c.index), phase)));
     }
-    // Its silhouette covers the pixel each cell's centre is seen in, and leaves pixels no cell is near.
+    // Its silhouette covers the pixel of each cell's centre, and omits pixels far from all cells.
     let view = &dataset.views[dataset.training()[0].view];
     let covered = hull.silhouette(&view.rays, (dataset.width, dataset.height), 1);
     let cells: Vec<_> = soft.cells[1].iter().filter_map(|c| view.rays.project(soft.centre(c.index))).collect();

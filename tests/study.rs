@@ -1,4 +1,4 @@
-//! Studies through the program: what is refused, what is done again and what is not, and that kills change nothing.
+//! Studies through the program: refused files, repeated and kept runs, and kills, which change no result.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/program.rs"]
@@ -29,7 +29,7 @@ fn output(args: &[&str]) -> Output {
     study(args).output().unwrap()
 }
 
-/// Expects success; what was printed.
+/// Expects success, and returns stdout.
 #[track_caller]
 fn ok(args: &[&str]) -> String {
     let out = output(args);
@@ -37,14 +37,14 @@ fn ok(args: &[&str]) -> String {
     String::from_utf8(out.stdout).unwrap()
 }
 
-/// What `study list` says of the runs in a directory, by name.
+/// States of the runs in a directory by `study list`, by name.
 fn states(file: &Path, directory: &Path) -> BTreeMap<String, String> {
     let listed: Value = serde_json::from_str(&ok(&["list", text(file), "--json", "-o", text(directory)])).unwrap();
     let field = |run: &Value, key: &str| run[key].as_str().unwrap().to_owned();
     listed.as_array().unwrap().iter().map(|run| (field(run, "id"), field(run, "state"))).collect()
 }
 
-/// A study of two methods on one tiny phantom; seconds a run.
+/// A study of two methods on one tiny phantom; a run takes seconds.
 const TINY: &str = r#"title = "tiny"
 seeds = [1]
 [phantom]
@@ -75,7 +75,7 @@ fn written(directory: &Path, content: &str) -> PathBuf {
 fn faults_have_their_line() {
     let directory = tempfile::tempdir().unwrap();
     std::fs::create_dir(directory.path().join("there")).unwrap();
-    // What is replaced in the study, by what, and what the message must say.
+    // Text that is replaced in the study, its replacement, and the required parts of the message.
     let cases = [
         ("preset = \"paper\"", "preset = \"papr\"", "line 11", "papr"),
         ("name = \"n\"", "name = \"m\"", "line 15", "another method"),
@@ -167,13 +167,13 @@ fn what_changed_runs_again_and_nothing_else() {
     let changed = TINY.replace("train.rays=32", "train.rays=48");
     written(directory.path(), &changed);
     assert_eq!(all("waiting"), ["a-3v.n.s1"]);
-    // What is of the study as it was is no result of the study as it is.
+    // Results of the previous version of the study are no results of the current one.
     assert!(ok(&["table", text(&file), "-o", text(&out)]).contains("1 results in this directory"));
     let events = ok(&["run", text(&file), "-o", text(&out), "--json"]);
     assert_eq!(events.matches("run_begun").count(), 1);
     assert_eq!(result("a-3v.m.s1"), before[0]);
     assert_ne!(result("a-3v.n.s1"), before[1]);
-    // What another program made counts where that is asked for.
+    // Results of another program version count on request.
     let file_of = |id: &str| out.join("runs").join(id).join("result.json");
     let mut other: Value = serde_json::from_slice(&result("a-3v.m.s1")).unwrap();
     other["fingerprint"]["commit"] = "of another day".into();
@@ -187,14 +187,14 @@ fn what_changed_runs_again_and_nothing_else() {
     };
     assert_eq!(begun(&["--any-commit"]), 0);
     assert_eq!(begun(&[]), 1);
-    // Settings of a data set alone.
+    // Settings for one data set only.
     let of_its_own = "iterations = 12\non = { a = [\"static.tv=0.5\"] }";
     written(directory.path(), &changed.replacen("iterations = 12", of_its_own, 1));
     assert_eq!(all("waiting"), ["a-3v.m.s1"]);
     assert_eq!(begun(&["--any-commit"]), 1, "another configuration");
     let config = std::fs::read_to_string(out.join("runs/a-3v.m.s1/config.toml")).unwrap();
     assert!(config.contains("tv = 0.5"), "{config}");
-    // Another data set under the same name.
+    // Another data set with the same name.
     written(directory.path(), &TINY.replace("phases = 3", "phases = 4"));
     assert_eq!(all("scored"), Vec::<String>::new());
 }
@@ -225,7 +225,7 @@ fn a_run_that_fails_is_a_row() {
     };
     assert_eq!(begun(&[]), 0, "a failure is a result");
     assert_eq!(begun(&["--retry-failed"]), 2);
-    // One run of its own: the failure is written, and a scheduler may go on.
+    // As a single run, the failure is recorded, and a scheduler may continue.
     let one = output(&["one", text(&file), "b.m.s1", "-o", text(&out), "--retry-failed"]);
     assert_eq!(one.status.code(), Some(0));
     assert!(String::from_utf8_lossy(&one.stderr).contains("b.m.s1 failed"));
@@ -242,7 +242,7 @@ fn two_processes_share_a_study() {
     let held = Lock::take(&out.join("locks/run-a-3v.m.s1")).unwrap().unwrap();
     let one = output(&["one", text(&file), "a-3v.m.s1", "-o", text(&out)]);
     assert_eq!(one.status.code(), Some(75), "{}", String::from_utf8_lossy(&one.stderr));
-    // The queue does the rest, and says that it is not through.
+    // The queue does the rest, and reports that it is incomplete.
     let all = output(&["run", text(&file), "-o", text(&out)]);
     assert_eq!(all.status.code(), Some(75), "{}", String::from_utf8_lossy(&all.stderr));
     let waiting = || states(&file, &out).into_values().filter(|state| state == "waiting").count();
@@ -252,12 +252,12 @@ fn two_processes_share_a_study() {
     assert_eq!(waiting(), 0);
 }
 
-/// Runs the smoke study until what it has said is enough, then sends it a signal; all it said, and how it ended.
+/// Runs the smoke study until its events are sufficient, then sends a signal; returns all events and the exit code.
 fn run_until(out: &Path, enough: impl Fn(&[Value]) -> bool, signal: &str) -> (Vec<Value>, Option<i32>) {
     let mut child = study(&["run", SMOKE, "-o", text(out), "--json"]).stdout(Stdio::piped()).spawn().unwrap();
     let (mut events, mut sent) = (Vec::new(), false);
     for line in BufReader::new(child.stdout.take().unwrap()).lines() {
-        // The last one may be cut off.
+        // The last line may be cut off.
         events.extend(serde_json::from_str::<Value>(&line.unwrap()));
         if !sent && enough(&events) {
             sent = true;
@@ -275,7 +275,7 @@ fn results(out: &Path) -> BTreeMap<String, Vec<u8>> {
     read.map(|(run, bytes)| (run.file_name().unwrap().to_str().unwrap().to_owned(), bytes)).collect()
 }
 
-/// What tables say, but for seconds and what follows from them.
+/// Table rows without seconds and values derived from them.
 fn timeless(out: &Path) -> Vec<String> {
     ok(&["table", SMOKE, "-o", text(out)]);
     let csv = std::fs::read_to_string(out.join("table.csv")).unwrap();
@@ -290,10 +290,10 @@ fn kills_change_nothing() {
     let [whole, killed] = ["whole", "killed"].map(|name| directory.path().join(name));
     ok(&["run", SMOKE, "-o", text(&whole)]);
     let (mut kills, mut began_anew) = (0, 0);
-    // Results as they were first seen.
+    // Results at their first appearance.
     let mut seen: BTreeMap<String, Vec<u8>> = BTreeMap::new();
     loop {
-        // The last time without a kill.
+        // The last round is not killed.
         let lines = if kills < 10 { 2 + (60.0 * uniform01(kills, 0, 0, 0)) as usize } else { usize::MAX };
         let (events, code) = run_until(&killed, |events| events.len() >= lines, "-KILL");
         let begun: Vec<&str> =
@@ -334,7 +334,8 @@ fn ctrl_c_saves() {
     assert!(first["step"].as_u64().unwrap() > 0, "it goes on: {first}");
 }
 
-/// Results in the repository stay results of its studies, and its tables are theirs: a new setting must not make others of them.
+/// Results in the repository remain results of its studies, and its tables are made from them: a new setting must not
+/// invalidate them.
 #[test]
 fn kept_results_are_of_their_studies_and_make_their_tables() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("studies");

@@ -1,5 +1,5 @@
-//! Kernels whose lanes exchange values within subgroups, and their counterparts for devices on which lanes cannot: both agree with
-//! the f64 twins, and each repeats bit by bit.
+//! Kernels whose lanes exchange values within subgroups, and their counterparts for devices without that ability: both
+//! agree with the f64 twins, and each repeats with equal bits.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -16,16 +16,16 @@ fn open(without_subgroups: bool) -> Gpu {
         .unwrap()
 }
 
-/// Workgroups of the layers' sums and of several rays as a GPU has them, of full subgroups, with operands whose kernels have both
-/// variants. A ray has `ray_lanes`.
+/// Tuning with workgroups for the layers' sums and for several rays as on a GPU, with full subgroups and operands whose
+/// kernels have both variants. A ray has `ray_lanes`.
 fn as_on_a_gpu(gpu: &Gpu, ray_lanes: u32) -> Tuning {
-    // More than the cases have samples of the static field.
+    // More than the number of samples of the static field in the cases.
     let march_lanes = 32.max(4 * ray_lanes);
     let sums = Tuning { layer_lanes: 64, weight_lanes: 64, splits: 3, ..tuning(gpu) };
     Tuning { operands: Operands::Storage, march_lanes, ray_lanes, ..sums }
 }
 
-/// Invocations of a ray: several subgroups, and half a one, as AMD's subgroups of 64 are shared by rays of 32.
+/// Invocations per ray: several subgroups, and half a subgroup, as rays of 32 share AMD's subgroups of 64.
 fn ray_lanes(gpu: &Gpu) -> [u32; 2] {
     [32, gpu.info().subgroup_size.min(32) / 2]
 }

@@ -1,4 +1,5 @@
-//! Whole runs: the loss falls, runs repeat bit by bit, resume equals no interruption, rendering equals the twin.
+//! Whole runs: the loss decreases, runs repeat with equal bits, resuming equals an uninterrupted run, rendering equals the
+//! twin.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -67,7 +68,7 @@ fn resume_equals_no_interruption() {
     assert_eq!(parts.moments, whole.moments);
     let steps = |name: &str| -> Vec<(String, u64)> {
         let text = std::fs::read_to_string(directory.path().join(name).join("metrics.jsonl")).unwrap();
-        // The stop adds a line of its own; the regular ones are the same.
+        // The stop adds a line of its own; the regular lines are equal.
         let lines = text.lines().map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap());
         lines
             .filter(|v| v["event"] == "progress" && v["step"].as_u64().unwrap() % 10 == 0)
@@ -189,7 +190,7 @@ fn older_checkpoints_follow_the_stated_rule() {
 fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
     let gpu = gpu();
     expect_agreement(|findings| drawing::compare_volumes(&gpu, &tuning(&gpu), findings));
-    // Finer cells than those of displays.
+    // Cells are finer than those used for display.
     let dataset = small_dataset(24, 20);
     let config = small_config("fast-mlp", &["train.rays=64", "train.chunk_samples=2000", "march.render_samples=200"]);
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
@@ -212,7 +213,7 @@ fn sampled_fields_equal_the_twin_and_baked_views_the_rendered_ones() {
         let off = got.iter().zip(&want).map(|(g, w)| (f64::from(*g) - w).powi(2)).sum::<f64>();
         assert!(norm > 0.0 && (off / norm).sqrt() < limit, "{name}: {:.1e} off", (off / norm).sqrt());
     }
-    // A recorded shot serves any view.
+    // A recorded command buffer serves any view.
     let other = Quantity { component: Component::Static, projection: drr };
     let turned = baked.render(&dataset.views[0].rays, 24, 20, 1, other).unwrap();
     assert_ne!(turned, show(Component::Static, drr));

@@ -1,4 +1,4 @@
-//! Trees that `phantom --tree` reads: those of VTK in each of its encodings, our own, and damaged ones.
+//! Trees that `phantom --tree` reads: VTK files in each encoding, the project's own files, and damaged ones.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/known_tree.rs"]
@@ -14,12 +14,12 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Digits of single precision.
+/// Tolerance of single precision.
 const NEAR_MM: f64 = 1e-5;
 
 type Lines = Vec<Vec<[f64; 3]>>;
 
-/// Files that VTK has written, and what they have, made once.
+/// Files written by VTK, and their content, created once.
 fn written() -> &'static (tempfile::TempDir, Value) {
     static FILES: OnceLock<(tempfile::TempDir, Value)> = OnceLock::new();
     FILES.get_or_init(|| {
@@ -54,7 +54,7 @@ fn lines_of_vtk_are_read_in_each_encoding() {
     let files: Vec<PathBuf> = serde_json::from_value(expected["files"].clone()).unwrap();
     assert_eq!(files.len(), 72);
     files.iter().for_each(|file| same(&directory.path().join(file), 0.0, &lines[0], &radii));
-    // The times of a collection are its order.
+    // The order of a collection defines its times.
     let beat = directory.path().join("beat.pvd");
     (0..3).for_each(|phase| same(&beat, phase as f64 / 3.0, &lines[phase], &radii));
 }
@@ -63,7 +63,7 @@ fn lines_of_vtk_are_read_in_each_encoding() {
 fn what_cannot_be_read_is_named() {
     let (directory, _) = written();
     let out = directory.path().join("never made");
-    // A reader that goes down with every element would end the program.
+    // A reader that recurses at every element would crash the program.
     let deep = "<a>".repeat(100_000);
     for (name, content, parts) in [
         ("deep.vtp", Some(deep.as_str()), &["XML"][..]),
@@ -114,7 +114,7 @@ fn damaged_lines_are_errors() {
                 bytes[place] ^= 1 << (try_ % 8)
             }
             std::fs::write(&damaged, bytes).unwrap();
-            // What is wrong in a value may be read; nothing else is, and nothing panics.
+            // A wrong value may be read; any other damage is an error, and nothing panics.
             refused += usize::from(TreeFile::read(&damaged).is_err());
         }
     }
@@ -137,7 +137,7 @@ fn our_own_lines_come_back() {
         same(&to("again.pvd"), phase as f64 / PHASES as f64, &lines, &radii);
         same(&to(&format!("again_{phase:04}.vtp")), 0.0, &lines, &radii);
     }
-    // A phantom of it has the same vessels.
+    // A phantom made from it has the same vessels.
     let (phases, out) = (PHASES.to_string(), to("phantom"));
     ok(&["phantom", text(&out), "--tree", text(&to("again.pvd")), "--size", "32", "--phases", &phases]);
     let lines: Lines = serde_json::from_value(of(2, "points_mm").into()).unwrap();

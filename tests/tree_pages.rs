@@ -1,4 +1,4 @@
-//! Trees where people look at them: over the viewer's pictures and on a run's page, in a browser that a script drives.
+//! Trees as shown to users: over the viewer's pictures and on a run's page, in a browser controlled by a script.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/known_tree.rs"]
@@ -24,7 +24,7 @@ const SIDE: usize = 420;
 
 type Line = Vec<[f64; 3]>;
 
-/// The viewer, until it is dropped.
+/// The viewer's process, until it is dropped.
 struct Server {
     process: Child,
     url: String,
@@ -39,7 +39,7 @@ impl Server {
         Server { process, url: url.trim().to_owned() }
     }
 
-    /// Body of an answer that must be a good one.
+    /// Body of a response, which must be successful.
     fn ask(&self, path: &str) -> Vec<u8> {
         let (host, token) = self.url.strip_prefix("http://").unwrap().split_once("/?token=").unwrap();
         let mut stream = TcpStream::connect(host).unwrap();
@@ -51,7 +51,7 @@ impl Server {
         answer[split + 4..].to_vec()
     }
 
-    /// What becomes of the tree.
+    /// Result of the tree's extraction.
     fn tree(&self) -> Value {
         loop {
             let answer: Value = serde_json::from_slice(&self.ask("/tree?")).unwrap();
@@ -118,7 +118,7 @@ fn the_viewer_draws_the_tree_where_the_engine_sees_it() {
     let all = json!({ "url": server.url, "tree": file, "cases": cases });
     std::fs::write(&expected, all.to_string()).unwrap();
     python_test("check_viewer.py", &[&expected, &shot]);
-    // The picture has the vessels where the lines are.
+    // The picture shows vessels at the positions of the lines.
     let query = format!("primary=40&secondary=10&phase=1&component=dynamic&projection=drr&size={SIDE}&low=0&high=1");
     let picture = image::load_from_memory(&server.ask(&format!("/frame?{query}&"))).unwrap().to_luma8();
     let rays = rays(40.0, 10.0);
@@ -133,7 +133,7 @@ fn the_viewer_draws_the_tree_where_the_engine_sees_it() {
 #[test]
 fn viewer_and_page_say_why_there_is_no_tree() {
     let Trained { directory, data, .. } = trained();
-    // A network that starts at nothing, and has not been trained yet, has no vessels.
+    // A network that starts at zero, and is not trained yet, has no vessels.
     let young = directory.path().join("young");
     let nothing = ["--set", "dynamic.best_start=false", "--set", "dynamic.normalised_shift=-15"];
     train(data, &young, &[&["--preset", "fast-mlp", "--iterations", "1", "--tree"], &nothing[..]].concat());
@@ -166,12 +166,12 @@ fn the_page_of_a_run_draws_the_tree_over_its_angiograms() {
     });
     std::fs::write(&expected, all.to_string()).unwrap();
     python_test("check_tree_page.py", &[&expected, &shot]);
-    // Asked for again, it is the same; not asked for, it is not there.
+    // On a second request it is the same; without a request it is absent.
     let again = directory.path().join("again");
     ok(&["eval", text(run), "--images", text(&again), "--tree"]);
     assert_eq!(std::fs::read(again.join("tree.json")).unwrap(), std::fs::read(run.join("tree.json")).unwrap());
     assert!(std::fs::read_to_string(again.join("report.html")).unwrap().contains("tree-data"));
-    // The run's own page is that of whichever test asks last.
+    // The run's own page is that of the last test that requests it.
     let without = directory.path().join("without");
     ok(&["eval", text(run), "--images", text(&without)]);
     assert!(!std::fs::read_to_string(without.join("report.html")).unwrap().contains("<script"));
@@ -187,7 +187,7 @@ fn scores_of_the_tree_are_those_of_scipy() {
     assert!(page.contains("Scores of the tree"));
     assert!(ok(&["eval", text(run), "--tree"]).0.contains("as a tree against the true one"), "there is a table");
     python_test("check_tree_scores.py", &[data, &out]);
-    // Not asked for, or without a truth, there are none.
+    // Without a request, or without a truth, there are none.
     let untold: Value = serde_json::from_str(&ok(&["eval", text(run), "--json"]).0).unwrap();
     assert!(untold.get("tree").is_none() && untold.get("volume").is_some());
 }

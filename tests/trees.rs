@@ -1,5 +1,5 @@
-//! Vessels as trees, through the program: a tree that is known is taken angiograms of, reconstructed and found again. VTK opens
-//! the files, SciPy compares.
+//! Vessels as trees, through the program: angiograms of a known tree are made, and the tree is reconstructed and extracted.
+//! VTK opens the files, SciPy compares.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "tests")]
 
 #[path = "common/known_tree.rs"]
@@ -40,7 +40,7 @@ fn the_tree_is_the_true_one_in_every_format() {
     check("check_tubes.py", &[&to("still.glb"), &to("still.json")]);
 }
 
-/// Runs one of the scripts of the tests.
+/// Runs one of the tests' scripts.
 fn check(script: &str, files: &[&Path]) {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python").join(script);
     let outcome = python().arg(script).args(files).output().unwrap();
@@ -105,7 +105,7 @@ fn what_has_no_tree_is_refused() {
     refuses(run, &out, &["--threshold", "nan"], &["threshold_per_mm", "positive"]);
     refuses(run, &out, &["--min-branch=-1"], &["least_branch_mm = -1", "positive"]);
     refuses(run, &out, &["--phase", "4"], &["--phase", "0 to 3"]);
-    // A network that starts at nothing, and has not been trained yet, has no vessels.
+    // A network that starts at zero, and is not trained yet, has no vessels.
     let young = directory.path().join("young");
     let nothing = ["--set", "dynamic.best_start=false", "--set", "dynamic.normalised_shift=-15"];
     train(data, &young, &[&["--preset", "fast-mlp", "--iterations", "1"], &nothing[..]].concat());
@@ -140,7 +140,7 @@ fn c_callers_get_the_same_tree() {
     room.branch_points = count.as_mut_ptr();
     room.points_mm = points_mm.as_mut_ptr();
     room.radius_mm = radius_mm.as_mut_ptr();
-    // Too little room is refused, and nothing is written.
+    // Insufficient room is refused, and nothing is written.
     room.points -= 1;
     assert_eq!(unsafe { nertca_reconstruction_tree(reconstruction, &mut room) }, NERTCA_ERROR_BUFFER);
     assert!(room.points == points && radius_mm[0].is_nan() && phase[0] == 9);
@@ -158,7 +158,7 @@ fn c_callers_get_the_same_tree() {
             let wanted_mm: Vec<f64> = wanted["points_mm"].as_array().unwrap().iter().flat_map(numbers).collect();
             let found_mm = &points_mm[3 * range.start..3 * range.end];
             assert_eq!(wanted_mm.len(), found_mm.len());
-            // The file keeps a tenth of a micrometre.
+            // The file is rounded to a tenth of a micrometre.
             assert!(wanted_mm.iter().zip(found_mm).all(|(a, b)| (a - b).abs() < 1e-4), "branch {branch}");
             let radii = numbers(&wanted["radius_mm"]);
             assert!(

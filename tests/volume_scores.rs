@@ -1,4 +1,5 @@
-//! Scores in 3D, and SSIM: against SciPy and scikit-image, and through the program, with a truth that the program itself exported.
+//! Scores in 3D, and SSIM: compared with SciPy and scikit-image, and through the program, with a truth that the program
+//! exported.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/program.rs"]
@@ -20,7 +21,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Chains of balls that wander through a grid, as vessels do; `wobble_mm` away from where they would be.
+/// Chains of balls along curved paths through a grid, like vessels, displaced by `wobble_mm`.
 fn vessels(seed: u32, size: [usize; 3], spacing_mm: DVec3, wobble_mm: f64) -> Mask {
     let extent_mm = spacing_mm * DVec3::from_array(size.map(|n| n as f64));
     let number = |what: u32, i: u32| uniform01(seed, 0, what, i);
@@ -42,7 +43,7 @@ fn vessels(seed: u32, size: [usize; 3], spacing_mm: DVec3, wobble_mm: f64) -> Ma
     Mask { size, spacing_mm, inside: (0..nx * ny * nz).map(|i| inside(at(i))).collect() }
 }
 
-/// Writes a mask as numpy reads it: (z, y, x).
+/// Writes a mask as a numpy file: (z, y, x).
 fn write_npy(path: &Path, mask: &Mask) {
     let [x, y, z] = mask.size;
     let mut header = format!("{{'descr': '|u1', 'fortran_order': False, 'shape': ({z}, {y}, {x}), }}");
@@ -109,11 +110,11 @@ struct Trained {
     directory: tempfile::TempDir,
     data: PathBuf,
     run: PathBuf,
-    /// What the program exports of the moving field, per phase.
+    /// Dynamic field exported by the program, per phase.
     fields: Vec<Volume>,
 }
 
-/// A small run, made once. Its dataset has volumes.
+/// A small run, created once. Its dataset has volumes.
 fn trained() -> &'static Trained {
     static RUN: OnceLock<Trained> = OnceLock::new();
     RUN.get_or_init(|| {
@@ -133,7 +134,7 @@ fn trained() -> &'static Trained {
     })
 }
 
-/// True vessels as the field has them itself: the vessels' attenuation where it exceeds the threshold.
+/// True vessels from the field itself: the vessels' attenuation where the field exceeds the threshold.
 fn vessels_of(field: &Volume) -> Volume {
     let values: Vec<f32> =
         field.values.iter().map(|v| if *v > THRESHOLD_PER_MM { VESSEL_PER_MM } else { 0.0 }).collect();
@@ -171,7 +172,7 @@ fn number(scores: &Value, name: &str) -> f64 {
     scores[name].as_f64().unwrap_or_else(|| panic!("{name} in {scores}"))
 }
 
-/// Positions of the voxels of a volume that are above a value, mm, and their values.
+/// Positions of the voxels of a volume above a value, mm, and their values.
 fn above(volume: &Volume, value: f32) -> Vec<(DVec3, f64)> {
     let [nx, ny, _] = volume.size;
     let index = |i: usize| DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64);
@@ -192,7 +193,7 @@ fn a_field_agrees_with_itself() {
     let rows = volume["phases"].as_array().unwrap();
     assert_eq!(rows.len(), PHASES as usize);
     for row in rows {
-        // Voxels at the threshold itself may fall on either side: positions are rounded.
+        // Voxels exactly at the threshold may be on either side, since positions are rounded.
         for (name, value, tolerance) in [
             ("dice", 1.0, 1e-3),
             ("chamfer_mm", 0.0, 1e-3),
@@ -207,7 +208,7 @@ fn a_field_agrees_with_itself() {
     }
 }
 
-/// Translations by whole voxels along each patient axis; the world's axes are others.
+/// Translations by whole voxels along each patient axis, which differ from the world's axes.
 #[test]
 fn a_moved_truth_is_as_far_away_as_it_was_moved() {
     const VOXELS: f64 = 10.0;
@@ -224,7 +225,7 @@ fn a_moved_truth_is_as_far_away_as_it_was_moved() {
             let mean = |d: &[f64]| d.iter().sum::<f64>() / d.len() as f64;
             let chamfer = 0.5 * (mean(&found) + mean(&right));
             assert!((number(row, "chamfer_mm") - chamfer).abs() < 0.01 * chamfer, "{name}: {chamfer} in {row}");
-            // Voxels of the field that float, by their values.
+            // Voxels of the field far from vessels, by their values.
             let field = above(field, 0.0);
             let away = distances(&field, &truth);
             let all: f64 = field.iter().map(|(_, v)| v).sum();
@@ -238,7 +239,8 @@ fn a_moved_truth_is_as_far_away_as_it_was_moved() {
     }
 }
 
-/// The reconstruction's own field as the truth: rays through its volumes find what rays through the field find.
+/// With the reconstruction's own field as the truth, rays through its volumes give the same values as rays through the
+/// field.
 #[test]
 fn true_vessels_are_scored_as_the_field_is() {
     let evaluation = evaluated("ceiling", Volume::clone);
@@ -248,7 +250,7 @@ fn true_vessels_are_scored_as_the_field_is() {
     for (field, volumes) in field.into_iter().zip(volumes) {
         assert!(field > 0.2 && (volumes - field).abs() < 0.05, "{volumes} of the volumes, {field} of the field");
     }
-    // Elsewhere they score nothing.
+    // At another position they score zero.
     let moved = |field: &Volume| {
         let mut volume = field.clone();
         volume.index_to_lps.translation += DVec3::new(0.0, 0.0, 15.0);
@@ -270,7 +272,7 @@ fn reports_show_scores_in_3d_and_do_without() {
     assert!(std::fs::read_to_string(run.join("report.html")).unwrap().contains("Scores in 3D"));
     let told = ok(&["eval", text(run)]);
     assert!(told.contains("Chamfer") && told.contains("mean"), "{told}");
-    // Without volumes there is not even the field.
+    // Without volumes, not even the field can be scored.
     let bare = directory.path().join("bare");
     ok(&["phantom", text(&bare), "--size", "40", "--phases", &PHASES.to_string(), "--no-volumes"]);
     let evaluation =
@@ -278,19 +280,19 @@ fn reports_show_scores_in_3d_and_do_without() {
     let without = evaluation().unwrap();
     assert!(without.get("volume").is_none() && without.get("ceiling").is_none());
     assert!(without["warnings"].to_string().contains("no ceiling"), "{}", without["warnings"]);
-    // A truth that cannot be used is told of, and images are scored all the same.
+    // A truth that cannot be used is reported, and images are scored nevertheless.
     std::fs::create_dir_all(bare.join("volumes")).unwrap();
     std::fs::write(bare.join("volumes/vessels-01.nrrd"), "NRRD0004\n").unwrap();
     let warnings = evaluation().unwrap()["warnings"].to_string();
     assert!(warnings.contains("3D") && warnings.contains("vessels-01.nrrd"), "{warnings}");
 }
 
-/// A field that fills its box cannot be compared voxel by voxel; that is no reason for a run to end.
+/// A field that fills its box cannot be compared voxel by voxel; the run must continue.
 #[test]
 fn a_field_everywhere_has_no_distance_and_trains_on() {
     let directory = tempfile::tempdir().unwrap();
     let (data, run) = (directory.path().join("data"), directory.path().join("run"));
-    // Small pixels, so that the box of the paper's moving field has too many voxels.
+    // Pixels are small, so that the box of the paper's dynamic field has too many voxels.
     ok(&["phantom", text(&data), "--size", "100", "--phases", "2"]);
     let settings = [
         "train.rays=32",
@@ -315,7 +317,7 @@ fn a_field_everywhere_has_no_distance_and_trains_on() {
 
 #[test]
 fn ssim_is_that_of_scikit_image() {
-    // The pair of images of the script.
+    // The script's pair of images.
     const WIDTH: usize = 37;
     let pixels = (0..23 * WIDTH).map(|i| ((i % WIDTH) as f64, (i / WIDTH) as f64));
     let (truth, prediction): (Vec<f64>, Vec<f64>) = pixels

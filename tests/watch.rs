@@ -1,4 +1,4 @@
-//! `watch`, through the program: runs are copied into the folder one by one while it trains, between files that are none.
+//! `watch`, through the program: runs are copied into the folder one by one during training, among files that are not runs.
 #![cfg(feature = "dicom")]
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
@@ -22,7 +22,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 const PHASES: usize = 6;
-/// Integrals that grey values span, as the import takes logarithmic ones.
+/// Range of the integrals that grey values represent, as the import assumes for logarithmic ones.
 const SPAN: f32 = 3.0;
 
 fn text(path: &Path) -> &str {
@@ -74,7 +74,7 @@ fn runs(directory: &Path) -> Vec<PathBuf> {
     dataset.training_views().into_iter().map(write).collect()
 }
 
-/// The program at work, until it is dropped.
+/// The running program, until it is dropped.
 struct Watcher {
     process: Child,
     url: String,
@@ -100,7 +100,7 @@ impl Watcher {
         Watcher { process, url: url.trim().to_owned(), said, reader: Some(reader) }
     }
 
-    /// Waits until the program has said something.
+    /// Waits for a message of the program.
     #[track_caller]
     fn hear(&mut self, what: &str) {
         while !self.said.lock().unwrap().contains(what) {
@@ -109,7 +109,7 @@ impl Watcher {
         }
     }
 
-    /// Status and body of an answer.
+    /// Status and body of a response.
     fn ask(&self, path: &str) -> (String, Vec<u8>) {
         let (host, token) = self.url.strip_prefix("http://").unwrap().split_once("/?token=").unwrap();
         let mut stream = TcpStream::connect(host).unwrap();
@@ -125,7 +125,7 @@ impl Watcher {
         serde_json::from_slice(&self.ask("/info?").1).unwrap()
     }
 
-    /// Waits until the page says that it is done so far.
+    /// Waits until the page reports the expected progress.
     #[track_caller]
     fn reach(&self, done: impl Fn(&Value) -> bool) {
         while !done(&self.about()) {
@@ -138,7 +138,7 @@ impl Watcher {
         assert!(sent.unwrap().success());
     }
 
-    /// What it said in all, and whether it ended well.
+    /// All messages, and whether the program ended successfully.
     fn end(mut self) -> (String, bool) {
         let status = self.process.wait().unwrap();
         self.reader.take().unwrap().join().unwrap();
@@ -148,7 +148,7 @@ impl Watcher {
 
 impl Drop for Watcher {
     fn drop(&mut self) {
-        // It may have ended.
+        // The process may already have ended.
         let _ = self.process.kill();
         let _ = self.process.wait();
     }
@@ -191,7 +191,7 @@ fn runs_are_taken_in_as_they_come() {
         watcher.ask("/frame?primary=0&secondary=0&phase=0&component=dynamic&projection=drr&size=64&low=0&high=1&");
     assert!(early.0.contains(" 503 "), "{}", early.0);
 
-    // A file that has not come as a whole is named, and taken in once it has.
+    // An incomplete file is named, and imported once it is complete.
     let whole = std::fs::read(&runs[0]).unwrap();
     std::fs::write(inbox.join("view0.dcm"), &whole[..whole.len() / 2]).unwrap();
     watcher.hear("not taken in: ");
@@ -205,7 +205,7 @@ fn runs_are_taken_in_as_they_come() {
     watcher.hear("taken in: view1 (");
     std::fs::copy(&runs[1], inbox.join("again.dcm")).unwrap();
     watcher.hear("again.dcm");
-    // Two views are enough to begin with.
+    // Two views are enough to start.
     let picture = loop {
         let query = "primary=10&secondary=5&phase=1&component=dynamic&projection=drr&size=64&low=0&high=1";
         let (status, body) = watcher.ask(&format!("/frame?{query}&"));
@@ -232,7 +232,7 @@ fn runs_are_taken_in_as_they_come() {
         assert_eq!(said.matches(part).count(), times, "`{part}` in {said}");
     }
 
-    // What is left is what import and training leave.
+    // The remaining files equal those of import and training.
     let imported = at("imported");
     let taken: Vec<&str> = runs.iter().map(|run| text(run)).collect();
     ok(&[&["import", "dicom"], &taken[..], &["-o", text(&imported)], &reading[..]].concat());
@@ -264,8 +264,8 @@ fn a_folder_without_runs_leaves_nothing() {
     assert!(!run.exists());
 }
 
-/// Two runs, a third once training is `far` enough, and Ctrl-C. What is left goes on with `train --resume`. Returns what was said,
-/// and the runs that were left.
+/// Starts with two runs, adds a third once training satisfies `far`, and sends Ctrl-C. The result continues with `train
+/// --resume`. Returns the messages, and the number of remaining runs.
 fn interrupted_after_a_third_run(iterations: u32, far: impl Fn(&Value) -> bool) -> (String, usize) {
     let directory = tempfile::tempdir().unwrap();
     let at = |name: &str| directory.path().join(name);

@@ -1,4 +1,4 @@
-//! The Python wheel is built, installed into an empty virtual environment as its users do, without a compiler within reach,
+//! The Python wheel is built, installed into an empty virtual environment like by its users, without access to a compiler,
 //! and used: README's example, and the tests of tests/python/wheel.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
@@ -27,14 +27,15 @@ fn run(command: &mut Command) -> String {
     said
 }
 
-/// A virtual environment with the wheel and what it asks for.
+/// A virtual environment with the wheel and its dependencies.
 struct Installed {
     wheel: PathBuf,
     environment: PathBuf,
 }
 
 impl Installed {
-    /// A program of the environment, with nothing else on the PATH: neither compilers nor this checkout's tools.
+    /// Command for a program of the environment, with nothing else on the PATH: neither compilers nor this checkout's
+    /// tools.
     fn command(&self, name: impl AsRef<OsStr>) -> Command {
         let binaries = self.environment.join("bin");
         let mut command = Command::new(binaries.join(name.as_ref()));
@@ -60,7 +61,7 @@ fn installed() -> &'static Installed {
         if scratch.exists() {
             std::fs::remove_dir_all(&scratch).unwrap();
         }
-        // Cargo's lock is free: it is held while tests are built, not while they run.
+        // Cargo's lock is free, since it is held only while tests are built.
         let said =
             run(Command::new(root().join("tools/wheel")).arg(&scratch).env("CARGO_TARGET_DIR", target_directory()));
         let wheel = PathBuf::from(said.lines().last().unwrap());
@@ -72,7 +73,7 @@ fn installed() -> &'static Installed {
     })
 }
 
-/// Where this test was built: target/release/deps/wheel-0123456789abcdef.
+/// Directory of this test's build: target/release/deps/wheel-0123456789abcdef.
 fn target_directory() -> PathBuf {
     std::env::current_exe().unwrap().ancestors().nth(3).unwrap().to_path_buf()
 }
@@ -102,7 +103,7 @@ fn the_wheel_is_small_stripped_and_whole() {
         let sections = run(Command::new("readelf").args(["--wide", "--section-headers"]).arg(&binary));
         assert!(!sections.contains(".debug_info") && !sections.contains(".symtab"), "{}: {sections}", binary.display());
     }
-    // maturin looks at what the program asks of the C library, and auditwheel at the library as well.
+    // maturin checks the program's use of the C library, and auditwheel that of the library as well.
     let auditwheel = root().join(".cache/python/bin/auditwheel");
     let audited = run(Command::new(auditwheel).arg("show").arg(&installed.wheel));
     assert!(audited.contains("is consistent with") && audited.contains(PLATFORM), "{audited}");
@@ -128,7 +129,7 @@ fn licences_of_everything_linked_come_along() {
     assert!(texts.contains("Permission is hereby granted") && texts.contains("Apache License"));
 }
 
-/// The library turns panics into errors: they must find their way through what zig links.
+/// The library turns panics into errors, so unwinding must work in binaries linked by zig.
 #[test]
 #[ignore = "builds everything once more, for any Linux: tools/test --packages"]
 fn panics_are_caught_in_what_zig_links() {
@@ -139,7 +140,7 @@ fn panics_are_caught_in_what_zig_links() {
         println!(\"{}\", caught.is_err());
     }";
     std::fs::write(&source, program).unwrap();
-    // Only what is named as what is given away goes through zig.
+    // Only binaries named like the distributed ones are linked by zig.
     let binary = scratch.path().join("deps/nertca_vk-panics");
     std::fs::create_dir(scratch.path().join("deps")).unwrap();
     let linker = format!("linker={}", root().join("tools/zig-linker").display());
@@ -149,7 +150,7 @@ fn panics_are_caught_in_what_zig_links() {
     assert_eq!(run(&mut Command::new(&binary)), "true\n");
 }
 
-/// Code of README's section on Python, in a language.
+/// Code block of README's section on Python, in a language.
 fn readme(language: &str) -> String {
     let text = std::fs::read_to_string(root().join("README.md")).unwrap();
     let section = text.split("\n## From Python\n").nth(1).expect("README has a section on Python");
@@ -200,7 +201,7 @@ fn types_are_strict_inside_and_for_users() {
         command
     };
     run(mypy().arg(root().join("python/nertca_vk")));
-    // As users see the package: through its installed types.
+    // The package as users see it, through its installed types.
     let of_users = || {
         let mut command = mypy();
         command.arg("--python-executable").arg(installed.environment.join("bin/python3"));

@@ -1,6 +1,6 @@
-//! X-Gaussian (the preset `x-gaussian`): stages equal their twins, the twins PyTorch and finite differences; runs fit
-//! what Gaussians that hide each other can show, repeat and resume bit by bit across density control; lists that
-//! outgrow their room get more, and nothing is lost.
+//! X-Gaussian (the preset `x-gaussian`): stages equal their twins, and the twins agree with PyTorch and finite differences;
+//! runs fit images of Gaussians that occlude each other, repeat and resume with equal bits across density control; lists
+//! that exceed their capacity are enlarged, and nothing is lost.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod common;
@@ -51,7 +51,7 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     let (_, gradient) = twin(&fit, shown, &all);
     let largest = gradient.iter().flatten().fold(0f64, |m, g| m.max(g.abs()));
     let mut compared = 0;
-    // Gaussians count from an opacity of 1/255 on: the loss jumps there, and a difference across a jump is no slope.
+    // Gaussians count from an opacity of 1/255: the loss jumps there, and a difference across a jump is no derivative.
     let mut across_jumps = 0;
     for i in [0, 1, 2, 3, 4, 8, 9, 10, 11, 13, 14] {
         for (k, want) in gradient[i].iter().enumerate() {
@@ -191,7 +191,7 @@ fn start(gpu: &Gpu, config: &Config, dataset: &Dataset) -> Trainer {
 
 const SIDES: &[[f64; 2]] = &[[-30.0, 25.0], [60.0, -20.0], [5.0, 8.0]];
 
-/// A bright disc before a faint one, as far as each view has them.
+/// A bright disc in front of a faint one, as far as each view shows them.
 fn discs() -> Dataset {
     dataset(SIDES, [33, 27], |_, view| {
         let near = |p: usize, place: [f64; 3], reach: f64| {
@@ -242,7 +242,7 @@ fn a_fit_shows_discs_that_hide_each_other_and_models_draw_what_fits_see() {
     let close = drawn.dynamic_integral.iter().zip(&want).filter(|(a, b)| (f64::from(**a) - **b).abs() < 1e-4).count();
     assert!(close * 100 > 98 * want.len(), "{close} of {}", want.len());
     assert!(drawn.static_integral.iter().all(|v| *v == 0.0));
-    // What attenuates is the sum of opacities, per 100 mm.
+    // The attenuation is the sum of opacities, per 100 mm.
     for pixel in [16 * 33 + 16, 5 * 33 + 20] {
         let (anchor, direction) = dataset.views[image].rays.pixel((pixel % 33) as f64, (pixel / 33) as f64);
         let sum = |depth: f64| -> f64 {
@@ -261,7 +261,7 @@ fn a_fit_shows_discs_that_hide_each_other_and_models_draw_what_fits_see() {
     expect_silence(gpu);
 }
 
-/// Short runs with density control and a reset on the way, of which much comes.
+/// A short configuration with strong effects of density control and with a reset.
 fn short(static_data: &str) -> Config {
     let data = format!("x.static_data={static_data}");
     config(&[
@@ -284,7 +284,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
         let config = short(static_data);
         let mut whole = start(&gpu, &config, &dataset);
         let losses = run(&mut whole, 60);
-        // Not where a submit ends, where opacities have just been reset, and where density control has just been.
+        // The stops are: not at the end of a submit, just after a reset of opacities, and just after density control.
         for stop in [13, 25, 30] {
             let mut parts = start(&gpu, &config, &dataset);
             let mut again = run(&mut parts, stop);
@@ -330,7 +330,7 @@ fn lists_that_outgrow_their_room_get_more_and_nothing_is_lost() {
         assert!(got.0 == want.0 && got.1 == want.1, "room for {capacity} at first");
         assert!(got.2 > capacity, "{}", got.2);
     }
-    // A device that has no buffer so large.
+    // The device has no buffer of this size.
     let error = nertca_vk::x_gaussian::picture::more_capacity(1001, 1000, ("x.most", 7)).unwrap_err().to_string();
     assert!(error.contains("1001") && error.contains("x.interval"), "{error}");
     expect_silence(gpu);
@@ -378,7 +378,7 @@ fn clones_and_children_show_more() {
         let x = nertca_vk::config::sections::X { size_limit: limit, weakest: 0.0, ..config.x.clone() };
         densified(&state, data.n_sets(), &x, extent, (1, 600))
     };
-    // Twice as opaque where a clone lies on its original.
+    // The opacity doubles where a clone lies on its original.
     let shown = |state: &XState| {
         let mut fit = XTrainer::with(&gpu, data.clone(), &config, state, 0).unwrap();
         fit.advance(1).unwrap();
@@ -408,7 +408,7 @@ fn what_cannot_be_fitted_is_refused() {
     let one = of_one_view(&small_dataset(21, 18));
     assert!(refused(&one).contains("one place"), "{}", refused(&one));
     assert!(Plan::new(&config(&["x.extent_mm=400"]), &one).is_ok());
-    // A checkpoint that is damaged.
+    // A damaged checkpoint is refused.
     let saved = start(&gpu, &config(&[]), &small_dataset(21, 18)).checkpoint().unwrap();
     let damaged = |damage: &dyn Fn(&mut XState)| {
         let mut other = saved.clone();
@@ -418,7 +418,7 @@ fn what_cannot_be_fitted_is_refused() {
     assert_eq!(damaged(&|_| ()), None);
     assert!(damaged(&|state| state.sets[3] = 3).unwrap().contains("x.set"));
     assert!(damaged(&|state| state.second[3][5] = f32::NAN).unwrap().contains("x.adam.v"));
-    // All too faint: opacities are reset below what is taken away.
+    // All are too faint: opacities are reset below the pruning threshold.
     let config = config(&["x.reset_every=2", "x.reset_opacity=0.001", "x.densify_every=3", "x.densify_from=0"]);
     let mut trainer = start(&gpu, &config, &small_dataset(21, 18));
     let error = (0..9).find_map(|_| trainer.advance(9).err()).unwrap().to_string();
@@ -427,7 +427,7 @@ fn what_cannot_be_fitted_is_refused() {
     expect_silence(gpu);
 }
 
-/// The same with every image taken by one view.
+/// Returns the dataset with all images assigned to one view.
 fn of_one_view(dataset: &Dataset) -> Dataset {
     let mut one = dataset.clone();
     one.frames.iter_mut().for_each(|frame| frame.view = 0);

@@ -1,4 +1,4 @@
-//! X-Gaussian from outside: the program trains, resumes, scores, draws, exports and times it.
+//! X-Gaussian through the program: training, resuming, scoring, rendering, export and timing.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "common/program.rs"]
@@ -44,9 +44,9 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
     assert_eq!(score["dice"]["dynamic"], score["dice_published"]["paper"], "the published threshold");
     assert!(score["threshold"]["rule"].as_str().unwrap().contains("opacities"), "{score}");
-    // Compared with images that go from 0 to 1, as it shows them.
+    // The comparison is with images of a range from 0 to 1, as it renders them.
     assert!((3.0..60.0).contains(&score["psnr"].as_f64().unwrap()), "{}", score["psnr"]);
-    // Each image by a threshold of its own.
+    // Each image has a threshold of its own.
     let images = score["images"].as_array().unwrap();
     let otsu: Vec<f64> = images.iter().map(|image| image["dice_otsu"].as_f64().unwrap()).collect();
     let mean = otsu.iter().sum::<f64>() / otsu.len() as f64;

@@ -1,5 +1,5 @@
-//! Whether a correction helps, and which: fitted to some phases, tested on those it has not seen (method, robustness of
-//! geometry, section 12).
+//! Decides whether a correction helps, and which one: each is fitted to some phases and tested on the others (method,
+//! robustness of geometry, section 12).
 
 use crate::calibrate::gauge;
 use crate::calibrate::observed::Observed;
@@ -11,36 +11,37 @@ use serde::{Deserialize, Serialize};
 
 /// Blurs of the coarse stages, bins of half a pixel.
 const COARSE: [f64; 2] = [24.0, 12.0];
-/// And of the fine ones.
+/// Blurs of the fine stages, bins of half a pixel.
 const FINE: [f64; 2] = [6.0, 3.0];
-/// Gauss-Newton steps of each.
+/// Gauss-Newton steps of each coarse and each fine stage.
 const STEPS: [usize; 2] = [2, 3];
-/// Residuals of the fine stages are alike far beyond the blur: so many count as one.
+/// Residuals of the fine stages are correlated far beyond the blur: this many count as one.
 const TEMPER: f64 = 10.0;
-/// A correction must take this share of the squared residual away at phases it has not seen: chance takes less.
+/// A correction must remove at least this share of the squared residual at phases it was not fitted to; chance removes
+/// less.
 pub const LEAST_GAIN: f64 = 0.02;
-/// And this share of the profiles' squares: what noise-free views leave when nothing is wrong changes by less. An error of 0.03 pixels
-/// adds as much.
+/// The squared residual must also drop by at least this share of the profiles' squares: without errors and noise it varies
+/// by less. An error of 0.03 pixels adds this much.
 pub const LEAST_DROP: f64 = 5e-4;
-/// Where vessels are cut off, which displacements of frames take up more than positions of views do, breathing must take this
-/// share away.
+/// Where vessels are cut off, breathing must remove this share: displacements of frames compensate for cut-off vessels more
+/// than positions of views do.
 pub const LARGE_GAIN: f64 = 0.3;
-/// Fewer phases cannot be split.
+/// Minimum number of phases that can be split into two halves.
 pub const LEAST_PHASES: usize = 4;
 
-/// How the views are corrected.
+/// Kind of correction of the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Correction {
-    /// Not at all.
+    /// No correction: the geometry as stated.
     Stated,
     /// Angles and position of each view.
     Static,
-    /// The same, and a displacement of the heart in each frame.
+    /// Angles and position of each view, and a displacement of the heart in each frame.
     Breathing,
 }
 
-/// Corrections by the wanted phases.
+/// Fits a correction to the wanted phases.
 pub fn fit(observed: &Observed, correction: Correction, phases: &[usize]) -> Poses {
     let mut poses = Poses::stated(observed.views.len(), observed.n_phases());
     let breathing = match correction {
@@ -65,13 +66,14 @@ pub fn fit(observed: &Observed, correction: Correction, phases: &[usize]) -> Pos
     poses
 }
 
-/// How far the views are from agreeing at the wanted phases.
+/// Misfit of the views at the wanted phases.
 pub fn misfit(views: &Views, poses: &Poses, phases: &[usize]) -> Misfit {
     solve::misfit(views, poses, FINE[1], phases)
 }
 
-/// Displacements at phases that were not fitted: on a straight line between those beside, the nearest at the ends. Breath
-/// goes on from the last phase, it does not return to the first.
+/// Fills in the displacements at phases that were not fitted: linear between the neighbouring fitted phases, and the
+/// nearest one at the ends. Breathing does not return at the last phase to its state at the first, so the phases are not
+/// cyclic here.
 fn between(heart: &mut [DVec3], fitted: &[usize]) {
     for t in (0..heart.len()).filter(|t| !fitted.contains(t)) {
         let before = fitted.iter().copied().filter(|f| *f < t).max();
@@ -84,16 +86,16 @@ fn between(heart: &mut [DVec3], fitted: &[usize]) {
     }
 }
 
-/// What halves of the phases say of a correction.
+/// Result of testing a correction on halves of the phases.
 #[derive(Debug, Clone)]
 pub struct Validated {
-    /// Squared residual of each half under the corrections of the other, as a share of the profiles' squares.
+    /// Squared residual of each half at the corrections fitted to the other, as a share of the profiles' squares.
     pub residual: f64,
-    /// Corrections by each half, for all phases.
+    /// Corrections fitted to each half, for all phases.
     pub halves: [Poses; 2],
 }
 
-/// Fits the even phases and tests on the odd ones, and the other way round.
+/// Fits the even phases and tests on the odd ones, and vice versa.
 pub fn validate(observed: &Observed, correction: Correction) -> Validated {
     let parity = |odd: usize| (0..observed.n_phases()).filter(|t| t % 2 == odd).collect::<Vec<usize>>();
     let (mut squares, mut power) = (0.0, 0.0);
@@ -109,8 +111,8 @@ pub fn validate(observed: &Observed, correction: Correction) -> Validated {
     Validated { residual: squares / power.max(f64::MIN_POSITIVE), halves }
 }
 
-/// The candidate that predicts unseen phases best; a later one must be better than those before by the share `gain` of the
-/// squared residual, and by [`LEAST_DROP`].
+/// Returns the candidate that predicts unseen phases best. A later candidate must be better than those before it by the
+/// share `gain` of the squared residual, and by [`LEAST_DROP`].
 pub fn best(residuals: &[f64], gain: impl Fn(usize) -> f64) -> usize {
     let mut best = 0;
     for (k, residual) in residuals.iter().enumerate() {

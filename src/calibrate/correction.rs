@@ -1,4 +1,4 @@
-//! What was corrected, why, and what came of it: `calibration.json`.
+//! The correction of the views, the reasons for it and its outcome: `calibration.json`.
 
 use crate::calibrate::choose::Correction;
 use crate::error::{Error, Result};
@@ -8,7 +8,7 @@ use crate::scan::dataset::Dataset;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// Name of the file in a run, or in a dataset that was corrected.
+/// Name of the file in a run, or in a corrected dataset.
 pub const FILE: &str = "calibration.json";
 const MAX_BYTES: u64 = 64 << 20;
 
@@ -17,13 +17,14 @@ const MAX_BYTES: u64 = 64 << 20;
 pub struct ViewCorrection {
     /// Index into the dataset's views.
     pub view: usize,
-    /// Added to the primary angle, degrees.
+    /// Correction added to the primary angle, degrees.
     pub primary_deg: f64,
-    /// Added to the secondary angle, degrees.
+    /// Correction added to the secondary angle, degrees.
     pub secondary_deg: f64,
-    /// How much further than stated the table has carried the patient along (left, posterior, superior), mm.
+    /// Table displacement of the patient beyond the stated one, along (left, posterior, superior), mm.
     pub table_mm: [f64; 3],
-    /// Root mean square of how far the correction moves the heart's image, pixels, less what moves all views alike.
+    /// Root mean square displacement of the heart's image by the correction, without the motion common to all views,
+    /// pixels.
     pub moved_px: f64,
     /// Difference of this view's profiles from those of the others before the correction, as a share of the profiles.
     pub residual_before: f64,
@@ -35,7 +36,7 @@ pub struct ViewCorrection {
     pub corrected: Geometry,
 }
 
-/// Correction of one frame: where breathing has carried the heart.
+/// Correction of one frame: the displacement of the heart by breathing.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FrameCorrection {
     /// Index into the dataset's views.
@@ -46,30 +47,32 @@ pub struct FrameCorrection {
     pub heart_shift_mm: [f64; 3],
 }
 
-/// The outcome.
+/// Outcome of the self-calibration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
-    /// What was corrected.
+    /// Kind of correction.
     pub correction: Correction,
-    /// Per view; empty where nothing was.
+    /// Corrections of the views; empty where none was made.
     pub views: Vec<ViewCorrection>,
-    /// Per frame; empty unless breathing was corrected.
+    /// Corrections of the frames; empty unless breathing was corrected.
     pub frames: Vec<FrameCorrection>,
-    /// How far views disagreed: root mean square of how far the correction moves the heart's images, pixels.
+    /// Disagreement of the views: root mean square displacement of the heart's images by the correction, pixels.
     pub disagreement_px: f64,
-    /// How well the correction is known: half of what the corrections by even and by odd phases differ by, pixels. Errors
-    /// that both have alike do not show.
+    /// Precision of the correction: half the distance between the corrections by the even and by the odd phases, pixels. It
+    /// does not show errors that both have in common.
     pub repeatability_px: Option<f64>,
-    /// Residual at phases that were not fitted, as a share of the profiles: as stated, static, breathing, as far as tried.
+    /// Residual at phases that were not fitted, as a share of the profiles, for each correction that was tried: stated,
+    /// static, breathing.
     pub tried: Vec<(Correction, f64)>,
-    /// Share of the pixels that show vessels for which all other views show some on the ray, to a pixel: before and after.
+    /// Share of the vessel pixels for which all other views show a vessel on the ray, to within a pixel: before and after
+    /// the correction.
     pub explained: [f64; 2],
-    /// What was done and why, in words.
+    /// Notes on what was done and why.
     pub notes: Vec<String>,
 }
 
 impl Calibration {
-    /// Nothing is corrected, for a reason.
+    /// Returns the outcome without a correction, with the reason.
     pub fn none(note: Option<String>) -> Calibration {
         Calibration {
             correction: Correction::Stated,
@@ -83,7 +86,7 @@ impl Calibration {
         }
     }
 
-    /// Writes it into a directory.
+    /// Writes the outcome into a directory.
     ///
     /// # Errors
     /// [`Error::Io`].
@@ -91,7 +94,7 @@ impl Calibration {
         files::write_atomic(&directory.join(FILE), files::pretty_json(self)?.as_bytes())
     }
 
-    /// Reads that of a run; none where the run has none, as those of before.
+    /// Reads the calibration of a run; `None` where the run has none.
     ///
     /// # Errors
     /// [`Error::Io`] or [`Error::Data`].
@@ -106,7 +109,7 @@ impl Calibration {
         parsed.map(Some).map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))
     }
 
-    /// What the geometry of a view was stated to be, where it was corrected.
+    /// Stated geometry of a view that was corrected.
     pub fn stated(&self, view: usize) -> Option<&Geometry> {
         self.views.iter().find(|c| c.view == view).map(|c| &c.stated)
     }
@@ -116,7 +119,7 @@ impl Dataset {
     /// The dataset with corrected geometry.
     ///
     /// # Errors
-    /// [`Error::Config`] when the correction is of other views.
+    /// [`Error::Config`] when the correction belongs to other views.
     pub fn corrected(&self, calibration: &Calibration) -> Result<Dataset> {
         let other =
             |what: String| Error::config(FILE, what, "is not what the dataset states: it was made for other data");

@@ -1,12 +1,12 @@
-//! What no image tells (method, robustness of geometry, section 3): a common motion of all views. Least corrections are
-//! chosen; with truth, the motion can be found.
+//! The motion that no image determines: a common motion of all views (method, robustness of geometry, section 3). The
+//! minimum corrections are chosen; where the truth is known, the motion can be found.
 
 use crate::calibrate::linear::Symmetric;
 use crate::calibrate::pose::{Poses, Stand};
 use crate::geometry::{ViewRays, lps_mm_from_world, world_from_lps_mm};
 use glam::{DAffine3, DMat3, DVec3};
 
-/// What a shift of each view does across its axis, and the inverse of the sum over views.
+/// Projections of a shift onto the plane across each view's axis, and the inverse of their sum over the views.
 struct Across {
     of_view: Vec<DMat3>,
     inverse: DMat3,
@@ -19,15 +19,15 @@ impl Across {
         (sum.determinant() > 1e-9).then(|| Across { of_view, inverse: sum.inverse() })
     }
 
-    /// The translation closest to all of `shifts` across their views.
+    /// Returns the translation closest to all of `shifts`, measured across their views.
     fn common(&self, shifts: impl Iterator<Item = DVec3>) -> DVec3 {
         self.inverse * self.of_view.iter().zip(shifts).map(|(q, s)| *q * s).sum::<DVec3>()
     }
 }
 
-/// Takes the common motion out of corrections, so that they are the least that make the views agree: the mean primary
-/// angle, the translation common to all views, and with `breathing` that of each phase. Images stay as consistent as
-/// they are.
+/// Removes the common motion from the corrections, so that they are the minimum ones that make the views agree: the mean
+/// primary angle, the translation common to all views and, with `breathing`, the common translation of each phase. The
+/// consistency of the images does not change.
 pub fn fix(stands: &[Stand], poses: &mut Poses, breathing: bool) {
     let n = stands.len() as f64;
     let mean = poses.views.iter().map(|p| p.angles_deg[0]).sum::<f64>() / n;
@@ -50,18 +50,18 @@ pub fn fix(stands: &[Stand], poses: &mut Poses, breathing: bool) {
     poses.views.iter_mut().for_each(|p| p.shift -= common);
 }
 
-/// A training frame as it truly was, and by corrected geometry: the rays by which the heart was seen.
+/// Rays of a training frame by its true and by its corrected geometry.
 #[derive(Debug, Clone)]
 pub struct FrameRays {
     /// Cardiac phase.
     pub phase: usize,
-    /// What the heart truly was seen by.
+    /// Rays of the frame by its true geometry.
     pub truth: ViewRays,
-    /// Rays of the frame after the correction.
+    /// Rays of the frame by its corrected geometry.
     pub corrected: ViewRays,
 }
 
-/// A rotation about the isocentre and a translation, the same for all phases or one for each.
+/// A rotation about the isocentre and a translation, one for all phases or one for each.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigidMotion {
     /// Axis times angle, radians.
@@ -81,12 +81,12 @@ impl RigidMotion {
         if angle == 0.0 { DMat3::IDENTITY } else { DMat3::from_axis_angle(self.rotation / angle, angle) }
     }
 
-    /// Where a point (world units) goes at a phase.
+    /// Returns the position of a point (world units) at a phase after the motion.
     pub fn carry(&self, point: DVec3, phase: usize) -> DVec3 {
         self.turn() * point + self.translations[phase]
     }
 
-    /// Where points in patient mm (left, posterior, superior) go at a phase.
+    /// Returns the motion at a phase for points in patient mm (left, posterior, superior).
     pub fn patient_mm(&self, phase: usize) -> DAffine3 {
         let carried = |point_mm: DVec3| lps_mm_from_world(self.carry(world_from_lps_mm(point_mm), phase));
         let origin = carried(DVec3::ZERO);
@@ -94,25 +94,25 @@ impl RigidMotion {
         DAffine3::from_mat3_translation(DMat3::from_cols(x, y, z), origin)
     }
 
-    /// The rays that see a carried object as these see it at rest.
+    /// Returns the rays that see a moved object as `rays` see it at rest.
     pub fn carry_rays(&self, rays: &ViewRays, phase: usize) -> ViewRays {
         rays.turned(self.turn(), DVec3::ZERO).moved(-self.translations[phase])
     }
 
-    /// Root of the mean square of the image distances, pixels, that remain between truth and correction over `points`
-    /// (world units).
+    /// Root mean square of the image distances, pixels, that remain between truth and correction over `points` (world
+    /// units).
     pub fn remainder_px(&self, frames: &[FrameRays], points: &[DVec3]) -> f64 {
         let squares = frames.iter().flat_map(|f| points.iter().map(|p| self.distance(f, *p).map_or(0.0, squared)));
         (squares.sum::<f64>() / (frames.len() * points.len()).max(1) as f64).sqrt()
     }
 
-    /// Columns and rows from where a point truly is seen to where it is seen carried; none behind a source.
+    /// Columns and rows from the true image of a point to its image after the motion; `None` behind a source.
     fn distance(&self, frame: &FrameRays, point: DVec3) -> Option<[f64; 2]> {
         let (truth, seen) = (frame.truth.project(point)?, frame.corrected.project(self.carry(point, frame.phase))?);
         Some([seen.0 - truth.0, seen.1 - truth.1])
     }
 
-    /// The motion after a small step of one of its numbers: 0 to 2 turn, the others translate, phase by phase or all.
+    /// Returns the motion after a small step of one parameter: 0 to 2 rotate, the others translate each phase or all.
     fn stepped(&self, number: usize, step: f64, each_phase: bool) -> RigidMotion {
         let mut next = self.clone();
         match number.checked_sub(3) {
@@ -128,13 +128,13 @@ fn squared(distance: [f64; 2]) -> f64 {
     distance[0] * distance[0] + distance[1] * distance[1]
 }
 
-/// The common motion between true and corrected geometry: what the reconstruction of the corrected views is moved by
-/// against the truth. It is the motion that brings `points` (world units, spread over the heart) closest to where they
-/// truly were seen; with `each_phase`, every phase has a translation of its own, as when the heart breathes.
+/// Returns the common motion between true and corrected geometry, by which a reconstruction from the corrected views is
+/// displaced against the truth. It brings `points` (world units, spread over the heart) closest to their true images. With
+/// `each_phase`, every phase has a translation of its own, as when the heart breathes.
 pub fn common_motion(frames: &[FrameRays], points: &[DVec3], n_phases: usize, each_phase: bool) -> RigidMotion {
     const STEPS: usize = 5;
     const DIFFERENCE: f64 = 1e-5;
-    // Phases that no frame shows, and what no view tells, stay where they are.
+    // The damping keeps parameters fixed that no frame or view determines.
     const DAMPING: f64 = 1e-9;
     let n = if each_phase { 3 + 3 * n_phases } else { 6 };
     let mut motion = RigidMotion::none(n_phases);
@@ -193,7 +193,7 @@ mod tests {
             assert!((*a - *b).length() < 1e-6, "{found:?}");
         }
         assert!(found.remainder_px(&frames, &points) < 1e-4);
-        // The same in patient millimetres.
+        // The motion in patient millimetres must agree.
         let place_mm = DVec3::new(12.0, -34.0, 56.0);
         let away = motion.patient_mm(1).transform_point3(place_mm)
             - lps_mm_from_world(motion.carry(world_from_lps_mm(place_mm), 1));

@@ -1,4 +1,4 @@
-//! Symmetric positive definite systems: some hundred unknowns, dense.
+//! Dense symmetric positive definite systems of some hundred unknowns.
 
 /// The lower triangle of a symmetric matrix, row by row.
 #[derive(Debug, Clone, PartialEq)]
@@ -8,7 +8,7 @@ pub struct Symmetric {
 }
 
 impl Symmetric {
-    /// Zeros.
+    /// Returns a matrix of zeros.
     pub fn zeros(n: usize) -> Symmetric {
         Symmetric { n, rows: vec![0.0; n * (n + 1) / 2] }
     }
@@ -23,7 +23,7 @@ impl Symmetric {
         self.rows[i * (i + 1) / 2 + j] += value;
     }
 
-    /// Adds another.
+    /// Adds another matrix.
     pub fn add_all(&mut self, other: &Symmetric) {
         self.rows.iter_mut().zip(&other.rows).for_each(|(a, b)| *a += b);
     }
@@ -33,7 +33,7 @@ impl Symmetric {
         self.rows.iter_mut().for_each(|a| *a *= factor);
     }
 
-    /// `x` with `self x = right`, by Cholesky; none where the matrix is not positive definite.
+    /// Solves `self x = right` by Cholesky; `None` where the matrix is not positive definite.
     pub fn solve(&self, right: &[f64]) -> Option<Vec<f64>> {
         let mut factor = Symmetric::zeros(self.n);
         for i in 0..self.n {

@@ -1,4 +1,4 @@
-//! What the angiograms show of the moving vessels, as far as it takes to make the views consistent.
+//! The evidence of moving vessels in the angiograms, as far as the self-calibration needs it.
 
 use crate::calibrate::pose::Stand;
 use crate::calibrate::profiles::{Moving, Views};
@@ -9,21 +9,22 @@ use crate::scan::dataset::{Dataset, Frame, View};
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Longer sides are brought to about so many pixels.
+/// Number of pixels that longer sides are binned to, approximately.
 const SIDE: usize = 128;
-/// Least side of a view's images on larger pixels.
+/// Minimum side of a view's binned images, pixels.
 const LEAST_SIDE: usize = 32;
-/// Log-likelihood ratio of "a vessel is here" from which a pixel takes part, at any phase: next to the most a view says.
+/// Log-likelihood ratio of "a vessel is here" from which, at any phase, a pixel takes part; near the maximum of a single
+/// view.
 const LIKELY: f32 = 2.0;
-/// Pixels that take part are so many more around: tight masks bias noisy data.
+/// Margin around the pixels that take part, pixels: tight masks bias noisy data.
 const MASK_MARGIN: usize = 2;
-/// Least change of a pixel that shows a vessel to a person, as a share of the strongest.
+/// Minimum change of a pixel that visibly shows a vessel, as a share of the strongest change.
 const SHOWN_SHARE: f32 = 0.15;
-/// The border, pixels.
+/// Width of the border, pixels.
 const BORDER: usize = 2;
-/// Views with more than this share of their change at the border have vessels that the image cuts off.
+/// Share of a view's change at the border above which the image cuts vessels off.
 const CUT_OFF: f64 = 0.02;
-/// Standard deviations of noise that are no vessel at the border.
+/// Changes at the border up to this many standard deviations of the noise do not count as vessels.
 const CLEAR: f32 = 4.0;
 
 /// The training views that show at least two phases.
@@ -31,15 +32,15 @@ const CLEAR: f32 = 4.0;
 pub struct Observed {
     /// Indices into [`Dataset::views`].
     pub views: Vec<usize>,
-    /// Where each of the views stands.
+    /// Geometry of each view.
     pub stands: Vec<Stand>,
-    /// Pixels of the dataset along one of these.
+    /// Pixels of the dataset along the side of one binned pixel.
     pub factor: usize,
-    /// What exceeds the still background: tells the rough way.
+    /// Positive differences from the static background, for the coarse stages.
     pub coarse: Views,
-    /// Differences from the still background, of either sign: tell the rest.
+    /// Differences of either sign from the static background, for the fine stages.
     pub fine: Views,
-    /// `[view][phase]`: images above the still background; these and all others on the canvas of the dataset's images.
+    /// `[view][phase]`: images above the static background. All images are on the canvas of the dataset's images.
     pub seen: Vec<Vec<Option<Vec<f32>>>>,
     /// `[view][phase]`: pixels that show vessels.
     pub shown: Vec<Vec<Option<Vec<bool>>>>,
@@ -53,7 +54,7 @@ pub struct Observed {
     pub at_border: Vec<f64>,
 }
 
-/// Means of `factor` x `factor` pixels.
+/// Averages `factor` x `factor` pixels.
 fn binned(values: &[f32], width: usize, factor: usize) -> Vec<f32> {
     let (w, h) = (width / factor, values.len() / width / factor);
     let scale = 1.0 / (factor * factor) as f32;
@@ -66,20 +67,20 @@ fn binned(values: &[f32], width: usize, factor: usize) -> Vec<f32> {
     out
 }
 
-/// Pixels of which a part is hidden.
+/// Binned pixels that are partly hidden.
 fn binned_hidden(hidden: &[bool], width: usize, factor: usize) -> Vec<bool> {
     let values: Vec<f32> = hidden.iter().map(|h| f32::from(u8::from(*h))).collect();
     binned(&values, width, factor).iter().map(|share| *share > 0.0).collect()
 }
 
-/// How many pixels along one larger pixel make the training images about [`SIDE`] wide, and none too small.
+/// Number of pixels along one binned pixel that makes the training images about [`SIDE`] wide, and none too small.
 fn factor(dataset: &Dataset) -> usize {
     let sides = || dataset.training_views().into_iter().flat_map(|view| dataset.views[view].size);
     let (least, most) = (sides().min().unwrap_or(0), sides().max().unwrap_or(0));
     ((most as f64 / SIDE as f64).round() as usize).min(least / LEAST_SIDE).max(1)
 }
 
-/// The training frames on larger pixels.
+/// Bins the training frames.
 fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
     let frame = |f: &Frame| Frame { integrals: binned(&f.integrals, dataset.width, factor), mask: None, ..f.clone() };
     let mut coarse = Dataset {
@@ -102,14 +103,14 @@ fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
     coarse
 }
 
-/// One view's part of it.
+/// Evidence of one view.
 struct Seen {
     stand: Stand,
     /// Pixels that change.
     mask: Vec<bool>,
-    /// The same with a margin.
+    /// Pixels that change, with a margin.
     wide_mask: Vec<bool>,
-    /// `[phase]`: above the still background.
+    /// `[phase]`: image above the static background.
     above: Vec<Option<Vec<f32>>>,
     /// `[phase]`: pixels that show vessels.
     shown: Vec<Option<Vec<bool>>>,
@@ -120,7 +121,7 @@ struct Seen {
     at_border: f64,
 }
 
-/// `[phase]`: pixels that are likely to show a vessel, and clearly one: a heart or a diaphragm that moves is wider.
+/// `[phase]`: pixels that are likely to show a vessel and change clearly; a moving heart or diaphragm is wider.
 fn shown(evidence: &ViewEvidence) -> Vec<Option<Vec<bool>>> {
     let least = SHOWN_SHARE * evidence.background.strongest;
     let phases = evidence.ratios.iter().zip(&evidence.background.changes).map(|(ratio, change)| {
@@ -173,7 +174,7 @@ impl Seen {
     }
 }
 
-/// Pixels next to what a view does not show: beyond the edges of its images, or hidden.
+/// Pixels next to those that a view does not show: beyond the edges of its images, or hidden.
 fn border(visible: &[bool], [width, height]: [usize; 2]) -> Vec<bool> {
     let hidden: Vec<bool> = visible.iter().map(|v| !v).collect();
     let beside = widened(&hidden, [width, height], BORDER);
@@ -210,12 +211,13 @@ impl Observed {
         }
     }
 
-    /// Places in [`Observed::views`] of those whose vessels the image, or what hides a part of it, cuts off.
+    /// Indices into [`Observed::views`] of the views whose vessels are cut off by the image or by its hidden part.
     pub fn cut_off(&self) -> Vec<usize> {
         (0..self.views.len()).filter(|slot| self.at_border[*slot] > CUT_OFF).collect()
     }
 
-    /// The same images by another geometry, and by its displacements of the heart, `[view][phase]` in world units.
+    /// Returns the images with the geometry of another dataset, and its displacements of the heart, `[view][phase]` in
+    /// world units.
     pub fn by_geometry_of(&self, dataset: &Dataset) -> (Observed, Vec<Vec<DVec3>>) {
         let mut other = self.clone();
         for (stand, view) in other.stands.iter_mut().zip(&self.views) {
@@ -231,7 +233,7 @@ impl Observed {
         (other, heart)
     }
 
-    /// Cardiac phases.
+    /// Number of cardiac phases.
     pub fn n_phases(&self) -> usize {
         self.fine.n_phases
     }

@@ -1,15 +1,15 @@
-//! Where views stand: as stated, and corrected by two angles and a translation per view and a shift per frame.
+//! Geometry of the views: as stated, and corrected by two angles and a translation per view and a shift per frame.
 
 use crate::geometry::{Geometry, ViewRays, angles_deg_of, rotation, world_from_lps_mm};
 use glam::{DMat3, DVec3};
 
-/// A view by its stated geometry.
+/// A view with its stated geometry.
 #[derive(Debug, Clone)]
 pub struct Stand {
     /// Rays of the images, as stated.
     pub rays: ViewRays,
     angles_deg: [f64; 2],
-    /// Turns the C-arm's axes into the world's; its third column looks from the source to the detector.
+    /// Rotation from the C-arm's axes to the world's; its third column points from the source to the detector.
     axes: DMat3,
     table: DVec3,
 }
@@ -17,25 +17,25 @@ pub struct Stand {
 /// Corrections of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ViewPose {
-    /// Added to the primary and the secondary angle, degrees.
+    /// Correction added to the primary and the secondary angle, degrees.
     pub angles_deg: [f64; 2],
-    /// How much further the patient was carried in the room than stated, world units.
+    /// Displacement of the patient in the room beyond the stated one, world units.
     pub shift: DVec3,
 }
 
-/// Corrections of all views, and what else the angiograms may differ by.
+/// Corrections of all views and frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Poses {
-    /// One per view.
+    /// Correction of each view.
     pub views: Vec<ViewPose>,
-    /// `[view][phase]`: how far breathing has carried the heart, world units.
+    /// `[view][phase]`: displacement of the heart by breathing, world units.
     pub heart: Vec<Vec<DVec3>>,
-    /// `[view][phase]`: contrast by which a frame exceeds the others; a nuisance.
+    /// `[view][phase]`: relative excess of a frame's contrast over the others; a nuisance parameter.
     pub gains: Vec<Vec<f64>>,
 }
 
 impl Poses {
-    /// No corrections.
+    /// Returns poses without corrections.
     pub fn stated(n_views: usize, n_phases: usize) -> Poses {
         Poses {
             views: vec![ViewPose::default(); n_views],
@@ -46,7 +46,8 @@ impl Poses {
 }
 
 impl Stand {
-    /// A view whose images have these rays. A projection matrix stands for the C-arm that looks where it looks.
+    /// Creates a view whose images have these rays. A projection matrix is treated as a C-arm with the same viewing
+    /// direction.
     pub fn new(geometry: &Geometry, rays: &ViewRays) -> Stand {
         let (angles_deg, table) = match geometry {
             Geometry::CArm(c) => ([c.primary_deg, c.secondary_deg], world_from_lps_mm(DVec3::from_array(c.table_mm))),
@@ -55,7 +56,7 @@ impl Stand {
         Stand { rays: rays.clone(), angles_deg, axes: rotation(angles_deg[0], angles_deg[1]), table }
     }
 
-    /// Where the table has carried the patient, world units.
+    /// Displacement of the patient by the table, world units.
     pub fn table(&self) -> DVec3 {
         self.table
     }
@@ -70,28 +71,29 @@ impl Stand {
         rotation(self.angles_deg[0] + pose.angles_deg[0], self.angles_deg[1] + pose.angles_deg[1])
     }
 
-    /// How directions turn when the view is corrected.
+    /// Rotation of directions by the correction of the view.
     pub fn turn(&self, pose: &ViewPose) -> DMat3 {
         self.corrected_axes(pose) * self.axes.transpose()
     }
 
-    /// The corrected source in the room, before table and patient move: it turns about the isocentre.
+    /// Corrected source in the room, before displacements of table and patient; the correction rotates it about the
+    /// isocentre.
     pub fn source_in_room(&self, pose: &ViewPose) -> DVec3 {
         self.turn(pose) * (self.rays.source() + self.table)
     }
 
-    /// The corrected source as the patient sees it.
+    /// Corrected source in the patient's coordinates.
     pub fn source(&self, pose: &ViewPose) -> DVec3 {
         self.source_in_room(pose) - self.table - pose.shift
     }
 
-    /// Axes, in the world, that the view turns about when the primary and the secondary angle grow.
+    /// World axes about which the view rotates when the primary and the secondary angle increase.
     pub fn turning_axes(&self, pose: &ViewPose) -> [DVec3; 2] {
         let (sin, cos) = (self.angles_deg[0] + pose.angles_deg[0]).to_radians().sin_cos();
         [-DVec3::Z, DVec3::new(sin, cos, 0.0)]
     }
 
-    /// Rays of the corrected view, its patient carried a further `heart`.
+    /// Rays of the corrected view, with the patient displaced by a further `heart`.
     pub fn corrected_rays(&self, pose: &ViewPose, heart: DVec3) -> ViewRays {
         self.rays.turned(self.turn(pose), self.table).moved(pose.shift + heart)
     }
@@ -119,7 +121,7 @@ mod tests {
         }
     }
 
-    /// Rays as rows of numbers.
+    /// Rays as a list of numbers.
     fn numbers(rays: &ViewRays) -> Vec<f64> {
         rays.anchor.iter().chain(&rays.direction).flat_map(|v| v.to_array()).chain([rays.sod]).collect()
     }

@@ -1,24 +1,24 @@
-//! Epipolar profiles (method, robustness of geometry, section 4): what a view's image adds up to in each plane through two
-//! sources. At true geometry both views of a pair have the same profile.
+//! Epipolar profiles (method, robustness of geometry, section 4): integrals of a view's image over each plane through two
+//! sources. At the true geometry both views of a pair have equal profiles.
 //!
-//! A plane is named by its angle about the baseline; angle zero is a direction both views share, so that a common motion
-//! of all views changes nothing. With a baseline `e`, a ray of direction `d` has `s = e.d` along it and `a = n1.d`,
+//! A plane is identified by its angle about the baseline. Angle zero is a direction that both views share, so that a common
+//! motion of all views changes nothing. With a baseline `e`, a ray of direction `d` has `s = e.d` along it and `a = n1.d`,
 //! `b = n2.d` across; its weight is `solid angle / cos^2 latitude`. All slopes of a profile follow from three sums over the
-//! pixels of a plane, of the weight and of the weight times `s a / (a^2 + b^2)` and `s b / (a^2 + b^2)`.
+//! pixels of a plane: of the weight, and of the weight times `s a / (a^2 + b^2)` and `s b / (a^2 + b^2)`.
 
 use crate::calibrate::pose::{Poses, Stand};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Shortest baseline, as a share of the distance from source to isocentre.
+/// Minimum length of a baseline, as a share of the distance from source to isocentre.
 const SHORTEST_BASELINE: f64 = 0.1;
-/// Least distance between baseline and isocentre, as the same share: the baseline of opposite views runs through the heart,
-/// where planes no longer tell anything apart.
+/// Minimum distance between baseline and isocentre, as a share of the distance from source to isocentre. The baseline of
+/// opposite views runs through the heart, where planes cannot be told apart.
 const LEAST_DISTANCE: f64 = 0.35;
-/// Bins of a pixel.
+/// Bins per pixel.
 const BINS_PER_PIXEL: f64 = 2.0;
-/// Kernels end after so many standard deviations.
+/// Reach of a kernel in standard deviations.
 const KERNEL_REACH: f64 = 3.5;
 
 /// A pixel that takes part.
@@ -34,10 +34,10 @@ pub struct Pixel {
     solid: f64,
 }
 
-/// What a view has to be consistent with the others: pixels, and how far each phase exceeds the still background there.
+/// Data of a view for the comparison: pixels, and the difference of each phase from the static background there.
 #[derive(Debug, Clone)]
 pub struct Moving {
-    /// Where the view stands.
+    /// Geometry of the view.
     pub stand: Stand,
     /// Columns and rows of its images.
     pub size: [usize; 2],
@@ -48,7 +48,7 @@ pub struct Moving {
 }
 
 impl Moving {
-    /// A view's images, as far as `mask` reaches.
+    /// Creates the data from a view's images, within `mask`.
     pub fn new(stand: Stand, size: [usize; 2], mask: &[bool], images: &[Option<Vec<f32>>]) -> Moving {
         let [d0, du, dv] = stand.rays.direction;
         let area = d0.dot(du.cross(dv)).abs();
@@ -65,46 +65,46 @@ impl Moving {
     }
 }
 
-/// The planes of a pair at a phase.
+/// Pencil of planes of a pair at a phase.
 #[derive(Debug, Clone, Copy)]
 pub struct Pencil {
     /// Unit vector from the first source to the second.
     pub baseline: DVec3,
-    /// Across it, at angle zero.
+    /// Unit vector across the baseline, at angle zero.
     pub first: DVec3,
-    /// Across both.
+    /// Unit vector across both `baseline` and `first`.
     pub second: DVec3,
     /// Length of the baseline.
     pub length: f64,
-    /// How far the shared direction reaches across the baseline, and along it.
+    /// Component of the shared direction across the baseline, and along it.
     pub middle: [f64; 2],
 }
 
-/// A pair's profile and its slopes, in one view and at one phase.
+/// Profile of a pair and its slopes, in one view and at one phase.
 #[derive(Debug, Clone)]
 pub struct Profile {
     /// Integral of density / (distance from the baseline)^2 in each plane.
     pub value: Vec<f64>,
-    /// Change of `value` when planes are counted from a direction a radian further about the baseline.
+    /// Change of `value` per radian by which the zero direction turns about the baseline.
     pub turned: Vec<f64>,
-    /// Change when the baseline tilts towards `first`, per radian.
+    /// Change of `value` when the baseline tilts towards `first`, per radian.
     pub towards_first: Vec<f64>,
-    /// Change when it tilts towards `second`.
+    /// Change of `value` when the baseline tilts towards `second`, per radian.
     pub towards_second: Vec<f64>,
 }
 
-/// Both views of a pair at a phase.
+/// Profiles of both views of a pair at a phase.
 #[derive(Debug, Clone)]
 pub struct PairAtPhase {
     /// Phase.
     pub phase: usize,
-    /// Planes.
+    /// Pencil of planes.
     pub pencil: Pencil,
     /// The views' profiles.
     pub profiles: [Profile; 2],
 }
 
-/// Two views, by their place among those calibrated.
+/// Two views, by their index among the calibrated ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pair {
     /// The two views of the pair.
@@ -116,7 +116,7 @@ pub struct Pair {
 pub struct Views {
     /// The views.
     pub views: Vec<Moving>,
-    /// Pairs that say something about each other.
+    /// Pairs that constrain each other.
     pub pairs: Vec<Pair>,
     /// Cardiac phases.
     pub n_phases: usize,
@@ -124,7 +124,7 @@ pub struct Views {
     pub bin: f64,
 }
 
-/// A kernel that profiles are smoothed by, and its slope per bin.
+/// A smoothing kernel of profiles, and its slope per bin.
 pub struct Blur {
     value: Vec<f64>,
     slope: Vec<f64>,
@@ -137,7 +137,8 @@ impl Blur {
         Blur { value: gaussian(sigma, reach), slope: gaussian_slope(sigma, reach) }
     }
 
-    /// A Gaussian of `sigma` bins less one of `wide` bins: what is as smooth as a heart or a lung that moves is taken out.
+    /// Returns a Gaussian of `sigma` bins minus one of `wide` bins, which suppresses structures as smooth as a moving heart
+    /// or lung.
     pub fn band(sigma: f64, wide: f64) -> Blur {
         let reach = (KERNEL_REACH * wide).ceil() as i32;
         let less = |a: Vec<f64>, b: Vec<f64>| a.iter().zip(b).map(|(a, b)| a - b).collect();
@@ -158,7 +159,7 @@ fn gaussian_slope(sigma: f64, reach: i32) -> Vec<f64> {
     gaussian(sigma, reach).iter().zip(-reach..=reach).map(|(g, i)| -f64::from(i) / (sigma * sigma) * g).collect()
 }
 
-/// `values` under `kernel`; zero outside.
+/// Convolves `values` with `kernel`; values outside are zero.
 fn convolved(values: &[f64], kernel: &[f64]) -> Vec<f64> {
     let reach = kernel.len() / 2;
     let mut out = vec![0.0; values.len()];
@@ -172,7 +173,7 @@ fn convolved(values: &[f64], kernel: &[f64]) -> Vec<f64> {
 }
 
 impl Views {
-    /// Finds the pairs that say something about each other.
+    /// Finds the pairs that constrain each other.
     pub fn new(views: Vec<Moving>, n_phases: usize) -> Views {
         let side = |v: &Moving| 0.5 * (v.stand.rays.direction[1].length() + v.stand.rays.direction[2].length());
         let pixel = views.iter().map(side).sum::<f64>() / views.len().max(1) as f64;
@@ -190,7 +191,7 @@ impl Views {
         pair.views.map(|v| self.views[v].stand.turn(&poses.views[v]))
     }
 
-    /// The planes of a pair at a phase.
+    /// Returns the pencil of planes of a pair at a phase.
     pub fn pencil(&self, pair: Pair, poses: &Poses, phase: usize) -> Pencil {
         let source = |v: usize| self.views[v].stand.source(&poses.views[v]) - poses.heart[v][phase];
         let axis = |v: usize| self.views[v].stand.corrected_axes(&poses.views[v]).z_axis;
@@ -205,7 +206,7 @@ impl Views {
         Pencil { baseline, first, second: baseline.cross(first), length, middle: [across.length(), along] }
     }
 
-    /// Bins that the images of a pair reach at any of the phases.
+    /// Bins that the images of a pair cover at any of the phases.
     fn range(&self, pair: Pair, poses: &Poses, phases: &[usize]) -> Range<i64> {
         let turns = self.turns(pair, poses);
         let (mut low, mut high) = (f64::MAX, f64::MIN);
@@ -223,7 +224,7 @@ impl Views {
         low.floor() as i64 - 1..high.ceil() as i64 + 2
     }
 
-    /// Profiles of a pair at all wanted phases that both views have.
+    /// Computes the profiles of a pair at all wanted phases that both views have.
     pub fn profiles(&self, pair: Pair, poses: &Poses, wanted: &[usize], blur: &Blur) -> Vec<PairAtPhase> {
         let phases: Vec<usize> = self.phases_of(pair, wanted).collect();
         let range = self.range(pair, poses, &phases);
@@ -241,7 +242,7 @@ impl Views {
     }
 }
 
-/// Whether a pair's baseline tells planes of the heart apart.
+/// Tells whether a pair's baseline distinguishes planes of the heart.
 fn tells(a: &Stand, b: &Stand) -> bool {
     let (from, to) = (a.rays.source(), b.rays.source());
     let sod = 0.5 * (a.sod() + b.sod());
@@ -255,7 +256,7 @@ struct Sums([Vec<f64>; 3]);
 
 impl Sums {
     fn of(view: &Moving, values: &[f32], pencil: &Pencil, turn: DMat3, range: &Range<i64>, bin: f64) -> Sums {
-        // The pencil's axes in the stated view's world, so that pixels need not be turned.
+        // Transforms the pencil's axes into the stated view's world, so that pixels need no rotation.
         let back = turn.transpose();
         let stated = view.stand.rays.direction;
         let along = |axis: DVec3| stated.map(|d| (back * axis).dot(d));

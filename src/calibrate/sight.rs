@@ -1,25 +1,26 @@
-//! Whether other views may show a vessel somewhere on a ray.
+//! Tells whether other views may show a vessel somewhere on a ray.
 
 use crate::calibrate::observed::Observed;
 use crate::geometry::ViewRays;
 use crate::raster::widened;
 use glam::{DMat3, DVec3};
 
-/// Depths looked at along a ray, of a pixel each at the isocentre.
+/// Number of depths sampled along a ray to either side of the isocentre, as a share of the image's longer side; their step
+/// is one pixel at the isocentre.
 const DEPTHS_PER_SIDE: f64 = 0.5;
 
-/// What a view tells of a point.
+/// Evidence of a view for a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Look {
-    /// It is beyond the image's edge, or hidden.
+    /// The point is beyond the image's edge, or hidden.
     Unseen,
-    /// There may be a vessel.
+    /// A vessel is possible at the point.
     Vessel,
-    /// There is none.
+    /// No vessel is at the point.
     Nothing,
 }
 
-/// What a view shows at a phase.
+/// Vessels of a view at a phase.
 struct Sight<'a> {
     source: DVec3,
     inverse: DMat3,
@@ -53,8 +54,8 @@ pub(super) struct Others<'a> {
 }
 
 impl<'a> Others<'a> {
-    /// The views beside `view` that have an image at `phase`, their vessels widened by so many pixels, on rays by `rays`; none
-    /// where no other has one.
+    /// Returns the views other than `view` that have an image at `phase`, with geometry by `rays` and their vessels widened
+    /// by `near` pixels; `None` where no other view has an image.
     pub(super) fn of(
         observed: &'a Observed,
         view: usize,
@@ -78,8 +79,8 @@ impl<'a> Others<'a> {
         (!sights.is_empty()).then_some(Others { size, sights })
     }
 
-    /// Whether at some place on the ray of a pixel, which may lie beyond the image, a view shows a vessel, and all that see the
-    /// place do.
+    /// Tells whether there is a place on the ray of a pixel, possibly beyond the image, where at least one view shows a
+    /// vessel and every view that sees the place does.
     pub(super) fn may_show(&self, rays: &ViewRays, column: f64, row: f64) -> bool {
         let pixel = 0.5 * (rays.anchor[1].length() + rays.anchor[2].length());
         let half = (DEPTHS_PER_SIDE * self.size[0].max(self.size[1]) as f64) as i64;

@@ -1,15 +1,16 @@
-//! Which pixels the other views explain: what a person sees at a look. Corrections are not found or judged by it.
+//! Pixels that the other views explain, as a measure that is easy to inspect. Corrections are neither fitted nor validated
+//! by it.
 
 use crate::calibrate::observed::Observed;
 use crate::calibrate::pose::Poses;
 use crate::calibrate::sight::Others;
 use rayon::prelude::*;
 
-/// Vessels of other views may be so many pixels off.
+/// Tolerance of the vessels of other views, pixels.
 const NEAR: usize = 1;
 
-/// The pixels of a view that show vessels at a phase and for which all other views that see it show some at a place on
-/// the ray, to a pixel; none where the view, or all others, have no image then.
+/// Vessel pixels of a view at a phase for which all other views that see it show a vessel at one place on the ray, to
+/// within a pixel; `None` where the view, or all others, have no image at the phase.
 pub fn explained_pixels(observed: &Observed, poses: &Poses, view: usize, phase: usize) -> Option<Vec<bool>> {
     let shown = observed.shown[view][phase].as_ref()?;
     let rays = |v: usize| observed.stands[v].corrected_rays(&poses.views[v], poses.heart[v][phase]);
@@ -19,7 +20,7 @@ pub fn explained_pixels(observed: &Observed, poses: &Poses, view: usize, phase: 
     Some((0..shown.len()).into_par_iter().map(|p| shown[p] && explained(p)).collect())
 }
 
-/// Share of the pixels that show vessels which the other views explain, over all views and phases.
+/// Share of the vessel pixels that the other views explain, over all views and phases.
 pub fn explained(observed: &Observed, poses: &Poses) -> f64 {
     let (mut all, mut explained) = (0, 0);
     for view in 0..observed.views.len() {

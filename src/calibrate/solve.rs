@@ -1,4 +1,4 @@
-//! Most likely corrections: Gauss-Newton on the difference of profiles (method, robustness of geometry, section 5).
+//! Most likely corrections, by Gauss-Newton on the difference of profiles (method, robustness of geometry, section 5).
 
 use crate::calibrate::linear::Symmetric;
 use crate::calibrate::pose::Poses;
@@ -7,58 +7,60 @@ use crate::geometry::MM_PER_UNIT;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Standard deviation that errors of angles are expected to have, degrees.
+/// Expected standard deviation of errors of the angles, degrees.
 pub const ANGLE_DEG: f64 = 0.3;
-/// Standard deviation that errors of the patient's position across the view are expected to have, mm.
+/// Expected standard deviation of errors of the patient's position across the view, mm.
 pub const IN_PLANE_MM: f64 = 3.0;
-/// Standard deviation that errors of the patient's position along the view are expected to have, mm.
+/// Expected standard deviation of errors of the patient's position along the view, mm.
 pub const DEPTH_MM: f64 = 1.0;
-/// Standard deviation that breathing is expected to displace the heart by along (posterior, left, superior), mm.
+/// Expected standard deviation of the heart's displacement by breathing along (posterior, left, superior), mm.
 pub const BREATHING_MM: [f64; 3] = [1.5, 1.5, 4.0];
-/// Of the contrast of a frame.
+/// Expected standard deviation of the contrast of a frame.
 const GAIN: f64 = 0.1;
-/// Of the mean contrast of a phase's frames, which is not observed: without it all gains run to -1, which makes every
-/// residual vanish.
+/// Standard deviation of the mean contrast of a phase's frames. Images do not determine this mean: without a prior all
+/// gains tend to -1, where every residual vanishes.
 const MEAN_GAIN: f64 = 1e-3;
 /// Residual that is always expected, as a share of the profiles.
 const FLOOR: f64 = 0.02;
-/// Standard deviation of what a band leaves out, in those of what it keeps.
+/// Standard deviation of the Gaussian that a band subtracts, in standard deviations of the blur.
 const WIDE: f64 = 4.0;
-/// Longest step of a translation, and of an angle.
+/// Maximum step of a translation, and of an angle.
 const LONGEST_STEP_MM: f64 = 4.0;
 const LONGEST_STEP_DEG: f64 = 2.0;
 
-/// What may be corrected, and how.
+/// Parameters that a stage corrects, and its settings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stage {
     /// Blur of the profiles, standard deviation in bins of half a pixel.
     pub blur: f64,
-    /// What is smoother than some times the blur is left out: hearts and lungs that move, which views mask differently.
+    /// Structures that are several times smoother than the blur are suppressed: moving hearts and lungs, which views mask
+    /// differently.
     pub band: bool,
     /// Gauss-Newton steps.
     pub steps: usize,
-    /// Angles and depth are corrected, not only positions across the view.
+    /// Angles and depth are corrected, in addition to positions across the view.
     pub angles: bool,
     /// Each frame has a displacement of its own.
     pub breathing: bool,
-    /// What does not change over the beat is left out: it is an error of the still background.
+    /// The part that is constant over the beat is removed: it is an error of the static background.
     pub demean: bool,
-    /// Residuals are errors of the model, alike in neighbours, more than noise: they count as so many times fewer.
+    /// Factor on the variance of the residuals: they are errors of the model, correlated between neighbours, more than
+    /// noise.
     pub temper: f64,
-    /// Views and frames stay where they are: only contrasts are fitted.
+    /// Views and frames stay fixed: only contrasts are fitted.
     pub contrast_alone: bool,
 }
 
-/// One number that is sought.
+/// One unknown parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Unknown {
-    /// Of a view: primary (0) or secondary (1) angle, degrees.
+    /// View, and its primary (0) or secondary (1) angle, degrees.
     Angle(usize, usize),
-    /// Of a view: position along an axis of the C-arm, world units.
+    /// View, and its position along an axis of the C-arm, world units.
     Shift(usize, usize),
-    /// Of a view and phase: displacement along an axis of the world, world units.
+    /// View and phase, and the displacement along an axis of the world, world units.
     Heart(usize, usize, usize),
-    /// Of a view and phase.
+    /// View and phase whose relative contrast is sought.
     Gain(usize, usize),
 }
 
@@ -101,9 +103,9 @@ impl Unknown {
 /// All unknowns of a stage: those of a view, then those of each of its frames, view by view.
 struct Unknowns {
     all: Vec<Unknown>,
-    /// Of each view.
+    /// Unknowns of each view.
     of_view: Vec<Vec<usize>>,
-    /// `[view][phase]`.
+    /// Unknowns of each frame, `[view][phase]`.
     of_frame: Vec<Vec<Vec<usize>>>,
 }
 
@@ -133,7 +135,7 @@ impl Unknowns {
         unknowns
     }
 
-    /// Their places.
+    /// Appends unknowns and returns their indices.
     fn add(&mut self, more: Vec<Unknown>) -> Vec<usize> {
         let first = self.all.len();
         self.all.extend(more);
@@ -141,8 +143,8 @@ impl Unknowns {
     }
 }
 
-/// How the planes of a pair move with an unknown: per unit of it, the way of the baseline's end against its beginning, and
-/// what the two views turn about.
+/// Derivative of a pair's pencil by one unknown: velocity of the baseline's end relative to its beginning, and the
+/// rotations of the two views.
 #[derive(Debug, Clone, Copy, Default)]
 struct PencilMotion {
     way: DVec3,
@@ -155,7 +157,7 @@ impl PencilMotion {
         let Pencil { baseline, first, second, length, middle: [across, along] } = *pencil;
         let tilt = [first.dot(self.way) / length, second.dot(self.way) / length];
         let middle: DVec3 = self.turns.iter().zip(axes).map(|(turn, axis)| turn.cross(axis)).sum();
-        // The zero of the planes' angles moves along with the views' common direction.
+        // The zero of the planes' angles moves with the views' common direction.
         let twist = (middle.dot(second) - along * tilt[1]) / across;
         self.turns.map(|turn| [twist - turn.dot(baseline), tilt[0] - turn.dot(second), tilt[1] + turn.dot(first)])
     }
@@ -164,9 +166,9 @@ impl PencilMotion {
 /// Residuals of a pair at a phase, and their slopes.
 struct Residuals {
     value: Vec<f64>,
-    /// Unknowns, with the residuals' change per prior deviation of them.
+    /// Indices of unknowns, with the change of the residuals per prior standard deviation.
     columns: Vec<(usize, Vec<f64>)>,
-    /// Squares of the profiles, summed.
+    /// Sum of the squares of the profiles.
     power: f64,
 }
 
@@ -199,9 +201,9 @@ impl Residuals {
     }
 }
 
-/// What an unknown of a pair's first (0) or second (1) view moves; none for contrasts.
+/// Motion of the pencil by an unknown of a pair's first (0) or second (1) view; `None` for contrasts.
 fn motion_of(unknown: Unknown, side: usize, v: usize, views: &Views, poses: &Poses) -> Option<PencilMotion> {
-    // The source moves against the patient; the baseline ends at the second view's.
+    // The source moves opposite to the patient; the baseline ends at the second view's source.
     let sign = if side == 0 { -1.0 } else { 1.0 };
     let (stand, pose) = (&views.views[v].stand, &poses.views[v]);
     match unknown {
@@ -217,7 +219,7 @@ fn motion_of(unknown: Unknown, side: usize, v: usize, views: &Views, poses: &Pos
     }
 }
 
-/// Change of a pair's residuals when its planes move.
+/// Change of a pair's residuals when its pencil moves.
 fn slope(
     at: &PairAtPhase,
     pair: Pair,
@@ -236,7 +238,7 @@ fn slope(
     difference(gains, &changes[0], &changes[1])
 }
 
-/// What all phases of a pair add to the normal equations.
+/// Contribution of all phases of a pair to the normal equations.
 struct PairTerms {
     matrix: Symmetric,
     gradient: Vec<f64>,
@@ -268,7 +270,7 @@ impl PairTerms {
             terms.count += r.value.iter().filter(|v| **v != 0.0).count();
         }
         if stage.demean && !residuals.is_empty() {
-            // The squares of deviations from the mean are those of the values less those of the mean.
+            // The sum of squared deviations from the mean is that of the values minus that of the mean.
             let mut mean = vec![0.0; residuals[0].value.len()];
             let mut columns: Vec<(usize, Vec<f64>)> = Vec::new();
             for r in &residuals {
@@ -296,7 +298,7 @@ impl PairTerms {
     }
 }
 
-/// All pairs' terms, scaled by the expected variance of residuals, and the priors.
+/// Sum of all pairs' terms, divided by the expected variance of the residuals, and the priors.
 struct Normal {
     matrix: Symmetric,
     gradient: Vec<f64>,
@@ -335,7 +337,7 @@ impl Normal {
         }
         let count = misfit.count.max(1) as f64;
         let expected = misfit.squares / count + FLOOR * FLOOR * misfit.power / count;
-        // Blurred residuals are alike in neighbours.
+        // Blurred residuals are correlated between neighbours.
         let alike = 2.0 * std::f64::consts::PI.sqrt() * stage.blur;
         let variance = expected * alike * stage.temper;
         normal.matrix.scale(1.0 / variance);
@@ -362,7 +364,7 @@ impl Normal {
     }
 }
 
-/// Runs a stage's steps on the wanted phases. Poses stay as they are where nothing is known.
+/// Runs a stage's steps on the wanted phases. Poses do not change where there is no information.
 pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, phases: &[usize]) {
     let unknowns = Unknowns::of(views, stage, phases);
     for _ in 0..stage.steps {
@@ -385,7 +387,7 @@ pub fn refine(views: &Views, poses: &mut Poses, stage: &Stage, phases: &[usize])
     }
 }
 
-/// How far the views are from agreeing at the wanted phases, whatever the contrasts of their frames.
+/// Misfit of the views at the wanted phases, with the contrasts of the frames fitted.
 pub fn misfit(views: &Views, poses: &Poses, blur: f64, phases: &[usize]) -> Misfit {
     let stage = Stage {
         blur,
@@ -413,8 +415,8 @@ pub(super) mod tests {
     pub(in crate::calibrate) const SIZE: [usize; 2] = [40, 36];
     pub(in crate::calibrate) const PHASES: usize = 3;
 
-    /// Blobs that move over three phases, as exact integrals, seen from nearby by views at these angles and tables off the middle;
-    /// the last view has other pixels.
+    /// Exact line integrals of blobs that move over three phases, seen from nearby by views at the given angles and with
+    /// tables off centre; the last view has other pixels.
     pub(in crate::calibrate) fn views(angles: &[(f64, f64)]) -> Views {
         let blob = |k: usize, t: usize| {
             let (a, b) = (1.3 * k as f64 + 0.4 * t as f64, 2.1 * k as f64 - 0.3 * t as f64);
@@ -461,7 +463,7 @@ pub(super) mod tests {
         }
     }
 
-    /// Poses that are none of the true ones.
+    /// Poses that all differ from the true ones.
     fn off(n_views: usize) -> Poses {
         let mut poses = Poses::stated(n_views, PHASES);
         for v in 0..n_views {
@@ -510,7 +512,7 @@ pub(super) mod tests {
                     let norm = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();
                     let apart = norm(&mut want.iter().zip(column).map(|(a, b)| a - b));
                     let size = norm(&mut want.iter().copied());
-                    // Pixels are shared between two bins, which no kernel's slope knows of.
+                    // Each pixel is shared between two bins, which the kernel's slope ignores.
                     assert!(apart < 0.1 * size + 1e-9, "{pair:?}, phase {t}, {unknown:?}: {apart:.2e} of {size:.2e}");
                 }
             }

@@ -1,12 +1,12 @@
-//! How well the views of a dataset agree, whatever the still background: what moves in one must add up, plane by plane
-//! through both sources, to what moves in the other (see [`crate::calibrate::profiles`]).
+//! Agreement of the views of a dataset, whatever the static background: the change over the beat in one view must add up,
+//! in every plane through both sources, to the change in the other (see [`crate::calibrate::profiles`]).
 
 use crate::calibrate::pose::Poses;
 use crate::calibrate::profiles::{Blur, Pair, PairAtPhase, Views};
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// How sharp the look is: blur of the profiles, bins of half a pixel.
+/// Sharpness of the comparison: blur of the profiles, in bins of half a pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Look {
     /// Sharp enough to tell a turned image from an upright one.
@@ -24,31 +24,30 @@ impl Look {
     }
 }
 
-/// How well two views agree.
+/// Agreement of two views.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PairAgreement {
-    /// The views, by their place among those that show motion.
+    /// The views, by their index among those that show motion.
     pub views: [usize; 2],
-    /// Squared difference of their profiles, as a share of their squares: 0 for the same object, about 1 for two that have
-    /// nothing to do with each other.
+    /// Squared difference of their profiles, as a share of their squares: 0 for one object, about 1 for two unrelated ones.
     pub residual: f64,
 }
 
-/// How well all views agree.
+/// Agreement of all views.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Agreement {
-    /// Difference of two views' profiles over all pairs, as a share of them, with fine profiles.
+    /// Squared difference of fine profiles over all pairs, as a share of their squares.
     pub fine: f64,
-    /// The difference over all pairs with profiles blurred so far that an error of geometry hardly matters.
+    /// Squared difference, as a share, with profiles so blurred that an error of geometry hardly matters.
     pub coarse: f64,
-    /// The difference with fine profiles, pair by pair.
+    /// Agreement of each pair with fine profiles.
     pub pairs: Vec<PairAgreement>,
 }
 
 /// Squared difference and squares of profiles.
 type Parts = (f64, f64);
 
-/// Of a pair at all phases. What is the same at all of them is left out: it is an error of the still background.
+/// Parts of a pair over all phases. The mean over the phases is subtracted: it is an error of the static background.
 fn parts(phases: &[PairAtPhase]) -> Parts {
     let Some(first) = phases.first() else { return (0.0, 0.0) };
     let mean = |side: usize, bin: usize| {
@@ -70,7 +69,7 @@ fn share(parts: impl Iterator<Item = Parts>) -> f64 {
     if squares > 0.0 { difference / squares } else { 0.0 }
 }
 
-/// What a look at all pairs of views shows.
+/// Comparison of all pairs of views at one sharpness.
 #[derive(Debug, Clone)]
 pub struct Comparison {
     look: Look,
@@ -84,7 +83,7 @@ impl Comparison {
         Comparison { look, by_pair }
     }
 
-    /// The comparison after a change of one view: only its pairs are looked at again.
+    /// Returns the comparison after a change of one view: only its pairs are compared again.
     pub fn after_change(&self, views: &Views, changed: usize) -> Comparison {
         let again = |(pair, before): (&Pair, &Parts)| {
             if pair.views.contains(&changed) { compare(views, *pair, self.look) } else { *before }
@@ -104,7 +103,7 @@ fn compare(views: &Views, pair: Pair, look: Look) -> Parts {
     parts(&views.profiles(pair, &poses, &phases, &look.blur()))
 }
 
-/// The agreement of views, over pairs that say something about each other; none when there is no such pair.
+/// Agreement of views over the pairs that constrain each other; `None` when there is no such pair.
 pub fn agreement(views: &Views) -> Option<Agreement> {
     let fine = Comparison::of(views, Look::Fine);
     let pair =

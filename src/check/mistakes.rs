@@ -1,32 +1,32 @@
-//! The usual mistakes in a dataset, and what it would be without them.
+//! The usual mistakes in a dataset, and how to undo them.
 
 use crate::calibrate::profiles::Views;
 use crate::geometry::{CArm, Geometry};
 use crate::scan::canvas::{framed, onto_canvas};
 use crate::scan::dataset::{Dataset, View};
 
-/// Something that is wrong with all images or all geometries alike.
+/// A mistake in all images or all geometries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mistake {
-    /// Rows are columns.
+    /// Rows and columns are exchanged.
     Transposed,
-    /// Columns run the wrong way; the mirrored patient, with the sign of the primary angle turned, shows the same.
+    /// Columns run the wrong way; the mirrored patient with the opposite sign of the primary angle gives equal images.
     Mirrored,
-    /// Rows run the wrong way; with the sign of the secondary angle turned, the mirrored patient shows the same.
+    /// Rows run the wrong way; the mirrored patient with the opposite sign of the secondary angle gives equal images.
     UpsideDown,
-    /// Both: images are turned by half a turn, or both angles have the wrong sign.
+    /// Rows and columns both run the wrong way: images are rotated by half a turn, or both angles have the wrong sign.
     Turned,
     /// Primary and secondary angle are exchanged.
     AnglesExchanged,
-    /// The pixel pitch is that at the isocentre, where the detector's is wanted.
+    /// The pixel pitch is stated at the isocentre instead of at the detector.
     PitchAtIsocentre,
     /// The logarithm was taken of line integrals.
     LogTwice,
-    /// Intensities were taken for line integrals.
+    /// Intensities were taken as line integrals.
     LogMissing,
 }
 
-/// All of them.
+/// All mistakes.
 pub const MISTAKES: [Mistake; 8] = [
     Mistake::Transposed,
     Mistake::Mirrored,
@@ -42,7 +42,7 @@ pub const MISTAKES: [Mistake; 8] = [
 const DARKEST: f32 = 1e-6;
 
 impl Mistake {
-    /// What the mistake is, and how to undo it.
+    /// Describes the mistake and how to undo it.
     pub fn advice(self) -> &'static str {
         match self {
             Mistake::Transposed => "the images are transposed: exchange rows and columns of every image",
@@ -70,7 +70,7 @@ impl Mistake {
         }
     }
 
-    /// The data without the mistake; none where it cannot have been made.
+    /// Returns the data without the mistake; `None` where it cannot have been made.
     pub fn undone(self, dataset: &Dataset) -> Option<Dataset> {
         match self {
             Mistake::Transposed => moved(dataset, |[w, h]| [h, w], |i, [w, h]| i % h * w + i / h),
@@ -96,8 +96,8 @@ impl Mistake {
     }
 }
 
-/// The dataset with the pixels of its training images elsewhere: `sized` gives the size (columns, rows) of images of another, and
-/// `from` where each pixel was in an image of a size.
+/// Returns the dataset with the pixels of its training images moved: `sized` maps the size (columns, rows) of an image, and
+/// `from` gives the source pixel of each pixel in an image of that size.
 fn moved(
     dataset: &Dataset,
     sized: impl Fn([usize; 2]) -> [usize; 2],
@@ -127,7 +127,7 @@ fn moved(
     Some(changed)
 }
 
-/// The dataset with other values in its training images.
+/// Returns the dataset with other values in its training images.
 fn revalued(dataset: &Dataset, value: impl Fn(f32) -> f32) -> Dataset {
     let mut changed = Dataset { frames: dataset.training().to_vec(), ..dataset.clone() };
     for frame in &mut changed.frames {
@@ -137,7 +137,7 @@ fn revalued(dataset: &Dataset, value: impl Fn(f32) -> f32) -> Dataset {
     changed
 }
 
-/// The dataset with other C-arms; none where a geometry is a matrix, or would be impossible.
+/// Returns the dataset with other C-arms; `None` where a geometry is a matrix, or would be impossible.
 fn geometries(dataset: &Dataset, change: impl Fn(&CArm) -> CArm) -> Option<Dataset> {
     let mut changed = dataset.clone();
     for view in &mut changed.views {
@@ -148,19 +148,19 @@ fn geometries(dataset: &Dataset, change: impl Fn(&CArm) -> CArm) -> Option<Datas
     Some(changed)
 }
 
-/// Something wrong with the phases of one view.
+/// A mistake in the phases of one view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhaseMistake {
-    /// The view, by its place among those that show motion.
+    /// The view, by its index among those that show motion.
     pub view: usize,
     /// The view's phases run backwards.
     pub reversed: bool,
-    /// Phases by which it is late.
+    /// Number of phases by which the view is late.
     pub late: usize,
 }
 
 impl PhaseMistake {
-    /// All that one view can have.
+    /// All phase mistakes that one view can have.
     pub fn all(n_views: usize, n_phases: usize) -> impl Iterator<Item = PhaseMistake> {
         let of_view = move |view| {
             let late = (1..n_phases).map(move |late| PhaseMistake { view, reversed: false, late });
@@ -169,7 +169,7 @@ impl PhaseMistake {
         (0..n_views).flat_map(of_view)
     }
 
-    /// What the views show without it.
+    /// Returns the views without the mistake.
     pub fn undone(self, views: &Views) -> Views {
         let n = views.n_phases;
         let taken = |t: usize| if self.reversed { (2 * n - 1 - t + self.late) % n } else { (t + self.late) % n };
@@ -180,7 +180,7 @@ impl PhaseMistake {
     }
 }
 
-/// Two views whose images, or geometries, are exchanged; none where one is impossible for the other's images.
+/// Exchanges the geometries of two views; `None` where one is impossible for the other's images.
 pub fn exchanged(dataset: &Dataset, [a, b]: [usize; 2]) -> Option<Dataset> {
     let mut changed = dataset.clone();
     changed.views.swap(a, b);

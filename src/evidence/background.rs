@@ -1,4 +1,4 @@
-//! What a still view looks like without its vessels, and how noisy it is.
+//! The static background of a view without its vessels, and the noise of its pixels.
 
 use crate::evidence::drift::Drift;
 use crate::evidence::filters::{gaussian, map2, separable};
@@ -8,23 +8,23 @@ use crate::scan::canvas::continued;
 use crate::scan::dataset::Dataset;
 use rayon::prelude::*;
 
-/// Phases within so many standard deviations of the background belong to it.
+/// Values within this many standard deviations of the background belong to it.
 const BACKGROUND_SIGMAS: f32 = 2.0;
-/// Times the set of phases that belong to the background is drawn up anew.
+/// Number of iterations that select the phases belonging to the background.
 const BACKGROUND_ROUNDS: usize = 4;
-/// Noise is never taken for less than this share of the strongest change: models are not exact either.
+/// Minimum noise, as a share of the strongest change: models have errors, too.
 pub(super) const LEAST_NOISE_SHARE: f32 = 0.01;
-/// Pixels of blur before the strongest change is read off.
+/// Blur before the strongest change is measured, pixels.
 const STRONGEST_BLUR: f32 = 0.7;
-/// Share of pixels whose change is below the strongest.
+/// Percentile of the changes that counts as the strongest change.
 const STRONGEST_PERCENTILE: f64 = 0.995;
 
-/// Radius of the opening that takes vessels out of the background, as a share of the image's smaller side: a field that
-/// shows a heart is some twenty times as wide as its widest vessel.
+/// Radius of the opening that removes vessels from the background, as a share of the image's smaller side: a field of view
+/// that shows a heart is about twenty times as wide as its widest vessel.
 const OPENING_SHARE: f64 = 0.03;
-/// Radius of the opening that tells a heart or a diaphragm that moves from vessels, junctions and crossings.
+/// Radius of the opening that separates a moving heart or diaphragm from vessels, junctions and crossings.
 const WIDE_SHARE: f64 = 0.06;
-/// And at least, pixels.
+/// Minimum radius of an opening, pixels.
 const LEAST_OPENING_RADIUS: usize = 2;
 
 /// Line integrals of one training view over the beat.
@@ -37,7 +37,7 @@ pub struct Series {
 }
 
 impl Series {
-    /// The training images of each view that has at least two phases; several images of one phase are averaged.
+    /// Returns the training images of each view that has at least two phases; several images of one phase are averaged.
     pub fn of(dataset: &Dataset) -> Vec<Series> {
         let series = dataset.training_views().into_iter().map(|view| Series {
             view,
@@ -62,29 +62,30 @@ fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
     (!frames.is_empty()).then_some(Image { width, height, values })
 }
 
-/// The still background of a view, and what stands out of it.
+/// The static background of a view, and the changes above it.
 #[derive(Debug, Clone)]
 pub struct Background {
-    /// The images as they would be if nothing wide moved: what all below is made of.
+    /// The images without wide motion; all fields below are derived from them.
     pub stilled: Series,
-    /// What moved.
+    /// The wide motion.
     pub drift: Drift,
     /// Mean of the phases at which no vessel covers the pixel.
     pub level: Image,
-    /// The background where a vessel covers the pixel at every phase: what remains without structures as thin as vessels.
+    /// Background where a vessel covers the pixel at every phase: the level after an opening that removes structures as
+    /// thin as vessels.
     pub low: Image,
-    /// What exceeds the level at each phase and is no wider than a vessel: a heart, a lung or a diaphragm that moves changes
-    /// wide areas. `None` where the view has no image.
+    /// Part of each phase above the level that is no wider than a vessel: a moving heart, lung or diaphragm changes wide
+    /// areas. `None` where the view has no image.
     pub changes: Vec<Option<Image>>,
-    /// Standard deviation of a pixel's noise; never zero.
+    /// Standard deviation of each pixel's noise; never zero.
     pub noise: Image,
-    /// The strongest change of the view, a line integral: what the thickest vessel adds.
+    /// The strongest change of the view, a line integral: the contribution of the thickest vessel.
     pub strongest: f32,
 }
 
-/// Noise of each pixel from the differences between successive phases.
+/// Computes the noise of each pixel from the differences between successive phases.
 fn noise(series: &Series) -> Vec<f32> {
-    // 1 / the deviation of a median of absolute values of normal draws.
+    // Ratio of a normal distribution's standard deviation to its median absolute value.
     const MEDIAN_TO_DEVIATION: f32 = 1.4826;
     let images: Vec<&Image> = series.seen().collect();
     let pixels = images[0].values.len();
@@ -99,8 +100,8 @@ fn noise(series: &Series) -> Vec<f32> {
     noise_by_intensity(&mean, &deviation)
 }
 
-/// Lower mode of a pixel over the phases: starting from the smallest value, corrected for the bias that taking a
-/// minimum of noisy values has, the mean of what lies no more than noise above it.
+/// Lower mode of a pixel over the phases: the mean of the values no further than the noise above it. The iteration starts
+/// from the minimum, corrected for the bias of a minimum of noisy values.
 fn lower_mode(values: &[f32], noise: f32, bias: f32) -> f32 {
     let mut level = values.iter().copied().fold(f32::INFINITY, f32::min) + bias * noise;
     for _ in 0..BACKGROUND_ROUNDS {
@@ -123,7 +124,7 @@ impl Background {
         let image = |values: Vec<f32>| Image { width, height, values };
         let mut noise = noise(&stilled);
         let bias = expected_minimum(images.len()) as f32;
-        // A pixel without noise at all still rounds.
+        // A pixel without noise still has rounding errors.
         let span = images.iter().flat_map(|i| &i.values).fold([f32::MAX, f32::MIN], |[l, h], v| [l.min(*v), h.max(*v)]);
         let least = 1e-6 * (span[1] - span[0]);
         let level: Vec<f32> = (0..width * height)
@@ -140,13 +141,13 @@ impl Background {
         let strongest = percentile(&largest, STRONGEST_PERCENTILE);
         let floor = (LEAST_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
         noise.iter_mut().for_each(|s| *s = s.max(floor));
-        // An opening of noise is biased low, one of the smoothed background much less.
+        // An opening of noise has a negative bias, an opening of the smoothed background a much smaller one.
         let mut low = opening(&blur(&level, STRONGEST_BLUR), opening_radius(OPENING_SHARE, width, height));
         low.values.iter_mut().zip(&level.values).for_each(|(low, b)| *low = low.min(*b));
         Background { level, low, changes, noise: image(noise), strongest, drift, stilled }
     }
 
-    /// The same in the corner of a canvas (columns, rows), on which its edges go on.
+    /// Places the background in the corner of a canvas (columns, rows), and continues its edges there.
     pub(super) fn on_canvas(self, canvas: [usize; 2]) -> Background {
         let all = |images: Vec<Option<Image>>| images.into_iter().map(|i| Some(continued(i?, canvas))).collect();
         Background {
@@ -160,24 +161,24 @@ impl Background {
     }
 }
 
-/// Radius of a window, from its share of an image's smaller side.
+/// Radius of an opening, from its share of an image's smaller side.
 pub fn opening_radius(share: f64, width: usize, height: usize) -> usize {
     ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
 }
 
-/// What exceeds the level, less what remains of it when all that is thinner than the opening is taken away.
+/// Change above the level, minus its wide part: the part that an opening by `radius` retains.
 fn narrow_change(seen: &Image, level: &Image, radius: usize) -> Image {
     let change = map2(seen, level, |y, b| y - b);
     let wide = opening(&blur(&change, STRONGEST_BLUR), radius);
     map2(&change, &wide, |d, wide| d - wide.max(0.0))
 }
 
-/// Largest value within `radius` pixels along both axes.
+/// Maximum within `radius` pixels along both axes.
 pub fn largest_within(image: &Image, radius: usize) -> Image {
     dilate(image, radius)
 }
 
-/// Gaussian blur; the border's pixels go on outside.
+/// Gaussian blur; outside, the border's pixels are continued.
 pub fn blur(image: &Image, sigma: f32) -> Image {
     separable(image, &gaussian(sigma))
 }

@@ -1,6 +1,7 @@
-//! What moves in a view besides its vessels and is wide: a diaphragm, a heart, a lung. Its edges may be as thin as vessels are,
-//! but they move as its inside does, so that few courses over the phases tell all of it. They are looked for in what a median
-//! wider than any vessel leaves of the images; each has a mode, the line integral it adds to each pixel.
+//! Wide motion of a view other than that of vessels: a diaphragm, a heart, a lung. The edges of such a structure may be as
+//! thin as vessels, but they move with its inside, so that a few courses over the phases describe all of it. Courses are
+//! found in the images after a median filter wider than any vessel. Each course has a mode, the line integral it adds to
+//! each pixel.
 
 use crate::evidence::background::{LEAST_NOISE_SHARE, Series, blur, opening_radius};
 use crate::evidence::filters::map2;
@@ -9,59 +10,62 @@ use rayon::prelude::*;
 
 /// Smaller side, pixels, of the images in which wide structures are looked for.
 const SIDE: usize = 100;
-/// Radius of the median that leaves nothing of vessels, as a share of the smaller side.
+/// Radius of the median filter that removes vessels, as a share of the smaller side.
 const WIDE_SHARE: f64 = 0.09;
-/// Most courses of a view.
+/// Maximum number of courses of a view.
 const MOST_COURSES: usize = 3;
-/// Phases that a course takes: as many courses as differences between phases tell anything, a vessel as well.
+/// Phases needed per course: with as many courses as independent phase differences, anything could be described, even a
+/// vessel.
 const PHASES_PER_COURSE: usize = 3;
 /// Rounds of the power iteration that finds a course.
 const POWER_ROUNDS: usize = 100;
-/// A mode is seen where its root mean square over the phases is this share of the strongest change.
+/// Minimum size of a visible mode: its root mean square over the phases, as a share of the strongest change.
 const LEAST_SIZE: f32 = 0.02;
-/// Share of a view in which a mode must be seen: what the median leaves of vessels that cross is in few places.
+/// Minimum share of a view in which a mode must be visible: the remainders of crossing vessels after the median filter
+/// cover few places.
 const LEAST_SPREAD: f64 = 0.03;
-/// Share of what is wide that a course must tell: of noise, each tells as much as any other.
+/// Minimum share of the wide part that a course must explain: in noise, all courses explain equal shares.
 const LEAST_TOLD: f32 = 0.5;
-/// Percentile of what is narrow that is the strongest change.
+/// Percentile of the narrow part that counts as the strongest change.
 const STRONGEST_PERCENTILE: f64 = 0.995;
-/// Rounds of the fit of a pixel.
+/// Iterations of the fit of a pixel.
 const FIT_ROUNDS: usize = 20;
-/// What is so many deviations above the fit, or more, is a vessel and weighs as this much.
+/// Residuals above this many standard deviations over the fit belong to a vessel and are limited to this value.
 const VESSEL_SIGMAS: f32 = 0.7;
-/// Blur within which a mode must tell what is narrow, pixels.
+/// Blur over which a mode must explain the narrow part, pixels.
 const TOLD_BLUR: f32 = 1.0;
-/// What is narrow stands out of noise from so many deviations on.
+/// Standard deviations above which the narrow part exceeds the noise.
 const STANDS_OUT_SIGMAS: f32 = 4.0;
-/// Shares of what is narrow at a pixel from which, and up to which, a mode is believed there.
+/// Explained shares of the narrow part at a pixel at which the confidence in a mode starts to rise from 0, and at which it
+/// reaches 1.
 const BELIEVED: [f32; 2] = [0.7, 0.9];
-/// Edges are told nearly whole, vessels more or less by chance: of the pixels that are told by half or more, so many must be told
-/// as well as the second of [`BELIEVED`], or nothing narrow is believed.
+/// Edges are explained almost completely, vessels by chance in varying degrees. Of the pixels explained by half or more, at
+/// least this share must be explained as well as the second of [`BELIEVED`]; otherwise all narrow parts are rejected.
 const LEAST_TOLD_WELL: f32 = 0.45;
 
-/// What moves widely in a view.
+/// The wide motion of a view.
 #[derive(Debug, Clone)]
 pub struct Drift {
-    /// By course, the strongest first.
+    /// Modes of the courses, the strongest first.
     modes: Vec<Mode>,
 }
 
-/// A course over the phases and what goes with it.
+/// A course over the phases and the image that follows it.
 #[derive(Debug, Clone)]
 struct Mode {
-    /// Values over the phases that are seen: of mean 0, their squares sum to 1, and orthogonal to other courses.
+    /// Values over the visible phases: their mean is 0, their squares sum to 1, and courses are orthogonal to each other.
     course: Vec<f32>,
     /// Line integral per pixel.
     image: Image,
-    /// Mean size of what is seen of it, as a share of the strongest change.
+    /// Mean size of the mode where it is visible, as a share of the strongest change.
     size: f32,
 }
 
-/// A course and its size, as [`Mode`] has them.
+/// A course and its size, as in [`Mode`].
 type Course = (Vec<f32>, f32);
 
 impl Drift {
-    /// Looks for what moves widely in images whose pixels are as noisy as `noise` says.
+    /// Finds the wide motion in images whose pixels have the standard deviations `noise`.
     pub(super) fn new(series: &Series, noise: &[f32]) -> Drift {
         let images: Vec<&Image> = series.seen().collect();
         let deviations = deviations(&images);
@@ -76,13 +80,13 @@ impl Drift {
         Drift { modes: modes.map(|((course, image), size)| Mode { course: course.clone(), image, size }).collect() }
     }
 
-    /// Root mean square over the phases of what moves most, where it is seen, as a share of the strongest change; `None` where
-    /// nothing wide moves.
+    /// Root mean square over the phases of the largest mode where it is visible, as a share of the strongest change; `None`
+    /// where there is no wide motion.
     pub fn size(&self) -> Option<f32> {
         self.modes.iter().map(|m| m.size).reduce(f32::max)
     }
 
-    /// The images as they would be if nothing wide moved.
+    /// Returns the images without the wide motion.
     pub(super) fn stilled(&self, series: &Series) -> Series {
         let mut stilled = series.clone();
         for (t, image) in stilled.images.iter_mut().flatten().enumerate() {
@@ -94,7 +98,7 @@ impl Drift {
     }
 }
 
-/// Images less their median over the phases.
+/// Images minus their median over the phases.
 fn deviations(images: &[&Image]) -> Vec<Image> {
     let middle = |p: usize| median(&mut images.iter().map(|i| i.values[p]).collect::<Vec<_>>());
     let level: Vec<f32> = (0..images[0].values.len()).into_par_iter().map(middle).collect();
@@ -102,7 +106,7 @@ fn deviations(images: &[&Image]) -> Vec<Image> {
     images.iter().map(|image| map2(image, &level, |y, b| y - b)).collect()
 }
 
-/// Courses that wide structures take, and the strongest change of what is narrow.
+/// Finds the courses of wide structures, and the strongest change of the narrow part.
 fn courses(deviations: &[Image]) -> (Vec<Course>, f32) {
     let factor = reduction(&deviations[0]);
     let small: Vec<Image> = deviations.par_iter().map(|d| reduced(d, factor)).collect();
@@ -130,14 +134,14 @@ fn courses(deviations: &[Image]) -> (Vec<Course>, f32) {
     (found, strongest)
 }
 
-/// Mean size, in `unit`s, of a mode in the pixels in which it is seen; `None` where those are too few.
+/// Mean size, in `unit`s, of a mode in the pixels where it is visible; `None` where these are too few.
 fn size_of_seen(mode: &Image, unit: f32) -> Option<f32> {
     let seen: Vec<f32> = mode.values.iter().map(|m| m.abs() / unit).filter(|size| *size > LEAST_SIZE).collect();
     let spread = seen.len() as f64 / mode.values.len() as f64;
     (spread >= LEAST_SPREAD).then(|| seen.iter().sum::<f32>() / seen.len() as f32)
 }
 
-/// The strongest course of images that have a mean of 0 over the phases; none where all is 0.
+/// The strongest course of images whose mean over the phases is 0; `None` where all are 0.
 fn strongest_course(wide: &[Image]) -> Option<Vec<f32>> {
     let gram: Vec<Vec<f32>> = wide.iter().map(|a| wide.iter().map(|b| dot(&a.values, &b.values)).collect()).collect();
     let loudest = (0..wide.len()).max_by(|a, b| gram[*a][*a].total_cmp(&gram[*b][*b]))?;
@@ -156,7 +160,7 @@ fn normalise(course: &mut [f32]) -> Option<()> {
     (length > 0.0).then_some(())
 }
 
-/// What of the images goes with a course.
+/// Projection of the images onto a course.
 fn mode(images: &[Image], course: &[f32]) -> Image {
     let value = |p: usize| images.iter().zip(course).map(|(image, a)| a * image.values[p]).sum();
     Image { values: (0..images[0].values.len()).map(value).collect(), ..images[0] }
@@ -166,12 +170,12 @@ fn mode(images: &[Image], course: &[f32]) -> Image {
 struct Fit<'a> {
     deviations: Vec<Image>,
     courses: &'a [Vec<f32>],
-    /// Deviation of each pixel's noise, nowhere 0.
+    /// Standard deviation of each pixel's noise, nowhere 0.
     noise: Vec<f32>,
 }
 
 impl Fit<'_> {
-    /// A mode per course: what is wide in it, and where it is believed what is narrow.
+    /// Computes a mode per course: its wide part, and its narrow part weighted by the confidence in it.
     fn modes(&self) -> Vec<Image> {
         let whole = self.whole();
         let wide: Vec<Image> = whole.par_iter().map(wide_part).collect();
@@ -184,7 +188,7 @@ impl Fit<'_> {
         wide.iter().zip(&narrow).map(joined).collect()
     }
 
-    /// What each pixel follows of the courses.
+    /// Fits each pixel's values by the courses.
     fn whole(&self) -> Vec<Image> {
         let fit = |p: usize| {
             let values: Vec<f32> = self.deviations.iter().map(|d| d.values[p]).collect();
@@ -195,8 +199,8 @@ impl Fit<'_> {
         (0..self.courses.len()).map(image).collect()
     }
 
-    /// How far to believe the `narrow` parts of modes at each pixel, 0 to 1: as far as they tell, around it, what the `wide`
-    /// parts leave.
+    /// Confidence in the `narrow` parts of modes at each pixel, 0 to 1: it rises with the share that they explain, in the
+    /// pixel's neighbourhood, of the residual of the `wide` parts.
     fn belief(&self, wide: &[Image], narrow: &[Image]) -> Image {
         let squares = |p: usize| self.squares_left(wide, narrow, p);
         let (before, after): (Vec<f32>, Vec<f32>) = (0..self.noise.len()).into_par_iter().map(squares).unzip();
@@ -211,7 +215,7 @@ impl Fit<'_> {
         })
     }
 
-    /// Squares of what the wide parts leave of a pixel over the phases, and of what the narrow parts leave of that.
+    /// Sums of squares over the phases of a pixel's residual after the wide parts, and after the narrow parts as well.
     fn squares_left(&self, wide: &[Image], narrow: &[Image], p: usize) -> (f32, f32) {
         let part = |modes: &[Image], t: usize| -> f32 {
             modes.iter().zip(self.courses).map(|(mode, course)| mode.values[p] * course[t]).sum()
@@ -223,7 +227,7 @@ impl Fit<'_> {
         (before, after)
     }
 
-    /// Whether what is narrow and goes with the courses are edges of what is wide, by [`LEAST_TOLD_WELL`].
+    /// Tells whether the narrow parts that follow the courses are edges of wide structures, by [`LEAST_TOLD_WELL`].
     fn are_edges(&self, before: &[f32], after: &[f32]) -> bool {
         let n = self.deviations.len() as f32;
         let stands_out = |p: &usize| before[*p] > n * (STANDS_OUT_SIGMAS * self.noise[*p]).powi(2);
@@ -234,8 +238,9 @@ impl Fit<'_> {
     }
 }
 
-/// How much of each course a pixel's values follow, vessels left out of account: from what would be followed without any, repeated
-/// projection of what is not followed yet, of which no more than `most` counts above (Huber 1981, modified residuals).
+/// Coefficients of the courses in a pixel's values, without the influence of vessels: repeated projection of the residual,
+/// of which no more than `most` counts above the fit (Huber 1981, modified residuals). The start is the fit without this
+/// limit.
 fn followed(values: &[f32], courses: &[Vec<f32>], most: f32) -> Vec<f32> {
     let mut level = 0.0;
     let mut sizes = vec![0.0; courses.len()];
@@ -256,7 +261,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Takes the mean over the phases away.
+/// Subtracts the mean over the phases.
 fn centre(images: &mut [Image]) {
     let share = 1.0 / images.len() as f32;
     for p in 0..images[0].values.len() {
@@ -265,23 +270,23 @@ fn centre(images: &mut [Image]) {
     }
 }
 
-/// What is wider than vessels.
+/// Removes structures as narrow as vessels.
 fn without_narrow(image: &Image) -> Image {
     median_filter(image, opening_radius(WIDE_SHARE, image.width, image.height))
 }
 
-/// The same, found in the reduced image.
+/// Removes narrow structures in the reduced image, and enlarges the result.
 fn wide_part(image: &Image) -> Image {
     let factor = reduction(image);
     enlarged(&without_narrow(&reduced(image, factor)), factor, [image.width, image.height])
 }
 
-/// Pixels along each axis that become one.
+/// Pixels along each axis that are averaged into one.
 fn reduction(image: &Image) -> usize {
     (image.width.min(image.height) / SIDE).max(1)
 }
 
-/// Means of squares of `factor` pixels; what is left over at the right and below counts in the last ones.
+/// Means of squares of `factor` pixels; remaining columns and rows at the right and bottom count in the last ones.
 fn reduced(image: &Image, factor: usize) -> Image {
     let (width, height) = (image.width / factor, image.height / factor);
     let mut sums = vec![(0f32, 0u32); width * height];
@@ -293,7 +298,7 @@ fn reduced(image: &Image, factor: usize) -> Image {
     Image { width, height, values: sums.into_iter().map(|(sum, n)| sum / n as f32).collect() }
 }
 
-/// The inverse, straight from pixel to pixel.
+/// Enlarges a reduced image by linear interpolation.
 fn enlarged(image: &Image, factor: usize, [width, height]: [usize; 2]) -> Image {
     let place = |at: usize, end: usize| {
         let place = ((at as f32 + 0.5) / factor as f32 - 0.5).clamp(0.0, (end - 1) as f32);
@@ -332,13 +337,13 @@ mod tests {
         Series { view: 0, images: (0..n_phases).map(image).collect() }
     }
 
-    /// A vessel that swings across the image twice as fast as breath comes and goes.
+    /// A vessel that moves across the image at twice the rate of breathing.
     fn vessel(x: f32, y: f32, time: f32) -> f32 {
         let middle = 30.0 + 5.0 * (2.0 * TAU * time).sin() + 0.2 * y;
         0.3 * (-0.5 * (x - middle).powi(2)).exp()
     }
 
-    /// A dome's edge at row 40 and all that is above and below, in the course of breath.
+    /// A dome with its edge at row 40 that moves, with all above and below it, by breathing.
     fn dome(y: f32, time: f32) -> f32 {
         let breath = (TAU * time).cos();
         1.0 / (1.0 + (-(y - 40.0 - breath) / 1.5).exp()) - 0.002 * y * breath
@@ -349,7 +354,7 @@ mod tests {
         (drift.stilled(series), drift.size())
     }
 
-    /// Mean over the pixels about the edge of how much the difference to images changes over the phases.
+    /// Mean, over the pixels about the edge, of the variation of the error over the phases.
     fn off(got: &Series, wanted: &Series) -> f32 {
         let pixel = |p: usize| {
             let error: Vec<f32> = got.seen().zip(wanted.seen()).map(|(g, w)| g.values[p] - w.values[p]).collect();

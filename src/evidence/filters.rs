@@ -1,12 +1,12 @@
-//! Filters of images whose pixels are not equally noisy: Gaussians, and matched filters for straight pieces of vessel.
+//! Filters of images with non-uniform noise: Gaussians, and matched filters for straight pieces of vessel.
 
 use crate::raster::Image;
 use rayon::prelude::*;
 
-/// Where lines are blind: a tap below this share of the middle one.
+/// Taps of lines below this share of the middle one are dropped.
 const LEAST_TAP: f32 = 0.01;
 
-/// Weights of a Gaussian of `sigma` pixels, summing to 1.
+/// Weights of a Gaussian of `sigma` pixels; their sum is 1.
 pub(super) fn gaussian(sigma: f32) -> Vec<f32> {
     let radius = (3.0 * sigma) as i32 + 1;
     let weights: Vec<f32> = (-radius..=radius).map(|i| (-0.5 * (i as f32 / sigma).powi(2)).exp()).collect();
@@ -14,7 +14,7 @@ pub(super) fn gaussian(sigma: f32) -> Vec<f32> {
     weights.iter().map(|w| w / sum).collect()
 }
 
-/// Correlates rows and columns with `kernel` (odd length); the border's pixels go on outside.
+/// Correlates rows and columns with `kernel` (odd length); outside, the border's pixels are continued.
 pub(super) fn separable(image: &Image, kernel: &[f32]) -> Image {
     let (w, h) = (image.width, image.height);
     let radius = kernel.len() / 2;
@@ -42,7 +42,7 @@ pub(super) struct Estimate {
     pub(super) deviation: Image,
 }
 
-/// Mean of the neighbourhood under a Gaussian of `sigma` pixels, pixels counting by `weight` (inverse variance).
+/// Gaussian mean of the neighbourhood over `sigma` pixels, with pixels weighted by `weight` (inverse variance).
 pub(super) fn blob(values: &Image, weight: &Image, sigma: f32) -> Estimate {
     let kernel = gaussian(sigma);
     let squared: Vec<f32> = kernel.iter().map(|k| k * k).collect();
@@ -59,15 +59,15 @@ pub(super) fn map2(a: &Image, b: &Image, f: impl Fn(f32, f32) -> f32) -> Image {
     Image { width: a.width, height: a.height, values }
 }
 
-/// A straight piece of vessel under several orientations.
+/// A straight piece of vessel in several orientations.
 pub(super) struct LineFilter {
     radius: usize,
-    /// Per orientation: offsets along x and y, weight.
+    /// Taps of each orientation: offsets along x and y, weight.
     orientations: Vec<Vec<(i32, i32, f32)>>,
 }
 
 impl LineFilter {
-    /// Pieces of about `length` pixels, `width` pixels (standard deviation) across.
+    /// Creates pieces of about `length` pixels, `width` pixels (standard deviation) across.
     pub(super) fn new(length: f32, width: f32) -> LineFilter {
         let count = if length < 10.0 { 12 } else { 16 };
         let radius = (0.75 * length).max(3.0 * width).ceil() as i32 + 1;
@@ -86,7 +86,7 @@ impl LineFilter {
         LineFilter { radius: radius as usize, orientations }
     }
 
-    /// What the filter needs to know of the weights alone, shared by all phases: per orientation sum h h w.
+    /// Sums of h h w per orientation, which depend on the weights only and are shared by all phases.
     pub(super) fn energies(&self, weight: &Image) -> Vec<Image> {
         let padded = Padded::new(weight, self.radius);
         self.orientations
@@ -101,8 +101,8 @@ impl LineFilter {
             .collect()
     }
 
-    /// Amplitude of the best orientation, the one of the largest ratio to its deviation, less `bias` deviations, and
-    /// that deviation, in the rows marked `wanted`. `weighted` is the image times its weights.
+    /// Amplitude of the best orientation, the one with the maximum ratio to its standard deviation, minus `bias` standard
+    /// deviations, and that standard deviation, in the rows marked `wanted`. `weighted` is the image times its weights.
     pub(super) fn best(&self, weighted: &Image, energies: &[Image], bias: f32, wanted: &[bool]) -> Estimate {
         let (w, h) = (weighted.width, weighted.height);
         let padded = Padded::new(weighted, self.radius);
@@ -133,7 +133,7 @@ impl LineFilter {
     }
 }
 
-/// An image with a border of zeros: outside, nothing was measured.
+/// An image with a border of zeros: outside, there is no measurement.
 struct Padded {
     border: usize,
     stride: usize,
@@ -174,7 +174,7 @@ mod tests {
         let kernel = gaussian(0.9);
         let square: f32 = kernel.iter().map(|k| k * k).sum();
         assert!(seen.amplitude.values.iter().all(|v| (v - 2.0).abs() < 1e-5));
-        // sd of a weighted mean: noise (1 / 2) times the kernel's norm along both axes.
+        // The standard deviation of a weighted mean is the noise (1 / 2) times the kernel's norm along both axes.
         assert!((seen.deviation.values[40] - 0.5 * square).abs() < 1e-5, "{}", seen.deviation.values[40]);
     }
 
@@ -192,7 +192,7 @@ mod tests {
         let energies = filter.energies(&weight);
         let seen = filter.best(&map2(&line, &weight, |v, w| v * w), &energies, 0.0, &vec![true; h]);
         let middle = seen.amplitude.values[20 * w + 20];
-        // The filter's ends fade while the line goes on, so it sees a little more than the line's height.
+        // The filter's ends fade while the line continues, so the amplitude slightly exceeds the line's height.
         assert!((0.3..0.45).contains(&middle), "{middle}");
         let tau = seen.deviation.values[20 * w + 20];
         assert!(tau < 0.1 / 3.0, "quieter than a pixel (0.1): {tau}");

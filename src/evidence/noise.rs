@@ -1,8 +1,8 @@
-//! How noisy pixels are, and what noise does to a minimum.
+//! The noise of pixels, and the bias of a minimum of noisy values.
 
 use crate::raster::median;
 
-/// How far the smallest of `n` standard normal draws lies below the mean, on average.
+/// Mean distance of the minimum of `n` standard normal draws below their expected value.
 pub fn expected_minimum(n: usize) -> f64 {
     // Blom's approximation of the first normal order statistic.
     if n < 2 {
@@ -26,10 +26,10 @@ fn upper_tail(z: f64) -> f64 {
     (-0.5 * z * z).exp() / std::f64::consts::TAU.sqrt() * poly
 }
 
-/// Noise of each pixel: successive phases of a still pixel differ by noise alone, and noise depends on
-/// intensity; so pixels are grouped by intensity and each group's median temporal deviation is its noise. A group that
-/// consists of moving vessels, as the darkest of an image with a plain background does, would pass them off as noise;
-/// so none is noisier than a few times the image as a whole.
+/// Noise of each pixel. Successive phases of a static pixel differ by noise alone, and noise depends on intensity; so
+/// pixels are grouped by intensity, and each group's median temporal deviation is its noise. A group that consists of
+/// moving vessels, as the darkest one of an image with a plain background does, would present them as noise; so the noise
+/// of a group is at most a few times that of the whole image.
 pub fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
     const GROUPS: usize = 24;
     const NOISIEST: f32 = 6.0;
@@ -58,7 +58,7 @@ mod tests {
 
     #[test]
     fn moving_vessels_are_not_taken_for_noise() {
-        // The brightest tenth moves; all else is still but for noise of 0.01.
+        // The brightest tenth moves; all other pixels are static, with noise of 0.01.
         let mean: Vec<f32> = (0..1000).map(|i| i as f32).collect();
         let deviation: Vec<f32> = (0..1000).map(|i| if i >= 900 { 0.5 } else { 0.01 }).collect();
         let noise = noise_by_intensity(&mean, &deviation);

@@ -1,7 +1,7 @@
-//! What a view says for and against a vessel at each pixel and phase: log-likelihood ratios of "a vessel is here".
+//! Evidence of a view for and against a vessel at each pixel and phase: log-likelihood ratios of "a vessel is here".
 //!
-//! Background -> change above it -> the smallest filter that is quiet enough for the weakest vessel -> ratio, clipped,
-//! so that no view alone can veto a cell or prove it.
+//! The steps are: background, change above it, the smallest filter with low enough noise for the weakest vessel, ratio.
+//! Ratios are clipped, so that no single view can reject or confirm a cell.
 
 use crate::evidence::background::{Background, Series, largest_within};
 use crate::evidence::filters::{Estimate, LineFilter, blob, map2};
@@ -9,43 +9,44 @@ use crate::raster::Image;
 use crate::scan::canvas::continued;
 use rayon::prelude::*;
 
-/// The weakest vessel looked for, as a share of the view's strongest change.
+/// Amplitude of the weakest vessel sought, as a share of the view's strongest change.
 const WEAKEST_SHARE: f32 = 0.08;
-/// A filter is quiet enough when its noise is at most the weakest vessel over this.
+/// The noise of a filter is low enough when it is at most the weakest vessel divided by this.
 const QUIET_ENOUGH: f32 = 1.5;
-/// Gaussians of the ladder, pixels.
+/// Gaussians of the ladder of filters, standard deviations in pixels.
 const BLOBS: [f32; 2] = [0.6, 0.9];
-/// Lines of the ladder: length and width (standard deviation), pixels.
+/// Lines of the ladder of filters: length and width (standard deviation), pixels.
 const LINES: [(f32, f32); 3] = [(5.0, 0.9), (9.0, 1.0), (13.0, 1.2)];
-/// Lines see no pixel beyond so many standard deviations, lest strong vessels leak sideways.
+/// Pixels are limited to this many standard deviations before line filters, so that strong vessels do not leak sideways.
 const LINE_CEILING: f32 = 3.0;
-/// Standard deviations by which the best of the orientations beats zero in pure noise.
+/// Mean excess of the best orientation over zero in pure noise, standard deviations.
 const LINE_BIAS: f32 = 1.2;
-/// Standard deviations of change that lines can show at most: what [`LINE_CEILING`] leaves of a vessel.
+/// Maximum change in standard deviations that line filters can show, as [`LINE_CEILING`] limits it.
 const LINE_MOST: f32 = 0.6 * LINE_CEILING;
-/// Beside a vessel, at least this share of it is asked for.
+/// Beside a vessel, the minimum amplitude is this share of it.
 const LEAK: f32 = 0.25;
-/// How far vessels leak, pixels.
+/// Reach of the leakage of vessels, pixels.
 const LEAK_PIXELS: usize = 2;
-/// Blur before leaks are looked for, and of covered pixels in noise.
+/// Blur before the search for leakage, and of covered pixels in noise, pixels.
 const NEAR_BLUR: f32 = 0.7;
-/// Most a view says for a cell: minus the log of the share of pixels that vessels cover.
+/// Maximum evidence of a view for a cell: minus the logarithm of the share of pixels that vessels cover.
 pub const MOST: f32 = 3.0;
-/// Most it says against: the log of the chance (9 %) that it hides a vessel that is there.
+/// Minimum evidence of a view, against a cell: the logarithm of the probability (9 %) that the view hides an existing
+/// vessel.
 pub const LEAST: f32 = -2.4;
-/// Paid where only the opened background shows the vessel.
+/// Evidence subtracted where only the opened background shows the vessel.
 const COVERED_COST: f32 = 0.5;
-/// Amplitudes tried between the weakest and the strongest vessel.
+/// Number of amplitudes between the weakest and the strongest vessel.
 const AMPLITUDES: usize = 8;
 
-/// What one view says.
+/// Evidence of one view.
 #[derive(Debug, Clone)]
 pub struct ViewEvidence {
     /// Index into the dataset's views.
     pub view: usize,
-    /// The view's still background.
+    /// The view's static background.
     pub background: Background,
-    /// Log-likelihood ratio per pixel, one image per phase; `None` where the view has none.
+    /// Log-likelihood ratio per pixel, one image per phase; `None` where the view has no image.
     pub ratios: Vec<Option<Image>>,
 }
 
@@ -71,7 +72,7 @@ impl ViewEvidence {
         ViewEvidence { view: series.view, background, ratios }
     }
 
-    /// The same in the corner of a canvas (columns, rows), on which its edges go on.
+    /// Places the evidence in the corner of a canvas (columns, rows), and continues its edges there.
     pub fn on_canvas(self, canvas: [usize; 2]) -> ViewEvidence {
         ViewEvidence {
             background: self.background.on_canvas(canvas),
@@ -92,16 +93,16 @@ fn largest_ratio<'a>(ratios: impl Iterator<Item = &'a Image>) -> Vec<f32> {
     largest
 }
 
-/// One phase, seen against the background.
+/// Evidence of one phase against the background.
 struct Phase {
     ratio: Image,
-    /// Amplitudes a vessel could have at each pixel.
+    /// Minimum amplitude of a vessel at each pixel.
     weakest: Image,
-    /// Some pixel was too noisy to be taken bare.
+    /// At least one pixel was too noisy to be used unfiltered.
     filtered: bool,
 }
 
-/// The filters of a view, and what they need of its noise.
+/// The filters of a view, with the quantities derived from its noise.
 struct Ladder<'a> {
     background: &'a Background,
     weakest: f32,
@@ -116,7 +117,8 @@ impl<'a> Ladder<'a> {
         let weight = Image { values: noise.values.iter().map(|s| 1.0 / (s * s)).collect(), ..noise.clone() };
         let weakest = WEAKEST_SHARE * background.strongest;
         let quiet = weakest / QUIET_ENOUGH;
-        // Noise of Gaussians does not depend on the image, so it is known now whether any pixel needs a line.
+        // The noise of Gaussians does not depend on the image, so it is known at this point whether any pixel needs a line
+        // filter.
         let widest = blob(noise, &weight, BLOBS[BLOBS.len() - 1]).deviation;
         let needed = widest.values.iter().any(|tau| *tau > quiet);
         let line = |(length, width): (f32, f32)| {
@@ -128,7 +130,7 @@ impl<'a> Ladder<'a> {
         Ladder { background, weakest, weight, lines }
     }
 
-    /// Climbs until every pixel is quiet enough, or the ladder ends.
+    /// Applies larger and larger filters until the noise of every pixel is low enough, or the ladder ends.
     fn phase(&self, change: &Image) -> Phase {
         let noise = &self.background.noise;
         let quiet = self.weakest / QUIET_ENOUGH;
@@ -151,7 +153,7 @@ impl<'a> Ladder<'a> {
         Phase { ratio, weakest, filtered }
     }
 
-    /// Replaces what is not quiet enough by what `filter` says; `filter` learns which rows matter.
+    /// Replaces the pixels that are too noisy by the output of `filter`, which receives the rows that are needed.
     fn climb(&self, best: &mut Estimate, quiet: f32, filter: impl Fn(&[bool]) -> Estimate, mut at: impl FnMut(usize)) {
         let width = best.deviation.width;
         let noisy: Vec<bool> = best.deviation.values.iter().map(|tau| *tau > quiet).collect();
@@ -167,8 +169,8 @@ impl<'a> Ladder<'a> {
         }
     }
 
-    /// What is asked of each pixel: the weakest vessel; more beside a strong one, whose blur is no vessel; no more than
-    /// lines can show where they are used.
+    /// Minimum amplitude of a vessel at each pixel: the weakest vessel, or more beside a strong one, whose blur is no
+    /// vessel; where line filters are used, no more than they can show.
     fn weakest_beside(&self, change: &Image, by_line: &[bool]) -> Image {
         let near = blob(change, &self.weight, NEAR_BLUR);
         let sure = map2(&near.amplitude, &near.deviation, |a, tau| (a - 2.0 * tau).max(0.0));
@@ -189,8 +191,8 @@ impl<'a> Ladder<'a> {
         Image { values, ..weakest.clone() }
     }
 
-    /// Pixels that a vessel covers at every phase: there the background itself holds vessel. The pixel counts where it
-    /// changes at some phase and stands above the opened background.
+    /// Corrects the ratios of pixels that a vessel covers at every phase, where the background itself contains the vessel.
+    /// Such a pixel counts where it changes at some phase and exceeds the opened background.
     fn with_covered_pixels(&self, image: &Image, phase: &Phase, largest: &[f32], filtered: bool) -> Image {
         let above = map2(image, &self.background.low, |y, b| y - b);
         let seen = if filtered {
@@ -206,15 +208,15 @@ impl<'a> Ladder<'a> {
     }
 }
 
-/// log p(a | vessel) - log p(a | none), clipped: a vessel's amplitude is log-uniform between `low` and `high`, noise
-/// is normal with deviation `tau`. Brighter than any vessel is no argument against one.
+/// log p(a | vessel) - log p(a | none), clipped. A vessel's amplitude is log-uniform between `low` and `high`, and noise is
+/// normal with standard deviation `tau`. An amplitude above any vessel's is no argument against a vessel.
 fn log_ratio(a: f32, tau: f32, low: f32, high: f32) -> f32 {
     let scale = 0.5 / (tau * tau);
     let none = a * a * scale;
     if a > high {
         return none.clamp(LEAST, MOST);
     }
-    // exp(-(a - a_k)^2 / 2 tau^2 + a^2 / 2 tau^2): the squares of a cancel before they can swamp the digits.
+    // exp(-(a - a_k)^2 / 2 tau^2 + a^2 / 2 tau^2): the squares of a cancel here, before they cause a loss of precision.
     let step = (high / low).max(1.01).powf(1.0 / (AMPLITUDES - 1) as f32);
     let mut amplitude = low;
     let mut exponents = [0f32; AMPLITUDES];
@@ -233,7 +235,7 @@ mod tests {
 
     #[test]
     fn ratios_are_those_of_the_densities() {
-        // Against the definition, in f64.
+        // Compares with the definition in f64.
         for (a, tau, low, high) in [(0.3f32, 0.2f32, 0.1f32, 1.0f32), (0.0, 0.2, 0.1, 1.0), (0.12, 0.1, 0.08, 0.9)] {
             let (a64, tau64) = (f64::from(a), f64::from(tau));
             let normal = |x: f64| (-0.5 * ((a64 - x) / tau64).powi(2)).exp();

@@ -1,10 +1,11 @@
-//! f64 twin of `gaussian_rays` and `gaussian_points`: plain sums over all Gaussians, and small steps along rays.
+//! f64 reference implementation (twin) of `gaussian_rays` and `gaussian_points`: plain sums over all Gaussians, and small
+//! steps along rays.
 
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::{MovingGaussians, Units};
 use glam::{DMat3, DQuat, DVec3};
 
-/// Steps of a Gaussian's least deviation along a ray.
+/// Number of steps along a ray per minimum standard deviation of a Gaussian.
 const STEPS: f64 = 12.0;
 
 /// A Gaussian in world units.
@@ -12,18 +13,18 @@ const STEPS: f64 = 12.0;
 pub struct Gauss {
     centre: DVec3,
     density: f64,
-    /// Axes in rows, divided by their deviations.
+    /// Axes in rows, divided by their standard deviations.
     whiten: DMat3,
     least: f64,
     cut: f64,
 }
 
-/// What a ray sees.
+/// Integral and maximum of a field along a ray.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Along {
     /// Line integral.
     pub integral: f64,
-    /// Largest attenuation per world unit.
+    /// Maximum attenuation per world unit.
     pub maximum: f64,
 }
 
@@ -42,7 +43,7 @@ fn gauss(g: &Gaussian, units: Units, setup: &GaussianSetup) -> Gauss {
     }
 }
 
-/// The field at a phase.
+/// Returns the Gaussians of the field at a phase.
 pub fn field(field: &MovingGaussians, phase: usize) -> Vec<Gauss> {
     let sets = field.rows();
     field.at(phase).iter().map(|g| gauss(g, sets.units, &sets.setup)).collect()
@@ -57,7 +58,8 @@ pub fn at(field: &[Gauss], point: DVec3) -> f64 {
     field.iter().map(value).sum()
 }
 
-/// What a ray (a point on it and its direction) sees: Gaussians whose line passes within the cut, to their ends.
+/// Integrates the field along a ray (a point on it and its direction) over the Gaussians within the cut, each over its
+/// whole length.
 pub fn along(field: &[Gauss], (anchor, direction): (DVec3, DVec3)) -> Along {
     let mut integral = 0.0;
     let mut met: Vec<(f64, f64, f64)> = Vec::new(); // depth of the peak, deviation along the ray, height

@@ -1,10 +1,10 @@
-//! f64 twins of the fields: plain loops over one point at a time, forward and backward.
+//! f64 reference implementations (twins) of the fields: plain loops over one point at a time, forward and backward.
 
 use crate::kernels::layout::Setup;
 use crate::model::params::{NetworkMap, ParamMap};
 use glam::{DVec3, Vec3};
 
-/// log(1 + e^x), the identity beyond 20 as in torch.
+/// log(1 + e^x), the identity above 20 as in torch.
 pub fn softplus(x: f64) -> f64 {
     if x > 20.0 { x } else { x.exp().ln_1p() }
 }
@@ -14,12 +14,12 @@ pub fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// A point of the constants that twin and shaders share.
+/// Converts a point of the constants that twins and shaders share.
 pub(super) fn point(at: [f32; 3]) -> DVec3 {
     Vec3::from(at).as_dvec3()
 }
 
-/// Whether a point lies in the static field's box.
+/// Tells whether a point lies in the static field's box.
 pub fn static_inside(s: &Setup, x: DVec3) -> bool {
     let (low, high) = (point(s.static_min), point(s.static_max));
     x.cmpge(low).all() && x.cmple(high).all()
@@ -36,7 +36,7 @@ struct ModeTaps {
     line: [(usize, f64); 2],
 }
 
-/// Positions (without rank) and weights of the taps of each mode: XY x Z, XZ x Y, YZ x X.
+/// Positions (without rank) and weights of the interpolation taps of each mode: XY x Z, XZ x Y, YZ x X.
 fn vm_taps(s: &Setup, p: &ParamMap, x: DVec3) -> [ModeTaps; 3] {
     let (low, high) = (point(s.static_min), point(s.static_max));
     let c = (x - low) / (high - low) * (p.grid - 1) as f64;
@@ -55,7 +55,7 @@ fn vm_taps(s: &Setup, p: &ParamMap, x: DVec3) -> [ModeTaps; 3] {
     })
 }
 
-/// Sum over modes and ranks of plane times line (paper, section 2.1).
+/// Sum over modes and ranks of plane times line factors (paper, section 2.1).
 pub fn vm_feature(s: &Setup, p: &ParamMap, params: &[f64], x: DVec3) -> f64 {
     let mut sum = 0.0;
     for taps in vm_taps(s, p, x) {
@@ -102,9 +102,9 @@ pub fn encode(s: &Setup, window: f64, x: DVec3) -> Vec<f64> {
 pub enum Precision {
     /// Everything in f64.
     Exact,
-    /// Weights, encoding, activations and scaled gradients rounded to f16 where the fused kernels round them.
+    /// Weights, encoding, activations and scaled gradients are rounded to f16 where the fused kernels round them.
     F16 {
-        /// Factor on gradients before they are rounded.
+        /// Factor on gradients before rounding.
         loss_scale: f64,
     },
 }
@@ -113,7 +113,7 @@ impl Precision {
     fn round(self, x: f64) -> f64 {
         match self {
             Precision::Exact => x,
-            // The kernels hold f32 before they round.
+            // The kernels compute in f32 before rounding.
             Precision::F16 { .. } => half::f16::from_f32((x as f32).clamp(-65504.0, 65504.0)).to_f64(),
         }
     }
@@ -136,12 +136,12 @@ pub struct NetworkTrace {
     pub feature: f64,
 }
 
-/// Phases that a ray shows, and what it shows of each; see [`BeatTime::shown`].
+/// Phases that a ray shows, and their shares; see [`BeatTime::shown`].
 ///
 /// [`BeatTime::shown`]: crate::scan::gating::BeatTime::shown
 pub type Shown = [(usize, f64); 2];
 
-/// The network at one encoded point, at one phase or between two.
+/// Evaluates the network at one encoded point, at one phase or between two.
 pub fn network_fwd(
     p: &NetworkMap,
     params: &[f64],
@@ -163,7 +163,8 @@ pub fn network_fwd(
                         let latent = &params[p.latents + phase * p.latent..][..p.latent];
                         z + weights.iter().zip(latent).map(|(w, v)| w * v).sum::<f64>()
                     };
-                    // On matrices, bias and latent are a column of the weights, and shares are numbers of the input.
+                    // In matrix products, bias and latent form a column of the weights, and shares are entries of the
+                    // input.
                     z = shown.iter().map(|(phase, share)| round(row(*phase)) * round(*share)).sum();
                 }
                 if let Some(at) = layer.encoded {
@@ -198,7 +199,7 @@ pub fn network_bwd(
     let scale = precision.loss_scale();
     let last = p.layers.len() - 1;
     gradient[p.out_bias] += dl_dfeature;
-    // dz is kept multiplied by the loss scale, as in f16 memory.
+    // dz stays multiplied by the loss scale, as in f16 memory.
     let mut dz = vec![0.0; p.width];
     for (j, (h, dz)) in trace.hidden[last].iter().zip(&mut dz).enumerate() {
         gradient[p.out_weights + j] += dl_dfeature * h;

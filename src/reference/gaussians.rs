@@ -1,5 +1,5 @@
-//! f64 twins of the Gaussians' stages: plain loops, no device. And the exact cone-beam integral, which the affine one of
-//! the stages approximates.
+//! f64 reference implementations (twins) of the Gaussians' stages, as plain loops without the device, and the exact
+//! cone-beam integral, which the affine one of the stages approximates.
 
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
@@ -11,7 +11,7 @@ pub const N_PARAMS: usize = 11;
 /// [`Gaussian`] in f64, in the order of [`N_PARAMS`].
 pub type Params = [f64; N_PARAMS];
 
-/// The parameters of a Gaussian as numbers.
+/// Returns the parameters of a Gaussian as numbers.
 pub fn params(g: &Gaussian) -> Params {
     let mut out = [0.0; N_PARAMS];
     let all = g.position.iter().chain([&g.log_density]).chain(&g.log_scale).chain(&g.rotation);
@@ -46,7 +46,7 @@ pub fn density(p: &Params, setup: &GaussianSetup, x: DVec3) -> f64 {
     (p[3] - 0.5 * c.length_squared()).exp()
 }
 
-/// Along a ray, attenuation is exp(log_density - (constant + 2 linear t + square t^2) / 2).
+/// Profile along a ray: attenuation is exp(log_density - (constant + 2 linear t + square t^2) / 2).
 #[derive(Debug, Clone, Copy)]
 pub struct AlongRay {
     /// Log of the attenuation at the centre.
@@ -60,11 +60,12 @@ pub struct AlongRay {
 }
 
 impl AlongRay {
-    /// `t` counts from the depth of the Gaussian's centre, in units of `ray`.
+    /// Creates the profile; `t` is measured from the depth of the Gaussian's centre, in units of `ray`.
     pub fn new(p: &Params, setup: &GaussianSetup, view: &SplatView, ray: DVec3) -> AlongRay {
         let to_axes = axes(p).transpose();
         let depth = view.project(position(p)).0;
-        // The ray's point at the centre's depth: no difference of large numbers that does not cancel in f64.
+        // The origin is the ray's point at the centre's depth, so no large numbers are subtracted that f64 could not
+        // handle.
         let a = to_axes * (view.source + ray * depth - position(p)) / scale(p, setup);
         let b = to_axes * ray / scale(p, setup);
         AlongRay { log_density: p[3], constant: a.length_squared(), linear: a.dot(b), square: b.length_squared() }
@@ -75,7 +76,7 @@ impl AlongRay {
         (self.log_density - 0.5 * (self.constant + t * (2.0 * self.linear + self.square * t))).exp()
     }
 
-    /// Where along a ray the Gaussian is largest, and its standard deviation along the ray.
+    /// Position of the Gaussian's maximum along the ray, and its standard deviation along the ray.
     pub fn peak(&self) -> (f64, f64) {
         (-self.linear / self.square, 1.0 / self.square.sqrt())
     }
@@ -89,7 +90,7 @@ pub fn exact_integral(p: &Params, setup: &GaussianSetup, view: &SplatView, colum
     along.at(at) * std::f64::consts::TAU.sqrt() * deviation * ray.length()
 }
 
-/// A Gaussian in an image, and what its gradient needs of the way there.
+/// Projection of a Gaussian into an image, with the intermediate values of its gradient.
 #[derive(Debug, Clone)]
 pub struct Projection {
     /// Column and row of the centre.
@@ -98,7 +99,7 @@ pub struct Projection {
     pub conic: DMat2,
     /// Line integral at the centre.
     pub amplitude: f64,
-    /// Half sides of the box it is cut to.
+    /// Half sides of the box of pixels it is limited to.
     pub half_box: DVec2,
     depth: f64,
     ray: DVec3,
@@ -107,7 +108,7 @@ pub struct Projection {
     beta: DVec3,
 }
 
-/// How a view sees a Gaussian; `None` behind the source.
+/// Projects a Gaussian into a view; `None` behind the source.
 pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Projection> {
     let (depth, column, row) = view.project(position(p));
     if depth <= 0.0 {
@@ -219,7 +220,7 @@ pub(super) fn rotation_gradient(p: &Params, d: DMat3) -> [f64; 4] {
     [(g[0], w), (g[1], x), (g[2], y), (g[3], z)].map(|(g, q)| (g - q * along) / norm)
 }
 
-/// Loss of an image, and its gradient: D is free between the bounds, Charbonnier-shaped outside.
+/// Loss of an image, and its gradient: zero between the bounds of each pixel, Charbonnier loss outside.
 pub fn residual(setup: &GaussianSetup, image: &[f64], low: &[f32], high: &[f32], weight: &[f32]) -> (f64, Vec<f64>) {
     let (bend, scale) = (f64::from(setup.bend), f64::from(setup.loss_weight));
     let mut loss = 0.0;
@@ -242,7 +243,7 @@ pub struct AdamState {
     second: Params,
 }
 
-/// One update; `rate` is the schedule's factor, `bias` its corrections.
+/// Applies one Adam update; `rate` is the schedule's factor, `bias` the bias corrections.
 pub fn adam(setup: &GaussianSetup, rate: f64, bias: [f64; 2], g: &Params, p: &mut Params, state: &mut AdamState) {
     let (beta1, beta2) = (f64::from(setup.beta1), f64::from(setup.beta2));
     for k in 0..N_PARAMS {

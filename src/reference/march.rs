@@ -1,4 +1,4 @@
-//! f64 twins of ray drawing, depths and the march.
+//! f64 reference implementations (twins) of ray drawing, depths and the march.
 
 use crate::kernels::layout::Setup;
 use crate::model::params::ParamMap;
@@ -18,15 +18,15 @@ pub struct Ray {
     pub shown: Shown,
     /// Measured line integral.
     pub target: f64,
-    /// Bounds of the integral above the pixel's still background.
+    /// Bounds of the integral above the pixel's static background.
     pub temporal: [f64; 2],
     /// frame * pixels + pixel.
     pub id: u32,
-    /// How much its pixel changes over the beat; 0 but for two networks.
+    /// Change of its pixel over the beat; 0 except for two networks.
     pub change: f64,
 }
 
-/// Rays of iteration `step` (twin of `batch`).
+/// Draws the rays of iteration `step` (twin of `batch`).
 pub fn batch(plan: &Plan, step: u32) -> Vec<Ray> {
     let s = &plan.setup;
     let draw = |slot: u32, per_step: u32, n: u32, stream: u32| {
@@ -49,7 +49,7 @@ pub fn batch(plan: &Plan, step: u32) -> Vec<Ray> {
         .collect()
 }
 
-/// A training ray by its id.
+/// Returns a training ray by its id.
 pub fn ray(plan: &Plan, id: u32) -> Ray {
     let s = &plan.setup;
     let frame = plan.frames[(id / s.n_pixels) as usize];
@@ -71,7 +71,7 @@ pub fn ray(plan: &Plan, id: u32) -> Ray {
     }
 }
 
-/// Depths of a ray and the path lengths they stand for.
+/// Depths of a ray, and the path lengths they represent.
 pub fn depths(s: &Setup, n: u32, near: f32, far: f32, step: u32, ray: &Ray) -> Vec<(f64, f64)> {
     let (near, far) = (f64::from(near), f64::from(far));
     let grid = |k: u32| near + (far - near) * f64::from(k) / f64::from(n - 1);
@@ -127,20 +127,20 @@ impl NearPart {
     }
 }
 
-/// Whether the dynamic field may exist at a point at a phase: its box and, if used, the hull.
+/// Tells whether the dynamic field may exist at a point at a phase, by its box and, if used, the hull.
 pub fn dynamic_inside(plan: &Plan, x: DVec3, phase: usize) -> bool {
     let s = &plan.setup;
     let (low, high) = (field::point(s.dynamic_min), field::point(s.dynamic_max));
     x.cmpge(low).all() && x.cmple(high).all() && plan.hull.as_ref().is_none_or(|h| h.contains_point(x, phase))
 }
 
-/// Whether the dynamic field is evaluated at a point of a ray (twin of `searched`); `occupied` says so of a phase.
+/// Tells whether the dynamic field is evaluated at a point of a ray (twin of `searched`); `occupied` decides for a phase.
 pub fn searched(plan: &Plan, x: DVec3, ray: &Ray, occupied: impl Fn(usize) -> bool) -> bool {
     let shows = |(phase, share): &(usize, f64)| *share > 0.0 && dynamic_inside(plan, x, *phase) && occupied(*phase);
     ray.shown.iter().any(shows)
 }
 
-/// A static sample: where, path length, feature.
+/// A static sample: position, path length, feature.
 pub struct StaticSample {
     /// Position.
     pub x: DVec3,
@@ -156,13 +156,13 @@ pub struct DynamicSample {
     pub x: DVec3,
     /// Path length.
     pub dl: f64,
-    /// Subject to occlusion minimisation.
+    /// Whether it is subject to occlusion minimisation.
     pub near: bool,
-    /// The network there.
+    /// Network values at the sample.
     pub trace: NetworkTrace,
 }
 
-/// What a ray sees, with everything its backward pass needs.
+/// Integrals of a ray, with all values for its backward pass.
 pub struct March {
     /// Samples in the static box.
     pub statics: Vec<StaticSample>,
@@ -176,7 +176,7 @@ pub struct March {
     pub occlusion: f64,
 }
 
-/// Marches one ray through the static field alone, if at all.
+/// Marches one ray through the static field only, or through no field.
 pub fn statics(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool) -> March {
     let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
     let mut out = March {

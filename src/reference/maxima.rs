@@ -1,4 +1,4 @@
-//! The largest attenuation of Gaussians along rays, in f64: the rule vessels are scored by.
+//! Maximum attenuation of Gaussians along rays, in f64, as used for scoring vessels.
 
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::GaussianSetup;
@@ -8,10 +8,10 @@ use rayon::prelude::*;
 
 /// Step along the ray, pixels at the isocentre.
 const STEP: f64 = 0.25;
-/// How far along the ray a Gaussian is looked for, standard deviations.
+/// Range of a Gaussian along the ray, standard deviations.
 const REACH: f64 = 3.2;
 
-/// Largest attenuation (per world unit) of the field of a phase along the ray of every pixel, rows first.
+/// Maximum attenuation (per world unit) of the field of a phase along the ray of every pixel, rows first.
 pub fn maxima(model: &Gaussians, view: &SplatView, width: usize, height: usize, phase: usize) -> Vec<f64> {
     let setup = GaussianSetup { width: width as u32, height: height as u32, ..model.setup };
     let all: Vec<Params> = model.at(phase).map(params).collect();
@@ -37,7 +37,7 @@ pub fn maxima(model: &Gaussians, view: &SplatView, width: usize, height: usize, 
         .collect()
 }
 
-/// Largest sum of Gaussians along the ray of a pixel.
+/// Maximum of the sum of Gaussians along the ray of a pixel.
 fn along<'a>(
     gaussians: impl Iterator<Item = &'a Params>,
     setup: &GaussianSetup,
@@ -46,7 +46,7 @@ fn along<'a>(
     row: f64,
 ) -> f64 {
     let ray = view.ray(column, row);
-    // Depths from and to which each counts; the profile's own depth counts from its Gaussian's.
+    // Depths between which each Gaussian counts; a profile's depth is relative to that of its Gaussian.
     let mut parts: Vec<(f64, f64, f64, AlongRay)> = gaussians
         .map(|p| {
             let own = view.project(glam::DVec3::new(p[0], p[1], p[2])).0;

@@ -1,5 +1,5 @@
-//! f64 twin of two networks as the fields: what a ray sees of both, their losses, and the gradient at each sample
-//! (`march_fwd_samples`, `loss_samples`).
+//! f64 reference implementation (twin) for two networks as fields: integrals of both along a ray, their losses, and the
+//! gradient at each sample (`march_fwd_samples`, `loss_samples`).
 
 use crate::plan::Plan;
 use crate::reference::field::{self, NetworkTrace, Precision, Shown};
@@ -7,9 +7,9 @@ use crate::reference::march::{self, Ray};
 use crate::reference::step::Losses;
 use glam::DVec3;
 
-/// Added where something might vanish, as in `loss_samples`.
+/// Offset against division by zero and logarithms of zero, as in `loss_samples`.
 const SMALL: f64 = 1e-10;
-/// Least share of a field, and least integral to divide by.
+/// Minimum share of a field, and minimum integral as a divisor.
 const SMALLEST: f64 = 1e-19;
 
 /// Both fields at a sample of a ray.
@@ -23,14 +23,14 @@ pub struct PairSample {
     pub sigma: [f64; 2],
 }
 
-/// What a ray sees.
+/// Integrals and maxima of both fields along a ray.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairIntegrals {
     /// Line integrals of the static and of the dynamic field.
     pub fields: [f64; 2],
-    /// That of near samples of the dynamic field.
+    /// Line integral of the dynamic field over near samples.
     pub near: f64,
-    /// Largest attenuation of the static field, of the dynamic field, and of their sum.
+    /// Maximum attenuation of the static field, of the dynamic field, and of their sum.
     pub largest: [f64; 3],
 }
 
@@ -48,7 +48,7 @@ pub fn integrals(samples: &[PairSample]) -> PairIntegrals {
     seen
 }
 
-/// What a ray adds to the losses, none of them weighted but the photometric one by its ray.
+/// Contribution of one ray to the losses, unweighted except for the photometric loss, which has the ray's weight.
 #[derive(Debug, Clone, Default)]
 pub struct PairLoss {
     /// Photometric.
@@ -61,13 +61,13 @@ pub struct PairLoss {
     pub ray_entropy: f64,
     /// Integral of the dynamic field's near samples.
     pub near: f64,
-    /// The static field's integrals and their squares.
+    /// Sum of the static field's integrals per sample and of their squares.
     pub static_size: f64,
     /// Derivative of the objective by both attenuations at each sample.
     pub gradient: Vec<[f64; 2]>,
 }
 
-/// Losses of a ray of `n_rays` at a step, whose integrals of both fields are S and D (twin of `loss_samples`).
+/// Losses of one of `n_rays` rays at a step, whose integrals of both fields are S and D (twin of `loss_samples`).
 pub fn ray_loss(
     plan: &Plan,
     step: u32,
@@ -85,7 +85,7 @@ pub fn ray_loss(
     let integral = d.max(SMALLEST);
     let share = |sample: &PairSample| sample.sigma[1] * sample.dl / integral;
     let slope = |p: f64| (p + SMALL).ln() + p / (p + SMALL);
-    // A constant divides where D is too small.
+    // Where D is too small, the divisor is a constant, so its derivative vanishes.
     let mean = if d > SMALLEST { samples.iter().map(|x| share(x) * slope(share(x))).sum() } else { 0.0 };
     let mut loss = PairLoss {
         data: per_ray * weight * residual * residual,
@@ -114,7 +114,7 @@ pub fn ray_loss(
     loss
 }
 
-/// Where a network is asked.
+/// Place at which a network is evaluated.
 #[derive(Debug, Clone, Copy)]
 pub struct Place {
     /// The point.
@@ -123,7 +123,7 @@ pub struct Place {
     pub shown: Shown,
 }
 
-/// Both networks at a place: the static field's first.
+/// Evaluates both networks at a place, the static field's first.
 pub fn traces(
     plan: &Plan,
     params: &[f64],
@@ -136,7 +136,7 @@ pub fn traces(
     [still, &plan.params.moving].map(|map| field::network_fwd(map, params, &encoded, shown, precision))
 }
 
-/// Attenuations and their derivatives by the features, of both networks.
+/// Attenuations of both networks, and their derivatives by the features.
 pub fn attenuations(plan: &Plan, traces: &[NetworkTrace; 2]) -> [[f64; 2]; 2] {
     let s = &plan.setup;
     let [still, moving] = [(s.static_gain, s.static_shift), (s.dynamic_gain, s.dynamic_shift)];
@@ -164,7 +164,7 @@ pub fn sample_bwd(
     }
 }
 
-/// Points of a ray, with what is the same for both fields.
+/// Places of a ray with their path lengths and whether they are near, which are shared by both fields.
 fn places(plan: &Plan, step: u32, ray: &Ray) -> Vec<(Place, f64, bool)> {
     let s = &plan.setup;
     march::depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray)
@@ -177,7 +177,7 @@ fn places(plan: &Plan, step: u32, ray: &Ray) -> Vec<(Place, f64, bool)> {
         .collect()
 }
 
-/// What a ray sees at a step, of fields with these parameters.
+/// Integrals of a ray at a step, for fields with these parameters.
 pub fn seen(plan: &Plan, params: &[f64], step: u32, ray: &Ray, precision: Precision) -> PairIntegrals {
     let sample = |(place, dl, near): (Place, f64, bool)| {
         let sigma = attenuations(plan, &traces(plan, params, step, place, precision)).map(|[sigma, _]| sigma);

@@ -1,4 +1,4 @@
-//! Twin of the occupancy learned while training.
+//! Reference implementation (twin) of the occupancy learned during training.
 
 use crate::kernels::constants::{CELLS_PER_WORD, OCCUPANCY_EPOCH, OCCUPANCY_EPOCHS, OCCUPIED, SEEN};
 use crate::kernels::layout::Setup;
@@ -6,10 +6,10 @@ use crate::random::{STREAM_OCCUPANCY, pcg4d};
 use crate::reference::field::point;
 use glam::DVec3;
 
-/// Share of a phase below which an empty sample tells nothing of it, as in `occupancy_mark`.
+/// Share of a phase below which an empty sample is no evidence for it, as in `occupancy_mark`.
 pub const LITTLE_SHOWN: f32 = 0.25;
 
-/// Position of a cell's two bits.
+/// Index of a cell's entry of two bits.
 pub fn entry(s: &Setup, x: DVec3, phase: u32) -> u32 {
     let (low, high) = (point(s.dynamic_min), point(s.dynamic_max));
     let n = s.occupancy_cells;
@@ -17,7 +17,7 @@ pub fn entry(s: &Setup, x: DVec3, phase: u32) -> u32 {
     ((phase * n + cell[2]) * n + cell[1]) * n + cell[0]
 }
 
-/// Whether a sample is evaluated at a step, given all epochs' words (twin of `occupied`).
+/// Tells whether a sample is evaluated at a step, given the words of all epochs (twin of `occupied`).
 pub fn occupied(s: &Setup, occupancy: &[u32], x: DVec3, phase: u32, step: u32) -> bool {
     if s.occupancy_cells == 0 || step < s.occupancy_start {
         return true;

@@ -1,4 +1,4 @@
-//! f64 projector, independent of the device's: same sampling rule, plain loops.
+//! f64 projector, independent of the device's, with the device's sampling rule in plain loops.
 
 use crate::formats::volume::Volume;
 use crate::geometry::{MM_PER_UNIT, ViewRays};
@@ -26,7 +26,7 @@ pub fn trilinear(volume: &Volume, index: DVec3) -> f64 {
     sum
 }
 
-/// Line integral of one pixel's ray: mid-points of equal depth steps of half a voxel.
+/// Line integral of one pixel's ray, by the mid-points of equal depth steps of half a voxel.
 pub fn project_pixel(volume: &Volume, rays: &ViewRays, column: usize, row: usize) -> f64 {
     let to_index = volume.world_to_index();
     let half = bounding_radius(volume).min(rays.sod);

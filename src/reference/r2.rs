@@ -1,4 +1,5 @@
-//! f64 twins of the stages of R2-Gaussian: plain loops, no device. Lengths are half sides of the volume.
+//! f64 reference implementations (twins) of the stages of R2-Gaussian, as plain loops without the device. Lengths are in
+//! half sides of the volume.
 
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Schedule, R2Setup};
@@ -7,14 +8,14 @@ use crate::reference::gaussians::{N_PARAMS, Params, axes, rotation_gradient};
 use crate::reference::r2_chords::Chords;
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
-/// Where slopes end to follow the centre, half images from the image's middle.
+/// Distance from the image's centre at which slopes stop following the Gaussian's centre, in half images.
 const SLOPES_END: f64 = 1.3;
-/// Least squared difference of variances when a radius is found, pixels^4.
+/// Minimum squared difference of variances in the computation of a radius, pixels^4.
 const LEAST_SPREAD: f64 = 0.1;
-/// Standard deviations along its longest axis at which a Gaussian ends among voxels.
+/// Standard deviations along its longest axis at which a Gaussian is cut off among voxels.
 const VOXEL_CUT: f64 = 3.0;
 
-/// What is stored of a Gaussian as numbers: position, density, scale, quaternion.
+/// Returns the stored parameters of a Gaussian: position, density, scale, quaternion.
 pub fn params(g: &R2Gaussian) -> Params {
     let mut out = [0.0; N_PARAMS];
     let all = g.position.iter().chain([&g.density]).chain(&g.scale).chain(&g.rotation);
@@ -38,7 +39,7 @@ fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// From gradients by the logarithms of density and scales to those by what is stored.
+/// Converts gradients by the logarithms of density and scales to gradients by the stored parameters.
 pub fn to_stored(p: &Params, setup: &GaussianSetup, by_logarithms: &Params) -> Params {
     let mut out = *by_logarithms;
     out[3] *= sigmoid(p[3]) / softplus(p[3]);
@@ -50,16 +51,16 @@ pub fn to_stored(p: &Params, setup: &GaussianSetup, by_logarithms: &Params) -> P
     out
 }
 
-/// A Gaussian in an image, and what its gradient needs of the way there.
+/// Projection of a Gaussian into an image, with the intermediate values of its gradient.
 #[derive(Debug, Clone)]
 pub struct Projection {
     /// Column and row of the centre.
     pub mean: DVec2,
     /// Inverse variance in the image.
     pub conic: DMat2,
-    /// Line integral along the ray of its slopes, through the centre.
+    /// Line integral through the centre, along the ray of its slopes.
     pub amplitude: f64,
-    /// Half side of the square it is cut to.
+    /// Half side of the square of pixels it is limited to.
     pub radius: f64,
     depth: f64,
     follows: DVec2,
@@ -69,7 +70,7 @@ pub struct Projection {
     beta: DVec3,
 }
 
-/// How a view sees a Gaussian; `None` behind the source.
+/// Projects a Gaussian into a view; `None` behind the source.
 pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Projection> {
     let (depth, column, row) = view.project(position(p));
     if depth <= 0.0 {
@@ -105,7 +106,7 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Pr
     })
 }
 
-/// Index and offset from the middle of every pixel of a box with these half sides.
+/// Index and offset from the centre of every pixel of a box with these half sides.
 pub(super) fn pixels_within(
     middle: DVec2,
     half: DVec2,
@@ -146,7 +147,7 @@ impl Projection {
         sums
     }
 
-    /// Length of the gradient by the centre in the image, in half images: what density control goes by.
+    /// Length of the gradient by the centre in the image, in half images, as used by density control.
     pub fn pull(&self, setup: &GaussianSetup, moments: [f64; 6]) -> f64 {
         let by_pixel = self.conic * DVec2::new(moments[1], moments[2]);
         (0.5 * DVec2::new(setup.width.into(), setup.height.into()) * by_pixel).length()
@@ -185,14 +186,14 @@ fn together(position: DVec3, density: f64, scale: DVec3, rotation: [f64; 4]) -> 
     out
 }
 
-/// Half the length of SSIM's window, less the middle.
+/// Half length of SSIM's window, without the middle.
 const REACH: i64 = 5;
-/// Its standard deviation, pixels.
+/// Standard deviation of SSIM's window, pixels.
 const DEVIATION: f64 = 1.5;
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
 
-/// An image under SSIM's window along lines of `length` pixels, `step` apart in memory; zeros beyond it.
+/// Filters an image with SSIM's window along lines of `length` pixels, `step` apart in memory, with zeros outside.
 fn along_lines(image: &[f64], step: usize, length: usize) -> Vec<f64> {
     let weight = |k: i64| (-0.5 * (k as f64 / DEVIATION).powi(2)).exp();
     let all: f64 = (-REACH..=REACH).map(weight).sum();
@@ -204,17 +205,17 @@ fn along_lines(image: &[f64], step: usize, length: usize) -> Vec<f64> {
     (0..image.len()).map(at).collect()
 }
 
-/// An image under SSIM's window along rows.
+/// Filters an image with SSIM's window along rows.
 pub fn along_rows(image: &[f64], width: usize) -> Vec<f64> {
     along_lines(image, 1, width)
 }
 
-/// An image under SSIM's window.
+/// Filters an image with SSIM's window.
 fn windowed(image: &[f64], width: usize) -> Vec<f64> {
     along_lines(&along_rows(image, width), width, image.len() / width)
 }
 
-/// SSIM at each pixel of pictures that go from 0 to 1, and the factors P, Q and T of its gradient.
+/// SSIM at each pixel of images with a range from 0 to 1, and the factors P, Q and T of its gradient.
 pub fn ssim(x: &[f64], y: &[f64], width: usize) -> (Vec<f64>, [Vec<f64>; 3]) {
     let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<f64>>();
     let [m1, m2, xx, yy, xy] =
@@ -244,14 +245,14 @@ pub fn picture_loss(x: &[f64], y: &[f64], width: usize, weight: f64) -> (f64, Ve
     (loss / n, (0..x.len()).map(slope).collect())
 }
 
-/// A box of voxels: the centre of its first one, and the constants it goes by.
+/// A box of voxels.
 #[derive(Debug, Clone, Copy)]
 pub struct VoxelBox<'a> {
     /// Centre of the first voxel.
     pub corner: DVec3,
-    /// Side, and voxels along it.
+    /// Voxel size, voxels along the box, and the weight of the total variation.
     pub r2: &'a R2Setup,
-    /// Bounds of scales.
+    /// Setup with the bounds of scales.
     pub setup: &'a GaussianSetup,
 }
 
@@ -261,12 +262,12 @@ impl VoxelBox<'_> {
         (self.r2.box_side as usize).pow(3)
     }
 
-    /// Whether it has none.
+    /// Tells whether the box has no voxels.
     pub fn is_empty(&self) -> bool {
         self.r2.box_side == 0
     }
 
-    /// Index of each voxel near a Gaussian, and how far it is from the centre in standard deviations along the axes.
+    /// Index of each voxel near a Gaussian, and the voxel's offset from the centre in standard deviations along the axes.
     fn near(&self, p: &Params) -> Vec<(usize, DVec3)> {
         let (side, voxel) = (i64::from(self.r2.box_side), f64::from(self.r2.voxel));
         let (scale, to_axes) = (scale(p, self.setup), axes(p).transpose());
@@ -319,8 +320,8 @@ impl VoxelBox<'_> {
         sums
     }
 
-    /// Gradient by position, the logarithms of density and scales, and the quaternion, from these moments. Centres are
-    /// left where they are unless the setting says otherwise.
+    /// Gradient by position, the logarithms of density and scales, and the quaternion, from these moments. Centres do not
+    /// move unless the setup says otherwise.
     pub fn gradient(&self, p: &Params, moments: [f64; 10]) -> Params {
         let mut sum = along_axes_gradient(p, self.setup, moments);
         if self.r2.tv_moves_centres == 0 {
@@ -330,8 +331,8 @@ impl VoxelBox<'_> {
     }
 }
 
-/// Gradient by position, the logarithms of density and scales, and the quaternion, from sums of h, h times a way along the axes, and h
-/// times products of ways along them.
+/// Gradient by position, the logarithms of density and scales, and the quaternion, from sums of h, of h times an offset
+/// along the axes, and of h times products of these offsets.
 fn along_axes_gradient(p: &Params, setup: &GaussianSetup, [h, x, y, z, xx, yy, zz, xy, xz, yz]: [f64; 10]) -> Params {
     let (axes, scale) = (axes(p), scale(p, setup));
     let d_position = axes * (DVec3::new(x, y, z) / scale);
@@ -341,17 +342,17 @@ fn along_axes_gradient(p: &Params, setup: &GaussianSetup, [h, x, y, z, xx, yy, z
     together(d_position, h, DVec3::new(xx, yy, zz), d_rotation)
 }
 
-/// What a view sees of a Gaussian, by either kind of line integral.
+/// Projection of a Gaussian into a view, by either kind of line integral.
 #[derive(Debug, Clone)]
 pub enum Sight {
-    /// Its affine picture.
+    /// Affine projection.
     Affine(Projection),
-    /// Pixels' own rays past it.
+    /// Exact integrals along the pixels' own rays.
     Exact(Chords),
 }
 
 impl Sight {
-    /// How a view sees a Gaussian; `None` behind the source.
+    /// Projects a Gaussian into a view; `None` behind the source.
     pub fn of(p: &Params, view: &SplatView, setup: &GaussianSetup, r2: &R2Setup) -> Option<Sight> {
         match r2.exact {
             0 => project(p, view, setup).map(Sight::Affine),
@@ -403,7 +404,7 @@ impl Sight {
     }
 }
 
-/// The moments of an affine picture.
+/// Moments of an affine projection.
 fn plane([h, u, v, uu, uv, vv, ..]: [f64; 10]) -> [f64; 6] {
     [h, u, v, uu, uv, vv]
 }
@@ -415,7 +416,7 @@ pub struct AdamState {
     second: Params,
 }
 
-/// One update by a row of the schedule.
+/// Applies one Adam update by a row of the schedule.
 pub fn adam(setup: &GaussianSetup, row: &R2Schedule, g: &Params, p: &mut Params, state: &mut AdamState) {
     if row.updates == 0 {
         return;

@@ -1,5 +1,6 @@
-//! f64 twins of R2-Gaussian's stages where line integrals are exact, along pixels' own rays: plain loops, no device. Lengths are half
-//! sides of the volume; along a Gaussian's axes they count standard deviations.
+//! f64 reference implementations (twins) of R2-Gaussian's stages with exact line integrals along pixels' own rays, as plain
+//! loops without the device. Lengths are in half sides of the volume; along a Gaussian's axes they are in standard
+//! deviations.
 
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::GaussianSetup;
@@ -8,7 +9,7 @@ use crate::reference::gaussians::{Params, axes};
 use crate::reference::r2::{pixels_within, position, scale};
 use glam::{DMat3, DVec2, DVec3};
 
-/// A Gaussian before a view, and the box of pixels whose rays come as near as the cut.
+/// A Gaussian in a view, and the box of pixels whose rays pass within the cut.
 #[derive(Debug, Clone)]
 pub struct Chords {
     /// Column and row of the centre.
@@ -17,13 +18,13 @@ pub struct Chords {
     pub half_box: DVec2,
     density: f64,
     depth: f64,
-    /// Directions in the world: of the ray through the centre, of unit depth, and its changes per column and row.
+    /// World directions: that of the ray through the centre, of unit depth, and its changes per column and row.
     rays: [DVec3; 3],
-    /// The same along the axes.
+    /// Components of `rays` along the Gaussian's axes.
     along: [DVec3; 3],
 }
 
-/// What a ray sees of a Gaussian.
+/// A ray past a Gaussian, and the Gaussian's integral along it.
 struct Chord {
     nearest: DVec3,
     direction: DVec3,
@@ -31,7 +32,7 @@ struct Chord {
 }
 
 impl Chords {
-    /// How a view sees a Gaussian; `None` behind the source.
+    /// Projects a Gaussian into a view; `None` behind the source.
     pub fn of(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Chords> {
         let (depth, column, row) = view.project(position(p));
         if depth <= 0.0 {
@@ -70,8 +71,8 @@ impl Chords {
         self.pixels(setup).for_each(|(pixel, d)| picture[pixel] += self.at(d).integral);
     }
 
-    /// Sums over the box of h = dL/dx times the integral: h, h c, and h (c c^T + b b^T) as xx, yy, zz, xy, xz, yz, with c the way from
-    /// the centre to the ray's nearest point and b its direction.
+    /// Sums over the box of h = dL/dx times the integral: h, h c, and h (c c^T + b b^T) as xx, yy, zz, xy, xz, yz, where c
+    /// is the vector from the centre to the ray's nearest point and b the ray's direction.
     pub fn moments(&self, setup: &GaussianSetup, gradient: &[f64]) -> [f64; 10] {
         let mut sums = [0.0; 10];
         for (pixel, d) in self.pixels(setup) {
@@ -85,7 +86,7 @@ impl Chords {
         sums
     }
 
-    /// Length of the gradient by the centre in the image, in half images: what density control goes by.
+    /// Length of the gradient by the centre in the image, in half images, as used by density control.
     pub fn pull(&self, setup: &GaussianSetup, moments: [f64; 10]) -> f64 {
         let linear = DVec3::new(moments[1], moments[2], moments[3]);
         let by_pixel = self.depth * DVec2::new(self.along[1].dot(linear), self.along[2].dot(linear));
@@ -93,8 +94,8 @@ impl Chords {
     }
 }
 
-/// Half sides of the box around the centre's pixel that holds all rays which come as near as the cut: roots of the outline's equation
-/// along columns and along rows. A Gaussian that reaches the source is seen by all pixels.
+/// Half sides of the box around the centre's pixel that contains all rays within the cut: roots of the outline's equation
+/// along columns and along rows. A Gaussian that reaches the source covers all pixels.
 fn half_box(mean: DVec2, depth: f64, view: &SplatView, (axes, scale): (DMat3, DVec3), setup: &GaussianSetup) -> DVec2 {
     let cut = f64::from(setup.cut);
     let along = |row: DVec3| cut * scale * (axes.transpose() * row);

@@ -1,4 +1,4 @@
-//! f64 twins of the stages of SAX-NeRF: plain loops, no device.
+//! f64 reference implementations (twins) of the stages of SAX-NeRF, as plain loops without the device.
 
 use crate::kernels::layout::{SaxLevel, SaxSetup};
 use crate::methods::sax_nerf::data::SaxData;
@@ -7,9 +7,9 @@ use crate::random::{STREAM_DEPTH, STREAM_RAY, STREAM_SAX_WINDOW, permute, unifor
 use std::collections::HashSet;
 use std::ops::Range;
 
-/// Samples that see each other.
+/// Number of samples that attend to each other.
 const PAIR: usize = 2;
-/// Numbers of a head.
+/// Values per attention head.
 const HEAD: usize = 4;
 const HEADS: usize = WIDTH / HEAD;
 const WIDE: usize = 4 * WIDTH;
@@ -17,7 +17,7 @@ const LEAK: f64 = 0.01;
 const LEAST_VARIANCE: f64 = 1e-5;
 /// Primes of the hash, along each axis.
 const PRIMES: [u64; 3] = [1, 19_349_663, 83_492_791];
-/// How far inside of the box's faces points stay, in box sides.
+/// Minimum distance of points from the faces of the unit box, in box sides.
 const INSIDE: f64 = 1.7e-6;
 /// Path length of the last sample of a ray whose direction has length 1.
 const LAST_PATH: f64 = 1e-10;
@@ -47,7 +47,7 @@ pub fn batch(data: &SaxData, setup: &SaxSetup, set: usize, seed: u32, step: u32)
     rays.iter().map(|pixel| image * data.n_pixels() + pixel).collect()
 }
 
-/// Depths of a ray and the path lengths they stand for, per length of its direction (twin of part of `sax_points`).
+/// Depths of a ray, and the path lengths they represent per length of its direction (twin of part of `sax_points`).
 pub fn depths(setup: &SaxSetup, seed: u32, step: u32, ray: u32) -> Vec<(f64, f64)> {
     let n = setup.n_samples;
     let (near, far) = (f64::from(setup.near), f64::from(setup.far));
@@ -64,12 +64,12 @@ pub fn depths(setup: &SaxSetup, seed: u32, step: u32, ray: u32) -> Vec<(f64, f64
     (0..n).map(|k| (depth(k), path(k))).collect()
 }
 
-/// A point of the world as one of the unit cube that the box of the grid is (twin of part of `sax_points`).
+/// Maps a point of the world to the unit cube of the grid's box (twin of part of `sax_points`).
 pub fn unit(setup: &SaxSetup, x: [f64; 3]) -> [f64; 3] {
     x.map(|x| (x / (2.0 * f64::from(setup.bound)) + 0.5).clamp(INSIDE, 1.0 - INSIDE))
 }
 
-/// The entry of a corner of a level's cells.
+/// Index of the entry of a corner of a level's cells.
 pub fn entry(level: &SaxLevel, corner: [u32; 3]) -> usize {
     let corner = corner.map(u64::from);
     let index = if level.dense != 0 {
@@ -83,8 +83,8 @@ pub fn entry(level: &SaxLevel, corner: [u32; 3]) -> usize {
     level.first as usize + (index % u64::from(level.entries)) as usize
 }
 
-/// The entries around a point of the unit cube, and its share of each. Where it lies is found in f32 as on the device:
-/// in fine levels that decides.
+/// Entries around a point of the unit cube, and its interpolation weights. The cell is computed in f32 as on the device,
+/// because in fine levels the rounding matters.
 pub fn taps(level: &SaxLevel, unit: [f32; 3]) -> Vec<(usize, f64)> {
     let position = unit.map(|x| x * (level.cells - 1) as f32 + 0.5);
     let (corner, share) = (position.map(|x| x as u32), position.map(|x| f64::from(x - x.floor())));
@@ -113,7 +113,7 @@ pub fn encode_bwd(levels: &[SaxLevel], unit: [f32; 3], by_features: &[f64], grad
     }
 }
 
-/// The share of a standard normal below x, by a series without cancellation.
+/// Cumulative distribution of a standard normal at x, by a series without cancellation.
 fn normal_share(x: f64) -> f64 {
     if x.abs() > 9.0 {
         return if x > 0.0 { 1.0 } else { 0.0 };
@@ -159,7 +159,7 @@ fn dot(x: &[f64], y: &[f64]) -> f64 {
     x.iter().zip(y).map(|(x, y)| x * y).sum()
 }
 
-/// A sample less its mean over its standard deviation, and the inverse of that.
+/// Normalises a sample by its mean and standard deviation, and returns the inverse of the latter as well.
 fn normalised(x: &[f64]) -> (Vec<f64>, f64) {
     let n = x.len() as f64;
     let mean = x.iter().sum::<f64>() / n;
@@ -167,20 +167,20 @@ fn normalised(x: &[f64]) -> (Vec<f64>, f64) {
     (map(x, |x| (x - mean) * inverse), inverse)
 }
 
-/// Gradient by what was normalised to `hat`.
+/// Gradient by the input of a normalisation whose output is `hat`.
 fn normalised_bwd(d: &[f64], hat: &[f64], inverse: f64) -> Vec<f64> {
     let n = d.len() as f64;
     let (mean, along) = (d.iter().sum::<f64>() / n, dot(d, hat) / n);
     d.iter().zip(hat).map(|(d, hat)| inverse * (d - mean - along * hat)).collect()
 }
 
-/// The Lineformer with its numbers, which come first among those of a field.
+/// The Lineformer with its parameters, which precede the grid's among those of a field.
 pub struct Lineformer<'a> {
     shape: SaxShape,
     params: &'a [f64],
 }
 
-/// What a sample of a pair came to.
+/// Intermediate values of one sample of a pair.
 struct SampleTrace {
     features: Vec<f64>,
     first: Vec<f64>,
@@ -201,20 +201,20 @@ struct SampleTrace {
     sigma: f64,
 }
 
-/// What a pair of samples came to.
+/// Intermediate values of a pair of samples.
 pub struct Trace {
     samples: Vec<SampleTrace>,
-    /// `[head][sample that sees][sample that is seen]`.
+    /// Attention weights, `[head][attending sample][attended sample]`.
     shares: Vec<[[f64; PAIR]; PAIR]>,
 }
 
 impl Trace {
-    /// Densities.
+    /// Densities of both samples.
     pub fn sigma(&self) -> [f64; PAIR] {
         [0, 1].map(|s| self.samples[s].sigma)
     }
 
-    /// What each sample makes of the values that it sees, before the attention's last matrix.
+    /// Output of the attention for each sample, before its last matrix.
     pub fn seen(&self) -> [&[f64]; PAIR] {
         [0, 1].map(|s| &self.samples[s].seen[..])
     }
@@ -226,7 +226,7 @@ impl Trace {
 }
 
 impl<'a> Lineformer<'a> {
-    /// Reads the numbers of a field.
+    /// Creates the Lineformer from the parameters of a field.
     pub fn new(shape: SaxShape, params: &'a [f64]) -> Lineformer<'a> {
         Lineformer { shape, params }
     }
@@ -241,12 +241,12 @@ impl<'a> Lineformer<'a> {
         &self.params[self.range(name)]
     }
 
-    /// W x of the matrix `name`.
+    /// Computes W x for the matrix `name`.
     fn times(&self, name: &str, x: &[f64]) -> Vec<f64> {
         self.part(name).chunks(x.len()).map(|row| dot(row, x)).collect()
     }
 
-    /// W^T d of the matrix `name`, which was multiplied with x; its gradient is added.
+    /// Computes W^T d for the matrix `name`, which was multiplied with x, and adds the matrix's gradient.
     fn times_bwd(&self, name: &str, x: &[f64], d: &[f64], gradient: &mut [f64]) -> Vec<f64> {
         let (range, mut back) = (self.range(name), vec![0.0; x.len()]);
         for ((row, by_row), d) in
@@ -264,7 +264,7 @@ impl<'a> Lineformer<'a> {
         gradient[self.range(name)].iter_mut().zip(d).for_each(|(sum, d)| *sum += d);
     }
 
-    /// A pair of samples by their features (twin of `sax_lineformer`).
+    /// Evaluates a pair of samples from their features (twin of `sax_lineformer`).
     pub fn fwd(&self, features: [&[f64]; PAIR]) -> Trace {
         let mut samples: Vec<SampleTrace> = features.iter().map(|features| self.before_attention(features)).collect();
         let shares: Vec<[[f64; PAIR]; PAIR]> = (0..HEADS).map(|head| self.shares(head, &samples)).collect();
@@ -327,10 +327,10 @@ impl<'a> Lineformer<'a> {
         t.sigma = 1.0 / (1.0 + (-density).exp());
     }
 
-    /// Gradient by the features of a pair from that by its densities; what follows for the numbers is added (twin of
+    /// Gradient by the features of a pair, from that by its densities; adds the gradient by the parameters (twin of
     /// `sax_lineformer_bwd`).
     pub fn bwd(&self, trace: &Trace, by_sigma: [f64; PAIR], gradient: &mut [f64]) -> [Vec<f64>; PAIR] {
-        // By features so far, by the block's first layer so far, and by what was seen.
+        // Gradients so far by the features, by the block's first layer, and by the output of the attention.
         let back: Vec<_> =
             trace.samples.iter().zip(by_sigma).map(|(t, d)| self.after_attention_bwd(t, d, gradient)).collect();
         let mut by_query = vec![vec![0.0; WIDTH]; PAIR];
@@ -407,16 +407,16 @@ pub fn loss(integrals: &[f64], targets: &[f64]) -> (f64, Vec<f64>) {
     (residuals.iter().map(|r| r * r).sum::<f64>() / n, map(&residuals, |r| 2.0 * r / n))
 }
 
-/// A ray whose samples are known: points of the unit cube, the paths they stand for, and the measured line integral.
+/// A ray with given samples: points of the unit cube, the path lengths they represent, and the measured line integral.
 #[derive(Debug, Clone)]
 pub struct SampledRay {
-    /// `[sample]`.
+    /// Point and path length of each sample.
     pub points: Vec<([f32; 3], f64)>,
-    /// In units of the density.
+    /// Measured line integral, in units of the density.
     pub target: f64,
 }
 
-/// Loss of a batch of a field, and its gradient by the field's numbers.
+/// Loss of a batch, and its gradient by the field's parameters.
 pub fn objective(shape: SaxShape, params: &[f64], rays: &[SampledRay]) -> (f64, Vec<f64>) {
     let (levels, n_weights) = (shape.grid(), shape.n_weights());
     let (lineformer, grid) = (Lineformer::new(shape, params), &params[n_weights..]);

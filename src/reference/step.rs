@@ -1,4 +1,4 @@
-//! f64 twin of one training iteration: loss, gradient, Adam.
+//! f64 reference implementation (twin) of one training iteration: loss, gradient, Adam.
 
 use crate::plan::Plan;
 use crate::reference::field::Precision;
@@ -20,7 +20,7 @@ pub struct Losses {
     pub favour_static: f64,
     /// Entropy of the dynamic field along rays, weighted; of two networks.
     pub ray_entropy: f64,
-    /// The static field's integrals over intervals and their squares, weighted; of two networks.
+    /// Integrals of the static field over intervals and their squares, weighted; of two networks.
     pub static_size: f64,
     /// Live dynamic samples.
     pub live: usize,
@@ -33,13 +33,13 @@ impl Losses {
     }
 }
 
-/// Whether a ray of the batch leaves the static field out (twin of `skips_static`).
+/// Tells whether a ray of the batch omits the static field (twin of `skips_static`).
 pub fn skips_static(plan: &Plan, r: usize) -> bool {
     let s = &plan.setup;
     s.temporal_target != 0 && (r as u32) < s.n_motion_rays && s.n_motion_rays < s.n_rays
 }
 
-/// Charbonnier's r^2 that turns linear beyond `scale` (0: never), and half its derivative.
+/// Charbonnier's r^2, linear beyond `scale` (0: never), and half its derivative.
 fn robust_square(scale: f64, r: f64) -> (f64, f64) {
     if scale == 0.0 {
         return (r * r, r);
@@ -48,7 +48,7 @@ fn robust_square(scale: f64, r: f64) -> (f64, f64) {
     (2.0 * scale * scale * (root - 1.0), r / root)
 }
 
-/// What a ray adds to the losses.
+/// Contribution of one ray to the losses.
 #[derive(Debug, Clone, Copy)]
 pub struct RayLoss {
     /// Weighted data terms.
@@ -59,7 +59,7 @@ pub struct RayLoss {
     pub gradient: [f64; 2],
 }
 
-/// Losses of ray `r` of `n_rays`, whose integrals are S and D (twin of `march_loss`).
+/// Losses of ray `r` of `n_rays` rays, whose integrals are S and D (twin of `march_loss`).
 pub fn ray_loss(plan: &Plan, r: usize, n_rays: usize, ray: &Ray, [s_integral, d]: [f64; 2]) -> RayLoss {
     let s = &plan.setup;
     let temporal = s.temporal_target != 0;

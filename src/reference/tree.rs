@@ -1,4 +1,5 @@
-//! f64 twin of the tree: where Gaussians are, the loss with its penalties, and its gradient.
+//! f64 reference implementation (twin) of the tree of Gaussians: their positions, the loss with its penalties, and its
+//! gradient.
 
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, TreeSetup};
@@ -8,19 +9,19 @@ use crate::reference::gaussians::{self, N_PARAMS, Params};
 use crate::scan::gating::BeatTime;
 use glam::DVec3;
 
-/// Everything that is fitted, or its gradient.
+/// All fitted parameters, or their gradient.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TreeParams {
     /// Gaussians at rest.
     pub rows: Vec<Params>,
-    /// `[Gaussian][basis function]`.
+    /// Own motion, `[Gaussian][basis function]`.
     pub own: Vec<DVec3>,
-    /// `[phase][node]`; the phase of rest stays as it is.
+    /// Displacements of the grid's nodes, `[phase][node]`; those of the phase of rest stay fixed.
     pub grid: Vec<DVec3>,
 }
 
 impl TreeParams {
-    /// Zeros of the same sizes.
+    /// Returns zeros of equal sizes.
     pub fn zeros(&self) -> TreeParams {
         TreeParams {
             rows: vec![[0.0; N_PARAMS]; self.rows.len()],
@@ -30,7 +31,7 @@ impl TreeParams {
     }
 }
 
-/// What a Gaussian's place at a phase is made of.
+/// Nodes and basis functions that determine a Gaussian's position at a phase.
 struct Motion {
     nodes: [(usize, f64); 8],
     basis: Vec<f64>,
@@ -56,7 +57,7 @@ pub fn phases_shown(phase: usize, view: &SplatView, n_phases: usize) -> [(usize,
     BeatTime { phase: phase as u32, after_phase: view.after_phase }.shown(n_phases as u32)
 }
 
-/// A Gaussian as an image of a phase shows it: on the straight way from one phase to another.
+/// Returns a Gaussian as in an image of a phase: linearly interpolated between two phases.
 pub fn shown(tree: &TreeSetup, p: &TreeParams, i: usize, phase: usize, view: &SplatView, n_phases: usize) -> Params {
     let at = |phase: usize| displaced(p, i, &motion(tree, &p.rows[i], phase, n_phases));
     let [(here, _), (beyond, share)] = phases_shown(phase, view, n_phases);
@@ -65,7 +66,8 @@ pub fn shown(tree: &TreeSetup, p: &TreeParams, i: usize, phase: usize, view: &Sp
     out
 }
 
-/// Loss without and with penalties, and the gradient of the latter. A Gaussian's share of the nodes is taken as given.
+/// Loss without and with penalties, and the gradient of the latter. The interpolation weights of nodes are treated as
+/// constants.
 pub fn loss_and_gradient(
     targets: &Targets,
     setup: &GaussianSetup,
@@ -111,7 +113,7 @@ pub fn loss_and_gradient(
     (loss, loss + penalty, gradient)
 }
 
-/// Adds the gradient of a Gaussian's place at a phase to that of what moves it there: at the phase of rest not the grid.
+/// Adds the gradient of a Gaussian's position at a phase to that of its motion; at the phase of rest the grid is excluded.
 fn add_place(gradient: &mut TreeParams, i: usize, at_rest: bool, motion: &Motion, x: DVec3) {
     for (k, b) in motion.basis.iter().enumerate() {
         gradient.own[i * motion.basis.len() + k] += *b * x;
@@ -121,7 +123,8 @@ fn add_place(gradient: &mut TreeParams, i: usize, at_rest: bool, motion: &Motion
     }
 }
 
-/// Squared own motion, and squared differences of neighbouring nodes.
+/// Adds the gradient of the penalties, and returns their value: squared own motion, and squared differences of neighbouring
+/// nodes.
 fn add_penalties(tree: &TreeSetup, p: &TreeParams, n_phases: usize, gradient: &mut TreeParams) -> f64 {
     let (own, smooth) = (f64::from(tree.own_penalty), f64::from(tree.smoothness));
     let mut penalty = 0.0;

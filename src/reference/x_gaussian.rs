@@ -1,31 +1,31 @@
-//! f64 twins of the stages of X-Gaussian: plain loops, no device.
+//! f64 reference implementations (twins) of the stages of X-Gaussian, as plain loops without the device.
 
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, Splat, XGaussian, XSchedule, XSetup};
 use crate::reference::gaussians;
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
-/// Numbers of a Gaussian: position, opacity before the sigmoid, logs of scales, intensity, quaternion.
+/// Number of parameters of a Gaussian: position, opacity before the sigmoid, logarithms of scales, intensity, quaternion.
 pub const N_PARAMS: usize = 12;
-/// The numbers of a Gaussian.
+/// Parameters of a Gaussian.
 pub type Params = [f64; N_PARAMS];
 /// Sums of a Gaussian over pixels: h, h (du, dv), h (du^2, du dv, dv^2), and the gradient by its intensity.
 pub type Sums = [f64; 7];
 
-/// Where slopes end to follow the centre, half images from the image's middle.
+/// Distance from the image's centre at which slopes stop following the Gaussian's centre, in half images.
 const SLOPES_END: f64 = 1.3;
-/// Least squared difference of variances when a radius is found, pixels^4.
+/// Minimum squared difference of variances in the computation of a radius, pixels^4.
 const LEAST_SPREAD: f64 = 0.1;
-/// Variance that each splat gains, pixels^2.
+/// Variance added to each splat, pixels^2.
 const LOW_PASS: f64 = 0.3;
-/// Standard deviations along its longest axis that a splat reaches.
+/// Extent of a splat in standard deviations along its longest axis.
 const REACH: f64 = 3.0;
 const TILE: usize = 16;
 const MOST_OPAQUE: f64 = 0.99;
 const LEAST_ALPHA: f64 = 1.0 / 255.0;
 const LEAST_LIGHT: f64 = 1e-4;
 
-/// What is stored of a Gaussian as numbers.
+/// Returns the stored parameters of a Gaussian.
 pub fn params(g: &XGaussian) -> Params {
     let mut out = [0.0; N_PARAMS];
     let all = g.position.iter().chain([&g.opacity]).chain(&g.log_scale).chain([&g.intensity]).chain(&g.rotation);
@@ -33,7 +33,7 @@ pub fn params(g: &XGaussian) -> Params {
     out
 }
 
-/// The numbers that other Gaussians have, too, in their order: of position, scale and quaternion.
+/// Returns the parameters that other Gaussians share, in their order: position, scale and quaternion.
 fn shape(p: &Params) -> gaussians::Params {
     [p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[8], p[9], p[10], p[11]]
 }
@@ -46,21 +46,21 @@ fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// What a pixel goes by of a Gaussian.
+/// Values of a Gaussian that a pixel needs.
 #[derive(Debug, Clone, Copy)]
 pub struct Blot {
     /// Column and row of the centre.
     pub mean: DVec2,
     /// Inverse variance in the image.
     pub conic: DMat2,
-    /// At the centre.
+    /// Opacity at the centre.
     pub opacity: f64,
-    /// What it shows.
+    /// Intensity that it contributes.
     pub intensity: f64,
 }
 
 impl Blot {
-    /// From what the device made of it.
+    /// Creates the values from the device's splat.
     pub fn of(splat: &Splat, intensity: f32) -> Blot {
         let [a, b, c] = splat.conic.map(f64::from);
         Blot {
@@ -71,7 +71,7 @@ impl Blot {
         }
     }
 
-    /// Opacity at a pixel, and whether it follows the parameters; none where it is too faint.
+    /// Opacity at a pixel, and whether it depends on the parameters; `None` where it is too faint.
     fn alpha(&self, d: DVec2) -> Option<(f64, bool)> {
         let alpha = self.opacity * (-0.5 * d.dot(self.conic * d)).exp();
         let follows = alpha <= MOST_OPAQUE;
@@ -79,14 +79,14 @@ impl Blot {
     }
 }
 
-/// A Gaussian in an image, and what its gradient needs of the way there.
+/// Projection of a Gaussian into an image, with the intermediate values of its gradient.
 #[derive(Debug, Clone)]
 pub struct Projection {
-    /// What pixels go by.
+    /// Values that pixels need.
     pub blot: Blot,
-    /// Half side of the square it is cut to.
+    /// Half side of the square of pixels it is limited to.
     pub radius: f64,
-    /// Along the view's axis.
+    /// Depth along the view's axis.
     pub depth: f64,
     follows: DVec2,
     slopes: [DVec3; 2],
@@ -94,7 +94,7 @@ pub struct Projection {
     beta: DVec3,
 }
 
-/// How a view sees a Gaussian; `None` at the source and behind it.
+/// Projects a Gaussian into a view; `None` at the source and behind it.
 pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup, x: &XSetup) -> Option<Projection> {
     let (depth, column, row) = view.project(DVec3::new(p[0], p[1], p[2]));
     if depth <= f64::from(x.nearest) {
@@ -124,7 +124,7 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup, x: &XSetup) 
     })
 }
 
-/// First tile (column, row) and one more than the last that the square of a splat touches.
+/// First tile (column, row) of a splat's square, and one after the last.
 pub fn tiles_of(mean: DVec2, radius: f64, x: &XSetup) -> [u32; 4] {
     let along = |v: f64, n: u32| (v / TILE as f64).trunc().clamp(0.0, n.into()) as u32;
     let last = TILE as f64 - 1.0;
@@ -137,7 +137,7 @@ pub fn tiles_of(mean: DVec2, radius: f64, x: &XSetup) -> [u32; 4] {
     if all[2] > all[0] && all[3] > all[1] { all } else { [0; 4] }
 }
 
-/// Pixels of a tile inside the image: place in the picture, column and row.
+/// Pixels of a tile inside the image: index in the image, column and row.
 fn pixels_of(tile: usize, setup: &GaussianSetup, x: &XSetup) -> Vec<(usize, DVec2)> {
     let (width, height) = (setup.width as usize, setup.height as usize);
     let corner = [tile % x.tile_columns as usize * TILE, tile / x.tile_columns as usize * TILE];
@@ -146,8 +146,8 @@ fn pixels_of(tile: usize, setup: &GaussianSetup, x: &XSetup) -> Vec<(usize, DVec
     rows.flat_map(|y| columns.clone().map(move |x| (y * width + x, DVec2::new(x as f64, y as f64)))).collect()
 }
 
-/// What a pixel shows of Gaussians from the nearest on, what light it leaves, and one more than the place of the last
-/// that shows.
+/// Value of a pixel from Gaussians, the nearest first, the remaining transmittance, and one more than the index of the last
+/// visible Gaussian.
 fn shown(list: &[Blot], at: DVec2) -> (f64, f64, usize) {
     let (mut sum, mut light, mut last) = (0.0, 1.0, 0);
     for (place, blot) in list.iter().enumerate() {
@@ -162,7 +162,7 @@ fn shown(list: &[Blot], at: DVec2) -> (f64, f64, usize) {
     (sum, light, last)
 }
 
-/// A picture of lists of Gaussians, one per tile, and the light that each pixel leaves.
+/// Blends an image from lists of Gaussians, one per tile, and returns the transmittance of each pixel as well.
 pub fn blend(lists: &[Vec<Blot>], setup: &GaussianSetup, x: &XSetup) -> (Vec<f64>, Vec<f64>) {
     let n = (setup.width * setup.height) as usize;
     let (mut picture, mut left) = (vec![0.0; n], vec![1.0; n]);
@@ -174,8 +174,8 @@ pub fn blend(lists: &[Vec<Blot>], setup: &GaussianSetup, x: &XSetup) -> (Vec<f64
     (picture, left)
 }
 
-/// Sums of each Gaussian of a tile's list over the tile's pixels, whose gradients are given for the whole picture.
-/// Front to back: what is behind a Gaussian is what the pixel shows less what those up to it show.
+/// Sums of each Gaussian of a tile's list over the tile's pixels, with gradients given for the whole image. They are
+/// computed front to back: the contribution behind a Gaussian is the pixel's value minus that of the Gaussians up to it.
 pub fn blend_back(tile: usize, list: &[Blot], setup: &GaussianSetup, x: &XSetup, gradient: &[f64]) -> Vec<Sums> {
     let mut sums = vec![[0.0; 7]; list.len()];
     for (pixel, at) in pixels_of(tile, setup, x) {
@@ -199,13 +199,13 @@ pub fn blend_back(tile: usize, list: &[Blot], setup: &GaussianSetup, x: &XSetup,
     sums
 }
 
-/// Length of the gradient by the centre in the image, in half images: what density control goes by.
+/// Length of the gradient by the centre in the image, in half images, as used by density control.
 pub fn pull(seen: &Projection, setup: &GaussianSetup, sums: &Sums) -> f64 {
     let by_pixel = seen.blot.conic * DVec2::new(sums[1], sums[2]);
     (0.5 * DVec2::new(setup.width.into(), setup.height.into()) * by_pixel).length()
 }
 
-/// Gradient of what is stored from the sums over all tiles.
+/// Gradient of the stored parameters from the sums over all tiles.
 pub fn gradient(p: &Params, seen: &Projection, view: &SplatView, sums: &Sums) -> Params {
     let [h, hu, hv, huu, huv, hvv, by_intensity] = *sums;
     let conic = seen.blot.conic;
@@ -234,7 +234,7 @@ pub fn gradient(p: &Params, seen: &Projection, view: &SplatView, sums: &Sums) ->
     out
 }
 
-/// Lists of Gaussians of one picture, one per tile, nearest first: which they are.
+/// Lists of Gaussians of one image, one per tile, as indices, nearest first.
 pub fn tile_lists(seen: &[Option<Projection>], x: &XSetup) -> Vec<Vec<usize>> {
     let mut order: Vec<(usize, &Projection)> =
         seen.iter().enumerate().filter_map(|(i, seen)| Some((i, seen.as_ref()?))).collect();
@@ -256,7 +256,7 @@ pub struct AdamState {
     second: Params,
 }
 
-/// One update by a row of the schedule.
+/// Applies one Adam update by a row of the schedule.
 pub fn adam(setup: &GaussianSetup, row: &XSchedule, g: &Params, p: &mut Params, state: &mut AdamState) {
     if row.updates == 0 {
         return;

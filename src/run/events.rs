@@ -1,11 +1,11 @@
-//! What a run tells its observer.
+//! Events that a run reports to its observer.
 
 use crate::fitting::losses::StepLoss;
 use crate::gpu::record::PassTime;
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// What a run tells its observer; also the lines of `metrics.jsonl`.
+/// Event that a run reports to its observer; also a line of `metrics.jsonl`.
 #[derive(Debug, Clone, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
@@ -15,17 +15,17 @@ pub enum Event {
         device: String,
         /// Iterations already done.
         step: u32,
-        /// Length of the run.
+        /// Total number of iterations of the run.
         iterations: u32,
-        /// Parameters.
+        /// Number of parameters.
         parameters: usize,
         /// Decisions about data and device.
         notes: Vec<String>,
     },
-    /// What comes before the first iteration: Gaussians that are sought and followed through the beat; not a line of
+    /// Preparation before the first iteration: Gaussians are placed and followed through the beat; not a line of
     /// `metrics.jsonl`.
     Preparing {
-        /// Share of it that is done, 0 to 1.
+        /// Share of the preparation that is done, 0 to 1.
         share: f64,
     },
     /// Losses, every few iterations.
@@ -33,7 +33,7 @@ pub enum Event {
         /// Losses of the last iteration.
         #[serde(flatten)]
         loss: StepLoss,
-        /// Loss of the moving field over that of no field, where a network moves: next to 1, it has died.
+        /// Loss of the dynamic field divided by that of no field, for a dynamic network: near 1, it has vanished.
         #[serde(skip_serializing_if = "Option::is_none")]
         dynamic_share: Option<f64>,
         /// PSNR of the training rays, dB, smoothed.
@@ -45,30 +45,31 @@ pub enum Event {
         /// Estimated seconds to the end.
         left_s: f64,
     },
-    /// A loss far above the first one; training goes on.
+    /// A loss far above the first one; training continues.
     LargeLoss {
         /// Iterations done after it.
         step: u32,
         /// The loss.
         loss: f64,
-        /// The loss over the first one of this start.
+        /// The loss divided by the first one of this start.
         ratio: f64,
     },
-    /// Metrics on some unseen images.
+    /// Metrics on a selection of unseen images.
     Validation {
         /// Iterations done.
         step: u32,
-        /// Seconds spent training until then; wall time where validation runs beside training, otherwise without it.
+        /// Seconds spent training so far; wall time where validation runs beside training, otherwise without validation.
         train_s: f64,
         /// Dice of the dynamic field.
         dice_dynamic: Option<f64>,
         /// Dice of both fields.
         dice_total: Option<f64>,
-        /// dB.
+        /// Peak signal-to-noise ratio, dB.
         psnr: f64,
         /// Structural similarity.
         ssim: f64,
-        /// Where the dataset has its vessels as volumes: mean distance to them (Chamfer) at the end of systole, mm.
+        /// Mean distance to the true vessels (Chamfer) at the end of systole, mm, where the dataset has its vessels as
+        /// volumes.
         #[serde(skip_serializing_if = "Option::is_none")]
         chamfer_mm: Option<f64>,
     },
@@ -79,22 +80,22 @@ pub enum Event {
         /// File.
         path: PathBuf,
     },
-    /// Images of the evaluation after training, one by one; not a line of `metrics.jsonl`.
+    /// Progress of the evaluation after training, image by image; not a line of `metrics.jsonl`.
     Evaluation {
         /// Images rendered so far.
         images: usize,
-        /// Images in all.
+        /// Total number of images.
         of: usize,
         /// Seconds of evaluation so far.
         elapsed_s: f64,
-        /// Estimated seconds to the end; none before the first image.
+        /// Estimated seconds to the end; `None` before the first image.
         left_s: Option<f64>,
     },
     /// Device time of each pass of one more iteration, whose result is not kept.
     Profile {
         /// Iterations done before.
         step: u32,
-        /// In order.
+        /// Passes in order of execution.
         passes: Vec<PassTime>,
     },
     /// The run reached its end or the requested stop.
@@ -103,9 +104,9 @@ pub enum Event {
         step: u32,
         /// Seconds spent training, validation excluded.
         train_s: f64,
-        /// Seconds in all.
+        /// Total seconds.
         elapsed_s: f64,
-        /// Loss of the moving network as a share of the loss without one; none where Gaussians move.
+        /// Loss of the dynamic network as a share of the loss without one; `None` for dynamic Gaussians.
         #[serde(skip_serializing_if = "Option::is_none")]
         dynamic_share: Option<f64>,
     },

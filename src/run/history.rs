@@ -1,31 +1,31 @@
-//! What the log of a run tells of its time: a run that was interrupted has several parts, whose clocks begin anew.
+//! Times and losses from a run's log. An interrupted run has several parts, each with its own clock.
 
 use serde_json::Value;
 use std::path::Path;
 
-/// The time of a run.
+/// Times and losses of a run.
 #[derive(Debug, Default, PartialEq)]
 pub struct History {
-    /// Seconds of training, all parts together.
+    /// Seconds of training over all parts.
     pub train_s: f64,
-    /// Seconds of all parts but the last, with what they spent on validation and saving.
+    /// Seconds of all parts but the last, including validation and saving.
     pub before_s: f64,
-    /// Parts.
+    /// Number of parts.
     pub parts: u32,
-    /// Validations on the way.
+    /// Validations during training.
     pub curve: Vec<Validated>,
-    /// Losses on the way.
+    /// Losses during training.
     pub losses: Vec<Losses>,
 }
 
-/// A validation on the way.
+/// One validation during training.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Validated {
     /// Iterations done.
     pub step: u32,
-    /// Seconds of training until then, all parts together.
+    /// Seconds of training until then, over all parts.
     pub train_s: f64,
-    /// Dice of the moving field, where images have masks.
+    /// Dice of the dynamic field, where images have masks.
     pub dice: Option<f64>,
     /// Dice of both fields.
     pub dice_total: Option<f64>,
@@ -38,19 +38,19 @@ pub struct Validated {
 /// Losses of an iteration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Losses {
-    /// Seconds until then, all parts together, with what they spent on validation and saving.
+    /// Seconds until then, over all parts, including validation and saving.
     pub elapsed_s: f64,
-    /// Of the images.
+    /// Data term of the loss.
     pub data: Option<f64>,
-    /// Of the moving field.
+    /// Data term of the dynamic field.
     pub dynamic: Option<f64>,
 }
 
-/// The time of one part, as far as its lines tell.
+/// Times of one part, as far as its lines state them.
 #[derive(Default)]
 struct Part {
     elapsed_s: f64,
-    /// Training alone, of a part that came to its end.
+    /// Seconds of training only, if the part was completed.
     train_s: Option<f64>,
 }
 
@@ -61,7 +61,7 @@ impl Part {
 }
 
 impl History {
-    /// Reads the log of a run; nothing where there is none.
+    /// Reads the log of a run; an empty history where there is none.
     pub fn read(run: &Path) -> History {
         History::of(&std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default())
     }

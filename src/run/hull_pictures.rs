@@ -1,4 +1,4 @@
-//! The motion hull in front of the images it was carved from.
+//! Pictures of the motion hull over the images from which it was carved.
 
 use crate::error::Result;
 use crate::files;
@@ -7,12 +7,12 @@ use crate::scan::dataset::{Dataset, View};
 use crate::score::pictures;
 use std::path::{Path, PathBuf};
 
-/// Where the picture of a view is kept, beside a run's other pictures.
+/// Path of a view's picture, in the directory of a run's pictures.
 pub fn file(pictures: &Path, view: usize) -> PathBuf {
     pictures.join(format!("hull-view{view}.png"))
 }
 
-/// Writes one picture per training view, of its first phase.
+/// Writes one picture per training view, at its first phase.
 ///
 /// # Errors
 /// [`crate::error::Error::Io`].

@@ -1,21 +1,21 @@
-//! What a run remembers of its surroundings.
+//! Record of a run's inputs.
 
 use crate::error::{Error, Result};
 use crate::files;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-/// What a run remembers of its surroundings: `run.json`.
+/// Record of a run's inputs: `run.json`.
 #[derive(Debug, Clone, Serialize, serde::Deserialize)]
 pub struct RunInfo {
-    /// Dataset it was trained on.
+    /// Dataset of the training.
     pub dataset: PathBuf,
 }
 
 impl RunInfo {
     const FILE: &str = "run.json";
 
-    /// Writes it into a run directory.
+    /// Writes the record into a run directory.
     ///
     /// # Errors
     /// [`Error::Io`].
@@ -24,7 +24,7 @@ impl RunInfo {
         files::write_atomic(&run.join(Self::FILE), text.as_bytes())
     }
 
-    /// Reads it from a run directory, or from beside a checkpoint.
+    /// Reads the record from a run directory, or from the directory of a checkpoint.
     ///
     /// # Errors
     /// [`Error::Io`] or [`Error::Data`].

@@ -6,7 +6,7 @@ use crate::run::events::Event;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// `metrics.jsonl`: appended line by line; on resume, lines beyond the resumed step are dropped first.
+/// `metrics.jsonl`, appended line by line. On resume, lines beyond the resumed step are dropped first.
 pub(super) struct MetricsLog {
     path: PathBuf,
     file: std::fs::File,

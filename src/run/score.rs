@@ -1,4 +1,4 @@
-//! Scores of a model on every unseen image, and pictures of them.
+//! Scores of a model on all unseen images, and pictures of them.
 
 use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
@@ -18,20 +18,20 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// How to score.
+/// Options of the scoring.
 pub struct ScoreOptions<'a> {
     /// Dice threshold on attenuation, 1/mm, instead of the rule.
     pub threshold_per_mm: Option<f64>,
     /// Directory for pictures: one comparison per image and one animation per view.
     pub pictures: Option<&'a Path>,
-    /// Set to true to stop after the image under way.
+    /// Set to true to stop after the current image.
     pub cancel: &'a AtomicBool,
 }
 
-/// A dataset by the geometry that a run went by.
+/// Returns a dataset with the geometry that a run used.
 ///
 /// # Errors
-/// [`Error::Data`] and [`Error::Io`] for a run's calibration that cannot be read or is of other data.
+/// [`Error::Data`] and [`Error::Io`] for a run's calibration that cannot be read or belongs to other data.
 pub fn as_trained(dataset: Dataset, run: &Path) -> Result<Dataset> {
     match Calibration::read(run)? {
         Some(calibration) => dataset.corrected(&calibration),
@@ -39,10 +39,9 @@ pub fn as_trained(dataset: Dataset, run: &Path) -> Result<Dataset> {
     }
 }
 
-/// Evaluates a model on all validation frames of a dataset whose training views are those the run went by. Where the truth of
-/// synthetic data tells, unseen views are seen from where the reconstruction has them and true vessels are carried there, and
-/// scores as stated are told beside.
-/// `observe` hears of [`Event::Evaluation`] after every image.
+/// Evaluates a model on all validation frames of a dataset with the geometry of the run. Where the truth of synthetic data
+/// is known, unseen views and true vessels are moved to the frame of the reconstruction, and the scores without this motion
+/// are reported as well. `observe` receives [`Event::Evaluation`] after every image.
 ///
 /// # Errors
 /// [`Error::Interrupted`] after a cancel; errors of data, device and files.
@@ -95,7 +94,7 @@ pub fn evaluate_model(
     let threshold_per_mm = evaluation.threshold.dynamic_per_mm;
     let motion = carried_by(stated)?;
     match volume::score(&renderer, &model.scene, dataset, threshold_per_mm, motion.as_ref(), || pace.check()) {
-        // The truth is at fault: images are scored all the same.
+        // The truth is invalid; images are scored nevertheless.
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
             evaluation.warnings.push(format!("There are no scores in 3D: {error}."));
         }
@@ -105,7 +104,7 @@ pub fn evaluate_model(
     Ok(evaluation)
 }
 
-/// Counts images, tells of them, and ends the work where that was asked for.
+/// Counts images, reports progress, and ends the work on request.
 struct Pace<'a> {
     done: usize,
     of: usize,
@@ -143,7 +142,7 @@ impl<'a> Pace<'a> {
 struct Beats<'a> {
     directory: &'a Path,
     views: Vec<usize>,
-    /// Line integrals of a view at a phase, as far as they are rendered.
+    /// Line integrals of the views and phases rendered so far.
     images: HashMap<(usize, u32), Vec<f32>>,
 }
 
@@ -155,7 +154,7 @@ impl<'a> Beats<'a> {
         Beats { directory, views, images: HashMap::new() }
     }
 
-    /// Views and phases that no validation frame shows.
+    /// Views and phases without a validation frame.
     fn missing(&self, dataset: &Dataset) -> Vec<(usize, u32)> {
         let every = self.views.iter().flat_map(|view| (0..dataset.n_phases).map(move |phase| (*view, phase)));
         let seen = |at: &(usize, u32)| dataset.validation().iter().any(|f| (f.view, f.phase) == *at);

@@ -1,4 +1,5 @@
-//! What training views show of vessels, and what of it the other views explain, before and after a correction.
+//! Pictures of the vessel pixels of training views, and the part that the other views explain, before and after a
+//! correction.
 
 use crate::calibrate::silhouettes;
 use crate::error::Result;
@@ -7,12 +8,12 @@ use crate::scan::dataset::Dataset;
 use crate::score::pictures;
 use std::path::{Path, PathBuf};
 
-/// Where the picture of a view is kept, beside a run's other pictures.
+/// Path of a view's picture, in the directory of a run's pictures.
 pub fn file(pictures: &Path, view: usize) -> PathBuf {
     pictures.join(format!("silhouettes-view{view}.png"))
 }
 
-/// Writes one picture per training view, of the phase that shows most of the vessels.
+/// Writes one picture per training view, at the phase that shows the most vessel pixels.
 ///
 /// # Errors
 /// [`crate::error::Error::Io`].

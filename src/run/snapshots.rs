@@ -1,4 +1,4 @@
-//! Saving and validating snapshots of a run, beside training or between its iterations.
+//! Saving and validation of snapshots of a run, beside training or between its iterations.
 
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
@@ -14,19 +14,19 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
 use std::time::Instant;
 
-/// What the worker answers: an event of a job, or that the job is done.
+/// Answer of the worker: an event of a job, or the end of the job.
 pub(super) type Answer = Result<Option<Event>>;
 
-/// A snapshot and what to do with it.
+/// A snapshot and its tasks.
 pub(super) struct Job {
     pub(super) snapshot: Snapshot,
     pub(super) save: bool,
     pub(super) validate: bool,
-    /// Seconds of training until then; none when training goes on meanwhile and only the clock tells.
+    /// Seconds of training until then; `None` where training continues meanwhile and wall time counts.
     pub(super) train_s: Option<f64>,
 }
 
-/// Saves and validates snapshots.
+/// Worker that saves and validates snapshots.
 pub(super) struct SnapshotWorker<'a> {
     pub(super) gpu: &'a Gpu,
     pub(super) tuning: &'a Tuning,
@@ -35,7 +35,7 @@ pub(super) struct SnapshotWorker<'a> {
     pub(super) validation: Vec<&'a Frame>,
     pub(super) distance: Option<Distance>,
     pub(super) begin: Instant,
-    /// Ends a validation under way once it is true.
+    /// Ends the current validation once it is true.
     pub(super) cancel: &'a AtomicBool,
 }
 
@@ -45,7 +45,7 @@ impl SnapshotWorker<'_> {
         for job in jobs {
             let mut events = Vec::new();
             let outcome = self.handle(job, &mut renderer, &mut events);
-            // A receiver that has gone away no longer wants to know.
+            // If the receiver is gone, nobody needs the answer.
             events.into_iter().for_each(|event| drop(done.send(Ok(Some(event)))));
             let failed = outcome.is_err();
             drop(done.send(outcome.map(|()| None)));
@@ -73,7 +73,7 @@ impl SnapshotWorker<'_> {
                 false => Ok(()),
             };
             let score = match evaluate(renderer, self.dataset, &self.validation, step, None, go_on) {
-                // The run ends; what is left to do is to save, not to score.
+                // The run is ending: the snapshot is saved but not scored.
                 Err(Error::Interrupted) => return Ok(()),
                 score => score?,
             };

@@ -1,4 +1,4 @@
-//! Scores of a tree, where a dataset carries its vessels as one.
+//! Scores of a tree, where a dataset has its vessels as one.
 
 use crate::error::Result;
 use crate::phantom::tree::Branch;
@@ -10,8 +10,9 @@ use crate::score::trees::{self, TreeScores, TrueLine};
 use crate::score::volume::VOLUMES;
 use crate::trees::tree::BeatTree;
 
-/// Scores a tree of all phases against the one a phantom left; none where there is none. The dataset is the one that the
-/// reconstruction went by. Scores are made in the frame of the reconstruction, with the means as stated beside.
+/// Scores a tree of all phases against the true tree of a phantom; `None` where there is none. The dataset has the geometry
+/// that the reconstruction used. Scores are computed in the frame of the reconstruction; the means without this motion are
+/// reported as well.
 ///
 /// # Errors
 /// [`crate::error::Error::Io`] and [`crate::error::Error::Data`] for a truth that cannot be read.

@@ -1,6 +1,6 @@
-//! Scores of synthetic data in the frame that the reconstruction lives in. Views know nothing of a motion that all of them
-//! share, so a reconstruction of corrected views is carried by one against the truth. Where `truth.json` says how images
-//! were really taken, that motion is found, and unseen views and true vessels are carried along.
+//! Scores of synthetic data in the frame of the reconstruction. Views do not determine a motion common to all of them, so a
+//! reconstruction from corrected views is displaced by one against the truth. Where `truth.json` states the true geometry
+//! of the images, that motion is found and applied to unseen views and true vessels.
 
 use crate::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
 use crate::error::{Error, Result};
@@ -11,22 +11,22 @@ use glam::DVec3;
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 
-/// Half side of the cube of points that stand for the heart, as a share of the field of view's half.
+/// Half side of the cube of points that represent the heart, as a share of half the field of view.
 const HEART_SHARE: f64 = 0.5;
 
-/// Rays by which the image of a frame of a view was really taken, the heart at its mean position.
+/// True rays of a frame's image, with the heart at its mean position.
 pub(super) fn true_rays(frame: &TrueFrame, view: usize, dataset: &Dataset) -> Result<ViewRays> {
     let [width, height] = dataset.views[view].size;
     let rays = Geometry::CArm(frame.geometry.clone()).rays(width, height);
     rays.map_err(|(field, problem)| Error::data(dataset.path.join(TRUTH), field, problem))
 }
 
-/// Where breathing had carried the heart, world units.
+/// True displacement of the heart by breathing, world units.
 pub(super) fn shift_of(frame: &TrueFrame) -> DVec3 {
     DVec3::from_array(frame.heart_shift_mm) / MM_PER_UNIT
 }
 
-/// Points that stand for the heart: the corners and the middle of a cube.
+/// Points that represent the heart: the corners and the centre of a cube.
 fn points(dataset: &Dataset) -> Vec<DVec3> {
     let View { rays, size: [width, height], .. } = &dataset.views[0];
     let pixel = rays.anchor[1].length().min(rays.anchor[2].length());
@@ -35,10 +35,10 @@ fn points(dataset: &Dataset) -> Vec<DVec3> {
     (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2))).chain([DVec3::ZERO]).collect()
 }
 
-/// Ways that no score shows, pixels.
+/// Displacements up to this have no influence on scores, pixels.
 const NEGLIGIBLE_PX: f64 = 0.01;
 
-/// The truth beside a dataset; none where there is none, or where it is of other frames.
+/// Truth of a dataset; `None` where there is none, or where it belongs to other frames.
 fn truth_of(dataset: &Dataset) -> Result<Option<Truth>> {
     if !dataset.path.join(TRUTH).is_file() {
         return Ok(None);
@@ -48,9 +48,9 @@ fn truth_of(dataset: &Dataset) -> Result<Option<Truth>> {
     Ok(of_these.then_some(truth))
 }
 
-/// The dataset, of corrected training views, with its unseen images where the reconstruction has them; of a view that is both
-/// trained and scored, the scored images get a view of their own. None without `truth.json`, where that is of other frames,
-/// or where nothing moves by it.
+/// Returns a dataset of corrected training views with its unseen images in the frame of the reconstruction. If a view is
+/// both trained and scored, the scored images get a view of their own. Returns `None` without `truth.json`, where it
+/// belongs to other frames, or where the motion is negligible.
 ///
 /// # Errors
 /// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read.
@@ -81,8 +81,8 @@ pub fn in_calibrated_frame(dataset: &Dataset) -> Result<Option<Dataset>> {
     Ok((farthest_px(dataset, &carried) > NEGLIGIBLE_PX).then_some(carried))
 }
 
-/// What the reconstruction of a dataset's corrected training views is carried by against the true vessels, phase by phase.
-/// None without `truth.json`, where that is of other frames, or where the heart is carried nowhere.
+/// Returns the motion of the reconstruction of a dataset's corrected training views against the true vessels, phase by
+/// phase; `None` without `truth.json`, where it belongs to other frames, or where the motion is negligible.
 ///
 /// # Errors
 /// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read.
@@ -106,14 +106,14 @@ impl<'a> TrueFrames<'a> {
         TrueFrames { truth, dataset }
     }
 
-    /// How the image of a frame was really taken; none where the truth is of other frames.
+    /// Truth of a frame's image; `None` where the truth belongs to other frames.
     pub(super) fn of(&self, frame: &Frame) -> Option<&'a TrueFrame> {
-        // A frame between two phases may count as the one or the other; names tell.
+        // The phase of a frame between two phases is ambiguous, so frames are identified by name.
         let is = |was: &&TrueFrame| was.split == frame.split && was.image.file_stem() == Some(OsStr::new(&frame.name));
         self.truth.frames.iter().find(is)
     }
 
-    /// What the reconstruction is carried by.
+    /// Motion of the reconstruction against the truth.
     fn motion(&self) -> Result<RigidMotion> {
         let dataset = self.dataset;
         let (mut frames, mut breathes) = (Vec::new(), dataset.heart_shifts());
@@ -127,7 +127,7 @@ impl<'a> TrueFrames<'a> {
     }
 }
 
-/// How far apart two datasets see points of the heart in unseen frames, at most.
+/// Maximum distance between the images of points of the heart in unseen frames of two datasets.
 fn farthest_px(a: &Dataset, b: &Dataset) -> f64 {
     let points = points(a);
     let apart = |(a, b): (ViewRays, ViewRays)| {

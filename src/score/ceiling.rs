@@ -1,4 +1,4 @@
-//! What the true vessels themselves would score on unseen images: no field can be expected to do much better by the same rule.
+//! Score of the true vessels on unseen images: no field can be expected to exceed it by much under the same rule.
 
 use crate::error::Result;
 use crate::formats::volume::{Volume, VolumeHints};
@@ -12,21 +12,21 @@ use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// Distance between the points of a ray at which a volume is looked at, voxels.
+/// Distance between the samples of a volume along a ray, voxels.
 const STEP: f64 = 0.5;
 
-/// Dice of the true vessels on unseen images, by the rule that the moving field is scored by.
+/// Dice of the true vessels on unseen images, by the rule for the dynamic field.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TruthDice {
-    /// Mean over images with a mask, at the moving field's threshold.
+    /// Mean over images with a mask, at the dynamic field's threshold.
     pub dice: f64,
-    /// At the threshold that suits them best, which is found with the masks.
+    /// Dice at the best threshold, which is found with the masks.
     pub best: Option<BestDice>,
 }
 
-/// Scores the true vessels of a dataset: the largest attenuation along each ray through their volumes counts as vessel above
-/// `threshold_per_mm`. None where no unseen image has both a mask and a volume of its phase. `proceed` is asked before every
-/// image; its error ends the work.
+/// Scores the true vessels of a dataset: a pixel counts as vessel where the maximum attenuation along its ray through the
+/// volumes exceeds `threshold_per_mm`. Returns `None` where no unseen image has both a mask and a volume of its phase.
+/// `proceed` is called before every image; its error ends the work.
 ///
 /// # Errors
 /// [`crate::error::Error::Data`] and [`crate::error::Error::Io`] for volumes that cannot be read; errors of `proceed`.
@@ -62,7 +62,7 @@ pub fn truth_dice(
     Ok(Some(TruthDice { dice, best }))
 }
 
-/// Largest attenuation of a volume along each ray of a view, per mm: `size` columns and rows, depths in world units.
+/// Maximum attenuation of a volume along each ray of a view, per mm: `size` columns and rows, depths in world units.
 fn largest_per_mm(volume: &Volume, rays: &ViewRays, size: [usize; 2], depths: (f64, f64)) -> Vec<f32> {
     let to_index = volume.world_to_index();
     let pixel = |index: usize| {
@@ -72,7 +72,7 @@ fn largest_per_mm(volume: &Volume, rays: &ViewRays, size: [usize; 2], depths: (f
     (0..size[0] * size[1]).into_par_iter().map(pixel).collect()
 }
 
-/// The same along one ray, an anchor and a direction of unit depth.
+/// Maximum attenuation of a volume along one ray, given by an anchor and a direction of unit depth.
 fn largest_along(
     volume: &Volume,
     to_index: &DAffine3,
@@ -81,7 +81,7 @@ fn largest_along(
 ) -> f32 {
     let (from, along) = (to_index.transform_point3(anchor), to_index.transform_vector3(direction));
     let last = DVec3::from_array(volume.size.map(|n| n as f64 - 1.0));
-    // A ray along an axis divides by zero, and is inside or outside for good.
+    // A ray along an axis divides by zero; the infinite results mean that it is inside or outside along its whole length.
     let (to_low, to_high) = (-from / along, (last - from) / along);
     let enters = to_low.min(to_high).max_element().max(near);
     let leaves = to_low.max(to_high).min_element().min(far);
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn rays_find_the_densest_place_on_their_way() {
-        // A bar along x (left) of 1 per mm in a grid of 21 mm, and a denser spot on it.
+        // A bar along x (left) of 1 per mm in a grid of 21 mm, with a denser spot.
         const N: usize = 21;
         let mut values = vec![0f32; N * N * N];
         for x in 0..N {
@@ -126,10 +126,10 @@ mod tests {
         assert!(front[..4].iter().all(|v| *v == 0.0) && front[8..23].iter().all(|v| *v > 0.5), "{front:?}");
         let spot = front.iter().copied().fold(0.0, f32::max);
         assert!((2.0..=3.0).contains(&spot), "{spot}");
-        // From the side the bar is a point, as dense as its densest place.
+        // From the side the bar is a point, with the density of its densest spot.
         let side = seen(90.0);
         assert!(side[15 * 31 + 15] > 2.2 && side.iter().filter(|v| **v > 0.5).count() < 12);
-        // Depths end where the dataset's do.
+        // Depths end at the limits of the dataset.
         let rays = Geometry::CArm(c_arm(90.0)).rays(31, 31).unwrap();
         assert!(largest_per_mm(&volume, &rays, [31, 31], (0.15, 0.2)).iter().all(|v| *v == 0.0));
     }

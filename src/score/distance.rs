@@ -1,4 +1,4 @@
-//! How far the vessels of a run in training are from the true ones: one number at one phase, soon told.
+//! Distance of the vessels of a run in training from the true ones: one number at one phase, quickly computed.
 
 use crate::calibrate::gauge::RigidMotion;
 use crate::error::{Error, Result};
@@ -11,7 +11,7 @@ use crate::score::volume::{TrueVessels, VOLUMES, on_one_grid, pixel_mm, read, tr
 use crate::vessels::field::MovingField;
 use std::path::PathBuf;
 
-/// The true vessels at the phase nearest to the end of systole, when they have come farthest.
+/// The true vessels at the phase nearest to the end of systole, where their displacement is largest.
 pub struct Distance {
     truth: TrueVessels,
     file: PathBuf,
@@ -20,8 +20,8 @@ pub struct Distance {
 }
 
 impl Distance {
-    /// Reads the truth in the dataset's directory; none where there is none. Where the reconstruction is `carried` against the
-    /// truth, the truth is carried along.
+    /// Reads the truth in the dataset's directory; `None` where there is none. Where the reconstruction is `carried`
+    /// against the truth, the motion is applied to the truth.
     ///
     /// # Errors
     /// As [`crate::score::volume::score`] for a truth that cannot be used.
@@ -39,8 +39,8 @@ impl Distance {
         Ok(Some(Distance { truth: TrueVessels::new(&volume, dataset), file, phase, pixel_mm: pixel_mm(dataset) }))
     }
 
-    /// The Chamfer distance, mm, of the moving field where it exceeds a threshold; none where it nowhere does, and where it fills
-    /// more of its box than can be compared, as fields may on their way.
+    /// Returns the Chamfer distance, mm, of the dynamic field where it exceeds a threshold; `None` where it does not exceed
+    /// it anywhere, or where it fills too much of its box to be compared, which can happen during training.
     ///
     /// # Errors
     /// Device errors.

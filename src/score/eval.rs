@@ -1,4 +1,4 @@
-//! Evaluation on views the reconstruction has not seen (method, section 5).
+//! Evaluation on views that the reconstruction was not trained on (method, section 5).
 
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
@@ -15,19 +15,20 @@ use crate::score::volume::VolumeScores;
 use serde::Serialize;
 use std::borrow::Cow;
 
-/// Share of the vessels' stated attenuation from which a field counts as vessel. Fields are smoother than vessels, so half
-/// of it would cut thin ones off; a tenth would take noise in. Of the shares tried (docs/performance.md) a fifth is within
-/// 0.04 of the best Dice everywhere: both forms of moving field, phantoms and real anatomy, with and without noise.
+/// Share of the vessels' stated attenuation from which a field counts as vessel. Fields are smoother than vessels, so one
+/// half would cut thin ones off, and one tenth would include noise. Among the shares tried (docs/performance.md), one fifth
+/// is within 0.04 of the best Dice in all cases: both forms of dynamic field, phantoms and real anatomy, with and without
+/// noise.
 pub const VESSEL_SHARE: f64 = 0.2;
-/// Attenuation per world unit from which the authors' public code takes a field for vessel, whatever the data.
+/// Attenuation per world unit above which the authors' public code takes a field for vessel, whatever the data.
 const PUBLISHED_THRESHOLD: f64 = 0.05;
-/// How a Dice threshold is chosen of X-Gaussian, whose opacities are no attenuation.
+/// Description of the Dice threshold for X-Gaussian, whose opacities are no attenuation.
 const OPACITY_RULE: &str = "the sum of opacities, by the published threshold of 0.05";
-/// How a Dice threshold is chosen where nothing else tells.
+/// Description of the Dice threshold where no attenuation is stated.
 const VESSEL_RULE: &str = "Otsu on the predicted maximum projections, held at their 99.5th percentile";
-/// Share of an image's pixels that may change more than what counts as its strongest change.
+/// Share of an image's pixels whose change may exceed the one that counts as its strongest.
 const STRONGEST: f64 = 0.005;
-/// A moving field that attenuates less than this share of the strongest change in the data is dead.
+/// A dynamic field whose line integrals stay below this share of the strongest change in the data has vanished.
 const DEAD_SHARE: f64 = 0.1;
 
 /// Metrics of one image.
@@ -41,14 +42,14 @@ pub struct ImageScore {
     pub secondary_deg: Option<f64>,
     /// Cardiac phase.
     pub phase: u32,
-    /// Dice of the dynamic field; none without a mask.
+    /// Dice of the dynamic field; `None` without a mask.
     pub dice_dynamic: Option<f64>,
-    /// Dice of both fields.
+    /// Dice of the sum of both fields.
     pub dice_total: Option<f64>,
-    /// Dice of X-Gaussian by Otsu's threshold of this image; none of other methods.
+    /// Dice of X-Gaussian at Otsu's threshold of this image; `None` for other methods.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dice_otsu: Option<f64>,
-    /// dB.
+    /// Peak signal-to-noise ratio, dB.
     pub psnr: f64,
     /// Structural similarity.
     pub ssim: f64,
@@ -57,45 +58,45 @@ pub struct ImageScore {
 /// Means over images with a mask.
 #[derive(Debug, Clone, Serialize)]
 pub struct DiceMeans {
-    /// Dynamic field (paper).
+    /// Mean of the dynamic field, as in the paper.
     pub dynamic: Option<f64>,
-    /// Both fields (authors' code).
+    /// Mean of the sum of both fields, as in the authors' code.
     pub total: Option<f64>,
 }
 
-/// Dice by the fixed threshold of the authors' public code, to be compared with what they publish.
+/// Dice at the fixed threshold of the authors' public code, for comparison with their published values.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PublishedDice {
     /// The threshold, per mm.
     pub threshold_per_mm: f64,
-    /// Dynamic field, mean over images with a mask: as the paper says.
+    /// Mean Dice of the dynamic field over images with a mask, as the paper states.
     pub paper: Option<f64>,
-    /// Both fields, of the first image alone: as their code does.
+    /// Dice of the sum of both fields in the first image alone, as the authors' code computes it.
     pub authors: Option<f64>,
 }
 
-/// Where predicted attenuation counts as vessel.
+/// Thresholds above which predicted attenuation counts as vessel.
 #[derive(Debug, Clone, Serialize)]
 pub struct Thresholds {
     /// Threshold of the dynamic field, per mm.
     pub dynamic_per_mm: f64,
     /// Threshold of the sum of both fields, per mm.
     pub total_per_mm: f64,
-    /// How the thresholds were chosen.
+    /// Rule by which the thresholds were chosen.
     pub rule: &'static str,
 }
 
-/// The best mean Dice that any threshold gives, to tell a bad field from a bad threshold. It is found with the masks of
-/// the scored images themselves, so it is no score.
+/// Maximum of the mean Dice over all thresholds, which distinguishes a bad field from a bad threshold. It is found with the
+/// masks of the scored images themselves, so it is no valid score.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct BestDice {
     /// Mean over images with a mask.
     pub dice: f64,
-    /// The threshold that gives it, per mm.
+    /// The threshold at this maximum, per mm.
     pub threshold_per_mm: f64,
 }
 
-/// Best Dice over thresholds; none without masks.
+/// Best Dice over thresholds; `None` without masks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct BestDices {
     /// Best Dice of the dynamic field.
@@ -104,23 +105,23 @@ pub struct BestDices {
     pub total: Option<BestDice>,
 }
 
-/// The outcome.
+/// Result of an evaluation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Evaluation {
     /// Iterations of the model.
     pub step: u32,
     /// Mean Dice.
     pub dice: DiceMeans,
-    /// Where unseen views of synthetic data were carried to the frame of the calibrated reconstruction: Dice where they were
-    /// left as stated.
+    /// Dice without the motion of the calibrated reconstruction, where that motion was applied to unseen views of synthetic
+    /// data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dice_as_stated: Option<DiceMeans>,
-    /// What Dice would be with the best threshold.
+    /// Dice at the best threshold.
     pub best_dice: BestDices,
-    /// Dice as the paper and the authors' code take it.
+    /// Dice by the definitions of the paper and of the authors' code.
     pub dice_published: PublishedDice,
-    /// Mean Dice of X-Gaussian by Otsu's threshold of each image's own largest sums of opacities, since these have no scale; none
-    /// of other methods.
+    /// Mean Dice of X-Gaussian at Otsu's threshold of each image's own maximum sums of opacities, since these have no
+    /// scale; `None` for other methods.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dice_otsu: Option<f64>,
     /// Mean PSNR, dB.
@@ -129,43 +130,43 @@ pub struct Evaluation {
     pub ssim: f64,
     /// Thresholds used.
     pub threshold: Thresholds,
-    /// What the true vessels score on the same images, where that was asked for and the dataset carries them as volumes.
+    /// Score of the true vessels on the same images, where it was requested and the dataset has them as volumes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ceiling: Option<TruthDice>,
-    /// Scores in 3D, where the dataset carries its vessels as volumes.
+    /// Scores in 3D, where the dataset has its vessels as volumes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub volume: Option<VolumeScores>,
-    /// Scores of the vessels as a tree, where one was made and the dataset carries the true one.
+    /// Scores of the vessels as a tree, where one was made and the dataset has the true one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tree: Option<TreeScores>,
-    /// What makes these scores worth less than they seem.
+    /// Reasons why these scores may be unreliable.
     pub warnings: Vec<String>,
     /// One row per image.
     pub images: Vec<ImageScore>,
 }
 
-/// What scoring shows of itself as it goes on.
+/// Events of scoring in progress.
 pub enum Scoring<'a> {
     /// An image has been rendered.
     Rendered,
     /// An image is scored.
     Scored {
-        /// The image, as large as those of its view.
+        /// The image, in the size of its view.
         frame: &'a Frame,
-        /// What the model makes of it.
+        /// The model's rendering of the frame.
         rendering: &'a Rendering,
         /// Threshold on the dynamic field, per world unit.
         threshold: f64,
     },
 }
 
-/// Which quantity of a rendering is compared with the mask.
+/// Selects the quantity of a rendering that is compared with the mask.
 type Maxima = fn(&Rendering) -> &[f32];
 
 const DYNAMIC: Maxima = |r| &r.dynamic_max;
 const TOTAL: Maxima = |r| &r.total_max;
 
-/// Threshold on attenuation per world unit for a set of maximum projections; `blended` ones are of opacities.
+/// Chooses the thresholds on attenuation per world unit for a set of maximum projections; `blended` ones are of opacities.
 fn choose_thresholds(
     seen: &[Rendering],
     stated: Option<f64>,
@@ -188,11 +189,11 @@ fn choose_thresholds(
     }
 }
 
-/// Attenuation per mm from which the moving field of a model counts as vessel: [`VESSEL_SHARE`] of the stated one, or
-/// Otsu's threshold of what the field has at phase 0 at the points of a grid; of X-Gaussian's opacities the published threshold.
+/// Attenuation per mm above which the dynamic field of a model counts as vessel: [`VESSEL_SHARE`] of the stated one, or
+/// Otsu's threshold of the field's values at phase 0 on a grid; for X-Gaussian's opacities the published threshold.
 ///
 /// # Errors
-/// Those of [`Renderer::sample_patient`].
+/// Errors of [`Renderer::sample_patient`].
 pub fn vessel_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid) -> Result<f64> {
     if renderer.is_blended() {
         return Ok(PUBLISHED_THRESHOLD / MM_PER_UNIT);
@@ -205,19 +206,19 @@ pub fn vessel_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &Patien
     Ok(f64::from(metrics::vessel_threshold(&inside)))
 }
 
-/// Dice of what exceeds a threshold with the mask of a frame; none without a mask.
+/// Dice between the values above a threshold and the mask of a frame; `None` without a mask.
 pub(super) fn overlap(frame: &Frame, values: &[f32], threshold: f64) -> Option<f64> {
     let mask = frame.mask.as_ref()?;
     let predicted: Vec<bool> = values.iter().map(|v| f64::from(*v) > threshold).collect();
     Some(metrics::dice(&predicted, mask))
 }
 
-/// Dice of what exceeds Otsu's threshold of an image's own values; none without a mask.
+/// Dice between the values above an image's own Otsu threshold and the mask; `None` without a mask.
 fn otsu_dice(frame: &Frame, values: &[f32]) -> Option<f64> {
     overlap(frame, values, metrics::vessel_threshold(values).into())
 }
 
-/// The mean; none of nothing.
+/// Mean of values; `None` if there are none.
 pub(super) fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     let (n, sum) = values.fold((0usize, 0.0), |(n, sum), value| (n + 1, sum + value));
     (n > 0).then(|| sum / n as f64)
@@ -234,7 +235,7 @@ fn published_dice(frames: &[&Frame], seen: &[Rendering]) -> PublishedDice {
     }
 }
 
-/// What a reconstruction shows of a frame, as large as the view's images.
+/// Renders a frame in the size of the view's images.
 ///
 /// # Errors
 /// Device errors.
@@ -243,7 +244,7 @@ pub fn rendered(renderer: &Renderer, dataset: &Dataset, frame: &Frame) -> Result
     renderer.render_taken(&dataset.heart_rays(frame), width, height, frame.beat_time())
 }
 
-/// Scores frames of a dataset. `threshold` (per world unit) overrides the rule. `observe` hears of every image; its
+/// Scores frames of a dataset. `threshold` (per world unit) overrides the rule. `observe` is called for every image; its
 /// error ends the work.
 ///
 /// # Errors
@@ -317,8 +318,8 @@ pub fn evaluate(
     })
 }
 
-/// The training image that changed most over time, and by how much: above the smallest value of each pixel over the
-/// phases of its view, at all but the strongest [`STRONGEST`] of its pixels. None where nothing changes.
+/// The training image with the strongest change over time, and that change: the excess over each pixel's minimum over the
+/// phases of its view, in all but the strongest [`STRONGEST`] of its pixels. `None` where nothing changes.
 fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
     let changes = dataset.training_views().into_iter().flat_map(|view| {
         let frames: Vec<&Frame> = dataset.training().iter().filter(|f| f.view == view).collect();
@@ -333,13 +334,13 @@ fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
     changes.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, change)| *change > 0.0)
 }
 
-/// Says so when the moving field has died: when its line integrals reach less than a tenth of the strongest change over
-/// time in the data, where that change was seen.
+/// Returns a warning when the dynamic field has vanished: when its line integrals in the image with the strongest change
+/// over time reach less than a tenth of that change.
 ///
 /// # Errors
 /// Device errors.
 pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Option<String>> {
-    // What X-Gaussian shows has no unit that a change could be compared with.
+    // The values of X-Gaussian have no unit to be compared with a change.
     if renderer.is_blended() {
         return Ok(None);
     }
@@ -367,7 +368,7 @@ pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Op
     }))
 }
 
-/// `n` of the dataset's validation frames, evenly spread.
+/// Selects `n` of the dataset's validation frames, evenly spread.
 pub fn spread_validation(dataset: &Dataset, n: usize) -> Vec<&Frame> {
     let all = dataset.validation();
     let n = n.min(all.len());

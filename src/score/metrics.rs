@@ -1,10 +1,10 @@
-//! Image metrics as plain functions.
+//! Image metrics.
 
 use crate::raster::percentile;
 
-/// Values above this percentile are as good as at it when a threshold is sought.
+/// Values above this percentile are limited to it in the search for a threshold.
 const HOT: f64 = 0.995;
-/// Steps in which the best threshold is sought.
+/// Number of steps in the search for the best threshold.
 const CANDIDATES: u32 = 200;
 
 /// Dice overlap of two masks; 1 when both are empty.
@@ -14,7 +14,7 @@ pub fn dice(a: &[bool], b: &[bool]) -> f64 {
     if sum == 0 { 1.0 } else { 2.0 * both as f64 / sum as f64 }
 }
 
-/// Both images brought to the true image's range (method, section 5).
+/// Scales both images to the true image's range (method, section 5).
 pub fn normalised(truth: &[f32], prediction: &[f32]) -> (Vec<f64>, Vec<f64>) {
     let (low, high) = truth.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
     let range = if high > low { f64::from(high - low) } else { 1.0 };
@@ -22,7 +22,7 @@ pub fn normalised(truth: &[f32], prediction: &[f32]) -> (Vec<f64>, Vec<f64>) {
     (truth.iter().map(scale).collect(), prediction.iter().map(scale).collect())
 }
 
-/// The true image brought to its own range, and what X-Gaussian shows, which is meant to be that, held from 0 to 1.
+/// Scales the true image to its own range, and clamps X-Gaussian's image, which is trained to equal it, to 0 to 1.
 pub fn normalised_to_shown(truth: &[f32], shown: &[f32]) -> (Vec<f64>, Vec<f64>) {
     let (truth, _) = normalised(truth, &[]);
     (truth, shown.iter().map(|v| f64::from(*v).clamp(0.0, 1.0)).collect())
@@ -106,16 +106,16 @@ pub fn otsu(values: &[f32]) -> f32 {
     low + (best_at as f32 + 1.0) / BINS as f32 * (high - low)
 }
 
-/// Otsu's threshold for vessels in values that are zero for the most part and have a few hot spots. Values are held at
-/// their 99.5th percentile: one pixel in two thousand far above all vessels would otherwise become the upper group.
-/// Zero where fewer values than that are above zero.
+/// Otsu's threshold for vessels in values that are mostly zero and have a few hot spots. Values are limited to their 99.5th
+/// percentile: otherwise one pixel in two thousand far above all vessels would form the upper group. The threshold is zero
+/// where fewer values than that exceed zero.
 pub fn vessel_threshold(values: &[f32]) -> f32 {
     let hottest = percentile(values, HOT);
     otsu(&values.iter().map(|v| v.min(hottest)).collect::<Vec<_>>())
 }
 
-/// The threshold with the best mean Dice of several images, and that Dice: values above it against a mask. `used` is
-/// tried too. None of no images.
+/// Returns the maximum mean Dice of several images over thresholds (values above the threshold against a mask), and its
+/// threshold. `used` is tried, too. Returns `None` without images.
 pub fn best_dice(images: &[(&[f32], &[bool])], used: f32) -> Option<(f64, f32)> {
     let sorted = |values: &mut dyn Iterator<Item = f32>| {
         let mut values: Vec<f32> = values.collect();
@@ -131,7 +131,7 @@ pub fn best_dice(images: &[(&[f32], &[bool])], used: f32) -> Option<(f64, f32)> 
         })
         .collect();
     let pooled = sorted(&mut images.iter().flat_map(|(all, _)| all.iter().copied()));
-    // Shares of the pixels above the threshold, from half of them to a few, evenly on a logarithmic scale.
+    // The shares of pixels above the threshold range from one half to a few pixels, evenly on a logarithmic scale.
     let candidates = (0..=CANDIDATES).map(|i| {
         let share = 0.5 * (2.0 / pooled.len().max(2) as f64).powf(f64::from(i) / f64::from(CANDIDATES));
         pooled.get(((1.0 - share) * (pooled.len().max(1) - 1) as f64) as usize).copied().unwrap_or(used)
@@ -190,7 +190,8 @@ mod tests {
         // The lower group ends at 0.14, the upper one begins at 0.6; a histogram's bin is 0.005 wide.
         let t = otsu(&two_levels(0.1, 900, 1.0, 100));
         assert!((0.14..0.146).contains(&t), "{t}");
-        // Groups that meet: one bin after the lower one ends, many of the upper one are below.
+        // Where groups meet, the threshold is one bin after the lower group's end, and many values of the upper one are
+        // below it.
         let t = otsu(&two_levels(0.1, 500, 0.4, 500));
         assert!((0.255..0.265).contains(&t), "{t}");
     }
@@ -212,7 +213,7 @@ mod tests {
         let mask = values.map(|v| v > 0.55);
         let (dice, threshold) = best_dice(&[(&values, &mask)], 0.0).unwrap();
         assert!(dice == 1.0 && (0.5..0.6).contains(&threshold), "{dice} at {threshold}");
-        // An image that wants another threshold is outvoted by two: the mean decides, 1, 1 and 1/2.
+        // An image with another best threshold is outvoted by two: the mean of 1, 1 and 1/2 decides.
         let few = values.map(|v| v > 0.75);
         let (dice, threshold) = best_dice(&[(&values, &mask), (&values, &mask), (&values, &few)], 0.0).unwrap();
         assert!((dice - 2.5 / 3.0).abs() < 1e-12 && (0.5..0.6).contains(&threshold), "{dice} at {threshold}");

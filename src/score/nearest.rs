@@ -1,11 +1,11 @@
-//! The place on lines that is nearest to a point.
+//! Search for the place on lines that is nearest to a point.
 
 use glam::DVec3;
 
-/// Steps of a line that are looked at or passed over together.
+/// Number of a line's steps that are searched or skipped together.
 const STEPS: usize = 16;
 
-/// A place on a line: so much of the way from a point to the next.
+/// A place on a line: the share of the distance from one point to the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Place {
     pub(super) line: usize,
@@ -23,7 +23,7 @@ impl Place {
     }
 }
 
-/// A few steps of a line, and a ball that holds them.
+/// A few steps of a line, and a ball that contains them.
 struct Stretch {
     line: usize,
     first: usize,
@@ -31,7 +31,7 @@ struct Stretch {
     radius: f64,
 }
 
-/// Lines that are asked for their nearest places.
+/// Lines prepared for the search for nearest places.
 pub(super) struct Lines<'a> {
     lines: &'a [&'a [DVec3]],
     stretches: Vec<Stretch>,
@@ -52,7 +52,7 @@ impl<'a> Lines<'a> {
         Lines { lines, stretches: lines.iter().enumerate().flat_map(of_line).collect() }
     }
 
-    /// How far away the nearest place is, and which; none on no line.
+    /// Returns the distance to the nearest place, and the place; `None` without lines.
     pub(super) fn nearest(&self, point: DVec3) -> (f64, Option<Place>) {
         let mut best = (f64::INFINITY, None);
         for stretch in &self.stretches {
@@ -71,7 +71,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// Where between two ends a point is nearest, and how far from it.
+/// Share of the step at which it is nearest to a point, and the distance there.
 fn on_step([begin, end]: [DVec3; 2], point: DVec3) -> (f64, f64) {
     let way = end - begin;
     let share = ((point - begin).dot(way) / way.length_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);

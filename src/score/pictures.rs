@@ -1,4 +1,4 @@
-//! Pictures a person can look at. Vessels are dark, as on an angiogram.
+//! Pictures for visual inspection. Vessels are dark, as on an angiogram.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -8,23 +8,23 @@ use crate::scan::dataset::Frame;
 use image::{DynamicImage, Rgb, RgbImage};
 use std::path::Path;
 
-/// Smallest side of a panel; smaller images are enlarged by a whole factor.
+/// Minimum side of a panel; smaller images are enlarged by an integer factor.
 const PANEL_PIXELS: usize = 200;
 const GAP: usize = 4;
-/// Of images that go from 0 to 1.
+/// Window of images with a range from 0 to 1.
 const NORMALISED: Window = Window { low: 0.0, high: 1.0 };
 
-/// Window of line integrals shown: `low` is white, `high` black.
+/// Window of displayed line integrals: `low` is white, `high` black.
 #[derive(Debug, Clone, Copy)]
 pub struct Window {
-    /// Shown white.
+    /// Value shown white.
     pub low: f32,
-    /// Shown black.
+    /// Value shown black.
     pub high: f32,
 }
 
 impl Window {
-    /// The range of an image.
+    /// Window of an image's range.
     pub fn of(values: &[f32]) -> Window {
         let (low, high) = values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
         Window { low, high: if high > low { high } else { low + 1.0 } }
@@ -35,13 +35,13 @@ impl Window {
         (255.0 * (1.0 - ((value - self.low) / (self.high - self.low)).clamp(0.0, 1.0))) as u8
     }
 
-    /// All codes of an image.
+    /// Grey codes of an image.
     pub fn codes(&self, values: &[f32]) -> Vec<u8> {
         values.iter().map(|v| self.code(*v)).collect()
     }
 }
 
-/// Grey codes as an enlarged colour image.
+/// Enlarges an image of `pixels` colours.
 fn panel(width: usize, colour: impl Fn(usize) -> Rgb<u8>, pixels: usize) -> RgbImage {
     let height = pixels / width;
     let factor = PANEL_PIXELS.div_ceil(width.min(height)).max(1);
@@ -62,8 +62,8 @@ fn beside(panels: &[RgbImage]) -> RgbImage {
     out
 }
 
-/// Truth, prediction, static field, dynamic field, and the vessel mask over the truth: overlap green,
-/// missed red, added blue.
+/// Writes truth, prediction, static field, dynamic field, and the vessel mask over the truth: overlap green, missed red,
+/// added blue.
 ///
 /// # Errors
 /// [`Error::Io`].
@@ -99,7 +99,8 @@ pub fn write_comparison(path: &Path, frame: &Frame, seen: &Rendering, threshold:
     png::write(path, &DynamicImage::ImageRgb8(picture))
 }
 
-/// An image, and the same with what the hull covers in orange: where vessels may be. A vessel outside was lost.
+/// Writes an image, and a copy with the region that the hull covers in orange, where vessels may be. A vessel outside is
+/// lost.
 ///
 /// # Errors
 /// [`Error::Io`].
@@ -110,7 +111,7 @@ pub fn write_hull(path: &Path, integrals: &[f32], covered: &[bool], width: usize
     png::write(path, &DynamicImage::ImageRgb8(beside(&[plain, panel(width, tinted, codes.len())])))
 }
 
-/// A looping animation of grey images, `width` columns each, `ms` milliseconds apart.
+/// Writes a looping animation of grey images, `width` columns each, `ms` milliseconds apart.
 ///
 /// # Errors
 /// [`Error::Io`] or [`Error::Internal`].
@@ -132,8 +133,8 @@ pub fn write_gif(path: &Path, frames: &[Vec<f32>], width: usize, window: Window,
     files::write_atomic(path, &bytes)
 }
 
-/// Writes what a view shows of vessels before and after a correction, side by side: green where the other views show vessels
-/// on the ray, too, red where they do not.
+/// Writes the vessel pixels of a view before and after a correction, side by side: green where the other views show vessels
+/// on the ray as well, red where they do not.
 ///
 /// # Errors
 /// [`Error::Io`].
@@ -157,7 +158,7 @@ pub fn write_silhouettes(
     png::write(path, &DynamicImage::ImageRgb8(beside(&explained.map(side))))
 }
 
-/// One grey image.
+/// Writes one grey image.
 ///
 /// # Errors
 /// [`Error::Io`].

@@ -1,4 +1,4 @@
-//! How far two sets of voxels agree, in millimetres (see `docs/formats.md`).
+//! Agreement of two sets of voxels, in millimetres (see `docs/formats.md`).
 
 use crate::error::{Error, Result};
 use crate::raster::percentile;
@@ -9,34 +9,34 @@ use crate::vessels::mask::{Mask, component_sizes};
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// Centrelines this near to each other are the same vessel, mm.
+/// Maximum distance at which centrelines count as one vessel, mm.
 pub const WITHIN_MM: f64 = 1.0;
-/// Share of the distances of Hausdorff's distance that count.
+/// Percentile of the distances that gives the Hausdorff distance.
 const HAUSDORFF_SHARE: f64 = 0.95;
 
-/// Agreement of a reconstructed set of voxels with the true one. Distances are between centres of voxels; none where a set
-/// is empty.
+/// Agreement of a reconstructed set of voxels with the true one. Distances are between centres of voxels; `None` where a
+/// set is empty.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Agreement {
     /// Dice overlap, 0 to 1.
     pub dice: f64,
-    /// Mean distance of a voxel of one set to the nearest of the other, both directions weighing the same, mm.
+    /// Mean distance of a voxel of one set to the nearest of the other, both directions with equal weight, mm.
     pub chamfer_mm: Option<f64>,
     /// The larger of both directions' 95th percentiles of these distances, mm.
     pub hausdorff95_mm: Option<f64>,
-    /// Share of the true centreline's voxels with one of ours within [`WITHIN_MM`].
+    /// Share of the true centreline's voxels with a reconstructed one within [`WITHIN_MM`].
     pub true_centreline_found: Option<f64>,
-    /// Share of our centreline's voxels with a true one within [`WITHIN_MM`].
+    /// Share of the reconstructed centreline's voxels with a true one within [`WITHIN_MM`].
     pub our_centreline_true: Option<f64>,
     /// Centreline Dice: the harmonic mean of the shares of each centreline inside the other set.
     pub cl_dice: Option<f64>,
-    /// Connected components (26 neighbours) of ours that are large enough to count.
+    /// Connected components (26 neighbours) of the reconstruction that are large enough to count.
     pub components: f64,
     /// Connected components of the truth, mean over the phases.
     pub true_components: f64,
 }
 
-/// A set that is not empty, the distances to it, and its centreline.
+/// A non-empty set, the distances to it, and its centreline.
 struct Measured<'a> {
     set: &'a Mask,
     to_set: DistanceMap,
@@ -50,7 +50,7 @@ impl Measured<'_> {
     }
 }
 
-/// How far the voxels of a set are from another, mm.
+/// Distances of the voxels of a set from another, mm.
 fn distances(set: &Mask, to: &DistanceMap) -> Vec<f32> {
     set.voxels().map(|voxel| to.at_mm(voxel)).collect()
 }
@@ -60,12 +60,12 @@ fn mean_distance(set: &Mask, to: &DistanceMap) -> f64 {
     distances.iter().map(|d| f64::from(*d)).sum::<f64>() / distances.len() as f64
 }
 
-/// Mean distance of a voxel of one set to the nearest of the other, both directions weighing the same, mm.
+/// Mean distance of a voxel of one set to the nearest of the other, both directions with equal weight, mm.
 fn mean_of_both([a, b]: [&Mask; 2], [to_a, to_b]: [&DistanceMap; 2]) -> f64 {
     0.5 * (mean_distance(a, to_b) + mean_distance(b, to_a))
 }
 
-/// The Chamfer distance of two sets of voxels of one grid alone, as [`Agreement`] has it.
+/// Chamfer distance of two sets of voxels of one grid, as in [`Agreement`].
 pub(super) fn chamfer_mm(a: &Mask, b: &Mask) -> Option<f64> {
     let (to_a, to_b) = rayon::join(|| DistanceMap::to(a), || DistanceMap::to(b));
     Some(mean_of_both([a, b], [&to_a?, &to_b?]))
@@ -95,7 +95,7 @@ fn share_near(line: &Mask, other: &Mask) -> f64 {
     share(line, has_near)
 }
 
-/// Share of a set's voxels of which something is true.
+/// Share of a set's voxels for which `holds` is true.
 fn share(set: &Mask, holds: impl Fn(usize) -> bool + Sync) -> f64 {
     let voxels: Vec<usize> = set.voxels().collect();
     voxels.par_iter().filter(|voxel| holds(**voxel)).count() as f64 / voxels.len() as f64
@@ -109,8 +109,8 @@ fn cl_dice(a: &Measured<'_>, b: &Measured<'_>) -> f64 {
     }
 }
 
-/// Compares two sets of voxels of one grid. Components smaller than `smallest_component_mm3` are left out of their numbers,
-/// and of nothing else.
+/// Compares two sets of voxels of one grid. Components smaller than `smallest_component_mm3` are excluded from the numbers
+/// of components only.
 ///
 /// # Errors
 /// [`Error::Config`] for sets on different grids.
@@ -146,7 +146,7 @@ mod tests {
 
     const SPACING_MM: DVec3 = DVec3::new(0.5, 0.25, 1.0);
 
-    /// A rod along x, `shift_mm` away from the middle.
+    /// A rod along x, displaced by `shift_mm` from the centre.
     fn rod(shift_mm: DVec3) -> Mask {
         drawn([60, 60, 24], SPACING_MM, |p| {
             let p = p - DVec3::new(15.0, 7.5, 12.0) - shift_mm;
@@ -169,14 +169,14 @@ mod tests {
         assert_eq!(compare(&rod(DVec3::ZERO), &rod(DVec3::ZERO), 0.1).unwrap(), expected);
     }
 
-    /// Rods that are further apart than they are thick: each voxel is as far from the other rod as its own row is.
+    /// Rods that are further apart than they are thick: the distance of each voxel is that of its row.
     #[test]
     fn a_translation_has_known_distances() {
         let truth = rod(DVec3::ZERO);
         for (shift_mm, rows_mm) in [
-            // Rows 0.25 mm apart, five of them.
+            // Five rows, 0.25 mm apart.
             (DVec3::new(0.0, 2.5, 0.0), vec![1.5, 1.75, 2.0, 2.25, 2.5]),
-            // Rows 1 mm apart, three of them.
+            // Three rows, 1 mm apart.
             (DVec3::new(0.0, 0.0, 6.0), vec![4.0, 5.0, 6.0]),
         ] {
             let scores = compare(&truth, &rod(shift_mm), 0.1).unwrap();
@@ -186,13 +186,14 @@ mod tests {
             assert_eq!((scores.dice, scores.cl_dice), (0.0, Some(0.0)));
             assert_eq!((scores.true_centreline_found, scores.our_centreline_true), (Some(0.0), Some(0.0)));
         }
-        // A quarter of a millimetre: a row of five is missed, and the centrelines are near.
+        // At a displacement of a quarter of a millimetre, one row of five is missed, and the centrelines are near each
+        // other.
         let scores = compare(&truth, &rod(DVec3::new(0.0, 0.25, 0.0)), 0.1).unwrap();
         assert!((scores.dice - 0.8).abs() < 1e-12 && (scores.chamfer_mm.unwrap() - 0.05).abs() < 1e-6, "{scores:?}");
         assert_eq!((scores.cl_dice, scores.true_centreline_found), (Some(1.0), Some(1.0)));
     }
 
-    /// What one side has too much counts in its own direction alone.
+    /// Additional voxels of one set count in that set's direction alone.
     #[test]
     fn both_directions_count() {
         let truth = rod(DVec3::ZERO);
@@ -202,7 +203,7 @@ mod tests {
         };
         for (truth, ours, found, right) in [(&truth, &half, 0.55, 1.0), (&half, &truth, 1.0, 0.55)] {
             let scores = compare(truth, ours, 0.1).unwrap();
-            // Voxels of the 21 columns that are missing are 0.5 to 10.5 mm away, all others are there.
+            // Voxels of the 21 missing columns are 0.5 to 10.5 mm away; all others are present.
             let missing = (1..=21).map(|i| 0.5 * f64::from(i)).sum::<f64>() / 41.0;
             assert!((scores.chamfer_mm.unwrap() - 0.5 * missing).abs() < 1e-6, "{scores:?}");
             assert_eq!(scores.hausdorff95_mm, Some(9.5), "{scores:?}");
@@ -218,7 +219,7 @@ mod tests {
         let ball = drawn([41; 3], DVec3::splat(0.5), |p| from_middle(p) < 1.0);
         let shell = drawn([41; 3], DVec3::splat(0.5), |p| (8.0..8.6).contains(&from_middle(p)));
         let scores = compare(&ball, &shell, 0.1).unwrap();
-        // From the ball's surface at 1 mm, or its middle, to the shell at 8: 7 to 8 mm, half a voxel more or less.
+        // From the ball's surface at 1 mm, or its centre, to the shell at 8 mm: 7 to 8 mm, give or take half a voxel.
         assert!((7.0..8.0).contains(&scores.chamfer_mm.unwrap()), "{scores:?}");
         assert_eq!((scores.components, scores.true_components), (1.0, 1.0));
     }

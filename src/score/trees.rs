@@ -1,4 +1,4 @@
-//! How far a tree of vessels agrees with the true one, over the beat (see `docs/formats.md`).
+//! Agreement of a vessel tree with the true one, over the beat (see `docs/formats.md`).
 
 use crate::calibrate::gauge::RigidMotion;
 use crate::error::{Error, Result};
@@ -14,7 +14,7 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-/// Lines are compared at points so far apart, mm: finer than images show.
+/// Distance of the points at which lines are compared, mm: below the resolution of images.
 const STEP_MM: f64 = 0.25;
 
 /// A true vessel at one moment.
@@ -26,27 +26,27 @@ pub struct TrueLine {
     pub radius_mm: Vec<f64>,
 }
 
-/// Scores of one phase, or their means. Distances are those of points of one centreline to the nearest point of the other.
+/// Scores of one phase, or their means. Distances are from points of one centreline to the nearest point of the other.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TreeAgreement {
-    /// Share of the true centreline with ours within [`WITHIN_MM`].
+    /// Share of the true centreline with the reconstructed one within [`WITHIN_MM`].
     pub true_centreline_found: f64,
-    /// Share of our centreline with a true one within [`WITHIN_MM`].
+    /// Share of the reconstructed centreline with a true one within [`WITHIN_MM`].
     pub our_centreline_true: f64,
-    /// Mean distance of our centreline to the true one, mm.
+    /// Mean distance of the reconstructed centreline to the true one, mm.
     pub ours_to_true_mm: f64,
-    /// Mean of our radius less the true one, where our centreline counts as true, mm.
+    /// Mean of the reconstructed radius minus the true one, where the reconstructed centreline counts as true, mm.
     pub radius_error_mm: Option<f64>,
-    /// Root of the mean square of the same, mm.
+    /// Root mean square of the radius error, where the reconstructed centreline counts as true, mm.
     pub radius_rmse_mm: Option<f64>,
-    /// Connected trees of ours.
+    /// Number of connected trees of the reconstruction.
     pub components: f64,
-    /// Mean distance of our centreline to the true one in the training images, mm at the isocentre.
+    /// Mean distance of the reconstructed centreline to the true one in the training images, mm at the isocentre.
     pub reprojection_training_mm: Option<f64>,
-    /// The same in images of views that were not trained on.
+    /// Mean distance of the centrelines in images of views that were not trained on, mm at the isocentre.
     pub reprojection_unseen_mm: Option<f64>,
-    /// Mean distance between where our points have come since the phase that is followed and where the true points beside them have, mm; where
-    /// points are followed, and not of that phase itself.
+    /// Mean error of the displacement of the reconstructed points since the reference phase, against the nearest true
+    /// points, mm; only where points are followed, and not for the reference phase itself.
     pub motion_error_mm: Option<f64>,
 }
 
@@ -63,21 +63,21 @@ pub struct PhaseTreeScores {
 /// Scores of a tree over the beat.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TreeScores {
-    /// Centrelines this near to each other are the same vessel, mm.
+    /// Maximum distance at which centrelines count as one vessel, mm.
     pub within_mm: f64,
     /// Means over the phases that have a value.
     pub mean: TreeAgreement,
-    /// Where the truth was carried to the frame of the reconstruction: the means where it was left as stated.
+    /// Means without the motion of the reconstruction, where that motion was applied to the truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mean_as_stated: Option<TreeAgreement>,
     /// One row per phase.
     pub phases: Vec<PhaseTreeScores>,
 }
 
-/// Scores a tree. `truth` has the true vessels at a moment of the beat, which goes from 0 to the dataset's number of phases.
-/// The dataset is the one that the reconstruction went by, with its unseen views where the reconstruction has them; where it is
-/// known how images were really `taken`, the true vessels are seen so. Where the reconstruction is `carried`
-/// against the truth, true vessels are carried along before they are compared in 3D.
+/// Scores a tree. `truth` returns the true vessels at a moment of the beat, which goes from 0 to the dataset's number of
+/// phases. The dataset has the geometry used by the reconstruction, with its unseen views in the frame of the
+/// reconstruction. Where the true acquisition `taken` is known, the true vessels are projected by it. Where the
+/// reconstruction is `carried` against the truth, the motion is applied to the true vessels before the comparison in 3D.
 ///
 /// # Errors
 /// [`Error::Data`] for a truth without vessels.
@@ -107,7 +107,7 @@ pub fn score(
         let mut scores = agreement(tree, &now);
         scores.reprojection_training_mm = images.reprojection_mm(beat, tree, Split::Train, &truth)?;
         scores.reprojection_unseen_mm = images.reprojection_mm(beat, tree, Split::Validation, &truth)?;
-        // The reference phase has no motion by definition, and would only flatter the mean.
+        // The reference phase has no motion by definition and would bias the mean to lower values.
         let first = first.filter(|first| first.phase != tree.phase);
         scores.motion_error_mm = first.and_then(|first| motion_error_mm([first, tree], [&rest, &now]));
         Ok(PhaseTreeScores { phase: tree.phase, scores })
@@ -116,7 +116,7 @@ pub fn score(
     Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), mean_as_stated: None, phases })
 }
 
-/// The mean of what there is; none of nothing.
+/// Mean of values; `None` if there are none.
 fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     let (n, sum) = values.fold((0usize, 0.0), |(n, sum), value| (n + 1, sum + value));
     (n > 0).then(|| sum / n as f64)
@@ -151,7 +151,7 @@ impl Along {
         self.sum += length_mm * value;
     }
 
-    /// None along nothing.
+    /// Returns the mean; `None` where the length is zero.
     fn mean(&self) -> Option<f64> {
         (self.length_mm > 0.0).then(|| self.sum / self.length_mm)
     }
@@ -161,7 +161,7 @@ fn is_near(away_mm: f64) -> f64 {
     f64::from(u8::from(away_mm <= WITHIN_MM))
 }
 
-/// Places on lines that are [`STEP_MM`] apart at most, and the length that each stands for, mm.
+/// Places on lines at most [`STEP_MM`] apart, and the length that each represents, mm.
 fn finely(lines: &[&[DVec3]]) -> Vec<(Place, f64)> {
     let of_line = |(line, points): (usize, &&[DVec3])| {
         let steps = points.windows(2).enumerate().flat_map(move |(from, ends)| {
@@ -178,8 +178,8 @@ fn ours(tree: &PhaseTree) -> Vec<&[DVec3]> {
     tree.branches.iter().map(|branch| &branch.points_mm[..]).collect()
 }
 
-/// Our lines as an image shows them that was taken near the phase of `tree`: where points are followed, on the straight way to the
-/// phase beyond.
+/// Reconstructed lines as in an image taken near the phase of `tree`: where points are followed, linearly interpolated
+/// towards the next phase.
 fn shown(beat: &BeatTree, tree: &PhaseTree, taken: BeatTime, n_phases: u32) -> Vec<Vec<DVec3>> {
     let next = BeatTime { phase: tree.phase, ..taken }.beyond(n_phases);
     let beyond = beat.phases.iter().find(|t| beat.reference_phase.is_some() && t.phase == next);
@@ -225,7 +225,7 @@ fn agreement(tree: &PhaseTree, truth: &[TrueLine]) -> TreeAgreement {
     }
 }
 
-/// How far our points go astray between two phases: against the true points that lie beside them at the first.
+/// Mean motion error of the reconstructed points between two phases, against the true points nearest to them at the first.
 fn motion_error_mm([first, now]: [&PhaseTree; 2], [true_first, true_now]: [&[TrueLine]; 2]) -> Option<f64> {
     let (rest, moved) = (ours(first), ours(now));
     let (true_rest, true_moved) = (true_points(true_first), true_points(true_now));
@@ -242,13 +242,13 @@ fn motion_error_mm([first, now]: [&PhaseTree; 2], [true_first, true_now]: [&[Tru
     error.mean()
 }
 
-/// How images were taken, as the reconstruction has it and really.
+/// Geometry of the images: that of the reconstruction and the true one.
 struct Images<'a> {
     dataset: &'a Dataset,
     truth: Option<TrueFrames<'a>>,
 }
 
-/// One image: how ours is seen, how the truth is, and when.
+/// Rays of the reconstruction and of the truth in one image, and its moment of the beat.
 struct Image {
     rays: ViewRays,
     true_rays: ViewRays,
@@ -256,7 +256,7 @@ struct Image {
 }
 
 impl Images<'_> {
-    /// None for a frame that `truth.json` knows nothing of.
+    /// Returns the geometry of a frame; `None` for a frame that is not in `truth.json`.
     fn image(&self, frame: &Frame) -> Result<Option<Image>> {
         let rays = self.dataset.heart_rays(frame);
         let Some(truth) = &self.truth else {
@@ -271,7 +271,7 @@ impl Images<'_> {
         Ok(Some(Image { rays, true_rays, moment: was.beat_phase }))
     }
 
-    /// Mean over the images of a phase; none without any.
+    /// Mean reprojection error over the images of a phase; `None` without images.
     fn reprojection_mm(
         &self,
         beat: &BeatTree,

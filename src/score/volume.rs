@@ -1,4 +1,4 @@
-//! Scores in 3D, where a dataset carries its vessels as volumes (see `docs/formats.md`).
+//! Scores in 3D, where a dataset has its vessels as volumes (see `docs/formats.md`).
 
 use crate::calibrate::gauge::RigidMotion;
 use crate::error::{Error, Result};
@@ -19,26 +19,26 @@ use std::path::{Path, PathBuf};
 
 /// Directory of the volumes inside a dataset.
 pub const VOLUMES: &str = "volumes";
-/// A voxel of the truth is vessel from this share of the vessel attenuation on.
+/// A voxel of the truth is vessel from this share of the vessel attenuation.
 const TRUTH_SHARE: f64 = 0.5;
-/// Attenuation farther from a vessel than so many pixels floats.
+/// Distance from a vessel beyond which attenuation is far from it, pixels.
 const FAR_PIXELS: f64 = 2.0;
-/// Attenuation farther from a vessel than this floats, mm.
+/// Distance from a vessel beyond which attenuation is far from it, mm.
 const FAR_MM: f64 = 2.0;
-/// Side of the smallest cube that counts as a component, pixels.
+/// Side of the minimum cube that counts as a component, pixels.
 const COMPONENT_PIXELS: f64 = 1.0;
-/// Voxels at most that are compared.
+/// Maximum number of voxels that are compared.
 pub(crate) const MOST_VOXELS: u64 = 1 << 26;
 
 /// Scores of one phase, or their means.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Scores {
-    /// How far our vessels agree with the true ones.
+    /// Agreement of the reconstructed vessels with the true ones.
     #[serde(flatten)]
     pub agreement: Agreement,
-    /// Share of the moving field's attenuation farther than 2 pixels at the isocentre from the nearest true vessel voxel.
+    /// Share of the dynamic field's attenuation farther than 2 pixels at the isocentre from the nearest true vessel voxel.
     pub mass_beyond_2_pixels: Option<f64>,
-    /// Share of the moving field's attenuation that lies more than 2 mm from a true vessel.
+    /// Share of the dynamic field's attenuation that lies more than 2 mm from a true vessel.
     pub mass_beyond_2_mm: Option<f64>,
 }
 
@@ -52,34 +52,34 @@ pub struct PhaseScores {
     pub scores: Scores,
 }
 
-/// Scores of all phases whose truth there is.
+/// Scores of all phases with a known truth.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct VolumeScores {
-    /// The moving field is vessel above this, per mm.
+    /// Threshold above which the dynamic field is vessel, per mm.
     pub threshold_per_mm: f64,
     /// Pixel at the isocentre, mm.
     pub pixel_mm: f64,
-    /// Centrelines this near to each other are the same vessel, mm.
+    /// Maximum distance at which centrelines count as one vessel, mm.
     pub within_mm: f64,
-    /// Smaller components are not counted, mm³.
+    /// Minimum volume of a counted component, mm³.
     pub smallest_component_mm3: f64,
-    /// Means over the phases; none where a phase has none.
+    /// Means over the phases; `None` where a phase has no value.
     pub mean: Scores,
-    /// Where the truth was carried to the frame of the reconstruction: the means where it was left as stated.
+    /// Means without the motion of the reconstruction, where that motion was applied to the truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mean_as_stated: Option<Scores>,
     /// One row per phase.
     pub phases: Vec<PhaseScores>,
 }
 
-/// File of the true vessels at a phase.
+/// Path of the true vessels at a phase.
 pub fn truth_file(volumes: &Path, phase: u32) -> PathBuf {
     volumes.join(format!("vessels-{phase:02}.nrrd"))
 }
 
-/// Scores the moving field where it exceeds `threshold_per_mm` at every phase whose truth lies in the dataset's directory;
-/// none where there is no truth. Where the reconstruction is `carried` against it, the truth is carried along, and the means
-/// as stated are told beside. `proceed` is asked before every phase; its error ends the work.
+/// Scores the dynamic field where it exceeds `threshold_per_mm` at every phase whose truth is in the dataset's directory;
+/// `None` where there is no truth. Where the reconstruction is `carried` against it, the motion is applied to the truth,
+/// and the means without it are reported as well. `proceed` is called before every phase; its error ends the work.
 ///
 /// # Errors
 /// [`Error::Io`] and [`Error::Data`] for a truth that cannot be read, that does not follow the patient's axes, or that has
@@ -123,8 +123,8 @@ pub fn score(
     }))
 }
 
-/// Scores the moving field where it exceeds `threshold_per_mm` at the phases whose true vessels are known; none where none are.
-/// A pixel has `pixel_mm` at the isocentre.
+/// Scores the dynamic field where it exceeds `threshold_per_mm` at the phases whose true vessels are known; `None` if none
+/// are. A pixel has `pixel_mm` at the isocentre.
 ///
 /// # Errors
 /// [`Error::Data`] for a truth that has too many voxels; device errors.
@@ -145,7 +145,7 @@ pub fn score_known(
     Ok((!phases.is_empty()).then(|| VolumeScores::of(phases, threshold_per_mm, pixel_mm)))
 }
 
-/// The smallest component that counts, where a pixel has so many mm at the isocentre.
+/// Minimum volume of a counted component, for a pixel size at the isocentre.
 fn smallest_component_mm3(pixel_mm: f64) -> f64 {
     (COMPONENT_PIXELS * pixel_mm).powi(3)
 }
@@ -164,7 +164,7 @@ impl VolumeScores {
     }
 }
 
-/// Means over phases; none where a phase has none.
+/// Means over phases; `None` where a phase has no value.
 fn mean(phases: &[PhaseScores]) -> Scores {
     let mean = |pick: &dyn Fn(&Scores) -> Option<f64>| {
         phases.iter().map(|p| pick(&p.scores)).sum::<Option<f64>>().map(|sum| sum / phases.len() as f64)
@@ -186,7 +186,7 @@ fn mean(phases: &[PhaseScores]) -> Scores {
     }
 }
 
-/// Pixel at the isocentre, mm.
+/// Pixel size at the isocentre, mm.
 pub(crate) fn pixel_mm(dataset: &Dataset) -> f64 {
     let c_arm = dataset.reference_c_arm();
     c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm
@@ -195,13 +195,13 @@ pub(crate) fn pixel_mm(dataset: &Dataset) -> f64 {
 /// True vessels of a phase.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrueVessels {
-    /// Where the voxels are.
+    /// Grid of the voxels.
     pub grid: PatientGrid,
-    /// Which of them are vessel, left fastest.
+    /// Whether each voxel is vessel, left fastest.
     pub inside: Vec<bool>,
 }
 
-/// True attenuation per mm on a grid along the patient's axes.
+/// Reads the true attenuation per mm on a grid along the patient's axes.
 pub(super) fn read(file: &Path) -> Result<Volume> {
     let volume = Volume::read(file, &VolumeHints::default())?;
     let spacing_mm = spacing_mm(&volume);
@@ -211,14 +211,15 @@ pub(super) fn read(file: &Path) -> Result<Volume> {
     Ok(volume)
 }
 
-/// Distances of voxels along the patient's axes.
+/// Distances between voxels along the patient's axes.
 fn spacing_mm(volume: &Volume) -> DVec3 {
     let axes = volume.index_to_lps.matrix3;
     DVec3::new(axes.x_axis.x, axes.y_axis.y, axes.z_axis.z)
 }
 
 impl TrueVessels {
-    /// Vessel is what reaches a share of the vessels' attenuation, or of the largest value where that is not stated.
+    /// Creates the mask: a voxel is vessel if it reaches a share of the vessels' attenuation, or of the maximum value if
+    /// that is not stated.
     pub(super) fn new(volume: &Volume, dataset: &Dataset) -> TrueVessels {
         let largest = || f64::from(volume.values.iter().copied().fold(0.0, f32::max));
         let vessel_per_mm = dataset.vessel_attenuation.map(|v| v / MM_PER_UNIT);
@@ -233,7 +234,7 @@ impl TrueVessels {
         }
     }
 
-    /// The same vessels on a grid that reaches from one corner to another at least.
+    /// Returns the vessels on a grid that extends at least from one corner to another.
     fn reaching(&self, corners: Corners, file: &Path) -> Result<(PatientGrid, Mask)> {
         let PatientGrid { origin_mm, spacing_mm, size } = self.grid;
         let own = Corners::of(&self.grid);
@@ -270,7 +271,7 @@ struct Mass {
 }
 
 impl Mass {
-    /// That of a field by its distance to the truth, which is known on a grid; beyond that grid all of it is far.
+    /// Sums a field by its distance to the truth, which is known on a grid; all attenuation beyond that grid is far.
     fn of(coarse: &CoarseField, grid: &PatientGrid, to_truth: &DistanceMap, pixel_mm: f64) -> Mass {
         let [nx, ny, _] = grid.size.map(|n| n as usize);
         let end = DVec3::from_array(grid.size.map(f64::from));
@@ -291,13 +292,13 @@ impl Mass {
         mass
     }
 
-    /// A share of all of it; none of nothing.
+    /// Returns a part as a share of the total; `None` if the total is zero.
     fn share(&self, part: f64) -> Option<f64> {
         (self.all > 0.0).then(|| part / self.all)
     }
 }
 
-/// True vessels, and those of a field, on a grid of the truth's voxels that holds both.
+/// True vessels, and those of a field, on a grid with the truth's voxels that contains both.
 pub(super) fn on_one_grid(
     field: &MovingField<'_>,
     coarse: &CoarseField,
@@ -340,7 +341,7 @@ mod tests {
         let box_at = |x: f64| move |p: DVec3| (x..=x + 1.0).contains(&p.x) && (4.0..=6.0).contains(&p.y) && p.z == 5.0;
         let truth = drawn(size, spacing_mm, box_at(2.0));
         let (near, far) = (drawn(size, spacing_mm, box_at(4.0)), drawn(size, spacing_mm, box_at(6.0)));
-        // Three parts where the vessel is, two 1 to 2 mm away from it, one 3 to 4 mm away.
+        // Weights are three where the vessel is, two at 1 to 2 mm from it, one at 3 to 4 mm.
         let weight = |i: usize| 3 * u8::from(truth.inside[i]) + 2 * u8::from(near.inside[i]) + u8::from(far.inside[i]);
         let grid = PatientGrid { origin_mm: DVec3::splat(-5.0), spacing_mm, size: size.map(|n| n as u32) };
         let field = CoarseField { grid, values: (0..truth.inside.len()).map(|i| f32::from(weight(i))).collect() };
@@ -369,7 +370,7 @@ mod tests {
         let corners = Corners { low_mm: DVec3::new(0.3, 2.0, -1.5), high_mm: DVec3::new(1.0, 4.1, 5.0) };
         let (larger, mask) = truth.reaching(corners, file).unwrap();
         assert_eq!((larger.origin_mm, larger.size, mask.size), (DVec3::new(0.0, 2.0, -3.0), [4, 4, 5], [4, 4, 5]));
-        // Voxels stay where they were.
+        // Voxels keep their positions.
         let places = |grid: &PatientGrid, inside: &[bool]| {
             let [nx, ny, _] = grid.size.map(|n| n as usize);
             let at = |i: usize| DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64);

@@ -1,23 +1,23 @@
-//! A forest of centrelines as branches that leave each other, from the roots on.
+//! Decomposition of a forest of centrelines into branches, from the roots.
 
 use crate::trees::graph::Forest;
 
-/// Nodes of a branch, from the root on.
+/// Nodes of a branch, in order from the root.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Chain {
-    /// The branch it leaves, always one before it.
+    /// Index of the parent branch, always smaller than the branch's own.
     pub(super) parent: Option<usize>,
     pub(super) nodes: Vec<usize>,
 }
 
-/// How wide a vessel is at one of its ends: the mean over the nearer half of the branch that ends there, mm.
+/// Width of a vessel at one of its ends: the mean over the nearer half of the branch that ends there, mm.
 fn width_mm(forest: &Forest, end: usize) -> f64 {
     let chain = forest.chain(end, forest.nodes[end].links[0]);
     let half = &chain[..chain.len().div_ceil(2)];
     half.iter().map(|node| forest.nodes[*node].inside_mm).sum::<f64>() / half.len() as f64
 }
 
-/// Branches of all trees; the root of each tree is its widest end, as that of coronary arteries is.
+/// Branches of all trees; the root of each tree is its widest end, as in coronary arteries.
 pub(super) fn chains(forest: &Forest) -> Vec<Chain> {
     let trees = forest.trees().all();
     let mut roots: Vec<(usize, f64)> = Vec::new();

@@ -1,4 +1,4 @@
-//! A model's vessels as trees.
+//! Extraction of a model's vessels as trees.
 
 use crate::error::{Error, Result};
 use crate::export::volumes::grid_over;
@@ -23,37 +23,38 @@ use crate::vessels::field::{Corners, MovingField};
 use crate::vessels::mask::Mask;
 use glam::DVec3;
 
-/// Distance between points of the grid that a field is sampled on, in units of what it resolves.
+/// Step of the grid on which a field is sampled, in units of the field's resolution.
 const GRID_STEP: f64 = 0.5;
-/// Points of that grid at most; vessels that need more are looked at more coarsely.
+/// Maximum number of points of that grid; vessels that need more are sampled more coarsely.
 const MOST_POINTS: f64 = (1u64 << 26) as f64;
-/// What a field of Gaussians resolves, in units of the least standard deviation that they may have.
+/// Resolution of a field of Gaussians, in units of their minimum standard deviation.
 const RESOLVED_DEVIATIONS: f64 = 2.5;
-/// The least length of a branch that is kept, in units of what the field resolves.
+/// Minimum length of a branch, in units of the field's resolution.
 const LEAST_BRANCH: f64 = 3.0;
-/// How often lines are brought to the ridge.
+/// Number of times that lines are moved to the ridge.
 const CENTRINGS: usize = 2;
 
-/// Which trees are wanted.
+/// Options of the extraction of trees.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TreeOptions {
     /// Phases, from 0.
     pub phases: Vec<u32>,
-    /// The field is vessel above this, per mm; by the rule of scoring otherwise ([`vessel_threshold_per_mm`]).
+    /// Threshold above which the field is vessel, per mm; by default that of scoring ([`vessel_threshold_per_mm`]).
     pub threshold_per_mm: Option<f64>,
-    /// Branches that end without reaching so far beyond the lumen of the vessel they leave are spurs, mm; three times what
-    /// the field resolves otherwise.
+    /// Minimum reach of a branch with an end beyond the lumen of its parent, mm; shorter branches are spurs. The default is
+    /// three times the field's resolution.
     pub least_branch_mm: Option<f64>,
 }
 
-/// The vessels of a model as trees of centrelines with radii. Where one set of Gaussians moves, the tree of the phase at which
-/// they rest is followed: point i of branch b is the same material point in all phases, with one radius, and motion along vessels, which
-/// projections do not show, is what the Gaussians' grid makes of it. Elsewhere each phase has a tree of its own. `progress`
-/// hears of phases done and phases in all, before the first one, too; its error ends the work.
+/// Extracts the vessels of a model as trees of centrelines with radii. Where one set of Gaussians moves, the tree of their
+/// phase of rest is followed: point i of branch b is the same material point in all phases, with one radius, and motion
+/// along vessels, which projections do not show, is determined by the Gaussians' grid. Otherwise each phase has a tree of
+/// its own. `progress` is called with the number of finished phases and of all phases, also before the first one; its error
+/// ends the work.
 ///
 /// # Errors
-/// [`Error::Config`] for a phase the model does not have, for lengths and thresholds that are not positive, and for a phase
-/// without vessels above the threshold; device errors; errors of `progress`.
+/// [`Error::Config`] for a phase that the model does not have, for lengths and thresholds that are not positive, and for a
+/// phase without vessels above the threshold; device errors; errors of `progress`.
 pub fn vessel_trees(
     renderer: &Renderer,
     model: &Model,
@@ -88,7 +89,7 @@ pub fn vessel_trees(
     })
 }
 
-/// A positive number, or what is wrong with it.
+/// Returns a positive number; other numbers are an error.
 fn positive(name: &str, value: f64) -> Result<f64> {
     if value.is_finite() && value > 0.0 {
         return Ok(value);
@@ -96,7 +97,7 @@ fn positive(name: &str, value: f64) -> Result<f64> {
     Err(Error::config(name, value, "is not a positive number"))
 }
 
-/// Finds the vessels of a model.
+/// State of the extraction of a model's vessels.
 struct Finder<'a> {
     renderer: &'a Renderer,
     model: &'a Model,
@@ -104,7 +105,7 @@ struct Finder<'a> {
     resolution_mm: f64,
     threshold_per_mm: f64,
     least_branch_mm: f64,
-    /// The largest distance so far between points of fields that were looked at.
+    /// The largest grid step used so far, mm.
     spacing_mm: f64,
 }
 
@@ -128,7 +129,7 @@ impl Finder<'_> {
             options.least_branch_mm.map_or(Ok(LEAST_BRANCH * resolution_mm), |mm| positive("least_branch_mm", mm))?;
         let finder =
             Finder { renderer, model, pixel_mm, resolution_mm, threshold_per_mm, least_branch_mm, spacing_mm: 0.0 };
-        // The rule gives nothing where the field is nothing at the first phase.
+        // The rule gives zero where the field vanishes at the first phase.
         if threshold_per_mm > 0.0 { Ok(finder) } else { Err(finder.no_vessels(0)) }
     }
 
@@ -141,13 +142,13 @@ impl Finder<'_> {
         Error::config("threshold_per_mm", format!("{:.3e}", self.threshold_per_mm), problem)
     }
 
-    /// The field at a phase, of which one can ask where it is not faint.
+    /// Returns the dynamic field at a phase.
     fn moving(&self, phase: u32) -> MovingField<'_> {
         let Finder { renderer, model, pixel_mm, threshold_per_mm, .. } = *self;
         MovingField { renderer, scene: &model.scene, phase, pixel_mm, threshold_per_mm }
     }
 
-    /// The field of a phase inside boxes; none without boxes.
+    /// Samples the field of a phase inside boxes; `None` without boxes.
     fn field(&mut self, phase: u32, boxes: &[Corners]) -> Result<Option<SampledField>> {
         let Some(reach) = boxes.iter().copied().reduce(Corners::joined) else { return Ok(None) };
         let extent_mm = reach.high_mm - reach.low_mm;
@@ -161,7 +162,7 @@ impl Finder<'_> {
         Ok(Some(SampledField { grid, values }))
     }
 
-    /// The tree of a phase by itself.
+    /// Extracts the tree of a single phase.
     fn tree(&mut self, phase: u32) -> Result<PhaseTree> {
         let moving = self.moving(phase);
         let boxes = moving.boxes(&moving.coarse()?);
@@ -173,7 +174,7 @@ impl Finder<'_> {
         Ok(PhaseTree { phase, branches: self.measured(&field, lines) })
     }
 
-    /// The tree of the reference phase as it is at another. A material point keeps its radius.
+    /// Moves the tree of the reference phase to another phase. A material point keeps its radius.
     fn followed(&mut self, reference: &PhaseTree, carrier: &Carrier<'_>, phase: u32) -> Result<PhaseTree> {
         if phase == reference.phase {
             return Ok(reference.clone());
@@ -194,7 +195,7 @@ impl Finder<'_> {
         Ok(PhaseTree { phase, branches })
     }
 
-    /// Lines with the radii of their vessels.
+    /// Measures the radii of the vessels along lines.
     fn measured(&self, field: &SampledField, lines: Vec<Line>) -> Vec<Branch> {
         let vessel_per_mm = self.model.vessel_attenuation.map(|attenuation| attenuation / MM_PER_UNIT);
         let lumen = Lumen { field, resolution_mm: self.resolution_mm, vessel_per_mm };
@@ -206,13 +207,13 @@ impl Finder<'_> {
     }
 }
 
-/// A centreline and the one it leaves.
+/// A centreline and its parent.
 struct Line {
     parent: Option<usize>,
     points_mm: Vec<DVec3>,
 }
 
-/// The centrelines of a field where it exceeds a threshold, each behind the one it leaves.
+/// Centrelines of a field where it exceeds a threshold, each after its parent.
 fn centrelines(field: &SampledField, threshold_per_mm: f64, resolution_mm: f64, least_branch_mm: f64) -> Vec<Line> {
     let mut forest = thinned(field, threshold_per_mm);
     bridge_gaps(&mut forest, resolution_mm);
@@ -233,7 +234,7 @@ fn centrelines(field: &SampledField, threshold_per_mm: f64, resolution_mm: f64, 
     lines
 }
 
-/// The forest of lines one voxel wide that a field is thinned to where it exceeds a threshold.
+/// Thins a field, where it exceeds a threshold, to a forest of lines one voxel wide.
 fn thinned(field: &SampledField, threshold_per_mm: f64) -> Forest {
     let inside: Vec<bool> = field.values.iter().map(|v| f64::from(*v) > threshold_per_mm).collect();
     let (size, spacing_mm) = (field.grid.size.map(|n| n as usize), field.grid.spacing_mm);
@@ -253,7 +254,7 @@ mod tests {
         centrelines(&vessels(tubes), 0.2 * VESSEL_PER_MM, RESOLUTION_MM, LEAST_BRANCH * RESOLUTION_MM)
     }
 
-    /// The largest distance of a line's points from the nearest of the true ones, mm.
+    /// Maximum distance of a line's points from the nearest true point, mm.
     fn farthest_mm(line: &[DVec3], truth: &[DVec3]) -> f64 {
         line.iter().map(|point| distance_mm(truth, *point)).fold(0.0, f64::max)
     }
@@ -268,7 +269,7 @@ mod tests {
         assert_eq!(lines.len(), 1);
         let line = &lines[0].points_mm;
         assert!(farthest_mm(line, &helix) < 0.15, "{} mm off", farthest_mm(line, &helix));
-        // Ends recede by the radius.
+        // Thinning shortens ends by the radius.
         assert!(farthest_mm(&helix, line) < 2.0, "{} mm missing", farthest_mm(&helix, line));
         let steps: Vec<f64> = line.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
         assert!(steps.iter().all(|step| (step / steps[0] - 1.0).abs() < 0.02), "points are even");
@@ -301,7 +302,7 @@ mod tests {
                 DVec3::new(12.0 * cosine, 12.0 * sine, 0.0)
             })
         };
-        // Thin around a quarter of the way round.
+        // The ring is thin around a quarter of its length.
         let lines = found(&[(ring(0.3, 1.2), 1.5), (ring(0.2, 0.3), 0.6)]);
         let lengths: f64 = lines.iter().map(|line| crate::trees::tree::length_mm(&line.points_mm)).sum();
         assert_eq!(lines.len(), 1, "one open line");

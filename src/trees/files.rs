@@ -1,4 +1,4 @@
-//! Trees as files (see `docs/formats.md`): JSON, VTK, SWC and glTF.
+//! File formats of trees (see `docs/formats.md`): JSON, VTK, SWC and glTF.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 const FORMAT: &str = "nertca-tree";
 const VERSION: u32 = 1;
 const AXES: &str = "left, posterior, superior";
-/// Digits kept: a tenth of a micrometre.
+/// Rounding of coordinates, per mm: a tenth of a micrometre.
 const PER_MM: f64 = 1e4;
 
 /// File format of trees.
@@ -21,7 +21,7 @@ const PER_MM: f64 = 1e4;
 pub enum TreeFormat {
     /// JSON: all phases in one file.
     Json,
-    /// VTK poly data, a file per phase with a `.pvd` of them all.
+    /// VTK poly data, a file per phase with a `.pvd` collection.
     Vtp,
     /// SWC, a file per phase.
     Swc,
@@ -30,7 +30,7 @@ pub enum TreeFormat {
 }
 
 impl TreeFormat {
-    /// Format by the end of a file name.
+    /// Returns the format by the extension of a file name.
     pub fn of(path: &Path) -> Option<TreeFormat> {
         match path.extension()?.to_str()?.to_lowercase().as_str() {
             "json" => Some(TreeFormat::Json),
@@ -42,7 +42,7 @@ impl TreeFormat {
     }
 }
 
-/// `tree.json`.
+/// Content of `tree.json`.
 #[derive(Serialize)]
 struct TreeFile {
     format: &'static str,
@@ -91,7 +91,7 @@ impl BranchRow {
     }
 }
 
-/// What every file says of how its phases belong together.
+/// Note in every file on the correspondence of points between phases.
 pub fn note(beat: &BeatTree) -> &'static str {
     match beat.reference_phase {
         Some(_) => {
@@ -102,8 +102,8 @@ pub fn note(beat: &BeatTree) -> &'static str {
     }
 }
 
-/// Writes a tree; returns the files made. `sequence` writes a number into each name of a format with a file per phase, and
-/// for VTK a collection, even for one phase.
+/// Writes a tree and returns the files written. `sequence` adds a number to each file name in a format with a file per
+/// phase and, for VTK, a collection, even for one phase.
 ///
 /// # Errors
 /// [`Error::Io`].
@@ -116,7 +116,7 @@ pub fn write(beat: &BeatTree, path: &Path, format: TreeFormat, sequence: bool) -
         TreeFormat::Vtp => {
             let mut made = write_phases(beat, path, sequence, to_vtp)?;
             if sequence {
-                // Last, so that all it names is there.
+                // The collection is written last, so that all files it lists exist.
                 let collection = path.with_extension("pvd");
                 files::write_atomic(&collection, to_collection(beat, &made).as_bytes())?;
                 made.push(collection);
@@ -131,7 +131,7 @@ pub fn write(beat: &BeatTree, path: &Path, format: TreeFormat, sequence: bool) -
     }
 }
 
-/// One file per phase: `name.vtp`, or `name_0000.vtp` and so on.
+/// Writes one file per phase: `name.vtp`, or `name_0000.vtp` and so on.
 fn write_phases(
     beat: &BeatTree,
     path: &Path,
@@ -150,10 +150,10 @@ fn write_phases(
     beat.phases.iter().map(write).collect()
 }
 
-/// All phases as the text of a `.json` file.
+/// Formats all phases as the text of a `.json` file.
 ///
 /// # Errors
-/// [`Error::Internal`] for what JSON cannot hold.
+/// [`Error::Internal`] for values that JSON cannot represent.
 pub fn to_json(beat: &BeatTree) -> Result<String> {
     let phases = beat.phases.iter().map(|tree| PhaseRow {
         phase: tree.phase,
@@ -189,7 +189,7 @@ fn to_vtp(beat: &BeatTree, tree: &PhaseTree) -> String {
         counts: branches().map(|b| b.points_mm.len()).collect(),
         of_points: vec![
             Values::Float("Radius", radii.clone()),
-            // What VMTK and 3D Slicer's extension of it look for.
+            // VMTK and its 3D Slicer extension expect this name.
             Values::Float("MaximumInscribedSphereRadius", radii),
             Values::Int("PointId", branches().flat_map(|b| 0..b.points_mm.len() as i64).collect()),
         ],
@@ -210,11 +210,11 @@ fn to_collection(beat: &BeatTree, files: &[PathBuf]) -> String {
 
 fn to_swc(beat: &BeatTree, tree: &PhaseTree) -> String {
     let mut points: Vec<swc::Point> = Vec::new();
-    // Where the last point of each branch is among all points.
+    // Index of the last point of each branch among all points.
     let mut ends = Vec::new();
     for branch in &tree.branches {
         let mut before = branch.parent.map(|parent| ends[parent]);
-        // The first point of a branch is the last of its parent, which is there already.
+        // The first point of a branch is the last of its parent, which is already stored.
         let first = usize::from(before.is_some());
         for (point, radius) in branch.points_mm.iter().zip(&branch.radius_mm).skip(first) {
             points.push(swc::Point { position: rounded_point(point), radius: rounded(*radius), parent: before });

@@ -1,18 +1,18 @@
-//! Material points of a set of Gaussians that moves: where they are at any phase.
+//! Positions of material points of a moving set of Gaussians at any phase.
 
 use crate::geometry::{lps_mm_from_world, world_from_lps_mm};
 use crate::kernels::layout::Gaussian;
 use crate::model::gaussians::{MovingTree, scales};
 use glam::{DMat3, DQuat, DVec3};
 
-/// A set of Gaussians that carries points through the beat.
+/// A set of Gaussians that moves points through the beat.
 pub(super) struct Carrier<'a> {
     tree: &'a MovingTree,
-    /// Of each Gaussian, as it is at rest.
+    /// Shape of each Gaussian at rest.
     shapes: Vec<Shape>,
 }
 
-/// A Gaussian's density at a place x: exp(log_density - |inverse (x - centre)|^2 / 2), lengths in its pixels.
+/// A Gaussian's density at a point x is exp(log_density - |inverse (x - centre)|^2 / 2), with lengths in its pixels.
 struct Shape {
     centre: DVec3,
     inverse: DMat3,
@@ -40,8 +40,8 @@ impl Carrier<'_> {
         Carrier { tree, shapes: tree.rest.rows.iter().copied().map(shape).collect() }
     }
 
-    /// Where points of the phase of rest are at a phase, LPS mm: the grid carries them, and what Gaussians move by themselves they do
-    /// in the mean of the Gaussians around, each by its density there.
+    /// Moves points of the phase of rest to a phase, LPS mm. The grid moves them; the Gaussians' own motion is added as the
+    /// mean over the Gaussians, each weighted by its density at the point.
     pub(super) fn carried_mm(&self, points_mm: &[DVec3], phase: u32) -> Vec<DVec3> {
         let (tree, phase) = (self.tree, f64::from(phase));
         let own = |(i, shape): (usize, &Shape)| tree.position(i, phase) - tree.carried(shape.centre, phase);
@@ -70,7 +70,7 @@ mod tests {
 
     const PIXEL: f64 = 0.01;
 
-    /// Two Gaussians far apart, the second of which moves by itself in a grid that carries all by (1, 2, 3) pixels.
+    /// Two distant Gaussians, of which the second has an own motion, in a grid that moves everything by (1, 2, 3) pixels.
     fn tree() -> MovingTree {
         let gaussian = |x: f32| Gaussian {
             position: [x, 0.0, 0.0],

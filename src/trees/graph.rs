@@ -1,4 +1,4 @@
-//! The graph of a centreline's voxels, without cycles.
+//! Acyclic graph of a centreline's voxels.
 
 use crate::trees::sampled::SampledField;
 use crate::trees::tree::length_mm;
@@ -12,7 +12,7 @@ pub(super) struct Node {
     pub(super) place_mm: DVec3,
     /// Distance to the outside of the vessel, mm.
     pub(super) inside_mm: f64,
-    /// Nodes it is linked to.
+    /// Nodes linked to it.
     pub(super) links: Vec<usize>,
 }
 
@@ -22,7 +22,7 @@ pub(super) struct Forest {
     pub(super) nodes: Vec<Node>,
 }
 
-/// Sets that are joined by and by.
+/// Disjoint sets that can be joined (union-find).
 pub(super) struct Sets(Vec<usize>);
 
 impl Sets {
@@ -30,7 +30,7 @@ impl Sets {
         Sets((0..n).collect())
     }
 
-    /// The element that stands for the set an element is in.
+    /// Returns the representative of an element's set.
     fn of(&mut self, element: usize) -> usize {
         let mut at = element;
         while self.0[at] != at {
@@ -40,12 +40,12 @@ impl Sets {
         at
     }
 
-    /// The element that stands for the set of each.
+    /// Returns the representative of each element's set.
     pub(super) fn all(&mut self) -> Vec<usize> {
         (0..self.0.len()).map(|element| self.of(element)).collect()
     }
 
-    /// Joins the sets of two elements; whether they were apart.
+    /// Joins the sets of two elements, and tells whether they were disjoint.
     pub(super) fn join(&mut self, a: usize, b: usize) -> bool {
         let (a, b) = (self.of(a), self.of(b));
         self.0[a] = b;
@@ -53,14 +53,14 @@ impl Sets {
     }
 }
 
-/// Whether a node lies within a branch: neither end nor bifurcation.
+/// Tells whether a node lies within a branch, that is, is neither an end nor a bifurcation.
 fn is_within(node: &Node) -> bool {
     node.links.len() == 2
 }
 
 impl Forest {
-    /// Links the voxels of a centreline that touch. Of each cycle the weakest link is left out: that with the least
-    /// attenuation at the weaker of its ends. `inside_mm` tells a voxel's distance to the outside of the vessel.
+    /// Links the touching voxels of a centreline. The weakest link of each cycle is left out: the one with the minimum
+    /// attenuation at the weaker of its ends. `inside_mm` gives a voxel's distance to the outside of the vessel.
     pub(super) fn of(line: &Mask, field: &SampledField, inside_mm: impl Fn(usize) -> f64) -> Forest {
         let voxels: Vec<usize> = line.voxels().collect();
         let [nx, ny, nz] = line.size;
@@ -77,7 +77,7 @@ impl Forest {
                 }
             }
         }
-        // Values that are not negative sort as their bits do.
+        // Non-negative values are ordered like their bit patterns.
         let strength = |(a, b): &(usize, usize)| field.values[voxels[*a]].min(field.values[voxels[*b]]).to_bits();
         links.sort_by_key(|link| Reverse(strength(link)));
         let node =
@@ -97,7 +97,7 @@ impl Forest {
         self.nodes[b].links.push(a);
     }
 
-    /// Takes the links of nodes away; nodes without links are no part of the forest.
+    /// Removes the links of nodes; nodes without links do not belong to the forest.
     pub(super) fn unlink(&mut self, nodes: &[usize]) {
         for node in nodes {
             for other in std::mem::take(&mut self.nodes[*node].links) {
@@ -106,7 +106,7 @@ impl Forest {
         }
     }
 
-    /// Nodes from a node on along a link, up to the next end or bifurcation.
+    /// Nodes from a node along a link, up to the next end or bifurcation.
     pub(super) fn chain(&self, from: usize, link: usize) -> Vec<usize> {
         let mut chain = vec![from, link];
         let (mut before, mut at) = (from, link);
@@ -119,12 +119,12 @@ impl Forest {
         chain
     }
 
-    /// Ends of lines.
+    /// Nodes at the ends of lines.
     pub(super) fn ends(&self) -> impl Iterator<Item = usize> {
         (0..self.nodes.len()).filter(|node| self.nodes[*node].links.len() == 1)
     }
 
-    /// Places of nodes, mm.
+    /// Positions of nodes, mm.
     pub(super) fn places_mm(&self, nodes: &[usize]) -> Vec<DVec3> {
         nodes.iter().map(|node| self.nodes[*node].place_mm).collect()
     }
@@ -134,7 +134,7 @@ impl Forest {
         length_mm(&self.places_mm(chain))
     }
 
-    /// The nodes of each tree as a set.
+    /// Returns the trees as disjoint sets of nodes.
     pub(super) fn trees(&self) -> Sets {
         let mut sets = Sets::apart(self.nodes.len());
         for (a, node) in self.nodes.iter().enumerate() {
@@ -149,7 +149,7 @@ mod tests {
     use super::*;
     use crate::render::grid::PatientGrid;
 
-    /// A ring of voxels in a plane; attenuation is 1, and as `weak` says at some of them.
+    /// A ring of voxels in a plane; attenuation is 1 except for the values in `weak`.
     fn ring(weak: &[([usize; 2], f32)]) -> (Mask, SampledField) {
         const N: usize = 7;
         let mut inside = vec![false; N * N];
@@ -188,7 +188,7 @@ mod tests {
         assert_eq!(forest.chain(2, 4), [2, 4, 5]);
         assert_eq!(forest.length_mm(&[2, 4, 5]), 3.0);
         assert_eq!(forest.ends().collect::<Vec<_>>(), [0, 3, 5]);
-        // Without one of its lines, the bifurcation is a point of the other.
+        // Without one of its lines, the bifurcation becomes an inner point of the other.
         forest.unlink(&[3]);
         assert_eq!(forest.chain(0, 1), [0, 1, 2, 4, 5]);
     }

@@ -7,30 +7,30 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
-/// Directions in which a profile is looked at. The median over them leaves out those in which another vessel lies.
+/// Number of directions of profiles. The median over them excludes directions that meet another vessel.
 const DIRECTIONS: u32 = 15;
-/// Distance between places of a profile, in units of what the field resolves.
+/// Step of a profile, in units of the field's resolution.
 const PROFILE_STEP: f64 = 0.125;
-/// Places of a profile at most: wider vessels than twenty such units are not measured.
+/// Maximum number of steps of a profile: vessels wider than twenty resolution lengths are not measured.
 const PROFILE_STEPS: u32 = 160;
 /// A profile ends below this share of its peak.
 const FOOT: f64 = 0.03;
-/// A profile ends in a valley: where it rises by this factor, once it has fallen below a share of its peak.
+/// A profile ends in a valley: where it rises by this factor after falling below the share [`FALLEN`] of its peak.
 const RISE: f64 = 1.02;
-/// That share.
+/// Share of the peak below which a profile may end in a valley.
 const FALLEN: f64 = 0.8;
-/// Radii are medians over so much of a line to either side, in units of what the field resolves.
+/// Half length of the median filter of radii along a line, in units of the field's resolution.
 const MEDIAN: f64 = 1.5;
 
-/// What a profile in one direction says.
+/// Result of a profile in one direction.
 struct Flank {
-    /// Attenuation times the distance, summed over the distance, mm: its share of the vessel's attenuating area.
+    /// Integral of attenuation times distance over the distance, mm: the profile's share of the vessel's attenuating area.
     area: f64,
-    /// Where the field has fallen to half its peak, mm.
+    /// Distance at which the field has fallen to half its peak, mm.
     half_mm: f64,
 }
 
-/// Measures how wide vessels are.
+/// Measurement of vessel widths.
 pub(super) struct Lumen<'a> {
     pub(super) field: &'a SampledField,
     pub(super) resolution_mm: f64,
@@ -39,11 +39,11 @@ pub(super) struct Lumen<'a> {
 }
 
 impl Lumen<'_> {
-    /// Radii along a centreline, mm.
+    /// Measures the radii along a centreline, mm.
     ///
-    /// Where the vessels' attenuation is known, a vessel has the area that holds as much of it as the field has across the
-    /// centreline, however blurred the field is: of what was tried on phantoms (`docs/performance.md`) that errs least.
-    /// Elsewhere it reaches to half of the local peak.
+    /// Where the vessels' attenuation is known, the area of a vessel is the field's integral across the centreline divided
+    /// by that attenuation, however blurred the field is; of all methods tried on phantoms (`docs/performance.md`) this one
+    /// has the smallest error. Otherwise the vessel ends at half of the local peak.
     pub(super) fn radii_mm(&self, points_mm: &[DVec3]) -> Vec<f64> {
         let radius = |(point, tangent): (&DVec3, DVec3)| self.radius_mm(*point, tangent) as f32;
         let radii: Vec<f32> = points_mm.par_iter().zip(tangents(points_mm)).map(radius).collect();
@@ -106,12 +106,12 @@ mod tests {
             for vessel_per_mm in [Some(VESSEL_PER_MM), None] {
                 let found = radius_mm(std::slice::from_ref(&straight), vessel_per_mm);
                 assert!((found / radius - 1.0).abs() < 0.1, "{found} mm for {radius} mm, {vessel_per_mm:?}");
-                // A vessel that passes nearby is not counted.
+                // A vessel that passes nearby must not contribute.
                 let beside = radius_mm(&[straight.clone(), tilted.clone()], vessel_per_mm);
                 assert!((beside / found - 1.0).abs() < 0.05, "{beside} mm beside another vessel, {found} mm alone");
             }
         }
-        // One between four others ends in the valleys around it.
+        // The profile of a vessel between four others ends in the valleys around it.
         let at = |y: f64, z: f64| points(400, |along| DVec3::new(36.0 * along - 18.0, y, z));
         let around = [(3.4, 0.0), (-3.4, 0.0), (0.0, 3.4), (0.0, -3.4)].map(|(y, z)| (at(y, z), 2.0));
         let among = [vec![(at(0.0, 0.0), 0.8)], around.to_vec()].concat();
@@ -119,7 +119,7 @@ mod tests {
             let found = radius_mm(&among, vessel_per_mm);
             assert!((found / 0.8 - 1.0).abs() < 0.15, "{found} mm among others, {vessel_per_mm:?}");
         }
-        // A wrong attenuation shows in the area.
+        // A wrong attenuation changes the area in proportion.
         let tube = [(points(400, |along| DVec3::X * (36.0 * along - 18.0)), 1.3)];
         let (right, half) = (radius_mm(&tube, Some(VESSEL_PER_MM)), radius_mm(&tube, Some(0.5 * VESSEL_PER_MM)));
         assert!((half / right - 2f64.sqrt()).abs() < 1e-6);

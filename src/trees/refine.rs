@@ -1,36 +1,36 @@
-//! Lines through voxels -> smooth centrelines on the field's ridge.
+//! Conversion of lines through voxels to smooth centrelines on the field's ridge.
 
 use crate::trees::sampled::SampledField;
 use crate::trees::tree::length_mm;
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Points of a centreline are about so far apart, in units of what the field resolves.
+/// Approximate step of a centreline's points, in units of the field's resolution.
 pub(super) const STEP: f64 = 0.5;
-/// The ridge is looked for in a disc of this radius, in units of what the field resolves.
+/// Radius of the disc in which the ridge is searched, in units of the field's resolution.
 const DISC: f64 = 1.5;
-/// Points of the disc are so far apart, in the same units.
+/// Step of the disc's points, in units of the field's resolution.
 const DISC_STEP: f64 = 0.25;
-/// How often a point is moved to the middle of what its disc holds. More let points wander to vessels beside: with 20, radii of
-/// the default phantom err by a sixth more.
+/// Number of times that a point is moved to the centroid of its disc. With more, points drift to neighbouring vessels: with
+/// 20, the error of radii in the default phantom grows by a sixth.
 const SHIFTS: usize = 6;
-/// A point moves at most this far from where the voxels have it, in the same units.
+/// Maximum displacement of a point from its position by the voxels, in units of the field's resolution.
 const FARTHEST: f64 = 1.5;
-/// Lines through voxels are smoothed with this standard deviation, in the same units.
+/// Standard deviation of the smoothing of lines through voxels, in units of the field's resolution.
 const SMOOTH: f64 = 1.0;
 
-/// Finds the ridge of a field.
+/// Search for the ridge of a field.
 pub(super) struct Centring<'a> {
     pub(super) field: &'a SampledField,
     pub(super) resolution_mm: f64,
 }
 
 impl Centring<'_> {
-    /// What is looked at lies at most this far from a point, in units of what the field resolves: a disc around the farthest
-    /// place it may move to, and the points that values in between are made of.
+    /// Maximum distance of the samples used for a point, in units of the field's resolution: a disc around its farthest
+    /// possible position, and the neighbours for interpolation.
     pub(super) const REACH: f64 = DISC + FARTHEST + 1.0;
 
-    /// The place on the ridge beside a point, within the plane across a direction.
+    /// Position on the ridge beside a point, within the plane across a direction.
     pub(super) fn on_ridge(&self, point_mm: DVec3, tangent: DVec3) -> DVec3 {
         let (u, v) = tangent.any_orthonormal_pair();
         let (radius, step) = (DISC * self.resolution_mm, DISC_STEP * self.resolution_mm);
@@ -55,8 +55,8 @@ impl Centring<'_> {
         point_mm + (at - point_mm).clamp_length_max(FARTHEST * self.resolution_mm)
     }
 
-    /// A line through points with every point on the ridge: how far points move is smoothed along the line. The first
-    /// stays where it is if `hold_first`.
+    /// Moves a line's points to the ridge, with displacements smoothed along the line. The first point stays fixed if
+    /// `hold_first`.
     pub(super) fn line(&self, points_mm: &[DVec3], hold_first: bool) -> Vec<DVec3> {
         let tangents = tangents(points_mm);
         let moved = |i: usize| match i {
@@ -82,16 +82,16 @@ pub(super) fn tangents(points_mm: &[DVec3]) -> Vec<DVec3> {
     (0..=last).map(tangent).collect()
 }
 
-/// What becomes of the ends of a line that is smoothed.
+/// Treatment of the ends of a line in smoothing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Ends {
-    /// They stay as they are.
+    /// Ends stay fixed.
     Held,
-    /// They are smoothed like all others.
+    /// Ends are smoothed like all other points.
     Free,
 }
 
-/// Values along a line, each the mean of those around it under a Gaussian, which narrows towards held ends.
+/// Gaussian mean of the values along a line; the Gaussian narrows towards held ends.
 pub(super) fn smoothed(values: &[DVec3], deviation: f64, ends: Ends) -> Vec<DVec3> {
     let last = values.len() as isize - 1;
     let at = |i: isize| {
@@ -107,7 +107,7 @@ pub(super) fn smoothed(values: &[DVec3], deviation: f64, ends: Ends) -> Vec<DVec
     (0..=last).map(at).collect()
 }
 
-/// Points at equal distances along a line, its ends among them, about `step_mm` apart.
+/// Points at equal distances of about `step_mm` along a line, including its ends.
 pub(super) fn evenly(points_mm: &[DVec3], step_mm: f64) -> Vec<DVec3> {
     let length = length_mm(points_mm);
     let n = (length / step_mm).round().max(1.0) as usize;
@@ -127,7 +127,7 @@ pub(super) fn evenly(points_mm: &[DVec3], step_mm: f64) -> Vec<DVec3> {
     even
 }
 
-/// A line through voxels as a smooth line of points at equal distances, its ends where they are.
+/// Converts a line through voxels to a smooth line of points at equal distances with fixed ends.
 pub(super) fn from_voxels(points_mm: &[DVec3], resolution_mm: f64) -> Vec<DVec3> {
     let step_mm = STEP * resolution_mm;
     evenly(&smoothed(&evenly(points_mm, step_mm), SMOOTH / STEP, Ends::Held), step_mm)
@@ -143,7 +143,7 @@ mod tests {
         let bent = [DVec3::ZERO, DVec3::X * 3.0, DVec3::new(3.0, 4.0, 0.0)];
         let even = evenly(&bent, 0.4);
         assert_eq!((even[0], even[even.len() - 1], even.len()), (bent[0], bent[2], 19));
-        // Around the corner the straight way is shorter.
+        // The straight connection across the corner is shorter.
         let steps: Vec<f64> = even.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
         assert_eq!(steps.iter().filter(|step| (**step - 7.0 / 18.0).abs() > 1e-9).count(), 1, "{steps:?}");
     }

@@ -1,22 +1,22 @@
-//! The moving field between the points of a grid.
+//! Interpolation of the dynamic field between the points of a grid.
 
 use crate::render::grid::PatientGrid;
 use glam::DVec3;
 
-/// Attenuation at the points of a grid, per mm; none beyond it.
+/// Attenuation at the points of a grid, per mm; zero beyond it.
 pub(super) struct SampledField {
     pub(super) grid: PatientGrid,
     pub(super) values: Vec<f32>,
 }
 
-/// Weights of the four points around a place that is `t` behind the second (Catmull-Rom).
+/// Catmull-Rom weights of the four points around a position at the share `t` between the second and the third.
 fn cubic(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (2.0 * t2 - t - t3), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (4.0 * t2 + t - 3.0 * t3), 0.5 * (t3 - t2)]
 }
 
 impl SampledField {
-    /// Attenuation at a place, per mm; cubic along each axis, and never below 0.
+    /// Attenuation at a position, per mm; cubic along each axis, and never below 0.
     pub(super) fn at(&self, place_mm: DVec3) -> f64 {
         let [nx, ny, nz] = self.grid.size.map(|n| n as isize);
         let index = (place_mm - self.grid.origin_mm) / self.grid.spacing_mm;
@@ -41,7 +41,7 @@ impl SampledField {
         sum.max(0.0)
     }
 
-    /// Place of a point of the grid, mm.
+    /// Position of a point of the grid, mm.
     pub(super) fn place_mm(&self, index: usize) -> DVec3 {
         let [nx, ny, _] = self.grid.size.map(|n| n as usize);
         let steps = DVec3::new((index % nx) as f64, (index / nx % ny) as f64, (index / (nx * ny)) as f64);
@@ -55,12 +55,12 @@ pub(super) mod tests {
 
     /// Distance between points of the grids of tests, mm.
     pub(in crate::trees) const SPACING_MM: f64 = 0.5;
-    /// What fields of tests resolve, mm.
+    /// Resolution of test fields, mm.
     pub(in crate::trees) const RESOLUTION_MM: f64 = 2.0 * SPACING_MM;
-    /// Attenuation inside vessels of tests.
+    /// Attenuation inside test vessels.
     pub(in crate::trees) const VESSEL_PER_MM: f64 = 0.02;
 
-    /// A vessel of tests: a line, and a radius in mm.
+    /// A test vessel: a line, and a radius in mm.
     pub(in crate::trees) type Tube = (Vec<DVec3>, f64);
 
     /// Points along a line, mm.
@@ -68,12 +68,12 @@ pub(super) mod tests {
         (0..=n).map(|i| at(i as f64 / n as f64)).collect()
     }
 
-    /// How far a place is from the nearest point of a line, mm.
+    /// Distance of a position from the nearest point of a line, mm.
     pub(in crate::trees) fn distance_mm(line: &[DVec3], place: DVec3) -> f64 {
         line.iter().map(|p| p.distance(place)).fold(f64::INFINITY, f64::min)
     }
 
-    /// Vessels with soft walls in a cube of 40 mm around the origin, whose walls they do not reach.
+    /// Vessels with soft walls in a cube of 40 mm around the origin; they do not reach its faces.
     pub(in crate::trees) fn vessels(tubes: &[Tube]) -> SampledField {
         const N: u32 = 81;
         let grid = PatientGrid {

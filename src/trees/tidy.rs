@@ -1,15 +1,15 @@
-//! What makes a vessel's tree of a forest of centrelines: gaps bridged, spurs and specks taken away.
+//! Clean-up of a forest of centrelines: bridging of gaps, pruning of spurs and removal of specks.
 
 use crate::trees::graph::Forest;
 use glam::DVec3;
 
-/// Ends point where the last so many millimetres do, in units of what the field resolves.
+/// Length of the last part of a line that defines an end's direction, in units of the field's resolution.
 const DIRECTION: f64 = 3.0;
-/// Gaps at most this wide are bridged, in units of what the field resolves.
+/// Maximum width of a bridged gap, in units of the field's resolution.
 const GAP: f64 = 5.0;
-/// The angle between an end's direction and its bridge is at most this.
+/// Maximum angle between an end's direction and its bridge.
 const GAP_DEG: f64 = 45.0;
-/// A tree is a speck below this share of the longest one's length.
+/// Maximum length of a speck, as a share of the longest tree's length.
 const SPECK: f64 = 0.05;
 
 /// A bridge from the end of one tree to a node of another.
@@ -20,7 +20,7 @@ struct Bridge {
     width_mm: f64,
 }
 
-/// Where an end points to: away from the tree, along its last few millimetres.
+/// Direction of an end: away from the tree, along its last few millimetres.
 fn direction(forest: &Forest, end: usize, along_mm: f64) -> Option<DVec3> {
     let chain = forest.chain(end, *forest.nodes[end].links.first()?);
     let tip = forest.nodes[end].place_mm;
@@ -28,8 +28,8 @@ fn direction(forest: &Forest, end: usize, along_mm: f64) -> Option<DVec3> {
     (tip - far.unwrap_or(forest.nodes[*chain.last()?].place_mm)).try_normalize()
 }
 
-/// Links ends of trees with a node of another tree that lies ahead of them, the narrowest gap first, each end once. Two lines
-/// that end in the same place are one, whatever their direction.
+/// Links ends of trees with a node of another tree ahead of them, the narrowest gap first, each end once. Two lines that
+/// end in one place are linked whatever their direction.
 pub(super) fn bridge_gaps(forest: &mut Forest, resolution_mm: f64) {
     let mut bridges: Vec<Bridge> = forest.ends().flat_map(|end| bridges_from(forest, end, resolution_mm)).collect();
     bridges.sort_by(|a, b| a.width_mm.total_cmp(&b.width_mm));
@@ -41,7 +41,7 @@ pub(super) fn bridge_gaps(forest: &mut Forest, resolution_mm: f64) {
     }
 }
 
-/// Bridges that may be built from an end.
+/// Possible bridges from an end.
 fn bridges_from(forest: &Forest, end: usize, resolution_mm: f64) -> Vec<Bridge> {
     let Some(ahead) = direction(forest, end, DIRECTION * resolution_mm) else { return Vec::new() };
     let tip = forest.nodes[end].place_mm;
@@ -55,7 +55,8 @@ fn bridges_from(forest: &Forest, end: usize, resolution_mm: f64) -> Vec<Bridge> 
     (0..forest.nodes.len()).filter_map(bridge).collect()
 }
 
-/// Takes away branches that end without reaching `least_mm` beyond the lumen of the vessel they leave, the shortest first.
+/// Prunes branches with an end that reach less than `least_mm` beyond the lumen of the vessel they leave, the shortest
+/// first.
 pub(super) fn prune_spurs(forest: &mut Forest, least_mm: f64) {
     loop {
         let spurs = forest.ends().filter_map(|end| {
@@ -74,13 +75,12 @@ pub(super) fn prune_spurs(forest: &mut Forest, least_mm: f64) {
     }
 }
 
-/// Takes away trees whose lines are shorter in all than a share of the longest tree's, and those that are no longer than a
-/// spur may be.
+/// Removes trees whose total length is below a share of the longest tree's, or below the minimum length of a branch.
 pub(super) fn drop_specks(forest: &mut Forest, least_mm: f64) {
     let trees = forest.trees().all();
     let mut lengths_mm = vec![0.0; trees.len()];
     for (a, node) in forest.nodes.iter().enumerate() {
-        // Each link is seen from both sides.
+        // Each link is visited from both sides.
         let away = |b: &usize| node.place_mm.distance(forest.nodes[*b].place_mm);
         lengths_mm[trees[a]] += 0.5 * node.links.iter().map(away).sum::<f64>();
     }
@@ -95,7 +95,7 @@ mod tests {
     use super::*;
     use crate::trees::graph::Node;
 
-    /// Lines of points a millimetre apart, as trees of their own.
+    /// Lines of points at distances of a millimetre, each a tree of its own.
     fn forest(lines: &[(DVec3, DVec3)]) -> Forest {
         let mut forest = Forest::default();
         for (from, to) in lines {
@@ -155,12 +155,12 @@ mod tests {
 
     #[test]
     fn spurs_go_by_how_far_they_leave_the_lumen() {
-        // The lumen takes 1 mm of each side branch: 2 mm are left of the first, 4 mm of the second.
+        // The lumen covers 1 mm of each side branch: 2 mm remain of the first, 4 mm of the second.
         let line = (DVec3::ZERO, DVec3::X * 20.0);
         let side = |x: f64, length: f64| (DVec3::new(x, 0.0, 0.0), DVec3::new(x, length, 0.0));
         let with = |least_mm: f64| {
             let mut forest = forest(&[line, side(5.0, 3.0), side(12.0, 5.0)]);
-            // Where side branches begin is a point of the line.
+            // The first point of a side branch is a point of the line.
             for (twin, at) in [(21, 5), (25, 12)] {
                 let next = forest.nodes[twin].links[0];
                 forest.unlink(&[twin]);

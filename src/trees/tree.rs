@@ -1,13 +1,13 @@
-//! Vessels as a tree of centrelines with radii, at one phase or followed over the beat. Patient coordinates, LPS mm.
+//! Vessels as a tree of centrelines with radii, at one phase or followed over the beat; patient coordinates, LPS mm.
 
 use glam::DVec3;
 
 /// A vessel between two bifurcations, or between a bifurcation and an end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Branch {
-    /// The branch it leaves, by its place in the tree, always before its own; none for one that begins at a root.
+    /// Index of the branch it leaves, always smaller than its own; `None` for one that begins at a root.
     pub parent: Option<usize>,
-    /// Points of the centreline, LPS mm, from the root on; the first is the last of the parent.
+    /// Points of the centreline, LPS mm, in order from the root; the first is the last of the parent.
     pub points_mm: Vec<DVec3>,
     /// Radius of the lumen at each point, mm.
     pub radius_mm: Vec<f64>,
@@ -19,7 +19,8 @@ impl Branch {
         length_mm(&self.points_mm)
     }
 
-    /// Mean diameter of the lumen along the centreline, mm; of one without length that of its first point.
+    /// Mean diameter of the lumen along the centreline, mm; for a centreline of length zero, the diameter at its first
+    /// point.
     pub fn mean_diameter_mm(&self) -> f64 {
         let steps = self.points_mm.windows(2).map(|pair| pair[0].distance(pair[1]));
         // The sum of both radii is the mean diameter of a step.
@@ -29,7 +30,7 @@ impl Branch {
         if length > 0.0 { area / length } else { first }
     }
 
-    /// Least diameter of the lumen, mm.
+    /// Minimum diameter of the lumen, mm.
     pub fn least_diameter_mm(&self) -> f64 {
         2.0 * self.radius_mm.iter().copied().fold(f64::INFINITY, f64::min)
     }
@@ -45,7 +46,7 @@ pub(super) fn length_mm(points_mm: &[DVec3]) -> f64 {
 pub struct PhaseTree {
     /// Cardiac phase, from 0.
     pub phase: u32,
-    /// Branches, each behind its parent.
+    /// Branches, each after its parent.
     pub branches: Vec<Branch>,
 }
 
@@ -55,7 +56,7 @@ impl PhaseTree {
         self.branches.iter().map(Branch::length_mm).sum()
     }
 
-    /// Trees it consists of: branches without a parent.
+    /// Number of connected trees: branches without a parent.
     pub fn components(&self) -> usize {
         self.branches.iter().filter(|branch| branch.parent.is_none()).count()
     }
@@ -64,15 +65,15 @@ impl PhaseTree {
 /// Vessels over the beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BeatTree {
-    /// The phase whose points are followed: point i of branch b is the same material point in all phases. None where the
-    /// moving field carries no points: then each phase has a tree of its own.
+    /// Reference phase, whose points are followed: point i of branch b is the same material point in all phases. `None`
+    /// where the dynamic field does not move points; each phase then has a tree of its own.
     pub reference_phase: Option<u32>,
-    /// The field is vessel above this, per mm.
+    /// Threshold above which the field is vessel, per mm.
     pub threshold_per_mm: f64,
-    /// What the field resolves, mm: the unit of the rules by which trees are made.
+    /// Resolution of the field, mm: the unit of the rules of the extraction.
     pub resolution_mm: f64,
-    /// Distance of the points at which the field was looked at, mm; the largest of all phases.
+    /// Grid step at which the field was sampled, mm; the maximum over all phases.
     pub spacing_mm: f64,
-    /// Phases, in the order they were asked for.
+    /// Phases, in the order of the request.
     pub phases: Vec<PhaseTree>,
 }

@@ -1,4 +1,4 @@
-//! Trees as tubes of their radius.
+//! Conversion of trees to tubes with the vessels' radii.
 
 use crate::error::Result;
 use crate::formats::gltf::{self, MovingMesh};
@@ -7,16 +7,16 @@ use crate::trees::tree::{BeatTree, Branch, PhaseTree};
 use glam::{DQuat, DVec3};
 use std::f64::consts::TAU;
 
-/// Corners of a ring.
+/// Number of vertices of a ring.
 const CORNERS: usize = 16;
 
-/// The tubes of all branches as one binary glTF, in metres, whose animation is the beat. Where points are followed, each branch
-/// is a mesh that changes its shape, on straight lines between phases; elsewhere each phase is a mesh that is shown for its
-/// share of the beat. A tube has, of each point, a ring of 16 vertices around it at the distance of its radius, then two
-/// flat caps.
+/// Writes the tubes of all branches as one binary glTF, in metres, with the beat as its animation. Where points are
+/// followed, each branch is a mesh whose shape is interpolated linearly between phases; otherwise each phase is a mesh that
+/// is shown for its share of the beat. A tube has a ring of 16 vertices around each point, at the distance of its radius,
+/// followed by two flat caps.
 ///
 /// # Errors
-/// [`crate::error::Error::Internal`] for what JSON cannot hold.
+/// [`crate::error::Error::Internal`] for values that JSON cannot represent.
 pub(super) fn to_glb(beat: &BeatTree) -> Result<Vec<u8>> {
     let Some(first) = beat.phases.first().filter(|_| beat.reference_phase.is_some()) else {
         let all = |tree: &PhaseTree| (tree.phase, joined(tree.branches.iter().map(|b| tube(b, &around(&b.points_mm)))));
@@ -47,7 +47,7 @@ fn directions(points_mm: &[DVec3]) -> Vec<DVec3> {
         .collect()
 }
 
-/// Where the first corner of the ring around each point of a line is: across the line, and turned as little as can be from
+/// Direction to the first vertex of the ring around each point of a line: across the line, with the minimum rotation from
 /// one point to the next.
 fn around(points_mm: &[DVec3]) -> Vec<DVec3> {
     let directions = directions(points_mm);
@@ -63,13 +63,13 @@ fn around(points_mm: &[DVec3]) -> Vec<DVec3> {
         .collect()
 }
 
-/// The same first corners where the line has moved, turned as little as can be.
+/// Directions to the first vertices after the line has moved, with the minimum rotation.
 fn turned(rest_around: &[DVec3], rest_directions: &[DVec3], points_mm: &[DVec3]) -> Vec<DVec3> {
     let turn = |((across, from), to): ((&DVec3, &DVec3), DVec3)| DQuat::from_rotation_arc(*from, to) * *across;
     rest_around.iter().zip(rest_directions).zip(directions(points_mm)).map(turn).collect()
 }
 
-/// The closed tube of a branch whose rings begin at `around`.
+/// Creates the closed tube of a branch, with rings that begin at `around`.
 fn tube(branch: &Branch, around: &[DVec3]) -> Mesh {
     let rings = branch.points_mm.len();
     let directions = directions(&branch.points_mm);
@@ -87,7 +87,7 @@ fn tube(branch: &Branch, around: &[DVec3]) -> Mesh {
         let (place, outwards) = corner(ring, k);
         add(place, outwards);
     }
-    // Caps have vertices of their own, whose normals are the line's.
+    // Caps have their own vertices, with normals along the line.
     for (ring, normal) in [(0, -directions[0]), (rings - 1, directions[rings - 1])] {
         (0..CORNERS).for_each(|k| add(corner(ring, k).0, normal));
         add(branch.points_mm[ring], normal);
@@ -113,7 +113,7 @@ fn triangles(rings: usize) -> Vec<[u32; 3]> {
     sides.chain((0..2).flat_map(|cap| (0..CORNERS).map(move |k| of_cap(cap, k)))).collect()
 }
 
-/// Meshes as one.
+/// Joins meshes to one.
 fn joined(meshes: impl Iterator<Item = Mesh>) -> Mesh {
     meshes.fold(Mesh::default(), |mut all, mesh| {
         let first = all.vertices.len() as u32;
@@ -129,7 +129,7 @@ mod tests {
     use super::*;
     use glam::Vec3;
 
-    /// A bent vessel that narrows.
+    /// A bent vessel that becomes narrower.
     fn bent(turn: f64) -> Branch {
         let point = |i: usize| {
             let angle = turn * i as f64 / 40.0;
@@ -152,7 +152,7 @@ mod tests {
                 assert!((away - branch.radius_mm[ring]).abs() < 1e-5, "{away} mm at ring {ring}");
             }
         }
-        // Rings of 16 corners hold a little less than circles.
+        // The area of a ring's polygon of 16 vertices is slightly smaller than a circle's.
         let share = CORNERS as f64 / TAU * (TAU / CORNERS as f64).sin();
         let area = |r: f64| share * std::f64::consts::PI * r * r;
         let length = branch.length_mm();

@@ -1,20 +1,20 @@
 //! Centrelines of sets of voxels: 3D thinning (Lee, Kashyap and Chu, CVGIP: Graphical Models 1994).
 //!
-//! Voxels of the surface are taken away, those that face one of six directions at a time, as long as they are *simple*:
-//! as long as neither components nor tunnels nor cavities come, go or join. The end of a line stays. A voxel is simple
-//! where its neighbours in the set are one component (26 neighbours) and so are those outside it that share faces and
-//! edges with it (6 neighbours; Bertrand and Malandain, Pattern Recognition Letters 1994).
+//! Voxels of the surface are removed, those that face one of six directions at a time, if they are *simple*: if neither
+//! components nor tunnels nor cavities appear, vanish or join. The end of a line stays. A voxel is simple if its neighbours
+//! in the set are one component (26 neighbours), and so are the outside neighbours that share a face or an edge with it (6
+//! neighbours; Bertrand and Malandain, Pattern Recognition Letters 1994).
 
 use crate::vessels::mask::{CELLS, CENTRE, Framed, Mask, steps_to};
 
-/// A set of the cells of a neighbourhood, a bit each.
+/// A set of the cells of a neighbourhood, one bit each.
 type Cells = u32;
 
-/// Cells that share a face with the middle, in the order in which the surfaces that face them are thinned: down and up
-/// each axis by turns.
+/// Cells that share a face with the centre, in the order in which the surfaces that face them are thinned: down and up each
+/// axis in turn.
 const FACES: [usize; 6] = [4, 22, 10, 16, 12, 14];
 
-/// Cells at most so many steps, one per axis, from another cell.
+/// Cells within `steps` steps, at most one per axis, of another cell.
 const fn within(cell: usize, steps: isize) -> Cells {
     let (from, mut cells, mut other) = (steps_to(cell), 0, 0);
     while other < CELLS {
@@ -28,7 +28,7 @@ const fn within(cell: usize, steps: isize) -> Cells {
     cells
 }
 
-/// [`within`] of every cell.
+/// Table of [`within`] for every cell.
 const fn within_of_all(steps: isize) -> [Cells; CELLS] {
     let (mut all, mut cell) = ([0; CELLS], 0);
     while cell < CELLS {
@@ -40,12 +40,12 @@ const fn within_of_all(steps: isize) -> [Cells; CELLS] {
 
 const TOUCHING: [Cells; CELLS] = within_of_all(3);
 const SHARING_A_FACE: [Cells; CELLS] = within_of_all(1);
-/// Cells that share a face with the middle.
+/// Cells that share a face with the centre.
 const AT_FACES: Cells = within(CENTRE, 1);
-/// Cells that share a face or an edge with the middle.
+/// Cells that share a face or an edge with the centre.
 const AT_FACES_OR_EDGES: Cells = within(CENTRE, 2);
 
-/// The cells of a set that are connected to one of them.
+/// Returns the cells of a set that are connected to `seed`.
 fn connected(set: Cells, seed: Cells, neighbours: &[Cells; CELLS]) -> Cells {
     let (mut reached, mut new) = (seed, seed);
     while new != 0 {
@@ -58,12 +58,12 @@ fn connected(set: Cells, seed: Cells, neighbours: &[Cells; CELLS]) -> Cells {
     reached
 }
 
-/// The lowest cell of a set.
+/// Returns the lowest cell of a set.
 fn any_of(set: Cells) -> Cells {
     set & set.wrapping_neg()
 }
 
-/// Whether the topology stays as it is without the voxel whose neighbours in the set these are.
+/// Tells whether the topology is unchanged without the voxel that has these neighbours in the set.
 fn is_simple(neighbours: Cells) -> bool {
     let outside = !neighbours & AT_FACES_OR_EDGES;
     let at_faces = outside & AT_FACES;
@@ -73,7 +73,8 @@ fn is_simple(neighbours: Cells) -> bool {
         && connected(outside, any_of(at_faces), &SHARING_A_FACE) & at_faces == at_faces
 }
 
-/// The centreline of a set: lines one voxel wide, with the set's components and tunnels. Around a cavity a surface stays.
+/// Returns the centreline of a set: lines one voxel wide, with the set's components and tunnels. Around a cavity a surface
+/// remains.
 pub fn centreline(mask: &Mask) -> Mask {
     let mut thinning = Thinning::new(mask);
     while thinning.one_layer() {}
@@ -86,7 +87,7 @@ pub fn centreline(mask: &Mask) -> Mask {
 struct Thinning {
     left: Framed,
     offsets: [isize; CELLS],
-    /// Voxels that share a face with the outside, and those that did and are gone.
+    /// Voxels that share a face with the outside, including those already removed.
     surface: Vec<usize>,
     on_surface: Vec<bool>,
 }
@@ -125,7 +126,7 @@ impl Thinning {
         cells.fold(0, |cells, cell| cells | 1 << cell)
     }
 
-    /// Takes away what may go of the surface; whether anything did.
+    /// Removes the removable voxels of the surface, and tells whether there were any.
     fn one_layer(&mut self) -> bool {
         let before = self.surface.len();
         let mut gone = 0;
@@ -136,7 +137,7 @@ impl Thinning {
                 neighbours.count_ones() > 1 && is_simple(neighbours)
             };
             let candidates: Vec<usize> = self.surface[..before].iter().copied().filter(removable).collect();
-            // Those before may have made it the last of its kind.
+            // The removal of earlier candidates may have changed this voxel's neighbourhood.
             for voxel in candidates {
                 if is_simple(self.neighbours(voxel)) {
                     self.left.inside[voxel] = false;
@@ -164,11 +165,12 @@ mod tests {
     use crate::vessels::mask::tests::drawn;
     use glam::DVec3;
 
-    /// Vertices less edges plus faces less cubes of a set's cells: components less tunnels plus cavities.
+    /// Euler number of a set's cells: vertices - edges + faces - cubes, which is components - tunnels + cavities.
     fn euler_number(mask: &Mask) -> i64 {
         let framed = mask.framed();
         let offsets = framed.offsets();
-        // Each element belongs to the lowest corner of those cells that have it; 26-connected sets hold closed cells.
+        // Each element belongs to the lowest corner of the cells that contain it; 26-connected sets consist of closed
+        // cells.
         let mut number = 0;
         for voxel in 0..framed.inside.len() {
             for element in 0..8usize {
@@ -198,7 +200,7 @@ mod tests {
         let (to_line, to_middle) = (DistanceMap::to(&line).unwrap(), DistanceMap::to(&middle).unwrap());
         assert!(line.voxels().all(|v| to_middle.at_mm(v) <= 1.0), "a line of the middle alone");
         let length = line.voxels().count();
-        // Ends recede by the radius at most.
+        // Thinning shortens ends by at most the radius.
         assert!((27..=38).contains(&length), "{length} voxels of a line of 35");
         let near = middle.voxels().filter(|v| to_line.at_mm(*v) <= 1.0).count();
         assert!(near >= 27, "{near} of 35 voxels of the middle have a line");

@@ -3,21 +3,21 @@
 use crate::vessels::mask::Mask;
 use rayon::prelude::*;
 
-/// How far each voxel of a grid is from the nearest voxel of a set, centre to centre.
+/// Distance of each voxel of a grid from the nearest voxel of a set, centre to centre.
 pub struct DistanceMap {
     size: [usize; 3],
-    /// Rows along x behind each other along z, planes along y.
+    /// Squared distances, mm²: rows along x, ordered along z within planes across y.
     squared_mm2: Vec<f32>,
 }
 
 impl DistanceMap {
-    /// Distances to a set; none where it is empty.
+    /// Computes the distances to a set; `None` where it is empty.
     pub fn to(mask: &Mask) -> Option<DistanceMap> {
         if !mask.inside.contains(&true) {
             return None;
         }
         let [nx, ny, nz] = mask.size;
-        // Within the planes across z, along x and then along y.
+        // The first pass is along x and then along y, within the planes across z.
         let mut planes = vec![f32::INFINITY; nx * ny * nz];
         planes.par_chunks_mut(nx * ny).zip(mask.inside.par_chunks(nx * ny)).for_each(|(plane, inside)| {
             plane.iter_mut().zip(inside).filter(|(_, inside)| **inside).for_each(|(value, _)| *value = 0.0);
@@ -25,7 +25,7 @@ impl DistanceMap {
             plane.chunks_mut(nx).for_each(|row| envelope.lower(row, mask.spacing_mm.x));
             lower_columns(plane, nx, mask.spacing_mm.y, &mut envelope);
         });
-        // Then along z, in planes across y.
+        // The second pass is along z, in planes across y.
         let mut squared_mm2 = vec![f32::INFINITY; nx * ny * nz];
         squared_mm2.par_chunks_mut(nx * nz).enumerate().for_each(|(y, plane)| {
             for (z, row) in plane.chunks_mut(nx).enumerate() {
@@ -44,7 +44,7 @@ impl DistanceMap {
     }
 }
 
-/// [`Envelope::lower`] for each column of rows of `nx` values.
+/// Applies [`Envelope::lower`] to each column of rows of `nx` values.
 fn lower_columns(plane: &mut [f32], nx: usize, step_mm: f64, envelope: &mut Envelope) {
     let mut column = vec![0f32; plane.len() / nx];
     for x in 0..nx {
@@ -58,20 +58,20 @@ fn lower_columns(plane: &mut [f32], nx: usize, step_mm: f64, envelope: &mut Enve
     }
 }
 
-/// The lower envelope of parabolas, one of which stands on each sample of a line.
+/// The lower envelope of parabolas, one on each sample of a line.
 #[derive(Default)]
 struct Envelope {
-    /// Parabolas that are lowest somewhere, by their samples, from left to right.
+    /// Indices of the samples whose parabolas are lowest somewhere, from left to right.
     lowest: Vec<usize>,
-    /// From where on each of them is the lowest, in samples.
+    /// Position from which each of them is the lowest, in samples.
     from: Vec<f64>,
-    /// Heights of all samples, in squares of the step.
+    /// Heights of all samples, in units of the squared step.
     heights: Vec<f64>,
 }
 
 impl Envelope {
-    /// Makes each value the smallest sum of any value of the line and the squared distance to it. Values are mm², or
-    /// infinite.
+    /// Replaces each value by the minimum, over all values of the line, of the value plus the squared distance to it.
+    /// Values are mm², or infinite.
     fn lower(&mut self, line: &mut [f32], step_mm: f64) {
         let Envelope { lowest, from, heights } = self;
         lowest.clear();
@@ -86,7 +86,7 @@ impl Envelope {
                 if from.last().is_none_or(|last| start > *last) {
                     break;
                 }
-                // The last one is nowhere the lowest any more.
+                // The last parabola is nowhere the lowest.
                 lowest.pop();
                 from.pop();
                 start = f64::NEG_INFINITY;

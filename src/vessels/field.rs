@@ -1,4 +1,5 @@
-//! The moving field where it is not faint: the whole of it at few points, and blocks of a finer grid around those that count.
+//! Sampling of the dynamic field where it is not faint: at coarse points everywhere, and in blocks of a finer grid where
+//! needed.
 
 use crate::error::Result;
 use crate::export::volumes::grid_over;
@@ -10,16 +11,16 @@ use crate::render::renderer::Renderer;
 use glam::DVec3;
 use std::collections::BTreeSet;
 
-/// The whole field is looked at in points so many pixels apart.
+/// Step of the coarse points, pixels.
 const COARSE_PIXELS: f64 = 0.75;
-/// Such points at most along its longest side.
+/// Maximum number of coarse points along the longest side.
 const COARSE_POINTS: f64 = 192.0;
-/// Around points below this share of the threshold nothing is vessel: a Gaussian of 0.4 pixels, the least, has as much of its
-/// peak left where it is farthest from such points.
+/// Share of the threshold below which a coarse point is faint, and nothing around it is vessel: a Gaussian of 0.4 pixels,
+/// the minimum, keeps this share of its peak at the largest possible distance from such points.
 const FAINT: f64 = 0.25;
-/// Voxels of a block that is sampled at once, along left, posterior (a group of the device) and superior.
+/// Voxels of a block that is sampled at once, along left, posterior (a workgroup of the device) and superior.
 const BLOCK: [u32; 3] = [8, 64, 8];
-/// Voxels along each side of the cubes that a block is made of, for which bounds are asked.
+/// Voxels along each side of the cubes that make up a block, for which bounds are computed.
 const CUBE: u32 = 8;
 
 /// The first and the last point of a box, patient mm.
@@ -30,7 +31,7 @@ pub(crate) struct Corners {
 }
 
 impl Corners {
-    /// Those of a grid's points.
+    /// Corners of a grid's points.
     pub(crate) fn of(grid: &PatientGrid) -> Corners {
         let steps = DVec3::from_array(grid.size.map(|n| f64::from(n) - 1.0));
         Corners { low_mm: grid.origin_mm, high_mm: grid.origin_mm + steps * grid.spacing_mm }
@@ -50,18 +51,18 @@ impl Corners {
     }
 }
 
-/// The moving field at a phase.
+/// The dynamic field at a phase.
 pub(crate) struct MovingField<'a> {
     pub(crate) renderer: &'a Renderer,
     pub(crate) scene: &'a Scene,
     pub(crate) phase: u32,
     pub(crate) pixel_mm: f64,
-    /// It is vessel above this.
+    /// Threshold above which the field is vessel.
     pub(crate) threshold_per_mm: f64,
 }
 
 impl MovingField<'_> {
-    /// The whole field at points a pixel apart; of large fields, farther apart.
+    /// Samples the whole field at points [`COARSE_PIXELS`] apart, or further for large fields.
     pub(crate) fn coarse(&self) -> Result<CoarseField> {
         let [low, high] = self.scene.region_of(Component::Dynamic).map(DVec3::from_array);
         let longest_mm = (high - low).max_element() * MM_PER_UNIT;
@@ -70,19 +71,19 @@ impl MovingField<'_> {
         Ok(CoarseField { grid, values: self.renderer.sample_patient(Component::Dynamic, self.phase, &grid)? })
     }
 
-    /// Boxes that hold all that is not faint.
+    /// Boxes that contain all points that are not faint.
     pub(crate) fn boxes(&self, coarse: &CoarseField) -> Vec<Corners> {
         coarse.boxes(FAINT * self.threshold_per_mm).collect()
     }
 
-    /// Hands on the field at the points of a grid that are in some boxes, per mm, a row along left at a time with the index of
-    /// its first point. Elsewhere it is not looked at.
+    /// Passes the field at the points of a grid inside boxes to `put`, per mm: one row along left at a time, with the index
+    /// of its first point. The field is not evaluated elsewhere.
     pub(crate) fn rows(&self, boxes: &[Corners], grid: &PatientGrid, put: impl FnMut(usize, &[f32])) -> Result<()> {
         self.sample(blocks(boxes, grid), grid, put)
     }
 
-    /// Points of a grid at which the field is vessel. Where Gaussians tell that all or nothing of a block is, it is not looked at;
-    /// of other fields, what is faint at the coarse points around is not.
+    /// Marks the points of a grid at which the field is vessel. Blocks that are entirely inside or outside by the
+    /// Gaussians' bounds are not sampled; for other fields, blocks that are faint at the coarse points around are not.
     pub(crate) fn vessels(&self, coarse: &CoarseField, grid: &PatientGrid) -> Result<Vec<bool>> {
         let mut inside = vec![false; grid.size.iter().map(|n| *n as usize).product()];
         let blocks = match self.renderer.bound_patient(self.phase, &cubes(grid), cube_reach_mm(grid))? {
@@ -96,7 +97,7 @@ impl MovingField<'_> {
         Ok(inside)
     }
 
-    /// Blocks of which bounds on cubes do not tell; marks those that are vessel as a whole.
+    /// Returns the blocks that the bounds of cubes leave undecided, and marks those that are entirely vessel.
     fn undecided(&self, grid: &PatientGrid, [least, most]: [Vec<f32>; 2], inside: &mut [bool]) -> Vec<Block> {
         let above = |bounds: Vec<f32>| bounds.into_iter().map(|v| f64::from(v) > self.threshold_per_mm).collect();
         let (surely, maybe): (Vec<bool>, Vec<bool>) = (above(least), above(most));
@@ -116,7 +117,7 @@ impl MovingField<'_> {
         undecided
     }
 
-    /// Hands on the field at the points of a grid that are in some blocks as [`MovingField::rows`] does.
+    /// Passes the field at the points of a grid inside blocks to `put`, as [`MovingField::rows`] does.
     fn sample(&self, blocks: Vec<Block>, grid: &PatientGrid, mut put: impl FnMut(usize, &[f32])) -> Result<()> {
         let [nx, ny, _] = grid.size.map(|n| n as usize);
         for block in blocks {
@@ -133,19 +134,19 @@ impl MovingField<'_> {
 
 /// Part of a grid.
 struct Block {
-    /// Its first point in the whole grid.
+    /// Index of its first point in the whole grid.
     first: [u32; 3],
     grid: PatientGrid,
 }
 
-/// The field at few points.
+/// The field at coarse points.
 pub(crate) struct CoarseField {
     pub(crate) grid: PatientGrid,
     pub(crate) values: Vec<f32>,
 }
 
 impl CoarseField {
-    /// Points that attenuate, patient mm, and how much, per mm.
+    /// Points with positive attenuation, patient mm, and the attenuation, per mm.
     pub(crate) fn points(&self) -> impl Iterator<Item = (DVec3, f64)> {
         let [nx, ny, _] = self.grid.size.map(|n| n as usize);
         let attenuating = self.values.iter().enumerate().filter(|(_, value)| **value > 0.0);
@@ -155,20 +156,20 @@ impl CoarseField {
         })
     }
 
-    /// A box for each point above a threshold, which holds all that is nearer to it than the next point.
+    /// Boxes around the points above a threshold, each with all that is closer to its point than the next point.
     fn boxes(&self, threshold_per_mm: f64) -> impl Iterator<Item = Corners> {
         let around_mm = self.grid.spacing_mm.max_element();
         let above = self.points().filter(move |(_, value)| *value > threshold_per_mm);
         above.map(move |(point, _)| Corners::around(point, around_mm))
     }
 
-    /// What a box must hold to hold all that is above a threshold.
+    /// Box that contains everything above a threshold.
     pub(crate) fn reach(&self, threshold_per_mm: f64) -> Option<Corners> {
         self.boxes(threshold_per_mm).reduce(Corners::joined)
     }
 }
 
-/// Middles of the cubes that a grid is made of.
+/// Centres of the cubes of a grid.
 fn cubes(grid: &PatientGrid) -> PatientGrid {
     let to_middle = 0.5 * (f64::from(CUBE) - 1.0);
     PatientGrid {
@@ -178,7 +179,7 @@ fn cubes(grid: &PatientGrid) -> PatientGrid {
     }
 }
 
-/// Distance of the corners of a cube from its middle, and a little for rounding, mm.
+/// Distance of the corners of a cube from its centre, slightly enlarged for rounding, mm.
 fn cube_reach_mm(grid: &PatientGrid) -> f64 {
     0.5 * f64::from(CUBE) * grid.spacing_mm.length()
 }
@@ -193,13 +194,13 @@ fn fill(inside: &mut [bool], grid: &PatientGrid, block: &Block) {
     }
 }
 
-/// Places of all blocks of a grid.
+/// Indices of all blocks of a grid.
 fn all_blocks(grid: &PatientGrid) -> impl Iterator<Item = [u32; 3]> {
     let [nx, ny, nz]: [u32; 3] = std::array::from_fn(|axis| grid.size[axis].div_ceil(BLOCK[axis]));
     (0..nz).flat_map(move |z| (0..ny).flat_map(move |y| (0..nx).map(move |x| [z, y, x])))
 }
 
-/// The block at a place: along superior, posterior and left.
+/// Returns the block at an index along superior, posterior and left.
 fn block_at([z, y, x]: [u32; 3], grid: &PatientGrid) -> Block {
     let first = [x * BLOCK[0], y * BLOCK[1], z * BLOCK[2]];
     let steps = DVec3::from_array(first.map(f64::from));
@@ -207,7 +208,7 @@ fn block_at([z, y, x]: [u32; 3], grid: &PatientGrid) -> Block {
     Block { first, grid: PatientGrid { origin_mm: grid.origin_mm + steps * grid.spacing_mm, size, ..*grid } }
 }
 
-/// Blocks of a grid that some boxes reach into.
+/// Blocks of a grid that overlap boxes.
 fn blocks(boxes: &[Corners], grid: &PatientGrid) -> Vec<Block> {
     let in_blocks = |point_mm: DVec3| {
         let voxel = (point_mm - grid.origin_mm) / grid.spacing_mm;
@@ -241,14 +242,14 @@ mod tests {
         assert_eq!((reach.low_mm, reach.high_mm), (DVec3::splat(-2.0), DVec3::splat(2.0)));
         assert_eq!(coarse.reach(1.0).unwrap().high_mm, DVec3::new(4.0, 2.0, 2.0));
         assert!(coarse.reach(6.0).is_none());
-        // Voxels of a quarter of a millimetre from the middle on: the box of the middle ends at 2 mm, the other's at 4.
+        // Voxels have a quarter of a millimetre, from the centre: the box of the centre ends at 2 mm, the other's at 4 mm.
         let grid = PatientGrid { origin_mm: DVec3::ZERO, spacing_mm: DVec3::splat(0.25), size: [20, 70, 20] };
         let blocks = |threshold| {
             let boxes: Vec<Corners> = coarse.boxes(threshold).collect();
             let blocks = blocks(&boxes, &grid);
             blocks.iter().map(|b| (b.first, b.grid.origin_mm.to_array(), b.grid.size)).collect::<Vec<_>>()
         };
-        // A block has 2 mm, 16 mm and 2 mm; the last one of a row is what is left of it.
+        // A block has 2 mm, 16 mm and 2 mm; the last one of a row is the remainder.
         let of_the_middle = blocks(4.0);
         assert!(
             of_the_middle.contains(&([0; 3], [0.0; 3], [8, 64, 8])) && of_the_middle.len() == 4,

@@ -1,4 +1,4 @@
-//! Voxels of a regular grid that belong to something.
+//! Sets of voxels of a regular grid.
 
 use glam::DVec3;
 
@@ -24,7 +24,7 @@ impl Mask {
         self.inside.iter().enumerate().filter(|(_, inside)| **inside).map(|(index, _)| index)
     }
 
-    /// The set with a voxel of the outside all around, in which each voxel has all its neighbours.
+    /// Returns the set with a border of one outside voxel, in which each voxel has all its neighbours.
     pub(super) fn framed(&self) -> Framed {
         let size = self.size.map(|n| n + 2);
         let mut framed = Framed { size, inside: vec![false; size.iter().product()] };
@@ -36,7 +36,7 @@ impl Mask {
     }
 }
 
-/// A set of voxels with a voxel of the outside all around.
+/// A set of voxels with a border of one outside voxel.
 pub(super) struct Framed {
     size: [usize; 3],
     pub(super) inside: Vec<bool>,
@@ -54,7 +54,7 @@ pub(super) const fn steps_to(cell: usize) -> [isize; 3] {
 }
 
 impl Framed {
-    /// Where a voxel of the unframed mask is.
+    /// Index of a voxel of the unframed mask.
     pub(super) fn index_of(&self, mask: &Mask, index: usize) -> usize {
         let [nx, ny, _] = mask.size;
         let (x, y, z) = (index % nx, index / nx % ny, index / (nx * ny));
@@ -71,8 +71,8 @@ impl Framed {
     }
 }
 
-/// Voxels in each connected component of a set, largest first; voxels that touch, be it at a corner, are connected (26
-/// neighbours).
+/// Number of voxels in each connected component of a set, largest first. Voxels that touch, even at a corner, are connected
+/// (26 neighbours).
 pub fn component_sizes(mask: &Mask) -> Vec<usize> {
     let mut left = mask.framed();
     let offsets = left.offsets();
@@ -103,7 +103,7 @@ pub fn component_sizes(mask: &Mask) -> Vec<usize> {
 pub(crate) mod tests {
     use super::*;
 
-    /// Voxels of a grid where `inside` says so of a position in mm from the first voxel.
+    /// Marks the voxels of a grid where `inside` holds for the position in mm from the first voxel.
     pub(crate) fn drawn(size: [usize; 3], spacing_mm: DVec3, inside: impl Fn(DVec3) -> bool) -> Mask {
         let [nx, ny, nz] = size;
         let at = |i: usize| DVec3::new((i % nx) as f64, (i / nx % ny) as f64, (i / (nx * ny)) as f64) * spacing_mm;
@@ -114,7 +114,7 @@ pub(crate) mod tests {
     fn what_touches_at_a_corner_is_connected() {
         let corner = |p: DVec3| p == DVec3::ZERO || p == DVec3::ONE;
         assert_eq!(component_sizes(&drawn([2; 3], DVec3::ONE, corner)), [2]);
-        // Opposite ends of rows and planes do not touch, however near they are in memory.
+        // Opposite ends of rows and planes do not touch, although they are adjacent in memory.
         let ends = |p: DVec3| p == DVec3::new(2.0, 0.0, 0.0) || p == DVec3::new(0.0, 1.0, 0.0);
         assert_eq!(component_sizes(&drawn([3; 3], DVec3::ONE, ends)), [1, 1]);
         assert!(component_sizes(&drawn([3; 3], DVec3::ONE, |_| false)).is_empty());

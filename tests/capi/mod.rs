@@ -1,4 +1,4 @@
-//! Shared by the tests of the C ABI: where the library is, and how programs are built against it.
+//! Helpers shared by the tests of the C ABI: the library's location, and compilation of programs against it.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ pub fn library() -> PathBuf {
     library
 }
 
-/// A directory in which the library has the name its soname asks for.
+/// A directory in which the library has the name of its soname.
 pub fn library_directory(scratch: &Path) -> PathBuf {
     let directory = scratch.join("lib");
     std::fs::create_dir_all(&directory).unwrap();

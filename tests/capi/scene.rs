@@ -1,4 +1,4 @@
-//! A small moving scene through the C ABI, and calls that must succeed.
+//! A small dynamic scene through the C ABI, and calls that must succeed.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 #![allow(clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
@@ -74,7 +74,7 @@ pub fn geometry(view: usize) -> nertca_geometry {
     }
 }
 
-/// Line integrals of a blob that moves over a gradient.
+/// Line integrals of a moving blob on a gradient.
 pub fn pixels(view: usize, phase: u32) -> Vec<f32> {
     let centre = (0.4 + 0.1 * f64::from(phase), 0.5 - 0.05 * view as f64);
     let n = SIZE as usize;
@@ -87,7 +87,7 @@ pub fn pixels(view: usize, phase: u32) -> Vec<f32> {
         .collect()
 }
 
-/// A frame that points to `pixels`, which must live as long.
+/// A frame that points to `pixels`, which must stay alive as long.
 pub fn frame(view: usize, phase: u32, pixels: &[f32]) -> nertca_frame {
     nertca_frame {
         size: size_of::<nertca_frame>(),
@@ -129,7 +129,7 @@ pub fn image(pixels: &mut [f32]) -> nertca_image {
     }
 }
 
-/// Trains in this thread; how many iterations were done.
+/// Trains in this thread, and returns the number of iterations.
 #[track_caller]
 pub fn train(reconstruction: *mut nertca_reconstruction, iterations: u32) -> u32 {
     let mut done = 0;
@@ -138,7 +138,7 @@ pub fn train(reconstruction: *mut nertca_reconstruction, iterations: u32) -> u32
     done
 }
 
-/// A view as it is drawn.
+/// Renders a view.
 #[track_caller]
 pub fn drawn(reconstruction: *mut nertca_reconstruction, view: &nertca_view) -> Vec<f32> {
     let mut pixels = vec![f32::NAN; (view.width * view.height) as usize];
@@ -147,14 +147,14 @@ pub fn drawn(reconstruction: *mut nertca_reconstruction, view: &nertca_view) -> 
     pixels
 }
 
-/// What a context says of itself.
+/// Description of a context by itself.
 pub fn described(context: *mut nertca_context) -> serde_json::Value {
     let mut text = vec![0; 1 << 16];
     ok(unsafe { nertca_context_describe(context, text.as_mut_ptr(), text.len(), null_mut()) }, context);
     serde_json::from_str(unsafe { CStr::from_ptr(text.as_ptr()) }.to_str().unwrap()).unwrap()
 }
 
-/// Destroys a reconstruction and its context; nothing may be left, and the validation layers must have been silent.
+/// Destroys a reconstruction and its context; nothing may be left, and the validation layers must have reported nothing.
 pub fn close(context: *mut nertca_context, reconstructions: &[*mut nertca_reconstruction]) {
     for reconstruction in reconstructions {
         ok(unsafe { nertca_reconstruction_destroy(*reconstruction) }, *reconstruction);

@@ -1,4 +1,4 @@
-//! A small angiography run to damage.
+//! A small angiography run, for tests that damage it.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "shared by tests")]
 
 use dicom_core::{DataElement, PrimitiveValue, VR};
@@ -6,7 +6,7 @@ use dicom_dictionary_std::tags;
 use dicom_object::{FileMetaTableBuilder, InMemDicomObject};
 use std::path::Path;
 
-/// A small angiography run whose frames show a bar that moves, with changes made to it before it is written.
+/// Writes a small angiography run whose frames show a moving bar, after `change` has been applied.
 pub fn angiogram(path: &Path, change: impl Fn(&mut InMemDicomObject)) {
     let (n, frames) = (64u16, 6u16);
     let mut o = InMemDicomObject::new_empty();

@@ -1,4 +1,4 @@
-//! Phantoms whose views disagree by known errors, and how well a correction does against the truth.
+//! Phantoms whose views disagree by known errors, and the error of a correction against the truth.
 
 use glam::DVec3;
 use nertca_vk::calibrate::gauge::{FrameRays, RigidMotion, common_motion};
@@ -17,7 +17,7 @@ use std::path::Path;
 pub const PHASES: u32 = 10;
 const SCALE: f64 = 0.37;
 
-/// A beating tree in a thorax, ready to be shot.
+/// A beating tree in a thorax, ready for projection.
 pub struct Studio {
     projector: Projector,
     still: LoadedVolume,
@@ -27,23 +27,23 @@ pub struct Studio {
     pub size: usize,
 }
 
-/// What is wrong with the stated geometry, standard deviations or amplitudes.
+/// Errors of the stated geometry: standard deviations or amplitudes.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Wrong {
     pub angle_deg: f64,
     pub shift_mm: f64,
     pub breathing_mm: f64,
-    /// Share of the strongest vessel's line integral.
+    /// Noise as a share of the strongest vessel's line integral.
     pub noise: f64,
     pub seed: u32,
 }
 
-/// A dataset with stated geometry, and what truly was.
+/// A dataset with stated geometry, and its true geometry.
 pub struct Shot {
     pub dataset: Dataset,
-    /// Per view.
+    /// True geometry of each view.
     pub truth: Vec<Geometry>,
-    /// `[view][phase]`, world units.
+    /// True displacement of the heart, `[view][phase]`, world units.
     pub heart: Vec<Vec<DVec3>>,
     pub breathes: bool,
     points: Vec<Vec<DVec3>>,
@@ -71,7 +71,8 @@ impl Studio {
         Studio { heart: hearts, vessels, still, trees, projector, size }
     }
 
-    /// Shoots the published training views, and those unseen if wanted, with errors that the stated geometry does not know of.
+    /// Projects the published training views, and unseen ones on request, with errors that the stated geometry does not
+    /// contain.
     pub fn shoot(&self, n_views: u32, unseen: bool, wrong: Wrong) -> Shot {
         let mut views = ViewAngles::published(n_views).unwrap();
         views.validation.truncate(if unseen { 2 } else { 0 });
@@ -190,7 +191,7 @@ impl Shot {
         truth.write(directory).unwrap();
     }
 
-    /// Frames of the training views as they truly were and by the rays that `corrected` says of (view, phase).
+    /// Rays of the training frames by their true geometry and by `corrected`, which maps (view, phase).
     pub fn frames(&self, corrected: &dyn Fn(usize, usize) -> ViewRays) -> Vec<FrameRays> {
         let size = self.dataset.width;
         let frame = |f: &Frame| {
@@ -201,7 +202,7 @@ impl Shot {
         self.dataset.training().iter().map(frame).collect()
     }
 
-    /// Root mean square image distance of vessel points after removing the gauge, pixels.
+    /// Root mean square image distance of vessel points after removal of the common motion, pixels.
     pub fn error_px(&self, corrected: &dyn Fn(usize, usize) -> ViewRays) -> f64 {
         let frames = self.frames(corrected);
         let some: Vec<DVec3> = self.points.iter().flatten().step_by(37).copied().collect();

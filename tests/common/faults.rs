@@ -1,4 +1,4 @@
-//! Faults planted in the code of shaders as the driver gets it, to be found by comparisons with the f64 twins.
+//! Faults planted in the shader code that the driver receives, to be found by comparisons with the f64 twins.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 
 use crate::common::tuning;
@@ -62,7 +62,7 @@ pub fn other_digits(words: &mut [u32]) {
     replace(words, SHIFT_RIGHT, SHIFT_LEFT);
 }
 
-/// Not for stages that add up a workgroup: they would read shared memory that nobody has written, at times NaN.
+/// Unsuitable for stages that sum over a workgroup: they would read shared memory that was never written, sometimes NaN.
 pub fn one_too_many(words: &mut [u32]) {
     replace(words, LESS, LESS_OR_EQUAL);
 }
@@ -71,7 +71,7 @@ pub fn difference_for_sum(words: &mut [u32]) {
     replace(words, ADD, SUBTRACT);
 }
 
-/// Stores of zero are left out.
+/// Removes stores of zero.
 pub fn missing_clear(words: &mut [u32]) {
     const NOTHING: u32 = 1 << 16;
     let all = instructions(words);
@@ -84,7 +84,7 @@ pub fn missing_clear(words: &mut [u32]) {
     }
 }
 
-/// Nothing is stored.
+/// Removes all stores.
 pub fn no_stores(words: &mut [u32]) {
     const NOTHING: u32 = 1 << 16;
     for (at, _, length) in instructions(words).into_iter().filter(|(_, operation, _)| *operation == STORE) {
@@ -92,7 +92,7 @@ pub fn no_stores(words: &mut [u32]) {
     }
 }
 
-/// The comparison that a fault is to be found by.
+/// The comparison that must find a fault.
 pub type Compare = fn(&Gpu, &mut Findings) -> Result<()>;
 
 /// A fault in the code of a stage.
@@ -108,13 +108,13 @@ pub fn fault(stage: &'static str, plant: fn(&mut [u32]), compare: Compare) -> Fa
 }
 
 impl Fault {
-    /// The same in another variant of the shader than the device would get by itself.
+    /// Returns the fault for another variant of the shader than the device's default.
     pub fn in_variant(self, name: &'static str) -> Fault {
         Fault { variant: Some(name), ..self }
     }
 }
 
-/// The code that the device gets of a stage, in that variant if one is asked for.
+/// Code of a stage that the device receives, in a given variant if one is requested.
 pub fn code(gpu: &Gpu, stage: &str, variant_asked: Option<&str>) -> Vec<u32> {
     let named = |variant: &str| kernel_code(&format!("{stage}{variant}"));
     if let Some(name) = variant_asked {
@@ -132,7 +132,7 @@ pub fn code(gpu: &Gpu, stage: &str, variant_asked: Option<&str>) -> Vec<u32> {
     bytemuck::pod_collect_to_vec(taken.unwrap().spirv)
 }
 
-/// Expects that nothing is found without a fault, and that each is found in the row of its stage before all others.
+/// Expects that nothing is found without a fault, and that each fault is found first in the row of its stage.
 pub fn expect_found(faults: &[Fault]) {
     for Fault { stage, variant, plant, compare } in faults {
         shim::begin(shim::Failing::None);
@@ -141,7 +141,7 @@ pub fn expect_found(faults: &[Fault]) {
             let mut findings = Findings::default();
             let outcome = compare(&open(), &mut findings);
             let found = findings.rows().iter().find(|row| !row.is_ok()).map(|row| row.stages.clone());
-            // A fault may end what follows with an error.
+            // A fault may end the following comparisons with an error.
             assert!(found.is_some() || outcome.is_ok(), "{stage}: {outcome:?}");
             found
         };

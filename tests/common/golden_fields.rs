@@ -1,5 +1,5 @@
-//! Cases of `tools/reference.py` and `tools/reference_training.py`: their data, configuration and parameters, and the loss terms by
-//! the names that the scripts give.
+//! Cases of `tools/reference.py` and `tools/reference_training.py`: their data, configuration and parameters, and the loss
+//! terms by the scripts' names.
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use crate::golden_file::Golden;
@@ -103,7 +103,7 @@ impl Golden {
         Config::load(Some(preset), None, &settings).unwrap()
     }
 
-    /// Settings of two networks, whose losses are delayed and not the field.
+    /// Settings of two networks, whose losses are delayed instead of the field.
     pub fn networks(&self) -> Config {
         let n = |key: &str| self.number(key);
         let mut settings = vec![
@@ -174,7 +174,7 @@ pub fn gather(golden: &Golden, plan: &Plan, prefix: &str) -> Vec<f64> {
     out
 }
 
-/// Terms of a loss by the names that the scripts give.
+/// Terms of a loss by the scripts' names.
 pub type Terms = Vec<(&'static str, f64)>;
 
 pub fn terms_of_engine(loss: &StepLoss) -> Terms {

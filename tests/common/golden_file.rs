@@ -7,12 +7,12 @@ use serde_json::Value;
 /// A file of `tests/golden`.
 pub struct Golden {
     bytes: Vec<u8>,
-    /// What the script was asked.
+    /// Settings of the script.
     pub case: Value,
 }
 
 impl Golden {
-    /// Reads `name`, which `script` made.
+    /// Reads `name`, a file made by `script`.
     pub fn open(name: &str, script: &str) -> Golden {
         let path = format!("{}/tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
         let bytes = std::fs::read(&path).unwrap_or_else(|e| panic!("{path}: {e}; run {script}"));

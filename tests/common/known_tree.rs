@@ -1,4 +1,4 @@
-//! Vessels that are known, angiograms taken of them, and a short run on those: what tests of trees share.
+//! Known vessels, angiograms of them, and a short run on these, shared by tests of trees.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 
 #[path = "program.rs"]
@@ -60,7 +60,7 @@ pub fn nertca(args: &[&str]) -> Output {
     program().arg("--validate").args(args).output().unwrap()
 }
 
-/// What the program says on stdout and stderr.
+/// Output of the program on stdout and stderr.
 #[track_caller]
 pub fn ok(args: &[&str]) -> (String, String) {
     let out = nertca(args);
@@ -75,13 +75,13 @@ pub struct Trained {
     pub run: PathBuf,
 }
 
-/// A short run on the true vessels, made once.
+/// A short run on the true vessels, created once.
 pub fn trained() -> &'static Trained {
     static RUN: OnceLock<Trained> = OnceLock::new();
     RUN.get_or_init(|| {
         let directory = tempfile::tempdir().unwrap();
         let (data, run) = (directory.path().join("data"), directory.path().join("run"));
-        // The detector is off centre, lest anybody forgets that it may be.
+        // The detector is off centre, so that errors in its handling are detected.
         phantom(&data, PHASES, &["--size", "64", "--offset", "2.5,-1.5"]);
         train(&data, &run, &["--iterations", "60", "--set", "gaussians.iterations=60", "--tree"]);
         Trained { directory, data, run }

@@ -1,4 +1,4 @@
-//! Shared by the integration tests: a device with validation layers, a small dataset, comparisons.
+//! Helpers shared by the integration tests: a device with validation layers, a small dataset, comparisons.
 #![allow(
     dead_code,
     unused_imports,
@@ -25,18 +25,18 @@ use nertca_vk::train::trainer::Trainer;
 use std::num::NonZeroU32;
 use std::path::Path;
 
-/// A device with validation on. A missing driver or layer fails the test: it is never skipped.
+/// Opens a device with validation. A missing driver or layer fails the test, which is never skipped.
 pub fn gpu() -> Gpu {
     Gpu::open(&DeviceOptions { validation: true, ..DeviceOptions::default() })
         .expect("tests need a Vulkan driver (Debian: mesa-vulkan-drivers) and vulkan-validationlayers")
 }
 
-/// The paths a device gets by default.
+/// The default paths of a device.
 pub fn tuning(gpu: &Gpu) -> Tuning {
     Tuning::for_device(gpu.info())
 }
 
-/// Trains up to an iteration; the objective of each on the way.
+/// Trains up to an iteration, and returns the objective of each iteration.
 pub fn run(trainer: &mut Trainer, until: u32) -> Vec<f64> {
     let mut losses = Vec::new();
     while trainer.step() < until {
@@ -45,18 +45,18 @@ pub fn run(trainer: &mut Trainer, until: u32) -> Vec<f64> {
     losses
 }
 
-/// Fails when the validation layers had anything to say, or when device objects leaked.
+/// Fails if the validation layers reported messages, or if device objects leaked.
 pub fn expect_silence(gpu: Gpu) {
     assert_eq!(gpu.validation_messages(), Vec::<String>::new());
     assert_eq!(gpu.live_objects(), 0, "device objects leaked");
 }
 
-/// A smooth blob that moves over three phases in front of a still gradient, seen from three sides.
+/// A smooth blob that moves over three phases in front of a static gradient, in three views.
 pub fn small_dataset(width: usize, height: usize) -> Dataset {
     problems::small_dataset(width, height, 3).unwrap()
 }
 
-/// The same, of which some images were taken between two phases.
+/// A dataset like [`small_dataset`], with some images taken between two phases.
 pub fn uneven_dataset(width: usize, height: usize) -> Dataset {
     problems::uneven_dataset(width, height).unwrap()
 }
@@ -66,7 +66,7 @@ pub fn small_config(preset: &str, settings: &[&str]) -> Config {
     problems::small_config(Preset::named(preset).unwrap(), settings).unwrap()
 }
 
-/// Runs comparisons, says what they found, and fails where that is beyond its tolerance.
+/// Runs comparisons, prints their findings, and fails where one exceeds its tolerance.
 #[track_caller]
 pub fn expect_agreement(compare: impl FnOnce(&mut Findings) -> Result<()>) {
     let mut findings = Findings::default();
@@ -80,7 +80,7 @@ pub fn expect_agreement(compare: impl FnOnce(&mut Findings) -> Result<()>) {
     assert!(!findings.rows().is_empty() && failed.is_empty(), "{}", failed.join("\n"));
 }
 
-/// The default phantom, procedural, without photon noise, with its vessel volumes beside it.
+/// The default procedural phantom without photon noise, with its vessel volumes.
 pub fn phantom(gpu: &Gpu, directory: &Path, size: usize, views: u32) -> Dataset {
     let options = PhantomOptions {
         setting: Setting::Xcat,
@@ -106,7 +106,7 @@ pub fn whiten(dataset: &mut Dataset, deviation: f64) {
     }
 }
 
-/// Leaves the first training view's images to validation alone.
+/// Assigns the first training view's images to validation only.
 pub fn drop_first_view(dataset: &mut Dataset) {
     let first = dataset.training_views()[0];
     dataset.frames.retain(|f| f.split == Split::Validation || f.view != first);

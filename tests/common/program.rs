@@ -1,12 +1,12 @@
-//! The program as users run it, but for its cache: pipelines and timings kept there by others must not decide what a test
-//! sees, and tests must not decide what a user's next run does.
+//! The program as users run it, except for its cache: pipelines and timings cached by others must not affect a test, and
+//! tests must not affect a user's next run.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "shared by tests")]
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
-/// A cache directory that is empty when the first test of this process asks for it.
+/// A cache directory that is empty at its first use by a test of this process.
 fn cache() -> &'static Path {
     static CACHE: OnceLock<PathBuf> = OnceLock::new();
     CACHE.get_or_init(|| {
@@ -19,7 +19,7 @@ fn cache() -> &'static Path {
     })
 }
 
-/// The program, to be given arguments.
+/// Command of the program, without arguments.
 pub fn program() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_nertca-vk"));
     command.env("XDG_CACHE_HOME", cache());

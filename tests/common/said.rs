@@ -1,4 +1,4 @@
-//! The program run to its end, and what it says.
+//! A complete run of the program, and its messages.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "shared by tests")]
 
 use crate::program::program;
@@ -8,7 +8,7 @@ pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// What the program says on stderr, once it has succeeded or failed as it should.
+/// Messages of the program on stderr, after it has succeeded or failed as expected.
 #[track_caller]
 pub fn run(args: &[&str], succeeds: bool) -> String {
     let out = program().args(args).output().unwrap();

@@ -1,10 +1,10 @@
-//! Data that are shared beside the project and not part of it.
+//! Data that are stored beside the project and are not part of it.
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use std::path::{Path, PathBuf};
 
-/// A folder of the shared data (`NERTCA_DATA`, or `../shared/data` beside the project). Where it is absent the test says that
-/// it is skipped, and fails with `NERTCA_SHARED=require`.
+/// A folder of the shared data (`NERTCA_DATA`, or `../shared/data` beside the project). If it is absent the test reports
+/// that it is skipped, or fails with `NERTCA_SHARED=require`.
 pub fn shared(folder: &str) -> Option<PathBuf> {
     let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
     let path = std::env::var_os("NERTCA_DATA").map_or(beside, PathBuf::from).join(folder);

@@ -1,6 +1,6 @@
-//! A Vulkan loader between the engine and the system's: it counts what is made and destroyed, makes calls fail on
-//! request, fills new memory with a pattern, with canaries behind each buffer, and makes devices look poorer than they are.
-//! One state per thread, since the engine calls Vulkan on its caller's thread as long as nobody starts another.
+//! A Vulkan loader between the engine and the system's loader: it counts created and destroyed objects, makes calls fail on
+//! request, fills new memory with a pattern, places canaries behind each buffer, and hides features of devices. There is
+//! one state per thread, since the engine calls Vulkan on its caller's thread unless another is started.
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 #![allow(clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks, reason = "passes on what it is given")]
 
@@ -11,26 +11,26 @@ use std::collections::BTreeMap;
 use std::ffi::{CStr, c_char, c_void};
 use std::sync::OnceLock;
 
-/// Which calls are to fail.
+/// Calls that are to fail.
 #[derive(Debug, Clone, Copy, Default)]
 pub enum Failing {
     #[default]
     None,
     /// The n-th call that can fail, counted from 1.
     Once(u32, vk::Result),
-    /// The n-th and all that follow.
+    /// The n-th call and all that follow.
     From(u32, vk::Result),
     /// Every call of a function.
     Every(&'static str, vk::Result),
 }
 
-/// A pattern in new memory, and what was found of it later.
+/// A pattern in new memory, and the results of its checks.
 #[derive(Default)]
 struct Poison {
     word: u32,
     /// Host addresses of memory.
     mapped: BTreeMap<vk::DeviceMemory, usize>,
-    /// Buffers with their size, and where they are once they are bound.
+    /// Buffers with their size, and their addresses once they are bound.
     buffers: BTreeMap<vk::Buffer, (u64, Option<usize>)>,
     filled: u32,
     unreachable: u32,
@@ -46,13 +46,13 @@ struct State {
     /// Objects alive by kind.
     alive: BTreeMap<&'static str, i64>,
     poison: Option<Poison>,
-    /// Code of a shader, and what the driver gets instead.
+    /// Code of a shader, and the code that the driver receives instead.
     planted: Option<(Vec<u32>, Vec<u32>)>,
-    /// What devices claim to have.
+    /// Capabilities that devices claim to have.
     poor: Option<Poor>,
 }
 
-/// What a device may still claim to have.
+/// Capabilities that a device may still claim to have.
 #[derive(Debug, Clone, Copy)]
 pub struct Poor {
     /// Device extensions.
@@ -61,9 +61,9 @@ pub struct Poor {
     pub features: bool,
     /// Timestamps.
     pub timestamps: bool,
-    /// Lowers limits.
+    /// Function that lowers limits.
     pub limits: fn(&mut vk::PhysicalDeviceLimits),
-    /// Bytes of each heap that others leave, where the device tells of that.
+    /// Bytes of each heap that are free for use, where the device reports this.
     pub free_memory: Option<u64>,
 }
 
@@ -75,33 +75,33 @@ fn with<T>(body: impl FnOnce(&mut State) -> T) -> T {
     STATE.with_borrow_mut(body)
 }
 
-/// What one session did.
+/// Results of one session.
 #[derive(Debug)]
 pub struct Outcome {
     /// Calls that could fail.
     pub calls: u32,
-    /// Those that were made to.
+    /// Calls that were made to fail.
     pub failed: Vec<&'static str>,
-    /// Objects made less objects destroyed, by kind, where not 0.
+    /// Number of objects created minus the number destroyed, by kind, where not 0.
     pub left: BTreeMap<&'static str, i64>,
 }
 
-/// Begins to count anew.
+/// Resets the counters.
 pub fn begin(failing: Failing) {
     with(|state| *state = State { failing, ..State::default() });
 }
 
-/// Changes which calls are to fail, and counts on.
+/// Changes the calls that are to fail, without a reset of the counters.
 pub fn fail(failing: Failing) {
     with(|state| state.failing = failing);
 }
 
-/// Pieces of memory alive.
+/// Number of live memory allocations.
 pub fn pieces_of_memory() -> i64 {
     with(|state| state.alive.get(std::any::type_name::<vk::DeviceMemory>()).copied().unwrap_or_default())
 }
 
-/// What happened since.
+/// Returns the results since the last reset.
 pub fn end() -> Outcome {
     with(|state| {
         let left = state.alive.iter().filter(|(_, n)| **n != 0).map(|(kind, n)| (*kind, *n)).collect();
@@ -109,7 +109,7 @@ pub fn end() -> Outcome {
     })
 }
 
-/// Bytes behind each buffer that nobody may touch.
+/// Bytes behind each buffer that must not be accessed.
 pub const CANARY_BYTES: u64 = 4096;
 
 /// Begins to fill new buffers, and the canaries behind them, with `word`.
@@ -118,8 +118,8 @@ pub fn begin_poison(word: u32) {
     with(|state| state.poison = Some(Poison { word, ..Poison::default() }));
 }
 
-/// How many buffers were filled, how many could not be for lack of a host address, and which canaries were found dead
-/// when their buffer went away.
+/// Number of buffers that were filled, number that could not be filled because they have no host address, and the canaries
+/// that were found overwritten when their buffer was destroyed.
 pub fn end_poison() -> (u32, u32, Vec<String>) {
     with(|state| {
         let poison = state.poison.take().unwrap();
@@ -127,23 +127,23 @@ pub fn end_poison() -> (u32, u32, Vec<String>) {
     })
 }
 
-/// Devices look poorer from now on.
+/// Hides capabilities of devices from now on.
 pub fn impoverish(poor: Poor) {
     begin(Failing::None);
     with(|state| state.poor = Some(poor));
 }
 
-/// Hands the driver `faulty` from now on where the engine has `code`.
+/// Passes `faulty` to the driver from now on where the engine uses `code`.
 pub fn plant(code: Vec<u32>, faulty: Vec<u32>) {
     with(|state| state.planted = Some((code, faulty)));
 }
 
-/// The loader to open a device with.
+/// The loader for opening a device.
 pub fn loader() -> Loader {
     unsafe { Loader::new(get_instance_proc_addr) }
 }
 
-/// The same, for a host that makes a device itself.
+/// The entry points of this loader, for a host that creates a device itself.
 pub fn entry() -> ash::Entry {
     unsafe { ash::Entry::from_static_fn(ash::StaticFn { get_instance_proc_addr }) }
 }
@@ -156,7 +156,7 @@ fn system() -> &'static ash::Entry {
     ENTRY.get_or_init(|| unsafe { ash::Entry::load() }.unwrap())
 }
 
-/// What a call is made on, which says where its real function is.
+/// Parent object of a call, which gives the address of the real function.
 trait Parent: Copy {
     unsafe fn real(self, name: &CStr) -> Void;
 }
@@ -193,7 +193,7 @@ impl Parent for vk::Queue {
     }
 }
 
-/// Counts a call; its failure if it is to fail.
+/// Counts a call; returns its error if it is to fail.
 fn attempt(name: &'static str) -> Option<vk::Result> {
     with(|state| {
         state.calls += 1;
@@ -212,7 +212,7 @@ fn count(kind: &'static str, by: i64) {
     with(|state| *state.alive.entry(kind).or_default() += by);
 }
 
-/// Functions that make an object, `vkCreateX(parent, info, callbacks, out)`.
+/// Functions that create an object, `vkCreateX(parent, info, callbacks, out)`.
 macro_rules! creating {
     ($($name:ident($parent:ty, $info:ty) -> $handle:ty;)*) => {
         $(
@@ -285,7 +285,7 @@ macro_rules! fallible {
                 };
                 match attempt(stringify!($name)) {
                     Some(code) => {
-                        // Whatever it says, nothing runs any more once a wait has returned.
+                        // Even if it reports a failure, no work is running after a wait has returned.
                         if stringify!($name) == "vkWaitSemaphores" {
                             let _ = call();
                         }
@@ -361,7 +361,7 @@ fallible! {
     vkQueueSubmit(vk::Queue, count: u32, submits: *const vk::SubmitInfo<'static>, fence: vk::Fence);
 }
 
-// What has a shape of its own, or does more than count.
+// Functions with a different signature, or that do more than count.
 
 #[allow(non_snake_case)]
 unsafe extern "system" fn vkEnumerateInstanceLayerProperties(
@@ -689,7 +689,7 @@ fn special(name: &str) -> Option<*const ()> {
     })
 }
 
-/// Ours in place of a real function, if we have one.
+/// Returns the shim's function in place of a real one, if there is one.
 unsafe fn ours(real: vk::PFN_vkVoidFunction, name: *const c_char) -> vk::PFN_vkVoidFunction {
     let text = unsafe { CStr::from_ptr(name) }.to_str().unwrap();
     let found = special(text).or_else(|| creating(text)).or_else(|| destroying(text)).or_else(|| fallible(text));
@@ -721,7 +721,7 @@ const UNUSED: [&str; 22] = [
     "vkDestroyDescriptorUpdateTemplate",
     "vkCreatePrivateDataSlot",
     "vkDestroyPrivateDataSlot",
-    // Freed with their pools.
+    // These are freed with their pools.
     "vkFreeCommandBuffers",
     "vkFreeDescriptorSets",
     "vkCreateDebugReportCallbackEXT",
