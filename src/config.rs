@@ -2,6 +2,7 @@
 //!
 //! Precedence: preset < TOML file < single settings `key=value`.
 
+mod acting;
 mod checks;
 mod forms;
 mod length;
@@ -328,14 +329,18 @@ impl Config {
 
     /// Lays a table of a file, then settings, over this configuration, whose preset stays.
     fn overlaid(&self, overlay: toml::Table, settings: &[String]) -> Result<Config> {
-        let mut table = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
-        let keep = table.get("preset").cloned();
+        let before = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
+        let (mut table, keep) = (before.clone(), before.get("preset").cloned());
+        // A file with every setting was written by a program, and says of those that do not act what it knew.
+        let is_whole = overlay.clone().try_into::<Config>().is_ok();
+        let mut given = if is_whole { Vec::new() } else { acting::keys(&overlay) };
         merge(&mut table, overlay, "")?;
         for setting in settings {
             let (key, value) = setting
                 .split_once('=')
                 .ok_or_else(|| Error::config("setting", setting, "write it as key=value, e.g. train.rays=512"))?;
             merge(&mut table, nested(key.trim(), parse_value(value.trim())), "")?;
+            given.push(key.trim().to_owned());
         }
         if let Some(preset) = keep {
             table.insert("preset".into(), preset);
@@ -344,6 +349,7 @@ impl Config {
             .try_into()
             .map_err(|e: toml::de::Error| Error::config("configuration", "", e.message().to_owned()))?;
         config.check()?;
+        given.iter().try_for_each(|key| config.check_acts(&before, key))?;
         Ok(config)
     }
 

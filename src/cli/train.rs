@@ -75,7 +75,7 @@ fn config(args: &TrainArgs) -> Result<Config> {
 pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     let config = config(args)?;
     if args.print_config {
-        out!("{}", config.to_toml()?.trim_end());
+        out!("{}", config.acting_toml()?.trim_end());
         return Ok(());
     }
     let (Some(data), Some(run)) = (&args.data, &args.out) else {

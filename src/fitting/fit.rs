@@ -45,6 +45,9 @@ pub trait Method: Sync {
     /// Lowers the learning rates by a factor, for measurements whose field is to stay as it is.
     fn lower_rates(&self, config: &mut Config, factor: f64);
 
+    /// Returns the settings that make its steps smaller, as advice for a run that diverged.
+    fn smaller_steps(&self) -> &'static str;
+
     /// Makes all pipelines, for a list of what drivers compile.
     ///
     /// # Errors

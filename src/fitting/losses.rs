@@ -1,5 +1,6 @@
 //! What an iteration tells of itself.
 
+use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::kernels::layout::StepReport;
 use serde::Serialize;
@@ -115,14 +116,16 @@ impl std::fmt::Display for LargeLoss {
 /// Watches the losses of a run for those that end it and for the first one that is large.
 pub(crate) struct LossWatch {
     stop_at_ratio: f64,
+    advice: &'static str,
     first: Option<f64>,
     has_warned: bool,
 }
 
 impl LossWatch {
-    /// Watches a run that ends at a loss `stop_at_ratio` times the first one; 0: at none that is finite.
-    pub(crate) fn new(stop_at_ratio: f64) -> LossWatch {
-        LossWatch { stop_at_ratio, first: None, has_warned: false }
+    /// Watches a run that ends at a loss `train.stop_at_loss_ratio` times the first one; 0: at none that is finite. `advice` names
+    /// settings that make its steps smaller.
+    pub(crate) fn new(config: &Config, advice: &'static str) -> LossWatch {
+        LossWatch { stop_at_ratio: config.train.stop_at_loss_ratio, advice, first: None, has_warned: false }
     }
 
     /// Takes in the next loss; returns the first one that is large.
@@ -134,7 +137,7 @@ impl LossWatch {
         let ratio = value / self.first.get_or_insert(value).max(1e-12);
         if !value.is_finite() || (self.stop_at_ratio > 0.0 && ratio > self.stop_at_ratio) {
             let (step, quantity) = (u64::from(loss.step), "loss");
-            return Err(Error::Diverged { step, quantity, value, advice: SMALLER_STEPS });
+            return Err(Error::Diverged { step, quantity, value, advice: self.advice });
         }
         if ratio <= LARGE || self.has_warned {
             return Ok(None);
@@ -147,6 +150,7 @@ impl LossWatch {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Preset;
 
     #[test]
     fn the_objective_counts_each_term_once() {
@@ -170,7 +174,8 @@ mod tests {
     #[test]
     fn large_losses_are_warned_of_once_and_end_a_run_only_where_that_is_set() {
         let loss = |step, data| StepLoss { tv: 0.0, ..StepLoss::of_gaussians(step, data) };
-        let mut watch = LossWatch::new(0.0);
+        let mut config = Config::preset(Preset::Paper);
+        let mut watch = LossWatch::new(&config, SMALLER_STEPS);
         assert_eq!(watch.see(&loss(1, 2e-3)).unwrap(), None);
         assert_eq!(watch.see(&loss(2, 1e3)).unwrap(), None);
         let warned = watch.see(&loss(3, 4e3)).unwrap().unwrap();
@@ -179,7 +184,8 @@ mod tests {
         assert_eq!(watch.see(&loss(4, 8e30)).unwrap(), None, "once");
         assert!(matches!(watch.see(&loss(5, f64::INFINITY)), Err(Error::Diverged { step: 5, .. })));
 
-        let mut watch = LossWatch::new(100.0);
+        config.train.stop_at_loss_ratio = 100.0;
+        let mut watch = LossWatch::new(&config, SMALLER_STEPS);
         assert_eq!(watch.see(&loss(1, 1.0)).unwrap(), None);
         assert_eq!(watch.see(&loss(2, 99.0)).unwrap(), None);
         assert!(matches!(watch.see(&loss(3, 101.0)), Err(Error::Diverged { step: 3, .. })));

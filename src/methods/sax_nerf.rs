@@ -75,6 +75,10 @@ impl Method for SaxNerf {
         config.sax.rate *= factor;
     }
 
+    fn smaller_steps(&self) -> &'static str {
+        field::SMALLER_STEPS
+    }
+
     fn make_pipelines(&self, gpu: &Gpu) -> Result<()> {
         SaxKernels::new(gpu).map(|_| ())
     }

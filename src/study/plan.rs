@@ -1,4 +1,4 @@
-//! A study, checked, and the runs it comes down to.
+//! A validated study and its runs.
 
 use crate::config::Config;
 use crate::error::{Error, Result};
@@ -10,7 +10,7 @@ use crate::study::published::Published;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// A study that can be run.
+/// A study that is ready to run.
 #[derive(Debug, Clone)]
 pub struct Study {
     /// Title of its tables and its page.
@@ -23,7 +23,7 @@ pub struct Study {
     pub methods: Vec<Method>,
     /// How results are shown.
     pub table: TableLayout,
-    /// Values to put beside ours.
+    /// Published values to put beside our own.
     pub published: Option<Published>,
 }
 
@@ -34,51 +34,51 @@ pub struct Method {
     pub name: String,
     /// Name in tables.
     pub label: String,
-    /// Its configuration, but for the seed.
+    /// Configuration, without the seed.
     pub config: Config,
-    /// Its configuration on data sets, by their names in the file, where that is another.
+    /// Configurations for single data sets, by their names in the file, where they differ from `config`.
     pub config_on: BTreeMap<String, Config>,
-    /// Length of the preset's own run.
+    /// Number of iterations of the unchanged preset.
     pub preset_iterations: u32,
-    /// Whose published values stand beside it.
+    /// Name of the method whose published values stand beside this one.
     pub published: Option<String>,
 }
 
 /// A run of a study: one method on one data set with one seed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Run {
-    /// Its name, and that of its directory: `DATA.METHOD.sSEED`.
+    /// Name of the run and of its directory: `DATA.METHOD.sSEED`.
     pub id: String,
-    /// Place of its data among the study's.
+    /// Index of its data set in the study.
     #[serde(skip)]
     pub data: usize,
-    /// Place of its method among the study's.
+    /// Index of its method in the study.
     #[serde(skip)]
     pub method: usize,
     /// Seed of data and training.
     pub seed: u32,
 }
 
-/// What a run is made of. A result counts for exactly this.
+/// Fingerprint of a run's data, configuration and program. A result is valid only for the same fingerprint.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunFingerprint {
-    /// Of the data: what they are made of, or their bytes.
+    /// Fingerprint of the data: of their description or of their bytes.
     pub data: String,
-    /// Of every hyper-parameter, the seed among them.
+    /// Fingerprint of all hyper-parameters, including the seed.
     pub configuration: String,
     /// Commit of the program.
     pub commit: String,
 }
 
 impl RunFingerprint {
-    /// Whether it is the same but, perhaps, for the program.
+    /// Tells whether data and configuration are equal; the commit of the program may differ.
     pub fn asks_the_same(&self, other: &RunFingerprint) -> bool {
         (&self.data, &self.configuration) == (&other.data, &other.configuration)
     }
 }
 
 impl Study {
-    /// All runs: data set by data set, in each seed by seed, so that what shares data stands together.
+    /// All runs, ordered by data set, then by seed, so that runs with the same data follow each other.
     pub fn runs(&self) -> Vec<Run> {
         let mut runs = Vec::new();
         for data in 0..self.data.len() {
@@ -89,12 +89,12 @@ impl Study {
         runs
     }
 
-    /// The run of a method on a data set, by their places, with a seed.
+    /// Returns the run of a method on a data set, both given by index, with a seed.
     pub fn run_of(&self, data: usize, method: usize, seed: u32) -> Run {
         Run { id: format!("{}.{}.s{seed}", self.data[data].id, self.methods[method].name), data, method, seed }
     }
 
-    /// The run of a name.
+    /// Returns the run with a name.
     ///
     /// # Errors
     /// [`Error::Config`] where there is none.
@@ -105,13 +105,13 @@ impl Study {
         runs.iter().find(|run| run.id == id).cloned().ok_or_else(none)
     }
 
-    /// The configuration of a run.
+    /// Configuration of a run.
     pub fn config(&self, run: &Run) -> Config {
         let (method, data) = (&self.methods[run.method], &self.data[run.data].name);
         Config { seed: run.seed, ..method.config_on.get(data).unwrap_or(&method.config).clone() }
     }
 
-    /// What a run is made of.
+    /// Fingerprint of a run.
     ///
     /// # Errors
     /// [`Error::Internal`] for a configuration that cannot be written down.
@@ -123,11 +123,15 @@ impl Study {
         })
     }
 }
-/// Settings, by section, that have come since results are kept, as they are written where they say what was done before.
-const NEW_AND_AS_BEFORE: [(&str, &str); 1] = [("[r2]", "integral = \"affine\"")];
+/// Settings, by section, that were added after results were first recorded, with the values that change nothing.
+const NEW_AND_AS_BEFORE: [(&str, &str); 3] = [
+    ("[r2]", "integral = \"affine\""),
+    ("[train]", "stop_at_loss_ratio = 0.0"),
+    ("[dynamic]", "occlusion_region = \"depth-range\""),
+];
 
-/// A configuration as a program wrote it that did not know the newer settings, where they change nothing: results of it are still its
-/// own.
+/// Removes newer settings from a configuration where they change nothing. Results recorded before these settings existed thus
+/// keep their fingerprint.
 fn as_before(configuration: &str) -> String {
     let mut section = "";
     let mut kept = String::with_capacity(configuration.len());
@@ -155,9 +159,9 @@ mod tests {
             Config::load(Some(Preset::R2Gaussian), None, &settings).unwrap().to_toml().unwrap()
         };
         let (affine, exact) = (of(&["r2.integral=affine"]), of(&["r2.integral=exact"]));
-        assert_eq!(as_before(&affine).lines().count() + 1, affine.lines().count());
-        assert_eq!(as_before(&exact), exact);
-        // Of other sections, the same words are something else.
+        assert_eq!(as_before(&affine).lines().count() + 3, affine.lines().count());
+        assert_eq!(as_before(&exact).lines().count() + 2, exact.lines().count());
+        // In another section, the same line is another setting.
         let other = "[x]\nintegral = \"affine\"\n";
         assert_eq!(as_before(other), other);
     }

@@ -1,11 +1,12 @@
 //! Owns the buffers and the step count of a run; hands iterations to the device, two submits in flight on a GPU,
 //! and reads losses without stalling it.
 
+use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
 use crate::fitting::RING_LENGTH;
 use crate::fitting::fit::{Fit, SavedFit};
-use crate::fitting::losses::{LargeLoss, LossWatch, NetworkLosses, StepLoss};
+use crate::fitting::losses::{LargeLoss, LossWatch, NetworkLosses, SMALLER_STEPS, StepLoss};
 use crate::fitting::ring::tells_nothing;
 use crate::geometry::CArm;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -15,10 +16,12 @@ use crate::gpu::record::{Commands, PassTime, Recording, Ticket};
 use crate::kernels::layout::{DeviceState, StepReport};
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::{Layers, Tuning};
+use crate::methods;
 use crate::model::Model;
 use crate::model::checkpoint::{Checkpoint, LossScale};
-use crate::model::gaussians::{MovingFeed, MovingGaussians};
+use crate::model::gaussians::{self, MovingFeed, MovingGaussians};
 use crate::model::setup::sample_capacity;
+use crate::model::{r2, x_gaussian};
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
@@ -95,6 +98,17 @@ fn begin_fit(gpu: &Gpu, plan: &mut Plan, saved: Option<&Checkpoint>, per_submit:
     config.train.iterations_per_submit = per_submit;
     let state = |saved: &Checkpoint| Some(SavedFit { field: saved.model.field.clone()?, state: saved.fit.clone()? });
     data.begin(gpu, &config, saved.and_then(state).as_ref()).map(Some)
+}
+
+/// Returns the settings of the configuration's method that make its steps smaller, as advice.
+fn smaller_steps(config: &Config) -> &'static str {
+    match methods::of(config) {
+        Some(method) => method.smaller_steps(),
+        None if config.is_r2() => r2::SMALLER_STEPS,
+        None if config.is_x() => x_gaussian::SMALLER_STEPS,
+        None if config.gaussians_move() => gaussians::SMALLER_STEPS,
+        None => SMALLER_STEPS,
+    }
 }
 
 /// Fingerprint of the training images: of their bits and geometry.
@@ -266,7 +280,7 @@ impl Trainer {
             submitted: step,
             completed: step,
             reported: step,
-            watch: LossWatch::new(plan.config.train.stop_at_loss_ratio),
+            watch: LossWatch::new(&plan.config, smaller_steps(&plan.config)),
             large_loss: None,
             moving,
             fit,
@@ -422,14 +436,20 @@ impl Trainer {
     fn advance_gaussians(&mut self, until: u32) -> Result<Vec<StepLoss>> {
         let Some(moving) = &mut self.moving else { return Ok(Vec::new()) };
         let losses = moving.advance(until, self.plan.config.gaussian_iterations())?;
-        if !moving.is_fitting() {
+        let ends = !moving.is_fitting();
+        if ends {
             self.leave_to_still_field()?;
         }
         let first = self.completed;
-        for done in [&mut self.submitted, &mut self.completed, &mut self.reported] {
-            *done = first + losses.len() as u32;
+        self.count(losses.len() as u32);
+        let of = |(loss, step)| StepLoss::of_gaussians(step, loss);
+        let losses: Vec<StepLoss> = losses.into_iter().zip(first + 1..).map(of).collect();
+        losses.iter().try_for_each(|loss| self.watch_loss(loss))?;
+        if ends {
+            // The static field's losses are others.
+            self.watch = LossWatch::new(&self.plan.config, SMALLER_STEPS);
         }
-        Ok(losses.into_iter().zip(first + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
+        Ok(losses)
     }
 
     /// Numbers on the device of the field of a method with a room of its own, for those who draw it; none of other methods.
@@ -442,7 +462,16 @@ impl Trainer {
         let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
         let losses = fit.advance(until)?;
         self.count(losses.len() as u32);
+        losses.iter().try_for_each(|loss| self.watch_loss(loss))?;
         Ok(losses)
+    }
+
+    /// Watches a loss for one that ends the run, and for the first one that is large.
+    fn watch_loss(&mut self, loss: &StepLoss) -> Result<()> {
+        if let Some(large) = self.watch.see(loss)? {
+            self.large_loss = Some(large);
+        }
+        Ok(())
     }
 
     /// Counts iterations that are submitted, done and reported at once.
@@ -480,9 +509,7 @@ impl Trainer {
                 loss_scale: report.loss_scale.into(),
                 networks: self.still.as_ref().map(|_| NetworkLosses::of(&report)),
             };
-            if let Some(large) = self.watch.see(&loss)? {
-                self.large_loss = Some(large);
-            }
+            self.watch_loss(&loss)?;
             losses.push(loss);
         }
         Ok(losses)
