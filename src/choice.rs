@@ -1,19 +1,19 @@
-//! Choices that users make by name, on a command line, in a query or in a file.
+//! Choices that users make by name: on a command line, in a query or in a file.
 
 /// An enumeration whose values have names.
 pub trait Choice: Copy + Send + Sync + 'static {
-    /// Every value.
+    /// All values.
     const ALL: &'static [Self];
 
-    /// What a user writes for it.
+    /// Name that a user writes for the value.
     fn name(self) -> &'static str;
 
-    /// The value of a name.
+    /// Returns the value with a name.
     fn named(name: &str) -> Option<Self> {
         Self::ALL.iter().copied().find(|choice| choice.name() == name)
     }
 
-    /// All names, for messages.
+    /// All names, separated by commas, for messages.
     fn names() -> String {
         Self::ALL.iter().map(|choice| choice.name()).collect::<Vec<_>>().join(", ")
     }

@@ -1,14 +1,14 @@
-//! Output files appear whole or not at all: written beside their target, then renamed.
+//! Writes output files atomically: a file is written under a temporary name beside its target, then renamed.
 
 use crate::error::{Error, Result};
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// How the names of files begin that are still being written.
+/// Beginning of the names of files that are still being written.
 const PARTIAL: &str = ".partial-";
 
-/// Writes `bytes` to `path` through a temporary file in the same directory; makes missing directories.
+/// Writes `bytes` to `path` through a temporary file in the same directory; creates missing directories.
 ///
 /// # Errors
 /// [`Error::Io`] naming the path.
@@ -19,7 +19,7 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<()> {
 /// Like [`write_atomic`], for content produced piece by piece.
 ///
 /// # Errors
-/// As [`write_atomic`].
+/// Errors of [`write_atomic`].
 pub fn write_atomic_with(
     path: &Path,
     produce: impl FnOnce(&mut BufWriter<&File>) -> std::io::Result<()>,
@@ -27,10 +27,10 @@ pub fn write_atomic_with(
     write_atomic_by(path, |file| produce(file).map_err(Error::io("write", path)))
 }
 
-/// Like [`write_atomic`], for content whose making may fail by itself.
+/// Like [`write_atomic`], for content whose production may fail with an error of its own.
 ///
 /// # Errors
-/// As [`write_atomic`]; errors of `produce`.
+/// Errors of [`write_atomic`] and of `produce`.
 pub fn write_atomic_by(path: &Path, produce: impl FnOnce(&mut BufWriter<&File>) -> Result<()>) -> Result<()> {
     let directory = match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent,
@@ -57,17 +57,17 @@ pub fn write_atomic_by(path: &Path, produce: impl FnOnce(&mut BufWriter<&File>) 
     Ok(())
 }
 
-/// Holds a file that is being written, for as long as it is open: [`remove_partial`] leaves it alone.
+/// Locks a file that is being written, for as long as it is open, so that [`remove_partial`] does not remove it.
 #[cfg(unix)]
 fn hold(file: &File) {
-    // Where a file system has no locks, a second process in the same directory goes without protection.
+    // A file system without locks gives no protection against a second process in the same directory.
     let _ = rustix::fs::flock(file, rustix::fs::FlockOperation::LockExclusive);
 }
 
 #[cfg(not(unix))]
 fn hold(_: &File) {}
 
-/// Tries to hold a file that is open: whether that worked, or none where the file system has no locks.
+/// Tries to lock an open file and tells whether that worked; none where the file system has no locks.
 #[cfg(unix)]
 fn try_hold(file: &File) -> Option<bool> {
     use rustix::fs::{FlockOperation, flock};
@@ -83,13 +83,13 @@ fn try_hold(_: &File) -> Option<bool> {
     None
 }
 
-/// Whether some process still writes a file; without locks nobody knows, but only Unix removes files that are open.
+/// Tells whether some process still writes a file. Without locks this is unknown, and only Unix removes files that are open.
 fn is_held(file: &File) -> bool {
     cfg!(unix) && try_hold(file) != Some(true)
 }
 
-/// Removes what a process that was killed has left half written in a directory; how many files. What other processes are
-/// writing stays, and so does a directory that cannot be listed.
+/// Removes the partial files that killed processes have left in a directory, and returns their number. Files that other
+/// processes are writing stay; a directory that cannot be listed is left as it is.
 pub fn remove_partial(directory: &Path) -> usize {
     let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
     let ours = entries.filter(|entry| {
@@ -100,15 +100,15 @@ pub fn remove_partial(directory: &Path) -> usize {
     left_over.filter(|entry| std::fs::remove_file(entry.path()).is_ok()).count()
 }
 
-/// A file that one process at a time holds, for as long as this lives; a process that is killed lets go. On systems without
-/// such locks, and on file systems without them, nobody is kept out.
+/// A lock file that one process at a time holds for as long as this value lives; the operating system releases it when a
+/// process is killed. Systems and file systems without such locks keep nobody out.
 #[derive(Debug)]
 pub struct Lock {
     _file: File,
 }
 
 impl Lock {
-    /// Takes it, and makes the file and its directory where they are missing; none while another process has it.
+    /// Takes the lock; creates the file and its directory where they are missing. Returns none while another process holds it.
     ///
     /// # Errors
     /// [`Error::Io`].
@@ -119,7 +119,7 @@ impl Lock {
     }
 }
 
-/// A value as indented JSON.
+/// Formats a value as indented JSON.
 ///
 /// # Errors
 /// [`Error::Internal`] for a value JSON cannot hold.
@@ -127,7 +127,7 @@ pub fn pretty_json(value: &impl serde::Serialize) -> Result<String> {
     serde_json::to_string_pretty(value).map_err(|e| Error::Internal(e.to_string()))
 }
 
-/// Makes a directory and its parents.
+/// Creates a directory and its parents.
 ///
 /// # Errors
 /// [`Error::Io`] naming the path.

@@ -57,7 +57,7 @@ pub struct CArm {
     pub table_mm: [f64; 3],
 }
 
-/// Whether a way is none.
+/// Tells whether a displacement is zero.
 pub(crate) fn is_at_rest(way_mm: &[f64; 3]) -> bool {
     *way_mm == [0.0; 3]
 }
@@ -92,7 +92,7 @@ pub fn rotation(primary_deg: f64, secondary_deg: f64) -> DMat3 {
 }
 
 impl Geometry {
-    /// Rays of a `width` x `height` image.
+    /// Returns the rays of a `width` x `height` image.
     ///
     /// # Errors
     /// Field and problem, for an impossible geometry.
@@ -103,7 +103,7 @@ impl Geometry {
         }
     }
 
-    /// Primary and secondary angle in degrees, when given as such.
+    /// Primary and secondary angle in degrees, where the geometry is stated by angles.
     pub fn angles_deg(&self) -> Option<(f64, f64)> {
         match self {
             Geometry::CArm(c) => Some((c.primary_deg, c.secondary_deg)),
@@ -111,8 +111,8 @@ impl Geometry {
         }
     }
 
-    /// This geometry turned by angles (primary and secondary, degrees) about the isocentre, and its patient carried a further
-    /// `shift` (world units). A matrix turns like the C-arm that looks where it looks.
+    /// Returns this geometry turned by angles (primary and secondary, degrees) about the isocentre, with the patient carried a
+    /// further `shift` (world units). A matrix turns like the C-arm with the same viewing direction.
     pub fn corrected(&self, angles_deg: [f64; 2], shift: DVec3) -> Geometry {
         match self {
             Geometry::CArm(c) => {
@@ -129,7 +129,7 @@ impl Geometry {
     }
 }
 
-/// Angles in degrees, primary and secondary, of the C-arm that looks along `axis`, from the source to the detector.
+/// Angles in degrees, primary and secondary, of the C-arm whose axis from the source to the detector is `axis`.
 pub fn angles_deg_of(axis: DVec3) -> [f64; 2] {
     [axis.y.atan2(-axis.x).to_degrees(), axis.z.clamp(-1.0, 1.0).asin().to_degrees()]
 }
@@ -171,7 +171,7 @@ impl CArm {
         let dv = r * DVec3::new(0.0, self.pixel_mm[1] / self.sid_mm, 0.0);
         let across = r * DVec3::new(u0 / self.sid_mm, v0 / self.sid_mm, 0.0);
         let direction = [across + r * DVec3::Z, du, dv];
-        // Seen from the patient, source and detector move against the table; depth counts from the patient's origin.
+        // Relative to the patient, source and detector move opposite to the table; depth is counted from the patient's origin.
         let table = world_from_lps_mm(DVec3::from_array(self.table_mm));
         let sod = self.sod_mm / MM_PER_UNIT + table.dot(r * DVec3::Z);
         let source = r * DVec3::new(0.0, 0.0, -self.sod_mm / MM_PER_UNIT) - table;
@@ -200,19 +200,20 @@ impl Matrix {
         if depth_of_origin == 0.0 {
             return Err((field, "puts the source in the isocentre plane".into()));
         }
-        // A matrix is defined up to sign: look from the source towards the isocentre.
+        // A matrix is defined up to its sign; choose the sign that looks from the source towards the isocentre.
         let scale = rows[2].length() * depth_of_origin.signum();
         let direction = [DVec3::Z, DVec3::X, DVec3::Y].map(|p| inverse * p * scale);
         Ok(ViewRays::at_depth(source, direction, depth_of_origin.abs()))
     }
 
-    /// See [`Geometry::corrected`]: the corrected view sees a point where this one sees it moved and turned back.
+    /// Implements [`Geometry::corrected`]: the corrected view sees a point where this view sees the point after it is moved and
+    /// turned back.
     fn corrected(&self, angles_deg: [f64; 2], shift: DVec3) -> Matrix {
         let Ok(rays) = self.rays() else { return self.clone() };
         let [primary, secondary] = angles_deg_of(rays.axis());
         let turn =
             rotation(primary + angles_deg[0], secondary + angles_deg[1]) * rotation(primary, secondary).transpose();
-        // The turn in the patient's axes (left, posterior, superior): first and second are exchanged.
+        // Turn in the patient's axes (left, posterior, superior): the first two axes are exchanged with respect to the world's.
         let back = |row: usize, column: usize| {
             let world = |axis: usize| [1, 0, 2][axis];
             turn.col(world(row))[world(column)]
@@ -232,13 +233,13 @@ impl ViewRays {
         ViewRays { anchor: [source + d0 * sod, du * sod, dv * sod], direction, sod }
     }
 
-    /// Unit vector across the detector, from the source to it.
+    /// Unit vector perpendicular to the detector, pointing from the source to the detector.
     pub fn axis(&self) -> DVec3 {
         let axis = self.direction[1].cross(self.direction[2]).normalize();
         if axis.dot(self.direction[0]) < 0.0 { -axis } else { axis }
     }
 
-    /// The rays that see the patient carried by `way` (world units).
+    /// Returns the rays that see the patient displaced by `way` (world units).
     pub fn moved(&self, way: DVec3) -> ViewRays {
         if way == DVec3::ZERO {
             return self.clone();
@@ -246,15 +247,15 @@ impl ViewRays {
         ViewRays::at_depth(self.source() - way, self.direction, self.sod + way.dot(self.axis()))
     }
 
-    /// The rays of the C-arm turned about the isocentre, which the table has carried the patient's origin away from by
-    /// `table` (world units).
+    /// Returns the rays of the C-arm turned about the isocentre, where the table has carried the patient's origin away from the
+    /// isocentre by `table` (world units).
     pub fn turned(&self, turn: DMat3, table: DVec3) -> ViewRays {
         let source = turn * (self.source() + table) - table;
         let direction = self.direction.map(|d| turn * d);
         ViewRays::at_depth(source, direction, -source.dot(turn * self.axis()))
     }
 
-    /// The rays of an image whose pixels are `factor` x `factor` of this one's.
+    /// Returns the rays of an image each of whose pixels covers `factor` x `factor` pixels of this one.
     pub fn binned(&self, factor: usize) -> ViewRays {
         let (middle, f) = (0.5 * (factor as f64 - 1.0), factor as f64);
         let (_, first) = self.pixel(middle, middle);
@@ -272,7 +273,7 @@ impl ViewRays {
         self.anchor[0] - self.direction[0] * self.sod
     }
 
-    /// The projection from patient mm (left, posterior, superior) to homogeneous pixels (column, row), rows first.
+    /// Projection matrix from patient mm (left, posterior, superior) to homogeneous pixels (column, row), in row-major order.
     pub fn projection(&self) -> [[f64; 4]; 3] {
         // [B^-1 | -B^-1 s] in world units, whose axes are posterior, left, superior.
         let basis = DMat3::from_cols(self.direction[1], self.direction[2], self.direction[0]).inverse();
@@ -283,7 +284,7 @@ impl ViewRays {
         })
     }
 
-    /// Column and row (pixel centres at integers) a world point projects to; `None` behind the source.
+    /// Column and row (pixel centres at integers) that a world point projects to; `None` behind the source.
     pub fn project(&self, point: DVec3) -> Option<(f64, f64)> {
         let basis = DMat3::from_cols(self.direction[1], self.direction[2], self.direction[0]);
         let h = basis.inverse() * (point - self.source());
@@ -295,7 +296,7 @@ impl ViewRays {
 pub(crate) mod tests {
     use super::*;
 
-    /// A projection matrix with these rays; its sign is free.
+    /// Returns a projection matrix with these rays; its sign can be chosen.
     pub(crate) fn matrix_of(rays: &ViewRays) -> Geometry {
         let matrix = rays.projection().map(|row| row.map(|value| -3.0 * value));
         Geometry::Matrix(Matrix { matrix })
@@ -318,7 +319,7 @@ pub(crate) mod tests {
         let mut moved = carm(30.0, 20.0);
         moved.table_mm = [12.0, -7.0, 25.0];
         let (at_rest, moved) = (carm(30.0, 20.0).rays(64, 48).unwrap(), moved.rays(64, 48).unwrap());
-        // The room sees a patient point where it is, plus the table's way.
+        // In the room, a patient point is displaced by the position of the table.
         let point = DVec3::new(5.0, 10.0, -15.0);
         let here = moved.project(world_from_lps_mm(point)).unwrap();
         let there = at_rest.project(world_from_lps_mm(point + DVec3::new(12.0, -7.0, 25.0))).unwrap();

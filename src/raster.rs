@@ -1,4 +1,4 @@
-//! 2D arrays of numbers, and what is done to them: order statistics and grey morphology.
+//! 2D arrays of numbers, with order statistics and grey morphology.
 
 /// A row-major 2D array of floats.
 #[derive(Debug, Clone, PartialEq)]
@@ -7,7 +7,7 @@ pub struct Image {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// `height * width` values, rows first.
+    /// `height * width` values in row-major order.
     pub values: Vec<f32>,
 }
 
@@ -17,14 +17,14 @@ impl Image {
         Image { width, height, values: vec![0.0; width * height] }
     }
 
-    /// Rows as columns.
+    /// Returns the transposed image: rows become columns.
     fn transposed(&self) -> Image {
         let columns = (0..self.width).flat_map(|x| self.values[x..].iter().step_by(self.width));
         Image { width: self.height, height: self.width, values: columns.copied().collect() }
     }
 }
 
-/// The value below which `share` of the values lie.
+/// Returns the value below which the fraction `share` of the values lies; 0 if there are no values.
 pub fn percentile(values: &[f32], share: f64) -> f32 {
     let mut sorted = values.to_vec();
     if sorted.is_empty() {
@@ -34,14 +34,15 @@ pub fn percentile(values: &[f32], share: f64) -> f32 {
     *sorted.select_nth_unstable_by(index, f32::total_cmp).1
 }
 
-/// Picks one of the values in a square of `2 radius + 1` pixels by comparing two at a time; `neutral` never wins.
+/// Reduces each square of `2 radius + 1` pixels to one of its values by picking between two at a time; `neutral` is never
+/// picked over another value.
 fn filter(image: &Image, radius: usize, neutral: f32, pick: impl Fn(f32, f32) -> f32) -> Image {
     let rows = filter_rows(image, radius, neutral, &pick);
     filter_rows(&rows.transposed(), radius, neutral, &pick).transposed()
 }
 
-/// Along rows, by three comparisons a pixel whatever the radius (van Herk 1992): a window is the end of one block of its
-/// length and the beginning of the next.
+/// Filters along rows with three comparisons per pixel for any radius (van Herk 1992): each window is the end of one block of
+/// its length and the beginning of the next.
 fn filter_rows(image: &Image, radius: usize, neutral: f32, pick: &impl Fn(f32, f32) -> f32) -> Image {
     let window = 2 * radius + 1;
     let padded = (image.width + 2 * radius).next_multiple_of(window);
@@ -67,19 +68,19 @@ pub fn dilate(image: &Image, radius: usize) -> Image {
     filter(image, radius, f32::NEG_INFINITY, f32::max)
 }
 
-/// A mask with a margin of so many pixels, as [`dilate`] has it.
+/// Widens a mask by `pixels` pixels on all sides, with the square of [`dilate`].
 pub fn widened(mask: &[bool], [width, height]: [usize; 2], pixels: usize) -> Vec<bool> {
     let values = mask.iter().map(|m| f32::from(u8::from(*m))).collect();
     dilate(&Image { width, height, values }, pixels).values.iter().map(|v| *v > 0.0).collect()
 }
 
-/// Grey opening: what is narrower than `2 radius + 1` pixels is cut down to its surroundings.
+/// Grey opening: structures narrower than `2 radius + 1` pixels are reduced to the values around them.
 pub fn opening(image: &Image, radius: usize) -> Image {
     dilate(&filter(image, radius, f32::INFINITY, f32::min), radius)
 }
 
-/// Median of each row's `2 radius + 1` pixels, then of each column's: in one or two directions what is narrower than half
-/// that goes.
+/// Median over `2 radius + 1` pixels of each row, then of each column: removes structures that are narrower than half of this
+/// window in one or both directions.
 pub fn median_filter(image: &Image, radius: usize) -> Image {
     let (w, h) = (image.width, image.height);
     let window = |centre: usize, end: usize| centre.saturating_sub(radius)..(centre + radius + 1).min(end);
@@ -102,7 +103,7 @@ pub fn median_filter(image: &Image, radius: usize) -> Image {
     out
 }
 
-/// The middle value; 0 of none. Reorders.
+/// Returns the middle value, or 0 if there are none. Reorders the values.
 pub fn median(values: &mut [f32]) -> f32 {
     if values.is_empty() {
         return 0.0;

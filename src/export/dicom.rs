@@ -1,7 +1,7 @@
-//! Rendered views as DICOM: X-ray angiograms (XA Image Storage) that say they are derived, and not for diagnosis.
+//! Writes rendered views as DICOM: X-ray angiograms (XA Image Storage), marked as derived and not for diagnosis.
 //!
-//! Values are those of a detector that is linear in intensity: 65535 exp(-integral), so that readers that know what LIN means get
-//! the line integrals back. Source runs are not referred to: no UID of theirs reaches a dataset.
+//! Values are those of a detector that is linear in intensity: 65535 exp(-integral). Readers that support LIN can recover the
+//! line integrals. There are no references to source runs, because a dataset contains none of their UIDs.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -11,34 +11,35 @@ use dicom_dictionary_std::{tags, uids};
 use dicom_object::{FileMetaTableBuilder, InMemDicomObject};
 use std::path::Path;
 
-/// Value of a pixel through which nothing is absorbed.
+/// Value of a pixel without absorption.
 const WHITE: f64 = 65535.0;
 const EXPLICIT_LITTLE_ENDIAN: &str = "1.2.840.10008.1.2.1";
-/// What viewers show beside the picture, wherever they show text of the file.
+/// Label that viewers show beside the picture, wherever they show text of the file.
 const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
-/// Characters of a decimal string at most.
+/// Largest number of characters of a decimal string.
 const DECIMAL_CHARACTERS: usize = 16;
-/// Pixel data of explicit length end here.
+/// Largest size of pixel data of explicit length, bytes.
 const MOST_BYTES: usize = u32::MAX as usize - 1;
 
-/// A view over some moments of a beat.
+/// A view at some times of a beat.
 #[derive(Debug, Clone)]
 pub struct DicomView<'a> {
-    /// How it is seen; the detector is centred and the patient at the isocentre, since nothing in the file could say otherwise.
+    /// C-arm of the view. The file cannot state other positions, so the detector is centred and the patient is at the
+    /// isocentre.
     pub c_arm: &'a CArm,
     /// Columns and rows.
     pub size: [usize; 2],
-    /// Line integrals of each frame, rows first.
+    /// Line integrals of each frame in row-major order.
     pub frames: &'a [Vec<f32>],
     /// Time between frames, ms.
     pub frame_ms: f64,
-    /// What is shown, in a few words.
+    /// Short description of the content.
     pub description: &'a str,
-    /// Random numbers that make the UIDs of study, series and image new.
+    /// Random numbers from which the UIDs of study, series and image are made.
     pub seeds: [u128; 3],
 }
 
-/// A number as text of a length that DICOM accepts, as exact as that allows.
+/// Formats a number with a length that DICOM accepts, as precisely as this length allows.
 fn decimal(value: f64) -> String {
     let texts = (0..=DECIMAL_CHARACTERS).rev().map(|digits| format!("{value:.digits$}"));
     let mut fits = texts.filter(|text| text.len() <= DECIMAL_CHARACTERS).map(|text| match text.contains('.') {
@@ -48,10 +49,10 @@ fn decimal(value: f64) -> String {
     fits.next().unwrap_or_else(|| format!("{value:.8e}"))
 }
 
-/// Writes a view.
+/// Writes a view as a DICOM file.
 ///
 /// # Errors
-/// [`Error::Config`] for frames that no file holds; [`Error::Io`].
+/// [`Error::Config`] for frames that a DICOM file cannot hold; [`Error::Io`].
 pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
     let [width, height] = view.size;
     let (columns, rows) = (u16::try_from(width), u16::try_from(height));
@@ -82,12 +83,12 @@ fn text(object: &mut InMemDicomObject, tag: Tag, vr: VR, value: &str) {
     object.put(DataElement::new(tag, vr, PrimitiveValue::from(value)));
 }
 
-/// Attributes that must be there, and of which nothing is known.
+/// Adds a required attribute whose value is unknown.
 fn unknown(object: &mut InMemDicomObject, tag: Tag, vr: VR) {
     object.put(DataElement::new(tag, vr, PrimitiveValue::Empty));
 }
 
-/// What the object is, of whom, and made by what.
+/// Adds the identity of the object, the patient and the manufacturer.
 fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     for (tag, vr) in [
         (tags::PATIENT_BIRTH_DATE, VR::DA),
@@ -133,19 +134,19 @@ fn describe(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     }
 }
 
-/// An angle from -180 to below 180 deg.
+/// Maps an angle to the range from -180 to below 180 deg.
 fn half_turn_deg(angle_deg: f64) -> f64 {
     (angle_deg + 180.0).rem_euclid(360.0) - 180.0
 }
 
-/// A new UID: a random UUID (version 4, RFC 9562) as a number, PS3.5 B.2.
+/// Makes a new UID: a random UUID (version 4, RFC 9562) as a decimal number, PS3.5 B.2.
 fn uid(random: u128) -> String {
     let version = 0xf_u128 << 76;
     let variant = 0b11_u128 << 62;
     format!("2.25.{}", random & !version & !variant | 4 << 76 | 0b10 << 62)
 }
 
-/// How the view is seen.
+/// Adds the geometry of the view.
 fn geometry(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     let c_arm = view.c_arm;
     text(object, tags::POSITIONER_MOTION, VR::CS, "STATIC");
@@ -158,7 +159,7 @@ fn geometry(object: &mut InMemDicomObject, view: &DicomView<'_>) {
     ] {
         text(object, tag, VR::DS, &decimal(value));
     }
-    // DICOM gives rows first.
+    // DICOM lists the spacing of rows first.
     let [across, down] = c_arm.pixel_mm.map(decimal);
     text(object, tags::IMAGER_PIXEL_SPACING, VR::DS, &format!("{down}\\{across}"));
 }

@@ -1,8 +1,8 @@
-//! Motion of a reconstruction for the tools people use: displacements of the grid that moves the Gaussians as NRRD or VTK,
-//! and the way of each Gaussian as lines. Patient coordinates, mm.
+//! Exports the motion of a reconstruction for common tools: displacements of the grid that moves the Gaussians as NRRD or VTK,
+//! and the trajectory of each Gaussian as lines. Patient coordinates, mm.
 //!
-//! Projections do not show motion along a vessel: what is exported there comes from the smoothness of the grid alone. So no
-//! strain is exported, and none should be derived.
+//! Projections do not show motion along a vessel; that part of the exported motion comes from the smoothness of the grid alone.
+//! So no strain is exported, and none should be derived.
 
 use crate::choice::Choice;
 use crate::config::GaussianForm;
@@ -21,20 +21,20 @@ use glam::DVec3;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// What every file says of them.
+/// Limitation that is stated in every file.
 const CAVEAT: &str = "motion along a vessel is not observed in projections";
 
 /// File format of displacements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MotionFormat {
-    /// NRRD: a vector axis, first, and a list axis of phases, last.
+    /// NRRD, with a vector axis first and a list axis of phases last.
     Nrrd,
-    /// Legacy VTK structured points with a vector array; a file per phase, which ParaView groups.
+    /// Legacy VTK structured points with a vector array; one file per phase, which ParaView groups.
     Vtk,
 }
 
 impl MotionFormat {
-    /// Format by the end of a file name.
+    /// Returns the format for the end of a file name.
     pub fn of(path: &Path) -> Option<MotionFormat> {
         match path.extension()?.to_str()?.to_lowercase().as_str() {
             "nrrd" => Some(MotionFormat::Nrrd),
@@ -44,11 +44,11 @@ impl MotionFormat {
     }
 }
 
-/// The one set of Gaussians whose motion a model knows.
+/// Returns the set of Gaussians that moves over the beat, of a model that has one.
 ///
 /// # Errors
-/// [`Error::Config`] where the moving field is a set of Gaussians per phase or a network: neither says what becomes of a
-/// point.
+/// [`Error::Config`] where the dynamic field is one set of Gaussians per phase or a network, because neither follows a point
+/// over time.
 pub fn moving_tree(model: &Model) -> Result<&MovingTree> {
     let form = model.moving.as_ref().map_or(GaussianForm::None, MovingGaussians::form);
     model.moving.as_ref().and_then(MovingGaussians::tree).ok_or_else(|| {
@@ -67,28 +67,29 @@ pub fn moving_tree(model: &Model) -> Result<&MovingTree> {
     })
 }
 
-/// A length or place along (posterior, left, superior) in the Gaussians' pixels, as LPS mm.
+/// Converts a length or position along (posterior, left, superior) in the Gaussians' pixels to LPS mm.
 fn lps_mm(tree: &MovingTree, x: DVec3) -> DVec3 {
     DVec3::new(x.y, x.x, x.z) * tree.rest.units.pixel * MM_PER_UNIT
 }
 
-/// Displacements on a tree's grid, to export.
+/// Export of the displacements on a tree's grid.
 pub struct MotionExport<'a> {
-    /// What moves.
+    /// The moving tree of Gaussians.
     pub tree: &'a MovingTree,
     /// Phases to export, from 0.
     pub phases: Vec<u32>,
-    /// Write an axis of phases, or a number into each name, even for one phase.
+    /// Whether a phase axis, or a number in each file name, is also written for a single phase.
     pub sequence: bool,
-    /// Format.
+    /// File format.
     pub format: MotionFormat,
-    /// How NRRD stores them.
+    /// Encoding of the data in NRRD.
     pub encoding: Encoding,
 }
 
 impl MotionExport<'_> {
-    /// Writes the displacement of every node of the grid from the phase of rest to each phase, mm along (left, posterior, superior);
-    /// left is fastest in the files. Returns the files made. Gaussians' own motion is not part of it.
+    /// Writes the displacement of every node of the grid from the rest phase to each phase, mm along (left, posterior,
+    /// superior), with left varying fastest. The Gaussians' individual motion is not included. Returns the files that were
+    /// written.
     ///
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have, and for gzip in VTK; [`Error::Io`].
@@ -106,7 +107,7 @@ impl MotionExport<'_> {
         }
     }
 
-    /// The grid and what is on it.
+    /// Header of a file with vectors on the grid.
     fn header(&self) -> VolumeHeader {
         let setup = &self.tree.setup;
         let (first, step) = (-f64::from(setup.half_side), 1.0 / f64::from(setup.inverse_step));
@@ -119,11 +120,11 @@ impl MotionExport<'_> {
         }
     }
 
-    /// Displacements of a phase in the order of the files.
+    /// Displacements at a phase in the order of the files.
     fn vectors(&self, phase: u32) -> Vec<f32> {
         let n = self.tree.setup.n_nodes as usize;
         let nodes = &self.tree.grid[phase as usize * n.pow(3)..][..n.pow(3)];
-        // The grid's axes are (posterior, left, superior), the first fastest.
+        // The grid's axes are (posterior, left, superior); the first varies fastest.
         let node = |i: usize| nodes[(i / (n * n) * n + i % n) * n + i / n % n];
         let vector = |[x, y, z, _]: [f32; 4]| lps_mm(self.tree, DVec3::new(x.into(), y.into(), z.into()));
         (0..n.pow(3)).flat_map(|i| vector(node(i)).as_vec3().to_array()).collect()
@@ -147,7 +148,7 @@ impl MotionExport<'_> {
         self.phases.iter().try_for_each(|p| raw::write_floats(&mut *out, &self.vectors(*p), ByteOrder::Little))
     }
 
-    /// One file per phase: `name.vtk`, or `name_0000.vtk` and so on.
+    /// Writes one file per phase: `name.vtk`, or `name_0000.vtk` and so on.
     fn write_vtk(&self, path: &Path) -> Result<Vec<PathBuf>> {
         let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let one = |phase: &u32| {
@@ -164,9 +165,9 @@ impl MotionExport<'_> {
     }
 }
 
-/// Writes the way of each Gaussian over the beat, own motion included, as a closed line in a legacy VTK file: a point per
-/// phase with its `phase`, the Gaussian's standard deviations from the least to the greatest (`scale_mm`), and its
-/// attenuation at the centre (`attenuation_per_mm`).
+/// Writes the trajectory of each Gaussian over the beat, including its individual motion, as a closed line in a legacy VTK
+/// file. A line has a point per phase, with its `phase`, the Gaussian's standard deviations in ascending order (`scale_mm`),
+/// and its attenuation at the centre (`attenuation_per_mm`).
 ///
 /// # Errors
 /// [`Error::Io`].

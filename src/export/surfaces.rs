@@ -1,4 +1,4 @@
-//! Surfaces of the vessels at each phase, as STL, PLY, OBJ or animated glTF. LPS mm; glTF in its own metres and axes.
+//! Exports surfaces of the vessels at each phase as STL, PLY, OBJ or animated glTF. LPS mm; glTF has its own axes and metres.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -15,18 +15,18 @@ use std::path::{Path, PathBuf};
 /// File format of meshes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MeshFormat {
-    /// Binary STL, a file per phase.
+    /// Binary STL, one file per phase.
     Stl,
-    /// Binary PLY with normals, a file per phase.
+    /// Binary PLY with normals, one file per phase.
     Ply,
-    /// Wavefront OBJ, a file per phase.
+    /// Wavefront OBJ, one file per phase.
     Obj,
-    /// glTF binary: all phases in one animated file.
+    /// Binary glTF with all phases in one animated file.
     Glb,
 }
 
 impl MeshFormat {
-    /// Format by the end of a file name.
+    /// Returns the format for the end of a file name.
     pub fn of(path: &Path) -> Option<MeshFormat> {
         Some(match path.extension()?.to_str()?.to_lowercase().as_str() {
             "stl" => MeshFormat::Stl,
@@ -38,11 +38,11 @@ impl MeshFormat {
     }
 }
 
-/// The surface on which a field on a grid has the value `iso`; closed, also where it leaves the grid. Naive surface nets:
-/// like marching cubes, with one vertex per cell and evener triangles.
+/// Returns the surface on which a field on a grid has the value `iso`; it is closed even where it reaches the edge of the grid.
+/// Naive surface nets: like marching cubes, but with one vertex per cell and more uniform triangles.
 pub fn surface(values: &[f32], grid: &PatientGrid, iso: f32) -> Mesh {
     let size = grid.size;
-    // A border outside closes the surface.
+    // A border of points outside the surface closes it.
     let padded: [u32; 3] = size.map(|n| n + 2);
     let shape = RuntimeShape::<u32, 3>::new(padded);
     let mut distance = vec![iso.max(f32::MIN_POSITIVE); shape.usize()];
@@ -59,10 +59,10 @@ pub fn surface(values: &[f32], grid: &PatientGrid, iso: f32) -> Mesh {
     Mesh::closed(vertices, nets.indices.chunks_exact(3).map(|t| [t[0], t[1], t[2]]).collect())
 }
 
-/// Surfaces of the moving vessels where their attenuation is `iso_per_mm`, at each phase; returns the files made.
+/// Writes the surfaces of the dynamic field at attenuation `iso_per_mm` for each phase; returns the files that were written.
 ///
 /// # Errors
-/// [`Error::Config`] when nothing reaches `iso_per_mm`; [`Error::Io`]; device errors.
+/// [`Error::Config`] when the field does not reach `iso_per_mm` at any phase; [`Error::Io`]; device errors.
 pub fn write_meshes(
     renderer: &Renderer,
     grid: &PatientGrid,
@@ -131,7 +131,7 @@ mod tests {
             assert!((outwards.length() - 8.0).abs() < 0.2);
             assert!(outwards.normalize().dot(Vec3::from(*n)) > 0.9, "normals point outwards");
         }
-        // Closed: every edge has two triangles, one in each direction.
+        // On a closed surface every edge belongs to two triangles, once in each direction.
         let edges: std::collections::HashSet<(u32, u32)> =
             mesh.triangles.iter().flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])]).collect();
         assert_eq!(edges.len(), 3 * mesh.triangles.len());

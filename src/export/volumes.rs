@@ -1,5 +1,5 @@
-//! Volumes of a reconstruction for the tools people use: NRRD (3D Slicer plays phases as a sequence), NIfTI, MetaImage,
-//! npy and VTK. Patient coordinates, mm; attenuation per mm; sampled and written slab by slab.
+//! Exports volumes of a reconstruction for common tools: NRRD (3D Slicer plays phases as a sequence), NIfTI, MetaImage, npy and
+//! VTK. Patient coordinates, mm; attenuation per mm; sampled and written slab by slab.
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
@@ -22,15 +22,15 @@ use std::path::{Path, PathBuf};
 /// File format of a volume.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// NRRD; phases as a list axis, which 3D Slicer loads as a sequence (`.seq.nrrd`).
+    /// NRRD with phases as a list axis, which 3D Slicer loads as a sequence (`.seq.nrrd`).
     Nrrd,
-    /// NIfTI-1; phases as the fourth axis.
+    /// NIfTI-1 with phases as the fourth axis.
     Nifti,
-    /// MetaImage; phases as the fourth axis.
+    /// MetaImage with phases as the fourth axis.
     Mha,
-    /// numpy; (phases,) superior, posterior, left. Without geometry.
+    /// NumPy array with axes (phases,) superior, posterior, left; without geometry.
     Npy,
-    /// Legacy VTK structured points; a file per phase, which ParaView groups.
+    /// Legacy VTK structured points; one file per phase, which ParaView groups.
     Vtk,
 }
 
@@ -49,7 +49,7 @@ impl Choice for Format {
 }
 
 impl Format {
-    /// Format and compression by the end of a file name.
+    /// Returns format and compression for the end of a file name.
     pub fn of(path: &Path) -> Option<(Format, Compression)> {
         let name = path.file_name()?.to_str()?.to_lowercase();
         if name.ends_with(".nii.gz") {
@@ -66,7 +66,7 @@ impl Format {
         Some((format, Compression::None))
     }
 
-    /// Refuses a compression a format does not have, and a name that promises another one.
+    /// Rejects a compression that the format does not have or that the file name contradicts.
     ///
     /// # Errors
     /// [`Error::Config`].
@@ -84,41 +84,42 @@ impl Format {
     }
 }
 
-/// Whether the values of a volume are compressed.
+/// Compression of the values of a volume.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Compression {
-    /// They are not.
+    /// No compression.
     None,
-    /// As one gzip stream: all of a NIfTI file, the values of an NRRD file.
+    /// One gzip stream: the whole NIfTI file, or the values of an NRRD file.
     Gzip,
 }
 
-/// What to export.
+/// Options of a volume export.
 #[derive(Debug, Clone)]
 pub struct VolumeExport {
-    /// The grid.
+    /// Grid on which the fields are sampled.
     pub grid: PatientGrid,
     /// Fields to export.
     pub component: Component,
     /// Phases to export, from 0.
     pub phases: Vec<u32>,
-    /// Write a fourth axis, even for one phase.
+    /// Whether the phase axis is also written for a single phase.
     pub sequence: bool,
-    /// Format.
+    /// File format.
     pub format: Format,
     /// Compression, for NIfTI and NRRD.
     pub compression: Compression,
 }
 
-/// What the values are.
+/// Quantity of the values.
 const QUANTITY: &str = "attenuation per mm";
-/// Cells of a slab.
+/// Number of cells of a slab.
 const SLAB_CELLS: usize = 1 << 22;
 
-/// The patient grid over where a scene's fields are looked at ([`Scene::region_of`]): points `spacing_mm` apart, one at each cell's middle.
+/// Returns the patient grid over the region of a scene's fields ([`Scene::region_of`]): points at cell centres, `spacing_mm`
+/// apart.
 ///
 /// # Errors
-/// [`Error::Config`] for a spacing that gives no or too many points.
+/// [`Error::Config`] for a spacing that is not positive or gives too many points.
 pub fn grid_over(scene: &Scene, component: Component, spacing_mm: f64) -> Result<PatientGrid> {
     if !(spacing_mm.is_finite() && spacing_mm > 0.0) {
         return Err(Error::config("spacing_mm", spacing_mm, "is not a positive length in mm"));
@@ -140,14 +141,15 @@ pub fn grid_over(scene: &Scene, component: Component, spacing_mm: f64) -> Result
 }
 
 impl VolumeExport {
-    /// Slices of each slab.
+    /// Ranges of slices, one for each slab.
     fn slabs(&self) -> impl Iterator<Item = Range<u32>> + use<> {
         let [nx, ny, nz] = self.grid.size;
         let thick = (SLAB_CELLS / (nx as usize * ny as usize)).clamp(1, nz as usize) as u32;
         (0..nz.div_ceil(thick)).map(move |i| i * thick..((i + 1) * thick).min(nz))
     }
 
-    /// Samples and writes; returns the files made. `progress` hears of cells done and cells in all.
+    /// Samples the fields and writes them; returns the files that were written. `progress` receives the cells done and the
+    /// total.
     ///
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have, and for a compression that does not fit the format or the
@@ -181,7 +183,7 @@ impl VolumeExport {
         }
     }
 
-    /// Everything of a file that holds all phases.
+    /// Writes a file that holds all phases.
     fn write_file(&self, path: &Path, file: &mut impl Write, sample: Sampler<'_>) -> Result<()> {
         let header = self.header();
         let failed = |e| Error::io("write", path)(e);
@@ -218,10 +220,10 @@ impl VolumeExport {
         }
     }
 
-    /// Hands all values on, slab by slab, in the order of the file.
+    /// Passes all values to `put`, slab by slab, in the order of the file.
     fn each_slab(&self, sample: Sampler<'_>, mut put: impl FnMut(&[f32]) -> Result<()>) -> Result<()> {
         if self.format == Format::Nrrd && self.sequence {
-            // The list axis comes first: all phases of a voxel follow each other.
+            // The list axis comes first, so all phases of a voxel are adjacent.
             for slices in self.slabs() {
                 let phases = self.phases.iter().map(|p| sample(*p, slices.clone())).collect::<Result<Vec<_>>>()?;
                 let voxels = 0..phases[0].len();
@@ -237,7 +239,7 @@ impl VolumeExport {
         Ok(())
     }
 
-    /// One file per phase: `name.vtk`, or `name_0000.vtk` and so on.
+    /// Writes one file per phase: `name.vtk`, or `name_0000.vtk` and so on.
     fn write_vtk(&self, path: &Path, sample: Sampler<'_>) -> Result<Vec<PathBuf>> {
         let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut made = Vec::new();
@@ -257,7 +259,7 @@ impl VolumeExport {
     }
 }
 
-/// Values of some slices at a phase.
+/// Function that returns the values of some slices at a phase.
 type Sampler<'a> = &'a mut dyn FnMut(u32, Range<u32>) -> Result<Vec<f32>>;
 
 #[cfg(test)]

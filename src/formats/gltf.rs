@@ -1,11 +1,11 @@
-//! Binary glTF (`.glb`): meshes of a beat as one animation. By hand: gltf-json is well kept, but its types want every field
-//! of the standard spelled out, which is longer than the few kinds of object needed here.
+//! Binary glTF (`.glb`): the meshes of a beat as one animation. The writer is our own: gltf-json is well maintained, but its
+//! types require every field of the standard, which takes more code than the few kinds of object needed here.
 
 use crate::error::{Error, Result};
 use crate::formats::mesh::Mesh;
 use serde_json::{Value, json};
 
-/// Codes of the standard.
+/// Numeric constants of the standard.
 mod code {
     pub(super) const FLOAT: u32 = 5126;
     pub(super) const UNSIGNED_INT: u32 = 5125;
@@ -17,18 +17,18 @@ mod code {
 /// Length of a beat in the animation, seconds.
 const BEAT_S: f32 = 1.0;
 const METRES_PER_MM: f32 = 1e-3;
-/// Chunks begin at multiples of this.
+/// Alignment of chunks and arrays, bytes.
 const ALIGNMENT: usize = 4;
 
-/// glTF has y up: x = left, y = superior, z = anterior.
+/// Converts LPS axes to glTF's, where y is up: x = left, y = superior, z = anterior.
 fn to_gltf_axes(v: &[f32; 3]) -> [f32; 3] {
     [v[0], v[2], -v[1]]
 }
 
-/// All phases as one binary glTF, in metres, whose animation shows each for its share of a beat.
+/// Writes all phases as one binary glTF, in metres, whose animation shows each phase for its share of a beat.
 ///
 /// # Errors
-/// [`Error::Internal`] for what JSON cannot hold.
+/// [`Error::Internal`] for values that JSON cannot hold.
 pub fn to_glb(meshes: &[(u32, Mesh)]) -> Result<Vec<u8>> {
     let mut scene = Scene::default();
     meshes.iter().enumerate().for_each(|(index, (phase, mesh))| scene.add_node(*phase, mesh, index == 0));
@@ -38,19 +38,19 @@ pub fn to_glb(meshes: &[(u32, Mesh)]) -> Result<Vec<u8>> {
     scene.into_container()
 }
 
-/// A mesh that changes its shape over the beat: the same triangles of the same vertices at all phases.
+/// A mesh that changes its shape over the beat, with the same triangles and corresponding vertices at all phases.
 pub struct MovingMesh {
     /// Name of its node.
     pub name: String,
-    /// The mesh at each phase; the triangles are those of the first.
+    /// Mesh at each phase; the triangles of the first mesh are used for all.
     pub phases: Vec<Mesh>,
 }
 
-/// Meshes that change their shapes as one binary glTF, in metres: morph targets are the phases behind the first, and the
-/// animation goes from each to the next on straight lines, from the last to the first at last.
+/// Writes meshes that change their shapes as one binary glTF, in metres. The phases after the first are morph targets; the
+/// animation interpolates linearly from each phase to the next and finally from the last to the first.
 ///
 /// # Errors
-/// [`Error::Internal`] for what JSON cannot hold.
+/// [`Error::Internal`] for values that JSON cannot hold.
 pub fn to_moving_glb(parts: &[MovingMesh]) -> Result<Vec<u8>> {
     let mut scene = Scene::default();
     parts.iter().for_each(|part| scene.add_moving_node(part));
@@ -61,7 +61,7 @@ pub fn to_moving_glb(parts: &[MovingMesh]) -> Result<Vec<u8>> {
     scene.into_container()
 }
 
-/// Places as glTF has them: metres.
+/// Vertex positions in glTF axes, metres.
 fn to_gltf_places(mesh: &Mesh) -> Vec<[f32; 3]> {
     mesh.vertices.iter().map(|v| to_gltf_axes(&v.map(|x| x * METRES_PER_MM))).collect()
 }
@@ -74,7 +74,7 @@ fn to_gltf_normals(mesh: &Mesh) -> Vec<[f32; 3]> {
     mesh.normals.iter().map(to_gltf_axes).collect()
 }
 
-/// Objects of a glTF document and the binary data they speak of.
+/// Objects of a glTF document and the binary data they refer to.
 #[derive(Default)]
 struct Scene {
     data: Vec<u8>,
@@ -86,7 +86,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// Keeps an array; the index of its accessor.
+    /// Appends an array and returns the index of its accessor.
     fn add_array(&mut self, bytes: impl Iterator<Item = u8>, target: Option<u32>, mut accessor: Value) -> usize {
         let start = self.data.len();
         self.data.extend(bytes);
@@ -105,7 +105,7 @@ impl Scene {
         self.add_array(values.iter().flat_map(|v| v.to_le_bytes()), target, accessor)
     }
 
-    /// Keeps vectors, one per vertex.
+    /// Appends vectors, one per vertex, and returns the index of their accessor.
     fn add_vectors(&mut self, vectors: &[[f32; 3]], bounds: Option<[[f32; 3]; 2]>) -> usize {
         let mut accessor = json!({ "componentType": code::FLOAT, "count": vectors.len(), "type": "VEC3" });
         if let Some([low, high]) = bounds {
@@ -114,7 +114,7 @@ impl Scene {
         self.add_floats(vectors.as_flattened(), Some(code::ARRAY_BUFFER), accessor)
     }
 
-    /// A node that shows a mesh, if there is any of it.
+    /// Adds a node for a phase; it has no mesh if the phase has no triangles.
     fn add_node(&mut self, phase: u32, mesh: &Mesh, shown: bool) {
         let scale = f32::from(u8::from(shown));
         let mut node = json!({ "name": format!("phase {phase}"), "scale": [scale, scale, scale] });
@@ -124,7 +124,8 @@ impl Scene {
         self.nodes.push(node);
     }
 
-    /// A node that shows a mesh, and how far its vertices and normals are from there at each further phase.
+    /// Adds a node that shows a mesh, with the displacements of its vertices and normals at each further phase as morph
+    /// targets.
     fn add_moving_node(&mut self, part: &MovingMesh) {
         let Some((rest, moved)) = part.phases.split_first() else { return };
         let mesh = self.add_mesh(rest);
@@ -142,7 +143,7 @@ impl Scene {
         self.nodes.push(json!({ "name": part.name, "mesh": mesh }));
     }
 
-    /// Keeps places, of which the standard wants bounds.
+    /// Appends positions with their bounds, which the standard requires.
     fn add_places(&mut self, places: &[[f32; 3]]) -> usize {
         let bound = |pick: fn(f32, f32) -> f32| {
             std::array::from_fn(|axis| places.iter().map(|p| p[axis]).fold(places[0][axis], pick))
@@ -164,7 +165,7 @@ impl Scene {
         self.meshes.len() - 1
     }
 
-    /// Keeps the times at which `n` phases begin, and the end of the beat.
+    /// Appends the start times of `n` phases and the end of the beat.
     fn add_times(&mut self, n: usize) -> usize {
         let times: Vec<f32> = (0..=n).map(|i| BEAT_S * i as f32 / n as f32).collect();
         self.add_floats(
@@ -174,7 +175,7 @@ impl Scene {
         )
     }
 
-    /// Gives every node the shape of each phase in turn, and that of the first at last.
+    /// Animates every node through the shapes of all phases and back to the first.
     fn animate_shapes(&mut self, n_phases: usize) {
         let time = self.add_times(n_phases);
         let weight = |i: usize, target: usize| f32::from(u8::from(i % n_phases == target));
@@ -188,7 +189,7 @@ impl Scene {
         self.animations.push(json!({ "name": "beat", "samplers": [sampler], "channels": channels }));
     }
 
-    /// Shows each node while its phase lasts: steps of its scale between 0 and 1.
+    /// Animates each node to be visible during its phase, by steps of its scale between 0 and 1.
     fn animate(&mut self) {
         let n = self.nodes.len();
         let time = self.add_times(n);
@@ -203,7 +204,7 @@ impl Scene {
         self.animations.push(json!({ "name": "beat", "samplers": samplers, "channels": channels }));
     }
 
-    /// The JSON of the document. Lists must not be empty.
+    /// Returns the JSON of the document. Empty lists are left out, because the standard forbids them.
     fn document(&self) -> Value {
         let mut document = json!({
             "asset": { "version": "2.0", "generator": concat!("nertca-vk ", env!("CARGO_PKG_VERSION")) },
@@ -226,7 +227,7 @@ impl Scene {
         document
     }
 
-    /// The file: a header, the document and the data.
+    /// Returns the file: a header, the document and the data.
     fn into_container(self) -> Result<Vec<u8>> {
         let mut text = serde_json::to_vec(&self.document()).map_err(|e| Error::Internal(e.to_string()))?;
         text.resize(text.len().next_multiple_of(ALIGNMENT), b' ');

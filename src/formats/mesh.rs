@@ -1,4 +1,4 @@
-//! Triangle meshes, and their files of one mesh each: binary STL, binary PLY with normals, Wavefront OBJ.
+//! Triangle meshes and file formats for a single mesh: binary STL, binary PLY with normals, Wavefront OBJ.
 
 use glam::Vec3;
 use std::fmt::Write as _;
@@ -8,18 +8,18 @@ use std::fmt::Write as _;
 pub struct Mesh {
     /// Vertices, LPS mm.
     pub vertices: Vec<[f32; 3]>,
-    /// Unit normals, outwards.
+    /// Unit normals, pointing outwards.
     pub normals: Vec<[f32; 3]>,
-    /// Triangles, counter-clockwise from outside.
+    /// Triangles as vertex indices, counter-clockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
 }
 
-/// Words of the header of an STL file, which is as long whatever they are.
+/// Text of the header of an STL file, padded to a fixed length.
 const STL_HEADER: &str = "nertca-vk vessel surface, LPS mm";
 const STL_HEADER_BYTES: usize = 80;
 
 impl Mesh {
-    /// A closed mesh of vertices and triangles, turned so that triangles face outwards, with normals.
+    /// Makes a closed mesh with normals, and orients its triangles outwards.
     pub fn closed(vertices: Vec<[f32; 3]>, triangles: Vec<[u32; 3]>) -> Mesh {
         let mut mesh = Mesh { vertices, normals: Vec::new(), triangles };
         if mesh.volume_mm3() < 0.0 {
@@ -33,7 +33,7 @@ impl Mesh {
         triangle.map(|i| Vec3::from(self.vertices[i as usize]))
     }
 
-    /// Volume inside, mm3.
+    /// Enclosed volume, mm3.
     pub fn volume_mm3(&self) -> f64 {
         let six_fold = |t: &[u32; 3]| {
             let [a, b, c] = self.corners(t).map(|v| v.as_dvec3());
@@ -52,7 +52,7 @@ impl Mesh {
         sums.into_iter().map(|n| n.normalize_or(Vec3::Z).to_array()).collect()
     }
 
-    /// The mesh as binary STL.
+    /// Returns the mesh as binary STL.
     pub fn to_stl(&self) -> Vec<u8> {
         let mut out = format!("{STL_HEADER:<STL_HEADER_BYTES$}").into_bytes();
         out.extend((self.triangles.len() as u32).to_le_bytes());
@@ -68,7 +68,7 @@ impl Mesh {
         out
     }
 
-    /// The mesh as binary PLY with normals.
+    /// Returns the mesh as binary PLY with normals.
     pub fn to_ply(&self) -> Vec<u8> {
         let mut out = format!(
             "ply\nformat binary_little_endian 1.0\ncomment vessel surface, LPS mm\nelement vertex {}\n\
@@ -89,7 +89,7 @@ impl Mesh {
         out
     }
 
-    /// The mesh as Wavefront OBJ with normals.
+    /// Returns the mesh as Wavefront OBJ with normals.
     pub fn to_obj(&self) -> Vec<u8> {
         let mut out = String::from("# vessel surface, LPS mm\n");
         // Writing to a string cannot fail.

@@ -1,4 +1,4 @@
-//! `.mha` volumes (MetaImage with LOCAL data), in LPS mm; a sequence is a fourth axis.
+//! `.mha` volumes (MetaImage with LOCAL data), in LPS mm; a sequence has a fourth axis.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -7,10 +7,10 @@ use crate::formats::volume::{MAX_BYTES, Volume, VolumeHeader, affine, numbers};
 use glam::DVec3;
 use std::path::Path;
 
-/// The key after whose line the values begin.
+/// Key of the last header line; the values begin after it.
 const DATA: &str = "ElementDataFile";
 
-/// The header of a file of little-endian floats that is written piece by piece, one phase after the other.
+/// Returns the header of a file of little-endian floats whose values are then written phase by phase.
 pub fn header_of(h: &VolumeHeader) -> Vec<u8> {
     let VolumeHeader { origin_mm: o, spacing_mm: s, size: [nx, ny, nz], .. } = h;
     let (dimensions, axis, point, step, turn) = match &h.phases {

@@ -1,12 +1,12 @@
-//! `.nii` and `.nii.gz` volumes (NIfTI-1), in RAS mm; a sequence is a fourth axis. Read with the `nifti` crate, whose writer
-//! wants all values at once; written by hand, so that volumes can be streamed.
+//! `.nii` and `.nii.gz` volumes (NIfTI-1), in RAS mm; a sequence has a fourth axis. The `nifti` crate reads them. Its writer
+//! needs all values at once, so the header is written here and volumes can be streamed.
 
 use crate::error::{Error, Result};
 use crate::formats::volume::{Volume, VolumeHeader};
 use glam::{DAffine3, DMat3, DVec3};
 use std::path::Path;
 
-/// Where the fields of a NIfTI-1 header are, bytes from its start.
+/// Offsets of the fields of a NIfTI-1 header, bytes from its start.
 mod offset {
     pub(super) const SIZEOF_HDR: usize = 0;
     pub(super) const DIM: usize = 40;
@@ -21,11 +21,11 @@ mod offset {
     pub(super) const MAGIC: usize = 344;
 }
 
-/// Length of the header itself.
+/// Length of the header itself, bytes.
 const HEADER_BYTES: i32 = 348;
-/// Where the values begin: after the header and four bytes that announce no extensions.
+/// Offset of the values, bytes: they follow the header and four bytes that announce no extensions.
 const DATA_AT: usize = 352;
-/// Longest description.
+/// Longest description, bytes.
 const DESCRIP_BYTES: usize = 79;
 const DT_FLOAT32: i16 = 16;
 const SCANNER_COORDINATES: i16 = 1;
@@ -51,7 +51,7 @@ impl Header {
     }
 }
 
-/// The header of a file of little-endian floats that is written piece by piece, one phase after the other.
+/// Returns the header of a file of little-endian floats whose values are then written phase by phase.
 pub fn header_of(h: &VolumeHeader) -> Vec<u8> {
     let VolumeHeader { origin_mm: o, spacing_mm: s, size, quantity, .. } = h;
     let mut out = Header([0; DATA_AT]);
@@ -65,7 +65,7 @@ pub fn header_of(h: &VolumeHeader) -> Vec<u8> {
     out.put(offset::XYZT_UNITS, [[UNITS_MM | UNITS_S]]);
     out.put(offset::DESCRIP, quantity.bytes().take(DESCRIP_BYTES).map(|b| [b]));
     out.put_i16(offset::QFORM_AND_SFORM_CODE, &[SCANNER_COORDINATES; 2]);
-    // NIfTI speaks RAS: left and posterior change sign. As a quaternion, half a turn about superior.
+    // NIfTI uses RAS: left and posterior change sign, which is half a turn about the superior axis as a quaternion.
     out.put_f32(offset::QUATERN_AND_QOFFSET, &[0.0, 0.0, 1.0, -o.x, -o.y, o.z]);
     out.put_f32(offset::SROW, &[-s.x, 0.0, 0.0, -o.x, 0.0, -s.y, 0.0, -o.y, 0.0, 0.0, s.z, o.z]);
     out.put(offset::MAGIC, [*b"n+1\0"]);

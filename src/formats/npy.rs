@@ -1,4 +1,4 @@
-//! `.npy` arrays of numbers (npyz).
+//! `.npy` arrays of numbers, through the `npyz` crate.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -8,9 +8,9 @@ use std::path::Path;
 /// A numeric array of any shape, in C order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Array {
-    /// Length of each axis, the slowest first.
+    /// Length of each axis, the slowest-varying axis first.
     pub shape: Vec<usize>,
-    /// Values, the last axis fastest.
+    /// Values, with the last axis varying fastest.
     pub values: Vec<f32>,
 }
 
@@ -64,7 +64,7 @@ pub fn read(path: &Path, limit: u64) -> Result<Array> {
     Ok(Array { shape, values })
 }
 
-/// The library multiplies the axes of a header's shape without a look at their size.
+/// Checks the shape in a header for overflow; the library multiplies its axes without a check.
 fn check_shape(bytes: &[u8]) -> std::result::Result<(), String> {
     let header = String::from_utf8_lossy(&bytes[..bytes.len().min(1 << 16)]);
     let Some((_, rest)) = header.split_once("'shape'") else { return Ok(()) };
@@ -103,10 +103,10 @@ pub fn write(path: &Path, shape: &[usize], values: &[f32]) -> Result<()> {
     })
 }
 
-/// Begins a `.npy` of `f32` in C order whose values follow piece by piece.
+/// Begins a `.npy` of `f32` in C order; the values are then written in pieces.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn begin<W: Write>(out: W, shape: &[usize]) -> std::io::Result<npyz::NpyWriter<f32, W>> {
     use npyz::WriterBuilder;
     let shape: Vec<u64> = shape.iter().map(|&n| n as u64).collect();

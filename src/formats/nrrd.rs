@@ -1,4 +1,4 @@
-//! `.nrrd` volumes with attached data, raw or gzip; a sequence is a list axis, which 3D Slicer plays (`.seq.nrrd`).
+//! `.nrrd` volumes with attached data, raw or gzip; a sequence has a list axis, which 3D Slicer plays (`.seq.nrrd`).
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -8,27 +8,27 @@ use glam::{DAffine3, DMat3, DVec3};
 use std::io::Write;
 use std::path::Path;
 
-/// How the data after the header are stored.
+/// Encoding of the data after the header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Encoding {
-    /// As they are.
+    /// Uncompressed.
     Raw,
     /// One gzip stream.
     Gzip,
 }
 
-/// What a file has beside its three axes of space.
+/// Axes of a file in addition to its three spatial axes.
 #[derive(Clone, Copy)]
 enum Beside<'a> {
-    /// Nothing: a single volume.
+    /// No further axis: a single volume.
     Nothing,
-    /// An axis of phases, first.
+    /// An axis of phases before the spatial axes.
     Phases(&'a [u32]),
-    /// An axis of three components, first, and one of phases, if there are several, last.
+    /// An axis of three components before the spatial axes and, for several phases, an axis of phases after them.
     Vectors(Option<&'a [u32]>),
 }
 
-/// Entries of the axes beside those of space: those in front of them, and those behind.
+/// Header entries of the additional axes: before the spatial axes and after them.
 struct MoreAxes {
     sizes: [String; 2],
     directions: [&'static str; 2],
@@ -74,7 +74,7 @@ impl MoreAxes {
     }
 }
 
-/// The header of a file of floats, its end included.
+/// Returns the header of a file of floats, including the empty line at its end.
 fn header(
     size: &str,
     index_to_lps: &DAffine3,
@@ -109,7 +109,7 @@ fn header(
     )
 }
 
-/// The header of a grid along the patient's axes.
+/// Returns the header of a grid along the patient's axes.
 fn header_on_grid(h: &VolumeHeader, beside: Beside<'_>, encoding: Encoding, comments: &[&str]) -> Vec<u8> {
     let [nx, ny, nz] = h.size;
     let axes = DMat3::from_diagonal(h.spacing_mm);
@@ -117,19 +117,19 @@ fn header_on_grid(h: &VolumeHeader, beside: Beside<'_>, encoding: Encoding, comm
     header(&format!("{nx} {ny} {nz}"), &index_to_lps, beside, encoding, &h.quantity, comments).into_bytes()
 }
 
-/// The header of a file that is written piece by piece. The values of a sequence follow with all phases of a voxel
-/// behind each other.
+/// Returns the header of a file whose values are then written in pieces. In a sequence, the values of all phases of a voxel are
+/// adjacent.
 pub fn header_of(h: &VolumeHeader, encoding: Encoding) -> Vec<u8> {
     header_on_grid(h, h.phases.as_deref().map_or(Beside::Nothing, Beside::Phases), encoding, &[])
 }
 
-/// The header of a file of vectors with `comments`, written piece by piece. Values follow phase by phase, with the
-/// components of a vector behind each other: a list axis that comes last is what 3D Slicer itself writes.
+/// Returns the header of a file of vectors with `comments`, whose values are then written in pieces. Values follow phase by
+/// phase, with the components of a vector adjacent. The list axis comes last, as in files that 3D Slicer writes itself.
 pub fn vector_header_of(h: &VolumeHeader, encoding: Encoding, comments: &[&str]) -> Vec<u8> {
     header_on_grid(h, Beside::Vectors(h.phases.as_deref()), encoding, comments)
 }
 
-/// Writes a gzip-compressed volume in LPS mm; `quantity` says what its values are.
+/// Writes a gzip-compressed volume in LPS mm; `quantity` names the meaning of its values.
 ///
 /// # Errors
 /// [`Error::Io`].

@@ -1,4 +1,4 @@
-//! `.png` pictures (image).
+//! `.png` pictures, through the `image` crate.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -8,7 +8,7 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{DynamicImage, ExtendedColorType, ImageEncoder};
 use std::path::Path;
 
-/// Reads a grey PNG of 8 or 16 bits; values are its codes.
+/// Reads a grey PNG of 8 or 16 bits; the values are the stored integers.
 ///
 /// # Errors
 /// [`Error::Io`] or [`Error::Data`] naming the file.
@@ -41,7 +41,7 @@ pub fn write_grey16(path: &Path, width: usize, height: usize, codes: Vec<u16>) -
     write(path, &DynamicImage::ImageLuma16(buffer))
 }
 
-/// A PNG of 8-bit grey codes, made fast rather than small: for pages, not for files.
+/// Encodes 8-bit grey codes as PNG, optimised for speed rather than size: for web pages, not for files.
 ///
 /// # Errors
 /// [`Error::Internal`] where there are not `width` x `height` codes.
@@ -59,7 +59,7 @@ pub fn grey8(width: usize, height: usize, codes: &[u8]) -> Result<Vec<u8>> {
 /// Writes a picture as PNG.
 ///
 /// # Errors
-/// As [`write_grey16`].
+/// Errors of [`write_grey16`].
 pub fn write(path: &Path, picture: &DynamicImage) -> Result<()> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     picture

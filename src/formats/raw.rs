@@ -1,4 +1,4 @@
-//! Bare numbers: element types, their decoding, and raw binary volumes.
+//! Element types of binary data, their decoding, and raw binary volumes.
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
@@ -7,7 +7,7 @@ use crate::formats::volume::{MAX_BYTES, Volume, VolumeHints};
 use std::io::{Read, Write};
 use std::path::Path;
 
-/// Type of the numbers in a file.
+/// Type of the numbers in a file, named after the Rust type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs, reason = "named after the types they stand for")]
 pub enum Element {
@@ -39,17 +39,17 @@ impl Choice for Element {
     }
 }
 
-/// Order of the bytes of a number.
+/// Byte order of numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ByteOrder {
-    /// Lowest byte first.
+    /// Least significant byte first.
     Little,
-    /// Highest byte first.
+    /// Most significant byte first.
     Big,
 }
 
 impl Element {
-    /// Bytes of one number.
+    /// Size of one number, bytes.
     pub fn bytes(self) -> usize {
         match self {
             Element::F64 => 8,
@@ -59,7 +59,7 @@ impl Element {
         }
     }
 
-    /// The first `n` numbers of `bytes`.
+    /// Decodes the first `n` numbers of `bytes`.
     ///
     /// # Errors
     /// [`Error::Data`] naming `path`, when there are fewer.
@@ -92,7 +92,7 @@ impl Element {
     }
 }
 
-/// Reads a raw binary volume, x fastest, little endian; all else comes from `hints`.
+/// Reads a raw binary volume, x varying fastest, little endian; size, type and spacing come from `hints`.
 ///
 /// # Errors
 /// [`Error::Data`] or [`Error::Io`] naming file and field.
@@ -107,17 +107,17 @@ pub fn read(path: &Path, hints: &VolumeHints) -> Result<Volume> {
     Ok(Volume { size, values, index_to_lps: Volume::axis_aligned(size, hints.spacing(path)?) })
 }
 
-/// Reads at most `n` bytes of `compressed`: never more than a header promises, so that a bomb stops there.
+/// Decompresses at most `n` bytes, the size that the header states, so that a decompression bomb cannot exhaust the memory.
 pub(super) fn read_at_most(compressed: impl Read, n: usize) -> std::io::Result<Vec<u8>> {
     let mut out = Vec::new();
     compressed.take(n as u64).read_to_end(&mut out)?;
     Ok(out)
 }
 
-/// Writes floats in a byte order, without a copy of them all.
+/// Writes floats in a byte order, in blocks rather than through a copy of all values.
 ///
 /// # Errors
-/// Those of `out`.
+/// Errors of `out`.
 pub fn write_floats(mut out: impl Write, values: &[f32], order: ByteOrder) -> std::io::Result<()> {
     let bytes = match order {
         ByteOrder::Little => f32::to_le_bytes,

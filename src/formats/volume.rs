@@ -1,5 +1,5 @@
-//! Voxel volumes on disk, whatever their format: `.npy`, `.nii(.gz)`, `.nrrd`, `.mha` and raw binaries. Values are
-//! attenuation per mm or Hounsfield units; positions are patient mm (LPS) with the isocentre at the origin.
+//! Reads voxel volumes of any supported format: `.npy`, `.nii(.gz)`, `.nrrd`, `.mha` and raw binaries. Values are attenuation
+//! per mm or Hounsfield units; positions are patient mm (LPS) with the isocentre at the origin.
 
 use crate::error::{Error, Result};
 use crate::formats::{metaimage, nifti, npy, nrrd, raw};
@@ -10,21 +10,21 @@ use std::path::Path;
 
 /// Largest accepted volume, voxels (2 GiB of floats).
 const MAX_VOXELS: u64 = 1 << 29;
-/// Largest accepted file: as many of the longest numbers.
+/// Largest accepted file, bytes: the largest volume with 8-byte numbers.
 pub(super) const MAX_BYTES: u64 = 8 * MAX_VOXELS;
 
 /// A scalar volume.
 #[derive(Debug, Clone)]
 pub struct Volume {
-    /// Voxels along the three index axes; the first is fastest in memory.
+    /// Voxels along the three index axes; the first axis varies fastest in memory.
     pub size: [usize; 3],
     /// Values.
     pub values: Vec<f32>,
-    /// Voxel index (centres at integers) to LPS mm.
+    /// Transform from voxel index (centres at integers) to LPS mm.
     pub index_to_lps: DAffine3,
 }
 
-/// What a file cannot say of itself.
+/// Properties of a volume that its file may not state.
 #[derive(Debug, Clone, Default)]
 pub struct VolumeHints {
     /// Voxel spacing, mm, for `.npy` and raw files.
@@ -33,12 +33,12 @@ pub struct VolumeHints {
     pub size: Option<[usize; 3]>,
     /// Element type of raw files: `f32`, `f64`, `i16`, `u16` or `u8`, little endian.
     pub raw_type: Option<String>,
-    /// Put the volume's centre at the isocentre, whatever its header says.
+    /// Whether the volume's centre is put at the isocentre, overriding the position in its header.
     pub centre: bool,
 }
 
 impl Volume {
-    /// A volume whose axes follow L, P, S, centred on `centre_mm`.
+    /// Makes a volume whose axes follow L, P and S, centred on `centre_mm`.
     pub fn centred(size: [usize; 3], spacing_mm: f64, centre_mm: DVec3, values: Vec<f32>) -> Volume {
         let half = DVec3::new(size[0] as f64 - 1.0, size[1] as f64 - 1.0, size[2] as f64 - 1.0) * 0.5;
         let index_to_lps = DAffine3::from_mat3_translation(
@@ -48,7 +48,7 @@ impl Volume {
         Volume { size, values, index_to_lps }
     }
 
-    /// World units to voxel index.
+    /// Transform from world units to voxel index.
     pub fn world_to_index(&self) -> DAffine3 {
         let columns = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| world_from_lps_mm(self.index_to_lps.matrix3 * axis));
         let index_to_world = DAffine3::from_mat3_translation(
@@ -64,7 +64,8 @@ impl Volume {
         m.x_axis.length().min(m.y_axis.length()).min(m.z_axis.length())
     }
 
-    /// Value at a voxel index, trilinear between voxel centres; beyond the border the nearest value.
+    /// Value at a voxel index, by trilinear interpolation between voxel centres; outside the volume, the value of the nearest
+    /// border point.
     pub fn interpolated(&self, index: DVec3) -> f32 {
         let [nx, ny, _] = self.size;
         let last = DVec3::from_array(self.size.map(|n| n as f64 - 1.0));
@@ -81,8 +82,8 @@ impl Volume {
         mix(plane(0), plane(1), share.z)
     }
 
-    /// What a volume shows where `carry` (patient mm to patient mm, rigid) takes it, on a grid of the same spacings along the
-    /// patient's axes; between voxels by linear interpolation, and 0 where the volume knows nothing.
+    /// Returns the volume moved by `carry` (patient mm to patient mm, rigid), resampled on a grid with the same spacings along
+    /// the patient's axes. Values are interpolated linearly; points outside the original volume are 0.
     pub fn carried(&self, carry: &DAffine3) -> Volume {
         let spacing_mm =
             DVec3::from_array(self.index_to_lps.matrix3.to_cols_array_2d().map(|axis| DVec3::from(axis).length()));
@@ -108,7 +109,7 @@ impl Volume {
         Volume { size, values, index_to_lps }
     }
 
-    /// Largest distance of a corner from the isocentre in the axial plane, mm.
+    /// Largest distance of a corner from the isocentre, projected onto the axial plane, mm.
     pub fn axial_radius_mm(&self) -> f64 {
         let mut radius = 0f64;
         for corner in 0..8 {
@@ -121,7 +122,7 @@ impl Volume {
         radius
     }
 
-    /// Reads a volume by its extension.
+    /// Reads a volume; the file name's extension selects the format.
     ///
     /// # Errors
     /// [`Error::Data`] or [`Error::Io`] naming file and field.
@@ -166,7 +167,7 @@ impl Volume {
         Ok(Volume { size, values, index_to_lps: Self::axis_aligned(size, hints.spacing(path)?) })
     }
 
-    /// Three axes, of as many voxels as are accepted.
+    /// Checks that there are three axes and an accepted number of voxels.
     pub(super) fn check_size(path: &Path, field: &str, size: &[u64]) -> Result<[usize; 3]> {
         let bad = || {
             Error::data(
@@ -185,7 +186,7 @@ impl Volume {
         Ok([x as usize, y as usize, z as usize])
     }
 
-    /// A grid along patient axes about the isocentre.
+    /// Transform of a grid along the patient's axes, centred at the isocentre.
     pub(super) fn axis_aligned(size: [usize; 3], spacing: [f64; 3]) -> DAffine3 {
         let spacing = DVec3::from_array(spacing);
         let half = DVec3::new(size[0] as f64, size[1] as f64, size[2] as f64) * 0.5 - 0.5;
@@ -194,7 +195,7 @@ impl Volume {
 }
 
 impl VolumeHints {
-    /// The spacing of a file that has none of its own.
+    /// Stated spacing, for a file format without spacing.
     pub(super) fn spacing(&self, path: &Path) -> Result<[f64; 3]> {
         match self.spacing_mm {
             Some(s) if s.iter().all(|v| v.is_finite() && *v > 0.0) => Ok(s),
@@ -204,22 +205,22 @@ impl VolumeHints {
     }
 }
 
-/// What a volume file that is written piece by piece says before its values: floats on a grid along patient axes (LPS).
+/// Header of a volume file whose values are then written in pieces: floats on a grid along the patient's axes (LPS).
 #[derive(Debug, Clone)]
 pub struct VolumeHeader {
-    /// First point.
+    /// Position of the first point, mm.
     pub origin_mm: DVec3,
-    /// Distance between neighbours along each axis.
+    /// Distance between neighbours along each axis, mm.
     pub spacing_mm: DVec3,
-    /// Points along left, posterior and superior.
+    /// Number of points along left, posterior and superior.
     pub size: [u32; 3],
     /// Phases of a sequence; none for a single volume.
     pub phases: Option<Vec<u32>>,
-    /// What the values are.
+    /// Meaning of the values.
     pub quantity: String,
 }
 
-/// The numbers of a header field, with or without brackets and commas.
+/// Parses the numbers of a header field, with or without brackets and commas.
 pub(super) fn numbers(path: &Path, field: &str, text: &str) -> Result<Vec<f64>> {
     text.split(|c: char| c.is_whitespace() || "(),".contains(c))
         .filter(|w| !w.is_empty())
@@ -227,7 +228,7 @@ pub(super) fn numbers(path: &Path, field: &str, text: &str) -> Result<Vec<f64>> 
         .collect()
 }
 
-/// Voxel index to LPS mm from the columns and the origin of a header whose axes differ from LPS by signs.
+/// Transform from voxel index to LPS mm, from the columns and the origin in a header whose axes differ from LPS only by signs.
 pub(super) fn affine(path: &Path, field: &str, columns: &[f64], origin: &[f64], flip: DVec3) -> Result<DAffine3> {
     let (Ok(c), Ok(o)) = (<[f64; 9]>::try_from(columns), <[f64; 3]>::try_from(origin)) else {
         return Err(Error::data(path, field, "needs three directions and an origin of three numbers"));

@@ -1,10 +1,11 @@
-//! Legacy `.vtk`: structured points, which ParaView groups by the numbers in their names, and lines. Floats are big-endian.
+//! Legacy `.vtk` files with structured points, which ParaView groups by the numbers in their names, or lines. Floats are
+//! big-endian.
 
 use crate::formats::raw::{self, ByteOrder};
 use crate::formats::volume::VolumeHeader;
 use std::io::{Result, Write};
 
-/// The header of a grid with `title`, up to what its points have.
+/// Header of a grid with `title`, up to the point data.
 fn grid_of(h: &VolumeHeader, title: &str) -> String {
     let VolumeHeader { origin_mm: o, spacing_mm: s, size: [nx, ny, nz], .. } = h;
     let points: usize = h.size.iter().map(|n| *n as usize).product();
@@ -16,42 +17,42 @@ fn grid_of(h: &VolumeHeader, title: &str) -> String {
     )
 }
 
-/// The header of a file of big-endian floats, one phase, that is written piece by piece.
+/// Returns the header of a file of big-endian floats at one phase, whose values are then written in pieces.
 pub fn header_of(h: &VolumeHeader, phase: u32) -> Vec<u8> {
     let grid = grid_of(h, &format!("{}, LPS mm, phase {phase}", h.quantity));
     format!("{grid}SCALARS attenuation float 1\nLOOKUP_TABLE default\n").into_bytes()
 }
 
-/// The header of a file of vectors called `name`, three big-endian floats per point, one phase, that is written piece by
-/// piece. `title` has a line to itself.
+/// Returns the header of a file of vectors called `name`, with three big-endian floats per point at one phase; the values are
+/// then written in pieces. `title` has a line of its own.
 pub fn vector_header_of(h: &VolumeHeader, name: &str, title: &str) -> Vec<u8> {
     format!("{}VECTORS {name} float\n", grid_of(h, title)).into_bytes()
 }
 
-/// Values of every point of [`Lines`].
+/// Values at every point of [`Lines`].
 pub struct PointValues {
-    /// Name, without blanks.
+    /// Name of the values, without blanks.
     pub name: &'static str,
-    /// Numbers per point, 1 to 4.
+    /// Number of values per point, 1 to 4.
     pub width: usize,
-    /// Point by point.
+    /// Values, point by point.
     pub values: Vec<f32>,
 }
 
-/// Closed lines of equally many points each.
+/// Closed lines with the same number of points each.
 pub struct Lines {
-    /// What the data are, in a line.
+    /// Title of the data, in one line.
     pub title: String,
-    /// Points of a line.
+    /// Number of points of each line.
     pub points_per_line: usize,
     /// Points of all lines in order, LPS mm.
     pub points: Vec<[f32; 3]>,
-    /// What points have.
+    /// Values at the points.
     pub values: Vec<PointValues>,
 }
 
 impl Lines {
-    /// Writes them as poly data.
+    /// Writes the lines as poly data.
     ///
     /// # Errors
     /// Errors of `out`.
@@ -61,7 +62,7 @@ impl Lines {
         let title = &self.title;
         write!(out, "# vtk DataFile Version 3.0\n{title}\nBINARY\nDATASET POLYDATA\nPOINTS {n} float\n")?;
         raw::write_floats(&mut *out, self.points.as_flattened(), ByteOrder::Big)?;
-        // A line is its number of points and their places; it ends where it begins.
+        // A line is stored as its number of points and their indices; the first index is repeated to close the line.
         write!(out, "\nLINES {n_lines} {}\n", n_lines * (each + 2))?;
         for first in (0..n).step_by(each) {
             let places = (first..first + each).chain([first]);

@@ -1,5 +1,6 @@
-//! Arrays of VTK's XML files, in every encoding VTK itself writes but two compressions: as text, as base64 beside their
-//! description, or appended as base64 or bytes; plain or in blocks of zlib; either byte order, lengths of 32 or 64 bits.
+//! Arrays of VTK's XML files, in every encoding that VTK itself writes except two compressions: as text, as base64 inside the
+//! element, or appended as base64 or raw bytes; uncompressed or in zlib blocks; in either byte order, with lengths of 32 or 64
+//! bits.
 
 use crate::error::{Error, Result};
 use flate2::read::ZlibDecoder;
@@ -7,15 +8,15 @@ use roxmltree::{Document, Node};
 use std::io::Read;
 use std::path::Path;
 
-/// Bytes of an array at most, once it is unpacked.
+/// Largest accepted array after decompression, bytes.
 const MOST_BYTES: usize = 1 << 27;
 const APPENDED: &[u8] = b"<AppendedData";
 const ROOT: &str = "VTKFile";
 const ZLIB: &str = "vtkZLibDataCompressor";
 
-/// A file as XML, and what is appended to it, which need not be XML.
+/// A file split into its XML and the appended data, which need not be XML.
 pub(super) struct Parts<'a> {
-    /// The XML, without what is appended.
+    /// The XML without the appended data.
     pub(super) text: String,
     appended: Option<Appended<'a>>,
 }
@@ -27,7 +28,7 @@ struct Appended<'a> {
 }
 
 impl<'a> Parts<'a> {
-    /// Parts of a file's bytes.
+    /// Splits the bytes of a file.
     pub(super) fn of(bytes: &'a [u8]) -> Parts<'a> {
         let Some(start) = bytes.windows(APPENDED.len()).position(|w| w == APPENDED) else {
             return Parts { text: String::from_utf8_lossy(bytes).into_owned(), appended: None };
@@ -36,14 +37,14 @@ impl<'a> Parts<'a> {
         let tag_end = tail.iter().position(|b| *b == b'>').unwrap_or(tail.len());
         let (tag, rest) = tail.split_at(tag_end);
         let base64 = String::from_utf8_lossy(tag).contains("base64");
-        // Data begin behind an underscore.
+        // The data begin after an underscore.
         let data = rest.iter().position(|b| *b == b'_').map_or(&rest[..0], |mark| &rest[mark + 1..]);
         let text = format!("{}</{ROOT}>", String::from_utf8_lossy(head));
         Parts { text, appended: Some(Appended { base64, data }) }
     }
 }
 
-/// How the arrays of a file are kept.
+/// Storage options of the arrays of a file.
 pub(super) struct Arrays<'a> {
     file: &'a Path,
     wide_lengths: bool,
@@ -53,7 +54,7 @@ pub(super) struct Arrays<'a> {
 }
 
 impl<'a> Arrays<'a> {
-    /// What the root of a document of kind `kind` says.
+    /// Reads the storage options from the root of a document whose type must be `kind`.
     ///
     /// # Errors
     /// [`Error::Data`] for another kind of file and for a compression that is not read.
@@ -81,7 +82,7 @@ impl<'a> Arrays<'a> {
         })
     }
 
-    /// Values of a `DataArray`.
+    /// Reads the values of a `DataArray`.
     ///
     /// # Errors
     /// [`Error::Data`] naming the array.
@@ -109,7 +110,7 @@ impl<'a> Arrays<'a> {
         self.numbers(&bytes, kind).ok_or_else(|| fail(format!("{} bytes are no values of type `{kind}`", bytes.len())))
     }
 
-    /// A length or a number of blocks.
+    /// Reads a length or a number of blocks.
     fn length(&self, stream: &mut Stream<'_>) -> Option<usize> {
         let bytes = stream.take(if self.wide_lengths { 8 } else { 4 })?;
         let fold = |value: u64, byte: &u8| (value << 8) | u64::from(*byte);
@@ -117,13 +118,14 @@ impl<'a> Arrays<'a> {
         usize::try_from(value).ok().filter(|length| *length <= MOST_BYTES)
     }
 
-    /// Bytes of an array, unpacked; none where there are fewer than it says.
+    /// Reads the uncompressed bytes of an array; none if there are fewer than the array states.
     fn bytes(&self, stream: &mut Stream<'_>) -> Option<Vec<u8>> {
         let first = self.length(stream)?;
         if !self.zlib {
             return stream.take(first);
         }
-        // A number of blocks, what each holds, what the last holds where that is less, and what each takes in the file.
+        // The header of compressed data: number of blocks, size of a block, size of the last block if it is smaller (else 0),
+        // and the compressed size of each block.
         let (block, last) = (self.length(stream)?, self.length(stream)?);
         let packed: Vec<usize> = (0..first).map_while(|_| self.length(stream)).collect();
         if packed.len() < first || first.checked_mul(block)? > MOST_BYTES {
@@ -134,7 +136,7 @@ impl<'a> Arrays<'a> {
             let wanted = if index + 1 == first && last > 0 { last } else { block };
             let before = all.len();
             let data = stream.take(length)?;
-            // One more byte than wanted would tell of too many.
+            // Reading one byte more than wanted detects blocks that are too large.
             ZlibDecoder::new(&data[..]).take(wanted as u64 + 1).read_to_end(&mut all).ok()?;
             if all.len() - before != wanted {
                 return None;
@@ -176,16 +178,16 @@ impl<'a> Arrays<'a> {
     }
 }
 
-/// Bytes that come one after the other, decoded as far as they are asked for.
+/// Bytes that are read in order and decoded as needed.
 struct Stream<'a> {
     rest: &'a [u8],
     base64: bool,
-    /// Bytes that were decoded and not taken yet.
+    /// Bytes that are decoded but not yet taken.
     decoded: Vec<u8>,
 }
 
 impl Stream<'_> {
-    /// The next `n` bytes; none where there are fewer, before anything is reserved for them.
+    /// Takes the next `n` bytes; returns none if there are fewer, before memory is reserved for them.
     fn take(&mut self, n: usize) -> Option<Vec<u8>> {
         if n > self.decoded.len() + self.rest.len() {
             return None;
@@ -201,7 +203,7 @@ impl Stream<'_> {
         Some(self.decoded.drain(..n).collect())
     }
 
-    /// Decodes the next four letters of base64. VTK pads each part of an array by itself, so that padding ends nothing.
+    /// Decodes the next four letters of base64. VTK pads each part of an array by itself, so padding does not end the data.
     fn decode(&mut self) -> Option<()> {
         let (mut bits, mut letters, mut padding) = (0u32, 0, 0);
         while letters < 4 {

@@ -1,6 +1,6 @@
-//! VTK's XML poly data (`.vtp`): lines with values at points and lines, and collections of such files over time (`.pvd`).
-//! Written as text: centrelines are small, and every reader of VTK's formats takes it. By hand: vtkio brings a parser and three
-//! compressions, none of which a few arrays need.
+//! VTK's XML poly data (`.vtp`): lines with values at points and lines, and collections of such files over time (`.pvd`). Files
+//! are written as text: centrelines are small, and every reader of VTK's formats accepts text. The code is our own: vtkio
+//! brings a parser and three compressions, and a few arrays need none of these.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -10,30 +10,30 @@ use std::fmt::{Display, Write};
 use std::path::{Path, PathBuf};
 
 const MOST_FILE_BYTES: u64 = 1 << 30;
-/// Elements and texts of a file at most: they may be nested as deep, and each level takes some of the stack.
+/// Largest accepted number of XML nodes: they may be nested to the same depth, and each level uses stack space.
 const MOST_NODES: u32 = 2048;
 
-/// Values by a name, one per point or line.
+/// Named values, one per point or line.
 pub enum Values {
-    /// Numbers.
+    /// Floating-point numbers.
     Float(&'static str, Vec<f64>),
-    /// Whole numbers.
+    /// Integers.
     Int(&'static str, Vec<i64>),
 }
 
 /// Open lines through points.
 pub struct Lines {
-    /// What the lines are, for a comment; without `--`.
+    /// Title of the lines, for a comment; it must not contain `--`.
     pub title: String,
-    /// When they are so.
+    /// Time of the lines.
     pub time: f64,
     /// Points of all lines.
     pub points: Vec<[f64; 3]>,
-    /// How many points each line has; lines follow each other in `points`.
+    /// Number of points of each line; the lines follow each other in `points`.
     pub counts: Vec<usize>,
-    /// What points have.
+    /// Values at the points.
     pub of_points: Vec<Values>,
-    /// What lines have.
+    /// Values of the lines.
     pub of_lines: Vec<Values>,
 }
 
@@ -59,7 +59,7 @@ fn arrays(all: &[Values]) -> String {
 }
 
 impl Lines {
-    /// Text of a `.vtp` file with the lines.
+    /// Returns the text of a `.vtp` file with the lines.
     pub fn to_vtp(&self) -> String {
         let (n_points, n_lines) = (self.points.len(), self.counts.len());
         let ends = self.counts.iter().scan(0, |end, count| {
@@ -89,12 +89,12 @@ impl Lines {
     }
 }
 
-/// Text as it may stand in an attribute.
+/// Escapes text for use in an attribute.
 fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('"', "&quot;")
 }
 
-/// A collection of files beside it, each with its time.
+/// Formats a collection of files in the same directory, each with its time.
 pub fn collection(files: &[(f64, String)]) -> String {
     let entry = |(time, file): &(f64, String)| format!("<DataSet timestep=\"{time}\" file=\"{}\"/>\n", escaped(file));
     let entries: String = files.iter().map(entry).collect();
@@ -104,14 +104,14 @@ pub fn collection(files: &[(f64, String)]) -> String {
     )
 }
 
-/// Lines of a file.
+/// Lines read from a file.
 #[derive(Debug, Default)]
 pub struct ReadLines {
     /// All points.
     pub points: Vec<[f64; 3]>,
-    /// Points of each line, by their place in `points`.
+    /// Points of each line, as indices into `points`.
     pub lines: Vec<Vec<usize>>,
-    /// Single values at all points, by their names.
+    /// Scalar values at all points, with their names.
     pub of_points: Vec<(String, Vec<f64>)>,
 }
 
@@ -128,7 +128,7 @@ fn parsed<'a>(path: &Path, text: &'a str) -> Result<Document<'a>> {
     Document::parse_with_options(text, options).map_err(|e| Error::data(path, "XML", e.to_string()))
 }
 
-/// Reads the lines of a `.vtp`, however VTK keeps its arrays, but for compression by LZ4 and LZMA.
+/// Reads the lines of a `.vtp` in any of VTK's encodings except LZ4 and LZMA compression.
 ///
 /// # Errors
 /// [`Error::Io`], and [`Error::Data`] naming the field.
@@ -169,7 +169,8 @@ pub fn read(path: &Path) -> Result<ReadLines> {
     Ok(ReadLines { points: points.to_vec(), lines, of_points })
 }
 
-/// Points of each line, from all lines' points one after the other and where each ends; none where these leave their lists.
+/// Splits the point indices of all lines (`connectivity`) at the end of each line (`ends`); none if an index or an end is out
+/// of range.
 fn lines(connectivity: &[f64], ends: &[f64], n_points: usize) -> Option<Vec<Vec<usize>>> {
     let whole = |value: &f64| (*value >= 0.0 && value.fract() == 0.0).then_some(*value as usize);
     let mut start = 0;
@@ -182,10 +183,10 @@ fn lines(connectivity: &[f64], ends: &[f64], n_points: usize) -> Option<Vec<Vec<
     ends.iter().map(line).collect()
 }
 
-/// Reads the files that a `.pvd` names, in the order of their times.
+/// Reads the list of files in a `.pvd`, in the order of their times.
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::Data`] for what is no collection, and for two files of one time.
+/// [`Error::Io`]; [`Error::Data`] for a file that is not a collection, and for two files with the same time.
 pub fn read_collection(path: &Path) -> Result<Vec<PathBuf>> {
     let bytes = files::read_limited(path, MOST_FILE_BYTES)?;
     let parts = Parts::of(&bytes);

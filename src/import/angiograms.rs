@@ -1,4 +1,4 @@
-//! DICOM runs -> a dataset: frames chosen, phases assigned, collimator cut away.
+//! DICOM runs -> a dataset: selects frames, assigns phases and crops to the open area of the collimator.
 
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
@@ -13,16 +13,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
-/// Width of the widest vessel looked for, mm at the isocentre.
+/// Width of the widest vessel that is searched, mm at the isocentre.
 const WIDEST_VESSEL_MM: f64 = 6.0;
-/// Frames whose vessels show this share of the strongest contrast count as filled.
+/// Share of the strongest contrast above which a frame counts as filled.
 const FILLED_SHARE: f64 = 0.6;
-/// A structure stands out when it does by this many standard deviations of the noise.
+/// Threshold for structures that stand out, in standard deviations of the noise.
 const NOISE_SIGMAS: f32 = 4.0;
-/// Display grey values span this many line integrals of attenuation.
+/// Line integral that corresponds to the full range of display grey values.
 const DISPLAY_SPAN: f64 = 3.0;
 
-/// Where phases come from.
+/// Source of the phases.
 #[derive(Debug, Clone)]
 pub enum Gating {
     /// The ECG of each file.
@@ -31,38 +31,39 @@ pub enum Gating {
     RPeaks(RPeaks),
     /// A steady heart, with an R-peak at the first frame.
     HeartRate(f64),
-    /// How the vessels of each run move: a steady heart (see [`image_beat`]).
+    /// Motion of the vessels in each run, assuming a steady heart (see [`image_beat`]).
     Images,
-    /// A phase for each selected frame of each run, in order; it may lie between two.
+    /// A list with a phase for each selected frame of each run, in order; a phase may lie between two whole phases.
     Phases(Vec<f64>),
-    /// Nothing moves: the frames of a run are averaged. Phase 0 is the object, phase 1 what it looks like without
-    /// vessels, as in subtraction angiography, so that the rest of the engine sees vessels come and go.
+    /// An object without motion: the frames of a run are averaged. Phase 0 is the object, phase 1 its estimated appearance
+    /// without vessels, as in subtraction angiography, so that the rest of the engine sees vessels that appear and vanish.
     Still,
 }
 
-/// How to import.
+/// Options of an import.
 #[derive(Debug, Clone)]
 pub struct ImportOptions {
-    /// Cardiac phases.
+    /// Number of cardiac phases.
     pub phases: u32,
-    /// Where phases come from.
+    /// Source of the phases.
     pub gating: Gating,
-    /// How times between R-peaks become phases.
+    /// Conversion of times between R-peaks to phases.
     pub scaling: BeatScaling,
-    /// Frames of each run, from 1; those filled with contrast without.
+    /// Frames of each run, counted from 1; without it, the frames filled with contrast.
     pub frames: Option<RangeInclusive<usize>>,
-    /// Pixel pitch on the detector along columns and rows, mm, instead of what the files say.
+    /// Pixel pitch on the detector along columns and rows, mm, which overrides the pitch in the files.
     pub pixel_mm: Option<[f64; 2]>,
-    /// Longest side of the images, pixels: larger ones are averaged down.
+    /// Longest side of the images, pixels; larger images are reduced by averaging.
     pub size: Option<usize>,
     /// Depth searched before and behind the isocentre, mm.
     pub depth_half_extent_mm: f64,
 }
 
-/// Imports runs as a dataset and returns what a user should know.
+/// Imports runs as a dataset and returns notes for the user.
 ///
 /// # Errors
-/// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. Nothing is written then.
+/// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. In these cases no dataset is
+/// written.
 pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
     if files.is_empty() || files.len() > MOST_RUNS {
         return Err(Error::config("FILE", files.len(), format!("1 to {MOST_RUNS} runs are accepted")));
@@ -74,12 +75,12 @@ pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> R
     Ok(notes)
 }
 
-/// An image of a run as it is trained on.
+/// An image of a run, ready for training.
 #[derive(Clone)]
 pub struct TakenFrame {
-    /// How it was taken.
+    /// C-arm that took it.
     pub c_arm: CArm,
-    /// When in the beat.
+    /// Time in the beat.
     pub taken: BeatTime,
     /// Line integrals.
     pub image: Image,
@@ -123,7 +124,7 @@ impl Prepared {
                 image
             })
             .collect();
-        // The image's middle moves with what was cut away.
+        // Cropping moves the centre of the image.
         let middle = |range: &std::ops::Range<usize>, kept: usize, all: usize| {
             range.start as f64 + 0.5 * (kept * factor) as f64 - 0.5 * all as f64
         };
@@ -154,26 +155,26 @@ impl Prepared {
     }
 }
 
-/// Frames of a run that are taken.
+/// Selected frames of a run.
 struct Chosen<'a> {
     run: &'a Run,
-    /// All of them, as line integrals.
+    /// All frames, as line integrals.
     frames: &'a [Image],
-    /// Of each frame, the first that was taken from where it was.
+    /// For each frame, the index of the first frame with the same pose.
     stands: &'a [usize],
-    /// Those that are taken; indices from 0.
+    /// Indices of the selected frames, from 0.
     selected: &'a [usize],
-    /// Radius of the widest vessel looked for, pixels.
+    /// Radius of the widest vessel that is searched, pixels.
     vessel: usize,
 }
 
 impl Chosen<'_> {
-    /// From where some frames were taken.
+    /// Distinct poses of frames, each as the index of its first frame.
     fn stands_of(&self, frames: &[usize]) -> BTreeSet<usize> {
         frames.iter().map(|frame| self.stands[*frame]).collect()
     }
 
-    /// Means of the frames that were taken at one phase from one place: when, from where, and what they show.
+    /// Averages the frames of each phase and pose. Returns their times in the beat, their poses and the mean images.
     fn phases(&self, options: &ImportOptions, notes: &mut Vec<String>) -> Result<Vec<(BeatTime, usize, Image)>> {
         let (run, selected, n_phases) = (self.run, self.selected, options.phases);
         let none = |problem: &str| Error::data(&run.path, "phases", problem.to_owned());
@@ -214,7 +215,7 @@ impl Chosen<'_> {
             let frames: Vec<usize> = of_phase.keys().copied().collect();
             seen += usize::from(!frames.is_empty());
             for stand in self.stands_of(&frames) {
-                // Frames of the same phase from several beats.
+                // Frames of the same phase may come from several beats.
                 let frames = from(stand, &frames);
                 let after_phase = frames.iter().map(|i| of_phase[i].after_phase).sum::<f64>() / frames.len() as f64;
                 images.push((BeatTime { phase, after_phase }, stand, mean(self.frames, &frames)));
@@ -227,7 +228,7 @@ impl Chosen<'_> {
         Ok(images)
     }
 
-    /// The beats of the run, by what is asked for.
+    /// Returns the R-peaks of the run from the requested source.
     fn r_peaks(&self, gating: &Gating, notes: &mut Vec<String>) -> Result<RPeaks> {
         let run = self.run;
         match gating {
@@ -256,7 +257,7 @@ impl Chosen<'_> {
     }
 }
 
-/// From a value, brighter where less is absorbed, to a line integral.
+/// Returns the conversion from a pixel value, brighter for less absorption, to a line integral.
 fn intensity(run: &Run) -> impl Fn(f32) -> f32 + use<> {
     let (white, relationship) = (f64::from(run.white), run.relationship);
     move |value: f32| {
@@ -268,7 +269,7 @@ fn intensity(run: &Run) -> impl Fn(f32) -> f32 + use<> {
     }
 }
 
-/// Frames filled with contrast, or those asked for; indices from 0.
+/// Selects the requested frames, or else the frames filled with contrast; returns indices from 0.
 fn select(
     run: &Run,
     frames: &[Image],
@@ -284,7 +285,7 @@ fn select(
         }
         return Ok((asked.start() - 1..*asked.end()).collect());
     }
-    // How strongly thin dark structures stand out.
+    // Contrast of thin dark structures in each frame.
     let contrast: Vec<f64> = frames
         .par_iter()
         .map(|frame| {
@@ -294,9 +295,9 @@ fn select(
         })
         .collect();
     let most = contrast.iter().copied().fold(0.0, f64::max);
-    // Closed by a frame that is not, so that a stretch may last to the end.
+    // A frame that is not filled is appended to end a sequence that lasts to the last frame.
     let filled = contrast.iter().map(|c| *c >= FILLED_SHARE * most).chain([false]);
-    // The longest stretch.
+    // Find the longest sequence.
     let mut best = 0..0;
     let mut start = 0;
     for (i, filled) in filled.enumerate() {
@@ -316,12 +317,12 @@ fn select(
     Ok(best.collect())
 }
 
-/// The image without structures as thin as vessels: where something stands out of its surroundings by more than noise
-/// does, it is cut down to them.
+/// Removes structures as thin as vessels: pixels that stand out of their surroundings by more than noise are set to the level
+/// of the surroundings.
 fn without_vessels(image: &Image, vessel: usize) -> Image {
     let mut background = opening(image, vessel);
     let stand_out: Vec<f32> = image.values.iter().zip(&background.values).map(|(v, b)| v - b).collect();
-    // An opening follows the lowest of its surroundings, and noise makes some low.
+    // An opening follows the minimum of the surroundings, which noise makes too small; the median difference corrects for that.
     let typical = percentile(&stand_out, 0.5);
     let spread = percentile(&stand_out.iter().map(|s| (s - typical).abs()).collect::<Vec<_>>(), 0.5);
     let limit = typical + NOISE_SIGMAS * 1.4826 * spread;
@@ -332,8 +333,8 @@ fn without_vessels(image: &Image, vessel: usize) -> Image {
     background
 }
 
-/// Pixels within `margin` of the edge, or of areas so dark that the collimator or the detector's rim must be there:
-/// their outlines are as thin as vessels.
+/// Pixels within `margin` of the image's edge, or of areas so dark that they belong to the collimator or the detector's rim,
+/// whose outlines are as thin as vessels.
 fn closed(background: &Image, margin: usize) -> Vec<bool> {
     let (w, h) = (background.width, background.height);
     let dark = background.values.iter().map(|v| f32::from(u8::from(f64::from(*v) > 0.85 * DISPLAY_SPAN))).collect();
@@ -354,8 +355,8 @@ fn mean(frames: &[Image], which: &[usize]) -> Image {
     sum
 }
 
-/// Pixels that are as bright or dark as can be, in every frame, beside others that are not: letters. Only looked for
-/// where the file does not say that there are none.
+/// Finds pixels that have the brightest or the darkest value in every frame, such as those of burnt-in letters. They are only
+/// searched where the file states that there is burnt-in text.
 fn burnt_in_text(run: &Run) -> Vec<usize> {
     if !run.burnt_in || run.frames.len() < 2 {
         return Vec::new();
@@ -369,7 +370,7 @@ fn without_text(frame: &[f32], width: usize, text: &[usize]) -> Vec<f32> {
     let mut out = frame.to_vec();
     let marked: std::collections::HashSet<usize> = text.iter().copied().collect();
     for p in text {
-        // The nearest pixels to the left and right that are no text.
+        // Nearest pixels to the left and right that are not text.
         let row = p / width * width;
         let left = (row..*p).rev().find(|q| !marked.contains(q));
         let right = (*p + 1..row + width).find(|q| !marked.contains(q));

@@ -1,4 +1,4 @@
-//! One X-ray angiography run from a DICOM file: frames, geometry, times, ECG. Nothing that identifies a patient is kept.
+//! Reads an X-ray angiography run from a DICOM file: frames, geometry, times, ECG. Nothing that identifies a patient is kept.
 
 use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
@@ -16,21 +16,21 @@ use std::path::{Path, PathBuf};
 const MAX_FILE_BYTES: u64 = 4 << 30;
 const MAX_SIDE: u32 = 4096;
 const MAX_FRAMES: u32 = 2000;
-/// Pixels of a run, which are kept as 32-bit floats.
+/// Largest accepted number of pixels of a run, which are kept as 32-bit floats.
 const MAX_PIXELS: u64 = 1 << 29;
 
-/// What pixel values are, as the file says.
+/// Meaning of pixel values, as the file states it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Relationship {
     /// Linear in intensity.
     Linear,
-    /// Logarithmic.
+    /// Logarithmic in intensity.
     Log,
-    /// Display grey values: taken as logarithmic, of unknown scale.
+    /// Display grey values, treated as logarithmic with unknown scale.
     Display,
 }
 
-/// A run.
+/// An X-ray angiography run.
 #[derive(Debug, Clone)]
 pub struct Run {
     /// File the run was read from.
@@ -39,15 +39,15 @@ pub struct Run {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// Frames, brighter where less is absorbed, rows first.
+    /// Frames in row-major order, with larger values for less absorption.
     pub frames: Vec<Vec<f32>>,
-    /// Value of a pixel as bright as can be.
+    /// Largest possible pixel value.
     pub white: f32,
-    /// Meaning of the values.
+    /// Meaning of the pixel values.
     pub relationship: Relationship,
-    /// How each frame was taken; offset and table as the file says, relative to nothing.
+    /// C-arm of each frame; table positions are as the file states them, not relative to another run.
     pub c_arms: Vec<CArm>,
-    /// Time of each frame, seconds from the first.
+    /// Time of each frame after the first, seconds.
     pub times_s: Vec<f64>,
     /// R-peaks on the same clock, where the file has an ECG.
     pub r_peaks: Option<RPeaks>,
@@ -55,11 +55,11 @@ pub struct Run {
     pub open: (Range<usize>, Range<usize>),
     /// Whether the file says that text is burnt into the pixels.
     pub burnt_in: bool,
-    /// What tells patients and studies apart, hashed: only equality means anything.
+    /// Hashes of patient and study, which can only be compared for equality.
     pub identity: [u64; 2],
-    /// What tells runs apart, hashed: copies of one have the same. None where the file does not say.
+    /// Hash of the instance, which is equal for copies of a run; none if the file does not state it.
     pub instance: Option<u64>,
-    /// What was assumed, and what is odd.
+    /// Notes on assumptions and on unusual content.
     pub notes: Vec<String>,
 }
 
@@ -98,7 +98,7 @@ impl Reader<'_> {
         self.number(tag, name)?.ok_or_else(|| self.bad(tag, name, "is missing"))
     }
 
-    /// One value per frame: a base and increments, of which the first may stand for all.
+    /// Returns one value per frame from a base and increments: one for each frame, or a single increment that is repeated.
     fn per_frame(&self, base: f64, tag: Tag, name: &str, frames: usize) -> Result<Vec<f64>> {
         Ok(match self.numbers(tag, name)? {
             Some(steps) if steps.len() == frames => steps.iter().map(|s| base + s).collect(),
@@ -112,7 +112,7 @@ impl Reader<'_> {
 }
 
 impl Run {
-    /// Reads a run. `pixel_mm` is the pixel pitch on the detector where the file does not say it.
+    /// Reads a run. `pixel_mm` overrides the pixel pitch on the detector and is needed where the file does not state it.
     ///
     /// # Errors
     /// [`Error::Data`] naming file and tag; [`Error::Io`].
@@ -173,13 +173,13 @@ impl Run {
         })
     }
 
-    /// Name for messages and files: that of the file, without its extension.
+    /// Name for messages and files: the file's name without its extension.
     pub fn name(&self) -> String {
         self.path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
     }
 }
 
-/// An error with its causes.
+/// Message of an error with its causes.
 fn describe(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
@@ -224,7 +224,7 @@ impl Reader<'_> {
         let spacing = self.numbers(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing")?;
         let pixel_mm = match (given, spacing, self.numbers(tags::FIELD_OF_VIEW_DIMENSIONS, "FieldOfViewDimensions")?) {
             (Some(pixel_mm), ..) => pixel_mm,
-            // DICOM gives rows first.
+            // DICOM lists the spacing of rows first.
             (None, Some(spacing), _) if spacing.len() >= 2 => [spacing[1], spacing[0]],
             (None, _, Some(field)) if field[0] > 0.0 => {
                 let pitch = field[0] / size[0].max(size[1]) as f64;
@@ -238,7 +238,7 @@ impl Reader<'_> {
                 return Err(self.bad(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing", problem));
             }
         };
-        // Above the isocentre the table's height is negative (DICOM: below is positive), so a rise is anterior.
+        // DICOM's table height is positive below the isocentre, so a larger height moves the patient towards posterior.
         let height = self.number(tags::TABLE_HEIGHT, "TableHeight")?.unwrap_or(0.0);
         let lateral = self.number(tags::TABLE_TRAVERSE, "TableTraverse")?.unwrap_or(0.0);
         let down = self.per_frame(height, tags::TABLE_VERTICAL_INCREMENT, "TableVerticalIncrement", n)?;
@@ -311,7 +311,7 @@ impl Reader<'_> {
         }
     }
 
-    /// All frames after the modality LUT, and the brightest value there can be.
+    /// Decodes all frames, applies the modality LUT, and returns them with the largest possible value.
     fn frames(&self, n: usize, pixels: usize, notes: &mut Vec<String>) -> Result<(Vec<Vec<f32>>, f32)> {
         let tag = tags::PIXEL_DATA;
         if self.object.get(tag).is_none() {
@@ -328,7 +328,7 @@ impl Reader<'_> {
         if has_table || slope != 1.0 || intercept != 0.0 {
             notes.push("the modality LUT was applied; VOI LUT and window were not".into());
         }
-        // A decoder that panics on malformed data is theirs; the run ends with an error all the same.
+        // A decoder may panic on malformed data; the panic becomes an ordinary error of this file.
         let decode = |frame: usize| -> std::result::Result<Vec<f32>, String> {
             let decoded = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
                 let options = ConvertOptions::new()
@@ -362,10 +362,10 @@ impl Reader<'_> {
         Ok((frames, white))
     }
 
-    /// Inside the shutters of the collimator.
+    /// Columns and rows inside the collimator's shutters.
     fn open_area(&self, width: usize, height: usize) -> Result<(Range<usize>, Range<usize>)> {
         let edge = |tag, name, otherwise: usize, most: usize| -> Result<usize> {
-            // Edges are counted from 1, and belong to the shutter.
+            // Edges are counted from 1, and the edge itself belongs to the shutter.
             Ok(self.number(tag, name)?.map_or(otherwise, |e| e.clamp(0.0, most as f64 + 1.0) as usize))
         };
         let left = edge(tags::SHUTTER_LEFT_VERTICAL_EDGE, "ShutterLeftVerticalEdge", 0, width)?;
@@ -379,7 +379,7 @@ impl Reader<'_> {
         Ok((left..right - 1, top..bottom - 1))
     }
 
-    /// R-peaks as the file lists them, or found in its ECG.
+    /// R-peaks that the file lists, or else those found in its ECG.
     fn r_peaks(&self, times_s: &[f64], notes: &mut Vec<String>) -> Option<RPeaks> {
         let listed = self.numbers(tags::R_WAVE_TIME_VECTOR, "RWaveTimeVector").ok().flatten();
         if let Some(peaks) = listed.and_then(|ms| RPeaks::new(&ms.iter().map(|t| t / 1e3).collect::<Vec<_>>()).ok()) {
@@ -402,7 +402,7 @@ impl Reader<'_> {
         }
     }
 
-    /// First channel of the first waveform.
+    /// Reads the first channel of the first waveform.
     fn waveform(&self) -> Option<(&'static str, Vec<f64>, f64)> {
         let item = self.object.get(tags::WAVEFORM_SEQUENCE)?.items()?.first()?;
         let number = |tag| item.get(tag)?.to_float64().ok();
@@ -418,7 +418,7 @@ impl Reader<'_> {
         Some(("WaveformSequence", trace, rate))
     }
 
-    /// The retired curve of group 5000, which spans the run.
+    /// Reads the ECG from the retired curve group 5000, which spans the run.
     fn curve(&self, times_s: &[f64]) -> Option<(&'static str, Vec<f64>, f64)> {
         if self.text(Tag(0x5000, 0x0020))? != "ECG" {
             return None;
@@ -440,7 +440,7 @@ impl Reader<'_> {
     }
 }
 
-/// The tag a field of the geometry came from.
+/// Name of the tag from which a field of the geometry was read.
 fn tag_of(field: &str) -> String {
     let name = match field {
         "sid_mm" => "(0018,1110) DistanceSourceToDetector",

@@ -1,14 +1,14 @@
-//! R-peaks in an ECG trace (after Pan and Tompkins: derivative, square, moving mean, threshold).
+//! Finds R-peaks in an ECG trace (after Pan and Tompkins: derivative, square, moving mean, threshold).
 
 use crate::error::{Error, Result};
 use crate::scan::gating::RPeaks;
 
-/// Hearts do not beat faster, seconds.
+/// Shortest possible beat, seconds.
 const SHORTEST_BEAT_S: f64 = 0.3;
 /// Width of a QRS complex, seconds.
 const QRS_S: f64 = 0.12;
 
-/// Times of the R-peaks of a trace sampled `rate_hz` times a second, the first sample at time 0.
+/// Returns the times of the R-peaks of a trace with `rate_hz` samples per second, whose first sample is at time 0.
 ///
 /// # Errors
 /// [`Error::Config`] for an unusable trace, or one with fewer than two R-peaks.
@@ -27,7 +27,7 @@ pub fn r_peaks(trace: &[f64], rate_hz: f64) -> Result<RPeaks> {
         (0..slope.len()).map(|i| sums[(i + half + 1).min(slope.len())] - sums[i.saturating_sub(half)]).collect();
     let mut sorted = energy.clone();
     sorted.sort_by(f64::total_cmp);
-    // QRS complexes fill a tenth of a beat.
+    // QRS complexes fill about a tenth of a beat, so the 98th percentile lies within them.
     let threshold = 0.3 * sorted[sorted.len() * 98 / 100];
     let mut times: Vec<f64> = Vec::new();
     let mut i = 0;
@@ -40,7 +40,7 @@ pub fn r_peaks(trace: &[f64], rate_hz: f64) -> Result<RPeaks> {
         let part = &trace[i..=end.min(trace.len() - 1)];
         let mean = trace[i.saturating_sub(4 * half)..(end + 4 * half).min(trace.len())].iter().sum::<f64>()
             / ((end + 4 * half).min(trace.len()) - i.saturating_sub(4 * half)) as f64;
-        // The largest excursion, whichever way the lead points.
+        // Largest deviation from the mean in either direction, because leads differ in polarity.
         let peak = (0..part.len()).max_by(|a, b| (part[*a] - mean).abs().total_cmp(&(part[*b] - mean).abs()));
         let time = (i + peak.unwrap_or(0)) as f64 / rate_hz;
         if times.last().is_none_or(|last| time - last >= SHORTEST_BEAT_S) {

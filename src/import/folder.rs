@@ -1,38 +1,38 @@
-//! A folder that files appear in: which of them are whole, and new.
+//! Watches a folder for files that are complete and new.
 
 use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// What tells whether a file has changed.
+/// Properties that show whether a file has changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Version {
     bytes: u64,
     modified: Option<SystemTime>,
 }
 
-/// A file that was seen.
+/// A file found by an earlier scan.
 struct Seen {
     version: Version,
-    /// Whether it was handed out as it is.
+    /// Whether this version was already returned.
     told: bool,
 }
 
-/// A folder that is looked at again and again. Files in folders inside it, and hidden files, are left alone.
+/// A folder that is scanned repeatedly. Subfolders and hidden files are ignored.
 pub struct Folder {
     path: PathBuf,
     seen: BTreeMap<PathBuf, Seen>,
 }
 
 impl Folder {
-    /// A folder that nobody has looked at yet.
+    /// Makes a folder without earlier scans.
     pub fn new(path: &Path) -> Folder {
         Folder { path: path.to_path_buf(), seen: BTreeMap::new() }
     }
 
-    /// Files that have not changed between the last look and this one, each once as it is: by name. One that changes later is
-    /// handed out again.
+    /// Returns the files that have not changed since the previous scan, sorted by name, each version once. A file that changes
+    /// later is returned again.
     ///
     /// # Errors
     /// [`Error::Io`] for a folder that cannot be read.
@@ -42,7 +42,7 @@ impl Folder {
         for entry in std::fs::read_dir(&self.path).map_err(unreadable())? {
             let entry = entry.map_err(unreadable())?;
             let hidden = entry.file_name().to_string_lossy().starts_with('.');
-            // One that is gone by now will be looked at when it is back.
+            // A file that is already gone is found again if it returns.
             let Some(meta) = std::fs::metadata(entry.path()).ok().filter(|meta| meta.is_file() && !hidden) else {
                 continue;
             };

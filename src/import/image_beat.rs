@@ -1,43 +1,44 @@
-//! R-peaks of a run without ECG, from how its vessels move: what they look like returns once a beat, and goes the way of a
-//! ventricle that contracts and fills.
+//! R-peaks of a run without ECG, from the motion of its vessels: their appearance repeats once a beat, and its variation within
+//! the beat follows the contraction of a ventricle.
 
 use crate::error::{Error, Result};
 use crate::raster::{Image, opening};
 use crate::scan::gating::{RPeaks, SYSTOLE_S, contraction, two_segment_fraction};
 use rayon::prelude::*;
 
-/// Longer sides are brought to so many pixels at most.
+/// Longest side of the reduced images, pixels.
 const SIDE: usize = 64;
-/// Beats that are looked for, seconds: 35 to 180 a minute.
+/// Accepted lengths of a beat, seconds: 35 to 180 beats per minute.
 const BEATS_S: std::ops::RangeInclusive<f64> = 60.0 / 180.0..=60.0 / 35.0;
-/// A run must show so many beats, so that half a beat is seen twice.
+/// Minimum length of a run, beats, so that half a beat is seen twice.
 const LEAST_BEATS: f64 = 1.5;
-/// Images after a beat must be more alike than those between by this share of what neighbours in time are, ...
+/// Minimum rise of the correlation one beat later, as a share of its drop from neighbouring images to the least similar ones.
 const LEAST_RETURN: f64 = 0.2;
-/// ... and by so much in all: noise alone makes them as alike now and then.
+/// Minimum rise of the correlation in absolute terms, because noise alone causes some similarity.
 const LEAST_LIKENESS: f64 = 0.02;
-/// The shortest time after which images return about as well as after any other is a beat; later ones are several.
+/// Share of the highest rise that makes a time the length of a beat; the shortest such time is used, because longer ones are
+/// several beats.
 const AS_GOOD: f64 = 0.8;
-/// Steps of the search for the R-peak, as shares of a beat.
+/// Number of steps of the search for the R-peak within a beat.
 const STEPS: usize = 200;
-/// Rounds of the power iteration.
+/// Iterations of the power method.
 const ROUNDS: usize = 100;
 
-/// A steady beat that images show.
+/// A steady beat found in images.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageBeat {
-    /// R-peaks from before the first image to after the last.
+    /// R-peaks from before the first image until after the last.
     pub r_peaks: RPeaks,
-    /// Heart rate.
+    /// Heart rate, beats per minute.
     pub beats_per_min: f64,
-    /// Correlation of how the vessels move with how a ventricle contracts, -1 to 1.
+    /// Correlation of the vessels' motion with the contraction of a ventricle, -1 to 1.
     pub likeness: f64,
 }
 
-/// Finds the beat in images of one view at rising times, seconds. `vessel_pixels` is half the width of the widest vessel.
+/// Finds the beat in images of one view at increasing times, seconds. `vessel_pixels` is half the width of the widest vessel.
 ///
 /// # Errors
-/// [`Error::Config`] when the images show fewer than one and a half beats, or do not return to what they were.
+/// [`Error::Config`] when the images show fewer than one and a half beats, or do not repeat.
 pub fn beat(images: &[&Image], times_s: &[f64], vessel_pixels: usize) -> Result<ImageBeat> {
     let refused = |problem: String| Error::config("gating", "images", problem);
     let n = images.len();
@@ -67,7 +68,8 @@ pub fn beat(images: &[&Image], times_s: &[f64], vessel_pixels: usize) -> Result<
     Ok(ImageBeat { r_peaks, beats_per_min: 60.0 / beat_s, likeness })
 }
 
-/// What stands out of its surroundings as vessels do, on larger pixels, as shares of its sum: contrast does not count.
+/// Extracts thin structures, such as vessels, on a coarser pixel grid and divides them by their sum, so that the amount of
+/// contrast has no effect.
 fn vessels(image: &Image, vessel_pixels: usize) -> Vec<f32> {
     let surroundings = opening(image, vessel_pixels);
     let factor = image.width.max(image.height).div_ceil(SIDE);
@@ -84,7 +86,8 @@ fn vessels(image: &Image, vessel_pixels: usize) -> Vec<f32> {
     out
 }
 
-/// Images less the mean of those around them, as many as `window`: what changes more slowly, as contrast and breath do, goes.
+/// Subtracts from each image the mean of `window` images around it, which removes slower changes such as contrast and
+/// breathing.
 fn centred(images: &[Vec<f32>], window: usize) -> Vec<Vec<f32>> {
     let n = images.len();
     let window = window.clamp(1, n);
@@ -99,13 +102,13 @@ fn centred(images: &[Vec<f32>], window: usize) -> Vec<Vec<f32>> {
     (0..n).into_par_iter().map(less_mean).collect()
 }
 
-/// Products of all pairs of images.
+/// Scalar products of all pairs of images.
 fn likeness(images: &[Vec<f32>]) -> Vec<Vec<f64>> {
     let product = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
     images.par_iter().map(|a| images.iter().map(|b| product(a, b)).collect()).collect()
 }
 
-/// Images after which they return, if they do.
+/// Number of images per beat, if the images repeat.
 fn period(likeness: &[Vec<f64>], frame_s: f64) -> Option<f64> {
     let n = likeness.len();
     let longest = (((n - 1) as f64) / LEAST_BEATS).min(BEATS_S.end() / frame_s).floor() as usize;
@@ -119,7 +122,7 @@ fn period(likeness: &[Vec<f64>], frame_s: f64) -> Option<f64> {
     let best = peaks.iter().map(|lag| returns(*lag)).fold(0.0, f64::max);
     let least = (LEAST_RETURN * (alike[1] - valley(n / 2))).max(LEAST_LIKENESS);
     let first = peaks.into_iter().find(|lag| returns(*lag) >= AS_GOOD * best && best >= least)?;
-    // Several beats later tell the length of one more finely.
+    // Times of several beats determine the length of one beat more precisely.
     let mut found = summit(&alike, first);
     for beats in 2.. {
         let about = (found * f64::from(beats)).round() as usize;
@@ -133,7 +136,7 @@ fn period(likeness: &[Vec<f64>], frame_s: f64) -> Option<f64> {
     Some(found)
 }
 
-/// Mean correlation of images so many apart.
+/// Mean correlation of images that are `lag` images apart.
 fn mean_after(likeness: &[Vec<f64>], lag: usize) -> f64 {
     let n = likeness.len();
     let (product, power) = (0..n - lag).fold((0.0, f64::MIN_POSITIVE), |(product, power), i| {
@@ -143,14 +146,14 @@ fn mean_after(likeness: &[Vec<f64>], lag: usize) -> f64 {
     product / power
 }
 
-/// Where a parabola through a value and its neighbours is highest.
+/// Position of the maximum of a parabola through a value and its neighbours.
 fn summit(values: &[f64], at: usize) -> f64 {
     let (before, here, after) = (values[at - 1], values[at], values[at + 1]);
     let bend = before - 2.0 * here + after;
     at as f64 + if bend < 0.0 { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) } else { 0.0 }
 }
 
-/// How much of the strongest pattern of change is in each image: the first eigenvector of their products.
+/// Amount of the strongest pattern of change in each image: the first eigenvector of their scalar products.
 fn principal_course(likeness: &[Vec<f64>]) -> Vec<f64> {
     let n = likeness.len();
     let strongest = (0..n).max_by(|a, b| likeness[*a][*a].total_cmp(&likeness[*b][*b])).unwrap_or(0);
@@ -163,7 +166,8 @@ fn principal_course(likeness: &[Vec<f64>]) -> Vec<f64> {
     course
 }
 
-/// The R-peak, seconds from the first image, for which vessels move most like a ventricle contracts, and their correlation.
+/// R-peak, seconds from the first image, for which the vessels' motion correlates best with the contraction of a ventricle, and
+/// the correlation.
 fn best_r_peak(course: &[f64], times_s: &[f64], beat_s: f64) -> (f64, f64) {
     let correlation = |r_peak_s: f64| {
         let since = |t: &f64| (t - r_peak_s).rem_euclid(beat_s);
@@ -172,7 +176,7 @@ fn best_r_peak(course: &[f64], times_s: &[f64], beat_s: f64) -> (f64, f64) {
         correlation(course, &expected)
     };
     let candidates = (0..STEPS).map(|step| beat_s * step as f64 / STEPS as f64);
-    // Which way the pattern goes while the ventricle contracts is not known.
+    // The sign of the pattern during contraction is unknown, so the absolute value is used.
     let rated = candidates.map(|at| (at, correlation(at).abs()));
     rated.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0.0, 0.0))
 }
@@ -191,7 +195,8 @@ mod tests {
 
     const SIZE: usize = 48;
 
-    /// Vessels, wide as three pixels, that swing with a beat, in front of something still; contrast comes, breath drifts.
+    /// Vessels of three pixels' width that swing with a beat before a static background, with arriving contrast and a drift by
+    /// breathing.
     fn run(n: usize, frames_per_s: f64, beat_s: f64, first_r_s: f64) -> (Vec<Image>, Vec<f64>) {
         let times: Vec<f64> = (0..n).map(|i| 2.0 + i as f64 / frames_per_s).collect();
         let image = |t: &f64| {
@@ -223,7 +228,7 @@ mod tests {
             let images: Vec<&Image> = images.iter().collect();
             let found = beat(&images, &times, 3).unwrap();
             assert!((found.beats_per_min / rate - 1.0).abs() < 0.02, "{rate}: {found:?}");
-            // The fraction of the beat at the first R-peak; a beat is a circle.
+            // Fraction of the beat at the first R-peak, on a cyclic beat.
             let off = (2.0 + first_r_s - found.r_peaks.times_s()[0]).rem_euclid(beat_s) / beat_s;
             assert!(off.min(1.0 - off) < 0.04, "{rate} per minute: R-peak off by {off} of a beat; {found:?}");
             assert!(found.likeness > 0.8, "{found:?}");

@@ -1,4 +1,4 @@
-//! Runs that are taken in, together or one after the other, and checked against one another.
+//! Accepts runs, together or one after the other, and checks them against each other.
 
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, MM_PER_UNIT};
@@ -11,18 +11,18 @@ use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
 use std::path::Path;
 
-/// Runs at most.
+/// Largest accepted number of runs.
 pub const MOST_RUNS: usize = 64;
-/// Angles within so many degrees are almost the same.
+/// Difference of angles, in degrees, below which two views are almost the same.
 const SAME_ANGLE_DEG: f64 = 5.0;
 
-/// What other runs are compared with.
+/// Properties of an accepted run with which other runs are compared.
 #[derive(Clone)]
 struct Taken {
     name: String,
     identity: [u64; 2],
     instance: Option<u64>,
-    /// Of the first frame, as the file says.
+    /// Table position of the first frame, as the file states it.
     table_mm: [f64; 3],
     angles_deg: [f64; 2],
 }
@@ -40,7 +40,7 @@ impl Taken {
     }
 }
 
-/// Runs that were taken in.
+/// Runs that were accepted, with the options of their import.
 pub struct Intake {
     options: ImportOptions,
     taken: Vec<Taken>,
@@ -48,33 +48,33 @@ pub struct Intake {
 }
 
 impl Intake {
-    /// No runs yet.
+    /// Makes an intake without runs.
     pub fn new(options: ImportOptions) -> Intake {
         Intake { options, taken: Vec::new(), runs: Vec::new() }
     }
 
-    /// Cardiac phases of the images.
+    /// Number of cardiac phases of the images.
     pub fn phases(&self) -> u32 {
         if matches!(self.options.gating, Gating::Still) { 2 } else { self.options.phases }
     }
 
-    /// Runs taken in so far.
+    /// Number of runs accepted so far.
     pub fn runs(&self) -> usize {
         self.runs.len()
     }
 
-    /// The first image of the first run; none without runs.
+    /// First image of the first run; none without runs.
     pub fn first(&self) -> Option<&TakenFrame> {
         self.runs.first().and_then(|run| run.frames.first())
     }
 
-    /// Name of the run taken in that a run is a copy of.
+    /// Name of the accepted run that a run is a copy of.
     pub fn copy_of(&self, run: &Run) -> Option<&str> {
         let same = |taken: &&Taken| taken.instance.is_some() && taken.instance == run.instance;
         self.taken.iter().find(same).map(|taken| taken.name.as_str())
     }
 
-    /// Takes runs in, all or none, and returns what a user should know.
+    /// Accepts all of the runs or none, and returns notes for the user.
     ///
     /// # Errors
     /// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option.
@@ -102,12 +102,12 @@ impl Intake {
         Ok(notes)
     }
 
-    /// The images of a run, counted from 0.
+    /// Images of a run; runs are counted from 0.
     pub fn frames(&self, run: usize) -> &[TakenFrame] {
         self.runs.get(run).map_or(&[], |run| &run.frames)
     }
 
-    /// Writes the runs as a dataset; how many views of which size there are.
+    /// Writes the runs as a dataset and returns a summary with the numbers of views, pixels and phases.
     ///
     /// # Errors
     /// [`Error::NotReady`] without runs; [`Error::Io`].
@@ -115,10 +115,10 @@ impl Intake {
         self.write_first(self.runs(), out)
     }
 
-    /// Writes the first `runs` as [`Intake::write`] would have before others came.
+    /// Writes the first `runs` runs, as [`Intake::write`] does for all.
     ///
     /// # Errors
-    /// As [`Intake::write`].
+    /// Errors of [`Intake::write`].
     pub fn write_first(&self, runs: usize, out: &Path) -> Result<String> {
         let none = || Error::NotReady("no run was taken in".into());
         let runs = runs.min(self.runs());
@@ -149,7 +149,7 @@ impl Intake {
     }
 }
 
-/// Refuses a run that no training could use, as those who read its dataset would.
+/// Rejects a run that training could not use, by the same checks as on reading a dataset.
 fn trainable(run: &Run, prepared: &Prepared, options: &ImportOptions) -> Result<()> {
     prepared
         .frames
@@ -162,7 +162,7 @@ fn trainable(run: &Run, prepared: &Prepared, options: &ImportOptions) -> Result<
         .map_err(|found| Error::data(&run.path, found.field, format!("{}: {}", found.value, found.problem)))
 }
 
-/// What does not fit to the runs before.
+/// Notes and warnings on differences between a run and the earlier runs.
 fn check(run: &Run, before: &[Taken]) -> Vec<String> {
     let (mut notes, name, this) = (Vec::new(), run.name(), Taken::of(run));
     let Some(first) = before.first() else { return notes };

@@ -1,11 +1,11 @@
-//! Whether the elements of a DICOM file claim no more than the file holds. The library that reads them reserves, and
-//! fills, what they claim: up to 4 GiB for a damaged file of a few bytes.
+//! Checks that the elements of a DICOM file claim no more bytes than the file holds. The library that reads the file allocates
+//! and fills the claimed length, which can be 4 GiB for a damaged file of a few bytes.
 
 use crate::error::{Error, Result};
 use std::io::{BufReader, Read};
 use std::path::Path;
 
-/// Sequences inside sequences.
+/// Largest accepted nesting depth of sequences.
 const DEEPEST: u32 = 16;
 const UNDEFINED: u32 = u32::MAX;
 const EXPLICIT_BIG_ENDIAN: &str = "1.2.840.10008.1.2.2";
@@ -21,7 +21,7 @@ struct Walker<'a> {
     implicit: bool,
 }
 
-/// Refuses a file whose elements reach beyond its end.
+/// Rejects a file with elements that reach beyond its end.
 ///
 /// # Errors
 /// [`Error::Data`] naming the element; [`Error::Io`].
@@ -33,7 +33,7 @@ pub(super) fn check(path: &Path) -> Result<()> {
     if &head[128..] != b"DICM" {
         return Err(Error::data(path, "DICOM", "has no DICM after its preamble: is it a DICOM file?"));
     }
-    // The group of meta information is little endian with explicit types, whatever follows.
+    // The meta information group is always little endian with explicit types.
     let mut syntax = String::new();
     while w.at < end {
         let begin = w.at;
@@ -71,7 +71,7 @@ impl Walker<'_> {
     }
 
     fn seek(&mut self, to: u64) -> Result<()> {
-        // Within what is buffered, where most steps end.
+        // Most steps end within the buffer, which a relative seek keeps.
         self.file.seek_relative(to as i64 - self.at as i64).map_err(Error::io("read", self.path))?;
         self.at = to;
         Ok(())
@@ -88,7 +88,7 @@ impl Walker<'_> {
         Ok(if self.big_endian { u32::from_be_bytes(b) } else { u32::from_le_bytes(b) })
     }
 
-    /// Group, element and length.
+    /// Reads the header of an element: group, element and length.
     fn header(&mut self) -> Result<(u16, u16, u32)> {
         let (group, element) = (self.u16()?, self.u16()?);
         // Items and their delimiters have no type.
@@ -96,11 +96,11 @@ impl Walker<'_> {
             return Ok((group, element, self.u32()?));
         }
         let kind = self.take(2)?;
-        // Types nobody knows have long lengths, as the newer ones do.
+        // Unknown types have 32-bit lengths, like the newer types.
         const SHORT: &[u8] = b"AE AS AT CS DA DS DT FL FD IS LO LT PN SH SL SS ST TM UI UL US";
         if SHORT.chunks(3).any(|known| known[..2] == kind[..]) {
             let length = self.u16()?;
-            // Of a value that ends inside a number, the rest would be taken for the next element.
+            // If a value ended inside a number, its last bytes would be read as the next element.
             let number = match &kind[..] {
                 b"FD" => 8,
                 b"AT" | b"FL" | b"SL" | b"UL" => 4,
@@ -125,7 +125,7 @@ impl Walker<'_> {
         Err(Error::data(self.path, format!("({group:04X},{element:04X})"), problem))
     }
 
-    /// Elements up to a place in the file, or to the delimiter of an item of undefined length.
+    /// Checks elements up to a position in the file, or to the delimiter of an item of undefined length.
     fn elements(&mut self, end: u64, depth: u32) -> Result<()> {
         while self.at < end {
             let (group, element, length) = self.header()?;
@@ -147,7 +147,7 @@ impl Walker<'_> {
         Ok(())
     }
 
-    /// Whether a value is a sequence, of which only its first item tells where types are implicit.
+    /// Tells whether a value begins with an item and so is a sequence; with implicit types nothing else shows that.
     fn begins_with_item(&mut self, length: u32) -> Result<bool> {
         if length < 8 {
             return Ok(false);
@@ -157,7 +157,7 @@ impl Walker<'_> {
         Ok(first == (0xfffe, 0xe000))
     }
 
-    /// Items, or fragments of pixel data, up to a place in the file or the delimiter of their sequence.
+    /// Checks items, or fragments of pixel data, up to a position in the file or the delimiter of their sequence.
     fn items(&mut self, end: u64, depth: u32, fragments: bool) -> Result<()> {
         if depth > DEEPEST {
             return Err(Error::data(self.path, "DICOM", format!("sequences more than {DEEPEST} deep")));

@@ -1,14 +1,15 @@
-//! From where the frames of a run were taken: a C-arm or a table that moves gives a run several views.
+//! Groups the frames of a run by C-arm pose: a moving C-arm or table gives a run several views.
 
 use crate::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
 use glam::DVec3;
 
-/// Frames that see points of the heart within so many pixels of each other are of one view.
+/// Distance below which two frames belong to the same view, pixels: the largest between their projections of points of the
+/// heart.
 const SAME_VIEW_PX: f64 = 0.1;
-/// Half side of the cube about the isocentre that stands for the heart, mm.
+/// Half side of a cube around the isocentre that represents the heart, mm.
 const HEART_MM: f64 = 50.0;
 
-/// Of each frame, the first that was taken from where it was; images have `size` (columns, rows).
+/// Returns, for each frame, the index of the first frame with the same pose; images have `size` (columns, rows).
 pub(super) fn stands(c_arms: &[CArm], size: [usize; 2]) -> Vec<usize> {
     let rays: Vec<Option<ViewRays>> =
         c_arms.iter().map(|c_arm| Geometry::CArm(c_arm.clone()).rays(size[0], size[1]).ok()).collect();
@@ -28,7 +29,7 @@ pub(super) fn stands(c_arms: &[CArm], size: [usize; 2]) -> Vec<usize> {
         .collect()
 }
 
-/// How far apart two views see a point of the heart, pixels, at most.
+/// Largest distance between the projections of a point of the heart in two views, pixels.
 fn apart_px(a: &ViewRays, b: &ViewRays) -> f64 {
     let sign = |k: usize, axis: usize| if k >> axis & 1 == 1 { HEART_MM } else { -HEART_MM };
     let corners = (0..8).map(|k| DVec3::new(sign(k, 0), sign(k, 1), sign(k, 2)));
@@ -58,7 +59,7 @@ mod tests {
 
     #[test]
     fn frames_share_a_view_while_nothing_moves_by_more_than_a_tenth_of_a_pixel() {
-        // A pixel is 0.3 mm at the isocentre: 0.1 of it are 0.03 mm of the table, or as much at 50 mm and an angle of 0.03 degrees.
+        // A pixel is 0.3 mm at the isocentre. A tenth of it is 0.03 mm of the table, or an angle of 0.03 degrees at 50 mm.
         let table: Vec<CArm> = [0.0, 0.015, 2.0, 2.01, 0.01, 4.0].map(|mm| c_arm(30.0, [mm, 0.0, 0.0])).into();
         assert_eq!(stands(&table, [512; 2]), [0, 0, 2, 2, 0, 5]);
         let turning: Vec<CArm> = [30.0, 30.01, 32.0, 34.0, 34.0].map(|deg| c_arm(deg, [0.0; 3])).into();

@@ -1,8 +1,8 @@
-//! A collimator's blade in an image.
+//! Collimator blade in an image.
 
 use crate::phantom::degradations::{Chance, Draw};
 
-/// The side a blade comes from.
+/// Side of the image that a blade enters from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Side {
     Left,
@@ -11,20 +11,20 @@ enum Side {
     Bottom,
 }
 
-/// A blade that hides the outer columns or rows of a view's images: they read the same at all phases.
+/// A blade that hides the outer columns or rows of a view's images, with the same value at all phases.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Blade {
     side: Side,
-    /// Columns or rows it covers.
+    /// Number of columns or rows that it covers.
     lines: usize,
-    /// Of its attenuation.
+    /// Line integral of its attenuation.
     integral: f32,
-    /// Share of the moving vessels' mass it hides.
+    /// Share of the moving vessels' mass that it hides.
     pub(super) cut_share: f64,
 }
 
 impl Blade {
-    /// A blade on a random side that hides about a share of `moving`, the mass that moves in each pixel of a square image.
+    /// Makes a blade on a random side that hides about a share of `moving`, the moving mass in each pixel of a square image.
     pub(super) fn hiding(share: f64, moving: &[f64], size: usize, integral: f32, chance: Chance) -> Blade {
         let sides = [Side::Left, Side::Right, Side::Top, Side::Bottom];
         let side = sides[(chance.uniform(Draw::Blade) * sides.len() as f64) as usize];
@@ -43,7 +43,7 @@ impl Blade {
         Blade { side, lines: best.0, integral, cut_share: best.1 }
     }
 
-    /// Puts the blade before an image and its mask.
+    /// Draws the blade over an image and removes the hidden pixels from its mask.
     pub(super) fn close(&self, image: &mut [f32], mask: Option<&mut Vec<bool>>, size: usize) {
         let covered = |pixel: usize| line(self.side, pixel, size) < self.lines;
         image.iter_mut().enumerate().filter(|(pixel, _)| covered(*pixel)).for_each(|(_, value)| *value = self.integral);
@@ -53,7 +53,7 @@ impl Blade {
     }
 }
 
-/// Columns or rows between a pixel and a side.
+/// Number of columns or rows between a pixel and a side.
 fn line(side: Side, pixel: usize, size: usize) -> usize {
     match side {
         Side::Left => pixel % size,

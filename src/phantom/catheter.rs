@@ -1,15 +1,15 @@
-//! A coronary catheter: from the arm through the aorta, its tip in the ostium.
+//! A coronary catheter: it enters through the aorta, with its tip in the ostium.
 
 use crate::formats::volume::Volume;
 use crate::phantom::tree::{Branch, Tree, spline};
 use crate::phantom::voxels;
 use glam::DVec3;
 
-/// 6 French are 2 mm.
+/// Radius, mm: 6 French, which is a diameter of 2 mm.
 const RADIUS_MM: f64 = 1.0;
-/// Wall and undiluted contrast attenuate so many times as much as a filled vessel.
+/// Attenuation of wall and undiluted contrast as a multiple of that of a filled vessel.
 const DENSITY: f64 = 2.0;
-/// Its course from the ostium: across the root of the aorta, up along its right wall, and out towards the neck; LPS mm.
+/// Course from the ostium, LPS mm: across the root of the aorta, up along its right wall, and out towards the neck.
 const COURSE: &[[f64; 3]] = &[
     [0.0, 0.0, 0.0],
     [-9.0, 1.0, 3.0],
@@ -19,11 +19,12 @@ const COURSE: &[[f64; 3]] = &[
     [-26.0, 10.0, 110.0],
     [-34.0, 8.0, 150.0],
 ];
-/// Points along the course.
+/// Number of intervals between points along the course.
 const STEPS: usize = 120;
 
-/// A catheter whose tip is at `tip_mm` and was at `rest_mm` when it took its course (LPS): the tip goes with the heart, the
-/// rest less and less, the far end not at all. `scale` shrinks it with the anatomy.
+/// Draws a catheter whose tip is at `tip_mm` and whose course begins at `rest_mm` when the heart is at rest (LPS). The tip
+/// moves with the heart, the rest of the catheter less with the distance from the tip, and the far end not at all. `scale`
+/// scales the catheter with the anatomy.
 pub(super) fn volume(tip_mm: DVec3, rest_mm: DVec3, scale: f64, vessel_per_mm: f64, spacing_mm: f64) -> Volume {
     let point = |step: usize| {
         let along = step as f64 / STEPS as f64;
@@ -44,7 +45,7 @@ pub(super) fn volume(tip_mm: DVec3, rest_mm: DVec3, scale: f64, vessel_per_mm: f
 mod tests {
     use super::*;
 
-    /// Mean attenuation around a point, LPS mm.
+    /// Attenuation of the voxel nearest to a point, LPS mm.
     fn attenuation(volume: &Volume, at: DVec3) -> f32 {
         let index = volume.index_to_lps.inverse().transform_point3(at).round().as_usizevec3();
         volume.values[(index.z * volume.size[1] + index.y) * volume.size[0] + index.x]

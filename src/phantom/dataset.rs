@@ -1,4 +1,4 @@
-//! Phantom datasets: volumes and motion -> projections, exact masks, degradations -> a dataset on disk.
+//! Phantom datasets: projects moving volumes, makes exact masks, applies degradations and writes the dataset.
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
@@ -26,12 +26,13 @@ use serde::{Deserialize, Serialize};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 
-/// A vessel-only line integral above this share of a 1 mm vessel's marks a vessel pixel.
+/// Threshold of a vessel pixel: its line integral through vessels alone exceeds this share of that of one pixel width of
+/// vessel.
 const MASK_SHARE: f64 = 0.05;
-/// A blade attenuates so many times as much as the densest part of its view.
+/// Attenuation of a blade as a multiple of the largest line integral of its view.
 const BLADE_DENSITY: f32 = 2.0;
 
-/// A published set-up of C-arm and volume.
+/// Published set-up of C-arm and volume.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Setting {
@@ -52,33 +53,34 @@ impl Choice for Setting {
     }
 }
 
-/// What to make.
+/// Options of a phantom dataset.
 #[derive(Debug, Clone)]
 pub struct PhantomOptions {
-    /// C-arm and volume when the anatomy is procedural.
+    /// C-arm and volume for procedural anatomy.
     pub setting: Setting,
     /// Columns and rows of the images.
     pub size: usize,
-    /// Cardiac phases.
+    /// Number of cardiac phases.
     pub phases: u32,
     /// Views.
     pub views: ViewAngles,
     /// Seed of shape, noise and degradations.
     pub seed: u32,
-    /// What is done to the training views.
+    /// Degradations of the images.
     pub degradations: Degradations,
     /// Layout to write.
     pub layout: Layout,
     /// Real anatomy instead of the procedural one.
     pub anatomy: Option<Anatomy>,
-    /// Also write the voxel volumes of the first of every so many phases; of none where this is none.
+    /// Interval of the phases whose voxel volumes are also written: the first of every so many. Without it, no volumes are
+    /// written.
     pub volumes_every: Option<NonZeroU32>,
 }
 
-/// A tree and a CT from files.
+/// Anatomy from files: a tree and a CT.
 #[derive(Debug, Clone)]
 pub struct Anatomy {
-    /// Tree, as [`TreeFile::read`] reads it.
+    /// File with the tree, as read by [`TreeFile::read`].
     pub tree: PathBuf,
     /// CT in Hounsfield units.
     pub background: Option<PathBuf>,
@@ -88,18 +90,18 @@ pub struct Anatomy {
     pub iodine_per_mm: f64,
 }
 
-/// A user's own volumes.
+/// Options of a dataset that is projected from a user's own volumes.
 #[derive(Debug, Clone)]
 pub struct VolumeOptions {
     /// One file per phase, in order.
     pub volumes: Vec<PathBuf>,
-    /// What the files cannot say of themselves.
+    /// Properties that the files may not state.
     pub hints: VolumeHints,
-    /// Values are Hounsfield units.
+    /// Whether values are Hounsfield units.
     pub hounsfield: bool,
     /// Factor on the values.
     pub scale: f32,
-    /// Attenuation from which a voxel is vessel, 1/mm.
+    /// Attenuation threshold above which a voxel belongs to a vessel, 1/mm.
     pub vessel_per_mm: Option<f64>,
     /// C-arms.
     pub c_arms: CArmOptions,
@@ -109,37 +111,37 @@ pub struct VolumeOptions {
     pub views: ViewAngles,
     /// Seed of noise and degradations.
     pub seed: u32,
-    /// What is done to the training views.
+    /// Degradations of the images.
     pub degradations: Degradations,
     /// Layout to write.
     pub layout: Layout,
 }
 
-/// What a phantom dataset is shot from.
+/// Subject and geometry that a phantom dataset is made from.
 struct Stage {
     description: String,
-    /// One per view.
+    /// C-arm of each view.
     c_arms: Vec<CArm>,
     depth_half_extent_mm: f64,
     vessel_attenuation: Option<f64>,
     phases: u32,
     subject: Box<dyn Subject>,
-    /// The vessels are part of the moving background already.
+    /// Whether the moving background already contains the vessels.
     vessels_in_background: bool,
 }
 
-/// How a stage is shot.
+/// Options of the images that are taken of a stage.
 struct Shooting<'a> {
     size: usize,
     views: &'a ViewAngles,
     seed: u32,
     degradations: &'a Degradations,
     layout: Layout,
-    /// Also write the voxel volumes of the first of every so many phases.
+    /// Interval of the phases whose voxel volumes are also written: the first of every so many.
     volumes_every: Option<NonZeroU32>,
 }
 
-/// Makes a phantom dataset in `out`.
+/// Makes a phantom dataset in the directory `out`.
 ///
 /// # Errors
 /// [`Error::Config`] for impossible options, [`Error::Data`] for unreadable anatomy, device errors.
@@ -165,11 +167,11 @@ pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl 
     shoot(&projector, &stage, &shooting, out, progress)
 }
 
-/// Projects a user's volumes, one per phase, into a dataset in `out`. Between phases the nearest volume is shown; where the
-/// patient breathes, what all volumes have in common stands still.
+/// Projects a user's volumes, one per phase, into a dataset in the directory `out`. At times between phases the nearest volume
+/// is used. If the patient breathes, the part that all volumes have in common is treated as static background.
 ///
 /// # Errors
-/// As [`make`]; also for degradations that need vessels where none are told apart.
+/// Errors of [`make`]; [`Error::Config`] also for degradations that need vessels where no vessel threshold is given.
 pub fn project_volumes(
     gpu: &Gpu,
     options: &VolumeOptions,
@@ -216,7 +218,7 @@ pub fn project_volumes(
     shoot(&projector, &stage, &shooting, out, progress)
 }
 
-/// Refuses degradations of volumes that lack what they are done to.
+/// Rejects degradations that need properties the volumes do not have.
 fn check_vessels(degradations: &Degradations, vessel_per_mm: Option<f64>) -> Result<()> {
     const WITHOUT_OSTIUM: &str = "volumes do not say where the ostium is; phantoms do";
     if degradations.catheter {
@@ -233,19 +235,19 @@ fn check_vessels(degradations: &Degradations, vessel_per_mm: Option<f64>) -> Res
     }
 }
 
-/// How far from the isocentre attenuation may lie: short of the nearest source.
+/// Largest accepted depth of attenuation from the isocentre, mm; it ends before the nearest source.
 fn largest_depth_mm(c_arms: &[CArm]) -> f64 {
     0.9 * c_arms.iter().map(|c_arm| c_arm.sod_mm).fold(f64::INFINITY, f64::min)
 }
 
-/// The widest field of view at the isocentre.
+/// Largest field of view at the isocentre, mm.
 fn widest_field_mm(c_arms: &[CArm], size: usize) -> f64 {
     let fields = c_arms.iter().map(|c_arm| c_arm.pixel_mm[0] * size as f64 * c_arm.sod_mm / c_arm.sid_mm);
     fields.fold(0.0, f64::max)
 }
 
 impl Shooting<'_> {
-    /// Refuses impossible images and directories that already hold a dataset, before any work is done.
+    /// Rejects impossible images, and directories that already hold a dataset, before any work is done.
     fn check(&self, out: &Path) -> Result<()> {
         if !(16..=2048).contains(&self.size) {
             return Err(Error::config("size", self.size, "16 to 2048 is accepted"));
@@ -262,7 +264,7 @@ impl Shooting<'_> {
         Chance { seed: self.seed, view: view as u32 }
     }
 
-    /// What the dataset says of a C-arm.
+    /// C-arm as the dataset states it.
     fn stated(&self, c_arm: &CArm, view: usize, split: Split) -> CArm {
         match self.degradations.geometry_error {
             Some(error) if split == Split::Train => error.stated(c_arm, self.chance(view)),
@@ -276,13 +278,13 @@ struct Camera<'a> {
     projector: &'a Projector,
     stage: &'a Stage,
     rays: Vec<ViewRays>,
-    /// Line integrals of what stands still, per view.
+    /// Line integrals of the static background, per view.
     still: Vec<Vec<f32>>,
-    /// What moves, as it was drawn last.
+    /// Moving parts at the pose that was drawn last.
     drawn: Option<(Pose, Moving)>,
 }
 
-/// Line integrals of an image, and of its vessels alone.
+/// Line integrals of an image and of its vessels alone.
 struct Exposure {
     image: Vec<f32>,
     vessels: Option<Vec<f32>>,
@@ -332,7 +334,7 @@ impl<'a> Camera<'a> {
         Ok(self.projector.project(&placed.volume, rays, placed.shift_mm)?.swap_remove(0))
     }
 
-    /// Vessel pixels, from the line integrals of vessels alone.
+    /// Mask of vessel pixels, from the line integrals of vessels alone.
     fn mask(&self, view: usize, vessels: &[f32]) -> Vec<bool> {
         let c_arm = &self.stage.c_arms[view];
         let pixel_at_isocentre = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
@@ -340,7 +342,7 @@ impl<'a> Camera<'a> {
         vessels.iter().map(|v| *v > threshold).collect()
     }
 
-    /// The blade that hides a share of what moves of a view's vessels.
+    /// Makes a blade that hides a share of the moving part of a view's vessels.
     fn blade(&mut self, view: usize, shots: &[Option<Shot>], shooting: &Shooting<'_>) -> Result<Blade> {
         let pixels = shooting.size * shooting.size;
         let (mut sum, mut least, mut densest, mut images) = (vec![0f64; pixels], vec![f32::MAX; pixels], 0f32, 0);
@@ -353,7 +355,7 @@ impl<'a> Camera<'a> {
             }
             images += 1;
         }
-        // Of a single image all vessels count: nothing tells which of them move.
+        // In a single image all vessels count as moving, because there is no other image to compare with.
         let still = |pixel: usize| if images > 1 { f64::from(images) * f64::from(least[pixel]) } else { 0.0 };
         let moving: Vec<f64> = sum.iter().enumerate().map(|(pixel, sum)| sum - still(pixel)).collect();
         let share = shooting.degradations.collimated_share;
@@ -449,7 +451,7 @@ fn add(image: &mut [f32], other: &[f32], factor: f32) {
 
 fn procedural(options: &PhantomOptions) -> Result<Stage> {
     let scale_pixels = 200.0 / options.size as f64;
-    // Volume offsets are in the world's axes (posterior, left, superior); LPS swaps the first two.
+    // Volume offsets are given in the world's axes (posterior, left, superior); LPS exchanges the first two.
     let (tissues, sid_mm, sod_mm, anatomy_scale, centre_mm, half_mm) = match options.setting {
         Setting::Xcat => (Tissues::XCAT, 2500.0, 450.0, 0.37, DVec3::new(-25.0, 10.0, 25.0), 64.0),
         Setting::Magix => (Tissues::MAGIX, 2000.0, 600.0, 0.62, DVec3::ZERO, 230.0),

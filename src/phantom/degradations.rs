@@ -1,7 +1,7 @@
-//! What a cath lab's angiograms have and a perfect phantom's lack: options, and the numbers drawn for them.
+//! Degradations: properties of clinical angiograms that a perfect phantom lacks. Holds their options and their random numbers.
 //!
-//! Training views alone are degraded; validation views show the heart where the others have it on average, from where the
-//! dataset says.
+//! Only training views are degraded, except for photon noise. Validation views show the heart without displacement by
+//! breathing, from the geometry that the dataset states.
 
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
@@ -11,36 +11,36 @@ use crate::scan::dataset::Layout;
 use crate::scan::gating::BeatScaling;
 use serde::{Deserialize, Serialize};
 
-/// Length of a breath at rest, seconds.
+/// Length of a breath at rest, seconds; the default.
 pub const USUAL_BREATH_S: f64 = 4.0;
-/// Images per second of an ordinary run.
+/// Images per second of a typical run; the default.
 pub const USUAL_FRAMES_PER_S: f64 = 15.0;
-/// Length of an ordinary run, beats: contrast fills the vessels for about so long.
+/// Length of a typical run, beats: contrast fills the vessels for about this time.
 pub const USUAL_BEATS: u32 = 3;
-/// Contrast that takes longer to reach the ends of the vessels is none that one takes angiograms of, seconds.
+/// Longest accepted time for contrast to reach the ends of the vessels, seconds; slower contrast is not useful for angiograms.
 const LONGEST_INFLOW_S: f64 = 10.0;
-/// Largest share of the vessels that may be cut off.
+/// Largest accepted share of the vessels that blades hide.
 const LARGEST_CUT: f64 = 0.9;
 
-/// What is done to the training views; nothing by default.
+/// Degradations of the training views; none by default.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Degradations {
-    /// Errors of the geometry that the dataset states; images are made with the true one.
+    /// Errors of the geometry that the dataset states; the images are made with the true geometry.
     pub geometry_error: Option<GeometryError>,
     /// Breathing during and between runs.
     pub breathing: Option<Breathing>,
-    /// Photon noise, of validation views too; none without.
+    /// Photon noise, also of validation views; no noise if it is none.
     pub photons: Option<Photons>,
-    /// Standard deviation of a run's contrast density as a share of it; within a run it drifts half as much.
+    /// Standard deviation of a run's contrast density, as a share of it; the variation within a run is half as large.
     pub contrast_variation: f64,
-    /// Contrast enters the vessels with the first image of a run and reaches their ends after so many seconds; vessels are full
-    /// from the start where it is 0.
+    /// Time after which contrast reaches the ends of the vessels, seconds from the first image of a run; 0 if the vessels are
+    /// full from the start.
     pub inflow_s: f64,
-    /// Hearts that beat at rates of their own, seen at a frame rate.
+    /// Heart rates of the views and the frame rate of the images; none for images exactly at the phases.
     pub rhythm: Option<Rhythm>,
-    /// Share of the moving vessels that blades hide in each view, 0 to 0.9.
+    /// Share of the moving vessels that a blade hides in each view, 0 to 0.9.
     pub collimated_share: f64,
-    /// A catheter in the aorta, its tip in the ostium.
+    /// Whether there is a catheter in the aorta with its tip in the ostium.
     pub catheter: bool,
 }
 
@@ -58,12 +58,12 @@ pub struct GeometryError {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Breathing {
-    /// The heart's way along the body, peak to peak, mm.
+    /// Displacement of the heart along the body, peak to peak, mm.
     pub peak_to_peak_mm: f64,
     /// Length of a breath, seconds.
     #[serde(default = "usual_breath_s")]
     pub period_s: f64,
-    /// Diaphragm and lower chest breathe, too.
+    /// Whether diaphragm and lower chest also move.
     #[serde(default)]
     pub background: bool,
 }
@@ -72,11 +72,11 @@ fn usual_breath_s() -> f64 {
     USUAL_BREATH_S
 }
 
-/// When images are taken, and how they get their phases.
+/// Times of the images and their conversion to phases.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rhythm {
-    /// Beats per minute: one for all training views, or one for each.
+    /// Beats per minute: one value for all training views, or one for each.
     pub beats_per_min: Vec<f64>,
     /// Images per second.
     #[serde(default = "usual_frames_per_s")]
@@ -84,7 +84,7 @@ pub struct Rhythm {
     /// Length of a run, beats.
     #[serde(default = "usual_beats")]
     pub beats: u32,
-    /// How time becomes phase.
+    /// Conversion of time to phase.
     #[serde(default = "usual_gating")]
     pub gating: BeatScaling,
 }
@@ -112,7 +112,7 @@ fn within(field: &str, value: f64, accepted: std::ops::RangeInclusive<f64>, unit
 }
 
 impl Degradations {
-    /// Refuses what cannot be done to so many training views in a layout.
+    /// Rejects degradations that are impossible for this number of training views or in a layout.
     ///
     /// # Errors
     /// [`Error::Config`] naming the field.
@@ -158,7 +158,7 @@ impl Rhythm {
     }
 }
 
-/// What is drawn at random for a run.
+/// Quantities that are drawn at random for a run.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Draw {
     Geometry,
@@ -170,7 +170,7 @@ pub(super) enum Draw {
     Blade,
 }
 
-/// The random numbers of one training view; each [`Draw`] has its own, so that one degradation changes no other.
+/// Random numbers of one training view. Each [`Draw`] has its own numbers, so that one degradation does not change another.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Chance {
     pub(super) seed: u32,
@@ -178,24 +178,24 @@ pub(super) struct Chance {
 }
 
 impl Chance {
-    /// Uniform in [0, 1).
+    /// Uniform number in [0, 1).
     pub(super) fn uniform(self, draw: Draw) -> f64 {
         uniform01(self.seed, STREAM_ACQUISITION, draw as u32, self.view)
     }
 
-    /// Standard normal; number `index` of a draw.
+    /// Standard normal number with an index within a draw.
     fn normal_at(self, draw: Draw, index: u32) -> f64 {
         normal(self.seed, STREAM_ACQUISITION, index << 16 | draw as u32, self.view)
     }
 
-    /// Standard normal.
+    /// Standard normal number.
     pub(super) fn normal(self, draw: Draw) -> f64 {
         self.normal_at(draw, 0)
     }
 }
 
 impl GeometryError {
-    /// What the dataset states of a C-arm.
+    /// C-arm as the dataset states it.
     pub(super) fn stated(self, truth: &CArm, chance: Chance) -> CArm {
         let error = |index| chance.normal_at(Draw::Geometry, index);
         CArm {

@@ -1,23 +1,23 @@
-//! Contrast on its way from the ostium to the ends of the vessels.
+//! Inflow of contrast from the ostium to the ends of the vessels.
 
 use crate::phantom::tree::{Branch, Tree};
 
-/// A branch leaves another one where its first point lies so near to the other's centreline: so many of the other's radii, and so
-/// many mm. Branches are taken to be told from their beginnings on.
+/// Largest distance between a branch's first point and another branch's centreline at which the branch may leave the other:
+/// this multiple of the other's radius plus this length in mm. Branches are assumed to be listed from their beginnings on.
 const NEAR_RADII: f64 = 2.0;
 const NEAR_MM: f64 = 1.0;
-/// Over this share of the longest way, contrast goes from nothing to what there is behind.
+/// Length of the contrast front, as a share of the longest path: the filling rises over it from nothing to full.
 const FRONT: f64 = 0.2;
 
 impl Tree {
-    /// The tree while contrast has come a share of the way from where it enters to the farthest end; 0 is none at all.
+    /// Fills the tree with contrast that has come a share of the way from the ostium to the farthest end; 0 means no contrast.
     pub fn filled_to(self, share: f64) -> Tree {
         if share >= 1.0 {
             return self;
         }
         let ways_mm = self.ways_mm();
         let longest_mm = ways_mm.iter().flatten().copied().fold(f64::MIN_POSITIVE, f64::max);
-        // At 1 the end of the front has reached the farthest end.
+        // At a share of 1, the end of the front has reached the farthest end.
         let filled = |way_mm: f64| ((share * (1.0 + FRONT) - way_mm / longest_mm) / FRONT).clamp(0.0, 1.0);
         let branch = |(branch, ways_mm): (Branch, Vec<f64>)| Branch {
             filling: branch.filling.iter().zip(ways_mm).map(|(full, way_mm)| full * filled(way_mm)).collect(),
@@ -26,8 +26,8 @@ impl Tree {
         Tree { branches: self.branches.into_iter().zip(ways_mm).map(branch).collect() }
     }
 
-    /// Way along the vessels from the nearest root to each point of each branch, mm. Roots are the first points of branches that
-    /// leave no other; where branches leave each other in a ring, of the one listed first.
+    /// Path length along the vessels from the nearest root to each point of each branch, mm. Roots are the first points of
+    /// branches that do not leave another branch; in a ring of branches, the first point of the branch listed first.
     fn ways_mm(&self) -> Vec<Vec<f64>> {
         let along_mm: Vec<Vec<f64>> = self.branches.iter().map(Branch::along_mm).collect();
         let joints: Vec<Vec<Joint>> = (0..self.branches.len()).map(|branch| self.joints(branch, &along_mm)).collect();
@@ -41,7 +41,7 @@ impl Tree {
         along_mm.into_iter().zip(starts_mm).map(|(along, start)| along.iter().map(|mm| start + mm).collect()).collect()
     }
 
-    /// Where a branch may leave others.
+    /// Joints at which a branch may leave others.
     fn joints(&self, branch: usize, along_mm: &[Vec<f64>]) -> Vec<Joint> {
         let Some(first) = self.branches[branch].points.first() else { return Vec::new() };
         let others = (0..self.branches.len()).filter(|other| *other != branch);
@@ -57,14 +57,14 @@ impl Tree {
     }
 }
 
-/// A branch begins near another one.
+/// Joint of a branch that begins near another one.
 struct Joint {
     other: usize,
-    /// Way from the first point of the other to the first of the branch, mm; the shortest.
+    /// Shortest path from the first point of the other branch to the first point of the branch, mm.
     way_mm: f64,
 }
 
-/// Carries ways to first points from branch to branch, wherever that shortens one.
+/// Propagates path lengths to first points from branch to branch until none becomes shorter.
 fn spread(joints: &[Vec<Joint>], starts_mm: &mut [f64]) {
     loop {
         let mut changed = false;
@@ -82,7 +82,7 @@ fn spread(joints: &[Vec<Joint>], starts_mm: &mut [f64]) {
 }
 
 impl Branch {
-    /// Way along the branch from its first point to each, mm.
+    /// Path length along the branch from its first point to each of its points, mm.
     fn along_mm(&self) -> Vec<f64> {
         let steps = self.points.windows(2).map(|pair| pair[0].distance(pair[1]));
         let ways = std::iter::once(0.0).chain(steps).scan(0.0, |way, step| {
@@ -108,7 +108,7 @@ mod tests {
         }
     }
 
-    /// A stem of 50 mm, what leaves its end listed first, and a vessel with an ostium of its own.
+    /// A stem of 50 mm, a branch that leaves its end and is listed first, and a vessel with its own ostium.
     fn tree() -> Tree {
         let (end, far) = (DVec3::X * 50.0, DVec3::Y * 200.0);
         let stem = branch("stem", DVec3::ZERO, end);

@@ -1,23 +1,23 @@
-//! Photon noise of phantoms.
+//! Photon noise of phantom images.
 
 use crate::random::{STREAM_PHOTON, normal, uniform01};
 
-/// Fewest counts of a pixel, for the logarithm.
+/// Minimum count of a pixel, so that its logarithm exists.
 const LEAST_COUNTS: f64 = 0.5;
-/// Beyond so many expected photons a normal is indistinguishable from Poisson's distribution.
+/// Expected count above which a normal distribution replaces the Poisson distribution.
 const MANY: f64 = 200.0;
 
-/// How many photons make an image.
+/// Number of photons of an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Photons {
-    /// Per pixel of the open beam, before the patient.
+    /// Photons per pixel of the unattenuated beam, before the patient.
     Unattenuated(f64),
-    /// Per pixel at the detector, behind the patient: the mean over each image.
+    /// Photons per pixel at the detector, behind the patient, averaged over each image.
     Detector(f64),
 }
 
 impl Photons {
-    /// Photons per pixel of the open beam, for an image of line integrals.
+    /// Photons per pixel of the unattenuated beam, for an image of line integrals.
     pub fn unattenuated(self, image: &[f32]) -> f64 {
         match self {
             Photons::Unattenuated(photons) => photons,
@@ -29,7 +29,7 @@ impl Photons {
     }
 }
 
-/// Adds the noise of counted photons to line integrals. `stream` is the image's own.
+/// Adds photon counting noise to line integrals. Each image has its own `stream`.
 pub fn add_noise(image: &mut [f32], photons: Photons, seed: u32, stream: u32) {
     let photons = photons.unattenuated(image);
     for (pixel, value) in image.iter_mut().enumerate() {
@@ -43,7 +43,7 @@ pub fn add_noise(image: &mut [f32], photons: Photons, seed: u32, stream: u32) {
     }
 }
 
-/// Knuth's product method; `expected` is at most [`MANY`].
+/// Poisson-distributed number by Knuth's product method; `expected` is at most [`MANY`].
 fn poisson(expected: f64, seed: u32, stream: u32, pixel: u32) -> f64 {
     let mut log_product = 0.0;
     let mut count = 0u32;

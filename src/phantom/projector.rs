@@ -1,4 +1,4 @@
-//! Line integrals through voxel volumes on the device: what phantoms and `project` are made with.
+//! Line integrals through voxel volumes on the device, for phantoms and `project`.
 
 use crate::error::Result;
 use crate::formats::volume::Volume;
@@ -12,12 +12,13 @@ use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
 use glam::DVec3;
 
-/// Depth steps of a projection through `volume` seen over `half_depth` (world units): half a voxel each.
+/// Number of depth steps, of half a voxel each, for a projection through `volume` over `half_depth` (world units) on both
+/// sides.
 pub fn depth_steps(volume: &Volume, half_depth: f64) -> u32 {
     (2.0 * half_depth * MM_PER_UNIT / (0.5 * volume.spacing_mm())).ceil() as u32
 }
 
-/// A device projector for images of one size.
+/// Projector on the device, for images of one size.
 pub struct Projector {
     gpu: Gpu,
     project: Stage<push::Project>,
@@ -32,15 +33,15 @@ pub struct LoadedVolume {
 }
 
 impl Projector {
-    /// A projector for `width` x `height` images.
+    /// Makes a projector for `width` x `height` images.
     ///
     /// # Errors
-    /// Errors of the pipeline's creation.
+    /// Errors of creating the pipeline.
     pub fn new(gpu: &Gpu, width: usize, height: usize) -> Result<Projector> {
         Ok(Projector { gpu: gpu.clone(), project: Build::default().stage(gpu)?, width, height })
     }
 
-    /// Puts a volume on the device; its host values are dropped.
+    /// Loads a volume onto the device; its values on the host are freed.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`].
@@ -50,7 +51,7 @@ impl Projector {
         Ok(LoadedVolume { values, volume })
     }
 
-    /// Line integrals (attenuation per mm times mm) of `volume`, moved by `shift_mm` (LPS), for each view.
+    /// Line integrals (attenuation per mm times mm) of `volume`, displaced by `shift_mm` (LPS), for each view.
     ///
     /// # Errors
     /// Device errors.

@@ -1,4 +1,4 @@
-//! When the images of each view are taken, and what heart, breath and contrast do at that time.
+//! Times of the images of each view, with the state of heart, breath and contrast at each time.
 
 use crate::phantom::degradations::{Breathing, Chance, Degradations, Draw, Rhythm};
 use crate::phantom::voxels::Breath;
@@ -6,51 +6,51 @@ use crate::scan::dataset::Split;
 use crate::scan::gating::{BeatTime, two_segment_fraction};
 use glam::DVec3;
 
-/// Length of a beat where no heart rate is asked for, seconds: phases are its equal parts.
+/// Length of a beat without a stated heart rate, seconds; phases divide it equally.
 const USUAL_BEAT_S: f64 = 1.0;
-/// The heart's way while the patient breathes out, per mm along the body, LPS: up and back. Shechter et al., "Respiratory
-/// motion of the heart from free breathing coronary angiograms", IEEE Trans. Med. Imaging 23:1046 (2004): 4.9 mm down and
-/// 1.3 mm to the front while breathing in.
+/// Displacement of the heart during expiration, per mm along the body, LPS: up and back. Shechter et al., "Respiratory motion
+/// of the heart from free breathing coronary angiograms", IEEE Trans. Med. Imaging 23:1046 (2004): 4.9 mm down and 1.3 mm to
+/// the front during inspiration.
 const BREATH: DVec3 = DVec3::new(0.0, 1.3 / 4.9, 1.0);
-/// End of systole after the R-peak, seconds, between runs: the still point that Shechter and others find.
+/// End of systole after the R-peak, seconds, with its range between runs: the time of rest that Shechter and others find.
 const SYSTOLE_S: std::ops::Range<f64> = 0.28..0.34;
-/// Contrast comes and goes within so many seconds.
+/// Period of the variation of contrast within a run, seconds.
 const CONTRAST_WAVE_S: f64 = 3.0;
-/// Contrast within a run varies by this share of what it varies between runs.
+/// Variation of contrast within a run as a share of its variation between runs.
 const CONTRAST_WITHIN: f64 = 0.5;
-/// Vessels never lose more contrast than down to this share.
+/// Lower bound of the factor on the vessels' contrast.
 const LEAST_CONTRAST: f64 = 0.1;
 
-/// One image to be taken.
+/// An image to be taken.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Shot {
-    /// When it is said to have been taken.
+    /// Time in the beat that the dataset states.
     pub(super) stated: BeatTime,
-    /// Since the first image of the run.
+    /// Time since the first image of the run, seconds.
     pub(super) time_s: f64,
-    /// Of the beat, 0 to 1: what the heart does.
+    /// True fraction of the beat, 0 to 1.
     pub(super) fraction: f64,
     pub(super) breath: Breath,
     /// Factor on the vessels' contrast.
     pub(super) contrast_gain: f64,
-    /// Share of the way to the farthest end of the vessels that contrast has come; 1 and more where it is everywhere.
+    /// Share of the way to the farthest end of the vessels that contrast has reached; 1 where all vessels are filled.
     pub(super) filled_to: f64,
 }
 
 impl Shot {
-    /// A phase of a heart that keeps to the phases, in held breath.
+    /// Makes a shot exactly at a phase, in held breath.
     pub(super) fn at_phase(phase: u32, phases: u32) -> Shot {
         let fraction = f64::from(phase) / f64::from(phases);
         Shot::full(BeatTime::at_phase(phase), USUAL_BEAT_S * fraction, fraction)
     }
 
-    /// Of full vessels in held breath.
+    /// Makes a shot with full vessels in held breath.
     fn full(stated: BeatTime, time_s: f64, fraction: f64) -> Shot {
         Shot { stated, time_s, fraction, breath: Breath::default(), contrast_gain: 1.0, filled_to: 1.0 }
     }
 }
 
-/// The images of a view by phase; `None` where its run has no image near enough.
+/// Images of a view by phase; `None` where its run has no image near enough to the phase.
 pub(super) fn shots(options: &Degradations, seed: u32, view: usize, split: Split, phases: u32) -> Vec<Option<Shot>> {
     let regular = (0..phases).map(|phase| Some(Shot::at_phase(phase, phases))).collect();
     if split == Split::Validation {
@@ -73,7 +73,7 @@ pub(super) fn shots(options: &Degradations, seed: u32, view: usize, split: Split
     shots
 }
 
-/// Of all images of a run, the one nearest to each phase: no farther than half a phase.
+/// Selects for each phase the nearest image of a run, at most half a phase away.
 fn gated(rhythm: &Rhythm, chance: Chance, phases: u32) -> Vec<Option<Shot>> {
     let rates = &rhythm.beats_per_min;
     let beat_s = 60.0 / rates[chance.view as usize % rates.len()];
@@ -95,7 +95,7 @@ fn gated(rhythm: &Rhythm, chance: Chance, phases: u32) -> Vec<Option<Shot>> {
 }
 
 impl Breathing {
-    /// Where the breath is at a time of a run; each run begins anywhere in it.
+    /// Displacement by breathing at a time of a run; each run begins at a random point of the breath.
     fn at(self, time_s: f64, chance: Chance) -> Breath {
         let course = chance.uniform(Draw::Breath) + time_s / self.period_s;
         let heart_mm = BREATH * (0.5 * self.peak_to_peak_mm * (std::f64::consts::TAU * course).sin());
@@ -103,7 +103,7 @@ impl Breathing {
     }
 }
 
-/// Contrast of a run, and its slow wave.
+/// Factor on the contrast of a run, with its slow variation over time.
 fn contrast_gain(variation: f64, time_s: f64, chance: Chance) -> f64 {
     let course = chance.uniform(Draw::ContrastCourse) + time_s / CONTRAST_WAVE_S;
     let wave = std::f64::consts::SQRT_2 * (std::f64::consts::TAU * course).sin();
@@ -122,7 +122,7 @@ mod tests {
         Rhythm { beats_per_min: vec![rate], frames_per_s, beats, gating }
     }
 
-    /// How far the true phase of images lies from the one they are given, phases; and how many phases have an image.
+    /// Largest distance between the true phase of an image and its assigned phase, and the number of phases with an image.
     fn phase_errors(rhythm: &Rhythm) -> (f64, usize) {
         let (mut worst, mut seen) = (0f64, 0);
         for view in 0..20 {
@@ -140,7 +140,7 @@ mod tests {
     #[test]
     fn gating_finds_the_phases() {
         use BeatScaling::{Linear, TwoSegment};
-        // Half a phase of sampling, and what 30 ms of systole are: 30 / 310 of 3.5 phases.
+        // Half a phase of sampling, plus the effect of 30 ms of systole: 30 / 310 of 3.5 phases.
         for rate in [50.0, 68.0, 100.0] {
             let (worst, seen) = phase_errors(&rhythm(rate, 30.0, 1, TwoSegment));
             assert!(worst < 0.9, "{rate} per minute: {worst} phases");

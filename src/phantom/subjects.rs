@@ -1,4 +1,4 @@
-//! What stands before the C-arm: a procedural thorax, a tree in a CT, or a user's volumes.
+//! Subjects of the images: a procedural thorax, a tree in a CT, or a user's volumes.
 
 use crate::error::{Error, Result};
 use crate::formats::nrrd;
@@ -14,31 +14,32 @@ use glam::DVec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// What the values of volumes are.
+/// Quantity of the volumes' values.
 const QUANTITY: &str = "attenuation per mm";
-/// Voxels of vessels from a file, mm.
+/// Voxel spacing of vessels from a file, mm.
 const VESSEL_VOXEL_MM: f64 = 0.5;
 
-/// What the subject does while an image is taken.
+/// State of the subject while an image is taken.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Pose {
-    /// Of the beat, 0 to 1.
+    /// Fraction of the beat, 0 to 1.
     pub(super) fraction: f64,
     pub(super) breath: Breath,
     pub(super) catheter: bool,
-    /// As in [`crate::phantom::runs::Shot`].
+    /// Share of the vessels that is filled, see [`crate::phantom::runs::Shot`].
     pub(super) filled_to: f64,
 }
 
 impl Pose {
-    /// Where a catheter's tip lay when it took its course, in the resting tree, and where it is now.
+    /// Positions of the catheter's tip: the ostium of the tree at rest, which fixes the catheter's course, and the ostium at
+    /// this pose.
     fn catheter_between(&self, rest: &Tree, now: &Tree) -> Option<[DVec3; 2]> {
         let tips = self.catheter.then(|| Some([rest.ostium_mm()?, now.ostium_mm()? + self.breath.heart_mm]));
         tips.flatten()
     }
 }
 
-/// A volume that breathing has carried away from where it was loaded.
+/// A volume on the device with its displacement by breathing.
 #[derive(Clone)]
 pub(super) struct Placed {
     pub(super) volume: Arc<LoadedVolume>,
@@ -51,32 +52,32 @@ impl Placed {
     }
 }
 
-/// What moves, at a pose.
+/// Moving parts of a subject at a pose.
 pub(super) struct Moving {
     pub(super) background: Option<Placed>,
     pub(super) vessels: Option<Placed>,
     pub(super) catheter: Option<Placed>,
 }
 
-/// Something to take angiograms of.
+/// Subject of angiograms.
 pub(super) trait Subject {
-    /// What does not beat, with the chest where breathing has carried it.
+    /// Static background, with the chest displaced by breathing.
     fn still(&self, projector: &Projector, chest_mm: DVec3) -> Result<Option<LoadedVolume>>;
 
-    /// What beats.
+    /// Beating parts at a pose.
     fn moving(&self, projector: &Projector, pose: &Pose) -> Result<Moving>;
 
-    /// The fraction of the beat nearest to another that can be shown.
+    /// Nearest fraction of the beat that the subject can show.
     fn nearest_fraction(&self, fraction: f64) -> f64 {
         fraction
     }
 
-    /// Its vessels at a fraction of the beat, where they are known as a tree.
+    /// Vessels at a fraction of the beat, where they are known as a tree.
     fn vessel_tree(&self, _fraction: f64) -> Option<Tree> {
         None
     }
 
-    /// Writes the voxels of a phase into a directory.
+    /// Writes the volumes of a phase into a directory.
     fn write_volumes(&self, _directory: &Path, _phase: u32, _fraction: f64) -> Result<()> {
         Ok(())
     }
@@ -94,7 +95,7 @@ pub(super) struct Thorax {
 }
 
 impl Thorax {
-    /// A thorax in a cube, its tree's middle at the isocentre, as on a real table.
+    /// Makes a thorax in a cube, with the middle of its tree at the isocentre, as on a real table.
     pub(super) fn new(
         tissues: Tissues,
         scale: f64,
@@ -166,7 +167,7 @@ fn write_vessels(directory: &Path, phase: u32, vessels: &Volume) -> Result<()> {
     nrrd::write(&truth_file(directory, phase), vessels, QUANTITY)
 }
 
-/// A tree from a file, in a CT where there is one.
+/// A tree from a file, with a CT as its background if there is one.
 pub(super) struct Patient {
     tree: TreeFile,
     bounds: Bounds,
@@ -186,7 +187,7 @@ impl Patient {
         Ok(Patient { tree, bounds, vessel_per_mm, still })
     }
 
-    /// Largest distance from the isocentre that attenuates, where there is a CT.
+    /// Largest axial distance of the CT's corners from the isocentre, mm; none without a CT.
     pub(super) fn axial_radius_mm(&self) -> Option<f64> {
         self.still.as_ref().map(Volume::axial_radius_mm)
     }
@@ -225,13 +226,13 @@ impl Subject for Patient {
     }
 }
 
-/// How the volumes of a user are read.
+/// Options for reading a user's volumes.
 pub(super) struct Reading<'a> {
     pub(super) paths: &'a [PathBuf],
     pub(super) hints: &'a VolumeHints,
     pub(super) hounsfield: bool,
     pub(super) scale: f32,
-    /// Attenuation from which a voxel is vessel.
+    /// Attenuation threshold above which a voxel belongs to a vessel, 1/mm.
     pub(super) vessel_per_mm: Option<f64>,
 }
 
@@ -245,7 +246,7 @@ impl Reading<'_> {
         Ok(volume)
     }
 
-    /// What never changes over the volumes: each voxel's smallest attenuation.
+    /// Static part of the volumes: the minimum attenuation of each voxel; none for a single volume.
     fn minimum(&self) -> Result<Option<Volume>> {
         let mut paths = self.paths.iter();
         let (Some(first), 2..) = (paths.next(), self.paths.len()) else {
@@ -265,16 +266,16 @@ impl Reading<'_> {
     }
 }
 
-/// A user's volumes, one per phase.
+/// A user's own volumes, one per phase.
 pub(super) struct Volumes {
-    /// What all volumes have in common, where it is told apart from what beats.
+    /// Common part of all volumes, where it is separated from the beating part.
     still: Option<Volume>,
     moving: Vec<(Arc<LoadedVolume>, Option<Arc<LoadedVolume>>)>,
     radius_mm: f64,
 }
 
 impl Volumes {
-    /// Reads all volumes. `breathing` tells what beats from what stands still.
+    /// Reads all volumes. If `breathing`, the static part is separated from the beating part.
     pub(super) fn read(
         projector: &Projector,
         reading: &Reading<'_>,

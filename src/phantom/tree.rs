@@ -1,4 +1,4 @@
-//! A coronary tree that moves: procedural, or [read from a file](super::tree_file).
+//! Moving coronary tree: procedural, or [read from a file](super::tree_file).
 //!
 //! Positions are patient mm (LPS), isocentre at the origin. Lumen diameters follow Dodge et al., "Lumen
 //! diameter of normal human coronary arteries", Circulation 86:232-246 (1992): left main 4.5 mm, proximal
@@ -9,7 +9,7 @@ use crate::random::{STREAM_SHAPE, uniform01};
 use crate::scan::gating::contraction;
 use glam::DVec3;
 
-/// One vessel: a polyline.
+/// A vessel as a polyline.
 #[derive(Debug, Clone)]
 pub struct Branch {
     /// Anatomical name.
@@ -22,17 +22,17 @@ pub struct Branch {
     pub filling: Vec<f64>,
 }
 
-/// A tree at one moment of the beat.
+/// A tree at one time of the beat.
 #[derive(Debug, Clone)]
 pub struct Tree {
     /// All vessels.
     pub branches: Vec<Branch>,
 }
 
-/// Direction of the heart's swing in systole: to the front, right and up; LPS.
+/// Direction of the heart's displacement in systole: to the front, right and up; LPS.
 const SWING: DVec3 = DVec3::new(-0.35, -0.85, 0.4);
 
-/// A beating heart as an ellipsoid of revolution: where a point of its surface is at a contraction.
+/// A beating heart as an ellipsoid of revolution; it gives the position of surface points at a contraction.
 #[derive(Debug, Clone)]
 pub struct Heart {
     centre: DVec3,
@@ -46,20 +46,20 @@ pub struct Heart {
 }
 
 impl Heart {
-    /// A left ventricle with its epicardium around `centre`, scaled by `scale`.
+    /// Makes a left ventricle with its epicardium around `centre`, scaled by `scale`.
     pub fn new(centre: DVec3, scale: f64) -> Heart {
-        // Apex to the left, front and down; LPS.
+        // The apex points to the left, front and down; LPS.
         let axis = DVec3::new(0.62, -0.58, -0.53).normalize();
         let front = (DVec3::new(-0.25, -1.0, 0.15) - axis * axis.dot(DVec3::new(-0.25, -1.0, 0.15))).normalize();
         Heart { centre, axis, front, side: front.cross(axis), long_mm: 52.0 * scale, short_mm: 33.0 * scale }
     }
 
-    /// Point of the wall. `along`: 0 at the base, 1 at the apex; `around`: radians from the anterior groove
-    /// to the lateral wall; `depth`: 1 on the epicardium, less inside; `squeeze`: see [`contraction`].
+    /// Point of the wall. `along`: 0 at the base, 1 at the apex; `around`: radians from the anterior groove to the lateral
+    /// wall; `depth`: 1 on the epicardium, smaller inside; `squeeze`: see [`contraction`].
     pub fn point(&self, along: f64, around: f64, depth: f64, squeeze: f64) -> DVec3 {
         let polar = along * std::f64::consts::FRAC_PI_2 * 0.96;
         let twist = squeeze * (12f64.to_radians() * along - 4f64.to_radians() * (1.0 - along));
-        // The base descends, the wall moves inwards, and the heart swings forward as a whole.
+        // The base descends, the wall moves inwards, and the whole heart moves forward.
         let radial = 1.0 - squeeze * (0.17 - 0.05 * along);
         let descent = squeeze * 0.20 * (1.0 - along) * self.long_mm;
         let swing = squeeze * self.swing_mm();
@@ -71,12 +71,12 @@ impl Heart {
             + SWING * swing
     }
 
-    /// How far the whole heart moves at full contraction, mm.
+    /// Displacement of the whole heart at full contraction, mm.
     fn swing_mm(&self) -> f64 {
         0.15 * self.short_mm
     }
 
-    /// Whether a point lies in the wall or chamber at a contraction.
+    /// Tells whether a point lies in the wall or chamber at a contraction.
     pub fn contains(&self, point: DVec3, squeeze: f64) -> bool {
         let p = point - self.centre - SWING * (squeeze * self.swing_mm());
         let along = p.dot(self.axis) / self.long_mm + 0.45;
@@ -163,8 +163,8 @@ const COURSES: &[Course] = &[
 ];
 
 impl Tree {
-    /// A left coronary tree on a beating heart, at a fraction of the beat. `scale` shrinks anatomy; `seed` varies its
-    /// course by a few degrees and the contrast along it.
+    /// Makes a left coronary tree on a beating heart, at a fraction of the beat. `scale` scales the anatomy; `seed` varies the
+    /// courses of vessels by a few degrees and the contrast along them.
     pub fn procedural(heart: &Heart, scale: f64, fraction: f64, seed: u32) -> Tree {
         let squeeze = contraction(fraction);
         let branches = COURSES
@@ -174,7 +174,7 @@ impl Tree {
                 let b = index as u32;
                 let random = |k: u32| 2.0 * uniform01(seed, STREAM_SHAPE, b, k) - 1.0;
                 let steps = 30 * (course.controls.len() - 1);
-                // Waves vanish at the start, so that branches stay attached.
+                // The variation vanishes at the start of a branch, so that branches stay attached.
                 let (wave, phase) = (2.0 + 1.2 * random(0), std::f64::consts::PI * random(1));
                 let amplitude = (2.0 + random(2)).to_radians();
                 let at = |i: usize| {
@@ -193,7 +193,7 @@ impl Tree {
                     name: course.name.to_owned(),
                     points: (0..=steps).map(point).collect(),
                     radius_mm: (0..=steps).map(|i| 0.5 * scale * (d0 + (d1 - d0) * share(i))).collect(),
-                    // Contrast thins towards the periphery and comes in slow waves.
+                    // Contrast decreases towards the periphery, with a slow variation along the vessel.
                     filling: (0..=steps)
                         .map(|i| 0.92 - 0.14 * share(i) + 0.08 * (5.0 * share(i) + 2.0 * random(3)).sin())
                         .collect(),
@@ -203,20 +203,20 @@ impl Tree {
         Tree { branches }
     }
 
-    /// The box of the tree, radii included.
+    /// Bounding box of the tree, including radii.
     pub fn bounds(&self) -> Bounds {
         let points = self.branches.iter().flat_map(|b| b.points.iter().zip(&b.radius_mm));
         let boxes = points.map(|(p, r)| Bounds { low_mm: *p - *r, high_mm: *p + *r });
         boxes.fold(Bounds::EMPTY, Bounds::joined)
     }
 
-    /// Where the first branch begins, LPS mm.
+    /// First point of the first branch, LPS mm.
     pub fn ostium_mm(&self) -> Option<DVec3> {
         self.branches.first()?.points.first().copied()
     }
 }
 
-/// A box along patient axes, LPS mm.
+/// Box along the patient's axes, LPS mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
     /// Lower corner.
@@ -228,19 +228,19 @@ pub struct Bounds {
 impl Bounds {
     const EMPTY: Bounds = Bounds { low_mm: DVec3::INFINITY, high_mm: DVec3::NEG_INFINITY };
 
-    /// The box around both.
+    /// Smallest box that contains both.
     pub fn joined(self, other: Bounds) -> Bounds {
         Bounds { low_mm: self.low_mm.min(other.low_mm), high_mm: self.high_mm.max(other.high_mm) }
     }
 
-    /// The box of a tree over the phases of its beat; `at` draws it at a fraction.
+    /// Bounding box of a tree over all phases of its beat; `at` returns the tree at a fraction.
     pub fn over_the_beat(n_phases: u32, at: impl Fn(f64) -> Tree) -> Bounds {
         let boxes = (0..n_phases).map(|p| at(f64::from(p) / f64::from(n_phases)).bounds());
         boxes.fold(Bounds::EMPTY, Bounds::joined)
     }
 }
 
-/// Catmull-Rom through the control points, `s` in [0, 1].
+/// Catmull-Rom spline through the control points, at `s` in [0, 1].
 pub(super) fn spline(controls: &[[f64; 3]], s: f64) -> [f64; 3] {
     let last = controls.len() - 1;
     let x = s * last as f64;

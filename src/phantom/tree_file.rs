@@ -1,4 +1,4 @@
-//! Trees as files: what `phantom --tree` reads, and the truth that phantoms leave.
+//! Tree files: the input of `phantom --tree`, and the true vessels that phantoms write.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -8,12 +8,12 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// File of the true vessels as a tree, among the volumes of a dataset.
+/// File of the true vessels as a tree, in the directory of a dataset's volumes.
 pub const TREE: &str = "tree.json";
-/// Names of radii at points, as VMTK and 3D Slicer write them, and as others do.
+/// Names of arrays of radii at points: the name VMTK and 3D Slicer use, and other common names.
 const RADII: [&str; 3] = ["MaximumInscribedSphereRadius", "Radius", "radius"];
 
-/// A tree and its beat, as read from a file.
+/// A tree over its beat, as stored in a file.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct TreeFile {
     branches: Vec<TreeBranch>,
@@ -29,8 +29,8 @@ struct TreeBranch {
 }
 
 impl TreeFile {
-    /// Reads a tree (see `docs/formats.md`): JSON in RAS mm; lines of a `.vtp` in LPS mm, which are at rest; or the files that a
-    /// `.pvd` names, which are the phases of a beat.
+    /// Reads a tree (see `docs/formats.md`): JSON in RAS mm; lines of a `.vtp` in LPS mm, which do not move; or the files that
+    /// a `.pvd` names, which are the phases of a beat.
     ///
     /// # Errors
     /// [`Error::Data`] naming file and field, [`Error::Io`].
@@ -50,7 +50,8 @@ impl TreeFile {
         Ok(file)
     }
 
-    /// Lines of files that are the phases of a beat; all must have the same lines. A point has its radius of the first.
+    /// Makes a tree from files that are the phases of a beat and must contain the same lines. Radii are those of the first
+    /// file.
     fn of_lines(phases: &[(PathBuf, ReadLines)]) -> Result<TreeFile> {
         let Some((first_file, rest)) = phases.first() else {
             return Ok(TreeFile { branches: Vec::new(), radius_mm: Vec::new(), points_mm: Vec::new() });
@@ -88,7 +89,7 @@ impl TreeFile {
         })
     }
 
-    /// The tree that has these shapes at equal fractions of its beat; none without any. All must have the same branches.
+    /// Makes a tree from its shapes at equal fractions of the beat, which must have the same branches; none without shapes.
     pub fn of(shapes: &[Tree]) -> Option<TreeFile> {
         let rest = shapes.first()?;
         let firsts = rest.branches.iter().scan(0, |end, branch| {
@@ -110,7 +111,7 @@ impl TreeFile {
         })
     }
 
-    /// Writes the tree, as [`TreeFile::read`] reads it.
+    /// Writes the tree in the JSON format that [`TreeFile::read`] reads.
     ///
     /// # Errors
     /// [`Error::Io`].
@@ -119,7 +120,7 @@ impl TreeFile {
         files::write_atomic(path, json.as_bytes())
     }
 
-    /// The tree at a fraction (0 to 1) of its beat, between the stored phases on straight lines; the beat closes.
+    /// Tree at a fraction (0 to 1) of its beat, by linear interpolation between the stored phases; the beat is cyclic.
     pub fn at(&self, fraction: f64) -> Tree {
         let stored = self.points_mm.len();
         let x = fraction * stored as f64;

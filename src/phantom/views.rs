@@ -1,4 +1,4 @@
-//! From where synthetic data are seen: angles, distances and detectors.
+//! Views of synthetic data: angles, distances and detectors.
 
 use crate::error::{Error, Result};
 use crate::geometry::CArm;
@@ -7,9 +7,9 @@ use crate::scan::dataset::Split;
 /// A pair of C-arm angles.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Angles {
-    /// LAO positive, degrees.
+    /// Primary angle in degrees, LAO positive.
     pub primary_deg: f64,
-    /// Cranial positive, degrees.
+    /// Secondary angle in degrees, cranial positive.
     pub secondary_deg: f64,
 }
 
@@ -17,11 +17,12 @@ const fn angles(primary_deg: f64, secondary_deg: f64) -> Angles {
     Angles { primary_deg, secondary_deg }
 }
 
-/// The validation views of the paper (method, section 1).
+/// Validation views of the paper (method, section 1).
 pub const VALIDATION_ANGLES: [Angles; 4] =
     [angles(-5.0, 40.0), angles(-5.0, -40.0), angles(90.0, 0.0), angles(-30.0, 0.0)];
 
-/// A view this near to another, as the sum of both angles' differences, would give it away.
+/// Distance below which a training view is too similar to a validation view: the sum of the differences of both angles,
+/// degrees.
 const TOO_NEAR_DEG: f64 = 15.0;
 
 impl Angles {
@@ -40,17 +41,17 @@ impl Angles {
     }
 }
 
-/// The views of a dataset.
+/// Views of a dataset.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewAngles {
-    /// Views to train on.
+    /// Training views.
     pub training: Vec<Angles>,
-    /// Views to score with.
+    /// Validation views.
     pub validation: Vec<Angles>,
 }
 
 impl ViewAngles {
-    /// The paper's 3, 4 or 9 training views and its validation views.
+    /// Returns the paper's 3, 4 or 9 training views and its validation views.
     ///
     /// # Errors
     /// [`Error::Config`] for another number.
@@ -75,7 +76,8 @@ impl ViewAngles {
         Ok(ViewAngles { training, validation: VALIDATION_ANGLES.to_vec() })
     }
 
-    /// A user's own training views; without validation views of their own those of the paper, except near training views.
+    /// Makes views from a user's training views. Without validation views, the paper's are used, except those near a training
+    /// view.
     ///
     /// # Errors
     /// [`Error::Config`] without training views and for impossible angles.
@@ -90,37 +92,36 @@ impl ViewAngles {
         Ok(views)
     }
 
-    /// Every view and what it is for, those of training first.
+    /// All views with their purpose; training views come first.
     pub fn all(&self) -> impl Iterator<Item = (Angles, Split)> {
         let training = self.training.iter().map(|a| (*a, Split::Train));
         training.chain(self.validation.iter().map(|a| (*a, Split::Validation)))
     }
 }
 
-/// How wide a detector's pixels are.
+/// Width of a detector's pixels.
 #[derive(Debug, Clone, PartialEq)]
 pub enum PixelPitch {
-    /// As wide as makes the image show so much at the isocentre, mm.
+    /// Width that gives this field of view at the isocentre, mm.
     FieldOfView(f64),
-    /// Along columns and rows of the detector, mm.
+    /// Pixel pitch along columns and rows of the detector, mm.
     Detector([f64; 2]),
 }
 
-/// C-arms given by what a user knows of them. Lists hold one value for all views, or one for each: those of training
-/// first, then those of validation.
+/// Options of C-arms. Each list holds one value for all views, or one for each: training views first, then validation views.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CArmOptions {
     /// Source to isocentre, mm.
     pub sod_mm: Vec<f64>,
     /// Source to detector, mm.
     pub sid_mm: Vec<f64>,
-    /// Pixels of the detector.
+    /// Pixel pitch of the detector.
     pub pixel: PixelPitch,
     /// Offset of the detector's centre along columns and rows, mm.
     pub offset_mm: Vec<[f64; 2]>,
 }
 
-/// The value of a view in a list of one for all or one for each.
+/// Value for a view in a list of one value for all views or one for each.
 fn of_view<T: Copy>(field: &str, list: &[T], view: usize, views: usize) -> Result<T> {
     match list {
         [one] => Ok(*one),
@@ -134,10 +135,10 @@ fn of_view<T: Copy>(field: &str, list: &[T], view: usize, views: usize) -> Resul
 }
 
 impl CArmOptions {
-    /// The C-arm of each view, for images of `size` columns and rows.
+    /// Returns the C-arm of each view, for images of `size` columns and rows.
     ///
     /// # Errors
-    /// [`Error::Config`] for lengths that are none and lists of another length.
+    /// [`Error::Config`] for values that are not lengths, and for lists of a wrong length.
     pub fn c_arms(&self, views: &ViewAngles, size: usize) -> Result<Vec<CArm>> {
         let all: Vec<Angles> = views.all().map(|(angles, _)| angles).collect();
         all.iter().enumerate().map(|(view, angles)| self.c_arm(*angles, view, all.len(), size)).collect()

@@ -25,10 +25,10 @@ impl Tissues {
     pub const MAGIX: Tissues = Tissues { soft: 3.8e-5, lung: 1.5e-5, bone: 5.5e-5, vessel: 5e-4 };
 }
 
-/// Side of a background voxel as a share of the volume's side.
+/// Number of background voxels along each side of the volume.
 const BACKGROUND_VOXELS: usize = 128;
 
-/// Fills a cube of half side `half_mm` around `centre` (LPS mm) from a function of position.
+/// Makes a cube of half side `half_mm` around `centre` (LPS mm) from a function of position.
 fn fill(centre: DVec3, half_mm: f64, value: impl Fn(DVec3) -> f64 + Sync) -> Volume {
     let n = BACKGROUND_VOXELS;
     let spacing = 2.0 * half_mm / n as f64;
@@ -54,11 +54,11 @@ fn ellipsoid(p: DVec3, centre: DVec3, radii: DVec3) -> f64 {
     (q.length() - 1.0) * radii.min_element()
 }
 
-/// The still part of a thorax: body, lungs, ribs, spine. `scale` shrinks anatomy around the heart at `heart_mm`.
+/// Static part of a thorax: body, lungs, ribs, spine. `scale` scales the anatomy around the heart at `heart_mm`.
 pub fn thorax(tissues: Tissues, heart_mm: DVec3, scale: f64, centre_mm: DVec3, half_mm: f64) -> Volume {
     let edge = 3.0 * scale;
     fill(centre_mm, half_mm, |lps| {
-        // Anatomical mm; the heart sits left of and before the spine.
+        // Anatomical coordinates, mm; the heart lies to the left of the spine and in front of it.
         let p = (lps - heart_mm) / scale + DVec3::new(25.0, -25.0, 0.0);
         let torso = (p.truncate() / glam::DVec2::new(165.0, 115.0)).length();
         let body = soft_edge((torso - 1.0) * 115.0, edge);
@@ -72,7 +72,7 @@ pub fn thorax(tissues: Tissues, heart_mm: DVec3, scale: f64, centre_mm: DVec3, h
             ((p - DVec3::new(0.0, 72.0, p.z)).length() - 17.0).max(4.0 - (p.z.rem_euclid(28.0) - 14.0).abs() - 10.0),
             edge,
         );
-        // Ribs slope down from spine to sternum on an elliptic cage.
+        // Ribs slope down from the spine to the sternum on an elliptic cage.
         let cage = ((p.truncate() / glam::DVec2::new(138.0, 98.0)).length() - 1.0).abs() * 98.0;
         let level = (p.z + 0.32 * (90.0 - p.y)).rem_euclid(26.0) - 13.0;
         let rib = soft_edge((cage / 3.5).hypot(level / 5.5) * 4.0 - 4.0, edge);
@@ -82,16 +82,16 @@ pub fn thorax(tissues: Tissues, heart_mm: DVec3, scale: f64, centre_mm: DVec3, h
     })
 }
 
-/// Where breathing has carried parts of the chest, LPS mm.
+/// Displacement of parts of the chest by breathing, LPS mm.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Breath {
-    /// The heart, its vessels included.
+    /// Displacement of the heart, including its vessels.
     pub heart_mm: DVec3,
-    /// The diaphragm and what lies on it.
+    /// Displacement of the diaphragm and the organs in contact with it.
     pub chest_mm: DVec3,
 }
 
-/// What moves against [`thorax`]: heart and diaphragm displace lung. `squeeze` is the heart's contraction.
+/// Moving parts relative to [`thorax`]: heart and diaphragm displace lung. `squeeze` is the heart's contraction.
 pub fn heart_and_diaphragm(
     tissues: Tissues,
     heart: &Heart,
@@ -119,9 +119,9 @@ pub fn heart_and_diaphragm(
     volume
 }
 
-/// Height over which the movement of breathing fades, from the diaphragm (below) to the upper chest, mm above the isocentre.
+/// Range of height over which the breathing motion fades, from the diaphragm to the upper chest, mm above the isocentre.
 const BREATHING_HEIGHT_MM: std::ops::Range<f64> = -40.0..40.0;
-/// Depth over which it fades, from the heart to the spine and the back, mm behind the isocentre.
+/// Range of depth over which the breathing motion fades, from the heart to the spine and the back, mm behind the isocentre.
 const BREATHING_DEPTH_MM: std::ops::Range<f64> = 20.0..60.0;
 
 /// Smooth step from 1 below a range to 0 above it.
@@ -130,8 +130,8 @@ fn fading(x: f64, range: &std::ops::Range<f64>) -> f64 {
     1.0 - t * t * (3.0 - 2.0 * t)
 }
 
-/// A chest around the isocentre whose lower part breathing has carried by `chest_mm` (LPS): all of it from 40 mm below the
-/// isocentre, nothing from 40 mm above, and nothing of what lies 60 mm behind, smoothly in between.
+/// Displaces the lower part of a chest around the isocentre by `chest_mm` (LPS), as breathing does: fully below 40 mm under the
+/// isocentre, not at all above 40 mm over it or beyond 60 mm behind it, smoothly in between.
 pub fn breathing_chest(chest: &Volume, chest_mm: DVec3) -> Volume {
     if chest_mm == DVec3::ZERO {
         return chest.clone();
@@ -152,14 +152,14 @@ pub fn breathing_chest(chest: &Volume, chest_mm: DVec3) -> Volume {
     volume
 }
 
-/// Hounsfield units to attenuation per mm: mu = 0.02 max(0, 1 + HU / 1000), usual at 60 to 70 keV.
+/// Converts Hounsfield units to attenuation per mm: mu = 0.02 max(0, 1 + HU / 1000), a usual value at 60 to 70 keV.
 pub fn attenuation_from_hounsfield(volume: &mut Volume) {
     for v in &mut volume.values {
         *v = 0.02 * (1.0 + *v / 1000.0).max(0.0);
     }
 }
 
-/// Draws a tree into voxels of a box: attenuation times filling inside, antialiased at the wall.
+/// Draws a tree into the voxels of a box: attenuation times filling inside, antialiased at the wall.
 pub fn vessels(tree: &Tree, bounds: Bounds, attenuation: f64, spacing_mm: f64) -> Volume {
     let (low, high) = (bounds.low_mm - 2.0 * spacing_mm, bounds.high_mm + 2.0 * spacing_mm);
     let size = ((high - low) / spacing_mm).ceil().as_usizevec3().to_array().map(|n| n + 1);
@@ -184,7 +184,7 @@ pub fn vessels(tree: &Tree, bounds: Bounds, attenuation: f64, spacing_mm: f64) -
     }
 }
 
-/// A tapering capsule between two points in voxel units; overlapping capsules join (largest value wins).
+/// Draws a tapering capsule between two points in voxel units; where capsules overlap, the largest value is kept.
 fn draw_segment(
     values: &mut [f32],
     size: [usize; 3],
@@ -222,7 +222,7 @@ mod tests {
     fn breathing_carries_the_lower_chest_and_leaves_the_rest() {
         let n = 40;
         let flat = Volume::centred([n; 3], 5.0, DVec3::ZERO, vec![0.0; n * n * n]);
-        // Values tell where they come from: the height.
+        // The value of each voxel is its height.
         let height = |i: usize| flat.index_to_lps.transform_point3(DVec3::new(0.0, 0.0, (i / (n * n)) as f64)).z;
         let chest = Volume { values: (0..n * n * n).map(|i| height(i) as f32).collect(), ..flat.clone() };
         let breathed = breathing_chest(&chest, DVec3::new(0.0, 0.0, 3.0));

@@ -1,20 +1,21 @@
-//! Images of different sizes side by side: each stands in the upper left corner of a canvas that holds them all. Rays begin at
-//! pixel (0, 0), so they are the same on the canvas, and what is beyond an image is hidden as what is behind a blade.
+//! Canvas for images of different sizes: each image is placed in the upper left corner of a canvas that holds all of them.
+//! Rays begin at pixel (0, 0), so they are the same on the canvas. Pixels beyond an image are hidden, like those behind a
+//! blade.
 
 use crate::raster::Image;
 use crate::scan::dataset::{Dataset, Frame, View};
 use crate::scan::frame_checks::Complaint;
 use std::borrow::Cow;
 
-/// Pixels of all images on a canvas, at most, where it is larger than some of them.
+/// Largest accepted number of pixels of all images together once they are extended to a larger canvas.
 const MOST_PIXELS: usize = 1 << 30;
 
-/// The upper left corner, of `size` (columns, rows), of what has `width` columns.
+/// Returns the upper left corner of `size` (columns, rows) of an array with `width` columns.
 pub fn corner<T: Copy>(values: &[T], width: usize, [columns, rows]: [usize; 2]) -> Vec<T> {
     values.chunks(width).take(rows).flat_map(|row| &row[..columns]).copied().collect()
 }
 
-/// Values of `size` (columns, rows) in the upper left corner of a canvas, and `margin` elsewhere.
+/// Places an array of `size` (columns, rows) in the upper left corner of a canvas, with `margin` elsewhere.
 pub fn framed<T: Copy>(values: &[T], [columns, rows]: [usize; 2], [width, height]: [usize; 2], margin: T) -> Vec<T> {
     let mut canvas = vec![margin; width * height];
     for (to, from) in canvas.chunks_mut(width).zip(values.chunks(columns)).take(rows) {
@@ -23,7 +24,7 @@ pub fn framed<T: Copy>(values: &[T], [columns, rows]: [usize; 2], [width, height
     canvas
 }
 
-/// An image in the upper left corner of a canvas (columns, rows) on which its right and lower edges go on.
+/// Extends an image to a canvas (columns, rows) by repeating its right and lower edges.
 pub fn continued(image: Image, [width, height]: [usize; 2]) -> Image {
     if (image.width, image.height) == (width, height) {
         return image;
@@ -32,7 +33,8 @@ pub fn continued(image: Image, [width, height]: [usize; 2]) -> Image {
     Image { width, height, values: (0..width * height).map(|p| image.values[nearest(p)]).collect() }
 }
 
-/// Brings frames that have the sizes of their views onto a canvas that holds them all: its columns and rows. None without frames.
+/// Extends frames from the sizes of their views to a canvas that holds all of them. Returns the canvas (columns, rows), or none
+/// without frames.
 pub(crate) fn onto_canvas(views: &[View], frames: &mut [Frame]) -> Result<Option<[usize; 2]>, Complaint> {
     let sizes = || frames.iter().map(|frame| views[frame.view].size);
     let Some(canvas) = sizes().reduce(|a, b| [a[0].max(b[0]), a[1].max(b[1])]) else { return Ok(None) };
@@ -60,13 +62,13 @@ impl Dataset {
         [self.width, self.height]
     }
 
-    /// What a view's image has of values on the canvas.
+    /// Returns the part of canvas values that lies within a view's image.
     pub fn own<'a, T: Copy>(&self, view: usize, values: &'a [T]) -> Cow<'a, [T]> {
         let size = self.views[view].size;
         if size == self.canvas() { Cow::Borrowed(values) } else { Cow::Owned(corner(values, self.width, size)) }
     }
 
-    /// A frame as large as the images of its view, as it was taken.
+    /// Returns a frame cropped to the size of its view's images, as it was taken.
     pub fn own_frame<'a>(&self, frame: &'a Frame) -> Cow<'a, Frame> {
         if self.views[frame.view].size == self.canvas() {
             return Cow::Borrowed(frame);
@@ -91,7 +93,7 @@ impl Dataset {
     }
 }
 
-/// Sizes (columns, rows) as a person writes them.
+/// Formats sizes (columns, rows) for messages.
 pub fn in_words(sizes: &[[usize; 2]]) -> String {
     sizes.iter().map(|[columns, rows]| format!("{columns} x {rows}")).collect::<Vec<_>>().join(" and ")
 }

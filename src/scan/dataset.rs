@@ -1,4 +1,4 @@
-//! A dataset in memory and its native layout on disk (`dataset.json` + images; see `docs/formats.md`).
+//! Dataset in memory and its native layout on disk (`dataset.json` + images; see `docs/formats.md`).
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
@@ -19,10 +19,10 @@ use std::path::{Path, PathBuf};
 pub const MANIFEST: &str = "dataset.json";
 const MAX_MANIFEST_BYTES: u64 = 256 << 20;
 const MAX_FRAMES: usize = 100_000;
-/// Most cardiac phases of a dataset.
+/// Largest accepted number of cardiac phases.
 pub(super) const MAX_PHASES: u32 = 4096;
 
-/// What pixel values mean.
+/// Meaning of the pixel values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
@@ -64,7 +64,7 @@ impl Intensity {
         if ok { Ok(()) } else { Err((format!("intensity.{field}"), "is not usable".into())) }
     }
 
-    /// Line integral of a stored value. Dark pixels of a linear detector are held at one part in 1e7.
+    /// Line integral of a stored value. The values of a linear detector are clamped from below at 1e-7 of `i0`.
     pub fn integral(&self, value: f32) -> f32 {
         let v = f64::from(value);
         (match self {
@@ -75,7 +75,7 @@ impl Intensity {
     }
 }
 
-/// What a frame is for.
+/// Purpose of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
@@ -123,13 +123,13 @@ pub struct ManifestFrame {
     pub split: Split,
     /// How it was taken.
     pub geometry: Geometry,
-    /// What its values mean.
+    /// Meaning of the image's values.
     pub intensity: Intensity,
     /// Vessel mask of the same size: non-zero inside vessels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<PathBuf>,
-    /// How far breathing has carried the heart from its mean along (posterior, left, superior) in this frame, mm. It moves
-    /// what beats, not the still background.
+    /// How far breathing has carried the heart from its mean along (posterior, left, superior) in this frame, mm. It moves the
+    /// beating heart, not the static background.
     #[serde(default, skip_serializing_if = "is_at_rest")]
     pub heart_shift_mm: [f64; 3],
     /// The geometry as it was stated before it was corrected; kept for the record, not used.
@@ -137,39 +137,39 @@ pub struct ManifestFrame {
     pub stated_geometry: Option<Geometry>,
 }
 
-/// Whole numbers as such, as other readers of the manifest expect of phases.
+/// Writes whole numbers as integers, because other readers of the manifest expect integer phases.
 fn whole_if_so<S: Serializer>(phase: &f64, to: S) -> std::result::Result<S::Ok, S::Error> {
     if phase.fract() == 0.0 { to.serialize_i64(*phase as i64) } else { to.serialize_f64(*phase) }
 }
 
-/// One image, ready for use.
+/// An image, ready for use.
 #[derive(Debug, Clone)]
 pub struct Frame {
     /// Name of the frame, for messages and pictures.
     pub name: String,
     /// Index into [`Dataset::views`].
     pub view: usize,
-    /// Cardiac phase nearest to when it was taken, from 0.
+    /// Cardiac phase nearest to the time it was taken, from 0.
     pub phase: u32,
-    /// How long after that phase it was taken, in phases: from -0.5 to 0.5.
+    /// Time between that phase and the image, in phases: from -0.5 to 0.5.
     pub after_phase: f64,
     /// Training or validation.
     pub split: Split,
-    /// Line integrals, rows first; in a dataset, on the canvas of all images (see [`crate::scan::canvas`]).
+    /// Line integrals in row-major order; in a dataset, on the canvas of all images (see [`crate::scan::canvas`]).
     pub integrals: Vec<f32>,
-    /// Vessel mask, where known; none of it is beyond the image's own size.
+    /// Vessel mask, where known; false outside the image's own size.
     pub mask: Option<Vec<bool>>,
-    /// How far breathing has carried the heart from its mean along (posterior, left, superior), mm.
+    /// Displacement of the heart from its mean position by breathing, along (posterior, left, superior), mm.
     pub heart_shift_mm: [f64; 3],
 }
 
 impl Frame {
-    /// When in the beat it was taken.
+    /// Time in the beat at which it was taken.
     pub fn beat_time(&self) -> BeatTime {
         BeatTime { phase: self.phase, after_phase: self.after_phase }
     }
 
-    /// How far breathing has carried the heart from its mean, world units.
+    /// Displacement of the heart from its mean position by breathing, world units.
     pub fn heart_shift(&self) -> DVec3 {
         DVec3::from_array(self.heart_shift_mm) / MM_PER_UNIT
     }
@@ -180,14 +180,14 @@ impl Frame {
 pub struct View {
     /// Geometry as stated in the file.
     pub geometry: Geometry,
-    /// Columns and rows of its images.
+    /// Columns and rows of the view's images.
     pub size: [usize; 2],
     /// Rays in world units.
     pub rays: ViewRays,
 }
 
 impl View {
-    /// A view of images of `size` (columns, rows).
+    /// Makes a view of images of `size` (columns, rows).
     ///
     /// # Errors
     /// Field and problem, for an impossible geometry.
@@ -197,7 +197,7 @@ impl View {
     }
 }
 
-/// Which layout a dataset was read from.
+/// Layout of a dataset on disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Layout {
@@ -227,50 +227,50 @@ pub struct Dataset {
     pub layout: Layout,
     /// Distinct geometries and sizes.
     pub views: Vec<View>,
-    /// All images; those of training first.
+    /// All images; training images come first.
     pub frames: Vec<Frame>,
-    /// Pixels of the canvas that show nothing of the patient, such as those behind a collimator's blade or beyond a smaller image,
+    /// Pixels of the canvas that do not show the patient, such as those behind a collimator's blade or beyond a smaller image,
     /// by index into `views`; views without such pixels are left out.
     pub hidden: BTreeMap<usize, Vec<bool>>,
-    /// Columns of the canvas: those of the widest image.
+    /// Columns of the canvas, equal to those of the widest image.
     pub width: usize,
-    /// Rows of the canvas: those of the highest image.
+    /// Rows of the canvas, equal to those of the highest image.
     pub height: usize,
-    /// Cardiac phases.
+    /// Number of cardiac phases.
     pub n_phases: u32,
     /// Depth range around the isocentre plane, world units.
     pub depth_range: (f64, f64),
     /// Vessel attenuation per world unit, where stated.
     pub vessel_attenuation: Option<f64>,
-    /// What was found on reading that is no error but may not be meant.
+    /// Findings on reading that are no errors but may be unintended.
     pub notes: Vec<String>,
 }
 
 impl Dataset {
-    /// Rays by which the heart is seen in a frame: the view's, moved against the heart's displacement.
+    /// Rays that see the heart in a frame: the view's rays, displaced opposite to the heart.
     pub fn heart_rays(&self, frame: &Frame) -> ViewRays {
         self.views[frame.view].rays.moved(frame.heart_shift())
     }
 
-    /// Rays by which the heart is seen in a view's training frames at a phase; those of the view where it has none.
+    /// Rays that see the heart in a view's training frames at a phase; the view's own rays if it has no such frame.
     pub fn heart_rays_at(&self, view: usize, phase: u32) -> ViewRays {
         let frame = self.training().iter().find(|f| (f.view, f.phase) == (view, phase));
         frame.map_or_else(|| self.views[view].rays.clone(), |f| self.heart_rays(f))
     }
 
-    /// How long after a phase a view's training frames of that phase were taken on the mean, in phases; 0 where it has none.
+    /// Mean time between a phase and a view's training frames of that phase, in phases; 0 if the view has none.
     pub fn after_phase(&self, view: usize, phase: u32) -> f64 {
         let frames = self.training().iter().filter(|f| (f.view, f.phase) == (view, phase));
         let (sum, n) = frames.fold((0.0, 0u32), |(sum, n), f| (sum + f.after_phase, n + 1));
         sum / f64::from(n.max(1))
     }
 
-    /// Whether some training frame has a displacement of the heart.
+    /// Tells whether some training frame has a displacement of the heart.
     pub fn heart_shifts(&self) -> bool {
         self.training().iter().any(|f| f.heart_shift_mm != [0.0; 3])
     }
 
-    /// Reads a dataset, detecting its layout.
+    /// Reads a dataset and detects its layout.
     ///
     /// # Errors
     /// [`Error::Data`] or [`Error::Io`] naming file and field.
@@ -341,7 +341,7 @@ impl Dataset {
         builder.finish(path, Layout::Native)
     }
 
-    /// Frames the reconstruction may see; they come first in [`Dataset::frames`].
+    /// Frames that the reconstruction may use; they come first in [`Dataset::frames`].
     pub fn training(&self) -> &[Frame] {
         &self.frames[..self.n_training()]
     }
@@ -355,19 +355,19 @@ impl Dataset {
         self.frames.iter().take_while(|f| f.split == Split::Train).count()
     }
 
-    /// Pixels of the canvas.
+    /// Number of pixels of the canvas.
     pub fn n_pixels(&self) -> usize {
         self.width * self.height
     }
 
-    /// The first of the training views with the most pixels: what is drawn without saying how is drawn like it.
+    /// Returns the first of the training views with the largest number of pixels. Renderings without a stated view use it.
     pub fn reference_view(&self) -> &View {
         let views = self.training().iter().map(|frame| &self.views[frame.view]);
         let larger = |a: &View, b: &View| b.size[0] * b.size[1] > a.size[0] * a.size[1];
         views.reduce(|a, b| if larger(a, b) { b } else { a }).unwrap_or(&self.views[0])
     }
 
-    /// The C-arm of [`Dataset::reference_view`]; for an explicit matrix, one with the same magnification.
+    /// Returns the C-arm of [`Dataset::reference_view`]; for an explicit matrix, a C-arm with the same magnification.
     pub fn reference_c_arm(&self) -> CArm {
         let view = self.reference_view();
         match &view.geometry {
@@ -397,7 +397,7 @@ impl Dataset {
     }
 }
 
-/// Collects frames, checking each as it comes.
+/// Collects frames and checks each one.
 pub(super) struct Builder {
     file: PathBuf,
     n_phases: u32,
@@ -513,7 +513,7 @@ impl Builder {
     }
 }
 
-/// Says which phases no training frame shows.
+/// Note on the phases that no training frame shows.
 fn untrained_phases(frames: &[Frame], n_phases: u32) -> Option<String> {
     let mut seen = vec![false; n_phases as usize];
     frames.iter().filter(|f| f.split == Split::Train).for_each(|f| seen[f.phase as usize] = true);
@@ -522,7 +522,7 @@ fn untrained_phases(frames: &[Frame], n_phases: u32) -> Option<String> {
         .then(|| format!("no training frame shows phase {}: the moving field is a guess there", list_of(&unseen)))
 }
 
-/// Numbers as a person lists them, runs of them as first-last.
+/// Formats numbers as a list in which consecutive numbers are written as first-last.
 pub(super) fn list_of(numbers: &[u32]) -> String {
     let runs = numbers.chunk_by(|a, b| a + 1 == *b).map(|run| match run {
         [first, .., last] => format!("{first}-{last}"),

@@ -1,15 +1,15 @@
-//! What every frame must satisfy, whether it comes from a file or from a caller.
+//! Checks of every frame, whether it comes from a file or from a caller.
 
 use crate::geometry::{Geometry, MM_PER_UNIT};
 use crate::scan::dataset::View;
 
-/// What is wrong with a frame.
+/// Problem with a frame.
 pub(crate) struct Complaint {
-    /// Part of the frame.
+    /// Field of the frame.
     pub(crate) field: String,
-    /// What it is.
+    /// Value of the field.
     pub(crate) value: String,
-    /// Why that cannot be.
+    /// Explanation why the value is not accepted.
     pub(crate) problem: String,
 }
 
@@ -19,7 +19,7 @@ impl Complaint {
     }
 }
 
-/// Refuses a value that is no number, naming its pixel.
+/// Rejects values that are not finite and names the pixel.
 pub(crate) fn check_values(values: &[f32], width: usize) -> Result<(), Complaint> {
     match values.iter().position(|v| !v.is_finite()) {
         Some(at) => {
@@ -30,7 +30,7 @@ pub(crate) fn check_values(values: &[f32], width: usize) -> Result<(), Complaint
     }
 }
 
-/// Refuses a time, counted in phases, that there is not.
+/// Rejects a time, counted in phases, outside the beat.
 pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complaint> {
     if (0.0..f64::from(n_phases)).contains(&time_phases) {
         return Ok(());
@@ -42,8 +42,8 @@ pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complai
     Err(Complaint::new("phase", time_phases, problem))
 }
 
-/// A view of images of `size` (columns, rows) whose source stands before what is searched, `depth_before` world units from the
-/// isocentre on.
+/// Makes a view of images of `size` (columns, rows) and checks that its source lies outside the searched depth range, which
+/// begins `depth_before` world units before the isocentre.
 pub(crate) fn checked_view(geometry: Geometry, size: [usize; 2], depth_before: f64) -> Result<View, Complaint> {
     let view = View::new(geometry, size).map_err(|(field, problem)| Complaint::new(&field, "", problem))?;
     if view.rays.sod <= depth_before {

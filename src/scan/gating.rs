@@ -4,21 +4,22 @@ use crate::choice::Choice;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// Time from the R-peak to the end of systole, seconds. Coronary arteries stand still 280 to 340 ms after R at heart rates of 60
-/// to 80 per minute.
+/// Time from the R-peak to the end of systole, seconds. Coronary arteries are at rest 280 to 340 ms after R at heart rates of
+/// 60 to 80 per minute.
 pub const SYSTOLE_S: f64 = 0.31;
-/// Share of the phases before the end of systole: phases are fractions of a beat of [`SYSTOLE_S`] / 0.35, 68 per minute.
+/// Share of the phases before the end of systole. Phases are fractions of a beat of [`SYSTOLE_S`] / 0.35, that is 68 beats per
+/// minute.
 pub const SYSTOLE_SHARE: f64 = 0.35;
-/// Fast hearts shorten systole, too: it takes this share of a beat at most.
+/// Longest systole as a share of the beat, because fast hearts also shorten systole.
 const LONGEST_SYSTOLE: f64 = 0.6;
 
-/// How time since the R-peak becomes a fraction of the beat, where hearts beat at different rates.
+/// Conversion of the time since the R-peak to a fraction of the beat, for different heart rates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum BeatScaling {
-    /// All of the beat stretches alike.
+    /// The whole beat is stretched uniformly.
     Linear,
-    /// Systole keeps its length ([`SYSTOLE_S`]), diastole takes the rest.
+    /// Systole keeps its length ([`SYSTOLE_S`]); diastole fills the rest of the beat.
     #[default]
     TwoSegment,
 }
@@ -35,7 +36,7 @@ impl Choice for BeatScaling {
 }
 
 impl BeatScaling {
-    /// Fraction of the beat (0 to 1) at a time after the R-peak in a beat of a length, both in seconds.
+    /// Fraction of the beat (0 to 1) at a time after the R-peak, for a beat of length `beat_s`, both in seconds.
     pub fn fraction(self, since_r_s: f64, beat_s: f64) -> f64 {
         match self {
             BeatScaling::Linear => (since_r_s / beat_s).clamp(0.0, 1.0),
@@ -44,8 +45,8 @@ impl BeatScaling {
     }
 }
 
-/// Fraction of the beat (0 to 1) at a time after the R-peak, seconds, in a beat whose systole ends after `systole_s`: systole
-/// fills the first [`SYSTOLE_SHARE`] evenly, diastole the rest.
+/// Fraction of the beat (0 to 1) at a time after the R-peak, seconds, in a beat whose systole ends after `systole_s`: linear
+/// within systole, which covers the first [`SYSTOLE_SHARE`], and linear within diastole, which covers the rest.
 pub fn two_segment_fraction(since_r_s: f64, beat_s: f64, systole_s: f64) -> f64 {
     let systole_s = systole_s.min(LONGEST_SYSTOLE * beat_s);
     let fraction = if since_r_s < systole_s {
@@ -56,8 +57,8 @@ pub fn two_segment_fraction(since_r_s: f64, beat_s: f64, systole_s: f64) -> f64 
     fraction.clamp(0.0, 1.0)
 }
 
-/// How far the ventricle has contracted at a fraction of the beat: 0 at end-diastole, 1 at end-systole
-/// ([`SYSTOLE_SHARE`] of the beat), back to 0 at 75 %, then rest.
+/// Contraction of the ventricle at a fraction of the beat: 0 at end-diastole, 1 at end-systole ([`SYSTOLE_SHARE`] of the beat),
+/// 0 again from 75 % of the beat to its end.
 pub fn contraction(fraction: f64) -> f64 {
     let x = fraction.rem_euclid(1.0);
     let since_systole = x - SYSTOLE_SHARE;
@@ -66,16 +67,16 @@ pub fn contraction(fraction: f64) -> f64 {
     (std::f64::consts::PI * half_wave).sin().powi(2)
 }
 
-/// When in the beat: at a phase, or between two.
+/// Time in the beat: at a phase, or between two phases.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BeatTime {
-    /// The nearest phase, from 0.
+    /// Nearest phase, from 0.
     pub phase: u32,
-    /// How long after that phase, in phases: from -0.5 to 0.5.
+    /// Time after that phase, in phases: from -0.5 to 0.5.
     pub after_phase: f64,
 }
 
-/// Times that differ by less than this, in phases, are the same: no clock is that good, and sums of times are rounded.
+/// Resolution of times in phases. Smaller differences are below the accuracy of clocks, and sums of times have rounding errors.
 const SAME_TIME_PHASES: f64 = 1e-6;
 
 impl BeatTime {
@@ -83,40 +84,40 @@ impl BeatTime {
         BeatTime { phase, after_phase: (after_phase / SAME_TIME_PHASES).round() * SAME_TIME_PHASES }
     }
 
-    /// Exactly at a phase.
+    /// Time exactly at a phase.
     pub fn at_phase(phase: u32) -> BeatTime {
         BeatTime { phase, after_phase: 0.0 }
     }
 
-    /// A time counted in phases, of which a beat has `n_phases`; the beat closes.
+    /// Converts a time counted in phases; a beat has `n_phases` of them and is cyclic.
     pub fn of(time_phases: f64, n_phases: u32) -> BeatTime {
         let nearest = time_phases.round();
         let phase = nearest.rem_euclid(f64::from(n_phases)) as u32;
         BeatTime::new(phase, time_phases - nearest)
     }
 
-    /// The phase on the other side of this time, of the `n_phases` of a beat, which closes.
+    /// Phase on the other side of this time, in a cyclic beat of `n_phases`.
     pub fn beyond(self, n_phases: u32) -> u32 {
         let step = if self.after_phase < 0.0 { n_phases - 1 } else { 1 };
         (self.phase + step) % n_phases
     }
 
-    /// The phases around this time, the nearest first, and what an image shows of each.
+    /// The two phases around this time, the nearest first, each with its share in an image taken at this time.
     pub fn shown(self, n_phases: u32) -> [(usize, f64); 2] {
         let share = self.after_phase.abs();
         [(self.phase as usize, 1.0 - share), (self.beyond(n_phases) as usize, share)]
     }
 
-    /// Counted in phases, from 0 to below `n_phases`.
+    /// Time counted in phases, from 0 to below `n_phases`.
     pub fn phases(self, n_phases: u32) -> f64 {
         let beat = f64::from(n_phases);
         let time = (f64::from(self.phase) + self.after_phase).rem_euclid(beat);
-        // Just before phase 0, the remainder may be rounded up to a whole beat.
+        // Just before phase 0, rounding can give a whole beat as the remainder.
         if time < beat { time } else { 0.0 }
     }
 }
 
-/// Beats longer than this many of the usual ones are gaps in the ECG, not beats.
+/// Longest beat as a multiple of the median beat; longer intervals are gaps in the ECG.
 const LONGEST_BEAT: f64 = 1.8;
 
 /// R-peaks of a run.
@@ -126,10 +127,10 @@ pub struct RPeaks {
 }
 
 impl RPeaks {
-    /// R-peaks at rising times.
+    /// Makes R-peaks from increasing times, seconds.
     ///
     /// # Errors
-    /// [`Error::Config`] for fewer than two, times that are not finite, or not rising.
+    /// [`Error::Config`] for fewer than two times, and for times that are not finite or do not increase.
     pub fn new(times_s: &[f64]) -> Result<RPeaks> {
         if times_s.len() < 2 {
             return Err(Error::config("r_peaks", times_s.len(), "at least two R-peaks bound a beat"));
@@ -143,7 +144,7 @@ impl RPeaks {
         Ok(RPeaks { times_s: times_s.to_vec() })
     }
 
-    /// R-peaks of a steady heart from `start_s` on, as many as cover `end_s`.
+    /// Makes R-peaks of a steady heart from `start_s` until they cover `end_s`.
     ///
     /// # Errors
     /// [`Error::Config`] for a rate outside 20 to 300 beats per minute.
@@ -156,7 +157,7 @@ impl RPeaks {
         Self::new(&(0..n).map(|i| start_s + i as f64 * beat).collect::<Vec<_>>())
     }
 
-    /// Their times, seconds.
+    /// Times of the R-peaks, seconds.
     pub fn times_s(&self) -> &[f64] {
         &self.times_s
     }
@@ -168,9 +169,9 @@ impl RPeaks {
         beats[beats.len() / 2]
     }
 
-    /// Phase of a time, from 0, of `n_phases` equal parts of its beat as `scaling` counts it, and how long after the middle of
-    /// that part. Up to one usual beat before the first and after the last R-peak counts; `None` beyond, and within gaps of
-    /// the ECG.
+    /// Time in the beat at a time in seconds: the phase, from 0, is one of `n_phases` equal parts of the beat as scaled by
+    /// `scaling`, and the time after the phase is counted from the middle of that part. Covers up to one median beat before the
+    /// first and after the last R-peak; `None` outside this range and within gaps of the ECG.
     pub fn beat_time(&self, time_s: f64, n_phases: u32, scaling: BeatScaling) -> Option<BeatTime> {
         let usual = self.beat_s();
         let after = self.times_s.partition_point(|r| *r <= time_s);
@@ -194,7 +195,7 @@ mod tests {
     use super::*;
     use BeatScaling::Linear;
 
-    /// Of ten phases.
+    /// Phase out of ten phases.
     fn phase(peaks: &RPeaks, time_s: f64, scaling: BeatScaling) -> Option<u32> {
         peaks.beat_time(time_s, 10, scaling).map(|found| found.phase)
     }

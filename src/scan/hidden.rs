@@ -1,4 +1,4 @@
-//! Pixels that show nothing of the patient: behind a collimator's blade, outside a round detector, or beyond an image that is
+//! Pixels that do not show the patient: behind a collimator's blade, outside a round detector, or beyond an image that is
 //! smaller than others.
 
 use crate::scan::canvas::framed;
@@ -6,23 +6,24 @@ use crate::scan::dataset::{Dataset, Split};
 use std::borrow::Cow;
 use std::collections::VecDeque;
 
-/// Pixels so little below the darkest, as a share of an image's range, are as dark.
+/// Tolerance for the darkest pixels, as a share of an image's range of values.
 const AS_DARK: f32 = 1e-4;
 
 impl Dataset {
-    /// Whether an image of a view shows the patient at a pixel.
+    /// Tells whether images of a view show the patient at a pixel.
     pub fn shows(&self, view: usize, pixel: usize) -> bool {
         self.hidden.get(&view).is_none_or(|hidden| !hidden[pixel])
     }
 
-    /// Finds the pixels that hide the patient. What a blade or a rim hides reads the same number in all images of a view,
-    /// the darkest of each, from the border of the image on; the pixels next to it are half hidden. Training images go on
-    /// there as at the edge, so that nothing takes a blade for tissue. All that is beyond an image on the canvas is hidden.
+    /// Finds the pixels that do not show the patient. A blade or a rim gives the same value in a whole image, the darkest of
+    /// the image, in all images of a view, in regions that touch the border of the image; the pixels next to these regions are
+    /// partly hidden. Training images are filled there with the nearest visible value, so that a blade is not taken for tissue.
+    /// All pixels of the canvas beyond an image are hidden.
     pub(crate) fn hide(&mut self) {
         for view in 0..self.views.len() {
             let of_view = self.frames.iter().filter(|f| f.view == view);
             let images: Vec<Cow<'_, [f32]>> = of_view.map(|f| self.own(view, &f.integrals)).collect();
-            // A session keeps views whose frames are not used, which the canvas may be too small for.
+            // A session keeps views whose frames are not used; the canvas may be too small for them.
             if images.is_empty() {
                 continue;
             }
@@ -48,7 +49,8 @@ impl Dataset {
     }
 }
 
-/// Hidden pixels of a view, of which some are shown; none where fewer are as dark than the shorter side of the image has.
+/// Hidden pixels of a view. Returns no pixel if fewer pixels than the shorter side of the image are dark, or if all would be
+/// hidden.
 fn hidden(images: &[Cow<'_, [f32]>], width: usize, height: usize) -> Vec<bool> {
     let mut dark = vec![!images.is_empty(); width * height];
     for image in images {
@@ -72,14 +74,14 @@ fn hidden(images: &[Cow<'_, [f32]>], width: usize, height: usize) -> Vec<bool> {
     hidden
 }
 
-/// Of each pixel, the nearest that is shown.
+/// Index of the nearest visible pixel, for each pixel.
 fn nearest_shown(hidden: &[bool], width: usize) -> Vec<usize> {
     let shown = (0..hidden.len()).filter(|p| !hidden[*p]);
     let from = flood(shown, width, hidden.len() / width, |_| true);
     from.iter().enumerate().map(|(p, from)| from.unwrap_or(p)).collect()
 }
 
-/// From which of the `starts` each pixel is reached first, by steps along rows and columns to pixels that `enters` allows.
+/// For each pixel, the start from which it is reached first, by steps along rows and columns to pixels that `enters` allows.
 fn flood(
     starts: impl Iterator<Item = usize>,
     width: usize,
@@ -140,7 +142,7 @@ mod tests {
         hidden(&frames.iter().map(|frame| Cow::from(&frame.integrals)).collect::<Vec<_>>(), WIDTH, HEIGHT)
     }
 
-    /// A chest, a vessel that moves, and darkness from `first` on.
+    /// A chest with a moving vessel, and dark columns from `first` on.
     fn chest(phase: u32, dark: f32, first: usize) -> Frame {
         frame(phase, move |x, y| match x {
             x if x >= first => dark,
@@ -152,7 +154,7 @@ mod tests {
 
     #[test]
     fn a_blade_and_the_pixels_it_half_covers_are_hidden() {
-        // Each image on a scale of its own, as when frames state intensities.
+        // Each image has a scale of its own, as when frames state intensities.
         let frames = [chest(0, 9.0, 24), chest(1, 8.0, 24), chest(2, 9.5, 24)];
         let hidden = hidden_of(&frames);
         assert!(hidden.iter().enumerate().all(|(p, h)| *h == (p % WIDTH >= 23)));
@@ -174,7 +176,7 @@ mod tests {
         let none = |frames: &[Frame]| hidden_of(frames).iter().all(|h| !h);
         assert!(none(&[chest(0, 9.0, usize::MAX), chest(1, 9.0, usize::MAX)]), "nothing is dark");
         assert!(none(&[frame(0, |_, _| 3.0), frame(1, |_, _| 3.0)]), "images that show nothing anywhere");
-        // A dense spot in the middle, a border that darkens at one phase only, and one whose darkness has structure.
+        // A dense spot in the middle, a border that darkens at one phase only, and a border whose dark values vary.
         assert!(none(&[frame(0, |x, y| if x.abs_diff(15) < 4 && y.abs_diff(10) < 4 { 9.0 } else { 1.0 })]));
         assert!(none(&[chest(0, 9.0, 24), chest(1, 9.0, usize::MAX)]));
         assert!(none(&[0, 1].map(|t| frame(t, |x, y| if x > 24 { 8.0 + 0.01 * y as f32 } else { 1.0 }))));

@@ -1,8 +1,8 @@
-//! The layout of the NeRF-CA / NerT-CA authors, read (and written) as it is.
+//! Reads and writes the layout of the NeRF-CA / NerT-CA authors.
 //!
-//! `general.json` plus `train-*.json` / `test-*.json`. Images are `.npy` arrays normalised to [0, 1] by
-//! `img_min_max`, ordinary pictures: [row = v][column = u] (method, section 6); pixel = I0 - line integral.
-//! Masks hold image values inside vessels and I0 elsewhere. Paths may be absolute and stale.
+//! It consists of `general.json` plus `train-*.json` / `test-*.json`. Images are `.npy` arrays normalised to [0, 1] by
+//! `img_min_max`, indexed as ordinary pictures: [row = v][column = u] (method, section 6); pixel = I0 - line integral. Masks
+//! hold image values inside vessels and I0 elsewhere. Paths may be absolute and out of date.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 pub const GENERAL: &str = "general.json";
 const MAX_JSON_BYTES: u64 = 256 << 20;
 
-/// `general.json`: lengths in mm before the authors' 1e-2 scale, or already scaled (`near_thresh` tells).
+/// Content of `general.json`: lengths in mm before the authors' 1e-2 scale, or already scaled, as `far_thresh` shows.
 #[derive(Debug, Serialize, Deserialize)]
 #[allow(non_snake_case, reason = "the authors' spelling")]
 pub(crate) struct General {
@@ -58,7 +58,7 @@ pub(crate) struct FrameEntry {
     pub larm: f64,
 }
 
-/// A frame, and where it is named.
+/// A frame with its list file and its index in it.
 struct Entry {
     file: PathBuf,
     index: usize,
@@ -104,7 +104,7 @@ pub fn open(path: &Path) -> Result<Dataset> {
     if general.near_thresh.partial_cmp(&general.far_thresh) != Some(std::cmp::Ordering::Less) {
         return Err(Error::data(&general_file, "near_thresh", "is not below far_thresh"));
     }
-    // Depth thresholds are in world units (100 mm); distances may be in mm or already scaled.
+    // Depth thresholds are in world units (100 mm); distances may be in mm or already in world units.
     let to_mm = if general.DSO > general.far_thresh * 2.0 { 1.0 } else { 100.0 };
     let sod = general.DSO * to_mm / 100.0;
     let depth_range = (general.near_thresh - sod, general.far_thresh - sod);
@@ -164,7 +164,7 @@ pub fn open(path: &Path) -> Result<Dataset> {
     builder.finish(path, Layout::Nerfca)
 }
 
-/// `train-*.json` and `test-*.json` of the directory, sorted.
+/// Lists `train-*.json` and `test-*.json` of the directory, sorted.
 fn frame_lists(path: &Path) -> Result<Vec<(PathBuf, Split)>> {
     let mut lists = Vec::new();
     for entry in std::fs::read_dir(path).map_err(Error::io("list", path))? {
@@ -185,7 +185,7 @@ fn frame_lists(path: &Path) -> Result<Vec<(PathBuf, Split)>> {
     Ok(lists)
 }
 
-/// Every `.npy` below the directory (three levels), by file name, for stale absolute paths.
+/// All `.npy` files below the directory (three levels), by file name, to resolve absolute paths that are out of date.
 fn files_by_name(path: &Path) -> Result<HashMap<String, PathBuf>> {
     let mut found = HashMap::new();
     let mut open = vec![(path.to_path_buf(), 0)];
@@ -210,11 +210,11 @@ fn resolve(root: &Path, by_name: &HashMap<String, PathBuf>, stated: &str) -> Opt
     if stated_path.is_relative() && direct.is_file() {
         return Some(direct);
     }
-    // A path written on another system may use either separator.
+    // A path written on another system may use another separator.
     by_name.get(stated.rsplit(['/', '\\']).next()?).cloned()
 }
 
-/// The `heart_phase` of each entry: it picks a row of the authors' table of latents, so it counts from 0 in whole numbers.
+/// Checks the `heart_phase` of each entry. It selects a row of the authors' table of latents, so it is an integer from 0.
 fn heart_phases(entries: &[Entry]) -> Result<Vec<u32>> {
     let check = |entry: &Entry| {
         let phase = entry.frame.heart_phase;
@@ -227,7 +227,7 @@ fn heart_phases(entries: &[Entry]) -> Result<Vec<u32>> {
     entries.iter().map(check).collect()
 }
 
-/// Phases that occur, in order, and a note about those between them that do not.
+/// Phases that occur, in order, and a note on missing phases between them.
 fn number_phases(phases: &[u32]) -> (Vec<u32>, Option<String>) {
     let mut found = phases.to_vec();
     found.sort_unstable();
@@ -245,12 +245,12 @@ fn number_phases(phases: &[u32]) -> (Vec<u32>, Option<String>) {
     (found, note)
 }
 
-/// An ordinary picture, rows first; axes of one entry, as stacks of one projection have, count for nothing.
+/// Reads a picture in row-major order; axes of length one, as in stacks of a single projection, are ignored.
 fn read_picture(path: &Path, width: usize, height: usize) -> Result<Image> {
     let npy::Array { shape, values } = npy::read(path, MAX_FILE_BYTES)?;
     let long: Vec<usize> = shape.iter().copied().filter(|n| *n != 1).collect();
     let wanted: Vec<usize> = [height, width].into_iter().filter(|n| *n != 1).collect();
-    // A flat list of pixels has its rows one after the other.
+    // A flat list of pixels is in row-major order.
     if long != wanted && shape[..] != [height * width] {
         let problem = format!("{shape:?}; a picture of {height} rows and {width} columns is [{height}, {width}]");
         return Err(Error::data(path, "shape", problem));

@@ -1,4 +1,4 @@
-//! `truth.json` beside a synthetic dataset: how each image was really taken (see `docs/formats.md`).
+//! `truth.json` of a synthetic dataset: the true acquisition of each image (see `docs/formats.md`).
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -13,7 +13,7 @@ const FORMAT: &str = "nertca-truth";
 const VERSION: u32 = 1;
 const MAX_BYTES: u64 = 256 << 20;
 
-/// How the images of a synthetic dataset were really taken.
+/// True acquisition of the images of a synthetic dataset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Truth {
@@ -21,21 +21,21 @@ pub struct Truth {
     format: String,
     /// Version of this layout: 1.
     version: u32,
-    /// Seed that all random numbers come from.
+    /// Seed of all random numbers.
     pub seed: u32,
     /// Number of cardiac phases T.
     pub phases: u32,
-    /// One per image, in the order of the dataset's.
+    /// One entry per image, in the order of the dataset.
     pub frames: Vec<TrueFrame>,
 }
 
-/// How one image was really taken.
+/// True acquisition of one image.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrueFrame {
     /// Image file, as the dataset names it.
     pub image: PathBuf,
-    /// View, from 0: those of training first.
+    /// View, from 0; training views come first.
     pub view: usize,
     /// Training or validation.
     pub split: Split,
@@ -43,34 +43,34 @@ pub struct TrueFrame {
     pub phase: u32,
     /// C-arm that the image was made with; the dataset may state another.
     pub geometry: CArm,
-    /// Where breathing had carried the heart from its mean position, mm along (posterior, left, superior): a point of
-    /// the heart at x is seen as if it were at x plus this.
+    /// Displacement of the heart from its mean position by breathing, mm along (posterior, left, superior): a point of the
+    /// heart at x is seen at x plus this displacement.
     pub heart_shift_mm: [f64; 3],
-    /// What the heart really did, 0 to T: a stated phase without its errors.
+    /// True phase of the heart, 0 to T, without the errors of the stated phase.
     pub beat_phase: f64,
     /// Time since the first image of the run, seconds.
     pub time_s: f64,
     /// Factor on the contrast of the vessels.
     pub contrast_gain: f64,
-    /// Share of the way to the farthest end of the vessels that contrast has come; 1 where it is everywhere.
+    /// Share of the way to the farthest end of the vessels that contrast has reached; 1 where all vessels are filled.
     #[serde(default = "everywhere")]
     pub filled_to: f64,
-    /// Share of the view's moving vessels that a blade hides, all phases taken together.
+    /// Share of the view's moving vessels that a blade hides, over all phases.
     pub cut_share: f64,
 }
 
-/// [`TrueFrame::filled_to`] in files from before it was told.
+/// Value of [`TrueFrame::filled_to`] in files that do not have the field.
 fn everywhere() -> f64 {
     1.0
 }
 
 impl Truth {
-    /// The truth of a dataset of `phases` phases, without frames yet.
+    /// Makes the truth of a dataset with `phases` phases and no frames.
     pub fn new(seed: u32, phases: u32) -> Truth {
         Truth { format: FORMAT.to_owned(), version: VERSION, seed, phases, frames: Vec::new() }
     }
 
-    /// Reads the truth beside a dataset in a directory.
+    /// Reads the truth of the dataset in a directory.
     ///
     /// # Errors
     /// [`Error::Io`] where there is none, [`Error::Data`] for a file of another kind.
@@ -85,7 +85,7 @@ impl Truth {
         Ok(truth)
     }
 
-    /// Writes the truth beside a dataset in a directory.
+    /// Writes the truth of the dataset in a directory.
     ///
     /// # Errors
     /// [`Error::Io`] where it cannot be written.

@@ -1,4 +1,4 @@
-//! Writes datasets in either layout.
+//! Writes datasets in the native layout or in the authors' layout.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -13,10 +13,10 @@ use std::path::{Path, PathBuf};
 
 /// ln(8.670397): the value of an unattenuated pixel in the authors' images.
 pub const I0_LOG: f64 = 2.159_914_6;
-/// What is said of a dataset whose images the authors' layout cannot hold.
+/// Message for a dataset with images of different sizes, which the authors' layout cannot hold.
 const ONE_SIZE: &str = "has one size for all images, and this dataset has several";
 
-/// What a dataset says besides its frames.
+/// Properties of a dataset other than its frames.
 #[derive(Debug, Clone)]
 pub struct About {
     /// Free text.
@@ -27,17 +27,17 @@ pub struct About {
     pub depth_half_extent_mm: f64,
     /// Attenuation of filled vessels, 1/mm, where known.
     pub vessel_attenuation_per_mm: Option<f64>,
-    /// Columns and rows of all images in the authors' layout, which has them once.
+    /// Columns and rows of all images in the authors' layout, which states one size for all.
     pub size: [usize; 2],
-    /// The authors' layout has distances and pixels once for all views: those of this C-arm.
+    /// C-arm that gives the distances and pixels of the authors' layout, which states them once for all views.
     pub c_arm: CArm,
 }
 
-/// Writes frames as they come and the manifest last, so that an interrupted run leaves no dataset.
+/// Writes frames as they come and the manifest last, so that an interrupted run leaves no valid dataset.
 pub struct Writer<'a> {
     out: &'a Path,
     size: [usize; 2],
-    /// Frames written under a name, to tell several of one view and phase apart.
+    /// Number of frames written under each name, to number several frames of one view and phase.
     names: HashMap<String, u32>,
     c_arm: CArm,
     layout: Layout,
@@ -47,7 +47,7 @@ pub struct Writer<'a> {
 }
 
 impl<'a> Writer<'a> {
-    /// Makes the directory.
+    /// Creates the directory of the dataset.
     ///
     /// # Errors
     /// [`Error::Io`].
@@ -87,8 +87,8 @@ impl<'a> Writer<'a> {
         })
     }
 
-    /// Writes a frame's image of line integrals and its mask; the image's file, relative to the dataset. The authors' layout
-    /// numbers phases: a frame between two gets the nearest there.
+    /// Writes a frame's image of line integrals and its mask; returns the image file, relative to the dataset. The authors'
+    /// layout has only whole phases: a frame between two phases gets the nearest.
     ///
     /// # Errors
     /// [`Error::Config`] for a geometry or a size that the authors' layout cannot state; [`Error::Io`].
@@ -161,8 +161,8 @@ impl<'a> Writer<'a> {
         }
     }
 
-    /// Says of the frame written last how far the heart was displaced, along (posterior, left, superior), mm, and what
-    /// its geometry was stated to be before it was corrected.
+    /// Adds to the frame written last the displacement of the heart along (posterior, left, superior), mm, and the geometry
+    /// that was stated before it was corrected.
     ///
     /// # Errors
     /// [`Error::Config`] where the layout cannot state a displacement.
@@ -180,7 +180,7 @@ impl<'a> Writer<'a> {
         Ok(())
     }
 
-    /// Angles of a geometry that differs from the common one by nothing else.
+    /// Angles of a geometry that may differ from the common one only in its angles.
     fn authors_angles(&self, geometry: &Geometry) -> Result<(f64, f64)> {
         let c_arm = match geometry {
             Geometry::CArm(c_arm) => c_arm,
@@ -196,7 +196,7 @@ impl<'a> Writer<'a> {
         Ok((c_arm.primary_deg, c_arm.secondary_deg))
     }
 
-    /// Writes what names the frames: from now on there is a dataset.
+    /// Writes the files that list the frames; from then on the dataset is complete.
     ///
     /// # Errors
     /// [`Error::Io`].
@@ -217,19 +217,19 @@ impl<'a> Writer<'a> {
     }
 }
 
-/// Writes a dataset in a layout. Values become line integrals.
+/// Writes a dataset in a layout. Stored values become line integrals.
 ///
 /// # Errors
-/// [`Error::Config`] for what the layout cannot state; [`Error::Io`].
+/// [`Error::Config`] for properties that the layout cannot state; [`Error::Io`].
 pub fn convert(dataset: &Dataset, layout: Layout, out: &Path) -> Result<()> {
     let description = format!("converted from {:?}", dataset.layout).to_lowercase();
     write(dataset, layout, out, description, &|_| None)
 }
 
-/// Writes a dataset of line integrals; `stated` gives what the geometry of a view was before it was corrected.
+/// Writes a dataset of line integrals; `stated` returns the geometry of a view before it was corrected.
 ///
 /// # Errors
-/// As [`convert`].
+/// Errors of [`convert`].
 pub fn write(
     dataset: &Dataset,
     layout: Layout,

@@ -1,4 +1,4 @@
-//! What a study's angiograms are: phantoms, made once and shared between methods, or a directory.
+//! Angiograms of a study: phantoms, made once and shared between methods, or an existing directory.
 
 use crate::error::{Error, Result};
 use crate::files::{self, Lock};
@@ -17,49 +17,49 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Written last into a phantom: what it was made of.
+/// Name of the file that is written last into a phantom; it records the data and the commit it was made from.
 const STAMP: &str = "study-data.json";
-/// How often it is looked whether another process is done with a data set.
+/// Interval between checks whether another process has finished a data set.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
-/// Sides and phases of a phantom where a study says nothing: those of the command line.
+/// Size, phases and views of a phantom where a study does not state them; the defaults of the command line.
 const USUAL_SIZE: usize = 100;
 const USUAL_PHASES: u32 = 10;
 const USUAL_VIEWS: u32 = 4;
 /// Attenuation of filled vessels in real anatomy, 1/mm.
 const USUAL_IODINE_PER_MM: f64 = 0.10;
-/// The C-arm of real anatomy: source to isocentre, source to detector, field of view, mm.
+/// C-arm of real anatomy: source to isocentre, source to detector, field of view, mm.
 const USUAL_C_ARM_MM: [f64; 3] = [750.0, 1100.0, 160.0];
 
-/// A phantom as a study states it; what it leaves out is as for all phantoms of the study, or usual.
+/// A phantom as a study states it. Omitted fields take the values of the study's common section, or defaults.
 #[derive(Debug, Clone, Default, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct PhantomSection {
     /// Published set-up: `xcat` or `magix`.
     geometry: Option<Setting>,
-    /// Columns and rows.
+    /// Columns and rows of the images.
     size: Option<usize>,
     /// Cardiac phases.
     phases: Option<u32>,
-    /// Numbers of training views: a data set each.
+    /// Numbers of training views; each gives a data set of its own.
     views: Option<Vec<u32>>,
-    /// The same shape and noise for all seeds of the study.
+    /// Seed of shape and noise for all runs; without it, each run uses its own seed.
     seed: Option<u32>,
-    /// Tree of real anatomy.
+    /// File with a tree of real anatomy.
     tree: Option<PathBuf>,
-    /// CT behind it.
+    /// CT file with the background of the tree.
     background: Option<PathBuf>,
     /// Attenuation of filled vessels with a tree, 1/mm.
     iodine_per_mm: Option<f64>,
     /// Whether the true vessels are written as volumes, for scores in 3D.
     volumes: Option<bool>,
-    /// The first of every so many phases has its volume.
+    /// Interval of the phases whose volumes are written: the first of every so many.
     volumes_every: Option<NonZeroU32>,
     catheter: Option<bool>,
     geometry_error: Option<GeometryError>,
     breathing: Option<Breathing>,
-    /// Per pixel of the open beam.
+    /// Photons per pixel of the unattenuated beam.
     photons: Option<f64>,
-    /// Per pixel at the detector.
+    /// Photons per pixel at the detector.
     detector_photons: Option<f64>,
     contrast_variation_percent: Option<f64>,
     inflow_s: Option<f64>,
@@ -68,10 +68,10 @@ pub struct PhantomSection {
 }
 
 impl PhantomSection {
-    /// With what `common` says where this says nothing.
+    /// Fills the fields that are missing here from `common`.
     pub(super) fn over(self, common: &PhantomSection) -> PhantomSection {
         let common = common.clone();
-        // Either kind of photons says how many there are.
+        // Either kind of photon count overrides both kinds of the common section.
         let counted = self.photons.is_some() || self.detector_photons.is_some();
         PhantomSection {
             geometry: self.geometry.or(common.geometry),
@@ -141,51 +141,51 @@ impl PhantomSection {
 /// A data set of a study, for all its seeds.
 #[derive(Debug, Clone)]
 pub struct DataSet {
-    /// What its runs are called by: its name, and the number of views of a phantom.
+    /// Prefix of the names of its runs: the name of the data set and, for a phantom, its number of views.
     pub id: String,
     /// Name in the study.
     pub name: String,
     /// Name in tables.
     pub label: String,
-    /// Training views of a phantom.
+    /// Number of training views of a phantom.
     pub views: Option<u32>,
-    /// What it is made of.
+    /// Source of the data.
     pub source: Source,
 }
 
-/// What a data set is made of.
+/// Source of a data set.
 #[derive(Debug, Clone)]
 pub enum Source {
-    /// Made by the study.
+    /// Phantom that the study makes.
     Phantom(Box<Phantom>),
-    /// Somebody's own.
+    /// Existing data in a directory.
     Directory {
-        /// Where it is.
+        /// The directory.
         path: PathBuf,
-        /// Of the bytes of its files.
+        /// Fingerprint of all its files.
         fingerprint: Fingerprint,
     },
 }
 
-/// A phantom, but for its seed.
+/// A phantom without its seed.
 #[derive(Debug, Clone)]
 pub struct Phantom {
-    /// Its seed is overridden by that of a run, unless `fixed_seed`.
+    /// Options; their seed is replaced by that of the run, or by `fixed_seed`.
     options: PhantomOptions,
     fixed_seed: Option<u32>,
-    /// Of what was stated, and of the bytes of its files.
+    /// Fingerprint of the stated options and of the files they name.
     fingerprint: Fingerprint,
 }
 
 impl Phantom {
-    /// Its seed in a run of a seed.
+    /// Seed of the phantom in a run with the seed `run`.
     fn seed(&self, run: u32) -> u32 {
         self.fixed_seed.unwrap_or(run)
     }
 }
 
 impl Source {
-    /// Data that lie in a directory.
+    /// Describes data that lie in a directory.
     ///
     /// # Errors
     /// [`Error::Io`].
@@ -196,7 +196,7 @@ impl Source {
     }
 }
 
-/// Takes a file in, or all files of a directory with their names, in the order of these.
+/// Adds a file to a fingerprint, or all files of a directory with their names, sorted by name.
 fn take_in(fingerprint: &mut Fingerprint, path: &Path) -> Result<()> {
     if path.is_dir() {
         let entries = std::fs::read_dir(path).map_err(Error::io("list", path))?;
@@ -211,7 +211,7 @@ fn take_in(fingerprint: &mut Fingerprint, path: &Path) -> Result<()> {
     std::io::copy(&mut file, fingerprint).map_err(Error::io("read", path)).map(drop)
 }
 
-/// The data sets of a section: one for each number of views.
+/// Expands a section into data sets, one for each number of views.
 pub(super) fn phantoms(
     name: &str,
     label: &str,
@@ -259,7 +259,7 @@ pub(super) fn phantoms(
     numbers.iter().map(|views| one(*views)).collect()
 }
 
-/// What a phantom in a study's directory was made of.
+/// Record of the data and the program that a phantom in a study's directory was made from.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Stamp {
     data: String,
@@ -267,7 +267,7 @@ struct Stamp {
 }
 
 impl DataSet {
-    /// What tells these data from others.
+    /// Fingerprint that tells these data from others.
     pub fn fingerprint(&self, seed: u32) -> String {
         match &self.source {
             Source::Directory { fingerprint, .. } => fingerprint.hex(),
@@ -279,7 +279,7 @@ impl DataSet {
         }
     }
 
-    /// Where the data of a run are, once made.
+    /// Directory of the data of a run; a phantom may not have been made yet.
     fn place(&self, study: &Path, seed: u32) -> PathBuf {
         match &self.source {
             Source::Directory { path, .. } => path.clone(),
@@ -287,7 +287,7 @@ impl DataSet {
         }
     }
 
-    /// Makes the data of a run where that is still to be done, and says where they are. One process makes them, others wait.
+    /// Makes the data of a run unless they are ready, and returns their directory. One process makes them while others wait.
     ///
     /// # Errors
     /// [`Error::Interrupted`]; errors of making phantoms.

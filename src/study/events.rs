@@ -1,9 +1,9 @@
-//! What a study tells its observer.
+//! Events that a study reports to its observer.
 
 use crate::run::events::Event;
 use serde::Serialize;
 
-/// What a study tells its observer; also the lines of `study run --json`, told apart by `study`.
+/// Event of a study; also a line of `study run --json`, whose kind is the value of `study`.
 #[derive(Debug, Serialize)]
 #[serde(tag = "study", rename_all = "snake_case")]
 pub enum StudyEvent<'a> {
@@ -11,14 +11,14 @@ pub enum StudyEvent<'a> {
     Begun {
         /// Runs of the study.
         runs: usize,
-        /// Those that have their result already.
+        /// Runs that already have a result.
         done: usize,
     },
-    /// A run begins or goes on.
+    /// A run begins or is resumed.
     RunBegun {
-        /// Its name.
+        /// Name of the run.
         run: &'a str,
-        /// Its number, from 1.
+        /// Number of the run, from 1.
         number: usize,
         /// Runs of the study.
         of: usize,
@@ -27,48 +27,48 @@ pub enum StudyEvent<'a> {
     },
     /// A phantom is being made.
     Making {
-        /// The run that needs it.
+        /// Run that needs the phantom.
         run: &'a str,
-        /// What is being done.
+        /// Step in progress.
         what: &'a str,
-        /// Steps done.
+        /// Steps completed.
         done: u64,
         /// Steps in all.
         of: u64,
     },
-    /// What a run tells.
+    /// An event of a run.
     Run {
-        /// Its name.
+        /// Name of the run.
         run: &'a str,
-        /// What it tells.
+        /// The event.
         #[serde(flatten)]
         event: &'a Event,
     },
     /// A run has its result.
     RunEnded {
-        /// Its name.
+        /// Name of the run.
         run: &'a str,
-        /// Why it failed, where it did.
+        /// Reason of the failure, if the run failed.
         failure: Option<&'a str>,
-        /// Mean Dice of the moving field.
+        /// Mean Dice of the dynamic field.
         dice: Option<f64>,
-        /// Seconds it took in all.
+        /// Total duration of the run, seconds.
         whole_s: f64,
     },
-    /// A run could not be done now; a later queue will.
+    /// A run could not be done at this time; a later queue will retry it.
     RunPutOff {
-        /// Its name.
+        /// Name of the run.
         run: &'a str,
-        /// Why.
+        /// Reason of the delay.
         why: &'a str,
     },
-    /// The queue is through.
+    /// The queue has ended.
     Ended {
         /// Runs of the study.
         runs: usize,
-        /// Those with a result.
+        /// Runs with a result.
         done: usize,
-        /// Those of them that failed.
+        /// Runs with a result that failed.
         failed: usize,
     },
 }

@@ -1,31 +1,31 @@
-//! How results are shown: what rows and columns stand for.
+//! Layout of result tables: the meaning of rows and columns.
 
 use crate::study::scores::Score;
 use serde::Deserialize;
 
-/// What rows and columns of a table can be.
+/// Dimension of a study that rows or columns of a table can stand for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Dimension {
-    /// What is seen.
+    /// Data set.
     Data,
-    /// From how many views.
+    /// Number of views.
     Views,
-    /// How it is reconstructed.
+    /// Reconstruction method.
     Method,
 }
 
-/// How results are shown.
+/// Layout of the results of a study.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TableLayout {
-    /// What columns stand for; rows stand for the rest.
+    /// Dimensions that columns stand for; rows stand for the others.
     pub columns: Vec<Dimension>,
-    /// What is shown in each of them.
+    /// Scores shown in each column group.
     pub scores: Vec<Score>,
 }
 
 impl Default for TableLayout {
-    /// That of the paper's first table.
+    /// Layout of the paper's first table.
     fn default() -> Self {
         TableLayout {
             columns: vec![Dimension::Views],
@@ -35,7 +35,7 @@ impl Default for TableLayout {
 }
 
 impl Dimension {
-    /// Heading of a column that names it.
+    /// Heading of a column of row names for this dimension.
     pub fn heading(self) -> &'static str {
         match self {
             Dimension::Data => "data",

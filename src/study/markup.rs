@@ -3,11 +3,11 @@
 use crate::study::scores::Score;
 use crate::study::table::{Cell, Grid, State, Table};
 
-/// How a language writes what a cell says.
+/// Markup of a language for the content of cells.
 struct Language {
     bold: [&'static str; 2],
     plus_minus: &'static str,
-    /// Makes plain text of what would be markup.
+    /// Escapes characters that the language would take for markup.
     escape: fn(&str) -> String,
 }
 
@@ -33,7 +33,7 @@ fn latex_escape(text: &str) -> String {
 }
 
 impl Cell {
-    /// What it says: our mean and its spread, how many runs there are where some are missing, and the published value.
+    /// Text of the cell: our mean and its spread, the number of runs where some are missing, and the published value.
     fn text(&self, score: Score, language: &Language) -> String {
         let ours = match self.state {
             State::Scored { mean, deviation, runs, of } => {
@@ -48,13 +48,13 @@ impl Cell {
             State::NotRun => "not run".to_owned(),
         };
         match self.published {
-            // As it was published: with no digit more.
+            // The published value is written with the digits it was published with.
             Some(value) => format!("{ours} ({value})"),
             None => ours,
         }
     }
 
-    /// What it says, without markup.
+    /// Text of the cell without markup.
     pub fn plain(&self, score: Score) -> String {
         self.text(score, &Language { bold: ["", ""], ..MARKDOWN })
     }
@@ -85,7 +85,7 @@ pub fn markdown(table: &Table) -> String {
     text
 }
 
-/// The table as LaTeX, to be put into a document; needs no package.
+/// The table as LaTeX, to be inserted into a document; it needs no package.
 pub fn latex(table: &Table) -> String {
     let grid = table.grid();
     let names = grid.headings.len();
@@ -114,7 +114,7 @@ pub fn latex(table: &Table) -> String {
     text
 }
 
-/// The table as CSV (RFC 4180), one line per score: numbers with all their digits.
+/// The table as CSV (RFC 4180), one line per score, with all digits of the numbers.
 pub fn csv(table: &Table) -> String {
     let quote = |text: &str| match text.contains([',', '"', '\n', '\r']) {
         true => format!("\"{}\"", text.replace('"', "\"\"")),

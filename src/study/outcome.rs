@@ -1,4 +1,4 @@
-//! What a run of a study leaves: `result.json`, written last and whole.
+//! Result of a run of a study: `result.json`, written atomically at the end of the run.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -14,7 +14,7 @@ const FORMAT: &str = "nertca-study-result";
 const VERSION: u32 = 1;
 const MAX_BYTES: u64 = 16 << 20;
 
-/// What became of a run.
+/// Result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Outcome {
@@ -24,49 +24,50 @@ pub struct Outcome {
     version: u32,
     /// Name of the run.
     pub run: String,
-    /// What it was made of.
+    /// Fingerprint of data, configuration and program.
     pub fingerprint: RunFingerprint,
     /// Seed of data and training.
     pub seed: u32,
     /// Name of the device.
     pub device: String,
-    /// Its driver, with version.
+    /// Driver of the device, with its version.
     pub driver: String,
-    /// Iterations done.
+    /// Iterations completed.
     pub iterations: u32,
-    /// What it took.
+    /// Duration of the run.
     pub seconds: Seconds,
-    /// Dice of some unseen images over the time of training, where the run was validated on the way.
+    /// Dice of some unseen images over the time of training, where the run was validated during training.
     pub curve: Vec<CurvePoint>,
-    /// Scores on all unseen images; none of a run that failed.
+    /// Scores on all unseen images; none for a run that failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scores: Option<RunScores>,
-    /// Why it failed, where it did.
+    /// Reason of the failure, if the run failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub failure: Option<String>,
 }
 
-/// Seconds of a run; of one that was interrupted, of all its parts together, as far as they were kept.
+/// Duration of a run, seconds. For a run that was interrupted: the sum over its parts, as far as they were recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Seconds {
-    /// Training. Parts that were interrupted are counted to their last report before the checkpoint, with saving and validation.
+    /// Training time. Interrupted parts are counted up to the last report before their checkpoint, including saving and
+    /// validation.
     pub training: f64,
-    /// From the dataset to the scores.
+    /// Time from opening the dataset to the scores.
     pub whole: f64,
-    /// Parts: 1 for a run that nothing interrupted.
+    /// Number of parts: 1 for a run without interruption.
     pub parts: u32,
 }
 
-/// A validation on the way.
+/// A validation during training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurvePoint {
-    /// Iterations done.
+    /// Iterations completed.
     pub step: u32,
-    /// Seconds of training until then.
+    /// Seconds of training up to this validation.
     pub train_s: f64,
-    /// Dice of the moving field, where images have masks.
+    /// Dice of the dynamic field, where images have masks.
     pub dice: Option<f64>,
     /// Distance to the true vessels at one phase, mm, where the data have them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -74,56 +75,56 @@ pub struct CurvePoint {
 }
 
 impl CurvePoint {
-    /// What a study keeps of a validation.
+    /// Keeps the part of a validation that a study records.
     pub(super) fn of(validated: &Validated) -> CurvePoint {
         let Validated { step, train_s, dice, chamfer_mm, .. } = *validated;
         CurvePoint { step, train_s, dice, chamfer_mm }
     }
 }
 
-/// Scores of a run: means over unseen images or over phases. `report/evaluation.json` beside has all of them.
+/// Scores of a run: means over unseen images or over phases. `report/evaluation.json` in the run directory has all values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunScores {
-    /// Dice of the moving field.
+    /// Dice of the dynamic field.
     pub dice: Option<f64>,
     /// Dice of both fields.
     pub dice_total: Option<f64>,
-    /// Dice of the moving field where unseen views were left as stated, where calibration moved them.
+    /// Dice of the dynamic field with the unseen views as stated, for data whose views calibration has moved.
     pub dice_as_stated: Option<f64>,
-    /// Dice of the moving field with the best threshold.
+    /// Dice of the dynamic field with the best threshold.
     pub dice_best: Option<f64>,
-    /// Dice of the moving field at the authors' threshold, as in the paper.
+    /// Dice of the dynamic field at the authors' threshold, as in the paper.
     pub dice_paper: Option<f64>,
     /// Dice of both fields in the first image at the authors' threshold, as in their code.
     pub dice_authors: Option<f64>,
-    /// Dice of X-Gaussian by Otsu's threshold of each image.
+    /// Dice of X-Gaussian with Otsu's threshold of each image.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub dice_otsu: Option<f64>,
-    /// dB.
+    /// Peak signal-to-noise ratio, dB.
     pub psnr: Option<f64>,
     /// Structural similarity.
     pub ssim: Option<f64>,
     /// Distance to the true vessels, mm.
     pub chamfer_mm: Option<f64>,
-    /// Largest distance to the true vessels but for 5 %, mm.
+    /// 95th percentile of the distance to the true vessels, mm.
     pub hausdorff95_mm: Option<f64>,
     /// Centreline Dice in 3D.
     pub cl_dice: Option<f64>,
-    /// Attenuation from which the moving field counts as vessel, per mm, and why.
+    /// Attenuation from which the dynamic field counts as vessel, per mm.
     pub threshold_per_mm: f64,
-    /// How the threshold was chosen.
+    /// Rule by which the threshold was chosen.
     pub threshold_rule: String,
-    /// Unseen images.
+    /// Number of unseen images.
     pub images: usize,
-    /// Renderings per second of the evaluation: all that is scored, at the size of the images.
+    /// Images rendered per second in the evaluation: all fields that are scored, at the size of the images.
     pub fps: Option<f64>,
-    /// What makes the scores worth less than they seem.
+    /// Limitations of the scores.
     pub warnings: Vec<String>,
 }
 
 impl RunScores {
-    /// What an evaluation comes down to.
+    /// Keeps the scores of an evaluation.
     pub fn new(evaluation: &Evaluation, fps: Option<f64>) -> RunScores {
         let finite = |value: f64| Some(value).filter(|v| v.is_finite());
         let volume = evaluation.volume.as_ref().map(|volume| &volume.mean.agreement);
@@ -149,7 +150,7 @@ impl RunScores {
     }
 }
 
-/// Where a run's directory is inside a study's.
+/// Directory of a run inside a study's directory.
 pub fn run_directory(study: &Path, run: &Run) -> PathBuf {
     study.join("runs").join(&run.id)
 }
@@ -177,7 +178,7 @@ impl Outcome {
         files::write_atomic(&directory.join(RESULT), files::pretty_json(self)?.as_bytes())
     }
 
-    /// The result in a run directory; none where there is none yet.
+    /// Reads the result in a run directory; none if there is none yet.
     ///
     /// # Errors
     /// [`Error::Data`] for a file of another kind or version; [`Error::Io`].
@@ -195,19 +196,19 @@ impl Outcome {
         Ok(Some(outcome))
     }
 
-    /// The result of a run if it is of exactly these data, this configuration and this program.
+    /// Result of a run if it was made from exactly these data, with this configuration and this program.
     ///
     /// # Errors
-    /// As [`Outcome::read`].
+    /// Errors of [`Outcome::read`].
     pub fn of(study: &Study, directory: &Path, run: &Run) -> Result<Option<Outcome>> {
         let wanted = study.fingerprint(run)?;
         Ok(Outcome::read(&run_directory(directory, run))?.filter(|outcome| outcome.fingerprint == wanted))
     }
 
-    /// The result of a run if it is of exactly these data and this configuration, whichever commit of the program made it.
+    /// Result of a run if it was made from exactly these data, with this configuration, by any commit of the program.
     ///
     /// # Errors
-    /// As [`Outcome::read`].
+    /// Errors of [`Outcome::read`].
     pub fn of_any_commit(study: &Study, directory: &Path, run: &Run) -> Result<Option<Outcome>> {
         let wanted = study.fingerprint(run)?;
         let found = Outcome::read(&run_directory(directory, run))?;

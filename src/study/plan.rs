@@ -21,7 +21,7 @@ pub struct Study {
     pub data: Vec<DataSet>,
     /// Methods, in the order of the file.
     pub methods: Vec<Method>,
-    /// How results are shown.
+    /// Layout of the result tables.
     pub table: TableLayout,
     /// Published values to put beside our own.
     pub published: Option<Published>,
@@ -114,7 +114,7 @@ impl Study {
     /// Fingerprint of a run.
     ///
     /// # Errors
-    /// [`Error::Internal`] for a configuration that cannot be written down.
+    /// [`Error::Internal`] for a configuration that cannot be written as TOML.
     pub fn fingerprint(&self, run: &Run) -> Result<RunFingerprint> {
         Ok(RunFingerprint {
             data: self.data[run.data].fingerprint(run.seed),

@@ -1,4 +1,4 @@
-//! What others have published, to stand beside our own results: never in their place.
+//! Values that others have published, shown beside our own results and never in place of them.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -13,9 +13,9 @@ const MAX_BYTES: u64 = 1 << 20;
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Published {
-    /// Where they are from.
+    /// Publication they come from.
     pub source: String,
-    /// What to know when comparing them.
+    /// Notes on the comparison.
     pub note: Option<String>,
     rows: Vec<PublishedRow>,
 }
@@ -25,7 +25,7 @@ pub struct Published {
 #[serde(deny_unknown_fields)]
 struct PublishedRow {
     method: String,
-    /// Name of the data set in studies; without, the values are means over all.
+    /// Name of the data set in studies; if missing, the values are means over all data sets.
     data: Option<String>,
     views: Option<u32>,
     dice: Option<f64>,
@@ -49,17 +49,17 @@ impl PublishedRow {
 }
 
 impl Published {
-    /// Reads published values.
+    /// Reads published values from a file.
     ///
     /// # Errors
-    /// [`Error::Data`] with the line of what is wrong; [`Error::Io`].
+    /// [`Error::Data`] with the line of the problem; [`Error::Io`].
     pub fn read(file: &Path) -> Result<Published> {
         let text = String::from_utf8(files::read_limited(file, MAX_BYTES)?)
             .map_err(|e| Error::data(file, "text", e.to_string()))?;
         Text { file, text: &text }.parse()
     }
 
-    /// Methods there are values for, in the order of the file.
+    /// Methods with published values, in the order of the file.
     pub fn methods(&self) -> Vec<&str> {
         let mut methods: Vec<&str> = Vec::new();
         for row in &self.rows {
@@ -70,7 +70,7 @@ impl Published {
         methods
     }
 
-    /// The value of a method on a data set, or its mean over all where that is what was published.
+    /// Published value of a method on a data set, or its mean over all data sets where only that was published.
     pub fn value(&self, method: &str, data: &str, views: Option<u32>, score: Score) -> Option<f64> {
         let of_method = || self.rows.iter().filter(|row| row.method == method);
         let here = of_method().filter(|row| row.data.as_deref() == Some(data) && row.views == views);

@@ -1,4 +1,4 @@
-//! All runs of a study, one after the other.
+//! Queue of a study: runs one after the other.
 
 use crate::error::{Error, Result};
 use crate::study::events::StudyEvent;
@@ -6,18 +6,18 @@ use crate::study::outcome::Outcome;
 use crate::study::plan::{Run, Study};
 use crate::study::work::{Observe, Workplace};
 
-/// What a queue came to.
+/// Summary of a queue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Summary {
     /// Runs of the study.
     pub runs: usize,
-    /// Those that have a result.
+    /// Runs that have a result.
     pub done: usize,
-    /// Those of them that failed.
+    /// Runs with a result that failed.
     pub failed: usize,
 }
 
-/// Seconds that runs took, by method.
+/// Durations of runs in seconds, by method.
 struct Times {
     of_methods: Vec<Vec<f64>>,
 }
@@ -31,7 +31,8 @@ impl Times {
         self.of_methods[run.method].push(outcome.seconds.whole);
     }
 
-    /// What runs to come take together, by the mean of their method, or of all methods; none before any was timed.
+    /// Estimated total duration of the runs to come, from the mean of their method or else of all methods; none before any run
+    /// was timed.
     fn left_s(&self, runs: &[&Run]) -> Option<f64> {
         let mean = |values: &mut dyn Iterator<Item = f64>| {
             let (n, sum) = values.fold((0, 0.0), |(n, sum), value| (n + 1, sum + value));
@@ -43,12 +44,12 @@ impl Times {
     }
 }
 
-/// Does all runs of a study that have no result yet. A run that fails is told and the others go on, as they do when a device
-/// is lost or another process is at a run: what cannot be done now is tried once more by the next call.
+/// Does all runs of a study that have no result yet. A run that fails is reported and the others continue, also when a device
+/// is lost or another process is busy with a run. Runs that cannot be done at this time are retried by the next call.
 ///
 /// # Errors
-/// [`Error::Interrupted`] after a cancel; in the end, the first error of what was put off; at once, where no device is to be
-/// had or results cannot be written.
+/// [`Error::Interrupted`] after a cancel; immediately, errors that prevent further runs, such as no device or results that
+/// cannot be written; at the end, the first error of a run that could not be done at this time.
 pub fn work_off(study: &Study, place: &Workplace<'_>, observe: Observe<'_>) -> Result<Summary> {
     let runs = study.runs();
     let mut times = Times::new(study);

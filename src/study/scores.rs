@@ -1,24 +1,24 @@
-//! What tables show of a run.
+//! Scores of a run that tables can show.
 
 use crate::choice::Choice;
 use crate::study::outcome::Outcome;
 use serde::{Deserialize, Serialize};
 
-/// A number of a run that a table may show.
+/// A number of a run that a table can show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Score {
-    /// Dice of the moving field, by the rule of `eval`.
+    /// Dice of the dynamic field, by the rule of `eval`.
     Dice,
     /// Dice of both fields, by the rule of `eval`.
     DiceTotal,
-    /// Dice of the moving field at the authors' threshold, on all unseen images.
+    /// Dice of the dynamic field at the authors' threshold, on all unseen images.
     DicePaper,
     /// Dice of both fields at the authors' threshold, on the first unseen image.
     DiceAuthors,
-    /// Dice of the moving field at the threshold that suits the truth best.
+    /// Dice of the dynamic field at the threshold that fits the true masks best.
     DiceBest,
-    /// Dice of X-Gaussian by Otsu's threshold of each image.
+    /// Dice of X-Gaussian with Otsu's threshold of each image.
     DiceOtsu,
     /// Peak signal-to-noise ratio, dB.
     Psnr,
@@ -26,17 +26,17 @@ pub enum Score {
     Ssim,
     /// Mean distance to the true vessels, mm.
     ChamferMm,
-    /// Distance to the true vessels that 5 % exceed, mm.
+    /// 95th percentile of the distance to the true vessels, mm.
     Hausdorff95Mm,
     /// Centreline Dice in 3D.
     ClDice,
-    /// Minutes of training.
+    /// Training time, minutes.
     Minutes,
-    /// Renderings per second.
+    /// Images rendered per second.
     Fps,
 }
 
-/// How a score is shown.
+/// Presentation of a score.
 struct Look {
     name: &'static str,
     heading: &'static str,
@@ -80,32 +80,32 @@ impl Score {
         Look { name, heading, meaning, digits, more_is_better }
     }
 
-    /// Heading of its column.
+    /// Heading of the score's column.
     pub fn heading(self) -> &'static str {
         self.look().heading
     }
 
-    /// What it means, after its heading.
+    /// Explanation of the score, to follow its heading.
     pub fn meaning(self) -> &'static str {
         self.look().meaning
     }
 
-    /// Digits behind the point.
+    /// Digits after the decimal point.
     pub fn digits(self) -> usize {
         self.look().digits
     }
 
-    /// Whether the largest value is the best.
+    /// Tells whether the largest value is the best.
     pub fn more_is_better(self) -> bool {
         self.look().more_is_better
     }
 
-    /// A value as tables show it.
+    /// Formats a value as tables show it.
     pub fn text(self, value: f64) -> String {
         format!("{value:.*}", self.digits())
     }
 
-    /// Its value in an outcome, where there is one.
+    /// Value of the score in an outcome, if it has one.
     pub fn of(self, outcome: &Outcome) -> Option<f64> {
         let scores = outcome.scores.as_ref()?;
         match self {

@@ -1,4 +1,4 @@
-//! Results of a study, put beside each other and beside published values.
+//! Results of a study, set beside each other and beside published values.
 
 use crate::error::Result;
 use crate::study::data::DataSet;
@@ -10,14 +10,14 @@ use std::path::Path;
 
 const DIMENSIONS: [Dimension; 3] = [Dimension::Data, Dimension::Views, Dimension::Method];
 
-/// A table, cell by cell.
+/// A table as a list of entries.
 #[derive(Debug, Clone)]
 pub struct Table {
-    /// Its title.
+    /// Title of the table.
     pub title: String,
     /// Every score of every method on every data set, data sets first.
     pub entries: Vec<Entry>,
-    /// What to know of it, a sentence or two each.
+    /// Notes below the table, a sentence or two each.
     pub notes: Vec<String>,
     layout: TableLayout,
 }
@@ -27,48 +27,48 @@ pub struct Table {
 pub struct Entry {
     /// Label of the data set.
     pub data: String,
-    /// Its views, where it states them.
+    /// Number of views, where the data set states it.
     pub views: Option<u32>,
     /// Label of the method.
     pub method: String,
     /// The score.
     pub score: Score,
-    /// Its values.
+    /// Values of the score.
     pub cell: Cell,
 }
 
 /// Values of a score over the seeds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Cell {
-    /// Ours.
+    /// State of our own values.
     pub state: State,
-    /// The published one.
+    /// The published value.
     pub published: Option<f64>,
     /// Whether no other method of the study is better on these data.
     pub best: bool,
 }
 
-/// What there is of our own values.
+/// State of our own values of a score.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum State {
-    /// Runs that were scored.
+    /// At least one run has the score.
     Scored {
         /// Mean.
         mean: f64,
         /// Standard deviation; none of a single run.
         deviation: Option<f64>,
-        /// Runs.
+        /// Number of runs with the score.
         runs: usize,
         /// Runs that the study asks for.
         of: usize,
     },
-    /// Runs were scored, but this score does not exist for them.
+    /// Runs were scored, but none of them has this score.
     NoScore,
     /// No run was scored, and some failed.
     Failed,
-    /// Nothing was run.
+    /// No run has a result yet.
     NotRun,
-    /// The study does not have this method.
+    /// The study does not have this method; only its published value is shown.
     Published,
 }
 
@@ -77,9 +77,9 @@ pub enum State {
 pub struct Grid<'a> {
     /// Headings of the columns that name the rows.
     pub headings: Vec<&'static str>,
-    /// Name of a group of columns, and the score of each.
+    /// Name of the group of columns and the score, for each column.
     pub columns: Vec<(String, Score)>,
-    /// Names of a row, and its cells; none where the row has none there.
+    /// Names and cells of each row; a cell is none where the table has no entry.
     pub rows: Vec<(Vec<String>, Vec<Option<&'a Cell>>)>,
 }
 
@@ -113,7 +113,7 @@ impl Results {
     }
 }
 
-/// Mean and standard deviation; no deviation of one value, nothing of none.
+/// Mean and standard deviation; no deviation for a single value, and none for no values.
 fn spread(values: &[f64]) -> Option<(f64, Option<f64>)> {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;
@@ -126,8 +126,8 @@ fn spread(values: &[f64]) -> Option<(f64, Option<f64>)> {
 }
 
 impl Table {
-    /// Gathers what a study's directory holds. Results of other data or another configuration are left out, and those of other
-    /// programs are told.
+    /// Gathers the results in a study's directory. Results of other data or another configuration are left out and counted; the
+    /// commits that made the results are noted.
     ///
     /// # Errors
     /// Errors of results that cannot be read.
@@ -153,10 +153,10 @@ impl Table {
         Ok(Table { title: study.title.clone(), entries, notes, layout: study.table.clone() })
     }
 
-    /// As rows and columns.
+    /// Arranges the entries as rows and columns.
     pub fn grid(&self) -> Grid<'_> {
         let in_rows: Vec<Dimension> = DIMENSIONS.into_iter().filter(|d| !self.layout.columns.contains(d)).collect();
-        // What is the same everywhere needs no column of its own.
+        // A dimension with the same label everywhere needs no column.
         let differs = |d: &Dimension| {
             self.entries.iter().any(|entry| Some(entry.label(*d)) != self.entries.first().map(|first| first.label(*d)))
         };
@@ -196,7 +196,7 @@ fn entry(set: &DataSet, method: &str, score: Score, cell: Cell) -> Entry {
     Entry { data: set.label.clone(), views: set.views, method: method.to_owned(), score, cell }
 }
 
-/// Values of methods that the study does not have.
+/// Published values of methods that the study does not have.
 fn published_alone(study: &Study, set: &DataSet) -> Vec<Entry> {
     let Some(published) = &study.published else { return Vec::new() };
     let ours = |name: &str| study.methods.iter().any(|m| m.published.as_deref() == Some(name));
@@ -211,7 +211,7 @@ fn published_alone(study: &Study, set: &DataSet) -> Vec<Entry> {
         .collect()
 }
 
-/// Marks the best of our own values of each score, as far as tables show them, where there are several.
+/// Marks the best of our own values of each score, compared as rounded in tables, where there are at least two.
 fn mark_best(entries: &mut [Entry], scores: &[Score]) {
     for &score in scores {
         let shown = |entry: &Entry| match entry.cell.state {
@@ -230,14 +230,14 @@ fn mark_best(entries: &mut [Entry], scores: &[Score]) {
     }
 }
 
-/// What is told below a table.
+/// Notes to be written below a table.
 #[derive(Default)]
 struct Gathered {
-    /// Commits, devices and drivers, in the order they were met.
+    /// Commits, devices and drivers, in the order of their first occurrence.
     made_by: Vec<String>,
     failures: Vec<String>,
     warnings: Vec<String>,
-    /// Results of other data or another configuration.
+    /// Number of results of other data or another configuration.
     others: usize,
 }
 
@@ -288,7 +288,7 @@ impl Gathered {
     }
 }
 
-/// What is to be said of a method whose run has another length than its preset's.
+/// Note on a method whose number of iterations differs from its preset's.
 fn scaled(method: &Method) -> Option<String> {
     let (own, preset) = (method.config.train.iterations, method.preset_iterations);
     let of = format!("{}: {own} iterations instead of the {preset} of the preset", method.label);
@@ -320,7 +320,7 @@ mod tests {
             mark_best(&mut entries, &[score]);
             entries.iter().map(|e| e.cell.best).collect::<Vec<_>>()
         };
-        // 0.8401 and 0.8404 are one number to a reader.
+        // Rounded to three digits, 0.8401 and 0.8404 are the same number.
         assert_eq!(of(Score::Dice, [0.8401, 0.7, 0.8404]), [true, false, true]);
         assert_eq!(of(Score::Minutes, [3.0, 1.0, 2.0]), [false, true, false]);
         let mut alone = [scored("a", 3, "m", Score::Dice, 0.5)];

@@ -1,39 +1,39 @@
-//! The text of a file that people write, and where files are that it names.
+//! Text of files that people write, and search for the files they name.
 
 use crate::error::{Error, Result};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-/// A text with its name, to say on which line something stands.
+/// A text with the name of its file, to report problems with line numbers.
 pub(super) struct Text<'a> {
     pub(super) file: &'a Path,
     pub(super) text: &'a str,
 }
 
 impl Text<'_> {
-    /// A fault of what stands at a place of the text.
+    /// Makes an error about the text in a range, naming its line.
     pub(super) fn fault(&self, at: &Range<usize>, problem: impl Into<String>) -> Error {
         let before = &self.text.as_bytes()[..at.start.min(self.text.len())];
         let line = 1 + before.iter().filter(|byte| **byte == b'\n').count();
         Error::data(self.file, format!("line {line}"), problem)
     }
 
-    /// Reads it as TOML.
+    /// Parses the text as TOML.
     pub(super) fn parse<T: serde::de::DeserializeOwned>(&self) -> Result<T> {
         toml::from_str(self.text).map_err(|e| self.fault(&e.span().unwrap_or(0..0), e.message().trim().to_owned()))
     }
 }
 
-/// Where a study looks for the files it names by relative paths: in each directory in turn.
+/// Directories in which a study searches, in order, for the files it names by relative paths.
 pub(super) struct Places<'a>(Vec<&'a Path>);
 
 impl<'a> Places<'a> {
-    /// Directories, in the order they are looked at.
+    /// Makes a search list of directories, searched in this order.
     pub(super) fn new(places: impl IntoIterator<Item = &'a Path>) -> Places<'a> {
         Places(places.into_iter().collect())
     }
 
-    /// The first that exists.
+    /// Returns the first existing path.
     pub(super) fn find(&self, path: &Path) -> std::result::Result<PathBuf, String> {
         let found = self.0.iter().map(|place| place.join(path)).find(|path| path.exists());
         found.ok_or_else(|| {

@@ -24,42 +24,42 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-/// What a run directory is being made of; written first.
+/// Name of the file that is written first into a run directory; it holds the run's fingerprint.
 const FINGERPRINT: &str = "fingerprint.json";
 
-/// Opens a device, for one run.
+/// Opens a device for one run.
 pub type Open<'a> = &'a dyn Fn() -> Result<Gpu>;
-/// Looks at a device once more after its run.
+/// Checks a device after its run.
 pub type Close<'a> = &'a dyn Fn(&Gpu) -> Result<()>;
-/// Chooses paths through the kernels.
+/// Selects kernel variants for a device.
 pub type Tune<'a> = &'a dyn Fn(&Gpu, &Config, &Dataset) -> Result<Tuning>;
-/// Hears of what goes on.
+/// Receives events.
 pub type Observe<'a> = &'a mut dyn FnMut(&StudyEvent<'_>);
 
-/// Where and how runs are done.
+/// Resources and options of the work on runs.
 pub struct Workplace<'a> {
     /// Directory of the study.
     pub directory: &'a Path,
-    /// Each run has a device of its own: one that was lost takes no other run with it.
+    /// Opens the device of a run. Each run opens its own, so that a lost device affects no other run.
     pub open: Open<'a>,
-    /// What is to be done with it in the end; its error ends the work.
+    /// Checks the device after its run; an error ends the work.
     pub close: Close<'a>,
-    /// Paths through the kernels.
+    /// Selects kernel variants for the run.
     pub tune: Tune<'a>,
-    /// Set to true to stop after the iterations in flight.
+    /// Flag that stops the work after the iterations in flight when it is true.
     pub cancel: &'a AtomicBool,
-    /// Runs that failed are done again.
+    /// Whether failed runs are repeated.
     pub retry_failed: bool,
-    /// Results of other commits of the program count as done, where data and configuration are the same.
+    /// Whether results of other commits of the program count as done if data and configuration are equal.
     pub any_commit: bool,
 }
 
-/// Comparison of truth and prediction in the first unseen image, in a run directory.
+/// Picture file in a run directory that compares truth and prediction for the first unseen image.
 pub fn picture_file(run: &Path) -> PathBuf {
     run.join("report/first-unseen.png")
 }
 
-/// Whether an error says nothing of the run itself: at another time, or elsewhere, the same run may do.
+/// Tells whether an error is unrelated to the run itself, so that the run may succeed at another time or on another machine.
 fn will_pass(error: &Error) -> bool {
     match error {
         Error::Interrupted | Error::NoDevice(_) | Error::DeviceLost { .. } | Error::Busy(_) => true,
@@ -69,10 +69,10 @@ fn will_pass(error: &Error) -> bool {
 }
 
 impl Workplace<'_> {
-    /// The result of a run that need not be done any more.
+    /// Result of a run that need not be repeated.
     ///
     /// # Errors
-    /// As [`Outcome::read`].
+    /// Errors of [`Outcome::read`].
     pub fn done(&self, study: &Study, run: &Run) -> Result<Option<Outcome>> {
         let outcome = if self.any_commit {
             Outcome::of_any_commit(study, self.directory, run)?
@@ -82,12 +82,12 @@ impl Workplace<'_> {
         Ok(outcome.filter(|outcome| outcome.failure.is_none() || !self.retry_failed))
     }
 
-    /// Does a run, goes on with one that was interrupted, or does nothing where there is a result. A run that fails by itself has
-    /// a result, too, which says why.
+    /// Does a run, resumes one that was interrupted, or returns an existing result. A run that fails because of its own error
+    /// also has a result, which states the reason.
     ///
     /// # Errors
-    /// [`Error::Interrupted`] after a cancel; [`Error::Busy`] while another process is at it; what may pass: a device that was
-    /// lost, memory that others have, no device; errors of writing results.
+    /// [`Error::Interrupted`] after a cancel; [`Error::Busy`] while another process works on the run; temporary problems: a
+    /// lost device, memory occupied by others, no device; errors of writing results.
     pub fn work(&self, study: &Study, run: &Run, observe: Observe<'_>) -> Result<Outcome> {
         let Some(_alone) = Lock::take(&self.directory.join("locks").join(format!("run-{}", run.id)))? else {
             return Err(Error::Busy(format!("another process is at the run {}", run.id)));
@@ -148,7 +148,8 @@ impl Workplace<'_> {
     }
 }
 
-/// Makes a run directory ready: whether it holds checkpoints of the same run to go on from. What is left of another is removed.
+/// Prepares a run directory and returns whether it holds checkpoints of the same run to resume from. The files of another run
+/// are removed.
 fn make_room(directory: &Path, fingerprint: &RunFingerprint) -> Result<bool> {
     let file = directory.join(FINGERPRINT);
     let found = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<RunFingerprint>(&text).ok());
@@ -166,12 +167,12 @@ fn make_room(directory: &Path, fingerprint: &RunFingerprint) -> Result<bool> {
     Ok(false)
 }
 
-/// How fast the unseen images of an evaluation are rendered.
+/// Measures the rendering rate of the unseen images of an evaluation.
 #[derive(Default)]
 struct RenderingPace {
-    /// Images that are scored.
+    /// Number of scored images.
     images: usize,
-    /// When the first was done, seconds: with it, pipelines are made.
+    /// Time at which the first image was complete, seconds; the first image also includes the creation of pipelines.
     first_s: f64,
     last_s: f64,
 }
@@ -187,7 +188,7 @@ impl RenderingPace {
         }
     }
 
-    /// Images per second; none of fewer than two.
+    /// Images per second; none for fewer than two images.
     fn fps(&self) -> Option<f64> {
         let seconds = self.last_s - self.first_s;
         (self.images > 1 && seconds > 0.0).then(|| (self.images - 1) as f64 / seconds)
