@@ -1,5 +1,5 @@
 //! The Python wheel is built, installed into an empty virtual environment like by its users, without access to a compiler,
-//! and used: README's example, and the tests of tests/python/wheel.
+//! and used: the example of docs/python.md, and the tests of tests/python/wheel.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 #[path = "common/python.rs"]
@@ -150,12 +150,12 @@ fn panics_are_caught_in_what_zig_links() {
     assert_eq!(run(&mut Command::new(&binary)), "true\n");
 }
 
-/// Code block of README's section on Python, in a language.
-fn readme(language: &str) -> String {
-    let text = std::fs::read_to_string(root().join("README.md")).unwrap();
-    let section = text.split("\n## From Python\n").nth(1).expect("README has a section on Python");
+/// Returns the code block of docs/python.md in a language.
+fn documented(language: &str) -> String {
+    let text = std::fs::read_to_string(root().join("docs/python.md")).unwrap();
+    let section = text.split("\n## From Python\n").nth(1).expect("docs/python.md has the section of the example");
     let section = section.split("\n## ").next().unwrap();
-    let block = section.split(&format!("```{language}\n")).nth(1).unwrap_or_else(|| panic!("no {language} in README"));
+    let block = section.split(&format!("```{language}\n")).nth(1).unwrap_or_else(|| panic!("no {language} in docs/python.md"));
     block.split("```").next().unwrap().to_owned()
 }
 
@@ -164,12 +164,12 @@ fn readme(language: &str) -> String {
 fn readmes_example_runs_with_nothing_but_the_wheel() {
     let installed = installed();
     let scratch = tempfile::tempdir().unwrap();
-    let phantom = readme("sh").lines().find(|line| line.starts_with("nertca-vk ")).expect("a phantom").to_owned();
+    let phantom = documented("sh").lines().find(|line| line.starts_with("nertca-vk ")).expect("a phantom").to_owned();
     let phantom = phantom.split('#').next().unwrap().trim();
     let mut words = phantom.split_whitespace();
     run(installed.command(words.next().unwrap()).args(words).current_dir(scratch.path()));
     let example = scratch.path().join("example.py");
-    std::fs::write(&example, readme("python")).unwrap();
+    std::fs::write(&example, documented("python")).unwrap();
     let said = run(installed.command("python3").arg(&example).current_dir(scratch.path()));
     assert!(said.contains("Scores(") && said.contains("images=40"), "{said}");
     let beat = "import numpy
@@ -191,7 +191,7 @@ fn types_are_strict_inside_and_for_users() {
     let installed = installed();
     let scratch = tempfile::tempdir().unwrap();
     let example = scratch.path().join("example.py");
-    std::fs::write(&example, readme("python")).unwrap();
+    std::fs::write(&example, documented("python")).unwrap();
     let wrong = scratch.path().join("wrong.py");
     std::fs::write(&wrong, "import nertca_vk\nnertca_vk.Reconstruction(phases=\"three\").render(5)\n").unwrap();
     let mypy = || {
