@@ -1,6 +1,6 @@
-//! Compiles the shaders of `glsl/` to SPIR-V and writes what they say of themselves as Rust: the kernel table, the
-//! structures and numbers they share with the host, their push constants and the names of what they bind. All of these
-//! therefore have one source: the shader.
+//! Compiles the shaders of `glsl/` to SPIR-V and writes Rust from what their text and their SPIR-V declare: the kernel table,
+//! the structures and numbers shared with the host, the push constants and the names of all bindings. The shader is therefore
+//! the single source of all of these.
 
 #[path = "build/compile.rs"]
 mod compile;
@@ -17,9 +17,9 @@ use std::{env, fs};
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Includes whose structures the host uses, too.
+/// Includes whose structures the host uses as well.
 const SHARED_STRUCTURES: [&str; 5] = ["layout", "gaussian_layout", "r2_layout", "sax_layout", "x_layout"];
-/// Includes whose integer constants the host uses, too.
+/// Includes whose integer constants the host uses as well.
 const SHARED_CONSTANTS: [&str; 6] = ["layout", "lineformer_layout", "occupancy", "positions", "random", "sample_rays"];
 
 fn main() -> Result<(), Failure> {
@@ -62,8 +62,8 @@ fn write_shaders(glsl: &Path, out: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The shared library carries its ABI version in its soname and is never unmapped: threads of its own, and of drivers it
-/// loaded, may outlive a `dlclose`.
+/// Sets the linker options of the shared library: its soname carries the ABI version, and it is never unmapped, because its own
+/// threads and those of drivers it loaded may outlive a `dlclose`.
 fn link_library() -> Result<(), Failure> {
     if env::var("CARGO_CFG_TARGET_OS")? != "linux" {
         return Ok(());
@@ -82,14 +82,15 @@ fn link_library() -> Result<(), Failure> {
 
 /// Commit of the checkout, for benchmark reports; "unknown" outside one.
 fn commit() -> String {
-    // Written by every commit and checkout, not by edits: a build of edited sources names the commit they are based on.
+    // This file changes with every commit and checkout, but not with edits: a build of edited sources names the commit they are
+    // based on.
     if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"]).filter(|log| Path::new(log).exists()) {
         println!("cargo:rerun-if-changed={log}");
     }
     git(&["describe", "--always", "--dirty"]).unwrap_or_else(|| "unknown".to_owned())
 }
 
-/// What git says; none where it fails or is not there.
+/// Returns the output of a git command; none when it fails or git is missing.
 fn git(args: &[&str]) -> Option<String> {
     let output = std::process::Command::new("git").args(args).output().ok().filter(|output| output.status.success())?;
     Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())

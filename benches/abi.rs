@@ -1,5 +1,5 @@
-//! What training through the C ABI costs beside training directly: paired repeats on the dataset given as argument,
-//! `cargo bench --bench abi -- DATASET [ITERATIONS] [REPEATS]`.
+//! Measures the cost of training through the C ABI relative to training directly. Repeats are paired, on the dataset
+//! given as argument: `cargo bench --bench abi -- DATASET [ITERATIONS] [REPEATS]`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks, reason = "a measurement")]
 
 use nertca_vk::capi::context::*;
@@ -85,7 +85,7 @@ fn main() {
     run_through(8);
     let mut ratios: Vec<f64> = (0..repeats)
         .map(|i| {
-            // The order changes, so that neither is always the one on a warmer machine.
+            // The order alternates, so that neither path always runs on the warmer machine.
             let first = if i % 2 == 0 { run_direct(iterations) } else { run_through(iterations) };
             let second = if i % 2 == 0 { run_through(iterations) } else { run_direct(iterations) };
             let (d, t) = if i % 2 == 0 { (first, second) } else { (second, first) };

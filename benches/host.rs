@@ -1,4 +1,4 @@
-//! What the host does before and after training, and one training step: `cargo bench --bench host`.
+//! Measures the host's work before and after training, and one training step: `cargo bench --bench host`.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a measurement")]
 
 #[path = "../tests/common/mod.rs"]

@@ -1,30 +1,30 @@
-//! `glsl/*.comp`, times the variants in `glsl/variants.txt` -> SPIR-V.
+//! Compiles `glsl/*.comp`, with every variant listed in `glsl/variants.txt`, to SPIR-V.
 
 use crate::Failure;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// A name and its value, as of `-DNAME=VALUE`.
+/// Name and value of a definition, as in `-DNAME=VALUE`.
 pub type Define = (String, String);
 
 /// A shader, or one of its variants.
 pub struct Kernel {
     /// Name of the shader's file.
     pub shader: String,
-    /// Name of the variant; of the shader itself where it is none.
+    /// Name of the variant; the shader's own name for the build without a variant.
     pub name: String,
-    /// What sets the variant apart.
+    /// Definitions that set the variant apart.
     pub defines: Vec<Define>,
     /// The shader's text.
     pub source: String,
-    /// Not optimised, with all names.
+    /// SPIR-V without optimisation, with all names.
     pub for_reflection: Vec<u32>,
-    /// Optimised.
+    /// Optimised SPIR-V, as bytes.
     pub shipped: Vec<u8>,
 }
 
-/// Compiles every shader and every variant, in the order of their names.
+/// Compiles every shader and every variant; shaders in the order of their names.
 pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
     let variants = read_variants(&glsl.join("variants.txt"))?;
     let compiler = shaderc::Compiler::new()?;
@@ -50,10 +50,10 @@ pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
     Ok(kernels)
 }
 
-/// Name of a further build of a shader, and what it defines.
+/// Name of a variant of a shader, and its definitions.
 type Variant = (String, Vec<Define>);
 
-/// `variants.txt`: `shader name [DEFINE[=VALUE]]...` per line; `#` starts a comment.
+/// Reads `variants.txt`: one `shader name [DEFINE[=VALUE]]...` per line; `#` starts a comment.
 fn read_variants(path: &Path) -> Result<BTreeMap<String, Vec<Variant>>, Failure> {
     let mut variants: BTreeMap<String, Vec<Variant>> = BTreeMap::new();
     for line in fs::read_to_string(path)?.lines() {

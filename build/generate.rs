@@ -1,4 +1,4 @@
-//! Rust from what the shaders say of themselves.
+//! Writes Rust from what the shaders declare.
 
 use crate::Failure;
 use crate::compile::Kernel;
@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// `static KERNEL_TABLE`: every kernel with its SPIR-V.
+/// Writes `static KERNEL_TABLE`: every kernel with its SPIR-V.
 pub fn table(kernels: &[(Kernel, Reflected)], out: &Path) -> String {
     let mut text = String::from("pub(crate) static KERNEL_TABLE: &[KernelCode] = &[\n");
     for (kernel, reflected) in kernels {
@@ -36,7 +36,7 @@ pub fn table(kernels: &[(Kernel, Reflected)], out: &Path) -> String {
     text + "];\n"
 }
 
-/// The structures that shaders and host share.
+/// Writes the structures that shaders and host share.
 pub fn layout(kernels: &[(Kernel, Reflected)], comments: &Comments) -> Result<String, Failure> {
     let mut structures: BTreeMap<&str, &Structure> = BTreeMap::new();
     for (kernel, reflected) in kernels {
@@ -61,7 +61,7 @@ pub fn layout(kernels: &[(Kernel, Reflected)], comments: &Comments) -> Result<St
     Ok(text)
 }
 
-/// The push constants of each shader.
+/// Writes the push constants of each shader.
 pub fn push(kernels: &[(Kernel, Reflected)]) -> Result<String, Failure> {
     let mut text = String::new();
     let mut seen: BTreeMap<&str, &Reflected> = BTreeMap::new();
@@ -90,11 +90,11 @@ pub fn push(kernels: &[(Kernel, Reflected)]) -> Result<String, Failure> {
     Ok(text)
 }
 
-/// `enum Binding`: the names of everything that shaders bind.
+/// Writes `enum Binding`: the names of everything that shaders bind.
 pub fn bindings(kernels: &[(Kernel, Reflected)]) -> String {
     let names: BTreeSet<&str> = kernels.iter().flat_map(|(_, r)| &r.bindings).map(|b| b.name.as_str()).collect();
     let mut text = String::from(
-        "/// What shaders bind, under the names they give it.\n#[derive(Debug, Clone, Copy, PartialEq, Eq)]\n\
+        "/// Buffers that shaders bind, by the names in the shaders.\n#[derive(Debug, Clone, Copy, PartialEq, Eq)]\n\
          #[allow(non_camel_case_types, missing_docs, reason = \"names and meanings are the shaders'\")]\n\
          pub enum Binding {\n",
     );
@@ -109,7 +109,7 @@ pub fn bindings(kernels: &[(Kernel, Reflected)]) -> String {
     text + "        }\n    }\n}\n"
 }
 
-/// The integer constants of one include.
+/// Writes the integer constants of one include.
 pub fn constants(constants: &[Constant]) -> String {
     let constant = |c: &Constant| {
         let comment = if c.comment.is_empty() { "see the shaders" } else { &c.comment };
@@ -118,11 +118,11 @@ pub fn constants(constants: &[Constant]) -> String {
     constants.iter().map(constant).collect()
 }
 
-/// Numbers that the text of a kernel fixes: a module for each kernel that has some.
+/// Writes the numbers that the text of a kernel fixes, in one module for each kernel that has some.
 pub fn numbers(numbers: &BTreeMap<String, BTreeMap<String, u32>>) -> String {
     let mut text = String::new();
     for (kernel, numbers) in numbers {
-        let _ = writeln!(text, "/// Of `{kernel}`.\npub mod {kernel} {{");
+        let _ = writeln!(text, "/// Constants of `{kernel}`.\npub mod {kernel} {{");
         for (name, value) in numbers {
             let _ = writeln!(text, "    /// `{name}` of the shader.\n    pub const {name}: u32 = {value};");
         }
@@ -138,7 +138,7 @@ fn head(name: &str) -> String {
     )
 }
 
-/// Fields up to `size` bytes, gaps filled.
+/// Writes the fields up to `size` bytes, with gaps filled by padding.
 fn fields(
     text: &mut String,
     structure: &Structure,
@@ -165,7 +165,7 @@ fn fields(
     Ok(())
 }
 
-/// Checks at build time that Rust puts each field where the shaders have it.
+/// Writes compile-time checks that Rust puts each field at the offset it has in the shaders.
 fn offsets(name: &str, structure: &Structure) -> String {
     let check =
         |f: &Field| format!("const _: () = assert!(std::mem::offset_of!({name}, {}) == {});\n", f.name, f.offset);
@@ -180,7 +180,7 @@ fn rust_type(ty: &Type) -> String {
     }
 }
 
-/// A comment as documentation: begins with a capital, ends with a full stop.
+/// Turns a comment into a doc sentence: it begins with a capital and ends with a full stop.
 fn sentence(comment: &str) -> String {
     let mut letters = comment.chars();
     let first = letters.next().map(|c| c.to_uppercase().to_string()).unwrap_or_default();

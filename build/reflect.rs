@@ -1,4 +1,4 @@
-//! What a shader binds, wants pushed and shares with the host, read from its SPIR-V.
+//! Reads the bindings, push constants and shared structures of a shader from its SPIR-V.
 
 use crate::Failure;
 use rspirv::dr::{Instruction, Module, Operand};
@@ -15,12 +15,12 @@ pub struct Binding {
     pub writes: bool,
 }
 
-/// Type of a field, as far as the host shares it.
+/// Type of a field that the host shares.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Type {
-    /// Components of a Rust type of four bytes.
+    /// Scalar or vector; `component` is a Rust type of four bytes.
     Vector { component: &'static str, count: u32 },
-    /// A structure of this name.
+    /// Structure, with its own fields.
     Structure(Structure),
 }
 
@@ -61,29 +61,29 @@ impl Structure {
         self.fields.iter().map(|f| f.ty.alignment()).max().unwrap_or(4)
     }
 
-    /// Bytes up to the end of the last field.
+    /// Number of bytes up to the end of the last field.
     pub fn used(&self) -> u32 {
         self.fields.iter().map(|f| f.offset + f.ty.size()).max().unwrap_or(0)
     }
 
-    /// Bytes from one element of an array to the next.
+    /// Number of bytes from one element of an array to the next.
     pub fn size(&self) -> u32 {
         self.used().next_multiple_of(self.alignment())
     }
 }
 
-/// What a shader says of itself.
+/// Declarations of one shader.
 pub struct Reflected {
     pub bindings: Vec<Binding>,
     /// Push constants without addresses.
     pub push: Structure,
-    /// Buffers whose device address the shader wants as push constant `NAME_address`, with its offset.
+    /// Buffers whose device address the shader takes as push constant `NAME_address`, with its offset.
     pub addresses: Vec<(String, u32)>,
-    /// Name and id.
+    /// Name and id of each specialisation constant.
     pub spec_constants: Vec<(String, u32)>,
-    /// Invocations of a workgroup, unless another number is asked for.
+    /// Default number of invocations of a workgroup.
     pub local_size: u32,
-    /// Structures of its buffers.
+    /// Structures in the shader's buffers.
     pub structures: Vec<Structure>,
 }
 
@@ -111,7 +111,7 @@ fn literal(operand: Option<&Operand>) -> u32 {
     }
 }
 
-/// A module with its names and types at hand.
+/// SPIR-V module with lookup tables of its names and types.
 struct Spirv<'a> {
     module: &'a Module,
     names: HashMap<u32, &'a str>,
@@ -154,12 +154,12 @@ impl<'a> Spirv<'a> {
         })
     }
 
-    /// Operand `index` of a type, where that is an id.
+    /// Returns operand `index` of a type, if that operand is an id.
     fn operand(&self, of: u32, index: usize) -> Option<u32> {
         self.types.get(&of).and_then(|t| t.operands.get(index)).and_then(id)
     }
 
-    /// Global variables: id, storage class, and the type pointed to.
+    /// Lists the global variables: id, storage class, and the type pointed to.
     fn variables(&self) -> impl Iterator<Item = (u32, StorageClass, u32)> {
         self.module.types_global_values.iter().filter(|i| i.class.opcode == Op::Variable).filter_map(|variable| {
             let Some(Operand::StorageClass(class)) = variable.operands.first() else { return None };
@@ -212,7 +212,7 @@ impl<'a> Spirv<'a> {
         }
     }
 
-    /// The push constants, and the addresses among them.
+    /// Returns the push constants, and separately the addresses among them.
     fn push_constants(&self) -> Result<(Structure, Vec<(String, u32)>), Failure> {
         let block = self.variables().find(|(_, class, _)| *class == StorageClass::PushConstant);
         let Some((_, _, block)) = block else {
@@ -226,7 +226,7 @@ impl<'a> Spirv<'a> {
         Ok((push, addresses))
     }
 
-    /// Named structures with a layout that are no block of their own.
+    /// Returns the named structures that have a layout and are not a block themselves.
     fn structures(&self) -> Result<Vec<Structure>, Failure> {
         let mut structures = Vec::new();
         for structure in self.module.types_global_values.iter().filter(|i| i.class.opcode == Op::TypeStruct) {
@@ -241,7 +241,7 @@ impl<'a> Spirv<'a> {
         Ok(structures)
     }
 
-    /// The size computed here is the one that the compiler gave an array of it.
+    /// Checks that the size computed here is the stride that the compiler gave an array of the structure.
     fn check_stride(&self, element: u32, structure: Option<&Structure>) -> Result<(), Failure> {
         let arrays = self.types.iter().filter(|(array, instruction)| {
             instruction.class.opcode == Op::TypeRuntimeArray && self.operand(**array, 0) == Some(element)
@@ -288,7 +288,7 @@ impl<'a> Spirv<'a> {
         }
     }
 
-    /// Names and ids, and the default size of a workgroup.
+    /// Returns names and ids of the specialisation constants, and the default size of a workgroup.
     fn spec_constants(&self) -> Result<(Vec<(String, u32)>, u32), Failure> {
         let (mut constants, mut local_size) = (Vec::new(), 1);
         for annotation in &self.module.annotations {

@@ -1,4 +1,4 @@
-//! What SPIR-V does not keep of the shaders' text: comments, integer constants and defines.
+//! Reads from the shaders' text what SPIR-V does not keep: comments, integer constants and defines.
 
 use crate::Failure;
 use crate::compile::Define;
@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 /// Comments of structures (`"Ray"`) and their fields (`"Ray.anchor"`).
 pub type Comments = BTreeMap<String, String>;
 
-/// Reads the comment lines above each structure and those behind its fields.
+/// Reads the comment lines above each structure and the comments behind its fields.
 pub fn comments(source: &str) -> Comments {
     let mut comments = Comments::new();
     let (mut above, mut within) = (String::new(), None);
@@ -27,15 +27,15 @@ pub fn comments(source: &str) -> Comments {
     comments
 }
 
-/// An integer constant that both sides use.
+/// Integer constant that shaders and host use.
 pub struct Constant {
     pub name: String,
-    /// As written, without the suffix.
+    /// Value as written, without the suffix.
     pub value: String,
     pub comment: String,
 }
 
-/// Lines `const uint NAME = LITERAL; // comment`.
+/// Reads the lines `const uint NAME = LITERAL; // comment`.
 pub fn constants(source: &str) -> Vec<Constant> {
     let constant = |line: &str| {
         let (code, comment) = line.split_once("//").unwrap_or((line, ""));
@@ -47,7 +47,7 @@ pub fn constants(source: &str) -> Vec<Constant> {
     source.lines().filter_map(constant).collect()
 }
 
-/// Numbers under `#ifndef NAME`, as a variant's defines change them.
+/// Reads the numbers defined under `#ifndef NAME`; the defines of a variant take precedence.
 pub fn numbers(source: &str, defines: &[Define]) -> Result<BTreeMap<String, u32>, Failure> {
     let mut numbers = BTreeMap::new();
     for line in source.lines() {

@@ -1,7 +1,7 @@
-//! Measurements: [`peaks`] of the device, its [`sensors`] meanwhile; [`crate::train::timing`] has those of training.
+//! Measurements of a device: its [`peaks`], and [`crate::gpu::sensors`] during a measurement. [`crate::train::timing`] times
+//! training.
 
 pub mod peaks;
-pub mod sensors;
 
 /// Seconds the paper needs for a reconstruction on an RTX A5000 (section 4: 37 minutes).
 pub const PAPER_SECONDS: f64 = 37.0 * 60.0;

@@ -1,4 +1,4 @@
-//! Every pipeline that runs of a configuration use on a device, and what its driver's compiler made of them.
+//! Lists every pipeline that runs of a configuration use on a device, with the statistics of its driver's compiler.
 
 use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
@@ -20,10 +20,10 @@ use crate::x_gaussian::stages::XKernels;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// A pipeline as the driver compiled it. Numbers that the driver does not tell are none.
+/// Pipeline as the driver compiled it. Numbers that the driver does not report are none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Compiled {
-    /// The kernel.
+    /// Name of the kernel.
     pub kernel: String,
     /// Invocations of a workgroup.
     pub lanes: u32,
@@ -31,24 +31,26 @@ pub struct Compiled {
     pub constants: BTreeMap<String, u32>,
     /// Invocations of a subgroup.
     pub subgroup_size: Option<u32>,
-    /// Registers of an invocation; on Intel the most that are live at once.
+    /// Registers of an invocation; on Intel the maximum number that are live at once.
     pub registers: Option<f64>,
-    /// What did not fit the registers, in the driver's own units: 0 is what to aim at.
+    /// Spilled registers in the driver's own units; the goal is 0.
     pub spills: Option<f64>,
     /// Shared memory of a workgroup, bytes.
     pub shared_bytes: Option<f64>,
-    /// Subgroups that a processor holds at once, by registers, and on AMD by shared memory and workgroups.
+    /// Number of subgroups that a processor holds at once, limited by registers, and on AMD also by shared memory and
+    /// workgroups.
     pub resident: Option<f64>,
-    /// Size of the code: bytes, or instructions where the driver tells those alone.
+    /// Size of the code in bytes, or in instructions where the driver reports only those.
     pub code: Option<f64>,
-    /// The compiler's estimate of cycles: it knows nothing of memory and of how often loops run.
+    /// Compiler's estimate of cycles. It takes no account of memory or of how often loops run.
     pub cycles: Option<f64>,
 }
 
-/// Names that drivers give a number; several that they have at once are added up.
+/// Driver names of one quantity. The values of all names of one list are added up.
 struct Names(&'static [&'static [&'static str]]);
 
-/// Mesa's drivers: NVK, RADV, ANV, in letters of either case. Of lists that a driver has something of, the first counts.
+/// Names used by Mesa's drivers NVK, RADV and ANV, compared without regard to case. The first list of which a driver has any
+/// name counts.
 const REGISTERS: Names = Names(&[&["Number of GPRs"], &["VGPRs"], &["Max live registers"]]);
 const SPILLS: Names =
     Names(&[&["Spills to memory", "Fills from memory"], &["Spilled VGPRs", "Spilled SGPRs"], &["Spills", "Fills"]]);
@@ -66,7 +68,7 @@ impl Names {
 }
 
 impl Compiled {
-    /// The driver's numbers under the names they have here.
+    /// Maps the driver's numbers to the names used here.
     pub fn of(found: &PipelineStatistics) -> Compiled {
         let PipelineStatistics { kernel, lanes, constants, subgroup_size, numbers } = found;
         Compiled {
@@ -83,26 +85,26 @@ impl Compiled {
         }
     }
 
-    /// Whether both are the same kernel, built alike.
+    /// Tells whether both are builds of the same kernel with the same options.
     fn is_build_of(&self, other: &Compiled) -> bool {
         (&self.kernel, self.lanes, &self.constants) == (&other.kernel, other.lanes, &other.constants)
     }
 
-    /// Kernel and constants, for messages.
+    /// Returns the kernel's name and constants, for messages.
     pub fn name(&self) -> String {
         let constants: Vec<String> = self.constants.iter().map(|(name, value)| format!("{name}={value}")).collect();
         [std::slice::from_ref(&self.kernel), &constants[..]].concat().join(" ")
     }
 }
 
-/// Samples of a chunk that buffers are made for: pipelines do not depend on it.
+/// Samples of a chunk that buffers are made for; pipelines do not depend on it.
 const CAPACITY: u32 = 1024;
 
-/// Builds every pipeline that training and rendering of a configuration use on `gpu`, which was opened to keep statistics,
-/// by the functions that they use, too. Each build of a kernel is listed once, in the order of names.
+/// Builds every pipeline that training and rendering of a configuration use on `gpu`, through the same functions that they use.
+/// The device must have been opened to keep statistics. Each build of a kernel is listed once, in the order of names.
 ///
-/// # Errors
-/// [`Error::Config`] where the network is not for the device; [`Error::Internal`] for a device without statistics; errors
+/// [`Error::Config`] where the network does not fit the device; [`Error::Internal`] for a device without statistics; errors of
+/// [`Gpu::pipeline`].
 /// of [`Gpu::pipeline`].
 pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> Result<Vec<Compiled>> {
     let tuning = tuning.clone().for_network(config.network_moves());
@@ -121,12 +123,12 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
         match config.gaussians.form {
             GaussianForm::R2 => {
                 R2Kernels::new(gpu, config.r2.integral)?;
-                // Pictures are drawn by a stage of other fits.
+                // A stage of other fits draws the pictures.
                 Build::default().stage::<push::GaussianProject>(gpu)?;
             }
             GaussianForm::X => {
                 XKernels::new(gpu)?;
-                // Which these have at hand, too.
+                // These fits also use the stages that draw pictures.
                 Build::default().stage::<push::GaussianProject>(gpu)?;
                 SplatStage::<push::GaussianSplat>::new(gpu)?;
             }
@@ -152,16 +154,15 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     Ok(all)
 }
 
-/// Growth that a comparison lets pass: compilers change a little from version to version.
+/// Relative growth that a comparison tolerates, because compilers differ slightly between versions.
 pub const GROWTH: f64 = 0.15;
 
-/// How pipelines differ from those of another time: what got worse by more than [`GROWTH`], or spills; and all else that is
-/// not the same.
+/// Differences between two lists of pipelines: what got worse by more than [`GROWTH`], or spills; and all other differences.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Differences {
-    /// Spills, growth, fewer subgroups at once: a sentence each.
+    /// Spills, growth, fewer subgroups at once; one sentence each.
     pub worse: Vec<String>,
-    /// Everything else: a sentence each.
+    /// All other differences; one sentence each.
     pub other: Vec<String>,
 }
 

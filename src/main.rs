@@ -1,6 +1,6 @@
-//! The command line: arguments, progress, exit codes. No algorithm lives here.
+//! The command line: arguments, progress, exit codes. It contains no algorithms.
 
-/// Prints a line to stdout; a reader that has gone away (`| head`) is no error.
+/// Prints a line to stdout. A closed stdout (as with `| head`) is not an error.
 macro_rules! out {
     ($($text:tt)*) => {{
         use std::io::Write as _;

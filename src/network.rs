@@ -1,5 +1,5 @@
-//! A field's network within an iteration, on either of two paths: [`layers`] or [`fused`]. The dynamic field is one; the still
-//! field may be another ([`still`]).
+//! A field's network within an iteration, computed on one of two paths: [`layers`] or [`fused`]. The dynamic field is a
+//! network; the static field may be another one ([`still`]).
 
 pub mod chunk;
 pub mod cost;
@@ -25,19 +25,20 @@ use crate::network::layers::LayerNetwork;
 use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
 
-/// Loss scale a run on matrices starts with.
+/// Initial loss scale of a run on matrices.
 pub const FIRST_LOSS_SCALE: f32 = 65_536.0;
-/// The same where both fields are networks, whose attenuations and gradients are a hundred times as small: the largest there is.
+/// Initial loss scale where both fields are networks, with attenuations and gradients a hundred times as small. It is also the
+/// largest scale that `report` allows.
 pub const FIRST_LOSS_SCALE_OF_TWO: f32 = 16_777_216.0;
 
 /// Bytes of a number in f32.
 pub(crate) const F32_BYTES: u64 = 4;
 /// Bytes of a number in f16.
 const F16_BYTES: u64 = 2;
-/// Bytes of a live sample's place, ray and pair of attenuations.
+/// Bytes of a live sample's position, ray and pair of attenuations.
 const SAMPLE_BYTES: u64 = 16 + 4 + 8;
 
-/// What a network is built for.
+/// Purpose that a network is built for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// The forward pass alone.
@@ -46,33 +47,33 @@ pub enum Purpose {
     Train,
 }
 
-/// One way to compute the network: its kernels and the buffers that it alone needs.
+/// One way to compute the network: its kernels and the buffers that only it needs.
 trait Path: Send + Sync {
-    /// The buffer of that name, if it is among the path's.
+    /// Returns the buffer of that name, if it is among the path's.
     fn find(&self, name: Binding) -> Option<&Buffer>;
 
-    /// Samples per tile, and tiles across a layer forward and backward.
+    /// Returns samples per tile, and tiles across a layer forward and backward.
     fn tiles(&self, params: &NetworkMap) -> Tiles;
 
-    /// How the backward pass leaves the gradient.
+    /// Returns how many partial sums of the gradient the backward pass leaves, and their length.
     fn partial_sums(&self, params: &NetworkMap) -> PartialSums;
 
-    /// Where in a part of the samples' sums the gradient of each network parameter lies.
+    /// Returns, for each network parameter, the position of its gradient within one part of the partial sums.
     fn gradient_source(&self, params: &NetworkMap) -> Vec<u32>;
 
-    /// Records what depends on parameters alone.
+    /// Records the stages that depend on parameters alone.
     fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()>;
 
-    /// Records the network over the live samples: `sample_sigma`.
+    /// Records the network over the live samples, which writes `sample_sigma`.
     fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()>;
 
-    /// Records the backward pass of a chunk: `partials`.
+    /// Records the backward pass of a chunk, which writes `partials`.
     fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()>;
 
-    /// Least work of the stages that see samples, for so many of them.
+    /// Minimum work of the stages that process samples, for `samples` of them.
     fn work(&self, params: &NetworkMap, samples: u64) -> Ledger;
 
-    /// Where in a part the sums of dz over each phase lie, where they are not in `phase_dz` already.
+    /// Returns the positions within a part of the sums of dz over each phase; empty where `phase_dz` has them already.
     fn phase_source(&self, _: &NetworkMap) -> Vec<u32> {
         Vec::new()
     }
@@ -88,11 +89,11 @@ struct Tiles {
     backward: u32,
 }
 
-/// Sums of the gradient over parts of the samples, still to be added up.
+/// Number and length of the partial sums of the gradient, one for each part of the samples, which must still be added up.
 struct PartialSums {
-    /// How many parts.
+    /// Number of parts.
     splits: u32,
-    /// Numbers of each.
+    /// Numbers of each part.
     len: u32,
 }
 
@@ -101,7 +102,7 @@ buffer_set! {
     pub struct GradientBuffers {
         /// Sums over parts of the samples, `[part][number]`.
         partials,
-        /// Where in a part the gradient of each network parameter lies, then each sum of dz over a phase.
+        /// Position within a part of the gradient of each network parameter, then of each sum of dz over a phase.
         source,
         /// Sums of dz over each phase, `[layer][phase][neuron]`.
         phase_dz,
@@ -119,29 +120,29 @@ pub struct Network {
 }
 
 buffer_set! {
-    /// Where parameters are.
+    /// Positions of the parameters.
     struct WeightBuffers {
-        /// Of each layer its bias and its weights on latents; NOWHERE: it has none.
+        /// Positions of each layer's bias and of its weights on latents; NOWHERE where it has no such weights.
         network_layers,
     }
 }
 
-/// Samples a chunk may have, by the range of one storage buffer.
+/// Returns the maximum number of samples of a chunk, limited by the range of one storage buffer.
 pub fn largest_chunk(gpu: &Gpu, tuning: &Tuning, params: &NetworkMap) -> u32 {
     let bytes_per_sample = match tuning.layers {
         Layers::F32 => 4 * params.width,
         Layers::Matrices => 2 * params.width * params.layers.len(),
     };
-    // Less what capacities are padded with.
+    // Capacities are padded by up to 256 samples.
     (gpu.info().max_storage_buffer_range / bytes_per_sample as u32).saturating_sub(256)
 }
 
 impl Network {
-    /// Builds the kernels `tuning` asks for and the buffers for chunks as large as `setup` says.
+    /// Builds the kernels that `tuning` asks for, and the buffers for chunks of the size in `setup`.
     ///
     /// # Errors
-    /// [`Error::Config`] when matrices are asked for and do not fit; errors of the device, among them
-    /// [`Error::OutOfMemory`] naming the buffer.
+    /// [`Error::Config`] when matrices are requested and do not fit; errors of the device, among them [`Error::OutOfMemory`]
+    /// naming the buffer.
     pub fn new(gpu: &Gpu, tuning: &Tuning, setup: &Setup, params: &NetworkMap, purpose: Purpose) -> Result<Network> {
         let path: Box<dyn Path> = match tuning.layers {
             Layers::F32 => Box::new(LayerNetwork::new(gpu, tuning, setup, params, purpose)?),
@@ -175,32 +176,32 @@ impl Network {
         Ok(Network { map: params.clone(), layers: tuning.layers, first_loss_scale, path, weights, gradient })
     }
 
-    /// Where its parameters live.
+    /// Returns the positions of its parameters.
     pub fn map(&self) -> &NetworkMap {
         &self.map
     }
 
-    /// The path that computes the layers.
+    /// Returns the path that computes the layers.
     pub fn layers(&self) -> Layers {
         self.layers
     }
 
-    /// Loss scale to start with.
+    /// Returns the initial loss scale.
     pub fn first_loss_scale(&self) -> f32 {
         self.first_loss_scale
     }
 
-    /// Least work of an iteration's stages with so many live samples.
+    /// Minimum work of an iteration's stages with `samples` live samples.
     pub fn work(&self, samples: u64) -> Ledger {
         let mut ledger = self.path.work(&self.map, samples);
         let sums = self.path.partial_sums(&self.map);
-        // A gradient is a sum over the parts, and written once.
+        // Each gradient is a sum over the parts, and is written once.
         let numbers = u64::from(sums.splits) * u64::from(sums.len) + self.map.len as u64;
         add(&mut ledger, "gradient_network", StageWork::per_item(numbers, 1, F32_BYTES));
         ledger
     }
 
-    /// Where the gradient is summed; none when built for rendering.
+    /// Returns the buffers in which the gradient is summed; none when built for rendering.
     pub fn gradient(&self) -> Option<&GradientBuffers> {
         self.gradient.as_ref()
     }
@@ -209,34 +210,34 @@ impl Network {
         self.weights.find(name).or_else(|| self.path.find(name)).or_else(|| self.gradient.as_ref()?.find(name))
     }
 
-    /// Records what depends on parameters alone: once per iteration.
+    /// Records the stages that depend on parameters alone; needed once per iteration.
     ///
     /// # Errors
-    /// As [`Pass::run`]; so do all that follow.
+    /// Fails like [`Pass::run`], as do all functions below.
     pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
         self.path.record_weights(pass)
     }
 
-    /// Records the network over the live samples: `sample_sigma`.
+    /// Records the network over the live samples, which writes `sample_sigma`.
     ///
     /// # Errors
-    /// As [`Network::record_weights`].
+    /// Fails like [`Network::record_weights`].
     pub fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
         self.path.record_forward(pass)
     }
 
-    /// Records the backward pass of a chunk: partial sums of the gradient.
+    /// Records the backward pass of a chunk, which writes partial sums of the gradient.
     ///
     /// # Errors
-    /// As [`Network::record_weights`].
+    /// Fails like [`Network::record_weights`].
     pub fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         self.path.record_backward(pass, chunk)
     }
 
-    /// Records the sums of the partial sums, and what follows from the sums per phase: the network's gradient.
+    /// Records the sums over the parts, and the gradients that follow from the sums per phase: together the network's gradient.
     ///
     /// # Errors
-    /// As [`Network::record_weights`].
+    /// Fails like [`Network::record_weights`].
     pub fn record_gradient(&self, pass: &mut Pass<'_>) -> Result<()> {
         if self.gradient.is_none() {
             return Err(built_for_rendering());
@@ -265,7 +266,7 @@ impl Network {
         Ok(())
     }
 
-    /// Push constants of `march_scan` for a chunk.
+    /// Returns the push constants of `march_scan` for a chunk.
     pub fn scan(&self, chunk: Chunk) -> push::MarchScan {
         let tiles = self.path.tiles(&self.map);
         push::MarchScan {

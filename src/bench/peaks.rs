@@ -1,4 +1,4 @@
-//! What a device reaches in kernels that do one thing only.
+//! Measures the peak rates of a device with kernels that do nothing else.
 
 use crate::error::Result;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -11,7 +11,7 @@ use crate::kernels::stages::{Build, Stage};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// What the device reaches in micro-benchmarks that do nothing else.
+/// Peak rates of a device, measured with micro-benchmarks.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Peaks {
     /// f32 multiply-adds, TFLOP/s.
@@ -20,16 +20,16 @@ pub struct Peaks {
     pub matrix_tflops: Option<f64>,
     /// Bytes read and written by a large copy, GB/s.
     pub copy_gb_per_s: f64,
-    /// Whether the device's own clock timed them; the host's did in reports of before.
+    /// Whether the device's own clock timed the kernels; reports of older versions were timed by the host's clock.
     #[serde(default)]
     pub by_timestamps: bool,
 }
 
-/// Times a dispatch is run for its best time.
+/// Number of times a dispatch is run to find its shortest time.
 const TRIES: u32 = 16;
 
-/// Shortest time of a dispatch, seconds: by the device's own clock; by the host's, of the submit and the wait for it, where the
-/// queue has no timestamps.
+/// Returns the shortest time of a dispatch, seconds, by the device's own clock. Where the queue has no timestamps, the host's
+/// clock times the submit and the wait for it.
 fn best_seconds<P: PushConstants>(
     gpu: &Gpu,
     stage: &Stage<P>,
@@ -51,14 +51,14 @@ fn best_seconds<P: PushConstants>(
     Ok(best)
 }
 
-/// Measures what the device can do at most.
+/// Measures the device's peak rates.
 ///
 /// # Errors
 /// Device errors.
 pub fn peaks(gpu: &Gpu) -> Result<Peaks> {
     let info = gpu.info();
     let is_cpu = info.is_cpu();
-    // Some milliseconds on either kind of device.
+    // These sizes take a few milliseconds on either kind of device.
     let (lanes, steps): (u32, u32) = if is_cpu { (256, 8000) } else { (1 << 19, 1024) };
     let stage: Stage<push::PeakF32> = Build::default().stage(gpu)?;
     let sink = gpu.buffer("sink", u64::from(lanes) * 16, Memory::Device)?;

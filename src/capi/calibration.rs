@@ -1,15 +1,15 @@
-//! How calibration sees frames, and geometry that is known better later.
+//! Corrections by calibration, and better geometry for frames that were added earlier.
 
 use crate::calibrate::choose::Correction;
 use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
 use crate::capi::status::nertca_status;
 use crate::capi::types::{nertca_correction, nertca_geometry, read, write};
 
-/// A frame's geometry is taken as stated.
+/// The stated geometry of the frame is used.
 pub const NERTCA_CORRECTION_STATED: u32 = 0;
 /// Angles and position of the frame's view are corrected.
 pub const NERTCA_CORRECTION_STATIC: u32 = 1;
-/// A correction of the view, and a displacement of the heart in this frame.
+/// The view is corrected, and so is a displacement of the heart in this frame.
 pub const NERTCA_CORRECTION_BREATHING: u32 = 2;
 
 fn code(correction: Correction) -> u32 {
@@ -20,12 +20,12 @@ fn code(correction: Correction) -> u32 {
     }
 }
 
-/// How the reconstruction sees a frame since training last took frames in: as stated, or as calibration (`calibrate.mode`)
-/// corrected it. Frames count from 0 in the order in which they were added. To draw the vessels over a frame, render with
-/// its `matrix`. Any thread, at any time.
+/// Returns how the reconstruction has corrected a frame's geometry since training last took in frames: not at all, or by
+/// calibration (`calibrate.mode`). Frames count from 0 in the order in which they were added. To draw the vessels over a frame,
+/// render with its `matrix`. Callable from any thread, at any time.
 ///
-/// A motion that all views share is not seen by any of them and is no part of the correction; and what a checkpoint was
-/// corrected by is not known after loading it.
+/// A motion common to all views cannot be observed and is no part of the correction. After loading a checkpoint, the
+/// corrections made before it was saved are not known.
 ///
 /// @return NERTCA_ERROR_ARGUMENT for a frame that was not added.
 ///
@@ -40,7 +40,7 @@ pub unsafe extern "C" fn nertca_reconstruction_correction(
     on_reconstruction(reconstruction, |reconstruction| {
         let found = reconstruction.session.corrected_frame(frame as usize)?;
         let view = found.view.as_ref();
-        // SAFETY: the header asks that `correction` is null or as long as its size says.
+        // SAFETY: the header requires that `correction` is null or as long as its size says.
         unsafe {
             write(correction, |size| nertca_correction {
                 size,
@@ -58,15 +58,15 @@ pub unsafe extern "C" fn nertca_reconstruction_correction(
     })
 }
 
-/// States another geometry for a frame that was added: what the C-arm, or a calibration elsewhere, knows better by now.
-/// Training takes it in as it does a new frame. Calibration begins from what is stated; with `calibrate.mode = off` that
-/// is what the reconstruction goes by. Any thread.
+/// Sets another geometry for a frame that was added, for example when the C-arm or an external calibration provides a better
+/// one. Training takes it in like a new frame. Calibration starts from the stated geometry; with `calibrate.mode = off` the
+/// reconstruction uses the stated geometry. Callable from any thread.
 ///
-/// @return NERTCA_ERROR_ARGUMENT naming the field that is wrong, or for a frame that was not added; NERTCA_ERROR_BUSY
-/// while training in the background in a deterministic context.
+/// @return NERTCA_ERROR_ARGUMENT naming the field that is wrong, or for a frame that was not added; NERTCA_ERROR_BUSY while
+/// training in the background in a deterministic context.
 ///
 /// # Safety
-/// `geometry` must be as long as it says, and its matrix null or readable for 12 numbers.
+/// `geometry` must be as long as its `size` says, and its matrix null or readable for 12 numbers.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_set_geometry(
     reconstruction: *mut nertca_reconstruction,
@@ -74,7 +74,8 @@ pub unsafe extern "C" fn nertca_reconstruction_set_geometry(
     geometry: *const nertca_geometry,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks that `geometry` is null or as long as its size says, and its matrix good.
+        // SAFETY: the header requires that `geometry` is null or as long as its size says, and that its matrix is null or has
+        // 12 numbers.
         let geometry = unsafe { read(geometry)?.geometry() }?;
         Ok(reconstruction.session.set_geometry(frame as usize, geometry)?)
     })

@@ -1,9 +1,9 @@
-//! Every log statement stays open for every context, whichever thread comes by first.
+//! Keeps every log statement enabled for every context, whichever thread reaches it first.
 //!
-//! A statement remembers for the whole process whether anyone listens. While there is a single subscriber, `tracing` asks
-//! the thread that comes by first, and that may work for a context without a log: the statement would then be off for all.
-//! Two subscribers that never go away, and never commit themselves, keep every statement open; whether it is heard is
-//! then up to the log of the context at work.
+//! A log statement stores for the whole process whether any subscriber is interested. While there is a single subscriber,
+//! `tracing` asks the subscriber of the thread that arrives first. That thread may work for a context without a log, which
+//! would disable the statement for all contexts. Two permanent subscribers that never give a final answer keep every statement
+//! enabled; the log of the context at work then decides whether the message is delivered.
 
 use std::sync::LazyLock;
 use tracing::span::{Attributes, Id, Record};
@@ -12,12 +12,12 @@ use tracing::{Dispatch, Event, Metadata, Subscriber};
 
 static UNDECIDED: LazyLock<[Dispatch; 2]> = LazyLock::new(|| [Dispatch::new(Undecided), Dispatch::new(Undecided)]);
 
-/// Called at the start of every call, so that no statement is reached before.
+/// Creates the two subscribers. Every call of the ABI does this first, so that it precedes every log statement.
 pub(super) fn keep_open() {
     LazyLock::force(&UNDECIDED);
 }
 
-/// Listens to nothing, and rules nothing out.
+/// Subscriber that receives nothing, but never declares a statement uninteresting.
 struct Undecided;
 
 impl Subscriber for Undecided {

@@ -14,18 +14,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use tracing::Dispatch;
 
-/// A device with a log and limits. Make one per device, and any number of reconstructions in it.
+/// A device with a log and limits. Make one per device; it can have any number of reconstructions.
 pub struct nertca_context {
     _opaque: [u8; 0],
 }
 
-/// Behind [`nertca_context`].
+/// Object behind [`nertca_context`].
 pub(super) struct Context {
     pub gpu: Option<Gpu>,
     pub tuning: Option<Tuning>,
     pub log: Dispatch,
     pub deterministic: bool,
-    /// Reconstructions and buffers alive.
+    /// Number of reconstructions and buffers that are alive.
     pub children: AtomicU32,
     process: u32,
 }
@@ -53,7 +53,7 @@ impl Context {
     }
 }
 
-/// A child's claim on its context.
+/// Reference of a reconstruction or buffer to its context, which counts it.
 pub(super) struct Claim {
     pub context: Arc<Context>,
 }
@@ -71,7 +71,7 @@ impl Drop for Claim {
     }
 }
 
-/// Takes a handle and runs a body on what it stands for, with the context's log.
+/// Runs a body on the context of a handle, with the context's log.
 pub(super) fn on_context<H>(handle: *const H, body: impl FnOnce(&Arc<Context>) -> Outcome<()>) -> nertca_status {
     call(handle, || {
         let context = handles::get::<Context, H>(handle)?;
@@ -79,7 +79,7 @@ pub(super) fn on_context<H>(handle: *const H, body: impl FnOnce(&Arc<Context>) -
     })
 }
 
-/// Options every context understands.
+/// Options that every context accepts.
 const KNOWN: &str = "device, validation, cache_dir, memory_limit_mib, deterministic, layers";
 
 struct Parsed {
@@ -126,7 +126,7 @@ fn tuning(gpu: &Gpu, layers: Option<Layers>) -> Tuning {
 }
 
 /// # Safety
-/// `options` must be null or end with a zero, `log` be null or as long as it says, `out` be null or writable.
+/// `options` must be null or end with a zero, `log` be null or as long as its `size` says, `out` be null or writable.
 unsafe fn create(
     options: *const c_char,
     log: *const nertca_log,
@@ -136,11 +136,11 @@ unsafe fn create(
     if out.is_null() {
         return Err(Failure::argument("context", "is null"));
     }
-    // SAFETY: `out` is not null, and this function asks its callers that it can be written.
+    // SAFETY: `out` is not null, and callers of this function guarantee that it can be written.
     unsafe { out.write_unaligned(std::ptr::null_mut()) };
-    // SAFETY: `log` is not null here, and this function asks its callers that it is as long as its size says.
+    // SAFETY: `log` is not null here, and callers of this function guarantee that it is as long as its size says.
     let log = log::dispatch(if log.is_null() { None } else { Some(unsafe { read(log) }?) })?;
-    // SAFETY: this function asks its callers that `options` is null or ends with a zero.
+    // SAFETY: callers of this function guarantee that `options` is null or ends with a zero.
     let parsed = parse(Options::parse(unsafe { text("options", options) }?.unwrap_or_default())?)?;
     tracing::dispatcher::with_default(&log, || {
         let gpu = open(&parsed)?;
@@ -157,7 +157,7 @@ unsafe fn create(
             process: std::process::id(),
         });
         let handle = handles::insert(context)?;
-        // SAFETY: checked and written above; nothing gave the caller's memory back in between.
+        // SAFETY: `out` was checked and written above, and the caller's memory is still valid.
         unsafe { out.write_unaligned(std::ptr::without_provenance_mut(handle)) };
         Ok(())
     })
@@ -165,19 +165,18 @@ unsafe fn create(
 
 /// Opens a device.
 ///
-/// `options` are lines of `key = value` or a JSON object, or null for defaults:
-/// `device` (index, part of the name or UUID; `none` for a context that checks and keeps frames but cannot train; the
-/// best device without), `validation` (true for the Khronos layer, which then reports to the log), `cache_dir` (where
-/// compiled kernels are kept between processes), `memory_limit_mib` (ceiling on device memory of everything made from
-/// the context), `deterministic` (true refuses whatever would make results depend on timing: frames added while
-/// training in the background), `layers` (f32 or matrices: how the network is computed, for which the device decides
-/// otherwise).
+/// `options` are lines of `key = value` or a JSON object, or null for defaults: `device` (index, part of the name or UUID, the
+/// best device by default; `none` for a context that checks and keeps frames but cannot train), `validation` (true turns on the
+/// Khronos validation layer, which then reports to the log), `cache_dir` (directory in which compiled kernels are kept between
+/// processes), `memory_limit_mib` (limit on the device memory of everything made from the context), `deterministic` (true
+/// refuses whatever would make results depend on timing: frames added while training in the background), `layers` (f32 or
+/// matrices: computation of the network's layers; chosen for the device by default).
 ///
-/// `log` may be null. `*context` is null on failure; the text is then found by `nertca_last_error(NULL, ...)`.
-/// Any thread.
+/// `log` may be null. `*context` is null on failure; `nertca_last_error(NULL, ...)` then returns the text. Callable from any
+/// thread.
 ///
 /// # Safety
-/// `options` must be null or end with a zero, `log` be null or as long as it says, `context` be writable.
+/// `options` must be null or end with a zero, `log` be null or as long as its `size` says, `context` be writable.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_context_create(
     options: *const c_char,
@@ -185,7 +184,7 @@ pub unsafe extern "C" fn nertca_context_create(
     context: *mut *mut nertca_context,
 ) -> nertca_status {
     call(std::ptr::null::<c_void>(), || {
-        // SAFETY: the header asks the same of these pointers as `create` does.
+        // SAFETY: the header requires the same of these pointers as `create` does.
         unsafe {
             create(options, log, context, |parsed| {
                 if parsed.without_device { Ok(None) } else { Ok(Some(Gpu::open(&parsed.device)?)) }
@@ -200,31 +199,32 @@ struct CallerLock {
     user: *mut c_void,
 }
 
-// SAFETY: the header asks for functions and a pointer that may be used on any thread.
+// SAFETY: the header requires functions and a pointer that may be used on any thread.
 unsafe impl Send for CallerLock {}
-// SAFETY: as for `Send`: the header asks for functions that any thread may call, and `QueueLock` gives them nothing but
+// SAFETY: as for `Send`: the header requires functions that any thread may call, and `QueueLock` passes them nothing but
 // `user`.
 unsafe impl Sync for CallerLock {}
 
 impl QueueLock for CallerLock {
     fn lock(&self) {
-        // SAFETY: the header asks for a function that takes `user`, good for as long as the context.
+        // SAFETY: the header requires a function that takes `user`, valid for the lifetime of the context.
         unsafe { (self.lock)(self.user) }
     }
 
     fn unlock(&self) {
-        // SAFETY: the header asks for a function that takes `user`, good for as long as the context; `lock` was called
+        // SAFETY: the header requires a function that takes `user`, valid for the lifetime of the context; `lock` was called
         // before.
         unsafe { (self.unlock)(self.user) }
     }
 }
 
-/// Makes a context as `nertca_context_create` does, on a device of the caller: both then share one GPU, its memory and, if wanted, buffers.
-/// Of the options, `device` and `validation` do not apply. Instance, device and queue must outlive the context, which
-/// leaves them as they are.
+/// Makes a context like `nertca_context_create`, on the caller's Vulkan device: both then share one GPU, its memory and, if
+/// wanted, buffers. The options `device` and `validation` do not apply. Instance, device and queue must outlive the context,
+/// which does not destroy them.
 ///
 /// # Safety
-/// As `nertca_context_create`; the handles in `vulkan` must be valid and made as its fields say.
+/// `options`, `log` and `context` as in `nertca_context_create`; the handles in `vulkan` must be valid and made as its fields
+/// say.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_context_adopt(
     vulkan: *const nertca_vulkan,
@@ -233,7 +233,7 @@ pub unsafe extern "C" fn nertca_context_adopt(
     context: *mut *mut nertca_context,
 ) -> nertca_status {
     call(std::ptr::null::<c_void>(), || {
-        // SAFETY: the header asks that `vulkan` is null or as long as its size says.
+        // SAFETY: the header requires that `vulkan` is null or as long as its size says.
         let theirs = unsafe { read(vulkan) }?;
         for (name, handle) in [
             ("vulkan.instance", theirs.instance),
@@ -253,7 +253,7 @@ pub unsafe extern "C" fn nertca_context_adopt(
         let raw = |handle: *mut c_void| handle.expose_provenance() as u64;
         let adoption = Adoption {
             get_instance_proc_addr: (!theirs.get_instance_proc_addr.is_null()).then(|| {
-                // SAFETY: the caller vouches that it is this function.
+                // SAFETY: the caller guarantees that the pointer is this function.
                 unsafe {
                     std::mem::transmute::<*const c_void, vk::PFN_vkGetInstanceProcAddr>(theirs.get_instance_proc_addr)
                 }
@@ -269,14 +269,14 @@ pub unsafe extern "C" fn nertca_context_adopt(
             cooperative_matrix: theirs.cooperative_matrix != 0,
             queue_lock,
         };
-        // SAFETY: the header asks for valid handles that were made as the fields of `vulkan` say, and the same of the
-        // other pointers as `create` does.
+        // SAFETY: the header requires valid handles that were made as the fields of `vulkan` say, and of the other pointers the
+        // same as `create` does.
         unsafe { create(options, log, context, |parsed| Ok(Some(Gpu::adopt(adoption, &parsed.device)?))) }
     })
 }
 
-/// The device and the paths chosen for it, as JSON; `text`, `size` and `length` as for `nertca_last_error`, but what it says of
-/// memory may be longer at the next call. Any thread.
+/// Describes the device and the computation paths chosen for it, as JSON. `text`, `size` and `length` work as in
+/// `nertca_last_error`, but the part about memory may be longer at the next call. Callable from any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.
@@ -296,13 +296,13 @@ pub unsafe extern "C" fn nertca_context_describe(
             "validation_messages": context.gpu.as_ref().map(Gpu::validation_messages),
             "deterministic": context.deterministic,
         });
-        // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
+        // SAFETY: the header requires that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&described.to_string(), text, size, length) }
     })
 }
 
-/// All Vulkan devices of this machine, usable or not, as a JSON list; `text`, `size` and `length` as for
-/// `nertca_last_error`, but what it says of free memory may be longer at the next call. Any thread.
+/// Lists all Vulkan devices of this machine, usable or not, as JSON. `text`, `size` and `length` work as in
+/// `nertca_last_error`, but the part about free memory may be longer at the next call. Callable from any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.
@@ -310,7 +310,7 @@ pub unsafe extern "C" fn nertca_context_describe(
 pub unsafe extern "C" fn nertca_devices(text: *mut c_char, size: usize, length: *mut usize) -> nertca_status {
     call(std::ptr::null::<c_void>(), || {
         let devices = serde_json::json!(list_devices()?);
-        // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
+        // SAFETY: the header requires that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&devices.to_string(), text, size, length) }
     })
 }
@@ -319,11 +319,11 @@ pub unsafe extern "C" fn nertca_devices(text: *mut c_char, size: usize, length: 
 ///
 /// Waits for calls on the context in other threads.
 ///
-/// @return NERTCA_ERROR_BUSY, and nothing is done, while reconstructions or buffers made from it exist, or from inside
-/// a callback of a call on it.
+/// @return NERTCA_ERROR_BUSY, with nothing done, while reconstructions or buffers made from it exist, or from inside a callback
+/// of a call on it.
 ///
 /// # Safety
-/// None: a stale handle is an error.
+/// Any value is allowed: a stale handle is an error.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_context_destroy(context: *mut nertca_context) -> nertca_status {
     if context.is_null() {
@@ -340,7 +340,7 @@ pub unsafe extern "C" fn nertca_context_destroy(context: *mut nertca_context) ->
         }
         let context = handles::remove::<Context, nertca_context>(context)?;
         if let Some(Err(error)) = context.gpu.as_ref().map(Gpu::save_pipeline_cache) {
-            // A missing cache only costs time at the next start.
+            // Without the cache, the next start only takes longer.
             tracing::dispatcher::with_default(&context.log, || tracing::warn!("{error}"));
         }
         Ok(())

@@ -1,5 +1,6 @@
-//! Handles are indices with a generation into one table of what is alive, so that one that was destroyed, is of another
-//! type or never was one is told apart without touching memory. The table is the library's only process-wide state.
+//! Handles are indices with a generation into one table of the objects that are alive. A handle that was destroyed, has
+//! another type or is arbitrary can therefore be recognised without touching memory. The table is the only process-wide
+//! state of the ABI's objects.
 
 use crate::capi::context::Context;
 use crate::capi::output::SharedBuffer;
@@ -8,10 +9,10 @@ use crate::capi::status::{Failure, NERTCA_ERROR_FORKED, NERTCA_ERROR_HANDLE, Out
 use std::cell::RefCell;
 use std::sync::{Arc, PoisonError, RwLock};
 
-/// Low bits of a handle: 1 + its index.
+/// Number of low bits of a handle, which hold 1 + its index.
 const INDEX_BITS: u32 = 20;
 
-/// What a handle stands for.
+/// Object behind a handle.
 #[derive(Clone)]
 pub(super) enum Object {
     Context(Arc<Context>),
@@ -32,16 +33,16 @@ struct Table {
 static TABLE: RwLock<Table> = RwLock::new(Table { slots: Vec::new(), free: Vec::new() });
 
 thread_local! {
-    /// Handles of the calls this thread is inside of, the outermost first: callbacks nest calls.
+    /// Handles of the calls this thread is inside of, the outermost first; callbacks can nest calls.
     static ACTIVE: RefCell<Vec<usize>> = const { RefCell::new(Vec::new()) };
 }
 
-/// A type with handles.
+/// Type of objects that have handles.
 pub(super) trait Kind: Sized {
     const NAME: &'static str;
     fn wrap(this: Arc<Self>) -> Object;
     fn unwrap(object: Object) -> Option<Arc<Self>>;
-    /// Process that made it.
+    /// Returns the id of the process that made the object.
     fn process(&self) -> u32;
 }
 
@@ -50,7 +51,7 @@ fn parts(handle: usize) -> Option<(usize, usize)> {
     Some((index.checked_sub(1)?, handle >> INDEX_BITS))
 }
 
-/// Makes a handle.
+/// Makes a handle for an object.
 pub(super) fn insert<T: Kind>(object: Arc<T>) -> Outcome<usize> {
     let mut table = TABLE.write().unwrap_or_else(PoisonError::into_inner);
     let object = Some(T::wrap(object));
@@ -67,7 +68,7 @@ pub(super) fn insert<T: Kind>(object: Arc<T>) -> Outcome<usize> {
     Ok(slot.generation << INDEX_BITS | (index + 1))
 }
 
-/// Whether something is alive under a handle.
+/// Tells whether a handle refers to an object that is alive.
 pub(super) fn exists(handle: usize) -> bool {
     let table = TABLE.read().unwrap_or_else(PoisonError::into_inner);
     let slot = parts(handle).and_then(|(index, generation)| {
@@ -76,7 +77,7 @@ pub(super) fn exists(handle: usize) -> bool {
     slot.is_some()
 }
 
-/// What a handle stands for, kept alive and marked as in use by this thread until dropped.
+/// Object behind a handle, kept alive and marked as in use by this thread until dropped.
 pub(super) struct InUse<T> {
     object: Arc<T>,
 }
@@ -95,7 +96,7 @@ impl<T> Drop for InUse<T> {
     }
 }
 
-/// Finds what a handle stands for.
+/// Finds the object behind a handle.
 pub(super) fn get<T: Kind, H>(handle: *const H) -> Outcome<InUse<T>> {
     let object = find::<T>(handle.addr())?;
     let _ = ACTIVE.try_with(|active| active.borrow_mut().push(handle.addr()));
@@ -121,12 +122,12 @@ fn find<T: Kind>(handle: usize) -> Outcome<Arc<T>> {
     Ok(object)
 }
 
-/// Whether this thread is inside a call on a handle, as callbacks are.
+/// Tells whether this thread is inside a call on a handle, as callbacks are.
 pub(super) fn is_active<H>(handle: *const H) -> bool {
     ACTIVE.try_with(|active| active.borrow().contains(&handle.addr())).unwrap_or(false)
 }
 
-/// Makes a handle stale, and gives what it stood for once no other call uses it.
+/// Makes a handle stale, and returns its object once no other call uses it.
 pub(super) fn remove<T: Kind, H>(handle: *const H) -> Outcome<Arc<T>> {
     let object = find::<T>(handle.addr())?;
     {
@@ -134,7 +135,7 @@ pub(super) fn remove<T: Kind, H>(handle: *const H) -> Outcome<Arc<T>> {
         let Some((index, generation)) = parts(handle.addr()) else { return Ok(object) };
         let slot = &mut table.slots[index];
         if slot.generation != generation || slot.object.is_none() {
-            // Another thread was faster.
+            // Another thread destroyed it first.
             return Err(Failure::new(NERTCA_ERROR_HANDLE, format!("{}: was destroyed, or never existed", T::NAME)));
         }
         slot.object = None;

@@ -1,4 +1,4 @@
-//! What the engine has to say goes to the caller's log callback; nothing is printed.
+//! Sends the engine's log messages to the caller's log callback; nothing is printed.
 
 use crate::capi::status::{Failure, Outcome};
 use crate::capi::types::nertca_log;
@@ -11,13 +11,13 @@ use tracing::{Dispatch, Event, Level, Metadata, Subscriber};
 
 /// Severity of a log message: an error.
 pub const NERTCA_LOG_ERROR: u32 = 1;
-/// Severity of a log message: something to look at.
+/// Severity of a log message: a warning.
 pub const NERTCA_LOG_WARNING: u32 = 2;
-/// Severity of a log message: what is being done, and why.
+/// Severity of a log message: information on the work being done, and the reasons.
 pub const NERTCA_LOG_INFO: u32 = 3;
 
-/// Receives log messages: level, UTF-8 text, and the caller's pointer. Called on whichever thread a message arises,
-/// also on the training thread, possibly on several at once. It must not call into the library.
+/// Receives log messages: level, UTF-8 text, and the caller's pointer. It is called on the thread on which a message arises,
+/// which may be the training thread, and possibly on several threads at once. It must not call into the library.
 pub type nertca_log_callback = Option<unsafe extern "C" fn(level: u32, text: *const c_char, user: *mut c_void)>;
 
 struct Callback {
@@ -26,12 +26,12 @@ struct Callback {
     most: u32,
 }
 
-// SAFETY: the header asks for a callback and a pointer that may be used on any thread.
+// SAFETY: the header requires a callback and a pointer that may be used on any thread.
 unsafe impl Send for Callback {}
 // SAFETY: the header also says that messages may come on several threads at once.
 unsafe impl Sync for Callback {}
 
-/// Where a context's messages go.
+/// Returns the receiver of a context's messages.
 pub(super) fn dispatch(log: Option<nertca_log>) -> Outcome<Dispatch> {
     let Some(log) = log else { return Ok(Dispatch::none()) };
     if log.level == 0 || log.level > NERTCA_LOG_INFO {
@@ -63,7 +63,7 @@ impl Visit for Text {
 }
 
 impl Subscriber for Callback {
-    /// Asked each time, since other contexts' logs answer for themselves; see [`crate::capi::callsites`].
+    /// Never gives a final answer, because other contexts have logs of their own; see [`crate::capi::callsites`].
     fn register_callsite(&self, _: &'static Metadata<'static>) -> Interest {
         Interest::sometimes()
     }
@@ -85,10 +85,10 @@ impl Subscriber for Callback {
     fn event(&self, event: &Event<'_>) {
         let mut text = Text(String::new());
         event.record(&mut text);
-        // A text with a zero inside would end there.
+        // A zero inside the text would end the C string.
         let text = CString::new(text.0.replace('\0', "?")).unwrap_or_default();
-        // SAFETY: the caller gave function and pointer for this, good for as long as the context; the text lives until the
-        // call returns.
+        // SAFETY: the caller gave function and pointer for this purpose, valid for the lifetime of the context; the text lives
+        // until the call returns.
         unsafe { (self.call)(severity(*event.metadata().level()), text.as_ptr(), self.user) };
     }
 

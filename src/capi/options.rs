@@ -1,15 +1,15 @@
-//! Options as text, so that new ones never change the ABI: lines of `key = value`, or a JSON object.
+//! Options as text, so that new options never change the ABI: lines of `key = value`, or a JSON object.
 
 use crate::capi::status::{Failure, Outcome};
 use std::ffi::{CStr, c_char};
 
-/// Options as they were given, in order.
+/// Options in the order in which they were given.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Options {
     pairs: Vec<(String, String)>,
 }
 
-/// A text of the caller; `None` for null.
+/// Reads a text of the caller; `None` for null.
 ///
 /// # Safety
 /// `text` must be null or end with a zero.
@@ -17,13 +17,13 @@ pub(super) unsafe fn text<'a>(name: &str, text: *const c_char) -> Outcome<Option
     if text.is_null() {
         return Ok(None);
     }
-    // SAFETY: not null, and this function asks its callers for a text that ends with a zero.
+    // SAFETY: the pointer is not null, and callers of this function guarantee a text that ends with a zero.
     let text = unsafe { CStr::from_ptr(text) };
     text.to_str().map(Some).map_err(|e| Failure::argument(name, format!("is not UTF-8: {e}")))
 }
 
 impl Options {
-    /// Reads both notations.
+    /// Parses either notation.
     pub fn parse(text: &str) -> Outcome<Options> {
         let text = text.trim();
         let mut options = Options::default();
@@ -68,25 +68,25 @@ impl Options {
         }
     }
 
-    /// Takes an option out.
+    /// Removes an option and returns its value.
     pub fn take(&mut self, key: &str) -> Option<String> {
         let at = self.pairs.iter().position(|(k, _)| k == key)?;
         Some(self.pairs.remove(at).1)
     }
 
-    /// Takes an option out and reads it as a `T`.
+    /// Removes an option and parses its value as a `T`.
     pub fn take_as<T: std::str::FromStr>(&mut self, key: &str, wanted: &str) -> Outcome<Option<T>> {
         let Some(value) = self.take(key) else { return Ok(None) };
         let parsed = value.parse().map_err(|_| Failure::argument(key, format!("`{value}` is not {wanted}")))?;
         Ok(Some(parsed))
     }
 
-    /// What is left, as `key=value`.
+    /// Returns the remaining options, as `key=value`.
     pub fn settings(self) -> Vec<String> {
         self.pairs.into_iter().map(|(key, value)| format!("{key}={value}")).collect()
     }
 
-    /// Refuses what is left.
+    /// Returns an error if any option remains.
     pub fn finish(self, known: &str) -> Outcome<()> {
         match self.pairs.first() {
             None => Ok(()),

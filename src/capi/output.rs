@@ -1,4 +1,4 @@
-//! What comes out: views, volumes, scores, and buffers shared with other APIs.
+//! Output: views, volumes, scores, and buffers shared with other APIs.
 
 use crate::capi::context::{Claim, Context, nertca_context, on_context};
 use crate::capi::handles::{self, Kind, Object};
@@ -18,12 +18,12 @@ use crate::render::quantity::{Projection, Quantity};
 use glam::DVec3;
 use std::sync::Arc;
 
-/// Memory on the device that other APIs and processes can import.
+/// A buffer in device memory that other APIs and processes can import.
 pub struct nertca_buffer {
     _opaque: [u8; 0],
 }
 
-/// Behind [`nertca_buffer`].
+/// Object behind [`nertca_buffer`].
 pub(super) struct SharedBuffer {
     buffer: Buffer,
     memory: shared_memory::Memory,
@@ -47,7 +47,7 @@ impl Kind for SharedBuffer {
     }
 }
 
-/// A view, checked.
+/// A view whose fields were checked.
 struct CheckedView {
     rays: ViewRays,
     size: (usize, usize),
@@ -66,9 +66,9 @@ fn component_of(component: u32) -> Outcome<Component> {
 }
 
 /// # Safety
-/// `view` must be null or as long as it says, with a geometry whose matrix is null or has 12 numbers.
+/// `view` must be null or as long as its `size` says, with a geometry whose matrix is null or has 12 numbers.
 unsafe fn checked_view(view: *const nertca_view) -> Outcome<CheckedView> {
-    // SAFETY: this function asks its callers that `view` is null or as long as its size says.
+    // SAFETY: callers of this function guarantee that `view` is null or as long as its size says.
     let view = unsafe { read(view) }?;
     let size = sides(view.width, view.height)?;
     let component = component_of(view.component)?;
@@ -82,14 +82,14 @@ unsafe fn checked_view(view: *const nertca_view) -> Outcome<CheckedView> {
         NERTCA_QUALITY_EXACT => true,
         other => return Err(Failure::argument("quality", format!("{other} is none of NERTCA_QUALITY_*"))),
     };
-    // SAFETY: this function asks its callers for a matrix that is null or has 12 numbers.
+    // SAFETY: callers of this function guarantee a matrix that is null or has 12 numbers.
     let geometry = unsafe { view.geometry.geometry() }?;
     let rays = geometry.rays(size.0, size.1).map_err(|(field, problem)| Failure::argument(&field, problem))?;
     let quantity = Quantity { component, projection };
     Ok(CheckedView { rays, size, phase: view.phase, quantity, exact })
 }
 
-/// Line integrals, or attenuation per mm.
+/// Draws a view: line integrals, or attenuation per mm.
 fn draw(reconstruction: &Reconstruction, checked: &CheckedView) -> Outcome<Vec<f32>> {
     let session = &reconstruction.session;
     let image = if checked.exact {
@@ -101,16 +101,16 @@ fn draw(reconstruction: &Reconstruction, checked: &CheckedView) -> Outcome<Vec<f
     Ok(image.into_iter().map(|v| v * per_mm).collect())
 }
 
-/// Draws a view into the caller's memory: line integrals, or attenuation per mm for a maximum projection. Works while
-/// training too, from the parameters as they then are: `NERTCA_QUALITY_LIVE` at display rates, from volumes that are
-/// refreshed as fast as is possible in a fifth of the time, `NERTCA_QUALITY_EXACT` from the fields themselves.
+/// Draws a view into the caller's memory: line integrals, or attenuation per mm for a maximum projection. It also works during
+/// training, from the current parameters: `NERTCA_QUALITY_LIVE` at display rates, from volumes whose refreshing takes at most a
+/// fifth of the time; `NERTCA_QUALITY_EXACT` from the fields themselves.
 ///
-/// Any thread; calls on one reconstruction draw one after the other.
+/// Callable from any thread; calls on one reconstruction draw one after the other.
 ///
 /// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT naming what is wrong.
 ///
 /// # Safety
-/// `view` and `image` must be as long as they say, and their pointers valid as far as they say.
+/// `view` and `image` must be as long as their `size` says, and their pointers valid for the stated lengths.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_render(
     reconstruction: *mut nertca_reconstruction,
@@ -118,9 +118,9 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
     image: *const nertca_image,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks of `view` what `checked_view` does.
+        // SAFETY: the header requires the same of `view` as `checked_view` does.
         let checked = unsafe { checked_view(view) }?;
-        // SAFETY: the header asks that `image` is null or as long as its size says.
+        // SAFETY: the header requires that `image` is null or as long as its size says.
         let image = unsafe { read(image) }?;
         let (width, height) = checked.size;
         if ![NERTCA_PIXELS_F32, NERTCA_PIXELS_U8].contains(&image.format) {
@@ -143,12 +143,12 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
             } else {
                 values.iter().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(*v), high.max(*v)))
             };
-            // A picture of one value is black.
+            // An image whose pixels all have one value becomes black.
             let scale = if low < high { 255.0 / (high - low) } else { 0.0 };
             values.iter().map(|v| ((v - low) * scale).round() as u8).collect()
         };
         for (row, content) in rows.chunks_exact(width * bytes).enumerate() {
-            // SAFETY: `stride` checked that every row lies within the bytes the caller vouches for.
+            // SAFETY: `stride` checked that every row lies within the bytes that the caller guarantees.
             unsafe {
                 let to = image.pixels.cast::<u8>().add(row * apart);
                 std::ptr::copy_nonoverlapping(content.as_ptr(), to, content.len());
@@ -158,12 +158,12 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
     })
 }
 
-/// Draws a view as `nertca_reconstruction_render` does, into a buffer of the same context: `width * height` floats, rows first. Live
-/// quality is written by the device itself, without a copy; maxima are then per 100 mm (divide by 100). The buffer is
+/// Draws a view like `nertca_reconstruction_render`, into a buffer of the same context: `width * height` floats, row by row. At
+/// live quality the device writes them itself, without a copy; maxima are then per 100 mm (divide by 100). The buffer is
 /// complete when the call returns.
 ///
 /// # Safety
-/// `view` must be as long as it says.
+/// `view` must be as long as its `size` says.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_render_buffer(
     reconstruction: *mut nertca_reconstruction,
@@ -171,7 +171,7 @@ pub unsafe extern "C" fn nertca_reconstruction_render_buffer(
     buffer: *mut nertca_buffer,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks of `view` what `checked_view` does.
+        // SAFETY: the header requires the same of `view` as `checked_view` does.
         let checked = unsafe { checked_view(view) }?;
         let target = handles::get::<SharedBuffer, _>(buffer)?;
         check_target(reconstruction, &target, checked.size.0 * checked.size.1)?;
@@ -197,9 +197,9 @@ fn check_target(reconstruction: &Reconstruction, target: &SharedBuffer, floats: 
 }
 
 /// # Safety
-/// `grid` must be null or as long as it says.
+/// `grid` must be null or as long as its `size` says.
 pub(super) unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, Component, u32)> {
-    // SAFETY: this function asks its callers that `grid` is null or as long as its size says.
+    // SAFETY: callers of this function guarantee that `grid` is null or as long as its size says.
     let grid = unsafe { read(grid) }?;
     let component = component_of(grid.component)?;
     let patient = PatientGrid {
@@ -214,11 +214,11 @@ pub(super) unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, 
     Ok((patient, component, grid.phase))
 }
 
-/// Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Zero outside
-/// what was reconstructed. Any thread, also while training.
+/// Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Values outside the
+/// reconstructed region are zero. Callable from any thread, also during training.
 ///
 /// # Safety
-/// `grid` must be as long as it says; `values` must be writable for `count` floats.
+/// `grid` must be as long as its `size` says; `values` must be writable for `count` floats.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_sample(
     reconstruction: *mut nertca_reconstruction,
@@ -227,7 +227,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
     count: usize,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks of `grid` what `grid_of` does.
+        // SAFETY: the header requires the same of `grid` as `grid_of` does.
         let (grid, component, phase) = unsafe { grid_of(grid) }?;
         if values.is_null() {
             return Err(Failure::argument("values", "is null"));
@@ -237,16 +237,16 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
             return Err(Failure::argument("count", format!("{count} where {needed} are needed")));
         }
         let cells = reconstruction.session.sample(component, phase, &grid)?;
-        // SAFETY: the caller has room for `count` numbers, which was checked to be enough; bytes need no alignment.
+        // SAFETY: the caller guarantees room for `count` numbers, which was checked to be enough; bytes need no alignment.
         unsafe { std::ptr::copy_nonoverlapping(cells.as_ptr().cast::<u8>(), values.cast::<u8>(), 4 * cells.len()) };
         Ok(())
     })
 }
 
-/// Samples the fields as `nertca_reconstruction_sample` does, into a buffer of the same context.
+/// Samples the fields like `nertca_reconstruction_sample`, into a buffer of the same context.
 ///
 /// # Safety
-/// `grid` must be as long as it says.
+/// `grid` must be as long as its `size` says.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
     reconstruction: *mut nertca_reconstruction,
@@ -254,7 +254,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
     buffer: *mut nertca_buffer,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks of `grid` what `grid_of` does.
+        // SAFETY: the header requires the same of `grid` as `grid_of` does.
         let (grid, component, phase) = unsafe { grid_of(grid) }?;
         let target = handles::get::<SharedBuffer, _>(buffer)?;
         check_target(reconstruction, &target, grid.size.iter().map(|n| *n as usize).product())?;
@@ -263,11 +263,10 @@ pub unsafe extern "C" fn nertca_reconstruction_sample_buffer(
     })
 }
 
-/// Makes a buffer on the device that can be shared through `VK_KHR_external_memory_fd`. `*buffer` is null on failure.
-/// Any thread.
+/// Makes a buffer on the device that can be shared through `VK_KHR_external_memory_fd`. `*buffer` is null on failure. Callable
+/// from any thread.
 ///
-/// @return NERTCA_ERROR_DEVICE where the device lacks the extension (`external_memory_fd` of
-/// `nertca_context_describe`).
+/// @return NERTCA_ERROR_DEVICE where the device lacks the extension (`external_memory_fd` of `nertca_context_describe`).
 ///
 /// # Safety
 /// `buffer` must be writable.
@@ -281,7 +280,7 @@ pub unsafe extern "C" fn nertca_buffer_create(
         if buffer.is_null() {
             return Err(Failure::argument("buffer", "is null"));
         }
-        // SAFETY: `buffer` is not null, and the header asks that it can be written.
+        // SAFETY: `buffer` is not null, and the header requires that it can be written.
         unsafe { buffer.write_unaligned(std::ptr::null_mut()) };
         if bytes == 0 || bytes > 1 << 40 {
             return Err(Failure::argument("bytes", format!("{bytes} is no size of a buffer")));
@@ -289,14 +288,14 @@ pub unsafe extern "C" fn nertca_buffer_create(
         let (made, memory) = shared_memory::make(context.device()?, bytes)?;
         let shared = SharedBuffer { buffer: made, memory, claim: Claim::new(context), process: std::process::id() };
         let handle = handles::insert(Arc::new(shared))?;
-        // SAFETY: checked and written above; nothing gave the caller's memory back in between.
+        // SAFETY: `buffer` was checked and written above, and the caller's memory is still valid.
         unsafe { buffer.write_unaligned(std::ptr::without_provenance_mut(handle)) };
         Ok(())
     })
 }
 
-/// A new file descriptor of the buffer's memory (`VK_EXTERNAL_MEMORY_HANDLE_TYPE_OPAQUE_FD_BIT`), the caller's to
-/// import or close, and the size of the allocation's buffer in bytes. Any thread.
+/// Returns a new file descriptor of the buffer's memory (`VK_EXTERNAL_MEMORY_HANDLE_TYPE_OPAQUE_FD_BIT`), which the caller must
+/// import or close, and the size of the exported buffer in bytes. Callable from any thread.
 ///
 /// # Safety
 /// `fd` must be writable; `bytes` must be writable or null.
@@ -312,7 +311,7 @@ pub unsafe extern "C" fn nertca_buffer_export_fd(
             return Err(Failure::argument("fd", "is null"));
         }
         let copy = shared.memory.descriptor()?;
-        // SAFETY: `fd` is not null, and the header asks that both can be written unless null.
+        // SAFETY: `fd` is not null, and the header requires that both can be written unless null.
         unsafe {
             if !bytes.is_null() {
                 bytes.write_unaligned(shared.buffer.bytes());
@@ -323,8 +322,8 @@ pub unsafe extern "C" fn nertca_buffer_export_fd(
     })
 }
 
-/// Frees a buffer; what others imported stays theirs. Null is allowed, and does nothing. Waits for calls on it in other
-/// threads.
+/// Destroys a buffer; memory that others imported stays valid for them. Null is allowed, and does nothing. Waits for calls on
+/// the buffer in other threads.
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_buffer_destroy(buffer: *mut nertca_buffer) -> nertca_status {
     if buffer.is_null() {

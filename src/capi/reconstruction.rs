@@ -1,4 +1,4 @@
-//! Reconstructions: frames in, checkpoints in and out.
+//! Reconstructions: adding frames, saving and loading checkpoints.
 
 use crate::capi::context::{Claim, Context, nertca_context, on_context};
 use crate::capi::handles::{self, Kind, Object};
@@ -23,12 +23,12 @@ pub struct nertca_reconstruction {
     _opaque: [u8; 0],
 }
 
-/// Behind [`nertca_reconstruction`].
+/// Object behind [`nertca_reconstruction`].
 pub(super) struct Reconstruction {
-    // Dropped in this order: the session's memory belongs to the context's device.
+    // Fields are dropped in this order, because the session's memory belongs to the context's device.
     pub session: Session,
     pub latest: Arc<Mutex<Option<Progress>>>,
-    /// The vessels as they were last found.
+    /// Vessels found by the last extraction.
     pub tree: Mutex<Option<BeatTree>>,
     pub claim: Claim,
     process: u32,
@@ -50,7 +50,7 @@ impl Kind for Reconstruction {
     }
 }
 
-/// Takes a handle and runs a body on what it stands for, with the context's log.
+/// Runs a body on the reconstruction of a handle, with the context's log.
 pub(super) fn on_reconstruction(
     handle: *mut nertca_reconstruction,
     body: impl FnOnce(&Arc<Reconstruction>) -> Outcome<()>,
@@ -85,14 +85,14 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
     Ok(Session::new(context.gpu.clone(), context.tuning.clone(), options)?)
 }
 
-/// Begins a reconstruction without frames.
+/// Creates a reconstruction without frames.
 ///
-/// `options` are lines of `key = value` or a JSON object: `phases` (cardiac phases; needed), `depth_half_extent_mm`
-/// (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (of filled
-/// vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
+/// `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required), `depth_half_extent_mm`
+/// (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (attenuation of
+/// filled vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
 /// x-gaussian or sax-nerf) and every key that `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
 ///
-/// `*reconstruction` is null on failure. Any thread.
+/// `*reconstruction` is null on failure. Callable from any thread.
 ///
 /// # Safety
 /// `options` must be null or end with a zero; `reconstruction` must be writable.
@@ -106,9 +106,9 @@ pub unsafe extern "C" fn nertca_reconstruction_create(
         if reconstruction.is_null() {
             return Err(Failure::argument("reconstruction", "is null"));
         }
-        // SAFETY: `reconstruction` is not null, and the header asks that it can be written.
+        // SAFETY: `reconstruction` is not null, and the header requires that it can be written.
         unsafe { reconstruction.write_unaligned(std::ptr::null_mut()) };
-        // SAFETY: the header asks that `options` is null or ends with a zero.
+        // SAFETY: the header requires that `options` is null or ends with a zero.
         let options = Options::parse(unsafe { text("options", options) }?.unwrap_or_default())?;
         let made = Arc::new(Reconstruction {
             session: session(context, options)?,
@@ -118,19 +118,19 @@ pub unsafe extern "C" fn nertca_reconstruction_create(
             process: std::process::id(),
         });
         let handle = handles::insert(made)?;
-        // SAFETY: checked and written above; nothing gave the caller's memory back in between.
+        // SAFETY: `reconstruction` was checked and written above, and the caller's memory is still valid.
         unsafe { reconstruction.write_unaligned(std::ptr::without_provenance_mut(handle)) };
         Ok(())
     })
 }
 
-/// Ends a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
-/// allowed, and does nothing. Any thread but that of its own callbacks.
+/// Destroys a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
+/// allowed, and does nothing. Callable from any thread except inside its own callbacks.
 ///
-/// @return NERTCA_ERROR_BUSY, and nothing is done, from inside a callback of a call on it.
+/// @return NERTCA_ERROR_BUSY, with nothing done, from inside a callback of a call on it.
 ///
 /// # Safety
-/// None: a stale handle is an error.
+/// Any value is allowed: a stale handle is an error.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_destroy(reconstruction: *mut nertca_reconstruction) -> nertca_status {
     if reconstruction.is_null() {
@@ -149,32 +149,32 @@ pub unsafe extern "C" fn nertca_reconstruction_destroy(reconstruction: *mut nert
     })
 }
 
-/// Adds a frame, whose pixels are copied. It may come at any time: training in the background takes it in by itself
-/// (soon: frames that come in quick succession are taken in together), other training when it next begins.
-/// Any thread.
+/// Adds a frame; its pixels are copied. Frames may be added at any time. Training in the background takes a new frame in by
+/// itself after a short while (frames that arrive in quick succession are taken in together); other training takes it in when
+/// it next begins. Callable from any thread.
 ///
 /// @return NERTCA_ERROR_ARGUMENT naming the field that is wrong; NERTCA_ERROR_BUSY while training in the background in a
 /// deterministic context.
 ///
 /// # Safety
-/// `frame` must be as long as it says, and its pointers readable as far as it says.
+/// `frame` must be as long as its `size` says, and its pointers readable for the stated lengths.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_add_frame(
     reconstruction: *mut nertca_reconstruction,
     frame: *const nertca_frame,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks that `frame` is null or as long as its size says, and its pointers good as far as its
-        // fields say.
+        // SAFETY: the header requires that `frame` is null or as long as its size says, and that its pointers are readable for
+        // the lengths in its fields.
         let frame = unsafe { read(frame)?.new_frame() }?;
         Ok(reconstruction.session.add_frame(frame)?)
     })
 }
 
-/// Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them,
-/// systole keeping its length (310 ms, 35 % of the phases) and diastole taking the rest; where one set of Gaussians moves, they are
-/// fitted at their own time within it. Replaces those given earlier, so that a growing list can be given again and again. Any
-/// thread.
+/// Sets the times of the R-peaks, seconds, in ascending order. Frames with time stamps get their phase from them: systole keeps
+/// its length (310 ms, 35 % of the phases) and diastole takes the rest of the beat. A method with one set of moving Gaussians
+/// fits each frame at its own time within the phase. A call replaces the times given earlier, so that a growing list can be
+/// given repeatedly. Callable from any thread.
 ///
 /// # Safety
 /// `times_s` must be readable for `count` numbers.
@@ -191,17 +191,17 @@ pub unsafe extern "C" fn nertca_reconstruction_set_r_peaks(
         if count > 1 << 20 {
             return Err(Failure::argument("count", format!("{count}; at most 2^20 are accepted")));
         }
-        // SAFETY: not null, and the header asks for `count` numbers, which need no alignment.
+        // SAFETY: the pointer is not null, and the header requires `count` numbers, which need no alignment.
         let times = (0..count).map(|i| unsafe { times_s.add(i).read_unaligned() }).collect::<Vec<_>>();
         reconstruction.session.set_r_peaks(RPeaks::new(&times)?);
         Ok(())
     })
 }
 
-/// State and progress. Any thread, at any time.
+/// Returns state and progress of training. Callable from any thread, at any time.
 ///
-/// @return NERTCA_OK also when training has failed: `state` is then `NERTCA_STATE_FAILED`, and the reason found by
-/// `nertca_reconstruction_failure`.
+/// @return NERTCA_OK also when training has failed: `state` is then `NERTCA_STATE_FAILED`, and `nertca_reconstruction_failure`
+/// returns the reason.
 ///
 /// # Safety
 /// `progress` must be writable, with its size set.
@@ -214,7 +214,7 @@ pub unsafe extern "C" fn nertca_reconstruction_progress(
         let latest = *reconstruction.latest.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let state = state_code(reconstruction.session.state());
         let step = reconstruction.session.step();
-        // SAFETY: the header asks that `progress` is null or as long as its size says.
+        // SAFETY: the header requires that `progress` is null or as long as its size says.
         unsafe {
             write(progress, |size| nertca_progress {
                 size,
@@ -230,8 +230,8 @@ pub unsafe extern "C" fn nertca_reconstruction_progress(
     })
 }
 
-/// Why training in the background failed; empty when it did not. `text`, `size` and `length` as for
-/// `nertca_last_error`. Any thread.
+/// Returns the reason why training in the background failed; empty when it did not. `text`, `size` and `length` work as in
+/// `nertca_last_error`. Callable from any thread.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.
@@ -244,12 +244,13 @@ pub unsafe extern "C" fn nertca_reconstruction_failure(
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
         let failure = reconstruction.session.failure().unwrap_or_default();
-        // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
+        // SAFETY: the header requires that `text` holds `size` bytes and that `length` is null or can be written.
         unsafe { copy_text(&failure, text, size, length) }
     })
 }
 
-/// Writes everything needed to continue into a file, which appears whole or not at all. Any thread, also while training.
+/// Writes a checkpoint, with everything needed to continue, into a file, which appears whole or not at all. Callable from any
+/// thread, also during training.
 ///
 /// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded.
 ///
@@ -261,18 +262,18 @@ pub unsafe extern "C" fn nertca_reconstruction_save(
     path: *const c_char,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks that `path` is null or ends with a zero.
+        // SAFETY: the header requires that `path` is null or ends with a zero.
         let path = unsafe { text("path", path) }?.filter(|p| !p.is_empty());
         let path = path.ok_or_else(|| Failure::argument("path", "is null or empty"))?;
         Ok(reconstruction.session.checkpoint()?.write(Path::new(path))?)
     })
 }
 
-/// Saves as `nertca_reconstruction_save` does, into memory. `*length` gets the bytes needed; with a null `bytes` and a `size` of
-/// 0 nothing else is done.
+/// Saves a checkpoint like `nertca_reconstruction_save`, into memory. `*length` receives the number of bytes needed; with a
+/// null `bytes` and a `size` of 0, only the length is returned.
 ///
-/// @return NERTCA_ERROR_BUFFER when `size` is too small. While training goes on in the background the state grows and shrinks, by
-/// kilobytes when Gaussians are added: then try again with the new `*length`.
+/// @return NERTCA_ERROR_BUFFER when `size` is too small. During training in the background the size of the state changes, by
+/// kilobytes when Gaussians are added: try again with the new `*length`.
 ///
 /// # Safety
 /// `bytes` must hold `size` bytes; `length` must be writable.
@@ -291,7 +292,7 @@ pub unsafe extern "C" fn nertca_reconstruction_save_memory(
             return Err(Failure::argument("bytes", "is null"));
         }
         let content = reconstruction.session.checkpoint()?.to_bytes()?;
-        // SAFETY: `length` is not null, and the header asks that it can be written.
+        // SAFETY: `length` is not null, and the header requires that it can be written.
         unsafe { length.write_unaligned(content.len()) };
         if bytes.is_null() {
             return Ok(());
@@ -299,15 +300,15 @@ pub unsafe extern "C" fn nertca_reconstruction_save_memory(
         if content.len() > size {
             return Err(Failure::new(NERTCA_ERROR_BUFFER, format!("{} bytes are needed", content.len())));
         }
-        // SAFETY: not null, with room for `size` bytes, which was checked to be enough; the content is ours, so they do
-        // not overlap.
+        // SAFETY: `bytes` is not null, with room for `size` bytes, which was checked to be enough; the content is ours, so the
+        // two do not overlap.
         unsafe { std::ptr::copy_nonoverlapping(content.as_ptr(), bytes.cast(), content.len()) };
         Ok(())
     })
 }
 
-/// Takes over a checkpoint file, of this library or of `nertca-vk train`, with its hyper-parameters and phases: it can
-/// be drawn at once, and trained further with the frames of this reconstruction. Any thread.
+/// Loads a checkpoint file of this library or of `nertca-vk train`, with its hyper-parameters and phases. It can be rendered at
+/// once, and trained further with the frames of this reconstruction. Callable from any thread.
 ///
 /// @return NERTCA_ERROR_BUSY while training in the background; NERTCA_ERROR_DATA for a malformed file.
 ///
@@ -319,14 +320,14 @@ pub unsafe extern "C" fn nertca_reconstruction_load(
     path: *const c_char,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks that `path` is null or ends with a zero.
+        // SAFETY: the header requires that `path` is null or ends with a zero.
         let path = unsafe { text("path", path) }?.filter(|p| !p.is_empty());
         let path = path.ok_or_else(|| Failure::argument("path", "is null or empty"))?;
         Ok(reconstruction.session.load(Checkpoint::read(Path::new(path))?)?)
     })
 }
 
-/// Loads as `nertca_reconstruction_load` does, from memory.
+/// Loads a checkpoint like `nertca_reconstruction_load`, from memory.
 ///
 /// # Safety
 /// `bytes` must be readable for `size` bytes.
@@ -343,7 +344,7 @@ pub unsafe extern "C" fn nertca_reconstruction_load_memory(
         if size > 4 << 30 {
             return Err(Failure::argument("size", format!("{size}; at most 4 GiB are accepted")));
         }
-        // SAFETY: not null, and the header asks for `size` bytes, which nobody changes during the call.
+        // SAFETY: the pointer is not null, and the header requires `size` bytes, which nobody changes during the call.
         let content = unsafe { std::slice::from_raw_parts(bytes.cast::<u8>(), size) };
         Ok(reconstruction.session.load(Checkpoint::from_bytes(content, Path::new("memory"))?)?)
     })

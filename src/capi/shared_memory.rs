@@ -1,4 +1,5 @@
-//! Memory that other processes and APIs import, by file descriptors: what Unix has, and other systems refuse.
+//! Memory that other processes and APIs import through file descriptors. Only Unix has it; other systems return an
+//! error.
 
 use crate::error::Result;
 use crate::gpu::buffer::Buffer;
@@ -10,7 +11,7 @@ mod system {
     use crate::error::Error;
     use std::os::fd::{AsFd, IntoRawFd, OwnedFd};
 
-    /// A buffer's memory, for others to import.
+    /// Descriptor of a buffer's memory, for import by others.
     pub struct Memory(OwnedFd);
 
     pub fn make(gpu: &Gpu, bytes: u64) -> Result<(Buffer, Memory)> {
@@ -19,7 +20,7 @@ mod system {
     }
 
     impl Memory {
-        /// Another descriptor of it, the caller's.
+        /// Returns a new descriptor of the memory, which the caller owns.
         pub fn descriptor(&self) -> Result<i32> {
             let copy = self.0.as_fd().try_clone_to_owned();
             Ok(copy.map_err(Error::io("duplicate the descriptor of", "a shared buffer"))?.into_raw_fd())
@@ -32,7 +33,7 @@ mod system {
     use super::{Buffer, Gpu, Result};
     use crate::error::Error;
 
-    /// There is none.
+    /// This type has no values: such memory does not exist here.
     pub enum Memory {}
 
     pub fn make(_: &Gpu, _: u64) -> Result<(Buffer, Memory)> {

@@ -1,4 +1,4 @@
-//! Status codes, error texts, and the boundary that no panic crosses.
+//! Status codes, error texts, and the boundary that catches all panics.
 
 use crate::capi::{callsites, handles};
 use crate::error::Error;
@@ -9,20 +9,20 @@ use std::ffi::{c_char, c_void};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Once;
 
-/// What a call returns: 0 for success, negative for an error whose text `nertca_last_error` gives.
+/// Result of a call: 0 for success, negative for an error whose text `nertca_last_error` returns.
 pub type nertca_status = i32;
 
-/// Done.
+/// Success.
 pub const NERTCA_OK: nertca_status = 0;
 /// An argument is null, out of range, or contradicts another.
 pub const NERTCA_ERROR_ARGUMENT: nertca_status = -1;
-/// A handle was destroyed, is of another type, or never was one.
+/// A handle was destroyed, has another type, or is not a handle.
 pub const NERTCA_ERROR_HANDLE: nertca_status = -2;
-/// Data given (a checkpoint, say) is malformed.
+/// Data that was passed (for example a checkpoint) is malformed.
 pub const NERTCA_ERROR_DATA: nertca_status = -3;
 /// The operating system refused a file operation.
 pub const NERTCA_ERROR_IO: nertca_status = -4;
-/// No device fits, or it lacks what was asked for.
+/// No device fits, or it lacks a requested feature.
 pub const NERTCA_ERROR_DEVICE: nertca_status = -5;
 /// The device stopped answering: destroy everything made from the context, then the context.
 pub const NERTCA_ERROR_DEVICE_LOST: nertca_status = -6;
@@ -30,20 +30,20 @@ pub const NERTCA_ERROR_DEVICE_LOST: nertca_status = -6;
 pub const NERTCA_ERROR_MEMORY: nertca_status = -7;
 /// Training diverged; the last good state is kept.
 pub const NERTCA_ERROR_DIVERGED: nertca_status = -8;
-/// A callback ended the call.
+/// A callback cancelled the call.
 pub const NERTCA_ERROR_CANCELLED: nertca_status = -9;
-/// The call cannot be done while something else goes on (training, or handles that still exist).
+/// The call is not possible while something else is active (training, or handles that still exist).
 pub const NERTCA_ERROR_BUSY: nertca_status = -10;
-/// The buffer given is too small; the length needed was written.
+/// The buffer passed is too small; the required length was written.
 pub const NERTCA_ERROR_BUFFER: nertca_status = -11;
-/// The call needs something that is still to come: frames, or training.
+/// The call needs something that is not there yet: frames, or training.
 pub const NERTCA_ERROR_NOT_READY: nertca_status = -12;
 /// A handle of the parent process was used after a fork.
 pub const NERTCA_ERROR_FORKED: nertca_status = -13;
 /// A fault of this library. Please report it.
 pub const NERTCA_ERROR_INTERNAL: nertca_status = -14;
 
-/// Why a call failed.
+/// Status and text of a failed call.
 #[derive(Debug)]
 pub(super) struct Failure {
     pub status: nertca_status,
@@ -81,19 +81,19 @@ impl From<Error> for Failure {
     }
 }
 
-/// Texts kept per thread; beyond that, those of destroyed handles go.
+/// Number of texts kept per thread; beyond it, texts of destroyed handles are discarded.
 const MOST_TEXTS: usize = 64;
 
 thread_local! {
-    /// Text of the last failure by handle; that of any handle under 0.
+    /// Text of the last failure by handle; key 0 has the last failure of any handle.
     static LAST: RefCell<HashMap<usize, String>> = RefCell::default();
-    /// Inside a call: a panic is reported as its failure and not printed.
+    /// Report of a panic inside a call: it becomes the call's failure, and is not printed.
     static PANIC: RefCell<Option<String>> = const { RefCell::new(None) };
     static DEPTH: Cell<u32> = const { Cell::new(0) };
 }
 
 fn remember(handle: usize, text: &str) {
-    // A thread that is going away has no texts any more.
+    // A thread that is ending has no texts.
     let _ = LAST.try_with(|last| {
         let mut last = last.borrow_mut();
         if last.len() >= MOST_TEXTS {
@@ -104,7 +104,8 @@ fn remember(handle: usize, text: &str) {
     });
 }
 
-/// Panics inside a call, or in threads that work for one, are kept for its failure; all others go where they went before.
+/// Installs a panic hook. Panics inside a call, or in threads that work for one, are kept for the call's failure; all others go
+/// to the previous hook.
 fn catch_reports() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
@@ -120,7 +121,7 @@ fn catch_reports() {
     });
 }
 
-/// Marks this thread as inside the library while it lives.
+/// Guard that marks this thread as inside the library.
 struct Inside;
 
 impl Inside {
@@ -138,7 +139,7 @@ impl Drop for Inside {
     }
 }
 
-/// Runs the body of a call on `handle` (null for none): its failure, or panic, becomes a status and a text.
+/// Runs the body of a call on `handle` (null for none). Its failure, or panic, becomes a status and a text.
 pub(super) fn call<H>(handle: *const H, body: impl FnOnce() -> Outcome<()>) -> nertca_status {
     let inside = Inside::enter();
     let outcome = catch_unwind(AssertUnwindSafe(body));
@@ -156,14 +157,14 @@ pub(super) fn call<H>(handle: *const H, body: impl FnOnce() -> Outcome<()>) -> n
     failure.status
 }
 
-/// Copies a text with its closing zero into a caller's buffer, cut to fit; `length` gets its full length without the
+/// Copies a text with its closing zero into a caller's buffer, truncated to fit. `length` receives the full length without the
 /// zero.
 ///
 /// # Safety
 /// `buffer` must hold `size` bytes, unless null; `length` must be writable, unless null.
 pub(super) unsafe fn copy_text(text: &str, buffer: *mut c_char, size: usize, length: *mut usize) -> Outcome<()> {
     if !length.is_null() {
-        // SAFETY: not null, and this function asks its callers that it can be written.
+        // SAFETY: the pointer is not null, and callers of this function guarantee that it can be written.
         unsafe { length.write_unaligned(text.len()) };
     }
     if buffer.is_null() {
@@ -174,7 +175,7 @@ pub(super) unsafe fn copy_text(text: &str, buffer: *mut c_char, size: usize, len
         return Err(Failure::argument("size", "is 0"));
     }
     let n = text.len().min(size - 1);
-    // SAFETY: the caller vouches for `size` bytes.
+    // SAFETY: the caller guarantees `size` bytes.
     unsafe {
         std::ptr::copy_nonoverlapping(text.as_ptr(), buffer.cast(), n);
         buffer.add(n).write(0);
@@ -185,13 +186,13 @@ pub(super) unsafe fn copy_text(text: &str, buffer: *mut c_char, size: usize, len
     Ok(())
 }
 
-/// Text of the last failed call on `handle` (of any type) in this thread, or of the last failed call at all when
-/// `handle` is null; empty when there was none. UTF-8, with a closing zero, cut to `size` bytes; `*length` gets the
-/// full length without the zero. With a null `text` and a `size` of 0, only the length is given.
+/// Returns the text of the last failed call on `handle` (of any type) in this thread, or of the last failed call of all when
+/// `handle` is null; empty when there was none. The text is UTF-8 with a closing zero, truncated to `size` bytes. `*length`
+/// receives the full length without the zero. With a null `text` and a `size` of 0, only the length is returned.
 ///
-/// Any thread. Texts of calls without a handle (those that create one) are found under null.
+/// Callable from any thread. Texts of calls without a handle (those that create one) are found under null.
 ///
-/// @return NERTCA_OK, NERTCA_ERROR_BUFFER when the text was cut, NERTCA_ERROR_ARGUMENT.
+/// @return NERTCA_OK, NERTCA_ERROR_BUFFER when the text was truncated, NERTCA_ERROR_ARGUMENT.
 ///
 /// # Safety
 /// `text` must hold `size` bytes; `length` must be writable or null.
@@ -204,10 +205,10 @@ pub unsafe extern "C" fn nertca_last_error(
 ) -> nertca_status {
     let inside = Inside::enter();
     let last = LAST.try_with(|last| last.borrow().get(&handle.addr()).cloned()).ok().flatten().unwrap_or_default();
-    // SAFETY: the header asks that `text` holds `size` bytes and that `length` is null or can be written.
+    // SAFETY: the header requires that `text` holds `size` bytes and that `length` is null or can be written.
     let outcome = catch_unwind(AssertUnwindSafe(|| unsafe { copy_text(&last, text, size, length) }));
     drop(inside);
-    // A failure here leaves the text that was asked for as it is.
+    // A failure here does not replace the text that the caller wanted to read.
     match outcome {
         Ok(Ok(())) => NERTCA_OK,
         Ok(Err(failure)) => failure.status,
@@ -215,7 +216,7 @@ pub unsafe extern "C" fn nertca_last_error(
     }
 }
 
-/// A short description of a status, for logs. Never null; the text is static. Any thread.
+/// Returns a short description of a status, for logs. The text is static, and never null. Callable from any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_status_text(status: nertca_status) -> *const c_char {
     (match status {

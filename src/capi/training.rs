@@ -11,7 +11,7 @@ use std::ffi::c_void;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-/// A state as a number.
+/// Converts a state to its number.
 pub(super) fn state_code(state: State) -> u32 {
     match state {
         State::Idle => NERTCA_STATE_IDLE,
@@ -35,7 +35,7 @@ struct Callback {
 unsafe impl Send for Callback {}
 
 impl Callback {
-    /// Tells the caller; whether to go on.
+    /// Reports progress to the caller; returns whether to continue.
     fn tell(&self, p: &Progress) -> bool {
         *self.latest.lock().unwrap_or_else(PoisonError::into_inner) = Some(*p);
         let Some(call) = self.call else { return true };
@@ -49,18 +49,19 @@ impl Callback {
             psnr_db: p.psnr_db,
             iterations_per_s: p.iterations_per_s,
         };
-        // SAFETY: the header asks for a function that takes `user`; the progress it points to lives until the call
+        // SAFETY: the header requires a function that takes `user`; the progress it receives lives until the call
         // returns.
         unsafe { call(&raw const progress, self.user) == 0 }
     }
 }
 
-/// Trains up to `iterations` more in the calling thread, with the frames there are. `progress` may be null; a non-zero
-/// result of it ends the call. `*done` (may be null) gets the iterations done: fewer at the end of the run.
+/// Trains up to `iterations` more iterations in the calling thread, with the frames added so far. `progress` may be
+/// null; a non-zero result of it ends the call. `*done` (may be null) receives the number of iterations done, which is
+/// smaller at the end of the run.
 ///
-/// One call at a time on a reconstruction; everything else may be called meanwhile from other threads.
+/// Only one such call at a time is allowed on a reconstruction; other threads may make all other calls meanwhile.
 ///
-/// @return NERTCA_ERROR_CANCELLED when the callback ended it; NERTCA_ERROR_NOT_READY without frames enough;
+/// @return NERTCA_ERROR_CANCELLED when the callback ended the call; NERTCA_ERROR_NOT_READY without enough frames;
 /// NERTCA_ERROR_BUSY while training in the background; NERTCA_ERROR_DIVERGED, with the last good state kept.
 ///
 /// # Safety
@@ -84,17 +85,17 @@ pub unsafe extern "C" fn nertca_reconstruction_train(
             !cancelled
         })?;
         if !done.is_null() {
-            // SAFETY: not null, and the header asks that it can be written.
+            // SAFETY: the pointer is not null, and the header requires that it can be written.
             unsafe { done.write_unaligned(trained) };
         }
         if cancelled { Err(crate::error::Error::Interrupted.into()) } else { Ok(()) }
     })
 }
 
-/// Trains in the background until the run is done, and waits for frames while there are too few. `progress` may be
-/// null; it is called on the training thread, and a non-zero result of it ends training. Any thread.
+/// Trains in the background until the run is complete, and waits for frames while there are too few. `progress` may be
+/// null; it is called on the training thread, and a non-zero result of it ends training. Callable from any thread.
 ///
-/// @return NERTCA_ERROR_BUSY while it does so already.
+/// @return NERTCA_ERROR_BUSY if it is already training in the background.
 ///
 /// # Safety
 /// `progress` must be callable with `user` on another thread until training has ended.
@@ -110,7 +111,8 @@ pub unsafe extern "C" fn nertca_reconstruction_start(
     })
 }
 
-/// Holds training in the background after the iterations under way; does nothing without any. Any thread.
+/// Pauses training in the background after the iterations under way; does nothing without such training. Callable from
+/// any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_reconstruction_pause(reconstruction: *mut nertca_reconstruction) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
@@ -119,7 +121,7 @@ pub extern "C" fn nertca_reconstruction_pause(reconstruction: *mut nertca_recons
     })
 }
 
-/// Lets paused training go on; does nothing otherwise. Any thread.
+/// Resumes paused training; does nothing otherwise. Callable from any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_reconstruction_resume(reconstruction: *mut nertca_reconstruction) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
@@ -128,8 +130,8 @@ pub extern "C" fn nertca_reconstruction_resume(reconstruction: *mut nertca_recon
     })
 }
 
-/// Ends training in the background after the iterations under way and waits for that; does nothing without any.
-/// Training may be started again. Any thread but that of the progress callback.
+/// Ends training in the background after the iterations under way, and waits until it has ended; does nothing without
+/// such training. Training may be started again. Callable from any thread except that of the progress callback.
 ///
 /// @return NERTCA_ERROR_BUSY from inside the progress callback.
 #[unsafe(no_mangle)]
@@ -137,8 +139,8 @@ pub extern "C" fn nertca_reconstruction_stop(reconstruction: *mut nertca_reconst
     on_reconstruction(reconstruction, |reconstruction| Ok(reconstruction.session.stop()?))
 }
 
-/// Waits until training in the background has ended, at most `limit_ms` milliseconds; `*ended` (may be null) gets 1 or
-/// 0. Any thread but that of the progress callback.
+/// Waits until training in the background has ended, at most `limit_ms` milliseconds. `*ended` (may be null) receives 1
+/// if it has ended, else 0. Callable from any thread except that of the progress callback.
 ///
 /// # Safety
 /// `ended` must be writable or null.
@@ -151,7 +153,7 @@ pub unsafe extern "C" fn nertca_reconstruction_wait(
     on_reconstruction(reconstruction, |reconstruction| {
         let over = reconstruction.session.wait(Duration::from_millis(limit_ms.into()));
         if !ended.is_null() {
-            // SAFETY: not null, and the header asks that it can be written.
+            // SAFETY: the pointer is not null, and the header requires that it can be written.
             unsafe { ended.write_unaligned(over.into()) };
         }
         Ok(())

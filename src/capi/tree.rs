@@ -6,27 +6,28 @@ use crate::capi::types::{nertca_tree, read, write};
 use crate::trees::tree::{BeatTree, Branch};
 use std::sync::PoisonError;
 
-/// Finds the vessels at all phases as trees of centrelines with radii, and tells how much room they need: with all arrays of
-/// `tree` null. Called again with arrays, it copies what it found, whatever training has done since. Takes seconds.
+/// Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and
+/// returns the sizes of the arrays. Called again with arrays, it copies the trees found before, whatever training has done
+/// since. The search takes seconds.
 ///
-/// Branches come phase by phase, each behind its parent. Where `followed` is 1, all phases have the same branches with the
-/// same number of points, and point i of a branch is the same material point at every phase; elsewhere each phase has
-/// branches of its own. Motion along a vessel is not observed in projections: what there is of it comes from smoothness
-/// alone. Any thread, also while training.
+/// Branches are listed phase by phase, each after its parent. Where `followed` is 1, all phases have the same branches with the
+/// same number of points, and point i of a branch is the same material point at every phase; otherwise each phase has its own
+/// branches. Motion along a vessel is not observed in projections: it is determined by smoothness alone. Callable from any
+/// thread, also during training.
 ///
-/// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a threshold or length
-/// that is negative, for a moving field without vessels above the threshold, and where only some arrays are given;
-/// NERTCA_ERROR_BUFFER when they are too short: the counts then tell what is needed.
+/// @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a negative threshold or
+/// length, for a dynamic field without vessels above the threshold, and where only some arrays are given; NERTCA_ERROR_BUFFER
+/// when the arrays are too short: the counts are then the required ones.
 ///
 /// # Safety
-/// `tree` must be as long as it says, and its arrays null or writable for `branches` and `points` elements.
+/// `tree` must be as long as its `size` says, and its arrays null or writable for `branches` and `points` elements.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_tree(
     reconstruction: *mut nertca_reconstruction,
     tree: *mut nertca_tree,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks that `tree` is null or as long as its size says.
+        // SAFETY: the header requires that `tree` is null or as long as its size says.
         let asked = unsafe { read(tree) }?;
         let copies = wants_copies(&asked)?;
         let mut kept = reconstruction.tree.lock().unwrap_or_else(PoisonError::into_inner);
@@ -46,7 +47,7 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
             ..asked
         };
         *kept = Some(found);
-        // SAFETY: the header asks for a struct of at least `tree->size` bytes that may be written.
+        // SAFETY: the header requires a struct of at least `tree->size` bytes that may be written.
         unsafe { write(tree, |size| nertca_tree { size, ..told }) }?;
         if !copies {
             return Ok(());
@@ -55,7 +56,7 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
             let needed = format!("room for {} branches and {} points is needed", told.branches, told.points);
             return Err(Failure::new(NERTCA_ERROR_BUFFER, needed));
         }
-        // SAFETY: no array is null, as was checked, and the header asks for as many elements as were compared above.
+        // SAFETY: no array is null, as was checked, and the header requires as many elements as were compared above.
         unsafe {
             copy(&flat.branch_phase, asked.branch_phase);
             copy(&flat.branch_parent, asked.branch_parent);
@@ -68,7 +69,7 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
     })
 }
 
-/// Whether the caller has arrays; all of them, or none.
+/// Tells whether the caller passed arrays; either all or none of them must be given.
 fn wants_copies(asked: &nertca_tree) -> Outcome<bool> {
     let missing = [
         ("branch_phase", asked.branch_phase.is_null()),
@@ -96,12 +97,12 @@ fn find(reconstruction: &Reconstruction, asked: &nertca_tree) -> Outcome<BeatTre
 /// `to` must be writable for as many elements as `from` has.
 unsafe fn copy<T: Copy>(from: &[T], to: *mut T) {
     for (i, value) in from.iter().enumerate() {
-        // SAFETY: this function asks its callers for as many elements, which need no alignment.
+        // SAFETY: callers of this function guarantee as many elements, which need no alignment.
         unsafe { to.add(i).write_unaligned(*value) };
     }
 }
 
-/// All phases one behind the other, an array for each quantity.
+/// Trees of all phases, concatenated, with one array for each quantity.
 #[derive(Default)]
 struct FlatTree {
     branch_phase: Vec<u32>,

@@ -1,4 +1,4 @@
-//! What the caller knows of the true vessels, and scores.
+//! True vessels given by the caller, and scores.
 
 use crate::capi::output::grid_of;
 use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
@@ -10,17 +10,18 @@ use crate::score::volume::TrueVessels;
 use glam::DVec3;
 use std::collections::BTreeMap;
 
-/// Points and branches of a true tree at most.
+/// Maximum number of points and of branches of a true tree.
 const MOST_ELEMENTS: usize = 1 << 24;
 
-/// Says which voxels are vessel at the phase of `grid`, in place of what was said of that phase before: a non-zero byte for each
-/// point of the grid that is inside one, left fastest; its component does not matter. `nertca_reconstruction_evaluate` then has
-/// scores in 3D. Null `vessels`, with `bytes` 0, forget the phase. The bytes are copied. Any thread.
+/// Sets the true vessel voxels at the phase of `grid`, in place of those set before for that phase. `vessels` has one byte for
+/// each point of the grid, left fastest, non-zero inside a vessel; the grid's component is ignored.
+/// `nertca_reconstruction_evaluate` then returns scores in 3D. Null `vessels`, with `bytes` 0, remove the phase. The bytes are
+/// copied. Callable from any thread.
 ///
-/// @return NERTCA_ERROR_ARGUMENT for a phase that there is not, a grid of more than 2^26 points, or too few bytes.
+/// @return NERTCA_ERROR_ARGUMENT for a phase that does not exist, a grid of more than 2^26 points, or too few bytes.
 ///
 /// # Safety
-/// `grid` must be as long as it says; `vessels` must be readable for `bytes` bytes or null.
+/// `grid` must be as long as its `size` says; `vessels` must be readable for `bytes` bytes or null.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_set_true_vessels(
     reconstruction: *mut nertca_reconstruction,
@@ -29,7 +30,7 @@ pub unsafe extern "C" fn nertca_reconstruction_set_true_vessels(
     bytes: usize,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks of `grid` what `grid_of` does.
+        // SAFETY: the header requires the same of `grid` as `grid_of` does.
         let (grid, _, phase) = unsafe { grid_of(grid) }?;
         if vessels.is_null() && bytes == 0 {
             return Ok(reconstruction.session.set_true_vessels(phase, None)?);
@@ -41,36 +42,37 @@ pub unsafe extern "C" fn nertca_reconstruction_set_true_vessels(
         if bytes < needed {
             return Err(Failure::argument("bytes", format!("{bytes} where {needed} are needed")));
         }
-        // SAFETY: not null, and the header asks for `bytes` bytes, which are enough and which nobody changes during the call.
+        // SAFETY: the pointer is not null, and the header requires `bytes` bytes, which are enough and which nobody changes
+        // during the call.
         let inside = unsafe { std::slice::from_raw_parts(vessels, needed) }.iter().map(|v| *v != 0).collect();
         Ok(reconstruction.session.set_true_vessels(phase, Some(TrueVessels { grid, inside }))?)
     })
 }
 
-/// Says where the true centrelines are, and how wide the vessels, in place of what was said before: arrays as
-/// `nertca_reconstruction_tree` fills them, of one phase or more, of which 0 is one, with the same branches of as many points at
-/// each; point i of a branch is the same material point at every phase. `branch_parent` may be null. No branches forget them.
-/// `nertca_reconstruction_evaluate` then finds the vessels as a tree, which takes seconds, and scores it. The arrays are copied.
-/// Any thread.
+/// Sets the true centrelines and vessel radii, in place of those set before. The arrays have the form that
+/// `nertca_reconstruction_tree` fills. They contain one phase or more, among them phase 0, each with the same branches of the
+/// same number of points; point i of a branch is the same material point at every phase. `branch_parent` may be null. Zero
+/// branches remove the true centrelines. `nertca_reconstruction_evaluate` then finds the vessels as a tree, which takes
+/// seconds, and scores it. The arrays are copied. Callable from any thread.
 ///
 /// @return NERTCA_ERROR_ARGUMENT naming what is wrong.
 ///
 /// # Safety
-/// `tree` must be as long as it says, and its arrays readable for `branches` and `points` elements.
+/// `tree` must be as long as its `size` says, and its arrays readable for `branches` and `points` elements.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn nertca_reconstruction_set_true_tree(
     reconstruction: *mut nertca_reconstruction,
     tree: *const nertca_tree,
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
-        // SAFETY: the header asks that `tree` is null or as long as its size says.
+        // SAFETY: the header requires that `tree` is null or as long as its size says.
         let tree = unsafe { read(tree) }?;
-        // SAFETY: the header asks for arrays as long as the struct says.
+        // SAFETY: the header requires arrays as long as the struct says.
         Ok(reconstruction.session.set_true_trees(unsafe { lines(&tree) }?)?)
     })
 }
 
-/// The lines of each phase.
+/// Returns the true lines of each phase.
 ///
 /// # Safety
 /// The arrays must be readable for as many elements as the struct says.
@@ -80,7 +82,7 @@ unsafe fn lines(tree: &nertca_tree) -> Outcome<BTreeMap<u32, Vec<TrueLine>>> {
             return Err(Failure::argument(name, format!("{count}; at most 2^24 are accepted")));
         }
     }
-    // SAFETY: this function asks its callers for as many elements, which need no alignment.
+    // SAFETY: callers of this function guarantee as many elements, which need no alignment.
     let (phases, firsts, counts, points, radii) = unsafe {
         (
             copied("branch_phase", tree.branch_phase.cast_const(), tree.branches)?,
@@ -112,15 +114,15 @@ unsafe fn copied<T: Copy>(name: &str, from: *const T, count: usize) -> Outcome<V
     if from.is_null() && count > 0 {
         return Err(Failure::argument(name, "is null"));
     }
-    // SAFETY: this function asks its callers for as many elements, which need no alignment.
+    // SAFETY: callers of this function guarantee as many elements, which need no alignment.
     Ok((0..count).map(|i| unsafe { from.add(i).read_unaligned() }).collect())
 }
 
-/// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`, of which there must be one, and what was reconstructed
-/// against the true vessels, where these are known. `threshold_per_mm` is the attenuation from which
-/// the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
-/// Any thread, also while training. A library of an earlier version leaves fields alone that it does not know: set them to NaN before,
-/// where that may be.
+/// Scores the frames that were added with `NERTCA_SPLIT_VALIDATION` (at least one is required), and compares the reconstruction
+/// with the true vessels where these are known. `threshold_per_mm` is the attenuation from which the dynamic field counts as
+/// vessel; 0 selects a fifth of `vessel_attenuation_per_mm`, or Otsu's threshold where that is unknown. Callable from any
+/// thread, also during training. A library of an earlier version does not write fields that it does not know: set them to NaN
+/// before the call if the version may be older.
 ///
 /// # Safety
 /// `scores` must be writable, with its size set.
@@ -138,12 +140,12 @@ pub unsafe extern "C" fn nertca_reconstruction_evaluate(
             return Err(Failure::argument("scores", "is null"));
         }
         let found = reconstruction.session.evaluate((threshold_per_mm > 0.0).then_some(threshold_per_mm))?;
-        // SAFETY: the header asks that `scores` is as long as its size says; it is not null.
+        // SAFETY: the header requires that `scores` is as long as its size says; it is not null.
         unsafe { write(scores, |size| told(size, &found)) }
     })
 }
 
-/// NaN where nothing is known.
+/// Fills the scores; NaN where nothing is known.
 fn told(size: usize, found: &Evaluation) -> nertca_scores {
     let (volume, tree) = (found.volume.as_ref(), found.tree.as_ref());
     let shape = volume.map(|v| v.mean.agreement);

@@ -1,4 +1,4 @@
-//! Structs that cross the boundary. Each begins with its size, so that later versions can add to its end.
+//! Structs of the ABI. Each begins with its size, so that later versions can add fields at its end.
 
 use crate::capi::status::{Failure, Outcome};
 use crate::geometry::{CArm, Geometry, Matrix};
@@ -6,11 +6,11 @@ use crate::scan::dataset::{Intensity, Split};
 use crate::session::{Moment, NewFrame};
 use std::ffi::{c_char, c_void};
 
-/// Pixels of 8 bits without sign.
+/// Unsigned 8-bit pixels.
 pub const NERTCA_PIXELS_U8: u32 = 1;
-/// Pixels of 16 bits without sign, in the machine's byte order.
+/// Unsigned 16-bit pixels, in the machine's byte order.
 pub const NERTCA_PIXELS_U16: u32 = 2;
-/// Pixels of 32-bit floats.
+/// Pixels that are 32-bit floats.
 pub const NERTCA_PIXELS_F32: u32 = 3;
 
 /// Pixel values `p` are line integrals of attenuation: `p * scale + offset`.
@@ -22,43 +22,43 @@ pub const NERTCA_INTENSITY_LINEAR: u32 = 3;
 
 /// A frame to train on.
 pub const NERTCA_SPLIT_TRAIN: u32 = 0;
-/// A frame to score with only.
+/// A frame used only for scores.
 pub const NERTCA_SPLIT_VALIDATION: u32 = 1;
 
 /// Both fields.
 pub const NERTCA_COMPONENT_TOTAL: u32 = 0;
-/// The still background.
+/// Static field: the static background.
 pub const NERTCA_COMPONENT_STATIC: u32 = 1;
-/// The moving vessels.
+/// Dynamic field: the moving vessels.
 pub const NERTCA_COMPONENT_DYNAMIC: u32 = 2;
 
-/// Line integrals of attenuation, as an angiogram shows them.
+/// Projection by line integrals of attenuation, as in an angiogram.
 pub const NERTCA_PROJECTION_DRR: u32 = 0;
-/// The largest attenuation along each ray, 1/mm.
+/// Projection by the maximum attenuation along each ray, 1/mm.
 pub const NERTCA_PROJECTION_MIP: u32 = 1;
 
-/// Display rates, also while training: Gaussians as they are, other fields through volumes baked from them, as fine as their
-/// cells (about 0.8 mm).
+/// Live quality: display rates, also during training. Gaussians are drawn directly; other fields through volumes baked from
+/// them, whose resolution is their cell size (about 0.8 mm).
 pub const NERTCA_QUALITY_LIVE: u32 = 0;
-/// Through the fields themselves: exact, and many times slower.
+/// Exact quality: from the fields themselves, many times slower.
 pub const NERTCA_QUALITY_EXACT: u32 = 1;
 
 /// Not training.
 pub const NERTCA_STATE_IDLE: u32 = 0;
 /// Training in the background.
 pub const NERTCA_STATE_RUNNING: u32 = 1;
-/// Held by `nertca_reconstruction_pause`.
+/// Paused by `nertca_reconstruction_pause`.
 pub const NERTCA_STATE_PAUSED: u32 = 2;
-/// Will train in the background as soon as there are frames enough.
+/// Waiting: training in the background starts as soon as there are enough frames.
 pub const NERTCA_STATE_WAITING: u32 = 3;
 /// All iterations are done.
 pub const NERTCA_STATE_FINISHED: u32 = 4;
-/// The progress callback ended it.
+/// The progress callback ended training.
 pub const NERTCA_STATE_CANCELLED: u32 = 5;
-/// An error ended it.
+/// An error ended training.
 pub const NERTCA_STATE_FAILED: u32 = 6;
 
-/// Where log messages go.
+/// Receiver of log messages.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_log {
@@ -66,19 +66,19 @@ pub struct nertca_log {
     pub size: usize,
     /// Called for each message.
     pub callback: super::log::nertca_log_callback,
-    /// Handed to the callback unchanged.
+    /// Passed to the callback unchanged.
     pub user: *mut c_void,
-    /// Least severe level wanted, one of `NERTCA_LOG_*`.
+    /// Lowest severity to report, one of `NERTCA_LOG_*`.
     pub level: u32,
 }
 
-/// A Vulkan device that the caller made and goes on owning. It must outlive the context made from it.
+/// A Vulkan device that the caller made and continues to own. It must outlive the context made from it.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_vulkan {
     /// `sizeof(nertca_vulkan)`.
     pub size: usize,
-    /// `vkGetInstanceProcAddr`; null takes that of the system's loader.
+    /// `vkGetInstanceProcAddr`; null selects that of the system's loader.
     pub get_instance_proc_addr: *const c_void,
     /// `VkInstance`, made for Vulkan 1.2 or newer.
     pub instance: *mut c_void,
@@ -86,7 +86,7 @@ pub struct nertca_vulkan {
     pub physical_device: *mut c_void,
     /// `VkDevice`, made with the feature `timelineSemaphore`.
     pub device: *mut c_void,
-    /// `VkQueue` that computes.
+    /// `VkQueue` that supports compute.
     pub queue: *mut c_void,
     /// Family of the queue.
     pub queue_family: u32,
@@ -94,22 +94,22 @@ pub struct nertca_vulkan {
     pub buffer_device_address: u32,
     /// Non-zero when the device was made with `VK_KHR_external_memory_fd`.
     pub external_memory_fd: u32,
-    /// Taken around every use of the queue, for a short time, on any thread; null when the queue is the library's alone.
+    /// Called before every use of the queue, for a short time, on any thread; null when only the library uses the queue.
     pub lock: Option<unsafe extern "C" fn(user: *mut c_void)>,
-    /// Gives the queue back after `lock`; null exactly when `lock` is.
+    /// Called after every use of the queue, to release it; null exactly when `lock` is.
     pub unlock: Option<unsafe extern "C" fn(user: *mut c_void)>,
-    /// Handed to `lock` and `unlock`.
+    /// Passed to `lock` and `unlock`.
     pub user: *mut c_void,
     /// Non-zero when the device was made with the features `subgroupSizeControl` and `computeFullSubgroups` (of
-    /// `VK_EXT_subgroup_size_control`, or of Vulkan 1.3): sums then go by shuffles, as on a device of the library's own.
+    /// `VK_EXT_subgroup_size_control`, or of Vulkan 1.3): sums then use shuffles, as on a device that the library opens itself.
     pub subgroup_size_control: u32,
     /// Non-zero when the device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, and with
-    /// `shaderFloat16`, `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`: networks then go by matrices, where the
-    /// library has kernels for the device's. Needs `subgroup_size_control` as well.
+    /// `shaderFloat16`, `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`: networks then use matrices, where the library
+    /// has kernels for the device's shapes. Requires `subgroup_size_control` as well.
     pub cooperative_matrix: u32,
 }
 
-/// How an image is taken. Patient coordinates are left, posterior, superior (LPS), mm, from the isocentre.
+/// Geometry of an image. Patient coordinates are left, posterior, superior (LPS), mm, from the isocentre.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_geometry {
@@ -119,15 +119,15 @@ pub struct nertca_geometry {
     pub primary_deg: f64,
     /// Secondary angle in degrees, cranial positive (DICOM PositionerSecondaryAngle).
     pub secondary_deg: f64,
-    /// Source to detector, mm.
+    /// Distance from source to detector, mm.
     pub sid_mm: f64,
-    /// Source to isocentre, mm.
+    /// Distance from source to isocentre, mm.
     pub sod_mm: f64,
     /// Pixel pitch on the detector along columns and rows, mm.
     pub pixel_mm: [f64; 2],
     /// Offset of the detector's centre along columns and rows, mm.
     pub offset_mm: [f64; 2],
-    /// How far the table has carried the patient (LPS), mm.
+    /// Displacement of the patient by the table (LPS), mm.
     pub table_mm: [f64; 3],
     /// Null, or 12 numbers that replace all of the above: a row-major 3 x 4 projection from patient mm to homogeneous
     /// pixels (column, row; integers are pixel centres).
@@ -140,13 +140,13 @@ pub struct nertca_geometry {
 pub struct nertca_frame {
     /// `sizeof(nertca_frame)`.
     pub size: usize,
-    /// How it was taken.
+    /// Geometry of the image.
     pub geometry: nertca_geometry,
-    /// First row; copied during the call.
+    /// First row of the pixels, which are copied during the call.
     pub pixels: *const c_void,
-    /// Bytes readable from `pixels`.
+    /// Number of bytes readable from `pixels`.
     pub pixels_bytes: usize,
-    /// Bytes from one row to the next; 0 when rows follow each other at once.
+    /// Bytes from one row to the next; 0 when rows are contiguous.
     pub stride_bytes: usize,
     /// Columns, 1 to 8192. Frames of a reconstruction may differ in size.
     pub width: u32,
@@ -154,7 +154,7 @@ pub struct nertca_frame {
     pub height: u32,
     /// One of `NERTCA_PIXELS_*`.
     pub format: u32,
-    /// What values mean, one of `NERTCA_INTENSITY_*`.
+    /// Meaning of the values, one of `NERTCA_INTENSITY_*`.
     pub intensity: u32,
     /// Factor on the values, for `INTEGRAL` and `LOG`; 0 stands for 1.
     pub scale: f64,
@@ -168,21 +168,21 @@ pub struct nertca_frame {
     pub split: u32,
     /// Time stamp on the clock of the R-peaks, seconds.
     pub time_s: f64,
-    /// Null, or a vessel mask of a byte per pixel, non-zero inside vessels.
+    /// Null, or a vessel mask with one byte per pixel, non-zero inside vessels.
     pub mask: *const u8,
-    /// Bytes readable from `mask`.
+    /// Number of bytes readable from `mask`.
     pub mask_bytes: usize,
-    /// Bytes from one row of the mask to the next; 0 when rows follow each other at once.
+    /// Bytes from one row of the mask to the next; 0 when rows are contiguous.
     pub mask_stride_bytes: usize,
 }
 
-/// What to draw.
+/// Description of a view to draw.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_view {
     /// `sizeof(nertca_view)`.
     pub size: usize,
-    /// From where the view is drawn.
+    /// Geometry of the view.
     pub geometry: nertca_geometry,
     /// Columns, 1 to 8192.
     pub width: u32,
@@ -198,7 +198,7 @@ pub struct nertca_view {
     pub quality: u32,
 }
 
-/// Where to draw to.
+/// Memory to draw into.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_image {
@@ -206,15 +206,15 @@ pub struct nertca_image {
     pub size: usize,
     /// First row.
     pub pixels: *mut c_void,
-    /// Bytes writable from `pixels`.
+    /// Number of bytes writable from `pixels`.
     pub pixels_bytes: usize,
-    /// Bytes from one row to the next; 0 when rows follow each other at once.
+    /// Bytes from one row to the next; 0 when rows are contiguous.
     pub stride_bytes: usize,
     /// `NERTCA_PIXELS_F32` or `NERTCA_PIXELS_U8`.
     pub format: u32,
-    /// The value shown as 0, for `U8`. With `low` = `high`, both are the image's own extremes.
+    /// Value shown as 0, for `U8`. With `low` = `high`, the image's own minimum and maximum are used.
     pub low: f64,
-    /// The value shown as 255, for `U8`.
+    /// Value shown as 255, for `U8`.
     pub high: f64,
 }
 
@@ -236,7 +236,7 @@ pub struct nertca_grid {
     pub phase: u32,
 }
 
-/// How far training is.
+/// Progress of training.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_progress {
@@ -244,21 +244,21 @@ pub struct nertca_progress {
     pub size: usize,
     /// One of `NERTCA_STATE_*`.
     pub state: u32,
-    /// Iterations done.
+    /// Number of iterations done.
     pub step: u32,
-    /// Length of the run.
+    /// Number of iterations of the run.
     pub iterations: u32,
-    /// Frames trained on.
+    /// Number of frames trained on.
     pub frames: u32,
     /// Loss of the last iteration.
     pub loss: f64,
-    /// PSNR of the last iteration's rays, dB; NaN while Gaussians are fitted, which have no rays.
+    /// PSNR of the last iteration's rays, dB; NaN for fits of Gaussians, which have no rays.
     pub psnr_db: f64,
-    /// Iterations per second since training was last begun.
+    /// Iterations per second since the last start of training.
     pub iterations_per_s: f64,
 }
 
-/// How calibration sees a frame.
+/// Correction of a frame's geometry by calibration.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_correction {
@@ -270,62 +270,63 @@ pub struct nertca_correction {
     pub primary_deg: f64,
     /// Added to the stated secondary angle, degrees.
     pub secondary_deg: f64,
-    /// How much further than stated the table has carried the patient (LPS), mm.
+    /// Additional displacement of the patient by the table, beyond the stated one (LPS), mm.
     pub table_mm: [f64; 3],
-    /// Where breathing has carried the heart in this frame (LPS), mm.
+    /// Displacement of the heart by breathing in this frame (LPS), mm.
     pub heart_shift_mm: [f64; 3],
-    /// Root mean square of how far the correction moves the heart's image in this view, pixels, less what moves all views
-    /// alike.
+    /// Root mean square displacement of the heart's image in this view by the correction, pixels, without the motion common to
+    /// all views.
     pub moved_px: f64,
-    /// Difference of this view's profiles from those of the others before the correction, as a share of the profiles.
+    /// Relative difference between this view's profiles and those of the other views before the correction.
     pub residual_before: f64,
-    /// Difference of this view's profiles from those of the others after the correction, as a share of the profiles.
+    /// Relative difference between this view's profiles and those of the other views after the correction.
     pub residual_after: f64,
-    /// All of it, displacement of the heart included, as a row-major 3 x 4 projection from patient mm to homogeneous pixels
-    /// (column, row; integers are pixel centres): what `nertca_geometry.matrix` takes.
+    /// Complete corrected geometry, including the displacement of the heart, as a row-major 3 x 4 projection from patient mm to
+    /// homogeneous pixels (column, row; integers are pixel centres): a value for `nertca_geometry.matrix`.
     pub matrix: [[f64; 4]; 3],
 }
 
-/// Vessels as trees of centrelines with radii: what is asked for, and room for the answer.
+/// Vessels as trees of centrelines with radii: parameters of the search, and arrays for its result.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_tree {
     /// `sizeof(nertca_tree)`.
     pub size: usize,
-    /// The moving field is vessel above this, 1/mm; 0 for the threshold that scores take. Set to what was taken.
+    /// Threshold from which the dynamic field counts as vessel, 1/mm; 0 selects the threshold that scores use. Set to the
+    /// threshold used.
     pub threshold_per_mm: f64,
-    /// Branches that end without reaching so far beyond the vessel they leave are left out, mm; 0 for three times what the
-    /// field resolves.
+    /// Minimum length by which a branch must extend beyond the vessel it leaves, mm; shorter end branches are omitted. 0
+    /// selects three times the field's resolution.
     pub least_branch_mm: f64,
-    /// Set to 1 where all phases have the same material points, to 0 where each has branches of its own.
+    /// Set to 1 where all phases have the same material points, to 0 where each phase has its own branches.
     pub followed: u32,
-    /// Elements that each of `branch_*` has room for; set to how many branches there are, over all phases.
+    /// Number of elements that each of the arrays `branch_*` has room for; set to the number of branches over all phases.
     pub branches: usize,
-    /// Points that `points_mm` and `radius_mm` have room for; set to how many there are, over all phases.
+    /// Number of points that `points_mm` and `radius_mm` have room for; set to the number of points over all phases.
     pub points: usize,
     /// Cardiac phase of each branch, from 0.
     pub branch_phase: *mut u32,
-    /// The branch that each leaves, by its place in these arrays; -1 for one that begins at a root.
+    /// Index in these arrays of the branch that each branch leaves; -1 for a branch that begins at a root.
     pub branch_parent: *mut i32,
-    /// First point of each branch, from 0.
+    /// Index of the first point of each branch, from 0.
     pub branch_first: *mut u32,
-    /// How many points each branch has; the first is the last of its parent.
+    /// Number of points of each branch; the first is the last point of its parent.
     pub branch_points: *mut u32,
-    /// Points of the centrelines (LPS), mm: three numbers each.
+    /// Points of the centrelines (LPS), mm; three numbers each.
     pub points_mm: *mut f64,
     /// Radius of the vessel at each point, mm.
     pub radius_mm: *mut f64,
 }
 
-/// Scores on the frames added for validation.
+/// Scores on the frames added for validation, and of the vessels in 3D where the truth is known.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct nertca_scores {
     /// `sizeof(nertca_scores)`.
     pub size: usize,
-    /// Iterations of the model.
+    /// Number of iterations of the model.
     pub step: u32,
-    /// Images scored.
+    /// Number of images scored.
     pub images: u32,
     /// Mean Dice of the moving vessels; NaN without masks.
     pub dice_dynamic: f64,
@@ -335,57 +336,60 @@ pub struct nertca_scores {
     pub psnr_db: f64,
     /// Mean structural similarity.
     pub ssim: f64,
-    /// Attenuation from which the moving field counts as vessel, 1/mm.
+    /// Attenuation from which the dynamic field counts as vessel, 1/mm.
     pub threshold_per_mm: f64,
-    /// Phases whose true vessels are known as voxels (`nertca_reconstruction_set_true_vessels`).
+    /// Number of phases whose true vessels are known as voxels (`nertca_reconstruction_set_true_vessels`).
     pub volume_phases: u32,
-    /// Phases whose true vessels are known as a tree (`nertca_reconstruction_set_true_tree`).
+    /// Number of phases whose true vessels are known as a tree (`nertca_reconstruction_set_true_tree`).
     pub tree_phases: u32,
-    /// Dice of the voxels that are vessel; this and what follows are means over the phases, and NaN where nothing is known.
+    /// Dice of the vessel voxels. This field and all that follow are means over the phases, and NaN where the truth is not
+    /// known.
     pub volume_dice: f64,
-    /// Mean distance of a voxel of one set to the nearest of the other, both directions weighing the same, mm.
+    /// Mean distance from a voxel of one set to the nearest voxel of the other, with equal weight of both directions, mm.
     pub chamfer_mm: f64,
     /// The larger of both directions' 95th percentiles of these distances, mm.
     pub hausdorff95_mm: f64,
-    /// Share of the true centreline's voxels with one of ours within 1 mm.
+    /// Share of the true centreline's voxels that have a reconstructed one within 1 mm.
     pub true_centreline_found: f64,
-    /// Share of our centreline's voxels with a true one within 1 mm.
+    /// Share of the reconstructed centreline's voxels that have a true one within 1 mm.
     pub our_centreline_true: f64,
     /// Centreline Dice: the harmonic mean of the shares of each centreline inside the other set.
     pub cl_dice: f64,
-    /// Connected components of ours that are a pixel at the isocentre wide or more.
+    /// Number of connected components of the reconstruction that are at least as wide as a pixel at the isocentre.
     pub components: f64,
-    /// Connected components of the truth.
+    /// Number of connected components of the truth.
     pub true_components: f64,
-    /// Share of the true tree's length with ours within 1 mm.
+    /// Share of the true tree's length with a reconstructed centreline within 1 mm.
     pub tree_true_centreline_found: f64,
-    /// Share of our tree's length with a true one within 1 mm.
+    /// Share of the reconstructed tree's length with a true centreline within 1 mm.
     pub tree_our_centreline_true: f64,
-    /// Mean distance of our centreline to the true one, mm.
+    /// Mean distance from the reconstructed centreline to the true one, mm.
     pub tree_ours_to_true_mm: f64,
-    /// Connected trees of ours.
+    /// Number of connected trees of the reconstruction.
     pub tree_components: f64,
-    /// Mean of our radius less the true one, where our centreline is true, mm.
+    /// Mean difference of the reconstructed radius and the true one, where the reconstructed centreline has a true one within 1
+    /// mm, mm.
     pub radius_error_mm: f64,
-    /// Root of the mean square of the same, mm.
+    /// Root mean square of this difference, mm.
     pub radius_rmse_mm: f64,
-    /// Mean distance between where our points have come since the phase that is followed and where the true points beside them have, mm.
+    /// Mean distance between the displacements of reconstructed points since the reference phase and those of the nearest true
+    /// points, mm.
     pub motion_error_mm: f64,
 }
 
-/// Told now and then how far training is; a non-zero result ends it. `progress` is valid during the call. Called on the
-/// thread that trains, with no lock held: it may call into the library, but not stop, train or destroy the same
-/// reconstruction.
+/// Receives progress of training from time to time; a non-zero result ends training. `progress` is valid during the call. It is
+/// called on the thread that trains, with no lock held: it may call into the library, but must not stop, train or destroy the
+/// same reconstruction.
 pub type nertca_progress_callback =
     Option<unsafe extern "C" fn(progress: *const nertca_progress, user: *mut c_void) -> i32>;
 
-/// A struct that begins with its size, of which every bit pattern is a value.
+/// A struct that begins with its size and for which every bit pattern is valid.
 ///
 /// # Safety
 /// `#[repr(C)]`, with a `usize` first, and no field with invalid bit patterns.
 pub(super) unsafe trait Versioned: Copy {
     const NAME: &'static str;
-    /// Size in the version of the ABI that had it first: fields behind that are left out for callers who do not know them.
+    /// Size in the first ABI version that had the struct; fields after it are omitted for callers that do not know them.
     const FIRST: usize = size_of::<Self>();
 }
 
@@ -421,41 +425,41 @@ fn check_size<T: Versioned>(size: usize) -> Outcome<()> {
     Ok(())
 }
 
-/// Reads a struct of the caller. A longer one, of a later version, is accepted if what is unknown here is zero; what a shorter one
-/// lacks is zero here.
+/// Reads a struct of the caller. A longer struct, of a later version, is accepted if all fields unknown here are zero; fields
+/// missing from a shorter struct are zero here.
 ///
 /// # Safety
-/// `from` must be null or point to a struct as long as it says.
+/// `from` must be null or point to a struct as long as its `size` says.
 pub(super) unsafe fn read<T: Versioned>(from: *const T) -> Outcome<T> {
     if from.is_null() {
         return Err(Failure::argument(T::NAME, "is null"));
     }
-    // SAFETY: a size comes first.
+    // SAFETY: the struct begins with its size.
     let size = unsafe { from.cast::<usize>().read_unaligned() };
     check_size::<T>(size)?;
     let known = size.min(size_of::<T>());
-    // SAFETY: the struct is as long as it says.
+    // SAFETY: the struct is as long as its size says.
     let rest = unsafe { std::slice::from_raw_parts(from.cast::<u8>().add(known), size - known) };
     if rest.iter().any(|byte| *byte != 0) {
         return Err(Failure::argument(T::NAME, "asks for what this version of the library does not know"));
     }
     let mut value = std::mem::MaybeUninit::<T>::zeroed();
-    // SAFETY: the struct is as long as its size says, ours has room for as much, and every bit pattern of it is a value.
+    // SAFETY: the struct is as long as its size says, ours has room for as much, and every bit pattern of it is valid.
     unsafe {
         std::ptr::copy_nonoverlapping(from.cast::<u8>(), value.as_mut_ptr().cast(), known);
         Ok(value.assume_init())
     }
 }
 
-/// Writes a struct to the caller, whose `size` must be set.
+/// Writes a struct of the caller, whose `size` must be set.
 ///
 /// # Safety
-/// `to` must be null or point to a struct as long as it says.
+/// `to` must be null or point to a struct as long as its `size` says.
 pub(super) unsafe fn write<T: Versioned>(to: *mut T, value: impl FnOnce(usize) -> T) -> Outcome<()> {
     if to.is_null() {
         return Err(Failure::argument(T::NAME, "is null"));
     }
-    // SAFETY: a size comes first.
+    // SAFETY: the struct begins with its size.
     let size = unsafe { to.cast::<usize>().read_unaligned() };
     check_size::<T>(size)?;
     let value = value(size);
@@ -482,7 +486,7 @@ impl nertca_geometry {
                 table_mm: self.table_mm,
             }));
         }
-        // SAFETY: the caller vouches for 12 numbers.
+        // SAFETY: the caller guarantees 12 numbers.
         let m = unsafe { self.matrix.cast::<[[f64; 4]; 3]>().read_unaligned() };
         Ok(Geometry::Matrix(Matrix { matrix: m }))
     }
@@ -491,7 +495,7 @@ impl nertca_geometry {
 /// Largest side of an image.
 const MAX_SIDE: u32 = crate::formats::images::MAX_SIDE as u32;
 
-/// Checks a size.
+/// Checks width and height of an image.
 pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {
     for (name, side) in [("width", width), ("height", height)] {
         if side == 0 || side > MAX_SIDE {
@@ -501,7 +505,7 @@ pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {
     Ok((width as usize, height as usize))
 }
 
-/// Checks that rows of `row_bytes` fit, and gives the distance between them.
+/// Checks that rows of `row_bytes` fit, and returns the distance between rows.
 pub(super) fn stride(name: &str, row_bytes: usize, height: usize, stride: usize, bytes: usize) -> Outcome<usize> {
     let stride = if stride == 0 { row_bytes } else { stride };
     if stride < row_bytes {
@@ -517,7 +521,7 @@ pub(super) fn stride(name: &str, row_bytes: usize, height: usize, stride: usize,
     }
 }
 
-/// Bytes of a pixel.
+/// Returns the bytes of a pixel.
 pub(super) fn pixel_bytes(format: u32) -> Outcome<usize> {
     match format {
         NERTCA_PIXELS_U8 => Ok(1),
@@ -528,10 +532,10 @@ pub(super) fn pixel_bytes(format: u32) -> Outcome<usize> {
 }
 
 impl nertca_frame {
-    /// Copies the pixels as line integrals.
+    /// Converts the frame; its pixels are copied as line integrals.
     ///
     /// # Safety
-    /// Pointers must be null or readable as far as stated.
+    /// Pointers must be null or readable for the stated lengths.
     pub(super) unsafe fn new_frame(&self) -> Outcome<NewFrame> {
         let (width, height) = sides(self.width, self.height)?;
         let bytes = pixel_bytes(self.format)?;
@@ -554,7 +558,7 @@ impl nertca_frame {
         };
         let mut integrals = Vec::with_capacity(width * height);
         for row in 0..height {
-            // SAFETY: `stride` checked that every row lies within the bytes the caller vouches for.
+            // SAFETY: `stride` checked that every row lies within the bytes that the caller guarantees.
             let row = unsafe { std::slice::from_raw_parts(self.pixels.cast::<u8>().add(row * apart), width * bytes) };
             integrals.extend(row.chunks_exact(bytes).map(|p| {
                 intensity.integral(match *p {
@@ -578,7 +582,7 @@ impl nertca_frame {
             Some(mask)
         };
         Ok(NewFrame {
-            // SAFETY: the header asks that the geometry's matrix is null or has 12 numbers.
+            // SAFETY: the header requires that the geometry's matrix is null or has 12 numbers.
             geometry: unsafe { self.geometry.geometry() }?,
             moment: u32::try_from(self.phase).map_or(Moment::TimeS(self.time_s), Moment::Phase),
             split: match self.split {
@@ -594,24 +598,24 @@ impl nertca_frame {
     }
 }
 
-/// Version of the ABI: of functions, structs and constants. A library serves callers built against its own number; it
-/// is also the number in its soname.
+/// Version of the ABI: of functions, structs and constants. A library serves callers that were built against its own number,
+/// which is also the number in its soname.
 pub const NERTCA_ABI_VERSION: u32 = 0;
 
-/// Version this header was made with, first number.
+/// Version of this header, first number (major).
 pub const NERTCA_VERSION_MAJOR: u32 = 0;
-/// Version this header was made with, second number.
+/// Version of this header, second number (minor).
 pub const NERTCA_VERSION_MINOR: u32 = 2;
-/// Version this header was made with, third number.
+/// Version of this header, third number (patch).
 pub const NERTCA_VERSION_PATCH: u32 = 0;
 
-/// Version of the library, as `major.minor.patch`. Static text. Any thread.
+/// Returns the version of the library, as `major.minor.patch`. The text is static. Callable from any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_version() -> *const c_char {
     concat!(env!("CARGO_PKG_VERSION"), "\0").as_ptr().cast()
 }
 
-/// `NERTCA_ABI_VERSION` of the library in use, to compare with that of the header. Any thread.
+/// Returns the `NERTCA_ABI_VERSION` of the library in use, to compare with that of the header. Callable from any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn nertca_abi_version() -> u32 {
     NERTCA_ABI_VERSION

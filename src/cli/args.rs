@@ -1,4 +1,5 @@
-//! What can be typed: options of every command, and what commands share. Each command has the rest beside what it does.
+//! Command-line arguments: commands, and the options that several commands share. Each command's own options are in its
+//! module.
 
 use super::bench::BenchArgs;
 use super::calibrate::CalibrateArgs;
@@ -39,10 +40,10 @@ pub struct Cli {
     /// Turn the Vulkan validation layers on (slow; messages make the program fail).
     #[arg(long, global = true)]
     pub validate: bool,
-    /// Say more on stderr.
+    /// Print more messages on stderr.
     #[arg(short, long, global = true)]
     pub verbose: bool,
-    /// What to do.
+    /// Command to run.
     #[command(subcommand)]
     pub command: Command,
 }
@@ -64,27 +65,27 @@ pub enum Command {
     Eval(EvalArgs),
     /// Render a run from any angle at any phase.
     Render(RenderArgs),
-    /// Look at a run in a browser: turn the C-arm with the mouse while the beat plays.
+    /// View a run in a browser: turn the C-arm with the mouse while the beat plays.
     View(ViewArgs),
-    /// Reconstruct DICOM runs as they appear in a folder, and look at it meanwhile in a browser.
+    /// Reconstruct DICOM runs as they appear in a folder, and view the reconstruction meanwhile in a browser.
     Watch(WatchArgs),
     /// Export volumes or vessel surfaces of a run for other tools.
     Export(ExportArgs),
-    /// Vessels of a run as trees: centrelines with radii in mm, followed over the beat.
+    /// Extract the vessels of a run as trees: centrelines with radii in mm, followed over the beat.
     Tree(TreeArgs),
-    /// Correct views that disagree, from the angiograms alone.
+    /// Correct views whose geometry is inconsistent, from the angiograms alone.
     Calibrate(CalibrateArgs),
     /// Convert a dataset between the native and the authors' layout.
     Convert(ConvertArgs),
     /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
     Bench(BenchArgs),
-    /// Compare every compute stage with its f64 twin on this device: the first thing to run on an unknown one.
+    /// Compare every compute stage with its f64 twin on this device; run this first on an unknown device.
     Selftest(SelftestArgs),
     /// List every pipeline that a preset uses, as the device's driver compiles it: registers, spills, size.
     Kernels(KernelsArgs),
     /// Run a study: data sets x methods x seeds, and tables of their results beside published ones.
     Study(StudyArgs),
-    /// Tell whether a dataset makes sense, and which of the usual mistakes it has.
+    /// Tell whether a dataset is consistent, and which of the usual mistakes it has.
     Check(CheckArgs),
     /// Describe a dataset or a run.
     Info(InfoArgs),
@@ -92,7 +93,7 @@ pub enum Command {
     Completions(CompletionsArgs),
 }
 
-/// Parses one of the names of a choice.
+/// Returns a parser for the names of a choice.
 pub(super) fn choice<T: Choice>() -> impl TypedValueParser<Value = T> {
     PossibleValuesParser::new(T::ALL.iter().map(|choice| choice.name()))
         .try_map(|name| T::named(&name).ok_or("is none of the choices"))
@@ -107,22 +108,23 @@ pub(super) fn pair(text: &str) -> Option<[f64; 2]> {
 /// Hyper-parameters, for every command that trains.
 #[derive(Debug, Args)]
 pub struct ConfigArgs {
-    /// Set of defaults: `fast` (Gaussians move; normalised, tuned), `fast-mlp` (a network does), `paper` (as the paper
-    /// states it), `public-code` (as the authors' code does it), `nerf-ca` (two networks, the method that the paper
-    /// compares itself with), `r2-gaussian`, `x-gaussian` or `sax-nerf` (static Gaussians, such as hide each other, or
-    /// static networks, for each phase: three other such); `fast`, unless a configuration file names one.
+    /// Set of defaults: `fast` (moving Gaussians; normalised, tuned), `fast-mlp` (a dynamic network; normalised,
+    /// tuned), `paper` (as described in the paper), `public-code` (as in the authors' code), `nerf-ca` (two networks; a
+    /// method that the paper compares with), `r2-gaussian`, `x-gaussian` or `sax-nerf` (static methods that the paper
+    /// compares with, fitted to each phase: Gaussians, Gaussians that occlude each other, or a hash grid with a
+    /// network); `fast`, unless a configuration file names one.
     #[arg(long, value_parser = choice::<Preset>())]
     pub preset: Option<Preset>,
     /// TOML file with hyper-parameters.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Set one hyper-parameter, e.g. --set dynamic.width=128. Repeatable; wins over the file.
+    /// Set one hyper-parameter, e.g. --set dynamic.width=128. Repeatable; takes precedence over the file.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 }
 
 impl ConfigArgs {
-    /// Builds the configuration; `more` settings come after those given with --set.
+    /// Builds the configuration; `more` settings are applied after those given with --set.
     pub fn load(&self, more: impl IntoIterator<Item = String>) -> Result<Config> {
         let settings: Vec<String> = self.set.iter().cloned().chain(more).collect();
         Config::load(self.preset, self.config.as_deref(), &settings)

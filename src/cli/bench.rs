@@ -1,4 +1,4 @@
-//! `bench`: iterations, passes and renderings against the device's own limits and the paper's 37 minutes.
+//! `bench`: compares iterations, passes and renderings with the device's own limits and with the paper's 37 minutes.
 
 use super::args::{Cli, ConfigArgs};
 use super::bench_report::{FullRun, Host, Report, compare, print};
@@ -32,30 +32,30 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// `bench`.
+/// Arguments of `bench`.
 #[derive(Debug, Args)]
 pub struct BenchArgs {
-    /// Dataset directory; the default phantom, made on the fly, without.
+    /// Dataset directory; by default a phantom that is made for the measurement.
     pub data: Option<PathBuf>,
     /// Hyper-parameters.
     #[command(flatten)]
     pub config: ConfigArgs,
-    /// Seconds of iterations before any is timed.
+    /// Seconds of iterations before the first timed one.
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = seconds)]
     pub warm_up: f64,
-    /// Seconds that all timed repeats take together; fits of Gaussians are timed whole.
+    /// Total seconds of all timed repeats; fits of Gaussians are timed as a whole.
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0, value_parser = seconds, conflicts_with = "iterations")]
     pub sample: f64,
-    /// Iterations of each timed repeat, instead of seconds; of Gaussians, the first of a fit.
+    /// Iterations of each timed repeat, instead of seconds; for Gaussians, the first iterations of a fit.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=2000))]
     pub iterations: Option<u32>,
-    /// Timed repeats.
+    /// Number of timed repeats.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=10))]
     pub repeats: u32,
-    /// Also run the whole reconstruction, with time-to-Dice; a dry run comes before everything else.
+    /// Also run the whole reconstruction, with time-to-Dice; a dry run comes first.
     #[arg(long)]
     pub full: bool,
-    /// Only go through all events of the schedule (delay, open window, density control) in a short run of full-size batches.
+    /// Only run through all events of the schedule (delay, open window, density control), in a short run of full-size batches.
     #[arg(long, conflicts_with_all = ["full", "kernels", "render", "compare"])]
     pub dry_run: bool,
     /// List the time of each pass.
@@ -64,19 +64,19 @@ pub struct BenchArgs {
     /// Also measure frames per second of renderings.
     #[arg(long)]
     pub render: bool,
-    /// Write everything, with raw samples, configuration and commit, as JSON.
+    /// Write all results, with raw samples, configuration and commit, as JSON.
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
-    /// Compare with a file of an earlier --json.
+    /// Compare with the file of an earlier --json.
     #[arg(long, value_name = "FILE")]
     pub compare: Option<PathBuf>,
 }
 
-/// Iterations timed pass by pass, at most.
+/// Maximum number of iterations timed pass by pass.
 const PROFILED: u32 = 8;
-/// An hour is too long for a measurement.
+/// Longest time for a measurement, seconds: one hour.
 const MOST_SECONDS: f64 = 3600.0;
-/// What times of iterations leave out.
+/// Work that times of iterations do not include.
 const LEFT_OUT: &str = "opening the device and compiling, reading data, calibration, hull, validation, checkpoints";
 
 fn seconds(text: &str) -> std::result::Result<f64, String> {
@@ -93,13 +93,13 @@ impl BenchArgs {
         Pace { warm_up_s: self.warm_up, repeats: self.repeats, length }
     }
 
-    /// Iterations timed pass by pass.
+    /// Returns the number of iterations timed pass by pass.
     fn profiled(&self) -> u32 {
         self.iterations.map_or(PROFILED, |n| n.min(PROFILED))
     }
 }
 
-/// Measures.
+/// Measures, prints the results and writes the report.
 pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
     let config = args.config.load([])?;
     let compared = args.compare.as_deref().map(read_report).transpose()?;
@@ -131,7 +131,7 @@ fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
     nertca_vk::files::write_atomic(file, nertca_vk::files::pretty_json(value)?.as_bytes())
 }
 
-/// A dry run, with a line that says what it went through.
+/// Performs a dry run, and prints a line about the events it covered.
 fn dry_run_of(cli: &Cli, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<DryRun> {
     let done = dry_run(gpu, config, dataset, &cli.training_tuning(gpu, config, dataset)?)?;
     out!(
@@ -149,7 +149,7 @@ fn read_report(file: &Path) -> Result<Report> {
     serde_json::from_slice(&text).map_err(|e| Error::data(file, "JSON", format!("{e}; is it from `bench --json`?")))
 }
 
-/// The default phantom of `nertca-vk phantom`.
+/// Makes the default phantom of `nertca-vk phantom`.
 fn default_phantom(gpu: &Gpu, scratch: &Path) -> Result<Dataset> {
     let directory = scratch.join("phantom");
     let options = PhantomOptions {
@@ -181,7 +181,7 @@ fn measure(
         true => time_gaussians(args, gpu, config, dataset, &tuning)?,
         false => time_network(args, gpu, config, dataset, &tuning)?,
     };
-    // Of a device that is warm by now.
+    // The device is warm by now.
     let peaks = peaks(gpu)?;
     let frame_rates = match args.render {
         false => Vec::new(),
@@ -220,10 +220,10 @@ fn measure(
     })
 }
 
-/// Frames per second of the fields as a run begins with them: any parameters of a network cost the same.
+/// Measures frames per second of the initial fields: the cost of a network does not depend on its parameters.
 fn frame_rates(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Vec<FrameRate>> {
     let mut trainer = Trainer::new(gpu, Plan::new(config, dataset)?, dataset, tuning.clone())?;
-    // But for Gaussians, which cost the more the larger they are.
+    // Gaussians are fitted first, because they cost more the larger they are.
     while trainer.step() < config.gaussian_iterations() {
         trainer.advance(config.gaussian_iterations())?;
     }
@@ -232,7 +232,7 @@ fn frame_rates(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -
     measure_frame_rates(&renderer, &model, Component::Total, &[200, 512], 2.0)
 }
 
-/// The whole run, really run.
+/// Executes the whole run.
 fn run_whole(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, scratch: &Path) -> Result<FullRun> {
     let directory = scratch.join("run");
     let never = AtomicBool::new(false);
@@ -254,8 +254,8 @@ fn run_whole(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, scr
     Ok(FullRun { train_s, elapsed_s, curve, dice, psnr: score.map(|s| s.psnr) })
 }
 
-/// Whether iterations do what the paper's do, so that its 37 minutes are theirs to beat whatever they find: all settings that work
-/// depends on are those of one of its presets.
+/// Tells whether iterations do the same work as the paper's, so that a comparison with its 37 minutes is fair whatever the
+/// result: all settings that affect the work are those of one of its presets.
 fn is_of_the_paper(config: &Config) -> bool {
     if !matches!(config.preset, Preset::Paper | Preset::PublicCode) {
         return false;
@@ -271,7 +271,7 @@ fn is_of_the_paper(config: &Config) -> bool {
     same == *config
 }
 
-/// What was timed of a run.
+/// Timings of a run.
 struct Timings {
     paths: Vec<String>,
     rays: u32,
@@ -289,7 +289,7 @@ fn internal(error: serde_json::Error) -> Error {
     Error::Internal(error.to_string())
 }
 
-/// Times a run whose dynamic field is a network, or whose method has a room of its own.
+/// Times a run whose dynamic field is a network, or whose method has its own module.
 fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
     let delay = config.dynamic.delay.min(config.train.iterations);
     let before = match delay {
@@ -315,7 +315,7 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
     })
 }
 
-/// Times a run whose moving field is made of Gaussians: their iterations, then those of the still field.
+/// Times a run whose dynamic field is made of Gaussians: their iterations, then those of the static field.
 fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<Timings> {
     let (pace, profiled) = (args.pace(), args.profiled());
     let fits = GaussianSubject::new(gpu, config, dataset, pace.length, profiled)?;
@@ -352,7 +352,8 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
         whole_run_s,
         passes,
         barriers: still.barriers(),
-        // Of the still field alone, whose stages have none but for the optimiser; the network, which nobody asks, sees no sample.
+        // The passes after the Gaussians are those of the static field, whose stages have no counted work except the optimiser;
+        // the network is not evaluated and has no samples.
         work: Ledger::new(),
     })
 }

@@ -1,9 +1,9 @@
-//! What `bench` has measured: the file it writes and compares with, and how it is printed.
+//! Results of `bench`: the file that it writes and compares with, and the printed form.
 
 use super::frame_rates::{FrameRate, print_frame_rates};
 use nertca_vk::bench::PAPER_SECONDS;
 use nertca_vk::bench::peaks::Peaks;
-use nertca_vk::bench::sensors::{Readings, Span, host_processor};
+use nertca_vk::gpu::sensors::{Readings, Span, host_processor};
 use nertca_vk::network::cost::NetworkCost;
 use nertca_vk::network::ledger::{Ledger, StageWork, of_pass};
 use nertca_vk::train::dry_run::DryRun;
@@ -11,101 +11,102 @@ use nertca_vk::train::timing::{GaussianTiming, Timing};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Everything measured; what `--json` writes and `--compare` reads.
+/// All results; `--json` writes them and `--compare` reads them.
 #[derive(Serialize, Deserialize)]
 pub struct Report {
     pub version: String,
     pub commit: String,
     pub device: String,
     pub driver: String,
-    /// Choices about data and device: the paths taken.
+    /// Choices made for data and device, such as computation paths.
     pub paths: Vec<String>,
     pub preset: String,
     pub config: serde_json::Value,
     pub rays: u32,
-    /// Whether iterations do what the paper's do; reports of before do not say.
+    /// Whether iterations do the same work as the paper's; false in older reports, which do not say.
     #[serde(default)]
     pub of_the_paper: bool,
     pub peaks: Peaks,
     /// Operations of the network per live sample; none where Gaussians move.
     pub network_cost: Option<NetworkCost>,
-    /// Iterations of Gaussians; none where the network moves, and in reports of versions that had none.
+    /// Iterations of Gaussians; none where the network moves, and in reports of versions without Gaussians.
     #[serde(default)]
     pub gaussians: Option<GaussianTiming>,
-    /// Iterations of the still field alone: those before the network starts, none without a delay; or those after Gaussians.
+    /// Iterations of the static field alone: those before the network starts, none without a delay; or those after Gaussians.
     pub before: Option<Timing>,
     /// Iterations with the network; none where Gaussians move.
     pub after: Option<Timing>,
-    /// Iterations of the whole run times the medians, and what Gaussians need before their first.
+    /// Extrapolated seconds of the whole run: numbers of iterations times the medians, plus the preparation of Gaussians.
     pub whole_run_s: f64,
-    /// Milliseconds of each pass, kept apart.
+    /// Milliseconds of each pass, timed without overlap.
     pub passes_ms: BTreeMap<String, f64>,
     pub frame_rates: Vec<FrameRate>,
-    /// The whole run, really run.
+    /// Results of the whole run, if it was executed.
     pub full: Option<FullRun>,
-    /// The dry run before a whole one; none in reports of before.
+    /// Dry run before a whole run; none in older reports.
     #[serde(default)]
     pub dry_run: Option<DryRun>,
-    /// Passes of each stage in an iteration; none in reports of before.
+    /// Number of passes of each stage in an iteration; empty in older reports.
     #[serde(default)]
     pub passes_per_iteration: BTreeMap<String, f64>,
-    /// Barriers of an iteration, of the still field's after Gaussians; none where there is none, and in reports of before.
+    /// Barriers of an iteration, after Gaussians of an iteration of the static field; none where there is no such iteration,
+    /// and in older reports.
     #[serde(default)]
     pub barriers_per_iteration: Option<u32>,
-    /// Least work of stages in an iteration; none where Gaussians move, and in reports of before.
+    /// Minimum work of stages in an iteration; empty where Gaussians move, and in older reports.
     #[serde(default)]
     pub work: Ledger,
-    /// What times of iterations leave out.
+    /// Work that times of iterations do not include.
     #[serde(default)]
     pub left_out: String,
     /// Precision, shapes, tiles and workgroups.
     #[serde(default)]
     pub tuning: serde_json::Value,
-    /// The machine around the device.
+    /// Machine in which the device is installed.
     #[serde(default)]
     pub host: Host,
 }
 
-/// The machine around the device.
+/// Machine in which the device is installed.
 #[derive(Default, Serialize, Deserialize)]
 pub struct Host {
-    /// Its processor, where the system tells.
+    /// Name of its processor, where the system reports it.
     pub processor: Option<String>,
-    /// Threads it runs at once.
+    /// Number of threads it runs at once.
     pub threads: Option<usize>,
     /// `linux`, `macos` or `windows`.
     pub system: String,
 }
 
 impl Host {
-    /// The machine this runs on.
+    /// Describes the machine that this program runs on.
     pub fn this() -> Host {
         let threads = std::thread::available_parallelism().ok().map(std::num::NonZero::get);
         Host { processor: host_processor(), threads, system: std::env::consts::OS.into() }
     }
 }
 
-/// A whole run.
+/// Results of a whole run.
 #[derive(Serialize, Deserialize)]
 pub struct FullRun {
-    /// Seconds of training, validation excluded.
+    /// Seconds of training, without validation.
     pub train_s: f64,
-    /// Seconds of everything.
+    /// Seconds of the whole run.
     pub elapsed_s: f64,
-    /// Validations on the way: iterations, seconds of training, Dice of the dynamic field.
+    /// Validations during the run: iterations, seconds of training, Dice of the dynamic field.
     pub curve: Vec<(u32, f64, Option<f64>)>,
     /// Dice of the dynamic field on all unseen images.
     pub dice: Option<f64>,
-    /// PSNR on them, dB; none without unseen images.
+    /// PSNR on all unseen images, dB; none without unseen images.
     pub psnr: Option<f64>,
 }
 
-/// Whether a pass is one over pairs of a Gaussian and a pixel, whose operations are counted.
+/// Tells whether a pass processes pairs of a Gaussian and a pixel, whose operations are counted.
 fn is_over_pairs(pass: &str) -> bool {
     ["gaussian_splat", "gaussian_moments"].iter().any(|stage| pass.starts_with(stage))
 }
 
-/// Whether a pass belongs to the network whose operations are counted.
+/// Tells whether a pass belongs to the network whose operations are counted.
 fn is_network(pass: &str) -> bool {
     pass.starts_with("mlp_layer") || pass.starts_with("mlp_out") || pass.starts_with("mlp_fused")
 }
@@ -130,7 +131,7 @@ pub fn print(report: &Report, kernels: bool) {
         p.copy_gb_per_s
     );
     match report.rays {
-        // Whole images are compared.
+        // Methods that compare whole images have no rays.
         0 => out!("preset {}", report.preset),
         rays => out!("preset {}, {rays} rays per iteration", report.preset),
     }
@@ -155,7 +156,7 @@ pub fn print(report: &Report, kernels: bool) {
     }
 }
 
-/// Forms of the Gaussians whose number grows after the iterations that are timed.
+/// Forms of the Gaussians whose number grows after the timed iterations.
 const GROWING: [&str; 2] = ["r2", "x"];
 
 fn print_whole_run(report: &Report) {
@@ -193,8 +194,8 @@ fn print_full(full: &FullRun) {
     }
 }
 
-/// Passes by their time, how much of an iteration they are, the least they have to do, and how much of their time that would take
-/// at the device's peaks.
+/// Prints the passes in order of their time, with their share of an iteration, their minimum work, and the share of their time
+/// that this work would take at the device's peaks.
 fn print_passes(report: &Report) {
     let mut passes: Vec<_> = report.passes_ms.iter().collect();
     passes.sort_by(|a, b| b.1.total_cmp(a.1));
@@ -225,20 +226,21 @@ fn print_passes(report: &Report) {
     }
 }
 
-/// Peak that a pass is measured by, TFLOP/s.
+/// Returns the peak rate to compare a pass with, TFLOP/s.
 fn peak_of(pass: &str, peaks: &Peaks) -> f64 {
     let on_matrices = pass.starts_with("mlp_fused");
     peaks.matrix_tflops.filter(|_| on_matrices).unwrap_or(peaks.f32_tflops)
 }
 
-/// Bytes that the stages over samples move per live sample.
+/// Returns the bytes that the network's stages move per live sample.
 fn bytes_per_sample(report: &Report, live_samples: u64) -> Option<f64> {
     let stages = report.work.iter().filter(|(stage, _)| is_network(stage) || *stage == "encode");
     let works: Vec<&StageWork> = stages.map(|(_, work)| work).collect();
     (!works.is_empty()).then(|| works.iter().map(|w| w.megabytes).sum::<f64>() * 1e6 / live_samples as f64)
 }
 
-/// How times were taken: iterations of a repeat, what the fields had learned, what the device showed.
+/// Prints the conditions of the times: iterations of a repeat, iterations that the fields had learned, and the device's
+/// sensors.
 fn print_conditions(iterations: u32, learned: Option<u32>, readings: Option<&Readings>) {
     let learned = learned.map_or(String::new(), |n| format!(", after {n} iterations of learning"));
     let span = |span: &Option<Span>, unit: &str| {
@@ -251,14 +253,14 @@ fn print_conditions(iterations: u32, learned: Option<u32>, readings: Option<&Rea
     out!("  repeats of {iterations} iterations{learned}{told}");
 }
 
-/// Times of an iteration, in a line.
+/// Prints the times of an iteration on one line.
 fn print_times(name: &str, ms: &[f64], median: f64, host_cpu_share: Option<f64>) {
     let (low, high) = ms.iter().fold((f64::INFINITY, 0f64), |(l, h), ms| (l.min(*ms), h.max(*ms)));
     let cpu = host_cpu_share.map_or(String::new(), |s| format!(", process uses {s:.2} CPUs"));
     out!("{name:25}: {median:.3} ms per iteration (median of {}; {low:.3} to {high:.3}){cpu}", ms.len());
 }
 
-/// Milliseconds of some passes together.
+/// Returns the total milliseconds of the passes that `belongs` selects.
 fn ms_of(report: &Report, belongs: impl Fn(&str) -> bool) -> f64 {
     report.passes_ms.iter().filter(|(name, _)| belongs(name)).map(|(_, ms)| ms).sum()
 }
@@ -312,7 +314,7 @@ fn print_network(report: &Report, after: &Timing) {
     }
 }
 
-/// Prints ratios of a report to another.
+/// Prints the ratios of one report's results to another's.
 pub fn compare(this: &Report, other: &Report) {
     out!("compared with {} on {} (ratios: this / other):", other.commit, other.device);
     if (&this.device, &this.driver) != (&other.device, &other.driver) {

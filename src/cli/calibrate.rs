@@ -1,4 +1,4 @@
-//! `calibrate`: a dataset whose views agree.
+//! `calibrate`: makes a dataset with consistent views.
 
 use super::args::choice;
 use super::calibration_table;
@@ -12,23 +12,24 @@ use nertca_vk::scan::dataset::{Dataset, Layout, MANIFEST};
 use nertca_vk::scan::writer;
 use std::path::PathBuf;
 
-/// `calibrate`.
+/// Arguments of `calibrate`.
 #[derive(Debug, Args)]
 pub struct CalibrateArgs {
     /// Dataset directory in either layout.
     pub data: PathBuf,
-    /// What is corrected.
+    /// Parameters to correct.
     #[arg(long, value_parser = choice::<CalibrateMode>(), default_value = "auto")]
     pub mode: CalibrateMode,
-    /// Dataset directory to make: the same images with corrected geometry, and pictures of what changed in `calibration`.
+    /// Dataset directory to make: the same images with corrected geometry; pictures of the changes are in its folder
+    /// `calibration`.
     #[arg(short, long)]
     pub out: PathBuf,
-    /// JSON instead of a table.
+    /// Print JSON instead of a table.
     #[arg(long)]
     pub json: bool,
 }
 
-/// Folder of what belongs to the correction, in the dataset.
+/// Folder in the dataset for the description and pictures of the correction.
 const FOLDER: &str = "calibration";
 
 /// Corrects a dataset.

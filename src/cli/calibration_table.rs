@@ -1,15 +1,15 @@
-//! A calibration as a table: the same columns on the terminal and on the page.
+//! A calibration as a table, with the same columns on the terminal and on the page.
 
 use nertca_vk::calibrate::correction::{Calibration, ViewCorrection};
 
-/// A column: what it shows, in two lines, and how.
+/// Column of the table: a heading of two lines, and the text of its cells.
 pub struct Column {
     /// First and second line of its heading.
     pub heading: [&'static str; 2],
     text: fn(&ViewCorrection) -> String,
 }
 
-/// All columns, a row per view.
+/// All columns; the table has one row per view.
 pub const COLUMNS: [Column; 9] = [
     Column { heading: ["", "view"], text: |v| v.view.to_string() },
     Column { heading: ["primary", "deg"], text: |v| format!("{:+.2}", v.primary_deg) },
@@ -22,13 +22,13 @@ pub const COLUMNS: [Column; 9] = [
     Column { heading: ["residual", "after"], text: |v| format!("{:.1} %", 100.0 * v.residual_after) },
 ];
 
-/// Rows of the table.
+/// Returns the rows of the table.
 pub fn rows(calibration: &Calibration) -> Vec<Vec<String>> {
     let row = |view| COLUMNS.iter().map(|column| (column.text)(view)).collect();
     calibration.views.iter().map(row).collect()
 }
 
-/// How far the views agree before and after.
+/// Describes how well the views agree before and after the calibration.
 pub fn legend(calibration: &Calibration) -> String {
     let [before, after] = calibration.explained.map(|share| 100.0 * share);
     format!(
@@ -38,7 +38,7 @@ pub fn legend(calibration: &Calibration) -> String {
     )
 }
 
-/// Prints the table where something was corrected, and what there is to say.
+/// Prints the table, if something was corrected, and the calibration's notes.
 pub fn print(calibration: &Calibration) {
     if !calibration.views.is_empty() {
         let line = |cells: Vec<&str>| out!("{}", cells.iter().map(|cell| format!("{cell:>11}")).collect::<String>());

@@ -1,4 +1,4 @@
-//! `check`.
+//! The command `check`.
 
 use clap::Args;
 use nertca_vk::calibrate::calibrate;
@@ -11,20 +11,20 @@ use nertca_vk::run::hull_pictures;
 use nertca_vk::scan::dataset::Dataset;
 use std::path::PathBuf;
 
-/// `check`.
+/// Arguments of `check`.
 #[derive(Debug, Args)]
 pub struct CheckArgs {
     /// Dataset directory.
     pub data: PathBuf,
-    /// JSON instead of text.
+    /// Print JSON instead of text.
     #[arg(long)]
     pub json: bool,
-    /// Leave a picture of each training view here, with what all views agree on in orange.
+    /// Write a picture of each training view to this directory, with the region on which all views agree in orange.
     #[arg(long, value_name = "DIR")]
     pub pictures: Option<PathBuf>,
 }
 
-/// Tells whether a dataset makes sense.
+/// Checks a dataset and prints the findings.
 pub fn run(args: &CheckArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
     let found = check(&dataset)?;

@@ -1,4 +1,4 @@
-//! `phantom`, `project` and `import`.
+//! The commands `phantom`, `project` and `import`.
 
 use super::args::Cli;
 use super::dicom_args::DicomArgs;
@@ -13,22 +13,22 @@ use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::scan::dataset::Layout;
 use std::path::PathBuf;
 
-/// `import`.
+/// Arguments of `import`.
 #[derive(Debug, Args)]
 pub struct ImportArgs {
-    /// What to import.
+    /// Kind of data to import.
     #[command(subcommand)]
     pub source: ImportSource,
 }
 
-/// What can be imported.
+/// Kinds of data that can be imported.
 #[derive(Debug, Subcommand)]
 pub enum ImportSource {
     /// X-ray angiography runs (DICOM XA or RF, multi-frame), one file per view.
     Dicom(ImportDicomArgs),
 }
 
-/// `import dicom`.
+/// Arguments of `import dicom`.
 #[derive(Debug, Args)]
 pub struct ImportDicomArgs {
     /// One file per view.
@@ -37,12 +37,12 @@ pub struct ImportDicomArgs {
     /// Directory to make.
     #[arg(short, long)]
     pub out: PathBuf,
-    /// How runs are read.
+    /// Options of reading runs.
     #[command(flatten)]
     pub reading: DicomArgs,
 }
 
-/// A progress bar for work whose length is known as it goes.
+/// Returns a progress bar for work whose length becomes known during the work.
 pub fn bar() -> impl FnMut(&str, u64, u64) {
     let bar = ProgressBar::new(1);
     if let Ok(style) = ProgressStyle::with_template("{msg:12} [{bar:30}] {pos}/{len} {elapsed}") {
@@ -55,7 +55,7 @@ pub fn bar() -> impl FnMut(&str, u64, u64) {
     }
 }
 
-/// Tells what the authors' layout cannot say of times.
+/// Tells the user that the authors' layout cannot store times between phases.
 fn tell_of_times(layout: Layout, degradations: &Degradations) {
     if layout == Layout::Nerfca && degradations.rhythm.is_some() {
         eprintln!("this layout numbers phases: frames between two get the nearest");

@@ -1,4 +1,4 @@
-//! The device and the paths through its kernels that the options ask for.
+//! Selection of the device and of the computation paths by the options.
 
 use super::args::Cli;
 use nertca_vk::config::Config;
@@ -10,7 +10,7 @@ use nertca_vk::train::calibrate;
 use std::path::PathBuf;
 
 impl Cli {
-    /// Opens the device the options ask for.
+    /// Opens the device selected by the options.
     pub fn open_device(&self) -> Result<Gpu> {
         Gpu::open(&DeviceOptions {
             select: self.device.clone(),
@@ -20,8 +20,8 @@ impl Cli {
         })
     }
 
-    /// Paths through the kernels for a configuration: as the options ask, as an earlier training on this device found
-    /// faster, or as the device suggests.
+    /// Returns the computation paths for a configuration: those that the options name, or those that an earlier training on
+    /// this device found faster, or those suggested for the device.
     pub fn tuning(&self, gpu: &Gpu, config: &Config) -> Tuning {
         let tuning = Tuning::for_device(gpu.info());
         let Some(layers) = self.layers else {
@@ -37,7 +37,7 @@ impl Cli {
         tuning.with_layers(layers, reason.into())
     }
 
-    /// The tuning of [`Cli::tuning`], after timing both paths where that is still to be done.
+    /// Returns the tuning of [`Cli::tuning`], after timing both paths of the layers if they have not been timed yet.
     pub fn training_tuning(&self, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<Tuning> {
         let tuning = Tuning::for_device(gpu.info());
         let either = self.layers.is_none() && Tuning::has_choice(gpu.info()) && config.network_moves();
@@ -46,7 +46,8 @@ impl Cli {
             return Ok(self.tuning(gpu, config));
         };
         let verdict = match calibrate::measure(gpu, config, dataset, &tuning) {
-            // A driver that offers matrices and does not take their kernels; if it is something else, f32 tells as well.
+            // The driver may offer matrices but reject their kernels. If the cause is different, the f32 path reports it as
+            // well.
             Err(error @ (Error::Vulkan { .. } | Error::Config { .. })) => {
                 let reason = format!("f32 layers: those on matrices fail on this device ({error})");
                 return Ok(tuning.with_layers(Layers::F32, reason));
@@ -54,7 +55,7 @@ impl Cli {
             verdict => verdict?,
         };
         if let Err(error) = calibrate::remember(&cache, gpu.info(), config, verdict) {
-            // It only has to be measured again.
+            // Without the file, the paths are only measured again.
             tracing::warn!("{error}");
         }
         Ok(verdict.apply(tuning))
@@ -63,7 +64,7 @@ impl Cli {
     /// Saves the pipeline cache and turns validation messages into a failure.
     pub fn close_device(&self, gpu: &Gpu) -> Result<()> {
         if let Err(error) = gpu.save_pipeline_cache() {
-            // A missing cache only costs time at the next start.
+            // Without the cache, the next start only takes longer.
             tracing::warn!("{error}");
         }
         match gpu.validation_messages().len() {
@@ -73,7 +74,7 @@ impl Cli {
     }
 }
 
-/// The user's cache directory (XDG), if there is one.
+/// Returns the user's cache directory (XDG), if there is one.
 fn cache_dir() -> Option<PathBuf> {
     let base = std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)

@@ -1,4 +1,4 @@
-//! `devices` and `completions`.
+//! The commands `devices` and `completions`.
 
 use super::args::Cli;
 use clap::{Args, CommandFactory};
@@ -10,18 +10,18 @@ use nertca_vk::gpu::memory::DeviceMemory;
 use nertca_vk::kernels::tuning::Tuning;
 use serde::Serialize;
 
-/// `devices`.
+/// Arguments of `devices`.
 #[derive(Debug, Args)]
 pub struct DevicesArgs {
-    /// JSON instead of text, with all that a report of a fault needs of a device.
+    /// Print JSON instead of text, with all details of devices that a bug report needs.
     #[arg(long)]
     pub json: bool,
 }
 
-/// `completions`.
+/// Arguments of `completions`.
 #[derive(Debug, Args)]
 pub struct CompletionsArgs {
-    /// Shell to print for.
+    /// Shell to print completions for.
     pub shell: clap_complete::Shell,
 }
 

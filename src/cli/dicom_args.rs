@@ -1,4 +1,4 @@
-//! How X-ray angiography runs are read: what `import dicom` and `watch` share.
+//! Options of reading X-ray angiography runs, shared by `import dicom` and `watch`.
 
 use super::args::choice;
 use super::synthetic_args::pitch;
@@ -10,47 +10,48 @@ use nertca_vk::import::angiograms::{Gating, ImportOptions};
 use nertca_vk::scan::gating::{BeatScaling, RPeaks};
 use std::path::{Path, PathBuf};
 
-/// How runs are read.
+/// Options of reading runs.
 #[derive(Debug, Args)]
 pub struct DicomArgs {
-    /// Cardiac phases.
+    /// Number of cardiac phases.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub phases: u32,
-    /// Nothing moves: average each run. Phase 0 is the object, phase 1 what it looks like without vessels.
+    /// The object does not move: average each run. Phase 0 is the object, phase 1 the same without vessels.
     #[arg(long, conflicts_with_all = ["r_peaks", "heart_rate", "phase_list"])]
     pub still: bool,
     /// R-peaks in seconds from the first frame, one per line, instead of the files' ECG.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["heart_rate", "phase_list"])]
     pub r_peaks: Option<PathBuf>,
-    /// Beats per minute of a steady heart with an R-peak at the first frame.
+    /// Heart rate, beats per minute, of a regular rhythm with an R-peak at the first frame.
     #[arg(long, value_name = "PER_MIN", conflicts_with = "phase_list")]
     pub heart_rate: Option<f64>,
-    /// No ECG: find the beat of each run in how its vessels move. The heart is taken to be steady; one and a half beats must be
-    /// filled with contrast.
+    /// No ECG: find the beat of each run from the motion of its vessels. A regular rhythm is assumed; at least one and a half
+    /// beats must be filled with contrast.
     #[arg(long, conflicts_with_all = ["still", "r_peaks", "heart_rate", "phase_list"])]
     pub gate_by_images: bool,
-    /// How times between R-peaks become phases.
+    /// Conversion of times between R-peaks to phases.
     #[arg(long, value_parser = choice::<BeatScaling>(), default_value = BeatScaling::default().name())]
     pub beat_scaling: BeatScaling,
-    /// A phase from 0 for each selected frame, one per line, the same for all runs; a frame may lie between two, as 3.4.
+    /// Phase (from 0) of each selected frame, one per line, the same for all runs; a frame may lie between two phases, e.g.
+    /// 3.4.
     #[arg(long, value_name = "FILE")]
     pub phase_list: Option<PathBuf>,
-    /// Frames of each run, from 1; those filled with contrast by default.
+    /// Frames of each run to use, from 1; by default those filled with contrast.
     #[arg(long, value_name = "FIRST-LAST", value_parser = frame_range)]
     pub frames: Option<std::ops::RangeInclusive<usize>>,
     /// Pixel pitch on the detector along columns and rows, mm: one number or two.
     #[arg(long, value_name = "MM[,MM]", value_parser = pitch)]
     pub pixel_spacing: Option<[f64; 2]>,
-    /// Longest side of the images, pixels: larger ones are averaged down.
+    /// Longest side of the images, pixels: larger images are reduced by averaging.
     #[arg(long)]
     pub size: Option<usize>,
-    /// Depth searched before and behind the isocentre, mm.
+    /// Depth to search in front of and behind the isocentre, mm.
     #[arg(long, default_value_t = 100.0, value_name = "MM")]
     pub depth: f64,
 }
 
 impl DicomArgs {
-    /// The same for the library.
+    /// Converts the options to those of the library.
     ///
     /// # Errors
     /// [`Error::Config`] and [`Error::Data`] for an option or a file that cannot be used.
@@ -87,7 +88,7 @@ fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize
     }
 }
 
-/// One value per line; what follows a `#` is left out.
+/// Reads one value per line; text after a `#` is ignored.
 fn list<T: std::str::FromStr>(path: &Path) -> Result<Vec<T>> {
     let text =
         String::from_utf8(files::read_limited(path, 1 << 20)?).map_err(|e| Error::data(path, "text", e.to_string()))?;

@@ -1,4 +1,4 @@
-//! `eval`.
+//! The command `eval`.
 
 use super::args::Cli;
 use super::progress::{show_evaluation, stop_flag};
@@ -17,28 +17,29 @@ use nertca_vk::score::eval::{BestDice, BestDices, Evaluation};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// `eval`.
+/// Arguments of `eval`.
 #[derive(Debug, Args)]
 pub struct EvalArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
-    /// Dataset with validation frames; the one the run was trained on by default.
+    /// Dataset with validation frames; by default the one that the run was trained on.
     #[arg(long, value_name = "DATA")]
     pub data: Option<PathBuf>,
-    /// JSON instead of a table.
+    /// Print JSON instead of a table.
     #[arg(long)]
     pub json: bool,
-    /// Leave comparison pictures and `report.html` here; without, a page without pictures is left in RUN as `eval.html`.
+    /// Write comparison pictures and `report.html` to this directory; without it, a page without pictures is written to RUN as
+    /// `eval.html`.
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
-    /// Find the vessels as a tree, too (seconds): over the angiograms on the page, with lengths and diameters, and as
-    /// `tree.json` beside it.
+    /// Also find the vessels as a tree (takes seconds): shown over the angiograms on the page, with lengths and diameters, and
+    /// written as `tree.json` beside it.
     #[arg(long)]
     pub tree: bool,
-    /// Score the true vessels by the same rule, too, where the dataset has their volumes: what a perfect field would reach.
+    /// Also score the true vessels by the same rule, where the dataset has their volumes: the scores of a perfect field.
     #[arg(long)]
     pub ceiling: bool,
-    /// Dice threshold on attenuation, 1/mm, instead of the rule.
+    /// Dice threshold on attenuation, 1/mm, instead of the automatic one.
     #[arg(long, value_name = "PER_MM")]
     pub threshold: Option<f64>,
 }
@@ -70,7 +71,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     let beside = page.parent().unwrap_or(Path::new(""));
     let warnings = &mut evaluation.warnings;
     let found = if args.tree { tree_of_page(cli, &gpu, &model, &cancel, beside, warnings) } else { Ok(None) };
-    // Scores are not lost with a tree that fails or is stopped.
+    // If the tree fails or is stopped, the scores are still printed.
     let tree = found.or_else(|error| print_scores(args, &evaluation).and(Err(error)))?;
     score_tree_of_page(tree.as_ref(), &dataset, &mut evaluation)?;
     Report {
@@ -90,12 +91,12 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     cli.close_device(&gpu)
 }
 
-/// Scores the true vessels of a dataset as the model was scored, by the geometry that the dataset states.
+/// Scores the true vessels of a dataset as the model was scored, with the geometry that the dataset states.
 fn add_ceiling(data: &Path, evaluation: &mut Evaluation, cancel: &AtomicBool) -> Result<()> {
     let proceed = || if cancel.load(Ordering::Relaxed) { Err(Error::Interrupted) } else { Ok(()) };
     let found = truth_dice(&Dataset::open(data)?, evaluation.threshold.dynamic_per_mm, proceed);
     let without = match found {
-        // The truth is at fault: the model is scored all the same.
+        // The truth is faulty: the model is scored nevertheless.
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => Some(error.to_string()),
         Ok(None) => {
             Some(format!("no unseen image of {} has a mask and a true volume (volumes/) of its phase", data.display()))

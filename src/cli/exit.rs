@@ -1,17 +1,17 @@
-//! How the program ends: exit codes, and what to type after an error.
+//! Exit codes of the program, and hints after an error.
 
 use nertca_vk::error::{Error, SMALLER_BATCHES};
 
-/// A command or an option is not usable.
+/// Exit code for a command or an option that is not usable.
 const USAGE: u8 = 2;
-/// No Vulkan device fits.
+/// Exit code when no Vulkan device fits.
 const NO_DEVICE: u8 = 3;
-/// What failed may succeed when it is tried again (`EX_TEMPFAIL`): for schedulers.
+/// Exit code for failures that may not occur at a later attempt (`EX_TEMPFAIL`); schedulers use it.
 const TRY_AGAIN: u8 = 75;
-/// Stopped by Ctrl-C or SIGTERM; what was done is saved.
+/// Exit code after a stop by Ctrl-C or SIGTERM; the work done is saved.
 pub const INTERRUPTED: u8 = 130;
 
-/// Exit code of an error; 1 for all that has none of its own.
+/// Returns the exit code of an error; 1 for errors without a code of their own.
 pub fn code(error: &Error) -> u8 {
     match error {
         Error::Config { .. } => USAGE,
@@ -23,7 +23,7 @@ pub fn code(error: &Error) -> u8 {
     }
 }
 
-/// What to try on the command line, where the error itself cannot say.
+/// Returns command-line options to try after an error, where the error itself does not name them.
 pub fn hint(error: &Error) -> Option<&'static str> {
     match error {
         Error::DeviceLost { .. } => Some(

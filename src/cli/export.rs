@@ -1,4 +1,4 @@
-//! `export` and `convert`.
+//! The commands `export` and `convert`.
 
 use super::args::{Cli, choice};
 use super::data::bar;
@@ -14,41 +14,43 @@ use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
-use nertca_vk::score::eval::vessel_threshold_per_mm;
+use nertca_vk::vessels::threshold::vessel_threshold_per_mm;
 use std::path::PathBuf;
 
-/// `export`.
+/// Arguments of `export`.
 #[derive(Debug, Args)]
 pub struct ExportArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
-    /// Field to export: both, the still background or the moving vessels.
+    /// Field to export: both, the static background or the moving vessels.
     #[arg(long, value_parser = choice::<Component>(), default_value = Component::Dynamic.name())]
     pub component: Component,
-    /// Phase from 0, or `all`: a fourth axis, or a file per phase.
+    /// Phase from 0, or `all`: as a fourth axis, or one file per phase.
     #[arg(long, default_value = "all")]
     pub phase: String,
     /// Distance between points, mm.
     #[arg(long, default_value_t = 0.5, value_name = "MM")]
     pub spacing: f64,
-    /// Format; by the end of --out otherwise.
+    /// Format; determined by the extension of --out if not given.
     #[arg(long, value_parser = choice::<Format>())]
     pub format: Option<Format>,
     /// Compress the values of an .nrrd (a .nii.gz is compressed by its name).
     #[arg(long, conflicts_with = "mesh")]
     pub compress: bool,
-    /// Surfaces of the vessels instead of volumes: --out ends in .stl, .ply, .obj (a file per phase) or .glb (animated).
+    /// Export surfaces of the vessels instead of volumes: --out ends in .stl, .ply, .obj (one file per phase) or .glb
+    /// (animated).
     #[arg(long, conflicts_with = "format")]
     pub mesh: bool,
-    /// Attenuation of the surface, 1/mm; the Dice threshold otherwise.
+    /// Attenuation of the surface, 1/mm; by default the Dice threshold.
     #[arg(long, requires = "mesh", value_name = "PER_MM")]
     pub iso: Option<f64>,
-    /// Motion instead of volumes: displacements from the phase of rest (mostly 0) at the nodes of the grid that moves the Gaussians, mm, where
-    /// one set moves (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion along a vessel is not observed in
-    /// projections: displacements along vessels come from smoothness alone, and no strain can be read from them.
+    /// Export motion instead of volumes: displacements from the reference phase (mostly 0) at the nodes of the grid that moves
+    /// the Gaussians, mm, where one set moves (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion along a vessel is
+    /// not observed in projections: displacements along vessels come from smoothness alone, and no strain can be derived from
+    /// them.
     #[arg(long, conflicts_with_all = ["mesh", "format", "component", "spacing"])]
     pub motion: bool,
-    /// With --motion: the way of each Gaussian over the beat, its own motion included, as lines in a .vtk.
+    /// With --motion: write the path of each Gaussian over the beat, including its own motion, as lines in a .vtk.
     #[arg(long, requires = "motion", conflicts_with_all = ["compress", "phase"])]
     pub trajectories: bool,
     /// Output: .nrrd (.seq.nrrd for 3D Slicer's sequences), .nii, .nii.gz, .mha, .npy or .vtk.
@@ -56,12 +58,12 @@ pub struct ExportArgs {
     pub out: PathBuf,
 }
 
-/// `convert`.
+/// Arguments of `convert`.
 #[derive(Debug, Args)]
 pub struct ConvertArgs {
     /// Dataset directory in either layout.
     pub data: PathBuf,
-    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, the layout of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>())]
     pub layout: Layout,
     /// Directory to make.
@@ -69,7 +71,7 @@ pub struct ConvertArgs {
     pub out: PathBuf,
 }
 
-/// The phases `--phase` names, and whether it names all.
+/// Returns the phases that `--phase` names, and whether it names all.
 pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
     match text {
         "all" => Ok(((0..n_phases).collect(), true)),
@@ -111,7 +113,7 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
         let export = VolumeExport {
             grid,
             component: args.component,
-            // The still background is the same at every phase.
+            // The static background is the same at every phase.
             sequence: all && args.component.has_dynamic(),
             phases: if args.component.has_dynamic() { phases } else { vec![0] },
             format: format.ok_or_else(|| unknown(".nrrd .nii .nii.gz .mha .npy .vtk; say which with --format"))?,
@@ -130,7 +132,7 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
     cli.close_device(&gpu)
 }
 
-/// Exports displacements, or the Gaussians' ways; no device is needed.
+/// Exports displacements, or the paths of the Gaussians; needs no device.
 fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: bool) -> Result<()> {
     let tree = moving_tree(model)?;
     let format = MotionFormat::of(&args.out);

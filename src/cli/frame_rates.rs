@@ -10,20 +10,20 @@ use nertca_vk::render::quantity::{Projection, Quantity};
 use nertca_vk::render::renderer::Renderer;
 use std::sync::Arc;
 
-/// Frames per second of a model turning about the patient, every phase in turn.
+/// Frames per second of a model that turns about the patient, with all phases in turn.
 #[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub struct FrameRate {
-    /// `fields` or `baked`.
+    /// Rendering from the `fields` or from `baked` volumes.
     pub way: String,
-    /// Columns and rows.
+    /// Number of columns and of rows.
     pub size: usize,
-    /// Frames rendered.
+    /// Number of frames rendered.
     pub frames: u32,
-    /// Per second of wall time, read back to the host.
+    /// Frames per second of wall time, including the read-back to the host.
     pub fps: f64,
 }
 
-/// Renders for at least `seconds` at each size, both ways.
+/// Renders for at least `seconds` at each size, both from the fields and from baked volumes.
 pub fn measure_frame_rates(
     renderer: &Arc<Renderer>,
     model: &Model,
@@ -68,7 +68,7 @@ pub fn print_frame_rates(rates: &[FrameRate]) {
     }
 }
 
-/// Measures and prints.
+/// Measures frame rates and prints them.
 pub fn print_measured(cli: &Cli, args: &RenderArgs, model: &Model) -> Result<()> {
     let gpu = cli.open_device()?;
     let renderer = Arc::new(Renderer::new(&gpu, model, cli.tuning(&gpu, &model.config))?);

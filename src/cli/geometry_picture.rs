@@ -1,4 +1,4 @@
-//! Where sources and detectors stand about the patient, as a picture: `info --picture`.
+//! Draws sources and detectors about the patient, for `info --picture`.
 
 use super::lettering;
 use glam::{DVec2, DVec3};
@@ -12,20 +12,21 @@ use std::path::Path;
 /// Side of each of the four fields, pixels.
 const FIELD: u32 = 480;
 const MARGIN: f64 = 45.0;
-/// Length of the patient's axes, as a share of what a field shows from its middle on.
+/// Length of the patient's axes, as a share of the field's reach.
 const AXIS_SHARE: f64 = 0.55;
-/// What a field shows from its middle on, mm, at least.
+/// Minimum reach of a field: the distance from its middle to its edge, mm.
 const LEAST_REACH_MM: f64 = 300.0;
-/// A matrix does not say where the detector is: it is drawn this many times as far from the source as the isocentre.
+/// Source-to-detector distance of a projection matrix, which does not define it, in units of the source-to-isocentre
+/// distance.
 const MATRIX_SID: f64 = 1.5;
-/// How far beyond a detector's middle its number is, pixels.
+/// Distance of a detector's number beyond the detector's middle, pixels.
 const BEYOND: f64 = 24.0;
 const MOST_NAMED: usize = 24;
 const WHITE: Rgb<u8> = Rgb([255, 255, 255]);
 const INK: Rgb<u8> = Rgb([40, 42, 48]);
 const GREY: Rgb<u8> = Rgb([165, 168, 175]);
 const AXES: Rgb<u8> = Rgb([120, 124, 132]);
-/// Of training views.
+/// Colours of training views.
 const COLOURS: [Rgb<u8>; 6] = [
     Rgb([214, 39, 60]),
     Rgb([20, 120, 220]),
@@ -35,12 +36,12 @@ const COLOURS: [Rgb<u8>; 6] = [
     Rgb([0, 150, 150]),
 ];
 
-/// From where a field shows the patient: columns and rows of a patient's vector (left, posterior, superior).
+/// Viewing direction of a field: patient directions (left, posterior, superior) of its columns and rows.
 struct Side {
     title: &'static str,
     columns: DVec3,
     rows: DVec3,
-    /// Where among the fields.
+    /// Position of the field among the four.
     at: [u32; 2],
 }
 
@@ -91,7 +92,7 @@ impl Stand {
 struct Field<'a> {
     picture: &'a mut RgbImage,
     side: &'a Side,
-    /// From the middle on.
+    /// Distance from the middle of the field to its edge, mm.
     reach_mm: f64,
 }
 
@@ -129,7 +130,7 @@ impl Field<'_> {
         for (axis, name) in [(DVec3::X, "LEFT"), (DVec3::Y, "POSTERIOR"), (DVec3::Z, "SUPERIOR")] {
             let end = AXIS_SHARE * self.reach_mm * axis;
             self.line(DVec3::ZERO, end, 0, AXES);
-            // An axis that points at the viewer has no name there.
+            // An axis that points at the viewer is not labelled.
             if self.place(end).distance(self.place(DVec3::ZERO)) > 1.0 {
                 self.text(self.place(end) + 4.0, name, AXES);
             }
@@ -145,14 +146,14 @@ impl Field<'_> {
         }
         self.dot(self.place(stand.source_mm), 5, stand.colour);
         let number = stand.name.split(':').next().unwrap_or_default();
-        // Detectors are farther apart than sources.
+        // Numbers are placed at the detectors, which are farther apart than the sources.
         let (iso, middle) = (self.place(DVec3::ZERO), self.place(stand.middle_mm));
         let beyond = middle + BEYOND * (middle - iso).normalize_or(DVec2::X);
         self.text(beyond - DVec2::new(5.0, 7.0), number, stand.colour);
     }
 }
 
-/// The picture of a dataset.
+/// Draws the picture of a dataset.
 pub fn drawn(dataset: &Dataset) -> RgbImage {
     let training = dataset.training_views();
     let colour = |view: usize| {
@@ -165,7 +166,7 @@ pub fn drawn(dataset: &Dataset) -> RgbImage {
     for side in &SIDES {
         let mut field = Field { picture: &mut picture, side, reach_mm };
         field.axes();
-        // Training views over the others.
+        // Training views are drawn over the others.
         let (unseen, seen): (Vec<&Stand>, Vec<&Stand>) = stands.iter().partition(|stand| stand.colour == GREY);
         unseen.into_iter().chain(seen).for_each(|stand| field.stand(stand));
     }

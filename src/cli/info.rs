@@ -1,4 +1,4 @@
-//! `info`.
+//! The command `info`.
 
 use super::geometry_picture;
 use clap::Args;
@@ -12,16 +12,17 @@ use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
 use nertca_vk::score::pictures::Window;
 use std::path::{Path, PathBuf};
 
-/// `info`.
+/// Arguments of `info`.
 #[derive(Debug, Args)]
 pub struct InfoArgs {
     /// Dataset directory, run directory or checkpoint.
     #[arg(required_unless_present = "schema")]
     pub path: Option<PathBuf>,
-    /// JSON instead of text.
+    /// Print JSON instead of text.
     #[arg(long)]
     pub json: bool,
-    /// Leave a picture of a dataset's geometry here: sources, detectors, central rays and the patient's axes, from three sides.
+    /// Write a picture of a dataset's geometry to this file: sources, detectors, central rays and the patient's axes, from
+    /// three sides.
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["schema", "json"])]
     pub picture: Option<PathBuf>,
     /// Print the JSON schema of `dataset.json` and exit.
@@ -122,7 +123,7 @@ fn print_tree(value: &serde_json::Value, depth: usize) {
     let Some(map) = value.as_object() else { return };
     for (key, value) in map {
         match value {
-            // What a run does not have.
+            // Properties that a run does not have are omitted.
             serde_json::Value::Null => {}
             serde_json::Value::Object(_) => {
                 out!("{:indent$}{key}:", "", indent = 2 * depth);

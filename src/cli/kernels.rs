@@ -1,4 +1,4 @@
-//! `kernels`: what the driver's compiler makes of every pipeline that a preset uses.
+//! `kernels`: lists the driver's compiler statistics of every pipeline that a preset uses.
 
 use super::args::{Cli, ConfigArgs};
 use clap::Args;
@@ -10,24 +10,24 @@ use nertca_vk::inventory::{self, Compiled, GROWTH};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// `kernels`.
+/// Arguments of `kernels`.
 #[derive(Debug, Args)]
 pub struct KernelsArgs {
-    /// Hyper-parameters, which decide the pipelines' constants.
+    /// Hyper-parameters, which determine the pipelines' constants.
     #[command(flatten)]
     pub config: ConfigArgs,
     /// Cardiac phases of the dataset: layers on matrices have a column for each.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub phases: u32,
-    /// JSON instead of text.
+    /// Print JSON instead of text.
     #[arg(long)]
     pub json: bool,
-    /// Compare with a file of an earlier --json, and fail where a kernel begins to spill or is much larger.
+    /// Compare with the file of an earlier --json, and fail if a kernel newly spills or is much larger.
     #[arg(long, value_name = "FILE")]
     pub compare: Option<PathBuf>,
 }
 
-/// What `--json` prints and `--compare` reads.
+/// Results; `--json` prints them and `--compare` reads them.
 #[derive(Serialize, Deserialize)]
 struct Answer {
     device: String,
@@ -42,7 +42,7 @@ struct Answer {
 pub fn run(cli: &Cli, args: &KernelsArgs) -> Result<()> {
     let config = args.config.load([])?;
     let before = args.compare.as_deref().map(|file| Ok((file, read(file)?))).transpose()?;
-    // Without a cache: a pipeline from there is not compiled.
+    // No pipeline cache is used, because a pipeline from a cache is not compiled.
     let gpu = Gpu::open(&DeviceOptions {
         select: cli.device.clone(),
         validation: cli.validate,

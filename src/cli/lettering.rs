@@ -1,4 +1,4 @@
-//! Letters of 5 x 7 pixels for pictures: capitals, digits and a few signs, as character displays have had them for decades.
+//! Letters of 5 x 7 pixels for pictures: capitals, digits and a few signs, in the form of character displays.
 
 use image::{Rgb, RgbImage};
 
@@ -46,7 +46,7 @@ const CAPITALS: [Letter; 26] = [
     [0x61, 0x51, 0x49, 0x45, 0x43],
 ];
 const SCALE: u32 = 2;
-/// From one letter to the next, pixels.
+/// Distance from one letter to the next, pixels.
 const ADVANCE: u32 = 6 * SCALE;
 /// Height of a letter, pixels.
 pub const HEIGHT: u32 = 7 * SCALE;
@@ -65,8 +65,8 @@ fn letter(c: char) -> Letter {
     }
 }
 
-/// Writes a text whose upper left corner is at a place; what lies outside the picture is left out, and what is no capital,
-/// digit or known sign is a space.
+/// Writes a text with its upper left corner at the given place. Pixels outside the picture are clipped; characters other than
+/// capitals, digits and known signs become spaces.
 pub fn write(picture: &mut RgbImage, (left, top): (i64, i64), text: &str, colour: Rgb<u8>) {
     for (index, c) in text.chars().enumerate() {
         for (column, bits) in letter(c).into_iter().enumerate() {

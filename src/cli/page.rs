@@ -1,5 +1,5 @@
-//! `report.html`: one page that needs nothing but itself. Plots are SVG, pictures are embedded, and phases are chosen by
-//! radio buttons, so that no script is needed but for a vessel tree, where one was asked for.
+//! `report.html`: one self-contained page. Plots are SVG, pictures are embedded, and phases are selected by radio buttons, so
+//! that the page needs no script, except for a vessel tree if there is one.
 
 use super::plot::{Line, plot};
 use super::tree_section::TreeSection;
@@ -17,43 +17,43 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Pictures embedded at most.
+/// Maximum number of embedded pictures.
 const MOST_PICTURES: usize = 120;
 
-/// Title of the plot of distances on the way.
+/// Title of the plot of distances during training.
 pub(super) const DISTANCE_TITLE: &str = "Distance to the true vessels at the end of systole, mm";
 
-/// What a page tells.
+/// Contents of a page.
 pub struct Page<'a> {
     /// Name of the run.
     pub title: String,
     /// Facts about the run: name and value.
     pub facts: Vec<(String, String)>,
-    /// Things to look at.
+    /// Warnings about the run.
     pub warnings: Vec<String>,
     /// Lines of `metrics.jsonl`; empty when there are none.
     pub metrics: Vec<Value>,
-    /// What those lines tell over time.
+    /// Losses and scores over time, from those lines.
     pub history: History,
     /// Scores, where there were views to score.
     pub evaluation: Option<&'a Evaluation>,
-    /// How far Gaussians that move have come at each phase; empty for other fields.
+    /// Displacements of moving Gaussians at each phase; empty for other fields.
     pub motion: Vec<Displacement>,
     /// Comparison picture of each scored frame: view, phase, file.
     pub pictures: Vec<(usize, u32, PathBuf)>,
     /// Picture of the motion hull in front of each training view: view, file.
     pub hull: Vec<(usize, PathBuf)>,
-    /// How views were corrected, where that is known.
+    /// Corrections of the views, where they are known.
     pub calibration: Option<Calibration>,
-    /// Picture of what each training view shows of vessels, before and after correction: view, file.
+    /// Picture of the vessels in each training view, before and after correction: view, file.
     pub silhouettes: Vec<(usize, PathBuf)>,
-    /// The vessels as a tree, where it was asked for.
+    /// Vessels as a tree, if it was requested.
     pub tree: Option<TreeSection>,
-    /// The whole configuration.
+    /// Complete configuration.
     pub config: String,
 }
 
-/// How pages look.
+/// Style sheet of the pages.
 pub(super) const STYLE: &str = "
 :root{color-scheme:light dark;--ink:#1b1d21;--paper:#fcfcfb;--soft:#6c7078;--line:#d9dbdf;--mark:#b3261e}
 @media(prefers-color-scheme:dark){:root{--ink:#e7e8ea;--paper:#17181b;--soft:#9a9ea7;--line:#3a3d44;--mark:#ff8a80}
@@ -71,13 +71,13 @@ input.p:focus-visible+label.p{outline:2px solid}.shot{display:none}.shot img{wid
 .by-view{display:flex;flex-wrap:wrap;gap:1rem}.by-view figure{margin:0;flex:1 1 24rem}.by-view img{width:100%;image-rendering:pixelated}
 .scroll{overflow-x:auto;max-height:26rem}";
 
-/// A picture as an address that holds it.
+/// Returns a picture as a data URL.
 pub(super) fn embedded(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
     Ok(format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes)))
 }
 
-/// Pictures side by side, a view each.
+/// Shows pictures side by side, one per view.
 fn by_view(what: &str, pictures: &[(usize, PathBuf)]) -> Result<Markup> {
     let pictures = pictures.iter().map(|(view, path)| Ok((view, embedded(path)?))).collect::<Result<Vec<_>>>()?;
     Ok(html! {
@@ -90,7 +90,7 @@ fn by_view(what: &str, pictures: &[(usize, PathBuf)]) -> Result<Markup> {
 }
 
 impl Page<'_> {
-    /// Losses, and scores of some unseen images, over the time of training.
+    /// Plots losses, and scores of some unseen images, over the time of training.
     fn plots(&self) -> Result<Markup> {
         let (blue, orange, green) = (RGBColor(30, 100, 190), RGBColor(215, 120, 20), RGBColor(40, 130, 70));
         let History { losses, curve, .. } = &self.history;
@@ -195,7 +195,7 @@ impl Page<'_> {
 
     fn views(&self) -> Result<Markup> {
         let mut by_view: BTreeMap<usize, Vec<(u32, &PathBuf)>> = BTreeMap::new();
-        // Evenly thinned out where there are too many.
+        // Too many pictures are thinned out evenly.
         let step = self.pictures.len().div_ceil(MOST_PICTURES).max(1);
         for (view, phase, path) in self.pictures.iter().step_by(step) {
             by_view.entry(*view).or_default().push((*phase, path));

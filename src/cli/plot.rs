@@ -6,7 +6,7 @@ use plotters::prelude::*;
 
 /// Series of a plot.
 pub struct Line {
-    /// Name in the legend; without one it has no entry there.
+    /// Name in the legend; a line with an empty name has no entry.
     pub name: String,
     /// Colour.
     pub colour: RGBColor,
@@ -14,7 +14,8 @@ pub struct Line {
     pub points: Vec<(f64, f64)>,
 }
 
-/// A plot over the time of training as SVG, on a logarithmic axis that reaches the paper's 37 minutes; empty without points.
+/// Draws a plot over the time of training as SVG, with a logarithmic time axis that reaches the paper's 37 minutes; empty
+/// without points.
 ///
 /// # Errors
 /// [`Error::Internal`] where the plot cannot be drawn.

@@ -1,4 +1,4 @@
-//! What a person or a program sees of a run while it goes on, and how it is told to stop.
+//! Progress of a run, as text for people and as JSON for programs, and the signals that stop it.
 
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
@@ -8,10 +8,10 @@ use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A moving field that leaves more than this share of the loss explains little.
+/// A dynamic field that leaves more than this share of the loss explains little.
 const EXPLAINS_LITTLE: f64 = 0.9;
 
-/// A flag that Ctrl-C and SIGTERM set; another of them ends the program at once.
+/// Returns a flag that Ctrl-C and SIGTERM set; a second signal ends the program at once.
 pub fn stop_flag() -> Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let seen = stop.clone();
@@ -25,7 +25,7 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// One JSON object per line on stdout.
+/// Prints an event as one line of JSON on stdout.
 pub fn print_json(event: &Event) {
     if let Ok(line) = serde_json::to_string(event) {
         out!("{line}");
@@ -40,7 +40,7 @@ fn bar(template: &str) -> ProgressBar {
     bar
 }
 
-/// A bar and lines on stderr.
+/// Returns an observer that shows a bar and lines on stderr.
 pub fn show_progress() -> impl FnMut(&Event) {
     let terminal = std::io::stderr().is_terminal();
     let bar = bar("[{bar:30}] {pos}/{len} {msg}");
@@ -92,7 +92,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
     }
 }
 
-/// A bar for an evaluation; where stderr is no terminal, a line for every tenth of it.
+/// Returns an observer that shows a bar for an evaluation, or a line for every tenth of it if stderr is not a terminal.
 pub fn show_evaluation() -> impl FnMut(&Event) {
     let terminal = std::io::stderr().is_terminal();
     let mut shown = None;

@@ -1,4 +1,4 @@
-//! `render`.
+//! The command `render`.
 
 use super::args::{Cli, choice};
 use super::frame_rates::print_measured;
@@ -20,7 +20,7 @@ use nertca_vk::score::pictures::{self, Window};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// `render`.
+/// Arguments of `render`.
 #[derive(Debug, Args)]
 pub struct RenderArgs {
     /// Run directory or checkpoint file.
@@ -31,43 +31,43 @@ pub struct RenderArgs {
     /// Secondary angle, degrees, cranial positive.
     #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
     pub secondary: f64,
-    /// Phase from 0, or `all`; between two, as 3.4, where a network or one set of Gaussians moves (all but fast's
-    /// gaussians.form = "phase").
+    /// Phase from 0, or `all`; a fraction such as 3.4 lies between two phases, where a network or one set of Gaussians moves
+    /// (all but gaussians.form = "phase" of the preset `fast`).
     #[arg(long, default_value = "0", allow_negative_numbers = true)]
     pub phase: String,
-    /// Pictures between neighbouring phases, for smooth animations with --phase all.
+    /// Number of pictures between neighbouring phases, for smooth animations with --phase all.
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=32))]
     pub between: u32,
-    /// Field to show: both, the still background or the moving vessels.
+    /// Field to show: both, the static background or the moving vessels.
     #[arg(long, value_parser = choice::<Component>(), default_value = Component::Total.name())]
     pub component: Component,
-    /// Line integral (`drr`) or largest attenuation along the ray (`mip`).
+    /// Line integral (`drr`) or maximum attenuation along the ray (`mip`).
     #[arg(long, value_parser = choice::<Projection>(), default_value = Projection::Drr.name())]
     pub projection: Projection,
-    /// Columns and rows; those of the dataset by default.
+    /// Columns and rows; by default those of the dataset.
     #[arg(long)]
     pub size: Option<usize>,
-    /// Through volumes baked from the fields: faster, and as fine as their cells.
+    /// Render from volumes baked from the fields: faster, with the resolution of their cells.
     #[arg(long)]
     pub baked: bool,
-    /// Measure frames per second, read back to the host, of the chosen component turning about the patient: both ways, at
-    /// 200 x 200, 512 x 512, and --size.
+    /// Measure frames per second, including the read-back to the host, of the chosen component turning about the patient: from
+    /// the fields and from baked volumes, at 200 x 200, 512 x 512, and --size.
     #[arg(long)]
     pub fps: bool,
-    /// Output: .png, .npy (floats; all phases stacked), .gif (all phases) or .dcm (line integrals as an X-ray angiogram, derived
-    /// and for research only, with the detector centred).
+    /// Output: .png, .npy (floats; all phases stacked), .gif (all phases) or .dcm (line integrals as an X-ray angiogram,
+    /// derived and for research only, with the detector centred).
     #[arg(short, long, value_name = "FILE", required_unless_present = "fps")]
     pub out: Option<PathBuf>,
 }
 
-/// Where and what to render.
+/// Rays and image size of a rendering.
 pub struct Viewpoint {
     pub rays: ViewRays,
     pub width: usize,
     pub height: usize,
 }
 
-/// The model's C-arm, turned, over the same field of view on more or fewer pixels.
+/// Returns the model's C-arm at other angles, with the same field of view on `width` x `height` pixels.
 fn turned(model: &Model, primary_deg: f64, secondary_deg: f64, [width, height]: [usize; 2]) -> CArm {
     CArm {
         primary_deg,
@@ -80,7 +80,7 @@ fn turned(model: &Model, primary_deg: f64, secondary_deg: f64, [width, height]: 
     }
 }
 
-/// A view of the model's C-arm, over the same field of view on more or fewer pixels.
+/// Returns a view of the model's C-arm at other angles, with the same field of view on `width` x `height` pixels.
 pub fn viewpoint(
     model: &Model,
     primary_deg: f64,
@@ -93,14 +93,14 @@ pub fn viewpoint(
     Ok(Viewpoint { rays, width, height })
 }
 
-/// The fields themselves, or volumes baked from them.
+/// Renderer of the fields themselves, or of volumes baked from them.
 pub enum Renders {
     Fields(Arc<Renderer>),
     Baked(Box<Baked>),
 }
 
 impl Renders {
-    /// Line integrals, or maxima per mm.
+    /// Renders line integrals, or maxima per mm.
     pub fn render(&self, viewpoint: &Viewpoint, phase: f64, quantity: Quantity) -> Result<Vec<f32>> {
         let (rays, width, height) = (&viewpoint.rays, viewpoint.width, viewpoint.height);
         let image = match self {
@@ -117,11 +117,11 @@ impl Renders {
     }
 }
 
-/// Milliseconds between the phases of an animation, and the least that viewers keep to.
+/// Milliseconds between the phases of an animation, and the minimum that viewers respect.
 const PHASE_MS: u32 = 90;
 const LEAST_MS: u32 = 20;
 
-/// Writes frames as an angiogram of a heart of 68 beats per minute: how fast it really beat is not kept.
+/// Writes frames as an angiogram of a heart of 68 beats per minute; the true heart rate is not stored.
 fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoint, frames: &[Vec<f32>]) -> Result<()> {
     let size = [viewpoint.width, viewpoint.height];
     let beat_frames = model.param_map.phases as u32 * (args.between + 1);
@@ -143,7 +143,7 @@ fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoi
     dicom::write(out, &view)
 }
 
-/// The moments of the beat that `--phase` and `--between` name.
+/// Returns the moments of the beat that `--phase` and `--between` name.
 fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
     let n_phases = model.param_map.phases as u32;
     let between = args.between + 1;
@@ -153,7 +153,7 @@ fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
     if args.between > 0 {
         return Err(Error::config("--between", args.between, "pictures between phases need --phase all"));
     }
-    // A beat that is continuous closes: it ends where it begins.
+    // A continuous beat is periodic: its end equals its beginning.
     let last = if model.is_continuous() { n_phases } else { n_phases - 1 };
     match args.phase.parse::<f64>() {
         Ok(phase) if (0.0..=f64::from(last)).contains(&phase) => Ok(vec![phase]),
@@ -185,7 +185,7 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
         return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
     }
     if extension == "dcm" {
-        // A file can say neither where the detector's middle is nor where the table stands.
+        // The file format can state neither the offset of the detector's middle nor the position of the table.
         (model.c_arm.offset_mm, model.c_arm.table_mm) = ([0.0; 2], [0.0; 3]);
     }
     let viewpoint = viewpoint(&model, args.primary, args.secondary, size)?;

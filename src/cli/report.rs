@@ -1,4 +1,4 @@
-//! What a finished run is worth: scores on every unseen image, pictures of them, and a page to look at.
+//! Report of a finished run: scores on every unseen image, pictures of them, and a page.
 
 use super::page::Page;
 use super::tree_section::TreeSection;
@@ -17,25 +17,25 @@ use nertca_vk::score::eval::Evaluation;
 use nertca_vk::trees::tree::BeatTree;
 use std::path::{Path, PathBuf};
 
-/// What `report.html` is made of.
+/// Inputs of `report.html`.
 pub struct Report<'a> {
     /// Device the model was scored on.
     pub gpu: &'a Gpu,
-    /// Paths through the kernels.
+    /// Computation paths of the kernels.
     pub tuning: &'a Tuning,
-    /// The fields.
+    /// Trained fields.
     pub model: &'a Model,
-    /// Data they were scored with.
+    /// Dataset that they were scored with.
     pub dataset: &'a Dataset,
     /// Scores, where there are any.
     pub evaluation: Option<&'a Evaluation>,
-    /// What makes the fields or the scores worth less than they seem.
+    /// Warnings that reduce the value of the fields or of the scores.
     pub warnings: &'a [String],
-    /// Where it may be told how the model came about: a run directory.
+    /// Run directory, whose log and calibration describe how the model was made, if they exist.
     pub run: &'a Path,
-    /// The vessels as a tree, where it was asked for.
+    /// Vessels as a tree, if it was requested.
     pub tree: Option<&'a BeatTree>,
-    /// Where comparison pictures were left.
+    /// Directory of the comparison pictures.
     pub pictures: &'a Path,
 }
 

@@ -1,4 +1,5 @@
-// The tree on a run's page: every training view with the lines of its picture's phase, one choice of phase and branch for all.
+// The tree on a run's page: every training view with the lines at the phase of its picture; phase and branch are chosen for all
+// views.
 (() => {
   const $ = id => document.getElementById(id), SVG = "http://www.w3.org/2000/svg", REACH_PX = 12;
   const {tree, views} = JSON.parse($("tree-data").textContent), phases = tree.phases.length;
@@ -19,13 +20,13 @@
     return {view, image, caption, overlay};
   });
 
-  // The picture of a view that is nearest to the chosen phase.
+  // Returns the picture of a view whose phase is nearest to the chosen one.
   function shown(view) {
     const phase = Number($("tree-phase").value);
     return view.frames.reduce((best, frame) => between(frame.phase, phase) < between(best.phase, phase) ? frame : best);
   }
   function choose(found) { place = found; draw(); }
-  // Branches that are not followed are others at another phase.
+  // In a tree that is not tracked, a branch number means another branch at another phase.
   const placeAt = phase => place && (tree.tracked || place.phase === phase) ? place : null;
   function draw() {
     $("tree-phase-text").textContent = $("tree-phase").value;

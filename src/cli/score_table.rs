@@ -1,41 +1,41 @@
-//! Scores by phase as a table: the same columns on the terminal and on the page.
+//! Scores by phase as a table, with the same columns on the terminal and on the page.
 
 use maud::{Markup, html};
 
-/// A column: what it shows, in two lines, and how.
+/// Column of the table: a heading of two lines, and the text of its cells.
 pub struct Column<S> {
     /// First and second line of its heading.
     pub heading: [&'static str; 2],
-    /// The text of a cell.
+    /// Returns the text of a cell.
     pub text: fn(&S) -> String,
 }
 
-/// A length that may not be known.
+/// Formats a length that may be unknown.
 pub fn mm(value: Option<f64>) -> String {
     value.map_or("-".into(), |v| format!("{v:.2}"))
 }
 
-/// A share that may not be known.
+/// Formats a share that may be unknown.
 pub fn percent(share: Option<f64>) -> String {
     share.map_or("-".into(), |v| format!("{:.1} %", 100.0 * v))
 }
 
-/// What tables say whose truth was carried.
+/// Remark under tables whose truth was moved by the common motion of the calibrated views.
 const CARRIED: &str = "The truth was carried by the motion that all calibrated views share, which no image tells; without \
     that, means are as stated.";
 
-/// A table whose rows are phases and their mean.
+/// A table with one row for each phase and one for their mean.
 pub struct ScoreTable {
     title: &'static str,
-    /// What the numbers mean.
+    /// Meaning of the numbers.
     legend: String,
     headings: Vec<[&'static str; 2]>,
-    /// The phase, `mean` or `as stated`, and the text of each column.
+    /// Name of each row (the phase, `mean` or `as stated`), and the text of each column.
     rows: Vec<(String, Vec<String>)>,
 }
 
 impl ScoreTable {
-    /// A table of all phases with their scores, of the mean, and of the mean with the truth left as stated.
+    /// Makes a table of all phases with their scores, of the mean, and of the mean with the truth as stated.
     pub fn new<'a, S: 'a>(
         title: &'static str,
         legend: String,
@@ -52,7 +52,7 @@ impl ScoreTable {
         ScoreTable { title, legend, headings: columns.iter().map(|column| column.heading).collect(), rows }
     }
 
-    /// The table on a page.
+    /// Returns the table for a page.
     pub fn markup(&self) -> Markup {
         html! {
             h2 { (self.title) }
@@ -64,7 +64,7 @@ impl ScoreTable {
         }
     }
 
-    /// Prints the table and what it means.
+    /// Prints the table and its legend.
     pub fn print(&self) {
         let line = |name: &str, cells: Vec<&str>| {
             out!("{name:9}{}", cells.iter().map(|cell| format!("{cell:>13}")).collect::<String>());

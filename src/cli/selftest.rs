@@ -1,4 +1,4 @@
-//! `selftest`: every compute stage against its f64 twin.
+//! `selftest`: compares every compute stage with its f64 twin.
 
 use super::args::Cli;
 use clap::Args;
@@ -8,15 +8,15 @@ use nertca_vk::selftest::{self, Report};
 use serde::Serialize;
 use std::time::Instant;
 
-/// `selftest`.
+/// Arguments of `selftest`.
 #[derive(Debug, Args)]
 pub struct SelftestArgs {
-    /// JSON instead of text.
+    /// Print JSON instead of text.
     #[arg(long)]
     pub json: bool,
 }
 
-/// What `--json` prints: with `devices --json`, all that a report of a fault needs.
+/// Output of `--json`; together with that of `devices --json`, it has all that a bug report needs.
 #[derive(Serialize)]
 struct Answer<'a> {
     version: &'static str,
@@ -28,7 +28,7 @@ struct Answer<'a> {
     report: &'a Report,
 }
 
-/// Compares, prints a table, and fails when a stage does not compute what its twin does.
+/// Runs the comparisons, prints a table, and fails when a stage differs from its twin.
 pub fn run(cli: &Cli, args: &SelftestArgs) -> Result<()> {
     let gpu = cli.open_device()?;
     let begin = Instant::now();
@@ -67,7 +67,7 @@ fn print(device: &DeviceInfo, report: &Report, seconds: f64) {
     }
 }
 
-/// The first stage that failed is the one to look at: those after it work on what it made.
+/// Describes the failure. The first failed stage is the relevant one, because the stages after it use its results.
 fn fault(device: &DeviceInfo, report: &Report) -> String {
     let (failed, all) = (report.failed().count(), report.rows.len());
     let first = match (report.failed().next(), report.errors.first()) {

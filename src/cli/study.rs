@@ -1,4 +1,4 @@
-//! `study`: many runs from one file, and tables of their results.
+//! `study`: many runs described by one file, and tables of their results.
 
 use super::args::Cli;
 use super::data::bar;
@@ -19,23 +19,23 @@ use nertca_vk::study::work::Workplace;
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// Where a study looks for files of others, where --data does not say it.
+/// Environment variable with the directory of the study's external files, used without --data.
 const DATA_VARIABLE: &str = "NERTCA_DATA";
 
-/// `study`.
+/// Arguments of `study`.
 #[derive(Debug, Args)]
 pub struct StudyArgs {
-    /// What to do with it.
+    /// Operation on the study.
     #[command(subcommand)]
     pub command: StudyCommand,
 }
 
-/// What can be done with a study.
+/// Operations on a study.
 #[derive(Debug, Subcommand)]
 pub enum StudyCommand {
-    /// Do all runs that have no result yet, and go on with those that were interrupted.
+    /// Do all runs that have no result yet, and continue interrupted runs.
     Run(RunArgs),
-    /// Do one run: for schedulers. Exit code 0: it has its result, be it a failure; 75: try again.
+    /// Do one run: for schedulers. Exit code 0: the run has its result, which may be a failure; 75: try again.
     One(OneArgs),
     /// List the runs.
     List(ListArgs),
@@ -45,21 +45,22 @@ pub enum StudyCommand {
     Report(PlaceArgs),
 }
 
-/// A study and its files.
+/// Arguments that name a study and its files.
 #[derive(Debug, Args)]
 pub struct FileArgs {
-    /// Study (TOML).
+    /// Study file (TOML).
     #[arg(value_name = "FILE")]
     pub file: PathBuf,
-    /// Where the study's relative paths are looked for first, then beside it; $NERTCA_DATA by default.
+    /// Directory in which the study's relative paths are looked up first, before the directory of the study file;
+    /// $NERTCA_DATA by default.
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
 }
 
-/// A study and its directory.
+/// Arguments that name a study and its directory.
 #[derive(Debug, Args)]
 pub struct PlaceArgs {
-    /// The study.
+    /// Study file and its data.
     #[command(flatten)]
     pub study: FileArgs,
     /// Directory of the study's data and runs.
@@ -67,55 +68,55 @@ pub struct PlaceArgs {
     pub out: PathBuf,
 }
 
-/// How to do runs.
+/// Options of doing runs.
 #[derive(Debug, Args)]
 pub struct DoingArgs {
-    /// The study and its directory.
+    /// Study and its directory.
     #[command(flatten)]
     pub place: PlaceArgs,
-    /// Also do runs again that failed.
+    /// Also repeat runs that failed.
     #[arg(long)]
     pub retry_failed: bool,
-    /// Results of other commits of this program count as done, where data and configuration are those of the study.
+    /// Count results of other commits of this program as done, if their data and configuration are those of the study.
     #[arg(long)]
     pub any_commit: bool,
-    /// One JSON object per line on stdout instead of progress.
+    /// Print one JSON object per line on stdout instead of progress.
     #[arg(long)]
     pub json: bool,
 }
 
-/// `study run`.
+/// Arguments of `study run`.
 #[derive(Debug, Args)]
 pub struct RunArgs {
-    /// How.
+    /// Options of doing runs.
     #[command(flatten)]
     pub doing: DoingArgs,
 }
 
-/// `study one`.
+/// Arguments of `study one`.
 #[derive(Debug, Args)]
 pub struct OneArgs {
-    /// How.
+    /// Options of doing runs.
     #[command(flatten)]
     pub doing: DoingArgs,
-    /// The run, as `study list` names it.
+    /// Run to do, by its name in `study list`.
     #[arg(value_name = "RUN")]
     pub run: String,
 }
 
-/// `study list`.
+/// Arguments of `study list`.
 #[derive(Debug, Args)]
 pub struct ListArgs {
-    /// The study.
+    /// Study file and its data.
     #[command(flatten)]
     pub study: FileArgs,
-    /// Directory of the study's runs, to say which have their result.
+    /// Directory of the study's runs, to show which of them have a result.
     #[arg(short, long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Results of other commits of this program count, as `study run --any-commit` counts them.
+    /// Count results of other commits of this program, as `study run --any-commit` does.
     #[arg(long, requires = "out")]
     pub any_commit: bool,
-    /// JSON instead of lines.
+    /// Print JSON instead of lines.
     #[arg(long)]
     pub json: bool,
 }
@@ -127,7 +128,7 @@ impl FileArgs {
     }
 }
 
-/// Does what was asked for.
+/// Executes the operation.
 pub fn run(cli: &Cli, args: &StudyArgs) -> Result<()> {
     match &args.command {
         StudyCommand::Run(args) => queue(cli, &args.doing),
@@ -138,7 +139,7 @@ pub fn run(cli: &Cli, args: &StudyArgs) -> Result<()> {
     }
 }
 
-/// Does something at the place where a study's runs are done.
+/// Executes work at the place where a study's runs are done.
 fn at_work<T>(
     cli: &Cli,
     args: &DoingArgs,
@@ -159,7 +160,8 @@ fn at_work<T>(
     if args.json { work(&study, &place, &mut print_json) } else { work(&study, &place, &mut show()) }
 }
 
-/// Results say which commit they are of; edits since then are not seen.
+/// Warns if this build has uncommitted edits. Results are identified by their commit, which does not include such
+/// edits.
 fn warn_of_edits() {
     if COMMIT == "unknown" || COMMIT.ends_with("-dirty") {
         eprintln!("warning: built from sources that no commit has ({COMMIT}): results of other edits count as done");
@@ -189,7 +191,7 @@ fn one(cli: &Cli, args: &OneArgs) -> Result<()> {
     Ok(())
 }
 
-/// A run in the output of `study list --json`.
+/// Run in the output of `study list --json`.
 #[derive(Serialize)]
 struct Listed<'a> {
     #[serde(flatten)]
@@ -197,9 +199,9 @@ struct Listed<'a> {
     data: &'a str,
     method: &'a str,
     iterations: u32,
-    /// What it is made of: another one is another run.
+    /// Fingerprint of its inputs: a different fingerprint means a different run.
     fingerprint: RunFingerprint,
-    /// `scored`, `failed` or `waiting`; none where no directory was given.
+    /// State `scored`, `failed` or `waiting`; none where no directory was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     state: Option<&'static str>,
 }
@@ -252,14 +254,14 @@ fn report(args: &PlaceArgs) -> Result<()> {
     Ok(())
 }
 
-/// One JSON object per line on stdout.
+/// Prints an event as one line of JSON on stdout.
 fn print_json(event: &StudyEvent<'_>) {
     if let Ok(line) = serde_json::to_string(event) {
         out!("{line}");
     }
 }
 
-/// Seconds as a person would say them.
+/// Formats seconds in a unit that is easy to read.
 fn duration(seconds: f64) -> String {
     match seconds {
         s if s < 100.0 => format!("{s:.0} s"),
@@ -268,7 +270,7 @@ fn duration(seconds: f64) -> String {
     }
 }
 
-/// A line per run on stderr, and the progress of the run under way.
+/// Returns an observer that prints a line per run on stderr, and the progress of the current run.
 fn show() -> impl FnMut(&StudyEvent<'_>) {
     let (mut making, mut training) = (None, None);
     move |event| match event {

@@ -1,4 +1,4 @@
-//! The page of a study: its table, Dice over the time of training, and pictures side by side; needs nothing but itself.
+//! The page of a study: its table, Dice over the time of training, and pictures side by side. It is self-contained.
 
 use super::page::{DISTANCE_TITLE, STYLE, embedded};
 use super::plot::{Line, plot};
@@ -14,7 +14,7 @@ use nertca_vk::study::work::picture_file;
 use plotters::style::RGBColor;
 use std::path::Path;
 
-/// Colours of methods, told apart by readers who see few of them (Okabe and Ito 2008).
+/// Colours of methods, distinguishable with colour vision deficiencies (Okabe and Ito 2008).
 const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -25,7 +25,7 @@ const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 0, 0),
 ];
 
-/// A run and what it came to.
+/// A run and its outcome.
 struct Finished {
     run: Run,
     outcome: Outcome,
@@ -71,7 +71,7 @@ pub fn write(study: &Study, directory: &Path, page: &Path) -> Result<()> {
     files::write_atomic(page, text.into_string().as_bytes())
 }
 
-/// Runs that have a result of what the study asks for.
+/// Returns the runs that have a result for the study's current inputs.
 fn finished(study: &Study, directory: &Path) -> Result<Vec<Finished>> {
     let mut finished = Vec::new();
     for run in study.runs() {
@@ -105,7 +105,7 @@ fn rows(table: &Table) -> Markup {
     }
 }
 
-/// Dice, and distances to true vessels, over the time of training.
+/// Plots Dice, and distances to true vessels, over the time of training.
 fn curves(study: &Study, finished: &[&Finished]) -> Result<Markup> {
     let mut dice = lines(study, finished, |point| point.dice);
     if let Some(Finished { run, .. }) = finished.first().filter(|_| !dice.is_empty()) {
@@ -119,7 +119,7 @@ fn curves(study: &Study, finished: &[&Finished]) -> Result<Markup> {
     Ok(html! { @for svg in plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } } })
 }
 
-/// A line per run, a colour per method.
+/// Makes one line per run, with one colour per method.
 fn lines(study: &Study, finished: &[&Finished], pick: fn(&CurvePoint) -> Option<f64>) -> Vec<Line> {
     let mut lines: Vec<Line> = Vec::new();
     for Finished { run, outcome } in finished {
@@ -134,7 +134,7 @@ fn lines(study: &Study, finished: &[&Finished], pick: fn(&CurvePoint) -> Option<
     lines
 }
 
-/// Where published runs on a data set ended, as far as that is known.
+/// Returns the final points of published runs on a data set, as far as they are known.
 fn published_ends(study: &Study, set: &DataSet) -> Vec<Line> {
     let Some(published) = &study.published else { return Vec::new() };
     let end = |(index, method): (usize, &str)| {
@@ -146,7 +146,7 @@ fn published_ends(study: &Study, set: &DataSet) -> Vec<Line> {
     published.methods().into_iter().enumerate().filter_map(end).collect()
 }
 
-/// The first unseen image of each method's first run.
+/// Shows the first unseen image of each method's first run.
 fn pictures(study: &Study, directory: &Path, finished: &[&Finished]) -> Result<Markup> {
     let mut figures = Vec::new();
     for (method, m) in study.methods.iter().enumerate() {

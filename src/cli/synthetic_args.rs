@@ -1,4 +1,4 @@
-//! What can be typed of synthetic data: views, C-arms, degradations.
+//! Options of synthetic data: views, C-arms, degradations.
 
 use super::args::{choice, pair, triple};
 use clap::Args;
@@ -14,7 +14,7 @@ use nertca_vk::scan::gating::BeatScaling;
 use std::num::NonZeroU32;
 use std::path::PathBuf;
 
-/// `phantom`.
+/// Arguments of `phantom`.
 #[derive(Debug, Args)]
 pub struct PhantomArgs {
     /// Directory to make.
@@ -25,23 +25,23 @@ pub struct PhantomArgs {
     /// Columns and rows of the images.
     #[arg(long, default_value_t = 100)]
     pub size: usize,
-    /// Cardiac phases.
+    /// Number of cardiac phases.
     #[arg(long, default_value_t = 10)]
     pub phases: u32,
-    /// From where it is seen.
+    /// Viewing angles.
     #[command(flatten)]
     pub views: ViewAngleArgs,
     /// Seed of shape, noise and degradations.
     #[arg(long, default_value_t = 1)]
     pub seed: u32,
-    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, the layout of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
     pub layout: Layout,
-    /// Coronary tree instead of the procedural one: .json, centrelines with radii as .vtp (at rest) of VMTK, 3D Slicer or
-    /// `tree`, or a .pvd that names such files of a beat.
+    /// Coronary tree instead of the procedural one: .json, centrelines with radii as .vtp (at rest) from VMTK, 3D Slicer or
+    /// `tree`, or a .pvd that lists such files of a beat.
     #[arg(long, value_name = "FILE")]
     pub tree: Option<PathBuf>,
-    /// Chest CT in Hounsfield units behind the tree.
+    /// Chest CT in Hounsfield units as background of the tree.
     #[arg(long, value_name = "CT", requires = "tree")]
     pub background: Option<PathBuf>,
     /// C-arm with --tree.
@@ -53,19 +53,19 @@ pub struct PhantomArgs {
     /// Do not write the voxel volumes (`volumes/*.nrrd`).
     #[arg(long)]
     pub no_volumes: bool,
-    /// Write the voxel volumes of the first of every so many phases: 3D scores take as much less time.
+    /// Write the voxel volumes of only the first of every N phases: 3D scores take proportionally less time.
     #[arg(long, value_name = "N", default_value = "1", conflicts_with = "no_volumes")]
     pub volumes_every: NonZeroU32,
-    /// A catheter of 2 mm (6F) in the aorta of the training views: its tip, in the ostium, goes with the heart, its other
-    /// end is still; not part of the masks.
+    /// Add a catheter of 2 mm (6F) in the aorta to the training views: its tip, in the ostium, moves with the heart, its other
+    /// end does not move; it is not part of the masks.
     #[arg(long, help_heading = DEGRADATIONS)]
     pub catheter: bool,
-    /// What a cath lab's angiograms have.
+    /// Degradations that occur in a cath lab.
     #[command(flatten)]
     pub degradations: DegradationArgs,
 }
 
-/// `project`.
+/// Arguments of `project`.
 #[derive(Debug, Args)]
 pub struct ProjectArgs {
     /// Volumes, one per phase in order: .npy .nii .nii.gz .nrrd .mha or raw binaries.
@@ -77,7 +77,7 @@ pub struct ProjectArgs {
     /// Columns and rows of the images.
     #[arg(long, default_value_t = 200)]
     pub size: usize,
-    /// From where it is seen.
+    /// Viewing angles.
     #[command(flatten)]
     pub views: ViewAngleArgs,
     /// C-arm.
@@ -107,10 +107,10 @@ pub struct ProjectArgs {
     /// Seed of noise and degradations.
     #[arg(long, default_value_t = 1)]
     pub seed: u32,
-    /// Layout to write: `native` (`dataset.json`), or `nerfca`, that of the NeRF-CA and NerT-CA authors.
+    /// Layout to write: `native` (`dataset.json`), or `nerfca`, the layout of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>(), default_value = Layout::Native.name())]
     pub layout: Layout,
-    /// What a cath lab's angiograms have.
+    /// Degradations that occur in a cath lab.
     #[command(flatten)]
     pub degradations: DegradationArgs,
 }
@@ -118,7 +118,7 @@ pub struct ProjectArgs {
 /// Heading of [`DegradationArgs`] in the help.
 const DEGRADATIONS: &str = "Degradations (of the training views; true values in truth.json)";
 
-/// What makes synthetic data worse, as a cath lab's are.
+/// Degradations of synthetic data, as they occur in a cath lab.
 #[derive(Debug, Args)]
 #[command(next_help_heading = DEGRADATIONS)]
 pub struct DegradationArgs {
@@ -126,37 +126,38 @@ pub struct DegradationArgs {
     /// axis, mm. Images are made with the true geometry.
     #[arg(long, value_name = "DEG,MM", allow_hyphen_values = true, value_parser = geometry_error)]
     pub geometry_error: Option<GeometryError>,
-    /// The heart breathes: its way along the body, peak to peak, mm, and the length of a breath, seconds (4 by default). Each
-    /// run begins anywhere in the breath; the background stays.
+    /// The heart moves with breathing: displacement along the body, peak to peak, mm, and the length of a breath, seconds (4 by
+    /// default). Each run begins at a random moment of the breath; the background does not move.
     #[arg(long, value_name = "MM[,PERIOD_S]", allow_hyphen_values = true, value_parser = breathing)]
     pub breathing: Option<Breathing>,
-    /// The diaphragm breathes, too, and with a CT or with volumes the lower front of the chest.
+    /// The diaphragm moves with breathing as well, and with a CT or with volumes also the lower front of the chest.
     #[arg(long, requires = "breathing")]
     pub breathing_background: bool,
-    /// Photon noise, of all views: photons per pixel of the open beam, before the patient.
+    /// Photon noise of all views: photons per pixel of the unattenuated beam, before the patient.
     #[arg(long, value_name = "N", allow_hyphen_values = true, conflicts_with = "detector_photons")]
     pub photons: Option<f64>,
-    /// Photon noise, of all views: photons per pixel at the detector, behind the patient, as the mean over each image.
+    /// Photon noise of all views: photons per pixel at the detector, behind the patient, as the mean over each image.
     #[arg(long, value_name = "N", allow_hyphen_values = true)]
     pub detector_photons: Option<f64>,
-    /// Contrast density differs between runs: its standard deviation, percent. Within a run it drifts half as much.
+    /// Standard deviation of the contrast density between runs, percent. Within a run it varies half as much.
     #[arg(long, value_name = "PERCENT", default_value_t = 0.0, allow_hyphen_values = true)]
     pub contrast_variation: f64,
-    /// Contrast enters the vessels with the first image of a run and reaches their ends after so many seconds. Full from the
-    /// start without.
+    /// Seconds from the first image of a run, when contrast enters the vessels, until it reaches their ends. By default,
+    /// vessels are full from the start.
     #[arg(long, value_name = "S", default_value_t = 0.0, allow_hyphen_values = true)]
     pub inflow: f64,
-    /// Beats per minute, one for all training views or one for each: images are taken at --fps from anywhere in the beat, and
-    /// each phase gets the nearest image by --gating, where one is nearer than half a phase. Regular phases without.
+    /// Beats per minute, one for all training views or one for each: images are taken at --fps from a random moment of the
+    /// beat, and each phase gets the nearest image by --gating, if one is nearer than half a phase. By default, images are
+    /// taken at regular phases.
     #[arg(long, value_name = "BPM[,BPM...]", value_delimiter = ',', allow_hyphen_values = true)]
     pub heart_rate: Vec<f64>,
-    /// Images per second, as 7.5, 15 or 30.
+    /// Images per second, e.g. 7.5, 15 or 30.
     #[arg(long, default_value_t = USUAL_FRAMES_PER_S, requires = "heart_rate", allow_hyphen_values = true)]
     pub fps: f64,
-    /// Length of each run, beats: contrast fills the vessels for about three.
+    /// Length of each run, beats: contrast fills the vessels for about three beats.
     #[arg(long, default_value_t = USUAL_BEATS, requires = "heart_rate")]
     pub beats: u32,
-    /// How time becomes phase: `two-segment` (systole keeps its length, diastole takes the rest) or `linear`.
+    /// Conversion of time to phase: `two-segment` (systole keeps its length, diastole takes the rest) or `linear`.
     #[arg(long, value_parser = choice::<BeatScaling>(), default_value = BeatScaling::TwoSegment.name(),
         requires = "heart_rate")]
     pub gating: BeatScaling,
@@ -166,7 +167,7 @@ pub struct DegradationArgs {
 }
 
 impl DegradationArgs {
-    /// The degradations asked for.
+    /// Returns the degradations that were requested.
     pub fn degradations(&self, catheter: bool) -> Degradations {
         let background = self.breathing_background;
         let open = self.photons.map(Photons::Unattenuated);
@@ -188,16 +189,16 @@ impl DegradationArgs {
     }
 }
 
-/// Views of synthetic data.
+/// Options of the views of synthetic data.
 #[derive(Debug, Args)]
 pub struct ViewAngleArgs {
-    /// Training views: the paper's 3, 4 or 9.
+    /// Number of training views: the paper's 3, 4 or 9.
     #[arg(long, default_value_t = 4, conflicts_with = "angles")]
     pub views: u32,
-    /// Training views by primary and secondary angle, degrees (LAO and cranial positive), instead of the paper's.
+    /// Primary and secondary angles of the training views, degrees (LAO and cranial positive), instead of the paper's.
     #[arg(long, value_name = "P,S[;P,S...]", allow_hyphen_values = true, value_parser = view_angles)]
     pub angles: Option<AngleList>,
-    /// Validation views, or `none`, instead of the paper's (of which those within 15 degrees of --angles are left out).
+    /// Validation views, or `none`, instead of the paper's (without those of the paper's within 15 degrees of --angles).
     #[arg(long, value_name = "P,S[;P,S...]", allow_hyphen_values = true, value_parser = test_angles)]
     pub test_angles: Option<AngleList>,
 }
@@ -207,7 +208,7 @@ pub struct ViewAngleArgs {
 pub struct AngleList(pub Vec<Angles>);
 
 impl ViewAngleArgs {
-    /// The views asked for.
+    /// Returns the views that were requested.
     pub fn views(&self) -> Result<ViewAngles> {
         let validation = self.test_angles.as_ref().map(|list| list.0.as_slice());
         let mut views = match &self.angles {
@@ -221,13 +222,13 @@ impl ViewAngleArgs {
     }
 }
 
-/// C-arms of synthetic data: one value for all views, or one for each, those of training first.
+/// C-arms of synthetic data: one value for all views, or one for each, with the training views first.
 #[derive(Debug, Args)]
 pub struct CArmArgs {
-    /// Source to isocentre, mm: one for all views, or one for each (training first, then validation).
+    /// Distance from source to isocentre, mm: one for all views, or one for each (training first, then validation).
     #[arg(long, default_value = "750", value_name = "MM[,MM...]", value_delimiter = ',')]
     pub sod: Vec<f64>,
-    /// Source to detector, mm: one for all views, or one for each.
+    /// Distance from source to detector, mm: one for all views, or one for each.
     #[arg(long, default_value = "1100", value_name = "MM[,MM...]", value_delimiter = ',')]
     pub sid: Vec<f64>,
     /// Field of view at the isocentre, mm.
@@ -243,13 +244,13 @@ pub struct CArmArgs {
 }
 
 impl CArmArgs {
-    /// Whether nothing was asked for.
+    /// Tells whether no option was given.
     pub fn is_default(&self) -> bool {
         let at_rest = self.offset == [[0.0; 2]] && self.pixel.is_none();
         self.sod == [750.0] && self.sid == [1100.0] && self.fov == 160.0 && at_rest
     }
 
-    /// The C-arms asked for.
+    /// Returns the C-arms that were requested.
     pub fn options(&self) -> CArmOptions {
         CArmOptions {
             sod_mm: self.sod.clone(),
@@ -287,12 +288,12 @@ fn view_angles(text: &str) -> std::result::Result<AngleList, String> {
     text.split(';').map(view).collect::<std::result::Result<_, _>>().map(AngleList)
 }
 
-/// Parses the same, or `none`.
+/// Parses `P,S[;P,S...]`, or `none`.
 fn test_angles(text: &str) -> std::result::Result<AngleList, String> {
     if text == "none" { Ok(AngleList(Vec::new())) } else { view_angles(text) }
 }
 
-/// Parses one length for both directions, or two.
+/// Parses one length for both directions, or two lengths.
 pub(super) fn pitch(text: &str) -> std::result::Result<[f64; 2], String> {
     let parts: Vec<f64> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
     match parts[..] {

@@ -1,4 +1,4 @@
-//! `train`: a run and its report.
+//! `train`: performs a run and writes its report.
 
 use super::args::{Cli, ConfigArgs};
 use super::eval::print_table;
@@ -21,7 +21,7 @@ use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::eval::{Evaluation, moving_field_warning};
 use std::path::{Path, PathBuf};
 
-/// `train`.
+/// Arguments of `train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
     /// Dataset directory (native or authors' layout).
@@ -42,17 +42,17 @@ pub struct TrainArgs {
     /// Continue from the newest checkpoint in RUN, with its configuration.
     #[arg(long, conflicts_with_all = ["preset", "config", "set", "iterations", "seed"])]
     pub resume: bool,
-    /// Save and stop after N iterations; schedules keep the full length.
+    /// Save and stop after N iterations; schedules are computed for the full length.
     #[arg(long, value_name = "N")]
     pub stop_at: Option<u32>,
-    /// One JSON object per line on stdout instead of a progress bar.
+    /// Print one JSON object per line on stdout instead of a progress bar.
     #[arg(long)]
     pub json: bool,
-    /// Leave scores and pictures of the unseen images for `eval`.
+    /// Do not write scores and pictures of the unseen images; `eval` can do it later.
     #[arg(long)]
     pub no_eval: bool,
-    /// Find the vessels as a tree, too (seconds): over the angiograms in the report, with lengths and diameters, and as
-    /// `tree.json` beside it.
+    /// Also find the vessels as a tree (takes seconds): shown over the angiograms in the report, with lengths and
+    /// diameters, and written as `tree.json` beside it.
     #[arg(long)]
     pub tree: bool,
     /// Start over in a directory that already holds a run.
@@ -71,7 +71,7 @@ fn config(args: &TrainArgs) -> Result<Config> {
     args.config.load(iterations.into_iter().chain(args.seed.map(|s| format!("seed={s}"))))
 }
 
-/// Trains.
+/// Trains and writes the report.
 pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     let config = config(args)?;
     if args.print_config {
@@ -89,7 +89,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     let cancel = stop_flag()?;
     let gpu = cli.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
-    // A resumed run keeps its own configuration, so that is what paths are chosen for.
+    // A resumed run keeps its own configuration, for which the paths are chosen.
     let config = if args.resume { newest_model(run)?.config } else { config };
     let tuning = cli.training_tuning(&gpu, &config, &dataset)?;
     let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
@@ -110,7 +110,8 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
             eprintln!("the run is complete; to score it: nertca-vk eval \"{run}\" --images \"{report}\"");
         }
         let scores = outcome?;
-        // Now, and again with those of the tree: finding that may fail or be stopped.
+        // The scores are written now, and again with those of the tree, because finding the tree may fail or be
+        // stopped.
         write_scores(&report, &scores)?;
         evaluation = Some(scores);
     }

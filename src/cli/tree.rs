@@ -1,4 +1,4 @@
-//! `tree`.
+//! The command `tree`.
 
 use super::args::Cli;
 use super::data::bar;
@@ -19,33 +19,33 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// `tree`.
+/// Arguments of `tree`.
 #[derive(Debug, Args)]
 pub struct TreeArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
     /// Phase from 0, or `all`. Where one set of Gaussians moves (gaussians.form = "tree"), point i of branch b is the same
-    /// material point at every phase; elsewhere each phase has a tree of its own, and program and file say "not tracked".
+    /// material point at every phase; otherwise each phase has its own tree, and program and file say "not tracked".
     #[arg(long, default_value = "all")]
     pub phase: String,
-    /// Attenuation from which the moving field is vessel, 1/mm; the Dice threshold otherwise.
+    /// Attenuation from which the dynamic field is vessel, 1/mm; by default the Dice threshold.
     #[arg(long, value_name = "PER_MM")]
     pub threshold: Option<f64>,
-    /// Branches that end without reaching so far beyond the vessel they leave are spurs and left out, mm; three times what
-    /// the field resolves otherwise.
+    /// Minimum length by which a branch must extend beyond the vessel it leaves, mm; shorter end branches are spurs and
+    /// omitted. By default three times the field's resolution.
     #[arg(long, value_name = "MM")]
     pub min_branch: Option<f64>,
-    /// Output: .json (all phases), .vtp (a file per phase and a .pvd of them all, for ParaView, 3D Slicer and VMTK), .swc
-    /// (a file per phase), in millimetres along (left, posterior, superior); or .glb (tubes, animated over the beat; metres).
+    /// Output: .json (all phases), .vtp (one file per phase and a .pvd of them all, for ParaView, 3D Slicer and VMTK), .swc
+    /// (one file per phase), in millimetres along (left, posterior, superior); or .glb (tubes, animated over the beat; metres).
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }
 
-/// Where a run keeps the tree its page shows.
+/// File in the run directory with the tree that the run's page shows.
 const TREE_FILE: &str = "tree.json";
 
-/// The tree of all phases of a model for a run's page, and beside the page as a file. A model without vessels has none, which
-/// is one more warning, as is a file that cannot be written.
+/// Finds the tree of all phases of a model for a run's page, and writes it to a file beside the page. If the model has no
+/// vessels or the file cannot be written, a warning is added.
 pub fn of_page(
     cli: &Cli,
     gpu: &Gpu,
@@ -70,7 +70,7 @@ pub fn of_page(
     }
 }
 
-/// Leaves a tree beside its page.
+/// Writes a tree beside its page.
 fn leave(beat: &BeatTree, directory: &Path, warnings: &mut Vec<String>) -> Result<()> {
     match write(beat, &directory.join(TREE_FILE), TreeFormat::Json, true) {
         Err(error @ Error::Io { .. }) => {
@@ -82,8 +82,8 @@ fn leave(beat: &BeatTree, directory: &Path, warnings: &mut Vec<String>) -> Resul
     }
 }
 
-/// Removes the tree that an earlier page left in a directory, lest it passes for that of a new page without one. A file that
-/// stays is one more warning.
+/// Removes the tree that an earlier page left in a directory, so that it is not mistaken for that of a new page without one. If
+/// the file cannot be removed, a warning is added.
 pub fn remove_old(directory: &Path, warnings: &mut Vec<String>) {
     let file = directory.join(TREE_FILE);
     match std::fs::remove_file(&file) {
@@ -94,7 +94,7 @@ pub fn remove_old(directory: &Path, warnings: &mut Vec<String>) {
     }
 }
 
-/// Scores the tree of a page, where there is a truth. One that cannot be used is one more warning.
+/// Scores the tree of a page, where there is a truth. If the truth cannot be used, a warning is added.
 pub fn score(tree: Option<&BeatTree>, dataset: &Dataset, evaluation: &mut Evaluation) -> Result<()> {
     let Some(tree) = tree else { return Ok(()) };
     match score_tree(tree, dataset) {
@@ -115,7 +115,7 @@ fn find(cli: &Cli, gpu: &Gpu, model: &Model, cancel: &AtomicBool, options: &Tree
     })
 }
 
-/// Writes the vessels of a run as trees.
+/// Finds the vessels of a run as trees and writes them.
 pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
     let unknown = || Error::config("--out", args.out.display(), "ends in none of .json .vtp .swc .glb");
     let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
@@ -123,7 +123,7 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
     let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
     let gpu = cli.open_device()?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
-    // Nothing is left half-way here, so that Ctrl-C may end the program at once.
+    // Ctrl-C may end the program at once, because no partial result has been written here.
     let beat = find(cli, &gpu, &model, &AtomicBool::new(false), &options)?;
     let made = write(&beat, &args.out, format, all)?;
     made.iter().for_each(|path| out!("{}", path.display()));

@@ -1,5 +1,5 @@
-//! The vessel tree on a run's page: lines over the angiograms it was made of, lengths and diameters of its branches. The one
-//! part of the page that needs a script, which it brings along.
+//! The vessel tree on a run's page: lines over the angiograms it was reconstructed from, with lengths and diameters of its
+//! branches. It is the only part of the page that needs a script, which is embedded.
 
 use super::view_server::TREES_SCRIPT;
 use base64::Engine;
@@ -15,7 +15,7 @@ use nertca_vk::trees::tree::{BeatTree, PhaseTree};
 use serde_json::{Value, json};
 
 const SCRIPT: &str = include_str!("report_trees.js");
-/// Angiograms embedded at most.
+/// Maximum number of embedded angiograms.
 const MOST_PICTURES: usize = 120;
 const STYLE: &str = "
 #tree-views svg{width:100%;display:block}#tree-views image{image-rendering:pixelated}
@@ -23,22 +23,22 @@ const STYLE: &str = "
 #tree-views .chosen{stroke-width:5px}#tree-views .mark{fill:#fff;stroke:#000;vector-effect:non-scaling-stroke}
 tr.chosen td{font-weight:600}td i{display:inline-block;width:.8rem;height:.8rem;margin-right:.4rem}";
 
-/// What the page shows of a tree.
+/// Contents of the section about a tree.
 pub struct TreeSection {
-    /// Tree and angiograms, JSON.
+    /// Tree and angiograms, as JSON.
     data: String,
     note: &'static str,
-    /// Names of phases, and their trees.
+    /// Names of the phases with tables, and their trees.
     tables: Vec<(&'static str, PhaseTree)>,
 }
 
 impl TreeSection {
-    /// A tree of all phases over the training views of a dataset, which are those the reconstruction went by.
+    /// Makes the section of a tree of all phases over the training views of a dataset, from which it was reconstructed.
     ///
     /// # Errors
-    /// [`Error::Internal`] for what JSON or a picture cannot hold.
+    /// [`Error::Internal`] for values that JSON or a picture cannot represent.
     pub fn new(beat: &BeatTree, dataset: &Dataset) -> Result<TreeSection> {
-        // Evenly thinned out where there are too many.
+        // Too many angiograms are thinned out evenly.
         let step = dataset.training().len().div_ceil(MOST_PICTURES).max(1);
         let views = dataset.training_views().into_iter().map(|view| view_data(dataset, view, step));
         let views = json!(views.collect::<Result<Vec<_>>>()?).to_string();
@@ -54,7 +54,7 @@ impl TreeSection {
         })
     }
 
-    /// The section.
+    /// Returns the section for the page.
     pub fn markup(&self) -> Markup {
         html! {
             h2 { "Vessels as a tree" }
@@ -69,17 +69,17 @@ impl TreeSection {
             p #tree-told role="status" {}
             div.by-view #tree-views {}
             div.by-view { @for (name, tree) in &self.tables { (table(name, tree)) } }
-            // Nothing in it can end the element: it has numbers and angles.
+            // The data contain only numbers, angles and base64 images, so that nothing in them can close the element.
             script #tree-data type="application/json" { (PreEscaped(&self.data)) }
             script { (PreEscaped(TREES_SCRIPT)) (PreEscaped(SCRIPT)) }
         }
     }
 }
 
-/// A training view: its angiograms, and how patient points are seen in each.
+/// Returns the data of a training view: its angiograms, and the projection of patient points in each.
 fn view_data(dataset: &Dataset, view: usize, step: usize) -> Result<Value> {
     let mut frames: Vec<&Frame> = dataset.training().iter().filter(|frame| frame.view == view).collect();
-    // A thousandth of a phase, so that captions are short.
+    // Phases are rounded to a thousandth, so that captions are short.
     let phases = |frame: &Frame| (1e3 * frame.beat_time().phases(dataset.n_phases)).round() / 1e3;
     frames.sort_by(|a, b| phases(a).total_cmp(&phases(b)));
     let [width, height] = dataset.views[view].size;

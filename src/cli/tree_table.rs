@@ -15,7 +15,7 @@ const COLUMNS: [Column<TreeAgreement>; 9] = [
     Column { heading: ["motion", "error, mm"], text: |s| mm(s.motion_error_mm) },
 ];
 
-/// The table of all phases, and their mean.
+/// Returns the table of all phases and their mean.
 pub fn table(tree: &TreeScores) -> ScoreTable {
     let legend = format!(
         "The vessels as a tree against the true one. Centrelines count within {} mm, and radii are compared there; in images \

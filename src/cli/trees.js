@@ -1,15 +1,16 @@
-// Trees of vessels over pictures: where a point is seen, lines, what is clicked, and what is told of it. Viewer and report share
-// it. Points are patient mm (left, posterior, superior); places in pictures are columns and rows, pixel centres at integers.
+// Vessel trees over pictures: projection of points, lines, selection by click, and text about the selected branch. The viewer
+// and the report share this script. Points are in patient mm (left, posterior, superior); places in pictures are columns and
+// rows, with pixel centres at integers.
 "use strict";
 const trees = (() => {
-  // Told apart on white, on grey and on black.
+  // Colours that can be distinguished on white, on grey and on black.
   const COLOURS = ["#e6194b", "#1f8fff", "#2ca02c", "#ff8c00", "#b14bff", "#00a5a5", "#e75cc4", "#9a7b00"];
   const SVG = "http://www.w3.org/2000/svg";
   const MARK_PX = 5;
   const mix = (a, b, share) => a + (b - a) * share;
   const colour = branch => COLOURS[branch % COLOURS.length];
 
-  // The projection of a C-arm onto a picture of `side` x `side` pixels, as `CArm::rays` of src/geometry.rs has it.
+  // Returns the projection of a C-arm onto a picture of `side` x `side` pixels, like `CArm::rays` of src/geometry.rs.
   function cArmProjection(cArm, primary, secondary, side) {
     const [a, b] = [primary, secondary].map(degrees => degrees * Math.PI / 180);
     const columns = [Math.cos(a), Math.sin(a), 0];
@@ -23,14 +24,14 @@ const trees = (() => {
     return [row(columns, 0), row(rows, 1), [...beam, cArm.sod_mm]];
   }
 
-  // Column and row of a point; none behind the source.
+  // Returns column and row of a point; null behind the source.
   function project(projection, point) {
     const [u, v, depth] = projection.map(r => r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]);
     return depth > 0 ? [u / depth, v / depth] : null;
   }
 
-  // Branches at a phase. Between two phases points that are followed lie on straight lines, and the beat closes; trees that are
-  // not followed are those of the nearest phase.
+  // Returns the branches at a phase. For a tracked tree, points between two phases are interpolated linearly, and the beat is
+  // periodic; for other trees, the branches are those of the nearest phase.
   function branchesAt(tree, phase) {
     const n = tree.phases.length, before = Math.floor(phase), share = phase - before;
     if (!tree.tracked || share === 0) return tree.phases[Math.round(phase) % n].branches;
@@ -41,13 +42,14 @@ const trees = (() => {
     }));
   }
 
-  // Way along a line to each of its points, mm.
+  // Returns the arc length along a line at each of its points, mm.
   function ways(points) {
     let way = 0;
     return points.map((p, i) => way += i ? Math.hypot(...p.map((v, axis) => v - points[i - 1][axis])) : 0);
   }
 
-  // Length and diameters of a branch, mm, and the diameter at a place: `share` of the way from point `from` to the next.
+  // Returns length and diameters of a branch, mm, and the diameter at a place: `share` of the way from point `from` to the
+  // next.
   function measure(branch, {from, share}) {
     const along = ways(branch.points_mm), wide = branch.radius_mm.map(r => 2 * r), length = along[along.length - 1];
     const sum = wide.slice(1).reduce((sum, d, i) => sum + (d + wide[i]) / 2 * (along[i + 1] - along[i]), 0);
@@ -57,14 +59,14 @@ const trees = (() => {
     };
   }
 
-  // What is told of a clicked branch.
+  // Returns the text about a clicked branch.
   function told(branches, place) {
     const m = measure(branches[place.branch], place), mm = v => v.toFixed(2) + " mm";
     return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; diameter ${mm(m.least_mm)} at least, `
       + `${mm(m.mean_mm)} in the mean, ${mm(m.here_mm)} here, ${m.along_mm.toFixed(1)} mm from its beginning`;
   }
 
-  // Lines over one picture, in an SVG element whose units are its pixels.
+  // Draws lines over one picture, in an SVG element whose units are the picture's pixels.
   class Overlay {
     constructor(svg) {
       this.svg = svg; this.lines = []; this.seen = []; this.branches = [];
@@ -89,7 +91,8 @@ const trees = (() => {
       this.mark.setAttribute("r", from && to ? MARK_PX / this.svg.getScreenCTM().a : 0);
       if (from && to) ["cx", "cy"].forEach((name, i) => this.mark.setAttribute(name, mix(from[i], to[i], place.share)));
     }
-    // The place on a line nearest to where the pointer is on the screen; none farther than `reach` of the screen's pixels.
+    // Returns the place on a line that is nearest to the pointer on the screen; null if none is within `reach` pixels of the
+    // screen.
     pick(clientX, clientY, reach) {
       const screen = this.svg.getScreenCTM();
       const at = new DOMPoint(clientX, clientY).matrixTransform(screen.inverse());

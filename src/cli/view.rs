@@ -1,4 +1,4 @@
-//! `view`: a run in a browser.
+//! `view`: shows a run in a browser.
 
 use super::args::Cli;
 use super::view_server::{Server, Shown, TYPICAL_SIDE, Taken};
@@ -18,7 +18,7 @@ use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// `view`.
+/// Arguments of `view`.
 #[derive(Debug, Args)]
 pub struct ViewArgs {
     /// Run directory or checkpoint file.
@@ -28,14 +28,14 @@ pub struct ViewArgs {
     pub port: u16,
 }
 
-/// Side of a cell of the moving field: finer than a vessel, coarse enough to draw while dragging.
+/// Side of a cell of the dynamic field: finer than a vessel, coarse enough to draw while the mouse is dragged.
 const CELL_MM: f64 = 0.5;
 
 /// A run that does not change.
 struct Finished {
     model: Model,
     taken: Taken,
-    /// One picture at a time: they share the device.
+    /// Baked volumes. The lock allows one picture at a time, because pictures share the device.
     baked: Mutex<Baked>,
     /// Largest value of each kind of picture.
     ranges: HashMap<Quantity, f32>,
@@ -84,19 +84,20 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
     let server = Server::open(args.port, Arc::new(shown), Arc::new(TreeWork::new(&gpu, tuning)))?;
     out!("{}", server.url());
     server.serve(async {
-        // Without a handler there is no Ctrl-C to wait for: the process then ends at once.
+        // Without a handler, Ctrl-C ends the process at once, and there is nothing to wait for.
         let _ = tokio::signal::ctrl_c().await;
     })?;
     cli.close_device(&gpu)
 }
 
-/// Largest value of each kind of picture from the model's own angle; also bakes every phase.
+/// Returns the largest value of each kind of picture from the model's own angle. As a side effect, every phase is
+/// baked.
 fn typical_ranges(shown: &Finished) -> Result<HashMap<Quantity, f32>> {
     let Taken { c_arm, .. } = &shown.taken;
     let rays = shown.taken.turned(c_arm.primary_deg, c_arm.secondary_deg, TYPICAL_SIDE)?;
     let mut ranges = HashMap::new();
     for &component in Component::ALL {
-        // The still background is the same at every phase.
+        // The static background is the same at every phase.
         let phases = if component.has_dynamic() { shown.phases() } else { 1 };
         for &projection in Projection::ALL {
             let quantity = Quantity { component, projection };

@@ -1,7 +1,7 @@
 //! The viewer's server: one page on this machine, on which the C-arm is turned with the mouse while the beat plays.
 //!
-//! Listens on 127.0.0.1 alone. Every request needs the token of the printed address, a host name that is this machine's,
-//! and, where a browser says so, to come from the page itself.
+//! It listens on 127.0.0.1 only. Every request needs the token of the printed address and a host name that is this machine's.
+//! If the browser states the origin of a request, it must be the page itself.
 
 use super::view_tree::TreeWork;
 use axum::Router;
@@ -25,35 +25,35 @@ use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
 const PAGE: &str = include_str!("view.html");
-/// What draws trees, on this page and on that of a report.
+/// Script that draws trees, both on this page and in a report.
 pub(super) const TREES_SCRIPT: &str = include_str!("trees.js");
-/// Where the page has it.
+/// Placeholder in the page that the script replaces.
 const TREES_PLACE: &str = "/* trees.js */";
-/// Side of a picture, pixels.
+/// Allowed side of a picture, pixels.
 const SIDES: std::ops::RangeInclusive<usize> = 16..=2048;
-/// Side of the pictures that tell typical values, pixels.
+/// Side of the pictures that determine typical values, pixels.
 pub const TYPICAL_SIDE: usize = 64;
 
-/// How angiograms were taken: what pictures of a viewer are like.
+/// Geometry of the angiograms, from which the viewer's pictures are derived.
 #[derive(Debug, Clone)]
 pub struct Taken {
     /// C-arm of the first view.
     pub c_arm: CArm,
-    /// Columns and rows.
+    /// Number of columns and rows.
     pub image_size: [usize; 2],
 }
 
 impl Taken {
-    /// Side of the square on the detector that pictures show, mm.
+    /// Returns the side of the detector square that pictures show, mm.
     fn extent_mm(&self) -> f64 {
         let ([w, h], [across, down]) = (self.image_size, self.c_arm.pixel_mm);
         across.max(down) * w.max(h) as f64
     }
 
-    /// The C-arm's view when it is turned, on a square of `side` pixels.
+    /// Returns the rays of the C-arm at other angles, on a square of `side` pixels.
     ///
     /// # Errors
-    /// [`Error::Config`] for angles that are none.
+    /// [`Error::Config`] for invalid angles.
     pub fn turned(&self, primary_deg: f64, secondary_deg: f64, side: usize) -> Result<ViewRays> {
         let pixel_mm = [self.extent_mm() / side as f64; 2];
         let turned = CArm { primary_deg, secondary_deg, pixel_mm, table_mm: [0.0; 3], ..self.c_arm.clone() };
@@ -61,48 +61,48 @@ impl Taken {
     }
 }
 
-/// What a viewer shows.
+/// Source of a viewer's pictures.
 pub trait Shown: Send + Sync {
-    /// How it was taken.
+    /// Returns the geometry of the angiograms.
     ///
     /// # Errors
     /// [`Error::NotReady`] before there is anything to show.
     fn taken(&self) -> Result<Taken>;
 
-    /// Cardiac phases.
+    /// Returns the number of cardiac phases.
     fn phases(&self) -> u32;
 
-    /// What the page says of it: an object.
+    /// Returns facts for the page, as a JSON object.
     fn about(&self) -> Value;
 
-    /// A square picture.
+    /// Renders a square picture.
     ///
     /// # Errors
     /// [`Error::NotReady`] before there is anything to show; device errors.
     fn render(&self, rays: &ViewRays, side: usize, phase: u32, quantity: Quantity) -> Result<Vec<f32>>;
 
-    /// Largest value of a typical picture.
+    /// Returns the largest value of a typical picture.
     ///
     /// # Errors
-    /// As [`Shown::render`].
+    /// Fails like [`Shown::render`].
     fn range(&self, quantity: Quantity, phase: u32) -> Result<f32>;
 
-    /// The fields as they are.
+    /// Returns the current fields.
     ///
     /// # Errors
-    /// As [`Shown::render`].
+    /// Fails like [`Shown::render`].
     fn model(&self) -> Result<Model>;
 }
 
 struct Viewer {
     shown: Arc<dyn Shown>,
-    /// The vessels as a tree, once the page asks for it.
+    /// Tree of the vessels, which is found when the page first requests it.
     tree: Arc<TreeWork>,
     token: String,
     port: u16,
 }
 
-/// What a picture shows.
+/// Query of a picture.
 #[derive(Debug, Deserialize)]
 struct PictureQuery {
     primary: f64,
@@ -117,13 +117,13 @@ struct PictureQuery {
     high: f32,
 }
 
-/// The value a query names.
+/// Returns the value that a query names.
 fn chosen<T: Choice>(field: &str, name: &str) -> Result<T> {
     T::named(name).ok_or_else(|| Error::config(field, name, format!("one of {} is accepted", T::names())))
 }
 
 impl Viewer {
-    /// A grey PNG: vessels dark, as in an angiogram. `low` and `high` are shares of the typical range.
+    /// Draws a grey PNG with dark vessels, as in an angiogram. `low` and `high` are shares of the typical range.
     fn picture(&self, query: &PictureQuery) -> Result<Vec<u8>> {
         if !(query.low.is_finite() && query.high.is_finite() && query.low < query.high) {
             return Err(Error::config("low, high", format!("{} to {}", query.low, query.high), "is no window"));
@@ -145,19 +145,20 @@ impl Viewer {
     }
 }
 
-/// Whether a request comes from the page that was printed.
+/// Tells whether a request comes from the printed page.
 fn authorised(viewer: &Viewer, headers: &HeaderMap, query: &str) -> bool {
     let here = |name: &str| {
         [format!("127.0.0.1:{}", viewer.port), format!("localhost:{}", viewer.port)].iter().any(|h| h == name)
     };
     let text = |name: header::HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
-    // A foreign name for this address would be a page that had its own name point here.
+    // With a foreign host name, the request comes from a page whose own name was made to resolve to this address (DNS
+    // rebinding).
     let host = text(header::HOST).is_some_and(here);
     let origin = text(header::ORIGIN).is_none_or(|o| o.strip_prefix("http://").is_some_and(here));
     let site = headers.get("sec-fetch-site").and_then(|v| v.to_str().ok());
     let site = site.is_none_or(|s| ["same-origin", "none"].contains(&s));
     let token = query.split('&').find_map(|pair| pair.strip_prefix("token=")).unwrap_or_default();
-    // In constant time, so that how long it takes tells nothing of how much was right.
+    // The comparison takes constant time, so that its duration reveals nothing about the token.
     let same = token.as_bytes().ct_eq(viewer.token.as_bytes());
     host && origin && site && bool::from(same)
 }
@@ -204,7 +205,7 @@ fn json_answer(text: String) -> Response {
     ([(header::CONTENT_TYPE, "application/json")], text).into_response()
 }
 
-/// The tree, or how far it has come; who asks first sets it off.
+/// Returns the tree, or its progress; the first request starts the search.
 async fn tree(State(viewer): State<Arc<Viewer>>) -> Response {
     let (answer, first) = viewer.tree.ask();
     if let Some(generation) = first {
@@ -224,7 +225,7 @@ async fn frame(State(viewer): State<Arc<Viewer>>, Query(query): Query<PictureQue
     }
 }
 
-/// A server that listens.
+/// A server that is listening.
 pub struct Server {
     runtime: Runtime,
     listener: TcpListener,
@@ -232,10 +233,10 @@ pub struct Server {
 }
 
 impl Server {
-    /// Listens on a port of 127.0.0.1, on a free one for 0.
+    /// Listens on a port of 127.0.0.1; 0 selects a free port.
     ///
     /// # Errors
-    /// [`Error::Io`] for a port that others have.
+    /// [`Error::Io`] for a port that is in use.
     pub fn open(port: u16, shown: Arc<dyn Shown>, tree: Arc<TreeWork>) -> Result<Server> {
         let mut secret = [0u8; 16];
         getrandom::fill(&mut secret).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
@@ -252,12 +253,12 @@ impl Server {
         Ok(Server { runtime, listener, viewer: Arc::new(Viewer { shown, tree, token, port }) })
     }
 
-    /// Address of the page.
+    /// Returns the address of the page.
     pub fn url(&self) -> String {
         format!("http://127.0.0.1:{}/?token={}", self.viewer.port, self.viewer.token)
     }
 
-    /// Serves the page until `end` comes.
+    /// Serves the page until `end` completes.
     ///
     /// # Errors
     /// [`Error::Io`].

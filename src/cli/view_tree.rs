@@ -1,4 +1,4 @@
-//! The tree of vessels of the viewer: found once, when the page first asks for it, beside the pictures.
+//! The viewer's vessel tree: found once, when the page first requests it, while pictures are still drawn.
 
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
@@ -11,18 +11,18 @@ use serde_json::json;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// How far the tree has come.
+/// State of the search for the tree.
 enum TreeState {
-    /// Phases that are done, and all of them.
+    /// Number of phases that are done, and of all phases.
     Working { done: u64, of: u64 },
-    /// Why there is none.
+    /// Reason why there is no tree.
     Failed(String),
-    /// The tree of all phases, as `tree -o FILE.json` writes it.
+    /// Tree of all phases, in the format that `tree -o FILE.json` writes.
     Ready(String),
 }
 
 impl TreeState {
-    /// What the page is answered, JSON.
+    /// Returns the answer to the page, as JSON.
     fn answer(&self) -> String {
         match self {
             TreeState::Working { done, of } => json!({ "state": "working", "done": done, "of": of }).to_string(),
@@ -32,16 +32,16 @@ impl TreeState {
     }
 }
 
-/// The tree of vessels as they are by now.
+/// Vessel tree of the current fields.
 #[derive(Default)]
 struct Current {
-    /// Rises whenever a tree is forgotten: what is found of an older one is dropped.
+    /// Incremented whenever a tree is forgotten; results of an older generation are discarded.
     generation: u64,
-    /// None before anybody has asked, and once a failure has been told.
+    /// State of the search; none before the first request, and after a failure has been reported.
     state: Option<TreeState>,
 }
 
-/// Finds the tree of a run on the device that draws it.
+/// Search for the tree of a run, on the device that draws it.
 pub struct TreeWork {
     gpu: Gpu,
     tuning: Tuning,
@@ -50,7 +50,7 @@ pub struct TreeWork {
 }
 
 impl TreeWork {
-    /// Work that begins when it is asked for.
+    /// Prepares the search, which starts with the first request.
     pub fn new(gpu: &Gpu, tuning: Tuning) -> TreeWork {
         TreeWork { gpu: gpu.clone(), tuning, current: Mutex::default(), stop: AtomicBool::new(false) }
     }
@@ -59,8 +59,8 @@ impl TreeWork {
         self.current.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How far the tree has come, as JSON; and its generation where the caller is the first to ask, who then calls
-    /// [`TreeWork::find`]. A failure is told once; who asks after that is the first again.
+    /// Returns the state of the search as JSON, and the generation if this is the first request. The first caller must
+    /// then call [`TreeWork::find`]. A failure is reported once; the next caller after that is a first one again.
     pub fn ask(&self) -> (String, Option<u64>) {
         let mut current = self.current();
         let first = current.state.is_none().then_some(current.generation);
@@ -71,7 +71,7 @@ impl TreeWork {
         (answer, first)
     }
 
-    /// Finds the tree of a model, if there is one. Takes seconds.
+    /// Finds the tree of a model, if the model exists. Takes seconds.
     pub fn find(&self, generation: u64, model: Result<Model>) {
         let found = match model.and_then(|model| self.tree(generation, &model)) {
             Ok(json) => TreeState::Ready(json),
@@ -80,7 +80,7 @@ impl TreeWork {
         self.tell(generation, found);
     }
 
-    /// Tells how far a tree has come; whether it is still wanted.
+    /// Stores the state of a tree's search; returns whether the tree is still wanted.
     fn tell(&self, generation: u64, state: TreeState) -> bool {
         let mut current = self.current();
         let wanted = current.generation == generation;
@@ -90,24 +90,24 @@ impl TreeWork {
         wanted
     }
 
-    /// Forgets the tree, also one that is being found: it is of vessels as they were.
+    /// Forgets the tree, also one that is being found, because the vessels have changed.
     pub fn forget(&self) {
         let mut current = self.current();
         *current = Current { generation: current.generation + 1, state: None };
     }
 
-    /// Rises whenever the tree is forgotten.
+    /// Returns the generation, which rises whenever the tree is forgotten.
     pub fn generation(&self) -> u64 {
         self.current().generation
     }
 
-    /// Ends the work under way before its next phase.
+    /// Stops the current search before its next phase.
     pub fn stop(&self) {
         self.stop.store(true, Ordering::Relaxed);
     }
 
     fn tree(&self, generation: u64, model: &Model) -> Result<String> {
-        // One of its own: pictures go on through the viewer's.
+        // The search has its own renderer, because the viewer's renderer goes on drawing pictures.
         let renderer = Renderer::new(&self.gpu, model, self.tuning.clone())?;
         let phases = (0..model.param_map.phases as u32).collect();
         let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };

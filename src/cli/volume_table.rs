@@ -16,13 +16,13 @@ const COLUMNS: [Column<Scores>; 10] = [
     Column { heading: ["mass beyond", "2 mm"], text: |s| percent(s.mass_beyond_2_mm) },
 ];
 
-/// The table of all phases, and their mean.
+/// Returns the table of all phases and their mean.
 pub fn table(volume: &VolumeScores) -> ScoreTable {
     let phases = volume.phases.iter().map(|p| (p.phase, &p.scores));
     ScoreTable::new("Scores in 3D", legend(volume), &COLUMNS, phases, &volume.mean, volume.mean_as_stated.as_ref())
 }
 
-/// What the numbers of the table mean.
+/// Describes the numbers of the table.
 fn legend(volume: &VolumeScores) -> String {
     format!(
         "Vessel where the moving field exceeds {:.4e} per mm. Centrelines count within {} mm, components from {:.3} mm³ on; \

@@ -1,4 +1,4 @@
-//! `watch`: DICOM runs that appear in a folder are reconstructed as they come.
+//! `watch`: reconstructs DICOM runs as they appear in a folder.
 
 use super::args::{Cli, ConfigArgs};
 use super::dicom_args::DicomArgs;
@@ -25,26 +25,26 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use tokio::sync::oneshot;
 
-/// Time between two looks at the folder.
+/// Time between two checks of the folder.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 
-/// `watch`.
+/// Arguments of `watch`.
 #[derive(Debug, Args)]
 pub struct WatchArgs {
-    /// Folder in which DICOM runs (XA or RF, one file per view) appear. A file is taken in once it rests; other files are named
-    /// and left alone until they change.
+    /// Folder in which DICOM runs (XA or RF, one file per view) appear. A file is read once it no longer changes; other files
+    /// are reported and ignored until they change.
     #[arg(value_name = "DIR")]
     pub directory: PathBuf,
-    /// Run directory to leave in the end, with the runs that were taken in as a dataset in `data`.
+    /// Run directory to write in the end, with the runs that were read as a dataset in `data`.
     #[arg(short, long, value_name = "RUN")]
     pub out: PathBuf,
-    /// End once no run has come, and nothing was trained, for so many seconds; otherwise Ctrl-C ends it.
+    /// End after this many seconds without a new run and without training; otherwise Ctrl-C ends the program.
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub until_idle: Option<Duration>,
     /// Port of the viewer's page on 127.0.0.1; a free one by default.
     #[arg(long, default_value_t = 0)]
     pub port: u16,
-    /// How runs are read.
+    /// Options of reading runs.
     #[command(flatten)]
     pub reading: DicomArgs,
     /// Hyper-parameters.
@@ -57,7 +57,7 @@ fn seconds(text: &str) -> std::result::Result<Duration, String> {
     Duration::try_from_secs_f64(seconds).map_err(|_| "is not a time in seconds".to_owned())
 }
 
-/// Takes runs in until it is told to end, and leaves a run directory.
+/// Reads runs until it is told to end, and writes a run directory.
 pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     let (config, options) = (args.config.load([])?, args.reading.options()?);
     let mut folder = Folder::new(&args.directory);
@@ -75,7 +75,7 @@ pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     let (end, ended) = oneshot::channel::<()>();
     let serving = std::thread::spawn(move || {
         server.serve(async {
-            // What was dropped has ended, too.
+            // A dropped sender also ends the server.
             let _ = ended.await;
         })
     });
@@ -94,7 +94,7 @@ pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     };
     let ends = || stop.load(Ordering::Relaxed) || serving.is_finished();
     let watched = watch.until(&mut folder, &ends, args.until_idle);
-    // Before all that may fail or take its time.
+    // The run directory is written before everything that may fail or take long.
     let left = watch.leave(&args.out);
     drop(end);
     watch.live.follow(None, None, 0);
@@ -105,7 +105,7 @@ pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     cli.close_device(&gpu)
 }
 
-/// What is under way.
+/// State of the command.
 struct Watch<'a> {
     gpu: &'a Gpu,
     tuning: Tuning,
@@ -114,20 +114,20 @@ struct Watch<'a> {
     intake: Intake,
     live: Arc<Live>,
     tree: Arc<TreeWork>,
-    /// What trains, or has.
+    /// Session that trains, or has trained.
     under_way: Option<UnderWay>,
-    /// What was reconstructed before training began anew.
+    /// Reconstruction from before training started again.
     kept: Option<Kept>,
-    /// Whether it was told that training has failed.
+    /// Whether the user was told that training has failed.
     failed: bool,
-    /// Whether training went on when it was looked at last.
+    /// Whether training was running at the last check.
     training: bool,
 }
 
-/// A session of runs.
+/// A session and its runs.
 struct UnderWay {
     session: Arc<Session>,
-    /// Runs handed to it.
+    /// Number of runs handed to it.
     runs: usize,
 }
 
@@ -136,7 +136,7 @@ impl Watch<'_> {
         let (mut busy, mut unreadable) = (Instant::now(), false);
         while !ends() {
             let files = match folder.look() {
-                // It may come back, as shares on a network do.
+                // The folder may become readable again, as network shares do.
                 Err(error @ Error::Io { .. }) => {
                     if !unreadable {
                         eprintln!("{error}; it is looked at again");
@@ -168,7 +168,7 @@ impl Watch<'_> {
         Ok(())
     }
 
-    /// Whether training goes on; tells once that it has failed.
+    /// Tells whether training is running; reports a failure once.
     fn trains(&mut self) -> bool {
         let Some(UnderWay { session, .. }) = &self.under_way else { return false };
         if let Some(problem) = session.failure().filter(|_| !self.failed) {
@@ -177,14 +177,14 @@ impl Watch<'_> {
         }
         let trains = session.state() == State::Running;
         if self.training && !trains {
-            // What was found on the way is of vessels as they were.
+            // A tree found during training shows an earlier state of the vessels.
             self.tree.forget();
         }
         self.training = trains;
         trains
     }
 
-    /// Takes a file in; whether it could be.
+    /// Reads a file; returns whether it could be used.
     fn take(&mut self, file: &Path) -> Result<bool> {
         let read = Run::read(file, self.options.pixel_mm).and_then(|run| match self.intake.copy_of(&run) {
             Some(first) => Err(Error::data(file, "SOPInstanceUID", format!("is that of {first}, which was taken in"))),
@@ -207,7 +207,7 @@ impl Watch<'_> {
                 eprintln!("taken in: {told}, phases {}", phases.join(" "));
                 Ok(true)
             }
-            // Others are no reason to end.
+            // Other files may be usable, so the program continues.
             Err(error @ (Error::Data { .. } | Error::Config { .. } | Error::Io { .. })) => {
                 eprintln!("not taken in: {error}");
                 Ok(false)
@@ -216,8 +216,8 @@ impl Watch<'_> {
         }
     }
 
-    /// Hands the newest run to training. Where that is past its half or over, it begins anew with all runs: the last iterations
-    /// alone would not do the new ones justice.
+    /// Hands the newest run to training. If training is past its half or finished, it starts again with all runs, because the
+    /// remaining iterations would not suffice for the new one.
     fn feed(&mut self) -> Result<()> {
         let Some(first) = self.intake.first() else { return Ok(()) };
         let taken = Taken { c_arm: first.c_arm.clone(), image_size: [first.image.width, first.image.height] };
@@ -229,7 +229,7 @@ impl Watch<'_> {
         match &self.under_way {
             Some(now) if young(&now.session) => self.add(&now.session, newest)?,
             _ => {
-                // The old one's memory is needed first.
+                // The memory of the old session must be freed first.
                 self.live.follow(None, None, newest);
                 self.keep();
                 let options = SessionOptions {
@@ -269,7 +269,8 @@ impl Watch<'_> {
         })
     }
 
-    /// Keeps what training has come to, where that is better than what was kept before; the reason where it has come to nothing.
+    /// Stops training and keeps its result, if that is better than the one kept before. Returns the reason if there is no
+    /// result.
     fn keep(&mut self) -> Option<Error> {
         let UnderWay { session, runs, .. } = self.under_way.take()?;
         match Kept::of(&session, runs) {
@@ -283,7 +284,7 @@ impl Watch<'_> {
         }
     }
 
-    /// Leaves a run directory as `train` does, with its dataset.
+    /// Writes a run directory like `train` does, with its dataset.
     fn leave(&mut self, run: &Path) -> Result<()> {
         let nothing = self.keep();
         let Some(kept) = &self.kept else {
@@ -305,7 +306,7 @@ impl Watch<'_> {
     }
 }
 
-/// A run in a few words.
+/// Describes a run in a few words.
 fn describe(run: &Run) -> String {
     let c_arm = &run.c_arms[0];
     let angle =

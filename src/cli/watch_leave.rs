@@ -1,4 +1,4 @@
-//! What `watch` leaves in the end: a run directory as `train` does, with the runs it was made of as a dataset.
+//! The result of `watch`: a run directory like that of `train`, with the runs it was made from as a dataset.
 
 use super::report::Report;
 use nertca_vk::calibrate::correction::Calibration;
@@ -15,12 +15,12 @@ use nertca_vk::session::Session;
 use nertca_vk::train::trainer::data_fingerprint;
 use std::path::{Path, PathBuf};
 
-/// Dataset of the runs that were taken in, inside the run directory.
+/// Name of the dataset of the runs that were read, inside the run directory.
 const DATA: &str = "data";
-/// The same while it is written.
+/// Name of this dataset while it is being written.
 const PARTIAL_DATA: &str = ".partial-data";
 
-/// Makes a run directory, or refuses one that holds something already or cannot be written to.
+/// Makes a run directory. Fails if it already holds a run or cannot be written to.
 pub fn prepare(run: &Path) -> Result<()> {
     if run.exists() {
         let log = run.join("metrics.jsonl");
@@ -35,41 +35,41 @@ pub fn prepare(run: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Removes a run directory that nothing was left in.
+/// Removes a run directory if it is empty.
 pub fn remove_empty(run: &Path) {
-    // One that is not empty stays.
+    // A directory that is not empty cannot be removed and stays.
     let _ = std::fs::remove_dir(run);
 }
 
-/// What training has come to.
+/// Result of training.
 pub struct Kept {
     checkpoint: Checkpoint,
     calibration: Option<Calibration>,
-    /// Runs that were handed to training, of which it may not have taken in the last ones.
+    /// Number of runs handed to training; it may not have taken in the last ones.
     runs: usize,
 }
 
 impl Kept {
-    /// Stops training, which was handed so many runs, and keeps what it has come to.
+    /// Stops training, which was handed `runs` runs, and keeps its result.
     ///
     /// # Errors
-    /// [`Error::NotReady`] where that is nothing; device errors.
+    /// [`Error::NotReady`] where there is no result; device errors.
     pub fn of(session: &Session, runs: usize) -> Result<Kept> {
         session.stop()?;
         Ok(Kept { checkpoint: session.checkpoint()?, calibration: session.calibration(), runs })
     }
 
-    /// Whether this is better than what was kept before: training that has barely begun anew is not, even with more runs.
+    /// Tells whether this result is better than `before`. A training that has barely started again is not, even with more runs.
     pub fn replaces(&self, before: &Kept) -> bool {
         2 * self.checkpoint.model.step >= before.checkpoint.model.step
     }
 
-    /// Iterations done.
+    /// Returns the number of iterations done.
     pub fn step(&self) -> u32 {
         self.checkpoint.model.step
     }
 
-    /// Leaves a run directory; the checkpoint in it. What cannot be made again is written first.
+    /// Writes a run directory and returns the checkpoint in it. Files that cannot be made again are written first.
     ///
     /// # Errors
     /// [`Error::Io`]; device errors of the report, which comes last.
@@ -120,11 +120,11 @@ impl Kept {
         Ok(data)
     }
 
-    /// Whether a dataset is what the checkpoint was trained on.
+    /// Tells whether a dataset is the one that the checkpoint was trained on.
     fn was_trained_on(&self, data: &Path) -> Result<bool> {
         let dataset = Dataset::open(data)?;
         let corrected = match &self.calibration {
-            // That of more views does not fit.
+            // A calibration of a different number of views does not fit.
             Some(calibration) => dataset.corrected(calibration).ok(),
             None => Some(dataset),
         };
@@ -132,7 +132,7 @@ impl Kept {
     }
 }
 
-/// Writes the first runs in place of what is there.
+/// Replaces a dataset by the first `runs` runs.
 fn write_anew(intake: &Intake, runs: usize, data: &Path) -> Result<String> {
     if data.exists() {
         std::fs::remove_dir_all(data).map_err(Error::io("remove", data))?;

@@ -1,4 +1,4 @@
-//! What the viewer shows while runs come in: the session under way, whatever it has learned by now.
+//! Source of the viewer's pictures while runs come in: the current session, with its current fields.
 
 use super::view_server::{Shown, TYPICAL_SIDE, Taken};
 use nertca_vk::error::{Error, Result};
@@ -11,20 +11,20 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// What is typical is looked at again after so long: vessels grow while training goes on.
+/// Time after which typical values are computed again, because vessels grow during training.
 const TYPICAL_FOR: Duration = Duration::from_secs(2);
 
-/// What is under way.
+/// Current session and its runs.
 #[derive(Default)]
 struct UnderWay {
     session: Option<Arc<Session>>,
     taken: Option<Taken>,
     runs: usize,
-    /// Largest values of typical pictures, and when they were looked at.
+    /// Largest values of typical pictures, and when they were computed.
     ranges: HashMap<Quantity, (Instant, f32)>,
 }
 
-/// The session that runs go to.
+/// Source of pictures that follows the current session.
 pub struct Live {
     phases: u32,
     iterations: u32,
@@ -32,7 +32,7 @@ pub struct Live {
 }
 
 impl Live {
-    /// No session yet.
+    /// Starts without a session.
     pub fn new(phases: u32, iterations: u32) -> Live {
         Live { phases, iterations, under_way: Mutex::default() }
     }
@@ -41,7 +41,7 @@ impl Live {
         self.under_way.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Shows a session of so many runs from now on.
+    /// Shows a session of `runs` runs from now on.
     pub fn follow(&self, session: Option<Arc<Session>>, taken: Option<Taken>, runs: usize) {
         *self.under_way() = UnderWay { session, taken, runs, ranges: HashMap::new() };
     }
@@ -51,7 +51,7 @@ impl Live {
     }
 }
 
-/// What the page says a session is doing.
+/// Describes the state of a session for the page.
 fn told(state: State) -> &'static str {
     match state {
         State::Waiting => "waiting for a run from another angle",

@@ -1,4 +1,5 @@
-//! Buffers over gpu-allocator: device-local, upload and read-back, and memory that other APIs can import.
+//! Buffers allocated with gpu-allocator (device-local, upload and read-back), and buffers in memory that other APIs can
+//! import.
 
 use super::device::{Gpu, Shared};
 use super::lock::lock;
@@ -9,10 +10,10 @@ use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Where a buffer lives.
+/// Kind of memory of a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Memory {
-    /// Fast for the device; reached by copies only.
+    /// Fast for the device; accessible to the host by copies only.
     Device,
     /// Written by the host, read by the device.
     Upload,
@@ -20,19 +21,19 @@ pub enum Memory {
     Readback,
 }
 
-/// How shaders read a buffer of vec4.
+/// Access of shaders to a buffer of vec4.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Operands {
-    /// As a storage buffer.
+    /// Storage buffer.
     Storage,
-    /// As a `rgba32f` texel buffer.
+    /// Texel buffer of format `rgba32f`.
     Texel,
-    /// Through its address, without bounds checks.
+    /// Access through the buffer's address, without bounds checks.
     Address,
 }
 
-/// Bytes on the device. Clones share the same memory, freed with the last one.
+/// Buffer on the device. Clones share the same memory, which is freed with the last one.
 #[derive(Clone)]
 pub struct Buffer {
     inner: Arc<Inner>,
@@ -47,23 +48,23 @@ struct Inner {
     backing: Backing,
 }
 
-/// Where a buffer's bytes are.
+/// Memory behind a buffer.
 enum Backing {
-    /// Nowhere yet.
+    /// No memory yet.
     None,
-    /// In a block of the allocator.
+    /// Block of the allocator.
     Block(Mutex<Allocation>),
-    /// In memory of its own, which may be exported.
+    /// Separate allocation, which may be exported.
     #[cfg_attr(not(unix), allow(dead_code, reason = "memory is shared on Unix only"))]
     Own(vk::DeviceMemory),
 }
 
-/// Drivers may read a little past the last element when a loop of uniform loads through an address ends (seen with
-/// llvmpipe of Mesa 26.2, which crashes without).
+/// Extra bytes of buffers read through an address: drivers may read a little past the last element when a loop of
+/// uniform loads ends (seen with llvmpipe of Mesa 26.2, which crashes without them).
 const ADDRESS_TAIL_BYTES: u64 = 4096;
 
 impl Gpu {
-    /// A buffer of `bytes` bytes, contents undefined.
+    /// Makes a buffer of `bytes` bytes, contents undefined.
     ///
     /// # Errors
     /// [`Error::OutOfMemory`] naming the buffer, also beyond the device's limits.
@@ -71,10 +72,10 @@ impl Gpu {
         self.make_buffer(name, bytes, memory, Operands::Storage)
     }
 
-    /// A device buffer that shaders may, besides as a storage buffer, read as `operands` says.
+    /// Makes a device buffer that shaders can read as a storage buffer and also in the way `operands` says.
     ///
     /// # Errors
-    /// As [`Gpu::buffer`].
+    /// Fails like [`Gpu::buffer`].
     pub fn operand_buffer(&self, name: &str, bytes: u64, operands: Operands) -> Result<Buffer> {
         let tail = if operands == Operands::Address { ADDRESS_TAIL_BYTES } else { 0 };
         self.make_buffer(name, bytes + tail, Memory::Device, operands)
@@ -121,8 +122,8 @@ impl Gpu {
         Ok(())
     }
 
-    /// A device buffer whose memory other processes and APIs can import: an opaque file descriptor of
-    /// [`Buffer::bytes`] bytes at offset 0. The descriptor is the caller's to close, or to hand to an import.
+    /// Makes a device buffer whose memory other processes and APIs can import, as an opaque file descriptor of
+    /// [`Buffer::bytes`] bytes at offset 0. The caller must close the descriptor or pass it to an import.
     ///
     /// # Errors
     /// [`Error::NoDevice`] where `VK_KHR_external_memory_fd` is missing; [`Error::OutOfMemory`].
@@ -145,17 +146,17 @@ impl Gpu {
     }
 }
 
-/// What memory is exported as.
+/// Handle type of exported memory.
 #[cfg(unix)]
 const EXPORTED: vk::ExternalMemoryHandleTypeFlags = vk::ExternalMemoryHandleTypeFlags::OPAQUE_FD;
 
-/// Sizes are whole vec4, and never nothing.
+/// Rounds a size up to whole vec4; at least one.
 fn rounded(bytes: u64) -> u64 {
     bytes.max(16).next_multiple_of(16)
 }
 
 impl Inner {
-    /// A buffer that is still to be made; dropping it cleans up, however far it came.
+    /// Starts a buffer without Vulkan objects; dropping it frees whatever has been created by then.
     fn new(gpu: &Arc<Shared>, name: &str, bytes: u64) -> Result<Inner> {
         gpu.reserve(name, bytes)?;
         gpu.track();
@@ -202,7 +203,7 @@ impl Inner {
                 allocation_scheme: AllocationScheme::GpuAllocatorManaged,
             })
             .map_err(|e| self.gpu.no_memory(&self.name, self.bytes, &e))?;
-        // SAFETY: the handle is only bound to; the allocation, which `self` keeps, goes on owning it.
+        // SAFETY: the handle is only used for binding; the allocation, which `self` keeps, still owns it.
         let (memory, offset) = (unsafe { allocation.memory() }, allocation.offset());
         self.backing = Backing::Block(Mutex::new(allocation));
         self.bind(memory, offset)
@@ -255,18 +256,18 @@ impl Inner {
         let export = ash::khr::external_memory_fd::Device::new(&self.gpu.device.instance, &self.gpu.device);
         // SAFETY: the memory was allocated for export as this type.
         let fd = unsafe { export.get_memory_fd(&get) }.map_err(Error::vulkan("vkGetMemoryFdKHR", &self.name))?;
-        // SAFETY: Vulkan hands the descriptor over to its caller, and nothing else knows of it.
+        // SAFETY: Vulkan passes ownership of the descriptor to its caller, and nothing else uses it.
         Ok(unsafe { std::os::fd::OwnedFd::from_raw_fd(fd) })
     }
 }
 
 impl Buffer {
-    /// Size in bytes (rounded up to 16).
+    /// Returns the size in bytes (rounded up to 16).
     pub fn bytes(&self) -> u64 {
         self.inner.bytes
     }
 
-    /// Debug name.
+    /// Returns the debug name.
     pub fn name(&self) -> &str {
         &self.inner.name
     }
@@ -275,11 +276,11 @@ impl Buffer {
         self.inner.raw
     }
 
-    /// Where shaders find an [`Operands::Address`] buffer.
+    /// Returns the device address of an [`Operands::Address`] buffer.
     pub(super) fn address(&self) -> u64 {
         let info = vk::BufferDeviceAddressInfo::default().buffer(self.inner.raw);
-        // SAFETY: only pipelines that push addresses ask, and these exist only on devices with the feature; kernels
-        // declare which of their buffers these are, and get them as `Operands::Address`.
+        // SAFETY: only pipelines that push addresses call this, and these exist only on devices with the feature;
+        // kernels declare which of their buffers need addresses, and those are made as `Operands::Address`.
         unsafe { self.inner.gpu.device.get_buffer_device_address(&info) }
     }
 
@@ -287,10 +288,10 @@ impl Buffer {
         self.inner.texel_view
     }
 
-    /// Refuses a range that is not inside the buffer.
+    /// Checks that a range lies inside the buffer.
     ///
     /// # Errors
-    /// [`Error::Internal`].
+    /// [`Error::Internal`] if it does not.
     pub fn check_range(&self, offset: u64, bytes: u64) -> Result<()> {
         match offset.checked_add(bytes) {
             Some(end) if end <= self.inner.bytes => Ok(()),
@@ -318,7 +319,7 @@ impl Buffer {
     /// Reads from the start of a [`Memory::Readback`] buffer.
     ///
     /// # Errors
-    /// As [`Buffer::write`].
+    /// Fails like [`Buffer::write`].
     pub fn read<T: Pod>(&self, out: &mut [T]) -> Result<()> {
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(out);
         self.check_range(0, bytes.len() as u64)?;
@@ -347,7 +348,7 @@ impl Drop for Inner {
         }
         match std::mem::replace(&mut self.backing, Backing::None) {
             Backing::None => {}
-            // SAFETY: allocated for this buffer alone, which is gone.
+            // SAFETY: the memory was allocated for this buffer alone, which is destroyed.
             Backing::Own(memory) => unsafe { device.free_memory(memory, None) },
             Backing::Block(allocation) => {
                 let allocation = allocation.into_inner().unwrap_or_else(PoisonError::into_inner);

@@ -1,4 +1,4 @@
-//! What a device is and can do: the capability table, and the faults of drivers that shape it.
+//! Capabilities of a device, with workarounds for faults of drivers.
 
 use super::memory::DeviceMemory;
 use ash::{ext, khr, nv, vk};
@@ -6,16 +6,16 @@ use serde::Serialize;
 use std::ffi::CStr;
 use std::fmt;
 
-/// What a device is and can do, as far as this engine cares.
+/// Properties and capabilities of a device that this engine uses.
 #[derive(Debug, Clone, Serialize)]
 pub struct DeviceInfo {
-    /// Position in the list of the loader.
+    /// Position in the loader's list.
     pub index: usize,
     /// Name given by the driver.
     pub name: String,
-    /// What kind of processor it is.
+    /// Kind of processor.
     pub kind: DeviceKind,
-    /// Who made it.
+    /// Manufacturer.
     pub vendor: Vendor,
     /// Device UUID, hexadecimal.
     pub uuid: String,
@@ -29,65 +29,66 @@ pub struct DeviceInfo {
     pub mesa_major: Option<u32>,
     /// Default subgroup size.
     pub subgroup_size: u32,
-    /// Invocations of the subgroups that a compute shader's workgroup can be asked to consist of, where they also exchange
-    /// values (shuffles); none where the device cannot do either.
+    /// Size of the full subgroups that a compute shader's workgroup can be required to consist of, where they also exchange
+    /// values (shuffles); none where the device lacks either ability.
     pub full_subgroups: Option<u32>,
-    /// The same for workgroups that are smaller than these; none where they are no larger than usual, or have one size.
+    /// Subgroup size for workgroups that are smaller than `full_subgroups`; none where full subgroups are not larger than 32 or
+    /// no smaller size can be requested.
     pub small_subgroups: Option<u32>,
-    /// Invocations of the subgroups that kernels on matrices ask for.
+    /// Subgroup size that kernels on matrices require.
     pub matrix_subgroup: u32,
-    /// Whether shaders can ask for a size of their subgroups.
+    /// Whether shaders can require a subgroup size.
     pub asks_for_subgroups: bool,
-    /// Subgroups of a workgroup whose size is asked for.
+    /// Maximum number of subgroups of a workgroup that requires a subgroup size.
     pub max_workgroup_subgroups: u32,
-    /// Shared memory of a workgroup, bytes.
+    /// Maximum shared memory of a workgroup, bytes.
     pub max_shared_memory: u32,
-    /// Invocations of a workgroup.
+    /// Maximum number of invocations of a workgroup.
     pub max_workgroup_invocations: u32,
-    /// Workgroups of one dispatch along x.
+    /// Maximum number of workgroups of one dispatch along x.
     pub max_workgroup_count: u32,
-    /// Range of one storage buffer binding, bytes.
+    /// Maximum range of one storage buffer binding, bytes.
     pub max_storage_buffer_range: u32,
-    /// Storage buffers that a kernel may bind: of a stage, or of a set where those are fewer.
+    /// Maximum number of storage buffers that a kernel may bind: the smaller of the limits per stage and per set.
     pub max_storage_buffers: u32,
-    /// Elements of one texel buffer.
+    /// Maximum number of elements of one texel buffer.
     pub max_texel_buffer_elements: u32,
-    /// Bytes of push constants.
+    /// Maximum number of bytes of push constants.
     pub max_push_constants: u32,
     /// Nanoseconds per timestamp tick; 0 when the queue has no timestamps.
     pub timestamp_period_ns: f32,
-    /// Bits of the queue's timestamps that mean something.
+    /// Number of valid bits of the queue's timestamps.
     pub timestamp_bits: u32,
-    /// Device-local memory, bytes: the largest heap.
+    /// Size of the largest device-local heap, bytes.
     pub device_memory: u64,
-    /// What this process could take of it when the device was looked at, bytes; none where the device does not tell
-    /// (`VK_EXT_memory_budget`). [`super::device::Gpu::memory`] asks anew.
+    /// Part of that heap that this process could allocate when the device was described, bytes; none where the device does not
+    /// report it (`VK_EXT_memory_budget`). [`super::device::Gpu::memory`] reads the current value.
     pub free_memory: Option<u64>,
     /// Whether shaders can read buffers through their addresses.
     pub buffer_device_address: bool,
-    /// Shapes of cooperative matrices with f16 operands and f32 sums at subgroup scope; empty when the device lacks
-    /// them or what their kernels need besides (16-bit floats, Vulkan's memory model, subgroups of a fixed size).
+    /// Shapes of cooperative matrices with f16 operands and f32 sums at subgroup scope; empty when the device lacks them or
+    /// something else that the kernels need (16-bit floats, Vulkan's memory model, subgroups of a fixed size).
     pub matrices: Vec<MatrixShape>,
-    /// Streaming multiprocessors or the like; 0 when the driver does not tell.
+    /// Number of streaming multiprocessors or similar units; 0 when the driver does not report it.
     pub multiprocessors: u32,
     /// Whether the device offers 16-bit float arithmetic.
     pub float16: bool,
     /// Whether the device offers float atomics on buffers.
     pub float_atomics: bool,
-    /// Whether the device adds 64-bit integers in buffers atomically (`shaderInt64`, `shaderBufferInt64Atomics`), and does not
-    /// crash then.
+    /// Whether the device adds 64-bit integers in buffers atomically (`shaderInt64`, `shaderBufferInt64Atomics`) without
+    /// crashing.
     pub int64_atomics: bool,
     /// Whether memory can be exported as file descriptors (`VK_KHR_external_memory_fd`).
     pub external_memory_fd: bool,
-    /// Whether the driver tells of the pipelines it compiles (`VK_KHR_pipeline_executable_properties`).
+    /// Whether the driver reports statistics of the pipelines it compiles (`VK_KHR_pipeline_executable_properties`).
     pub pipeline_statistics: bool,
-    /// Whether the device is Vulkan on top of another interface, as on macOS (`VK_KHR_portability_subset`).
+    /// Whether the driver implements Vulkan on top of another interface, as on macOS (`VK_KHR_portability_subset`).
     pub portability_subset: bool,
-    /// Why this device cannot be used, if so.
+    /// Reason why this device cannot be used; none if it can.
     pub unusable: Option<String>,
 }
 
-/// Makers of devices for which sizes of kernels are chosen.
+/// Manufacturers of devices for which sizes of kernels are chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Vendor {
@@ -97,12 +98,12 @@ pub enum Vendor {
     Intel,
     /// NVIDIA.
     Nvidia,
-    /// Any other, among them drivers that compute on a CPU.
+    /// Any other manufacturer, including drivers that compute on a CPU.
     Other,
 }
 
 impl Vendor {
-    /// By its PCI id.
+    /// Returns the manufacturer with this PCI id.
     fn of(id: u32) -> Vendor {
         match id {
             0x1002 => Vendor::Amd,
@@ -114,13 +115,13 @@ impl Vendor {
 }
 
 impl DeviceInfo {
-    /// Whether the device is the host's own processor.
+    /// Tells whether the device is the host's own processor.
     pub fn is_cpu(&self) -> bool {
         self.kind == DeviceKind::Cpu
     }
 }
 
-/// What kind of processor a device is.
+/// Kind of processor of a device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DeviceKind {
@@ -128,11 +129,11 @@ pub enum DeviceKind {
     Discrete,
     /// A GPU that shares the host's memory.
     Integrated,
-    /// A GPU handed on by a virtual machine.
+    /// A GPU passed through by a virtual machine.
     Virtual,
     /// The host's own processor.
     Cpu,
-    /// None of these.
+    /// Any other kind.
     Other,
 }
 
@@ -157,8 +158,8 @@ pub struct MatrixShape {
     pub n: u32,
     /// Columns of the left operand.
     pub k: u32,
-    /// Whether the device has matrices of f16 sums of that shape, too: numbers become f16 in registers then, else by way of
-    /// shared memory.
+    /// Whether the device also has matrices of that shape with f16 sums. If so, numbers become f16 in registers; otherwise they
+    /// go through shared memory.
     pub f16_sums: bool,
 }
 
@@ -166,12 +167,12 @@ fn c_chars(text: &[std::ffi::c_char]) -> String {
     text.iter().take_while(|c| **c != 0).map(|c| char::from(*c as u8)).collect()
 }
 
-/// Features that kernels need beyond what every device has, by Vulkan's names, and whether a device offers them.
+/// Vulkan's names of the features that some kernels need beyond those every device has, and whether a device offers them.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct KernelFeatures {
-    /// Of kernels whose workgroups consist of full subgroups of a size.
+    /// Features for kernels whose workgroups consist of full subgroups of a given size.
     pub subgroups: [(&'static str, bool); 2],
-    /// Of kernels on cooperative matrices, which need those as well.
+    /// Features for kernels on cooperative matrices, which need `subgroups` as well.
     pub matrices: [(&'static str, bool); 4],
 }
 
@@ -206,14 +207,14 @@ impl KernelFeatures {
         }
     }
 
-    /// Those of a physical device.
+    /// Returns the features that a physical device offers.
     pub fn offered(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Result<KernelFeatures, vk::Result> {
         // SAFETY: callers take `physical` from this instance.
         let extensions = unsafe { instance.enumerate_device_extension_properties(physical) }?;
         Ok(KernelFeatures::of(instance, physical, |name| is_among(&extensions, name)))
     }
 
-    /// Whether kernels on matrices have all they need.
+    /// Tells whether all features for kernels on matrices are offered.
     fn take_matrices(&self) -> bool {
         self.subgroups.iter().chain(&self.matrices).all(|(_, offered)| *offered)
     }
@@ -223,23 +224,23 @@ fn is_among(extensions: &[vk::ExtensionProperties], name: &CStr) -> bool {
     extensions.iter().any(|e| e.extension_name_as_c_str().is_ok_and(|n| n == name))
 }
 
-/// Sizes that a shader's subgroups can have.
+/// Subgroup sizes of a device's shaders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct SubgroupSizes {
     default: u32,
-    /// Least and greatest.
+    /// Minimum and maximum.
     range: (u32, u32),
-    /// Whether compute shaders can ask for one between these.
+    /// Whether compute shaders can require a size in this range.
     can_ask: bool,
-    /// Most subgroups of a workgroup that asks for their size.
+    /// Maximum number of subgroups of a workgroup that requires a subgroup size.
     most: u32,
-    /// Whether workgroups can be asked to consist of full ones.
+    /// Whether workgroups can be required to consist of full subgroups.
     full: bool,
     /// Whether lanes exchange values.
     exchanges: bool,
 }
 
-/// Subgroups that workgroups of as many lanes consist of.
+/// Subgroup size for workgroups of this many lanes.
 const USUAL_SUBGROUP: u32 = 32;
 
 impl SubgroupSizes {
@@ -272,19 +273,19 @@ impl SubgroupSizes {
         }
     }
 
-    /// See [`DeviceInfo::full_subgroups`].
+    /// Returns [`DeviceInfo::full_subgroups`].
     fn full(&self) -> Option<u32> {
         (self.full && self.exchanges && self.default.is_power_of_two()).then_some(self.default)
     }
 
-    /// See [`DeviceInfo::small_subgroups`].
+    /// Returns [`DeviceInfo::small_subgroups`].
     fn small(&self) -> Option<u32> {
         let usual = self.can_ask && (self.range.0..=self.range.1).contains(&USUAL_SUBGROUP);
         self.full().filter(|size| *size > USUAL_SUBGROUP && usual).map(|_| USUAL_SUBGROUP)
     }
 
-    /// See [`DeviceInfo::matrix_subgroup`]; none where nobody knows it. The default is the best by the estimates of compilers, of
-    /// Intel's 16 and 32 and AMD's 32 and 64.
+    /// Returns [`DeviceInfo::matrix_subgroup`]; none where the size is not known. The default size is the best by the
+    /// compilers' estimates, among Intel's 16 and 32 and AMD's 32 and 64.
     fn for_matrices(&self) -> Option<u32> {
         let (least, greatest) = self.range;
         let is_known = self.can_ask || (least, greatest) == (self.default, self.default);
@@ -292,8 +293,8 @@ impl SubgroupSizes {
     }
 }
 
-/// Matrix shapes our kernels can use on a device with their [`KernelFeatures`], most work per product first; or why they
-/// cannot be told.
+/// Returns the matrix shapes our kernels can use on a device with their [`KernelFeatures`], the shape with the most work per
+/// product first; or the reason why the query failed.
 fn matrix_shapes(
     entry: &ash::Entry,
     instance: &ash::Instance,
@@ -306,7 +307,7 @@ fn matrix_shapes(
     Ok(usable_shapes(&found))
 }
 
-/// Of the products that a device lists, the shapes of those that our kernels can use, the best first.
+/// Returns the shapes our kernels can use among the products that a device lists, the best first.
 fn usable_shapes(found: &[vk::CooperativeMatrixPropertiesKHR<'_>]) -> Vec<MatrixShape> {
     let (f16, f32) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
     let size = |p: &vk::CooperativeMatrixPropertiesKHR<'_>| (p.m_size, p.n_size, p.k_size);
@@ -323,7 +324,8 @@ fn usable_shapes(found: &[vk::CooperativeMatrixPropertiesKHR<'_>]) -> Vec<Matrix
     // Rows are handled eight f16 at a time, and widths are multiples of 16.
     let fits = |size: u32| size.is_multiple_of(8) && 16 % size == 0;
     shapes.retain(|s| [s.m, s.n, s.k].into_iter().all(fits));
-    // The largest product reuses its operands most; the way through shared memory is the longer one.
+    // The largest product reuses its operands most. Shapes without f16 sums come last, because their numbers go through shared
+    // memory.
     shapes.sort_by_key(|s| std::cmp::Reverse((s.f16_sums, s.m * s.n * s.k, s.m)));
     shapes
 }
@@ -361,7 +363,7 @@ pub(super) fn describe(
     // SAFETY: the chain lives until the call returns; it holds an extension's structure only where the device has it, and
     // that of Vulkan 1.2 is ignored by older devices.
     unsafe { instance.get_physical_device_features2(physical, &mut features) };
-    // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes to a subgroup, as LP_NATIVE_VECTOR_WIDTH=512 gives, the simplest
+    // A fault of llvmpipe (seen in Mesa 26.2.6): with 16 lanes per subgroup, as with LP_NATIVE_VECTOR_WIDTH=512, the simplest
     // product of matrices crashes the process, and so do atomics on 64-bit integers.
     let crashes = driver.driver_id == vk::DriverId::MESA_LLVMPIPE && subgroup.subgroup_size > 8;
     let adds_int64 = features.features.shader_int64 == vk::TRUE && f12.shader_buffer_int64_atomics == vk::TRUE;
@@ -447,22 +449,23 @@ pub(super) fn describe(
     }
 }
 
-/// A family of queues that compute.
+/// A queue family that supports compute.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct ComputeFamily {
-    /// Its place among the device's families.
+    /// Index among the device's families.
     pub index: u32,
-    /// Bits of its timestamps that mean something; 0 without timestamps.
+    /// Number of valid bits of its timestamps; 0 without timestamps.
     pub timestamp_bits: u32,
 }
 
-/// The family whose queue we take: one that only computes where there is one, so that what draws the screen does not wait for us.
+/// Chooses the family whose queue we use: preferably one without graphics, so that drawing the screen does not wait for our
+/// work.
 pub(super) fn compute_family(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<ComputeFamily> {
     // SAFETY: callers take `physical` from this instance.
     best_family(&unsafe { instance.get_physical_device_queue_family_properties(physical) })
 }
 
-/// A family of a device by its place.
+/// Returns a family of a device by its index.
 pub(super) fn family_at(instance: &ash::Instance, physical: vk::PhysicalDevice, index: u32) -> Option<ComputeFamily> {
     // SAFETY: callers take `physical` from this instance.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
@@ -472,7 +475,7 @@ pub(super) fn family_at(instance: &ash::Instance, physical: vk::PhysicalDevice, 
 fn best_family(families: &[vk::QueueFamilyProperties]) -> Option<ComputeFamily> {
     let computes = |f: &vk::QueueFamilyProperties| f.queue_count > 0 && f.queue_flags.contains(vk::QueueFlags::COMPUTE);
     let draws = |f: &vk::QueueFamilyProperties| f.queue_flags.contains(vk::QueueFlags::GRAPHICS);
-    // Without timestamps nothing can be measured; the first of equals is the driver's own choice.
+    // Without timestamps nothing can be measured; among equals, the first is the driver's own choice.
     let usable = families.iter().enumerate().filter(|(_, f)| computes(f));
     let best = usable.min_by_key(|(_, f)| (f.timestamp_valid_bits == 0, draws(f)));
     best.map(|(i, f)| ComputeFamily { index: i as u32, timestamp_bits: f.timestamp_valid_bits })
@@ -488,13 +491,14 @@ mod tests {
             |default, range| SubgroupSizes { default, range, can_ask: true, most: 32, full: true, exchanges: true };
         let fixed = |default, range| SubgroupSizes { can_ask: false, ..sizes(default, range) };
         let chosen = |sizes: SubgroupSizes| (sizes.full(), sizes.small(), sizes.for_matrices());
-        // NVIDIA; AMD's chips of either generation, as Mesa's drivers tell; Intel; llvmpipe.
+        // In this order: NVIDIA; AMD's chips of both generations, as Mesa's drivers report them; Intel; llvmpipe.
         assert_eq!(chosen(sizes(32, (32, 32))), (Some(32), None, Some(32)));
         assert_eq!(chosen(sizes(64, (32, 64))), (Some(64), Some(32), Some(64)));
         assert_eq!(chosen(sizes(64, (64, 64))), (Some(64), None, Some(64)));
         assert_eq!(chosen(sizes(32, (16, 32))), (Some(32), None, Some(32)));
         assert_eq!(chosen(sizes(8, (8, 8))), (Some(8), None, Some(8)));
-        // Where nothing can be asked for, the default has to do; matrices, whose kernels must know, need one that is the only one.
+        // Where no size can be required, the default is used; kernels on matrices must know the size, so they need it to be the
+        // only one.
         assert_eq!(chosen(fixed(32, (32, 32))), (Some(32), None, Some(32)));
         assert_eq!(chosen(fixed(64, (32, 64))), (Some(64), None, None));
         assert_eq!(SubgroupSizes { full: false, ..sizes(32, (32, 32)) }.full(), None);
@@ -518,7 +522,7 @@ mod tests {
         let taken =
             |found: &[_]| usable_shapes(found).iter().map(|s| ([s.m, s.n, s.k], s.f16_sums)).collect::<Vec<_>>();
         let (large, small) = ([16, 16, 16], [8, 8, 16]);
-        // Intel's first chips with matrices; a shape of either kind; what our kernels cannot use.
+        // Cases: Intel's first chips with matrices; a shape of either kind; shapes that our kernels cannot use.
         assert_eq!(taken(&[product(small, half, single)]), [(small, false)]);
         let both = [product(large, half, single), product(small, half, half), product(small, half, single)];
         assert_eq!(taken(&both), [(small, true), (large, false)]);

@@ -1,4 +1,4 @@
-//! What a report of a fault tells of a device beyond [`super::capabilities`]: nothing here decides anything.
+//! Details of a device for bug reports, beyond [`super::capabilities`]. No decision depends on them.
 
 use super::instance::Instance;
 use crate::error::Result;
@@ -6,26 +6,26 @@ use ash::{ext, khr, vk};
 use serde::Serialize;
 use std::ffi::CStr;
 
-/// A device as its driver describes it.
+/// Description of a device by its driver.
 #[derive(Debug, Clone, Serialize)]
 pub struct DeviceDetails {
     /// PCI id of the vendor, hexadecimal.
     pub vendor_id: String,
     /// PCI id of the device, hexadecimal.
     pub device_id: String,
-    /// The driver's version as it counts itself, hexadecimal: vendors pack it differently.
+    /// Driver's version number, hexadecimal: vendors encode it differently.
     pub driver_version: String,
-    /// The conformance tests that the driver says it passes.
+    /// Version of the conformance tests that the driver claims to pass.
     pub conformance_version: String,
     /// Subgroups of compute shaders.
     pub subgroups: Subgroups,
-    /// Integers of 64 bits in shaders.
+    /// Whether shaders have 64-bit integers.
     pub int64: bool,
-    /// Atomics on 64-bit integers in buffers.
+    /// Whether there are atomics on 64-bit integers in buffers.
     pub buffer_int64_atomics: bool,
-    /// Atomics on 64-bit integers in shared memory.
+    /// Whether there are atomics on 64-bit integers in shared memory.
     pub shared_int64_atomics: bool,
-    /// 16-bit values in storage buffers.
+    /// Whether storage buffers can have 16-bit values.
     pub storage_16_bit: bool,
     /// Products of cooperative matrices that the driver offers, whether or not our kernels can use them.
     pub matrix_products: Vec<MatrixProduct>,
@@ -33,13 +33,13 @@ pub struct DeviceDetails {
     pub queues: Vec<QueueFamily>,
     /// Heaps of memory.
     pub heaps: Vec<Heap>,
-    /// Types of memory: the heap, and what it is good for.
+    /// Types of memory: heap and properties.
     pub memory_types: Vec<String>,
-    /// Most workgroups of a dispatch along each axis.
+    /// Maximum number of workgroups of a dispatch along each axis.
     pub max_workgroup_count: [u32; 3],
-    /// Most invocations of a workgroup along each axis.
+    /// Maximum number of invocations of a workgroup along each axis.
     pub max_workgroup_size: [u32; 3],
-    /// Most allocations at once.
+    /// Maximum number of simultaneous allocations.
     pub max_allocations: u32,
     /// Largest allocation, bytes.
     pub max_allocation_bytes: u64,
@@ -50,13 +50,13 @@ pub struct DeviceDetails {
 /// Subgroups of compute shaders.
 #[derive(Debug, Clone, Serialize)]
 pub struct Subgroups {
-    /// Invocations, unless another size is asked for.
+    /// Default number of invocations.
     pub default_size: u32,
-    /// Least and most that can be asked for; none where no size can be.
+    /// Minimum and maximum size that can be required; none where no size can be.
     pub sizes: Option<[u32; 2]>,
-    /// Whether compute shaders have their operations.
+    /// Whether compute shaders support subgroup operations.
     pub in_compute: bool,
-    /// Kinds of operations.
+    /// Supported kinds of operations.
     pub operations: String,
 }
 
@@ -69,20 +69,20 @@ pub struct MatrixProduct {
     pub n: u32,
     /// Columns of the left operand.
     pub k: u32,
-    /// Types of both operands, of what is added, and of the result.
+    /// Types of both operands, of the addend and of the result.
     pub types: String,
-    /// Who shares a matrix.
+    /// Scope that shares a matrix.
     pub scope: String,
 }
 
 /// A family of queues.
 #[derive(Debug, Clone, Serialize)]
 pub struct QueueFamily {
-    /// What its queues can do.
+    /// Capabilities of its queues.
     pub flags: String,
-    /// Queues.
+    /// Number of queues.
     pub count: u32,
-    /// Bits of timestamps that mean something; 0 without timestamps.
+    /// Number of valid bits of timestamps; 0 without timestamps.
     pub timestamp_bits: u32,
 }
 
@@ -91,11 +91,11 @@ pub struct QueueFamily {
 pub struct Heap {
     /// Size, bytes.
     pub bytes: u64,
-    /// What it is good for.
+    /// Properties of the heap.
     pub flags: String,
 }
 
-/// Details of every device the loader offers, in its order.
+/// Lists the details of every device that the loader offers, in its order.
 ///
 /// # Errors
 /// [`crate::error::Error::NoDevice`] when there is no Vulkan loader.
@@ -105,7 +105,7 @@ pub fn list_details() -> Result<Vec<DeviceDetails>> {
     Ok(devices.into_iter().map(|(physical, _)| details(&instance, physical)).collect())
 }
 
-/// Names of an extension's offer, such as `VK_KHR_cooperative_matrix 2`.
+/// Lists the extensions with their versions, such as `VK_KHR_cooperative_matrix 2`.
 fn extensions(instance: &Instance, physical: vk::PhysicalDevice) -> Vec<String> {
     // SAFETY: the caller takes `physical` from this instance.
     let found = unsafe { instance.enumerate_device_extension_properties(physical) }.unwrap_or_default();
@@ -203,7 +203,7 @@ fn matrix_products(instance: &Instance, physical: vk::PhysicalDevice) -> Vec<Mat
     found.iter().map(product).collect()
 }
 
-/// Vulkan's own names in lower case, without brackets and commas.
+/// Returns Vulkan's own names in lower case, without brackets and commas.
 fn words(flags: impl std::fmt::Debug) -> String {
     let text = format!("{flags:?}").to_lowercase().replace(" | ", " ");
     text.chars().filter(|c| !"[],".contains(*c)).collect()

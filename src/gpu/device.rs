@@ -1,5 +1,5 @@
-//! The choice of a device, adoption of someone else's, and what all objects made from one share: queue, allocator,
-//! timeline, debug names.
+//! Choice of a device, adoption of an application's device, and the state that all objects made from a device share: queue,
+//! allocator, timeline, debug names.
 
 use super::capabilities::{DeviceInfo, DeviceKind, KernelFeatures, compute_family, family_at};
 use super::instance::{DRIVER_PACKAGES, Instance, Loader};
@@ -16,30 +16,30 @@ use std::ffi::CString;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
-/// How to open a device.
+/// Options of opening a device.
 #[derive(Debug, Clone, Default)]
 pub struct DeviceOptions {
-    /// Index, part of the name (any case) or UUID; `None` takes the best device.
+    /// Index, part of the name (any case) or UUID; `None` selects the best device.
     pub select: Option<String>,
-    /// Turn the Khronos validation layer on, with synchronisation validation.
+    /// Whether to turn the Khronos validation layer on, with synchronisation validation.
     pub validation: bool,
     /// Directory for the pipeline cache; `None` keeps it in memory only.
     pub cache_dir: Option<std::path::PathBuf>,
-    /// Most bytes of buffers and images alive at once; `None` leaves the limit to the device.
+    /// Maximum number of bytes of buffers and images alive at once; `None` leaves the limit to the device.
     pub memory_limit: Option<u64>,
     /// An application's own loader in place of the system's.
     pub loader: Option<Loader>,
-    /// Keep what the driver tells of each pipeline; see [`Gpu::pipeline_statistics`].
+    /// Whether to keep the driver's statistics of each pipeline; see [`Gpu::pipeline_statistics`].
     pub statistics: bool,
-    /// Do without operations across a subgroup, as on a device that lacks them.
+    /// Whether to avoid operations across a subgroup, as on a device that lacks them.
     pub without_subgroups: bool,
-    /// Do without atomic operations on 64-bit integers, as on a device that lacks them.
+    /// Whether to avoid atomic operations on 64-bit integers, as on a device that lacks them.
     pub without_int64_atomics: bool,
 }
 
-/// A device that someone else made and goes on owning; see [`Gpu::adopt`].
+/// A device that an application made and continues to own; see [`Gpu::adopt`].
 pub struct Adoption {
-    /// `vkGetInstanceProcAddr` of the owner's loader; `None` takes the system's loader.
+    /// `vkGetInstanceProcAddr` of the owner's loader; `None` uses the system's loader.
     pub get_instance_proc_addr: Option<vk::PFN_vkGetInstanceProcAddr>,
     /// Instance made for Vulkan 1.2 or newer.
     pub instance: vk::Instance,
@@ -47,26 +47,26 @@ pub struct Adoption {
     pub physical_device: vk::PhysicalDevice,
     /// Device with the feature `timelineSemaphore`.
     pub device: vk::Device,
-    /// A queue of it that computes.
+    /// Queue of the device that supports compute.
     pub queue: vk::Queue,
     /// Family of the queue.
     pub queue_family: u32,
-    /// The device was made with the feature `bufferDeviceAddress`.
+    /// Whether the device was made with the feature `bufferDeviceAddress`.
     pub buffer_device_address: bool,
-    /// The device was made with `VK_KHR_external_memory_fd`.
+    /// Whether the device was made with `VK_KHR_external_memory_fd`.
     pub external_memory_fd: bool,
-    /// The device was made with the features `subgroupSizeControl` and `computeFullSubgroups`, of
+    /// Whether the device was made with the features `subgroupSizeControl` and `computeFullSubgroups`, of
     /// `VK_EXT_subgroup_size_control` or Vulkan 1.3.
     pub subgroup_size_control: bool,
-    /// The device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, and with `shaderFloat16`,
-    /// `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`; and with what `subgroup_size_control` stands for.
+    /// Whether the device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, with `shaderFloat16`,
+    /// `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`, and with all features of `subgroup_size_control`.
     pub cooperative_matrix: bool,
-    /// Held around every use of the queue; `None` when the queue is ours alone.
+    /// Lock held around every use of the queue; `None` when nobody else uses the queue.
     pub queue_lock: Option<Box<dyn QueueLock>>,
 }
 
 impl Adoption {
-    /// Refuses features that no device of this kind was made with: kernels that use them would have undefined results.
+    /// Refuses features that this physical device does not offer: kernels that use them would have undefined results.
     fn check_features(&self, device: &str, offered: &KernelFeatures) -> Result<()> {
         let claims = [
             ("subgroup_size_control", self.subgroup_size_control, &offered.subgroups[..]),
@@ -86,25 +86,25 @@ impl Adoption {
     }
 }
 
-/// Keeps several users of one queue apart.
+/// Lock that keeps several users of one queue apart.
 pub trait QueueLock: Send + Sync {
-    /// Waits until the queue is free and takes it.
+    /// Waits until the queue is free, and takes it.
     fn lock(&self);
-    /// Gives it back.
+    /// Releases the queue.
     fn unlock(&self);
 }
 
-/// An open device. Cheap to clone; everything is freed when the last user is gone.
+/// An open device. It is cheap to clone; everything is freed when the last clone is dropped.
 #[derive(Clone)]
 pub struct Gpu {
     pub(super) shared: Arc<Shared>,
 }
 
-/// What every object made from a device holds on to.
+/// State that every object made from a device keeps alive.
 pub(super) struct Shared {
     pub(super) queue: Mutex<vk::Queue>,
     pub(super) queue_family: u32,
-    /// Frees its blocks when dropped, which needs the device below.
+    /// Allocator; it frees its blocks when dropped, which needs the device below.
     pub(super) allocator: Mutex<Allocator>,
     pub(super) pipeline_cache: vk::PipelineCache,
     pub(super) timeline: vk::Semaphore,
@@ -122,7 +122,7 @@ pub(super) struct Shared {
     pub(super) device: Device,
 }
 
-/// A device, destroyed on drop if it was made here.
+/// A device; it is destroyed on drop if it was made here.
 pub(super) struct Device {
     raw: ash::Device,
     ours: bool,
@@ -141,20 +141,20 @@ impl std::ops::Deref for Device {
 impl Drop for Device {
     fn drop(&mut self) {
         if self.ours {
-            // SAFETY: made by us and destroyed once, here. What was made from it is gone: it belongs to objects that
+            // SAFETY: made by us and destroyed once, here. Everything made from it is destroyed: it belongs to objects that
             // hold the `Shared` around this, or to that struct itself, which drops this field last.
             unsafe { self.raw.destroy_device(None) };
         }
     }
 }
 
-/// Bytes of buffers and images.
+/// Counter and limit of the bytes of buffers and images.
 struct Taken {
     in_use: AtomicU64,
     limit: u64,
 }
 
-/// A queue that is locked for its owner as well.
+/// Queue locked both here and for its owner.
 pub(super) struct LockedQueue<'a> {
     queue: MutexGuard<'a, vk::Queue>,
     theirs: Option<&'a dyn QueueLock>,
@@ -225,7 +225,7 @@ fn choose(
 }
 
 impl Device {
-    /// A device with one queue, and what `info` says it can do.
+    /// Creates a device with one queue, and with the capabilities that `info` lists.
     fn create(
         instance: Instance,
         physical: vk::PhysicalDevice,
@@ -277,7 +277,7 @@ impl Device {
     }
 }
 
-/// A device on its way to a [`Gpu`].
+/// Parts from which a [`Gpu`] is made.
 struct Parts {
     physical: vk::PhysicalDevice,
     info: DeviceInfo,
@@ -365,16 +365,16 @@ impl Gpu {
         Parts { physical, info, device, queue, queue_family, queue_lock: None }.into_gpu(options)
     }
 
-    /// Works on a device someone else made. Instance and device must outlive the last clone, and are left as they are.
-    /// Of the options, only the pipeline cache and the memory limit apply.
+    /// Adopts a device that the caller made. Instance and device must outlive the last clone, and are not destroyed. Only two
+    /// of the options apply: the pipeline cache and the memory limit.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] when the device lacks what the engine needs; [`Error::Config`] for features it cannot have been made
-    /// with.
+    /// [`Error::NoDevice`] when the device lacks something the engine needs; [`Error::Config`] for features that it cannot have
+    /// been made with.
     ///
     /// # Safety
-    /// The handles must be valid and belong together; the device must have been made with what `adoption` says, and
-    /// the queue be used by others only while they hold the lock.
+    /// The handles must be valid and belong together. The device must have been made with the features that `adoption` lists.
+    /// Others may use the queue only while they hold the lock.
     pub unsafe fn adopt(adoption: Adoption, options: &DeviceOptions) -> Result<Gpu> {
         if adoption.cooperative_matrix && !adoption.subgroup_size_control {
             let problem = "needs subgroup_size_control as well: kernels on matrices ask for full subgroups";
@@ -400,7 +400,7 @@ impl Gpu {
         if wait.is_none() {
             return Err(Error::NoDevice(format!("{}: the device was not made for Vulkan 1.2", info.name)));
         }
-        // What a device was made with cannot be asked of it.
+        // Vulkan has no query for the features a device was made with.
         info.buffer_device_address &= adoption.buffer_device_address;
         let family = family_at(&instance, adoption.physical_device, adoption.queue_family);
         info.timestamp_bits = family.map_or(0, |family| family.timestamp_bits);
@@ -408,7 +408,7 @@ impl Gpu {
             info.timestamp_period_ns = 0.0;
         }
         info.external_memory_fd &= adoption.external_memory_fd;
-        // Pairs of 32 bits add up to the same sums.
+        // Without 64-bit atomics, pairs of 32-bit integers give the same sums.
         info.int64_atomics = false;
         if !adoption.cooperative_matrix {
             info.matrices.clear();
@@ -427,37 +427,37 @@ impl Gpu {
         parts.into_gpu(options)
     }
 
-    /// What this device is and can do.
+    /// Returns the device's properties and capabilities.
     pub fn info(&self) -> &DeviceInfo {
         &self.shared.info
     }
 
-    /// Where those who want a picture of what is computed here say so.
+    /// Returns the record of requests for pictures computed on this device; see [`Looks`].
     pub fn looks(&self) -> &Looks {
         &self.shared.looks
     }
 
-    /// Errors and warnings of the validation layer so far; empty without validation.
+    /// Returns the validation layer's errors and warnings so far; empty without validation.
     pub fn validation_messages(&self) -> Vec<String> {
         self.shared.device.instance.messages()
     }
 
-    /// Buffers, pipelines and recordings alive at the moment; 0 once all are dropped.
+    /// Returns the number of buffers, pipelines and recordings that are alive; 0 once all are dropped.
     pub fn live_objects(&self) -> u64 {
         self.shared.live_objects.load(Ordering::Relaxed)
     }
 
-    /// Shaders that dispatches were recorded of so far, for those who tell what has been tried on a device.
+    /// Returns the shaders whose dispatches were recorded so far, for reports of what was run on a device.
     pub fn recorded_shaders(&self) -> Vec<&'static str> {
         lock(&self.shared.recorded).iter().copied().collect()
     }
 
-    /// Bytes of buffers and images alive at the moment.
+    /// Returns the bytes of buffers and images that are alive.
     pub fn memory_in_use(&self) -> u64 {
         self.shared.taken.in_use.load(Ordering::Relaxed)
     }
 
-    /// Writes the pipeline cache to disk so that the next start compiles nothing.
+    /// Writes the pipeline cache to disk, so that the next start compiles nothing.
     ///
     /// # Errors
     /// [`Error::Io`] when the directory cannot be written.
@@ -482,7 +482,7 @@ impl Shared {
         }
     }
 
-    /// The queue, for a submit.
+    /// Locks the queue, for a submit.
     pub(super) fn locked_queue(&self) -> LockedQueue<'_> {
         let queue = lock(&self.queue);
         let theirs = self.queue_lock.as_deref();
@@ -508,12 +508,12 @@ impl Shared {
         })
     }
 
-    /// The device's memory as it is now.
+    /// Returns the current state of the device's memory.
     pub(super) fn memory(&self) -> DeviceMemory {
         DeviceMemory::of(&self.device.instance, self.physical, self.info.free_memory.is_some())
     }
 
-    /// What an allocator says when there is no memory left for an object.
+    /// Returns the error for a failed allocation of an object.
     pub(super) fn no_memory(&self, object: &str, bytes: u64, why: &impl std::fmt::Display) -> Error {
         Error::OutOfMemory {
             object: object.into(),
@@ -524,7 +524,7 @@ impl Shared {
         }
     }
 
-    /// Gives back what [`Shared::reserve`] counted.
+    /// Subtracts bytes that [`Shared::reserve`] counted.
     pub(super) fn release(&self, bytes: u64) {
         self.taken.in_use.fetch_sub(bytes, Ordering::Relaxed);
     }
@@ -559,8 +559,8 @@ impl Drop for Shared {
             // A lost device has nothing left to wait for.
             let _ = self.wait(submitted);
         }
-        // SAFETY: pipelines and recordings, which use the two, hold an `Arc` of this struct, so none is left; nothing of
-        // ours is on the queue once the wait returns. The device goes after this, with the fields.
+        // SAFETY: pipelines and recordings, which use these two objects, hold an `Arc` of this struct, so none is left; none of
+        // our work is on the queue once the wait returns. The device is destroyed afterwards, with the fields.
         unsafe {
             self.device.destroy_pipeline_cache(self.pipeline_cache, None);
             self.device.destroy_semaphore(self.timeline, None);

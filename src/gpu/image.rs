@@ -8,7 +8,7 @@ use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
 use std::sync::Arc;
 
-/// An image in the device's sampling units. Clones share the same memory, freed with the last one.
+/// An image in the tiling optimal for sampling. Clones share the same memory, which is freed with the last one.
 #[derive(Clone)]
 pub struct Image3d {
     inner: Arc<Inner>,
@@ -29,7 +29,7 @@ const FORMAT: vk::Format = vk::Format::R16_SFLOAT;
 const CELL_BYTES: u64 = 2;
 
 impl Gpu {
-    /// An image of `size` cells, still to be filled; outside, its nearest cell repeats.
+    /// Makes an image of `size` cells with undefined contents. Outside the image, the nearest cell's value repeats.
     ///
     /// # Errors
     /// [`Error::Internal`] for a size of zero, [`Error::OutOfMemory`].
@@ -48,7 +48,7 @@ impl Gpu {
 }
 
 impl Inner {
-    /// An image that is still to be made; dropping it cleans up, however far it came.
+    /// Starts an image without Vulkan objects; dropping it frees whatever has been created by then.
     fn new(gpu: &Arc<Shared>, name: &str, size: [u32; 3], bytes: u64) -> Result<Inner> {
         gpu.reserve(name, bytes)?;
         gpu.track();
@@ -94,7 +94,7 @@ impl Inner {
                 allocation_scheme: AllocationScheme::GpuAllocatorManaged,
             })
             .map_err(|e| self.gpu.no_memory(&self.name, requirements.size, &e))?;
-        // SAFETY: the handle is only bound to; the allocation, which `self` keeps, goes on owning it.
+        // SAFETY: the handle is only used for binding; the allocation, which `self` keeps, still owns it.
         let (memory, offset) = (unsafe { allocation.memory() }, allocation.offset());
         self.allocation = Some(allocation);
         // SAFETY: the allocator gave memory and offset for exactly this image's requirements; it is bound once.
@@ -129,7 +129,7 @@ impl Inner {
 }
 
 impl Image3d {
-    /// All there is of the image.
+    /// Range of the whole image.
     pub(super) const RANGE: vk::ImageSubresourceRange = vk::ImageSubresourceRange {
         aspect_mask: vk::ImageAspectFlags::COLOR,
         base_mip_level: 0,
@@ -138,12 +138,12 @@ impl Image3d {
         layer_count: 1,
     };
 
-    /// Cells along x, y, z.
+    /// Returns the number of cells along x, y, z.
     pub(super) fn size(&self) -> [u32; 3] {
         self.inner.size
     }
 
-    /// Bytes of all cells.
+    /// Returns the bytes of all cells.
     pub(super) fn bytes(&self) -> u64 {
         self.inner.bytes
     }

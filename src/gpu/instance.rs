@@ -1,4 +1,4 @@
-//! The Vulkan loader, an instance of it, and what its validation layer says.
+//! The Vulkan loader, an instance of it, and the messages of its validation layer.
 
 use super::capabilities::{DeviceInfo, describe};
 use super::lock::lock;
@@ -8,18 +8,18 @@ use std::ffi::{CStr, c_void};
 use std::sync::Mutex;
 
 const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
-/// What to install where there is no loader.
+/// Packages to install where there is no loader.
 const LOADER_PACKAGES: &str = "Debian, Ubuntu: libvulkan1; Fedora: vulkan-loader; Arch: vulkan-icd-loader";
-/// What to install where there is no driver.
+/// Packages to install where there is no driver.
 pub(super) const DRIVER_PACKAGES: &str = "the GPU vendor's, or Mesa's, which has one for CPUs as well: Debian, Ubuntu, \
                                           Fedora: mesa-vulkan-drivers; Arch: vulkan-swrast";
 
-/// A Vulkan loader that an application brings along, in place of the system's.
+/// A Vulkan loader that an application supplies in place of the system's.
 #[derive(Debug, Clone, Copy)]
 pub struct Loader(vk::PFN_vkGetInstanceProcAddr);
 
 impl Loader {
-    /// Takes a loader by its `vkGetInstanceProcAddr`.
+    /// Makes a loader from its `vkGetInstanceProcAddr`.
     ///
     /// # Safety
     /// The function must be that of a working Vulkan loader, and stay loaded as long as anything opened with it.
@@ -34,12 +34,12 @@ impl Loader {
     }
 }
 
-/// An instance, destroyed on drop if it was made here.
+/// An instance; it is destroyed on drop if it was made here.
 pub(super) struct Instance {
     raw: ash::Instance,
     ours: bool,
     messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
-    /// The messenger knows the address, which a box keeps.
+    /// Messages of the validation layer; boxed because the messenger keeps their address.
     messages: Box<Mutex<Vec<String>>>,
     /// Keeps the loader's library in memory.
     entry: ash::Entry,
@@ -66,7 +66,7 @@ fn load(loader: Option<Loader>) -> Result<ash::Entry> {
     })
 }
 
-/// No driver that the loader finds is the commonest reason of all.
+/// Returns the error of a failed instance creation. The most common reason is that the loader finds no driver.
 fn no_instance(code: vk::Result) -> Error {
     Error::NoDevice(match code {
         vk::Result::ERROR_INCOMPATIBLE_DRIVER => {
@@ -76,7 +76,7 @@ fn no_instance(code: vk::Result) -> Error {
     })
 }
 
-/// Whether the loader hides drivers such as MoltenVK from those who do not ask for them.
+/// Tells whether the loader hides drivers such as MoltenVK from applications that do not ask for them.
 fn lists_portability_drivers(entry: &ash::Entry) -> Result<bool> {
     // SAFETY: needs nothing but a loader, which `entry` keeps loaded.
     let found = unsafe { entry.enumerate_instance_extension_properties(None) }
@@ -99,7 +99,7 @@ fn require_validation_layer(entry: &ash::Entry) -> Result<()> {
 }
 
 impl Instance {
-    /// An instance of Vulkan 1.2 of a loader (`None`: the system's), with the validation layer listening if asked for.
+    /// Creates an instance of Vulkan 1.2 with a loader (`None`: the system's), and on demand with the validation layer.
     pub fn create(loader: Option<Loader>, validation: bool) -> Result<Instance> {
         let entry = load(loader)?;
         let app = vk::ApplicationInfo::default()
@@ -137,7 +137,7 @@ impl Instance {
         Ok(instance)
     }
 
-    /// Someone else's instance, left as it is.
+    /// Adopts an application's instance, which is not destroyed.
     ///
     /// # Safety
     /// The handle must be valid, come from the loader, and outlive the result.
@@ -167,29 +167,29 @@ impl Instance {
         Ok(())
     }
 
-    /// Whether objects can be given names that the validation layer uses.
+    /// Tells whether objects can be given names that the validation layer uses.
     pub fn has_debug_names(&self) -> bool {
         self.messenger.is_some()
     }
 
-    /// Errors and warnings of the validation layer so far.
+    /// Returns the validation layer's errors and warnings so far.
     pub fn messages(&self) -> Vec<String> {
         lock(&self.messages).clone()
     }
 
-    /// What a device of this instance is and can do.
+    /// Returns the properties and capabilities of a device of this instance.
     pub fn describe(&self, index: usize, physical: vk::PhysicalDevice) -> DeviceInfo {
         describe(&self.entry, &self.raw, index, physical)
     }
 
-    /// Functions that tell of cooperative matrices, for devices that have them.
+    /// Returns the functions that query cooperative matrices, for devices that have them.
     pub fn cooperative_matrix(&self) -> khr::cooperative_matrix::Instance {
         khr::cooperative_matrix::Instance::new(&self.entry, &self.raw)
     }
 
-    /// Every device, usable or not.
+    /// Lists every device, usable or not.
     pub fn devices(&self) -> Result<Vec<(vk::PhysicalDevice, DeviceInfo)>> {
-        // SAFETY: asks about the instance alone, which `self` keeps alive.
+        // SAFETY: the query needs only the instance, which `self` keeps alive.
         let physical = unsafe { self.raw.enumerate_physical_devices() }
             .map_err(|code| Error::NoDevice(format!("vkEnumeratePhysicalDevices failed: {code}")))?;
         Ok(physical.into_iter().enumerate().map(|(i, p)| (p, self.describe(i, p))).collect())

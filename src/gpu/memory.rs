@@ -1,18 +1,18 @@
-//! How much memory a device has, and how much of it is free at the moment.
+//! Total and free memory of a device.
 
 use super::device::Gpu;
 use ash::vk;
 use std::fmt;
 
-/// Bytes of a MiB, in which people are told of memory.
+/// Bytes of a MiB, the unit of memory in messages.
 const MIB: u64 = 1 << 20;
 
-/// The largest of a device's own heaps.
+/// Largest device-local heap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DeviceMemory {
     /// Its size, bytes.
     pub bytes: u64,
-    /// What this process can still take of it, bytes; none where the device does not tell (`VK_EXT_memory_budget`).
+    /// Bytes of it that this process can still allocate; none where the device does not report them (`VK_EXT_memory_budget`).
     pub free: Option<u64>,
 }
 
@@ -27,15 +27,15 @@ impl fmt::Display for DeviceMemory {
 }
 
 impl DeviceMemory {
-    /// As it is now. The budget is a query of the physical device: no device has to be made with its extension.
+    /// Reads the current state. The budget is a query of the physical device: the device need not be made with the extension.
     pub(super) fn of(instance: &ash::Instance, physical: vk::PhysicalDevice, tells_budget: bool) -> DeviceMemory {
         let mut budget = vk::PhysicalDeviceMemoryBudgetPropertiesEXT::default();
         let mut memory = vk::PhysicalDeviceMemoryProperties2::default();
         if tells_budget {
             memory = memory.push_next(&mut budget);
         }
-        // SAFETY: callers take `physical` from this instance, and say truly whether it offers the extension whose structure is
-        // chained; the chain lives until the call returns.
+        // SAFETY: callers take `physical` from this instance, and say correctly whether it offers the extension whose structure
+        // is chained; the chain lives until the call returns.
         unsafe { instance.get_physical_device_memory_properties2(physical, &mut memory) };
         let memory = memory.memory_properties;
         largest(&memory.memory_heaps[..memory.memory_heap_count as usize], tells_budget.then_some(&budget))
@@ -47,8 +47,8 @@ fn largest(heaps: &[vk::MemoryHeap], budget: Option<&vk::PhysicalDeviceMemoryBud
     let Some((index, heap)) = own.max_by_key(|(_, heap)| heap.size) else {
         return DeviceMemory { bytes: 0, free: None };
     };
-    // A budget counts what this process has taken; others may have left it less than that. A driver whose budget is more than
-    // there is counts memory of another kind.
+    // A budget includes the memory that this process has already taken; other processes may leave it less. A driver whose
+    // budget exceeds the heap's size counts memory of another kind.
     let left = |budget: &vk::PhysicalDeviceMemoryBudgetPropertiesEXT<'_>| {
         budget.heap_budget[index].saturating_sub(budget.heap_usage[index]).min(heap.size)
     };
@@ -56,7 +56,7 @@ fn largest(heaps: &[vk::MemoryHeap], budget: Option<&vk::PhysicalDeviceMemoryBud
 }
 
 impl Gpu {
-    /// Memory of the device as it is now: what is free changes with what this process and others take.
+    /// Returns the current memory of the device; the free part changes with allocations of this process and others.
     pub fn memory(&self) -> DeviceMemory {
         self.shared.memory()
     }
@@ -70,7 +70,7 @@ mod tests {
     fn free_is_what_the_budget_of_the_largest_own_heap_leaves() {
         let own = vk::MemoryHeapFlags::DEVICE_LOCAL;
         let heap = |size, flags| vk::MemoryHeap { size, flags };
-        // The host's memory, a window into the device's own, and that.
+        // The heaps are the host's memory, a window into the device's memory, and the device's memory.
         let heaps = [heap(900, vk::MemoryHeapFlags::empty()), heap(200, own), heap(800, own)];
         let told = |budget: [u64; 3], usage: [u64; 3]| {
             let mut told = vk::PhysicalDeviceMemoryBudgetPropertiesEXT::default();

@@ -1,26 +1,27 @@
-//! How much goes into a submit: as much as no watchdog minds.
+//! Size of a submit: as large as possible without alarming a watchdog.
 
 use super::capabilities::DeviceInfo;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Longest submit, seconds: systems reset devices that are busy for two, and what draws the screen waits behind each.
+/// Longest submit, seconds: systems reset devices that are busy for two seconds, and drawing of the screen waits behind each
+/// submit.
 pub const LONGEST_SUBMIT_S: f64 = 0.1;
-/// Longest submit of a run in training while someone looks at it, seconds. A picture waits for the two that are under way, which
-/// then take little more than a display shows one of its pictures, at sixty a second.
+/// Longest submit during training while someone looks at pictures of the run, seconds. A picture waits for the two submits
+/// under way, which then take little longer than one frame of a display at 60 Hz.
 pub const LONGEST_SUBMIT_LOOKED_AT_S: f64 = 0.01;
-/// Someone who asked for a picture so long ago may ask for the next one: who turns a view or plays a beat asks several times
-/// a second.
+/// Time after a request for a picture during which another is expected: a user who turns a view or plays a beat makes several
+/// requests a second.
 const LOOKS_LAST: Duration = Duration::from_secs(1);
-/// Submits that are remembered: where the least of them took long, it was not for waiting behind others.
+/// Number of submits that are remembered: if the shortest of them took long, the reason was not waiting behind other work.
 const REMEMBERED: usize = 3;
 
-/// When somebody last asked for a picture that waits behind what a device computes. Clones tell of the same.
+/// Time of the last request for a picture that waits behind the device's work. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub struct Looks(Arc<Mutex<Option<Instant>>>);
 
 impl Looks {
-    /// Somebody asks for a picture.
+    /// Notes a request for a picture.
     pub fn note(&self) {
         self.note_at(Instant::now());
     }
@@ -29,7 +30,7 @@ impl Looks {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(when);
     }
 
-    /// Whether somebody is likely to ask for another.
+    /// Tells whether another request is likely.
     fn are_recent(&self) -> bool {
         is_recent(*self.0.lock().unwrap_or_else(PoisonError::into_inner), Instant::now())
     }
@@ -39,40 +40,41 @@ fn is_recent(last: Option<Instant>, now: Instant) -> bool {
     last.is_some_and(|last| now.saturating_duration_since(last) < LOOKS_LAST)
 }
 
-/// How many items, iterations or rays, a submit takes on a device: what its last submits say.
+/// Number of items (iterations or rays) per submit, derived from the times of the device's last submits.
 #[derive(Debug)]
 pub struct SubmitPace {
     longest_s: Option<f64>,
-    /// Of those whose pictures wait behind these submits.
+    /// Requests of the users whose pictures wait behind these submits.
     looks: Option<Looks>,
     first: u32,
     most: u32,
-    /// Seconds per item of the last submits, newest last.
+    /// Seconds per item of the last submits, the newest last.
     seen: Mutex<Vec<f64>>,
 }
 
-/// The longest submit of a device, seconds; none where nothing watches over it.
+/// Returns the longest submit of a device, seconds; none where no watchdog limits it.
 pub fn longest_submit_s(info: &DeviceInfo) -> Option<f64> {
     (!info.is_cpu()).then_some(LONGEST_SUBMIT_S)
 }
 
 impl SubmitPace {
-    /// Begins with `first` items to a submit, and never takes more than `most`; without a longest submit it takes these at once.
+    /// Starts with `first` items per submit, and never takes more than `most`. Without a longest submit, it always takes
+    /// `most`.
     pub fn new(longest_s: Option<f64>, first: u32, most: u32) -> SubmitPace {
         SubmitPace { longest_s, looks: None, first: first.min(most), most, seen: Mutex::default() }
     }
 
-    /// The same, but submits are short while somebody looks.
+    /// Makes submits short while somebody looks at pictures.
     pub fn giving_way_to(self, looks: &Looks) -> SubmitPace {
         SubmitPace { looks: Some(looks.clone()), ..self }
     }
 
-    /// Whether too few submits are known.
+    /// Tells whether there are too few submits yet to derive a pace.
     pub fn is_trying(&self) -> bool {
         self.longest_s.is_some() && self.seen.lock().unwrap_or_else(PoisonError::into_inner).len() < REMEMBERED
     }
 
-    /// Items of the next submit, at least one.
+    /// Returns the number of items of the next submit, at least one.
     pub fn items(&self) -> u32 {
         let Some(mut longest_s) = self.longest_s else { return self.most };
         if self.looks.as_ref().is_some_and(Looks::are_recent) {
@@ -86,7 +88,7 @@ impl SubmitPace {
         ((longest_s / least_s) as u32).clamp(1, self.most)
     }
 
-    /// Tells how long a submit of so many items took, the wait for it included.
+    /// Notes the duration of a submit of `items` items, including the wait for it.
     pub fn note(&self, items: u32, seconds: f64) {
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         if seen.len() == REMEMBERED {
@@ -95,7 +97,7 @@ impl SubmitPace {
         seen.push(seconds / f64::from(items.max(1)));
     }
 
-    /// Forgets what it knows, before items of another kind.
+    /// Forgets all submits, before items of another kind.
     pub fn restart(&self) {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
@@ -108,13 +110,13 @@ mod tests {
     #[test]
     fn submits_grow_to_what_no_watchdog_minds() {
         let pace = SubmitPace::new(Some(0.1), 4, 1000);
-        // The first waited behind something else.
+        // The first submit waited behind something else.
         for seconds in [3.0, 0.008, 0.008] {
             assert_eq!((pace.items(), pace.is_trying()), (4, true));
             pace.note(4, seconds);
         }
         assert_eq!((pace.items(), pace.is_trying()), (50, false));
-        // A slow one may have waited; several have not.
+        // A single slow submit may have waited; several in a row have not.
         pace.note(50, 1.0);
         pace.note(50, 1.0);
         assert_eq!(pace.items(), 50);
@@ -139,7 +141,7 @@ mod tests {
             (pace(Some(0.1), 0.002), pace(Some(0.1), 0.02), pace(Some(0.001), 0.0005), pace(None, 0.002));
         let items = || [&quick, &slow, &shorter, &unwatched].map(SubmitPace::items);
         assert_eq!(items(), [50, 5, 2, 1000]);
-        // Later than any clock of this test.
+        // This time is later than any clock reading of this test.
         looks.note_at(Instant::now() + hour);
         assert_eq!(items(), [5, 1, 2, 1000], "a hundredth of a second, or an iteration, which is not divided");
         let (now, moment) = (Instant::now() + hour, Duration::from_millis(1));

@@ -1,22 +1,22 @@
-//! One compute pipeline: SPIR-V, specialisation constants, binding table, limit checks.
+//! Compute pipelines: SPIR-V, specialisation constants, binding table, limit checks.
 
 use super::device::{Gpu, Shared};
 use crate::error::{Error, Result};
 use ash::vk;
 use std::sync::Arc;
 
-/// A compiled shader with what reflection found in it.
+/// A compiled shader with its reflected declarations.
 #[derive(Debug)]
 pub struct KernelCode {
-    /// Stage name: shader file, debug label and bench row share it.
+    /// Stage name, which shader file, debug label and bench row share.
     pub name: &'static str,
-    /// Shader it is a build of; the same name where there is only one.
+    /// Shader that this is a build of; equal to `name` for a shader without variants.
     pub shader: &'static str,
     /// SPIR-V bytes.
     pub spirv: &'static [u8],
-    /// Bytes of push constants the caller gives.
+    /// Bytes of push constants that the caller passes.
     pub push_bytes: u32,
-    /// Buffers whose device address is pushed as well, with its offset.
+    /// Buffers whose device address is also pushed, with its offset.
     pub addresses: &'static [(&'static str, u32)],
     /// Buffers the shader uses.
     pub bindings: &'static [BindingCode],
@@ -24,12 +24,12 @@ pub struct KernelCode {
     pub spec_constants: &'static [(&'static str, u32)],
 }
 
-/// What a shader's binding is.
+/// Kind of a shader's binding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BindingKind {
     /// A storage buffer.
     Storage,
-    /// A buffer of few numbers that stay the same during a dispatch.
+    /// A buffer of few numbers that do not change during a dispatch.
     Uniform,
     /// A buffer read through a texel-buffer view.
     Texel,
@@ -44,16 +44,16 @@ pub struct BindingCode {
     pub slot: u32,
     /// Name in the shader.
     pub name: &'static str,
-    /// What is bound.
+    /// Kind of the binding.
     pub kind: BindingKind,
-    /// The shader may read it.
+    /// Whether the shader may read it.
     pub reads: bool,
-    /// The shader may write it.
+    /// Whether the shader may write it.
     pub writes: bool,
 }
 
 impl KernelCode {
-    /// Bytes of push constants, addresses included.
+    /// Returns the bytes of push constants, including addresses.
     pub(super) fn all_push_bytes(&self) -> u32 {
         self.addresses.iter().map(|(_, offset)| offset + 8).fold(self.push_bytes, u32::max)
     }
@@ -70,17 +70,17 @@ pub struct Pipeline {
     pub local_size: u32,
 }
 
-/// What a kernel needs of its subgroups.
+/// Requirements of a kernel on its subgroups.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Subgroups {
-    /// Nothing.
+    /// No requirement.
     Any,
-    /// All full, of so many invocations.
+    /// All subgroups full, with this many invocations.
     Full(u32),
 }
 
 impl Gpu {
-    /// Builds a pipeline. `spec` gives values by name; constants not named keep the shader's default.
+    /// Builds a pipeline. `spec` gives values by name; other constants keep the shader's default.
     ///
     /// # Errors
     /// [`Error::Internal`] for an unknown constant, [`Error::NoDevice`] when the kernel binds more than the device allows,
@@ -89,11 +89,12 @@ impl Gpu {
         self.make_pipeline(code, local_size, spec, Subgroups::Any)
     }
 
-    /// A pipeline as [`Gpu::pipeline`] makes it, with subgroups of the device's default size, all of them full: for cooperative matrices,
-    /// which only devices with [`super::capabilities::DeviceInfo::matrices`] have.
+    /// Builds a pipeline like [`Gpu::pipeline`], with full subgroups of the size
+    /// [`super::capabilities::DeviceInfo::matrix_subgroup`]. It is for cooperative matrices, which only devices with
+    /// [`super::capabilities::DeviceInfo::matrices`] have.
     ///
     /// # Errors
-    /// As [`Gpu::pipeline`].
+    /// Fails like [`Gpu::pipeline`].
     pub fn matrix_pipeline(
         &self,
         code: &'static KernelCode,
@@ -106,14 +107,14 @@ impl Gpu {
         self.make_pipeline(code, local_size, spec, Subgroups::Full(self.info().matrix_subgroup))
     }
 
-    /// Builds a kernel whose subgroups must be full, of so many invocations each: [`DeviceInfo::full_subgroups`], or
+    /// Builds a kernel whose subgroups must be full, with `size` invocations each: [`DeviceInfo::full_subgroups`] or
     /// [`DeviceInfo::small_subgroups`].
     ///
     /// [`DeviceInfo::full_subgroups`]: crate::gpu::capabilities::DeviceInfo::full_subgroups
     /// [`DeviceInfo::small_subgroups`]: crate::gpu::capabilities::DeviceInfo::small_subgroups
     ///
     /// # Errors
-    /// As [`Gpu::pipeline`]; [`Error::Internal`] where subgroups cannot be full.
+    /// Fails like [`Gpu::pipeline`]; [`Error::Internal`] where subgroups cannot be full.
     pub fn subgroup_pipeline(
         &self,
         code: &'static KernelCode,
@@ -234,7 +235,7 @@ impl Gpu {
         // SAFETY: module and layout were just made; entries and values live until the call returns, and the entries lie
         // inside the values.
         let made = unsafe { device.create_compute_pipelines(shared.pipeline_cache, &create, None) };
-        // SAFETY: the module was made above and is no longer needed, whether the pipeline came to be or not.
+        // SAFETY: the module was made above and is not needed after pipeline creation, whether that succeeded or not.
         unsafe { device.destroy_shader_module(module, None) };
         pipeline.raw = made
             .map_err(|(_, code)| code)

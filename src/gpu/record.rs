@@ -1,5 +1,5 @@
-//! A recording of dispatches. Each states what it reads and writes (from the shader's own
-//! qualifiers); barriers follow from that.
+//! Recordings of dispatches. The reads and writes of each dispatch follow from the shader's own qualifiers; barriers follow
+//! from the reads and writes.
 
 use super::buffer::Buffer;
 use super::device::{Gpu, Shared};
@@ -13,12 +13,12 @@ use std::ffi::CString;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-/// What a dispatch binds.
+/// Object that a dispatch binds.
 #[derive(Clone, Copy)]
 pub enum Bound<'a> {
-    /// To a storage or texel buffer.
+    /// Buffer for a storage, uniform or texel binding.
     Buffer(&'a Buffer),
-    /// To a 3D sampler.
+    /// Image for a 3D sampler.
     Image(&'a Image3d),
 }
 
@@ -31,18 +31,18 @@ impl<'a> Bound<'a> {
     }
 }
 
-/// Workgroups along an axis that every device takes.
+/// Number of workgroups along an axis that every device supports.
 pub const MOST_GROUPS: u32 = 65_535;
 
-/// How many workgroups to run.
+/// Number of workgroups to run.
 pub enum Groups<'a> {
-    /// Known now.
+    /// Number known at recording time.
     Direct([u32; 3]),
-    /// Read by the device from three `u32` at a byte offset.
+    /// Number that the device reads as three `u32` at a byte offset.
     Indirect(&'a Buffer, u64),
 }
 
-/// Time one pass took on the device.
+/// Device time of one pass.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct PassTime {
     /// Stage name.
@@ -59,7 +59,7 @@ pub struct Recording {
     timed: Option<u32>,
 }
 
-/// Finished commands; may be submitted any number of times.
+/// Finished commands; they may be submitted any number of times.
 pub struct Commands {
     gpu: Arc<Shared>,
     name: String,
@@ -75,7 +75,7 @@ pub struct Commands {
     last_submit: std::sync::atomic::AtomicU64,
 }
 
-/// What a slot of a descriptor set refers to.
+/// Object in a slot of a descriptor set.
 enum Descriptor {
     Buffer(vk::DescriptorBufferInfo),
     Texel(vk::BufferView),
@@ -115,7 +115,7 @@ impl Descriptor {
     }
 }
 
-/// Bytes of a uniform buffer that every device takes.
+/// Largest uniform buffer that every device supports, bytes.
 const LARGEST_UNIFORM: u64 = 16384;
 const SETS_PER_POOL: u32 = 64;
 const MAX_BINDINGS: u32 = 16;
@@ -129,10 +129,10 @@ impl Recording {
         Self::start(gpu, name, None)
     }
 
-    /// Like [`Recording::new`], with a timestamp around each of at most `max_passes` dispatches.
+    /// Starts a recording like [`Recording::new`], with a timestamp before and after each of at most `max_passes` dispatches.
     ///
     /// # Errors
-    /// As [`Recording::new`].
+    /// Fails like [`Recording::new`].
     pub fn timed(gpu: &Gpu, name: &str, max_passes: u32) -> Result<Recording> {
         Self::start(gpu, name, (gpu.info().timestamp_period_ns > 0.0).then_some(max_passes))
     }
@@ -157,7 +157,7 @@ impl Recording {
         };
         let device = &shared.device;
         let create = vk::CommandPoolCreateInfo::default().queue_family_index(shared.queue_family);
-        // SAFETY: the create info lives until the call returns; the family is the one the device's queue is of.
+        // SAFETY: the create info lives until the call returns; the family is that of the device's queue.
         commands.pool =
             unsafe { device.create_command_pool(&create, None) }.map_err(Error::vulkan("vkCreateCommandPool", name))?;
         let allocate = vk::CommandBufferAllocateInfo::default().command_pool(commands.pool).command_buffer_count(1);
@@ -229,7 +229,7 @@ impl Recording {
         }
     }
 
-    /// Records one dispatch. `given` are bound by the names the shader gives them.
+    /// Records one dispatch. `given` are bound by their names in the shader.
     ///
     /// # Errors
     /// [`Error::Internal`] when a name or a push-constant size does not fit the shader, or a group count the device.
@@ -313,7 +313,7 @@ impl Recording {
             if pass >= max {
                 return Err(Error::Internal(format!("{}: more than {max} timed passes", self.commands.name)));
             }
-            // A barrier after each pass keeps passes from overlapping, so that times are theirs alone.
+            // A barrier after each pass keeps passes from overlapping, so that each time belongs to one pass only.
             self.barrier();
             // SAFETY: the start of this recording reset all queries, of which there are two for each of `max` passes.
             unsafe {
@@ -369,13 +369,13 @@ impl Recording {
         Ok(set)
     }
 
-    /// A set from the last pool, or from a new one when that is full.
+    /// Allocates a set from the last pool, or from a new one when that is full.
     fn empty_set(&mut self, pipeline: &Pipeline) -> Result<vk::DescriptorSet> {
         let layouts = [pipeline.set_layout];
         let gpu = self.commands.gpu.clone();
         let from = |pool| {
             let allocate = vk::DescriptorSetAllocateInfo::default().descriptor_pool(pool).set_layouts(&layouts);
-            // SAFETY: the pool belongs to this recording, which one thread at a time uses; the layout to the pipeline.
+            // SAFETY: the pool belongs to this recording, which one thread at a time uses; the layout belongs to the pipeline.
             unsafe { gpu.device.allocate_descriptor_sets(&allocate) }.map(|sets| sets[0])
         };
         let failed = || Error::vulkan("vkAllocateDescriptorSets", pipeline.code.name);
@@ -414,7 +414,7 @@ impl Recording {
         Ok(())
     }
 
-    /// Records filling a whole image from a buffer; afterwards it may be sampled.
+    /// Records a copy from a buffer to a whole image; afterwards the image may be sampled.
     pub(super) fn fill_image(&mut self, from: &Buffer, to: &Image3d) -> Result<()> {
         from.check_range(0, to.bytes())?;
         self.depend(&[from], &[]);
@@ -449,7 +449,7 @@ impl Recording {
         let by_region = vk::DependencyFlags::empty();
         // SAFETY: the command buffer is being recorded; the buffer holds all cells, as checked; `commands` keeps both.
         unsafe {
-            // Frames submitted earlier may still read what is replaced.
+            // Work submitted earlier may still read the old contents.
             device.cmd_pipeline_barrier(raw, top | compute, transfer, by_region, &[], &[], &before);
             device.cmd_copy_buffer_to_image(raw, from.raw(), to.raw(), copying, &region);
             device.cmd_pipeline_barrier(raw, transfer, compute, by_region, &[], &[], &after);
@@ -493,12 +493,12 @@ impl Recording {
     }
 }
 
-/// A point in the device's work; see [`Gpu::wait`].
+/// A point in the sequence of the device's submits; see [`Gpu::wait`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Ticket(u64);
 
 impl Commands {
-    /// Hands the commands to the device.
+    /// Submits the commands to the device.
     ///
     /// # Errors
     /// [`Error::DeviceLost`], [`Error::OutOfMemory`] or [`Error::Vulkan`].
@@ -521,12 +521,12 @@ impl Commands {
         Ok(Ticket(value))
     }
 
-    /// Barriers at which commands wait for earlier ones, that at the beginning among them.
+    /// Returns the number of barriers at which commands wait for earlier ones, including the barrier at the start.
     pub fn barriers(&self) -> u32 {
         self.barriers
     }
 
-    /// Device time of each pass of the last submit, which must be complete. Empty without timestamps.
+    /// Returns the device time of each pass of the last submit, which must be complete. Empty without timestamps.
     ///
     /// # Errors
     /// [`Error::Vulkan`].
@@ -540,7 +540,7 @@ impl Commands {
         unsafe { self.gpu.device.get_query_pool_results(self.queries, 0, &mut ticks, flags) }
             .map_err(Error::vulkan("vkGetQueryPoolResults", &self.name))?;
         let period_ms = f64::from(self.gpu.info.timestamp_period_ns) * 1e-6;
-        // Counters of fewer bits begin again at zero.
+        // Counters of fewer bits wrap around to zero.
         let bits = self.gpu.info.timestamp_bits;
         let mask = if bits < u64::BITS { (1 << bits) - 1 } else { u64::MAX };
         Ok(self
@@ -566,7 +566,7 @@ impl Drop for Commands {
     fn drop(&mut self) {
         let submitted = self.last_submit.load(Ordering::Acquire);
         if submitted > 0 {
-            // After a lost device nothing runs any more, so destroying is allowed all the same.
+            // A lost device runs nothing, so destroying is allowed even if the wait fails.
             let _ = self.gpu.wait(submitted);
         }
         // SAFETY: the last submit is complete, and each pool is destroyed once, here; null handles are ignored.

@@ -1,5 +1,5 @@
-//! Clock, power and temperature of a device while something is measured, where the system tells: `nvidia-smi` of NVIDIA's
-//! driver, the `amdgpu` driver's files, `/proc/cpuinfo` for the host's own processor.
+//! Reads clock, power and temperature of a device during a measurement, where the system provides them: `nvidia-smi` of
+//! NVIDIA's driver, the `amdgpu` driver's files, `/proc/cpuinfo` for the host's own processor.
 
 use crate::gpu::capabilities::DeviceInfo;
 use serde::{Deserialize, Serialize};
@@ -12,12 +12,12 @@ use std::time::{Duration, Instant};
 
 /// Time from one reading to the next.
 const PAUSE: Duration = Duration::from_millis(500);
-/// Time that a program may take to tell.
+/// Longest wait for a program's output.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// Where Linux keeps devices that draw.
+/// Directory in which Linux lists graphics devices.
 const DRM: &str = "/sys/class/drm";
 
-/// One look at a device; what the system does not tell is none.
+/// One reading of a device's sensors; values that the system does not provide are none.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Reading {
     /// Clock of the compute units, MHz.
@@ -28,23 +28,23 @@ pub struct Reading {
     pub temperature_c: Option<f64>,
 }
 
-/// Least, mean and greatest of a quantity.
+/// Minimum, mean and maximum of a quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Span {
-    /// Least.
+    /// Minimum.
     pub least: f64,
     /// Mean.
     pub mean: f64,
-    /// Greatest.
+    /// Maximum.
     pub greatest: f64,
 }
 
-/// What a device showed meanwhile.
+/// Summary of a device's readings during a measurement.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Readings {
-    /// Who told.
+    /// Name of the source of the readings.
     pub source: String,
-    /// Readings taken, two a second.
+    /// Number of readings, two per second.
     pub count: usize,
     /// Clock of the compute units, MHz.
     pub clock_mhz: Option<Span>,
@@ -54,7 +54,7 @@ pub struct Readings {
     pub temperature_c: Option<Span>,
 }
 
-/// Where a device's readings come from.
+/// Source of a device's readings.
 #[derive(Debug, Clone, PartialEq)]
 enum Source {
     NvidiaSmi { uuid: String },
@@ -63,7 +63,7 @@ enum Source {
 }
 
 impl Source {
-    /// What knows the device, if anything does.
+    /// Returns the source that can read the device's sensors, if there is one.
     fn of(info: &DeviceInfo) -> Option<Source> {
         let name = format!("{} {}", info.name, info.driver).to_lowercase();
         let source = if info.is_cpu() {
@@ -95,7 +95,7 @@ impl Source {
     }
 }
 
-/// A device's UUID as NVIDIA's tools write it, from 32 hexadecimal digits.
+/// Returns a device's UUID as NVIDIA's tools write it, from 32 hexadecimal digits.
 fn nvidia_uuid(digits: &str) -> Option<String> {
     let part = |from: usize, to: usize| digits.get(from..to);
     let (a, b, c, d, e) = (part(0, 8)?, part(8, 12)?, part(12, 16)?, part(16, 20)?, part(20, 32)?);
@@ -109,7 +109,8 @@ fn read_nvidia(uuid: &str) -> Option<Reading> {
     nvidia_line(&output_within(command, PATIENCE)?)
 }
 
-/// What a command prints, if it succeeds in time; it hangs where a driver does. What it prints must fit a pipe.
+/// Returns the output of a command, if it succeeds in time: the command may hang when a driver does. The output must fit in a
+/// pipe.
 fn output_within(mut command: Command, patience: Duration) -> Option<String> {
     let mut child = command.spawn().ok()?;
     let end = Instant::now() + patience;
@@ -118,7 +119,7 @@ fn output_within(mut command: Command, patience: Duration) -> Option<String> {
             Some(status) => break status,
             None if Instant::now() < end => std::thread::sleep(PAUSE / 50),
             None => {
-                // Killed or gone: either way there is nothing to read.
+                // The command was killed or had already ended; in both cases there is no output to read.
                 let _ = child.kill();
                 return None;
             }
@@ -129,14 +130,15 @@ fn output_within(mut command: Command, patience: Duration) -> Option<String> {
     status.success().then_some(text)
 }
 
-/// A line of `nvidia-smi`: numbers, or words in brackets for what the card does not tell.
+/// Reads a line of `nvidia-smi`: numbers, or words in brackets for values the card does not provide.
 fn nvidia_line(line: &str) -> Option<Reading> {
     let mut fields = line.lines().next()?.split(',').map(|field| field.trim().parse::<f64>().ok());
     let mut next = || fields.next();
     Some(Reading { clock_mhz: next()?, power_w: next()?, temperature_c: next()? })
 }
 
-/// The sensors of the one card of the `amdgpu` driver; none where there are several, as nothing says which is meant.
+/// Finds the sensors of the only card of the `amdgpu` driver; none where there are several, because nothing says which one is
+/// meant.
 fn the_only_amdgpu(drm: &Path) -> Option<PathBuf> {
     let entries = |directory: &Path| std::fs::read_dir(directory).into_iter().flatten().flatten().map(|e| e.path());
     let is_card = |path: &PathBuf| {
@@ -149,7 +151,7 @@ fn the_only_amdgpu(drm: &Path) -> Option<PathBuf> {
     found.next().filter(|_| found.next().is_none())
 }
 
-/// Files of the kernel's hardware monitor: hertz, microwatts, thousandths of a degree.
+/// Reads files of the kernel's hardware monitor, which are in hertz, microwatts and thousandths of a degree.
 fn read_amdgpu(directory: &Path) -> Option<Reading> {
     let number = |file: &str| std::fs::read_to_string(directory.join(file)).ok()?.trim().parse::<f64>().ok();
     let power = number("power1_average").or_else(|| number("power1_input"));
@@ -160,7 +162,7 @@ fn read_amdgpu(directory: &Path) -> Option<Reading> {
     })
 }
 
-/// The greatest clock of the processors that `/proc/cpuinfo` lists: others may be idle.
+/// Returns the highest clock of the processors that `/proc/cpuinfo` lists, because other processors may be idle.
 fn cpu_clock(cpuinfo: &str) -> Option<Reading> {
     let field = |line: &str| line.strip_prefix("cpu MHz")?.split(':').nth(1)?.trim().parse::<f64>().ok();
     let clocks: Vec<f64> = cpuinfo.lines().filter_map(field).collect();
@@ -168,7 +170,7 @@ fn cpu_clock(cpuinfo: &str) -> Option<Reading> {
     Some(Reading { clock_mhz: Some(span.greatest), ..Reading::default() })
 }
 
-/// The name that `/proc/cpuinfo` has for the host's processor.
+/// Returns the name of the host's processor from `/proc/cpuinfo`.
 pub fn host_processor() -> Option<String> {
     let text = std::fs::read_to_string("/proc/cpuinfo").ok()?;
     let line = text.lines().find(|line| line.starts_with("model name"))?;
@@ -195,14 +197,14 @@ fn summary(source: &Source, readings: &[Reading]) -> Readings {
     }
 }
 
-/// Reads a device's sensors until it is asked what they said.
+/// Thread that reads a device's sensors until it is stopped.
 pub struct Watch {
     stop: Sender<()>,
     thread: JoinHandle<Readings>,
 }
 
 impl Watch {
-    /// Begins; none where nothing tells of the device.
+    /// Starts reading; none where no source can read the device's sensors.
     pub fn begin(info: &DeviceInfo) -> Option<Watch> {
         let source = Source::of(info)?;
         let (stop, stopped) = channel::<()>();
@@ -219,7 +221,7 @@ impl Watch {
         Some(Watch { stop, thread })
     }
 
-    /// Ends; what the device showed since the beginning.
+    /// Stops reading and returns the summary since the start.
     pub fn end(self) -> Option<Readings> {
         drop(self.stop);
         self.thread.join().ok()
@@ -232,7 +234,7 @@ mod tests {
 
     #[test]
     fn a_line_of_nvidia_smi_is_read() {
-        // As `nvidia-smi --query-gpu=clocks.sm,power.draw,temperature.gpu --format=csv,noheader,nounits` prints.
+        // Output format of `nvidia-smi --query-gpu=clocks.sm,power.draw,temperature.gpu --format=csv,noheader,nounits`.
         let told = nvidia_line("1980, 412.35, 54\n").unwrap();
         assert_eq!(told, Reading { clock_mhz: Some(1980.0), power_w: Some(412.35), temperature_c: Some(54.0) });
         let silent = nvidia_line("1980, [N/A], [Not Supported]\n").unwrap();
@@ -269,7 +271,7 @@ mod tests {
         };
         let sensors = card("card1", "amdgpu\n");
         card("card0", "i915\n");
-        // Its connectors are listed beside a card.
+        // The directory lists a card's connectors beside the card.
         card("card1-DP-1", "amdgpu\n");
         assert_eq!(the_only_amdgpu(drm.path()), Some(sensors.clone()));
         let told = read_amdgpu(&sensors).unwrap();

@@ -1,4 +1,4 @@
-//! What drivers tell of the pipelines they compile, where they are asked to: `VK_KHR_pipeline_executable_properties`.
+//! Drivers' statistics of the pipelines they compile, kept on demand: `VK_KHR_pipeline_executable_properties`.
 
 use super::capabilities::DeviceInfo;
 use super::device::{Gpu, Shared};
@@ -9,24 +9,25 @@ use ash::{khr, vk};
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
-/// A pipeline that was built.
+/// Statistics of one built pipeline.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PipelineStatistics {
-    /// The kernel.
+    /// Name of the kernel.
     pub kernel: &'static str,
     /// Invocations of a workgroup.
     pub lanes: u32,
     /// Specialisation constants that were set.
     pub constants: BTreeMap<String, u32>,
-    /// Invocations of a subgroup; none where the driver does not tell.
+    /// Invocations of a subgroup; none where the driver does not report them.
     pub subgroup_size: Option<u32>,
-    /// Numbers under the driver's own names; empty where it does not tell.
+    /// Numbers under the driver's own names; empty where it reports none.
     pub numbers: BTreeMap<String, f64>,
 }
 
-/// Pipelines built so far.
+/// Statistics of the pipelines built so far.
 pub(super) struct StatisticsKeeper {
-    /// None where the driver does not tell; pipelines are listed all the same.
+    /// Functions of the extension; none where the driver does not have it, in which case pipelines are listed without
+    /// numbers.
     functions: Option<khr::pipeline_executable_properties::Device>,
     found: Mutex<Vec<PipelineStatistics>>,
 }
@@ -38,7 +39,7 @@ impl StatisticsKeeper {
         StatisticsKeeper { functions, found: Mutex::default() }
     }
 
-    /// What a pipeline must be made with.
+    /// Returns the flags that a pipeline must be made with.
     pub(super) fn flags(&self) -> vk::PipelineCreateFlags {
         match self.functions {
             Some(_) => vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR,
@@ -46,7 +47,7 @@ impl StatisticsKeeper {
         }
     }
 
-    /// Notes a pipeline that was just made with [`StatisticsKeeper::flags`].
+    /// Adds a pipeline that was just made with [`StatisticsKeeper::flags`].
     pub(super) fn note(&self, raw: vk::Pipeline, code: &KernelCode, lanes: u32, spec: &[(&str, u32)]) -> Result<()> {
         let mut pipeline = PipelineStatistics {
             kernel: code.name,
@@ -60,7 +61,7 @@ impl StatisticsKeeper {
             // SAFETY: the device was made with the extension and its feature, and the pipeline from the device.
             let executables = unsafe { functions.get_pipeline_executable_properties(&about) }
                 .map_err(Error::vulkan("vkGetPipelineExecutablePropertiesKHR", code.name))?;
-            // The driver may have built a kernel for several sizes of subgroups, and runs the last.
+            // The driver may have built a kernel for several subgroup sizes; it runs the last one.
             if let Some(last) = executables.len().checked_sub(1) {
                 pipeline.subgroup_size = Some(executables[last].subgroup_size).filter(|size| *size > 0);
                 let about = vk::PipelineExecutableInfoKHR::default().pipeline(raw).executable_index(last as u32);
@@ -81,7 +82,7 @@ fn name(statistic: &vk::PipelineExecutableStatisticKHR<'_>) -> Option<String> {
 
 fn value(statistic: &vk::PipelineExecutableStatisticKHR<'_>) -> f64 {
     use vk::PipelineExecutableStatisticFormatKHR as Format;
-    // SAFETY: the driver says by the format which of the union's members it has written.
+    // SAFETY: the format says which of the union's members the driver has written.
     unsafe {
         match statistic.format {
             Format::BOOL32 => f64::from(statistic.value.b32),
@@ -93,14 +94,14 @@ fn value(statistic: &vk::PipelineExecutableStatisticKHR<'_>) -> f64 {
 }
 
 impl Shared {
-    /// Flags of pipelines to be made.
+    /// Returns the flags for new pipelines.
     pub(super) fn pipeline_flags(&self) -> vk::PipelineCreateFlags {
         self.statistics.as_ref().map_or(vk::PipelineCreateFlags::empty(), StatisticsKeeper::flags)
     }
 }
 
 impl Gpu {
-    /// Pipelines built so far, in their order; none unless the device was opened to keep statistics.
+    /// Returns the pipelines built so far, in their order; empty unless the device was opened to keep statistics.
     pub fn pipeline_statistics(&self) -> Vec<PipelineStatistics> {
         self.shared.statistics.as_ref().map_or(Vec::new(), |keeper| lock(&keeper.found).clone())
     }

@@ -1,4 +1,4 @@
-//! Data on its way between host and device: uploads, downloads, cells of images.
+//! Transfers between host and device: uploads, downloads, cells of images.
 
 use super::buffer::{Buffer, Memory};
 use super::device::Gpu;
@@ -7,21 +7,21 @@ use super::record::{Commands, Recording};
 use crate::error::{Error, Result};
 use bytemuck::Pod;
 
-/// Copies larger than this go through several staging buffers, to bound host memory.
+/// Size of a staging buffer; larger copies go through several, to bound host memory.
 const STAGING_BYTES: usize = 32 << 20;
 
 impl Gpu {
-    /// A device buffer filled with `data`.
+    /// Makes a device buffer filled with `data`.
     ///
     /// # Errors
-    /// As [`Gpu::buffer`], plus errors of the copy.
+    /// Fails like [`Gpu::buffer`], or with the errors of the copy.
     pub fn buffer_with<T: Pod>(&self, name: &str, data: &[T]) -> Result<Buffer> {
         let buffer = self.buffer(name, size_of_val(data).max(16) as u64, Memory::Device)?;
         self.upload(&buffer, 0, data)?;
         Ok(buffer)
     }
 
-    /// Copies `data` into `buffer` at `offset` bytes and waits.
+    /// Copies `data` into `buffer` at `offset` bytes, and waits for the copy.
     ///
     /// # Errors
     /// [`Error::Internal`] when it does not fit; errors of the copy otherwise.
@@ -40,10 +40,10 @@ impl Gpu {
         Ok(())
     }
 
-    /// Reads `count` elements at `offset` bytes of `buffer`, waiting for earlier submits.
+    /// Reads `count` elements at `offset` bytes of `buffer`, after waiting for earlier submits.
     ///
     /// # Errors
-    /// As [`Gpu::upload`].
+    /// Fails like [`Gpu::upload`].
     pub fn download<T: Pod>(&self, buffer: &Buffer, offset: u64, count: usize) -> Result<Vec<T>> {
         let mut out = vec![T::zeroed(); count];
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut out);
@@ -62,11 +62,11 @@ impl Gpu {
 }
 
 impl Image3d {
-    /// Replaces all cells, x fastest, between what was submitted so far and what is submitted next. Dropping the result
-    /// waits.
+    /// Replaces all cells, x fastest, after the work submitted so far and before the work submitted next. Dropping the
+    /// result waits for the copy.
     ///
     /// # Errors
-    /// [`Error::Internal`] for another number of cells; errors of the upload.
+    /// [`Error::Internal`] for a wrong number of cells; errors of the upload.
     pub fn fill(&self, cells: &[half::f16]) -> Result<Commands> {
         let bytes: &[u8] = bytemuck::cast_slice(cells);
         if bytes.len() as u64 != self.bytes() {

@@ -1,4 +1,4 @@
-//! Dispatches whose buffers are found by the names the shaders give them.
+//! Dispatches whose buffers are found by their names in the shaders.
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::Buffer;
@@ -11,11 +11,11 @@ include!(concat!(env!("OUT_DIR"), "/bindings.rs"));
 
 /// Buffers that shaders find by name.
 pub trait BufferSet {
-    /// The buffer of that name, if it is among them.
+    /// Returns the buffer of that name, if the set has it.
     fn find(&self, name: Binding) -> Option<&Buffer>;
 }
 
-/// Declares a struct of buffers, which shaders find under the names of its fields.
+/// Declares a struct of buffers; shaders find each buffer by its field's name.
 macro_rules! buffer_set {
     ($(#[$about:meta])* $visibility:vis struct $name:ident { $($(#[$doc:meta])* $field:ident,)* }) => {
         $(#[$about])*
@@ -46,7 +46,7 @@ impl<'a> From<&'a Image3d> for Bound<'a> {
     }
 }
 
-/// Records `stage`, binding everything its shader names from `bound`.
+/// Records `stage`; `bound` must provide everything that its shader binds.
 ///
 /// # Errors
 /// [`Error::Internal`] naming what is not bound; errors of [`Recording::dispatch`].
@@ -60,10 +60,10 @@ pub fn dispatch<P: PushConstants>(
     dispatch_finding(recording, stage, groups, bound, |_| None, push)
 }
 
-/// Records `stage` as [`dispatch`] does; what is not in `bound` is found by `find`.
+/// Records `stage` like [`dispatch`]; buffers that are not in `bound` are looked up with `find`.
 ///
 /// # Errors
-/// As [`dispatch`].
+/// Fails like [`dispatch`].
 pub fn dispatch_finding<'a, P: PushConstants>(
     recording: &mut Recording,
     stage: &Stage<P>,

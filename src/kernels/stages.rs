@@ -1,5 +1,5 @@
-//! The compute stages. A stage has one name everywhere: shader file, field of [`Kernels`], CPU twin,
-//! debug label and bench row. Buffers are found by the names the shaders give them.
+//! The compute stages. A stage has the same name everywhere: shader file, field of [`Kernels`], CPU twin, debug label and bench
+//! row. Buffers are found by their names in the shaders.
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::Operands;
@@ -22,12 +22,12 @@ pub fn kernel_code(name: &str) -> Result<&'static KernelCode> {
     KERNEL_TABLE.iter().find(|k| k.name == name).ok_or_else(|| Error::Internal(format!("no kernel is called `{name}`")))
 }
 
-/// Every shader there is, by name: variants are not counted apart.
+/// Returns the names of all shaders; variants are not counted separately.
 pub fn shaders() -> BTreeSet<&'static str> {
     KERNEL_TABLE.iter().map(|code| code.shader).collect()
 }
 
-/// A pipeline of the shader whose push constants are `P`; clones share it.
+/// Pipeline of the shader whose push constants are `P`; clones share it.
 pub struct Stage<P> {
     pipeline: Arc<Pipeline>,
     push: PhantomData<P>,
@@ -49,24 +49,24 @@ impl<P: PushConstants> Stage<P> {
         self.pipeline.local_size
     }
 
-    /// Workgroups for `n` invocations.
+    /// Returns the workgroups for `n` invocations.
     pub fn groups_for(&self, n: u32) -> Groups<'static> {
         Groups::Direct([n.div_ceil(self.local_size()).max(1), 1, 1])
     }
 
-    /// Workgroups for `n` invocations of a shader that counts them by `inc/workgroup.glsl`, however many there are.
+    /// Returns the workgroups for any number `n` of invocations of a shader that counts them by `inc/workgroup.glsl`.
     pub fn groups_over(&self, n: u32) -> Groups<'static> {
         along_two_axes(n.div_ceil(self.local_size()))
     }
 }
 
-/// So many workgroups or a few more, along two axes where one does not take them all.
+/// Returns at least `groups` workgroups, spread over two axes where one axis does not take them all.
 pub fn along_two_axes(groups: u32) -> Groups<'static> {
     let rows = groups.div_ceil(MOST_GROUPS).max(1);
     Groups::Direct([groups.div_ceil(rows).max(1), rows, 1])
 }
 
-/// How a stage is built: as its shader says, unless stated otherwise.
+/// Options of building a stage; the defaults are those of its shader.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Build<'a> {
     /// Suffix of the shader's variant in `glsl/variants.txt`.
@@ -77,13 +77,14 @@ pub struct Build<'a> {
     pub constants: &'a [(&'a str, u32)],
     /// Whether the stage needs full subgroups, for cooperative matrices.
     pub matrices: bool,
-    /// Whether the shader also has a variant whose lanes exchange values within full subgroups: it is taken where they can.
+    /// Whether the shader also has a variant whose lanes exchange values within full subgroups; it is used on devices that have
+    /// them.
     pub exchanges: bool,
-    /// Whether the shader also has variants that add 64-bit integers to memory: they are taken where the device can.
+    /// Whether the shader also has variants that add 64-bit integers to memory; they are used on devices that support it.
     pub int64: bool,
 }
 
-/// Invocations of the subgroups that a workgroup of so many `lanes` consists of, if they are full and exchange values.
+/// Returns the subgroup size for a workgroup of `lanes` invocations, if the subgroups can be full and exchange values.
 pub fn full_subgroup(gpu: &Gpu, lanes: u32) -> Option<u32> {
     let info = gpu.info();
     let fits = |size: &u32| lanes.is_multiple_of(*size) && lanes / size <= info.max_workgroup_subgroups;
@@ -92,7 +93,7 @@ pub fn full_subgroup(gpu: &Gpu, lanes: u32) -> Option<u32> {
 
 /// Suffix of variants whose lanes exchange values.
 const EXCHANGING: &str = "_subgroup";
-/// Suffix of variants that add 64-bit integers to memory, behind that of [`EXCHANGING`].
+/// Suffix of variants that add 64-bit integers to memory; it follows [`EXCHANGING`].
 const INT64: &str = "_int64";
 
 impl Build<'_> {
@@ -101,9 +102,9 @@ impl Build<'_> {
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
     pub fn stage<P: PushConstants>(self, gpu: &Gpu) -> Result<Stage<P>> {
-        // Not every device takes workgroups as large as some shaders would like; these work with any power of two.
+        // Some devices do not take workgroups as large as some shaders' default; these shaders work with any power of two.
         let lanes = self.lanes.unwrap_or(P::LOCAL_SIZE.min(power_of_two_below(gpu.info().max_workgroup_invocations)));
-        // Operands through texel buffers are for drivers that are old and slow at all else.
+        // Variants with texel buffers are for old drivers, which do not exchange values or add 64-bit integers efficiently.
         let is_plain = self.variant.is_empty();
         let subgroup = full_subgroup(gpu, lanes).filter(|_| self.exchanges && is_plain);
         let variant = if subgroup.is_some() { EXCHANGING } else { self.variant };
@@ -120,54 +121,54 @@ impl Build<'_> {
     }
 }
 
-/// The largest power of two that is not larger.
+/// Returns the largest power of two that is not larger than `n`.
 fn power_of_two_below(n: u32) -> u32 {
     1 << n.max(1).ilog2()
 }
 
 /// Pipelines of every path.
 pub struct Kernels {
-    /// Choices they were built with.
+    /// Tuning that the pipelines were built with.
     pub tuning: Tuning,
-    /// Rays of a workgroup of `march_count` and `march_emit`.
+    /// Rays per workgroup of `march_count` and `march_emit`.
     pub rays_counted: u32,
-    /// Rays of a workgroup of `march_loss` and `march_fwd`.
+    /// Rays per workgroup of `march_loss` and `march_fwd`.
     pub rays_marched: u32,
     /// Draws the rays of an iteration.
     pub batch: Stage<push::Batch>,
-    /// Rays of a pose, for rendering.
+    /// Sets up the rays of a pose, for rendering.
     pub pose_rays: Stage<push::PoseRays>,
     /// Counts live dynamic samples.
     pub march_count: Stage<push::MarchCount>,
-    /// Offsets and indirect arguments.
+    /// Computes sample offsets and indirect arguments.
     pub march_scan: Stage<push::MarchScan>,
     /// Writes live samples.
     pub march_emit: Stage<push::MarchEmit>,
-    /// Line integrals, residuals and their gradients, and the scatter to planes and lines.
+    /// Computes line integrals, residuals and their gradients, and scatters the gradients to planes and lines.
     pub march_loss: Stage<push::MarchLoss>,
-    /// Line integrals and maxima, for rendering.
+    /// Computes line integrals and maxima, for rendering.
     pub march_fwd: Stage<push::MarchFwd>,
-    /// Cells of the dynamic field.
+    /// Writes cells of the dynamic field.
     pub volume_dynamic: Stage<push::VolumeDynamic>,
-    /// Cells of the static field.
+    /// Writes cells of the static field.
     pub volume_static: Stage<push::VolumeStatic>,
-    /// Line integrals and maxima of baked volumes.
+    /// Computes line integrals and maxima of baked volumes.
     pub baked_march: Stage<push::BakedMarch>,
-    /// Gradients of biases, latent weights and latents.
+    /// Computes the gradients of biases, latent weights and latents.
     pub mlp_latent_bwd: Stage<push::MlpLatentBwd>,
-    /// Gradient of the static field, with its total variation.
+    /// Computes the gradient of the static field, with its total variation.
     pub gradient_static: Stage<push::GradientStatic>,
-    /// Gradient of the network.
+    /// Computes the gradient of the network.
     pub gradient_network: Stage<push::GradientNetwork>,
-    /// The optimiser.
+    /// Updates the parameters (optimiser).
     pub adam: Stage<push::Adam>,
-    /// Losses, loss scale and step count.
+    /// Reports losses; updates loss scale and step count.
     pub report: Stage<push::Report>,
 }
 
 impl Kernels {
-    /// Builds the pipelines for a static field with `line_params` numbers on its lines, which is looked at in `static_samples` on each
-    /// ray.
+    /// Builds the pipelines for a static field with `line_params` numbers on its lines, which is evaluated at `static_samples`
+    /// samples of each ray.
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
@@ -205,11 +206,11 @@ impl Kernels {
     }
 }
 
-/// Pipelines of a still field that is a network.
+/// Pipelines of a static field that is a network.
 pub struct StillKernels {
-    /// Line integrals of two networks, and maxima.
+    /// Computes line integrals of two networks, and maxima.
     pub march_fwd_samples: Stage<push::MarchFwdSamples>,
-    /// Losses of two networks and their gradient at each sample.
+    /// Computes the losses of two networks and their gradient at each sample.
     pub loss_samples: Stage<push::LossSamples>,
 }
 
@@ -226,23 +227,23 @@ impl StillKernels {
 
 /// Pipelines of the f32 network.
 pub struct LayerKernels {
-    /// Choices they were built with.
+    /// Tuning that the pipelines were built with.
     pub tuning: Tuning,
-    /// Bias and latent, one row per phase.
+    /// Computes bias plus latent contribution, one row per phase.
     pub mlp_latent_fwd: Stage<push::MlpLatentFwd>,
-    /// Positional encoding.
+    /// Computes the positional encoding.
     pub encode: Stage<push::Encode>,
-    /// One hidden layer.
+    /// Computes one hidden layer.
     pub mlp_layer_fwd: Stage<push::MlpLayerFwd>,
-    /// Output neuron and activation.
+    /// Computes output neuron and activation.
     pub mlp_out_fwd: Stage<push::MlpOutFwd>,
-    /// Gradient at the output neuron.
+    /// Computes the gradient at the output neuron.
     pub mlp_out_bwd: Stage<push::MlpOutBwd>,
-    /// Weight gradient of the output neuron.
+    /// Computes the weight gradient of the output neuron.
     pub mlp_out_bwd_weight: Stage<push::MlpOutBwdWeight>,
-    /// Gradient to a layer's hidden input.
+    /// Computes the gradient to a layer's hidden input.
     pub mlp_layer_bwd_input: Stage<push::MlpLayerBwdInput>,
-    /// Weight gradient of a hidden layer.
+    /// Computes the weight gradient of a hidden layer.
     pub mlp_layer_bwd_weight: Stage<push::MlpLayerBwdWeight>,
     /// Sums over each ray's samples.
     pub mlp_ray_sum: Stage<push::MlpRaySum>,
@@ -276,12 +277,12 @@ impl LayerKernels {
     }
 }
 
-/// Variant of the shaders that read arrays of vec4; only the layers' time depends on doing so through addresses.
+/// Returns the variant of the shaders that read arrays of vec4. Reading through addresses only matters for the layers' time.
 pub(crate) fn vec4_variant(tuning: &Tuning) -> &'static str {
     if tuning.operands == Operands::Texel { "_texel" } else { "" }
 }
 
-/// Variant of the layers' shaders.
+/// Returns the variant of the layers' shaders.
 fn layer_variant(tuning: &Tuning) -> &'static str {
     match tuning.operands {
         Operands::Storage => "",

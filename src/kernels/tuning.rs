@@ -8,7 +8,7 @@ use crate::kernels::constants;
 use crate::kernels::push::{MarchLoss, PushConstants};
 use serde::Serialize;
 
-/// The register tile of three kernels that work together, from what their text defines.
+/// Returns the register tile of three kernels that work together, from the numbers that their text defines.
 macro_rules! lane_tile {
     ($forward:ident, $input:ident, $weight:ident) => {{
         const { assert!(constants::$forward::SAMPLES == constants::$input::SAMPLES) };
@@ -22,7 +22,7 @@ macro_rules! lane_tile {
     }};
 }
 
-/// How the network's layers are computed.
+/// Computation path of the network's layers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Layers {
@@ -50,46 +50,48 @@ pub struct MatrixTuning {
     pub workgroups: u32,
     /// Samples of a workgroup's tile, at most; shared memory may allow fewer.
     pub largest_tile: u32,
-    /// Unroll the forward pass's loops over the inner dimension: operands stay in registers, compilation takes longer.
+    /// Whether the forward pass's loops over the inner dimension are unrolled: operands stay in registers, but compilation
+    /// takes longer.
     pub unroll_forward: bool,
-    /// The same of the backward passes.
+    /// Whether the backward passes' loops over the inner dimension are unrolled.
     pub unroll_backward: bool,
-    /// Go backward through two layers at once where two follow each other: less memory moves, with twice the sums.
+    /// Whether a backward pass goes through two consecutive layers at once: less memory traffic, but twice as many sums.
     pub pairs: bool,
-    /// f32 sums of weight gradients that an invocation of the backward passes keeps, at most; workgroups become larger
-    /// before there are more.
+    /// Maximum number of f32 sums of weight gradients that an invocation of the backward passes keeps. Workgroups grow before
+    /// this is exceeded.
     pub backward_sums: u32,
-    /// Invocations of a backward workgroup, at most.
+    /// Maximum number of invocations of a backward workgroup.
     pub backward_lanes: u32,
-    /// Compute the encoding and the first layer again in the backward pass of a pair instead of keeping them: less memory moves.
+    /// Whether the backward pass of a pair recomputes the encoding and the first layer instead of reading stored values: less
+    /// memory traffic.
     pub recompute: bool,
-    /// Make numbers f16 in registers, for which a device must have matrices of f16 sums.
+    /// Whether numbers become f16 in registers; the device must have matrices with f16 sums.
     pub f16_sums: bool,
 }
 
-/// Rays of a workgroup.
+/// Distribution of the lanes of a workgroup over rays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RayLanes {
     /// Invocations that share a ray.
     pub(super) lanes: u32,
-    /// How many.
+    /// Rays of a workgroup.
     pub(super) rays: u32,
 }
 
 impl RayLanes {
-    /// Invocations of a workgroup, as a stage is built with them.
+    /// Number of invocations of a workgroup, in the form that a stage is built with.
     pub(super) fn workgroup(self) -> Option<u32> {
         Some(self.lanes * self.rays)
     }
 
-    /// The constant by which shaders know the rays of a workgroup.
+    /// Specialisation constant that tells shaders the rays of a workgroup.
     pub(super) fn constant(self) -> [(&'static str, u32); 1] {
         [("rays_of_workgroup", self.rays)]
     }
 }
 
 impl MatrixTuning {
-    /// As a CPU takes them. Unrolled, a driver compiles these kernels for minutes; sums are in memory, and the encoding is dear.
+    /// Sizes for CPUs. Drivers would compile unrolled kernels for minutes; sums are in memory, and the encoding is expensive.
     pub const CPU: MatrixTuning = MatrixTuning {
         workgroups: 4,
         largest_tile: 32,
@@ -102,8 +104,8 @@ impl MatrixTuning {
         f16_sums: true,
     };
 
-    /// As NVIDIA's GPUs take them, and others of which nothing is known. What differs for the next two is by their compilers'
-    /// numbers (docs/performance.md).
+    /// Sizes for NVIDIA's GPUs and for GPUs of unknown vendors. The deviations of the next two follow from their compilers'
+    /// statistics (docs/log/2026-11-performance.md).
     pub const NVIDIA: MatrixTuning = MatrixTuning {
         workgroups: 264,
         largest_tile: 128,
@@ -116,10 +118,10 @@ impl MatrixTuning {
         f16_sums: true,
     };
 
-    /// As AMD's GPUs take them: unrolled, the forward pass has twice the instructions.
+    /// Sizes for AMD's GPUs: unrolled, the forward pass has twice as many instructions.
     pub const AMD: MatrixTuning = MatrixTuning { unroll_forward: false, ..MatrixTuning::NVIDIA };
 
-    /// As Intel's GPUs take them: registers are few, and spilling costs more than memory that moves.
+    /// Sizes for Intel's GPUs: registers are few, and spilling costs more than memory traffic.
     pub const INTEL: MatrixTuning = MatrixTuning {
         largest_tile: 64,
         unroll_forward: false,
@@ -130,7 +132,7 @@ impl MatrixTuning {
         ..MatrixTuning::NVIDIA
     };
 
-    /// Chooses for a device.
+    /// Chooses sizes for a device.
     fn for_device(info: &DeviceInfo) -> MatrixTuning {
         if info.is_cpu() {
             return MatrixTuning::CPU;
@@ -152,53 +154,53 @@ impl MatrixTuning {
 /// Sizes and variants chosen for a device, with the reasons.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Tuning {
-    /// How the network's layers are computed.
+    /// Computation path of the network's layers.
     pub layers: Layers,
-    /// How kernels read weights and activations in f32.
+    /// Access of the kernels to weights and activations in f32.
     pub operands: Operands,
     /// Invocations of a workgroup of the layer kernels.
     pub layer_lanes: u32,
     /// Invocations of a workgroup of the weight-gradient kernels.
     pub weight_lanes: u32,
-    /// Parts the samples are split into for weight gradients.
+    /// Number of parts that the samples are split into for weight gradients.
     pub splits: u32,
     /// Sizes of the passes on matrices.
     pub matrices: MatrixTuning,
-    /// Invocations of a workgroup of the kernels that march along rays: all share a ray where each gets one of its samples at least;
-    /// else a ray has `ray_lanes`, and a workgroup as many rays as that makes.
+    /// Invocations of a workgroup of the kernels that march along rays. All of them share one ray if each gets at least one of
+    /// its samples; otherwise each ray has `ray_lanes`, and the workgroup has as many rays as fit.
     pub march_lanes: u32,
-    /// Invocations that share a ray of few samples, and in any case the depths among which live samples are sought.
+    /// Invocations that share a ray of few samples. The search for live samples always uses this number.
     pub ray_lanes: u32,
     /// Shared memory in which a workgroup may sum the static field's lines before they go to memory, bytes.
     pub private_line_bytes: u32,
-    /// Samples handled at once, at most; the configuration may ask for fewer.
+    /// Maximum number of samples handled at once; the configuration may ask for fewer.
     pub chunk_samples: u32,
-    /// Iterations handed to the device at once, at most, instead of what the configuration says.
+    /// Maximum number of iterations handed to the device at once, in place of the configuration's number.
     pub iterations_per_submit: Option<u32>,
-    /// Longest submit, seconds; none where nothing watches over the device.
+    /// Longest submit, seconds; none where no watchdog limits it.
     pub longest_submit_s: Option<f64>,
-    /// Validate and save beside training instead of between iterations.
+    /// Whether validation and saving run concurrently with training instead of between iterations.
     pub overlap: bool,
     /// One sentence per choice.
     pub reasons: Vec<String>,
 }
 
-/// Workgroups that keep a device busy whose number of multiprocessors the driver does not tell: too many write and add up sums of
-/// their own for nothing.
+/// Returns the workgroups that keep a device busy when the driver does not report its number of multiprocessors. Too many
+/// workgroups would write and add up partial sums for nothing.
 fn workgroups_untold(info: &DeviceInfo) -> u32 {
     match (info.kind, info.vendor) {
         (DeviceKind::Integrated, _) => 32,
-        // Two for each of 32 cores, which the largest have.
+        // Two workgroups for each of the 32 cores of the largest devices.
         (_, Vendor::Intel) => 64,
         _ => 264,
     }
 }
 
-/// Partial sums that are too many for one invocation to add up.
+/// Number of partial sums from which on several invocations add them up.
 const MANY_SPLITS: u32 = 64;
 
 impl Tuning {
-    /// Chooses for a device.
+    /// Chooses sizes and variants for a device.
     pub fn for_device(info: &DeviceInfo) -> Tuning {
         let old_lavapipe = info.is_llvmpipe && info.mesa_major.is_some_and(|v| v < 24);
         let mut reasons = Vec::new();
@@ -229,19 +231,19 @@ impl Tuning {
         reasons.push(why);
         let f16_sums = info.matrices.first().is_some_and(|s| s.f16_sums);
         let matrices = MatrixTuning { f16_sums, ..MatrixTuning::for_device(info) };
-        // Some kilobytes per sample must fit beside all else. By what there is, not by what is free now: sums of a batch in other
-        // chunks are rounded otherwise, and runs on one device repeat bit by bit.
+        // Some kilobytes per sample must fit beside everything else. The limit depends on total memory, not on free memory:
+        // other chunks round a batch's sums differently, and runs on one device must repeat bit by bit.
         let chunk_samples = match info.kind {
             DeviceKind::Cpu => 1 << 17,
             _ => (info.device_memory >> 14).clamp(1 << 16, 1 << 19) as u32,
         };
         let overlap = !info.is_cpu();
-        // Workgroups on a multiprocessor are few, so that one subgroup in each leaves it two thirds empty.
+        // A multiprocessor holds few workgroups, so that workgroups of one subgroup would leave it two thirds empty.
         let ray_lanes = MarchLoss::LOCAL_SIZE;
         let march_lanes = if info.is_cpu() { ray_lanes } else { 2 * ray_lanes };
         // Shared memory is no faster on a CPU.
         let private_line_bytes = if info.is_cpu() { 0 } else { info.max_shared_memory / 2 };
-        // Kernels that read through texel buffers have no variants.
+        // Kernels that read through texel buffers have no variants with 64-bit integers.
         let bits = if info.int64_atomics && operands != Operands::Texel { 64 } else { 32 };
         let lines = if private_line_bytes == 0 { "" } else { ", lines in shared memory first" };
         reasons.push(format!("static gradients through {bits}-bit integer atomics{lines}: exact sums"));
@@ -263,27 +265,28 @@ impl Tuning {
         }
     }
 
-    /// Whether matrices may be faster on a device, so that timing both paths is worth its time.
+    /// Tells whether matrices may be faster on a device, so that timing both paths is worthwhile.
     pub fn has_choice(info: &DeviceInfo) -> bool {
         !info.is_cpu() && !info.matrices.is_empty()
     }
 
-    /// `line_params` if that many sums fit the shared memory set aside for them, else 0; `private_lines` of `march_loss`.
+    /// Returns `line_params` if that many sums fit the shared memory reserved for them, else 0; this is `private_lines` of
+    /// `march_loss`.
     pub(super) fn private_lines(&self, line_params: u32) -> u32 {
         if 8 * line_params <= self.private_line_bytes { line_params } else { 0 }
     }
 
-    /// How `march_loss` and `march_fwd` share out rays of so many samples of the static field.
+    /// Returns how `march_loss` and `march_fwd` distribute rays with `n_samples` samples of the static field.
     pub(super) fn rays_with(&self, n_samples: u32) -> RayLanes {
         self.rays_of(if n_samples < self.march_lanes { self.ray_lanes } else { self.march_lanes })
     }
 
-    /// How kernels that give so many lanes to a ray share out rays.
+    /// Returns how kernels that give `lanes` invocations to a ray distribute rays.
     pub(super) fn rays_of(&self, lanes: u32) -> RayLanes {
         RayLanes { lanes, rays: (self.march_lanes / lanes).max(1) }
     }
 
-    /// Invocations that share out the partial sums of a number of the network's gradient.
+    /// Number of invocations that add up the partial sums of one number of the network's gradient.
     pub(crate) fn gradient_parts(&self) -> u32 {
         let splits = match self.layers {
             Layers::F32 => self.splits,
@@ -292,7 +295,7 @@ impl Tuning {
         if splits < MANY_SPLITS { 1 } else { 8 }
     }
 
-    /// This tuning with the layers on another path, for the reason given.
+    /// Returns this tuning with another path of the layers, for the reason given.
     pub fn with_layers(mut self, layers: Layers, reason: String) -> Tuning {
         self.layers = layers;
         self.reasons.retain(|r| !r.contains("layers"));
@@ -300,17 +303,17 @@ impl Tuning {
         self
     }
 
-    /// The plainest path where the network is never asked.
+    /// Returns this tuning, with the simplest path of the layers where the network is never evaluated.
     pub fn for_network(self, asked: bool) -> Tuning {
         if asked { self } else { self.with_layers(Layers::F32, "no layers: the network is not asked".into()) }
     }
 
-    /// Samples one workgroup of the layer kernels covers.
+    /// Number of samples that one workgroup of the layer kernels covers.
     pub fn tile_samples(&self) -> u32 {
         self.layer_lanes * self.tile().samples
     }
 
-    /// What a lane of the layer kernels keeps in registers.
+    /// Returns the register tile of a lane of the layer kernels.
     pub fn tile(&self) -> LaneTile {
         match self.operands {
             Operands::Storage => lane_tile!(mlp_layer_fwd, mlp_layer_bwd_input, mlp_layer_bwd_weight),
@@ -325,14 +328,14 @@ impl Tuning {
 /// Register tiles of the layer kernels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LaneTile {
-    /// Samples a lane of `mlp_layer_fwd` and `mlp_layer_bwd_input` keeps.
+    /// Samples that a lane of `mlp_layer_fwd` and `mlp_layer_bwd_input` keeps.
     pub samples: u32,
-    /// Neurons of `mlp_layer_fwd`.
+    /// Neurons that a lane of `mlp_layer_fwd` keeps.
     pub fwd_neurons: u32,
-    /// Inputs of `mlp_layer_bwd_input`.
+    /// Inputs that a lane of `mlp_layer_bwd_input` keeps.
     pub bwd_inputs: u32,
-    /// Neurons of `mlp_layer_bwd_weight`.
+    /// Neurons that a lane of `mlp_layer_bwd_weight` keeps.
     pub weight_neurons: u32,
-    /// Inputs of `mlp_layer_bwd_weight`.
+    /// Inputs that a lane of `mlp_layer_bwd_weight` keeps.
     pub weight_inputs: u32,
 }

@@ -1,4 +1,4 @@
-//! Rays whose samples are handled at once.
+//! Chunks: rays of a batch whose samples are handled at once.
 
 use crate::error::{Error, Result};
 use crate::gpu::record::{Groups, MOST_GROUPS};
@@ -9,44 +9,45 @@ use crate::kernels::layout::Setup;
 pub struct Chunk {
     /// First ray of the batch.
     pub first_ray: u32,
-    /// How many.
+    /// Number of rays.
     pub n_rays: u32,
 }
 
 impl Chunk {
-    /// One workgroup per ray.
+    /// Returns one workgroup per ray.
     pub fn per_ray(self) -> Groups<'static> {
         self.workgroups(1)
     }
 
-    /// Workgroups of so many rays each.
+    /// Returns the workgroups that take `rays_each` rays each.
     pub fn workgroups(self, rays_each: u32) -> Groups<'static> {
         Groups::Direct([self.n_rays.div_ceil(rays_each), 1, 1])
     }
 
-    /// Whether it ends a batch of `n_rays`.
+    /// Tells whether the chunk ends a batch of `n_rays`.
     pub fn is_last(self, n_rays: u32) -> bool {
         self.first_ray + self.n_rays == n_rays
     }
 
-    /// 1 for all chunks of a batch but the first: sums add to what that one wrote.
+    /// Returns 0 for the first chunk of a batch and 1 for all others, whose sums are added to what the first one wrote.
     pub fn accumulate(self) -> u32 {
         u32::from(self.first_ray > 0)
     }
 }
 
-/// Live samples that a chunk has room for, in whole tiles.
+/// Number of live samples that a chunk has room for, in whole tiles.
 pub fn chunk_samples(setup: &Setup) -> u32 {
     setup.sample_capacity / 128 * 128
 }
 
-/// Rays handled at once: their samples fit one chunk even if all are live, and a dispatch takes a workgroup for each.
+/// Number of rays handled at once: their samples fit one chunk even if all are live, and one dispatch can have a workgroup for
+/// each.
 pub fn chunk_rays(setup: &Setup) -> u32 {
     (chunk_samples(setup) / setup.n_dynamic_samples).clamp(1, MOST_GROUPS)
 }
 
-/// A batch in chunks of as many rays as there is `room` for the `live` samples of: never more chunks than [`chunks`] makes, and few
-/// where a hull leaves little to look at.
+/// Splits a batch into chunks of as many rays as possible such that the `live` samples of each chunk fit into `room`. There are
+/// never more chunks than [`chunks`] makes, and few where the hull leaves few live samples.
 ///
 /// # Errors
 /// [`Error::Internal`] for a ray with more samples than there is room for.
@@ -71,7 +72,7 @@ pub fn packed(live: &[u32], room: u32) -> Result<Vec<Chunk>> {
     Ok(chunks)
 }
 
-/// A batch in chunks.
+/// Splits a batch into chunks of equal numbers of rays.
 pub fn chunks(setup: &Setup, n_rays: u32) -> impl Iterator<Item = Chunk> + use<> {
     let per = chunk_rays(setup).min(n_rays).max(1);
     (0..n_rays.div_ceil(per)).map(move |i| Chunk { first_ray: i * per, n_rays: per.min(n_rays - i * per) })

@@ -1,4 +1,4 @@
-//! Operations that the network costs.
+//! Number of operations of the networks.
 
 use crate::model::params::{NetworkMap, ParamMap};
 use serde::{Deserialize, Serialize};
@@ -6,16 +6,16 @@ use serde::{Deserialize, Serialize};
 /// Operations of the networks per sample, a multiply-add counted as two.
 #[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 pub struct NetworkCost {
-    /// Forward.
+    /// Forward pass.
     pub forward: u64,
-    /// Gradient of the weights.
+    /// Weight gradients.
     pub weights: u64,
-    /// Gradient of hidden inputs.
+    /// Gradients of hidden inputs.
     pub inputs: u64,
 }
 
 impl NetworkCost {
-    /// Counts all networks, without padding and without biases and latents, which cost one row per phase.
+    /// Counts all networks, without padding, and without biases and latents, which cost only one row per phase.
     pub fn of(params: &ParamMap) -> NetworkCost {
         params.networks().map(NetworkCost::of_network).fold(NetworkCost::default(), |a, b| NetworkCost {
             forward: a.forward + b.forward,
@@ -36,7 +36,7 @@ impl NetworkCost {
         NetworkCost { forward: 2 * forward, weights: 2 * forward, inputs: 2 * inputs }
     }
 
-    /// All three.
+    /// Sum of all three.
     pub fn total(&self) -> u64 {
         self.forward + self.weights + self.inputs
     }
@@ -50,7 +50,7 @@ mod tests {
     #[test]
     fn both_networks_of_nerf_ca_count() {
         let cost = NetworkCost::of(&ParamMap::new(&Config::preset(Preset::NerfCa), 10));
-        // Products of 75 numbers, four hidden layers and an output, in each of two networks; latents are rows per phase.
+        // The product has 75 inputs, four hidden layers and an output, in each of two networks; latents are rows per phase.
         let forward = 2 * 2 * (128 * 75 + 4 * 128 * 128 + 128);
         assert_eq!((cost.forward, cost.weights), (forward, forward));
         assert_eq!(cost.inputs, 2 * 2 * (4 * 128 * 128 + 128));

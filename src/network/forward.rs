@@ -1,4 +1,4 @@
-//! The forward pass of a batch: live samples, network, integrals. What training and rendering share.
+//! The forward pass of a batch, shared by training and rendering: live samples, network, integrals.
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::{Buffer, Memory};
@@ -17,7 +17,7 @@ use crate::network::pass::Pass;
 use std::mem::offset_of;
 
 buffer_set! {
-    /// Buffers of the forward pass, but for those of the network.
+    /// Buffers of the forward pass, except those of the network.
     pub struct ForwardBuffers {
         /// [`Setup`].
         setup,
@@ -25,23 +25,23 @@ buffer_set! {
         state,
         /// [`crate::kernels::layout::Schedule`] of each iteration.
         schedule,
-        /// The motion hull's cells, a bit each.
+        /// Cells of the motion hull, one bit each.
         hull,
-        /// Parameters, as [`ParamMap`] says.
+        /// Parameters, at the positions in [`ParamMap`].
         params,
-        /// The same buffer: parameters of the static field come first.
+        /// Another binding of the buffer `params`: parameters of the static field come first.
         static_params,
         /// [`Ray`]s of the batch.
         rays,
         /// [`RayOut`] of each ray.
         ray_out,
-        /// Which depths of each lane are live, a bit each.
+        /// Live depths of each lane, one bit each.
         lane_masks,
-        /// Live samples of a ray's lanes before each.
+        /// Number of live samples of a ray's lanes before each lane.
         lane_offsets,
-        /// Live samples of each ray.
+        /// Number of live samples of each ray.
         ray_counts,
-        /// Live samples of the rays before each.
+        /// Number of live samples of the rays before each ray.
         ray_start,
         /// [`LiveSamples`].
         live,
@@ -49,16 +49,16 @@ buffer_set! {
         arguments,
         /// Position and path length of each live sample.
         sample_points,
-        /// Ray of each live sample, and whether it is near.
+        /// Ray of each live sample, and whether the sample is near.
         sample_rays,
-        /// Attenuation of each live sample and its derivative.
+        /// Attenuation of each live sample, and its derivative.
         sample_sigma,
-        /// Where the dynamic field has been seen empty.
+        /// Cells in which the dynamic field was found empty.
         occupancy,
     }
 }
 
-/// What a rendering is of.
+/// Buffers of the pose that a rendering is of.
 pub struct PoseBuffers {
     /// One [`crate::kernels::layout::View`].
     pub views: Buffer,
@@ -67,7 +67,7 @@ pub struct PoseBuffers {
 }
 
 impl ForwardBuffers {
-    /// Buffers for batches of `n_rays`; parameters are left undefined.
+    /// Allocates the buffers for batches of `n_rays`; parameters are left undefined.
     ///
     /// # Errors
     /// [`Error::OutOfMemory`] naming the buffer.
@@ -80,7 +80,7 @@ impl ForwardBuffers {
         schedule: Buffer,
         hull: Option<&Hull>,
     ) -> Result<ForwardBuffers> {
-        // Samplers of volumes may have fewer samples a ray and more rays a chunk than `setup` says.
+        // Samplers of volumes may have fewer samples per ray and more rays per chunk than `setup` says.
         let n_rays = u64::from(n_rays);
         let lanes = n_rays * u64::from(tuning.ray_lanes);
         let capacity = u64::from(setup.sample_capacity);
@@ -91,13 +91,13 @@ impl ForwardBuffers {
             setup: gpu.buffer_with("setup", &[*setup])?,
             state: new(Binding::state, size_of::<DeviceState>() as u64)?,
             schedule,
-            // A single empty word without a hull.
+            // Without a hull, the buffer is a single empty word.
             hull: gpu.buffer_with("hull", hull.map_or(&[0][..], |h| &h.bits))?,
             static_params: params.clone(),
             params,
             rays: new(Binding::rays, n_rays * size_of::<Ray>() as u64)?,
             ray_out: new(Binding::ray_out, n_rays * size_of::<RayOut>() as u64)?,
-            // A bit per sample of each ray, live or not, each lane's rounded up to words.
+            // The masks have one bit per sample of each ray, live or not; each lane's bits are rounded up to words.
             lane_masks: new(Binding::lane_masks, lanes * lane_words * 4)?,
             lane_offsets: new(Binding::lane_offsets, lanes * 4)?,
             ray_counts: new(Binding::ray_counts, n_rays * 4)?,
@@ -131,17 +131,17 @@ impl ForwardBuffers {
         dispatch(recording, stage, stage.groups_for(push.n_rays), &bound, push)
     }
 
-    /// One invocation per padded sample.
+    /// Returns one invocation per padded sample.
     pub fn per_sample(&self) -> Groups<'_> {
         self.indirect(offset_of!(IndirectArguments, samples))
     }
 
-    /// One workgroup per tile of samples and of a layer's neurons.
+    /// Returns one workgroup per tile of samples and of a layer's neurons.
     pub fn forward_tiles(&self) -> Groups<'_> {
         self.indirect(offset_of!(IndirectArguments, forward_tiles))
     }
 
-    /// One workgroup per tile of samples and of a layer's inputs.
+    /// Returns one workgroup per tile of samples and of a layer's inputs.
     pub fn backward_tiles(&self) -> Groups<'_> {
         self.indirect(offset_of!(IndirectArguments, backward_tiles))
     }
@@ -153,25 +153,25 @@ impl ForwardBuffers {
     }
 }
 
-/// Bytes of all epochs of occupancy; none without it.
+/// Number of bytes of all epochs of occupancy; 0 when occupancy is off.
 pub fn occupancy_bytes(setup: &Setup) -> u64 {
     if setup.occupancy_cells > 0 { u64::from(OCCUPANCY_EPOCHS) * 4 * setup.occupancy_words() as u64 } else { 0 }
 }
 
 impl Pass<'_> {
-    /// Records the live dynamic samples of a chunk: counts, offsets and indirect arguments, points.
+    /// Records the live dynamic samples of a chunk: counts, then offsets, indirect arguments and positions.
     ///
     /// # Errors
-    /// As [`Pass::run`].
+    /// Fails like [`Pass::run`].
     pub fn samples(&mut self, chunk: Chunk) -> Result<()> {
         self.count(chunk)?;
         self.place(chunk)
     }
 
-    /// Records which samples of a chunk's rays are live, and how many of each ray.
+    /// Records which samples of a chunk's rays are live, and their number per ray.
     ///
     /// # Errors
-    /// As [`Pass::run`].
+    /// Fails like [`Pass::run`].
     pub fn count(&mut self, chunk: Chunk) -> Result<()> {
         let Chunk { first_ray, n_rays } = chunk;
         self.run(
@@ -181,7 +181,7 @@ impl Pass<'_> {
         )
     }
 
-    /// Records offsets and indirect arguments, and points, of a chunk whose samples were counted.
+    /// Records offsets, indirect arguments and positions of a chunk whose samples were counted.
     fn place(&mut self, chunk: Chunk) -> Result<()> {
         let k = self.kernels;
         let Chunk { first_ray, n_rays } = chunk;
@@ -189,10 +189,11 @@ impl Pass<'_> {
         self.run(&k.march_emit, chunk.workgroups(k.rays_counted), push::MarchEmit { first_ray, n_rays })
     }
 
-    /// Records the dynamic field at the live samples of `n_rays` rays already in `rays`, put into the rows of `volume`.
+    /// Records the dynamic field at the live samples of `n_rays` rays that are already in `rays`, written to the rows of
+    /// `volume`.
     ///
     /// # Errors
-    /// As [`Pass::run`].
+    /// Fails like [`Pass::run`].
     pub fn volume(&mut self, n_rays: u32, volume: &Buffer) -> Result<()> {
         let (k, network, buffers) = (self.kernels, self.network, self.buffers);
         network.record_weights(self)?;
@@ -205,10 +206,10 @@ impl Pass<'_> {
         Ok(())
     }
 
-    /// Records what depends on parameters alone, of each network.
+    /// Records the stages that depend on parameters alone, for each network.
     ///
     /// # Errors
-    /// As [`Pass::run`].
+    /// Fails like [`Pass::run`].
     pub fn weights(&mut self) -> Result<()> {
         self.network.record_weights(self)?;
         self.still.map_or(Ok(()), |still| still.record_weights(self))
@@ -217,16 +218,17 @@ impl Pass<'_> {
     /// Records the networks at the live samples.
     ///
     /// # Errors
-    /// As [`Pass::run`].
+    /// Fails like [`Pass::run`].
     pub fn fields(&mut self) -> Result<()> {
         self.network.record_forward(self)?;
         self.still.map_or(Ok(()), |still| still.record_forward(self))
     }
 
-    /// Records a rendering of `n_rays` rays already in `rays`: integrals and, on demand, maxima land in `ray_out`.
+    /// Records a rendering of `n_rays` rays that are already in `rays`: integrals and, on demand, maxima are written to
+    /// `ray_out`.
     ///
     /// # Errors
-    /// [`Error::Internal`] for jittered depths; else as [`Pass::run`].
+    /// [`Error::Internal`] for jittered depths; otherwise fails like [`Pass::run`].
     pub fn render(&mut self, n_rays: u32, maxima: bool) -> Result<()> {
         if self.setup.jitter != 0 {
             return Err(Error::Internal("rendering wants regular depths".into()));
@@ -239,10 +241,10 @@ impl Pass<'_> {
         Ok(())
     }
 
-    /// Records a rendering as [`Pass::render`] does, of rays whose samples were counted, in chunks that have room for them.
+    /// Records a rendering like [`Pass::render`], for rays whose samples were counted, in chunks that have room for them.
     ///
     /// # Errors
-    /// As [`Pass::run`].
+    /// Fails like [`Pass::run`].
     pub fn render_counted(&mut self, chunks: &[Chunk], maxima: bool) -> Result<()> {
         self.weights()?;
         chunks.iter().try_for_each(|chunk| self.render_chunk(*chunk, maxima))

@@ -1,11 +1,11 @@
-//! The network on cooperative matrices: f16 operands, f32 sums, f32 master parameters. One pass forward, one for two layers
-//! backward.
+//! The network on cooperative matrices: f16 operands, f32 sums, f32 master parameters. There is one forward pass; a backward
+//! pass goes through up to two layers.
 //!
-//! A layer that sees the input has one weight matrix on `[encoding, one-hot phase, zeros]`: the columns of the phases
-//! hold bias and latent contribution, so that their gradient, summed per phase, is part of the weight gradient.
+//! A layer that sees the input has one weight matrix on `[encoding, one-hot phase, zeros]`: the columns of the phases hold bias
+//! and latent contribution, so that their gradient, summed per phase, is part of the weight gradient.
 //!
-//! Gradients are multiplied by a loss scale (`state.loss_scale`) before they become f16 and divided by it after the sums.
-//! A sum that is not finite skips the update and halves the scale; many good ones double it (`report`).
+//! Gradients are multiplied by a loss scale (`state.loss_scale`) before they become f16, and divided by it after the sums. A
+//! sum that is not finite skips the update and lowers the scale; enough finite updates in a row double it (`report`).
 
 mod shape;
 mod span;
@@ -51,37 +51,37 @@ buffer_set! {
         features16,
         /// Activations of all layers, kept for the backward pass.
         activations16,
-        /// Where each packed weight, then each row of biases, comes from.
+        /// Sources of each packed weight, then of each row of biases.
         pack_source,
     }
 }
 
-/// What the backward pass needs besides.
+/// Passes and buffers that only the backward pass needs.
 struct FusedTraining {
     passes: Vec<BackwardPass>,
-    /// dz at the neurons of one layer, and of the next that a pass leaves.
+    /// dz at the neurons of one layer, and of the next layer below, which a pass writes.
     dz16: [Buffer; 2],
 }
 
-/// A pass through the layers of a span.
+/// One backward pass through the layers of a span.
 struct BackwardPass {
     span: Span,
     stage: BackwardStage,
-    /// Which of the two buffers has its dz.
+    /// Index of the buffer in `dz16` that the pass reads.
     reads: usize,
-    /// Whether the upper part is the first to see its layer's dz, and sums what depends on that alone.
+    /// Whether this pass is the first to read dz of its upper part's layer; it then computes the sums that depend on dz alone.
     sums_dz: bool,
 }
 
-/// The kernel of a backward pass.
+/// Kernel of a backward pass.
 enum BackwardStage {
-    /// Reads what the layers saw.
+    /// Reads the layers' stored inputs.
     Kept(Stage<push::MlpFusedBwd>),
-    /// Through the first two layers: computes the encoding and the first layer again.
+    /// Goes through the first two layers, and recomputes the encoding and the first layer.
     Recomputed(Stage<push::MlpFusedBwdFirst>),
 }
 
-/// Builds the passes on matrices.
+/// Builds the kernels on matrices.
 struct Builder<'a> {
     gpu: &'a Gpu,
     shape: &'a Shape,
@@ -89,8 +89,8 @@ struct Builder<'a> {
     tuning: &'a MatrixTuning,
 }
 
-/// Suffix of a kernel's variant: unrolled or not, with f16 sums or without, they compute the same. Where there are no f16 sums, there
-/// is only one.
+/// Suffix of a kernel's variant. All variants compute the same results: unrolled or not, with f16 sums or without. Without f16
+/// sums there is only one.
 fn variant(f16_sums: bool, unroll: bool) -> &'static str {
     match (f16_sums, unroll) {
         (true, true) => "_unrolled",
@@ -132,8 +132,8 @@ impl Builder<'_> {
         }
     }
 
-    /// Shares of the columns of a weight gradient: those with which subgroups keep the fewest tiles, then load the fewest
-    /// operands.
+    /// Chooses the number of shares of a weight gradient's columns: the one for which subgroups keep the fewest tiles, and
+    /// among these load the fewest operands.
     fn shares(&self, columns: u32) -> u32 {
         let (MatrixShape { m, n, .. }, subgroups) = (self.shape.matrix, self.shape.backward.subgroups);
         let cost = |shares: &u32| {
@@ -169,7 +169,7 @@ impl Builder<'_> {
         Ok(BackwardStage::Kept(self.build(sizes.subgroups, self.tuning.unroll_backward, &constants).stage(self.gpu)?))
     }
 
-    /// The backward passes, from the last layer down.
+    /// Builds the backward passes, from the last layer down.
     fn passes(&self) -> Result<Vec<BackwardPass>> {
         let mut built: Vec<BackwardPass> = Vec::new();
         let mut reads = vec![0; self.params.layers.len()];
@@ -185,7 +185,7 @@ impl Builder<'_> {
     }
 }
 
-/// Whether the backward passes compute the encoding and the first layer of such a network again.
+/// Tells whether the backward passes recompute the encoding and the first layer of such a network.
 pub(crate) fn computes_again(tuning: &MatrixTuning, params: &NetworkMap) -> bool {
     tuning.recompute && recomputes(&spans(&params.layers, tuning.pairs))
 }
@@ -248,13 +248,13 @@ impl FusedNetwork {
         self.training.as_ref().ok_or_else(built_for_rendering)
     }
 
-    /// Where activations of a layer that is kept begin, in `uvec4`s.
+    /// Position at which the stored activations of a layer begin, in `uvec4`s.
     fn activations_at(&self, layer: usize, pass: &Pass<'_>) -> u32 {
         let layer = (layer - self.shape.first_kept()) as u32;
         layer * pass.setup.sample_capacity * pass.network.map().width as u32 / 8
     }
 
-    /// What a part sees: buffer, and where in it.
+    /// Returns the buffer of a part's inputs, and their position in it.
     fn inputs(&self, part: Part, pass: &Pass<'_>) -> (&Buffer, u32) {
         match part {
             Part::Hidden(layer) => (&self.buffers.activations16, self.activations_at(layer - 1, pass)),
@@ -338,7 +338,7 @@ impl Path for FusedNetwork {
         self.shape.gradient_source(params)
     }
 
-    /// f16 copies of the weights, bias and latent of each phase among them.
+    /// Records `mlp_pack`, which writes f16 copies of the weights, with bias and latent contribution of each phase among them.
     fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
         let n_pairs = (self.shape.weights_len / 2) as u32;
         let params = pass.network.map();
@@ -356,7 +356,7 @@ impl Path for FusedNetwork {
         self.training()?.passes.iter().try_for_each(|backward| self.record_pass(pass, backward, chunk))
     }
 
-    /// They are part of the partial sums.
+    /// Returns their positions in the partial sums, which contain them.
     fn phase_source(&self, params: &NetworkMap) -> Vec<u32> {
         self.shape.phase_source(params)
     }
@@ -375,7 +375,7 @@ mod tests {
     fn the_papers_network_moves_two_kilobytes_a_sample() {
         let params = ParamMap::new(&Config::preset(Preset::Paper), 10);
         let cost = NetworkCost::of(&params);
-        // 63 numbers and 10 phases, filled up to 80 columns.
+        // The weights on the input have 63 numbers and 10 phases, padded to 80 columns.
         let ledger = |pairs, recompute| {
             let backward = Backward { subgroups: 8, tile: 64, pairs, recompute };
             let ledger = work(&params.moving, 80, 1_000_000_000, backward);
@@ -384,14 +384,16 @@ mod tests {
         let [forward, backward] = ledger(true, false);
         assert_eq!(forward.gflop as u64, cost.forward);
         assert_eq!(backward.gflop as u64, cost.weights + cost.inputs);
-        // Two bytes of 80 columns and 4 x 128 activations; 4 x 128 numbers of the upper two layers, 2 x 128 + 80 of the others.
+        // The stored values have two bytes each: 80 columns and 4 x 128 activations forward; 4 x 128 numbers of the upper two
+        // layers and 2 x 128 + 80 of the others backward.
         assert_eq!(forward.megabytes as u64, 1_000 * (160 + 4 * 256 + SAMPLE_BYTES));
         assert_eq!(backward.megabytes as u64, 1_000 * (4 * 256 + 2 * 256 + 160 + SAMPLE_BYTES));
         let [forward, backward] = ledger(true, true);
         assert_eq!(backward.gflop as u64, cost.weights + cost.inputs + 2 * 63 * 128);
         assert_eq!(forward.megabytes as u64, 1_000 * (3 * 256 + SAMPLE_BYTES));
         assert_eq!(backward.megabytes as u64, 1_000 * (4 * 256 + 256 + 2 * SAMPLE_BYTES));
-        // Layer by layer: inputs and dz of each of three, and dz of the layer below; of the first layer, no dz below.
+        // Without pairs, each of three layers moves its inputs, its dz and dz of the layer below; the first layer has no dz
+        // below.
         let [_, backward] = ledger(false, false);
         assert_eq!(backward.gflop as u64, cost.weights + cost.inputs);
         assert_eq!(backward.megabytes as u64, 1_000 * (3 * 768 + 416 + SAMPLE_BYTES));
@@ -409,7 +411,7 @@ mod tests {
         assert_eq!(spans_of(4, 0, true), [(Hidden(3), Some(Hidden(2))), (Hidden(1), Some(Encoded(0)))]);
         assert_eq!(spans_of(3, 0, true), [(Hidden(2), None), (Hidden(1), Some(Encoded(0)))]);
         assert_eq!(spans_of(1, 0, true), [(Encoded(0), None)]);
-        // dz of a layer that sees both inputs goes to memory.
+        // A layer that sees both inputs has its dz in memory.
         let skips = spans_of(4, 3, true);
         assert_eq!(skips, [(Hidden(3), None), (Hidden(2), None), (Encoded(2), None), (Hidden(1), Some(Encoded(0)))]);
         assert_eq!(spans_of(3, 0, false), [(Hidden(2), None), (Hidden(1), None), (Encoded(0), None)]);

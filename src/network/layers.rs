@@ -1,4 +1,4 @@
-//! The network in f32, one pass per layer: runs on every device, and is the yardstick for [`super::fused`].
+//! The network in f32, one pass per layer: runs on every device, and is the reference for [`super::fused`].
 
 use crate::error::Result;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -20,7 +20,7 @@ use crate::network::{F32_BYTES, PartialSums, Path, Purpose, SAMPLE_BYTES, Tiles,
 pub(super) struct LayerNetwork {
     kernels: LayerKernels,
     buffers: LayerBuffers,
-    /// What each hidden layer gives.
+    /// Output of each hidden layer.
     activations: Vec<Buffer>,
     training: Option<LayerTraining>,
 }
@@ -28,7 +28,7 @@ pub(super) struct LayerNetwork {
 buffer_set! {
     /// Buffers of the forward pass.
     struct LayerBuffers {
-        /// When the ray of each live sample was taken.
+        /// Times at which the ray of each live sample was taken.
         sample_times,
         /// Encoding of each live sample.
         features,
@@ -37,7 +37,7 @@ buffer_set! {
     }
 }
 
-/// What the backward pass needs besides.
+/// Buffers that only the backward pass needs.
 struct LayerTraining {
     sums: LayerSums,
     /// Gradients at the neurons of even and odd layers.
@@ -93,7 +93,7 @@ impl LayerNetwork {
         })
     }
 
-    /// What a hidden layer sees of the layer below; the first sees the encoding.
+    /// Returns the input of a hidden layer that comes from the layer below; the first layer sees the encoding.
     fn below(&self, layer: usize) -> &Buffer {
         if layer == 0 { &self.buffers.features } else { &self.activations[layer - 1] }
     }
@@ -131,7 +131,7 @@ impl LayerNetwork {
         pass.run_with(&k.mlp_out_bwd_weight, groups, &[activations], push)
     }
 
-    /// Records dz of the layer below `i`, which has one.
+    /// Records dz of the layer below `i`, which must exist.
     fn record_input_gradient(&self, pass: &mut Pass<'_>, i: usize, weights: usize) -> Result<()> {
         let (k, training) = (&self.kernels, self.training()?);
         let groups = pass.network.map().width as u32 / 4;
@@ -155,7 +155,7 @@ impl LayerNetwork {
         let (width, groups) = (params.width as u32, params.width as u32 / 4);
         let PartialSums { splits, len: n_partials } = self.partial_sums(params);
         let tile = k.tuning.tile();
-        // Biases of layers without latents are summed here, once; the others come from the sums per phase.
+        // Biases of layers without latents are summed here, once; the other biases come from the sums per phase.
         let mut bias = layer.latent.is_none().then(|| in_partials(params, layer.bias));
         let inputs = [
             (&self.buffers.features, params.encode_groups as u32, layer.encoded),
@@ -181,7 +181,7 @@ impl LayerNetwork {
         Ok(())
     }
 
-    /// Records the sums of dz over the rays of each phase.
+    /// Records the sums of layer `i`'s dz over the rays of each phase.
     fn record_phase_sum(&self, pass: &mut Pass<'_>, i: usize, chunk: Chunk) -> Result<()> {
         let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
         let groups = params.width as u32 / 4;
@@ -196,12 +196,12 @@ impl LayerNetwork {
     }
 }
 
-/// Where a parameter of the network lies in a part of the partial sums: in the order of the parameters.
+/// Returns the position of a parameter of the network in a part of the partial sums, which have the order of the parameters.
 fn in_partials(params: &NetworkMap, at: usize) -> u32 {
     (at - params.first) as u32
 }
 
-/// Least work of the stages: every one reads what the one before it wrote.
+/// Minimum work of the stages: each reads what the stage before it wrote.
 fn work(params: &NetworkMap, samples: u64) -> Ledger {
     let (width, encoded) = (params.width as u64, 4 * params.encode_groups as u64);
     let mut ledger = Ledger::new();
@@ -260,7 +260,7 @@ impl Path for LayerNetwork {
         pass.run(stage, stage.groups_for(rows), push)
     }
 
-    /// `encode`, `mlp_layer_fwd` of each layer and `mlp_out_fwd`.
+    /// Records `encode`, `mlp_layer_fwd` of each layer and `mlp_out_fwd`.
     fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
         let (k, params, buffers) = (&self.kernels, pass.network.map(), pass.buffers);
         let capacity = pass.setup.sample_capacity;
@@ -289,12 +289,12 @@ impl Path for LayerNetwork {
         pass.run_with(&k.mlp_out_fwd, buffers.per_sample(), &bound, push)
     }
 
-    /// `partials` and `phase_dz`.
+    /// Records the passes that write `partials` and `phase_dz`.
     fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         self.record_output_backward(pass)?;
         for (i, layer) in pass.network.map().layers.iter().enumerate().rev() {
             if let (Some(weights), true) = (layer.hidden, i > 0) {
-                // The input gradient goes first: nothing below writes what it reads, so the three may overlap.
+                // The input gradient goes first: none of the passes below writes what it reads, so that the three may overlap.
                 self.record_input_gradient(pass, i, weights)?;
             }
             self.record_weight_gradients(pass, i, layer, chunk)?;
@@ -302,7 +302,8 @@ impl Path for LayerNetwork {
                 self.record_phase_sum(pass, i, chunk)?;
             }
         }
-        // Beside the first layer's sums over phases: those of weights share a buffer, so that each waits for the one before.
+        // This pass overlaps with the first layer's sums over phases. Passes of weight gradients share a buffer and wait for
+        // one another.
         self.record_output_weight_gradient(pass, chunk)
     }
 }

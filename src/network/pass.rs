@@ -1,4 +1,4 @@
-//! What the stages of one recording share.
+//! State that the stages of one recording share.
 
 use crate::error::Result;
 use crate::gpu::buffer::Buffer;
@@ -12,28 +12,28 @@ use crate::network::Network;
 use crate::network::forward::ForwardBuffers;
 use crate::network::still::StillNetwork;
 
-/// Where stages are recorded, and what they work with.
+/// Recording of stages, with all that they work with.
 pub struct Pass<'a> {
-    /// Takes the stages down.
+    /// Recording that stages are added to.
     pub recording: &'a mut Recording,
     /// Pipelines of every path.
     pub kernels: &'a Kernels,
     /// The dynamic field's network.
     pub network: &'a Network,
-    /// The still field, where it is a network as well.
+    /// Static field, where it is a network as well.
     pub still: Option<&'a StillNetwork>,
     /// Buffers of the forward pass.
     pub buffers: &'a ForwardBuffers,
-    /// Further buffers when training.
+    /// Further buffers for training.
     pub training: Option<&'a dyn BufferSet>,
-    /// Where each parameter lives.
+    /// Positions of the parameters.
     pub params: &'a ParamMap,
-    /// What stays fixed; `buffers` holds the same.
+    /// Constants of the run; `buffers` holds a copy.
     pub setup: &'a Setup,
 }
 
 impl<'a> Pass<'a> {
-    /// Records a stage on the buffers that go by the names its shader gives them.
+    /// Records a stage on the buffers that have the names used in its shader.
     ///
     /// # Errors
     /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
@@ -41,10 +41,10 @@ impl<'a> Pass<'a> {
         self.run_with(stage, groups, &[], push)
     }
 
-    /// Records a stage like [`Pass::run`]; those `bound` come first.
+    /// Records a stage like [`Pass::run`]; the buffers in `bound` take precedence.
     ///
     /// # Errors
-    /// As [`Pass::run`].
+    /// Fails like [`Pass::run`].
     pub fn run_with<P: PushConstants>(
         &mut self,
         stage: &Stage<P>,

@@ -1,6 +1,6 @@
-//! The still field as a second network, at the samples of the moving one: attenuations add up (NeRF-CA). It runs through the same
-//! stages, on buffers of its own where the two differ; what a ray sees and the gradient of the losses take both fields
-//! at each sample.
+//! The static field as a second network, evaluated at the samples of the dynamic field; attenuations add up (NeRF-CA). It runs
+//! through the same stages, on its own buffers where the two differ. A ray's integrals and the gradient of the losses take both
+//! fields at each sample.
 
 use crate::error::Result;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -16,22 +16,22 @@ use crate::network::forward::ForwardBuffers;
 use crate::network::pass::Pass;
 use crate::network::{Network, Purpose, built_for_rendering};
 
-/// The still field's network: kernels and buffers.
+/// Network of the static field: kernels and buffers.
 pub struct StillNetwork {
     kernels: StillKernels,
     network: Network,
-    /// Those of the moving field but for constants and attenuations.
+    /// Forward buffers shared with the dynamic field; setup and attenuations are its own.
     buffers: ForwardBuffers,
     training: Option<StillTraining>,
 }
 
-/// What the backward pass needs besides.
+/// Buffers that only the backward pass needs.
 struct StillTraining {
     /// Gradient of each sample's attenuation.
     gradient: Buffer,
 }
 
-/// What a network's backward pass finds: its own gradient at samples before all else.
+/// Buffers of this network's backward pass: its own gradient at samples comes first.
 struct Own<'a> {
     gradient: &'a Buffer,
     rest: Option<&'a dyn BufferSet>,
@@ -46,16 +46,16 @@ impl BufferSet for Own<'_> {
     }
 }
 
-/// Constants by which the stages of a network compute the still field.
+/// Returns the constants with which the stages of a network compute the static field.
 pub fn still_setup(setup: &Setup) -> Setup {
     Setup { dynamic_gain: setup.static_gain, dynamic_shift: setup.static_shift, ..*setup }
 }
 
 impl StillNetwork {
-    /// Builds kernels and buffers beside `moving`, those of the moving field.
+    /// Builds kernels and buffers; `moving` are the buffers of the dynamic field.
     ///
     /// # Errors
-    /// As [`Network::new`].
+    /// Fails like [`Network::new`].
     pub fn new(
         gpu: &Gpu,
         tuning: &Tuning,
@@ -98,7 +98,7 @@ impl StillNetwork {
         self.training.as_ref().map(|training| &training.gradient)
     }
 
-    /// Records `stages` of this network, as those of the moving field go in `pass`.
+    /// Records `stages` for this network, with the buffers of `pass` except its own.
     fn with(&self, pass: &mut Pass<'_>, stages: impl FnOnce(&Network, &mut Pass<'_>) -> Result<()>) -> Result<()> {
         let own = self.training.as_ref().map(|training| Own { gradient: &training.gradient, rest: pass.training });
         let mut still = Pass {
@@ -114,10 +114,10 @@ impl StillNetwork {
         stages(&self.network, &mut still)
     }
 
-    /// Records what depends on parameters alone.
+    /// Records the stages that depend on parameters alone.
     ///
     /// # Errors
-    /// As [`Pass::run`]; so do all that follow.
+    /// Fails like [`Pass::run`], as do all functions below.
     pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
         self.with(pass, Network::record_weights)
     }
@@ -125,15 +125,15 @@ impl StillNetwork {
     /// Records the network over the live samples.
     ///
     /// # Errors
-    /// As [`StillNetwork::record_weights`].
+    /// Fails like [`StillNetwork::record_weights`].
     pub fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
         self.with(pass, Network::record_forward)
     }
 
-    /// Records the line integrals of both fields, and on demand their maxima: `ray_out`.
+    /// Records the line integrals of both fields, and on demand their maxima, written to `ray_out`.
     ///
     /// # Errors
-    /// As [`StillNetwork::record_weights`].
+    /// Fails like [`StillNetwork::record_weights`].
     pub fn record_integrals(&self, pass: &mut Pass<'_>, chunk: Chunk, maxima: bool) -> Result<()> {
         let Chunk { first_ray, n_rays } = chunk;
         let bound = [(Binding::still_sigma, self.sigma().into())];
@@ -141,10 +141,11 @@ impl StillNetwork {
         pass.run_with(&self.kernels.march_fwd_samples, chunk.per_ray(), &bound, push)
     }
 
-    /// Records the losses of a chunk and their gradient at each sample of both fields, after [`StillNetwork::record_integrals`].
+    /// Records the losses of a chunk and their gradient at each sample of both fields; [`StillNetwork::record_integrals`] must
+    /// come first.
     ///
     /// # Errors
-    /// As [`StillNetwork::record_weights`].
+    /// Fails like [`StillNetwork::record_weights`].
     pub fn record_losses(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         let gradient = self.sigma_gradient().ok_or_else(built_for_rendering)?;
         let Chunk { first_ray, n_rays } = chunk;
@@ -156,7 +157,7 @@ impl StillNetwork {
     /// Records the backward pass of a chunk.
     ///
     /// # Errors
-    /// As [`StillNetwork::record_weights`].
+    /// Fails like [`StillNetwork::record_weights`].
     pub fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         self.with(pass, |network, pass| network.record_backward(pass, chunk))
     }
@@ -164,7 +165,7 @@ impl StillNetwork {
     /// Records the gradient of its parameters.
     ///
     /// # Errors
-    /// As [`StillNetwork::record_weights`].
+    /// Fails like [`StillNetwork::record_weights`].
     pub fn record_gradient(&self, pass: &mut Pass<'_>) -> Result<()> {
         self.with(pass, Network::record_gradient)
     }

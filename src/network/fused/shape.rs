@@ -1,4 +1,4 @@
-//! Sizes of the matrix passes, and where the packed weights and their gradients lie.
+//! Sizes of the matrix passes, and positions of the packed weights and of their gradients.
 
 use crate::error::{Error, Result};
 use crate::gpu::capabilities::{DeviceInfo, MatrixShape};
@@ -8,26 +8,27 @@ use crate::model::params::NetworkMap;
 use crate::network::fused::computes_again;
 use crate::network::fused::span::Part;
 
-/// Shared memory beside the tiles, bytes.
+/// Shared memory reserved for everything but the tiles, bytes.
 const SHARED_RESERVE: u32 = 512;
 
 /// Positions of one hidden layer in the packed weights, which are also those of its gradient in the partial sums.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct PackedLayer {
-    /// `[width][encoded]`.
+    /// Weights on the encoding, `[width][encoded]`.
     pub(super) encoded: Option<usize>,
-    /// `[width][width]`.
+    /// Weights on the layer below, `[width][width]`.
     pub(super) hidden: Option<usize>,
-    /// `[width]`, in the partial sums only.
+    /// Bias, `[width]`; in the partial sums only.
     pub(super) bias: Option<usize>,
 }
 
-/// Bytes of so many numbers in a row of shared memory: one more `uvec4` a row keeps rows off the same banks.
+/// Number of bytes of a row of `numbers` values in shared memory. One more `uvec4` per row avoids bank conflicts
+/// between rows.
 fn row_bytes(numbers: u32) -> u32 {
     16 * (numbers / 8 + 1)
 }
 
-/// What tiles of samples must fit.
+/// Constraints on tiles of samples: multiples of `m` and `k`, and at most `bytes` of shared memory.
 struct Room {
     m: u32,
     k: u32,
@@ -35,7 +36,7 @@ struct Room {
 }
 
 impl Room {
-    /// Samples of the largest tile that needs no more bytes than there are.
+    /// Returns the number of samples of the largest tile that fits into the bytes available.
     fn tile(&self, largest: u32, bytes: impl Fn(u32) -> u32) -> Option<u32> {
         let tiles = [128, 64, 32, 16].into_iter();
         let mut tiles = tiles.filter(|t| *t <= largest && t.is_multiple_of(self.m) && t.is_multiple_of(self.k));
@@ -50,16 +51,16 @@ pub(super) struct Backward {
     pub(super) subgroups: u32,
     /// Samples of a tile.
     pub(super) tile: u32,
-    /// Whether a pass goes through two layers at once where it can.
+    /// Whether a pass goes through two layers at once where possible.
     pub(super) pairs: bool,
-    /// Whether the encoding and the first layer's activations are computed again instead of read.
+    /// Whether the encoding and the first layer's activations are recomputed instead of read.
     pub(super) recompute: bool,
 }
 
-/// Largest backward tile: further samples would lengthen a workgroup's wait at its barriers.
+/// Largest backward tile: more samples would lengthen a workgroup's wait at its barriers.
 const LARGEST_BACKWARD_TILE: u32 = 64;
 
-/// Sizes and positions, from the network's shape and the device's limits.
+/// Sizes and positions, derived from the network's shape and the device's limits.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Shape {
     pub(super) matrix: MatrixShape,
@@ -69,13 +70,14 @@ pub(super) struct Shape {
     pub(super) fwd_tile: u32,
     /// Sizes of the backward passes.
     pub(super) backward: Backward,
-    /// Columns of the weights on the encoding: numbers, phases, padding.
+    /// Columns of the weights on the encoding: encoded numbers, phases, padding.
     pub(super) encoded: usize,
     pub(super) layers: Vec<PackedLayer>,
-    /// Output weights: `n` rows of `[width]` in the packed weights, the first of them in the partial sums.
+    /// Position of the output weights: `n` rows of `[width]` in the packed weights, of which only the first is in the
+    /// partial sums.
     pub(super) out_weights: usize,
     pub(super) weights_len: usize,
-    /// Output bias in the partial sums.
+    /// Position of the output bias in the partial sums.
     pub(super) out_bias: usize,
     pub(super) partials_len: usize,
 }
@@ -98,12 +100,12 @@ impl Shape {
         if subgroups * info.matrix_subgroup < width / 8 {
             return Err(unfit("is too wide for the matrix kernels on this device".into()));
         }
-        // Without f16 sums, each subgroup has a tile of sums beside the tiles of samples.
+        // Without f16 sums, each subgroup has a tile of sums in addition to the tiles of samples.
         let room = |subgroups: u32| {
             let sums = if tuning.f16_sums { 0 } else { subgroups * m * n * 4 };
             Room { m, k, bytes: info.max_shared_memory.saturating_sub(SHARED_RESERVE + sums) }
         };
-        // The output's n sums come to lie in a row of the last layer's activations.
+        // The output's n sums are stored in a row of the last layer's activations.
         let (hidden_row, encoded_row) = (row_bytes(width).max(4 * n), row_bytes(encoded as u32));
         let skips = params.layers.iter().skip(1).any(|l| l.encoded.is_some());
         let rows = if skips { hidden_row + encoded_row } else { hidden_row.max(encoded_row) };
@@ -116,7 +118,7 @@ impl Shape {
             let tile = room(subgroups).tile(tuning.largest_tile.min(LARGEST_BACKWARD_TILE), bytes)?;
             Some(Backward { subgroups, tile, pairs: tuning.pairs, recompute })
         };
-        // Subgroups beyond the tiles across a layer share out the rows of its input gradient.
+        // If there are more subgroups than tiles across a layer, they share the rows of its input gradient.
         let sums = if tuning.pairs { 2 } else { 1 } * width * width;
         let few_sums = |b: &Backward| sums <= tuning.backward_sums * b.subgroups * info.matrix_subgroup;
         let fits = |b: &Backward| {
@@ -168,12 +170,12 @@ impl Shape {
         })
     }
 
-    /// The first layer whose activations the forward pass keeps.
+    /// Returns the first layer whose activations the forward pass keeps.
     pub(super) fn first_kept(&self) -> usize {
         usize::from(self.backward.recompute)
     }
 
-    /// Where a part's weights lie, packed and in the partial sums.
+    /// Position of a part's weights, both packed and in the partial sums.
     pub(super) fn weights_of(&self, part: Part) -> Option<usize> {
         match part {
             Part::Hidden(layer) => self.layers[layer].hidden,
@@ -181,7 +183,7 @@ impl Shape {
         }
     }
 
-    /// Where each packed weight, then each row of biases, comes from.
+    /// Returns the source of each packed weight, then of each row of biases.
     pub(super) fn pack_source(&self, params: &NetworkMap) -> Vec<u32> {
         let mut source = vec![NOWHERE; self.weights_len];
         let width = params.width;
@@ -194,7 +196,7 @@ impl Shape {
                     for (c, s) in row[..params.encoded_len].iter_mut().enumerate() {
                         *s = (from + j * 4 * params.encode_groups + c) as u32;
                     }
-                    // Without latents a bias is a bias, the same at all phases.
+                    // Without latents, the bias is the same at all phases.
                     let columns = if layer.latent.is_some() { params.phases } else { 0 };
                     for (phase, s) in row[params.encoded_len..][..columns].iter_mut().enumerate() {
                         *s = phase_bias(l, phase, j);
@@ -221,7 +223,7 @@ impl Shape {
         source
     }
 
-    /// Where the gradient of each network parameter lies in the partial sums.
+    /// Returns the position of the gradient of each network parameter in the partial sums.
     pub(super) fn gradient_source(&self, params: &NetworkMap) -> Vec<u32> {
         let mut source = vec![NOWHERE; params.len];
         let width = params.width;
@@ -246,7 +248,7 @@ impl Shape {
         source
     }
 
-    /// Where the sum of dz over each phase, `[layer][phase][neuron]`, lies in the partial sums.
+    /// Returns the positions in the partial sums of the sums of dz over each phase, `[layer][phase][neuron]`.
     pub(super) fn phase_source(&self, params: &NetworkMap) -> Vec<u32> {
         let mut source = Vec::new();
         for packed in &self.layers {

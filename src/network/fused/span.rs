@@ -1,16 +1,16 @@
-//! Which layers a backward pass goes through, and what that moves.
+//! Grouping of layers into backward passes, and the work of these passes.
 
 use crate::model::params::{Layer, NetworkMap};
 use crate::network::fused::shape::Backward;
 use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::{F16_BYTES, SAMPLE_BYTES};
 
-/// A layer's weights on one of its inputs; layers count from 0.
+/// Weights of a layer on one of its inputs; layers count from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Part {
-    /// On the layer below.
+    /// Weights on the layer below.
     Hidden(usize),
-    /// On the encoding.
+    /// Weights on the encoding.
     Encoded(usize),
 }
 
@@ -22,7 +22,7 @@ impl Part {
     }
 }
 
-/// One backward pass. Where it has a lower part, dz of the layer in between stays on the multiprocessor.
+/// One backward pass. If it has a lower part, dz of the layer in between stays on the multiprocessor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Span {
     pub(super) upper: Part,
@@ -30,19 +30,19 @@ pub(super) struct Span {
 }
 
 impl Span {
-    /// The part whose input comes last.
+    /// Returns the part that is processed last.
     pub(super) fn last(self) -> Part {
         self.lower.unwrap_or(self.upper)
     }
 
-    /// Whether it leaves dz of a layer below.
+    /// Tells whether the pass writes dz of a layer below.
     pub(super) fn with_input(self) -> bool {
         matches!(self.last(), Part::Hidden(_))
     }
 }
 
-/// The backward passes in their order, from the last layer down; with `pairs`, two layers to a pass where that can be, made from the
-/// first layer up, so that what is left over is the last layer's.
+/// Returns the backward passes in their order, from the last layer down. With `pairs`, a pass takes two layers where possible;
+/// pairs are made from the first layer up, so that a single remaining layer is the last one.
 pub(super) fn spans(layers: &[Layer], pairs: bool) -> Vec<Span> {
     let parts = |(l, layer): (usize, &Layer)| {
         [layer.hidden.map(|_| Part::Hidden(l)), layer.encoded.map(|_| Part::Encoded(l))].into_iter().flatten()
@@ -63,23 +63,24 @@ pub(super) fn spans(layers: &[Layer], pairs: bool) -> Vec<Span> {
     spans
 }
 
-/// Whether one pass may go through both: a layer that sees both inputs wants its dz twice, hence in memory.
+/// Tells whether one pass may go through both. A layer that sees both inputs needs its dz twice, hence in memory.
 fn joins(layers: &[Layer], upper: Part, lower: Part) -> bool {
     let below = &layers[lower.layer()];
     matches!(upper, Part::Hidden(layer) if layer == lower.layer() + 1)
         && !(below.hidden.is_some() && below.encoded.is_some())
 }
 
-/// Whether the last pass can compute the encoding and the first layer again: nothing else reads them, and it does not begin
-/// at the output, whose gradient has buffers of its own.
+/// Tells whether the last pass can recompute the encoding and the first layer: nothing else reads them, and the pass does not
+/// begin at the output, whose gradient has buffers of its own.
 pub(super) fn recomputes(spans: &[Span]) -> bool {
     let encoded = |part: Part| matches!(part, Part::Encoded(_));
     let readers = spans.iter().flat_map(|span| [Some(span.upper), span.lower]).flatten().filter(|part| encoded(*part));
     spans.len() > 1 && readers.count() == 1 && spans.last().is_some_and(|span| span.lower.is_some_and(encoded))
 }
 
-/// Least work of the passes, of such backward ones, with so many columns of weights on the encoding. The forward pass keeps what the backward passes
-/// read; of these each reads its dz, its inputs, and for masks the last layer's activations, and leaves dz of the layer below.
+/// Minimum work of the passes, for the given backward sizes and number of columns of weights on the encoding. The forward pass
+/// stores what the backward passes read. Each backward pass reads its dz, its inputs and, for masks, the last layer's
+/// activations, and writes dz of the layer below.
 pub(super) fn work(params: &NetworkMap, encoded: u64, samples: u64, backward: Backward) -> Ledger {
     let Backward { pairs, recompute, .. } = backward;
     let width = params.width as u64;
@@ -114,7 +115,7 @@ pub(super) fn work(params: &NetworkMap, encoded: u64, samples: u64, backward: Ba
         let written = if span.with_input() { width } else { 0 };
         count("mlp_fused_bwd", 0, width + written, 0);
     }
-    // The last dz comes from the output, where the loss is.
+    // The last layer's dz comes from the output, where the loss is.
     count("mlp_fused_bwd", 4 * width, 0, SAMPLE_BYTES);
     ledger
 }
