@@ -96,6 +96,7 @@ pub mod gpu {
     pub mod pace;
     pub mod pipeline;
     pub mod record;
+    pub mod sensors;
     pub mod statistics;
     mod transfer;
 }
@@ -254,6 +255,22 @@ pub mod vessels {
     pub mod distances;
     pub(crate) mod field;
     pub mod mask;
+    pub mod threshold;
+}
+
+/// Vessels as trees of centrelines with radii, followed over the beat.
+pub mod trees {
+    mod branches;
+    pub mod extract;
+    pub mod files;
+    mod follow;
+    mod graph;
+    mod radii;
+    mod refine;
+    mod sampled;
+    mod tidy;
+    pub mod tree;
+    mod tubes;
 }
 
 /// What a reconstruction is worth.
@@ -270,19 +287,21 @@ pub mod score {
     pub mod volume;
 }
 
-/// Vessels as trees of centrelines with radii, followed over the beat.
-pub mod trees {
-    mod branches;
-    pub mod extract;
-    pub mod files;
-    mod follow;
-    mod graph;
-    mod radii;
-    mod refine;
-    mod sampled;
-    mod tidy;
+/// Synthetic data with exact truth.
+pub mod phantom {
+    mod blades;
+    mod catheter;
+    pub mod dataset;
+    pub mod degradations;
+    mod inflow;
+    pub mod noise;
+    pub mod projector;
+    mod runs;
+    mod subjects;
     pub mod tree;
-    mod tubes;
+    pub mod tree_file;
+    pub mod views;
+    pub mod voxels;
 }
 
 /// One run, from a dataset to a run directory.
@@ -319,23 +338,6 @@ pub mod capi {
     pub mod tree;
     pub mod truth;
     pub mod types;
-}
-
-/// Synthetic data with exact truth.
-pub mod phantom {
-    mod blades;
-    mod catheter;
-    pub mod dataset;
-    pub mod degradations;
-    mod inflow;
-    pub mod noise;
-    pub mod projector;
-    mod runs;
-    mod subjects;
-    pub mod tree;
-    pub mod tree_file;
-    pub mod views;
-    pub mod voxels;
 }
 
 #[cfg(feature = "study")]

@@ -24,7 +24,6 @@ use nertca_vk::reference::gaussians::{self as reference, N_PARAMS, Params, param
 use nertca_vk::reference::maxima::maxima;
 use nertca_vk::reference::tree::{TreeParams, loss_and_gradient};
 use nertca_vk::scan::dataset::{Dataset, Frame};
-use nertca_vk::score::eval::VESSEL_SHARE;
 use nertca_vk::score::metrics;
 use nertca_vk::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
 use nertca_vk::selftest::problems::{
@@ -33,6 +32,7 @@ use nertca_vk::selftest::problems::{
 use nertca_vk::selftest::trees;
 use nertca_vk::train::gaussians::GaussianTrainer;
 use nertca_vk::train::tree::TreeTrainer;
+use nertca_vk::vessels::threshold::VESSEL_SHARE;
 use std::time::Instant;
 
 /// The default configuration.
@@ -393,7 +393,7 @@ fn the_default_phantom_is_reconstructed() {
 }
 
 /// Runs both forms on the datasets whose folders `GAUSSIANS_DATA` names, separated by colons, for the table of
-/// docs/performance.md.
+/// docs/log/2026-11-performance.md.
 #[test]
 #[ignore = "a measurement, of folders named by GAUSSIANS_DATA"]
 fn forms_on_data() {

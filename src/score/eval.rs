@@ -2,26 +2,17 @@
 
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
-use crate::model::Model;
-use crate::model::component::Component;
 use crate::raster::percentile;
-use crate::render::grid::PatientGrid;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::ceiling::TruthDice;
 use crate::score::metrics;
 use crate::score::trees::TreeScores;
 use crate::score::volume::VolumeScores;
+use crate::vessels::threshold::{self, PUBLISHED_THRESHOLD, VESSEL_SHARE};
 use serde::Serialize;
 use std::borrow::Cow;
 
-/// Share of the vessels' stated attenuation from which a field counts as vessel. Fields are smoother than vessels, so one
-/// half would cut thin ones off, and one tenth would include noise. Among the shares tried (docs/performance.md), one fifth
-/// is within 0.04 of the best Dice in all cases: both forms of dynamic field, phantoms and real anatomy, with and without
-/// noise.
-pub const VESSEL_SHARE: f64 = 0.2;
-/// Attenuation per world unit above which the authors' public code takes a field for vessel, whatever the data.
-const PUBLISHED_THRESHOLD: f64 = 0.05;
 /// Description of the Dice threshold for X-Gaussian, whose opacities are no attenuation.
 const OPACITY_RULE: &str = "the sum of opacities, by the published threshold of 0.05";
 /// Description of the Dice threshold where no attenuation is stated.
@@ -182,28 +173,11 @@ fn choose_thresholds(
         (None, None) => {
             let all = |maxima: Maxima| {
                 let values: Vec<f32> = seen.iter().flat_map(|r| maxima(r).iter().copied()).collect();
-                f64::from(metrics::vessel_threshold(&values))
+                f64::from(threshold::vessel_threshold(&values))
             };
             (all(DYNAMIC), all(TOTAL), VESSEL_RULE)
         }
     }
-}
-
-/// Attenuation per mm above which the dynamic field of a model counts as vessel: [`VESSEL_SHARE`] of the stated one, or
-/// Otsu's threshold of the field's values at phase 0 on a grid; for X-Gaussian's opacities the published threshold.
-///
-/// # Errors
-/// Errors of [`Renderer::sample_patient`].
-pub fn vessel_threshold_per_mm(renderer: &Renderer, model: &Model, grid: &PatientGrid) -> Result<f64> {
-    if renderer.is_blended() {
-        return Ok(PUBLISHED_THRESHOLD / MM_PER_UNIT);
-    }
-    if let Some(attenuation) = model.vessel_attenuation {
-        return Ok(VESSEL_SHARE * attenuation / MM_PER_UNIT);
-    }
-    let values = renderer.sample_patient(Component::Dynamic, 0, grid)?;
-    let inside: Vec<f32> = values.into_iter().filter(|v| *v > 0.0).collect();
-    Ok(f64::from(metrics::vessel_threshold(&inside)))
 }
 
 /// Dice between the values above a threshold and the mask of a frame; `None` without a mask.
@@ -215,7 +189,7 @@ pub(super) fn overlap(frame: &Frame, values: &[f32], threshold: f64) -> Option<f
 
 /// Dice between the values above an image's own Otsu threshold and the mask; `None` without a mask.
 fn otsu_dice(frame: &Frame, values: &[f32]) -> Option<f64> {
-    overlap(frame, values, metrics::vessel_threshold(values).into())
+    overlap(frame, values, threshold::vessel_threshold(values).into())
 }
 
 /// Mean of values; `None` if there are none.

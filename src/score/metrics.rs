@@ -1,9 +1,5 @@
 //! Image metrics.
 
-use crate::raster::percentile;
-
-/// Values above this percentile are limited to it in the search for a threshold.
-const HOT: f64 = 0.995;
 /// Number of steps in the search for the best threshold.
 const CANDIDATES: u32 = 200;
 
@@ -78,42 +74,6 @@ pub fn ssim(truth: &[f64], prediction: &[f64], width: usize) -> f64 {
     sum / mean_t.len() as f64
 }
 
-/// Otsu's threshold of a list of values (256 bins).
-pub fn otsu(values: &[f32]) -> f32 {
-    const BINS: usize = 256;
-    let (low, high) = values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
-    if high <= low || values.is_empty() {
-        return high;
-    }
-    let mut counts = [0f64; BINS];
-    for v in values {
-        counts[(((v - low) / (high - low) * BINS as f32) as usize).min(BINS - 1)] += 1.0;
-    }
-    let total: f64 = counts.iter().sum();
-    let mean_all: f64 = counts.iter().enumerate().map(|(i, c)| i as f64 * c).sum::<f64>() / total;
-    let (mut weight, mut sum, mut best, mut best_at) = (0.0, 0.0, -1.0, 0);
-    for (i, c) in counts.iter().enumerate() {
-        weight += c;
-        sum += i as f64 * c;
-        if weight == 0.0 || weight == total {
-            continue;
-        }
-        let between = (mean_all * weight - sum).powi(2) / (weight * (total - weight));
-        if between > best {
-            (best, best_at) = (between, i);
-        }
-    }
-    low + (best_at as f32 + 1.0) / BINS as f32 * (high - low)
-}
-
-/// Otsu's threshold for vessels in values that are mostly zero and have a few hot spots. Values are limited to their 99.5th
-/// percentile: otherwise one pixel in two thousand far above all vessels would form the upper group. The threshold is zero
-/// where fewer values than that exceed zero.
-pub fn vessel_threshold(values: &[f32]) -> f32 {
-    let hottest = percentile(values, HOT);
-    otsu(&values.iter().map(|v| v.min(hottest)).collect::<Vec<_>>())
-}
-
 /// Returns the maximum mean Dice of several images over thresholds (values above the threshold against a mask), and its
 /// threshold. `used` is tried, too. Returns `None` without images.
 pub fn best_dice(images: &[(&[f32], &[bool])], used: f32) -> Option<(f64, f32)> {
@@ -177,34 +137,6 @@ mod tests {
         let noisy: Vec<f64> =
             truth.iter().enumerate().map(|(i, v)| v + 0.3 * f64::from(u8::from(i % 2 == 0))).collect();
         assert!(ssim(&truth, &noisy, 20) < 0.8);
-    }
-
-    /// Values spread evenly about two levels.
-    fn two_levels(low: f32, n_low: usize, high: f32, n_high: usize) -> Vec<f32> {
-        let spread = |level: f32, n: usize| (0..n).map(move |i| level * (0.6 + 0.8 * i as f32 / n as f32));
-        spread(low, n_low).chain(spread(high, n_high)).collect()
-    }
-
-    #[test]
-    fn otsu_splits_two_groups_where_they_part() {
-        // The lower group ends at 0.14, the upper one begins at 0.6; a histogram's bin is 0.005 wide.
-        let t = otsu(&two_levels(0.1, 900, 1.0, 100));
-        assert!((0.14..0.146).contains(&t), "{t}");
-        // Where groups meet, the threshold is one bin after the lower group's end, and many values of the upper one are
-        // below it.
-        let t = otsu(&two_levels(0.1, 500, 0.4, 500));
-        assert!((0.255..0.265).contains(&t), "{t}");
-    }
-
-    #[test]
-    fn a_few_hot_spots_do_not_move_the_threshold() {
-        let mut values = two_levels(0.1, 900, 1.0, 100);
-        values.extend([0.0; 5000]);
-        let cool = vessel_threshold(&values);
-        values.extend([40.0, 55.0, 60.0, 70.0]);
-        let hot = vessel_threshold(&values);
-        assert!((cool - hot).abs() < 0.02 && (0.13..0.6).contains(&hot), "{cool} without, {hot} with hot spots");
-        assert!(otsu(&values) > 1.4, "Otsu alone sees the hot spots only: {}", otsu(&values));
     }
 
     #[test]

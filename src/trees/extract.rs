@@ -8,7 +8,6 @@ use crate::model::component::Component;
 use crate::model::gaussians::MovingGaussians;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
-use crate::score::eval::vessel_threshold_per_mm;
 use crate::trees::branches::chains;
 use crate::trees::follow::Carrier;
 use crate::trees::graph::Forest;
@@ -21,6 +20,7 @@ use crate::vessels::centreline::centreline;
 use crate::vessels::distances::DistanceMap;
 use crate::vessels::field::{Corners, MovingField};
 use crate::vessels::mask::Mask;
+use crate::vessels::threshold::vessel_threshold_per_mm;
 use glam::DVec3;
 
 /// Step of the grid on which a field is sampled, in units of the field's resolution.
