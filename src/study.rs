@@ -1,8 +1,9 @@
-//! Studies: data sets x methods x seeds as one file, run until each has its result, and put beside what is published.
+//! Studies: data sets x methods x seeds, described in one file. Each combination is run until it has a result, and the results
+//! are put beside published values.
 //!
-//! 1. [`mod@file`] reads a study, [`data`] says what its angiograms are made of, [`plan`] expands it into runs
-//! 2. [`work`] does one run in the study's directory, [`queue`] all of them; [`outcome`] is what a run leaves
-//! 3. [`mod@table`] puts outcomes beside [`published`] values; [`markup`] writes that as Markdown, CSV and LaTeX
+//! 1. [`mod@file`] reads a study, [`data`] describes its angiograms, [`plan`] expands it into runs
+//! 2. [`work`] does one run in the study's directory, [`queue`] does all of them; [`outcome`] is the result of a run
+//! 3. [`mod@table`] puts outcomes beside [`published`] values; [`markup`] writes tables as Markdown, CSV and LaTeX
 //!
 //! A study's directory holds `data/` (phantoms, shared between methods), `runs/ID/` (run directories, each with its
 //! `result.json`) and `locks/`. See `docs/studies.md`.
@@ -21,5 +22,5 @@ pub mod table;
 mod text;
 pub mod work;
 
-/// Commit of this program: results of another one are not its own, and its runs are not gone on with.
+/// Commit of this program. Results of another commit do not count as its own, and runs of another commit are not resumed.
 pub const COMMIT: &str = env!("NERTCA_COMMIT");

@@ -1,6 +1,5 @@
 //! Timing of training iterations.
 
-use crate::bench::sensors::{Readings, Watch};
 use crate::choice::Choice;
 use crate::config::Config;
 use crate::config::sections::Tree;
@@ -8,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
+use crate::gpu::sensors::{Readings, Watch};
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::network::cost::NetworkCost;
