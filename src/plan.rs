@@ -1,5 +1,5 @@
-//! From a dataset and a configuration to everything a run needs, in the device's terms: scales, boxes,
-//! hull, backgrounds, ray lists, schedule. Pure host code; both the engine and its CPU twin start here.
+//! Builds everything a run needs from a dataset and a configuration, in the device's terms: scales, boxes, hull, backgrounds,
+//! ray lists, schedule. Pure host code; both the engine and its CPU twin start here.
 
 pub mod carve;
 pub mod changes;
@@ -32,7 +32,7 @@ use crate::r2::data::R2Data;
 use crate::scan::dataset::Dataset;
 use crate::x_gaussian::data::XData;
 
-/// A run, ready to start.
+/// Prepared run, ready to start.
 pub struct Plan {
     /// The configuration it came from.
     pub config: Config,
@@ -40,7 +40,7 @@ pub struct Plan {
     pub scene: Scene,
     /// Constants for the shaders.
     pub setup: Setup,
-    /// Where each parameter lives.
+    /// Location of each parameter.
     pub params: ParamMap,
     /// One row per iteration.
     pub schedule: Vec<layout::Schedule>,
@@ -50,26 +50,27 @@ pub struct Plan {
     pub frames: Vec<layout::Frame>,
     /// Line integrals of all training frames.
     pub images: Vec<f32>,
-    /// Bounds of the still background of each pixel of each view.
+    /// Bounds of the static background of each pixel of each view.
     pub backgrounds: Vec<[f32; 2]>,
-    /// How much each pixel of each view changes over the beat, where two networks are the fields; else empty.
+    /// Change of each pixel of each view over the beat where two networks are the fields; else empty.
     pub pixel_changes: Vec<f32>,
-    /// Rays as frame * pixels + pixel: first those that meet the hull, then, where some pixels are hidden, all that are not. Of
-    /// two networks, first those that change, then the others that are not hidden.
+    /// Listed rays as frame * pixels + pixel. With a hull: first the rays that meet it, then, if some pixels are hidden, all
+    /// rays that are not hidden. With two networks: first the rays that change over the beat, then the other rays that are not
+    /// hidden.
     pub listed_rays: Vec<u32>,
-    /// The hull, when it is used.
+    /// Motion hull, if it is used.
     pub hull: Option<Hull>,
-    /// What Gaussians are fitted to, when they are the moving field and follow it.
+    /// Targets of the Gaussians, where they are the dynamic field and follow the beat.
     pub targets: Option<Targets>,
-    /// What R2-Gaussian's are fitted to, when they are all there is.
+    /// Data of R2-Gaussian's fit, where that method is used.
     pub r2: Option<R2Data>,
-    /// What X-Gaussian's are fitted to, when they are all there is.
+    /// Data of X-Gaussian's fit, where that method is used.
     pub x: Option<XData>,
-    /// Data of a method with a room of its own ([`crate::methods`]); none of others.
+    /// Fit data of a method of [`crate::methods`]; `None` for all other methods.
     pub fit: Option<Box<dyn FitData>>,
-    /// Weighted loss of the moving field when there is none, where a network moves with a temporal target.
+    /// Weighted loss of an empty dynamic field, where a network is the dynamic field and the target is temporal.
     pub empty_loss: Option<f64>,
-    /// Decisions worth telling the user.
+    /// Decisions that the user should know.
     pub notes: Vec<String>,
 }
 
@@ -196,7 +197,7 @@ impl Plan {
         })
     }
 
-    /// This plan in a scene that is known, as when resuming.
+    /// Returns this plan in a known scene, for example when resuming.
     pub fn in_scene(self, scene: Scene) -> Plan {
         let setup = Setup {
             n_motion_rays: self.setup.n_motion_rays,
@@ -214,7 +215,7 @@ impl Plan {
 /// Cells along each axis of the soft hull that Gaussians are seeded in.
 const SOFT_HULL_CELLS: usize = 112;
 
-/// Where vessels may be, and what Gaussians are fitted to.
+/// Computes where vessels may be, and the targets that Gaussians are fitted to.
 fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {
     let soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
     let targets = Targets::new(dataset, &soft, &config.gaussians)?;
@@ -245,7 +246,7 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     Ok((soft.hull.to_hull(), targets))
 }
 
-/// What R2-Gaussian is fitted to, and what is to be said of that.
+/// Prepares R2-Gaussian's data, and notes about them for the user.
 fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
     let half = volume_half(config.r2.half_extent_mm, dataset);
     let data = R2Data::new(dataset, &config.r2, half)?;
@@ -279,7 +280,7 @@ fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
     Ok(data)
 }
 
-/// What X-Gaussian is fitted to, and what is to be said of that.
+/// Prepares X-Gaussian's data, and notes about them for the user.
 fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
     let half = volume_half(config.x.half_extent_mm, dataset);
     let data = XData::new(dataset, &config.x, half)?;
@@ -312,7 +313,7 @@ fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result
     Ok(data)
 }
 
-/// What is said of frames that Gaussians are not fitted to: those of views that have one phase alone.
+/// Returns a note on the frames that Gaussians are not fitted to: frames of views with a single phase.
 fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
     let fitted = |view: usize| soft.views.iter().any(|v| v.view == view);
     let left = dataset.training().iter().filter(|frame| !fitted(frame.view)).count();
@@ -325,7 +326,7 @@ fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
     })
 }
 
-/// What is said of views in which more moves than vessels.
+/// Returns a note on the views in which more than vessels moves.
 fn wide_motion(soft: &SoftMotion) -> Option<String> {
     let views: Vec<usize> = soft.views.iter().filter(|v| v.background.drift.size().is_some()).map(|v| v.view).collect();
     let what = "something wide moves besides vessels, as a heart, a diaphragm or lungs do: \
@@ -333,7 +334,7 @@ fn wide_motion(soft: &SoftMotion) -> Option<String> {
     (!views.is_empty()).then(|| format!("views {views:?}: {what}"))
 }
 
-/// What is said of two networks, of whose rays a `share` changes over the beat.
+/// Returns the notes on two networks; a `share` of the rays changes over the beat.
 fn two_networks(config: &Config, share: f64) -> [String; 2] {
     let near = config.dynamic.occlusion_share;
     [

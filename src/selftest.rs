@@ -1,10 +1,10 @@
-//! Every compute stage against its f64 twin, on the user's own device: what someone with an unknown card runs first, and
-//! what a report of a fault begins with. The tests use the same problems, comparisons and tolerances.
+//! Compares every compute stage with its f64 twin on the user's own device. Someone with an unknown card runs this first, and a
+//! fault report begins with it. The tests use the same problems, comparisons and tolerances.
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
 //! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
-//!    [`gaussians`], [`trees`], [`mod@r2`], [`x_gaussian`] and [`blobs`] about Gaussians; [`mod@sax`] about SAX-NeRF, [`projections`]
-//!    about phantoms
+//!    [`gaussians`], [`trees`], [`mod@r2`], [`x_gaussian`] and [`blobs`] about Gaussians; [`mod@sax`] about SAX-NeRF,
+//!    [`projections`] about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 
 pub mod blobs;
@@ -35,20 +35,20 @@ use serde::Serialize;
 /// Stages that measure a device's limits: their results are not used.
 const MEASURING: [&str; 3] = [push::PeakCopy::SHADER, push::PeakF32::SHADER, push::PeakMatrix::SHADER];
 
-/// What a self-test found.
+/// Result of a self-test.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     /// A row for each stage and path, in the order in which stages run.
     pub rows: Vec<Row>,
-    /// Parts of the test that an error ended.
+    /// Parts of the test that ended with an error.
     pub errors: Vec<Failure>,
     /// Stages that were not compared with anything.
     pub untested: Vec<&'static str>,
-    /// Paths through the kernels that the device got, a sentence each, and why others were left out.
+    /// Paths through the kernels that the device got, a sentence each, with the reasons why others were left out.
     pub paths: Vec<String>,
 }
 
-/// A part of the test that an error ended.
+/// A part of the test that ended with an error.
 #[derive(Debug, Clone, Serialize)]
 pub struct Failure {
     /// The part.
@@ -63,7 +63,7 @@ impl Report {
         self.rows.iter().filter(|row| !row.is_ok())
     }
 
-    /// Whether everything that was compared is as it should be. Stages that were not are listed, and no failure.
+    /// Tells whether every comparison passed. Stages without a comparison are listed, and do not count as failures.
     pub fn is_ok(&self) -> bool {
         self.errors.is_empty() && self.failed().next().is_none() && !self.rows.is_empty()
     }
@@ -99,7 +99,7 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
         (name("equal runs"), Box::new(move |findings| repeats::compare_network(gpu, dataset, tuning, findings))),
     ];
     if tuning.layers == Layers::Matrices {
-        // What the backward pass computes again, or keeps, is the device's choice: the other way must be right, too.
+        // The device chooses whether the backward pass recomputes or keeps results: the other way must be right, too.
         let matrices = MatrixTuning { recompute: !tuning.matrices.recompute, ..tuning.matrices };
         let other_way = Tuning { matrices, ..tuning.clone() };
         let case = &iteration::MATRIX_CASES[0];
@@ -125,11 +125,11 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
     ]
 }
 
-/// Compares every stage that the device can run with its twin. `progress` hears the name of each part that begins, the
-/// number of those before it and of all.
+/// Compares every stage that the device can run with its twin. `progress` receives the name of each part that begins, the
+/// number of parts before it, and the number of all.
 ///
 /// # Errors
-/// [`Error::DeviceLost`], after which nothing can be told; other errors are part of the report.
+/// [`Error::DeviceLost`], after which nothing can be compared; other errors are part of the report.
 pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Report> {
     let (even, dataset) = (problems::small_dataset(13, 11, 3)?, problems::uneven_dataset(13, 11)?);
     let chosen = Tuning::for_device(gpu.info());

@@ -1,5 +1,5 @@
 //! A reconstruction in memory that grows with its frames: angiograms come in at any time, also while training in the
-//! background, and any pose and phase can be drawn meanwhile. What the C ABI offers, for Rust.
+//! background, and any pose and phase can be drawn meanwhile. This is the Rust side of the C ABI.
 //!
 //! Threads: every function may be called from any thread at any time. Training holds the engine for a few iterations
 //! at a time; drawing never waits for more than those.
@@ -42,7 +42,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What a session is doing.
+/// State of a session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum State {
     /// Not training.
@@ -62,13 +62,13 @@ pub enum State {
 }
 
 impl State {
-    /// Whether training in the background goes on, or will again.
+    /// Tells whether training in the background goes on, or will again.
     fn in_background(self) -> bool {
         matches!(self, State::Running | State::Paused | State::Waiting)
     }
 }
 
-/// How far training is.
+/// Progress of training.
 #[derive(Debug, Clone, Copy)]
 pub struct Progress {
     /// Losses of the last iteration.
@@ -83,7 +83,7 @@ pub struct Progress {
     pub iterations_per_s: f64,
 }
 
-/// Told now and then how far training is; returns whether to go on.
+/// Callback that receives the progress of training now and then; returns whether to go on.
 pub type Observer<'a> = dyn FnMut(&Progress) -> bool + 'a;
 
 /// A reconstruction in memory that grows with its frames (see the module).
@@ -137,7 +137,8 @@ impl Session {
         })
     }
 
-    /// Adds a frame, which counts from 0 on. Training in the background takes it in by itself, soon; training that starts later, at once.
+    /// Adds a frame; frames are counted from 0. Training in the background takes it in soon, by itself; training that starts
+    /// later takes it in at once.
     ///
     /// # Errors
     /// [`Error::Config`] naming what is wrong with it; [`Error::Busy`] while a deterministic session is training.
@@ -145,8 +146,8 @@ impl Session {
         self.change_frames(|inbox| inbox.add(new))
     }
 
-    /// States another geometry for a frame that was added: what the C-arm or a calibration elsewhere knows better by now.
-    /// Training takes it in as it does a new frame.
+    /// States another geometry for a frame that was added, for example when the C-arm or an external calibration knows it
+    /// better. Training takes it in as it does a new frame.
     ///
     /// # Errors
     /// As [`Session::add_frame`]; [`Error::Config`] for a frame that was not added.
@@ -210,12 +211,12 @@ impl Session {
         self.shared.step.load(Ordering::Acquire)
     }
 
-    /// What training is doing.
+    /// State of training.
     pub fn state(&self) -> State {
         lock(&self.shared.control).state
     }
 
-    /// What ended training in the background, if an error did.
+    /// Error that ended training in the background, if one did.
     pub fn failure(&self) -> Option<String> {
         lock(&self.shared.control).failure.clone()
     }
@@ -261,7 +262,7 @@ impl Session {
         self.not_from_observer()?;
         let _alone = self.alone()?;
         self.shared.device()?;
-        // A `stop` meanwhile comes before all of this, or after it.
+        // A `stop` from another thread comes before all of this, or after it.
         let mut worker = lock(&self.worker);
         let shared = self.shared.clone();
         shared.stop.store(false, Ordering::Release);
@@ -274,7 +275,7 @@ impl Session {
         let spawned = std::thread::Builder::new().name(TRAINING_THREAD.into()).spawn(move || {
             tracing::dispatcher::with_default(&dispatch, || {
                 lock(&shared.control).worker = Some(std::thread::current().id());
-                // The observer goes before training is said to have ended: nothing of its owner's is used after that.
+                // The observer is dropped before training is said to have ended: nothing of its owner's is used after that.
                 let work = std::panic::AssertUnwindSafe(|| {
                     let mut observe = observe;
                     shared.work(&mut *observe)
@@ -331,7 +332,7 @@ impl Session {
         Ok(())
     }
 
-    /// The right to train, or to change what is trained; refused while someone else has it.
+    /// Acquires the right to train, or to change what is trained; refused while another caller has it.
     fn alone(&self) -> Result<MutexGuard<'_, ()>> {
         let blocking = match self.blocking.try_lock() {
             Ok(guard) => guard,
@@ -340,7 +341,7 @@ impl Session {
                 return Err(Error::Busy("the session is training in another call".into()));
             }
         };
-        // By what the session says, as those who waited for the end go by it: the thread may take a moment longer.
+        // The session's state decides, since those who waited for the end go by it: the thread may take a moment longer.
         if self.state().in_background() {
             return Err(Error::Busy("the session is training in the background already".into()));
         }
@@ -356,7 +357,7 @@ impl Session {
         Ok(())
     }
 
-    /// Waits until training in the background has ended, at most so long; whether it has.
+    /// Waits until training in the background has ended, at most for `limit`; returns whether it has.
     pub fn wait(&self, limit: Duration) -> bool {
         let until = Instant::now() + limit;
         let mut control = lock(&self.shared.control);
@@ -411,7 +412,7 @@ impl Session {
     }
 
     /// The vessels at all phases as trees of centrelines with radii, from the fields as they are after the iterations under
-    /// way; see [`vessel_trees`] for the threshold and the least length.
+    /// way; see [`vessel_trees`] for the threshold and the minimum length.
     ///
     /// # Errors
     /// [`Error::NotReady`] before anything was trained or loaded; those of [`vessel_trees`].
@@ -464,7 +465,7 @@ impl Session {
     }
 }
 
-/// Waits for the thread that trains; others who would wait for it, too, have the lock after that.
+/// Waits for the thread that trains; other callers that wait for it get the lock after that.
 fn join(mut worker: MutexGuard<'_, Option<JoinHandle<()>>>) {
     if let Some(handle) = worker.take() {
         // A panic of the worker has become its failure.

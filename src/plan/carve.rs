@@ -52,7 +52,7 @@ pub fn carve(dataset: &Dataset, motion: &[ViewMotion], half: f64, resolution: us
     Hull { size: [n; 3], min, cell, n_phases, bits }
 }
 
-/// World point to pixel.
+/// Projection of world points to pixels of a view.
 pub(super) struct Projector<'a> {
     source: DVec3,
     inverse: DMat3,
@@ -63,7 +63,7 @@ pub(super) struct Projector<'a> {
 }
 
 impl<'a> Projector<'a> {
-    /// Of a view, by its rays or by those that frames of it see the heart by.
+    /// Creates the projector of a view from `rays`: the view's own, or those by which a frame of the view sees the heart.
     pub(super) fn new(dataset: &'a Dataset, view: usize, rays: &ViewRays) -> Self {
         let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
         let (width, height) = (dataset.width as i64, dataset.height as i64);

@@ -1,12 +1,12 @@
-//! How much what passes of the X-rays changes at each pixel over the beat, by which NeRF-CA chooses and weighs rays.
+//! Change of the X-ray transmission at each pixel over the beat, by which NeRF-CA chooses and weighs rays.
 
 use crate::plan::motion::ViewMotion;
 use crate::scan::dataset::Dataset;
 use rayon::prelude::*;
 
-/// Variance over a view's training images of the transmission exp(-L) of each pixel of the canvas, from 0 where it is least in
-/// the view to 1 where it is greatest; nothing but 0 in views that do not change. Pixels that show nothing of the patient
-/// have none.
+/// Returns, per view, the variance over its training images of the transmission exp(-L) at each pixel of the canvas, scaled
+/// from 0 at the view's minimum to 1 at its maximum. It is 0 everywhere in views that do not change, and 0 at pixels that show
+/// nothing of the patient.
 pub fn of_views(dataset: &Dataset, motion: &[ViewMotion]) -> Vec<Vec<f32>> {
     motion.par_iter().map(|m| of_view(dataset, m.view)).collect()
 }
@@ -27,8 +27,9 @@ fn of_view(dataset: &Dataset, view: usize) -> Vec<f32> {
     all.iter().map(share).collect()
 }
 
-/// Training rays, as frame * pixels + pixel, that change by more than `least`, then the others; none that show nothing of the
-/// patient. Their numbers are told apart. Where all change, the others are all of them.
+/// Returns training rays, as frame * pixels + pixel: first the rays that change by more than `least`, then the others, and the
+/// number of the first ones. Rays that show nothing of the patient are left out. If all rays change, the second part repeats
+/// all of them.
 pub fn rays(dataset: &Dataset, motion: &[ViewMotion], changes: &[Vec<f32>], least: f64) -> (Vec<u32>, usize) {
     let pixels = dataset.n_pixels();
     let (mut changing, mut others) = (Vec::new(), Vec::new());

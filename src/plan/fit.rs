@@ -10,11 +10,11 @@ use crate::plan::targets::Targets;
 /// Decay of Adam's first and second moments, and its smallest denominator.
 const BETAS: [f32; 2] = [0.9, 0.98];
 const EPSILON: f32 = 1e-12;
-/// The same while a phase is tracked: little memory, for few iterations.
+/// Decay of Adam's moments while a phase is tracked: little memory, for few iterations.
 const TRACK_BETAS: [f32; 2] = [0.8, 0.95];
-/// What the rate falls to, linearly, over the iterations of a tracked phase.
+/// Share of the rate that is left at the end of a tracked phase; the rate falls to it linearly.
 const TRACK_LAST_RATE: f64 = 0.2;
-/// The grid reaches this far beyond the hull, pixels.
+/// Margin of the grid beyond the hull, pixels.
 const MARGIN: f64 = 2.0;
 
 /// Constants of a fit.
@@ -58,12 +58,12 @@ pub fn track_setup(setup: &GaussianSetup, settings: &sections::Tree) -> Gaussian
     }
 }
 
-/// A tree's grid, around the hull.
+/// Constants of a tree's grid, which encloses the hull.
 pub fn tree_setup(targets: &Targets, settings: &sections::Tree) -> TreeSetup {
     let reach = targets.places.iter().flatten().map(|p| p.position.abs().max_element()).fold(0.0, f64::max);
     let half_side = reach + MARGIN;
     let n_nodes = (2.0 * half_side / settings.node).ceil() as u32 + 1;
-    // More harmonics than half the phases cannot be told apart.
+    // Harmonics beyond half the number of phases cannot be told apart.
     let harmonics = settings.harmonics.min((targets.n_phases as u32).saturating_sub(1) / 2);
     TreeSetup {
         n_nodes,
@@ -95,33 +95,35 @@ fn row(step: u32, rate: f64, betas: [f32; 2]) -> GaussianSchedule {
     GaussianSchedule { rate: rate as f32, bias1: bias(betas[0]), bias2: bias(betas[1]) }
 }
 
-/// Whether Gaussians are dropped and placed before an iteration.
+/// Tells whether Gaussians are dropped and placed before an iteration.
 pub fn grows(settings: &sections::Gaussians, step: u32) -> bool {
     settings.grow_at > 0 && step == settings.grow_at
 }
 
-/// Whether Gaussians too faint for vessels are dropped before an iteration.
+/// Tells whether Gaussians too faint for vessels are dropped before an iteration.
 pub fn clears(settings: &sections::Gaussians, step: u32) -> bool {
     settings.clear_at > 0 && step == settings.clear_at
 }
 
-/// Whether Gaussians that stand for no vessel are dropped after an iteration.
+/// Tells whether Gaussians that stand for no vessel are dropped after an iteration.
 pub fn parts_from_strays(settings: &sections::Gaussians, step: u32) -> bool {
     settings.link > 0.0 && step == settings.iterations
 }
 
-/// Whether the still background is estimated anew before an iteration: not while rates fall, when little could follow.
+/// Tells whether the static background is estimated anew before an iteration. It is not while rates fall, since the fit could
+/// hardly follow.
 pub fn renews_background(settings: &sections::Gaussians, step: u32) -> bool {
     let every = settings.background_every;
     every > 0 && step > 0 && step.is_multiple_of(every) && rate(settings, step) == 1.0
 }
 
-/// The iteration from which a fit goes on that is carried to other data: where the background is first estimated anew.
+/// Returns the iteration from which a fit goes on that is carried over to other data: the first one before which the background
+/// is estimated anew.
 pub fn carried_step(settings: &sections::Gaussians) -> u32 {
     (1..settings.iterations).find(|step| renews_background(settings, *step)).unwrap_or(0)
 }
 
-/// Where iterations from `step` on towards `until` must stop, as something is to be done before the next.
+/// Returns where iterations from `step` on towards `until` must stop, because something must be done before the next one.
 pub fn next_stop(settings: &sections::Gaussians, step: u32, until: u32) -> u32 {
     (step + 1..until)
         .find(|s| grows(settings, *s) || clears(settings, *s) || renews_background(settings, *s))

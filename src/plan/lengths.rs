@@ -1,28 +1,29 @@
-//! What settings in pixels mean on the images at hand: larger images show the same field, and noise asks for smoother vessels.
+//! Lengths of the settings, in pixels, adapted to the images at hand: larger images show the same field, and noise asks for
+//! smoother vessels.
 
 use crate::config::sections::{Gaussians, Tree};
 use crate::evidence::background::blur;
 use crate::raster::{Image, percentile};
 
-/// Smaller side of the images, pixels, whose pixels the settings' lengths are.
+/// Smaller side, pixels, of the images to which the settings' lengths refer.
 const SIDE: f64 = 100.0;
-/// Noise, share of the strongest change, from which vessels are held smoothest.
+/// Noise, as a share of the strongest change, from which on vessels are smoothed most.
 const NOISY: f64 = 0.1;
-/// Factor on the least scale then.
+/// Factor on the minimum scale at that noise.
 const SMOOTHEST: f64 = 1.5;
-/// Noise makes the least scale no larger than this share of the width of wide vessels.
+/// Upper limit of a minimum scale that noise has raised, as a share of the width of wide vessels.
 const SHARE_OF_WIDTH: f64 = 0.27;
-/// Change, share of the strongest, that wide vessels exceed.
+/// Change, as a share of the strongest, that wide vessels exceed.
 const WIDE_CHANGE: f32 = 0.3;
-/// Blur before it is looked for, pixels.
+/// Blur of the images before wide vessels are looked for, pixels.
 const WIDE_BLUR: f32 = 0.7;
 
 /// Lengths of a fit, from its images.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lengths {
-    /// Pixels of the images per pixel of the settings: what lengths and rates of lengths are multiplied by.
+    /// Pixels of the images per pixel of the settings; lengths and rates of lengths are multiplied by it.
     pub factor: f64,
-    /// Factor on the least scale besides, from noise.
+    /// Additional factor on the minimum scale, from noise.
     pub smoothing: f64,
 }
 
@@ -63,8 +64,8 @@ impl Lengths {
     }
 }
 
-/// Mean width, pixels, of vessels that change the `images` by much of the `strongest` change: twice their area over the
-/// length of their outline; 0 without any.
+/// Mean width, pixels, of vessels whose change of the `images` is a large share of the `strongest` change: twice their area
+/// over the length of their outline; 0 without any.
 pub fn vessel_width<'a>(images: impl Iterator<Item = &'a Image>, strongest: f32) -> f64 {
     // A line of any direction crosses on average 4 / pi as many edges of pixels as it is long.
     const EDGES_PER_LENGTH: f64 = 4.0 / std::f64::consts::PI;

@@ -1,5 +1,5 @@
-//! What moves in the angiograms, found without segmentation: each view's still background, its noise,
-//! and the motion hull, the set of points whose projection changes over time in every view that sees them.
+//! Motion in the angiograms, found without segmentation: each view's static background, its noise, and the motion hull, the set
+//! of points whose projection changes over time in every view that sees them.
 
 use crate::config;
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
@@ -13,10 +13,10 @@ use rayon::prelude::*;
 pub struct ViewMotion {
     /// Index into [`Dataset::views`].
     pub view: usize,
-    /// Upper bound of the still background: each pixel's smallest line integral over the phases, corrected for
+    /// Upper bound of the static background: each pixel's smallest line integral over the phases, corrected for
     /// the bias that taking a minimum of noisy values has.
     pub background: Vec<f32>,
-    /// Lower bound of the still background: what remains of it without structures as thin as vessels, since a
+    /// Lower bound of the static background: what remains of it without structures as thin as vessels, since a
     /// vessel that covers a pixel at every phase is part of the minimum.
     pub background_low: Vec<f32>,
     /// Largest integral above the background over the phases.
@@ -25,15 +25,15 @@ pub struct ViewMotion {
     pub noise: Vec<f32>,
     /// Pixels that move at some phase.
     pub moving: Vec<bool>,
-    /// Pixels that stand out of the background at each phase of the dataset, or in an image taken on the way to or from it; empty
-    /// for phases not seen.
+    /// Pixels that stand out of the background at each phase of the dataset, or in an image taken between it and a neighbouring
+    /// phase; empty for phases that are not seen.
     pub moving_at: Vec<Vec<bool>>,
     /// Training phases of this view.
     pub n_phases: usize,
 }
 
 impl ViewMotion {
-    /// The same for images of `size` (columns, rows) in the corner of a canvas, beyond which nothing moves.
+    /// Places this motion, found on images of `size` (columns, rows), in the corner of a canvas, beyond which nothing moves.
     fn on_canvas(self, size: [usize; 2], canvas: [usize; 2]) -> ViewMotion {
         if size == canvas {
             return self;
@@ -68,7 +68,7 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
             let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
             let at = |p: usize| images.iter().map(move |image| image[p]);
             let mean: Vec<f32> = (0..pixels).map(|p| at(p).sum::<f32>() / n as f32).collect();
-            // Successive differences over sqrt 2: slow change over the beat counts little.
+            // Differences of successive phases over sqrt 2: a slow change over the beat contributes little.
             let deviation: Vec<f32> = (0..pixels)
                 .map(|p| {
                     let mut steps: Vec<f32> = images.windows(2).map(|w| (w[1][p] - w[0][p]).abs()).collect();
@@ -100,7 +100,7 @@ pub fn analyse(dataset: &Dataset, config: &config::sections::Hull) -> Vec<ViewMo
             for (frame, values) in frames.iter().zip(&images) {
                 let stands_out = |p: usize| values[p] - background_low[p] > threshold(p);
                 let seen = grow(&|p| range[p] > threshold(p) && stands_out(p));
-                // What is seen between two phases, or at another moment near one, is no reason to rule it out at either.
+                // A structure seen between two phases, or at another moment near one, is not ruled out at either of them.
                 for (phase, _) in
                     frame.beat_time().shown(dataset.n_phases).into_iter().filter(|(_, share)| *share > 0.0)
                 {

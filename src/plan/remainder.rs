@@ -1,31 +1,31 @@
-//! The still background anew, from what a moving field leaves of the images: where a vessel covers a pixel at most phases,
-//! the lowest phases do not show the background, but the images less the vessels do.
+//! Estimates the static background anew from what a dynamic field leaves of the images: where a vessel covers a pixel at most
+//! phases, the lowest phases do not show the background, but the images minus the vessels do.
 
 use crate::evidence::background::{blur, opening_radius};
 use crate::plan::targets::Targets;
 use crate::raster::{Image, median_filter};
 use rayon::prelude::*;
 
-/// Radius of the median that tells slow changes of the background, such as a heart's, from what is lacking of vessels, as a
-/// share of the image's smaller side.
+/// Radius of the median that separates slow changes of the background, such as a heart's, from vessels that the field lacks, as
+/// a share of the image's smaller side.
 const SLOW_SHARE: f64 = 0.04;
-/// Blur of the slow changes, likewise.
+/// Blur of the slow changes, as a share of the image's smaller side.
 const SLOW_BLUR_SHARE: f64 = 0.02;
-/// How much more line integral than the estimate says is free, in standard deviations of the noise.
+/// Line integral above the estimate that costs nothing, in standard deviations of the noise.
 const FREE_NOISE: f32 = 2.0;
 
-/// Bounds of the moving field's images, `[image][pixel]`, shares of the strongest change.
+/// Bounds of the dynamic field's images, `[image][pixel]`, shares of the strongest change.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bounds {
-    /// Least line integral that explains the pixel.
+    /// Minimum line integral that explains the pixel.
     pub low: Vec<f32>,
-    /// Greatest.
+    /// Maximum line integral that explains the pixel.
     pub high: Vec<f32>,
 }
 
-/// Bounds by the background that the field's `images` (`[image][pixel]`, shares of the strongest change) leave: the
+/// Computes bounds from the background that the field's `images` (`[image][pixel]`, shares of the strongest change) leave: the
 /// median over a view's phases, and what changes slowly from pixel to pixel around it. Views of fewer than three phases keep
-/// theirs.
+/// their bounds.
 pub fn bounds(targets: &Targets, images: &[f32]) -> Bounds {
     let mut bounds = Bounds { low: targets.low.clone(), high: targets.high.clone() };
     let n = targets.n_pixels();
@@ -50,14 +50,14 @@ pub fn bounds(targets: &Targets, images: &[f32]) -> Bounds {
     bounds
 }
 
-/// What the field leaves of an image.
+/// Returns an image minus the field's image.
 fn left(targets: &Targets, images: &[f32], image: usize) -> Image {
     let range = image * targets.n_pixels()..(image + 1) * targets.n_pixels();
     let values = targets.images[range.clone()].iter().zip(&images[range]).map(|(y, d)| y - d).collect();
     Image { width: targets.width, height: targets.height, values }
 }
 
-/// Median of each pixel.
+/// Returns the median of each pixel over the images.
 fn level(left: &[Image]) -> Vec<f32> {
     let (n, m) = (left[0].values.len(), left.len());
     let of = |p: usize| {
@@ -68,7 +68,7 @@ fn level(left: &[Image]) -> Vec<f32> {
     (0..n).into_par_iter().map(of).collect()
 }
 
-/// Changes of wide areas.
+/// Returns the changes of wide areas relative to the median.
 fn slow(left: &Image, level: &[f32]) -> Image {
     let (width, height) = (left.width, left.height);
     let values = left.values.iter().zip(level).map(|(left, level)| left - level).collect();
@@ -88,8 +88,8 @@ mod tests {
     const SIDE: usize = 40;
     const PHASES: usize = 10;
 
-    /// A vessel 3 pixels wide that moves by a pixel at the first three phases, before a still chest; the middle of the image
-    /// brightens slowly over the beat. Vessel and background of each phase.
+    /// Vessel and background of each phase: a vessel 3 pixels wide, which moves by a pixel at the first three phases, in front
+    /// of a static chest; the middle of the image brightens slowly over the beat.
     fn scene() -> (Vec<f32>, Vec<f32>) {
         let (mut vessel, mut background) = (Vec::new(), Vec::new());
         for phase in 0..PHASES {
@@ -104,7 +104,7 @@ mod tests {
         (vessel, background)
     }
 
-    /// Targets by the least of each pixel over the phases.
+    /// Targets from the minimum of each pixel over the phases.
     fn targets(images: &[f32]) -> Targets {
         let geometry = CArm {
             primary_deg: 0.0,

@@ -75,7 +75,8 @@ impl Scene {
         Ok(scene)
     }
 
-    /// Boxes of a static method's volume, of half a side each way, and of what the views see of it. The still field is nothing.
+    /// Sets the boxes of a static method to its volume, of half side `half`, and the region to the part of it that the views
+    /// see, of half side `seen`. There is no static field.
     fn hold_volume(&mut self, half: f64, seen: f64) {
         (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
         (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
@@ -85,13 +86,13 @@ impl Scene {
         self.static_gain = 0.0;
     }
 
-    /// Boxes of two networks, which hold every point of the views' rays, however a C-arm turns them about the isocentre: none
-    /// is left out, of poses that no view has either. Their activations.
+    /// Sets the boxes of two networks, which hold every point of the views' rays however a C-arm turns them about the
+    /// isocentre, so that new poses lose none either. Sets the networks' activations, too.
     fn hold_all_rays(&mut self, config: &Config, dataset: &Dataset) {
         let half = reach(dataset);
         (self.static_min, self.static_max) = ([-half; 3], [half; 3]);
         (self.dynamic_min, self.dynamic_max) = ([-half; 3], [half; 3]);
-        // Most of that is seen by no view or by one: no place to look for vessels.
+        // Most of that box is seen by one view or by none, and is no place to look for vessels.
         let seen = seen_half(dataset);
         self.region = Some([[-seen; 3], [seen; 3]]);
         (self.static_gain, self.dynamic_gain) = (config.networks.gain, config.networks.gain);
@@ -138,14 +139,15 @@ impl Scene {
     }
 }
 
-/// Half side of the box of the still field, world units: what is far outside the field of view is seen by one view at a time,
-/// and a box that holds it spends the field on it.
+/// Half side of the static field's box, world units. Points far outside the field of view are seen by one view at a time, and a
+/// box that held them would spend the field on them.
 fn static_half(config: &Config, dataset: &Dataset) -> f64 {
     box_half(config.static_field.half_extent_mm, dataset)
 }
 
-/// Radius of the least ball around the isocentre that holds all rays of the views over the depth range, and a little more, so that
-/// rounding leaves none out. Largest coordinates would be those of the views' own directions, and leave out ends of rays from others.
+/// Radius of the smallest ball around the isocentre that holds all rays of the views over the depth range, with a margin
+/// against rounding. The largest coordinates would not do: they depend on the views' own directions, and would leave out ends
+/// of rays from other directions.
 fn reach(dataset: &Dataset) -> f64 {
     let mut reach = 0f64;
     for view in &dataset.views {
@@ -188,7 +190,8 @@ mod tests {
         View::new(geometry, [SIZE; 2]).unwrap()
     }
 
-    /// Two views of two phases of pixels that are `still`, but for the middle ones, which gain `change` at the second.
+    /// Two views at two phases, whose pixels have the value `still` except for the middle ones, which gain `change` at the
+    /// second.
     fn dataset(still: f32, change: f32) -> Dataset {
         let views: Vec<View> = [-30.0, 60.0].map(|primary_deg| view(primary_deg, 0.0)).into();
         let middle = |p: usize| (2..6).contains(&(p % SIZE)) && (2..6).contains(&(p / SIZE));

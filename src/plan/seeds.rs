@@ -1,4 +1,4 @@
-//! Where Gaussians begin: drawn from the hull's cells, and later where data are missing.
+//! First places of Gaussians, drawn from the hull's cells, and later places where data are missing.
 
 use crate::config::sections;
 use crate::gaussians::view::SplatView;
@@ -10,18 +10,18 @@ use glam::DVec3;
 
 /// Share of the data that the first images explain: Gaussians grow into the rest.
 const FIRST_SHARE: f64 = 0.7;
-/// Evidence of four views at which half the cells hold vessel, and how fast that share rises.
+/// Evidence of four views at which half of the cells hold vessel, and the width over which that share rises.
 const LIKELY_EVIDENCE: f64 = 14.0;
 const EVIDENCE_WIDTH: f64 = 1.5;
 
-/// Chance that a cell of the hull holds vessel, as measured on phantoms.
+/// Probability that a cell of the hull holds vessel, as measured on phantoms.
 fn likelihood(evidence: f64, n_views: usize) -> f64 {
     let likely = LIKELY_EVIDENCE / 4.0 * n_views.max(4) as f64;
     1.0 / (1.0 + (-(evidence - likely) / EVIDENCE_WIDTH).exp())
 }
 
-/// `count` of the indices of `weights`, drawn without replacement with chances in proportion to the weights; by
-/// ascending index.
+/// Draws `count` of the indices of `weights` without replacement, with chances in proportion to the weights; returns them in
+/// ascending order.
 fn draw(weights: &[f64], count: usize, seed: u32, round: u32) -> Vec<usize> {
     // Efraimidis and Spirakis: the smallest of exponential variates whose rates are the weights.
     let key = |i: usize| -(1.0 - uniform01(seed, STREAM_PLACE, round, i as u32)).ln() / weights[i];
@@ -42,7 +42,7 @@ struct Draw<'a> {
 }
 
 impl Draw<'_> {
-    /// `count` Gaussians of a phase and a density in places drawn by their weights.
+    /// Creates `count` Gaussians of a phase and a density in places drawn by their weights.
     fn gaussians(self, weights: &[f64], count: usize, phase: usize, density: f64) -> impl Iterator<Item = Gaussian> {
         let drawn = draw(weights, count, self.seed, self.round).into_iter();
         drawn.map(move |i| Gaussian {
@@ -54,14 +54,14 @@ impl Draw<'_> {
         })
     }
 
-    /// Somewhere in the cell of a place.
+    /// Random position in the cell of a place.
     fn position(self, place: &Place, index: u32) -> DVec3 {
         let jitter = [0, 1, 2].map(|axis| uniform01(self.seed, STREAM_JITTER, self.round, 3 * index + axis) - 0.5);
         place.position + DVec3::from_array(jitter) * self.targets.cell
     }
 }
 
-/// The first Gaussians of every phase, of density 1; [`first_density`] says how much they should have.
+/// First Gaussians of every phase, of density 1; [`first_density`] tells the density they should have.
 pub fn seeds(targets: &Targets, settings: &sections::Gaussians, seed: u32) -> Vec<Gaussian> {
     let mut all = Vec::new();
     for (phase, places) in targets.places.iter().enumerate() {
@@ -78,7 +78,7 @@ pub fn first_density(targets: &Targets, images: &[f32]) -> f64 {
     let weighted = |values: &[f32], p: usize| if targets.weight[p] > 0.0 { f64::from(values[p].max(0.0)) } else { 0.0 };
     let total = |values: &[f32]| -> f64 { (0..values.len()).map(|p| weighted(values, p)).sum() };
     let (shown, wanted) = (total(images), FIRST_SHARE * total(&targets.low));
-    // Without anything to show, or to explain, there is nothing to go by.
+    // Without anything to show, or to explain, the density stays 1.
     if shown > 0.0 && wanted > 0.0 { wanted / shown } else { 1.0 }
 }
 
@@ -97,8 +97,8 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
     all
 }
 
-/// New Gaussians of a tree at places of its phase of rest where, carried along by `carried` (place, phase), every view lacks line
-/// integral at half the phases or more; phases may lie between two.
+/// New Gaussians of a tree, at places of its rest phase where, moved along by `carried` (place, phase), every view lacks line
+/// integral at half of the phases or more; phases may lie between two.
 pub fn tree_additions(
     targets: &Targets,
     settings: &sections::Gaussians,
@@ -121,12 +121,13 @@ pub fn tree_additions(
     draw.gaussians(&weights, count, targets.rest_phase, added_density(targets, settings)).collect()
 }
 
-/// Density of a new Gaussian: the same line integral whatever a pixel is.
+/// Density of a new Gaussian, whose line integral does not depend on the size of a pixel.
 fn added_density(targets: &Targets, settings: &sections::Gaussians) -> f64 {
     settings.missing / targets.lengths.factor
 }
 
-/// Least line integral that the views of a phase lack at a point; `at` says where it is so long after the phase, in phases.
+/// Minimum line integral that the views of a phase lack at a point; `at` gives its position at a time after the phase, in
+/// phases.
 fn lacking(targets: &Targets, missing: &[f32], phase: usize, at: impl Fn(f64) -> DVec3) -> f64 {
     let at_phase = at(0.0);
     let of = |(image, view): (usize, &SplatView)| {
@@ -144,12 +145,12 @@ fn lacking(targets: &Targets, missing: &[f32], phase: usize, at: impl Fn(f64) ->
     if least.is_finite() { least } else { 0.0 }
 }
 
-/// What is lacking, where it is worth a Gaussian.
+/// Returns `lacking` where it is worth a Gaussian, else 0.
 fn enough(settings: &sections::Gaussians, lacking: f64) -> f64 {
     if lacking > settings.missing { lacking } else { 0.0 }
 }
 
-/// Mean of the 3 x 3 pixels around each of what the images lack; outside, nothing is lacking.
+/// Mean over the 3 x 3 pixels around each pixel of what the images lack; outside the image nothing is lacking.
 fn missing_images(targets: &Targets, images: &[f32]) -> Vec<f32> {
     let (w, h) = (targets.width, targets.height);
     let lack = |p: usize| images[p].clamp(targets.low[p], targets.high[p]) - images[p];

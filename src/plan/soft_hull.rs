@@ -1,4 +1,4 @@
-//! The soft hull: each view says for and against a vessel at each pixel and phase ([`crate::evidence`]), and cells are kept by
-//! what all views say together, so that no view alone can veto one.
+//! The soft hull: each view gives evidence for or against a vessel at each pixel and phase ([`crate::evidence`]), and cells are
+//! kept by the evidence of all views together, so that no view alone can veto one.
 
 pub mod carve;

@@ -1,5 +1,5 @@
-//! Where the network starts: at the best constant field in the hull. From a field that nearly every ray asks to be fainter, the
-//! first steps throw the network below the softplus, where nothing calls it back (method, robustness of training).
+//! Start of the network: the best constant field in the hull. If nearly every ray asks for a fainter field, the first steps
+//! push the network below the softplus, where no gradient brings it back (method, robustness of training).
 
 use crate::config::Config;
 use crate::model::hull::Hull;
@@ -8,20 +8,20 @@ use crate::scan::dataset::{Dataset, Frame};
 use glam::DVec3;
 use rayon::prelude::*;
 
-/// Rays looked at.
+/// Number of rays that are looked at.
 const RAYS: f64 = 4000.0;
-/// Depths of a ray that are looked up in the hull.
+/// Depths of a ray at which the hull is looked up.
 const DEPTHS: usize = 128;
-/// Shifts tried, from the least on.
+/// First shift that is tried, the minimum, and the step to the next one.
 const LEAST_SHIFT: f64 = -8.0;
 const SHIFT_STEP: f64 = 0.125;
 const SHIFTS: usize = 73;
-/// A constant field that leaves more than this share of what no field leaves tells nothing, as where there is no hull.
+/// Share of the empty field's loss above which the best constant field tells nothing, for example without a hull.
 const TELLS_NOTHING: f64 = 0.99;
-/// The least start then.
+/// Minimum start in that case.
 const LEAST_BLIND_SHIFT: f64 = -5.0;
 
-/// What a ray asks of a constant field.
+/// Constraints of a ray on a constant field.
 #[derive(Debug, Clone, Copy)]
 struct StartRay {
     /// Length inside the hull at the phases that the ray shows, world units.
@@ -30,22 +30,23 @@ struct StartRay {
     bounds: [f64; 2],
 }
 
-/// Rays that tell of a constant field, spread over the images evenly, those that meet the hull as often as in training.
+/// Rays that constrain a constant field, spread evenly over the images; rays that meet the hull are as frequent as in training.
 pub struct StartRays(Vec<StartRay>);
 
-/// What rays are made from.
+/// Inputs from which the rays are made.
 struct Source<'a> {
     config: &'a Config,
     dataset: &'a Dataset,
     hull: Option<&'a Hull>,
     /// First and last depth along rays, world units.
     depth: [f64; 2],
-    /// Training images, and what moves in their views.
+    /// Training images, and the motion in their views.
     frames: Vec<(&'a Frame, &'a ViewMotion)>,
 }
 
 impl StartRays {
-    /// Rays of a dataset's training images, by what moves in each view, as deep as the moving field goes (`depth`, world units).
+    /// Collects rays of a dataset's training images, by the motion in each view, as deep as the dynamic field reaches (`depth`,
+    /// world units).
     pub fn new(
         config: &Config,
         dataset: &Dataset,
@@ -62,13 +63,13 @@ impl StartRays {
         StartRays(chosen.into_par_iter().map(|(index, p)| source.ray(index, p)).collect())
     }
 
-    /// The shift inside the softplus of the constant field with the least loss with a temporal target, where a softplus of 1 is
-    /// an attenuation of `gain` per world unit and residuals beyond `robust` cost linearly (0: none).
+    /// Returns the shift inside the softplus of the constant field with the minimum loss with a temporal target, where a
+    /// softplus of 1 is an attenuation of `gain` per world unit and residuals beyond `robust` cost linearly (0: none).
     pub fn best_shift(&self, gain: f64, robust: f64) -> f64 {
         best_shift(&self.0, gain, robust)
     }
 
-    /// Mean loss of no field at all.
+    /// Mean loss of an empty field.
     pub fn empty_loss(&self, robust: f64) -> f64 {
         self.0.iter().map(|ray| ray.loss(0.0, robust)).sum::<f64>() / self.0.len().max(1) as f64
     }
@@ -85,7 +86,8 @@ impl Source<'_> {
         seen[pixel] && self.shows(index, pixel)
     }
 
-    /// About `count` of the wanted (image, pixel), evenly. They are counted first: a list of all would be as large as the images.
+    /// Picks about `count` of the wanted (image, pixel), evenly. They are counted first: a list of all would be as large as the
+    /// images.
     fn spread(&self, count: f64, wanted: impl Fn(usize, usize) -> bool) -> Vec<(usize, usize)> {
         let pixels = self.dataset.n_pixels();
         let all = || (0..self.frames.len()).flat_map(|index| (0..pixels).map(move |p| (index, p)));
@@ -112,7 +114,7 @@ impl Source<'_> {
     }
 }
 
-/// About `count` of the `n` items, evenly.
+/// Picks about `count` of the `n` items, evenly.
 fn spread<T>(n: usize, count: f64, items: impl Iterator<Item = T>) -> Vec<T> {
     if count < 1.0 {
         return Vec::new();
@@ -136,10 +138,10 @@ fn best_shift(rays: &[StartRay], gain: f64, robust: f64) -> f64 {
 }
 
 impl StartRay {
-    /// As in training: of what is beyond the bounds.
+    /// Loss as in training: the part of the line integral beyond the bounds counts.
     fn loss(&self, attenuation: f64, robust: f64) -> f64 {
         let integral = attenuation * self.length;
-        // Not `clamp`, which panics where a bound is no number.
+        // `clamp` would panic where a bound is not a number.
         let residual = integral - integral.max(self.bounds[0]).min(self.bounds[1]);
         if robust == 0.0 {
             return residual * residual;

@@ -1,4 +1,4 @@
-//! What Gaussians are fitted to: views, bounds of the moving field's images, weights, and where vessels may be.
+//! Targets of Gaussians: views, bounds of the dynamic field's images, weights, and where vessels may be.
 
 use crate::config::{GaussianForm, sections};
 use crate::error::{Error, Result};
@@ -12,14 +12,13 @@ use crate::raster::Image;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
-/// The first phase is one to rest at where it shows this share of what the one shows that shows most.
+/// Share of the vessels of the best phase that the first phase must show to be the rest phase.
 const MUCH: f64 = 0.75;
-/// A phase that shows less than this share of what its views show at most lacks contrast: the beat and noise have been seen to take
-/// a third.
+/// Share of its views' maximum below which a phase lacks contrast: the beat and noise alone have been seen to take a third.
 const LITTLE: f64 = 0.5;
-/// Views that tell where along a ray a vessel is.
+/// Minimum number of views that tell where along a ray a vessel is.
 const LEAST_VIEWS: usize = 2;
-/// A line integral of so many standard deviations of its noise is no noise.
+/// Standard deviations of the noise from which on a line integral stands out.
 const STANDS_OUT: f32 = 4.0;
 
 /// A place where a vessel may be.
@@ -27,14 +26,14 @@ const STANDS_OUT: f32 = 4.0;
 pub struct Place {
     /// Centre of a hull cell, pixels at the isocentre.
     pub position: DVec3,
-    /// What all views say for it: a log-likelihood ratio.
+    /// Evidence of all views for it: a log-likelihood ratio.
     pub evidence: f64,
 }
 
-/// The data in the Gaussians' units.
+/// Data in the Gaussians' units.
 #[derive(Debug, Clone)]
 pub struct Targets {
-    /// Their units.
+    /// Units of the Gaussians.
     pub units: Units,
     /// Columns of an image.
     pub width: usize,
@@ -44,27 +43,27 @@ pub struct Targets {
     pub n_phases: usize,
     /// Training views with at least two phases.
     pub n_views: usize,
-    /// What each image sees the heart by: its view, moved against the heart's displacement in that frame.
+    /// View of each image, moved against the heart's displacement in that frame.
     pub views: Vec<SplatView>,
     /// `[phase][view]`: index of the image, where there is one.
     pub image_of: Vec<Option<usize>>,
-    /// Images.
+    /// Number of images.
     pub n_images: usize,
     /// `[image][pixel]`: line integrals of the images, shares of the strongest change.
     pub images: Vec<f32>,
-    /// `[image][pixel]`: greatest line integral of the moving field by what is known before it is fitted.
+    /// `[image][pixel]`: maximum line integral of the dynamic field that is known before the fit.
     pub most: Vec<f32>,
-    /// `[image][pixel]`: least line integral of the moving field that explains the pixel.
+    /// `[image][pixel]`: minimum line integral of the dynamic field that explains the pixel.
     pub low: Vec<f32>,
-    /// `[image][pixel]`: greatest.
+    /// `[image][pixel]`: maximum line integral of the dynamic field that explains the pixel.
     pub high: Vec<f32>,
     /// `[image][pixel]`: factor on the residual, from the pixel's noise.
     pub weight: Vec<f32>,
     /// `[image][pixel]`: standard deviation of the noise, share of the strongest change.
     pub noise: Vec<f32>,
-    /// What lengths in the settings mean here.
+    /// Lengths of the settings on these images.
     pub lengths: Lengths,
-    /// The phase at which the Gaussians of a tree rest.
+    /// Phase at which the Gaussians of a tree rest.
     pub rest_phase: usize,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<Place>>,
@@ -97,7 +96,7 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 impl Targets {
-    /// Brings a dataset and what moves in it into the Gaussians' units.
+    /// Brings a dataset and its motion into the Gaussians' units.
     ///
     /// # Errors
     /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
@@ -189,9 +188,9 @@ impl Targets {
         Ok(targets)
     }
 
-    /// The form of moving field that suits the data where `asked` leaves it open: a tree shares one set of Gaussians over
-    /// the beat, which takes phases enough to follow it from one to the next, a phase to rest at that two views show, and
-    /// vessels that are full all the time.
+    /// Returns the form of the dynamic field that suits the data where `asked` leaves it open. A tree shares one set of
+    /// Gaussians over the beat; it needs enough phases to be followed from one to the next, a rest phase that two views show,
+    /// and vessels that are filled all the time.
     pub fn form(&self, asked: GaussianForm) -> GaussianForm {
         const LEAST_PHASES: usize = 4;
         let rests = self.views_at(self.rest_phase).count() >= LEAST_VIEWS;
@@ -204,8 +203,8 @@ impl Targets {
         }
     }
 
-    /// The phase whose images show most of the vessels, of those that two views show; the first one unless it lacks much of that,
-    /// as where contrast has not arrived.
+    /// Phase whose images show most of the vessels, among the phases that two views show; the first one unless it lacks much of
+    /// that, for example before contrast has arrived.
     fn phase_that_shows_most(&self) -> usize {
         let seen: Vec<usize> =
             (0..self.n_phases).filter(|phase| self.views_at(*phase).count() >= LEAST_VIEWS).collect();
@@ -214,8 +213,8 @@ impl Targets {
         if first_shows_much { 0 } else { most }
     }
 
-    /// Whether some phase shows so much less than others that contrast must have come or gone meanwhile. Each view is compared
-    /// with itself: not every view has every phase, and some see more of the vessels than others.
+    /// Tells whether some phase shows so much less than others that contrast must have come or gone meanwhile. Each view is
+    /// compared with itself: not every view has every phase, and some see more of the vessels than others.
     pub fn contrast_comes_and_goes(&self) -> bool {
         let shown = |phase: usize, view: usize| Some(self.shown_in(self.image_of[phase * self.n_views + view]?));
         let most_in = |view: usize| (0..self.n_phases).filter_map(|phase| shown(phase, view)).fold(0.0, f64::max);
@@ -228,7 +227,7 @@ impl Targets {
         (0..self.n_phases).any(lacks)
     }
 
-    /// What all images of a phase show.
+    /// Sum of the line integrals that stand out, over all images of a phase.
     fn shown_at(&self, phase: usize) -> f64 {
         self.views_at(phase).map(|(image, _)| self.shown_in(image)).sum()
     }
@@ -238,13 +237,13 @@ impl Targets {
         self.pixels_that_stand_out(image).map(|p| f64::from(self.low[p])).sum()
     }
 
-    /// Pixels of an image where more moves than noise, counted over all images.
+    /// Pixels of an image whose change stands out from noise, as indices over all images.
     pub fn pixels_that_stand_out(&self, image: usize) -> impl Iterator<Item = usize> {
         let pixels = image * self.n_pixels()..(image + 1) * self.n_pixels();
         pixels.filter(|p| self.weight[*p] > 0.0 && self.low[*p] > STANDS_OUT * self.noise[*p])
     }
 
-    /// Phases that some view has.
+    /// Number of phases that some view has.
     pub fn phases_seen(&self) -> usize {
         self.image_of.chunks(self.n_views).filter(|row| row.iter().any(Option::is_some)).count()
     }
@@ -254,14 +253,14 @@ impl Targets {
         self.width * self.height
     }
 
-    /// Images of a phase, and what they see the heart by.
+    /// Images of a phase, and their views.
     pub fn views_at(&self, phase: usize) -> impl Iterator<Item = (usize, &SplatView)> {
         let row = &self.image_of[phase * self.n_views..][..self.n_views];
         row.iter().flatten().map(|image| (*image, &self.views[*image]))
     }
 }
 
-/// Residuals count less where pixels are noisy, so that the loss bends later there, and nothing where pixels are hidden.
+/// Weights of residuals: lower where pixels are noisy, so that the loss bends later there, and 0 where pixels are hidden.
 fn weights(dataset: &Dataset, view: &ViewEvidence, strongest: f64, scale: f64) -> Vec<f32> {
     let weight = |(pixel, noise): (usize, &f32)| match f64::from(*noise) / strongest {
         _ if !dataset.shows(view.view, pixel) => 0.0,

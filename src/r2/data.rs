@@ -10,11 +10,11 @@ use crate::model::gaussians::{Gaussians, Units};
 use crate::r2::parameters::ScaleBounds;
 use crate::scan::dataset::Dataset;
 
-/// Line integrals of images, in units of the drawn field, which hold eight times as much.
+/// Maximum line integral of the images, in units of the drawn field, which can hold eight times as much.
 const DRAWN_RANGE: f64 = 256.0;
 
-/// Standard deviations at which Gaussians end where they are drawn: of what is fitted, whose squares reach three of the
-/// longest, next to nothing is beyond.
+/// Standard deviations at which drawn Gaussians end. Fitted ones are seen in squares that reach three of the longest standard
+/// deviations; next to nothing lies beyond.
 const DRAWN_CUT: f32 = 4.0;
 /// Bounds of drawn scales are a little wider than what scales can be, so that rounding changes none.
 const SLACK: f64 = 1e-3;
@@ -106,18 +106,18 @@ impl R2Data {
         self.width * self.height
     }
 
-    /// Sets of Gaussians.
+    /// Number of sets of Gaussians.
     pub fn n_sets(&self) -> usize {
         self.images_of_set.len()
     }
 
-    /// What a set is called in messages.
+    /// Name of a set in messages.
     pub fn name_of_set(&self, set: usize) -> String {
         self.phase_of_set[set].map_or("all phases".into(), |phase| format!("phase {phase}"))
     }
 
-    /// How many times the attenuation of a density of 1 that of a drawn one is: so much that pictures, sums of integers, hold the
-    /// images' greatest line integral many times.
+    /// Returns the attenuation of a drawn density of 1 over that of a stored one. It is so large that pictures, which are sums
+    /// of integers, hold the images' maximum line integral many times.
     fn drawn_scale(&self) -> f64 {
         let greatest = self.images.iter().copied().fold(0f32, f32::max);
         (f64::from(greatest) * self.half / self.pixel / DRAWN_RANGE).max(1.0)

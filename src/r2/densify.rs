@@ -1,5 +1,5 @@
-//! Density control of R2-Gaussian: where images pull hard, small Gaussians are cloned and large ones split, and weak
-//! ones and those that have left the volume are taken away. Each set by itself.
+//! Density control of R2-Gaussian: where the gradient of the images is large, small Gaussians are cloned and large ones split;
+//! weak Gaussians and those that have left the volume are removed. Each set is treated by itself.
 
 use crate::config::sections::R2;
 use crate::kernels::layout::R2Gaussian;
@@ -8,17 +8,17 @@ use crate::r2::parameters::{ScaleBounds, softplus_inverse};
 use crate::random::{STREAM_R2_CHILD, normal};
 use glam::DVec3;
 
-/// A split Gaussian leaves two, narrower by this factor.
+/// Factor by which the two halves of a split Gaussian are narrower.
 const NARROWER: f64 = 1.6;
 const CHILDREN: u32 = 2;
 
-/// Whether Gaussians are added and taken away after iteration `step`, counted from 1.
+/// Tells whether Gaussians are added and removed after iteration `step`, counted from 1.
 pub fn densifies(settings: &R2, step: u32) -> bool {
     let R2 { densify_every: every, densify_from: from, densify_until: until, .. } = *settings;
     every > 0 && step > from && step < until && step.is_multiple_of(every)
 }
 
-/// What becomes of a Gaussian.
+/// Decision of density control on a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fate {
     Stays,
@@ -50,7 +50,7 @@ pub fn densified(before: &R2State, n_sets: usize, settings: &R2, seed: u32, step
     after
 }
 
-/// Cloned and split Gaussians are those that the images pull at, as many as their set has room for.
+/// Decides on each Gaussian. Those with a large image gradient are cloned or split, as many as their set has room for.
 fn fates(particles: &R2State, n_sets: usize, settings: &R2, bounds: ScaleBounds) -> Vec<Fate> {
     let mut counts = vec![0u32; n_sets];
     particles.rows.iter().for_each(|g| counts[g.set as usize] += 1);
@@ -69,7 +69,7 @@ fn fates(particles: &R2State, n_sets: usize, settings: &R2, bounds: ScaleBounds)
     particles.rows.iter().enumerate().map(fate).collect()
 }
 
-/// What is stored of half the density, which two Gaussians share.
+/// Stored form of half the density, which two Gaussians share.
 fn shared(g: &R2Gaussian) -> f32 {
     softplus_inverse(0.5 * g.attenuation()) as f32
 }
@@ -101,7 +101,7 @@ mod tests {
         Config::preset(Preset::R2Gaussian).r2
     }
 
-    /// A small and a large Gaussian in each of two sets, all pulled at.
+    /// A small and a large Gaussian in each of two sets, all with a large image gradient.
     fn four() -> R2State {
         let bounds = ScaleBounds::of(&settings());
         let row = |i: u32| {

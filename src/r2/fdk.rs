@@ -18,7 +18,7 @@ struct Filtered<'a> {
     values: Vec<f64>,
 }
 
-/// The ramp at a distance of so many pixels, for pixels of side 1.
+/// Ramp filter at a distance of `apart` pixels, for pixels of side 1.
 fn ramp(apart: usize) -> f64 {
     match apart {
         0 => 0.25,
@@ -45,7 +45,7 @@ impl<'a> Filtered<'a> {
         Filtered { view, distance, width, height, values }
     }
 
-    /// What the view adds at a point: between pixels linear, beyond the image nothing.
+    /// Returns the view's contribution at a point: linear between pixels, 0 beyond the image.
     fn at(&self, x: DVec3) -> f64 {
         let (depth, column, row) = self.view.project(x);
         let place = DVec2::new(column, row);

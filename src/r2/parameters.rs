@@ -1,11 +1,11 @@
-//! What R2-Gaussian stores of a Gaussian and what that stands for, in f64: densities through a softplus, scales between
-//! bounds through a sigmoid. Lengths are half sides of the volume, which is the cube from -1 to 1.
+//! Conversion of R2-Gaussian's stored parameters to the values they stand for and back, in f64: densities through a softplus,
+//! scales between bounds through a sigmoid. Lengths are half sides of the volume, which is the cube from -1 to 1.
 
 use crate::config::sections::R2;
 use crate::kernels::layout::R2Gaussian;
 use glam::{DMat3, DQuat, DVec3};
 
-/// Scales are kept this share of their range away from its ends when they are stored.
+/// Share of their range by which stored scales keep away from its ends.
 const LEAST_SHARE: f64 = 1e-6;
 
 /// ln(1 + e^x) without loss of small values.
@@ -13,7 +13,7 @@ pub fn softplus(x: f64) -> f64 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()
 }
 
-/// Where [`softplus`] is `density`, which is positive.
+/// Inverse of [`softplus`] at `density`, which is positive.
 pub fn softplus_inverse(density: f64) -> f64 {
     density + (-(-density).exp_m1()).ln()
 }
@@ -21,31 +21,31 @@ pub fn softplus_inverse(density: f64) -> f64 {
 /// Standard deviations that a Gaussian may have.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScaleBounds {
-    /// Least.
+    /// Minimum.
     pub least: f64,
-    /// Greatest.
+    /// Maximum.
     pub greatest: f64,
 }
 
 impl ScaleBounds {
-    /// Those of the settings, which are shares of the volume's side.
+    /// Bounds from the settings, which are shares of the volume's side.
     pub fn of(settings: &R2) -> ScaleBounds {
         ScaleBounds { least: 2.0 * settings.least_scale, greatest: 2.0 * settings.greatest_scale }
     }
 
-    /// What is stored of a scale; one beyond the bounds counts as the bound.
+    /// Stored form of a scale; one beyond the bounds counts as the bound.
     pub fn stored(self, scale: f64) -> f64 {
         let share = ((scale - self.least) / (self.greatest - self.least)).clamp(LEAST_SHARE, 1.0 - LEAST_SHARE);
         (share / (1.0 - share)).ln()
     }
 
-    /// The scale of what is stored.
+    /// Scale of a stored value.
     pub fn scale(self, stored: f64) -> f64 {
         self.least + (self.greatest - self.least) / (1.0 + (-stored).exp())
     }
 }
 
-/// A round Gaussian, to be stored.
+/// Stored form of a round Gaussian.
 pub fn round(position: DVec3, density: f64, scale: f64, bounds: ScaleBounds, set: u32) -> R2Gaussian {
     R2Gaussian {
         position: position.as_vec3().to_array(),
@@ -72,7 +72,7 @@ impl R2Gaussian {
         DVec3::from_array(self.scale.map(|stored| bounds.scale(stored.into())))
     }
 
-    /// Its axes, as columns.
+    /// Axes, as columns.
     pub fn axes(&self) -> DMat3 {
         let [w, x, y, z] = self.rotation.map(f64::from);
         DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())

@@ -1,4 +1,4 @@
-//! Gaussians of R2-Gaussian on the device, and what an iteration computes of each.
+//! Gaussians of R2-Gaussian on the device, and the results of an iteration for each.
 
 use crate::error::Result;
 use crate::gpu::buffer::Memory;
@@ -8,7 +8,7 @@ use crate::kernels::layout::Splat;
 use crate::model::r2::R2State;
 
 buffer_set! {
-    /// Gaussians on the device, and what an iteration computes of each.
+    /// Gaussians on the device, and the results of an iteration for each.
     pub struct R2ParticleBuffers {
         /// [`crate::kernels::layout::R2Gaussian`]s.
         r2_gaussians,
@@ -18,15 +18,15 @@ buffer_set! {
         gaussian_adam_second,
         /// Gradient, laid out alike.
         gaussian_gradient,
-        /// Of density control, two numbers per Gaussian.
+        /// Statistics of density control, two numbers per Gaussian.
         r2_statistics,
         /// [`Splat`]s.
         splats,
         /// Picture that each splat belongs to.
         image_of_splat,
-        /// What the gradient needs of each splat's pixels, two vec4, or three where line integrals are exact.
+        /// Moments over each splat's pixels for the gradient: two vec4, or three where line integrals are exact.
         splat_moments,
-        /// What the gradient needs of the voxels near each Gaussian, three vec4.
+        /// Moments over the voxels near each Gaussian for the gradient: three vec4.
         r2_voxel_moments,
     }
 }

@@ -11,7 +11,7 @@ use crate::r2::parameters::ScaleBounds;
 use crate::r2::stages::{box_parts, picture_parts};
 use crate::random::{STREAM_R2_BOX, STREAM_R2_VIEW, permute, uniform01};
 
-/// Standard deviations along its longest axis that half the square has in which a Gaussian is seen.
+/// Half side of the square in which a Gaussian is seen, standard deviations along its longest axis.
 const CUT: f32 = 3.0;
 /// Bits behind the point of the integer sums: pictures and densities up to 512, in steps of 2.4e-7.
 const FIXED_POINT_BITS: i32 = 22;
@@ -31,7 +31,7 @@ pub fn gaussian_setup(data: &R2Data, config: &Config) -> GaussianSetup {
         least_scale: bounds.least as f32,
         greatest_scale: bounds.greatest as f32,
         fixed_point: 2f32.powi(FIXED_POINT_BITS),
-        // Each set has a loss of its own; their mean is told.
+        // Each set has its own loss; their mean is reported.
         loss_weight: 1.0 / n_sets as f32,
         beta1: config.adam.beta1 as f32,
         beta2: config.adam.beta2 as f32,
@@ -57,7 +57,7 @@ pub fn r2_setup(data: &R2Data, settings: &R2) -> R2Setup {
     }
 }
 
-/// One row per iteration and one more, which is there to be timed.
+/// One row per iteration, and one more for timing.
 pub fn schedule(config: &Config) -> Vec<R2Schedule> {
     let (r2, adam, n) = (&config.r2, &config.adam, config.train.iterations);
     let mut updates = 0;
@@ -80,8 +80,8 @@ pub fn schedule(config: &Config) -> Vec<R2Schedule> {
     (1..=n + 1).map(row).collect()
 }
 
-/// What each set sees in each iteration of the schedule: images in an order that is drawn anew when all have been seen,
-/// and a box anywhere in the volume.
+/// Turns of each set in each iteration of the schedule: an image, in an order that is drawn anew when all have been seen, and a
+/// box anywhere in the volume.
 pub fn turns(data: &R2Data, config: &Config) -> Vec<R2Turn> {
     let r2 = &config.r2;
     let voxel = 2.0 / f64::from(r2.voxels);

@@ -16,20 +16,20 @@ use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::r2::particles::R2ParticleBuffers;
 
-/// Pipelines that ask what pixels see of Gaussians.
+/// Pipelines that compute how pixels see Gaussians.
 pub enum R2PictureKernels {
     /// [`R2Integral::Affine`].
     Affine {
         /// Pictures.
         splat: SplatStage<push::GaussianSplat>,
-        /// What gradients need of them.
+        /// Moments over the pixels, for gradients.
         moments: SplatStage<push::GaussianMoments>,
     },
     /// [`R2Integral::Exact`].
     Exact {
         /// Pictures.
         splat: SplatStage<push::R2ChordSplat>,
-        /// What gradients need of them.
+        /// Moments over the pixels, for gradients.
         moments: SplatStage<push::R2ChordMoments>,
     },
 }
@@ -49,9 +49,9 @@ impl R2PictureKernels {
 
 /// Pipelines of a fit.
 pub struct R2Kernels {
-    /// How each Gaussian is seen.
+    /// Projection of each Gaussian.
     pub project: Stage<push::R2Project>,
-    /// Pictures, and what gradients need of them.
+    /// Pictures, and their moments for gradients.
     pub pictures: R2PictureKernels,
     /// SSIM, first pass.
     pub ssim_rows: Stage<push::SsimRows>,
@@ -65,7 +65,7 @@ pub struct R2Kernels {
     pub voxel_splat: SplatStage<push::R2VoxelSplat>,
     /// Total variation.
     pub voxel_tv: Stage<push::R2VoxelTv>,
-    /// What gradients need of the voxels.
+    /// Moments over the voxels, for gradients.
     pub voxel_moments: SplatStage<push::R2VoxelMoments>,
     /// Gradients, density control's statistic, and the optimiser.
     pub update: Stage<push::R2Update>,
@@ -98,7 +98,7 @@ impl R2Kernels {
 }
 
 buffer_set! {
-    /// What a fit goes by and what it counts, but for the Gaussians.
+    /// Buffers of a fit, except for the Gaussians.
     pub struct R2Buffers {
         /// [`GaussianSetup`].
         gaussian_setup,
@@ -112,7 +112,7 @@ buffer_set! {
         r2_schedule,
         /// Iterations done.
         gaussian_step,
-        /// `[image][pixel]`: line integrals to be shown.
+        /// `[image][pixel]`: target line integrals.
         r2_targets,
         /// `[set][pixel]`: pictures in fixed point.
         splat_images,
@@ -120,7 +120,7 @@ buffer_set! {
         splat_image_gradient,
         /// `[set][pixel]`: SSIM's sums along rows.
         ssim_row_sums,
-        /// `[set][pixel]`: one more of them.
+        /// `[set][pixel]`: one more of SSIM's sums along rows.
         ssim_row_products,
         /// `[set][pixel]`: factors of SSIM's gradient, and its value.
         ssim_factors,
@@ -149,19 +149,19 @@ pub fn box_parts(box_side: u32) -> u32 {
 
 /// A recording of stages on `n` Gaussians.
 pub struct R2Pass<'a> {
-    /// Where stages go.
+    /// Recording that the stages are added to.
     pub recording: &'a mut Recording,
     /// The stages.
     pub kernels: &'a R2Kernels,
-    /// What the fit goes by.
+    /// Buffers of the fit.
     pub buffers: &'a R2Buffers,
     /// The Gaussians.
     pub particles: &'a R2ParticleBuffers,
     /// Constants on the host.
     pub setup: &'a GaussianSetup,
-    /// Those of this method.
+    /// Constants of this method on the host.
     pub r2: &'a R2Setup,
-    /// Gaussians of all sets.
+    /// Number of Gaussians of all sets.
     pub n: u32,
 }
 
@@ -193,7 +193,7 @@ impl R2Pass<'_> {
         }
     }
 
-    /// Records the loss of the pictures, its gradient, and what gradients of Gaussians need of that.
+    /// Records the loss of the pictures, its gradient, and the moments that gradients of Gaussians need of it.
     fn compare_pictures(&mut self) -> Result<()> {
         let (kernels, n) = (self.kernels, self.n);
         self.run(&kernels.ssim_rows, self.pixels(&kernels.ssim_rows), push::SsimRows {})?;
@@ -210,7 +210,7 @@ impl R2Pass<'_> {
         }
     }
 
-    /// Records the total variation of this iteration's boxes, and what gradients need of it.
+    /// Records the total variation of this iteration's boxes, and the moments that gradients need of it.
     fn smooth_voxels(&mut self) -> Result<()> {
         let (kernels, n, r2) = (self.kernels, self.n, self.r2);
         self.recording.fill(&self.buffers.r2_voxel_sums, 0);

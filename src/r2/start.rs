@@ -1,4 +1,4 @@
-//! Where a fit begins: at voxels that a filtered back-projection shows, or anywhere in the volume.
+//! Start of a fit: at voxels that a filtered back-projection shows, or anywhere in the volume.
 
 use crate::config::R2Start;
 use crate::config::sections::R2;
@@ -13,12 +13,12 @@ use rayon::prelude::*;
 
 /// Neighbours whose mean squared distance is the squared scale of a Gaussian.
 const NEIGHBOURS: usize = 3;
-/// Points in a cell of the grid that neighbours are looked for in, on the mean.
+/// Mean number of points in a cell of the grid in which neighbours are looked for.
 const POINTS_PER_CELL: f64 = 2.0;
-/// Least density that can be stored and fitted.
+/// Minimum density that can be stored and fitted.
 const LEAST_DENSITY: f64 = 1e-9;
 
-/// First Gaussians of all sets, and what is to be said of them.
+/// First Gaussians of all sets, and notes about them for the user.
 pub fn first_rows(data: &R2Data, settings: &R2, seed: u32) -> (Vec<R2Gaussian>, Vec<String>) {
     let (mut rows, mut notes) = (Vec::new(), Vec::new());
     for set in 0..data.n_sets() {
@@ -29,7 +29,7 @@ pub fn first_rows(data: &R2Data, settings: &R2, seed: u32) -> (Vec<R2Gaussian>, 
     (rows, notes)
 }
 
-/// Centres and densities of a set, and why they are not those that were asked for.
+/// Centres and densities of a set, and the reason if they are not those that were asked for.
 fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f64)>, Option<String>) {
     let count = settings.count as usize;
     if settings.init == R2Start::Random {
@@ -53,19 +53,19 @@ fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f
         let n = candidates.len() as u32;
         let k = candidates[permute(i as u32, n, seed_of_set(seed, set), 0, STREAM_PLACE) as usize];
         let index = DVec3::new((k % side) as f64, (k / side % side) as f64, (k / side / side) as f64);
-        // The voxel's corner and not its centre, as the code has it.
+        // The reference code takes the voxel's corner instead of its centre.
         (voxel * index - 1.0, settings.density_share * f64::from(volume[k]))
     });
     (drawn.collect(), None)
 }
 
-/// Uniform in the volume, densities from 0 to 1.
+/// Points uniform in the volume, with densities from 0 to 1.
 fn anywhere(count: usize, seed: u32) -> Vec<(DVec3, f64)> {
     let value = |i: usize, k: u32| uniform01(seed, STREAM_JITTER, i as u32, k);
     (0..count).map(|i| (DVec3::from_array([0, 1, 2].map(|k| 2.0 * value(i, k) - 1.0)), value(i, 3))).collect()
 }
 
-/// Round Gaussians as wide as their neighbours are away.
+/// Round Gaussians as wide as the distance to their neighbours.
 fn gaussians(places: &[(DVec3, f64)], bounds: ScaleBounds, set: u32) -> Vec<R2Gaussian> {
     let points: Vec<DVec3> = places.iter().map(|(x, _)| *x).collect();
     let spacings = spacings(&points);
@@ -73,7 +73,7 @@ fn gaussians(places: &[(DVec3, f64)], bounds: ScaleBounds, set: u32) -> Vec<R2Ga
     pairs.map(|((x, density), scale)| round(*x, density.max(LEAST_DENSITY), scale, bounds, set)).collect()
 }
 
-/// Root of the mean squared distance to the nearest three other points, of each; of the other points where there are
+/// Root of the mean squared distance of each point to the nearest three other points; to all other points where there are
 /// fewer, and the volume's side without any.
 pub(crate) fn spacings(points: &[DVec3]) -> Vec<f64> {
     let grid = PointGrid::new(points);
@@ -134,7 +134,7 @@ impl PointGrid {
         best
     }
 
-    /// Cells that are exactly so many away from another.
+    /// Cells at exactly the distance `shell` from `home`, counted in cells.
     fn shell(&self, home: [usize; 3], shell: usize) -> impl Iterator<Item = usize> + '_ {
         let range = move |at: usize| at.saturating_sub(shell)..=(at + shell).min(self.side - 1);
         range(home[2]).flat_map(move |z| {

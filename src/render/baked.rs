@@ -21,23 +21,23 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Cells of a baked volume along its longest side.
 pub const BAKED_CELLS: u32 = 192;
-/// Fewest.
+/// Minimum number of cells along the longest side.
 const LEAST_BAKED_CELLS: u32 = 32;
 
-/// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates;
-/// finer detail than a cell is lost, but for Gaussians, which are drawn as they are in front of the baked static field.
-/// Volumes are baked when first needed, or when asked for.
+/// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates; finer
+/// detail than a cell is lost, except for Gaussians, which are drawn themselves in front of the baked static field. Volumes are
+/// baked when first needed, or when asked for.
 pub struct Baked {
     renderer: Arc<Renderer>,
     still: Grid,
     moving: Grid,
     /// The static field, then each phase.
     volumes: Mutex<Vec<Option<Image3d>>>,
-    /// Recorded once per size, phase and quantity: a frame is a view written, a submit and a picture read.
+    /// Recorded commands by size, phase and quantity: a frame only writes a view, submits, and reads a picture.
     recorded: Mutex<HashMap<RecordedKey, Arc<RecordedView>>>,
 }
 
-/// Recorded frames kept; a viewer in use has far fewer.
+/// Maximum number of recorded frames kept; a viewer in use has far fewer.
 const MOST_RECORDED: usize = 256;
 
 /// Columns, rows, phase, quantity.
@@ -48,17 +48,18 @@ struct RecordedView {
     commands: Commands,
     view: Buffer,
     image: Buffer,
-    /// Its buffers hold one frame.
+    /// Held while its buffers, which hold one frame, are in use.
     in_use: Mutex<()>,
 }
 
-/// Where a field's volume is kept: the static field, then each phase.
+/// Index of a field's volume: the static field, then each phase.
 fn slot(field: Component, phase: u32) -> usize {
     if field == Component::Static { 0 } else { 1 + phase as usize }
 }
 
 impl Baked {
-    /// Bakes the static field and, where the network moves, all phases, with `cells` cells along the longest side of each box.
+    /// Bakes the static field and, where a network is the dynamic field, all phases, with `cells` cells along the longest side
+    /// of each box.
     ///
     /// # Errors
     /// Device errors, [`Error::OutOfMemory`] first of all.
@@ -72,8 +73,8 @@ impl Baked {
         Ok(baked)
     }
 
-    /// Prepares volumes whose moving cells have sides of `cell_mm`, for drawing at display rates; bakes none yet. The
-    /// static field has no detail between the cells of its grid, of which there are two to one of those.
+    /// Prepares volumes for drawing at display rates, with dynamic cells of side `cell_mm`; bakes none yet. A static tensor
+    /// field gets two cells per cell of its grid, since it has no finer detail.
     pub fn for_display(renderer: Arc<Renderer>, model: &Model, cell_mm: f64) -> Baked {
         let scene = &model.scene;
         let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
@@ -96,13 +97,13 @@ impl Baked {
         Baked { still, moving, volumes, renderer, recorded: Mutex::default() }
     }
 
-    /// What the volumes are baked from.
+    /// Renderer whose fields are baked.
     pub fn renderer(&self) -> &Renderer {
         &self.renderer
     }
 
-    /// Bakes the fields of a component as the renderer's parameters are now, for the first time or again. The last copies
-    /// may be under way: they are in order with what is rendered next; dropping the result waits for them.
+    /// Bakes the fields of a component with the renderer's present parameters, for the first time or again. The last copies may
+    /// still be under way: they precede whatever is rendered next; dropping the result waits for them.
     ///
     /// # Errors
     /// As [`Renderer::sample`]; [`Error::OutOfMemory`].
@@ -132,7 +133,7 @@ impl Baked {
         }
     }
 
-    /// Whether every field of a component has been baked.
+    /// Tells whether every field of a component has been baked.
     pub fn has(&self, component: Component, phase: u32) -> bool {
         component.fields().iter().all(|field| self.volume(*field, phase).is_some())
     }
@@ -173,7 +174,7 @@ impl Baked {
         Ok(image)
     }
 
-    /// Gaussians as they are, in front of the baked static field.
+    /// Renders Gaussians themselves, in front of the baked static field.
     fn render_gaussians(
         &self,
         rays: &ViewRays,
@@ -213,8 +214,7 @@ impl Baked {
         self.renderer.gpu.wait(commands.submit()?)
     }
 
-    /// [`Baked::render_gaussians`] into a buffer. Only their largest values, which are climbed to with a few other things, come
-    /// by way of the host.
+    /// Draws [`Baked::render_gaussians`] into a buffer. Only maxima along rays come by way of the host.
     fn render_gaussians_into(
         &self,
         target: &Buffer,

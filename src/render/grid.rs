@@ -15,8 +15,8 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// `cells` points along the longest side of a box and as many along the others as keep them apart as far; the
-    /// first and last lie on its faces.
+    /// Returns a grid with `cells` points along the longest side of a box, and as many along the others as give the same
+    /// spacing; the first and last lie on its faces.
     pub fn over(low: DVec3, high: DVec3, cells: u32) -> Grid {
         let extent = high - low;
         let step = extent.max_element() / f64::from(cells - 1);
@@ -25,12 +25,12 @@ impl Grid {
         Grid { origin: low, spacing, size }
     }
 
-    /// Points in all.
+    /// Number of points.
     pub fn len(&self) -> usize {
         self.size.iter().map(|n| *n as usize).product()
     }
 
-    /// Whether the grid has no points.
+    /// Tells whether the grid has no points.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -63,7 +63,7 @@ impl PatientGrid {
         Ok(())
     }
 
-    /// Some of its slices.
+    /// Returns a range of its slices as a grid.
     pub fn slices(&self, slices: std::ops::Range<u32>) -> PatientGrid {
         let [nx, ny, _] = self.size;
         let origin_mm = self.origin_mm + DVec3::Z * self.spacing_mm.z * f64::from(slices.start);

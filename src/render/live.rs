@@ -18,26 +18,26 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError};
 use std::time::Instant;
 
-/// Side of a cell of the moving field: finer than a thin vessel, coarse enough to be baked again and again.
+/// Side of a cell of the dynamic field: finer than a thin vessel, coarse enough to be baked again and again.
 const CELL_MM: f64 = 0.8;
-/// After a refresh that took some time, this many times as long passes before the next.
+/// Pause after a refresh, as a multiple of the time that it took.
 const REST: u32 = 4;
 
-/// Where a run in training keeps what a view needs.
+/// Data of a run in training that a view needs.
 #[derive(Clone)]
 pub struct Source {
-    /// Model that is drawn, with parameters if `params` has none.
+    /// Model that is drawn, with its parameters if `params` has none.
     pub outline: Model,
     /// Parameters of the model on the device.
     pub params: Option<Buffer>,
-    /// Gaussians of the model, where they are the moving field.
+    /// Gaussians of the model, where they are the dynamic field.
     pub moving: Option<MovingFeed>,
-    /// Numbers on the device of the field of a method with a room of its own.
+    /// Parameters on the device of the field of a method of `crate::methods`.
     pub fit: Option<Vec<Buffer>>,
 }
 
 impl Source {
-    /// A model that does not change.
+    /// Returns the source of a model that does not change.
     pub fn of(model: &Model) -> Source {
         Source { outline: model.clone(), params: None, moving: None, fit: None }
     }
@@ -50,7 +50,7 @@ pub struct Live {
     scene: Scene,
     params: Option<Buffer>,
     moving: Option<MovingFeed>,
-    /// Change of the feed that is drawn.
+    /// Count of the feed's changes at the field that is drawn.
     moving_at: AtomicU64,
     /// Iteration the static field and each phase were baked at.
     baked_at: Vec<u32>,
@@ -80,8 +80,8 @@ impl Live {
         })
     }
 
-    /// Draws a view as [`Baked::render`] does. A volume older than `step`, the source's present iteration, is baked anew unless the last
-    /// refresh was too recent: refreshing takes at most a fifth of the time.
+    /// Draws a view as [`Baked::render`] does. A volume older than `step`, the source's present iteration, is baked anew unless
+    /// the last refresh was too recent: refreshing takes at most a fifth of the time.
     ///
     /// # Errors
     /// As [`Renderer::render`].
@@ -136,7 +136,7 @@ impl Live {
         Ok(under_way)
     }
 
-    /// Through the fields themselves, as they are at the source's present iteration.
+    /// Renders through the fields themselves, as they are at the source's present iteration.
     ///
     /// # Errors
     /// As [`Renderer::render`].
@@ -145,7 +145,7 @@ impl Live {
         self.baked.renderer().render(rays, size.0, size.1, phase)
     }
 
-    /// The renderer, brought up to the source's present iteration.
+    /// Returns the renderer, brought up to the source's present iteration.
     ///
     /// # Errors
     /// Device errors.

@@ -1,4 +1,4 @@
-//! What a pixel shows.
+//! Quantities that pixels show.
 
 use crate::choice::Choice;
 use crate::model::component::Component;
@@ -23,7 +23,7 @@ impl Choice for Projection {
     }
 }
 
-/// What the pixels of a view show.
+/// Quantity that the pixels of a view show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Quantity {
     /// Which fields are shown.

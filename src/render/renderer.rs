@@ -34,15 +34,15 @@ use std::time::Instant;
 /// Pixels rendered by one submit, which has a workgroup for each.
 pub(super) const RAYS_PER_SUBMIT: u32 = MOST_GROUPS;
 
-/// Pixels rendered by the first submits, where these tell how many the next may have.
+/// Pixels rendered by the first submits, whose times tell how many the next may have.
 const FIRST_RAYS: u32 = 4096;
 
-/// What every pixel of a view sees; all lists are rows first, attenuation per world unit.
+/// Values seen by every pixel of a view; all lists are rows first, attenuation per world unit.
 #[derive(Debug, Clone, Default)]
 pub struct Rendering {
     /// Line integral of the static field.
     pub static_integral: Vec<f32>,
-    /// Line integral of the dynamic field; of X-Gaussian what it shows instead, from about 0 to 1.
+    /// Line integral of the dynamic field; for X-Gaussian its blended picture, from about 0 to 1.
     pub dynamic_integral: Vec<f32>,
     /// Largest attenuation of the static field along the ray.
     pub static_max: Vec<f32>,
@@ -50,7 +50,7 @@ pub struct Rendering {
     pub dynamic_max: Vec<f32>,
     /// Largest sum of both along the ray.
     pub total_max: Vec<f32>,
-    /// Whether there is no line integral, but what X-Gaussian shows.
+    /// Whether the picture is X-Gaussian's blended one and no line integral.
     pub is_blended: bool,
 }
 
@@ -65,7 +65,7 @@ impl Rendering {
         }
     }
 
-    /// What a view shows; maxima per world unit.
+    /// Returns the quantity that a view shows; maxima per world unit.
     pub fn show(self, quantity: Quantity) -> Vec<f32> {
         match (quantity.projection, quantity.component) {
             (Projection::Drr, Component::Total) => self.total_integral(),
@@ -88,17 +88,17 @@ pub struct Renderer {
     pub(super) gpu: Gpu,
     pub(super) kernels: Kernels,
     network: Network,
-    /// The still field, where it is a network as well.
+    /// Static field, where it is a network as well.
     pub(super) still: Option<StillNetwork>,
     pub(super) buffers: ForwardBuffers,
     pub(super) setup: Setup,
     param_map: ParamMap,
-    /// Where Gaussians are the moving field.
+    /// Gaussians, where they are the dynamic field.
     pub(super) moving: Option<Blobs>,
     pictures: Option<Pictures>,
-    /// Field of a method with a room of its own, which is all there is then.
+    /// Field of a method of `crate::methods`, which is then the only field.
     pub(super) field: Option<Box<dyn FieldDrawing>>,
-    /// Of rays, without and with the still field, of integrals and of maxima: what one kind takes says nothing of another.
+    /// Submit pace per kind of rendering, without and with the static field, of integrals and of maxima; their costs differ.
     paces: [SubmitPace; 4],
     drawn: Mutex<Drawn>,
 }
@@ -164,10 +164,10 @@ impl Renderer {
         self.set_params(model)
     }
 
-    /// Replaces the moving field of a model that has Gaussians.
+    /// Replaces the dynamic field of a model that has Gaussians.
     ///
     /// # Errors
-    /// [`Error::Internal`] where the network moves; device errors.
+    /// [`Error::Internal`] where a network is the dynamic field; device errors.
     pub fn set_gaussians(&self, field: &MovingGaussians) -> Result<()> {
         match (&self.moving, &self.pictures) {
             (Some(blobs), Some(pictures)) => {
@@ -178,7 +178,7 @@ impl Renderer {
         }
     }
 
-    /// Draws numbers that are on the device, of the field of a method with a room of its own; nothing of other methods.
+    /// Draws from numbers on the device, for the field of a method of `crate::methods`; does nothing for other methods.
     pub fn follow_fit(&self, params: &[Buffer]) {
         if let Some(drawing) = &self.field {
             drawing.follow(params.to_vec());
@@ -216,7 +216,7 @@ impl Renderer {
         Err(Error::config("phase", phase, format!("phases go from 0 to {}", self.setup.n_phases - 1)))
     }
 
-    /// Gaussians as they are between two phases.
+    /// Gaussians interpolated between two phases.
     fn between(&self, phase: f64) -> Result<BlobList> {
         match self.moving.as_ref().map(|blobs| blobs.between(phase)).transpose()?.flatten() {
             Some(list) => Ok(list),
@@ -229,12 +229,12 @@ impl Renderer {
         }
     }
 
-    /// Most samples a ray may have.
+    /// Maximum number of samples of a ray.
     pub(super) fn largest_row(&self) -> u32 {
         self.setup.sample_capacity / 128 * 128
     }
 
-    /// What forward stages work with; `buffers` and `setup` may differ from the renderer's own in what they sample.
+    /// Inputs of the forward stages; `buffers` and `setup` may differ from the renderer's own in the points they sample.
     pub(super) fn pass<'a>(
         &'a self,
         recording: &'a mut Recording,
@@ -253,8 +253,9 @@ impl Renderer {
         self.render_parts(rays, (width, height), phase, Parts { still: true, maxima: true })
     }
 
-    /// What a `width` x `height` view at a phase shows, rows first; maxima per world unit. Where Gaussians move, their line
-    /// integrals alone come at display rates, true to the share of a Gaussian's peak that its cut leaves out (0.6 %).
+    /// Renders the quantity that a `width` x `height` view shows at a phase, rows first; maxima per world unit. Where Gaussians
+    /// are the dynamic field, only their line integrals are drawn at display rates, exact up to the share of a Gaussian's peak
+    /// that its cut leaves out (0.6 %).
     ///
     /// # Errors
     /// As [`Renderer::render`].
@@ -276,11 +277,11 @@ impl Renderer {
         Ok(self.render_parts(rays, (width, height), phase, parts)?.show(quantity))
     }
 
-    /// Draws line integrals of Gaussians as [`Renderer::show`] does, into a buffer on the device, `in_front` of what it holds or
-    /// instead of it.
+    /// Draws line integrals of Gaussians as [`Renderer::show`] does, into a buffer on the device, either in front of its
+    /// content (`in_front`) or in place of it.
     ///
     /// # Errors
-    /// As [`Renderer::render`]; [`Error::Internal`] where a network moves.
+    /// As [`Renderer::render`]; [`Error::Internal`] where a network is the dynamic field.
     pub(crate) fn show_gaussians_into(
         &self,
         target: &Buffer,
@@ -294,29 +295,29 @@ impl Renderer {
         pictures.draw_into(target, rays, size, phase, in_front)
     }
 
-    /// Whether nearer Gaussians hide those behind them, as X-Gaussian's do: in place of line integrals are blended pictures, from
-    /// about 0 to 1, and attenuation is a sum of opacities.
+    /// Tells whether nearer Gaussians hide those behind them, as in X-Gaussian: blended pictures, from about 0 to 1, then take
+    /// the place of line integrals, and attenuation is a sum of opacities.
     pub fn is_blended(&self) -> bool {
         self.pictures.as_ref().is_some_and(Pictures::are_blended)
     }
 
-    /// Whether Gaussians are the moving field, not a network.
+    /// Tells whether Gaussians are the dynamic field, not a network.
     pub fn gaussians_move(&self) -> bool {
         self.moving.is_some()
     }
 
-    /// Whether a motion hull says where the moving field may be.
+    /// Tells whether a motion hull bounds the dynamic field.
     pub fn has_hull(&self) -> bool {
         self.setup.hull_enabled != 0
     }
 
-    /// Whether the network on encoded coordinates is the moving field.
+    /// Tells whether the network on encoded coordinates is the dynamic field.
     pub fn network_moves(&self) -> bool {
         self.moving.is_none() && self.field.is_none()
     }
 
-    /// Whether a view of the moving field is drawn from Gaussians as they are, at display rates. The largest value of their
-    /// sum with the still field is not the sum of the largest values: that one takes the rays' samples, or volumes.
+    /// Tells whether a view of the dynamic field is drawn from the Gaussians themselves, at display rates. The maximum of their
+    /// sum with the static field is not the sum of the maxima: it takes the rays' samples, or volumes.
     pub fn draws_gaussians(&self, quantity: Quantity) -> bool {
         let summed = quantity.projection == Projection::Drr || quantity.component == Component::Dynamic;
         self.moving.is_some() && quantity.component.has_dynamic() && summed
@@ -334,8 +335,8 @@ impl Renderer {
         self.draw(rays, (width, height), BeatTime::at_phase(phase), blobs.as_ref(), parts)
     }
 
-    /// Renders a `width` x `height` view as it was when an image was taken; at the nearest phase where the moving field knows
-    /// whole phases alone.
+    /// Renders a `width` x `height` view as it was when an image was taken; at the nearest phase where the dynamic field knows
+    /// whole phases only.
     ///
     /// # Errors
     /// As [`Renderer::render`].
@@ -349,12 +350,12 @@ impl Renderer {
         }
     }
 
-    /// Renders a `width` x `height` view at a phase that may lie between two, such as 3.4, of a model whose moving field
-    /// is one set of Gaussians that moves, or a network, whose latents have values between those of two phases; its beat
-    /// closes, so that the number of phases is phase 0 again. Whole phases are those of [`Renderer::render`].
+    /// Renders a `width` x `height` view at a phase that may lie between two, such as 3.4. The dynamic field must be one set of
+    /// Gaussians that moves, or a network, whose latents are interpolated between two phases; its beat closes, so that the
+    /// number of phases is phase 0 again. Whole phases are those of [`Renderer::render`].
     ///
     /// # Errors
-    /// [`Error::Config`] for a phase below 0 or beyond the beat, and for one between two where the moving field is a set
+    /// [`Error::Config`] for a phase below 0 or beyond the beat, and for one between two where the dynamic field is a set
     /// of Gaussians per phase; device errors.
     pub fn render_at(&self, rays: &ViewRays, width: usize, height: usize, phase: f64) -> Result<Rendering> {
         let last = self.last_moment();
@@ -372,13 +373,13 @@ impl Renderer {
         self.render(rays, width, height, if closes { 0 } else { phase as u32 })
     }
 
-    /// The last phase that can be asked for: that of a field that is continuous in time is the first of the next beat.
+    /// Last phase that can be rendered: for a field that is continuous in time, the first phase of the next beat.
     fn last_moment(&self) -> u32 {
         let continuous = self.field.is_none() && self.moving.as_ref().is_none_or(Blobs::move_between_phases);
         if continuous { self.setup.n_phases } else { self.setup.n_phases - 1 }
     }
 
-    /// Renders a view at a time, with `blobs` of that time where Gaussians are the moving field.
+    /// Renders a view at a time, with `blobs` of that time where Gaussians are the dynamic field.
     fn draw(
         &self,
         rays: &ViewRays,
@@ -420,13 +421,13 @@ impl Renderer {
         Ok(out)
     }
 
-    /// Whether the live samples of so many rays are counted before they are drawn, since a hull leaves out most of them: then many
-    /// more rays go into a chunk than if all might be live. Without it the host is not asked on the way.
+    /// Tells whether the live samples of `n_rays` rays are counted before they are drawn. A hull leaves out most of them, so a
+    /// chunk then takes many more rays than if all might be live. Without a hull, the host is not involved on the way.
     fn counts_first(&self, n_rays: u32) -> bool {
         self.network_moves() && self.has_hull() && chunk_rays(&self.setup) < n_rays
     }
 
-    /// Records what draws a strip whose samples were counted, in chunks that have room for them.
+    /// Records the commands that draw a strip whose samples were counted, in chunks that have room for them.
     fn record_counted(&self, chunks: &[Chunk], n_rays: u32, parts: Parts, seen: &Buffer) -> Result<Commands> {
         let mut recording = Recording::new(&self.gpu, "render counted")?;
         self.pass(&mut recording, &self.buffers, &self.setup).render_counted(chunks, parts.maxima)?;
@@ -434,7 +435,7 @@ impl Renderer {
         recording.finish()
     }
 
-    /// Records what draws a strip, or counts its samples.
+    /// Records the commands that draw a strip, or count its samples.
     fn record_strip(&self, strip: Strip, taken: BeatTime, blobs: Option<&BlobList>) -> Result<RecordedStrip> {
         let Strip { n_rays, image_width, parts } = strip;
         let bytes = u64::from(n_rays) * size_of::<RayOut>() as u64;
@@ -468,8 +469,8 @@ impl Renderer {
     }
 }
 
-/// Rays of a strip: whole rows, which tiles of pixels are made of, and of these a power of two, so that strips that were recorded
-/// serve again.
+/// Number of rays of a strip: whole rows, of which tiles of pixels are made, and a power of two of them, so that recorded
+/// strips can be used again.
 fn rays_at_once(pace: &SubmitPace, image_width: u32) -> u32 {
     let rows = (pace.items() / image_width).max(1);
     (1 << rows.ilog2()) * image_width.min(RAYS_PER_SUBMIT)
@@ -483,30 +484,30 @@ struct Strip {
     parts: Parts,
 }
 
-/// Commands that draw a strip of any view, and where these say what of.
+/// Commands that draw a strip of any view, and the buffers that select view and pose.
 struct RecordedStrip {
     commands: Commands,
     of: PoseBuffers,
-    /// Live samples of its rays, where all that the commands do is to count them.
+    /// Live samples of its rays, where the commands only count them.
     counts: Option<Buffer>,
-    /// What its rays saw.
+    /// Values that its rays saw.
     seen: Buffer,
 }
 
-/// Strips kept recorded; a display in use has far fewer.
+/// Maximum number of strips kept recorded; a display in use has far fewer.
 const MOST_RECORDED: usize = 16;
 
 /// Strips drawn so far.
 #[derive(Default)]
 struct Drawn {
-    /// Of fields that are networks, whose commands are the same at all times.
+    /// Strips of fields that are networks, whose commands are the same at all times.
     recorded: HashMap<Strip, RecordedStrip>,
-    /// Of another field: the last.
+    /// Last strip of any other field.
     once: Option<RecordedStrip>,
 }
 
 impl Drawn {
-    /// What draws a strip at a time: recorded before, or now.
+    /// Returns the commands that draw a strip at a time, recorded before or now.
     fn strip(
         &mut self,
         renderer: &Renderer,
@@ -527,16 +528,16 @@ impl Drawn {
     }
 }
 
-/// What rays from `first_pixel` on show of a time.
+/// Returns the pose of the rays from `first_pixel` on at a time.
 pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32) -> Pose {
     let (beyond, beyond_share) = (taken.beyond(setup.n_phases), taken.after_phase.abs() as f32);
     Pose { first_pixel, phase: taken.phase, beyond, beyond_share }
 }
 
-/// What of a rendering is wanted; the rest is undefined.
+/// Parts of a rendering that are wanted; the rest is undefined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 struct Parts {
-    /// The still field.
+    /// The static field.
     still: bool,
     /// Maxima along rays.
     maxima: bool,

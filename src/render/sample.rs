@@ -36,8 +36,8 @@ impl Renderer {
         Ok(sum)
     }
 
-    /// A single field at the points of a grid; of Gaussians with an `away` other than zero, world units, what it is at most (above
-    /// zero) or at least (below) anywhere so near to the points.
+    /// Samples a single field at the points of a grid. For Gaussians and an `away` other than zero, world units, returns the
+    /// maximum (`away` above zero) or the minimum (below) within that distance of each point.
     fn sample_field(&self, field: Component, phase: u32, grid: &Grid, away: f32) -> Result<Vec<f32>> {
         let [nx, ny, nz] = grid.size;
         if nx < 2 || nx > self.largest_row() {
@@ -107,7 +107,7 @@ impl Renderer {
         Ok(out)
     }
 
-    /// Records the field of a method with a room of its own at the cells of rows along x.
+    /// Records the field of a method of `crate::methods` at the cells of rows along x.
     fn record_field(
         &self,
         recording: &mut Recording,
@@ -121,7 +121,7 @@ impl Renderer {
         field.record_cells(recording, &buffers.rays, row, phase, n_rows, cells)
     }
 
-    /// Bytes on their way to the device, behind what was recorded so far.
+    /// Creates a buffer of bytes that are uploaded after the commands recorded so far.
     fn constants(&self, recording: &mut Recording, name: &str, bytes: &[u8]) -> Result<Buffer> {
         let staging = self.gpu.buffer(name, bytes.len() as u64, Memory::Upload)?;
         staging.write(bytes)?;
@@ -144,8 +144,8 @@ impl Renderer {
         Ok(out)
     }
 
-    /// Attenuation per mm that the moving field has at least and at most anywhere within `away_mm` of the points of a grid; none
-    /// where it is not made of Gaussians, of which alone that is known.
+    /// Minimum and maximum attenuation per mm of the dynamic field within `away_mm` of the points of a grid; `None` where it is
+    /// not made of Gaussians, the only form with known bounds.
     ///
     /// # Errors
     /// As [`Renderer::sample_patient`].
@@ -166,7 +166,7 @@ impl Renderer {
     }
 }
 
-/// A grid of the patient as one of the world, whose rows are along posterior and have two points or more.
+/// Converts a grid of the patient to one of the world, whose rows run along posterior and have two points or more.
 fn rows_of(grid: &PatientGrid) -> Grid {
     let swap = |v: DVec3| DVec3::new(v.y, v.x, v.z);
     let [nl, np, ns] = grid.size;
@@ -177,7 +177,7 @@ fn rows_of(grid: &PatientGrid) -> Grid {
     }
 }
 
-/// Adds what such rows hold, per world unit, to the points of the patient's grid, per mm.
+/// Adds the values of such rows, per world unit, to the points of the patient's grid, per mm.
 fn add_per_mm(out: &mut [f32], cells: &[f32], grid: &PatientGrid) {
     let [nl, np, _] = grid.size.map(|n| n as usize);
     let row = np.max(2);

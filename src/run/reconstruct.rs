@@ -33,7 +33,7 @@ use std::time::Instant;
 /// Losses are written and reported once per this many iterations.
 const REPORT_EVERY: u32 = 10;
 
-/// How to run.
+/// Options of a run.
 pub struct RunOptions<'a> {
     /// Run directory.
     pub run: &'a Path,
@@ -59,7 +59,7 @@ pub fn reconstruct(
     options: &RunOptions<'_>,
     observe: &mut dyn FnMut(&Event),
 ) -> Result<()> {
-    // What an earlier process on this run was writing when it was killed.
+    // Files that an earlier process on this run was writing when it was killed are removed.
     for directory in [options.run, &options.run.join("report")] {
         files::remove_partial(directory);
     }
@@ -89,7 +89,7 @@ pub fn reconstruct(
     notes.extend(trainer.plan().notes.iter().cloned());
     notes.extend(trainer.tuning().reasons.iter().cloned());
     let distance = match Distance::new(dataset, carried.as_ref()) {
-        // Images are scored all the same.
+        // Images are scored nevertheless.
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
             notes.push(format!("there are no distances on the way: {error}"));
             None
@@ -124,16 +124,16 @@ pub fn reconstruct(
     })
 }
 
-/// What a run goes by.
+/// Dataset and calibration of a run.
 struct Calibrated {
-    /// By the corrected geometry, unseen images where the reconstruction has them.
+    /// Dataset with the corrected geometry; unseen images lie where the reconstruction has them.
     dataset: Dataset,
-    /// What the reconstruction is carried by against the truth, where that is known.
+    /// Rigid motion of the reconstruction against the truth, where that is known.
     carried: Option<RigidMotion>,
     calibration: Calibration,
 }
 
-/// The dataset by the geometry that the run goes by: found now, or when the run was begun.
+/// Returns the dataset with the geometry of the run: calibrated now, or when the run was begun.
 fn calibrated(config: &Config, dataset: &Dataset, options: &RunOptions<'_>) -> Result<Calibrated> {
     let calibration = if options.resume {
         Calibration::read(options.run)?.unwrap_or_else(|| Calibration::none(None))
@@ -162,7 +162,7 @@ struct Loop<'a> {
     end: u32,
     /// Jobs the worker has not finished.
     waiting: u32,
-    /// Of the last iteration told of.
+    /// Dynamic share of the last reported iteration.
     dynamic_share: Option<f64>,
 }
 
@@ -243,7 +243,7 @@ impl<'a> Loop<'a> {
         every > 0 && (step == self.end || step.is_multiple_of(every))
     }
 
-    /// Tells of every few iterations, and the last.
+    /// Reports every few iterations, and the last.
     fn report(&mut self, progress: Vec<Progress>) -> Result<()> {
         if let Some(LargeLoss { step, loss, ratio }) = self.training.trainer_mut().take_large_loss() {
             (self.tell)(Event::LargeLoss { step, loss, ratio })?;

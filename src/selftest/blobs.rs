@@ -41,7 +41,7 @@ const PICTURE: Tolerance = Tolerance::OfLargest(0.01);
 /// Every so many cells are compared.
 const CELL_STRIDE: usize = 17;
 
-/// A model of a dataset whose moving field is `field`; its still field is untrained.
+/// A model of a dataset whose dynamic field is `field`; its static field is untrained.
 ///
 /// # Errors
 /// Device errors.
@@ -120,11 +120,11 @@ pub fn compare_crowd(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Res
     Ok(())
 }
 
-/// How much coarser the search in a crowd may be than that among a few: peaks between others may be missed, which cost 2 % on one
-/// ray of a thousand here.
+/// Factor on the tolerance of the search in a crowd: peaks between others may be missed, which costs 2 % on one ray of a
+/// thousand here.
 const CROWD_SEARCH: f64 = 4.0;
-/// Shares of the volume's half side that Gaussians of a crowd are wide, from narrowest to widest: the narrowest lie between the
-/// depths that the kernel looks at.
+/// Widths of the Gaussians of a crowd, from narrowest to widest, shares of the volume's half side: the narrowest lie between
+/// the depths that the kernel looks at.
 const CROWD_WIDTHS: [f64; 2] = [0.004, 0.1];
 
 /// Gaussians of phase 0, narrow and wide ones, in a model of R2-Gaussian.

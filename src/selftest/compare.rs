@@ -3,8 +3,8 @@
 use crate::error::{Error, Result};
 use serde::Serialize;
 
-/// What iterations tell of themselves. Of a device that tells nothing, no more is known than that: what its stages computed is compared
-/// all the same.
+/// Returns the losses that iterations reported; none for a device that reports none, whose stages' results are compared
+/// nevertheless.
 pub(super) fn told<T>(losses: Result<Vec<T>>) -> Result<Vec<T>> {
     match losses {
         Err(Error::NoDevice(_)) => Ok(Vec::new()),
@@ -41,17 +41,17 @@ fn finite_or_infinite(error: f64) -> f64 {
     if error.is_finite() { error } else { f64::INFINITY }
 }
 
-/// What numbers may be off by.
+/// Tolerated deviation of numbers.
 #[derive(Debug, Clone, Copy)]
 pub enum Tolerance {
-    /// Each of them, as a share of the largest that is wanted.
+    /// Deviation of each number, as a share of the largest expected number.
     OfLargest(f64),
-    /// All of them together, as a share of the norm of what is wanted.
+    /// Deviation of all numbers together, as a share of the norm of the expected numbers.
     OfNorm(f64),
 }
 
 impl Tolerance {
-    /// So many times as much.
+    /// Returns the tolerance multiplied by a factor.
     pub fn times(self, factor: f64) -> Tolerance {
         match self {
             Tolerance::OfLargest(most) => Tolerance::OfLargest(factor * most),
@@ -60,7 +60,7 @@ impl Tolerance {
     }
 }
 
-/// What comparisons found of a stage, or of stages whose results only show together, over all cases.
+/// Comparisons of a stage, or of stages whose results only show together, over all cases.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     /// The stages whose result was compared; words with blanks name what all stages do together.
@@ -72,16 +72,16 @@ pub struct Row {
     /// The deviation that came closest to its tolerance, or is furthest beyond; in JSON, null where it is infinite, as for
     /// values that are no numbers.
     pub deviation: f64,
-    /// What it may be.
+    /// Tolerated deviation.
     pub tolerance: f64,
-    /// Case and quantity it was seen in.
+    /// Case and quantity of that deviation.
     pub seen_in: String,
     #[serde(skip)]
     last_case: String,
 }
 
 impl Row {
-    /// Whether the stage computes what its twin does.
+    /// Tells whether the stage computes what its twin does.
     pub fn is_ok(&self) -> bool {
         self.deviation <= self.tolerance
     }
@@ -101,7 +101,7 @@ pub struct Findings {
 }
 
 impl Findings {
-    /// What follows is found on this path, in this case.
+    /// Begins a case on a path; the comparisons that follow belong to it.
     pub fn begin(&mut self, path: &str, case: &str) {
         (self.path, self.case) = (path.to_owned(), case.to_owned());
     }
@@ -111,7 +111,7 @@ impl Findings {
         &self.rows
     }
 
-    /// Notes how far numbers are off. Nothing but zeros is no comparison, and fails.
+    /// Records the deviation of numbers. A list of zeros is no comparison, and fails.
     pub fn numbers(
         &mut self,
         stages: &[&'static str],
@@ -136,14 +136,14 @@ impl Findings {
         }
     }
 
-    /// Notes a failure of `stages` where a case does not hold what it is made for, as nothing to be seen.
+    /// Records a failure of `stages` where a case does not hold what it is made for, for example where nothing is seen.
     pub fn require(&mut self, stages: &[&'static str], what: &str, holds: bool) {
         if !holds {
             self.add(stages, what, f64::INFINITY, 1.0);
         }
     }
 
-    /// Notes a deviation of `quantity`, a result of `stages`.
+    /// Records a deviation of `quantity`, a result of `stages`.
     pub fn add(&mut self, stages: &[&'static str], quantity: &str, deviation: f64, tolerance: f64) {
         let place = self.rows.iter().position(|row| row.stages == stages && row.path == self.path);
         let at = place.unwrap_or_else(|| {

@@ -103,7 +103,7 @@ pub(super) fn f32s(values: &[f64]) -> Vec<f32> {
     values.iter().map(|v| *v as f32).collect()
 }
 
-/// How far a splat is from where the twin has it: in pixels, or as a share of its own size.
+/// Distance of a splat from the twin's: in pixels, or as a share of its own size.
 fn splat_error(got: &Splat, want: &Projection) -> f64 {
     let conic = [want.conic.x_axis.x, want.conic.x_axis.y, want.conic.y_axis.y];
     let largest = conic.iter().fold(0f64, |most, c| most.max(c.abs()));
@@ -117,8 +117,8 @@ fn splat_error(got: &Splat, want: &Projection) -> f64 {
     all.fold(0.0, |worst, error| if error.is_nan() { f64::INFINITY } else { worst.max(error) })
 }
 
-/// Compares splats, each of a Gaussian in a view: where the twin sees something of it, size and place; elsewhere that its box
-/// is empty. `seen` says how the twin has the splat at an index, and which image it belongs to.
+/// Compares splats, each of a Gaussian in a view: size and place where the twin sees something of it; elsewhere the box must be
+/// empty. `seen` returns the twin's splat at an index, and the image it belongs to.
 pub(super) fn compare_splats(
     gpu: &Gpu,
     particles: &ParticleBuffers,
@@ -154,7 +154,7 @@ pub(super) fn compare_splats(
 /// A splat as the twin sees it, and the image it belongs to; none where a view lacks the phase.
 pub(super) type Seen = Option<(usize, Option<Projection>)>;
 
-/// Compares residuals with those of the device's own images, and moments with those of the device's own residuals; the
+/// Compares residuals with those of the device's own images, and moments with those of the device's own residuals; returns the
 /// twin's loss of the images, and the device's moments.
 pub(super) fn compare_backward(
     gpu: &Gpu,

@@ -25,13 +25,13 @@ use crate::train::step::tv_parts;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
-/// With the paper's learning rate, networks this small are dead after an update: nothing but zeros is left to compare.
+/// With the paper's learning rate, networks this small are dead after one update, and only zeros would be left to compare.
 pub const STEADY: &[&str] = &["dynamic.lr=1e-3", "dynamic.lr_end=1e-4"];
 
 /// A configuration whose gradients are compared.
 #[derive(Debug, Clone, Copy)]
 pub struct Case {
-    /// What it is on top of.
+    /// Preset that the settings modify.
     pub preset: Preset,
     /// Settings, beside those of [`small_config`].
     pub settings: &'static [&'static str],
@@ -54,7 +54,7 @@ impl Case {
         let settings = [STEADY, self.settings].concat();
         let mut plan = Plan::new(&small_config(self.preset, &settings)?, dataset)?;
         if self.settings.iter().any(|setting| setting.starts_with("dynamic.least_slope")) {
-            // Every ray asks for more.
+            // Every ray asks for more attenuation.
             plan.images.iter_mut().for_each(|value| *value += 1.0);
         }
         Ok(plan)
@@ -73,7 +73,7 @@ pub const F32_CASES: &[Case] = &[
     ),
     // more than 32 depths a lane
     case(Preset::FastMlp, &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
-    // a field asleep, that rays call back
+    // a field far below the bend of its softplus, which rays bring back
     case(Preset::FastMlp, &["dynamic.best_start=false", "dynamic.normalised_shift=-9", "dynamic.least_slope=0.05"]),
     // a single hidden layer, skip in a deep net, wide layers
     case(Preset::Paper, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
@@ -90,8 +90,8 @@ pub const MATRIX_CASES: &[Case] = &[
     case(Preset::FastMlp, &["train.rays=1", "march.dynamic_samples=7"]),
 ];
 
-/// Cases on matrices that are compared on images between phases, too; in others some activation is then so near zero that the order of
-/// a sum decides whether it counts.
+/// Cases on matrices that are compared on images between phases, too. In the other cases some activation is so near zero there
+/// that the order of a sum decides whether it counts.
 pub const MATRIX_CASES_BETWEEN_PHASES: &[Case] = &[MATRIX_CASES[0], MATRIX_CASES[1]];
 
 const RAYS: &[&str] = &[push::Batch::SHADER];
@@ -105,7 +105,7 @@ const OUTPUT_BACKWARD: &[&str] =
     &[push::MlpOutBwd::SHADER, push::MlpOutBwdWeight::SHADER, push::GradientNetwork::SHADER];
 const LAYERS_BACKWARD: &[&str] = &[push::MlpLayerBwdInput::SHADER, push::MlpLayerBwdWeight::SHADER];
 const BACKWARD_ON_MATRICES: &[&str] = &[push::MlpFusedBwd::SHADER, push::GradientNetwork::SHADER];
-/// Where the first layer is computed again.
+/// Backward stages where the first layer is recomputed.
 const BACKWARD_AGAIN_ON_MATRICES: &[&str] =
     &[push::MlpFusedBwd::SHADER, push::MlpFusedBwdFirst::SHADER, push::GradientNetwork::SHADER];
 const LATENTS_BACKWARD: &[&str] = &[push::MlpRaySum::SHADER, push::MlpPhaseSum::SHADER, push::MlpLatentBwd::SHADER];
@@ -118,7 +118,7 @@ const WHOLE: &[&str] = &["whole iteration"];
 /// Gradients on matrices beside those in f64.
 const F16_BESIDE_F64: &[&str] = &["f16 beside f64"];
 
-/// What a path may be off by.
+/// Tolerances of a path.
 pub(super) struct Tolerances {
     /// Attenuation at samples.
     pub(super) sigma: Tolerance,
@@ -156,7 +156,7 @@ struct Twin<'a> {
     computes_again: bool,
 }
 
-/// What the device made in an iteration.
+/// Results of an iteration on the device.
 struct Seen {
     loss: StepLoss,
     rays: Vec<layout::Ray>,
@@ -171,7 +171,7 @@ struct Seen {
 
 /// A live sample of the device.
 pub(super) struct Sample {
-    /// Of the batch.
+    /// Index of its ray in the batch.
     pub(super) ray: usize,
     pub(super) x: DVec3,
     pub(super) path_length: f64,
@@ -204,7 +204,7 @@ impl Seen {
 /// The live samples of an iteration, which one chunk held.
 pub(super) fn samples(gpu: &Gpu, trainer: &Trainer, live: usize) -> Result<Vec<Sample>> {
     let (forward, capacity) = (trainer.forward(), trainer.plan().setup.sample_capacity as usize);
-    // More than fit would be a fault of the count, which is compared anyway.
+    // A larger count would be a fault of the counter, which is compared anyway.
     let live = live.min(capacity);
     let points: Vec<[f32; 4]> = gpu.download(&forward.sample_points, 0, live)?;
     let rays: Vec<u32> = gpu.download(&forward.sample_rays, 0, live)?;
@@ -239,7 +239,7 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
     Ok(())
 }
 
-/// Iterations that are compared: the first, and one that finds what another has left.
+/// Number of compared iterations: the first, and one that starts from the state another has left.
 pub(super) const ITERATIONS: usize = 2;
 
 /// Runs an iteration, which begins with `params`, and compares its stages.
@@ -287,7 +287,7 @@ pub(super) fn precision_of(trainer: &Trainer) -> Precision {
     }
 }
 
-/// What rows call a path.
+/// Name of a path in the rows.
 pub fn path_name(layers: Layers) -> &'static str {
     layers.name()
 }
@@ -297,7 +297,7 @@ pub(super) fn one_iteration(trainer: &mut Trainer) -> Result<StepLoss> {
     Ok(told(trainer.advance(next))?.last().copied().unwrap_or(UNTOLD))
 }
 
-/// The losses of an iteration that left none.
+/// Losses of an iteration that reported none.
 const UNTOLD: StepLoss = StepLoss {
     step: 0,
     data: f64::NAN,
@@ -316,7 +316,7 @@ const UNTOLD: StepLoss = StepLoss {
 };
 
 impl Tolerances {
-    /// Of a path on a device.
+    /// Tolerances of a path on a device.
     pub(super) fn of(precision: Precision, info: &DeviceInfo) -> Tolerances {
         let exact = match precision {
             Precision::Exact => IN_F32,
@@ -328,8 +328,8 @@ impl Tolerances {
     }
 }
 
-/// How much more the network may be off on a device: Vulkan asks of sine and cosine an error of 2^-11 at most, which CPU drivers
-/// stay far below. Faults are larger than that by far.
+/// Factor on the network's tolerances on a device. Vulkan allows sine and cosine an error of 2^-11, which CPU drivers stay far
+/// below. Faults are far larger than that.
 pub fn sine_factor(info: &DeviceInfo) -> f64 {
     if info.is_cpu() { 1.0 } else { 10.0 }
 }
@@ -339,7 +339,7 @@ impl Twin<'_> {
         self.precision != Precision::Exact
     }
 
-    /// The stages that make the gradient of the output neuron, of layers and of latents.
+    /// Stages that compute the gradient of the output neuron, of layers and of latents.
     fn backward_stages(&self) -> [&'static [&'static str]; 3] {
         if !self.on_matrices() {
             return [OUTPUT_BACKWARD, LAYERS_BACKWARD, LATENTS_BACKWARD];
@@ -365,7 +365,7 @@ impl Twin<'_> {
         findings.add(RAYS, "rays", worst, POSITION);
     }
 
-    /// Number of live samples; and where both have as many on a ray, their places.
+    /// Compares the number of live samples and, where both have as many on a ray, their places.
     fn compare_samples(&self, samples: &[Sample], seen: &Seen, findings: &mut Findings) {
         let s = &self.plan.setup;
         let (mut strays, mut worst) = (0, 0f64);
@@ -401,7 +401,7 @@ impl Twin<'_> {
         self.rays.get(sample.ray).map_or([(0, 1.0), (0, 0.0)], |ray| ray.shown)
     }
 
-    /// Attenuation and its slope at the device's samples.
+    /// Compares attenuation and its slope at the device's samples.
     fn compare_forward(&self, samples: &[Sample], findings: &mut Findings) {
         let s = &self.plan.setup;
         let (gain, shift) = (f64::from(s.dynamic_gain), f64::from(s.dynamic_shift));
@@ -415,7 +415,7 @@ impl Twin<'_> {
         findings.numbers(stages, "slope of sample_sigma", &got(1), &slopes, tolerance);
     }
 
-    /// Integrals of the device's samples, and of the twin's static field.
+    /// Compares integrals of the device's samples, and of the twin's static field.
     fn compare_integrals(&self, seen: &Seen, findings: &mut Findings) {
         let statics = |r: usize| self.march_statics(r).static_integral;
         let want: Vec<f64> = (0..self.rays.len()).map(statics).collect();
@@ -441,7 +441,7 @@ impl Twin<'_> {
         march::statics(self.plan, self.params, self.step, &self.rays[r], !step::skips_static(self.plan, r))
     }
 
-    /// Losses and their gradient, of the device's integrals.
+    /// Compares losses and their gradient, from the device's integrals.
     fn compare_loss(&self, seen: &Seen, findings: &mut Findings) {
         let n = self.rays.len();
         let loss = |(r, out): (usize, &RayOut)| {
@@ -464,7 +464,7 @@ impl Twin<'_> {
         findings.add(TOTAL_VARIATION, "value", relative(seen.total_variation(), value), IN_F32.loss);
     }
 
-    /// Gradient of the static field by the device's ray gradients, and by the total variation.
+    /// Compares the gradient of the static field, from the device's ray gradients and the total variation.
     fn compare_static_gradient(&self, seen: &Seen, findings: &mut Findings) {
         let params = &self.plan.params;
         let mut want = vec![0.0; params.len];
@@ -480,7 +480,7 @@ impl Twin<'_> {
         }
     }
 
-    /// Gradient of the network by the device's samples and ray gradients.
+    /// Compares the gradient of the network, from the device's samples and ray gradients.
     fn compare_backward(&self, samples: &[Sample], seen: &Seen, findings: &mut Findings) {
         let params = &self.plan.params;
         let mut want = vec![0.0; params.len];
@@ -497,7 +497,7 @@ impl Twin<'_> {
         }
     }
 
-    /// Sums of what the device's rays came to.
+    /// Compares sums over the results of the device's rays.
     fn compare_report(&self, seen: &Seen, findings: &mut Findings) {
         let sum = |k: usize| seen.ray_loss.iter().map(|loss| f64::from(loss[k])).sum::<f64>();
         let occlusion = f64::from(self.plan.setup.occlusion_weight) * sum(2);
@@ -513,7 +513,7 @@ impl Twin<'_> {
         }
     }
 
-    /// Losses and gradients beside those the twin comes to by itself.
+    /// Compares losses and gradients with those that the twin computes by itself.
     fn compare_whole(&self, seen: &Seen, findings: &mut Findings) {
         let whole = |precision| step::loss_and_gradient(self.plan, self.params, self.step, &self.rays, precision);
         let (want, gradient) = whole(self.precision);
@@ -538,14 +538,14 @@ impl Twin<'_> {
     }
 }
 
-/// A part of the network's gradient, and the stages that make it.
+/// A part of the network's gradient, and the stages that compute it.
 struct Part {
     stages: &'static [&'static str],
     name: String,
     positions: Vec<u32>,
 }
 
-/// The network's gradient by the stages that make it: the columns of latents are apart from the weights beside them.
+/// Splits the network's gradient by the stages that compute it: the columns of latents are apart from the weights beside them.
 fn parts(params: &ParamMap, [output, layers, latents]: [&'static [&'static str]; 3]) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut last = Vec::new();
@@ -592,7 +592,7 @@ pub(super) fn pick<T: Copy>(positions: &[u32], all: &[T]) -> Vec<T> {
     positions.iter().map(|at| all[*at as usize]).collect()
 }
 
-/// Losses below this are nothing.
+/// Losses below this count as zero.
 const NO_LOSS: f64 = 1e-12;
 
 /// Relative difference of losses.
@@ -606,7 +606,7 @@ fn larger(a: f64, b: f64) -> f64 {
     if a.is_nan() || b.is_nan() { f64::INFINITY } else { a.max(b) }
 }
 
-/// The optimiser, on the gradient that the device came to; parameters and moments after it.
+/// Compares the optimiser on the device's gradient: parameters and moments after it.
 pub(super) fn compare_update(
     gpu: &Gpu,
     trainer: &Trainer,

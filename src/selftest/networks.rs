@@ -35,13 +35,14 @@ pub const LARGE: &[&str] = &[
     "networks.static_size_end=1e-2",
 ];
 
-/// Fields of next to nothing, whose entropy counts along some rays; the near part of rays; a skip layer.
+/// Almost empty fields, whose entropy counts along some rays; the near part of rays; a skip layer.
 const FAINT: &[&str] = &[
     "networks.gain=1e-5",
     "networks.favour_static_end=0.3",
     "networks.delay=0",
     "networks.ramp=1",
-    // More would hide all else: what scales a field does not change its entropy, and sums of that nearly cancel.
+    // A larger weight would hide all else: scaling a field does not change its entropy, so the sums of that gradient nearly
+    // cancel.
     "networks.ray_entropy=1e-3",
     "networks.ray_entropy_end=1e-3",
     "networks.near_integral=0.3",
@@ -69,10 +70,10 @@ const BACKWARD: &[&str] = &["both networks backward"];
 const REPORT: &[&str] = &[push::Report::SHADER];
 const WHOLE: &[&str] = &["whole iteration of two networks"];
 
-/// Change of a pixel, of which shaders and twin know the same f32.
+/// Tolerance of a pixel's change, which shaders and twin know as the same f32.
 const CHANGE: f64 = 1e-7;
 
-/// What the device made in an iteration.
+/// Results of an iteration on the device.
 struct Seen {
     loss: StepLoss,
     networks: NetworkLosses,
@@ -186,7 +187,7 @@ impl Twin<'_> {
         pairs.moving.iter().map(at).collect()
     }
 
-    /// Attenuations and their slopes at the device's samples.
+    /// Compares attenuations and their slopes at the device's samples.
     fn compare_forward(&self, pairs: &Pairs, traces: &[[NetworkTrace; 2]], findings: &mut Findings) {
         let want: Vec<_> = traces.iter().map(|traces| networks::attenuations(self.trainer.plan(), traces)).collect();
         for (k, what) in ["attenuation", "slope"].into_iter().enumerate() {
@@ -200,7 +201,7 @@ impl Twin<'_> {
         }
     }
 
-    /// Integrals of the device's samples.
+    /// Compares integrals of the device's samples.
     fn compare_integrals(&self, pairs: &Pairs, seen: &Seen, findings: &mut Findings) {
         let want: Vec<_> = (0..self.rays.len()).map(|r| networks::integrals(&pairs.of_ray(r).1)).collect();
         let column =
@@ -213,7 +214,7 @@ impl Twin<'_> {
         column("near integral", |out| out.occlusion, |w| w.near, findings);
     }
 
-    /// Losses of the device's integrals and samples, and their gradient at each.
+    /// Compares losses of the device's integrals and samples, and their gradient at each.
     fn compare_losses(&self, pairs: &Pairs, seen: &Seen, findings: &mut Findings) {
         let (plan, n) = (self.trainer.plan(), self.rays.len());
         let mut gradient = [vec![0.0; pairs.moving.len()], vec![0.0; pairs.moving.len()]];
@@ -245,7 +246,7 @@ impl Twin<'_> {
         column("static size", more(2), |l| l.static_size, findings);
     }
 
-    /// Gradient of both networks by the device's gradients at samples.
+    /// Compares the gradient of both networks, from the device's gradients at samples.
     fn compare_backward(&self, pairs: &Pairs, traces: &[[NetworkTrace; 2]], seen: &Seen, findings: &mut Findings) {
         let (plan, precision) = (self.trainer.plan(), precision_of(self.trainer));
         let mut want = vec![0.0; plan.params.len];
@@ -256,7 +257,7 @@ impl Twin<'_> {
         self.compare_tensors(BACKWARD, &want, seen, findings);
     }
 
-    /// Tensor by tensor, so that a missing small gradient cannot hide behind a large one.
+    /// Compares tensor by tensor, so that a missing small gradient cannot hide behind a large one.
     fn compare_tensors(&self, stages: &[&'static str], want: &[f64], seen: &Seen, findings: &mut Findings) {
         for tensor in self.trainer.plan().params.tensors() {
             let (got, want) = (pick(&tensor.positions, &seen.gradient), pick(&tensor.positions, want));
@@ -264,7 +265,7 @@ impl Twin<'_> {
         }
     }
 
-    /// Sums of what the device's rays came to.
+    /// Compares sums over the results of the device's rays.
     fn compare_report(&self, seen: &Seen, findings: &mut Findings) {
         let row = self.trainer.plan().schedule[self.step as usize];
         let sum = |all: &[[f32; 4]], k: usize| all.iter().map(|loss| f64::from(loss[k])).sum::<f64>();
@@ -286,7 +287,7 @@ impl Twin<'_> {
         );
     }
 
-    /// Losses and gradients beside those the twin comes to by itself.
+    /// Compares losses and gradients with those that the twin computes by itself.
     fn compare_whole(&self, seen: &Seen, findings: &mut Findings) {
         let (plan, precision) = (self.trainer.plan(), precision_of(self.trainer));
         let (want, gradient) = step::loss_and_gradient(plan, self.params, self.step, &self.rays, precision);

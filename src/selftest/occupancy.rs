@@ -1,4 +1,4 @@
-//! Where the dynamic field has been seen empty: what an iteration notes, and that later ones heed it.
+//! Cells in which the dynamic field has been seen empty: the notes of an iteration, and their use by later ones.
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
@@ -61,7 +61,7 @@ fn notes(gpu: &Gpu, trainer: &Trainer) -> Result<Vec<u32>> {
     gpu.download(&trainer.forward().occupancy, 0, 3 * trainer.plan().setup.occupancy_words())
 }
 
-/// What one iteration notes: the first of the second epoch. The epoch before is left alone.
+/// Compares the notes of one iteration, the first of the second epoch. The epoch before is left alone.
 fn compare_notes(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> Result<()> {
     advance(trainer, OCCUPANCY_EPOCH)?;
     let before = notes(gpu, trainer)?;
@@ -93,7 +93,7 @@ fn compare_notes(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> R
     Ok(())
 }
 
-/// The samples of a later iteration are those the twin lets live.
+/// Compares the samples of a later iteration with those that the twin lets live.
 fn compare_use(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> Result<()> {
     advance(trainer, HEEDING)?;
     let noted = notes(gpu, trainer)?;

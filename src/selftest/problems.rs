@@ -44,7 +44,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
         });
         views.push(View { rays: rays(&geometry, width, height)?, size: [width, height], geometry });
         for phase in 0..n_phases {
-            // The way of three phases, in as many steps as there are.
+            // The path is that of three phases, in as many steps as there are phases.
             let along = 3.0 * f64::from(phase) / f64::from(n_phases);
             let centre = (0.4 + 0.1 * along, 0.5 - 0.05 * v as f64);
             let integrals = (0..width * height)
@@ -83,7 +83,7 @@ pub fn small_dataset(width: usize, height: usize, n_phases: u32) -> Result<Datas
     })
 }
 
-/// [`small_dataset`] of three phases, of which some images were taken between two, before and after the nearest.
+/// A dataset like [`small_dataset`] of three phases, with some images taken between two, before and after the nearest.
 ///
 /// # Errors
 /// As [`small_dataset`].
@@ -189,7 +189,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
     })
 }
 
-/// What kernels are compared on: sizes that are no multiples of anything, Gaussians outside the image and behind the
+/// Problem that kernels are compared on: sizes that are no multiples of anything, Gaussians outside the image and behind the
 /// source, a phase that a view lacks.
 ///
 /// # Errors
@@ -204,7 +204,7 @@ pub fn hard_case() -> Result<(Targets, Vec<Gaussian>)> {
     Ok((targets, rows))
 }
 
-/// The defaults but for the Gaussians' settings.
+/// Default configuration with the given settings of Gaussians.
 pub fn with_gaussians(gaussians: sections::Gaussians) -> Config {
     Config { gaussians, ..Config::preset(Preset::Fast) }
 }
@@ -291,7 +291,7 @@ fn drawn_tree(n: usize, n_phases: u32) -> MovingTree {
     MovingTree { rest, setup, grid, own: (0..n * 4).map(vector).collect() }
 }
 
-/// Moving fields of three phases to be drawn, one of each form.
+/// Dynamic fields of three phases to be drawn, one of each form.
 pub fn drawn_fields() -> [MovingGaussians; 2] {
     [MovingGaussians::PerPhase(drawn_set(231, 3)), MovingGaussians::Tree(drawn_tree(77, 3))]
 }

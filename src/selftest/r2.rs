@@ -99,7 +99,7 @@ pub fn hard_case(config: &Config) -> Result<(R2Data, Vec<R2Gaussian>)> {
     Ok((data, rows))
 }
 
-/// What a set sees in an iteration, in the twin's terms.
+/// Turn of a set in an iteration, in the twin's terms.
 struct Turn<'a> {
     data: &'a R2Data,
     image: usize,
@@ -121,8 +121,8 @@ impl<'a> Turn<'a> {
         Sight::of(p, &self.data.views[self.image], self.voxels.setup, self.voxels.r2)
     }
 
-    /// Gradient of what is stored from moments in the view and in the box, and how the image pulls, where it sees the
-    /// Gaussian.
+    /// Gradient of the stored parameters from the moments in the view and in the box, and the image's contribution to density
+    /// control, where it sees the Gaussian.
     fn gradient(&self, p: &Params, of_picture: [f64; 10], of_voxels: [f64; 10]) -> (Params, Option<f64>) {
         let setup = self.voxels.setup;
         let seen = self.see(p).filter(|seen| seen.pixels(setup).next().is_some());
@@ -307,7 +307,7 @@ impl Iteration<'_> {
         Ok(of)
     }
 
-    /// The device's moments, and the twin's loss.
+    /// Compares the voxels; returns the device's moments, and the twin's loss.
     fn compare_voxels(
         &self,
         shown: &[Turn<'_>],
@@ -343,7 +343,7 @@ impl Iteration<'_> {
         Ok((got.iter().map(|m| m.map(f64::from)).collect(), variation))
     }
 
-    /// Of the pictures, as [`Sight::moments`] has them.
+    /// Moments of the pictures, laid out as by [`Sight::moments`].
     fn picture_moments(&self, n: usize) -> Result<Vec<[f32; 10]>> {
         let moments = &self.fit.particles().splat_moments;
         if self.fit.setups().1.exact != 0 {
@@ -378,11 +378,11 @@ impl Iteration<'_> {
     }
 }
 
-/// What the device's pictures lead to.
+/// Results that follow from the device's pictures.
 struct OfPictures {
-    /// By the twin.
+    /// Loss, by the twin.
     loss: f64,
-    /// The device's.
+    /// Moments, by the device.
     moments: Vec<[f64; 10]>,
 }
 
@@ -415,10 +415,10 @@ fn worst_of(errors: impl Iterator<Item = f64>) -> f64 {
 
 fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("r2", "77 Gaussians, ten updates");
-    // After the fourth iteration density control would come, which finds nothing to do: it takes no step.
+    // Density control would come after the fourth iteration, but finds nothing to do: it takes no step.
     let config = small_config(&["r2.densify_every=4", "r2.densify_from=0", "r2.densify_until=5", "r2.most=60"])?;
     let (data, mut rows) = hard_case(&config)?;
-    // Nothing that is taken away.
+    // Only Gaussians that density control keeps.
     rows.retain(|g| g.position.iter().all(|x| x.abs() < 0.95) && g.density > -9.0);
     let settings = Config { r2: crate::config::sections::R2 { densify_gradient: 1e6, ..config.r2.clone() }, ..config };
     let mut fit = R2Trainer::with(gpu, data, &settings, &R2State::fresh(rows.clone()), 0)?;

@@ -22,7 +22,7 @@ const ITERATIONS: u32 = 24;
 /// Where the second run stops on its way, so that its submits differ from the first one's.
 const STOPS: [&[u32]; 2] = [&[ITERATIONS], &[5, 6, ITERATIONS]];
 
-/// Notes how many numbers of two equal runs differ. Losses come first.
+/// Records how many numbers of two equal runs differ. Losses come first.
 fn compare_runs(run: impl Fn(&[u32]) -> Result<Vec<u64>>, findings: &mut Findings) -> Result<()> {
     let [whole, parts] = [run(STOPS[0])?, run(STOPS[1])?];
     findings.require(REPEATS, "losses that change", whole.first() != whole.get(1));
@@ -31,7 +31,7 @@ fn compare_runs(run: impl Fn(&[u32]) -> Result<Vec<u64>>, findings: &mut Finding
     Ok(())
 }
 
-/// Both fields, with empty cells learned on the way.
+/// Compares runs of both fields, with empty cells learned on the way.
 ///
 /// # Errors
 /// Device errors.
@@ -53,7 +53,7 @@ fn bits_of(rows: &[Gaussian]) -> Vec<u64> {
     words.iter().map(|word| u64::from(*word)).collect()
 }
 
-/// Bits of the losses of a run with these stops on the way; `advance` goes towards one, and comes back empty when there.
+/// Bits of the losses of a run with these stops on the way; `advance` goes towards a stop, and returns nothing once there.
 fn losses(stops: &[u32], mut advance: impl FnMut(u32) -> Result<Vec<f64>>) -> Result<Vec<u64>> {
     let mut bits = Vec::new();
     for stop in stops {
@@ -68,7 +68,7 @@ fn losses(stops: &[u32], mut advance: impl FnMut(u32) -> Result<Vec<f64>>) -> Re
     Ok(bits)
 }
 
-/// Gaussians, a set per phase and one set that moves.
+/// Compares runs of Gaussians, a set per phase and one set that moves.
 ///
 /// # Errors
 /// Device errors.

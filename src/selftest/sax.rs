@@ -42,7 +42,7 @@ const VIEW: &[&str] = &[push::SaxView::SHADER];
 const NUMBERS: Tolerance = Tolerance::OfLargest(2e-5);
 /// Gradients, sums over all samples.
 const GRADIENTS: Tolerance = Tolerance::OfLargest(1e-4);
-/// What goes through all stages of drawing, from points that are not seen.
+/// Results of all stages of drawing, from sample points that are not compared themselves.
 const DRAWN: Tolerance = Tolerance::OfLargest(2e-4);
 /// Differences of depths, which f32 knows to 1e-7 of 100 mm.
 const PATHS: Tolerance = Tolerance::OfLargest(1e-4);
@@ -69,7 +69,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
     Config::load(Some(Preset::SaxNerf), None, &all)
 }
 
-/// Data, and fields of no special numbers: a grid that says something, normalisations that do something.
+/// Data, and fields without special values: a grid and normalisations that have an effect.
 ///
 /// # Errors
 /// As [`small_dataset`] and [`Plan::new`].
@@ -129,7 +129,7 @@ struct Iteration<'a> {
     field: SaxField,
 }
 
-/// What the device made of the last field's batch.
+/// Results of the device for the last field's batch.
 struct Made {
     rays: Vec<Ray>,
     points: Vec<[f32; 4]>,
@@ -272,7 +272,7 @@ impl Iteration<'_> {
         Ok(())
     }
 
-    /// The first update by the gradient that the device found.
+    /// Compares the first update, from the gradient that the device found.
     fn compare_update(&self, findings: &mut Findings) -> Result<()> {
         let (adam, row) = (&self.config.adam, schedule(&self.config)[0]);
         let n = self.field.shape.n_params();
@@ -291,7 +291,7 @@ impl Iteration<'_> {
         Ok(())
     }
 
-    /// The scatter once more by itself, as the stage behind it cleared its sums.
+    /// Compares the scatter, run once more by itself, since the stage behind it clears its sums.
     fn compare_grid(&self, made: &Made, findings: &mut Findings) -> Result<()> {
         let (setup, shape) = (self.fit.setup(), self.field.shape);
         let (n_weights, n_grid) = (setup.n_weights as usize, setup.n_grid as usize);

@@ -29,7 +29,7 @@ const GUESS: &[&str] = &[push::TreeGuess::SHADER];
 
 /// First steps of Adam, all of nearly the same length, which f32 displacements lose a little of.
 const FIRST_STEP: Tolerance = Tolerance::OfLargest(2e-3);
-/// Slopes below this make no whole first step.
+/// Minimum slope that makes a full first step.
 const STEEP: f64 = 1e-3;
 
 fn flat(all: &[DVec3]) -> Vec<f64> {
@@ -105,7 +105,7 @@ fn drawn(targets: &Targets, setup: &GaussianSetup, seen: &[Seen]) -> Vec<f64> {
     images
 }
 
-/// Gradients of grid and own motion, and the first step along them.
+/// Compares gradients of grid and own motion, and the first step along them.
 fn compare_motion(
     gpu: &Gpu,
     trainer: &TreeTrainer,
@@ -131,7 +131,7 @@ fn compare_motion(
     Ok(())
 }
 
-/// Every number that has a slope moves by its rate, against the gradient.
+/// Compares the first step: every number that has a slope moves by its rate, against the gradient.
 fn compare_step(
     stages: &[&'static str],
     got: &[f32],
@@ -146,7 +146,7 @@ fn compare_step(
     findings.numbers(stages, "first step", &f32s(&moved), &want, FIRST_STEP);
 }
 
-/// Where tracking begins: as at the phase before, and half its last step on.
+/// Compares where tracking begins: at the position of the phase before, plus half of its last step.
 fn compare_guess(
     gpu: &Gpu,
     trainer: &TreeTrainer,

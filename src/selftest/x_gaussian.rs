@@ -35,7 +35,7 @@ const REPORT: &[&str] = &[push::XReport::SHADER];
 const NUMBERS: Tolerance = Tolerance::OfLargest(1e-4);
 /// Small differences of squares: see the stages of R2-Gaussian.
 const VARIANCES: Tolerance = Tolerance::OfLargest(2e-3);
-/// What is behind a Gaussian comes from products of hundreds of shares of light, which are undone one by one.
+/// Values behind a Gaussian come from products of hundreds of shares of light, which are undone one by one.
 const BEHIND: Tolerance = Tolerance::OfLargest(5e-4);
 /// Pixels, or shares of a splat's own size.
 const SPLAT_ERROR: f64 = 1e-3;
@@ -52,7 +52,7 @@ const FAR: f64 = 0.1;
 /// Updates that are compared.
 const UPDATES: u32 = 10;
 
-/// Which numbers of a Gaussian are of one kind.
+/// Ranges of a Gaussian's numbers by kind.
 pub const TENSORS: [(&str, Range<usize>); 5] =
     [("position", 0..3), ("opacity", 3..4), ("scale", 4..7), ("intensity", 7..8), ("rotation", 8..12)];
 
@@ -265,7 +265,7 @@ impl Iteration<'_> {
         Ok(())
     }
 
-    /// The device's order; that of the host is stable, too.
+    /// Compares the device's order with that of the host, which is stable, too.
     fn compare_order(&self, findings: &mut Findings) -> Result<Vec<XKey>> {
         let (particles, n) = (self.fit.particles().0, self.state.rows.len());
         // An odd number of passes leaves them in the other buffer.
@@ -296,7 +296,7 @@ impl Iteration<'_> {
         Ok(order)
     }
 
-    /// The device's lists of each set's tiles: `[set][tile]`.
+    /// Compares the device's lists of each set's tiles, and returns them: `[set][tile]`.
     fn compare_lists(&self, order: &[XKey], findings: &mut Findings) -> Result<Vec<Vec<Vec<usize>>>> {
         let (particles, (scene, _)) = (self.fit.particles().0, self.fit.buffers());
         let (_, x) = self.fit.setups();
@@ -333,7 +333,7 @@ impl Iteration<'_> {
         Ok(all)
     }
 
-    /// The loss, and the device's sums of each Gaussian over its tiles.
+    /// Compares the pictures; returns the loss, and the device's sums of each Gaussian over its tiles.
     fn compare_pictures(&self, lists: &[Vec<Vec<usize>>], findings: &mut Findings) -> Result<(f64, Vec<Sums>)> {
         let (data, (setup, x)) = (self.fit.data(), self.fit.setups());
         let ((particles, learning), (scene, fit)) = (self.fit.particles(), self.fit.buffers());
@@ -418,14 +418,14 @@ impl Iteration<'_> {
     }
 }
 
-/// Where the sums of a Gaussian in a tile are.
+/// Index of the sums of a Gaussian in a tile.
 fn entry_of(span: &XSpan, tile: u32, tile_columns: u32) -> usize {
     let columns = (span.end & 0xffff) - (span.first & 0xffff);
     let from_first = [tile % tile_columns - (span.first & 0xffff), tile / tile_columns - (span.first >> 16)];
     (span.first_entry + from_first[1] * columns + from_first[0]) as usize
 }
 
-/// How far a splat is from where the twin has it: in pixels, or as a share of its own size.
+/// Distance of a splat from the twin's: in pixels, or as a share of its own size.
 fn splat_error(got: &Splat, want: &Projection) -> f64 {
     let blot = &want.blot;
     let conic = [blot.conic.x_axis.x, blot.conic.x_axis.y, blot.conic.y_axis.y];
@@ -441,7 +441,7 @@ fn splat_error(got: &Splat, want: &Projection) -> f64 {
 
 fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("x", "97 Gaussians, ten updates");
-    // After the fourth iteration density control would come, which finds nothing to do: it takes no step.
+    // Density control would come after the fourth iteration, but finds nothing to do: it takes no step.
     let config = small_config(&[
         "x.densify_every=4",
         "x.densify_from=0",

@@ -15,29 +15,29 @@ pub struct CorrectedFrame {
     pub correction: Correction,
     /// Correction of the frame's view; none where the view is taken as stated.
     pub view: Option<ViewCorrection>,
-    /// Where breathing has carried the heart along (left, posterior, superior), mm.
+    /// Displacement of the heart by breathing (left, posterior, superior), mm.
     pub heart_shift_mm: [f64; 3],
-    /// Projection from patient mm (left, posterior, superior) to homogeneous pixels (column, row; integers are pixel centres), rows
-    /// first: draws the vessels where this frame shows them.
+    /// Projection from patient mm (left, posterior, superior) to homogeneous pixels (column, row; integers are pixel centres),
+    /// rows first: it draws the vessels where this frame shows them.
     pub projection: [[f64; 4]; 3],
 }
 
 impl Session {
-    /// How views are corrected that training goes by; none before it begins, and of a checkpoint that was loaded.
+    /// Returns the corrections of the views that training uses; none before it begins, and for a checkpoint that was loaded.
     pub fn calibration(&self) -> Option<Calibration> {
         lock(&self.shared.calibration).clone()
     }
 }
 
 impl CorrectedFrame {
-    /// `phase` is that of the frame, which is of `view`.
+    /// Creates the corrected frame; `phase` is the frame's phase, and `view` is its view.
     pub(super) fn new(
         view: &View,
         frame: &Frame,
         phase: Option<u32>,
         calibration: &Calibration,
     ) -> Result<CorrectedFrame> {
-        // What was stated may have been changed since.
+        // The stated geometry may have been changed since.
         let corrected = calibration.views.iter().find(|c| c.view == frame.view && c.stated == view.geometry);
         let rays = match corrected {
             Some(c) => c.corrected.rays(view.size[0], view.size[1]).map_err(|(field, problem)| {

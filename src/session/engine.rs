@@ -1,4 +1,4 @@
-//! What trains a session and what is drawn of it, shared by the threads that do so.
+//! Training of a session and its source for drawing, shared by the session's threads.
 
 use crate::calibrate::calibrate;
 use crate::calibrate::correction::Calibration;
@@ -19,14 +19,14 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
-/// After taking in new frames, this many times as long passes before the next ones are taken in.
+/// Pause after taking in new frames, as a multiple of the time that took.
 const SETTLE: u32 = 4;
-/// Unless no frame has come for so long, or for as long as taking them in took last.
+/// Time without a new frame that ends the pause early; so does the time that the last intake took.
 const QUIET: Duration = Duration::from_millis(300);
-/// While others wait for the engine, training looks again after this long.
+/// Interval at which training looks again while others wait for the engine.
 const GIVE_WAY: Duration = Duration::from_micros(200);
 
-/// What the threads of a session share.
+/// State that the threads of a session share.
 pub(super) struct Shared {
     pub(super) gpu: Option<Gpu>,
     pub(super) tuning: Option<Tuning>,
@@ -34,10 +34,10 @@ pub(super) struct Shared {
     /// Rises with every change of the inbox.
     pub(super) version: AtomicU64,
     pub(super) engine: Mutex<Engine>,
-    /// Who waits for the engine, other than training in the background.
+    /// Number of threads that wait for the engine, other than training in the background.
     pub(super) visitors: AtomicU32,
     pub(super) published: Mutex<Published>,
-    /// Of the frames that training goes by; none before it begins.
+    /// Calibration of the frames that training uses; none before it begins.
     pub(super) calibration: Mutex<Option<Calibration>>,
     /// Iterations handed to the device.
     pub(super) step: AtomicU32,
@@ -54,30 +54,30 @@ pub(super) struct Engine {
     pub(super) training: Option<Training>,
     /// State to begin from where there is no trainer, and to fall back to.
     pub(super) saved: Option<Checkpoint>,
-    /// Of the inbox the trainer was built from.
+    /// Version of the inbox from which the trainer was built.
     pub(super) version: u64,
     pub(super) frames: u32,
-    /// When new frames are taken in.
+    /// Pause before new frames are taken in.
     pub(super) settling: Option<Settling>,
 }
 
-/// Frames that come one after the other are taken in together: training would do nothing else.
+/// Pause by which frames that come one after the other are taken in together: otherwise training would do nothing else.
 #[derive(Clone, Copy)]
 pub(super) struct Settling {
-    /// They wait until then.
+    /// End of the pause.
     until: Instant,
-    /// Unless none has come for so long.
+    /// Time without a new frame that ends the pause early.
     quiet: Duration,
 }
 
-/// What is drawn.
+/// Source that is drawn.
 #[derive(Default)]
 pub(super) struct Published {
     pub(super) generation: u64,
     pub(super) source: Option<Source>,
 }
 
-/// What training is doing, for those who wait for it.
+/// State of training, for those who wait for it.
 pub(super) struct Control {
     pub(super) state: State,
     pub(super) failure: Option<String>,
@@ -103,7 +103,7 @@ impl Engine {
         }
     }
 
-    /// Of the run.
+    /// Number of iterations of the run.
     pub(super) fn length(&self) -> u32 {
         self.training.as_ref().map_or(0, |t| t.trainer().plan().config.train.iterations)
     }
@@ -117,7 +117,7 @@ impl Shared {
         }
     }
 
-    /// The engine, before training in the background takes it again.
+    /// Locks the engine before training in the background takes it again.
     pub(super) fn visit(&self) -> MutexGuard<'_, Engine> {
         self.visitors.fetch_add(1, Ordering::AcqRel);
         let engine = lock(&self.engine);
@@ -142,7 +142,7 @@ impl Shared {
             (published.generation, if current { None } else { published.source.clone() })
         };
         if let Some(source) = source {
-            // The old one's memory is needed first.
+            // The memory of the old viewer must be free first.
             *viewer = None;
             *viewer = Some((generation, Live::new(gpu, &source, tuning.clone())?));
         }
@@ -281,7 +281,7 @@ impl Shared {
         }
     }
 
-    /// Training in the background.
+    /// Runs training in the background.
     pub(super) fn work(&self, observe: &mut Observer<'_>) -> Result<State> {
         lock(&self.engine).start_clock();
         loop {
@@ -330,8 +330,8 @@ impl Shared {
     }
 }
 
-/// Whether fields trained in an old scene can go on in a new one: their box holds it, and numbers are of a like size. Two networks
-/// are functions of all space, whose boxes hold rays and do not bound the fields: theirs may grow.
+/// Tells whether fields trained in an old scene can go on in a new one: their box must hold the new one, and scales must be
+/// similar. Two networks are functions of all space, whose boxes hold rays and do not bound the fields: their boxes may grow.
 fn holds(model: &Model, new: &Scene) -> bool {
     let old = &model.scene;
     let slack = 0.02 * (0..3).map(|i| old.dynamic_max[i] - old.dynamic_min[i]).fold(0.0, f64::max);

@@ -10,7 +10,7 @@ use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// What a session is about.
+/// Options of a session.
 #[derive(Debug, Clone)]
 pub struct SessionOptions {
     /// Hyper-parameters.
@@ -39,9 +39,9 @@ pub enum Moment {
 /// A calibrated angiogram.
 #[derive(Debug, Clone)]
 pub struct NewFrame {
-    /// How it was taken.
+    /// Geometry by which it was taken.
     pub geometry: Geometry,
-    /// When.
+    /// Moment at which it was taken.
     pub moment: Moment,
     /// Whether to train on it, or to score with it.
     pub split: Split,
@@ -128,7 +128,7 @@ impl Inbox {
         Ok(self.views.len() - 1)
     }
 
-    /// When in the beat a moment is, where that is known.
+    /// Returns the time in the beat of a moment, where that is known.
     pub(super) fn beat_time(&self, moment: Moment) -> Option<BeatTime> {
         match (moment, &self.r_peaks) {
             (Moment::Phase(phase), _) => Some(BeatTime::at_phase(phase)),

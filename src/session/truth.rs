@@ -1,4 +1,4 @@
-//! What a caller knows of the true vessels, and scores of a session against it and its frames for validation.
+//! True vessels that a caller knows, and scores of a session against them and against its frames for validation.
 
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
@@ -17,11 +17,11 @@ pub(super) struct Known {
 }
 
 impl Session {
-    /// Says which voxels are vessel at a phase, in place of what was said of it before; none forgets that.
-    /// [`Session::evaluate`] then has scores in 3D.
+    /// Sets which voxels are vessel at a phase, in place of an earlier statement; `None` removes it. [`Session::evaluate`] then
+    /// has scores in 3D.
     ///
     /// # Errors
-    /// [`Error::Config`] for a phase that there is not, or a grid that its voxels do not fit or that has too many.
+    /// [`Error::Config`] for a phase that does not exist, or a grid that does not fit its voxels or has too many.
     pub fn set_true_vessels(&self, phase: u32, vessels: Option<TrueVessels>) -> Result<()> {
         self.check_phase(phase)?;
         let Some(vessels) = vessels else {
@@ -41,13 +41,13 @@ impl Session {
         Ok(())
     }
 
-    /// Says where the true centrelines are at each phase and how wide the vessels, in place of what was said before.
-    /// [`Session::evaluate`] then finds the vessels as trees and scores those; where a line is the same at all phases, point i of
-    /// it must be the same material point.
+    /// Sets the true centrelines and vessel widths at each phase, in place of an earlier statement. [`Session::evaluate`] then
+    /// finds the vessels as trees and scores those; where a line is the same at all phases, point i of it must be the same
+    /// material point.
     ///
     /// # Errors
-    /// [`Error::Config`] for a phase that there is not, where phase 0 is missing or phases differ in their lines, and for what is
-    /// no line.
+    /// [`Error::Config`] for a phase that does not exist, where phase 0 is missing or phases differ in their lines, and for
+    /// invalid lines.
     pub fn set_true_trees(&self, trees: BTreeMap<u32, Vec<TrueLine>>) -> Result<()> {
         trees.keys().try_for_each(|phase| self.check_phase(*phase))?;
         check_lines(&trees)?;
@@ -63,9 +63,9 @@ impl Session {
         Err(Error::config("phase", phase, format!("phases go from 0 to {}", phases.saturating_sub(1))))
     }
 
-    /// Scores the frames that were added for validation, and what was reconstructed against the true vessels where these are
-    /// known: where they were said to be, whatever calibration did to the views. `threshold_per_mm` replaces the rule for the
-    /// threshold from which the moving field counts as vessel.
+    /// Scores the frames that were added for validation, and the reconstruction against the true vessels where these are known,
+    /// at their stated places, whatever calibration did to the views. `threshold_per_mm` replaces the rule for the threshold
+    /// from which the dynamic field counts as vessel.
     ///
     /// # Errors
     /// [`Error::Data`] without such frames; as [`Session::render`] and [`Session::trees`].

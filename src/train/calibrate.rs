@@ -23,12 +23,12 @@ pub struct Verdict {
 }
 
 impl Verdict {
-    /// The faster path.
+    /// Returns the faster path.
     pub fn layers(&self) -> Layers {
         if self.matrices_ms < self.f32_ms { Layers::Matrices } else { Layers::F32 }
     }
 
-    /// `tuning` on the faster path, and why.
+    /// Returns `tuning` on the faster path, with the reason.
     pub fn apply(&self, tuning: Tuning) -> Tuning {
         let text = format!(
             "{} layers: {:.3} ms per iteration in f32, {:.3} ms on matrices, timed once on this device",
@@ -43,7 +43,7 @@ impl Verdict {
     }
 }
 
-/// Both paths after the same warming up: the first must not pay for clocks that rise.
+/// Both paths are timed after the same warm-up: the first must not pay for clocks that rise.
 const PACE: Pace = Pace { warm_up_s: 0.5, repeats: 5, length: Length::Seconds(0.05) };
 
 /// Times both paths on the task at hand.
@@ -60,7 +60,7 @@ pub fn measure(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -
 
 const FILE: &str = "paths.json";
 
-/// What a verdict holds for.
+/// Key of the device, driver and network that a verdict holds for.
 fn key(info: &DeviceInfo, config: &Config) -> String {
     let (d, rays, samples) = (&config.dynamic, config.train.rays, config.march.dynamic_samples);
     let networks = if config.two_networks() { "two networks of " } else { "" };

@@ -9,14 +9,14 @@ use crate::plan::fit;
 use crate::plan::targets::Targets;
 use crate::train::tree::TreeTrainer;
 
-/// A tree that explains less of the images of a view or a phase does not know that view or phase.
+/// Minimum share of the images of each view and phase that an earlier tree must explain to be carried over.
 const LEAST_EXPLAINED: f64 = 0.7;
 
-/// What became of an attempt to go on.
+/// Result of an attempt to go on.
 pub(super) enum Carried {
     /// The fit goes on from the earlier tree.
     On(Box<TreeTrainer>),
-    /// The earlier tree is none of these images: they are to be fitted anew.
+    /// The earlier tree does not explain these images: they are to be fitted anew.
     Anew(Box<Targets>),
 }
 
@@ -33,7 +33,7 @@ impl Carried {
         let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
         let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
         let has_room = fit::carried_step(&config.gaussians) < config.gaussian_iterations();
-        // Another view tells more than a fit that does without it can take in.
+        // An additional view tells more than a fit that was done without it can take in.
         let seen_alike = was.n_views as usize == targets.n_views;
         if !(phases_alike && rests_alike && seen_alike && has_room) || earlier.rest.rows.is_empty() {
             return Ok(Carried::anew(targets));
@@ -56,7 +56,7 @@ impl Carried {
     }
 }
 
-/// Share of what vessels are known to add to the images that a field explains: the least of all views and phases; none
+/// Share of what vessels are known to add to the images that a field explains: the minimum over all views and phases; none
 /// where nothing is known. `drawn` is `[image][pixel]`, shares of the strongest change.
 fn least_explained(targets: &Targets, drawn: &[f32]) -> Option<f64> {
     let shares = |images: &mut dyn Iterator<Item = usize>| -> Option<f64> {

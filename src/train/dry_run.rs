@@ -26,7 +26,8 @@ pub struct DryRun {
 /// Runs through all events of a configuration's schedule.
 ///
 /// # Errors
-/// [`crate::error::Error::Diverged`] when a loss or a parameter is not finite; errors of the configuration, the data and the device.
+/// [`crate::error::Error::Diverged`] when a loss or a parameter is not finite; errors of the configuration, the data and the
+/// device.
 pub fn dry_run(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning) -> Result<DryRun> {
     let short = config.of_dry_run()?;
     let iterations = short.train.iterations;

@@ -81,17 +81,17 @@ impl GaussianTrainer {
         self.step
     }
 
-    /// Gaussians of all phases.
+    /// Number of Gaussians of all phases.
     pub fn count(&self) -> u32 {
         self.n
     }
 
-    /// What the run is fitted to.
+    /// Targets of the run.
     pub fn targets(&self) -> &Targets {
         &self.targets
     }
 
-    /// The same, when the run is over.
+    /// Returns the targets when the run is over.
     pub(super) fn into_targets(self) -> Targets {
         self.targets
     }
@@ -106,13 +106,13 @@ impl GaussianTrainer {
         &self.particles
     }
 
-    /// What is fitted to on the device, for tests.
+    /// Target buffers on the device, for tests.
     pub fn target_buffers(&self) -> &TargetBuffers {
         &self.buffers
     }
 
-    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the losses
-    /// of the iterations done. An empty list means the target was reached before.
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
+    /// losses of the iterations done. An empty list means the target was reached before.
     ///
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite; device errors.
@@ -142,15 +142,15 @@ impl GaussianTrainer {
         losses(&self.gpu, &self.buffers.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
 
-    /// Estimates the still background anew from what the Gaussians leave of the images, and with it the bounds of the
+    /// Estimates the static background anew from what the Gaussians leave of the images, and with it the bounds of the
     /// fit's targets.
     pub(super) fn renew_background(&mut self) -> Result<()> {
         let images = self.images()?;
         renew_bounds(&self.gpu, &mut self.targets, &self.buffers, &self.setup, &images)
     }
 
-    /// Drops weak Gaussians and places new ones where data are missing. Once in a run, so it is the host's work: it needs
-    /// the hull's cells and a weighted draw, a few megabytes each way.
+    /// Drops weak Gaussians and places new ones where data are missing. This happens once in a run, so the host does it: it
+    /// needs the hull's cells and a weighted draw, a few megabytes each way.
     fn grow(&mut self) -> Result<()> {
         let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
         particles.retain(&strong(&particles.rows, &self.setup, self.settings.weakest));
@@ -160,14 +160,14 @@ impl GaussianTrainer {
         self.replace(&particles)
     }
 
-    /// Drops what is too faint for vessels: it stands for what else moves.
+    /// Drops Gaussians that are too faint for vessels: they stand for other motion.
     fn clear(&mut self) -> Result<()> {
         let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
         particles.retain(&dense(&particles.rows, &self.setup, self.settings.faint));
         self.replace(&particles)
     }
 
-    /// Drops what is alone and broad.
+    /// Drops Gaussians that are alone and broad.
     fn drop_strays(&mut self) -> Result<()> {
         let mut particles = self.particles.download(&self.gpu, self.n as usize)?;
         particles.retain(&vessels(&particles.rows, &self.setup, self.settings.link));
@@ -227,7 +227,7 @@ impl GaussianTrainer {
         pass_times(&self.gpu, recording)
     }
 
-    /// What the last iteration cost.
+    /// Work of the last iteration.
     ///
     /// # Errors
     /// Device errors.
@@ -237,15 +237,15 @@ impl GaussianTrainer {
     }
 }
 
-/// Most passes of an iteration that is timed.
+/// Maximum number of passes of a timed iteration.
 pub(super) const MAX_PASSES: u32 = 64;
 
-/// Which Gaussians show more than the weakest that is kept.
+/// Tells which Gaussians show more than the weakest that is kept.
 pub(super) fn strong(rows: &[Gaussian], setup: &GaussianSetup, weakest: f64) -> Vec<bool> {
     rows.iter().map(|g| amplitude(g, setup) > weakest).collect()
 }
 
-/// Their number; none, or too many, cannot be fitted.
+/// Returns the number of Gaussians; refuses none and too many.
 pub(super) fn check_count(particles: &Particles) -> Result<u32> {
     let n = particles.rows.len();
     if n == 0 {

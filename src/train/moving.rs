@@ -1,4 +1,4 @@
-//! Gaussians of a run: their fit, and what they leave of the images to the still field.
+//! Gaussians of a run: their fit, and what they leave of the images to the static field.
 
 use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
@@ -24,14 +24,14 @@ use crate::train::x_gaussian::XTrainer;
 use crate::x_gaussian::data::XData;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Iterations of R2-Gaussian and X-Gaussian after which those who draw the field get it anew: of half a million Gaussians per
-/// phase that takes as long as some iterations.
+/// Iterations of R2-Gaussian and X-Gaussian between updates of the field that is drawn: with half a million Gaussians per phase
+/// an update takes as long as some iterations.
 const SHOWN_EVERY: u32 = 100;
 
-/// What Gaussians are fitted to.
+/// Data that Gaussians are fitted to.
 #[derive(Clone)]
 pub(super) enum FitData {
-    /// Bounds of the moving field's images.
+    /// Bounds of the dynamic field's images.
     Targets(Box<Targets>),
     /// Whole images.
     R2(Box<R2Data>),
@@ -40,7 +40,7 @@ pub(super) enum FitData {
 }
 
 impl FitData {
-    /// What a plan has; none where the network moves.
+    /// Takes the fit data of a plan; none where a network is the dynamic field.
     pub(super) fn take(plan: &mut Plan) -> Option<FitData> {
         let r2 = plan.r2.take().map(|data| FitData::R2(Box::new(data)));
         let x = plan.x.take().map(|data| FitData::X(Box::new(data)));
@@ -52,7 +52,7 @@ impl FitData {
 pub(super) enum MovingFit {
     /// A set per phase.
     PerPhase(Box<GaussianTrainer>),
-    /// One set for the beat, on its way.
+    /// One set for the beat, in preparation.
     Start(Box<TreeStart>),
     /// One set for the beat.
     Tree(Box<TreeTrainer>),
@@ -63,7 +63,7 @@ pub(super) enum MovingFit {
 }
 
 impl MovingFit {
-    /// Begins a fit, and what is to be said of its beginning.
+    /// Begins a fit; returns it, and notes about its beginning for the user.
     ///
     /// # Errors
     /// As [`R2Trainer::new`], [`XTrainer::new`], [`GaussianTrainer::new`] and [`TreeStart::new`].
@@ -106,7 +106,7 @@ impl MovingFit {
         MovingFit::new(gpu, targets, config)
     }
 
-    /// Whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
+    /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
     fn is_presentable(&self, end: u32) -> bool {
         match self {
             MovingFit::PerPhase(fit) => fit.step() >= end / 2,
@@ -126,7 +126,7 @@ impl MovingFit {
         }
     }
 
-    /// Share done of what comes before the first iteration; none when that has begun.
+    /// Share done of the preparation before the first iteration; none when that has begun.
     pub(super) fn preparation(&self) -> Option<f64> {
         match self {
             MovingFit::Start(start) => Some(start.share()),
@@ -134,7 +134,7 @@ impl MovingFit {
         }
     }
 
-    /// Runs some iterations towards `until`; their losses. None while a tree is on its way.
+    /// Runs some iterations towards `until`; returns their losses, none while a tree is in preparation.
     ///
     /// # Errors
     /// As [`GaussianTrainer::advance`] and [`TreeStart::advance`].
@@ -167,7 +167,7 @@ impl MovingFit {
         })
     }
 
-    /// Gaussians that there are.
+    /// Number of Gaussians.
     pub(super) fn count(&self) -> u32 {
         match self {
             MovingFit::PerPhase(fit) => fit.count(),
@@ -178,7 +178,7 @@ impl MovingFit {
         }
     }
 
-    /// What it fits.
+    /// Form of the field that it fits.
     pub(super) fn form(&self) -> GaussianForm {
         match self {
             MovingFit::PerPhase(_) => GaussianForm::Phase,
@@ -202,7 +202,7 @@ impl MovingFit {
         }
     }
 
-    /// What the last iteration cost.
+    /// Work of the last iteration.
     ///
     /// # Errors
     /// Device errors.
@@ -221,22 +221,22 @@ fn not_begun() -> Error {
     Error::Internal("the tree's iterations have not begun".into())
 }
 
-/// The moving field of a run, where it is made of Gaussians.
+/// The dynamic field of a run, where it is made of Gaussians.
 pub(super) struct Moving {
-    /// Until its iterations are done; the still field begins then.
+    /// Fit, until its iterations are done; the static field begins then.
     fit: Option<MovingFit>,
     feed: MovingFeed,
-    /// What is shown is of earlier data, until the fit has something better.
+    /// Whether the field of earlier data is shown, until the fit has a better one.
     shows_earlier: bool,
-    /// Where each training image was taken, and when: counted in phases.
+    /// View of each training image, and its time, counted in phases.
     shots: Vec<(ViewRays, f64)>,
 }
 
 impl Moving {
-    /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where the network
-    /// moves. A fit that was saved half way is done again up to there: that takes seconds and comes to the same bits, however
-    /// many iterations go into a submit (but for one that had gone on from an earlier tree, which begins from seeds). A field that
-    /// was fitted to `earlier` data is shown, and gone on from, where it can be.
+    /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where a network is
+    /// the dynamic field. A fit that was saved half way is repeated up to there: that takes seconds and gives the same bits,
+    /// however many iterations go into a submit (except for one that had gone on from an earlier tree, which begins from
+    /// seeds). A field that was fitted to `earlier` data is shown, and gone on from, where it can be.
     ///
     /// # Errors
     /// As [`MovingFit::new`], and as [`TreeStart::advance`] for what is done again.
@@ -356,17 +356,17 @@ impl Moving {
         self.fit.as_ref().map(MovingFit::step)
     }
 
-    /// Share done of what comes before the first iteration; none when that has begun.
+    /// Share done of the preparation before the first iteration; none when that has begun.
     pub(super) fn preparation(&self) -> Option<f64> {
         self.fit.as_ref().and_then(MovingFit::preparation)
     }
 
-    /// Whether iterations of the fit are left.
+    /// Tells whether iterations of the fit are left.
     pub(super) fn is_fitting(&self) -> bool {
         self.fit.is_some()
     }
 
-    /// For those who draw the field.
+    /// Feed for those who draw the field.
     pub(super) fn feed(&self) -> MovingFeed {
         self.feed.clone()
     }
@@ -376,7 +376,7 @@ impl Moving {
         self.feed.lock().unwrap_or_else(PoisonError::into_inner).1.clone()
     }
 
-    /// Runs some iterations towards `until`, and ends the fit after `end` of them; their losses.
+    /// Runs some iterations towards `until`, and ends the fit after `end` of them; returns their losses.
     ///
     /// # Errors
     /// As [`MovingFit::advance`].
@@ -391,7 +391,7 @@ impl Moving {
             return Ok(losses);
         }
         let field = fit.field()?;
-        // No still field comes after R2-Gaussian's and X-Gaussian's.
+        // No static field follows R2-Gaussian and X-Gaussian.
         if fit.step() >= end && !is_alone {
             self.fit = None;
         }

@@ -37,7 +37,7 @@ pub struct R2Trainer {
 }
 
 impl R2Trainer {
-    /// Begins where the settings say, and what is to be said of that.
+    /// Begins where the settings say; returns the run, and notes about its beginning for the user.
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings; device errors.
@@ -78,12 +78,12 @@ impl R2Trainer {
         self.step
     }
 
-    /// Gaussians of all sets.
+    /// Number of Gaussians of all sets.
     pub fn count(&self) -> u32 {
         self.n
     }
 
-    /// What the run is fitted to.
+    /// Data of the run.
     pub fn data(&self) -> &R2Data {
         &self.data
     }
@@ -98,12 +98,12 @@ impl R2Trainer {
         &self.particles
     }
 
-    /// All else on the device, for tests.
+    /// Other buffers on the device, for tests.
     pub fn buffers(&self) -> &R2Buffers {
         &self.buffers
     }
 
-    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
     /// losses of the iterations done, each the mean over the sets. An empty list means the target was reached before.
     ///
     /// # Errors
@@ -123,7 +123,7 @@ impl R2Trainer {
         Ok(losses)
     }
 
-    /// Adds and takes away Gaussians. Rare enough for the host, which draws children in f64.
+    /// Adds and removes Gaussians. This is rare enough for the host, which draws children in f64.
     fn densify(&mut self) -> Result<()> {
         let (r2, n_sets) = (&self.config.r2, self.data.n_sets());
         let state = densified(&self.state()?, n_sets, r2, self.config.seed, self.step);
@@ -135,7 +135,7 @@ impl R2Trainer {
         Ok(())
     }
 
-    /// The state after the iterations done: what a resumed run goes on from.
+    /// The state after the iterations done, from which a resumed run goes on.
     ///
     /// # Errors
     /// [`Error::Diverged`] when a parameter is not finite; device errors.
@@ -163,7 +163,7 @@ impl R2Trainer {
     /// # Errors
     /// [`Error::Internal`] when the fit is over; device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        // The schedule has a row more than iterations, for this.
+        // The schedule has one more row than iterations for this.
         if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
         }
@@ -178,7 +178,7 @@ impl R2Trainer {
         Ok(times)
     }
 
-    /// What the last iteration cost, but for voxels.
+    /// Work of the last iteration, without voxels.
     ///
     /// # Errors
     /// Device errors.
@@ -192,12 +192,12 @@ impl R2Trainer {
     }
 }
 
-/// Gaussians of a set, at most, so that those of all fit the device's buffers.
+/// Maximum number of Gaussians of a set, such that all sets fit the device's buffers.
 fn most_of_set(gpu: &Gpu, data: &R2Data) -> u32 {
     gpu.info().max_storage_buffer_range / size_of::<R2Gaussian>() as u32 / data.n_sets() as u32
 }
 
-/// Their number; a set without any cannot be fitted.
+/// Returns the number of Gaussians; refuses a set without any.
 fn check_count(state: &R2State, data: &R2Data) -> Result<u32> {
     let mut counts = vec![0usize; data.n_sets()];
     for g in &state.rows {

@@ -3,7 +3,7 @@
 //! batch -> march_count -> march_scan -> march_emit -> network forward -> march_loss -> gradient_static, network backward
 //! -> gradient_network -> adam -> report
 //!
-//! Where the still field is a network, too, `march_fwd_samples`, `loss_samples` and its backward passes take the place of
+//! Where the static field is a network, too, `march_fwd_samples`, `loss_samples` and its backward passes take the place of
 //! `march_loss`, and its gradient that of `gradient_static`.
 //!
 //! Nothing here waits for the host: counters, schedules and random numbers live on the device.
@@ -32,9 +32,9 @@ buffer_set! {
         frames,
         /// Line integrals of all training images.
         images,
-        /// Still backgrounds of each view: lower and upper bound per pixel.
+        /// Static backgrounds of each view: lower and upper bound per pixel.
         backgrounds,
-        /// How much each pixel of each view changes, where two networks are the fields.
+        /// Change of each pixel of each view, where two networks are the fields.
         pixel_changes,
         /// Rays that meet the hull, then those that are not hidden, where some are.
         listed_rays,
@@ -60,7 +60,7 @@ buffer_set! {
 }
 
 impl TrainingBuffers {
-    /// Buffers filled from the plan, else undefined.
+    /// Creates the buffers; those that the plan has no content for are left undefined.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
@@ -150,7 +150,7 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
         network.record_backward(pass, chunk)?;
     }
     if let Some(still) = pass.still {
-        // After the moving network's backward passes, which begin beside its last one.
+        // After the dynamic network's backward passes, which begin beside its last one.
         still.record_gradient(pass)?;
     }
     network.record_gradient(pass)?;
@@ -158,7 +158,7 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
     pass.run(&k.report, Groups::Direct([1, 1, 1]), push::Report { n_tv_parts: tv_parts(pass.params) })
 }
 
-/// Parts that the total variation comes in, one per workgroup of `gradient_static`; none where the still field is a network.
+/// Number of parts of the total variation, one per workgroup of `gradient_static`; 0 where the static field is a network.
 pub fn tv_parts(params: &ParamMap) -> u32 {
     if params.still.is_some() { 0 } else { (params.static_len as u32).div_ceil(push::GradientStatic::LOCAL_SIZE) }
 }

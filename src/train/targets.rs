@@ -41,7 +41,7 @@ pub(super) fn target_buffers(
     Ok(buffers)
 }
 
-/// Bounds by the background that `images` of the field leave, on the host and on the device.
+/// Computes bounds from the background that the field's `images` leave, on the host and on the device.
 pub(super) fn renew_bounds(
     gpu: &Gpu,
     targets: &mut Targets,
@@ -56,7 +56,7 @@ pub(super) fn renew_bounds(
     Ok(())
 }
 
-/// Images, each filled up to the stride with zeros, which residuals of nothing are.
+/// Images, each padded with zeros up to the stride.
 pub(super) fn padded(values: &[f32], targets: &Targets, setup: &GaussianSetup) -> Vec<f32> {
     let fill = vec![0.0; setup.image_stride as usize - targets.n_pixels()];
     values.chunks(targets.n_pixels()).flat_map(|image| image.iter().chain(&fill)).copied().collect()

@@ -20,23 +20,23 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// How long is measured.
+/// Duration of a measurement.
 #[derive(Debug, Clone, Copy)]
 pub struct Pace {
-    /// Least time of iterations before any is timed, seconds: the clocks of a GPU take some to come to rest.
+    /// Minimum time of iterations before any is timed, seconds: the clocks of a GPU take some to come to rest.
     pub warm_up_s: f64,
     /// Timed repeats.
     pub repeats: u32,
-    /// Length of one.
+    /// Length of one repeat.
     pub length: Length,
 }
 
 /// Length of a timed repeat.
 #[derive(Debug, Clone, Copy)]
 pub enum Length {
-    /// So many iterations; of Gaussians, as many of a fit's first at most.
+    /// This many iterations; for Gaussians, at most this many of a fit's first ones.
     Iterations(u32),
-    /// About so many seconds; of Gaussians, whole fits, as many as fill all repeats, and three at least.
+    /// About this many seconds; for Gaussians, whole fits, as many as fill all repeats, and three at least.
     Seconds(f64),
 }
 
@@ -51,13 +51,13 @@ pub struct Timing {
     pub network_gflop: f64,
     /// Host CPU seconds per second of training, all threads of the process; a CPU driver's work is among them.
     pub host_cpu_share: Option<f64>,
-    /// Iterations of each repeat; not told in reports of before.
+    /// Iterations of each repeat; missing in older reports.
     #[serde(default)]
     pub iterations: u32,
-    /// Iterations that the fields had learned for before the first repeat.
+    /// Iterations of training before the first repeat.
     #[serde(default)]
     pub learned: u32,
-    /// Clock, power and temperature meanwhile, where the system tells.
+    /// Clock, power and temperature meanwhile, where the system reports them.
     #[serde(default)]
     pub readings: Option<Readings>,
 }
@@ -85,10 +85,10 @@ pub struct GaussianTiming {
     pub host_cpu_share: Option<f64>,
     /// Work of the last timed iteration.
     pub work: GaussianWork,
-    /// Iterations of each repeat; not told in reports of before.
+    /// Iterations of each repeat; missing in older reports.
     #[serde(default)]
     pub iterations: u32,
-    /// Clock, power and temperature meanwhile, where the system tells.
+    /// Clock, power and temperature meanwhile, where the system reports them.
     #[serde(default)]
     pub readings: Option<Readings>,
 }
@@ -106,7 +106,7 @@ fn median(ms: &[f64]) -> f64 {
     sorted[sorted.len() / 2]
 }
 
-/// CPU time this process has used, where the system tells (Linux).
+/// CPU time this process has used, where the system reports it (Linux).
 fn cpu_time() -> Option<Duration> {
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
     // Fields after the command, which may hold blanks and ends at the last parenthesis: 12 and 13 are ticks of 10 ms.
@@ -115,7 +115,7 @@ fn cpu_time() -> Option<Duration> {
     Some(Duration::from_millis(10 * ticks))
 }
 
-/// What the host and the device showed while something ran.
+/// State of the host and the device at the beginning of a measurement.
 struct Meanwhile {
     cpu: Option<Duration>,
     begin: Instant,
@@ -127,7 +127,7 @@ impl Meanwhile {
         Meanwhile { cpu: cpu_time(), begin: Instant::now(), watch: Watch::begin(gpu.info()) }
     }
 
-    /// CPU seconds per second, and the device's sensors.
+    /// Returns CPU seconds per second, and the readings of the device's sensors.
     fn end(self) -> (Option<f64>, Option<Readings>) {
         let share =
             |(before, after): (Duration, Duration)| (after - before).as_secs_f64() / self.begin.elapsed().as_secs_f64();
@@ -141,9 +141,9 @@ pub type Passes = BTreeMap<String, PassMean>;
 /// All passes of a stage in an iteration.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct PassMean {
-    /// How many there are.
+    /// Number of them.
     pub count: f64,
-    /// Milliseconds of all of them, each kept apart from the others.
+    /// Milliseconds of all of them, each timed apart from the others.
     pub ms: f64,
 }
 
@@ -156,7 +156,7 @@ fn add_passes(means: &mut Passes, passes: Vec<PassTime>, iterations: u32) {
     }
 }
 
-/// A run to time. It learns, slowly, so that operands are those of a field that has learned something and a schedule's high
+/// A run to time. It learns slowly, so that operands are those of a field that has learned something and a schedule's high
 /// rates cannot make it diverge; all bands of the encoding are open.
 pub struct Subject {
     gpu: Gpu,
@@ -167,16 +167,16 @@ pub struct Subject {
     most: u32,
 }
 
-/// Share of its last learning rates that a timed run learns with.
+/// Learning rate of a timed run, as a share of the last rates of its configuration.
 const SLOWLY: f64 = 0.1;
-/// Iterations that a schedule is made for, at most; nothing is timed longer.
+/// Maximum number of iterations that a schedule is made for; nothing is timed longer.
 const MOST_ITERATIONS: u32 = 300_000;
-/// Iterations before anything is timed, at least: a CPU's driver compiles in the first.
+/// Minimum number of iterations before anything is timed: a CPU's driver compiles in the first.
 const WARM_UP: u32 = 4;
 
 impl Subject {
     /// Prepares a run of a configuration, with the network on or off throughout; where Gaussians move, it is off, and the
-    /// run is that of the still field after them.
+    /// run is that of the static field after them.
     ///
     /// # Errors
     /// Errors of the configuration, the data and the device.
@@ -192,7 +192,7 @@ impl Subject {
         if let Some(method) = methods::of(&config) {
             method.lower_rates(&mut config, SLOWLY);
         }
-        // As few Gaussians' iterations as can be, which leave the still field the same work.
+        // The minimum number of Gaussians' iterations, which leave the static field the same work.
         config.gaussians.iterations = 1;
         config.tree = Tree { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.tree };
         config.dynamic.delay = if with_network { 0 } else { config.train.iterations };
@@ -224,12 +224,12 @@ impl Subject {
         self.cost
     }
 
-    /// Least work of an iteration's stages with so many live samples.
+    /// Minimum work of an iteration's stages with `live_samples` live samples.
     pub fn work(&self, live_samples: u64) -> Ledger {
         self.trainer.work(live_samples)
     }
 
-    /// Runs so many iterations; live samples of all of them.
+    /// Runs `n` iterations; returns the live samples of all of them.
     fn run(&mut self, n: u32) -> Result<u64> {
         let target = self.trainer.step() + n;
         let mut live = 0;
@@ -263,7 +263,7 @@ impl Subject {
         Ok(Timing { ms, live_samples, network_gflop, host_cpu_share, iterations, learned, readings })
     }
 
-    /// Runs for so many seconds, an iteration at least; milliseconds of one.
+    /// Runs for this many seconds, an iteration at least; returns the milliseconds of one.
     fn warm_up(&mut self, seconds: f64) -> Result<f64> {
         let (begin, mut done) = (Instant::now(), 0);
         while done == 0 || (begin.elapsed().as_secs_f64() < seconds && self.trainer.step() < self.most / 2) {
@@ -299,26 +299,26 @@ pub struct GaussianSubject {
     notes: Vec<String>,
 }
 
-/// Iterations of R2-Gaussian and X-Gaussian that are timed, of thousands that come before their Gaussians become more.
+/// Timed iterations of R2-Gaussian and X-Gaussian, out of thousands that come before their Gaussians become more.
 const ALONE_TIMED: u32 = 200;
 
-/// Fits at least: one says nothing of how they differ.
+/// Minimum number of fits: one says nothing of how they differ.
 const LEAST_FITS: usize = 3;
 
 /// A fit that was timed.
 struct TimedFit {
     fit: MovingFit,
     preparation_s: f64,
-    /// Per iteration.
+    /// Milliseconds per iteration.
     ms: f64,
 }
 
 impl GaussianSubject {
-    /// Prepares fits of a configuration whose moving field is made of Gaussians, of which `profiled` more iterations may be
+    /// Prepares fits of a configuration whose dynamic field is made of Gaussians, of which `profiled` more iterations may be
     /// timed pass by pass.
     ///
     /// # Errors
-    /// [`Error::Config`] where the network moves; errors of the configuration and the data.
+    /// [`Error::Config`] where a network is the dynamic field; errors of the configuration and the data.
     pub fn new(
         gpu: &Gpu,
         config: &Config,

@@ -35,7 +35,7 @@ use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use std::collections::VecDeque;
 use std::time::Instant;
 
-/// Where the ring has the report of the last of `step` iterations, bytes.
+/// Offset in the ring of the report of the last of `step` iterations, bytes.
 fn last_report_at(step: u32) -> u64 {
     u64::from(step.saturating_sub(1) % RING_LENGTH) * REPORT_BYTES
 }
@@ -52,20 +52,20 @@ pub struct Trainer {
     plan: Plan,
     kernels: Kernels,
     network: Network,
-    /// The still field, where it is a network as well.
+    /// The static field, where it is a network as well.
     still: Option<StillNetwork>,
     forward: ForwardBuffers,
     training: TrainingBuffers,
-    /// Gaussians, where they are the moving field.
+    /// Gaussians, where they are the dynamic field.
     moving: Option<Moving>,
-    /// Fit of a method with a room of its own, which is all there is then.
+    /// Fit of a method of `crate::methods`, which is then the only fit.
     fit: Option<Box<dyn Fit>>,
     pace: SubmitPace,
     /// When the last submit was done, or the one under way began.
     last_completion: Instant,
     /// An iteration of fields that rays are marched through; none where Gaussians are all there is.
     single: Option<Commands>,
-    /// As many of them as a submit takes, once that is known.
+    /// Several iterations in one recording, as many as a submit takes, once that is known.
     several: Option<(Commands, u32)>,
     in_flight: VecDeque<(Ticket, u32)>,
     submitted: u32,
@@ -90,8 +90,8 @@ fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
     Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
 }
 
-/// Begins the fit of a method with a room of its own to the plan's data, or goes on from what was `saved` of one to the same data;
-/// none of other methods.
+/// Begins the fit of a method of `crate::methods` to the plan's data, or goes on from what was `saved` of one to the same data;
+/// none for other methods.
 fn begin_fit(gpu: &Gpu, plan: &mut Plan, saved: Option<&Checkpoint>, per_submit: u32) -> Result<Option<Box<dyn Fit>>> {
     let Some(data) = plan.fit.take() else { return Ok(None) };
     let mut config = plan.config.clone();
@@ -179,8 +179,8 @@ impl Trainer {
         Self::start(gpu, plan, dataset, tuning, Some(checkpoint), None)
     }
 
-    /// Continues a run on other images than it was begun on, as when more of them arrived. Gaussians go on from those so far where
-    /// these explain every view and phase, and are fitted anew elsewhere.
+    /// Continues a run on other images than it was begun on, for example when more of them arrived. Gaussians go on from those
+    /// so far if these explain every view and phase, and are fitted anew otherwise.
     ///
     /// # Errors
     /// [`Error::Config`] when parameters and plan do not fit; device errors.
@@ -224,11 +224,11 @@ impl Trainer {
             gpu.upload(&training.moments, 0, &saved.moments)?;
             now.step = saved.model.step;
             now.stopped = u32::from(saved.stopped);
-            // A run whose learning has ended repeats what came last; one of before this was kept repeats zeros.
+            // A run whose learning has ended repeats its last report; a checkpoint without that report repeats zeros.
             if saved.stopped && saved.last_report.len() * 4 == REPORT_BYTES as usize {
                 gpu.upload(&training.ring, last_report_at(now.step), &saved.last_report)?;
             }
-            // One of another size, as of an older version, starts anew.
+            // Occupancy of another size, from an older version, starts anew.
             if saved.occupancy.len() as u64 * 4 == occupancy_bytes(&plan.setup) && !saved.occupancy.is_empty() {
                 gpu.upload(&forward.occupancy, 0, &saved.occupancy)?;
             }
@@ -246,7 +246,7 @@ impl Trainer {
         let fit = begin_fit(gpu, &mut plan, of_these_data, per_submit)?;
         let of_fit = moving.as_ref().and_then(Moving::step).or(fit.as_ref().map(|fit| fit.step()));
         let step = of_fit.unwrap_or(now.step);
-        // The still field's iterations follow those of Gaussians, which may have begun anew.
+        // The static field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
         let record_single = || {
@@ -303,7 +303,7 @@ impl Trainer {
         self.completed
     }
 
-    /// What the run was prepared from.
+    /// Plan that the run was prepared from.
     pub fn plan(&self) -> &Plan {
         &self.plan
     }
@@ -323,7 +323,7 @@ impl Trainer {
         &self.training
     }
 
-    /// The still field's network, where it is one, for tests.
+    /// Network of the static field, where it is one, for tests.
     pub fn still(&self) -> Option<&StillNetwork> {
         self.still.as_ref()
     }
@@ -333,8 +333,8 @@ impl Trainer {
         self.single.as_ref().map(Commands::barriers)
     }
 
-    /// Least work of an iteration's stages with so many live samples. What of the still tensor field is looked up stays in caches,
-    /// so its stages over samples are not among them.
+    /// Minimum work of an iteration's stages with `live_samples` live samples. Values looked up in the static tensor field stay
+    /// in caches, so its stages over samples are not included.
     pub fn work(&self, live_samples: u64) -> Ledger {
         let mut ledger = self.network.work(live_samples);
         for (stage, work) in self.still.iter().flat_map(|still| still.network().work(live_samples)) {
@@ -362,7 +362,7 @@ impl Trainer {
         if self.in_flight.is_empty() {
             self.last_completion = Instant::now();
         }
-        // The network's iterations are others than those before it starts: when these are done, they are tried anew.
+        // Iterations change when the network starts: when those before it are done, the number per submit is tried anew.
         let starts = self.plan.config.dynamic.delay;
         while let Some(single) = &self.single {
             let is_starting = self.submitted == starts && self.completed < starts;
@@ -389,7 +389,7 @@ impl Trainer {
         self.read_losses()
     }
 
-    /// Submits under way at once: one while it is seen how long they take.
+    /// Submits under way at once: one while their duration is being measured.
     fn submits_in_flight(&self) -> usize {
         if self.pace.is_trying() { 1 } else { submits_in_flight(&self.gpu) }
     }
@@ -422,17 +422,17 @@ impl Trainer {
         }
     }
 
-    /// Share done of what comes before the first iteration; none when that has begun.
+    /// Share done of the preparation before the first iteration; none when that has begun.
     pub fn preparation(&self) -> Option<f64> {
         self.moving.as_ref().and_then(Moving::preparation)
     }
 
-    /// The moving field as it is now, for those who draw it; none where the network moves.
+    /// The dynamic field as it is now, for those who draw it; none where a network is the dynamic field.
     pub fn moving_feed(&self) -> Option<MovingFeed> {
         self.moving.as_ref().map(Moving::feed)
     }
 
-    /// Some iterations of the Gaussians' fit; after its last, the still field begins with what they leave.
+    /// Runs some iterations of the Gaussians' fit; after its last, the static field begins with what they leave of the images.
     fn advance_gaussians(&mut self, until: u32) -> Result<Vec<StepLoss>> {
         let Some(moving) = &mut self.moving else { return Ok(Vec::new()) };
         let losses = moving.advance(until, self.plan.config.gaussian_iterations())?;
@@ -446,18 +446,18 @@ impl Trainer {
         let losses: Vec<StepLoss> = losses.into_iter().zip(first + 1..).map(of).collect();
         losses.iter().try_for_each(|loss| self.watch_loss(loss))?;
         if ends {
-            // The static field's losses are others.
+            // The losses of the static field are different ones.
             self.watch = LossWatch::new(&self.plan.config, SMALLER_STEPS);
         }
         Ok(losses)
     }
 
-    /// Numbers on the device of the field of a method with a room of its own, for those who draw it; none of other methods.
+    /// Parameters on the device of the field of a method of `crate::methods`, for those who draw it; none for other methods.
     pub fn fit_params(&self) -> Option<Vec<Buffer>> {
         self.fit.as_ref().map(|fit| fit.params())
     }
 
-    /// Runs some iterations of the fit of a method with a room of its own.
+    /// Runs some iterations of the fit of a method of `crate::methods`.
     fn advance_fit(&mut self, until: u32) -> Result<Vec<StepLoss>> {
         let Some(fit) = &mut self.fit else { return Ok(Vec::new()) };
         let losses = fit.advance(until)?;
@@ -481,7 +481,7 @@ impl Trainer {
         }
     }
 
-    /// The still field is trained on the images less the moving field.
+    /// Lets the static field be trained on the images minus the dynamic field.
     fn leave_to_still_field(&self) -> Result<()> {
         let Some(moving) = &self.moving else { return Ok(()) };
         let remains = moving.what_remains(&self.gpu, &self.plan)?;
@@ -543,7 +543,7 @@ impl Trainer {
         commands.pass_times()
     }
 
-    /// The model without its parameters, which are on the device: what a renderer that follows the run needs.
+    /// The model without its parameters, which are on the device, for a renderer that follows the run.
     pub fn outline(&self) -> Model {
         Model {
             config: self.plan.config.clone(),

@@ -29,7 +29,7 @@ pub struct Training {
     trainer: Trainer,
     /// Span of the line integrals of the training images.
     image_range: f64,
-    /// Logarithm of the squared error, smoothed: one of a loss that is large for a moment is forgotten in as many iterations as any.
+    /// Smoothed logarithm of the squared error: through the logarithm, a short peak is forgotten as soon as any other value.
     smoothed_log_mse: Option<f64>,
     clock: Clock,
     train_s: f64,
@@ -103,7 +103,7 @@ impl Training {
         let newest = loss.squared_error;
         let log = newest.max(f64::MIN_POSITIVE).ln();
         let smoothed = self.smoothed_log_mse.map_or(log, |before| (1.0 - SMOOTHING) * before + SMOOTHING * log);
-        // Gaussians have none.
+        // Gaussians have no such error.
         let smoothed = if newest.is_nan() { f64::NAN } else { smoothed };
         self.smoothed_log_mse = Some(smoothed).filter(|log| log.is_finite());
         let elapsed_s = self.elapsed_s();

@@ -1,5 +1,5 @@
-//! Fits a moving tree: Gaussians of one phase, carried through the beat by a grid, all of it together. [`TreeStart`] brings
-//! it about.
+//! Fits a moving tree: Gaussians of one phase, carried through the beat by a grid, all of it together. [`TreeStart`] prepares
+//! it.
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
@@ -39,7 +39,7 @@ pub struct TreeTrainer {
     step: u32,
 }
 
-/// What iterations of one kind go by: the joint fit of everything, or the tracking of a phase.
+/// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
 pub(super) struct Fit {
     setup: GaussianSetup,
     tree: TreeSetup,
@@ -68,7 +68,7 @@ impl Fit {
             });
             padded(&images.collect::<Vec<_>>(), targets, &setup)
         };
-        // One phase at a time: what lies beyond is not known yet.
+        // One phase at a time: the motion beyond it is not known yet.
         let at_phase = |view: &SplatView| SplatView { after_phase: 0.0, ..view.clone() }.to_device();
         let views: Vec<GaussianView> = targets.views.iter().map(at_phase).collect();
         let buffers = TargetBuffers {
@@ -115,7 +115,7 @@ impl TreeTrainer {
         Ok(TreeTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
     }
 
-    /// What the grid is tracked by.
+    /// Returns the fit by which the grid is tracked.
     pub(super) fn tracking(&self) -> Result<Fit> {
         self.joint.tracking(&self.gpu, &self.targets, &self.targets.lengths.tree(&self.config.tree))
     }
@@ -138,7 +138,7 @@ impl TreeTrainer {
         Ok(())
     }
 
-    /// What follows tracking begins without momentum.
+    /// Clears the optimiser's momentum, so that iterations after tracking begin without it.
     pub(super) fn forget_momentum(&self) -> Result<()> {
         let mut recording = Recording::new(&self.gpu, "clear momentum")?;
         recording.fill(&self.joint.grid.motion_grid_first, 0);
@@ -151,23 +151,23 @@ impl TreeTrainer {
         self.step
     }
 
-    /// Gaussians of the tree.
+    /// Number of Gaussians of the tree.
     pub fn count(&self) -> u32 {
         self.n
     }
 
-    /// What the run is fitted to.
+    /// Targets of the run.
     pub fn targets(&self) -> &Targets {
         &self.targets
     }
 
-    /// The same, when the run is not wanted.
+    /// Returns the targets when the run is not wanted.
     pub(super) fn into_targets(self) -> Targets {
         self.targets
     }
 
-    /// Gives the Gaussians, which have been fitted before, the motion of a tree of the same ones on the same grid; iterations go on
-    /// from where the background is estimated anew.
+    /// Gives the Gaussians, which were fitted before, the motion of a tree of the same Gaussians on the same grid; iterations
+    /// go on from where the background is estimated anew.
     pub(super) fn move_as(&mut self, tree: &MovingTree) -> Result<()> {
         self.gpu.upload(&self.joint.grid.motion_grid, 0, &tree.grid)?;
         self.gpu.upload(&self.own.own_motion, 0, &tree.own)?;
@@ -190,7 +190,7 @@ impl TreeTrainer {
         &self.particles
     }
 
-    /// What is fitted to on the device, for tests.
+    /// Target buffers on the device, for tests.
     pub fn target_buffers(&self) -> &TargetBuffers {
         &self.joint.targets
     }
@@ -205,8 +205,8 @@ impl TreeTrainer {
         &self.own
     }
 
-    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the losses
-    /// of the iterations done, penalties not included. An empty list means the target was reached before.
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
+    /// losses of the iterations done, penalties not included. An empty list means the target was reached before.
     ///
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite; device errors.
@@ -237,8 +237,8 @@ impl TreeTrainer {
         losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
     }
 
-    /// Drops weak Gaussians and places new ones where data are missing at half the phases. Once in a run, on the host, as
-    /// with a set per phase.
+    /// Drops weak Gaussians and places new ones where data are missing at half the phases. This happens once in a run, on the
+    /// host, as with a set per phase.
     fn grow(&mut self) -> Result<()> {
         let (weakest, setup) = (self.config.gaussians.weakest, self.joint.setup);
         let (mut particles, mut own) = self.retain(|rows| strong(rows, &setup, weakest))?;
@@ -246,7 +246,7 @@ impl TreeTrainer {
         let carried = |x: DVec3, phase: f64| tree.carried(x, phase);
         let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
         let additions = seeds::tree_additions(&self.targets, &settings, seed, &self.images()?, carried);
-        // They move as their nearest neighbour does.
+        // New Gaussians move as their nearest neighbours do.
         let n_basis = self.joint.tree.n_basis as usize;
         for g in &additions {
             let nearest = tree.nearest(DVec3::from_array(g.position.map(f64::from)));
@@ -256,19 +256,19 @@ impl TreeTrainer {
         self.replace(&particles, &own)
     }
 
-    /// Drops what is too faint for vessels: it stands for what else moves.
+    /// Drops Gaussians that are too faint for vessels: they stand for other motion.
     fn clear(&mut self) -> Result<()> {
         let (faint, setup) = (self.config.gaussians.faint, self.joint.setup);
         self.retain(|rows| dense(rows, &setup, faint)).map(|_| ())
     }
 
-    /// Drops what is alone and broad.
+    /// Drops Gaussians that are alone and broad.
     fn drop_strays(&mut self) -> Result<()> {
         let (link, setup) = (self.targets.lengths.gaussians(&self.config.gaussians).link, self.joint.setup);
         self.retain(|rows| vessels(rows, &setup, link)).map(|_| ())
     }
 
-    /// Keeps some of the Gaussians, on the device and as returned.
+    /// Keeps some of the Gaussians on the device, and returns them.
     fn retain(&mut self, kept: impl Fn(&[Gaussian]) -> Vec<bool>) -> Result<(Particles, OwnMotion)> {
         let n = self.n as usize;
         let mut particles = self.particles.download(&self.gpu, n)?;
@@ -339,7 +339,7 @@ impl TreeTrainer {
         pass_times(&self.gpu, recording)
     }
 
-    /// What the last iteration cost.
+    /// Work of the last iteration.
     ///
     /// # Errors
     /// Device errors.

@@ -1,5 +1,5 @@
-//! How a moving tree begins: a set of Gaussians per phase, of which that of the phase of rest becomes the tree; then the grid tracked from
-//! phase to phase.
+//! Start of a moving tree: a set of Gaussians per phase, of which that of the rest phase becomes the tree; then the grid is
+//! tracked from phase to phase.
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
@@ -11,7 +11,7 @@ use crate::plan::targets::Targets;
 use crate::train::gaussians::{GaussianTrainer, strong};
 use crate::train::tree::{Fit, TreeTrainer};
 
-/// A tree on its way.
+/// A tree in preparation.
 pub struct TreeStart {
     gpu: Gpu,
     config: Config,
@@ -19,9 +19,9 @@ pub struct TreeStart {
 }
 
 enum Stage {
-    /// A set per phase, which tells the background as well.
+    /// Fit of a set per phase, which yields the background as well.
     Warming(Box<GaussianTrainer>),
-    /// The grid from phase to phase.
+    /// Tracking of the grid from phase to phase.
     Tracking(Box<Tracking>),
     /// The tree has been handed over, or lost to an error.
     Over,
@@ -30,9 +30,9 @@ enum Stage {
 struct Tracking {
     trainer: TreeTrainer,
     fit: Fit,
-    /// Last first.
+    /// Tracks that are left, the last one first.
     left: Vec<Track>,
-    /// What is shown until every phase has been reached.
+    /// Field that is shown until every phase has been reached.
     meanwhile: Gaussians,
 }
 
@@ -42,7 +42,7 @@ impl TreeStart {
     /// # Errors
     /// As [`GaussianTrainer::new`].
     pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<TreeStart> {
-        // Strays are told when all iterations are done: what is one at first may find its vessel.
+        // Strays are dropped when all iterations are done: a stray may find its vessel before.
         let warm =
             sections::Gaussians { iterations: config.tree.warm_iterations, link: 0.0, ..config.gaussians.clone() };
         let warm = Config { gaussians: warm, ..config.clone() };
@@ -50,7 +50,7 @@ impl TreeStart {
         Ok(TreeStart { gpu: gpu.clone(), config: config.clone(), stage: Stage::Warming(Box::new(warming)) })
     }
 
-    /// Does some of the work, a submit or two; the tree when it is ready to be fitted as a whole.
+    /// Does some of the work, a submit or two; returns the tree when it is ready to be fitted as a whole.
     ///
     /// # Errors
     /// [`Error::Config`] when the phase of rest shows nothing; [`Error::Diverged`]; device errors.
@@ -75,7 +75,7 @@ impl TreeStart {
         Ok(None)
     }
 
-    /// Makes a tree of what the phase of rest shows.
+    /// Makes a tree of the Gaussians of the rest phase.
     fn plant(&self, mut first: GaussianTrainer) -> Result<Tracking> {
         if self.config.gaussians.background_every > 0 {
             first.renew_background()?;
@@ -93,7 +93,7 @@ impl TreeStart {
         Ok(Tracking { trainer, fit, left, meanwhile })
     }
 
-    /// Share that is done, 0 to 1: half of it the sets per phase, half of it following them.
+    /// Share that is done, 0 to 1: one half is the sets per phase, the other the tracking.
     pub fn share(&self) -> f64 {
         match &self.stage {
             Stage::Warming(first) => 0.5 * f64::from(first.step()) / f64::from(self.config.tree.warm_iterations.max(1)),
@@ -117,7 +117,7 @@ impl TreeStart {
         }
     }
 
-    /// Gaussians that there are.
+    /// Number of Gaussians.
     pub fn count(&self) -> u32 {
         match &self.stage {
             Stage::Warming(first) => first.count(),

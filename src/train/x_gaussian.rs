@@ -20,7 +20,7 @@ use crate::x_gaussian::setup::{comparing_setup, gaussian_setup, schedule, turns,
 use crate::x_gaussian::stages::{SUMS, XFitBuffers, XKernels, XParts, XSceneBuffers};
 use crate::x_gaussian::start::first_state;
 
-/// Passes of an iteration that is timed: a sort has dozens.
+/// Maximum number of passes of a timed iteration: a sort has dozens.
 const MAX_PASSES: u32 = 128;
 /// Pixels of a tile.
 const TILE_PIXELS: u64 = 256;
@@ -51,7 +51,7 @@ pub struct XTrainer {
 }
 
 impl XTrainer {
-    /// Begins where the settings say, and what is to be said of that.
+    /// Begins where the settings say; returns the run, and notes about its beginning for the user.
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings; device errors.
@@ -94,12 +94,12 @@ impl XTrainer {
         self.step
     }
 
-    /// Gaussians of all sets.
+    /// Number of Gaussians of all sets.
     pub fn count(&self) -> u32 {
         self.sets.len() as u32
     }
 
-    /// What the run is fitted to.
+    /// Data of the run.
     pub fn data(&self) -> &XData {
         &self.data
     }
@@ -119,7 +119,7 @@ impl XTrainer {
         (&self.seen, &self.learning)
     }
 
-    /// All else on the device, for tests.
+    /// Other buffers on the device, for tests.
     pub fn buffers(&self) -> (&XSceneBuffers, &XFitBuffers) {
         (&self.scene, &self.fit)
     }
@@ -137,7 +137,7 @@ impl XTrainer {
         }
     }
 
-    /// Gives lists room for so many Gaussians, less or more than they have: for tests.
+    /// Gives lists room for `capacity` Gaussians, less or more than they have: for tests.
     ///
     /// # Errors
     /// Device errors.
@@ -150,7 +150,7 @@ impl XTrainer {
         Ok(())
     }
 
-    /// Whether the last iterations had room for their lists; if not, they did nothing, and there is more room now.
+    /// Tells whether the last iterations had room for their lists; if not, they did nothing, and there is more room now.
     fn had_room(&mut self) -> Result<bool> {
         let mut status = [XStatus::default()];
         self.fit.x_status.read(&mut status)?;
@@ -166,7 +166,7 @@ impl XTrainer {
         Ok(had_room)
     }
 
-    /// A device that does not count the iterations it was asked for would be asked for them for ever.
+    /// Error for a device that does not count its iterations, which would be asked for them for ever.
     fn counts_wrongly(&self, first: u32, stop: u32) -> Error {
         let step = self.step;
         counts_wrongly(
@@ -196,7 +196,7 @@ impl XTrainer {
         }
     }
 
-    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; the
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
     /// losses of the iterations done, each the mean over the sets. An empty list means the target was reached before.
     ///
     /// # Errors
@@ -219,7 +219,7 @@ impl XTrainer {
         densifies(&self.config.x, step) || resets(&self.config.x, step)
     }
 
-    /// Adds and takes away Gaussians, and resets opacities, where it is time. Rare enough for the host, which draws
+    /// Adds and removes Gaussians, and resets opacities, where it is time. This is rare enough for the host, which draws
     /// children in f64.
     fn control_density(&mut self) -> Result<()> {
         if !self.changes(self.step) {
@@ -241,7 +241,7 @@ impl XTrainer {
         Ok(())
     }
 
-    /// The state after the iterations done: what a resumed run goes on from.
+    /// The state after the iterations done, from which a resumed run goes on.
     ///
     /// # Errors
     /// [`Error::Diverged`] when a parameter is not finite; device errors.
@@ -269,7 +269,7 @@ impl XTrainer {
     /// # Errors
     /// [`Error::Internal`] when the fit is over; device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        // The schedule has a row more than iterations, for this.
+        // The schedule has one more row than iterations for this.
         if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
         }
@@ -284,7 +284,7 @@ impl XTrainer {
         }
     }
 
-    /// What the last iteration cost: pairs of a Gaussian in a tile's list and a pixel of that tile.
+    /// Work of the last iteration: pairs of a Gaussian in a tile's list and a pixel of that tile.
     ///
     /// # Errors
     /// Device errors.
@@ -302,17 +302,17 @@ impl XTrainer {
     }
 }
 
-/// Gaussians of a set, at most, so that those of all fit the device's buffers.
+/// Maximum number of Gaussians of a set, such that all sets fit the device's buffers.
 fn most_of_set(gpu: &Gpu, data: &XData) -> u32 {
     gpu.info().max_storage_buffer_range / size_of::<XGaussian>() as u32 / data.n_sets() as u32
 }
 
-/// Most entries of lists whose gradients a buffer holds.
+/// Maximum number of list entries whose gradients a buffer holds.
 fn capacity_limit(gpu: &Gpu) -> u32 {
     gpu.info().max_storage_buffer_range / (size_of::<f32>() as u32 * SUMS)
 }
 
-/// Their number; a set without any cannot be fitted.
+/// Returns the number of Gaussians; refuses a set without any.
 fn check_count(state: &XState, data: &XData, weakest: f64) -> Result<u32> {
     if let Some(bad) = state.sets.iter().find(|set| **set as usize >= data.n_sets()) {
         return Err(Error::config("checkpoint", bad, "its sets of Gaussians are not those of the images"));

@@ -12,7 +12,7 @@ use crate::model::x_gaussian::XState;
 use crate::scan::dataset::Dataset;
 use glam::DVec3;
 
-/// Extents per distance of the sources from their middle.
+/// Extent of the scene, in units of the largest distance of a source from the sources' mean.
 const EXTENTS: f64 = 1.1;
 /// Standard deviations at which Gaussians end where their sum is drawn or sampled.
 const DRAWN_CUT: f32 = 4.0;
@@ -24,7 +24,7 @@ const DRAWN_SCALES: [f32; 2] = [1e-6, 1e6];
 pub struct XData {
     /// Half a side of the volume, mm.
     pub half_mm: f64,
-    /// What rates of positions and bounds of scales count in, mm.
+    /// Unit of the rates of positions and of the bounds of scales, mm.
     pub extent_mm: f64,
     /// Side of a pixel at the isocentre, world units.
     pub pixel: f64,
@@ -46,7 +46,7 @@ pub struct XData {
     phase_of_set: Vec<Option<u32>>,
 }
 
-/// An image from its smallest value, which becomes 0, to its largest, which becomes 1; nothing of an even one.
+/// Scales an image from its minimum, which becomes 0, to its maximum, which becomes 1; a constant image becomes 0.
 fn normalised(image: &[f32]) -> Vec<f32> {
     let (low, high) = image.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
     if high <= low {
@@ -118,12 +118,12 @@ impl XData {
         self.width * self.height
     }
 
-    /// Sets of Gaussians.
+    /// Number of sets of Gaussians.
     pub fn n_sets(&self) -> usize {
         self.images_of_set.len()
     }
 
-    /// What a set is called in messages.
+    /// Name of a set in messages.
     pub fn name_of_set(&self, set: usize) -> String {
         self.phase_of_set[set].map_or("all phases".into(), |phase| format!("phase {phase}"))
     }

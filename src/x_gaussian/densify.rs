@@ -1,5 +1,5 @@
-//! Density control of X-Gaussian: where images pull hard, small Gaussians are cloned and large ones split; faint and
-//! huge ones are taken away; and now and then all become faint. Each set by itself.
+//! Density control of X-Gaussian: where the gradient of the images is large, small Gaussians are cloned and large ones split;
+//! faint and huge ones are removed; and now and then all become faint. Each set is treated by itself.
 
 use crate::config::sections::X;
 use crate::kernels::layout::{XGaussian, XStatistics};
@@ -7,22 +7,22 @@ use crate::model::x_gaussian::XState;
 use crate::random::{STREAM_R2_CHILD, normal};
 use glam::DVec3;
 
-/// A split Gaussian leaves two, narrower by this factor.
+/// Factor by which the two halves of a split Gaussian are narrower.
 const NARROWER: f64 = 1.6;
 const CHILDREN: u32 = 2;
 
-/// Whether Gaussians are added and taken away after iteration `step`, counted from 1.
+/// Tells whether Gaussians are added and removed after iteration `step`, counted from 1.
 pub fn densifies(settings: &X, step: u32) -> bool {
     let X { densify_every: every, densify_from: from, densify_until: until, .. } = *settings;
     every > 0 && step > from && step < until && step.is_multiple_of(every)
 }
 
-/// Whether opacities are reset after iteration `step`, counted from 1.
+/// Tells whether opacities are reset after iteration `step`, counted from 1.
 pub fn resets(settings: &X, step: u32) -> bool {
     settings.reset_every > 0 && step > 0 && step < settings.densify_until && step.is_multiple_of(settings.reset_every)
 }
 
-/// What becomes of a Gaussian.
+/// Decision of density control on a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Fate {
     Stays,
@@ -55,7 +55,7 @@ pub fn densified(before: &XState, n_sets: usize, settings: &X, extent_mm: f64, (
     after
 }
 
-/// Cloned and split Gaussians are those that the images pull at, as many as their set has room for.
+/// Decides on each Gaussian. Those with a large image gradient are cloned or split, as many as their set has room for.
 fn fates(state: &XState, n_sets: usize, settings: &X, extent_mm: f64) -> Vec<Fate> {
     let mut counts = state.counts(n_sets);
     let fate = |i: usize| {
@@ -109,7 +109,7 @@ mod tests {
         }
     }
 
-    /// A small and a large Gaussian in each of two sets, all pulled at.
+    /// A small and a large Gaussian in each of two sets, all with a large image gradient.
     fn four() -> XState {
         let rows = (0..4).map(|i| row(i as f32, if i % 2 == 0 { 2.0 } else { 9.0 }, 0.5));
         let mut state = XState::fresh(rows.collect(), vec![0, 0, 1, 1]);

@@ -1,4 +1,4 @@
-//! Gaussians of X-Gaussian on the device: what pictures need of each, and what the fit does.
+//! Gaussians of X-Gaussian on the device: data for pictures, and data for the fit.
 
 use crate::error::Result;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -26,11 +26,11 @@ buffer_set! {
         x_spans,
         /// [`XKey`]s.
         x_keys,
-        /// The same, to be sorted into.
+        /// [`XKey`]s that a pass of the sort writes.
         x_keys_moved,
-        /// `[digit][block]`: of the sort.
+        /// `[digit][block]`: counts of the sort.
         x_sort_counts,
-        /// Gaussians of all tiles.
+        /// Gaussians in the lists of all tiles.
         x_list_items,
     }
 }
@@ -76,7 +76,7 @@ fn lists(gpu: &Gpu, capacity: u32) -> Result<Buffer> {
 }
 
 buffer_set! {
-    /// What the fit knows of each Gaussian.
+    /// State of the optimiser and statistics of each Gaussian.
     pub struct XLearningBuffers {
         /// First moments of Adam, three vec4 per Gaussian: position and opacity, scale and intensity, rotation.
         gaussian_adam_first,
@@ -86,7 +86,7 @@ buffer_set! {
         gaussian_gradient,
         /// [`crate::kernels::layout::XStatistics`].
         x_statistics,
-        /// `[entry][sum]`: what gradients need of the tiles.
+        /// `[entry][sum]`: sums over tiles, for gradients.
         x_entries,
     }
 }

@@ -20,10 +20,10 @@ pub fn unit() -> f32 {
 
 /// Entries of all tiles' lists per Gaussian for which there is room at first.
 const FIRST_ENTRIES: u32 = 4;
-/// Room that lists get beyond what they needed, as a share of it.
+/// Additional room of lists: one part in so many of what they need.
 const MORE_ROOM: u32 = 4;
 
-/// Room for the lists of so many Gaussians before it is known what they need.
+/// Room for the lists of `n` Gaussians before their need is known.
 pub fn first_capacity(n: u32, limit: u32) -> u32 {
     (FIRST_ENTRIES * n.max(256)).min(limit)
 }
@@ -53,7 +53,7 @@ pub struct BlendedPicture {
     n: u32,
 }
 
-/// What is drawn of a Gaussian of a model.
+/// Drawable form of a Gaussian of a model.
 fn drawn((g, intensity): &(Gaussian, f32)) -> XGaussian {
     XGaussian {
         position: g.position,
@@ -141,7 +141,7 @@ impl BlendedPicture {
     }
 }
 
-/// Most entries of lists that a buffer holds.
+/// Maximum number of list entries that a buffer holds.
 fn capacity_limit(gpu: &Gpu) -> u32 {
     gpu.info().max_storage_buffer_range / size_of::<u32>() as u32
 }

@@ -37,7 +37,7 @@ pub fn gaussian_setup(data: &XData, config: &Config) -> GaussianSetup {
         width: data.width as u32,
         height: data.height as u32,
         fixed_point: 2f32.powi(FIXED_POINT_BITS),
-        // Each set has a loss of its own; their mean is told.
+        // Each set has its own loss; their mean is reported.
         loss_weight: (absolute_weight(&config.x) / f64::from(n_sets)) as f32,
         beta1: config.adam.beta1 as f32,
         beta2: config.adam.beta2 as f32,
@@ -77,7 +77,7 @@ fn intensity_share(settings: &X, step: u32) -> f64 {
     RATES_BY_DEGREE[degree.min(RATES_BY_DEGREE.len() - 1)]
 }
 
-/// One row per iteration and one more, which is there to be timed; positions are in mm, of a scene of `extent_mm`.
+/// One row per iteration, and one more for timing; positions are in mm, in a scene of `extent_mm`.
 pub fn schedule(config: &Config, extent_mm: f64) -> Vec<XSchedule> {
     let (x, adam, n) = (&config.x, &config.adam, config.train.iterations);
     let mut updates = 0;
@@ -101,7 +101,7 @@ pub fn schedule(config: &Config, extent_mm: f64) -> Vec<XSchedule> {
     (1..=n + 1).map(row).collect()
 }
 
-/// What each set sees in each iteration of the schedule: images in an order that is drawn anew when all have been seen.
+/// Turns of each set in each iteration of the schedule: an image, in an order that is drawn anew when all have been seen.
 pub fn turns(data: &XData, config: &Config) -> Vec<R2Turn> {
     let turn = |step: u32, set: usize| {
         let (images, seed) = (&data.images_of_set[set], seed_of_set(config.seed, set));

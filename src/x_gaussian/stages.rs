@@ -14,7 +14,7 @@ use crate::x_gaussian::particles::{XLearningBuffers, XSeenBuffers};
 
 /// Sums of a Gaussian over the pixels of a tile.
 pub const SUMS: u32 = 7;
-/// Keys of a block of the sort.
+/// Number of keys of a block of the sort.
 const KEYS_OF_BLOCK: u32 = 16 * push::XSortCount::LOCAL_SIZE;
 const _: () = assert!(push::XSortMove::LOCAL_SIZE == push::XSortCount::LOCAL_SIZE);
 /// Bits that a pass sorts by, and values that these have.
@@ -36,7 +36,7 @@ fn sort_passes(n_sets: u32) -> u32 {
 
 /// Pipelines of pictures.
 pub struct XPictureKernels {
-    /// How each Gaussian is seen.
+    /// Projection of each Gaussian.
     pub project: Stage<push::XProject>,
     /// Sort, first pass.
     pub sort_count: Stage<push::XSortCount>,
@@ -80,7 +80,7 @@ pub struct XKernels {
     pub ssim_rows_back: Stage<push::SsimRowsBack>,
     /// SSIM's gradient, second pass, and that of the loss.
     pub residual: Stage<push::R2Residual>,
-    /// What gradients need of the tiles.
+    /// Sums over the tiles, for gradients.
     pub blend_back: Stage<push::XBlendBack>,
     /// Gradients, density control's statistics, and the optimiser.
     pub update: Stage<push::XUpdate>,
@@ -136,19 +136,19 @@ buffer_set! {
 }
 
 buffer_set! {
-    /// What a fit goes by and what it counts, but for pictures and Gaussians.
+    /// Buffers of a fit, except for pictures and Gaussians.
     pub struct XFitBuffers {
         /// [`crate::kernels::layout::R2Setup`], of the stages that compare pictures.
         r2_setup,
         /// [`crate::kernels::layout::XSchedule`]s.
         x_schedule,
-        /// `[image][pixel]`: images to be shown.
+        /// `[image][pixel]`: target images.
         r2_targets,
         /// `[set][pixel]`: gradient of the loss.
         splat_image_gradient,
         /// `[set][pixel]`: SSIM's sums along rows.
         ssim_row_sums,
-        /// `[set][pixel]`: one more of them.
+        /// `[set][pixel]`: one more of SSIM's sums along rows.
         ssim_row_products,
         /// `[set][pixel]`: factors of SSIM's gradient, and its value.
         ssim_factors,
@@ -165,7 +165,7 @@ buffer_set! {
 
 /// A recording of pictures of `n` Gaussians.
 pub struct XPicturePass<'a> {
-    /// Where stages go.
+    /// Recording that the stages are added to.
     pub recording: &'a mut Recording,
     /// The stages.
     pub kernels: &'a XPictureKernels,
@@ -175,7 +175,7 @@ pub struct XPicturePass<'a> {
     pub seen: &'a XSeenBuffers,
     /// Constants on the host.
     pub x: &'a XSetup,
-    /// Gaussians of all sets.
+    /// Number of Gaussians of all sets.
     pub n: u32,
 }
 
@@ -230,24 +230,24 @@ impl XPicturePass<'_> {
     }
 }
 
-/// What stages of a fit work on.
+/// Inputs of the stages of a fit.
 #[derive(Clone, Copy)]
 pub struct XParts<'a> {
     /// The stages.
     pub kernels: &'a XKernels,
     /// Views and pictures.
     pub scene: &'a XSceneBuffers,
-    /// What the fit goes by.
+    /// Buffers of the fit.
     pub fit: &'a XFitBuffers,
     /// The Gaussians.
     pub seen: &'a XSeenBuffers,
-    /// What the fit knows of them.
+    /// State of the optimiser and statistics of the Gaussians.
     pub learning: &'a XLearningBuffers,
     /// Constants on the host.
     pub setup: &'a GaussianSetup,
-    /// Those of this method.
+    /// Constants of this method on the host.
     pub x: &'a XSetup,
-    /// Gaussians of all sets.
+    /// Number of Gaussians of all sets.
     pub n: u32,
 }
 

@@ -1,4 +1,4 @@
-//! Where a fit begins: at voxel centres all over the volume ("angle-pose cuboid uniform initialisation").
+//! Start of a fit: voxel centres all over the volume ("angle-pose cuboid uniform initialisation").
 
 use crate::config::sections::X;
 use crate::kernels::layout::XGaussian;
@@ -8,7 +8,7 @@ use crate::r2::start::spacings;
 use crate::x_gaussian::data::XData;
 use glam::DVec3;
 
-/// What all Gaussians show at the start: random colours of at most 1/255 in the code, which leave this much.
+/// Intensity of all Gaussians at the start: the reference code has random colours of at most 1/255, which leave this much.
 const FIRST_INTENSITY: f32 = 0.5;
 
 /// Centres of one voxel in each interval, of the cube from -1 to 1, x first.

@@ -1,4 +1,4 @@
-//! From what the views say of pixels to what they say of cells: sums over views, support from the phases beside.
+//! Combines the views' evidence at pixels into evidence at cells: sums over views, and support from the neighbouring phases.
 
 use crate::evidence::background::Series;
 use crate::evidence::ratios::{LEAST, MOST, ViewEvidence};
@@ -11,11 +11,11 @@ use rayon::prelude::*;
 
 /// Weight of the best neighbour at the phase before, and of the one after.
 const SUPPORT: f32 = 0.25;
-/// Kept from this sum on, seen by four views or more; the largest possible is 18 with four.
+/// Minimum sum of a kept cell that four views or more see; the largest possible is 18 with four.
 const KEEP_FOUR_VIEWS: f32 = 9.5;
-/// Kept from this sum per view on, seen by fewer; the largest possible is 4.5.
+/// Minimum sum per view of a kept cell that fewer views see; the largest possible is 4.5.
 const KEEP_PER_VIEW: f32 = 7.0 / 3.0;
-/// Least that neighbours say, in units of what a single view says against a cell.
+/// Lower limit of the neighbours' evidence, in units of a single view's strongest evidence against a cell.
 const LEAST_SUPPORT: f32 = 2.5;
 
 /// A cell that may hold a moving vessel.
@@ -23,7 +23,7 @@ const LEAST_SUPPORT: f32 = 2.5;
 pub struct HullCell {
     /// Position on the grid, x fastest.
     pub index: u32,
-    /// What all views and the phases beside say for it: a log-likelihood ratio.
+    /// Evidence of all views and of the neighbouring phases for it: a log-likelihood ratio.
     pub evidence: f32,
 }
 
@@ -43,9 +43,9 @@ pub struct SoftHull {
 /// The evidence of every training view with at least two phases, and the hull carved by it.
 #[derive(Debug, Clone)]
 pub struct SoftMotion {
-    /// What the views say, on the dataset's canvas.
+    /// Evidence of the views, on the dataset's canvas.
     pub views: Vec<ViewEvidence>,
-    /// What remains.
+    /// Cells that remain.
     pub hull: SoftHull,
 }
 
@@ -66,9 +66,9 @@ fn threshold(n_views: usize) -> f32 {
     KEEP_FOUR_VIEWS.min(KEEP_PER_VIEW * n_views as f32)
 }
 
-/// The views' pixels under points, and what they add up to.
+/// Pixels of the views under points, and the sums of their evidence.
 struct Votes<'a> {
-    /// Of each view, or of each view at each phase where the heart's displacement differs from frame to frame.
+    /// Projectors of each view, or of each view at each phase where the heart's displacement differs from frame to frame.
     projectors: Vec<Vec<Projector<'a>>>,
     views: &'a [ViewEvidence],
     /// Largest ratio of each pixel over the phases, per view.
@@ -101,12 +101,12 @@ impl<'a> Votes<'a> {
         }
     }
 
-    /// Views that have the phase.
+    /// Number of views that have the phase.
     fn n_at(&self, phase: usize) -> usize {
         self.views.iter().filter(|v| v.ratios[phase].is_some()).count()
     }
 
-    /// Pixels differ from phase to phase.
+    /// Tells whether the pixels of a point differ from phase to phase.
     fn moves(&self) -> bool {
         self.projectors.iter().any(|of_view| of_view.len() > 1)
     }
@@ -124,11 +124,11 @@ impl<'a> Votes<'a> {
         (count >= self.needed).then_some(sum)
     }
 
-    /// No phase says more than this.
+    /// Upper bound of the sums of all phases.
     fn at_most(&self, pixels: &[Option<usize>]) -> Option<f32> {
         let seen = self.largest.iter().zip(pixels).filter_map(|(most, p)| Some(most[(*p)?]));
         let (sum, count) = seen.fold((0.0, 0), |(sum, count), ratio| (sum + ratio, count + 1));
-        // A view without the phase adds nothing, which may be more than what it says against.
+        // A view without the phase adds 0, which may exceed its evidence against the cell at other phases.
         (count >= self.needed).then_some(sum.max(0.0))
     }
 }
@@ -138,8 +138,8 @@ fn centre(min: DVec3, cell: f64, n: usize, index: usize) -> DVec3 {
     min + (at + 0.5) * cell
 }
 
-/// What the neighbours at the phases beside say for each cell of a grid of `n` cells a side, per phase: a vessel moves
-/// at most a coarse cell per phase.
+/// Evidence of the neighbours at the previous and the next phase for each cell of a grid of `n` cells a side, per phase: a
+/// vessel moves at most a coarse cell per phase.
 fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) -> Vec<Vec<f32>> {
     let least = LEAST_SUPPORT * LEAST;
     let mut sums = vec![vec![least; n * n * n]; n_phases];
@@ -166,7 +166,7 @@ fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) 
         }
     }
     let best: Vec<Vec<f32>> = sums.par_iter().map(|sums| largest_neighbour(sums, n)).collect();
-    // Phases are those of a whole beat, so the last is beside the first.
+    // The phases cover a whole beat, so the last is next to the first.
     (0..n_phases)
         .into_par_iter()
         .map(|t| {
@@ -195,9 +195,9 @@ fn largest_neighbour(values: &[f32], n: usize) -> Vec<f32> {
 }
 
 impl SoftHull {
-    /// Carves a cube of half side `half` (world units) into `resolution` (even) cells a side. A cell stays at a phase
-    /// when the sum of what the views that see it say, and the support of its neighbours at the phases beside, reach a
-    /// threshold: no single view can veto it.
+    /// Carves a cube of half side `half` (world units) into `resolution` (even) cells a side. A cell stays at a phase when the
+    /// summed evidence of the views that see it, and the support of its neighbours at the adjacent phases, reach a threshold:
+    /// no single view can veto it.
     pub fn carve(dataset: &Dataset, views: &[ViewEvidence], half: f64, resolution: usize) -> SoftHull {
         let n = resolution;
         let cell = 2.0 * half / n as f64;
@@ -224,7 +224,7 @@ impl SoftHull {
                 for at in 0..n * n {
                     let index = z * n * n + at;
                     let beside = ((z / 2) * coarse + at / n / 2) * coarse + at % n / 2;
-                    // No view says more than MOST: many cells are settled without looking at a pixel.
+                    // The evidence of a view never exceeds MOST: many cells are settled without looking at a pixel.
                     if MOST * views.len() as f32 + most_support[beside] < least {
                         continue;
                     }
@@ -266,7 +266,7 @@ impl SoftHull {
         kept as f64 / (self.resolution.pow(3) * self.cells.len().max(1)) as f64
     }
 
-    /// The hull's cells as bits: what training gates samples with, and what is drawn and exported.
+    /// Returns the hull's cells as bits, which training masks samples with, and which are drawn and exported.
     pub fn to_hull(&self) -> Hull {
         let n = self.resolution;
         let words = n.pow(3).div_ceil(32);
