@@ -23,22 +23,22 @@ use std::path::Path;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Preset {
-    /// Gaussians move in front of a still tensor field; the default.
+    /// Moving Gaussians in front of a static tensor field; the default.
     #[default]
     Fast,
-    /// The paper's two fields, normalised, hull-gated, tuned.
+    /// The paper's two fields with normalised data, a motion hull and tuned settings.
     FastMlp,
-    /// As the paper states it.
+    /// The method as the paper states it.
     Paper,
-    /// As the authors' public code does it.
+    /// The method as the authors' public code implements it.
     PublicCode,
-    /// NeRF-CA, which the paper compares itself with, as its public code does it: both fields are networks.
+    /// NeRF-CA, a baseline of the paper, as its public code implements it: both fields are networks.
     NerfCa,
-    /// R2-Gaussian, a static method the paper compares itself with: each phase by itself, all of it Gaussians.
+    /// R2-Gaussian, a static baseline of the paper: Gaussians alone, fitted to each phase separately.
     R2Gaussian,
-    /// X-Gaussian, another such: Gaussians that hide each other, as in Gaussian splatting.
+    /// X-Gaussian, a static baseline of the paper: Gaussians that hide each other, as in Gaussian splatting.
     XGaussian,
-    /// SAX-NeRF, a static method the paper compares itself with: each phase by itself, a hash grid and a Lineformer.
+    /// SAX-NeRF, a static baseline of the paper: a hash grid and a Lineformer, fitted to each phase separately.
     SaxNerf,
 }
 
@@ -68,16 +68,16 @@ impl Choice for Preset {
     }
 }
 
-/// What the still field is made of.
+/// Representation of the static field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StaticForm {
     /// Planes and lines.
     #[default]
     Tensor,
-    /// A network like that of the dynamic field, but for the latents; their attenuations add up at the same samples.
+    /// A network like that of the dynamic field, but without latents; the attenuations of both are added at the same samples.
     Network,
-    /// Nothing: the moving field is all there is.
+    /// No static field: the model consists of the dynamic field alone.
     None,
 }
 
@@ -93,31 +93,32 @@ impl Choice for StaticForm {
     }
 }
 
-/// How a learning rate goes from start to end.
+/// Course of a learning rate from its start value to its end value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Decay {
     /// A straight line that ends with the run.
     Linear,
-    /// A constant factor per iteration, which takes as many iterations as the run has from start to end.
+    /// A constant factor per iteration, chosen so that the rate reaches its end value with the end of the run.
     Exponential,
 }
 
-/// What the moving field is made of.
+/// Representation of the dynamic field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GaussianForm {
-    /// The network: no Gaussians.
+    /// The network, without Gaussians.
     None,
-    /// A set of Gaussians per phase, nothing shared.
+    /// A separate set of Gaussians per phase; the sets share nothing.
     Phase,
     /// One set of Gaussians that moves over the beat.
     Tree,
-    /// A tree where the data allow it, a set per phase else.
+    /// `Tree` where the data allow it, otherwise `Phase`.
     Auto,
-    /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all: no still field beside them.
+    /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all phases, without a static field.
     R2,
-    /// Static sets as X-Gaussian fits them to normalised images: alone as well, and nearer ones hide those behind them.
+    /// Static sets as X-Gaussian fits them to normalised images, without a static field; nearer Gaussians hide those behind
+    /// them.
     X,
 }
 
@@ -143,13 +144,13 @@ impl Choice for GaussianForm {
     }
 }
 
-/// Which images a static method sees of an object that moves.
+/// Images of a moving object to which a static method is fitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StaticData {
-    /// A set of Gaussians for each phase, which sees that phase's images.
+    /// A set of parameters for each phase, fitted to the images of that phase.
     PerPhase,
-    /// One set, which sees all images and is shown at every phase.
+    /// One set of parameters, fitted to all images and rendered at every phase.
     Pooled,
 }
 
@@ -164,13 +165,13 @@ impl Choice for StaticData {
     }
 }
 
-/// Where R2-Gaussian's fit begins.
+/// Initial positions of the Gaussians in a fit of R2-Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum R2Start {
-    /// At voxels of a filtered back-projection.
+    /// Voxels of a filtered back-projection.
     Fdk,
-    /// Anywhere in the volume.
+    /// Random positions in the volume.
     Random,
 }
 
@@ -185,11 +186,11 @@ impl Choice for R2Start {
     }
 }
 
-/// What a pixel sees of a Gaussian of R2-Gaussian.
+/// Line integral of one Gaussian at a pixel, for R2-Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum R2Integral {
-    /// The line integral of the Gaussian's affine picture around its centre, as published.
+    /// The line integral of the Gaussian under a projection linearised around its centre, as published.
     #[default]
     Affine,
     /// The line integral along the pixel's own ray.
@@ -207,17 +208,17 @@ impl Choice for R2Integral {
     }
 }
 
-/// What is corrected of the views' stated geometry.
+/// Corrections of the views' stated geometry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CalibrateMode {
-    /// Whatever predicts phases best that it has not seen: nothing, positions of views, or breathing too.
+    /// The mode that best predicts phases left out of the calibration: none, static, or breathing.
     Auto,
-    /// Nothing.
+    /// No correction.
     Off,
-    /// Angles and position of each view, where that helps.
+    /// Angles and position of each view, where this improves the agreement.
     Static,
-    /// The same and a displacement of the heart in each frame, where that helps.
+    /// Angles and position of each view and a displacement of the heart in each frame, where this improves the agreement.
     Breathing,
 }
 
@@ -235,60 +236,60 @@ impl Choice for CalibrateMode {
     }
 }
 
-/// What drives the dynamic field.
+/// Data that the dynamic field is fitted to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DynamicTarget {
     /// The shared residual of both fields (paper).
     Absolute,
-    /// The line integral above the pixel's still background: cancels whatever does not move.
+    /// The line integral minus that of the pixel's static background; everything that does not move cancels.
     Temporal,
 }
 
-/// Everything that can be set.
+/// All settings of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Where the defaults came from.
+    /// Preset that the defaults came from.
     pub preset: Preset,
     /// Seed of initialisation, ray order and depths.
     pub seed: u32,
-    /// The loop.
+    /// The training loop.
     pub train: Train,
-    /// Self-calibration of the views; checkpoints of before have none.
+    /// Self-calibration of the views; absent from older checkpoints.
     #[serde(default = "presets::uncalibrated")]
     pub calibrate: Calibrate,
     /// Sampling along rays.
     pub march: March,
-    /// The still background.
+    /// The static field.
     #[serde(rename = "static")]
     pub static_field: StaticField,
-    /// The moving vessels.
+    /// The dynamic field.
     pub dynamic: DynamicField,
     /// Loss terms.
     pub loss: Loss,
     /// Motion hull.
     pub hull: Hull,
-    /// Occupancy learned while training.
+    /// Occupancy grid learned during training.
     pub occupancy: Occupancy,
-    /// Two networks as the fields; checkpoints of before have none.
+    /// Two networks as the fields; absent from older checkpoints.
     #[serde(default = "presets::networks")]
     pub networks: Networks,
     /// The optimiser.
     pub adam: Adam,
-    /// Gaussians as the moving field; checkpoints of before have none.
+    /// Gaussians as the dynamic field; absent from older checkpoints.
     #[serde(default = "presets::gaussians")]
     pub gaussians: Gaussians,
-    /// One set of Gaussians that moves; checkpoints of before have none.
+    /// One moving set of Gaussians; absent from older checkpoints.
     #[serde(default = "presets::tree")]
     pub tree: Tree,
-    /// Gaussians as R2-Gaussian fits them; checkpoints of before have none.
+    /// Gaussians as R2-Gaussian fits them; absent from older checkpoints.
     #[serde(default = "presets::r2")]
     pub r2: R2,
-    /// Gaussians as X-Gaussian fits them; checkpoints of before have none.
+    /// Gaussians as X-Gaussian fits them; absent from older checkpoints.
     #[serde(default = "presets::x")]
     pub x: X,
-    /// A hash grid and a Lineformer as SAX-NeRF fits them; checkpoints of before have none.
+    /// A hash grid and a Lineformer as SAX-NeRF fits them; absent from older checkpoints.
     #[serde(default = "presets::sax")]
     pub sax: Sax,
 }
@@ -327,11 +328,11 @@ impl Config {
         self.overlaid(toml::Table::new(), settings)
     }
 
-    /// Lays a table of a file, then settings, over this configuration, whose preset stays.
+    /// Overrides this configuration with the table of a file, then with settings; the preset is kept.
     fn overlaid(&self, overlay: toml::Table, settings: &[String]) -> Result<Config> {
         let before = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
         let (mut table, keep) = (before.clone(), before.get("preset").cloned());
-        // A file with every setting was written by a program, and says of those that do not act what it knew.
+        // A file with every setting was written by a program; it may also contain settings that do not act.
         let is_whole = overlay.clone().try_into::<Config>().is_ok();
         let mut given = if is_whole { Vec::new() } else { acting::keys(&overlay) };
         merge(&mut table, overlay, "")?;
@@ -353,47 +354,48 @@ impl Config {
         Ok(config)
     }
 
-    /// Whether Gaussians are the moving field, and not the network.
+    /// Tells whether the dynamic field consists of Gaussians.
     pub fn gaussians_move(&self) -> bool {
         self.gaussians.form != GaussianForm::None
     }
 
-    /// Whether the still field is a network, too.
+    /// Tells whether the static field is a network as well.
     pub fn two_networks(&self) -> bool {
         self.static_field.form == StaticForm::Network
     }
 
-    /// Whether the moving field is R2-Gaussian's, which is all there is: the still field is nothing.
+    /// Tells whether the method is R2-Gaussian, which has no static field.
     pub fn is_r2(&self) -> bool {
         self.gaussians.form == GaussianForm::R2
     }
 
-    /// Whether the moving field is X-Gaussian's, which is all there is as well.
+    /// Tells whether the method is X-Gaussian, which has no static field.
     pub fn is_x(&self) -> bool {
         self.gaussians.form == GaussianForm::X
     }
 
-    /// Whether Gaussians are all there is, fitted to whole images.
+    /// Tells whether the model consists of Gaussians alone, fitted to whole images.
     pub fn has_gaussians_alone(&self) -> bool {
         self.is_r2() || self.is_x()
     }
 
-    /// Whether the dynamic field is SAX-NeRF's, which is all there is: the still field is nothing.
+    /// Tells whether the method is SAX-NeRF, which has no static field.
     pub fn is_sax(&self) -> bool {
         self.dynamic.form == DynamicForm::Lineformer
     }
 
-    /// Whether the network on encoded coordinates is the moving field.
+    /// Tells whether the dynamic field is the network on encoded coordinates.
     pub fn network_moves(&self) -> bool {
         !self.gaussians_move() && !self.is_sax()
     }
 
-    /// Whether the moving field takes displacements of the heart, frame by frame: a method that sees whole images cannot.
+    /// Tells whether the dynamic field supports a displacement of the heart in each frame; methods fitted to whole images do
+    /// not.
     pub fn follows_breath(&self) -> bool {
         self.gaussians_move() && !self.has_gaussians_alone()
     }
 
-    /// Iterations, the first of the run, that go to Gaussians; the still field has the others.
+    /// Returns the number of iterations at the start of the run that fit Gaussians; the others fit the static field.
     pub fn gaussian_iterations(&self) -> u32 {
         match self.gaussians.form {
             GaussianForm::None => 0,
@@ -402,14 +404,14 @@ impl Config {
         }
     }
 
-    /// The configuration as TOML.
+    /// Returns the configuration as TOML.
     pub fn to_toml(&self) -> Result<String> {
         toml::to_string_pretty(self).map_err(|e| Error::Internal(e.to_string()))
     }
 }
 
 fn parse_value(text: &str) -> toml::Value {
-    // A bare word is a string; anything TOML understands is taken as that.
+    // A value that TOML does not parse is taken as a string.
     format!("v = {text}")
         .parse::<toml::Table>()
         .ok()
@@ -426,7 +428,7 @@ fn nested(key: &str, value: toml::Value) -> toml::Table {
     table
 }
 
-/// Lays `overlay` over `base`; keys that `base` lacks are refused.
+/// Overrides values of `base` with those of `overlay`; keys that `base` lacks are refused.
 fn merge(base: &mut toml::Table, overlay: toml::Table, prefix: &str) -> Result<()> {
     for (key, value) in overlay {
         let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };

@@ -1,14 +1,14 @@
-//! One error type: a variant per thing a caller can act on.
+//! The error type of the crate, with one variant per case that a caller can handle.
 
 use std::path::{Path, PathBuf};
 
 /// Result of every fallible function of this crate.
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// What takes less memory of most runs; see [`Error::OutOfMemory`].
+/// Settings that reduce the memory of most runs; see [`Error::OutOfMemory`].
 pub const SMALLER_BATCHES: &str = "a smaller train.chunk_samples or train.rays";
 
-/// What went wrong, where, and what to try.
+/// Error of this crate: its cause, its place, and advice where there is any.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -17,9 +17,9 @@ pub enum Error {
     Config {
         /// Name of the key, as written in a TOML file.
         field: String,
-        /// The value that was given.
+        /// The given value.
         value: String,
-        /// Why it is refused and what is accepted.
+        /// The reason of the refusal, and the accepted values.
         problem: String,
     },
     /// An input file is malformed.
@@ -29,20 +29,20 @@ pub enum Error {
         file: PathBuf,
         /// Field, frame or element inside the file.
         field: String,
-        /// What is wrong and what is expected.
+        /// The fault, and the expected content.
         problem: String,
     },
     /// The operating system refused a file operation.
     #[error("{}: {action} failed: {source}", path.display())]
     Io {
-        /// What was attempted, e.g. `read`.
+        /// The attempted action, e.g. `read`.
         action: &'static str,
         /// The path concerned.
         path: PathBuf,
-        /// The system's own reason.
+        /// The error that the system returned.
         source: std::io::Error,
     },
-    /// No Vulkan device fits.
+    /// No suitable Vulkan device was found.
     #[error("no usable Vulkan device: {0}")]
     NoDevice(String),
     /// A Vulkan call failed.
@@ -55,7 +55,7 @@ pub enum Error {
         /// The code the driver returned.
         code: ash::vk::Result,
     },
-    /// The device stopped answering.
+    /// The device was lost.
     #[error(
         "the Vulkan device was lost during {pass}. The driver may have reset it after a time limit: \
          try a smaller train.iterations_per_submit, another device, or a newer driver. \
@@ -72,11 +72,11 @@ pub enum Error {
         object: String,
         /// Requested size.
         bytes: u64,
-        /// The allocator's words.
+        /// The allocator's message.
         detail: String,
-        /// Whether it may fit later: no limit stands against it, others hold the memory.
+        /// Whether it may succeed later, because only other programs hold the memory and no limit is exceeded.
         may_pass: bool,
-        /// What needs less.
+        /// Alternative that needs less memory.
         instead: &'static str,
     },
     /// The optimisation produced a value that is not finite, or a loss at which the configuration ends a run.
@@ -84,47 +84,47 @@ pub enum Error {
         "training diverged at iteration {step}: {quantity} = {value}. The last good checkpoint is kept. Try {advice}"
     )]
     Diverged {
-        /// Iteration at which it was seen.
+        /// Iteration at which the divergence was detected.
         step: u64,
-        /// Which quantity.
+        /// Name of the diverged quantity.
         quantity: &'static str,
         /// Its value.
         value: f64,
         /// Settings of the method that make its steps smaller.
         advice: &'static str,
     },
-    /// What was asked for cannot be done while something else goes on.
+    /// The request cannot be served while another operation is in progress.
     #[error("busy: {0}")]
     Busy(String),
-    /// What was asked for needs something that is still to come.
+    /// The request needs a result that is not available yet.
     #[error("not ready: {0}")]
     NotReady(String),
     /// The user asked to stop; state was saved.
     #[error("interrupted")]
     Interrupted,
-    /// An internal rule was broken: a fault of this program.
+    /// An internal invariant was violated, which is a fault of this program.
     #[error("internal fault: {0}. Please report it")]
     Internal(String),
 }
 
 impl Error {
-    /// A [`Error::Data`] for `field` of `file`.
+    /// Returns an [`Error::Data`] for `field` of `file`.
     pub fn data(file: impl AsRef<Path>, field: impl Into<String>, problem: impl Into<String>) -> Self {
         Error::Data { file: file.as_ref().to_path_buf(), field: field.into(), problem: problem.into() }
     }
 
-    /// A [`Error::Config`] for one key.
+    /// Returns an [`Error::Config`] for one key.
     pub fn config(field: impl Into<String>, value: impl ToString, problem: impl Into<String>) -> Self {
         Error::Config { field: field.into(), value: value.to_string(), problem: problem.into() }
     }
 
-    /// Wraps a system error with the action and the path.
+    /// Returns a function that wraps a system error with the action and the path.
     pub fn io(action: &'static str, path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.as_ref().to_path_buf();
         move |source| Error::Io { action, path, source }
     }
 
-    /// Wraps a Vulkan code with the call and the object it concerned.
+    /// Returns a function that wraps a Vulkan code with the call and the object it concerned.
     pub(crate) fn vulkan(call: &'static str, object: impl Into<String>) -> impl FnOnce(ash::vk::Result) -> Self {
         let object = object.into();
         move |code| match code {

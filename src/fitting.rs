@@ -1,5 +1,5 @@
-//! What the fits of all methods share: traits of fits and fields, recorded iterations, losses, sets of static methods, tensors of
-//! checkpoints. It knows no method.
+//! Code that the fits of all methods share: traits of fits and fields, recorded iterations, losses, sets of static methods,
+//! tensors of checkpoints. It depends on no method.
 
 pub(crate) mod extent;
 pub mod field;
@@ -12,5 +12,5 @@ pub mod tensors;
 
 /// Iterations whose losses the device keeps for the host.
 pub const RING_LENGTH: u32 = 1024;
-/// Scale of the static gradient's 64-bit sums: resolves 1e-15, holds +-8192.
+/// Fractional bits of the static gradient's 64-bit sums, which resolve 1e-15 and hold +-8192.
 pub const FIXED_POINT_BITS: u32 = 50;

@@ -1,26 +1,28 @@
 //! 4D reconstruction of the beating coronary arteries from 3 or 4 X-ray angiography views, on Vulkan compute.
 //!
-//! The way of the data, and where to read it:
+//! Data flow, with the modules in their order:
 //!
-//! 1. [`scan`]: angiograms with geometry and phase, validated -> line integrals (`import`, of the feature `dicom`, brings them in)
-//! 2. [`evidence`]: what each view shows by itself; [`calibrate`] brings views that disagree together by it, and
-//!    [`mod@check`] names the mistake where that cannot be;
-//!    [`plan`]: what moves -> still backgrounds, the motion hull, scales and boxes: everything a run needs
-//! 3. [`train::step`]: one iteration, top to bottom: rays -> samples -> [`network`] -> loss -> gradients -> Adam
+//! 1. [`scan`]: validated angiograms with geometry and phase -> line integrals (`import`, of the feature `dicom`, reads
+//!    clinical runs)
+//! 2. [`evidence`]: static background, noise and possible vessels of each single view. From it, [`calibrate`] corrects the
+//!    geometry of views that disagree, and [`mod@check`] names the mistake where they cannot be made to agree;
+//!    [`plan`]: everything a run needs: static backgrounds, the motion hull, scales and boxes
+//! 3. [`train::step`]: one iteration, in this order: rays -> samples -> [`network`] -> loss -> gradients -> Adam
 //! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses. Beside it, [`train::gaussians`] and
-//!    [`train::tree`] fit [`gaussians`] as the moving field to [`plan::targets`], from [`plan::seeds`] in a
+//!    [`train::tree`] fit [`gaussians`] as the dynamic field to [`plan::targets`]; the fit starts from [`plan::seeds`] in a
 //!    [`plan::soft_hull`]
 //! 5. [`model`]: parameters, scales, hull and configuration; [`model::checkpoint`] keeps them in one safetensors file
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
-//! 7. [`export`] hands them to other tools, [`score`] compares them with what was seen, [`trees`] turns them into centrelines
+//! 7. [`export`] writes them for other tools, [`score`] compares them with the images, [`trees`] extracts centrelines from them
 //!
-//! [`run`] ties these to a run directory, [`session`] is a reconstruction in memory that grows with its frames, and
-//! [`capi`] the same for C. [`phantom`] makes data to try it on, `study` (a feature) puts methods beside each other on them,
-//! [`mod@bench`] times the engine, and [`mod@reference`] holds an f64 twin of every compute stage, which tests and `selftest` compare the
-//! device with; `inventory` lists pipelines as drivers compile them (both of the feature `diagnostics`). Below them all, [`kernels`] are the compute stages and [`gpu`] is Vulkan
-//! without any knowledge of angiography. Modules use only what stands above them in this file.
+//! [`run`] connects these to a run directory, [`session`] is a reconstruction in memory to which frames can be added, and
+//! [`capi`] is its C interface. [`phantom`] makes synthetic data, `study` (a feature) compares methods on them, [`mod@bench`]
+//! measures the speed, and [`mod@reference`] holds an f64 reference of every compute stage, with which tests and `selftest`
+//! compare the device; `inventory` lists pipelines as drivers compile them (both belong to the feature `diagnostics`). All of
+//! them build on the compute stages in [`kernels`] and on [`gpu`], which is Vulkan code independent of angiography. A module
+//! uses only modules that stand above it in this file.
 //!
-//! A dataset becomes a reconstruction, in memory:
+//! The following example turns a dataset into a reconstruction in memory:
 //!
 //! ```
 //! use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
@@ -74,7 +76,8 @@
 //! # Ok::<(), nertca_vk::error::Error>(())
 //! ```
 //!
-//! Public functions speak mm and degrees; inside, lengths are world units of 100 mm along (posterior, left, superior).
+//! Public functions take and return mm and degrees; inside, lengths are world units of 100 mm along (posterior, left,
+//! superior).
 
 pub mod choice;
 pub mod error;
@@ -83,7 +86,7 @@ pub mod fingerprint;
 pub mod random;
 pub mod raster;
 
-/// Vulkan compute, free of any knowledge of angiography.
+/// Vulkan compute, independent of angiography.
 pub mod gpu {
     pub mod buffer;
     pub mod capabilities;
@@ -144,7 +147,7 @@ pub mod scan {
     pub mod writer;
 }
 
-/// Clinical runs -> a dataset.
+/// Import of clinical runs into a dataset.
 #[cfg(feature = "dicom")]
 pub mod import {
     pub mod angiograms;
@@ -157,7 +160,7 @@ pub mod import {
     mod stands;
 }
 
-/// What each view shows by itself: its still background, its noise, and where vessels may be.
+/// Evidence of each single view: its static background, its noise, and where vessels may be.
 pub mod evidence {
     pub mod background;
     pub mod drift;
@@ -174,7 +177,7 @@ pub mod methods;
 pub mod model;
 pub mod network;
 
-/// Gaussians on the device: how views see them, and one iteration.
+/// Gaussians on the device: their projection into views, and one iteration of a fit.
 pub mod gaussians {
     pub mod blobs;
     pub mod particles;
@@ -185,7 +188,7 @@ pub mod gaussians {
     pub mod work;
 }
 
-/// R2-Gaussian, a static method that the paper compares itself with: its data, where it begins, its stages and density control.
+/// R2-Gaussian, a static baseline of the paper: its data, initial values, stages and density control.
 pub mod r2 {
     pub mod data;
     pub mod densify;
@@ -197,8 +200,7 @@ pub mod r2 {
     pub mod start;
 }
 
-/// X-Gaussian, another static method that the paper compares itself with: its data, where it begins, its stages and density
-/// control.
+/// X-Gaussian, a static baseline of the paper: its data, initial values, stages and density control.
 pub mod x_gaussian {
     pub mod data;
     pub mod densify;
@@ -211,7 +213,7 @@ pub mod x_gaussian {
 
 pub mod plan;
 
-/// Drawing a model, for any pose and phase.
+/// Rendering of a model for any pose and phase.
 pub mod render {
     pub mod baked;
     pub mod grid;
@@ -240,7 +242,7 @@ pub mod train {
     pub mod x_gaussian;
 }
 
-/// A model for other tools: volumes, surfaces and motion.
+/// Export of a model for other tools: volumes, surfaces and motion.
 pub mod export {
     #[cfg(feature = "dicom")]
     pub mod dicom;
@@ -249,7 +251,7 @@ pub mod export {
     pub mod volumes;
 }
 
-/// Where the moving field is vessel, as sets of voxels.
+/// Vessels of the dynamic field, as sets of voxels.
 pub mod vessels {
     pub mod centreline;
     pub mod distances;
@@ -273,7 +275,7 @@ pub mod trees {
     mod tubes;
 }
 
-/// What a reconstruction is worth.
+/// Quality measures of a reconstruction.
 pub mod score {
     pub mod calibrated;
     pub mod ceiling;
@@ -345,7 +347,8 @@ pub mod study;
 
 pub mod bench;
 
-/// f64 twins of the compute stages: plain loops, no device. For tests and `selftest`; no result stands on them.
+/// Reference implementations of the compute stages in f64: plain loops, no device. They serve tests and `selftest`; no result
+/// depends on them.
 pub mod reference {
     pub mod blobs;
     pub mod field;

@@ -1,12 +1,12 @@
-//! The registry of methods that have a room of their own. To add one: its folder here, its line below, its settings and preset
-//! in [`crate::config`].
+//! The registry of methods with a module of their own. To add a method, add its folder here, its line below, and its settings
+//! and preset in [`crate::config`].
 
 pub mod sax_nerf;
 
 use crate::config::Config;
 use crate::fitting::fit::Method;
 
-/// All methods with a room of their own.
+/// All methods with a module of their own.
 pub static METHODS: &[&dyn Method] = &[&sax_nerf::SaxNerf];
 
 /// Returns the method that a configuration chooses; none for those that share the trainer of fields and Gaussians.

@@ -32,13 +32,13 @@ pub struct Model {
     pub config: Config,
     /// Scales and boxes.
     pub scene: Scene,
-    /// Where each parameter lives.
+    /// Positions of the parameters in `params`.
     pub param_map: ParamMap,
     /// Motion hull, when the run uses one.
     pub hull: Option<Hull>,
-    /// Gaussians, where they are the moving field; else the network is.
+    /// Gaussians, where they are the dynamic field; none where it is the network.
     pub moving: Option<MovingGaussians>,
-    /// Field of a method with a room of its own ([`crate::methods`]), which is all there is then.
+    /// Field of a method with a module of its own ([`crate::methods`]); the model then has no other field.
     pub field: Option<Arc<dyn Field>>,
     /// Parameters, padded as [`ParamMap`] says.
     pub params: Vec<f32>,
@@ -53,8 +53,8 @@ pub struct Model {
 }
 
 impl Model {
-    /// Tells whether the dynamic field has a value between phases: a network or one set of Gaussians that moves. Sets per phase and
-    /// fields of methods with a room of their own have none.
+    /// Tells whether the dynamic field has values between phases, as a network or one moving set of Gaussians has. Sets per
+    /// phase and fields of methods with a module of their own have none.
     pub fn is_continuous(&self) -> bool {
         self.field.is_none() && self.moving.as_ref().is_none_or(|field| field.tree().is_some())
     }

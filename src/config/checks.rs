@@ -1,11 +1,11 @@
-//! What is refused of a configuration.
+//! Checks of a configuration.
 
 use crate::choice::Choice;
 use crate::config::sections::check_range;
 use crate::config::{Config, DynamicTarget, OcclusionRegion, StaticForm};
 use crate::error::{Error, Result};
 
-/// Cells along a side of the hash grid's box that f32 coordinates tell apart.
+/// Maximum number of cells along a side of the hash grid's box that f32 coordinates can resolve.
 const MOST_CELLS: u64 = 1 << 20;
 
 impl Config {
@@ -73,7 +73,7 @@ impl Config {
         Ok(())
     }
 
-    /// Refuses what does not go with two networks.
+    /// Refuses settings that two networks do not support.
     fn check_two_networks(&self) -> Result<()> {
         let form = "does not go with static.form = \"network\"";
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
@@ -128,7 +128,7 @@ impl Config {
         Ok(())
     }
 
-    /// Refuses what R2-Gaussian and X-Gaussian cannot do, and a run without a still field where that is not meant.
+    /// Refuses settings that R2-Gaussian and X-Gaussian do not support, and a run of another method without a static field.
     fn check_gaussians_alone(&self) -> Result<()> {
         let form = self.static_field.form;
         if !self.has_gaussians_alone() {
@@ -202,7 +202,7 @@ impl Config {
         Ok(())
     }
 
-    /// Refuses what SAX-NeRF cannot do.
+    /// Refuses settings that SAX-NeRF does not support.
     fn check_sax(&self) -> Result<()> {
         if !self.is_sax() {
             return Ok(());

@@ -1,17 +1,17 @@
-//! Choices about the fields: what they are made of, and where they are penalised.
+//! Choices about the fields: their representation, and the regions in which they are penalised.
 
 use crate::choice::Choice;
 use serde::{Deserialize, Serialize};
 
-/// What the dynamic field is where no Gaussians are.
+/// Representation of the dynamic field where it does not consist of Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DynamicForm {
     /// A network on encoded coordinates and latents.
     #[default]
     Network,
-    /// A hash grid and a Lineformer as SAX-NeRF fits them to whole images, for each phase or for all: no still field
-    /// beside them.
+    /// A hash grid and a Lineformer as SAX-NeRF fits them to whole images, for each phase or for all phases, without a static
+    /// field.
     Lineformer,
 }
 

@@ -3,14 +3,15 @@
 use crate::config::Config;
 use crate::error::Result;
 
-/// Iterations from one density control of a shortened run to the next, at least: nothing is learned in those that have one.
+/// Minimum number of iterations between two density controls of a shortened run: an iteration with density control learns
+/// nothing.
 const LEAST_BETWEEN_DENSIFYING: u32 = 10;
 
 /// Iterations of a dry run: enough for every event of the presets to have iterations before and after it.
 const DRY_RUN: u32 = 20;
-/// Iterations of a dry run with density control, which comes every ten iterations at most.
+/// Iterations of a dry run with density control, which happens at most every ten iterations.
 const DRY_RUN_WITH_DENSIFYING: u32 = 60;
-/// Iterations of a dry run after its last event, at least.
+/// Minimum number of iterations of a dry run after its last event.
 const AFTER_THE_LAST: u32 = 4;
 
 impl Config {
@@ -77,7 +78,7 @@ impl Config {
         }
         let mut short = self.of_length(iterations)?;
         if short.follows_breath() {
-            // A fit of Gaussians has a length of its own, of which nothing is a share of the run.
+            // A fit of Gaussians has its own number of iterations, which does not scale with the run.
             short.train.iterations = short.gaussians.iterations.saturating_add(iterations).min(self.train.iterations);
         }
         if short.is_sax() {
@@ -89,7 +90,7 @@ impl Config {
         Ok(short)
     }
 
-    /// Returns the iterations at which the schedule changes something that a run must get past, in their order.
+    /// Returns the iterations, in ascending order, at which the schedule changes something.
     pub fn schedule_events(&self) -> Vec<u32> {
         let mut events = Vec::new();
         if self.network_moves() {
@@ -113,7 +114,7 @@ impl Config {
         if self.occupancy.enabled {
             events.push(self.dynamic.delay.saturating_add(self.occupancy.start));
         }
-        // The static field begins where Gaussians end.
+        // The fit of the static field begins where that of the Gaussians ends.
         if self.gaussians_move() {
             events.push(self.gaussian_iterations());
         }

@@ -25,7 +25,7 @@ impl Config {
     }
 }
 
-/// As the paper states it (section 4).
+/// Returns the method as the paper states it (section 4).
 fn paper() -> Config {
     Config {
         preset: Preset::Paper,
@@ -109,12 +109,12 @@ fn paper() -> Config {
     }
 }
 
-/// Geometry is what the dataset says, as in the paper.
+/// Returns the setting that takes the geometry from the dataset, as in the paper.
 pub(super) fn uncalibrated() -> Calibrate {
     Calibrate { mode: CalibrateMode::Off }
 }
 
-/// Gaussians are none of the paper's: one set of defaults for all presets.
+/// Returns the defaults of the Gaussians for all presets; the paper does not use Gaussians.
 pub(super) fn gaussians() -> Gaussians {
     Gaussians {
         form: GaussianForm::None,
@@ -143,7 +143,7 @@ pub(super) fn gaussians() -> Gaussians {
     }
 }
 
-/// As [`gaussians`].
+/// Returns the defaults of the moving tree for all presets; the paper does not use it.
 pub(super) fn tree() -> Tree {
     Tree {
         warm_iterations: 60,
@@ -160,7 +160,7 @@ pub(super) fn tree() -> Tree {
     }
 }
 
-/// Where the authors' public code differs from the paper.
+/// Applies the differences between the authors' public code and the paper.
 fn public_code(paper: Config) -> Config {
     Config {
         preset: Preset::PublicCode,
@@ -199,7 +199,7 @@ pub(super) fn networks() -> Networks {
     }
 }
 
-/// NeRF-CA as its public code does it: two networks, no boxes, nothing left out.
+/// NeRF-CA as its public code implements it: two networks, no boxes, and no samples left out.
 fn nerf_ca(paper: Config) -> Config {
     Config {
         preset: Preset::NerfCa,
@@ -230,7 +230,8 @@ fn nerf_ca(paper: Config) -> Config {
             lr: 1e-3,
             lr_end: 1e-5,
             occlusion: 0.0,
-            // The code covers the near fifth of rays with a mask, then all of them with another.
+            // The code selects the near fifth of each ray with one mask, then replaces it with a mask that covers the whole
+            // ray.
             occlusion_share: 1.0,
             ..paper.dynamic
         },
@@ -275,22 +276,22 @@ pub(super) fn r2() -> R2 {
     }
 }
 
-/// R2-Gaussian as its public code does it: a static method, fitted to the whole images of each phase.
+/// R2-Gaussian as its public code implements it: a static method, fitted to the whole images of each phase.
 fn r2_gaussian(paper: Config) -> Config {
     Config {
         preset: Preset::R2Gaussian,
         train: Train {
             iterations: 30_000,
-            // Divides what lies between changes of the Gaussians' number.
+            // Must divide the number of iterations between changes of the number of Gaussians.
             iterations_per_submit: 10,
             checkpoint_every: 5000,
             validate_every: 5000,
             ..paper.train
         },
-        // Neither field is marched through: the still one is nothing.
+        // Rays are marched through neither field, and there is no static field.
         march: March { static_samples: 2, dynamic_samples: 2, render_samples: 2, ..paper.march },
         static_field: StaticField { form: StaticForm::None, ..paper.static_field },
-        // The network is never asked; the smallest one takes no memory.
+        // The network is never evaluated; the smallest one takes hardly any memory.
         dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, delay: 0, ..paper.dynamic },
         adam: Adam { beta2: 0.999, epsilon: 1e-15, ..paper.adam },
         gaussians: Gaussians { form: GaussianForm::R2, ..paper.gaussians },
@@ -331,7 +332,7 @@ pub(super) fn x() -> X {
     }
 }
 
-/// X-Gaussian as its public code does it: a static method, fitted to the normalised images of each phase.
+/// X-Gaussian as its public code implements it: a static method, fitted to the normalised images of each phase.
 fn x_gaussian(paper: Config) -> Config {
     let r2 = r2_gaussian(paper);
     Config {
@@ -342,8 +343,8 @@ fn x_gaussian(paper: Config) -> Config {
     }
 }
 
-/// The constants of SAX-NeRF's public code for the chest, whose rate falls after 1500 of 1501 passes over the images:
-/// here over three of them.
+/// The constants of SAX-NeRF's public code for the chest. Its rate falls after 1500 of 1501 passes over the images; here the
+/// count assumes three images.
 pub(super) fn sax() -> Sax {
     Sax {
         static_data: StaticData::PerPhase,
@@ -363,7 +364,7 @@ pub(super) fn sax() -> Sax {
     }
 }
 
-/// SAX-NeRF as its public code does it: a static method, fitted to the whole images of each phase.
+/// SAX-NeRF as its public code implements it: a static method, fitted to the whole images of each phase.
 fn sax_nerf(paper: Config) -> Config {
     Config {
         preset: Preset::SaxNerf,
@@ -374,10 +375,10 @@ fn sax_nerf(paper: Config) -> Config {
             validate_every: 500,
             ..paper.train
         },
-        // Neither field is marched through: the still one is nothing.
+        // Rays are marched through neither field, and there is no static field.
         march: March { static_samples: 2, dynamic_samples: 2, render_samples: 2, ..paper.march },
         static_field: StaticField { form: StaticForm::None, ..paper.static_field },
-        // The network is never asked; the smallest one takes no memory.
+        // The network is never evaluated; the smallest one takes hardly any memory.
         dynamic: DynamicField {
             form: DynamicForm::Lineformer,
             layers: 1,
@@ -392,7 +393,7 @@ fn sax_nerf(paper: Config) -> Config {
     }
 }
 
-/// Gaussians in front of the still field of [`fast_mlp`].
+/// Gaussians in front of the static field of [`fast_mlp`].
 fn fast(mlp: Config) -> Config {
     Config {
         preset: Preset::Fast,
@@ -400,17 +401,17 @@ fn fast(mlp: Config) -> Config {
             iterations: 300,
             rays: 256,
             motion_share: 0.0,
-            // Divides what lies between changes of the Gaussians' number and background.
+            // Must divide the numbers of iterations between changes of the number of Gaussians and of the background.
             iterations_per_submit: 10,
             checkpoint_every: 100,
             validate_every: 0,
             ..mlp.train
         },
         march: March { dynamic_samples: 2, ..mlp.march },
-        // Three or four views leave a low-rank field free to look like anything from elsewhere: only smoothness does
-        // not. Few iterations take long steps.
+        // Three or four views do not determine how a low-rank field looks from other angles; smoothness does. Few iterations
+        // need large steps.
         static_field: StaticField { tv: 100.0, lr: 3e-2, lr_end: 3e-3, ..mlp.static_field },
-        // The network is never asked; the smallest one takes no memory.
+        // The network is never evaluated; the smallest one takes hardly any memory.
         dynamic: DynamicField {
             layers: 1,
             width: 16,
@@ -426,7 +427,7 @@ fn fast(mlp: Config) -> Config {
     }
 }
 
-/// The paper's two fields, normalised, hull-gated, tuned.
+/// The paper's two fields with normalised data, a motion hull and tuned settings.
 fn fast_mlp(paper: Config) -> Config {
     Config {
         preset: Preset::FastMlp,

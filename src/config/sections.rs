@@ -1,4 +1,4 @@
-//! The sections of a configuration: each hyper-parameter with what it means and the range it may have.
+//! The sections of a configuration: each hyper-parameter with its meaning and accepted range.
 
 use crate::config::{
     CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
@@ -30,7 +30,7 @@ macro_rules! section {
 }
 
 pub(super) fn check_range(field: &str, value: f64, low: f64, high: f64) -> Result<()> {
-    // A value that is not a number is in no range.
+    // A value that is not a number (NaN) is in no range.
     if value >= low && value <= high {
         return Ok(());
     }
@@ -42,15 +42,16 @@ fn whole_run() -> f64 {
 }
 
 section! {
-    /// The loop.
+    /// The training loop.
     Train, "train" {
         /// Length of the run; schedules refer to it.
         iterations: u32 in 1.0 to 1e6,
         /// Rays of a batch.
         rays: u32 in 1.0 to 65_535.0,
-        /// Share of the batch drawn from rays that meet the motion hull; with two networks, from those that change.
+        /// Share of the batch drawn from rays that meet the motion hull; with two networks, from rays whose pixel changes.
         motion_share: f64 in 0.0 to 1.0,
-        /// Samples evaluated at once, at most: bounds device memory, not results. A device may allow fewer.
+        /// Maximum number of samples evaluated at once. It bounds device memory and does not affect results. A device may allow
+        /// fewer.
         chunk_samples: u32 in 1024.0 to 1_048_576.0,
         /// Iterations handed to the device at once.
         iterations_per_submit: u32 in 1.0 to 256.0,
@@ -60,16 +61,16 @@ section! {
         validate_every: u32,
         /// Validation images used during training; evenly spread over all of them.
         validate_images: u32,
-        /// Loss, as a multiple of the first one of a start, at which a run stops as diverged; 0 = never. A loss that is not finite
-        /// always stops it, and one of 1e6 times the first is warned of.
+        /// Loss, as a multiple of the first loss after a start, at which a run stops as diverged; 0 = never. A loss that is not
+        /// finite always stops the run; a loss of 1e6 times the first one causes a warning.
         #[serde(default)] stop_at_loss_ratio: f64 in 0.0 to 1e30,
     }
 }
 
 section! {
-    /// Self-calibration: corrections of the views' stated geometry, found in the angiograms before anything else.
+    /// Self-calibration: corrections of the views' stated geometry, estimated from the angiograms before the fit.
     Calibrate, "calibrate" {
-        /// What is corrected.
+        /// Corrections to be estimated.
         mode: CalibrateMode,
     }
 }
@@ -87,7 +88,7 @@ section! {
         per_ray_depths: bool,
         /// Spread the dynamic field's depths over its own box instead of the whole depth range.
         fit_dynamic_range: bool,
-        /// Look for the static field only as near and as far as its box reaches.
+        /// Spread the static field's depths over its own box instead of the whole depth range.
         fit_static_range: bool,
         /// Count path lengths along the source-detector axis, not along the ray, as NeRF-CA does.
         #[serde(default)] along_axis: bool,
@@ -95,10 +96,11 @@ section! {
 }
 
 section! {
-    /// The static field. As a network ("network") it has the dynamic one's layers, and of what is below the learning rate alone.
+    /// The static field. As a network ("network") it has the layers of the dynamic field; only the learning rate settings below
+    /// apply then.
     StaticField, "static" {
-        /// What it is made of: "tensor" (low-rank planes and lines), "network", or "none", which goes with R2-Gaussian,
-        /// X-Gaussian and SAX-NeRF alone.
+        /// Representation: "tensor" (low-rank planes and lines), "network", or "none", which only R2-Gaussian, X-Gaussian and
+        /// SAX-NeRF accept.
         #[serde(default)] form: StaticForm,
         /// Cells per axis, D.
         grid: u32 in 2.0 to 512.0,
@@ -112,13 +114,13 @@ section! {
         lr: f64 in 0.0 to 100.0,
         /// Learning rate at the end.
         lr_end: f64 in 0.0 to 100.0,
-        /// How it decays.
+        /// Course of the learning rate.
         decay: Decay,
         /// Weight of total variation, lambda_TV.
         tv: f64 in 0.0 to 1e6,
-        /// Share of the planes in it.
+        /// Share of the planes in the total variation.
         tv_plane: f64,
-        /// Share of the lines in it.
+        /// Share of the lines in the total variation.
         tv_line: f64,
     }
 }
@@ -126,7 +128,8 @@ section! {
 section! {
     /// The dynamic neural field.
     DynamicField, "dynamic" {
-        /// What it is where no Gaussians are: "network", or "lineformer" (section `sax`, and of this one nothing else).
+        /// Representation where the dynamic field does not consist of Gaussians: "network", or "lineformer" (configured in
+        /// section `sax`; no other setting of this section applies then).
         #[serde(default)] form: DynamicForm,
         /// Hidden layers.
         layers: u32 in 1.0 to 16.0,
@@ -134,7 +137,7 @@ section! {
         width: u32 in 16.0 to 1024.0,
         /// Hidden layer (from 1) that sees the encoded input again; 0 = none.
         skip_layer: u32,
-        /// Numbers of a phase's latent.
+        /// Length of a phase's latent vector.
         latent: u32 in 1.0 to 64.0,
         /// Frequency bands of the encoding.
         bands: u32 in 1.0 to 16.0,
@@ -146,25 +149,27 @@ section! {
         half_extent_mm: f64 in 0.0 to 1e5,
         /// Encode coordinates relative to the field's box instead of world units.
         encode_box: bool,
-        /// Iterations before the field starts. After the first one with it, both fields' moments and learning rates start again.
+        /// Iterations before the field starts. After the first iteration with it, moments and learning rates of both fields
+        /// start again.
         delay: u32,
         /// Learning rate at the start.
         lr: f64 in 0.0 to 100.0,
         /// Learning rate at the end.
         lr_end: f64 in 0.0 to 100.0,
-        /// How it decays.
+        /// Course of the learning rate.
         decay: Decay,
         /// Shift inside its softplus when the problem is normalised.
         normalised_shift: f64 in -20.0 to 20.0,
-        /// Start, with a temporal target, where the best constant field is instead.
+        /// With a temporal target, start at the best constant field instead.
         best_start: bool,
-        /// Least slope of its softplus where a ray asks for more, so that the field cannot die; 0 = none.
+        /// Minimum slope of its softplus where a ray demands more attenuation, so that the gradient cannot vanish; 0 = none.
         least_slope: f64 in 0.0 to 1.0,
         /// Weight of occlusion minimisation, lambda_o.
         occlusion: f64 in 0.0 to 1e6,
-        /// Share of the depth range, from the source, it covers; with two networks, that `networks.near_integral` does.
+        /// Share of the depth range, counted from the source, that occlusion minimisation covers; with two networks, that
+        /// `networks.near_integral` covers.
         occlusion_share: f64 in 0.0 to 1.0,
-        /// How the region of occlusion minimisation is found: "depth-range" (that share of the depth range) or "last-ray" (that
+        /// Region of occlusion minimisation: "depth-range" (that share of the depth range) or "last-ray" (that
         /// share of the path length of the batch's last ray).
         #[serde(default)] occlusion_region: OcclusionRegion,
     }
@@ -175,7 +180,7 @@ section! {
     Loss, "loss" {
         /// Scale both fields and residuals by the data, so that numbers are near 1.
         normalise: bool,
-        /// What drives the dynamic field.
+        /// Data that the dynamic field is fitted to.
         dynamic_target: DynamicTarget,
         /// Residual of the dynamic field, as a share of strong temporal change, from which its loss grows linearly with a
         /// temporal target, when the problem is normalised; 0 = squared throughout.
@@ -188,7 +193,7 @@ section! {
     Hull, "hull" {
         /// Restrict the dynamic field to it.
         enabled: bool,
-        /// Carve each phase from its own images, not only from what moves over the whole beat.
+        /// Carve each phase from its own images too, not only from the pixels that move over the whole beat.
         per_phase: bool,
         /// Cells along each side.
         resolution: u32 in 8.0 to 512.0,
@@ -196,10 +201,10 @@ section! {
         noise_sigmas: f64 in 0.0 to 1e3,
         /// A pixel moves, with four views or more, when its range also exceeds this share of the strongest change in its view.
         min_share: f64 in 0.0 to 1.0,
-        /// As `min_share`, with fewer than four views: each carves less, so more has to be asked of it.
+        /// Threshold like `min_share` for fewer than four views: they carve less, so the threshold has to be higher.
         min_share_few_views: f64 in 0.0 to 1.0,
-        /// Half width of the widest vessel, pixels: structures as thin as that may hide in the still background.
-        /// 0 trusts each pixel's minimum over the phases.
+        /// Half width of the widest vessel, pixels: structures up to this width may be hidden in the static background. 0 takes
+        /// each pixel's minimum over the phases as its background.
         vessel_pixels: u32 in 0.0 to 1024.0,
         /// Pixels by which moving regions grow.
         dilate_pixels: u32 in 0.0 to 64.0,
@@ -209,13 +214,13 @@ section! {
 }
 
 section! {
-    /// Occupancy learned while training: where the dynamic field is empty, samples are mostly left out.
+    /// Occupancy grid learned during training: where the dynamic field is empty, most samples are left out.
     Occupancy, "occupancy" {
-        /// Heed it.
+        /// Leave out samples where the field is empty.
         enabled: bool,
         /// Cells along each side of the dynamic field's box, for each phase.
         cells: u32 in 2.0 to 256.0,
-        /// Iterations of the dynamic field before it is heeded.
+        /// Iterations of the dynamic field before samples are left out.
         start: u32 in 0.0 to 1e6,
         /// Attenuation up to which a sample is empty, as a share of the dynamic field's scale: a typical vessel's when the
         /// problem is normalised, 0.01 per mm otherwise.
@@ -224,40 +229,42 @@ section! {
 }
 
 section! {
-    /// Two networks as the fields (`static.form = "network"`), as NeRF-CA has them. Weights of losses go from one value to
-    /// another on a straight line, then stay.
+    /// Two networks as the fields (`static.form = "network"`), as in NeRF-CA. Loss weights change linearly from their first
+    /// value to their last one and then stay constant.
     Networks, "networks" {
         /// Attenuation of either field where its softplus is 1, per world unit.
         gain: f64 in 1e-9 to 1e6,
-        /// What a ray weighs more whose pixel changes most over the beat, in what passes of the X-rays.
+        /// Extra weight of rays whose pixel changes: a ray weighs 1 + this times the change of its X-ray transmission over the
+        /// beat, from 0 to 1 in each view.
         change_weight: f64 in 0.0 to 1e3,
-        /// Change, as a share of the view's greatest, beyond which `train.motion_share` counts a ray as one that moves.
+        /// Change, as a share of the view's maximum, above which `train.motion_share` counts a ray as moving.
         least_change: f64 in 0.0 to 1.0,
-        /// Line integral of the dynamic field from which its entropy along a ray counts though the ray does not change.
+        /// Minimum line integral of the dynamic field at which its entropy along a ray counts although the ray does not change.
         least_integral: f64 in 0.0 to 1e6,
-        /// Iterations before the shares' entropy and near samples count.
+        /// Iterations before the losses `favour_static` and `near_integral` count.
         delay: u32 in 0.0 to 1e6,
-        /// Iterations that weights take from the first value to the last.
+        /// Iterations over which weights change from the first value to the last.
         ramp: u32 in 1.0 to 1e6,
-        /// First weight of the entropy of the fields' shares at samples: each is to belong to one.
+        /// First weight of the entropy of the fields' shares at samples; it makes each sample belong to one field.
         favour_static: f64 in 0.0 to 1e6,
-        /// Last weight of it.
+        /// Last weight of this loss.
         favour_static_end: f64 in 0.0 to 1e6,
         /// First weight of the entropy of the dynamic field along rays.
         ray_entropy: f64 in 0.0 to 1e6,
-        /// Last weight of it.
+        /// Last weight of this loss.
         ray_entropy_end: f64 in 0.0 to 1e6,
-        /// First weight of the dynamic field's integral over the share `dynamic.occlusion_share` of the ray that is near.
+        /// First weight of the dynamic field's integral over the share `dynamic.occlusion_share` of the ray nearest to the
+        /// source.
         near_integral: f64 in 0.0 to 1e6,
-        /// Last weight of it.
+        /// Last weight of this loss.
         near_integral_end: f64 in 0.0 to 1e6,
-        /// First weight of the static field's integrals over intervals, and their squares.
+        /// First weight of the static field's integrals over intervals and of their squares.
         static_size: f64 in 0.0 to 1e6,
-        /// Last weight of it.
+        /// Last weight of this loss.
         static_size_end: f64 in 0.0 to 1e6,
-        /// Iterations after which learning ends when an entropy has vanished; 0 = it does not.
+        /// Iterations after which learning ends when an entropy has vanished; 0 = never.
         stop_after: u32 in 0.0 to 1e6,
-        /// Entropy that has vanished, before it is weighted.
+        /// Threshold of an unweighted entropy below which it counts as vanished.
         stop_below: f64 in 0.0 to 1.0,
     }
 }
@@ -269,29 +276,29 @@ section! {
         beta1: f64 in 0.0 to 0.999_999,
         /// Decay of the second moment.
         beta2: f64 in 0.0 to 0.999_999,
-        /// Added to the denominator.
+        /// Constant added to the denominator.
         epsilon: f64 in 1e-30 to 1.0,
-        /// Share of the run over which learning rates go from start to end; then they stay.
+        /// Share of the run over which learning rates change from start to end; then they stay constant.
         #[serde(default = "whole_run")] decay_share: f64 in 0.001 to 1.0,
     }
 }
 
 section! {
-    /// Gaussians as the moving field. Lengths are pixels at the isocentre of images whose smaller side has 100, and grow with
-    /// the images; line integrals are shares of the views' strongest change.
+    /// Gaussians as the dynamic field. Lengths are in pixels at the isocentre for images whose smaller side has 100 pixels, and
+    /// scale with the image size; line integrals are shares of the views' strongest change.
     Gaussians, "gaussians" {
-        /// What the moving field is made of: "none" (the network), "phase", "tree", "auto", or "r2" (section
-        /// `r2`, and of this one nothing else).
+        /// Representation of the dynamic field: "none" (the network), "phase", "tree", "auto", or "r2" and "x" (configured in
+        /// the sections `r2` and `x`; no other setting of this section applies then).
         form: GaussianForm,
         /// Iterations, each over all images.
         iterations: u32 in 1.0 to 1e6,
         /// Gaussians seeded per phase.
         count: u32 in 1.0 to 1_048_576.0,
-        /// First scale.
+        /// Initial scale.
         first_scale: f64 in 0.01 to 100.0,
-        /// Least scale; noise raises it by up to half, where vessels are wide enough.
+        /// Minimum scale; noise raises it by up to half where vessels are wide enough.
         least_scale: f64 in 0.01 to 100.0,
-        /// Greatest scale.
+        /// Maximum scale.
         greatest_scale: f64 in 0.01 to 100.0,
         /// Adam's rate of positions.
         position_rate: f64 in 0.0 to 100.0,
@@ -303,43 +310,45 @@ section! {
         density_rate: f64 in 0.0 to 100.0,
         /// Share of the iterations, at the end, over which rates fall.
         fall_share: f64 in 0.001 to 1.0,
-        /// What rates fall to, as a share of themselves.
+        /// Final learning rates, as a share of their initial values.
         last_rate: f64 in 0.0 to 1.0,
-        /// Where the loss bends from square to linear.
+        /// Residual at which the loss changes from quadratic to linear.
         bend: f64 in 1e-6 to 1e3,
-        /// Noise at which a pixel counts 0.7 times; 0 = all pixels count alike.
+        /// Noise at which the weight of a pixel is 0.7; 0 = all pixels have the same weight.
         noise_scale: f64 in 0.0 to 1e3,
-        /// Standard deviations at which a Gaussian ends.
+        /// Number of standard deviations at which a Gaussian is cut off.
         cut: f64 in 1.0 to 10.0,
-        /// Iteration at which weak Gaussians are dropped and new ones placed where data are missing; 0 = never.
+        /// Iteration at which weak Gaussians are pruned and new ones are seeded where line integrals are missing; 0 = never.
         grow_at: u32 in 0.0 to 1e6,
         /// New Gaussians per phase, as a share of `count`.
         grow_share: f64 in 0.0 to 10.0,
-        /// Amplitude below which a Gaussian is dropped.
+        /// Amplitude threshold below which a Gaussian is pruned.
         weakest: f64 in 0.0 to 1e3,
-        /// Iteration at which Gaussians too faint for vessels are dropped: they stand for what else moves; 0 = never.
+        /// Iteration at which Gaussians too faint for vessels are pruned, since they represent other moving structures; 0 =
+        /// never.
         clear_at: u32 in 0.0 to 1e6,
-        /// Density below which a Gaussian is too faint, as a share of the vessels'.
+        /// Density below which a Gaussian is too faint, as a share of the vessels' density.
         faint: f64 in 0.0 to 1.0,
-        /// Distance within which Gaussians belong to one vessel, a length as the scales are: broad ones that stand alone are dropped when all iterations are
-        /// done; 0 = never. Runs from before it was a setting did not.
+        /// Distance within which Gaussians belong to one vessel, in the unit of the scales. Broad isolated Gaussians are pruned
+        /// after all iterations; 0 = never, the default for older files without this setting.
         #[serde(default)] link: f64 in 0.0 to 1e3,
-        /// Missing line integral from which a Gaussian is placed; also its first density.
+        /// Minimum missing line integral at which a Gaussian is seeded; also its initial density.
         missing: f64 in 1e-6 to 1e3,
-        /// Iterations after which the still background is estimated anew from what the Gaussians leave of the images, and
-        /// again after as many; not while rates fall; 0 = never.
+        /// Interval, in iterations, at which the static background is estimated again from the images minus the Gaussians; not
+        /// while rates fall; 0 = never.
         background_every: u32 in 0.0 to 1e6,
     }
 }
 
 section! {
-    /// One set of Gaussians that moves over the beat. Lengths are those of `gaussians`.
+    /// One set of Gaussians that moves over the beat. Lengths are in the unit of section `gaussians`.
     Tree, "tree" {
-        /// Iterations of a set per phase, before the tree is made of one of them.
+        /// Iterations that fit a set per phase, before the tree is made from one of these sets.
         warm_iterations: u32 in 1.0 to 1e6,
-        /// Amplitude from which a Gaussian of the phase of rest is taken into the tree, share of the views' strongest change.
+        /// Minimum amplitude at which a Gaussian of the rest phase is taken into the tree, as a share of the views' strongest
+        /// change.
         take: f64 in 0.0 to 1e3,
-        /// Distance of the grid's nodes.
+        /// Distance between nodes of the displacement grid.
         node: f64 in 1.0 to 1e4,
         /// Adam's rate of displacements.
         grid_rate: f64 in 0.0 to 100.0,
@@ -347,7 +356,7 @@ section! {
         smoothness: f64 in 0.0 to 1e6,
         /// Harmonics of a Gaussian's own motion.
         harmonics: u32 in 0.0 to 64.0,
-        /// Adam's rate of own motion.
+        /// Adam's rate of the Gaussians' own motion.
         own_rate: f64 in 0.0 to 100.0,
         /// Penalty on squared own motion.
         own_penalty: f64 in 0.0 to 1e6,
@@ -361,17 +370,16 @@ section! {
 }
 
 section! {
-    /// Gaussians as R2-Gaussian fits them (`gaussians.form = "r2"`), with what its code uses as defaults. Its volume is a
-    /// cube around the isocentre; lengths are shares of that cube's side unless they are called rates, which count half
-    /// sides.
+    /// Gaussians as R2-Gaussian fits them (`gaussians.form = "r2"`), with the defaults of its code. The volume is a cube around
+    /// the isocentre. Lengths are shares of the cube's side; rates are shares of half the side.
     R2, "r2" {
-        /// Which images a set of Gaussians sees: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one
+        /// Images that a set of Gaussians is fitted to: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one
         /// set).
         static_data: StaticData,
-        /// Where the fit begins: "fdk" (at voxels of a filtered back-projection) or "random".
+        /// Initial positions: "fdk" (voxels of a filtered back-projection) or "random".
         init: R2Start,
-        /// What a pixel sees of a Gaussian: "affine" (as published: exact for the Gaussian's affine picture around its centre) or
-        /// "exact" (along the pixel's own ray).
+        /// Line integral of a Gaussian at a pixel: "affine" (as published: under a projection linearised around the Gaussian's
+        /// centre) or "exact" (along the pixel's own ray).
         #[serde(default)] integral: R2Integral,
         /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities are near 1.
         normalise: bool,
@@ -384,11 +392,11 @@ section! {
         count: u32 in 1.0 to 1_048_576.0,
         /// Density of a Gaussian at the start, as a share of the back-projection there.
         density_share: f64 in 1e-6 to 1e3,
-        /// Back-projection beyond which a Gaussian may begin at a voxel.
+        /// Threshold of the back-projection above which a Gaussian may be seeded at a voxel.
         candidate: f64 in 0.0 to 1e3,
-        /// Least standard deviation.
+        /// Minimum standard deviation.
         least_scale: f64 in 1e-6 to 1.0,
-        /// Greatest standard deviation.
+        /// Maximum standard deviation.
         greatest_scale: f64 in 1e-6 to 10.0,
         /// Adam's rate of positions at the start; rates fall by a constant factor per iteration.
         position_rate: f64 in 1e-12 to 100.0,
@@ -406,51 +414,53 @@ section! {
         rotation_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of quaternions at the end.
         rotation_rate_end: f64 in 1e-12 to 100.0,
-        /// Weight of 1 - SSIM beside the mean absolute difference, which has 1.
+        /// Weight of 1 - SSIM; the mean absolute difference has weight 1.
         ssim: f64 in 0.0 to 1e3,
         /// Weight of total variation in a box of voxels.
         tv: f64 in 0.0 to 1e3,
-        /// Voxels along each side of that box, which is elsewhere in each iteration.
+        /// Voxels along each side of that box, which is placed anew in each iteration.
         tv_box: u32 in 2.0 to 128.0,
-        /// Let total variation move Gaussians: what its code computes, but scales by the square of a voxel's side by
-        /// mistake, so that it is nothing.
+        /// Let total variation move Gaussians. The public code computes this gradient, but mistakenly scales it by the square
+        /// of a voxel's side, so that it has no effect.
         tv_moves_centres: bool,
-        /// Iterations after which Gaussians are added and taken away, and again after as many; 0 = never.
+        /// Interval of density control, in iterations: Gaussians are added and pruned; 0 = never.
         densify_every: u32 in 0.0 to 1e6,
-        /// Iteration beyond which that begins.
+        /// Iteration after which density control begins.
         densify_from: u32 in 0.0 to 1e6,
-        /// Iteration from which it no longer happens.
+        /// Iteration at which density control ends.
         densify_until: u32 in 0.0 to 1e6,
-        /// Mean gradient of the loss by a centre, in half images, from which a Gaussian is cloned or split.
+        /// Mean gradient of the loss with respect to a centre, in half images, at or above which a Gaussian is cloned or split.
         densify_gradient: f64 in 0.0 to 1e6,
-        /// Greatest standard deviation up to which a Gaussian is cloned, and beyond which it is split.
+        /// Threshold of the largest standard deviation up to which a Gaussian is cloned, and above which it is split.
         size_limit: f64 in 0.0 to 10.0,
-        /// Most Gaussians of a set.
+        /// Maximum number of Gaussians of a set.
         most: u32 in 1.0 to 1_048_576.0,
-        /// Density below which a Gaussian is taken away.
+        /// Density threshold below which a Gaussian is pruned.
         weakest: f64 in 0.0 to 1e3,
     }
 }
 
 section! {
-    /// Gaussians as X-Gaussian fits them (`gaussians.form = "x"`), with what its code uses for most of its scenes as defaults.
+    /// Gaussians as X-Gaussian fits them (`gaussians.form = "x"`), with the defaults of its code for most of its scenes.
     X, "x" {
-        /// Which images a set of Gaussians sees: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one set).
+        /// Images that a set of Gaussians is fitted to: "per-phase" (those of its phase; a set per phase) or "pooled" (all; one
+        /// set).
         static_data: StaticData,
         /// Divide line integrals by the vessels' attenuation where the dataset states it, before they are clamped.
         normalise: bool,
-        /// What line integrals are clamped to, from 0 on, before each image is scaled to 0 to 1; 0 = not at all.
+        /// Upper limit that line integrals are clamped to (the lower limit is 0) before each image is scaled to 0 to 1; 0 = no
+        /// clamping.
         clamp: f64 in 0.0 to 1e6,
         /// Half side of the volume, mm; 0 = 1.6 radii of the field of view, or the dataset's depth range where that is less.
         half_extent_mm: f64 in 0.0 to 1e5,
         /// Voxels along each side of the volume.
         voxels: u32 in 1.0 to 2048.0,
-        /// Voxels from the centre where a Gaussian begins to the next, along each axis.
+        /// Distance between the initial centres of Gaussians along each axis, voxels.
         interval: u32 in 1.0 to 2048.0,
-        /// Extent of the scene, mm, which rates of positions and bounds of scales count in; 0 = 1.1 times the largest distance of
-        /// a source from the mean of the sources.
+        /// Extent of the scene, mm: the unit of position rates and scale bounds; 0 = 1.1 times the largest distance of a source
+        /// from the mean of the sources.
         extent_mm: f64 in 0.0 to 1e6,
-        /// Opacity at the start.
+        /// Initial opacity.
         first_opacity: f64 in 1e-6 to 0.99,
         /// Adam's rate of positions at the start, extents; it falls by a constant factor per iteration.
         position_rate: f64 in 1e-12 to 100.0,
@@ -458,7 +468,8 @@ section! {
         position_rate_end: f64 in 1e-12 to 100.0,
         /// Adam's rate of colours' first coefficients; those of higher degrees have a twentieth.
         intensity_rate: f64 in 1e-12 to 100.0,
-        /// Iterations after which colours gain a degree, up to three, which makes intensities faster; 0 = never.
+        /// Interval, in iterations, after which colours gain a degree, up to three, which makes intensities change faster; 0 =
+        /// never.
         degree_every: u32 in 0.0 to 1e6,
         /// Adam's rate of opacities, before the sigmoid.
         opacity_rate: f64 in 1e-12 to 100.0,
@@ -468,37 +479,38 @@ section! {
         rotation_rate: f64 in 1e-12 to 100.0,
         /// Weight of 1 - SSIM; the mean absolute difference has the rest of 1.
         ssim: f64 in 0.0 to 0.99,
-        /// Iterations after which Gaussians are added and taken away, and again after as many; 0 = never.
+        /// Interval of density control, in iterations: Gaussians are added and pruned; 0 = never.
         densify_every: u32 in 0.0 to 1e6,
-        /// Iteration beyond which that begins.
+        /// Iteration after which density control begins.
         densify_from: u32 in 0.0 to 1e6,
-        /// Iteration from which it no longer happens.
+        /// Iteration at which density control ends.
         densify_until: u32 in 0.0 to 1e6,
-        /// Mean gradient of the loss by a centre, in half images, from which a Gaussian is cloned or split.
+        /// Mean gradient of the loss with respect to a centre, in half images, at or above which a Gaussian is cloned or split.
         densify_gradient: f64 in 0.0 to 1e6,
-        /// Greatest standard deviation, extents, up to which a Gaussian is cloned, and beyond which it is split.
+        /// Threshold of the largest standard deviation, in extents, up to which a Gaussian is cloned, and above which it is
+        /// split.
         size_limit: f64 in 0.0 to 10.0,
-        /// Most Gaussians of a set.
+        /// Maximum number of Gaussians of a set.
         most: u32 in 1.0 to 16_777_216.0,
-        /// Opacity below which a Gaussian is taken away.
+        /// Opacity threshold below which a Gaussian is pruned.
         weakest: f64 in 0.0 to 1.0,
-        /// Greatest standard deviation, extents, beyond which a Gaussian is taken away once opacities have been reset.
+        /// Maximum standard deviation, in extents; larger Gaussians are pruned once opacities have been reset.
         greatest_scale: f64 in 0.0 to 1e6,
-        /// Radius in a picture, pixels, beyond which a Gaussian is taken away then, too; 0 = whatever it is. The code says 20, but
-        /// forgets radii before it looks at them.
+        /// Maximum radius in an image, pixels; larger Gaussians are pruned once opacities have been reset; 0 = no limit. The
+        /// public code sets 20, but clears the radii before it reads them.
         greatest_radius: f64 in 0.0 to 1e6,
-        /// Iterations after which opacities are reset, while Gaussians are added; 0 = never.
+        /// Interval, in iterations, at which opacities are reset while density control is active; 0 = never.
         reset_every: u32 in 0.0 to 1e6,
-        /// What larger opacities are reset to.
+        /// Value that larger opacities are reset to.
         reset_opacity: f64 in 1e-6 to 0.99,
     }
 }
 
 section! {
-    /// SAX-NeRF's field (`dynamic.form = "lineformer"`), a hash grid and a Lineformer, with what its code uses as
-    /// defaults for the chest.
+    /// SAX-NeRF's field (`dynamic.form = "lineformer"`), a hash grid and a Lineformer, with the defaults of its code for the
+    /// chest.
     Sax, "sax" {
-        /// Which images a field sees: "per-phase" (those of its phase; a field per phase) or "pooled" (all; one field).
+        /// Images that a field is fitted to: "per-phase" (those of its phase; a field per phase) or "pooled" (all; one field).
         static_data: StaticData,
         /// Divide line integrals by the vessels' attenuation where the dataset states it, so that densities, which a
         /// sigmoid keeps below 1, can be near 1.
@@ -506,13 +518,13 @@ section! {
         /// Half side of the volume that rays cross, mm; 0 = 1.6 radii of the field of view, or the dataset's depth
         /// range where that is less.
         half_extent_mm: f64 in 0.0 to 1e5,
-        /// Half side of the box that the hash grid divides, mm; beyond it, rays see what is at its faces.
+        /// Half side of the box that the hash grid divides, mm; outside the box, the field has the values at its faces.
         bound_mm: f64 in 1.0 to 1e5,
         /// Levels of the hash grid, an even number; each has two features.
         levels: u32 in 2.0 to 16.0,
         /// Cells along each side of the box in the first level; each further one has twice as many.
         base: u32 in 1.0 to 65_536.0,
-        /// Logarithm to base 2 of the entries that a level has at most.
+        /// Logarithm to base 2 of the maximum number of entries of a level.
         log2_table: u32 in 4.0 to 24.0,
         /// Windows of a batch.
         windows: u32 in 0.0 to 4096.0,
@@ -522,11 +534,11 @@ section! {
         rays: u32 in 1.0 to 65_535.0,
         /// Samples of a ray, an even number.
         samples: u32 in 2.0 to 4096.0,
-        /// Adam's rate.
+        /// Adam's learning rate.
         rate: f64 in 1e-12 to 100.0,
-        /// Iteration after which it falls; 0 = it does not.
+        /// Iteration after which the learning rate falls; 0 = never.
         rate_falls_at: u32 in 0.0 to 1e6,
-        /// What it falls to, as a share of itself.
+        /// Learning rate after its fall, as a share of the initial rate.
         rate_fall: f64 in 0.0 to 1.0,
     }
 }

@@ -1,4 +1,4 @@
-//! Extent of what the views of a dataset see, and frames that a method takes for what they are not.
+//! Extent of the region that the views of a dataset see, and a note about frames taken between two phases.
 
 use crate::geometry::MM_PER_UNIT;
 use crate::scan::dataset::Dataset;
@@ -26,7 +26,7 @@ pub(crate) fn box_half(stated_mm: f64, dataset: &Dataset) -> f64 {
     half_depth(dataset).min(STATIC_FIELDS_OF_VIEW * field_of_view(dataset))
 }
 
-/// Half side of a static method's volume, a cube around the isocentre, world units, where one is stated or not.
+/// Half side of a static method's volume, a cube around the isocentre, world units: as stated, or the default of [`box_half`].
 pub(crate) fn volume_half(stated_mm: f64, dataset: &Dataset) -> f64 {
     box_half(stated_mm, dataset)
 }
@@ -35,12 +35,12 @@ pub(crate) fn half_depth(dataset: &Dataset) -> f64 {
     dataset.depth_range.0.abs().max(dataset.depth_range.1.abs())
 }
 
-/// Half side of the box of what the views see, within the depth range, world units.
+/// Half side of the box that the views see within the depth range, world units.
 pub(crate) fn seen_half(dataset: &Dataset) -> f64 {
     field_of_view(dataset).min(half_depth(dataset))
 }
 
-/// What is said of frames that were taken between two phases, and of their `fate`.
+/// Returns a note that counts the frames taken between two phases and tells their `fate`; none without such frames.
 pub(crate) fn between_phases(dataset: &Dataset, fate: &str) -> Option<String> {
     let n = dataset.training().iter().filter(|f| f.after_phase != 0.0).count();
     (n > 0).then(|| format!("{n} of {} frames were taken between two phases and {fate}", dataset.training().len()))

@@ -1,4 +1,4 @@
-//! Fields of methods, as checkpoints keep them and renderers draw them.
+//! Traits of the fields of methods, for checkpoints and renderers.
 
 use crate::error::Result;
 use crate::gpu::buffer::Buffer;
@@ -7,12 +7,12 @@ use crate::gpu::record::Recording;
 use std::any::Any;
 use std::fmt::Debug;
 
-/// The field of a method that has no part in the tensor field, the network or the Gaussians of other methods.
+/// The field of a method that uses neither the tensor field nor the network nor the Gaussians of other methods.
 pub trait Field: Debug + Send + Sync {
     /// Returns the key of the method, under which headers of checkpoints and `info` have this field.
     fn key(&self) -> &'static str;
 
-    /// Returns what tensors and configuration do not tell, as JSON for the header of a checkpoint.
+    /// Returns the properties that tensors and configuration do not contain, as JSON for the header of a checkpoint.
     ///
     /// # Errors
     /// [`crate::error::Error::Internal`] when it cannot be written as JSON.
@@ -21,10 +21,10 @@ pub trait Field: Debug + Send + Sync {
     /// Describes the field for `info`.
     fn describe(&self) -> serde_json::Value;
 
-    /// Returns a name and a line for the page of a run.
+    /// Returns a name and a line of text for the report page of a run.
     fn fact(&self) -> (String, String);
 
-    /// Puts the field on a device, to be drawn.
+    /// Uploads the field to a device for drawing.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`]; other device errors.
@@ -57,7 +57,7 @@ pub trait FieldDrawing: Send + Sync {
     /// Draws numbers that are on the device, as [`crate::fitting::fit::Fit::params`] returns them.
     fn follow(&self, params: Vec<Buffer>);
 
-    /// Records what `n_rays` of `rays` see at a phase, into `ray_out`.
+    /// Records the rendering of `n_rays` of `rays` at a phase into `ray_out`.
     ///
     /// # Errors
     /// [`crate::error::Error::Internal`] when stages and buffers do not fit, or there are no numbers yet.
@@ -73,7 +73,7 @@ pub trait FieldDrawing: Send + Sync {
     /// Records attenuation per world unit at the cells of `n_rows` rows along `rays` at a phase, into `volume`.
     ///
     /// # Errors
-    /// As [`FieldDrawing::record_rays`]; [`crate::error::Error::Config`] for rows that are too long.
+    /// Errors of [`FieldDrawing::record_rays`]; [`crate::error::Error::Config`] for rows that are too long.
     fn record_cells(
         &self,
         recording: &mut Recording,

@@ -15,16 +15,16 @@ use std::sync::Arc;
 
 /// A method of reconstruction with settings, data, stages and a field of its own.
 pub trait Method: Sync {
-    /// Returns the key of the method: that of its settings, and of its field in headers of checkpoints.
+    /// Returns the key of the method, which names its settings and its field in headers of checkpoints.
     fn key(&self) -> &'static str;
 
-    /// Returns the name of the format of its checkpoints.
+    /// Returns the name of the format of the method's checkpoints.
     fn checkpoint_format(&self) -> &'static str;
 
-    /// Tells whether a configuration chooses it.
+    /// Tells whether a configuration chooses this method.
     fn is_chosen(&self, config: &Config) -> bool;
 
-    /// Prepares the data of a fit; `notes` takes what is to be said of them.
+    /// Prepares the data of a fit and appends remarks about them to `notes`.
     ///
     /// # Errors
     /// [`crate::error::Error::Config`] when dataset and configuration do not fit.
@@ -45,10 +45,10 @@ pub trait Method: Sync {
     /// Lowers the learning rates by a factor, for measurements whose field is to stay as it is.
     fn lower_rates(&self, config: &mut Config, factor: f64);
 
-    /// Returns the settings that make its steps smaller, as advice for a run that diverged.
+    /// Returns the settings that make the method's steps smaller, as advice for a run that diverged.
     fn smaller_steps(&self) -> &'static str;
 
-    /// Makes all pipelines, for a list of what drivers compile.
+    /// Builds all pipelines, for the inventory of compiled pipelines.
     ///
     /// # Errors
     /// Device errors.
@@ -60,11 +60,11 @@ pub trait Method: Sync {
 pub struct FieldVolume {
     /// Half side of a cube around the isocentre, world units.
     pub half: f64,
-    /// Attenuation per world unit that volumes of the field count in.
+    /// Attenuation per world unit that is the unit of the field's volumes.
     pub attenuation: f64,
 }
 
-/// Run and iteration that a checkpoint was made of.
+/// Number of phases of the run and iteration at which a checkpoint was saved.
 #[derive(Debug, Clone, Copy)]
 pub struct SavedAt {
     /// Cardiac phases.
@@ -73,7 +73,7 @@ pub struct SavedAt {
     pub step: u32,
 }
 
-/// A field, and the state that its fit goes on from.
+/// A field, and the state from which its fit is resumed.
 #[derive(Debug, Clone)]
 pub struct SavedFit {
     /// The field.
@@ -96,7 +96,7 @@ pub trait FitState: Debug + Send + Sync {
 
 /// Data that a method is fitted to.
 pub trait FitData: Send {
-    /// Begins a fit, or goes on from a `saved` one to the same data.
+    /// Begins a fit, or resumes a `saved` fit to the same data.
     ///
     /// # Errors
     /// [`crate::error::Error::Config`] for impossible settings, for a `saved` fit of other sizes and where memory does not suffice;
@@ -121,7 +121,7 @@ pub trait Fit: Send {
     /// Returns the field without its numbers, which are on the device.
     fn outline(&self) -> Arc<dyn Field>;
 
-    /// Returns the numbers of the field on the device, for those who draw them meanwhile.
+    /// Returns the parameters of the field on the device, for drawing during the fit.
     fn params(&self) -> Vec<Buffer>;
 
     /// Returns the field and the state after the iterations done.

@@ -15,13 +15,13 @@ pub(crate) struct Iterations {
 }
 
 impl Iterations {
-    /// Records iterations, `per_submit` to a submit and one by one, by a function that records so many.
+    /// Records a submit of `per_submit` iterations and a submit of one iteration. `make` records a given number of iterations.
     pub(crate) fn record(gpu: &Gpu, per_submit: u32, make: impl Fn(u32) -> Result<Commands>) -> Result<Iterations> {
         let pace = SubmitPace::new(longest_submit_s(gpu.info()), 1, per_submit).giving_way_to(gpu.looks());
         Ok(Iterations { several: make(per_submit)?, n_several: per_submit, single: make(1)?, pace })
     }
 
-    /// Runs one submit of iterations, at most up to `stop`, and returns how many they were.
+    /// Runs one submit of iterations, at most up to `stop`, and returns their number.
     pub(crate) fn run(&self, gpu: &Gpu, step: u32, stop: u32) -> Result<u32> {
         let several = stop - step >= self.n_several && self.pace.items() >= self.n_several;
         let (commands, n) = if several { (&self.several, self.n_several) } else { (&self.single, 1) };

@@ -1,4 +1,4 @@
-//! What an iteration tells of itself.
+//! Losses of an iteration, and the detection of divergence.
 
 use crate::config::Config;
 use crate::error::{Error, Result};
@@ -8,7 +8,7 @@ use serde::Serialize;
 /// Losses of one iteration.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct StepLoss {
-    /// Iterations done after it.
+    /// Number of iterations done after this one.
     pub step: u32,
     /// Weighted data terms.
     pub data: f64,
@@ -16,20 +16,20 @@ pub struct StepLoss {
     pub dynamic: f64,
     /// Total variation, weighted.
     pub tv: f64,
-    /// Occlusion, weighted.
+    /// Occlusion loss, weighted.
     pub occlusion: f64,
     /// Mean squared residual of the total line integral; not a number while Gaussians are fitted.
     pub squared_error: f64,
-    /// Live dynamic samples of the batch.
+    /// Dynamic samples of the batch that were evaluated.
     pub live_samples: u64,
     /// Factor on gradients in f16; 1 on the f32 path.
     pub loss_scale: f64,
-    /// Losses that two networks have beside these.
+    /// Additional losses of two networks.
     #[serde(flatten)]
     pub networks: Option<NetworkLosses>,
 }
 
-/// Losses of two networks beside those of every run.
+/// Additional losses of two networks.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct NetworkLosses {
     /// Entropy of the fields' shares at samples, weighted.
@@ -52,14 +52,14 @@ impl NetworkLosses {
         }
     }
 
-    /// What they add to the objective.
+    /// Returns the contribution of these losses to the objective.
     fn total(&self) -> f64 {
         self.favour_static + self.ray_entropy + self.static_size
     }
 }
 
 impl StepLoss {
-    /// An iteration of Gaussians, which are fitted to bounds and not to line integrals.
+    /// Returns the losses of an iteration on Gaussians, which are fitted to bounds of line integrals.
     pub(crate) fn of_gaussians(step: u32, loss: f64) -> StepLoss {
         let none = StepLoss {
             step,
@@ -75,30 +75,31 @@ impl StepLoss {
         StepLoss { data: loss, dynamic: loss, ..none }
     }
 
-    /// Losses of an iteration on whole images, whose line integrals are in units of `attenuation`.
+    /// Returns the losses of an iteration on whole images, whose line integrals are in units of `attenuation`.
     pub(crate) fn of_images(step: u32, loss: f64, attenuation: f64) -> StepLoss {
         StepLoss { squared_error: loss * attenuation * attenuation, ..StepLoss::of_gaussians(step, loss) }
     }
 
-    /// The objective.
+    /// Returns the objective.
     pub fn total(&self) -> f64 {
         self.data + self.tv + self.occlusion + self.networks.map_or(0.0, |networks| networks.total())
     }
 }
 
-/// A loss this many times the first one is warned of.
+/// Multiple of the first loss at which a warning is issued.
 const LARGE: f64 = 1e6;
-/// Settings that make the steps of fields smaller that rays are marched through.
+/// Settings that make the steps of ray-marched fields smaller.
 pub(crate) const SMALLER_STEPS: &str = "a lower static.lr or dynamic.lr, or a longer dynamic.delay";
 
-/// A loss far above the first one. Published learning rates give one when the dynamic field starts, and training goes on from it.
+/// A loss far above the first one. With the published learning rates, such a loss occurs when the dynamic field starts, and
+/// training continues.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LargeLoss {
-    /// Iterations done after it.
+    /// Number of iterations done after this one.
     pub step: u32,
     /// The loss.
     pub loss: f64,
-    /// The loss over the first one of this start.
+    /// The loss divided by the first loss after this start.
     pub ratio: f64,
 }
 
@@ -113,7 +114,7 @@ impl std::fmt::Display for LargeLoss {
     }
 }
 
-/// Watches the losses of a run for those that end it and for the first one that is large.
+/// Checks the losses of a run for those that end it and for the first large one.
 pub(crate) struct LossWatch {
     stop_at_ratio: f64,
     advice: &'static str,
@@ -122,13 +123,13 @@ pub(crate) struct LossWatch {
 }
 
 impl LossWatch {
-    /// Watches a run that ends at a loss `train.stop_at_loss_ratio` times the first one; 0: at none that is finite. `advice` names
-    /// settings that make its steps smaller.
+    /// Creates the check for a run that ends at a loss of `train.stop_at_loss_ratio` times the first one; 0: only at a loss
+    /// that is not finite. `advice` names settings that make the steps of the run smaller.
     pub(crate) fn new(config: &Config, advice: &'static str) -> LossWatch {
         LossWatch { stop_at_ratio: config.train.stop_at_loss_ratio, advice, first: None, has_warned: false }
     }
 
-    /// Takes in the next loss; returns the first one that is large.
+    /// Checks the next loss; returns it if it is the first large one.
     ///
     /// # Errors
     /// [`Error::Diverged`] for a loss that is not finite, or at which the run is to end.

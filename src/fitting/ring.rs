@@ -1,4 +1,4 @@
-//! Rings of losses: the device writes one per iteration, the host reads those of a submit.
+//! Ring buffers of losses: the device writes one loss per iteration, the host reads those of a submit.
 
 use crate::error::{Error, Result};
 use crate::fitting::RING_LENGTH;
@@ -6,17 +6,17 @@ use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use std::ops::Range;
 
-/// In the place of a loss that no device has written: not a number, and none that arithmetic comes to.
+/// Initial value of a loss that the device has not written: a NaN that arithmetic does not produce.
 const UNTOLD: u32 = 0x7fc0_dead;
 
-/// A ring that tells nothing yet.
+/// Creates a ring without losses.
 pub(crate) fn ring(gpu: &Gpu, name: &str) -> Result<Buffer> {
     let buffer = gpu.buffer(name, 4 * u64::from(RING_LENGTH), Memory::Readback)?;
     buffer.write(&[UNTOLD; RING_LENGTH as usize])?;
     Ok(buffer)
 }
 
-/// Returns the losses of some iterations. The error of one that is not finite gives the `advice`.
+/// Returns the losses of some iterations. A loss that is not finite is an error with the `advice`.
 pub(crate) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>, advice: &'static str) -> Result<Vec<f64>> {
     let mut told = vec![0f32; RING_LENGTH as usize];
     ring.read(&mut told)?;
@@ -33,12 +33,12 @@ pub(crate) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>, advice: &'stat
     steps.map(loss).collect()
 }
 
-/// Of a device that ends its submits and has done nothing.
+/// Returns the error for a device whose submit ended without having written a loss.
 pub(crate) fn tells_nothing(gpu: &Gpu, step: u32) -> Error {
     counts_wrongly(gpu, &format!("was to do iteration {step} and tells nothing of it"))
 }
 
-/// Of a device that does not do, or does not count, the iterations it was asked for.
+/// Returns the error for a device that does not execute, or does not count, the requested iterations.
 pub(crate) fn counts_wrongly(gpu: &Gpu, what: &str) -> Error {
     Error::NoDevice(format!("{} {what}; `nertca-vk selftest` tells which stages it computes wrongly", gpu.info().name))
 }

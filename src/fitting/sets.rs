@@ -1,10 +1,10 @@
-//! Static methods on an object that moves: a set of parameters for each phase, or one for all.
+//! Parameter sets of static methods on a moving object: a set for each phase, or one for all phases.
 
 use crate::config::StaticData;
 use crate::error::{Error, Result};
 use crate::scan::dataset::{Dataset, Frame};
 
-/// Images of each set of a static method, and the phase of each, where it is of one.
+/// Images of each set of a static method, and the phase of each set if it belongs to one.
 pub(crate) type Sets = (Vec<Vec<usize>>, Vec<Option<u32>>);
 
 /// Returns the sets of a static method. `key` is the name of its setting, for messages.
@@ -25,7 +25,7 @@ pub(crate) fn sets_of(dataset: &Dataset, static_data: StaticData, key: &str) -> 
     })
 }
 
-/// Refuses an image with pixels that are no number, which would spread to all others.
+/// Refuses an image with pixels that are not finite, which would spread to all parameters.
 ///
 /// # Errors
 /// [`Error::Config`] naming the image and the pixel.

@@ -1,13 +1,13 @@
-//! Tensors of a checkpoint file on their way out and in.
+//! Tensors of a checkpoint file: writing and reading.
 
 use crate::error::{Error, Result};
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::Path;
 
-/// A tensor on its way into a file: name, type, shape, bytes.
+/// A tensor to be written: name, type, shape, bytes.
 pub type FileTensor = (String, Dtype, Vec<usize>, Vec<u8>);
 
-/// A checkpoint file that is read.
+/// A checkpoint file being read.
 pub struct File<'a> {
     /// Its tensors.
     pub tensors: &'a SafeTensors<'a>,
@@ -16,7 +16,7 @@ pub struct File<'a> {
 }
 
 impl File<'_> {
-    /// The bytes of a tensor of a type and shape; `None` stands for any length.
+    /// Returns the bytes of a tensor of a type and shape; `None` stands for any length.
     ///
     /// # Errors
     /// [`Error::Data`] naming the tensor that is missing or of another type or shape.

@@ -1,4 +1,4 @@
-//! Gaussians as they are drawn: along rays, and at the cells of volumes.
+//! Drawing of Gaussians along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::Buffer;
@@ -24,7 +24,7 @@ pub struct BlobKernels {
     pub rays: Stage<push::GaussianRays>,
     /// Line integrals and maxima.
     pub rays_maxima: Stage<push::GaussianRays>,
-    /// Maxima where many overlap.
+    /// Maxima where many Gaussians overlap.
     pub crowd: Stage<push::GaussianCrowd>,
     /// Attenuation at the cells of rows.
     pub points: Stage<push::GaussianPoints>,
@@ -48,7 +48,7 @@ impl BlobKernels {
 }
 
 impl Blob {
-    /// A Gaussian in world units.
+    /// Returns a Gaussian in world units.
     pub fn of(g: &Gaussian, units: Units, setup: &GaussianSetup) -> Blob {
         let scale = scales(g, setup) * units.pixel;
         let [w, x, y, z] = g.rotation.map(f64::from);
@@ -67,7 +67,7 @@ impl Blob {
     }
 }
 
-/// Gaussians on the device as they are at one moment of the beat: some of a buffer.
+/// Gaussians on the device at one moment of the beat: a range of a buffer.
 #[derive(Clone)]
 pub struct BlobList {
     blobs: Buffer,
@@ -77,11 +77,11 @@ pub struct BlobList {
 /// Gaussians of all phases on the device.
 struct BlobSet {
     blobs: Buffer,
-    /// Those of each phase.
+    /// Range of each phase's Gaussians in the buffer.
     phases: Vec<Range<u32>>,
-    /// What moves between phases, if anything does.
+    /// The moving tree, if the field is one.
     tree: Option<MovingTree>,
-    /// Whether so many overlap that the strongest of a ray do not tell their sum.
+    /// Whether so many Gaussians overlap that the strongest ones of a ray do not determine the maximum of their sum.
     is_crowd: bool,
 }
 
@@ -97,13 +97,13 @@ impl BlobSet {
     }
 }
 
-/// A buffer of Gaussians; it is never empty.
+/// Creates a buffer of Gaussians, which is never empty.
 fn upload(gpu: &Gpu, blobs: Vec<Blob>) -> Result<Buffer> {
     let blobs = if blobs.is_empty() { vec![Blob::default()] } else { blobs };
     gpu.buffer_with("blobs", &blobs)
 }
 
-/// Draws a moving field that is made of Gaussians.
+/// Draws a dynamic field that consists of Gaussians.
 pub struct Blobs {
     gpu: Gpu,
     kernels: BlobKernels,
@@ -111,7 +111,7 @@ pub struct Blobs {
 }
 
 impl Blobs {
-    /// Puts a field on the device.
+    /// Uploads a field to the device.
     ///
     /// # Errors
     /// [`Error::OutOfMemory`]; other device errors.
@@ -120,17 +120,17 @@ impl Blobs {
         Ok(Blobs { gpu: gpu.clone(), kernels: BlobKernels::new(gpu, tuning)?, set })
     }
 
-    /// Draws another field from now on. What was recorded before draws the old one.
+    /// Replaces the field to be drawn. Commands that were recorded before draw the old field.
     ///
     /// # Errors
-    /// As [`Blobs::new`].
+    /// Errors of [`Blobs::new`].
     pub fn replace(&self, field: &MovingGaussians) -> Result<()> {
         let new = BlobSet::new(&self.gpu, field)?;
         *self.set.lock().unwrap_or_else(PoisonError::into_inner) = new;
         Ok(())
     }
 
-    /// Gaussians as they are at a phase.
+    /// Returns the Gaussians at a phase.
     ///
     /// # Errors
     /// [`Error::Internal`] for a phase the field does not have.
@@ -140,13 +140,13 @@ impl Blobs {
         Ok(BlobList { blobs: set.blobs.clone(), range: set.phases.get(phase as usize).ok_or_else(missing)?.clone() })
     }
 
-    /// Whether the field is known between phases.
+    /// Tells whether the field is known between phases.
     pub fn move_between_phases(&self) -> bool {
         self.set.lock().unwrap_or_else(PoisonError::into_inner).tree.is_some()
     }
 
-    /// Gaussians of a tree as they are at a phase, which may lie between two; none of another field, which is known at
-    /// whole phases alone.
+    /// Returns the Gaussians of a tree at a phase, which may be fractional; none for another field, which is known only at
+    /// whole phases.
     ///
     /// # Errors
     /// [`Error::OutOfMemory`]; other device errors.
@@ -161,9 +161,9 @@ impl Blobs {
         Ok(Some(BlobList { blobs: upload(&self.gpu, blobs)?, range }))
     }
 
-    /// Records integrals, and maxima where asked for, of the `n_rays` rays in `buffers`, rows of an image of `image_width`
-    /// columns, of Gaussians as they are at some moment. For the sum's largest value, what `ray_out` says of the static field
-    /// must be there already.
+    /// Records line integrals, and maxima if requested, of Gaussians at one moment along the `n_rays` rays in `buffers`, which
+    /// are rows of an image of `image_width` columns. For the maximum of the sum of both fields, `ray_out` must already hold
+    /// the values of the static field.
     ///
     /// # Errors
     /// [`Error::Internal`] when stage and buffers do not fit.
@@ -193,10 +193,11 @@ impl Blobs {
     }
 
     /// Records the field at the cells of `volume`: rows of `row_cells` along the rays `rows` in `buffers`. With an `away` other
-    /// than zero, world units, what it is at most (above zero) or at least (below) anywhere so near to them.
+    /// than zero, world units, records the maximum (`away` above zero) or minimum (below zero) of the field within this
+    /// distance of the cells.
     ///
     /// # Errors
-    /// As [`Blobs::record_rays`].
+    /// Errors of [`Blobs::record_rays`].
     pub fn record_points(
         &self,
         recording: &mut Recording,

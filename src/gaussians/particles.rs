@@ -1,4 +1,4 @@
-//! Gaussians with the optimiser's moments, on the host and on the device: what grows and shrinks together.
+//! Gaussians with the optimiser's moments, on the host and on the device. All arrays have one entry per Gaussian.
 
 use crate::error::Result;
 use crate::gpu::buffer::Memory;
@@ -13,45 +13,45 @@ pub struct Particles {
     pub rows: Vec<Gaussian>,
     /// First moments: position and log-density, log-scale, rotation.
     pub first: Vec<[f32; 12]>,
-    /// Second moments, laid out alike.
+    /// Second moments, in the same layout.
     pub second: Vec<[f32; 12]>,
 }
 
 buffer_set! {
-    /// Gaussians on the device, and what an iteration computes of each.
+    /// Gaussians on the device, and the values that an iteration computes for each.
     pub struct ParticleBuffers {
         /// [`Gaussian`]s.
         gaussians,
         /// First moments of Adam, three vec4 per Gaussian: position and log-density, log-scale, rotation.
         gaussian_adam_first,
-        /// Second moments of Adam, laid out alike.
+        /// Second moments of Adam, in the same layout.
         gaussian_adam_second,
-        /// Gradient, laid out alike.
+        /// Gradient, in the same layout.
         gaussian_gradient,
         /// [`Splat`]s, view by view.
         splats,
         /// Image that each splat belongs to, or -1.
         image_of_splat,
-        /// What the gradient needs of each splat's pixels, two vec4.
+        /// Moments over each splat's pixels for the gradient, two vec4.
         splat_moments,
     }
 }
 
 impl Particles {
-    /// Gaussians that were never updated.
+    /// Returns Gaussians with zero moments.
     pub fn fresh(rows: Vec<Gaussian>) -> Particles {
         let zeros = vec![[0.0; 12]; rows.len()];
         Particles { rows, first: zeros.clone(), second: zeros }
     }
 
-    /// Keeps those marked in `keep`, one mark per Gaussian.
+    /// Keeps the Gaussians marked in `keep`, one mark per Gaussian.
     pub fn retain(&mut self, keep: &[bool]) {
         retain_marked(&mut self.rows, keep);
         retain_marked(&mut self.first, keep);
         retain_marked(&mut self.second, keep);
     }
 
-    /// Adds Gaussians that were never updated.
+    /// Appends Gaussians with zero moments.
     pub fn append(&mut self, rows: Vec<Gaussian>) {
         let fresh = Particles::fresh(rows);
         self.rows.extend(fresh.rows);
@@ -59,7 +59,7 @@ impl Particles {
         self.second.extend(fresh.second);
     }
 
-    /// Puts them on the device, with room for splats in `n_views` views.
+    /// Uploads the Gaussians to the device, with room for splats in `n_views` views.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
@@ -93,7 +93,7 @@ impl ParticleBuffers {
     }
 }
 
-/// Keeps the values whose Gaussians are marked; each Gaussian has equally many.
+/// Keeps the values of marked Gaussians; all Gaussians have the same number of values.
 pub(super) fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
     let each = values.len() / keep.len().max(1);
     let mut at = 0..;

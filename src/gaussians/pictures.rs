@@ -1,5 +1,5 @@
-//! Pictures of Gaussians at display rates: line integrals by the kernels that fit them, a few thousand pixels' worth of work.
-//! Affine around each centre: the error is below that of the cut.
+//! Pictures of Gaussians at display rates: line integrals by the kernels of the fit. The projection is linearised around each
+//! centre; its error is smaller than that of cutting Gaussians off.
 
 use crate::error::Result;
 use crate::gaussians::stages::{FIXED_POINT_BITS, SplatStage};
@@ -18,10 +18,10 @@ use crate::x_gaussian::stages::XPictureKernels;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Pictures kept recorded; a display in use has far fewer.
+/// Maximum number of recorded pictures that are kept; a display needs far fewer.
 const MOST_RECORDED: usize = 256;
 
-/// What leaves a picture in a buffer; the other stages are those of fits.
+/// Builds the stage that writes a picture into a buffer; the other stages are those of fits.
 ///
 /// # Errors
 /// Errors of [`Gpu::pipeline`].
@@ -29,12 +29,12 @@ pub fn into_buffers(gpu: &Gpu) -> Result<Stage<push::GaussianPicture>> {
     Build::default().stage(gpu)
 }
 
-/// Line integral of a unit of the sums in fixed point.
+/// Line integral of one unit of the fixed-point sums.
 fn line_integral(units: Units) -> f32 {
     (units.strongest / 2f64.powi(FIXED_POINT_BITS)) as f32
 }
 
-/// What a recorded picture is of.
+/// Key of a recorded picture: its size and time.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 struct Key {
     columns: usize,
@@ -43,13 +43,14 @@ struct Key {
     time: u64,
 }
 
-/// Draws line integrals of a moving field that is made of Gaussians; where nearer ones hide those behind them, what they show.
+/// Draws line integrals of a dynamic field that consists of Gaussians, or the blended intensities where nearer Gaussians hide
+/// those behind them.
 pub struct Pictures {
     gpu: Gpu,
     project: Stage<push::GaussianProject>,
     splat: SplatStage<push::GaussianSplat>,
     show: Stage<push::GaussianPicture>,
-    /// Where nearer Gaussians hide those behind them.
+    /// Stages for Gaussians of which nearer ones hide those behind them; none where line integrals add up.
     blend: Option<XPictureKernels>,
     state: Mutex<State>,
 }
@@ -68,7 +69,7 @@ impl State {
 }
 
 buffer_set! {
-    /// What the stages bind.
+    /// Buffers that the stages bind.
     struct PictureBuffers {
         /// [`GaussianSetup`].
         gaussian_setup,
@@ -80,7 +81,7 @@ buffer_set! {
         gaussians,
         /// [`Splat`]s.
         splats,
-        /// Image of each.
+        /// Image that each splat belongs to.
         image_of_splat,
         /// The picture in fixed point.
         splat_images,
@@ -90,7 +91,7 @@ buffer_set! {
 struct Picture {
     commands: Commands,
     buffers: PictureBuffers,
-    /// Of a picture under way.
+    /// Lock held while the picture is drawn.
     in_use: Mutex<()>,
 }
 
@@ -106,13 +107,13 @@ impl Pictures {
         Ok(Pictures { gpu: gpu.clone(), project, splat: SplatStage::new(gpu)?, show: into_buffers(gpu)?, blend, state })
     }
 
-    /// Draws another field from now on.
+    /// Replaces the field to be drawn.
     pub fn replace(&self, field: &MovingGaussians) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         *state = State::new(field);
     }
 
-    /// Line integrals of a `width` x `height` view at a phase, rows first.
+    /// Returns line integrals of a `width` x `height` view at a phase, row by row.
     ///
     /// # Errors
     /// Device errors.
@@ -120,7 +121,8 @@ impl Pictures {
         self.draw_at(rays, size, f64::from(phase))
     }
 
-    /// The same at a time counted in phases; at the nearest phase where each has a set of its own.
+    /// Returns the picture of [`Pictures::draw`] at a time counted in phases; at the nearest phase where each phase has its own
+    /// set.
     ///
     /// # Errors
     /// Device errors.
@@ -138,8 +140,8 @@ impl Pictures {
         Ok(sums.iter().map(|v| *v as f32 * line_integral(units)).collect())
     }
 
-    /// Draws a view as [`Pictures::draw`] does, into a buffer on the device: `width` x `height` floats, `in_front` of the line
-    /// integrals that it holds or instead of them.
+    /// Draws a view as [`Pictures::draw`] does, into a buffer of `width` x `height` floats on the device. The picture is added
+    /// to the line integrals in the buffer if `in_front`, otherwise it replaces them.
     ///
     /// # Errors
     /// Device errors.
@@ -172,7 +174,8 @@ impl Pictures {
         self.gpu.wait(shown.submit()?)
     }
 
-    /// Draws a view of Gaussians that hide each other, for `take` to take from fixed point; none where line integrals add up.
+    /// Draws a view of Gaussians that hide each other and passes the fixed-point image to `take`; none where line integrals add
+    /// up.
     fn blended<T>(&self, key: Key, rays: &ViewRays, take: impl FnOnce(&Buffer) -> Result<T>) -> Result<Option<T>> {
         let Some(kernels) = &self.blend else { return Ok(None) };
         let picture = {
@@ -195,7 +198,7 @@ impl Pictures {
         take(picture.draw(&self.gpu, kernels, rays)?).map(Some)
     }
 
-    /// Whether nearer Gaussians hide those behind them: pictures are no line integrals.
+    /// Tells whether nearer Gaussians hide those behind them, so that pictures are not line integrals.
     pub fn are_blended(&self) -> bool {
         self.blend.is_some()
     }

@@ -1,4 +1,4 @@
-//! The stages of a fit of Gaussians, what they bind, and one iteration on a set per phase, top to bottom:
+//! The stages of a fit of Gaussians, their buffers, and one iteration on a set per phase, in this order:
 //!
 //! gaussian_project -> gaussian_splat -> gaussian_residual -> gaussian_moments -> gaussian_update -> gaussian_report
 
@@ -13,18 +13,18 @@ use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage, along_two_axes, full_subgroup};
 use std::ops::Range;
 
-/// Bits behind the point of the integer sums: images hold up to 2048 times the strongest change, in steps of 1e-6.
+/// Fractional bits of the integer sums: images hold up to 2048 times the strongest change, in steps of 1e-6.
 pub const FIXED_POINT_BITS: i32 = 20;
 
 /// Pipelines of a fit.
 pub struct GaussianKernels {
-    /// How every view sees every Gaussian of a set per phase.
+    /// Projection of the Gaussians of a set per phase into every view.
     pub project: Stage<push::GaussianProject>,
-    /// Images.
+    /// Images of the Gaussians.
     pub splat: SplatStage<push::GaussianSplat>,
     /// Residuals, their gradients and losses.
     pub residual: Stage<push::GaussianResidual>,
-    /// What gradients need of the images.
+    /// Moments of the image gradients over each splat's pixels.
     pub moments: SplatStage<push::GaussianMoments>,
     /// Gradients and the optimiser.
     pub update: Stage<push::GaussianUpdate>,
@@ -32,13 +32,13 @@ pub struct GaussianKernels {
     pub report: Stage<push::GaussianReport>,
 }
 
-/// A stage on splats, of which lanes of a subgroup share each where they exchange values.
+/// A stage on splats. Several lanes of a subgroup share a splat where they can exchange values.
 pub struct SplatStage<P> {
     pub(crate) stage: Stage<P>,
     lanes_per_splat: u32,
 }
 
-/// Lanes that share a splat, of some hundred pixels.
+/// Maximum number of lanes that share a splat, which covers some hundred pixels.
 const LANES_PER_SPLAT: u32 = 8;
 impl<P: PushConstants> SplatStage<P> {
     /// Builds the pipeline.
@@ -53,7 +53,7 @@ impl<P: PushConstants> SplatStage<P> {
         Ok(SplatStage { stage: Build { constants, exchanges: true, ..Build::default() }.stage(gpu)?, lanes_per_splat })
     }
 
-    /// Workgroups for so many splats, along two axes where one does not take them all.
+    /// Returns the workgroups for a number of splats, along two axes where one axis is too short.
     pub fn groups_for(&self, n_splats: u32) -> Groups<'static> {
         along_two_axes(n_splats.div_ceil(self.stage.local_size() / self.lanes_per_splat))
     }
@@ -79,7 +79,7 @@ impl GaussianKernels {
 }
 
 buffer_set! {
-    /// What Gaussians are fitted to, and what a fit counts.
+    /// Target data of a fit of Gaussians, and its counters.
     pub struct TargetBuffers {
         /// [`GaussianSetup`].
         gaussian_setup,
@@ -87,15 +87,15 @@ buffer_set! {
         gaussian_views,
         /// `[phase][view]`: index of the image, or -1.
         image_of_view,
-        /// `[image][pixel]`: least line integral of the moving field.
+        /// `[image][pixel]`: lower bound of the dynamic field's line integral.
         bound_low,
-        /// `[image][pixel]`: greatest.
+        /// `[image][pixel]`: upper bound of the dynamic field's line integral.
         bound_high,
         /// `[image][pixel]`: factor on the residual.
         pixel_weight,
         /// [`crate::kernels::layout::GaussianSchedule`]s.
         gaussian_schedule,
-        /// `[image][pixel]`: images of the Gaussians in fixed point; clear between iterations.
+        /// `[image][pixel]`: images of the Gaussians in fixed point; zero between iterations.
         splat_images,
         /// `[image][pixel]`: gradient of the loss.
         splat_image_gradient,
@@ -108,29 +108,29 @@ buffer_set! {
     }
 }
 
-/// Partial sums of the loss of so many groups of four pixels.
+/// Returns the number of partial sums of the loss over `n_quads` groups of four pixels.
 pub fn loss_parts(n_quads: u32) -> u32 {
     n_quads.div_ceil(constants::gaussian_residual::QUADS * push::GaussianResidual::LOCAL_SIZE)
 }
 
 /// A recording of stages on `n` Gaussians.
 pub struct GaussianPass<'a> {
-    /// Where stages go.
+    /// Recording that the stages are added to.
     pub recording: &'a mut Recording,
     /// The stages.
     pub kernels: &'a GaussianKernels,
-    /// What is fitted to.
+    /// Target data of the fit.
     pub targets: &'a TargetBuffers,
     /// The Gaussians.
     pub particles: &'a ParticleBuffers,
     /// Constants on the host.
     pub setup: &'a GaussianSetup,
-    /// Their number.
+    /// Number of Gaussians.
     pub n: u32,
 }
 
 impl GaussianPass<'_> {
-    /// Records a stage that finds its buffers here or in `more`.
+    /// Records a stage that finds its buffers in this pass or in `more`.
     pub(super) fn run<P: PushConstants>(
         &mut self,
         stage: &Stage<P>,
@@ -144,7 +144,7 @@ impl GaussianPass<'_> {
         dispatch_finding(self.recording, stage, groups, &[], find, push)
     }
 
-    /// Records the images of splats that are projected already.
+    /// Records the images of splats that have already been projected.
     pub(super) fn splats(&mut self, n_splats: u32) -> Result<()> {
         let splat = &self.kernels.splat;
         self.run(&splat.stage, splat.groups_for(n_splats), &[], push::GaussianSplat { n_splats })
@@ -160,13 +160,13 @@ impl GaussianPass<'_> {
         self.run(&moments.stage, moments.groups_for(n_splats), &[], push::GaussianMoments { n_splats })
     }
 
-    /// Records the end of an iteration: its loss, and the count.
+    /// Records the end of an iteration: its loss and the step count.
     pub(super) fn report(&mut self) -> Result<()> {
         self.run(&self.kernels.report, Groups::Direct([1, 1, 1]), &[], push::GaussianReport {})
     }
 }
 
-/// Records the images of Gaussians, each of one phase; the images must be clear.
+/// Records the images of Gaussians of a set per phase; the images must be zero.
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
@@ -177,7 +177,7 @@ pub fn record_images(pass: &mut GaussianPass<'_>) -> Result<()> {
     pass.splats(n * pass.setup.n_views)
 }
 
-/// Records one iteration on Gaussians, each of one phase.
+/// Records one iteration on Gaussians of a set per phase.
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.

@@ -1,4 +1,4 @@
-//! The stages of a moving tree: an iteration over all phases, and one that tracks the grid at a single phase.
+//! The stages of a moving tree: an iteration over all phases, and an iteration that tracks the grid at a single phase.
 
 use crate::error::Result;
 use crate::gaussians::particles::retain_marked;
@@ -16,9 +16,9 @@ use std::ops::Range;
 
 /// Pipelines of the tree, beside those of [`crate::gaussians::stages::GaussianKernels`].
 pub struct TreeKernels {
-    /// How every view sees every Gaussian at some phases.
+    /// Projection of the Gaussians into every view at some phases.
     pub project: Stage<push::TreeProject>,
-    /// Gradients of shapes and places.
+    /// Gradients of shapes and positions.
     pub gradient: Stage<push::TreeGradient>,
     /// The optimiser on Gaussians and their own motion.
     pub update: Stage<push::TreeUpdate>,
@@ -26,7 +26,7 @@ pub struct TreeKernels {
     pub grid_gradient: Stage<push::TreeGridGradient>,
     /// The optimiser on the grid.
     pub grid_update: Stage<push::TreeGridUpdate>,
-    /// Where tracking begins.
+    /// Initial guess of the grid for tracking.
     pub guess: Stage<push::TreeGuess>,
 }
 
@@ -57,17 +57,17 @@ buffer_set! {
         motion_basis,
         /// `[phase][node]`: displacement.
         motion_grid,
-        /// First moments of Adam, laid out alike.
+        /// First moments of Adam, in the same layout.
         motion_grid_first,
-        /// Second moments of Adam, laid out alike.
+        /// Second moments of Adam, in the same layout.
         motion_grid_second,
-        /// Gradient, laid out alike.
+        /// Gradient, in the same layout.
         motion_grid_gradient,
     }
 }
 
 impl GridBuffers {
-    /// A grid at rest.
+    /// Creates a grid with zero displacements.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
@@ -87,7 +87,7 @@ impl GridBuffers {
         })
     }
 
-    /// This grid's buffers under other constants.
+    /// Returns the buffers of this grid with other constants.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
@@ -112,17 +112,17 @@ buffer_set! {
     pub struct OwnMotionBuffers {
         /// `[Gaussian][basis function]`: amplitudes.
         own_motion,
-        /// First moments of Adam, laid out alike.
+        /// First moments of Adam, in the same layout.
         own_motion_first,
-        /// Second moments of Adam, laid out alike.
+        /// Second moments of Adam, in the same layout.
         own_motion_second,
-        /// `[phase][Gaussian]`: gradient of the place.
+        /// `[phase][Gaussian]`: gradient of the position.
         place_gradient,
     }
 }
 
 impl OwnMotion {
-    /// Motion of these amplitudes that was never updated.
+    /// Returns motion of these amplitudes with zero moments.
     pub fn fresh(amplitudes: Vec<[f32; 4]>) -> OwnMotion {
         let zeros = vec![[0.0; 4]; amplitudes.len()];
         OwnMotion { amplitudes, first: zeros.clone(), second: zeros }
@@ -135,7 +135,7 @@ impl OwnMotion {
         retain_marked(&mut self.second, keep);
     }
 
-    /// Adds motion that was never updated.
+    /// Appends motion with zero moments.
     pub fn append(&mut self, amplitudes: Vec<[f32; 4]>) {
         let fresh = OwnMotion::fresh(amplitudes);
         self.amplitudes.extend(fresh.amplitudes);
@@ -143,7 +143,7 @@ impl OwnMotion {
         self.second.extend(fresh.second);
     }
 
-    /// Puts it on the device, with room for `n_places` places of Gaussians: one per Gaussian and phase.
+    /// Uploads the motion to the device, with room for `n_places` positions: one per Gaussian and phase.
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
@@ -173,7 +173,7 @@ impl OwnMotionBuffers {
 
 /// A recording of stages on a tree.
 pub struct TreePass<'a> {
-    /// The tree's Gaussians at rest, and what they are fitted to.
+    /// The tree's Gaussians at rest, and their target data.
     pub gaussians: GaussianPass<'a>,
     /// The tree's own stages.
     pub kernels: &'a TreeKernels,
@@ -191,12 +191,12 @@ impl TreePass<'_> {
         self.gaussians.run(stage, groups, &more, push)
     }
 
-    /// Workgroups of a stage on the nodes of some phases.
+    /// Returns the workgroups of a stage on the nodes of some phases.
     fn nodes<P: PushConstants>(&self, stage: &Stage<P>, n_phases: usize) -> Groups<'static> {
         Groups::Direct([(self.setup.nodes() as u32).div_ceil(stage.local_size()), n_phases as u32, 1])
     }
 
-    /// Splats of some phases.
+    /// Returns the number of splats of some phases.
     fn n_splats(&self, phases: &Range<u32>) -> u32 {
         self.gaussians.n * phases.len() as u32 * self.gaussians.setup.n_views
     }
@@ -223,7 +223,7 @@ impl TreePass<'_> {
     }
 }
 
-/// Records the images of some phases; the images must be clear.
+/// Records the images of some phases; the images must be zero.
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
@@ -247,20 +247,21 @@ pub fn record_step(pass: &mut TreePass<'_>) -> Result<()> {
     pass.gaussians.report()
 }
 
-/// A phase to be tracked, and what is known.
+/// A phase to be tracked, and the two preceding phases, from which its grid is extrapolated.
 #[derive(Debug, Clone)]
 pub struct Track {
     /// The phase.
     pub phase: u32,
-    /// The one it follows.
+    /// Preceding phase in the order of tracking.
     pub before: u32,
-    /// The one that follows.
+    /// Phase that precedes `before` in the order of tracking.
     pub before_that: u32,
-    /// Images of the phase, which follow each other.
+    /// Images of the phase, which are consecutive.
     pub images: Range<u32>,
 }
 
-/// Records the first guess of a phase's grid, from those before; the pass has constants of tracking.
+/// Records the initial guess of a phase's grid, extrapolated from the two preceding phases; the pass has the constants of
+/// tracking.
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
@@ -273,10 +274,10 @@ pub fn record_guess(pass: &mut TreePass<'_>, track: &Track) -> Result<()> {
     Ok(())
 }
 
-/// Records iterations of a phase's tracking over its images, after its guess.
+/// Records iterations that track a phase on its images, after the initial guess.
 ///
 /// # Errors
-/// As [`record_guess`].
+/// Errors of [`record_guess`].
 pub fn record_track(pass: &mut TreePass<'_>, track: &Track, iterations: u32) -> Result<()> {
     let phase = track.phase;
     for _ in 0..iterations {

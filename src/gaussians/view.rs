@@ -10,19 +10,19 @@ use glam::{DMat3, DVec3};
 pub struct SplatView {
     /// Rows that give depth, depth times column and depth times row of `x + (0, 0, 0, 1)`.
     pub rows: [DVec3; 3],
-    /// Their constants.
+    /// Constant terms of these rows.
     pub offsets: [f64; 3],
     /// Direction of pixel (0, 0)'s ray, of unit depth, and its change per column and row.
     pub direction: [DVec3; 3],
     /// The X-ray source.
     pub source: DVec3,
-    /// How long after its phase the image was taken, in phases from -0.5 to 0.5: a moving tree is seen on its way to the next
-    /// phase, or from the last.
+    /// Time of the image after its phase, in phases from -0.5 to 0.5. A moving tree is interpolated towards the next or the
+    /// previous phase.
     pub after_phase: f64,
 }
 
 impl SplatView {
-    /// The view at a phase whose rays are given in world units.
+    /// Returns the view, at a phase, whose rays are given in world units.
     pub fn new(rays: &ViewRays, units: Units) -> SplatView {
         let direction = rays.direction;
         let source = rays.source() / units.pixel;
@@ -31,24 +31,24 @@ impl SplatView {
         SplatView { rows, offsets: rows.map(|row| -row.dot(source)), direction, source, after_phase: 0.0 }
     }
 
-    /// Depth, column and row of a point.
+    /// Returns depth, column and row of a point.
     pub fn project(&self, x: DVec3) -> (f64, f64, f64) {
         let [z, u, v] = [0, 1, 2].map(|k| self.rows[k].dot(x) + self.offsets[k]);
         (z, u / z, v / z)
     }
 
-    /// Direction of a pixel's ray, of unit depth.
+    /// Returns the direction of a pixel's ray, of unit depth.
     pub fn ray(&self, column: f64, row: f64) -> DVec3 {
         self.direction[0] + column * self.direction[1] + row * self.direction[2]
     }
 
-    /// 1 / |det (d0, du, dv)|: pixels per unit of solid angle.
+    /// Returns 1 / |det (d0, du, dv)|: pixels per unit of solid angle.
     pub fn inverse_det(&self) -> f64 {
         let [d0, du, dv] = self.direction;
         1.0 / d0.dot(du.cross(dv)).abs()
     }
 
-    /// The view in f32, for the device.
+    /// Returns the view in f32, for the device.
     pub fn to_device(&self) -> layout::GaussianView {
         let pack = |v: DVec3, w: f64| [v.x as f32, v.y as f32, v.z as f32, w as f32];
         let row = |k: usize| pack(self.rows[k], self.offsets[k]);

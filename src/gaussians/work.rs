@@ -1,4 +1,4 @@
-//! What an iteration of a fit costs: pairs of a splat and a pixel, operations, bytes.
+//! Cost of an iteration of a fit: pairs of a splat and a pixel, operations, bytes.
 
 use crate::error::Result;
 use crate::gpu::buffer::Buffer;
@@ -6,19 +6,19 @@ use crate::gpu::device::Gpu;
 use crate::kernels::layout::{GaussianSetup, Splat};
 use serde::{Deserialize, Serialize};
 
-/// How Gaussians are seen.
+/// Cost of a splat, which depends on how Gaussians are projected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SplatCost {
     /// Operations per pair of a splat and a pixel of its box, forward and backward; an exponential counts as one.
     flop_per_pair: u64,
-    /// Bytes of what the gradient needs of a splat's pixels.
+    /// Bytes of the moments over a splat's pixels that the gradient needs.
     moment_bytes: u64,
 }
 
 impl SplatCost {
-    /// As ellipses: `gaussian_splat`, `gaussian_moments`.
+    /// Cost of Gaussians projected as ellipses: `gaussian_splat`, `gaussian_moments`.
     pub const AFFINE: SplatCost = SplatCost { flop_per_pair: 52, moment_bytes: 32 };
-    /// Along the ray of each pixel: `r2_chord_splat`, `r2_chord_moments`.
+    /// Cost of Gaussians integrated along the ray of each pixel: `r2_chord_splat`, `r2_chord_moments`.
     pub const CHORD: SplatCost = SplatCost { flop_per_pair: 173, moment_bytes: 48 };
 }
 
@@ -32,13 +32,13 @@ const BYTES_PER_SPLAT: u64 = 3 * (size_of::<Splat>() as u64 + 4);
 /// Work of one iteration over all images. Parameters, gradients and the optimiser are not counted.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GaussianWork {
-    /// Gaussians as views see them: each once per view, of a tree once per view and phase.
+    /// Splats: one per Gaussian and view; for a tree, one per Gaussian, view and phase.
     pub splats: u64,
     /// Pairs of a splat and a pixel of its box.
     pub pairs: u64,
-    /// Operations on them, forward and backward, GFLOP.
+    /// Operations on these pairs, forward and backward, GFLOP.
     pub gflop: f64,
-    /// Bytes that stages ask for, caches left aside, MB.
+    /// Bytes that stages read and write without regard to caches, MB.
     pub megabytes: f64,
 }
 
@@ -47,7 +47,7 @@ fn pixels(splat: &Splat, setup: &GaussianSetup) -> u64 {
     let along = |axis: usize, n: u32| {
         let first = (splat.mean[axis] - splat.half_box[axis]).ceil().max(0.0);
         let last = (splat.mean[axis] + splat.half_box[axis]).floor().min(n as f32 - 1.0);
-        // Behind the source the box is less than nothing.
+        // The box of a Gaussian behind the source has a negative size.
         if last >= first { (last - first) as u64 + 1 } else { 0 }
     };
     along(0, setup.width) * along(1, setup.height)

@@ -84,7 +84,7 @@ impl Method for SaxNerf {
     }
 }
 
-/// Decisions about the data that are worth telling the user.
+/// Returns notes for the user about decisions on the data.
 fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
     let images = data.images_of_set.iter().map(Vec::len).max().unwrap_or(1);
     let passes = config.train.iterations as usize / images;

@@ -26,9 +26,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 const FORMAT: &str = "nertca-checkpoint-2";
-/// Of checkpoints whose moving field is made of Gaussians: they have no network.
+/// Format of checkpoints whose dynamic field consists of Gaussians; they contain no network.
 const GAUSSIAN_FORMAT: &str = "nertca-checkpoint-3";
-/// What names of the network's tensors begin with.
+/// Prefix of the names of the network's tensors.
 const NETWORK: &str = "dynamic.";
 const OCCUPANCY: &str = "occupancy.bits";
 const LAST_REPORT: &str = "report.words";
@@ -41,35 +41,35 @@ const KEEP_OLDER: usize = 2;
 pub struct Checkpoint {
     /// The fields.
     pub model: Model,
-    /// Adam's first and second moment of each parameter, padded as the parameters.
+    /// Adam's first and second moment of each parameter, padded like the parameters.
     pub moments: Vec<[f32; 2]>,
-    /// Occupancy of three epochs, as the shaders keep it; empty without.
+    /// Occupancy of three epochs, in the layout of the shaders; empty for a run without occupancy.
     pub occupancy: Vec<u32>,
-    /// Loss scale of a run on matrices.
+    /// Loss scale of a run on matrix units.
     pub loss_scale: Option<LossScale>,
-    /// Whether learning has ended before the run, as an entropy of two networks vanished.
+    /// Whether learning ended before the end of the run because an entropy of two networks vanished.
     pub stopped: bool,
     /// Words of the last [`crate::kernels::layout::StepReport`], which a run whose learning has ended repeats; empty while it
     /// learns.
     pub last_report: Vec<u32>,
-    /// State of a fit as R2-Gaussian does it; none of other methods.
+    /// State of a fit of R2-Gaussian; none for other methods.
     pub r2: Option<R2State>,
-    /// State of a fit as X-Gaussian does it; none of other methods.
+    /// State of a fit of X-Gaussian; none for other methods.
     pub x: Option<XState>,
-    /// State of the fit of a method with a room of its own, beside [`Model::field`]; none of other methods.
+    /// State of the fit of a method with a module of its own, beside [`Model::field`]; none for other methods.
     pub fit: Option<Arc<dyn FitState>>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
 }
 
-/// Factor on gradients in f16, and how long it has held.
+/// Factor on gradients in f16, and the number of updates since its last change.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LossScale {
     /// The factor.
     pub scale: f32,
-    /// Updates since it changed, that of a growth counted.
+    /// Number of updates since the factor changed, including the update at which it grew.
     pub good_updates: u32,
-    /// Scale that is returned to quickly after overflows; 0 = none yet, as in checkpoints of before.
+    /// Scale to which the factor returns quickly after overflows; 0 = none yet, as in older checkpoints.
     #[serde(default)]
     pub return_scale: f32,
 }
@@ -117,12 +117,12 @@ fn with_section(header: &str, key: &str, section: &str) -> String {
     format!("{},\"{key}\":{section}}}", header.strip_suffix('}').unwrap_or(header))
 }
 
-/// Name of the checkpoint of a step.
+/// Returns the name of the checkpoint file of a step.
 pub fn file_name(step: u32) -> String {
     format!("checkpoint-{step:07}.safetensors")
 }
 
-/// Checkpoints of a run, oldest first.
+/// Returns the checkpoints of a run, oldest first.
 ///
 /// # Errors
 /// [`Error::Io`].
@@ -140,7 +140,7 @@ pub fn list(run: &Path) -> Result<Vec<(u32, PathBuf)>> {
     Ok(found)
 }
 
-/// Newest checkpoint of a run directory, or the file itself.
+/// Returns the newest checkpoint of a run directory; returns the path itself if it is a file.
 ///
 /// # Errors
 /// [`Error::Data`] when there is none.
@@ -157,10 +157,10 @@ pub fn newest(run: &Path) -> Result<PathBuf> {
         .ok_or_else(|| Error::data(run, "checkpoint", "no checkpoint-*.safetensors: has this run saved anything yet?"))
 }
 
-/// The fields of a run's newest checkpoint, or of a checkpoint file.
+/// Returns the model of a run's newest checkpoint, or of a checkpoint file.
 ///
 /// # Errors
-/// As [`newest`] and [`Checkpoint::read`].
+/// Errors of [`newest`] and [`Checkpoint::read`].
 pub fn newest_model(run: &Path) -> Result<Model> {
     Ok(Checkpoint::read(&newest(run)?)?.model)
 }
@@ -193,7 +193,7 @@ impl Checkpoint {
         files::write_atomic(path, &self.to_bytes()?)
     }
 
-    /// The content of a checkpoint file.
+    /// Returns the content of a checkpoint file.
     ///
     /// # Errors
     /// [`Error::Internal`].
@@ -281,7 +281,7 @@ impl Checkpoint {
     /// Reads the content of a checkpoint file; `path` is for messages.
     ///
     /// # Errors
-    /// As [`Checkpoint::read`].
+    /// Errors of [`Checkpoint::read`].
     pub fn from_bytes(bytes: &[u8], path: &Path) -> Result<Checkpoint> {
         let bad = |field: &str, problem: String| Error::data(path, field, problem);
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|e| bad("header", e.to_string()))?;

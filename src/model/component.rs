@@ -1,20 +1,20 @@
-//! Which of a model's fields.
+//! Selection among a model's fields.
 
 use crate::choice::Choice;
 
-/// The fields of a model that something is about.
+/// Selection among the fields of a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Component {
     /// The sum of both fields.
     Total,
-    /// The still background.
+    /// The static field.
     Static,
-    /// The moving vessels.
+    /// The dynamic field.
     Dynamic,
 }
 
 impl Component {
-    /// The single fields it is made of.
+    /// Returns the single fields of the selection.
     pub fn fields(self) -> &'static [Component] {
         match self {
             Component::Total => &[Component::Dynamic, Component::Static],
@@ -23,12 +23,12 @@ impl Component {
         }
     }
 
-    /// Whether the still background is part of it.
+    /// Tells whether the static field is part of the selection.
     pub fn has_static(self) -> bool {
         self != Component::Dynamic
     }
 
-    /// Whether the moving vessels are part of it.
+    /// Tells whether the dynamic field is part of the selection.
     pub fn has_dynamic(self) -> bool {
         self != Component::Static
     }

@@ -1,11 +1,11 @@
-//! Gaussians in other units, and a moving tree on another grid: what data that were added make of a field fitted before.
+//! Conversion of Gaussians to other units and of a moving tree to another grid, needed when data are added to a fitted field.
 
 use crate::kernels::layout::{Gaussian, TreeSetup};
 use crate::model::gaussians::{Gaussians, MovingTree, Units, vector};
 use glam::DVec3;
 
 impl Gaussians {
-    /// The same field in other units.
+    /// Returns this field in other units.
     pub fn in_units(&self, units: Units) -> Gaussians {
         let pixels = self.units.pixel / units.pixel;
         let (scale, density) = (pixels.ln() as f32, (self.units.attenuation() / units.attenuation()).ln() as f32);
@@ -20,8 +20,8 @@ impl Gaussians {
 }
 
 impl MovingTree {
-    /// The same motion of Gaussians in other units, which `rest` has, on another grid, which has as many numbers of own motion.
-    /// Displacements are those at the new nodes; beyond the grid before they are as on its faces.
+    /// Returns this tree in the units of `rest` on another grid with the same number of basis functions of own motion.
+    /// Displacements are evaluated at the new nodes; outside the old grid they have the values on its faces.
     pub fn on_grid(&self, rest: Gaussians, setup: TreeSetup) -> MovingTree {
         let pixels = self.rest.units.pixel / rest.units.pixel;
         let pack = |v: DVec3| {
@@ -63,7 +63,7 @@ mod tests {
         }
     }
 
-    /// A tree whose displacements are linear in the place, so that any grid holds them.
+    /// Returns a tree whose displacements are linear in position, so that any grid represents them exactly.
     fn tree() -> MovingTree {
         let setup = grid(5, 40.0);
         let node = |i: usize| DVec3::new((i % 5) as f64, (i / 5 % 5) as f64, (i / 25) as f64) * 20.0 - 40.0;

@@ -1,4 +1,4 @@
-//! Gaussians in a checkpoint: tensors under documented names, and what the header says of them.
+//! Gaussians in a checkpoint: tensors under documented names, and their section of the header.
 
 use crate::error::{Error, Result};
 use crate::fitting::tensors::{File, FileTensor};
@@ -8,33 +8,33 @@ use safetensors::tensor::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// Most nodes along an axis of a tree's grid, and most numbers per axis of own motion: no run comes near.
+/// Maximum number of nodes along an axis of a tree's grid, and of numbers per axis of own motion, far above those of any run.
 const MOST_NODES: u32 = 512;
 const MOST_BASIS: u32 = 256;
 
-/// What tensors do not tell.
+/// Properties of the Gaussians that tensors do not contain.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct GaussianHeader {
     /// World units (100 mm) of a pixel at the isocentre, the unit of all lengths.
     pixel: f64,
     /// Line integral that counts as 1.
     strongest: f64,
-    /// Standard deviations at which a Gaussian ends.
+    /// Number of standard deviations at which a Gaussian is cut off.
     cut: f32,
     /// Bounds of the scales, pixels.
     least_scale: f32,
     greatest_scale: f32,
     /// Iterations of the fit.
     step: u32,
-    /// Views it was fitted to; 0 where that is not known.
+    /// Number of views of the fit; 0 where it is not known.
     #[serde(default)]
     views: u32,
     /// The grid that moves a tree; none for a set per phase.
     grid: Option<GridHeader>,
-    /// Whether Gaussians are all there is and overlap by the hundred.
+    /// Whether the model consists of Gaussians alone, of which hundreds overlap.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     crowd: bool,
-    /// Whether nearer ones hide those behind them, so that each has an intensity.
+    /// Whether nearer Gaussians hide those behind them, so that each has an intensity.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     blended: bool,
 }
@@ -43,16 +43,16 @@ pub(super) struct GaussianHeader {
 struct GridHeader {
     /// Nodes along each axis of a cube around the isocentre.
     nodes: u32,
-    /// Half its side, pixels.
+    /// Half side of the cube, pixels.
     half_side: f32,
     /// Numbers per axis of a Gaussian's own motion.
     basis: u32,
-    /// Phase at which Gaussians are where their positions say.
+    /// Rest phase, at which Gaussians are at their stored positions.
     #[serde(default)]
     rest_phase: u32,
 }
 
-/// Name of what blended Gaussians show.
+/// Name of the tensor of blended Gaussians' intensities.
 const INTENSITY: &str = "gaussians.intensity";
 
 pub(super) fn header(field: &MovingGaussians) -> GaussianHeader {
@@ -115,13 +115,13 @@ pub(super) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
 }
 
 impl MovingGaussians {
-    /// Bytes that the field takes in a checkpoint.
+    /// Returns the number of bytes that the field takes in a checkpoint.
     pub fn bytes(&self) -> usize {
         tensors(self).iter().map(|(.., bytes)| bytes.len()).sum()
     }
 }
 
-/// Reads what [`header`] and [`tensors`] describe.
+/// Reads the Gaussians that [`header`] and [`tensors`] describe.
 pub(super) fn read(
     header: &GaussianHeader,
     tensors: &SafeTensors<'_>,

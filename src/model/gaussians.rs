@@ -1,4 +1,4 @@
-//! Gaussians as the moving field, plain data: a set per phase, or one set that moves.
+//! Gaussians as the dynamic field, plain data: a set per phase, or one moving set.
 
 use crate::config::GaussianForm;
 use crate::error::{Error, Result};
@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex};
 pub const SMALLER_STEPS: &str = "lower rates of section `gaussians`: gaussians.position_rate, gaussians.scale_rate, gaussians.rotation_rate, \
      gaussians.density_rate";
 
-/// What turns world units and line integrals into the Gaussians' own, and back.
+/// Units of Gaussians, for conversion from and to world units and line integrals.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Units {
     /// World units (100 mm) of a pixel at the isocentre.
@@ -22,44 +22,45 @@ pub struct Units {
 }
 
 impl Units {
-    /// Attenuation per world unit of a density of 1.
+    /// Returns the attenuation per world unit of a density of 1.
     pub fn attenuation(&self) -> f64 {
         self.strongest / self.pixel
     }
 }
 
-/// The quaternion of axes along the world's.
+/// Returns the identity quaternion.
 pub fn rotation_none() -> [f32; 4] {
     [1.0, 0.0, 0.0, 0.0]
 }
 
-/// A moving field as a set of Gaussians per phase.
+/// A dynamic field as a set of Gaussians per phase.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gaussians {
-    /// Their units.
+    /// Units of the Gaussians.
     pub units: Units,
     /// Cardiac phases.
     pub n_phases: usize,
-    /// Bounds of the scales, and where Gaussians end.
+    /// Bounds of the scales, and cut-off of the Gaussians.
     pub setup: GaussianSetup,
-    /// All phases', in the order of training.
+    /// Gaussians of all phases, in the order of training.
     pub rows: Vec<Gaussian>,
     /// Iterations done.
     pub step: u32,
-    /// Whether Gaussians are all there is and overlap by the hundred, as R2-Gaussian's do: their largest sum along a ray is
-    /// sought among all of them.
+    /// Whether the model consists of Gaussians alone, of which hundreds overlap, as with R2-Gaussian: the maximum of their sum
+    /// along a ray is then searched among all of them.
     pub is_crowd: bool,
-    /// What each shows where nearer ones hide those behind them, as X-Gaussian's do; none where line integrals add up.
+    /// Intensities of Gaussians of which nearer ones hide those behind them, as with X-Gaussian; none where line integrals add
+    /// up.
     pub intensities: Option<Vec<f32>>,
 }
 
 impl Gaussians {
-    /// Gaussians of a phase.
+    /// Returns the Gaussians of a phase.
     pub fn at(&self, phase: usize) -> impl Iterator<Item = &Gaussian> {
         self.rows.iter().filter(move |g| g.phase as usize == phase)
     }
 
-    /// Gaussians of a phase, and what each shows; none where line integrals add up.
+    /// Returns the Gaussians of a phase with their intensities; empty where line integrals add up.
     pub fn blended_at(&self, phase: usize) -> Vec<(Gaussian, f32)> {
         let shown = self.rows.iter().zip(self.intensities.iter().flatten());
         shown.filter(|(g, _)| g.phase as usize == phase).map(|(g, intensity)| (*g, *intensity)).collect()
@@ -68,7 +69,7 @@ impl Gaussians {
     /// Refuses parameters that are not finite.
     ///
     /// # Errors
-    /// [`Error::Diverged`] with the first of them.
+    /// [`Error::Diverged`] with the first such parameter.
     pub fn check(&self) -> Result<()> {
         let numbers = |g: &Gaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.log_density]);
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
@@ -82,23 +83,23 @@ impl Gaussians {
     }
 }
 
-/// Standard deviations of a Gaussian along its own axes, within its bounds, pixels.
+/// Returns the standard deviations of a Gaussian along its own axes, clamped to the bounds, pixels.
 pub fn scales(g: &Gaussian, setup: &GaussianSetup) -> DVec3 {
     DVec3::from_array(g.log_scale.map(|log| f64::from(log.exp().clamp(setup.least_scale, setup.greatest_scale))))
 }
 
-/// About the largest line integral through a Gaussian, whatever the direction: through its thinnest axis.
+/// Returns an approximate maximum of the line integrals through a Gaussian, from the scale of its thinnest axis.
 pub fn amplitude(g: &Gaussian, setup: &GaussianSetup) -> f64 {
     let thinnest = g.log_scale.iter().copied().fold(f32::INFINITY, f32::min).exp();
     let scale = f64::from(thinnest.clamp(setup.least_scale, setup.greatest_scale));
     f64::from(g.log_density).exp() * std::f64::consts::TAU.sqrt() * scale
 }
 
-/// Share of all attenuation that is in Gaussians less dense than vessels are said to be.
+/// Share of the total attenuation in Gaussians that are less dense than the vessels.
 const BELOW_VESSELS: f64 = 0.75;
 
-/// Density of the vessels that Gaussians stand for: three quarters of what attenuates is less dense, as the ends, the walls
-/// and the thin branches of vessels are, and what moves beside them.
+/// Returns the density of the vessels: three quarters of the attenuation are in less dense Gaussians, such as the ends, the
+/// walls and the thin branches of vessels, and other moving structures.
 fn vessel_density(rows: &[Gaussian], setup: &GaussianSetup) -> f64 {
     let mut by_density: Vec<(f64, f64)> = rows.iter().map(|g| (density(g), mass(g, setup))).collect();
     by_density.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -117,19 +118,20 @@ fn density(g: &Gaussian) -> f64 {
     f64::from(g.log_density).exp()
 }
 
-/// What a Gaussian attenuates in all, but for a factor that all share.
+/// Returns the total attenuation of a Gaussian, up to a common factor.
 fn mass(g: &Gaussian, setup: &GaussianSetup) -> f64 {
     density(g) * scales(g, setup).element_product()
 }
 
-/// Which Gaussians are at least so dense, as a share of the vessels' density.
+/// Tells for each Gaussian whether its density is at least a `share` of the vessels' density.
 pub fn dense(rows: &[Gaussian], setup: &GaussianSetup, share: f64) -> Vec<bool> {
     let least = share * vessel_density(rows, setup);
     rows.iter().map(|g| density(g) >= least).collect()
 }
 
-/// Nodes per pixel of a tree's grid of so many nodes along each axis, which reaches `half_side` pixels to either side. From
-/// what checkpoints keep, to the last bit: a field that was loaded must draw the pictures of the one that was saved.
+/// Returns the nodes per pixel of a tree's grid of `n_nodes` nodes along each axis, which reaches `half_side` pixels to either
+/// side. It is computed from values that checkpoints keep exactly, so that a loaded field draws the same pictures as the saved
+/// one.
 pub fn inverse_step(n_nodes: u32, half_side: f32) -> f32 {
     (f64::from(n_nodes - 1) / (2.0 * f64::from(half_side))) as f32
 }
@@ -137,30 +139,30 @@ pub fn inverse_step(n_nodes: u32, half_side: f32) -> f32 {
 /// One set of Gaussians for the whole beat.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MovingTree {
-    /// Gaussians as they are at the phase of rest.
+    /// Gaussians at the rest phase.
     pub rest: Gaussians,
     /// The grid.
     pub setup: TreeSetup,
-    /// `[phase][node]`: displacement (x, y, z, 0), pixels at the isocentre; none at the phase of rest.
+    /// `[phase][node]`: displacement (x, y, z, 0), pixels at the isocentre; zero at the rest phase.
     pub grid: Vec<[f32; 4]>,
     /// `[Gaussian][basis function]`: own motion (x, y, z, 0), pixels at the isocentre.
     pub own: Vec<[f32; 4]>,
 }
 
-/// Gaussians as the moving field of a model.
+/// Gaussians as the dynamic field of a model.
 #[derive(Debug, Clone, PartialEq)]
 pub enum MovingGaussians {
-    /// A set per phase, nothing shared.
+    /// A separate set per phase; the sets share nothing.
     PerPhase(Gaussians),
-    /// One set for the beat.
+    /// One moving set for the whole beat.
     Tree(MovingTree),
 }
 
-/// Gaussians of a run in training as they are now, and how often they have changed.
+/// Current Gaussians of a run in training, and the number of their changes so far.
 pub type MovingFeed = Arc<Mutex<(u64, MovingGaussians)>>;
 
 impl MovingGaussians {
-    /// The set, for a tree as it is at its phase of rest.
+    /// Returns the Gaussians; for a tree, those at its rest phase.
     pub fn rows(&self) -> &Gaussians {
         match self {
             MovingGaussians::PerPhase(sets) => sets,
@@ -168,7 +170,7 @@ impl MovingGaussians {
         }
     }
 
-    /// The tree, if the field is one.
+    /// Returns the tree, if the field is one.
     pub fn tree(&self) -> Option<&MovingTree> {
         match self {
             MovingGaussians::PerPhase(_) => None,
@@ -176,7 +178,7 @@ impl MovingGaussians {
         }
     }
 
-    /// Form of the field: a set of Gaussians per phase, X-Gaussian's, R2-Gaussian's or another, or one for the beat.
+    /// Returns the form of the field: a set per phase as in X-Gaussian, in R2-Gaussian or in neither, or one moving set.
     pub fn form(&self) -> GaussianForm {
         match self {
             MovingGaussians::PerPhase(sets) if sets.intensities.is_some() => GaussianForm::X,
@@ -186,12 +188,12 @@ impl MovingGaussians {
         }
     }
 
-    /// Gaussians at a phase, from 0.
+    /// Returns the Gaussians at a phase, from 0.
     pub fn at(&self, phase: usize) -> Vec<Gaussian> {
         self.at_time(phase as f64)
     }
 
-    /// Gaussians at a time counted in phases; those of the nearest phase where each has a set of its own.
+    /// Returns the Gaussians at a time counted in phases; those of the nearest phase where each phase has its own set.
     pub fn at_time(&self, phases: f64) -> Vec<Gaussian> {
         match self {
             MovingGaussians::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
@@ -199,7 +201,7 @@ impl MovingGaussians {
         }
     }
 
-    /// Lower and upper corner of a box around the centres at all phases, world units; `None` without Gaussians.
+    /// Returns the lower and upper corner of a box around the centres at all phases, world units; `None` without Gaussians.
     pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
         let phases = 0..self.rows().n_phases;
         let centres = phases.flat_map(|phase| self.at(phase)).map(|g| DVec3::from_array(g.position.map(f64::from)));
@@ -208,15 +210,15 @@ impl MovingGaussians {
     }
 }
 
-/// Values of the basis functions of own motion at a fraction of the beat, counted from the phase of rest: harmonics that vanish
-/// there.
+/// Returns the values of the basis functions of own motion at a fraction of the beat, counted from the rest phase: harmonics
+/// that vanish there.
 pub fn basis(n_basis: usize, fraction: f64) -> Vec<f64> {
     let angle = |k: usize| std::f64::consts::TAU * fraction * k as f64;
     let harmonics = n_basis / 2;
     (1..=harmonics).map(|k| angle(k).cos() - 1.0).chain((1..=harmonics).map(|k| angle(k).sin())).collect()
 }
 
-/// Nodes around a point with their shares of its displacement.
+/// Returns the nodes around a point with their interpolation weights.
 pub fn shares(setup: &TreeSetup, x: DVec3) -> [(usize, f64); 8] {
     let n = setup.n_nodes as usize;
     let last = DVec3::splat(f64::from(setup.n_nodes) - 1.001);
@@ -232,22 +234,23 @@ pub fn shares(setup: &TreeSetup, x: DVec3) -> [(usize, f64); 8] {
     })
 }
 
-/// How far Gaussians are at a phase from where they are at phase 0.
+/// Distances of Gaussians at a phase from their positions at phase 0.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Displacement {
     /// Mean over the Gaussians, mm; 0 without any.
     pub mean_mm: f64,
-    /// Largest, mm.
+    /// Maximum over the Gaussians, mm.
     pub largest_mm: f64,
 }
 
-/// The first three of four numbers.
+/// Returns the first three of four numbers.
 pub(super) fn vector(v: &[f32; 4]) -> DVec3 {
     DVec3::new(v[0].into(), v[1].into(), v[2].into())
 }
 
 impl MovingTree {
-    /// Where the grid carries a point of the phase of rest at a phase, which may lie between two; the beat closes.
+    /// Returns the position at a phase to which the grid moves a point of the rest phase. The phase may be fractional; the
+    /// motion is periodic.
     pub fn carried(&self, x: DVec3, phase: f64) -> DVec3 {
         let n_phases = self.rest.n_phases;
         let phase = phase.rem_euclid(n_phases as f64);
@@ -260,8 +263,8 @@ impl MovingTree {
         x + at(before).lerp(at((before + 1) % n_phases), share)
     }
 
-    /// Where Gaussian `index` is at a phase, which may lie between two: on the straight way from one to the other, as images
-    /// that were taken there are fitted. The beat closes.
+    /// Returns the position of Gaussian `index` at a phase, which may be fractional: positions are interpolated linearly
+    /// between phases, as in the fit of images taken there. The motion is periodic.
     pub fn position(&self, index: usize, phase: f64) -> DVec3 {
         let n_phases = self.rest.n_phases;
         let phase = phase.rem_euclid(n_phases as f64);
@@ -270,7 +273,7 @@ impl MovingTree {
         self.carried(self.at_rest(index), phase) + own
     }
 
-    /// How far Gaussian `index` is from where the grid has carried it, at a phase.
+    /// Returns the displacement of Gaussian `index` by its own motion, relative to the position given by the grid, at a phase.
     fn own_way(&self, index: usize, phase: usize) -> DVec3 {
         let n_basis = self.setup.n_basis as usize;
         let own = &self.own[index * n_basis..][..n_basis];
@@ -283,7 +286,7 @@ impl MovingTree {
         DVec3::from_array(self.rest.rows[index].position.map(f64::from))
     }
 
-    /// How far Gaussians are at a phase from where they are at phase 0, own motion included.
+    /// Returns the distances of Gaussians at a phase from their positions at phase 0, own motion included.
     pub fn displacement(&self, phase: f64) -> Displacement {
         let mm = self.rest.units.pixel * MM_PER_UNIT;
         let n = self.rest.rows.len();
@@ -294,13 +297,13 @@ impl MovingTree {
         }
     }
 
-    /// The Gaussian nearest to a point of the phase of rest.
+    /// Returns the index of the Gaussian nearest to a point of the rest phase.
     pub fn nearest(&self, x: DVec3) -> usize {
         let distance = |i: usize| self.at_rest(i).distance_squared(x);
         (0..self.rest.rows.len()).min_by(|a, b| distance(*a).total_cmp(&distance(*b))).unwrap_or(0)
     }
 
-    /// The set as it is at a phase, which may lie between two.
+    /// Returns the Gaussians at a phase, which may be fractional.
     pub fn at(&self, phase: f64) -> Vec<Gaussian> {
         let moved = |(i, g): (usize, &Gaussian)| Gaussian {
             position: self.position(i, phase).as_vec3().to_array(),
@@ -310,7 +313,7 @@ impl MovingTree {
         self.rest.rows.iter().enumerate().map(moved).collect()
     }
 
-    /// The set as it is at every phase: what phases are scored by.
+    /// Returns the Gaussians at all phases as a set per phase, for scoring.
     pub fn expand(&self) -> Gaussians {
         let rows = (0..self.rest.n_phases).flat_map(|phase| self.at(phase as f64)).collect();
         Gaussians { rows, ..self.rest.clone() }
@@ -340,12 +343,12 @@ mod tests {
             log_scale: [scale.ln(); 3],
             ..Gaussian::default()
         };
-        // A quarter of the attenuation is in what is broad, hardly any in a hot spot.
+        // A quarter of the attenuation is in the broad Gaussian, hardly any in the small dense one.
         let mut rows = vec![gaussian(0.01, 4.0)];
         rows.extend(vec![gaussian(0.2, 1.0); 10]);
         rows.push(gaussian(0.6, 0.5));
         assert!((vessel_density(&rows, &setup) - 0.2).abs() < 1e-6);
-        // Scales beyond the bounds are taken as the bounds, as images take them.
+        // Scales beyond the bounds are clamped to them, as in images.
         rows[0].log_scale = [100f32.ln(); 3];
         assert!((vessel_density(&rows, &setup) - 0.2).abs() < 1e-6);
         let kept = |share: f64| dense(&rows, &setup, share).iter().filter(|kept| **kept).count();

@@ -1,4 +1,4 @@
-//! Which Gaussians hang together as those of a vessel do, and which stand for something else.
+//! Separation of connected Gaussians, which represent vessels, from isolated ones.
 
 use crate::kernels::layout::{Gaussian, GaussianSetup};
 use crate::model::gaussians::scales;
@@ -6,16 +6,16 @@ use crate::raster::percentile;
 use glam::{DVec3, IVec3};
 use std::collections::HashMap;
 
-/// Gaussians that hang together are a piece of vessel when they are at least so many.
+/// Minimum number of connected Gaussians that form a piece of a vessel.
 const LEAST_OF_A_VESSEL: usize = 4;
-/// Vessels are as broad as all but the broadest of their Gaussians are.
+/// Percentile of the breadths of connected Gaussians that is taken as the breadth of vessels.
 const BROAD_PERCENTILE: f64 = 0.95;
-/// What is broader by this factor is no vessel.
+/// Factor on the breadth of vessels above which an isolated Gaussian is no vessel.
 const BROADER: f64 = 1.2;
 
-/// Which Gaussians may be vessels: those that hang together with others of their phase, neighbours no more than `link` pixels
-/// apart, and of those that stand alone the ones no broader than what hangs together. Where views are few and noisy, a broad
-/// and lonely Gaussian explains noise of several views at once. All of them, where nothing hangs together.
+/// Tells for each Gaussian whether it may be part of a vessel: it is connected with others of its phase, neighbours being at
+/// most `link` pixels apart, or it is not broader than connected ones. With few and noisy views, a broad isolated Gaussian
+/// explains noise of several views at once. All Gaussians are kept where none are connected.
 pub fn vessels(rows: &[Gaussian], setup: &GaussianSetup, link: f64) -> Vec<bool> {
     let sizes = group_sizes(rows, link);
     let grouped = sizes.iter().map(|size| *size >= LEAST_OF_A_VESSEL);
@@ -29,13 +29,13 @@ pub fn vessels(rows: &[Gaussian], setup: &GaussianSetup, link: f64) -> Vec<bool>
     breadths.iter().zip(grouped).map(|(breadth, grouped)| grouped || *breadth <= broadest).collect()
 }
 
-/// The middle one of a Gaussian's three scales, pixels: the greatest may lie along a vessel.
+/// Returns the middle one of a Gaussian's three scales, pixels; the maximum may lie along a vessel.
 fn breadth(g: &Gaussian, setup: &GaussianSetup) -> f32 {
     let scales = scales(g, setup);
     (scales.element_sum() - scales.max_element() - scales.min_element()) as f32
 }
 
-/// How many Gaussians of its phase each hangs together with, itself counted.
+/// Returns for each Gaussian the number of connected Gaussians of its phase, itself included.
 fn group_sizes(rows: &[Gaussian], link: f64) -> Vec<usize> {
     let mut left = Cells::new(rows, link);
     let mut sizes = vec![0; rows.len()];
@@ -54,10 +54,10 @@ fn group_sizes(rows: &[Gaussian], link: f64) -> Vec<usize> {
     sizes
 }
 
-/// Phase and place of a cube.
+/// Phase and position of a cube.
 type Cell = (u32, IVec3);
 
-/// Gaussians that belong to no group yet, in cubes as wide as neighbours may be apart.
+/// Gaussians that belong to no group yet, sorted into cubes whose side is the maximum distance of neighbours.
 struct Cells<'a> {
     rows: &'a [Gaussian],
     link: f64,
@@ -81,7 +81,7 @@ impl Cells<'_> {
         (self.rows[i].phase, (self.position(i) / self.link).floor().as_ivec3())
     }
 
-    /// Takes out what is within reach of a Gaussian, itself as well if it is still there.
+    /// Removes and returns the Gaussians within `link` of a Gaussian, including itself if it is still there.
     fn take_near(&mut self, i: usize) -> Vec<usize> {
         let (phase, middle) = self.cell(i);
         let (at, rows, reach) = (self.position(i), self.rows, self.link * self.link);

@@ -1,4 +1,4 @@
-//! The motion hull: where the dynamic field may exist.
+//! The motion hull: the region in which the dynamic field may exist.
 
 use crate::formats::volume::Volume;
 use crate::geometry::{MM_PER_UNIT, ViewRays};
@@ -20,12 +20,12 @@ pub struct Hull {
 }
 
 impl Hull {
-    /// Words of one phase's volume.
+    /// Returns the number of words of one phase's volume.
     pub fn words(&self) -> usize {
         self.bits.len() / self.n_phases
     }
 
-    /// The hull as a volume, to look at: the number of phases at which a cell is kept.
+    /// Returns the hull as a volume for display: the number of phases at which each cell is kept.
     pub fn to_volume(&self) -> Volume {
         let cell_mm = self.cell * MM_PER_UNIT;
         // Index axes follow the world's (posterior, left, superior); LPS swaps the first two.
@@ -39,7 +39,7 @@ impl Hull {
         }
     }
 
-    /// Whether a point lies in a cell kept at a phase.
+    /// Tells whether a point lies in a cell kept at a phase.
     pub fn contains_point(&self, point: DVec3, phase: usize) -> bool {
         let c = ((point - self.min) / self.cell).floor();
         let inside = |v: f64, n: usize| v >= 0.0 && v < n as f64;
@@ -51,13 +51,13 @@ impl Hull {
         self.bits[start + index / 32] >> (index % 32) & 1 == 1
     }
 
-    /// Kept share of all cells, averaged over phases.
+    /// Returns the share of kept cells, averaged over phases.
     pub fn share(&self) -> f64 {
         let kept: u64 = self.bits.iter().map(|w| u64::from(w.count_ones())).sum();
         kept as f64 / (self.size.iter().product::<usize>() * self.n_phases) as f64
     }
 
-    /// Lower and upper corner of the cells kept at any phase; `None` when nothing is kept.
+    /// Returns the lower and upper corner of the cells kept at any phase; `None` when no cell is kept.
     pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
         let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
         for corner in (0..self.n_phases).flat_map(|phase| self.corners(phase)) {
@@ -67,7 +67,7 @@ impl Hull {
         low.is_finite().then_some((low, high))
     }
 
-    /// Lower corners of the cells kept at a phase.
+    /// Returns the lower corners of the cells kept at a phase.
     fn corners(&self, phase: usize) -> impl Iterator<Item = DVec3> {
         let [nx, ny, _] = self.size;
         let corner = move |index: usize| {
@@ -80,8 +80,8 @@ impl Hull {
         })
     }
 
-    /// Pixels of a `width` x `height` view, rows first, behind which a cell is kept at a phase: what the hull lets the moving
-    /// field explain. A cell covers the square that holds it.
+    /// Tells for each pixel of a `width` x `height` view, row by row, whether a cell kept at a phase projects onto it, so that
+    /// the dynamic field can explain the pixel. A cell covers the square that contains its projection.
     pub fn silhouette(&self, rays: &ViewRays, (width, height): (usize, usize), phase: usize) -> Vec<bool> {
         let mut covered = vec![false; width * height];
         let pixel = rays.direction[1].length().min(rays.direction[2].length()) * rays.sod;

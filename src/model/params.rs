@@ -1,7 +1,7 @@
 //! One flat buffer of parameters: named slices with shape, offset and seeded initial values.
 //!
-//! Order: the still field, which is planes, then lines (both with ranks padded to a multiple of 4), or a network; then the
-//! moving field's network: per hidden layer encoded-input weights, hidden weights, latent weights, bias; output weights,
+//! Order: the static field, which is planes, then lines (both with ranks padded to a multiple of 4), or a network; then the
+//! dynamic field's network: per hidden layer encoded-input weights, hidden weights, latent weights, bias; output weights,
 //! output bias, latents. Every slice starts at a multiple of 4 so that shaders can read vec4. Padding is zero, gets zero
 //! gradient and so stays zero.
 
@@ -10,7 +10,7 @@ use crate::config::{Config, StaticForm};
 use crate::random::{STREAM_INIT, normal, uniform01};
 use std::ops::Range;
 
-/// Where the parts of one hidden layer live.
+/// Positions of the parts of one hidden layer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layer {
     /// Weights on the encoded input, `[width][4 * encode_groups]`, if the layer sees it.
@@ -23,10 +23,10 @@ pub struct Layer {
     pub bias: usize,
 }
 
-/// Where the parameters of a network live.
+/// Positions of the parameters of a network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NetworkMap {
-    /// First of its parameters.
+    /// Index of its first parameter.
     pub first: usize,
     /// Hidden layers in order.
     pub layers: Vec<Layer>,
@@ -38,28 +38,28 @@ pub struct NetworkMap {
     pub latents: usize,
     /// Neurons per hidden layer.
     pub width: usize,
-    /// Numbers of the encoded input.
+    /// Length of the encoded input.
     pub encoded_len: usize,
     /// Length of the encoded input in vec4, rounded up.
     pub encode_groups: usize,
-    /// Numbers of a latent; 0: it is the same at all phases.
+    /// Length of a latent; 0: the network is the same at all phases.
     pub latent: usize,
     /// Cardiac phases.
     pub phases: usize,
-    /// Its parameters, padding included.
+    /// Number of its parameters, padding included.
     pub len: usize,
 }
 
-/// Where every parameter lives.
+/// Positions of all parameters.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ParamMap {
-    /// Cells per axis of the static field; 0 where it is a network or nothing.
+    /// Cells per axis of the static field; 0 where it is a network or absent.
     pub grid: usize,
-    /// Ranks per mode; 0 where it is a network or nothing.
+    /// Ranks per mode; 0 where the static field is a network or absent.
     pub ranks: usize,
     /// `ranks` rounded up to vec4, in vec4.
     pub rank4: usize,
-    /// Parameters of the static field; those of the dynamic field follow.
+    /// Number of parameters of the static field; those of the dynamic field follow.
     pub static_len: usize,
     /// The static field, where it is a network.
     pub still: Option<NetworkMap>,
@@ -67,7 +67,7 @@ pub struct ParamMap {
     pub moving: NetworkMap,
     /// Cardiac phases.
     pub phases: usize,
-    /// All parameters, padding included.
+    /// Number of all parameters, padding included.
     pub len: usize,
 }
 
@@ -83,7 +83,8 @@ pub struct Tensor {
 }
 
 impl NetworkMap {
-    /// A network of the shape that the dynamic field has, from parameter `first` on, with `latent` numbers for each phase.
+    /// Returns the map of a network with the dynamic field's shape, from parameter `first` on, with `latent` numbers for each
+    /// phase.
     fn new(shape: &DynamicField, first: usize, latent: usize, phases: usize) -> NetworkMap {
         let width = shape.width as usize;
         let encoded_len = 3 + 6 * shape.bands as usize;
@@ -124,8 +125,8 @@ impl NetworkMap {
         }
     }
 
-    /// Every tensor, its name after that of the field. A layer that sees the input has one weight matrix on `[encoded, latent]`
-    /// or `[encoded, latent, hidden]`, as in the authors' code.
+    /// Returns every tensor, whose name is prefixed by that of the field. A layer that sees the input has one weight matrix on
+    /// `[encoded, latent]` or `[encoded, latent, hidden]`, as in the authors' code.
     fn tensors(&self, field: &str) -> Vec<Tensor> {
         let mut out = Vec::new();
         let mut push =
@@ -159,7 +160,7 @@ impl NetworkMap {
         out
     }
 
-    /// Inputs of what makes a tensor of [`NetworkMap::tensors`]; none for latents.
+    /// Returns the number of inputs of the linear layer that a tensor of [`NetworkMap::tensors`] belongs to; none for latents.
     fn inputs(&self, name: &str) -> Option<usize> {
         if name.ends_with(".latent") {
             return None;
@@ -181,7 +182,7 @@ fn tensor(name: String, shape: Vec<usize>, positions: Vec<usize>) -> Tensor {
 }
 
 impl ParamMap {
-    /// Map for a configuration and a number of phases.
+    /// Returns the map for a configuration and a number of phases.
     pub fn new(config: &Config, phases: usize) -> ParamMap {
         let (s, d) = (&config.static_field, &config.dynamic);
         let (grid, ranks, still) = match s.form {
@@ -196,27 +197,28 @@ impl ParamMap {
         ParamMap { grid, ranks, rank4, static_len, still, moving, phases, len }
     }
 
-    /// The networks there are, the static field's first.
+    /// Returns the existing networks, the static field's first.
     pub fn networks(&self) -> impl Iterator<Item = &NetworkMap> {
         self.still.iter().chain([&self.moving])
     }
 
-    /// Numbers on the lines of the static field, padding included; they are its last.
+    /// Returns the number of parameters of the static field's lines, padding included; they are the last ones of the static
+    /// field.
     pub fn line_len(&self) -> usize {
         3 * self.grid * self.rank4 * 4
     }
 
-    /// Position of plane element `(mode, rank, v, u)`; `u` runs along the plane's first axis.
+    /// Returns the position of plane element `(mode, rank, v, u)`; `u` runs along the plane's first axis.
     pub fn plane(&self, mode: usize, rank: usize, v: usize, u: usize) -> usize {
         ((mode * self.grid + v) * self.grid + u) * self.rank4 * 4 + rank
     }
 
-    /// Position of line element `(mode, rank, w)`.
+    /// Returns the position of line element `(mode, rank, w)`.
     pub fn line(&self, mode: usize, rank: usize, w: usize) -> usize {
         (3 * self.grid * self.grid + mode * self.grid + w) * self.rank4 * 4 + rank
     }
 
-    /// Every tensor under its documented name, padding left out.
+    /// Returns every tensor under its documented name, without padding.
     pub fn tensors(&self) -> Vec<Tensor> {
         let mut out = self.still.as_ref().map_or_else(|| self.planes_and_lines(), |network| network.tensors("static"));
         out.extend(self.moving.tensors("dynamic"));
@@ -245,8 +247,8 @@ impl ParamMap {
         out
     }
 
-    /// Initial values: planes and lines `init_std * N(0, 1)`, linear layers uniform in
-    /// `+-1/sqrt(inputs)` (torch's default), latents uniform in [0, 1).
+    /// Returns the initial values: planes and lines `init_std * N(0, 1)`, linear layers uniform in `+-1/sqrt(inputs)` (torch's
+    /// default), latents uniform in [0, 1).
     pub fn initial(&self, config: &Config) -> Vec<f32> {
         let mut params = vec![0f32; self.len];
         for (index, tensor) in self.tensors().into_iter().enumerate() {

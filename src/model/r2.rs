@@ -1,4 +1,4 @@
-//! The state of a fit as R2-Gaussian does it, plain data: stored Gaussians and what the fit knows of each.
+//! State of a fit of R2-Gaussian, plain data: stored Gaussians with the optimiser's moments and statistics of each.
 
 use crate::error::{Error, Result};
 use crate::kernels::layout::R2Gaussian;
@@ -7,17 +7,18 @@ use crate::kernels::layout::R2Gaussian;
 pub const SMALLER_STEPS: &str =
     "lower rates of section `r2`: r2.position_rate, r2.density_rate, r2.scale_rate, r2.rotation_rate";
 
-/// Stored Gaussians with the optimiser's moments and what density control goes by: with the iteration's number, all
-/// that a fit goes on from.
+/// Stored Gaussians with the optimiser's moments and the statistics of density control. Together with the iteration's number,
+/// this is all that a resumed fit needs.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct R2State {
     /// Parameters.
     pub rows: Vec<R2Gaussian>,
-    /// First moments of Adam: position and density, scale and nothing, rotation.
+    /// First moments of Adam: position and density, scale and an unused number, rotation.
     pub first: Vec<[f32; 12]>,
-    /// Second moments, laid out alike.
+    /// Second moments, in the same layout.
     pub second: Vec<[f32; 12]>,
-    /// Sum over iterations of the gradient by the centre, in half images, and how often a view saw it.
+    /// Sum over iterations of the gradient with respect to the centre, in half images, and the number of times a view saw the
+    /// Gaussian.
     pub statistics: Vec<[f32; 2]>,
 }
 
@@ -27,13 +28,13 @@ fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
 }
 
 impl R2State {
-    /// Gaussians that were never updated.
+    /// Returns Gaussians with zero moments and statistics.
     pub fn fresh(rows: Vec<R2Gaussian>) -> R2State {
         let n = rows.len();
         R2State { rows, first: vec![[0.0; 12]; n], second: vec![[0.0; 12]; n], statistics: vec![[0.0; 2]; n] }
     }
 
-    /// Keeps those marked in `keep`, one mark per Gaussian.
+    /// Keeps the Gaussians marked in `keep`, one mark per Gaussian.
     pub fn retain(&mut self, keep: &[bool]) {
         retain_marked(&mut self.rows, keep);
         retain_marked(&mut self.first, keep);
@@ -41,7 +42,7 @@ impl R2State {
         retain_marked(&mut self.statistics, keep);
     }
 
-    /// Adds Gaussians that were never updated.
+    /// Appends Gaussians with zero moments and statistics.
     pub fn append(&mut self, rows: Vec<R2Gaussian>) {
         let fresh = R2State::fresh(rows);
         self.rows.extend(fresh.rows);
@@ -53,7 +54,7 @@ impl R2State {
     /// Refuses parameters that are not finite.
     ///
     /// # Errors
-    /// [`Error::Diverged`] with the first of them.
+    /// [`Error::Diverged`] with the first such parameter.
     pub fn check(&self, step: u32) -> Result<()> {
         let numbers = |g: &R2Gaussian| g.position.into_iter().chain(g.scale).chain(g.rotation).chain([g.density]);
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {

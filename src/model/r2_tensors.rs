@@ -1,4 +1,4 @@
-//! The state of a fit as R2-Gaussian does it in a checkpoint: tensors under documented names.
+//! State of a fit of R2-Gaussian in a checkpoint: tensors under documented names.
 
 use crate::error::{Error, Result};
 use crate::fitting::tensors::{File, FileTensor};
@@ -7,9 +7,9 @@ use crate::model::r2::R2State;
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::Path;
 
-/// Numbers of a Gaussian: position, density, scale, rotation.
+/// Number of parameters of a Gaussian: position, density, scale, rotation.
 const N_NUMBERS: usize = 11;
-/// Where each has its moments, of which one is none's.
+/// Index of each parameter's moment in a row of twelve, of which number 7 is unused.
 const PLACES: [usize; N_NUMBERS] = [0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11];
 
 pub(super) fn tensors(state: &R2State) -> Vec<FileTensor> {
@@ -33,7 +33,7 @@ pub(super) fn tensors(state: &R2State) -> Vec<FileTensor> {
     ]
 }
 
-/// Reads what [`tensors`] describes, of a run on so many phases.
+/// Reads the state that [`tensors`] describes, of a run on `n_phases` phases.
 pub(super) fn read(tensors: &SafeTensors<'_>, n_phases: usize, path: &Path) -> Result<R2State> {
     let file = File { tensors, path };
     let position = file.floats("r2.position", &[None, Some(3)])?;

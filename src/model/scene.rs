@@ -1,9 +1,9 @@
-//! How numbers are scaled and where the fields live.
+//! Scales and boxes of the fields.
 
 use crate::model::component::Component;
 use serde::{Deserialize, Serialize};
 
-/// How numbers are scaled and where fields live; kept in checkpoints.
+/// Scales and boxes of the fields; kept in checkpoints.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Scene {
     /// Lower corner of the static field's box, world units.
@@ -36,14 +36,15 @@ pub struct Scene {
     pub dynamic_weight: f64,
     /// Residual of the dynamic field from which the loss grows linearly; 0 = never.
     pub robust_scale: f64,
-    /// Lower and upper corner of where the fields are looked at, world units, where their boxes hold much more than views see, as
-    /// those of two networks do; none where the boxes are it, and in checkpoints of before.
+    /// Lower and upper corner of the region of interest, world units, where the fields' boxes contain much more than views see,
+    /// as those of two networks do; none where the region is the boxes, and in older checkpoints.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub region: Option<[[f64; 3]; 2]>,
 }
 
 impl Scene {
-    /// Lower and upper corner of where the fields of a component are looked at, as for vessels and exports, world units.
+    /// Returns the lower and upper corner of the region of interest of a component's fields, as for vessels and exports, world
+    /// units.
     pub fn region_of(&self, component: Component) -> [[f64; 3]; 2] {
         self.region.unwrap_or(match component {
             Component::Dynamic => [self.dynamic_min, self.dynamic_max],

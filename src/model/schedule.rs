@@ -4,7 +4,7 @@ use crate::config::{Config, Decay};
 use crate::kernels::layout;
 
 impl Config {
-    /// Rows for every step and one more, so that the state after the last step has a row as well.
+    /// Returns a row for every step and one more, so that the state after the last step has a row as well.
     pub fn schedule_table(&self) -> Vec<layout::Schedule> {
         (0..=self.train.iterations).map(|step| self.schedule(step)).collect()
     }
@@ -30,10 +30,10 @@ impl Config {
         (self.dynamic.delay > 0 && !self.gaussians_move()).then(|| self.dynamic.delay.saturating_add(1))
     }
 
-    /// Adam's update of the static field.
+    /// Returns Adam's update of the static field.
     fn static_update(&self, step: u32) -> layout::FieldUpdate {
         let f = &self.static_field;
-        // Where Gaussians move, the static field begins where they end.
+        // With Gaussians, the fit of the static field begins where that of the Gaussians ends.
         let begin = match self.restart() {
             Some(restart) if step >= restart => restart,
             _ => self.gaussian_iterations(),
@@ -42,8 +42,8 @@ impl Config {
         self.update(rates.at(self.progress(f.decay, step)), step.saturating_sub(begin) + 1)
     }
 
-    /// Adam's update of the dynamic field. The one at the delay uses the optimiser that the static field has had so far, so that the
-    /// update after it is a first one again.
+    /// Returns Adam's update of the dynamic field. The update at the delay uses the optimiser that the static field has used so
+    /// far, so that the next update is a first one again.
     fn dynamic_update(&self, step: u32) -> layout::FieldUpdate {
         let d = &self.dynamic;
         let (begin, progress) = match self.restart() {
@@ -55,7 +55,7 @@ impl Config {
         self.update(rates.at(progress), step.saturating_sub(begin) + 1)
     }
 
-    /// Adam's update number `updates` (from 1) since its moments were zero.
+    /// Returns Adam's update number `updates` (from 1) since its moments were zero.
     fn update(&self, rate: f64, updates: u32) -> layout::FieldUpdate {
         let correction = |beta: f64| (1.0 - beta.powi(updates as i32)) as f32;
         layout::FieldUpdate {
@@ -66,8 +66,8 @@ impl Config {
         }
     }
 
-    /// Returns how far learning rates have gone from start (0) to end (1). After the restart a straight line reaches its end with
-    /// the run, as the paper states it, and a factor per iteration stays what it was, as the code has it.
+    /// Returns the progress of learning rates from start (0) to end (1). After the restart, a linear decay ends with the run,
+    /// as the paper states, and an exponential decay keeps its factor per iteration, as in the authors' code.
     fn progress(&self, decay: Decay, step: u32) -> f64 {
         let whole = f64::from(self.train.iterations) * self.adam.decay_share;
         let Some(restart) = self.restart().filter(|restart| step >= *restart) else {
@@ -80,7 +80,7 @@ impl Config {
         (f64::from(step - restart) / length).min(1.0)
     }
 
-    /// Weights of the losses that two networks have.
+    /// Returns the weights of the losses of two networks.
     fn network_weights(&self, step: u32) -> layout::Schedule {
         let n = &self.networks;
         if !self.two_networks() {
@@ -103,7 +103,7 @@ impl Config {
     }
 }
 
-/// How a learning rate goes from start to end.
+/// Course of a learning rate from start to end.
 #[derive(Clone, Copy)]
 struct Rates {
     start: f64,
@@ -132,7 +132,8 @@ mod tests {
         assert!((f64::from(got) - want).abs() <= 1e-6 * want, "{got} {want}");
     }
 
-    /// What `run_hybrid.py` of the authors does: update number of each field and its rate as a power of the factor per iteration.
+    /// Expected values follow `run_hybrid.py` of the authors: update number of each field, and its rate as a power of the
+    /// factor per iteration.
     #[test]
     fn the_delay_of_the_public_code_is_that_of_its_authors() {
         let config = Config::preset(Preset::PublicCode);
@@ -141,7 +142,7 @@ mod tests {
         for (step, restarts, static_powers, static_updates, dynamic_powers, dynamic_updates) in [
             (0, [1, 0], 0, 1, 0, 1),
             (1499, [0, 0], 1499, 1500, 0, 1),
-            // One step of the dynamic field with the old optimiser, then both begin again.
+            // One step of the dynamic field with the old optimiser, then both optimisers restart.
             (1500, [0, 1], 1500, 1501, 0, 1),
             (1501, [1, 1], 0, 1, 0, 1),
             (1502, [0, 0], 1, 2, 1, 2),
@@ -188,7 +189,7 @@ mod tests {
         close(start.static_size, 1e-8);
         close(delayed.favour_static, 1e-12);
         close(delayed.near_integral, 1e-8);
-        // Half of both ramps, counted from their own beginnings.
+        // Half of both ramps, each counted from its own beginning.
         close(config.schedule(50_000).ray_entropy, 0.5 * (1e-10 + 1e-8));
         close(half.favour_static, 0.5 * (1e-12 + 1e-10));
         close(half.near_integral, 0.5 * (1e-8 + 1e-4));

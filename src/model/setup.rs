@@ -1,4 +1,4 @@
-//! The constants that shaders read, from a model.
+//! The constants that shaders read, computed from a model.
 
 use crate::config::sections::Networks;
 use crate::config::{Config, DynamicTarget, OcclusionRegion};
@@ -9,7 +9,7 @@ use crate::model::params::ParamMap;
 use crate::model::scene::Scene;
 
 impl Scene {
-    /// Constants for the shaders; those of a training set (ray counts, image size) stay 0.
+    /// Returns the constants for the shaders; those of a training set (ray counts, image size) stay 0.
     pub fn setup(&self, config: &Config, params: &ParamMap, hull: Option<&Hull>) -> Setup {
         let mut setup = Setup {
             seed: config.seed,
@@ -33,7 +33,7 @@ impl Scene {
         setup
     }
 
-    /// Boxes and depths of both fields, and their scales.
+    /// Sets boxes, depths and scales of both fields.
     fn place_fields(&self, setup: &mut Setup) {
         let corner = |at: [f64; 3]| at.map(|x| x as f32);
         (setup.static_min, setup.static_max) = (corner(self.static_min), corner(self.static_max));
@@ -48,7 +48,7 @@ impl Scene {
         setup.dynamic_gain = self.dynamic_gain as f32;
     }
 
-    /// What counts how much in the objective.
+    /// Sets the weights of the objective.
     fn weigh_losses(&self, setup: &mut Setup, config: &Config) {
         let [near, far] = self.static_depth;
         setup.static_weight = self.static_weight as f32;
@@ -66,7 +66,7 @@ impl Scene {
         setup.tv_line = (config.static_field.tv * config.static_field.tv_line) as f32;
     }
 
-    /// When the dynamic field counts as empty.
+    /// Sets when and where the dynamic field counts as empty.
     fn set_occupancy(&self, setup: &mut Setup, config: &Config) {
         setup.occupancy_cells = if config.occupancy.enabled { config.occupancy.cells } else { 0 };
         setup.occupancy_start = config.dynamic.delay + config.occupancy.start;
@@ -82,7 +82,7 @@ fn place_hull(setup: &mut Setup, hull: &Hull) {
     setup.hull_phase_words = if hull.n_phases > 1 { hull.words() as u32 } else { 0 };
 }
 
-/// Samples of a ray and of a chunk.
+/// Sets the numbers of samples of a ray and of a chunk.
 fn choose_samples(setup: &mut Setup, config: &Config) {
     let march = &config.march;
     setup.n_static_samples = march.static_samples;
@@ -94,7 +94,7 @@ fn choose_samples(setup: &mut Setup, config: &Config) {
     setup.sample_capacity = sample_capacity(most);
 }
 
-/// Sizes of planes, lines and network.
+/// Sets the sizes of planes, lines and network.
 fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
     setup.n_phases = params.phases as u32;
     setup.n_bands = config.dynamic.bands;
@@ -107,7 +107,7 @@ fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
     setup.n_params = params.len as u32;
 }
 
-/// Losses of two networks that have no schedule.
+/// Sets the constants of the losses of two networks that have no schedule.
 fn set_networks(setup: &mut Setup, networks: &Networks) {
     setup.two_networks = 1;
     setup.change_weight = networks.change_weight as f32;
@@ -123,8 +123,8 @@ fn set_optimiser(setup: &mut Setup, config: &Config) {
     setup.epsilon = config.adam.epsilon as f32;
 }
 
-/// Samples a chunk can hold that is to take `samples`; also the stride between the features of a sample. Live samples
-/// are padded to tiles of up to 128; the remainder keeps strides off powers of two, which would map a sample's features
+/// Returns the capacity, in samples, of a chunk for `samples`, which is also the stride between the features of a sample. Live
+/// samples are padded to tiles of up to 128; the remainder avoids strides of powers of two, which would map a sample's features
 /// to one cache set.
 pub fn sample_capacity(samples: u32) -> u32 {
     samples.next_multiple_of(128) + 12

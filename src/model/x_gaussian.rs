@@ -1,4 +1,4 @@
-//! The state of a fit as X-Gaussian does it, plain data: stored Gaussians and what the fit knows of each.
+//! State of a fit of X-Gaussian, plain data: stored Gaussians with the optimiser's moments and statistics of each.
 
 use crate::error::{Error, Result};
 use crate::kernels::layout::{XGaussian, XStatistics};
@@ -9,55 +9,55 @@ pub const SMALLER_STEPS: &str =
     "lower rates of section `x`: x.position_rate, x.intensity_rate, x.opacity_rate, x.scale_rate, x.rotation_rate";
 
 impl XGaussian {
-    /// Opacity at the centre.
+    /// Returns the opacity at the centre.
     pub fn shown_opacity(&self) -> f64 {
         1.0 / (1.0 + (-f64::from(self.opacity)).exp())
     }
 
-    /// The opacity's logarithm, true to the last digits of those near 1, too.
+    /// Returns the logarithm of the opacity, accurate also for opacities near 1.
     pub fn log_opacity(&self) -> f64 {
         -(-f64::from(self.opacity)).exp().ln_1p()
     }
 
-    /// Centre.
+    /// Returns the centre.
     pub fn centre(&self) -> DVec3 {
         DVec3::from_array(self.position.map(f64::from))
     }
 
-    /// Standard deviations along its axes.
+    /// Returns the standard deviations along its axes.
     pub fn scales(&self) -> DVec3 {
         DVec3::from_array(self.log_scale.map(|log| f64::from(log).exp()))
     }
 
-    /// Its axes, as columns.
+    /// Returns its axes as columns.
     pub fn axes(&self) -> DMat3 {
         let [w, x, y, z] = self.rotation.map(f64::from);
         DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
     }
 }
 
-/// What is stored of an opacity between 0 and 1, given by its logarithm.
+/// Returns the stored parameter of an opacity between 0 and 1 that is given by its logarithm.
 pub fn stored_opacity(log_opacity: f64) -> f64 {
     log_opacity - (-log_opacity.exp_m1()).ln()
 }
 
-/// Stored Gaussians with the optimiser's moments and what density control goes by: with the iteration's number, all
-/// that a fit goes on from.
+/// Stored Gaussians with the optimiser's moments and the statistics of density control. Together with the iteration's number,
+/// this is all that a resumed fit needs.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct XState {
     /// Parameters.
     pub rows: Vec<XGaussian>,
-    /// The set of each.
+    /// Set of each Gaussian.
     pub sets: Vec<u32>,
     /// First moments of Adam: position and opacity, scale and intensity, rotation.
     pub first: Vec<[f32; 12]>,
-    /// Second moments, laid out alike.
+    /// Second moments, in the same layout.
     pub second: Vec<[f32; 12]>,
-    /// Since density control came last.
+    /// Statistics since the last density control.
     pub statistics: Vec<XStatistics>,
 }
 
-/// Place of the opacity among the moments of a Gaussian.
+/// Index of the opacity among the moments of a Gaussian.
 const OPACITY: usize = 3;
 
 fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
@@ -66,14 +66,14 @@ fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
 }
 
 impl XState {
-    /// Gaussians that were never updated, and the set of each.
+    /// Returns Gaussians with zero moments and statistics, and the set of each.
     pub fn fresh(rows: Vec<XGaussian>, sets: Vec<u32>) -> XState {
         let n = rows.len();
         let statistics = vec![XStatistics::default(); n];
         XState { rows, sets, first: vec![[0.0; 12]; n], second: vec![[0.0; 12]; n], statistics }
     }
 
-    /// Keeps those marked in `keep`, one mark per Gaussian.
+    /// Keeps the Gaussians marked in `keep`, one mark per Gaussian.
     pub fn retain(&mut self, keep: &[bool]) {
         retain_marked(&mut self.rows, keep);
         retain_marked(&mut self.sets, keep);
@@ -82,7 +82,7 @@ impl XState {
         retain_marked(&mut self.statistics, keep);
     }
 
-    /// Adds Gaussians that were never updated, and the set of each.
+    /// Appends Gaussians with zero moments and statistics, and the set of each.
     pub fn append(&mut self, rows: Vec<XGaussian>, sets: Vec<u32>) {
         let fresh = XState::fresh(rows, sets);
         self.rows.extend(fresh.rows);
@@ -92,14 +92,14 @@ impl XState {
         self.statistics.extend(fresh.statistics);
     }
 
-    /// Makes no Gaussian more opaque than `most`; the optimiser forgets what it knew of opacities.
+    /// Limits the opacity of all Gaussians to `most` and resets the optimiser's moments of opacities.
     pub fn reset_opacities(&mut self, most: f64) {
         let most = stored_opacity(most.ln()) as f32;
         self.rows.iter_mut().for_each(|g| g.opacity = g.opacity.min(most));
         self.first.iter_mut().chain(&mut self.second).for_each(|moments| moments[OPACITY] = 0.0);
     }
 
-    /// Gaussians of each of so many sets.
+    /// Returns the number of Gaussians of each of `n_sets` sets.
     pub fn counts(&self, n_sets: usize) -> Vec<u32> {
         let mut counts = vec![0; n_sets];
         self.sets.iter().for_each(|set| counts[*set as usize] += 1);
@@ -109,7 +109,7 @@ impl XState {
     /// Refuses parameters that are not finite.
     ///
     /// # Errors
-    /// [`Error::Diverged`] with the first of them.
+    /// [`Error::Diverged`] with the first such parameter.
     pub fn check(&self, step: u32) -> Result<()> {
         let numbers =
             |g: &XGaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.opacity, g.intensity]);
@@ -134,7 +134,7 @@ mod tests {
             assert!((g.shown_opacity() / opacity - 1.0).abs() < 1e-5, "{opacity}");
             assert!((g.log_opacity() - opacity.ln()).abs() < 1e-5, "{opacity}");
         }
-        // Nearly opaque ones are told apart.
+        // Nearly opaque Gaussians remain distinguishable.
         assert!((stored_opacity(f64::from(-1e-8f32)) - 18.42).abs() < 0.01);
     }
 

@@ -1,4 +1,4 @@
-//! The state of a fit as X-Gaussian does it in a checkpoint: tensors under documented names.
+//! State of a fit of X-Gaussian in a checkpoint: tensors under documented names.
 
 use crate::error::{Error, Result};
 use crate::fitting::tensors::{File, FileTensor};
@@ -7,7 +7,7 @@ use crate::model::x_gaussian::XState;
 use safetensors::tensor::{Dtype, SafeTensors};
 use std::path::Path;
 
-/// Numbers of a Gaussian: position, opacity, scale, intensity, rotation.
+/// Number of parameters of a Gaussian: position, opacity, scale, intensity, rotation.
 const N_NUMBERS: usize = 12;
 
 pub(super) fn tensors(state: &XState) -> Vec<FileTensor> {
@@ -33,7 +33,7 @@ pub(super) fn tensors(state: &XState) -> Vec<FileTensor> {
     ]
 }
 
-/// Reads what [`tensors`] describes, of a run on so many phases.
+/// Reads the state that [`tensors`] describes, of a run on `n_phases` phases.
 pub(super) fn read(tensors: &SafeTensors<'_>, n_phases: usize, path: &Path) -> Result<XState> {
     let file = File { tensors, path };
     let position = file.floats("x.position", &[None, Some(3)])?;

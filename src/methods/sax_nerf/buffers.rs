@@ -1,4 +1,4 @@
-//! What a fit takes of a device, and whether the device has it.
+//! Buffers of SAX-NeRF on a device, and a check of the memory that a fit takes.
 
 use crate::config::Config;
 use crate::error::{Error, Result};
@@ -24,16 +24,16 @@ const MIB: u64 = 1 << 20;
 /// Bytes that a fit takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SaxMemory {
-    /// Of the largest buffer of a field: moments, or sums of the grid's gradient.
+    /// Size of the largest buffer of a field: moments, or sums of the grid's gradient.
     pub of_field_buffer: u64,
-    /// Of the largest buffer of a batch.
+    /// Size of the largest buffer of a batch.
     pub of_batch_buffer: u64,
-    /// In all, images left out.
+    /// Total size without images.
     pub total: u64,
 }
 
 impl SaxMemory {
-    /// What fields of `setup` and their batches take.
+    /// Returns the memory that the fields of `setup` and their batches take.
     pub fn of(setup: &SaxSetup) -> SaxMemory {
         let (weights, grid) = (u64::from(setup.n_weights), u64::from(setup.n_grid));
         let params = weights + grid;
@@ -48,10 +48,10 @@ impl SaxMemory {
         }
     }
 
-    /// Refuses a device that has too little, or too little that is free.
+    /// Refuses a device with too little memory in total or too little free memory.
     ///
     /// # Errors
-    /// [`Error::Config`] naming what to lower; [`Error::OutOfMemory`] where others hold what there is.
+    /// [`Error::Config`] naming the setting to lower; [`Error::OutOfMemory`] where other programs hold the memory.
     pub fn check(&self, gpu: &Gpu, config: &Config, n_sets: usize) -> Result<()> {
         let (sax, info) = (&config.sax, gpu.info());
         let largest = u64::from(info.max_storage_buffer_range);
@@ -100,16 +100,16 @@ impl SaxMemory {
     }
 }
 
-/// What samples are for: how many vectors of the Lineformer they take.
+/// Purpose of samples, which determines how many vectors of the Lineformer they need.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Passes {
-    /// Forward alone.
+    /// Forward pass alone.
     Drawing,
-    /// Forward and back.
+    /// Forward and backward pass.
     Fitting,
 }
 
-/// Buffers that asking a field takes for so many samples at once.
+/// Creates the buffers for evaluating a field at a number of samples at once.
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer.
@@ -139,7 +139,7 @@ pub fn sample_buffers(
     })
 }
 
-/// A field's numbers on the device.
+/// Uploads the parameters of a field to the device.
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer; other device errors.
@@ -149,7 +149,7 @@ pub fn params_buffer(gpu: &Gpu, name: &str, params: &[f32]) -> Result<Buffer> {
     Ok(buffer)
 }
 
-/// Buffers of a fit.
+/// Creates the buffers of a fit.
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer; other device errors.
@@ -187,7 +187,7 @@ pub fn fit_buffers(
     Ok(fit)
 }
 
-/// Fields on the device.
+/// Creates the buffers of the fields.
 ///
 /// # Errors
 /// [`Error::OutOfMemory`] naming the buffer; other device errors.
@@ -217,7 +217,7 @@ mod tests {
     use crate::methods::sax_nerf::field::SaxShape;
     use crate::methods::sax_nerf::setup::n_parts;
 
-    /// What every device holds in a buffer.
+    /// Minimum buffer size that every device supports, bytes.
     const LEAST_STORAGE_BUFFER: u64 = 128 << 20;
 
     #[test]

@@ -1,4 +1,4 @@
-//! A dataset as SAX-NeRF sees it: whole images in its units, which of their pixels show something, and which images
+//! A dataset in the form that SAX-NeRF uses: whole images in its units, the pixels that show something, and the images that
 //! each field is fitted to.
 
 use crate::config::sections::Sax;
@@ -8,7 +8,7 @@ use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{SaxList, View};
 use crate::scan::dataset::Dataset;
 
-/// Beyond the volume's corners rays go on for so much, mm.
+/// Length by which rays continue beyond the volume's corners, mm.
 const TOLERANCE_MM: f64 = 5.0;
 
 /// The data in SAX-NeRF's units.
@@ -30,7 +30,7 @@ pub struct SaxData {
     pub views: Vec<View>,
     /// `[image][pixel]`: line integrals of the density.
     pub images: Vec<f32>,
-    /// Where each image's pixels are in `listed`.
+    /// Range of each image's pixels in `listed`.
     pub lists: Vec<SaxList>,
     /// Pixels that show something; all of an image that shows nothing.
     pub listed: Vec<u32>,
@@ -39,11 +39,11 @@ pub struct SaxData {
 }
 
 impl SaxData {
-    /// Brings a dataset into a volume of half a side `half` each way, world units.
+    /// Converts a dataset for a volume of half side `half`, world units.
     ///
     /// # Errors
-    /// [`Error::Config`] for images of several sizes or smaller than what the windows take, for a pixel that is not a
-    /// number, and for phases that no image shows.
+    /// [`Error::Config`] for images of several sizes or without room for the windows, for a pixel that is not finite, and for
+    /// phases that no image shows.
     pub fn new(dataset: &Dataset, settings: &Sax, half: f64) -> Result<SaxData> {
         let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
         if dataset.sizes().len() > 1 {
@@ -84,17 +84,17 @@ impl SaxData {
         self.images.extend(image);
     }
 
-    /// Pixels of an image.
+    /// Returns the number of pixels of an image.
     pub fn n_pixels(&self) -> usize {
         self.width * self.height
     }
 
-    /// Fields, each fitted by itself.
+    /// Returns the number of fields, each fitted separately.
     pub fn n_sets(&self) -> usize {
         self.images_of_set.len()
     }
 
-    /// Images of all sets in their order, and where each set's begin.
+    /// Returns the images of all sets in their order, and the index of each set's first image.
     pub fn turns(&self) -> (Vec<u32>, Vec<u32>) {
         let turns = self.images_of_set.iter().flatten().map(|image| *image as u32).collect();
         let mut first = 0;
@@ -106,13 +106,14 @@ impl SaxData {
     }
 }
 
-/// First and last depth of rays: as far as the corners of the volume's slices are from its axis, and a little more.
+/// Returns the first and last depth of rays: the distance of the corners of the volume's slices from its axis, plus a
+/// tolerance.
 fn depths(half: f64) -> [f64; 2] {
     let far = half * 2f64.sqrt() + TOLERANCE_MM / MM_PER_UNIT;
     [-far, far]
 }
 
-/// Refuses windows that images do not have room for.
+/// Refuses windows that do not fit into the images.
 fn check_windows(settings: &Sax, [width, height]: [usize; 2]) -> Result<()> {
     let side = settings.window as usize;
     let room = (width / side) * (height / side);

@@ -1,4 +1,4 @@
-//! SAX-NeRF's field as it is drawn: along rays, and at the cells of volumes.
+//! Drawing of SAX-NeRF's field along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
 use crate::fitting::field::{Field, FieldDrawing, Row};
@@ -12,7 +12,7 @@ use crate::methods::sax_nerf::setup::drawing_setup;
 use crate::methods::sax_nerf::stages::{SaxFieldKernels, SaxSampleBuffers, SaxSampling, record_view};
 use std::sync::{Mutex, PoisonError};
 
-/// Samples asked at once: 16 MiB of features where there are 16 levels.
+/// Number of samples evaluated at once: 16 MiB of features with 16 levels.
 const SAMPLES_AT_ONCE: u32 = 131_072;
 
 /// Draws a field.
@@ -22,21 +22,21 @@ pub struct SaxDrawing {
     field: SaxField,
     setup: SaxSetup,
     buffers: SaxSampleBuffers,
-    /// Numbers of each set on the device.
+    /// Parameters of each set on the device.
     params: Mutex<Vec<Buffer>>,
 }
 
-/// What is drawn into.
+/// Target of a drawing.
 #[derive(Clone, Copy)]
 enum Target<'a> {
-    /// What rays see.
+    /// Rendered values of rays.
     View(&'a Buffer),
     /// Attenuation per world unit at samples, `[ray][sample]`.
     Cells(&'a Buffer),
 }
 
 impl SaxDrawing {
-    /// Puts a field on the device; numbers that it lacks come by [`FieldDrawing::follow`].
+    /// Uploads a field to the device; parameters that it lacks are set by [`FieldDrawing::follow`].
     ///
     /// # Errors
     /// [`Error::OutOfMemory`]; other device errors.

@@ -1,4 +1,4 @@
-//! SAX-NeRF's field, plain data: a hash grid and a Lineformer for each phase, or one of each for all.
+//! SAX-NeRF's field as plain data: a hash grid and a Lineformer for each phase, or one of each for all phases.
 
 use super::KEY;
 use super::drawing::SaxDrawing;
@@ -13,35 +13,35 @@ use crate::kernels::constants::LINEFORMER_INPUT;
 use crate::kernels::layout::SaxLevel;
 use std::any::Any;
 
-/// Numbers between the Lineformer's layers.
+/// Width of the Lineformer's layers.
 pub const WIDTH: usize = 32;
 /// Features of a level of the grid.
 pub const FEATURES: usize = 2;
-/// Numbers inside its feed-forward part.
+/// Width inside its feed-forward part.
 const WIDE: usize = 4 * WIDTH;
 /// Heads of its attention.
 const HEADS: usize = 8;
-/// Samples that see each other.
+/// Number of samples that attend to each other.
 const PAIR: usize = 2;
 
-/// Numbers of a field that belong together.
+/// Group of parameters of a field that form one tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Part {
-    /// What they are called in files.
+    /// Name of the group in files.
     pub name: &'static str,
-    /// Their shape: outputs before inputs.
+    /// Shape of the group: outputs before inputs.
     pub shape: Vec<usize>,
-    /// Where they begin among the field's numbers.
+    /// Index of the first one among the field's parameters.
     pub first: usize,
 }
 
 impl Part {
-    /// How many they are.
+    /// Returns the number of parameters of the group.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
     }
 
-    /// Whether there are none.
+    /// Tells whether the group is empty.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -54,22 +54,22 @@ pub struct SaxShape {
     pub levels: u32,
     /// Cells along each side of the box in the first level; each further one has twice as many.
     pub base: u32,
-    /// Logarithm to base 2 of the entries that a level has at most.
+    /// Logarithm to base 2 of the maximum number of entries of a level.
     pub log2_table: u32,
 }
 
 impl SaxShape {
-    /// That of a configuration.
+    /// Returns the sizes for a configuration.
     pub fn of(settings: &Sax) -> SaxShape {
         SaxShape { levels: settings.levels, base: settings.base, log2_table: settings.log2_table }
     }
 
-    /// Features of a point.
+    /// Returns the number of features of a point.
     pub fn n_features(&self) -> usize {
         FEATURES * self.levels as usize
     }
 
-    /// The levels: cells, entries, and whether each corner has an entry of its own.
+    /// Returns the levels: cells, entries, and whether each corner has its own entry.
     pub fn grid(&self) -> Vec<SaxLevel> {
         let (table, mut first) = (1u64 << self.log2_table, 0);
         let level = |l: u32| {
@@ -83,28 +83,28 @@ impl SaxShape {
         (0..self.levels).map(level).collect()
     }
 
-    /// Numbers of the grid.
+    /// Returns the number of parameters of the grid.
     pub fn n_grid(&self) -> usize {
         FEATURES * self.grid().iter().map(|level| level.entries as usize).sum::<usize>()
     }
 
-    /// Numbers of the Lineformer, with some that are nothing's.
+    /// Returns the number of parameters of the Lineformer, padding included.
     pub fn n_weights(&self) -> usize {
         let input = self.n_features();
         4 * LINEFORMER_INPUT as usize + WIDTH * input + WIDTH * (input + WIDTH)
     }
 
-    /// Numbers of the field.
+    /// Returns the number of parameters of the field, padding included.
     pub fn n_params(&self) -> usize {
         self.n_weights() + self.n_grid()
     }
 
-    /// Numbers of the field without those that fill up rows of four and mean nothing.
+    /// Returns the number of parameters of the field without padding.
     pub fn n_meant(&self) -> usize {
         self.parts().iter().map(Part::len).sum()
     }
 
-    /// What the numbers are, in their order.
+    /// Returns the groups of parameters in their order.
     pub fn parts(&self) -> Vec<Part> {
         let input = self.n_features();
         let parts = [
@@ -131,7 +131,7 @@ impl SaxShape {
         let mut first = 0;
         let place = |(name, shape): (&'static str, Vec<usize>)| {
             let part = Part { name, shape, first };
-            // A single number is followed by nothing up to a row.
+            // A single number is padded to a row.
             first += part.len().max(WIDTH);
             part
         };
@@ -139,7 +139,7 @@ impl SaxShape {
     }
 }
 
-/// A field as it is drawn and kept.
+/// A field as it is drawn and stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SaxField {
     /// Its sizes.
@@ -154,20 +154,20 @@ pub struct SaxField {
     pub attenuation: f64,
     /// Fields: one for each phase, or one for all.
     pub n_sets: usize,
-    /// `[set]`: numbers as [`SaxShape::parts`] has them; none of a run whose numbers are on the device.
+    /// `[set]`: parameters in the order of [`SaxShape::parts`]; empty for a run whose parameters are on the device.
     pub params: Vec<Vec<f32>>,
     /// Iterations done.
     pub step: u32,
 }
 
 impl SaxField {
-    /// The set that a phase shows.
+    /// Returns the index of the set that represents a phase.
     pub fn set_of(&self, phase: u32) -> usize {
         (phase as usize).min(self.n_sets - 1)
     }
 }
 
-/// What a fit goes on from, beside the field.
+/// State that a resumed fit needs beside the field.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SaxState {
     /// `[set]`: first and second moment of Adam of each number.
@@ -222,10 +222,10 @@ impl FitState for SaxState {
 /// Settings that make the steps of a fit smaller.
 pub const SMALLER_STEPS: &str = "a lower sax.rate";
 
-/// Refuses numbers that are not finite.
+/// Refuses parameters that are not finite.
 ///
 /// # Errors
-/// [`Error::Diverged`] with the first of them.
+/// [`Error::Diverged`] with the first such parameter.
 pub fn check_params(params: &[Vec<f32>], step: u32) -> Result<()> {
     match params.iter().flatten().find(|v| !v.is_finite()) {
         Some(bad) => Err(Error::Diverged {

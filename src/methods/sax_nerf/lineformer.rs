@@ -1,7 +1,7 @@
-//! The Lineformer, layer by layer, on a chunk of samples: forward to attenuation, and back to the features' gradient.
+//! The Lineformer on a chunk of samples, layer by layer: forward to attenuation, and backward to the features' gradient.
 //!
-//! Vectors of 32 numbers of all samples of a chunk lie in one buffer (`inc/lineformer_layout.glsl` has their list); features stay
-//! where the grid's stages have them.
+//! Vectors of 32 numbers of all samples of a chunk lie in one buffer (`inc/lineformer_layout.glsl` lists them); features stay
+//! in the buffer of the grid's stages.
 
 use crate::error::Result;
 use crate::gpu::device::Gpu;
@@ -12,43 +12,44 @@ use crate::kernels::stages::{Build, Stage, vec4_variant};
 use crate::kernels::tuning::Tuning;
 use crate::methods::sax_nerf::field::{SaxShape, WIDTH};
 
-/// Numbers of a vec4, a vector in vec4, and a matrix of 32 x 32.
+/// Length of a vec4; lengths of a vector and of a 32 x 32 matrix in vec4.
 const LANES: u32 = 4;
 const WIDTH4: u32 = WIDTH as u32 / LANES;
 const SQUARE: u32 = WIDTH as u32 * WIDTH4;
-/// Vectors of the feed-forward part.
+/// Number of vectors of the feed-forward part.
 const WIDE: u32 = 4;
 
-/// Most samples of a chunk: with all vectors of a backward pass 105 MiB, below what a buffer of every device holds.
+/// Maximum number of samples of a chunk: all vectors of a backward pass take 105 MiB, less than the buffer size that every
+/// device supports.
 pub const MOST_SAMPLES: u32 = 16_384;
-/// Samples that one workgroup adds up of a gradient.
+/// Number of samples that one workgroup sums for a gradient.
 pub const PART_SAMPLES: u32 = 512;
-/// Strides that are no power of two spare caches from collisions.
+/// Padding that makes strides no power of two, which avoids cache conflicts.
 const PADDING: u32 = 8;
 
-/// Room for the vectors of a chunk of so many samples.
+/// Returns the number of samples for which the vectors' buffer of a chunk of `n_samples` has room.
 pub fn capacity(n_samples: u32) -> u32 {
     n_samples.min(MOST_SAMPLES) + PADDING
 }
 
-/// Bytes of so many vectors of a chunk.
+/// Returns the bytes of `n_vectors` vectors of a chunk.
 pub fn vector_bytes(n_vectors: u32, capacity: u32) -> u64 {
     u64::from(n_vectors) * u64::from(capacity) * 4 * WIDTH as u64
 }
 
-/// Samples of all that a chunk is of: where it begins, how many they are, and how far along its ray the first one is.
+/// Range of samples that a chunk consists of, and the place of its first sample along its ray.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chunk {
-    /// Among the samples whose features there are.
+    /// Index of the first sample among those with features.
     pub first: u32,
-    /// How many.
+    /// Number of samples.
     pub n: u32,
-    /// Place of the first along its ray.
+    /// Place of the first sample along its ray.
     pub along: u32,
 }
 
-/// Chunks of `n_rays` rays of `row` samples, of at most [`MOST_SAMPLES`]: whole rays, or even parts of one, so that pairs stay
-/// together.
+/// Returns the chunks of `n_rays` rays of `row` samples, each of at most [`MOST_SAMPLES`]: whole rays, or parts of a ray with
+/// an even number of samples, so that pairs stay together.
 pub fn chunks(n_rays: u32, row: u32) -> Vec<Chunk> {
     if row > MOST_SAMPLES {
         let of_ray = |ray: u32| {
@@ -79,7 +80,7 @@ pub struct LineformerBackKernels {
     products: Stage<push::SaxProducts>,
 }
 
-/// How stages of a device are built: those on samples, and those on numbers.
+/// Returns the build options for a device: of stages on samples, and of stages on parameters.
 fn builds(gpu: &Gpu) -> (Build<'static>, Build<'static>) {
     let tuning = Tuning::for_device(gpu.info());
     let plain = Build { variant: vec4_variant(&tuning), ..Build::default() };
@@ -119,7 +120,7 @@ impl LineformerBackKernels {
     }
 }
 
-/// Records a stage with what is bound beside its vectors.
+/// Records a stage and binds its other buffers beside the vectors.
 pub trait Recorder {
     /// Records a dispatch.
     ///
@@ -127,7 +128,7 @@ pub trait Recorder {
     /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
     fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()>;
 
-    /// Samples that a lane of these tiled stages has, as they were compiled for this device.
+    /// Returns the number of samples per lane of the tiled stages, as compiled for this device.
     fn lane_samples(&self) -> u32;
 }
 
@@ -136,9 +137,9 @@ pub trait Recorder {
 pub struct Lineformer {
     /// Sizes.
     pub shape: SaxShape,
-    /// Room of the vectors' buffer.
+    /// Number of samples for which the vectors' buffer has room.
     pub capacity: u32,
-    /// Samples whose features there are.
+    /// Number of samples with features.
     pub n_all: u32,
     /// Samples of a ray.
     pub row: u32,
@@ -146,7 +147,7 @@ pub struct Lineformer {
     pub chunk: Chunk,
 }
 
-/// A matrix: where its numbers begin, and from row to row, vec4.
+/// A matrix: index of its first number and stride between rows, vec4.
 #[derive(Clone, Copy)]
 struct Matrix {
     first: u32,
@@ -158,14 +159,14 @@ impl Lineformer {
         self.shape.n_features() as u32 / LANES
     }
 
-    /// The first layer's, and that of the layer on both.
+    /// Returns the matrices of the first layer and of the joint layer, which sees the features and the block's output.
     fn outer(&self) -> [Matrix; 2] {
         let input = self.features4();
         let joint = at::LINEFORMER_INPUT + WIDTH as u32 * input;
         [Matrix { first: at::LINEFORMER_INPUT, stride: input }, Matrix { first: joint, stride: input + WIDTH4 }]
     }
 
-    /// A product of vectors, without features, bias or activation.
+    /// Returns a product of vectors, without features, bias or activation.
     fn times(&self, to: u32, from: u32, columns: u32, weights: u32) -> SaxTimes {
         SaxTimes {
             n_samples: self.chunk.n,
@@ -195,10 +196,10 @@ impl Lineformer {
         run.run(stage, stage.groups_for(self.chunk.n), push)
     }
 
-    /// Records the layers up to the last but one.
+    /// Records all layers except the last.
     ///
     /// # Errors
-    /// As [`Recorder::run`].
+    /// Errors of [`Recorder::run`].
     pub fn layers(&self, run: &mut impl Recorder, kernels: &LineformerKernels) -> Result<()> {
         let (n_samples, capacity) = (self.chunk.n, self.capacity);
         let (times, norm) = (&kernels.times, &kernels.norm);
@@ -230,7 +231,7 @@ impl Lineformer {
     /// Records attenuation, times `scale`, from these layers' results.
     ///
     /// # Errors
-    /// As [`Recorder::run`].
+    /// Errors of [`Recorder::run`].
     pub fn density(
         &self,
         run: &mut impl Recorder,
@@ -242,7 +243,7 @@ impl Lineformer {
         self.each(run, &kernels.density, push)
     }
 
-    /// A product with a transposed matrix, without an activation.
+    /// Returns a product with a transposed matrix, without an activation.
     fn back(&self, to: u32, columns: u32, (from, rows4): (u32, u32), matrix: Matrix) -> SaxTimesBack {
         SaxTimesBack {
             n_samples: self.chunk.n,
@@ -270,10 +271,10 @@ impl Lineformer {
         run.run(stage, Groups::Direct([self.chunk.n.div_ceil(samples), tiles, 1]), push)
     }
 
-    /// Records the way back to the features, from what [`Lineformer::layers`] left.
+    /// Records the backward pass to the features, from the vectors that [`Lineformer::layers`] left.
     ///
     /// # Errors
-    /// As [`Recorder::run`].
+    /// Errors of [`Recorder::run`].
     pub fn backward(&self, run: &mut impl Recorder, kernels: &LineformerBackKernels) -> Result<()> {
         let (n_samples, capacity) = (self.chunk.n, self.capacity);
         let (times, wide) = (&kernels.times, WIDE * WIDTH4);
@@ -333,10 +334,11 @@ impl Lineformer {
         self.run_back(run, times, push)
     }
 
-    /// Records what the chunk says of the Lineformer's numbers, in `n_parts` parts: after what chunks before said, or instead.
+    /// Records the chunk's gradients of the Lineformer's parameters, in `n_parts` parts: added to those of earlier chunks if
+    /// `adds`, otherwise replacing them.
     ///
     /// # Errors
-    /// As [`Recorder::run`].
+    /// Errors of [`Recorder::run`].
     pub fn products(
         &self,
         run: &mut impl Recorder,

@@ -1,17 +1,17 @@
-//! What the gradients of the Lineformer's numbers are products of.
+//! Products of vectors that make up the gradients of the Lineformer's parameters.
 
 use crate::kernels::constants as at;
 use crate::kernels::layout::SaxProduct;
 use crate::methods::sax_nerf::field::{SaxShape, WIDTH};
 
-/// Numbers of a vec4.
+/// Length of a vec4.
 const LANES: u32 = 4;
-/// A vector in vec4.
+/// Length of a vector in vec4.
 const WIDTH4: u32 = WIDTH as u32 / LANES;
 /// Slices of the feed-forward part.
 const SLICES: u32 = 4;
 
-/// The products, and the sums of one vector, of a field's backward pass.
+/// Returns the products of vectors, and the sums of single vectors, of a field's backward pass.
 pub fn products(shape: SaxShape) -> Vec<SaxProduct> {
     let input = shape.n_features() as u32 / LANES;
     let (joint, joint_stride) = (at::LINEFORMER_INPUT + WIDTH as u32 * input, input + WIDTH4);

@@ -1,4 +1,4 @@
-//! Constants and rates of a fit as SAX-NeRF does it.
+//! Constants and learning rates of a fit of SAX-NeRF.
 
 use crate::config::Config;
 use crate::config::sections::Sax;
@@ -8,7 +8,7 @@ use crate::methods::sax_nerf::data::SaxData;
 use crate::methods::sax_nerf::field::{SaxField, SaxShape};
 use crate::methods::sax_nerf::lineformer::{PART_SAMPLES, chunks};
 
-/// What does not depend on what is drawn or fitted.
+/// Returns the constants of a field that do not depend on the target of drawing or fitting.
 fn field_setup(field: &SaxField) -> SaxSetup {
     SaxSetup {
         n_levels: field.shape.levels,
@@ -25,17 +25,17 @@ fn field_setup(field: &SaxField) -> SaxSetup {
     }
 }
 
-/// Rays of a batch.
+/// Returns the number of rays of a batch.
 pub fn n_rays(settings: &Sax) -> u32 {
     settings.windows * settings.window * settings.window + settings.rays
 }
 
-/// Parts that a chunk of samples is cut into for sums.
+/// Returns the maximum number of parts into which a chunk of samples is divided for sums.
 pub fn n_parts(n_rays: u32, n_samples: u32) -> u32 {
     chunks(n_rays, n_samples).iter().map(|chunk| chunk.n.div_ceil(PART_SAMPLES)).max().unwrap_or(1)
 }
 
-/// Constants of a fit.
+/// Returns the constants of a fit.
 pub fn fit_setup(field: &SaxField, data: &SaxData, settings: &Sax) -> SaxSetup {
     let rays = n_rays(settings);
     SaxSetup {
@@ -50,12 +50,12 @@ pub fn fit_setup(field: &SaxField, data: &SaxData, settings: &Sax) -> SaxSetup {
     }
 }
 
-/// Constants of drawing: regular depths.
+/// Returns the constants of drawing, with regular depths.
 pub fn drawing_setup(field: &SaxField) -> SaxSetup {
     SaxSetup { jitter: 0, ..field_setup(field) }
 }
 
-/// What the optimiser reads: all numbers of a field count as those of a still one.
+/// Returns the constants of the optimiser, which treats all parameters as those of a static field.
 pub fn adam_setup(shape: SaxShape, config: &Config) -> Setup {
     let n = shape.n_params() as u32;
     Setup {
@@ -68,7 +68,7 @@ pub fn adam_setup(shape: SaxShape, config: &Config) -> Setup {
     }
 }
 
-/// One row per iteration and one more, which is there to be timed.
+/// Returns one row per iteration and one more for an iteration that is timed after the end.
 pub fn schedule(config: &Config) -> Vec<Schedule> {
     let (sax, adam) = (&config.sax, &config.adam);
     let row = |step: u32| {
@@ -85,7 +85,7 @@ pub fn schedule(config: &Config) -> Vec<Schedule> {
     (0..=config.train.iterations).map(row).collect()
 }
 
-/// The field that a fit of `data` begins with, without its numbers.
+/// Returns the field of a fit of `data`, without its parameters.
 pub fn outline(data: &SaxData, settings: &Sax, step: u32) -> SaxField {
     SaxField {
         shape: SaxShape::of(settings),

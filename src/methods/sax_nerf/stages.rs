@@ -1,9 +1,9 @@
-//! The stages of SAX-NeRF, what they bind, and one iteration, top to bottom. Each field has, one after the other,
+//! The stages of SAX-NeRF, their buffers, and one iteration. For each field, the stages run in this order,
 //!
 //! sax_batch -> sax_points -> sax_encode -> the Lineformer's layers -> sax_loss -> back through them -> sax_products ->
 //! sax_weight_gradient -> sax_encode_bwd -> sax_grid_gradient -> adam
 //!
-//! in buffers that all share but for its numbers; then comes sax_report.
+//! in buffers that all fields share except for their parameters; sax_report follows.
 
 use crate::error::Result;
 use crate::gpu::buffer::Buffer;
@@ -20,17 +20,17 @@ use crate::methods::sax_nerf::lineformer::{
     Lineformer, LineformerBackKernels, LineformerKernels, Recorder, capacity, chunks,
 };
 
-/// Pipelines that ask a field.
+/// Pipelines that evaluate a field.
 pub struct SaxFieldKernels {
     /// Samples along rays.
     pub points: Stage<push::SaxPoints>,
     /// Features of samples.
     pub encode: Stage<push::SaxEncode>,
-    /// Their attenuation.
+    /// Attenuation of samples.
     pub lineformer: LineformerKernels,
-    /// Samples that a lane of its layers has.
+    /// Number of samples per lane of the layers.
     lane_samples: u32,
-    /// What rays see.
+    /// Rendering of rays.
     pub view: Stage<push::SaxView>,
 }
 
@@ -51,7 +51,7 @@ impl SaxFieldKernels {
     }
 }
 
-/// Samples that a lane of the tiled stages has on a device; both directions are compiled alike.
+/// Returns the number of samples per lane of the tiled stages on a device; forward and backward stages have the same.
 fn lane_samples(gpu: &Gpu) -> u32 {
     let is_plain = vec4_variant(&Tuning::for_device(gpu.info())).is_empty();
     if is_plain { sax_times::SAMPLES } else { sax_times_texel::SAMPLES }
@@ -59,17 +59,17 @@ fn lane_samples(gpu: &Gpu) -> u32 {
 
 /// Pipelines of a fit.
 pub struct SaxKernels {
-    /// Those that ask the field.
+    /// Pipelines that evaluate the field.
     pub field: SaxFieldKernels,
-    /// Draws rays.
+    /// Draws the rays of a batch.
     pub batch: Stage<push::SaxBatch>,
     /// Residuals.
     pub loss: Stage<push::SaxLoss>,
-    /// Gradients by features, and what samples say of the Lineformer's numbers.
+    /// Gradients with respect to the features, and partial gradients of the Lineformer's parameters.
     pub lineformer_bwd: LineformerBackKernels,
-    /// Gradient of the Lineformer's numbers.
+    /// Gradient of the Lineformer's parameters.
     pub weight_gradient: Stage<push::SaxWeightGradient>,
-    /// Scatter to the grid.
+    /// Scatter of the features' gradient to the grid.
     pub encode_bwd: Stage<push::SaxEncodeBwd>,
     /// Gradient of the grid.
     pub grid_gradient: Stage<push::SaxGridGradient>,
@@ -101,7 +101,7 @@ impl SaxKernels {
 }
 
 buffer_set! {
-    /// What asking a field takes, but for its numbers.
+    /// Buffers for evaluating a field, except for its parameters.
     pub struct SaxSampleBuffers {
         /// [`SaxSetup`].
         sax_setup,
@@ -109,23 +109,23 @@ buffer_set! {
         sax_levels,
         /// [`crate::kernels::layout::DeviceState`]: iterations done.
         state,
-        /// `[ray][sample]`: points of the unit cube, and the paths they stand for.
+        /// `[ray][sample]`: points of the unit cube, and their path lengths.
         sax_points,
         /// `[pair of levels][sample]`: features.
         sax_encoding,
         /// `[ray][sample]`: attenuation.
         sax_sigma,
-        /// `[vector][number / 4][sample of a chunk]`: what layers make.
+        /// `[vector][number / 4][sample of a chunk]`: outputs of the layers.
         sax_vectors,
-        /// The same, to be read.
+        /// Read-only view of `sax_vectors`.
         sax_operands,
     }
 }
 
 buffer_set! {
-    /// What a fit goes by and what it counts, beside [`SaxSampleBuffers`].
+    /// Data and counters of a fit, beside [`SaxSampleBuffers`].
     pub struct SaxFitBuffers {
-        /// [`crate::kernels::layout::Setup`], of which the optimiser reads its own.
+        /// [`crate::kernels::layout::Setup`] for the optimiser.
         setup,
         /// [`crate::kernels::layout::Schedule`]s.
         schedule,
@@ -137,7 +137,7 @@ buffer_set! {
         sax_lists,
         /// Pixels that show something.
         sax_listed,
-        /// `[image][pixel]`: line integrals to be shown.
+        /// `[image][pixel]`: target line integrals.
         sax_images,
         /// [`crate::kernels::layout::Ray`]s of a batch.
         rays,
@@ -147,43 +147,43 @@ buffer_set! {
         sax_losses,
         /// [`crate::kernels::layout::SaxProduct`]s.
         sax_products,
-        /// `[part of a chunk][number]`: gradients.
+        /// `[part of a chunk][parameter]`: partial gradients.
         sax_weight_parts,
-        /// `[pair of levels][sample]`: gradient by features.
+        /// `[pair of levels][sample]`: gradient with respect to the features.
         sax_encoding_gradient,
-        /// `[number]`: sums of the grid's gradient in fixed point.
+        /// `[parameter]`: sums of the grid's gradient in fixed point.
         sax_grid_sums,
-        /// `[number]`: gradient of a field.
+        /// `[parameter]`: gradient of a field.
         gradient,
         /// Losses of the last iterations.
         sax_ring,
     }
 }
 
-/// Numbers of a field on the device, and their moments.
+/// Parameters of a field on the device, and their moments.
 #[derive(Clone)]
 pub struct SaxSetBuffers {
-    /// The numbers.
+    /// The parameters.
     pub params: Buffer,
     /// First and second moments.
     pub moments: Buffer,
     /// Seed of its random numbers.
     pub seed: u32,
-    /// Where its images are among the turns, and how many.
+    /// Index of its first image among the turns, and number of its images.
     pub turns: (u32, u32),
 }
 
-/// Asks a field: records what makes attenuations of the rays that `find` binds.
+/// Records the evaluation of a field at the samples of rays.
 pub struct SaxSampling<'a> {
     /// The stages.
     pub kernels: &'a SaxFieldKernels,
-    /// What they work with.
+    /// Buffers of the stages.
     pub buffers: &'a SaxSampleBuffers,
     /// Constants on the host.
     pub setup: &'a SaxSetup,
     /// Sizes of the field.
     pub shape: SaxShape,
-    /// Numbers of the field.
+    /// Parameters of the field.
     pub params: &'a Buffer,
     /// Rays.
     pub rays: &'a Buffer,
@@ -233,7 +233,7 @@ impl SaxSampling<'_> {
     }
 }
 
-/// Where the Lineformer's layers of a field that is asked are recorded.
+/// Recorder of the Lineformer's layers for evaluating a field.
 struct Sampled<'a, 'b> {
     sampling: &'b SaxSampling<'a>,
     recording: &'b mut Recording,
@@ -252,13 +252,13 @@ impl Recorder for Sampled<'_, '_> {
 
 /// A recording of a fit's stages.
 pub struct SaxPass<'a> {
-    /// Where stages go.
+    /// Recording that the stages are added to.
     pub recording: &'a mut Recording,
     /// The stages.
     pub kernels: &'a SaxKernels,
-    /// What samples take.
+    /// Buffers of the samples.
     pub samples: &'a SaxSampleBuffers,
-    /// What the fit goes by.
+    /// Data and counters of the fit.
     pub fit: &'a SaxFitBuffers,
     /// The fields.
     pub sets: &'a [SaxSetBuffers],
@@ -311,7 +311,7 @@ impl SaxPass<'_> {
         self.run(set, &kernels.loss, along_two_axes(n_rays), push)
     }
 
-    /// Records the gradient of that loss by the Lineformer's numbers and by features.
+    /// Records the gradient of that loss with respect to the Lineformer's parameters and the features.
     fn backward(&mut self, set: &SaxSetBuffers) -> Result<()> {
         let (kernels, setup, shape) = (self.kernels, self.setup, self.shape);
         let (row, n_all) = (setup.n_samples, setup.n_rays * setup.n_samples);
@@ -320,7 +320,7 @@ impl SaxPass<'_> {
             let lineformer = Lineformer { shape, capacity: capacity(n_all), n_all, row, chunk: *chunk };
             let mut run = Fitted { pass: &mut *self, set };
             if all.len() > 1 {
-                // The vectors are another chunk's.
+                // The buffer holds the vectors of another chunk.
                 lineformer.layers(&mut run, &kernels.field.lineformer)?;
             }
             lineformer.backward(&mut run, &kernels.lineformer_bwd)?;
@@ -330,17 +330,17 @@ impl SaxPass<'_> {
         self.run(set, weights, weights.groups_over(setup.n_weights), push::SaxWeightGradient {})
     }
 
-    /// Records what the gradient by features says of the grid, as sums in fixed point.
+    /// Records the gradient of the grid from that of the features, as sums in fixed point.
     ///
     /// # Errors
-    /// As [`record_step`].
+    /// Errors of [`record_step`].
     pub fn scatter(&mut self, set: &SaxSetBuffers) -> Result<()> {
         let (kernels, n_samples) = (self.kernels, self.setup.n_rays * self.setup.n_samples);
         let groups = kernels.encode_bwd.groups_over(n_samples * (self.setup.n_levels / 2));
         self.run(set, &kernels.encode_bwd, groups, push::SaxEncodeBwd { n_samples })
     }
 
-    /// Records the gradient of the grid from these sums, which are zero after it, and the update of all numbers.
+    /// Records the gradient of the grid from these sums, which it resets to zero, and the update of all parameters.
     fn update(&mut self, set: &SaxSetBuffers) -> Result<()> {
         let (kernels, setup) = (self.kernels, self.setup);
         let grid = &kernels.grid_gradient;
@@ -350,7 +350,7 @@ impl SaxPass<'_> {
     }
 }
 
-/// Where the Lineformer's layers of a fit are recorded.
+/// Recorder of the Lineformer's layers for a fit.
 struct Fitted<'a, 'b> {
     pass: &'b mut SaxPass<'a>,
     set: &'b SaxSetBuffers,
@@ -366,7 +366,7 @@ impl Recorder for Fitted<'_, '_> {
     }
 }
 
-/// Records one iteration: an image of each field.
+/// Records one iteration, which uses one image of each field.
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
@@ -382,10 +382,10 @@ pub fn record_step(pass: &mut SaxPass<'_>) -> Result<()> {
     pass.run(&sets[0], report, Groups::Direct([1, 1, 1]), push::SaxReport {})
 }
 
-/// Records what `n_rays` rays of a view from `first_ray` on see, from the attenuations at their samples.
+/// Records the rendering of `n_rays` rays of a view from `first_ray` on, from the attenuations at their samples.
 ///
 /// # Errors
-/// As [`record_step`].
+/// Errors of [`record_step`].
 pub fn record_view(
     recording: &mut Recording,
     sampling: &SaxSampling<'_>,

@@ -1,18 +1,18 @@
-//! Where a fit begins: random numbers, as PyTorch begins with them.
+//! Initial parameters of a fit: random numbers distributed as in PyTorch.
 
 use crate::methods::sax_nerf::field::{SaxShape, WIDTH};
 use crate::random::{STREAM_INIT, normal, uniform01};
 use rayon::prelude::*;
 
-/// Entries of the grid lie within so much of zero.
+/// Maximum absolute initial value of the grid's entries.
 const GRID: f64 = 1e-4;
-/// Deviations from zero that the attention's biases are cut at: they are normal otherwise.
+/// Number of standard deviations at which the normal distribution of the attention's biases is truncated.
 const CUT: f64 = 2.0;
-/// Draws of these biases come after all other random numbers; one in twenty is beyond the cut.
+/// Index of the first draw of these biases, after all other random numbers; one draw in twenty is beyond the cut.
 const FIRST_ATTEMPT: u32 = 1000;
 const MOST_ATTEMPTS: usize = 100;
 
-/// First numbers of a field whose random numbers go by `seed`.
+/// Returns the initial parameters of a field for the random `seed`.
 pub fn first_params(shape: SaxShape, seed: u32) -> Vec<f32> {
     let mut params = vec![0f32; shape.n_params()];
     let fan_in_of_bias =
@@ -37,7 +37,7 @@ pub fn first_params(shape: SaxShape, seed: u32) -> Vec<f32> {
     params
 }
 
-/// A normal number that is not beyond [`CUT`]: the first of those drawn for `index`.
+/// Returns a normal number that is not beyond [`CUT`]: the first such number drawn for `index`.
 fn cut_normal(seed: u32, index: u32) -> f64 {
     let draws = (0..).map(|attempt| normal(seed, STREAM_INIT, index, FIRST_ATTEMPT + attempt));
     draws.take(MOST_ATTEMPTS).find(|x| x.abs() <= CUT).unwrap_or(0.0)
@@ -76,7 +76,7 @@ mod tests {
         let mut draws: Vec<f64> = (0..n).map(|i| cut_normal(1, i)).collect();
         draws.sort_by(f64::total_cmp);
         assert!(draws[0] >= -CUT && draws[n as usize - 1] <= CUT && draws[0] < -1.98);
-        // A normal that is cut there has a standard deviation of 0.88.
+        // A normal distribution truncated there has a standard deviation of 0.88.
         let variance = draws.iter().map(|x| x * x).sum::<f64>() / f64::from(n);
         assert!((variance.sqrt() - 0.88).abs() < 0.03, "{variance}");
     }

@@ -7,7 +7,7 @@ use crate::methods::sax_nerf::field::{Part, SaxField, SaxShape, SaxState};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
-/// What tensors and configuration do not tell.
+/// Properties of the field that tensors and configuration do not contain.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SaxHeader {
     /// Half side of the box of the grid, world units (100 mm).
@@ -22,7 +22,7 @@ pub(super) struct SaxHeader {
     sets: usize,
 }
 
-/// Returns what the header of a checkpoint says of a field.
+/// Returns the header of a checkpoint for a field.
 pub(super) fn header(field: &SaxField) -> SaxHeader {
     SaxHeader {
         bound: field.bound,
@@ -33,7 +33,7 @@ pub(super) fn header(field: &SaxField) -> SaxHeader {
     }
 }
 
-/// Where a tensor of a part's numbers is found, and its shape for so many sets.
+/// Returns the name of the tensor of a group of parameters, and its shape for `n_sets` sets.
 fn described(prefix: &str, part: &Part, n_sets: usize) -> (String, Vec<usize>) {
     (format!("sax.{prefix}{}", part.name), [&[n_sets], &part.shape[..]].concat())
 }
@@ -56,7 +56,7 @@ pub(super) fn tensors(field: &SaxField, state: &SaxState) -> Vec<FileTensor> {
     all
 }
 
-/// Reads what [`header`] and [`tensors`] describe, of a run on so many phases.
+/// Reads the field and state that [`header`] and [`tensors`] describe, of a run on `n_phases` phases.
 pub(super) fn read(
     header: &SaxHeader,
     shape: SaxShape,
@@ -74,7 +74,7 @@ pub(super) fn read(
         return Err(Error::data(path, "sax.sets", format!("{} of {n_phases} phases", header.sets)));
     }
     let n_sets = header.sets;
-    // Of a damaged file nothing is reserved that it does not hold.
+    // Memory is allocated only for data that the file really holds, in case it is damaged.
     let parts = shape.parts();
     let of_part = |prefix: &str, part: &Part| -> Result<Vec<f32>> {
         let (name, shape) = described(prefix, part, n_sets);

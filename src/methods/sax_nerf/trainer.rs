@@ -1,4 +1,4 @@
-//! Fits the fields of SAX-NeRF, all of them in lockstep: an image of each per iteration.
+//! Fits all fields of SAX-NeRF together: each iteration uses one image of each field.
 
 use crate::config::Config;
 use crate::error::{Error, Result};
@@ -23,9 +23,9 @@ use crate::methods::sax_nerf::stages::{
 use crate::methods::sax_nerf::start::first_params;
 use std::sync::Arc;
 
-/// Passes of an iteration of a field, and of all fields together, but for those over its chunks of samples.
+/// Maximum number of passes of an iteration of a field, and of all fields together, without those over chunks of samples.
 const MAX_PASSES: u32 = 16;
-/// Passes over a chunk: forward, and forward and back.
+/// Maximum number of passes over a chunk: forward, and forward and backward.
 const CHUNK_PASSES: u32 = 40;
 
 /// A run on a device.
@@ -33,7 +33,7 @@ pub struct SaxTrainer {
     gpu: Gpu,
     data: SaxData,
     config: Config,
-    /// The field without its numbers.
+    /// The field without its parameters.
     outline: SaxField,
     setup: SaxSetup,
     kernels: SaxKernels,
@@ -45,13 +45,13 @@ pub struct SaxTrainer {
 }
 
 impl SaxTrainer {
-    /// Begins with random numbers.
+    /// Begins a fit with random parameters.
     ///
     /// # Errors
     /// [`Error::Config`] for impossible settings, and for a device that has too little memory; device errors.
     pub fn new(gpu: &Gpu, data: SaxData, config: &Config) -> Result<SaxTrainer> {
         let outline = outline(&data, &config.sax, 0);
-        // Before random numbers by the million are drawn.
+        // The check comes before millions of random numbers are drawn.
         SaxMemory::of(&fit_setup(&outline, &data, &config.sax)).check(gpu, config, data.n_sets())?;
         let shape = outline.shape;
         let params = (0..data.n_sets()).map(|set| first_params(shape, seed_of_set(config.seed, set))).collect();
@@ -59,10 +59,10 @@ impl SaxTrainer {
         Self::with(gpu, data, config, &SaxField { params, ..outline }, &SaxState { moments })
     }
 
-    /// Goes on from a field and the state of its fit, after as many iterations as the field says.
+    /// Resumes a fit from a field and its state, after the number of iterations that the field states.
     ///
     /// # Errors
-    /// As [`SaxTrainer::new`], and for a field of other sizes.
+    /// Errors of [`SaxTrainer::new`]; [`Error::Config`] for a field of other sizes.
     pub fn with(gpu: &Gpu, data: SaxData, config: &Config, field: &SaxField, state: &SaxState) -> Result<SaxTrainer> {
         config.check()?;
         let outline = outline(&data, &config.sax, field.step);
@@ -99,43 +99,43 @@ impl SaxTrainer {
         Ok(SaxTrainer { gpu, data, config, outline, setup, kernels, samples, fit, sets, iterations, step })
     }
 
-    /// Iterations done.
+    /// Returns the number of iterations done.
     pub fn step(&self) -> u32 {
         self.step
     }
 
-    /// What the run is fitted to.
+    /// Returns the data of the run.
     pub fn data(&self) -> &SaxData {
         &self.data
     }
 
-    /// Constants of the run.
+    /// Returns the constants of the run.
     pub fn setup(&self) -> &SaxSetup {
         &self.setup
     }
 
-    /// Buffers of samples and of the fit, for tests.
+    /// Returns the buffers of samples and of the fit, for tests.
     pub fn buffers(&self) -> (&SaxSampleBuffers, &SaxFitBuffers) {
         (&self.samples, &self.fit)
     }
 
-    /// The fields on the device, for tests.
+    /// Returns the fields on the device, for tests.
     pub fn sets(&self) -> &[SaxSetBuffers] {
         &self.sets
     }
 
-    /// Numbers of the fields on the device, for those who draw them.
+    /// Returns the parameters of the fields on the device, for drawing.
     pub fn params(&self) -> Vec<Buffer> {
         self.sets.iter().map(|set| set.params.clone()).collect()
     }
 
-    /// The field without its numbers.
+    /// Returns the field without its parameters.
     pub fn outline(&self) -> SaxField {
         SaxField { step: self.step, ..self.outline.clone() }
     }
 
-    /// Runs a submit's worth of iterations towards `until`; the losses of those done, each the mean over the fields. An
-    /// empty list means the target was reached before.
+    /// Runs one submit of iterations towards `until` and returns their losses, each the mean over the fields. The list is empty
+    /// when `until` was reached before.
     ///
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite; device errors.
@@ -149,7 +149,7 @@ impl SaxTrainer {
         losses(&self.gpu, &self.fit.sax_ring, first..self.step, SMALLER_STEPS)
     }
 
-    /// The fields after the iterations done, and what a resumed run goes on from beside them.
+    /// Returns the fields after the iterations done, and the state that a resumed run needs beside them.
     ///
     /// # Errors
     /// [`Error::Diverged`] when a number is not finite; device errors.
@@ -167,7 +167,7 @@ impl SaxTrainer {
     /// # Errors
     /// [`Error::Internal`] when the fit is over; device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        // The schedule has a row more than iterations, for this.
+        // The schedule has one row more than there are iterations, for this iteration.
         if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
         }
@@ -179,7 +179,7 @@ impl SaxTrainer {
         pass_times(&self.gpu, recording)
     }
 
-    /// Where stages of this fit are recorded.
+    /// Returns a pass that records stages of this fit into `recording`.
     pub fn pass<'a>(&'a self, recording: &'a mut Recording) -> SaxPass<'a> {
         let (kernels, samples, fit) = (&self.kernels, &self.samples, &self.fit);
         let shape = self.outline.shape;
