@@ -16,17 +16,17 @@
 #include <stdint.h>
 
 /**
- * Pixels of 8 bits without sign.
+ * Unsigned 8-bit pixels.
  */
 #define NERTCA_PIXELS_U8 1
 
 /**
- * Pixels of 16 bits without sign, in the machine's byte order.
+ * Unsigned 16-bit pixels, in the machine's byte order.
  */
 #define NERTCA_PIXELS_U16 2
 
 /**
- * Pixels of 32-bit floats.
+ * Pixels that are 32-bit floats.
  */
 #define NERTCA_PIXELS_F32 3
 
@@ -51,7 +51,7 @@
 #define NERTCA_SPLIT_TRAIN 0
 
 /**
- * A frame to score with only.
+ * A frame used only for scores.
  */
 #define NERTCA_SPLIT_VALIDATION 1
 
@@ -61,33 +61,33 @@
 #define NERTCA_COMPONENT_TOTAL 0
 
 /**
- * The still background.
+ * Static field: the static background.
  */
 #define NERTCA_COMPONENT_STATIC 1
 
 /**
- * The moving vessels.
+ * Dynamic field: the moving vessels.
  */
 #define NERTCA_COMPONENT_DYNAMIC 2
 
 /**
- * Line integrals of attenuation, as an angiogram shows them.
+ * Projection by line integrals of attenuation, as in an angiogram.
  */
 #define NERTCA_PROJECTION_DRR 0
 
 /**
- * The largest attenuation along each ray, 1/mm.
+ * Projection by the maximum attenuation along each ray, 1/mm.
  */
 #define NERTCA_PROJECTION_MIP 1
 
 /**
- * Display rates, also while training: Gaussians as they are, other fields through volumes baked from them, as fine as their
- * cells (about 0.8 mm).
+ * Live quality: display rates, also during training. Gaussians are drawn directly; other fields through volumes baked from
+ * them, whose resolution is their cell size (about 0.8 mm).
  */
 #define NERTCA_QUALITY_LIVE 0
 
 /**
- * Through the fields themselves: exact, and many times slower.
+ * Exact quality: from the fields themselves, many times slower.
  */
 #define NERTCA_QUALITY_EXACT 1
 
@@ -102,12 +102,12 @@
 #define NERTCA_STATE_RUNNING 1
 
 /**
- * Held by `nertca_reconstruction_pause`.
+ * Paused by `nertca_reconstruction_pause`.
  */
 #define NERTCA_STATE_PAUSED 2
 
 /**
- * Will train in the background as soon as there are frames enough.
+ * Waiting: training in the background starts as soon as there are enough frames.
  */
 #define NERTCA_STATE_WAITING 3
 
@@ -117,33 +117,33 @@
 #define NERTCA_STATE_FINISHED 4
 
 /**
- * The progress callback ended it.
+ * The progress callback ended training.
  */
 #define NERTCA_STATE_CANCELLED 5
 
 /**
- * An error ended it.
+ * An error ended training.
  */
 #define NERTCA_STATE_FAILED 6
 
 /**
- * Version of the ABI: of functions, structs and constants. A library serves callers built against its own number; it
- * is also the number in its soname.
+ * Version of the ABI: of functions, structs and constants. A library serves callers that were built against its own number,
+ * which is also the number in its soname.
  */
 #define NERTCA_ABI_VERSION 0
 
 /**
- * Version this header was made with, first number.
+ * Version of this header, first number (major).
  */
 #define NERTCA_VERSION_MAJOR 0
 
 /**
- * Version this header was made with, second number.
+ * Version of this header, second number (minor).
  */
 #define NERTCA_VERSION_MINOR 2
 
 /**
- * Version this header was made with, third number.
+ * Version of this header, third number (patch).
  */
 #define NERTCA_VERSION_PATCH 0
 
@@ -153,17 +153,17 @@
 #define NERTCA_LOG_ERROR 1
 
 /**
- * Severity of a log message: something to look at.
+ * Severity of a log message: a warning.
  */
 #define NERTCA_LOG_WARNING 2
 
 /**
- * Severity of a log message: what is being done, and why.
+ * Severity of a log message: information on the work being done, and the reasons.
  */
 #define NERTCA_LOG_INFO 3
 
 /**
- * A frame's geometry is taken as stated.
+ * The stated geometry of the frame is used.
  */
 #define NERTCA_CORRECTION_STATED 0
 
@@ -173,17 +173,17 @@
 #define NERTCA_CORRECTION_STATIC 1
 
 /**
- * A correction of the view, and a displacement of the heart in this frame.
+ * The view is corrected, and so is a displacement of the heart in this frame.
  */
 #define NERTCA_CORRECTION_BREATHING 2
 
 /**
- * Memory on the device that other APIs and processes can import.
+ * A buffer in device memory that other APIs and processes can import.
  */
 typedef struct nertca_buffer nertca_buffer;
 
 /**
- * A device with a log and limits. Make one per device, and any number of reconstructions in it.
+ * A device with a log and limits. Make one per device; it can have any number of reconstructions.
  */
 typedef struct nertca_context nertca_context;
 
@@ -193,18 +193,18 @@ typedef struct nertca_context nertca_context;
 typedef struct nertca_reconstruction nertca_reconstruction;
 
 /**
- * What a call returns: 0 for success, negative for an error whose text `nertca_last_error` gives.
+ * Result of a call: 0 for success, negative for an error whose text `nertca_last_error` returns.
  */
 typedef int32_t nertca_status;
 
 /**
- * Receives log messages: level, UTF-8 text, and the caller's pointer. Called on whichever thread a message arises,
- * also on the training thread, possibly on several at once. It must not call into the library.
+ * Receives log messages: level, UTF-8 text, and the caller's pointer. It is called on the thread on which a message arises,
+ * which may be the training thread, and possibly on several threads at once. It must not call into the library.
  */
 typedef void (*nertca_log_callback)(uint32_t level, const char *text, void *user);
 
 /**
- * Where log messages go.
+ * Receiver of log messages.
  */
 typedef struct {
   /**
@@ -216,17 +216,17 @@ typedef struct {
    */
   nertca_log_callback callback;
   /**
-   * Handed to the callback unchanged.
+   * Passed to the callback unchanged.
    */
   void *user;
   /**
-   * Least severe level wanted, one of `NERTCA_LOG_*`.
+   * Lowest severity to report, one of `NERTCA_LOG_*`.
    */
   uint32_t level;
 } nertca_log;
 
 /**
- * A Vulkan device that the caller made and goes on owning. It must outlive the context made from it.
+ * A Vulkan device that the caller made and continues to own. It must outlive the context made from it.
  */
 typedef struct {
   /**
@@ -234,7 +234,7 @@ typedef struct {
    */
   size_t size;
   /**
-   * `vkGetInstanceProcAddr`; null takes that of the system's loader.
+   * `vkGetInstanceProcAddr`; null selects that of the system's loader.
    */
   const void *get_instance_proc_addr;
   /**
@@ -250,7 +250,7 @@ typedef struct {
    */
   void *device;
   /**
-   * `VkQueue` that computes.
+   * `VkQueue` that supports compute.
    */
   void *queue;
   /**
@@ -266,32 +266,32 @@ typedef struct {
    */
   uint32_t external_memory_fd;
   /**
-   * Taken around every use of the queue, for a short time, on any thread; null when the queue is the library's alone.
+   * Called before every use of the queue, for a short time, on any thread; null when only the library uses the queue.
    */
   void (*lock)(void *user);
   /**
-   * Gives the queue back after `lock`; null exactly when `lock` is.
+   * Called after every use of the queue, to release it; null exactly when `lock` is.
    */
   void (*unlock)(void *user);
   /**
-   * Handed to `lock` and `unlock`.
+   * Passed to `lock` and `unlock`.
    */
   void *user;
   /**
    * Non-zero when the device was made with the features `subgroupSizeControl` and `computeFullSubgroups` (of
-   * `VK_EXT_subgroup_size_control`, or of Vulkan 1.3): sums then go by shuffles, as on a device of the library's own.
+   * `VK_EXT_subgroup_size_control`, or of Vulkan 1.3): sums then use shuffles, as on a device that the library opens itself.
    */
   uint32_t subgroup_size_control;
   /**
    * Non-zero when the device was made with `VK_KHR_cooperative_matrix` and its feature `cooperativeMatrix`, and with
-   * `shaderFloat16`, `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`: networks then go by matrices, where the
-   * library has kernels for the device's. Needs `subgroup_size_control` as well.
+   * `shaderFloat16`, `vulkanMemoryModel` and `vulkanMemoryModelDeviceScope`: networks then use matrices, where the library
+   * has kernels for the device's shapes. Requires `subgroup_size_control` as well.
    */
   uint32_t cooperative_matrix;
 } nertca_vulkan;
 
 /**
- * How an image is taken. Patient coordinates are left, posterior, superior (LPS), mm, from the isocentre.
+ * Geometry of an image. Patient coordinates are left, posterior, superior (LPS), mm, from the isocentre.
  */
 typedef struct {
   /**
@@ -307,11 +307,11 @@ typedef struct {
    */
   double secondary_deg;
   /**
-   * Source to detector, mm.
+   * Distance from source to detector, mm.
    */
   double sid_mm;
   /**
-   * Source to isocentre, mm.
+   * Distance from source to isocentre, mm.
    */
   double sod_mm;
   /**
@@ -323,7 +323,7 @@ typedef struct {
    */
   double offset_mm[2];
   /**
-   * How far the table has carried the patient (LPS), mm.
+   * Displacement of the patient by the table (LPS), mm.
    */
   double table_mm[3];
   /**
@@ -342,19 +342,19 @@ typedef struct {
    */
   size_t size;
   /**
-   * How it was taken.
+   * Geometry of the image.
    */
   nertca_geometry geometry;
   /**
-   * First row; copied during the call.
+   * First row of the pixels, which are copied during the call.
    */
   const void *pixels;
   /**
-   * Bytes readable from `pixels`.
+   * Number of bytes readable from `pixels`.
    */
   size_t pixels_bytes;
   /**
-   * Bytes from one row to the next; 0 when rows follow each other at once.
+   * Bytes from one row to the next; 0 when rows are contiguous.
    */
   size_t stride_bytes;
   /**
@@ -370,7 +370,7 @@ typedef struct {
    */
   uint32_t format;
   /**
-   * What values mean, one of `NERTCA_INTENSITY_*`.
+   * Meaning of the values, one of `NERTCA_INTENSITY_*`.
    */
   uint32_t intensity;
   /**
@@ -398,21 +398,21 @@ typedef struct {
    */
   double time_s;
   /**
-   * Null, or a vessel mask of a byte per pixel, non-zero inside vessels.
+   * Null, or a vessel mask with one byte per pixel, non-zero inside vessels.
    */
   const uint8_t *mask;
   /**
-   * Bytes readable from `mask`.
+   * Number of bytes readable from `mask`.
    */
   size_t mask_bytes;
   /**
-   * Bytes from one row of the mask to the next; 0 when rows follow each other at once.
+   * Bytes from one row of the mask to the next; 0 when rows are contiguous.
    */
   size_t mask_stride_bytes;
 } nertca_frame;
 
 /**
- * How far training is.
+ * Progress of training.
  */
 typedef struct {
   /**
@@ -424,15 +424,15 @@ typedef struct {
    */
   uint32_t state;
   /**
-   * Iterations done.
+   * Number of iterations done.
    */
   uint32_t step;
   /**
-   * Length of the run.
+   * Number of iterations of the run.
    */
   uint32_t iterations;
   /**
-   * Frames trained on.
+   * Number of frames trained on.
    */
   uint32_t frames;
   /**
@@ -440,17 +440,17 @@ typedef struct {
    */
   double loss;
   /**
-   * PSNR of the last iteration's rays, dB; NaN while Gaussians are fitted, which have no rays.
+   * PSNR of the last iteration's rays, dB; NaN for fits of Gaussians, which have no rays.
    */
   double psnr_db;
   /**
-   * Iterations per second since training was last begun.
+   * Iterations per second since the last start of training.
    */
   double iterations_per_s;
 } nertca_progress;
 
 /**
- * How calibration sees a frame.
+ * Correction of a frame's geometry by calibration.
  */
 typedef struct {
   /**
@@ -470,42 +470,42 @@ typedef struct {
    */
   double secondary_deg;
   /**
-   * How much further than stated the table has carried the patient (LPS), mm.
+   * Additional displacement of the patient by the table, beyond the stated one (LPS), mm.
    */
   double table_mm[3];
   /**
-   * Where breathing has carried the heart in this frame (LPS), mm.
+   * Displacement of the heart by breathing in this frame (LPS), mm.
    */
   double heart_shift_mm[3];
   /**
-   * Root mean square of how far the correction moves the heart's image in this view, pixels, less what moves all views
-   * alike.
+   * Root mean square displacement of the heart's image in this view by the correction, pixels, without the motion common to
+   * all views.
    */
   double moved_px;
   /**
-   * Difference of this view's profiles from those of the others before the correction, as a share of the profiles.
+   * Relative difference between this view's profiles and those of the other views before the correction.
    */
   double residual_before;
   /**
-   * Difference of this view's profiles from those of the others after the correction, as a share of the profiles.
+   * Relative difference between this view's profiles and those of the other views after the correction.
    */
   double residual_after;
   /**
-   * All of it, displacement of the heart included, as a row-major 3 x 4 projection from patient mm to homogeneous pixels
-   * (column, row; integers are pixel centres): what `nertca_geometry.matrix` takes.
+   * Complete corrected geometry, including the displacement of the heart, as a row-major 3 x 4 projection from patient mm to
+   * homogeneous pixels (column, row; integers are pixel centres): a value for `nertca_geometry.matrix`.
    */
   double matrix[3][4];
 } nertca_correction;
 
 /**
- * Told now and then how far training is; a non-zero result ends it. `progress` is valid during the call. Called on the
- * thread that trains, with no lock held: it may call into the library, but not stop, train or destroy the same
- * reconstruction.
+ * Receives progress of training from time to time; a non-zero result ends training. `progress` is valid during the call. It is
+ * called on the thread that trains, with no lock held: it may call into the library, but must not stop, train or destroy the
+ * same reconstruction.
  */
 typedef int32_t (*nertca_progress_callback)(const nertca_progress *progress, void *user);
 
 /**
- * What to draw.
+ * Description of a view to draw.
  */
 typedef struct {
   /**
@@ -513,7 +513,7 @@ typedef struct {
    */
   size_t size;
   /**
-   * From where the view is drawn.
+   * Geometry of the view.
    */
   nertca_geometry geometry;
   /**
@@ -543,7 +543,7 @@ typedef struct {
 } nertca_view;
 
 /**
- * Where to draw to.
+ * Memory to draw into.
  */
 typedef struct {
   /**
@@ -555,11 +555,11 @@ typedef struct {
    */
   void *pixels;
   /**
-   * Bytes writable from `pixels`.
+   * Number of bytes writable from `pixels`.
    */
   size_t pixels_bytes;
   /**
-   * Bytes from one row to the next; 0 when rows follow each other at once.
+   * Bytes from one row to the next; 0 when rows are contiguous.
    */
   size_t stride_bytes;
   /**
@@ -567,11 +567,11 @@ typedef struct {
    */
   uint32_t format;
   /**
-   * The value shown as 0, for `U8`. With `low` = `high`, both are the image's own extremes.
+   * Value shown as 0, for `U8`. With `low` = `high`, the image's own minimum and maximum are used.
    */
   double low;
   /**
-   * The value shown as 255, for `U8`.
+   * Value shown as 255, for `U8`.
    */
   double high;
 } nertca_image;
@@ -607,7 +607,7 @@ typedef struct {
 } nertca_grid;
 
 /**
- * Vessels as trees of centrelines with radii: what is asked for, and room for the answer.
+ * Vessels as trees of centrelines with radii: parameters of the search, and arrays for its result.
  */
 typedef struct {
   /**
@@ -615,24 +615,25 @@ typedef struct {
    */
   size_t size;
   /**
-   * The moving field is vessel above this, 1/mm; 0 for the threshold that scores take. Set to what was taken.
+   * Threshold from which the dynamic field counts as vessel, 1/mm; 0 selects the threshold that scores use. Set to the
+   * threshold used.
    */
   double threshold_per_mm;
   /**
-   * Branches that end without reaching so far beyond the vessel they leave are left out, mm; 0 for three times what the
-   * field resolves.
+   * Minimum length by which a branch must extend beyond the vessel it leaves, mm; shorter end branches are omitted. 0
+   * selects three times the field's resolution.
    */
   double least_branch_mm;
   /**
-   * Set to 1 where all phases have the same material points, to 0 where each has branches of its own.
+   * Set to 1 where all phases have the same material points, to 0 where each phase has its own branches.
    */
   uint32_t followed;
   /**
-   * Elements that each of `branch_*` has room for; set to how many branches there are, over all phases.
+   * Number of elements that each of the arrays `branch_*` has room for; set to the number of branches over all phases.
    */
   size_t branches;
   /**
-   * Points that `points_mm` and `radius_mm` have room for; set to how many there are, over all phases.
+   * Number of points that `points_mm` and `radius_mm` have room for; set to the number of points over all phases.
    */
   size_t points;
   /**
@@ -640,19 +641,19 @@ typedef struct {
    */
   uint32_t *branch_phase;
   /**
-   * The branch that each leaves, by its place in these arrays; -1 for one that begins at a root.
+   * Index in these arrays of the branch that each branch leaves; -1 for a branch that begins at a root.
    */
   int32_t *branch_parent;
   /**
-   * First point of each branch, from 0.
+   * Index of the first point of each branch, from 0.
    */
   uint32_t *branch_first;
   /**
-   * How many points each branch has; the first is the last of its parent.
+   * Number of points of each branch; the first is the last point of its parent.
    */
   uint32_t *branch_points;
   /**
-   * Points of the centrelines (LPS), mm: three numbers each.
+   * Points of the centrelines (LPS), mm; three numbers each.
    */
   double *points_mm;
   /**
@@ -662,7 +663,7 @@ typedef struct {
 } nertca_tree;
 
 /**
- * Scores on the frames added for validation.
+ * Scores on the frames added for validation, and of the vessels in 3D where the truth is known.
  */
 typedef struct {
   /**
@@ -670,11 +671,11 @@ typedef struct {
    */
   size_t size;
   /**
-   * Iterations of the model.
+   * Number of iterations of the model.
    */
   uint32_t step;
   /**
-   * Images scored.
+   * Number of images scored.
    */
   uint32_t images;
   /**
@@ -694,23 +695,24 @@ typedef struct {
    */
   double ssim;
   /**
-   * Attenuation from which the moving field counts as vessel, 1/mm.
+   * Attenuation from which the dynamic field counts as vessel, 1/mm.
    */
   double threshold_per_mm;
   /**
-   * Phases whose true vessels are known as voxels (`nertca_reconstruction_set_true_vessels`).
+   * Number of phases whose true vessels are known as voxels (`nertca_reconstruction_set_true_vessels`).
    */
   uint32_t volume_phases;
   /**
-   * Phases whose true vessels are known as a tree (`nertca_reconstruction_set_true_tree`).
+   * Number of phases whose true vessels are known as a tree (`nertca_reconstruction_set_true_tree`).
    */
   uint32_t tree_phases;
   /**
-   * Dice of the voxels that are vessel; this and what follows are means over the phases, and NaN where nothing is known.
+   * Dice of the vessel voxels. This field and all that follow are means over the phases, and NaN where the truth is not
+   * known.
    */
   double volume_dice;
   /**
-   * Mean distance of a voxel of one set to the nearest of the other, both directions weighing the same, mm.
+   * Mean distance from a voxel of one set to the nearest voxel of the other, with equal weight of both directions, mm.
    */
   double chamfer_mm;
   /**
@@ -718,11 +720,11 @@ typedef struct {
    */
   double hausdorff95_mm;
   /**
-   * Share of the true centreline's voxels with one of ours within 1 mm.
+   * Share of the true centreline's voxels that have a reconstructed one within 1 mm.
    */
   double true_centreline_found;
   /**
-   * Share of our centreline's voxels with a true one within 1 mm.
+   * Share of the reconstructed centreline's voxels that have a true one within 1 mm.
    */
   double our_centreline_true;
   /**
@@ -730,45 +732,47 @@ typedef struct {
    */
   double cl_dice;
   /**
-   * Connected components of ours that are a pixel at the isocentre wide or more.
+   * Number of connected components of the reconstruction that are at least as wide as a pixel at the isocentre.
    */
   double components;
   /**
-   * Connected components of the truth.
+   * Number of connected components of the truth.
    */
   double true_components;
   /**
-   * Share of the true tree's length with ours within 1 mm.
+   * Share of the true tree's length with a reconstructed centreline within 1 mm.
    */
   double tree_true_centreline_found;
   /**
-   * Share of our tree's length with a true one within 1 mm.
+   * Share of the reconstructed tree's length with a true centreline within 1 mm.
    */
   double tree_our_centreline_true;
   /**
-   * Mean distance of our centreline to the true one, mm.
+   * Mean distance from the reconstructed centreline to the true one, mm.
    */
   double tree_ours_to_true_mm;
   /**
-   * Connected trees of ours.
+   * Number of connected trees of the reconstruction.
    */
   double tree_components;
   /**
-   * Mean of our radius less the true one, where our centreline is true, mm.
+   * Mean difference of the reconstructed radius and the true one, where the reconstructed centreline has a true one within 1
+   * mm, mm.
    */
   double radius_error_mm;
   /**
-   * Root of the mean square of the same, mm.
+   * Root mean square of this difference, mm.
    */
   double radius_rmse_mm;
   /**
-   * Mean distance between where our points have come since the phase that is followed and where the true points beside them have, mm.
+   * Mean distance between the displacements of reconstructed points since the reference phase and those of the nearest true
+   * points, mm.
    */
   double motion_error_mm;
 } nertca_scores;
 
 /**
- * Done.
+ * Success.
  */
 #define NERTCA_OK 0
 
@@ -778,12 +782,12 @@ typedef struct {
 #define NERTCA_ERROR_ARGUMENT -1
 
 /**
- * A handle was destroyed, is of another type, or never was one.
+ * A handle was destroyed, has another type, or is not a handle.
  */
 #define NERTCA_ERROR_HANDLE -2
 
 /**
- * Data given (a checkpoint, say) is malformed.
+ * Data that was passed (for example a checkpoint) is malformed.
  */
 #define NERTCA_ERROR_DATA -3
 
@@ -793,7 +797,7 @@ typedef struct {
 #define NERTCA_ERROR_IO -4
 
 /**
- * No device fits, or it lacks what was asked for.
+ * No device fits, or it lacks a requested feature.
  */
 #define NERTCA_ERROR_DEVICE -5
 
@@ -813,22 +817,22 @@ typedef struct {
 #define NERTCA_ERROR_DIVERGED -8
 
 /**
- * A callback ended the call.
+ * A callback cancelled the call.
  */
 #define NERTCA_ERROR_CANCELLED -9
 
 /**
- * The call cannot be done while something else goes on (training, or handles that still exist).
+ * The call is not possible while something else is active (training, or handles that still exist).
  */
 #define NERTCA_ERROR_BUSY -10
 
 /**
- * The buffer given is too small; the length needed was written.
+ * The buffer passed is too small; the required length was written.
  */
 #define NERTCA_ERROR_BUFFER -11
 
 /**
- * The call needs something that is still to come: frames, or training.
+ * The call needs something that is not there yet: frames, or training.
  */
 #define NERTCA_ERROR_NOT_READY -12
 
@@ -847,60 +851,65 @@ extern "C" {
 #endif // __cplusplus
 
 /**
- * Text of the last failed call on `handle` (of any type) in this thread, or of the last failed call at all when
- * `handle` is null; empty when there was none. UTF-8, with a closing zero, cut to `size` bytes; `*length` gets the
- * full length without the zero. With a null `text` and a `size` of 0, only the length is given.
+ * Returns the text of the last failed call on `handle` (of any type) in this thread, or of the last failed call of all when
+ * `handle` is null; empty when there was none. The text is UTF-8 with a closing zero, truncated to `size` bytes. `*length`
+ * receives the full length without the zero. With a null `text` and a `size` of 0, only the length is returned.
  *
- * Any thread. Texts of calls without a handle (those that create one) are found under null.
+ * Callable from any thread. Texts of calls without a handle (those that create one) are found under null.
  *
- * @return NERTCA_OK, NERTCA_ERROR_BUFFER when the text was cut, NERTCA_ERROR_ARGUMENT.
+ * @return NERTCA_OK, NERTCA_ERROR_BUFFER when the text was truncated, NERTCA_ERROR_ARGUMENT.
  *
  * # Safety
  * `text` must hold `size` bytes; `length` must be writable or null.
  */
-nertca_status nertca_last_error(const void *handle, char *text, size_t size, size_t *length);
+nertca_status nertca_last_error(const void *handle,
+                                char *text,
+                                size_t size,
+                                size_t *length);
 
 /**
- * A short description of a status, for logs. Never null; the text is static. Any thread.
+ * Returns a short description of a status, for logs. The text is static, and never null. Callable from any thread.
  */
 const char *nertca_status_text(nertca_status status);
 
 /**
- * Version of the library, as `major.minor.patch`. Static text. Any thread.
+ * Returns the version of the library, as `major.minor.patch`. The text is static. Callable from any thread.
  */
 const char *nertca_version(void);
 
 /**
- * `NERTCA_ABI_VERSION` of the library in use, to compare with that of the header. Any thread.
+ * Returns the `NERTCA_ABI_VERSION` of the library in use, to compare with that of the header. Callable from any thread.
  */
 uint32_t nertca_abi_version(void);
 
 /**
  * Opens a device.
  *
- * `options` are lines of `key = value` or a JSON object, or null for defaults:
- * `device` (index, part of the name or UUID; `none` for a context that checks and keeps frames but cannot train; the
- * best device without), `validation` (true for the Khronos layer, which then reports to the log), `cache_dir` (where
- * compiled kernels are kept between processes), `memory_limit_mib` (ceiling on device memory of everything made from
- * the context), `deterministic` (true refuses whatever would make results depend on timing: frames added while
- * training in the background), `layers` (f32 or matrices: how the network is computed, for which the device decides
- * otherwise).
+ * `options` are lines of `key = value` or a JSON object, or null for defaults: `device` (index, part of the name or UUID, the
+ * best device by default; `none` for a context that checks and keeps frames but cannot train), `validation` (true turns on the
+ * Khronos validation layer, which then reports to the log), `cache_dir` (directory in which compiled kernels are kept between
+ * processes), `memory_limit_mib` (limit on the device memory of everything made from the context), `deterministic` (true
+ * refuses whatever would make results depend on timing: frames added while training in the background), `layers` (f32 or
+ * matrices: computation of the network's layers; chosen for the device by default).
  *
- * `log` may be null. `*context` is null on failure; the text is then found by `nertca_last_error(NULL, ...)`.
- * Any thread.
+ * `log` may be null. `*context` is null on failure; `nertca_last_error(NULL, ...)` then returns the text. Callable from any
+ * thread.
  *
  * # Safety
- * `options` must be null or end with a zero, `log` be null or as long as it says, `context` be writable.
+ * `options` must be null or end with a zero, `log` be null or as long as its `size` says, `context` be writable.
  */
-nertca_status nertca_context_create(const char *options, const nertca_log *log, nertca_context **context);
+nertca_status nertca_context_create(const char *options,
+                                    const nertca_log *log,
+                                    nertca_context **context);
 
 /**
- * Makes a context as `nertca_context_create` does, on a device of the caller: both then share one GPU, its memory and, if wanted, buffers.
- * Of the options, `device` and `validation` do not apply. Instance, device and queue must outlive the context, which
- * leaves them as they are.
+ * Makes a context like `nertca_context_create`, on the caller's Vulkan device: both then share one GPU, its memory and, if
+ * wanted, buffers. The options `device` and `validation` do not apply. Instance, device and queue must outlive the context,
+ * which does not destroy them.
  *
  * # Safety
- * As `nertca_context_create`; the handles in `vulkan` must be valid and made as its fields say.
+ * `options`, `log` and `context` as in `nertca_context_create`; the handles in `vulkan` must be valid and made as its fields
+ * say.
  */
 nertca_status nertca_context_adopt(const nertca_vulkan *vulkan,
                                    const char *options,
@@ -908,20 +917,17 @@ nertca_status nertca_context_adopt(const nertca_vulkan *vulkan,
                                    nertca_context **context);
 
 /**
- * The device and the paths chosen for it, as JSON; `text`, `size` and `length` as for `nertca_last_error`, but what it says of
- * memory may be longer at the next call. Any thread.
+ * Describes the device and the computation paths chosen for it, as JSON. `text`, `size` and `length` work as in
+ * `nertca_last_error`, but the part about memory may be longer at the next call. Callable from any thread.
  *
  * # Safety
  * `text` must hold `size` bytes; `length` must be writable or null.
  */
-nertca_status nertca_context_describe(nertca_context *context,
-                                      char *text,
-                                      size_t size,
-                                      size_t *length);
+nertca_status nertca_context_describe(nertca_context *context, char *text, size_t size, size_t *length);
 
 /**
- * All Vulkan devices of this machine, usable or not, as a JSON list; `text`, `size` and `length` as for
- * `nertca_last_error`, but what it says of free memory may be longer at the next call. Any thread.
+ * Lists all Vulkan devices of this machine, usable or not, as JSON. `text`, `size` and `length` work as in
+ * `nertca_last_error`, but the part about free memory may be longer at the next call. Callable from any thread.
  *
  * # Safety
  * `text` must hold `size` bytes; `length` must be writable or null.
@@ -933,23 +939,23 @@ nertca_status nertca_devices(char *text, size_t size, size_t *length);
  *
  * Waits for calls on the context in other threads.
  *
- * @return NERTCA_ERROR_BUSY, and nothing is done, while reconstructions or buffers made from it exist, or from inside
- * a callback of a call on it.
+ * @return NERTCA_ERROR_BUSY, with nothing done, while reconstructions or buffers made from it exist, or from inside a callback
+ * of a call on it.
  *
  * # Safety
- * None: a stale handle is an error.
+ * Any value is allowed: a stale handle is an error.
  */
 nertca_status nertca_context_destroy(nertca_context *context);
 
 /**
- * Begins a reconstruction without frames.
+ * Creates a reconstruction without frames.
  *
- * `options` are lines of `key = value` or a JSON object: `phases` (cardiac phases; needed), `depth_half_extent_mm`
- * (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (of filled
- * vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
+ * `options` are lines of `key = value` or a JSON object: `phases` (number of cardiac phases; required), `depth_half_extent_mm`
+ * (attenuation is searched within this distance of the isocentre plane; 100), `vessel_attenuation_per_mm` (attenuation of
+ * filled vessels, where known: sets the Dice threshold), `preset` (fast, fast-mlp, paper, public-code, nerf-ca, r2-gaussian,
  * x-gaussian or sax-nerf) and every key that `nertca-vk train --print-config` shows, as in `train.iterations = 800`.
  *
- * `*reconstruction` is null on failure. Any thread.
+ * `*reconstruction` is null on failure. Callable from any thread.
  *
  * # Safety
  * `options` must be null or end with a zero; `reconstruction` must be writable.
@@ -959,34 +965,35 @@ nertca_status nertca_reconstruction_create(nertca_context *context,
                                            nertca_reconstruction **reconstruction);
 
 /**
- * Ends a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
- * allowed, and does nothing. Any thread but that of its own callbacks.
+ * Destroys a reconstruction: stops its training, waits for calls on it in other threads, and frees its memory. Null is
+ * allowed, and does nothing. Callable from any thread except inside its own callbacks.
  *
- * @return NERTCA_ERROR_BUSY, and nothing is done, from inside a callback of a call on it.
+ * @return NERTCA_ERROR_BUSY, with nothing done, from inside a callback of a call on it.
  *
  * # Safety
- * None: a stale handle is an error.
+ * Any value is allowed: a stale handle is an error.
  */
 nertca_status nertca_reconstruction_destroy(nertca_reconstruction *reconstruction);
 
 /**
- * Adds a frame, whose pixels are copied. It may come at any time: training in the background takes it in by itself
- * (soon: frames that come in quick succession are taken in together), other training when it next begins.
- * Any thread.
+ * Adds a frame; its pixels are copied. Frames may be added at any time. Training in the background takes a new frame in by
+ * itself after a short while (frames that arrive in quick succession are taken in together); other training takes it in when
+ * it next begins. Callable from any thread.
  *
  * @return NERTCA_ERROR_ARGUMENT naming the field that is wrong; NERTCA_ERROR_BUSY while training in the background in a
  * deterministic context.
  *
  * # Safety
- * `frame` must be as long as it says, and its pointers readable as far as it says.
+ * `frame` must be as long as its `size` says, and its pointers readable for the stated lengths.
  */
-nertca_status nertca_reconstruction_add_frame(nertca_reconstruction *reconstruction, const nertca_frame *frame);
+nertca_status nertca_reconstruction_add_frame(nertca_reconstruction *reconstruction,
+                                              const nertca_frame *frame);
 
 /**
- * Gives the times of the R-peaks, seconds, rising: frames with time stamps get their phase from them,
- * systole keeping its length (310 ms, 35 % of the phases) and diastole taking the rest; where one set of Gaussians moves, they are
- * fitted at their own time within it. Replaces those given earlier, so that a growing list can be given again and again. Any
- * thread.
+ * Sets the times of the R-peaks, seconds, in ascending order. Frames with time stamps get their phase from them: systole keeps
+ * its length (310 ms, 35 % of the phases) and diastole takes the rest of the beat. A method with one set of moving Gaussians
+ * fits each frame at its own time within the phase. A call replaces the times given earlier, so that a growing list can be
+ * given repeatedly. Callable from any thread.
  *
  * # Safety
  * `times_s` must be readable for `count` numbers.
@@ -996,19 +1003,20 @@ nertca_status nertca_reconstruction_set_r_peaks(nertca_reconstruction *reconstru
                                                 size_t count);
 
 /**
- * State and progress. Any thread, at any time.
+ * Returns state and progress of training. Callable from any thread, at any time.
  *
- * @return NERTCA_OK also when training has failed: `state` is then `NERTCA_STATE_FAILED`, and the reason found by
- * `nertca_reconstruction_failure`.
+ * @return NERTCA_OK also when training has failed: `state` is then `NERTCA_STATE_FAILED`, and `nertca_reconstruction_failure`
+ * returns the reason.
  *
  * # Safety
  * `progress` must be writable, with its size set.
  */
-nertca_status nertca_reconstruction_progress(nertca_reconstruction *reconstruction, nertca_progress *progress);
+nertca_status nertca_reconstruction_progress(nertca_reconstruction *reconstruction,
+                                             nertca_progress *progress);
 
 /**
- * Why training in the background failed; empty when it did not. `text`, `size` and `length` as for
- * `nertca_last_error`. Any thread.
+ * Returns the reason why training in the background failed; empty when it did not. `text`, `size` and `length` work as in
+ * `nertca_last_error`. Callable from any thread.
  *
  * # Safety
  * `text` must hold `size` bytes; `length` must be writable or null.
@@ -1019,21 +1027,23 @@ nertca_status nertca_reconstruction_failure(nertca_reconstruction *reconstructio
                                             size_t *length);
 
 /**
- * Writes everything needed to continue into a file, which appears whole or not at all. Any thread, also while training.
+ * Writes a checkpoint, with everything needed to continue, into a file, which appears whole or not at all. Callable from any
+ * thread, also during training.
  *
  * @return NERTCA_ERROR_NOT_READY before anything was trained or loaded.
  *
  * # Safety
  * `path` must end with a zero.
  */
-nertca_status nertca_reconstruction_save(nertca_reconstruction *reconstruction, const char *path);
+nertca_status nertca_reconstruction_save(nertca_reconstruction *reconstruction,
+                                         const char *path);
 
 /**
- * Saves as `nertca_reconstruction_save` does, into memory. `*length` gets the bytes needed; with a null `bytes` and a `size` of
- * 0 nothing else is done.
+ * Saves a checkpoint like `nertca_reconstruction_save`, into memory. `*length` receives the number of bytes needed; with a
+ * null `bytes` and a `size` of 0, only the length is returned.
  *
- * @return NERTCA_ERROR_BUFFER when `size` is too small. While training goes on in the background the state grows and shrinks, by
- * kilobytes when Gaussians are added: then try again with the new `*length`.
+ * @return NERTCA_ERROR_BUFFER when `size` is too small. During training in the background the size of the state changes, by
+ * kilobytes when Gaussians are added: try again with the new `*length`.
  *
  * # Safety
  * `bytes` must hold `size` bytes; `length` must be writable.
@@ -1044,18 +1054,19 @@ nertca_status nertca_reconstruction_save_memory(nertca_reconstruction *reconstru
                                                 size_t *length);
 
 /**
- * Takes over a checkpoint file, of this library or of `nertca-vk train`, with its hyper-parameters and phases: it can
- * be drawn at once, and trained further with the frames of this reconstruction. Any thread.
+ * Loads a checkpoint file of this library or of `nertca-vk train`, with its hyper-parameters and phases. It can be rendered at
+ * once, and trained further with the frames of this reconstruction. Callable from any thread.
  *
  * @return NERTCA_ERROR_BUSY while training in the background; NERTCA_ERROR_DATA for a malformed file.
  *
  * # Safety
  * `path` must end with a zero.
  */
-nertca_status nertca_reconstruction_load(nertca_reconstruction *reconstruction, const char *path);
+nertca_status nertca_reconstruction_load(nertca_reconstruction *reconstruction,
+                                         const char *path);
 
 /**
- * Loads as `nertca_reconstruction_load` does, from memory.
+ * Loads a checkpoint like `nertca_reconstruction_load`, from memory.
  *
  * # Safety
  * `bytes` must be readable for `size` bytes.
@@ -1063,12 +1074,12 @@ nertca_status nertca_reconstruction_load(nertca_reconstruction *reconstruction, 
 nertca_status nertca_reconstruction_load_memory(nertca_reconstruction *reconstruction, const void *bytes, size_t size);
 
 /**
- * How the reconstruction sees a frame since training last took frames in: as stated, or as calibration (`calibrate.mode`)
- * corrected it. Frames count from 0 in the order in which they were added. To draw the vessels over a frame, render with
- * its `matrix`. Any thread, at any time.
+ * Returns how the reconstruction has corrected a frame's geometry since training last took in frames: not at all, or by
+ * calibration (`calibrate.mode`). Frames count from 0 in the order in which they were added. To draw the vessels over a frame,
+ * render with its `matrix`. Callable from any thread, at any time.
  *
- * A motion that all views share is not seen by any of them and is no part of the correction; and what a checkpoint was
- * corrected by is not known after loading it.
+ * A motion common to all views cannot be observed and is no part of the correction. After loading a checkpoint, the
+ * corrections made before it was saved are not known.
  *
  * @return NERTCA_ERROR_ARGUMENT for a frame that was not added.
  *
@@ -1080,27 +1091,28 @@ nertca_status nertca_reconstruction_correction(nertca_reconstruction *reconstruc
                                                nertca_correction *correction);
 
 /**
- * States another geometry for a frame that was added: what the C-arm, or a calibration elsewhere, knows better by now.
- * Training takes it in as it does a new frame. Calibration begins from what is stated; with `calibrate.mode = off` that
- * is what the reconstruction goes by. Any thread.
+ * Sets another geometry for a frame that was added, for example when the C-arm or an external calibration provides a better
+ * one. Training takes it in like a new frame. Calibration starts from the stated geometry; with `calibrate.mode = off` the
+ * reconstruction uses the stated geometry. Callable from any thread.
  *
- * @return NERTCA_ERROR_ARGUMENT naming the field that is wrong, or for a frame that was not added; NERTCA_ERROR_BUSY
- * while training in the background in a deterministic context.
+ * @return NERTCA_ERROR_ARGUMENT naming the field that is wrong, or for a frame that was not added; NERTCA_ERROR_BUSY while
+ * training in the background in a deterministic context.
  *
  * # Safety
- * `geometry` must be as long as it says, and its matrix null or readable for 12 numbers.
+ * `geometry` must be as long as its `size` says, and its matrix null or readable for 12 numbers.
  */
 nertca_status nertca_reconstruction_set_geometry(nertca_reconstruction *reconstruction,
                                                  uint32_t frame,
                                                  const nertca_geometry *geometry);
 
 /**
- * Trains up to `iterations` more in the calling thread, with the frames there are. `progress` may be null; a non-zero
- * result of it ends the call. `*done` (may be null) gets the iterations done: fewer at the end of the run.
+ * Trains up to `iterations` more iterations in the calling thread, with the frames added so far. `progress` may be
+ * null; a non-zero result of it ends the call. `*done` (may be null) receives the number of iterations done, which is
+ * smaller at the end of the run.
  *
- * One call at a time on a reconstruction; everything else may be called meanwhile from other threads.
+ * Only one such call at a time is allowed on a reconstruction; other threads may make all other calls meanwhile.
  *
- * @return NERTCA_ERROR_CANCELLED when the callback ended it; NERTCA_ERROR_NOT_READY without frames enough;
+ * @return NERTCA_ERROR_CANCELLED when the callback ended the call; NERTCA_ERROR_NOT_READY without enough frames;
  * NERTCA_ERROR_BUSY while training in the background; NERTCA_ERROR_DIVERGED, with the last good state kept.
  *
  * # Safety
@@ -1113,10 +1125,10 @@ nertca_status nertca_reconstruction_train(nertca_reconstruction *reconstruction,
                                           uint32_t *done);
 
 /**
- * Trains in the background until the run is done, and waits for frames while there are too few. `progress` may be
- * null; it is called on the training thread, and a non-zero result of it ends training. Any thread.
+ * Trains in the background until the run is complete, and waits for frames while there are too few. `progress` may be
+ * null; it is called on the training thread, and a non-zero result of it ends training. Callable from any thread.
  *
- * @return NERTCA_ERROR_BUSY while it does so already.
+ * @return NERTCA_ERROR_BUSY if it is already training in the background.
  *
  * # Safety
  * `progress` must be callable with `user` on another thread until training has ended.
@@ -1126,26 +1138,27 @@ nertca_status nertca_reconstruction_start(nertca_reconstruction *reconstruction,
                                           void *user);
 
 /**
- * Holds training in the background after the iterations under way; does nothing without any. Any thread.
+ * Pauses training in the background after the iterations under way; does nothing without such training. Callable from
+ * any thread.
  */
 nertca_status nertca_reconstruction_pause(nertca_reconstruction *reconstruction);
 
 /**
- * Lets paused training go on; does nothing otherwise. Any thread.
+ * Resumes paused training; does nothing otherwise. Callable from any thread.
  */
 nertca_status nertca_reconstruction_resume(nertca_reconstruction *reconstruction);
 
 /**
- * Ends training in the background after the iterations under way and waits for that; does nothing without any.
- * Training may be started again. Any thread but that of the progress callback.
+ * Ends training in the background after the iterations under way, and waits until it has ended; does nothing without
+ * such training. Training may be started again. Callable from any thread except that of the progress callback.
  *
  * @return NERTCA_ERROR_BUSY from inside the progress callback.
  */
 nertca_status nertca_reconstruction_stop(nertca_reconstruction *reconstruction);
 
 /**
- * Waits until training in the background has ended, at most `limit_ms` milliseconds; `*ended` (may be null) gets 1 or
- * 0. Any thread but that of the progress callback.
+ * Waits until training in the background has ended, at most `limit_ms` milliseconds. `*ended` (may be null) receives 1
+ * if it has ended, else 0. Callable from any thread except that of the progress callback.
  *
  * # Safety
  * `ended` must be writable or null.
@@ -1153,39 +1166,39 @@ nertca_status nertca_reconstruction_stop(nertca_reconstruction *reconstruction);
 nertca_status nertca_reconstruction_wait(nertca_reconstruction *reconstruction, uint32_t limit_ms, int32_t *ended);
 
 /**
- * Draws a view into the caller's memory: line integrals, or attenuation per mm for a maximum projection. Works while
- * training too, from the parameters as they then are: `NERTCA_QUALITY_LIVE` at display rates, from volumes that are
- * refreshed as fast as is possible in a fifth of the time, `NERTCA_QUALITY_EXACT` from the fields themselves.
+ * Draws a view into the caller's memory: line integrals, or attenuation per mm for a maximum projection. It also works during
+ * training, from the current parameters: `NERTCA_QUALITY_LIVE` at display rates, from volumes whose refreshing takes at most a
+ * fifth of the time; `NERTCA_QUALITY_EXACT` from the fields themselves.
  *
- * Any thread; calls on one reconstruction draw one after the other.
+ * Callable from any thread; calls on one reconstruction draw one after the other.
  *
  * @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT naming what is wrong.
  *
  * # Safety
- * `view` and `image` must be as long as they say, and their pointers valid as far as they say.
+ * `view` and `image` must be as long as their `size` says, and their pointers valid for the stated lengths.
  */
 nertca_status nertca_reconstruction_render(nertca_reconstruction *reconstruction,
                                            const nertca_view *view,
                                            const nertca_image *image);
 
 /**
- * Draws a view as `nertca_reconstruction_render` does, into a buffer of the same context: `width * height` floats, rows first. Live
- * quality is written by the device itself, without a copy; maxima are then per 100 mm (divide by 100). The buffer is
+ * Draws a view like `nertca_reconstruction_render`, into a buffer of the same context: `width * height` floats, row by row. At
+ * live quality the device writes them itself, without a copy; maxima are then per 100 mm (divide by 100). The buffer is
  * complete when the call returns.
  *
  * # Safety
- * `view` must be as long as it says.
+ * `view` must be as long as its `size` says.
  */
 nertca_status nertca_reconstruction_render_buffer(nertca_reconstruction *reconstruction,
                                                   const nertca_view *view,
                                                   nertca_buffer *buffer);
 
 /**
- * Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Zero outside
- * what was reconstructed. Any thread, also while training.
+ * Samples a volume into the caller's memory: attenuation per mm at each point of a grid, left fastest. Values outside the
+ * reconstructed region are zero. Callable from any thread, also during training.
  *
  * # Safety
- * `grid` must be as long as it says; `values` must be writable for `count` floats.
+ * `grid` must be as long as its `size` says; `values` must be writable for `count` floats.
  */
 nertca_status nertca_reconstruction_sample(nertca_reconstruction *reconstruction,
                                            const nertca_grid *grid,
@@ -1193,70 +1206,75 @@ nertca_status nertca_reconstruction_sample(nertca_reconstruction *reconstruction
                                            size_t count);
 
 /**
- * Samples the fields as `nertca_reconstruction_sample` does, into a buffer of the same context.
+ * Samples the fields like `nertca_reconstruction_sample`, into a buffer of the same context.
  *
  * # Safety
- * `grid` must be as long as it says.
+ * `grid` must be as long as its `size` says.
  */
 nertca_status nertca_reconstruction_sample_buffer(nertca_reconstruction *reconstruction,
                                                   const nertca_grid *grid,
                                                   nertca_buffer *buffer);
 
 /**
- * Makes a buffer on the device that can be shared through `VK_KHR_external_memory_fd`. `*buffer` is null on failure.
- * Any thread.
+ * Makes a buffer on the device that can be shared through `VK_KHR_external_memory_fd`. `*buffer` is null on failure. Callable
+ * from any thread.
  *
- * @return NERTCA_ERROR_DEVICE where the device lacks the extension (`external_memory_fd` of
- * `nertca_context_describe`).
+ * @return NERTCA_ERROR_DEVICE where the device lacks the extension (`external_memory_fd` of `nertca_context_describe`).
  *
  * # Safety
  * `buffer` must be writable.
  */
-nertca_status nertca_buffer_create(nertca_context *context, uint64_t bytes, nertca_buffer **buffer);
+nertca_status nertca_buffer_create(nertca_context *context,
+                                   uint64_t bytes,
+                                   nertca_buffer **buffer);
 
 /**
- * A new file descriptor of the buffer's memory (`VK_EXTERNAL_MEMORY_HANDLE_TYPE_OPAQUE_FD_BIT`), the caller's to
- * import or close, and the size of the allocation's buffer in bytes. Any thread.
+ * Returns a new file descriptor of the buffer's memory (`VK_EXTERNAL_MEMORY_HANDLE_TYPE_OPAQUE_FD_BIT`), which the caller must
+ * import or close, and the size of the exported buffer in bytes. Callable from any thread.
  *
  * # Safety
  * `fd` must be writable; `bytes` must be writable or null.
  */
-nertca_status nertca_buffer_export_fd(nertca_buffer *buffer, int32_t *fd, uint64_t *bytes);
+nertca_status nertca_buffer_export_fd(nertca_buffer *buffer,
+                                      int32_t *fd,
+                                      uint64_t *bytes);
 
 /**
- * Frees a buffer; what others imported stays theirs. Null is allowed, and does nothing. Waits for calls on it in other
- * threads.
+ * Destroys a buffer; memory that others imported stays valid for them. Null is allowed, and does nothing. Waits for calls on
+ * the buffer in other threads.
  */
 nertca_status nertca_buffer_destroy(nertca_buffer *buffer);
 
 /**
- * Finds the vessels at all phases as trees of centrelines with radii, and tells how much room they need: with all arrays of
- * `tree` null. Called again with arrays, it copies what it found, whatever training has done since. Takes seconds.
+ * Finds the vessels at all phases as trees of centrelines with radii. If all arrays of `tree` are null, the call searches and
+ * returns the sizes of the arrays. Called again with arrays, it copies the trees found before, whatever training has done
+ * since. The search takes seconds.
  *
- * Branches come phase by phase, each behind its parent. Where `followed` is 1, all phases have the same branches with the
- * same number of points, and point i of a branch is the same material point at every phase; elsewhere each phase has
- * branches of its own. Motion along a vessel is not observed in projections: what there is of it comes from smoothness
- * alone. Any thread, also while training.
+ * Branches are listed phase by phase, each after its parent. Where `followed` is 1, all phases have the same branches with the
+ * same number of points, and point i of a branch is the same material point at every phase; otherwise each phase has its own
+ * branches. Motion along a vessel is not observed in projections: it is determined by smoothness alone. Callable from any
+ * thread, also during training.
  *
- * @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a threshold or length
- * that is negative, for a moving field without vessels above the threshold, and where only some arrays are given;
- * NERTCA_ERROR_BUFFER when they are too short: the counts then tell what is needed.
+ * @return NERTCA_ERROR_NOT_READY before anything was trained or loaded; NERTCA_ERROR_ARGUMENT for a negative threshold or
+ * length, for a dynamic field without vessels above the threshold, and where only some arrays are given; NERTCA_ERROR_BUFFER
+ * when the arrays are too short: the counts are then the required ones.
  *
  * # Safety
- * `tree` must be as long as it says, and its arrays null or writable for `branches` and `points` elements.
+ * `tree` must be as long as its `size` says, and its arrays null or writable for `branches` and `points` elements.
  */
 nertca_status nertca_reconstruction_tree(nertca_reconstruction *reconstruction,
                                          nertca_tree *tree);
 
 /**
- * Says which voxels are vessel at the phase of `grid`, in place of what was said of that phase before: a non-zero byte for each
- * point of the grid that is inside one, left fastest; its component does not matter. `nertca_reconstruction_evaluate` then has
- * scores in 3D. Null `vessels`, with `bytes` 0, forget the phase. The bytes are copied. Any thread.
+ * Sets the true vessel voxels at the phase of `grid`, in place of those set before for that phase. `vessels` has one byte for
+ * each point of the grid, left fastest, non-zero inside a vessel; the grid's component is ignored.
+ * `nertca_reconstruction_evaluate` then returns scores in 3D. Null `vessels`, with `bytes` 0, remove the phase. The bytes are
+ * copied. Callable from any thread.
  *
- * @return NERTCA_ERROR_ARGUMENT for a phase that there is not, a grid of more than 2^26 points, or too few bytes.
+ * @return NERTCA_ERROR_ARGUMENT for a phase that does not exist, a grid of more than 2^26 points, or too few bytes.
  *
  * # Safety
- * `grid` must be as long as it says; `vessels` must be readable for `bytes` bytes or null.
+ * `grid` must be as long as its `size` says; `vessels` must be readable for `bytes` bytes or null.
  */
 nertca_status nertca_reconstruction_set_true_vessels(nertca_reconstruction *reconstruction,
                                                      const nertca_grid *grid,
@@ -1264,26 +1282,26 @@ nertca_status nertca_reconstruction_set_true_vessels(nertca_reconstruction *reco
                                                      size_t bytes);
 
 /**
- * Says where the true centrelines are, and how wide the vessels, in place of what was said before: arrays as
- * `nertca_reconstruction_tree` fills them, of one phase or more, of which 0 is one, with the same branches of as many points at
- * each; point i of a branch is the same material point at every phase. `branch_parent` may be null. No branches forget them.
- * `nertca_reconstruction_evaluate` then finds the vessels as a tree, which takes seconds, and scores it. The arrays are copied.
- * Any thread.
+ * Sets the true centrelines and vessel radii, in place of those set before. The arrays have the form that
+ * `nertca_reconstruction_tree` fills. They contain one phase or more, among them phase 0, each with the same branches of the
+ * same number of points; point i of a branch is the same material point at every phase. `branch_parent` may be null. Zero
+ * branches remove the true centrelines. `nertca_reconstruction_evaluate` then finds the vessels as a tree, which takes
+ * seconds, and scores it. The arrays are copied. Callable from any thread.
  *
  * @return NERTCA_ERROR_ARGUMENT naming what is wrong.
  *
  * # Safety
- * `tree` must be as long as it says, and its arrays readable for `branches` and `points` elements.
+ * `tree` must be as long as its `size` says, and its arrays readable for `branches` and `points` elements.
  */
 nertca_status nertca_reconstruction_set_true_tree(nertca_reconstruction *reconstruction,
                                                   const nertca_tree *tree);
 
 /**
- * Scores the frames that were added with `NERTCA_SPLIT_VALIDATION`, of which there must be one, and what was reconstructed
- * against the true vessels, where these are known. `threshold_per_mm` is the attenuation from which
- * the moving field counts as vessel; 0 for a fifth of `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
- * Any thread, also while training. A library of an earlier version leaves fields alone that it does not know: set them to NaN before,
- * where that may be.
+ * Scores the frames that were added with `NERTCA_SPLIT_VALIDATION` (at least one is required), and compares the reconstruction
+ * with the true vessels where these are known. `threshold_per_mm` is the attenuation from which the dynamic field counts as
+ * vessel; 0 selects a fifth of `vessel_attenuation_per_mm`, or Otsu's threshold where that is unknown. Callable from any
+ * thread, also during training. A library of an earlier version does not write fields that it does not know: set them to NaN
+ * before the call if the version may be older.
  *
  * # Safety
  * `scores` must be writable, with its size set.

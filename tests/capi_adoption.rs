@@ -229,7 +229,10 @@ fn refused(vulkan: &nertca_vulkan) -> String {
 
 /// Returns the vessels after a short training of a network, and a description of the context.
 fn trained(context: *mut nertca_context) -> (Vec<f32>, serde_json::Value) {
-    let made = reconstruction(context, &format!("preset = fast-mlp\n{SMALL}"));
+    let made = reconstruction(
+        context,
+        &format!("preset = fast-mlp\nmarch.dynamic_samples = 40\ndynamic.width = 32\nhull.enabled = false\n{SMALL}"),
+    );
     add_frames(made, 0..3);
     train(made, 20);
     let (seen, described) = (drawn(made, &view(1)), described(context));

@@ -50,16 +50,15 @@ const SHORT: &[&str] = &[
     "--set",
     "train.rays=64",
     "--set",
-    "dynamic.width=16",
-    "--set",
     "march.render_samples=64",
     "--set",
     "train.validate_every=15",
     "--set",
     "train.chunk_samples=16384",
-    "--set",
-    "hull.resolution=32",
 ];
+
+/// Further settings of runs whose dynamic field is a network.
+const SMALL_NETWORK: &[&str] = &["--set", "dynamic.width=16", "--set", "hull.resolution=32"];
 
 #[test]
 fn a_whole_life() {
@@ -99,18 +98,7 @@ fn a_whole_life() {
     assert!(ok(&["info", text(&run)]).contains("step: 30"));
     assert!(ok(&["info", text(&data)]).contains("phases: 3"));
     let hull = directory.path().join("hull.nrrd");
-    ok(&[
-        "train",
-        text(&data),
-        "-o",
-        text(&run),
-        "--export-hull",
-        text(&hull),
-        "--set",
-        "hull.max_share=1",
-        "--set",
-        "hull.dilate_pixels=2",
-    ]);
+    ok(&["train", text(&data), "-o", text(&run), "--export-hull", text(&hull), "--set", "hull.dilate_pixels=2"]);
     assert!(hull.is_file());
     fails(&["render", text(&run), "--primary", "0", "--secondary", "0", "-o", "x.bmp"], 2, &["x.bmp", ".png"]);
     fails(
@@ -455,7 +443,12 @@ fn measurements_and_baked_views() {
     ok(&[&["train", text(&data), "-o", text(&run)], SHORT].concat());
     let file = directory.path().join("bench.json");
     let quick = ["--preset", "fast-mlp", "--warm-up", "0", "--iterations", "2", "--repeats", "3"];
-    let full = [&["bench", text(&data), "--full", "--json", text(&file), "--set", "dynamic.delay=5"], SHORT, &quick];
+    let full = [
+        &["bench", text(&data), "--full", "--json", text(&file), "--set", "dynamic.delay=5"],
+        SHORT,
+        SMALL_NETWORK,
+        &quick,
+    ];
     let said = ok(&full.concat());
     for part in ["before the network starts", "peaks: f32", "37:00", "really run", "network passes alone", "dry run: "]
     {
@@ -490,7 +483,7 @@ fn measurements_and_baked_views() {
     let mut unscored = report.clone();
     unscored["full"]["psnr"] = Value::Null;
     std::fs::write(&file, unscored.to_string()).unwrap();
-    let compared = [&["bench", text(&data), "--kernels", "--compare", text(&file)], SHORT, &quick];
+    let compared = [&["bench", text(&data), "--kernels", "--compare", text(&file)], SHORT, SMALL_NETWORK, &quick];
     let said = ok(&compared.concat());
     assert!(said.contains("with the network, ms") && said.contains("another configuration"), "{said}");
     fails(&["bench", text(&data), "--compare", text(&data.join("dataset.json"))], 1, &["dataset.json", "bench --json"]);
@@ -519,7 +512,11 @@ fn matrices_are_refused_where_there_are_none() {
     }
     let data = phantom(directory.path(), &[]);
     let run = directory.path().join("run");
-    let asked = [&["--layers", "matrices", "train", "--preset", "fast-mlp", text(&data), "-o", text(&run)], SHORT];
+    let asked = [
+        &["--layers", "matrices", "train", "--preset", "fast-mlp", text(&data), "-o", text(&run)],
+        SHORT,
+        SMALL_NETWORK,
+    ];
     fails(&asked.concat(), 2, &["cooperative matrices", "f32"]);
 }
 
@@ -583,8 +580,7 @@ fn a_run_killed_at_random_ends_in_the_same_file() {
     let directory = tempfile::tempdir().unwrap();
     let data = phantom(directory.path(), &[]);
     let settings = [SHORT, &["--set", "train.checkpoint_every=3", "--set", "train.validate_every=0"]].concat();
-    let settings =
-        [&settings[..], &["--set", "train.iterations_per_submit=1", "--set", "dynamic.delay=5", "--no-eval"]].concat();
+    let settings = [&settings[..], &["--set", "train.iterations_per_submit=1", "--no-eval"]].concat();
     let (whole, killed) = (directory.path().join("whole"), directory.path().join("killed"));
     ok(&[&["train", text(&data), "-o", text(&whole)], &settings[..]].concat());
     // The run is killed repeatedly after a random number of lines until it completes; the numbers come from a fixed seed.

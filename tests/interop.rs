@@ -52,13 +52,7 @@ fn trained() -> &'static (tempfile::TempDir, PathBuf, PathBuf) {
         let dir = tempfile::tempdir().unwrap();
         let (data, run) = (dir.path().join("data é"), dir.path().join("a run"));
         ok(&["phantom", text(&data), "--size", "40", "--phases", "3", "--no-volumes"]);
-        let short = [
-            "train.iterations=150",
-            "train.rays=256",
-            "dynamic.width=32",
-            "train.validate_every=50",
-            "hull.resolution=96",
-        ];
+        let short = ["train.iterations=150", "train.rays=256", "train.validate_every=50"];
         let set: Vec<&str> = short.iter().flat_map(|s| ["--set", s]).collect();
         ok(&[&["train", text(&data), "-o", text(&run)], &set[..]].concat());
         (dir, data, run)

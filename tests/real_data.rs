@@ -13,8 +13,8 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::gating::BeatScaling;
-use nertca_vk::vessels::threshold::vessel_threshold;
 use nertca_vk::train::trainer::Trainer;
+use nertca_vk::vessels::threshold::vessel_threshold;
 use shared::shared;
 use std::path::PathBuf;
 

@@ -155,7 +155,8 @@ fn documented(language: &str) -> String {
     let text = std::fs::read_to_string(root().join("docs/python.md")).unwrap();
     let section = text.split("\n## From Python\n").nth(1).expect("docs/python.md has the section of the example");
     let section = section.split("\n## ").next().unwrap();
-    let block = section.split(&format!("```{language}\n")).nth(1).unwrap_or_else(|| panic!("no {language} in docs/python.md"));
+    let block =
+        section.split(&format!("```{language}\n")).nth(1).unwrap_or_else(|| panic!("no {language} in docs/python.md"));
     block.split("```").next().unwrap().to_owned()
 }
 

@@ -51,7 +51,7 @@ int main(int argc, char **argv) {
   }
   check(nertca_context_create(options, &log, &context), NULL, "nertca_context_create");
 
-  sprintf(text, "phases = %d\nvessel_attenuation_per_mm = 0.05\ntrain.iterations = %u\nhull.resolution = 96\n",
+  sprintf(text, "phases = %d\nvessel_attenuation_per_mm = 0.05\ntrain.iterations = %u\n",
           PHANTOM_PHASES, iterations);
   check(nertca_reconstruction_create(context, text, &reconstruction), context, "nertca_reconstruction_create");
 

@@ -16,7 +16,7 @@ int main(int argc, char **argv) try {
   const std::uint32_t size = 64, iterations = argc > 1 ? std::atoi(argv[1]) : 100;
   nertca::Context context(argc > 2 ? argv[2] : "");
   nertca::Reconstruction reconstruction(
-      context, "phases = " + std::to_string(PHANTOM_PHASES) + "\nhull.resolution = 96\ntrain.iterations = " + std::to_string(iterations));
+      context, "phases = " + std::to_string(PHANTOM_PHASES) + "\ntrain.iterations = " + std::to_string(iterations));
 
   std::vector<float> pixels(size * size);
   for (int phase = 0; phase < PHANTOM_PHASES; phase++)

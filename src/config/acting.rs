@@ -1,4 +1,4 @@
-//! Which settings act in a configuration: those of its method, and those that all methods share.
+//! Selection of the settings that act in a configuration: those of its method, and those that all methods share.
 
 use crate::config::{Config, GaussianForm, StaticForm};
 use crate::error::{Error, Result};
@@ -46,8 +46,8 @@ impl Kind {
     }
 }
 
-/// Tells whether a setting that is no choice of the method acts.
-fn acts(kind: Kind, config: &Config, section: &str, name: &str) -> bool {
+/// Tells whether a setting acts, for settings that do not choose the method.
+fn acts(kind: Kind, section: &str, name: &str) -> bool {
     match (section, name) {
         ("train", "rays" | "motion_share") => !kind.is_alone(),
         ("march", "static_samples") => matches!(kind, Kind::Fields | Kind::Gaussians),
@@ -65,7 +65,7 @@ fn acts(kind: Kind, config: &Config, section: &str, name: &str) -> bool {
         ("networks", _) => kind == Kind::Networks,
         ("adam", "decay_share") => !kind.is_alone(),
         ("gaussians", _) => kind == Kind::Gaussians,
-        ("tree", _) => kind == Kind::Gaussians && config.gaussians.form != GaussianForm::Phase,
+        ("tree", _) => kind == Kind::Gaussians,
         ("r2", _) => kind == Kind::R2,
         ("x", _) => kind == Kind::X,
         ("sax", _) => kind == Kind::Sax,
@@ -79,7 +79,7 @@ impl Config {
         match key.split_once('.') {
             // The form of a field chooses the method.
             None | Some((_, "form")) => true,
-            Some((section, name)) => acts(Kind::of(self), self, section, name),
+            Some((section, name)) => acts(Kind::of(self), section, name),
         }
     }
 
@@ -167,7 +167,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("config.toml");
         let mut config = Config::preset(Preset::SaxNerf);
-        // As a program wrote it whose defaults were others.
+        // A program with other defaults may have written such a file.
         config.dynamic.lr = 0.123;
         std::fs::write(&file, config.to_toml().unwrap()).unwrap();
         assert_eq!(Config::load(None, Some(&file), &[]).unwrap(), config);

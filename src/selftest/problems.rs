@@ -105,6 +105,7 @@ pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
         "train.chunk_samples=1024",
         "train.iterations=40",
         "train.iterations_per_submit=4",
+        "march.static_samples=24",
         "march.dynamic_samples=40",
         "march.render_samples=32",
         "static.grid=9",
@@ -113,9 +114,13 @@ pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
         "dynamic.window_iterations=20",
         "hull.enabled=false",
     ];
-    // Two networks share the dynamic field's samples and refuse others.
-    let still: &[&str] = if preset == Preset::NerfCa { &[] } else { &["march.static_samples=24"] };
-    let all: Vec<String> = small.iter().chain(still).chain(settings).map(|setting| (*setting).to_owned()).collect();
+    // Settings of the forms choose the method, and the method those that act.
+    let owned = |settings: &[&str]| -> Vec<String> { settings.iter().map(|setting| (*setting).to_owned()).collect() };
+    let forms: Vec<&str> = settings.iter().copied().filter(|setting| setting.contains(".form=")).collect();
+    let method = Config::load(Some(preset), None, &owned(&forms)).unwrap_or_else(|_| Config::preset(preset));
+    let acts = |setting: &&&str| setting.split_once('=').is_some_and(|(key, _)| method.acts(key));
+    let base: Vec<&str> = small.iter().filter(acts).copied().collect();
+    let all = [owned(&base), owned(settings)].concat();
     Config::load(Some(preset), None, &all)
 }
 

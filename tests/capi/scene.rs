@@ -23,13 +23,9 @@ train.chunk_samples = 1024
 train.iterations = 60
 train.checkpoint_every = 20
 march.static_samples = 24
-march.dynamic_samples = 40
 march.render_samples = 32
 static.grid = 9
-dynamic.width = 32
-dynamic.window_iterations = 20
-dynamic.half_extent_mm = 20
-hull.enabled = false";
+dynamic.half_extent_mm = 20";
 
 pub fn last_error<H>(handle: *const H) -> String {
     let mut text = [0; 1024];
