@@ -103,9 +103,9 @@ const CAPACITY: u32 = 1024;
 /// Builds every pipeline that training and rendering of a configuration use on `gpu`, through the same functions that they use.
 /// The device must have been opened to keep statistics. Each build of a kernel is listed once, in the order of names.
 ///
+/// # Errors
 /// [`Error::Config`] where the network does not fit the device; [`Error::Internal`] for a device without statistics; errors of
 /// [`Gpu::pipeline`].
-/// of [`Gpu::pipeline`].
 pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> Result<Vec<Compiled>> {
     let tuning = tuning.clone().for_network(config.network_moves());
     let params = ParamMap::new(config, n_phases);

@@ -146,16 +146,17 @@ fn the_inventory_is_what_a_run_builds() {
         (Preset::XGaussian, 13, "x"),
         (Preset::SaxNerf, 13, "none"),
     ] {
-        let settings =
-            ["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"];
         let short = match preset {
-            Preset::R2Gaussian => &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"][..],
+            Preset::Fast => {
+                &["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"][..]
+            }
+            Preset::R2Gaussian => &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"],
             Preset::XGaussian => &["train.iterations=2", "x.voxels=8", "x.interval=2"],
             Preset::SaxNerf => &["train.iterations=2", "sax.log2_table=8", "sax.windows=2", "sax.window=4"],
             _ => &[],
         };
         let form = format!("gaussians.form={form}");
-        let settings: Vec<String> = settings.iter().chain(short).map(|s| (*s).to_owned()).chain([form]).collect();
+        let settings: Vec<String> = short.iter().map(|s| (*s).to_owned()).chain([form]).collect();
         let config = Config::load(Some(preset), None, &settings).unwrap();
         let listed = open();
         let inventory = inventory::compile(&listed, &config, 3, &tuning(&listed)).unwrap();
