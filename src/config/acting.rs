@@ -52,7 +52,7 @@ fn acts(kind: Kind, section: &str, name: &str) -> bool {
         ("train", "rays" | "motion_share") => !kind.is_alone(),
         ("march", "static_samples") => matches!(kind, Kind::Fields | Kind::Gaussians),
         ("march", "dynamic_samples") => matches!(kind, Kind::Fields | Kind::Networks),
-        ("march", "render_samples") => kind != Kind::Sax,
+        ("march", "render_samples") => true,
         ("march", _) => !kind.is_alone(),
         ("static", "lr" | "lr_end" | "decay") => !kind.is_alone(),
         ("static", _) => matches!(kind, Kind::Fields | Kind::Gaussians),
