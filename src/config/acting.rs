@@ -73,6 +73,9 @@ fn acts(kind: Kind, section: &str, name: &str) -> bool {
     }
 }
 
+/// Settings that studies scale with the length of a run for every method, so that kept results state them.
+const SCALED_FOR_ALL: [&str; 3] = ["dynamic.delay", "dynamic.window_iterations", "occupancy.start"];
+
 impl Config {
     /// Tells whether a setting, by its key, acts in this configuration.
     pub fn acts(&self, key: &str) -> bool {
@@ -87,7 +90,7 @@ impl Config {
     pub(super) fn check_acts(&self, before: &toml::Table, key: &str) -> Result<()> {
         let now = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
         let value = at(&now, key);
-        if self.acts(key) || value == at(before, key) {
+        if self.acts(key) || SCALED_FOR_ALL.contains(&key) || value == at(before, key) {
             return Ok(());
         }
         let method = Kind::of(self).name();

@@ -51,7 +51,6 @@ impl Config {
         if self.is_sax() {
             schedule.push(("sax.rate_falls_at", of(self.sax.rate_falls_at)));
         }
-        schedule.retain(|(key, _)| self.acts(key));
         schedule
     }
 
