@@ -57,7 +57,7 @@ fn seconds(text: &str) -> std::result::Result<Duration, String> {
     Duration::try_from_secs_f64(seconds).map_err(|_| "is not a time in seconds".to_owned())
 }
 
-/// Reads runs until it is told to end, and writes a run directory.
+/// Reads runs until a signal ends it, and writes a run directory.
 pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     let (config, options) = (args.config.load([])?, args.reading.options()?);
     let mut folder = Folder::new(&args.directory);
