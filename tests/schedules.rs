@@ -66,7 +66,10 @@ fn every_preset_trains_past_the_last_event_of_its_schedule() {
     let (gpu, directory) = (gpu(), tempfile::tempdir().unwrap());
     let dataset = phantom(&gpu, directory.path(), 32, 4);
     for preset in Preset::ALL {
-        let mut settings = vec!["train.rays=32", "train.chunk_samples=8192"];
+        let mut settings = match preset {
+            Preset::NerfCa | Preset::R2Gaussian | Preset::XGaussian | Preset::SaxNerf => vec![],
+            _ => vec!["train.rays=32", "train.chunk_samples=8192"],
+        };
         settings.extend(match preset {
             Preset::R2Gaussian => vec!["r2.count=300", "r2.voxels=16", "r2.tv_box=8"],
             Preset::XGaussian => vec!["x.voxels=16", "x.interval=2"],
