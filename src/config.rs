@@ -6,12 +6,14 @@ mod acting;
 mod checks;
 mod forms;
 mod length;
+pub mod method;
 mod presets;
 pub mod sections;
 
 use crate::choice::Choice;
 use crate::error::{Error, Result};
 pub use forms::{DynamicForm, OcclusionRegion};
+use method::MethodKind;
 use sections::{
     Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
     Tree, X,
@@ -354,45 +356,15 @@ impl Config {
         Ok(config)
     }
 
-    /// Tells whether the dynamic field consists of Gaussians.
-    pub fn gaussians_move(&self) -> bool {
-        self.gaussians.form != GaussianForm::None
-    }
-
-    /// Tells whether the static field is a network as well.
-    pub fn two_networks(&self) -> bool {
-        self.static_field.form == StaticForm::Network
-    }
-
-    /// Tells whether the method is R2-Gaussian, which has no static field.
-    pub fn is_r2(&self) -> bool {
-        self.gaussians.form == GaussianForm::R2
-    }
-
-    /// Tells whether the method is X-Gaussian, which has no static field.
-    pub fn is_x(&self) -> bool {
-        self.gaussians.form == GaussianForm::X
-    }
-
-    /// Tells whether the model consists of Gaussians alone, fitted to whole images.
-    pub fn has_gaussians_alone(&self) -> bool {
-        self.is_r2() || self.is_x()
-    }
-
-    /// Tells whether the method is SAX-NeRF, which has no static field.
-    pub fn is_sax(&self) -> bool {
-        self.dynamic.form == DynamicForm::Lineformer
-    }
-
-    /// Tells whether the dynamic field is the network on encoded coordinates.
-    pub fn network_moves(&self) -> bool {
-        !self.gaussians_move() && !self.is_sax()
+    /// Returns the method that the configuration chooses.
+    pub fn method(&self) -> MethodKind {
+        MethodKind::of(self)
     }
 
     /// Tells whether the dynamic field supports a displacement of the heart in each frame; methods fitted to whole images do
     /// not.
     pub fn follows_breath(&self) -> bool {
-        self.gaussians_move() && !self.has_gaussians_alone()
+        self.method() == MethodKind::Gaussians
     }
 
     /// Returns the number of iterations at the start of the run that fit Gaussians; the others fit the static field.

@@ -1,5 +1,4 @@
-//! Code that the fits of all methods share: traits of fits and fields, recorded iterations, losses, sets of static methods,
-//! tensors of checkpoints. It depends on no method.
+//! Code that the fits of all methods share: traits of fits and fields, recorded iterations, losses, sets of static methods. It depends on no method.
 
 pub(crate) mod extent;
 pub mod field;
@@ -8,7 +7,7 @@ pub(crate) mod iterations;
 pub mod losses;
 pub(crate) mod ring;
 pub mod sets;
-pub mod tensors;
+pub mod shown;
 
 /// Iterations whose losses the device keeps for the host.
 pub const RING_LENGTH: u32 = 1024;

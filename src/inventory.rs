@@ -1,22 +1,20 @@
 //! Lists every pipeline that runs of a configuration use on a device, with the statistics of its driver's compiler.
 
+use crate::config::method::MethodKind;
 use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::gaussians::blobs::BlobKernels;
 use crate::gaussians::pictures::into_buffers;
-use crate::gaussians::stages::{GaussianKernels, SplatStage};
+use crate::gaussians::stages::GaussianKernels;
 use crate::gaussians::tree::TreeKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
 use crate::kernels::layout::Setup;
-use crate::kernels::push;
-use crate::kernels::stages::{Build, Kernels, StillKernels};
+use crate::kernels::stages::{Kernels, StillKernels};
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::model::params::ParamMap;
 use crate::network::{Network, Purpose};
-use crate::r2::stages::R2Kernels;
-use crate::x_gaussian::stages::XKernels;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -107,7 +105,7 @@ const CAPACITY: u32 = 1024;
 /// [`Error::Config`] where the network does not fit the device; [`Error::Internal`] for a device without statistics; errors of
 /// [`Gpu::pipeline`].
 pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> Result<Vec<Compiled>> {
-    let tuning = tuning.clone().for_network(config.network_moves());
+    let tuning = tuning.clone().for_network(config.method().has_network());
     let params = ParamMap::new(config, n_phases);
     let setup = Setup { sample_capacity: CAPACITY, n_rays: 1, n_dynamic_samples: 1, ..Setup::default() };
     for purpose in [Purpose::Train, Purpose::Render] {
@@ -119,31 +117,16 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     for samples in [config.march.static_samples, config.march.render_samples] {
         Kernels::new(gpu, tuning.clone(), params.line_len() as u32, samples)?;
     }
-    if config.gaussians_move() {
-        match config.gaussians.form {
-            GaussianForm::R2 => {
-                R2Kernels::new(gpu, config.r2.integral)?;
-                // A stage of other fits draws the pictures.
-                Build::default().stage::<push::GaussianProject>(gpu)?;
-            }
-            GaussianForm::X => {
-                XKernels::new(gpu)?;
-                // These fits also use the stages that draw pictures.
-                Build::default().stage::<push::GaussianProject>(gpu)?;
-                SplatStage::<push::GaussianSplat>::new(gpu)?;
-            }
-            form => {
-                GaussianKernels::new(gpu)?;
-                if form != GaussianForm::Phase {
-                    TreeKernels::new(gpu)?;
-                }
-            }
+    if config.method() == MethodKind::Gaussians {
+        GaussianKernels::new(gpu)?;
+        if config.gaussians.form != GaussianForm::Phase {
+            TreeKernels::new(gpu)?;
         }
         BlobKernels::new(gpu, &tuning)?;
         into_buffers(gpu)?;
     }
     if let Some(method) = methods::of(config) {
-        method.make_pipelines(gpu)?;
+        method.make_pipelines(gpu, config, &tuning)?;
     }
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
     if all.is_empty() {

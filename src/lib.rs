@@ -85,6 +85,7 @@ pub mod files;
 pub mod fingerprint;
 pub mod random;
 pub mod raster;
+pub mod tensors;
 
 /// Vulkan compute, independent of angiography.
 pub mod gpu {
@@ -172,44 +173,26 @@ pub mod evidence {
 pub mod calibrate;
 pub mod check;
 
-pub mod fitting;
-pub mod methods;
-pub mod model;
-pub mod network;
-
-/// Gaussians on the device: their projection into views, and one iteration of a fit.
+/// Gaussians, which several methods share: as data, in checkpoints, and on the device, where views see them.
 pub mod gaussians {
+    pub mod blending;
     pub mod blobs;
+    pub mod comparison;
+    pub mod field;
     pub mod particles;
     pub mod pictures;
+    pub mod spacing;
     pub mod stages;
+    pub(crate) mod tensors;
     pub mod tree;
     pub mod view;
     pub mod work;
 }
 
-/// R2-Gaussian, a static baseline of the paper: its data, initial values, stages and density control.
-pub mod r2 {
-    pub mod data;
-    pub mod densify;
-    pub mod fdk;
-    pub mod parameters;
-    pub mod particles;
-    pub mod setup;
-    pub mod stages;
-    pub mod start;
-}
-
-/// X-Gaussian, a static baseline of the paper: its data, initial values, stages and density control.
-pub mod x_gaussian {
-    pub mod data;
-    pub mod densify;
-    pub mod particles;
-    pub mod picture;
-    pub mod setup;
-    pub mod stages;
-    pub mod start;
-}
+pub mod fitting;
+pub mod methods;
+pub mod model;
+pub mod network;
 
 pub mod plan;
 
@@ -228,9 +211,9 @@ pub mod train {
     pub mod calibrate;
     mod carried;
     pub mod dry_run;
+    pub mod fields;
     pub mod gaussians;
     pub mod moving;
-    pub mod r2;
     pub mod snapshot;
     pub mod step;
     mod targets;
@@ -239,7 +222,6 @@ pub mod train {
     pub mod training;
     pub mod tree;
     pub mod tree_start;
-    pub mod x_gaussian;
 }
 
 /// Export of a model for other tools: volumes, surfaces and motion.
@@ -358,12 +340,9 @@ pub mod reference {
     pub mod networks;
     pub mod occupancy;
     pub mod projector;
-    pub mod r2;
-    pub mod r2_chords;
-    pub mod sax;
+    pub mod ssim;
     pub mod step;
     pub mod tree;
-    pub mod x_gaussian;
 }
 
 #[cfg(feature = "diagnostics")]

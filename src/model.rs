@@ -3,23 +3,17 @@
 pub mod checkpoint;
 pub mod component;
 mod conversions;
-mod gaussian_tensors;
-pub mod gaussians;
 pub mod groups;
 pub mod hull;
 pub mod params;
-pub mod r2;
-mod r2_tensors;
 pub mod scene;
 mod schedule;
 pub mod setup;
-pub mod x_gaussian;
-mod x_tensors;
 
 use crate::config::Config;
 use crate::fitting::field::Field;
+use crate::gaussians::field::MovingGaussians;
 use crate::geometry::CArm;
-use crate::model::gaussians::MovingGaussians;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::scene::Scene;

@@ -62,13 +62,13 @@ trait Path: Send + Sync {
     fn gradient_source(&self, params: &NetworkMap) -> Vec<u32>;
 
     /// Records the stages that depend on parameters alone.
-    fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()>;
+    fn record_weights(&self, map: &NetworkMap, pass: &mut Pass<'_>) -> Result<()>;
 
     /// Records the network over the live samples, which writes `sample_sigma`.
-    fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()>;
+    fn record_forward(&self, map: &NetworkMap, pass: &mut Pass<'_>) -> Result<()>;
 
     /// Records the backward pass of a chunk, which writes `partials`.
-    fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()>;
+    fn record_backward(&self, map: &NetworkMap, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()>;
 
     /// Minimum work of the stages that process samples, for `samples` of them.
     fn work(&self, params: &NetworkMap, samples: u64) -> Ledger;
@@ -215,7 +215,7 @@ impl Network {
     /// # Errors
     /// Fails like [`Pass::run`], as do all functions below.
     pub fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
-        self.path.record_weights(pass)
+        self.path.record_weights(&self.map, pass)
     }
 
     /// Records the network over the live samples, which writes `sample_sigma`.
@@ -223,7 +223,7 @@ impl Network {
     /// # Errors
     /// Fails like [`Network::record_weights`].
     pub fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
-        self.path.record_forward(pass)
+        self.path.record_forward(&self.map, pass)
     }
 
     /// Records the backward pass of a chunk, which writes partial sums of the gradient.
@@ -231,7 +231,7 @@ impl Network {
     /// # Errors
     /// Fails like [`Network::record_weights`].
     pub fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        self.path.record_backward(pass, chunk)
+        self.path.record_backward(&self.map, pass, chunk)
     }
 
     /// Records the sums over the parts, and the gradients that follow from the sums per phase: together the network's gradient.
@@ -242,7 +242,7 @@ impl Network {
         if self.gradient.is_none() {
             return Err(built_for_rendering());
         }
-        let (k, params) = (pass.kernels, pass.network.map());
+        let (k, params) = (pass.kernels, &self.map);
         let PartialSums { splits, len: n_partials } = self.path.partial_sums(params);
         let (first, count) = (params.first as u32, params.len as u32);
         let phase_sums = self.path.phase_source(params).len() as u32;

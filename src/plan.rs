@@ -13,11 +13,11 @@ pub mod soft_hull;
 pub mod start;
 pub mod targets;
 
-use crate::config::{Config, DynamicTarget, GaussianForm, StaticData};
+use crate::config::method::MethodKind;
+use crate::config::{Config, DynamicTarget, GaussianForm};
 use crate::error::{Error, Result};
-use crate::fitting::extent::{between_phases, volume_half};
+use crate::fitting::extent::between_phases;
 use crate::fitting::fit::FitData;
-use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{self, Setup};
 use crate::methods;
 use crate::model::hull::Hull;
@@ -28,9 +28,7 @@ use crate::plan::scale::dynamic_half;
 use crate::plan::soft_hull::carve::SoftMotion;
 use crate::plan::start::StartRays;
 use crate::plan::targets::Targets;
-use crate::r2::data::R2Data;
 use crate::scan::dataset::Dataset;
-use crate::x_gaussian::data::XData;
 
 /// Prepared run, ready to start.
 pub struct Plan {
@@ -62,10 +60,6 @@ pub struct Plan {
     pub hull: Option<Hull>,
     /// Targets of the Gaussians, where they are the dynamic field and follow the beat.
     pub targets: Option<Targets>,
-    /// Data of R2-Gaussian's fit, where that method is used.
-    pub r2: Option<R2Data>,
-    /// Data of X-Gaussian's fit, where that method is used.
-    pub x: Option<XData>,
     /// Fit data of a method of [`crate::methods`]; `None` for all other methods.
     pub fit: Option<Box<dyn FitData>>,
     /// Weighted loss of an empty dynamic field, where a network is the dynamic field and the target is temporal.
@@ -82,17 +76,11 @@ impl Plan {
     pub fn new(config: &Config, dataset: &Dataset) -> Result<Plan> {
         let mut notes = Vec::new();
         let motion = motion::analyse(dataset, &config.hull);
-        let (mut r2, mut x, mut fit) = (None, None, None);
+        let mut fit = None;
         let (hull, targets) = if let Some(method) = methods::of(config) {
             fit = Some(method.plan(config, dataset, &mut notes)?);
             (None, None)
-        } else if config.is_r2() {
-            r2 = Some(plan_r2(config, dataset, &mut notes)?);
-            (None, None)
-        } else if config.is_x() {
-            x = Some(plan_x(config, dataset, &mut notes)?);
-            (None, None)
-        } else if config.gaussians_move() {
+        } else if config.method() == MethodKind::Gaussians {
             let (hull, targets) = plan_gaussians(config, dataset, &mut notes)?;
             (Some(hull), Some(targets))
         } else {
@@ -148,7 +136,7 @@ impl Plan {
         }
         let mut n_motion_list = listed_rays.len();
         let mut pixel_changes = Vec::new();
-        if config.two_networks() {
+        if config.method() == MethodKind::TwoNetworks {
             let changes = changes::of_views(dataset, &motion);
             (listed_rays, n_motion_list) = changes::rays(dataset, &motion, &changes, config.networks.least_change);
             pixel_changes = changes.concat();
@@ -189,8 +177,6 @@ impl Plan {
             listed_rays,
             hull,
             targets,
-            r2,
-            x,
             fit,
             empty_loss,
             notes,
@@ -244,73 +230,6 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
         _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))
-}
-
-/// Prepares R2-Gaussian's data, and notes about them for the user.
-fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
-    let half = volume_half(config.r2.half_extent_mm, dataset);
-    let data = R2Data::new(dataset, &config.r2, half)?;
-    let side_mm = 2.0 * half * MM_PER_UNIT;
-    notes.push(match config.r2.static_data {
-        StaticData::PerPhase => format!(
-            "R2-Gaussian, a static method: each phase is reconstructed from its own images, in a cube of {side_mm:.1} mm \
-             (r2.static_data = \"per-phase\")"
-        ),
-        StaticData::Pooled => format!(
-            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} mm, \
-             is shown at each (r2.static_data = \"pooled\")"
-        ),
-    });
-    if config.r2.normalise && dataset.vessel_attenuation.is_none() {
-        notes.push(
-            "the dataset states no attenuation of vessels: densities are per 100 mm, and what R2-Gaussian fixes of them may \
-             not fit"
-                .into(),
-        );
-    }
-    if !dataset.hidden.is_empty() {
-        notes.push(
-            "pixels that show nothing of the patient are fitted like all others: R2-Gaussian knows no masks".into(),
-        );
-    }
-    if dataset.heart_shifts() {
-        notes.push("R2-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
-    }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
-    Ok(data)
-}
-
-/// Prepares X-Gaussian's data, and notes about them for the user.
-fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
-    let half = volume_half(config.x.half_extent_mm, dataset);
-    let data = XData::new(dataset, &config.x, half)?;
-    let side_mm = 2.0 * half * MM_PER_UNIT;
-    let whose = match config.x.static_data {
-        StaticData::PerPhase => "each phase has Gaussians of its own images (x.static_data = \"per-phase\")",
-        StaticData::Pooled => "one set of the images of all phases is shown at each (x.static_data = \"pooled\")",
-    };
-    notes.push(format!(
-        "X-Gaussian, a static method of Gaussians that hide each other: {whose}, from a cube of {side_mm:.1} mm on, in a scene of \
-         {:.0} mm; its pictures have no unit, and its opacities are no attenuation",
-        data.extent_mm
-    ));
-    if data.clamped > 0.0 {
-        notes.push(format!(
-            "{:.1} % of the images' pixels are beyond x.clamp = {} and count as that",
-            100.0 * data.clamped,
-            config.x.clamp
-        ));
-    }
-    if !dataset.hidden.is_empty() {
-        notes.push(
-            "pixels that show nothing of the patient are fitted like all others: X-Gaussian knows no masks".into(),
-        );
-    }
-    if dataset.heart_shifts() {
-        notes.push("X-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
-    }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
-    Ok(data)
 }
 
 /// Returns a note on the frames that Gaussians are not fitted to: frames of views with a single phase.

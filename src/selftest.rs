@@ -16,11 +16,8 @@ pub mod networks;
 pub mod occupancy;
 pub mod problems;
 pub mod projections;
-pub mod r2;
 pub mod repeats;
-pub mod sax;
 pub mod trees;
-pub mod x_gaussian;
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
@@ -28,6 +25,7 @@ use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages;
 use crate::kernels::tuning::{Layers, MatrixTuning, Tuning};
+use crate::methods;
 use crate::scan::dataset::Dataset;
 use compare::{Findings, Row};
 use serde::Serialize;
@@ -113,9 +111,9 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
 fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
     vec![
         ("Gaussians per phase".into(), Box::new(move |findings| gaussians::compare(gpu, findings))),
-        ("R2-Gaussian".into(), Box::new(move |findings| r2::compare(gpu, findings))),
-        ("X-Gaussian".into(), Box::new(move |findings| x_gaussian::compare(gpu, findings))),
-        ("SAX-NeRF".into(), Box::new(move |findings| sax::compare(gpu, findings))),
+        ("R2-Gaussian".into(), Box::new(move |findings| methods::r2_gaussian::selftest::compare(gpu, findings))),
+        ("X-Gaussian".into(), Box::new(move |findings| methods::x_gaussian::selftest::compare(gpu, findings))),
+        ("SAX-NeRF".into(), Box::new(move |findings| methods::sax_nerf::selftest::compare(gpu, findings))),
         ("a moving tree".into(), Box::new(move |findings| trees::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
         ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_crowd(gpu, tuning, findings))),

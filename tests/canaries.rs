@@ -6,12 +6,12 @@ mod common;
 mod shim;
 
 use common::{expect_silence, run, small_config, small_dataset};
+use nertca_vk::gaussians::field::MovingGaussians;
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::layout::Gaussian;
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::model::component::Component;
-use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::baked::Baked;
 use nertca_vk::render::quantity::{Projection, Quantity};
@@ -44,7 +44,8 @@ fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning
     let gpu = gpu();
     let tuning = choose(Tuning::for_device(gpu.info()));
     let config = small_config(preset, settings);
-    let (width, height) = if config.gaussians_move() { (40, 36) } else { (13, 11) };
+    let (width, height) =
+        if config.gaussians.form != nertca_vk::config::GaussianForm::None { (40, 36) } else { (13, 11) };
     let dataset = small_dataset(width, height);
     let plan = Plan::new(&config, &dataset).unwrap();
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning.clone()).unwrap();

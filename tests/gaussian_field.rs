@@ -8,12 +8,12 @@ use glam::DVec3;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset, sections};
 use nertca_vk::error::Error;
+use nertca_vk::gaussians::field::{Gaussians, MovingGaussians};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::model::component::Component;
-use nertca_vk::model::gaussians::{Gaussians, MovingGaussians};
 use nertca_vk::plan::Plan;
 use nertca_vk::render::grid::PatientGrid;
 use nertca_vk::render::renderer::Renderer;
@@ -99,8 +99,6 @@ fn checkpoints_keep_every_bit() {
             loss_scale: None,
             stopped: false,
             last_report: Vec::new(),
-            r2: None,
-            x: None,
             fit: None,
             data_fingerprint: "x".into(),
         };
@@ -134,8 +132,6 @@ fn damaged_gaussians_are_refused_by_name() {
             loss_scale: None,
             stopped: false,
             last_report: Vec::new(),
-            r2: None,
-            x: None,
             fit: None,
             data_fingerprint: String::new(),
         };
@@ -259,7 +255,7 @@ fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
     assert_eq!(losses.len(), 32);
     assert!(losses.iter().all(|l| l.is_finite() && *l > 0.0), "{losses:?}");
     // Schedules and losses are indexed by the device's count.
-    let state: Vec<DeviceState> = gpu.download(&trainer.forward().state, 0, 1).unwrap();
+    let state: Vec<DeviceState> = gpu.download(&trainer.fields().unwrap().forward().state, 0, 1).unwrap();
     assert_eq!(state[0].step, 32);
     drop(trainer);
     expect_silence(gpu);

@@ -50,7 +50,7 @@ fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
     let gpu = gpu();
     let mut trainer = Trainer::new(&gpu, plan, dataset, tuning(&gpu)).unwrap();
     let initial: Vec<f32> = gather(golden, trainer.plan(), "initial").iter().map(|v| *v as f32).collect();
-    gpu.upload(&trainer.forward().params, 0, &initial).unwrap();
+    gpu.upload(&trainer.fields().unwrap().forward().params, 0, &initial).unwrap();
     let compared = [0u32, golden.number("delay") as u32, golden.number("delay") as u32 + 3];
     for step in 0..10 {
         // At parameters that already differ by rounding, a comparison of gradients would mix two effects, so the
@@ -73,7 +73,7 @@ fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
             }
             compare(&gradient.iter().map(|v| *v as f32).collect::<Vec<_>>(), &reference, trainer.plan(), 2e-5, name);
             let uploaded: Vec<f32> = params.iter().map(|v| *v as f32).collect();
-            gpu.upload(&trainer.forward().params, 0, &uploaded).unwrap();
+            gpu.upload(&trainer.fields().unwrap().forward().params, 0, &uploaded).unwrap();
         }
         let loss = trainer.advance(step + 1).unwrap()[0];
         if compared.contains(&step) {
@@ -82,7 +82,7 @@ fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
                 assert!((value - want).abs() <= 1e-4 * want.abs() + 1e-12, "{name} {step} {term}: {value} {want}");
             }
             let len = trainer.plan().params.len;
-            let got: Vec<f32> = gpu.download(&trainer.training().gradient, 0, len).unwrap();
+            let got: Vec<f32> = gpu.download(&trainer.fields().unwrap().training().gradient, 0, len).unwrap();
             let want = gather(golden, trainer.plan(), &format!("gradient{step}"));
             compare(&got, &want, trainer.plan(), 1e-4, name);
         }

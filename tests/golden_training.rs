@@ -67,7 +67,7 @@ fn train(gpu: &Gpu, golden: &Golden, plan: Plan) -> Worst {
     let tuning = Tuning { layers: Layers::F32, ..tuning(gpu) };
     let mut trainer = Trainer::new(gpu, plan, &golden.dataset(), tuning).unwrap();
     let initial: Vec<f32> = gather(golden, trainer.plan(), "initial").iter().map(|v| *v as f32).collect();
-    gpu.upload(&trainer.forward().params, 0, &initial).unwrap();
+    gpu.upload(&trainer.fields().unwrap().forward().params, 0, &initial).unwrap();
     let compared = golden.case["compared"].as_array().unwrap().iter().map(|n| n.as_u64().unwrap() as u32);
     let mut worst = Worst::default();
     for iteration in compared {

@@ -11,8 +11,11 @@ use faults::{code, no_stores};
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::methods::r2_gaussian::selftest as r2;
+use nertca_vk::methods::sax_nerf::selftest as sax;
+use nertca_vk::methods::x_gaussian::selftest as x_gaussian;
 use nertca_vk::plan::Plan;
-use nertca_vk::selftest::{problems, r2, sax, x_gaussian};
+use nertca_vk::selftest::problems;
 use nertca_vk::train::trainer::Trainer;
 
 fn open() -> Gpu {

@@ -70,7 +70,7 @@ fn rays_and_depths_match() {
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let losses = trainer.advance(1).unwrap();
     let plan = trainer.plan();
-    let got: Vec<Ray> = gpu.download(&trainer.forward().rays, 0, plan.setup.n_rays as usize).unwrap();
+    let got: Vec<Ray> = gpu.download(&trainer.fields().unwrap().forward().rays, 0, plan.setup.n_rays as usize).unwrap();
     let want = march::batch(plan, losses.last().unwrap().step - 1);
     let params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
     let mut live = 0;
@@ -190,7 +190,7 @@ fn hidden_pixels_are_never_drawn() {
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let step = trainer.advance(1).unwrap().last().unwrap().step - 1;
     let plan = trainer.plan();
-    let got: Vec<Ray> = gpu.download(&trainer.forward().rays, 0, plan.setup.n_rays as usize).unwrap();
+    let got: Vec<Ray> = gpu.download(&trainer.fields().unwrap().forward().rays, 0, plan.setup.n_rays as usize).unwrap();
     let want = march::batch(plan, step);
     let mut of_view = [0, 0];
     for (got, want) in got.iter().zip(&want) {

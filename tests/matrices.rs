@@ -170,12 +170,14 @@ fn an_overflow_skips_the_update_and_lowers_the_scale_for_a_while() {
     let (before, first) = (plan.params.initial(&plan.config), plan.params.static_len);
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning).unwrap();
     let huge = DeviceState { loss_scale: 2f32.powi(60), good_updates: 7, ..DeviceState::default() };
-    gpu.upload(&trainer.forward().state, 0, &[huge]).unwrap();
+    gpu.upload(&trainer.fields().unwrap().forward().state, 0, &[huge]).unwrap();
     trainer.advance(1).unwrap();
     let after = trainer.model().unwrap().params;
     assert_eq!(before[first..], after[first..], "the network moved");
     assert_ne!(before[..first], after[..first], "the static field needs no scale");
-    let state = |trainer: &Trainer| -> DeviceState { gpu.download(&trainer.forward().state, 0, 1).unwrap()[0] };
+    let state = |trainer: &Trainer| -> DeviceState {
+        gpu.download(&trainer.fields().unwrap().forward().state, 0, 1).unwrap()[0]
+    };
     assert_eq!(
         state(&trainer),
         DeviceState { step: 1, loss_scale: 2f32.powi(56), return_scale: 2f32.powi(59), ..DeviceState::default() }
@@ -193,12 +195,12 @@ fn an_overflow_skips_the_update_and_lowers_the_scale_for_a_while() {
 
     // A scale below the one to return to grows after 20 good updates, one above it after 500.
     let set = DeviceState { loss_scale: 2f32.powi(6), good_updates: 1, return_scale: 2f32.powi(10), ..last };
-    gpu.upload(&trainer.forward().state, 0, &[set]).unwrap();
+    gpu.upload(&trainer.fields().unwrap().forward().state, 0, &[set]).unwrap();
     let until = last.step + 20;
     run(&mut trainer, until);
     assert_eq!((state(&trainer).loss_scale, state(&trainer).good_updates), (2f32.powi(7), 1));
     let set = DeviceState { loss_scale: 2f32.powi(10), good_updates: 1, ..state(&trainer) };
-    gpu.upload(&trainer.forward().state, 0, &[set]).unwrap();
+    gpu.upload(&trainer.fields().unwrap().forward().state, 0, &[set]).unwrap();
     run(&mut trainer, until + 20);
     assert_eq!((state(&trainer).loss_scale, state(&trainer).good_updates), (2f32.powi(10), 21));
     drop(trainer);

@@ -10,11 +10,11 @@ mod python;
 use common::{expect_silence, gpu, small_config, small_dataset, tuning};
 use glam::{DMat3, DVec3};
 use nertca_vk::formats::npy;
+use nertca_vk::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units};
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::Checkpoint;
-use nertca_vk::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units};
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::gaussians::{Params, exact_integral, params};
 use nertca_vk::render::renderer::Renderer;
@@ -135,8 +135,6 @@ fn saved(model: Model, path: &Path) -> String {
         loss_scale: None,
         stopped: false,
         last_report: Vec::new(),
-        r2: None,
-        x: None,
         fit: None,
         data_fingerprint: "none".into(),
     };

@@ -16,9 +16,10 @@ use nertca_vk::kernels::dispatch::{Binding, dispatch};
 use nertca_vk::kernels::push;
 use nertca_vk::kernels::stages::{Build, Stage};
 use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::selftest::{drawing, gaussians, repeats, sax, trees};
+use nertca_vk::selftest::{drawing, gaussians, repeats, trees};
 use nertca_vk::train::trainer::Trainer;
 use shim::Poor;
 

@@ -6,35 +6,39 @@
 mod common;
 #[path = "common/golden_file.rs"]
 mod golden_file;
+#[path = "common/still.rs"]
+mod still;
 
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
-use nertca_vk::geometry::{CArm, Geometry};
+use nertca_vk::gaussians::field::MovingGaussians;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{R2Gaussian, R2Turn};
+use nertca_vk::methods::r2_gaussian::data::R2Data;
+use nertca_vk::methods::r2_gaussian::densify::densified;
+use nertca_vk::methods::r2_gaussian::fdk::back_projection;
+use nertca_vk::methods::r2_gaussian::parameters::{ScaleBounds, round, softplus};
+use nertca_vk::methods::r2_gaussian::selftest::{compare, hard_case, small_config, twin};
+use nertca_vk::methods::r2_gaussian::setup::{gaussian_setup, turns};
+use nertca_vk::methods::r2_gaussian::start::first_rows;
+use nertca_vk::methods::r2_gaussian::state::R2State;
+use nertca_vk::methods::r2_gaussian::trainer::R2Trainer;
+use nertca_vk::methods::r2_gaussian::twin::{self as reference, params};
+use nertca_vk::methods::r2_gaussian::twin_chords::Chords;
 use nertca_vk::model::checkpoint::Checkpoint;
-use nertca_vk::model::gaussians::MovingGaussians;
-use nertca_vk::model::r2::R2State;
 use nertca_vk::plan::Plan;
-use nertca_vk::r2::data::R2Data;
-use nertca_vk::r2::densify::densified;
-use nertca_vk::r2::fdk::back_projection;
-use nertca_vk::r2::parameters::{ScaleBounds, round, softplus};
-use nertca_vk::r2::setup::{gaussian_setup, turns};
-use nertca_vk::r2::start::first_rows;
 use nertca_vk::reference::gaussians::{N_PARAMS, Params};
-use nertca_vk::reference::r2::{self as reference, params};
-use nertca_vk::reference::r2_chords::Chords;
+use nertca_vk::reference::ssim;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
+use nertca_vk::scan::dataset::{Dataset, View};
 use nertca_vk::selftest::gaussians::{TENSORS, numbers, of_rows};
-use nertca_vk::selftest::r2::{compare, hard_case, small_config, twin};
-use nertca_vk::train::r2::R2Trainer;
 use nertca_vk::train::trainer::Trainer;
 use std::collections::BTreeSet;
+use std::sync::Arc;
+use still::dataset;
 
 fn config(settings: &[&str]) -> Config {
     small_config(settings).unwrap()
@@ -95,17 +99,17 @@ fn the_gradient_of_ssim_is_its_derivative() {
     let (width, height) = (13, 9);
     let wave = |k: f64| (0..width * height).map(|i| 0.5 + 0.4 * (k * i as f64).sin()).collect::<Vec<f64>>();
     let (x, y) = (wave(0.31), wave(0.47));
-    let (_, gradient) = reference::picture_loss(&x, &y, width, 0.25);
+    let (_, gradient) = ssim::picture_loss(&x, &y, width, 0.25);
     for (p, want) in gradient.iter().enumerate() {
         let loss = |h: f64| {
             let mut moved = x.clone();
             moved[p] += h;
-            reference::picture_loss(&moved, &y, width, 0.25).0
+            ssim::picture_loss(&moved, &y, width, 0.25).0
         };
         let difference = (loss(1e-6) - loss(-1e-6)) / 2e-6;
         assert!((difference - want).abs() < 1e-7, "{p}: {difference} against {want}");
     }
-    assert!((reference::picture_loss(&y, &y, width, 0.25).0).abs() < 1e-15);
+    assert!((ssim::picture_loss(&y, &y, width, 0.25).0).abs() < 1e-15);
 }
 
 /// Compares sums along rays, and the outline of the region within the cut, for long and short Gaussians.
@@ -159,48 +163,14 @@ fn exact_line_integrals_are_sums_along_rays() {
     assert!(compared > 20, "{compared}");
 }
 
-/// Images of a C-arm, `(primary, secondary)` degrees each, all of one phase unless stated otherwise.
-fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(usize, &View) -> Vec<f32>) -> Dataset {
-    let view = |angles: &[f64; 2]| {
-        let geometry = Geometry::CArm(CArm {
-            primary_deg: angles[0],
-            secondary_deg: angles[1],
-            sid_mm: 1000.0,
-            sod_mm: 620.0,
-            pixel_mm: [1.5, 1.8],
-            offset_mm: [0.0; 2],
-            table_mm: [0.0; 3],
-        });
-        View::new(geometry, [width, height]).unwrap()
-    };
-    let views: Vec<View> = angles.iter().map(view).collect();
-    let frame = |(v, view): (usize, &View)| Frame {
-        name: format!("v{v}"),
-        view: v,
-        phase: 0,
-        split: Split::Train,
-        integrals: image(v, view),
-        mask: None,
-        after_phase: 0.0,
-        heart_shift_mm: [0.0; 3],
-    };
-    Dataset {
-        path: "test".into(),
-        layout: Layout::Native,
-        frames: views.iter().enumerate().map(frame).collect(),
-        views,
-        width,
-        height,
-        n_phases: 1,
-        notes: Vec::new(),
-        depth_range: (-0.5, 0.5),
-        hidden: Default::default(),
-        vessel_attenuation: None,
-    }
+/// State of the fit in a checkpoint.
+fn state_of(checkpoint: &Checkpoint) -> R2State {
+    checkpoint.fit.as_ref().unwrap().as_any().downcast_ref::<R2State>().unwrap().clone()
 }
 
 fn data_of(dataset: &Dataset, config: &Config) -> R2Data {
-    Plan::new(config, dataset).unwrap().r2.unwrap()
+    let planned = Plan::new(config, dataset).unwrap().fit.unwrap();
+    planned.as_any().downcast_ref::<R2Data>().unwrap().clone()
 }
 
 #[test]
@@ -420,16 +390,19 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             let mut again = run(&mut parts, stop);
             let saved = parts.checkpoint().unwrap();
             let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
-            assert_eq!((&read.r2, &read.model.moving), (&saved.r2, &saved.model.moving));
+            assert_eq!((state_of(&read), &read.model.moving), (state_of(&saved), &saved.model.moving));
             let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
             let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
             assert_eq!(resumed.step(), stop);
             again.extend(run(&mut resumed, 60));
             assert_eq!(losses, again, "{static_data}, stopped at {stop}");
             let (want, got) = (whole.checkpoint().unwrap(), resumed.checkpoint().unwrap());
-            assert!(want.r2 == got.r2 && want.model.moving == got.model.moving, "{static_data}, {stop}");
+            assert!(
+                state_of(&want) == state_of(&got) && want.model.moving == got.model.moving,
+                "{static_data}, {stop}"
+            );
         }
-        let state = whole.checkpoint().unwrap().r2.unwrap();
+        let state = state_of(&whole.checkpoint().unwrap());
         let first = first_rows(&data_of(&dataset, &config), &config.r2, config.seed).0.len();
         assert!(state.rows.len() > first, "{} after {first}", state.rows.len());
     }
@@ -531,7 +504,9 @@ fn what_cannot_be_fitted_is_refused() {
     let saved = start(&gpu, &config(&[]), &small_dataset(13, 11)).checkpoint().unwrap();
     let damaged = |damage: &dyn Fn(&mut R2State)| {
         let mut other = saved.clone();
-        damage(other.r2.as_mut().unwrap());
+        let mut state = state_of(&saved);
+        damage(&mut state);
+        other.fit = Some(Arc::new(state));
         Checkpoint::from_bytes(&other.to_bytes().unwrap(), "checkpoint".as_ref()).err().map(|e| e.to_string())
     };
     assert_eq!(damaged(&|_| ()), None);

@@ -6,10 +6,11 @@ mod common;
 
 use common::{expect_silence, gpu, tuning};
 use nertca_vk::config::{Config, GaussianForm, Preset};
+use nertca_vk::fitting::fit::FieldFeed;
+use nertca_vk::gaussians::field::MovingGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::checkpoint::Checkpoint;
-use nertca_vk::model::gaussians::MovingGaussians;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::views::ViewAngles;
@@ -165,7 +166,7 @@ fn what_was_there_is_shown_until_there_is_better() {
     };
     let plan = Plan::new(&Config::preset(Preset::Fast), &dataset).unwrap();
     let mut trainer = Trainer::start_over(&gpu, plan, &dataset, tuning(&gpu), Some(&earlier)).unwrap();
-    let feed = trainer.moving_feed().unwrap();
+    let Some(FieldFeed::Gaussians(feed)) = trainer.feed() else { panic!("no Gaussians") };
     let shown = || feed.lock().unwrap().1.clone();
     let mut before = 0;
     while trainer.preparation().is_some() {

@@ -6,27 +6,30 @@
 mod common;
 #[path = "common/golden_file.rs"]
 mod golden_file;
+#[path = "common/still.rs"]
+mod still;
 
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
 use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
-use nertca_vk::geometry::{CArm, Geometry};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{R2Turn, XGaussian, XStatistics};
+use nertca_vk::methods::x_gaussian::data::XData;
+use nertca_vk::methods::x_gaussian::densify::densified;
+use nertca_vk::methods::x_gaussian::selftest::{TENSORS, compare, hard_case, numbers, small_config, twin, with_sets};
+use nertca_vk::methods::x_gaussian::setup::turns;
+use nertca_vk::methods::x_gaussian::start::first_state;
+use nertca_vk::methods::x_gaussian::state::XState;
+use nertca_vk::methods::x_gaussian::trainer::XTrainer;
+use nertca_vk::methods::x_gaussian::twin::{N_PARAMS, Params, params};
 use nertca_vk::model::checkpoint::Checkpoint;
-use nertca_vk::model::x_gaussian::XState;
 use nertca_vk::plan::Plan;
-use nertca_vk::reference::x_gaussian::{N_PARAMS, Params, params};
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split, View};
-use nertca_vk::selftest::x_gaussian::{TENSORS, compare, hard_case, numbers, small_config, twin, with_sets};
+use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
-use nertca_vk::train::x_gaussian::XTrainer;
-use nertca_vk::x_gaussian::data::XData;
-use nertca_vk::x_gaussian::densify::densified;
-use nertca_vk::x_gaussian::setup::turns;
-use nertca_vk::x_gaussian::start::first_state;
+use std::sync::Arc;
+use still::dataset;
 
 fn config(settings: &[&str]) -> Config {
     small_config(settings).unwrap()
@@ -74,48 +77,14 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     expect_silence(gpu);
 }
 
-/// Images of a C-arm, `(primary, secondary)` degrees each, all of one phase.
-fn dataset(angles: &[[f64; 2]], [width, height]: [usize; 2], image: impl Fn(usize, &View) -> Vec<f32>) -> Dataset {
-    let view = |angles: &[f64; 2]| {
-        let geometry = Geometry::CArm(CArm {
-            primary_deg: angles[0],
-            secondary_deg: angles[1],
-            sid_mm: 1000.0,
-            sod_mm: 620.0,
-            pixel_mm: [1.5, 1.8],
-            offset_mm: [0.0; 2],
-            table_mm: [0.0; 3],
-        });
-        View::new(geometry, [width, height]).unwrap()
-    };
-    let views: Vec<View> = angles.iter().map(view).collect();
-    let frame = |(v, view): (usize, &View)| Frame {
-        name: format!("v{v}"),
-        view: v,
-        phase: 0,
-        split: Split::Train,
-        integrals: image(v, view),
-        mask: None,
-        after_phase: 0.0,
-        heart_shift_mm: [0.0; 3],
-    };
-    Dataset {
-        path: "test".into(),
-        layout: Layout::Native,
-        frames: views.iter().enumerate().map(frame).collect(),
-        views,
-        width,
-        height,
-        n_phases: 1,
-        notes: Vec::new(),
-        depth_range: (-0.5, 0.5),
-        hidden: Default::default(),
-        vessel_attenuation: None,
-    }
+/// State of the fit in a checkpoint.
+fn state_of(checkpoint: &Checkpoint) -> XState {
+    checkpoint.fit.as_ref().unwrap().as_any().downcast_ref::<XState>().unwrap().clone()
 }
 
 fn data_of(dataset: &Dataset, config: &Config) -> XData {
-    Plan::new(config, dataset).unwrap().x.unwrap()
+    let planned = Plan::new(config, dataset).unwrap().fit.unwrap();
+    planned.as_any().downcast_ref::<XData>().unwrap().clone()
 }
 
 #[test]
@@ -229,7 +198,7 @@ fn a_fit_shows_discs_that_hide_each_other_and_models_draw_what_fits_see() {
     let saved = trainer.checkpoint().unwrap();
     let renderer = Renderer::new(&gpu, &saved.model, tuning(&gpu)).unwrap();
     assert!(renderer.is_blended());
-    let x = saved.x.as_ref().unwrap();
+    let x = &state_of(&saved);
     let mut fit = XTrainer::with(&gpu, data_of(&dataset, &config), &config, x, 299).unwrap();
     fit.advance(300).unwrap();
     let image = turns(fit.data(), &config)[299].image as usize;
@@ -290,16 +259,19 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             let mut again = run(&mut parts, stop);
             let saved = parts.checkpoint().unwrap();
             let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
-            assert_eq!((&read.x, &read.model.moving), (&saved.x, &saved.model.moving));
+            assert_eq!((state_of(&read), &read.model.moving), (state_of(&saved), &saved.model.moving));
             let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
             let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
             assert_eq!(resumed.step(), stop);
             again.extend(run(&mut resumed, 60));
             assert_eq!(losses, again, "{static_data}, stopped at {stop}");
             let (want, got) = (whole.checkpoint().unwrap(), resumed.checkpoint().unwrap());
-            assert!(want.x == got.x && want.model.moving == got.model.moving, "{static_data}, {stop}");
+            assert!(
+                state_of(&want) == state_of(&got) && want.model.moving == got.model.moving,
+                "{static_data}, {stop}"
+            );
         }
-        let state = whole.checkpoint().unwrap().x.unwrap();
+        let state = state_of(&whole.checkpoint().unwrap());
         let first = first_state(&data_of(&dataset, &config), &config.x).rows.len();
         assert!(state.rows.len() > first, "{} after {first}", state.rows.len());
     }
@@ -331,7 +303,8 @@ fn lists_that_outgrow_their_room_get_more_and_nothing_is_lost() {
         assert!(got.2 > capacity, "{}", got.2);
     }
     // The device has no buffer of this size.
-    let error = nertca_vk::x_gaussian::picture::more_capacity(1001, 1000, ("x.most", 7)).unwrap_err().to_string();
+    let error =
+        nertca_vk::gaussians::blending::picture::more_capacity(1001, 1000, ("x.most", 7)).unwrap_err().to_string();
     assert!(error.contains("1001") && error.contains("x.interval"), "{error}");
     expect_silence(gpu);
 }
@@ -412,7 +385,9 @@ fn what_cannot_be_fitted_is_refused() {
     let saved = start(&gpu, &config(&[]), &small_dataset(21, 18)).checkpoint().unwrap();
     let damaged = |damage: &dyn Fn(&mut XState)| {
         let mut other = saved.clone();
-        damage(other.x.as_mut().unwrap());
+        let mut state = state_of(&saved);
+        damage(&mut state);
+        other.fit = Some(Arc::new(state));
         Checkpoint::from_bytes(&other.to_bytes().unwrap(), "checkpoint".as_ref()).err().map(|e| e.to_string())
     };
     assert_eq!(damaged(&|_| ()), None);
@@ -446,6 +421,6 @@ fn presets_and_notes_say_what_the_method_is() {
     says("a static method");
     says("count as taken at the nearest phase");
     says("are beyond x.clamp = 1");
-    let data = plan.x.unwrap();
+    let data = data_of(&dataset, &config);
     assert!(data.images.iter().all(|v| (0.0..=1.0).contains(v)) && data.images.contains(&1.0));
 }

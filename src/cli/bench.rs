@@ -7,7 +7,7 @@ use clap::Args;
 use nertca_vk::bench::peaks::peaks;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::sections::Train;
-use nertca_vk::config::{Config, Preset};
+use nertca_vk::config::{Config, GaussianForm, Preset};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
@@ -177,7 +177,7 @@ fn measure(
 ) -> Result<Report> {
     let dry_run = args.full.then(|| dry_run_of(cli, gpu, config, dataset)).transpose()?;
     let tuning = cli.training_tuning(gpu, config, dataset)?;
-    let timings = match config.gaussians_move() {
+    let timings = match config.gaussians.form != GaussianForm::None {
         true => time_gaussians(args, gpu, config, dataset, &tuning)?,
         false => time_network(args, gpu, config, dataset, &tuning)?,
     };
@@ -304,8 +304,8 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
     Ok(Timings {
         paths: subject.notes(),
         rays: methods::of(config).map_or_else(|| subject.rays(), |method| method.rays_per_iteration(config)),
-        network_cost: config.network_moves().then(|| subject.cost()),
-        work: if config.network_moves() { subject.work(after.live_samples) } else { Ledger::new() },
+        network_cost: config.method().has_network().then(|| subject.cost()),
+        work: if config.method().has_network() { subject.work(after.live_samples) } else { Ledger::new() },
         gaussians: None,
         before,
         after: Some(after),
@@ -323,7 +323,7 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
     let notes = fits.notes().to_vec();
     drop(fits);
     let whole_fit_s = |iterations: u32| gaussians.preparation_s + 1e-3 * gaussians.median() * f64::from(iterations);
-    if config.has_gaussians_alone() {
+    if config.method().is_alone() {
         return Ok(Timings {
             paths: notes,
             rays: 0,

@@ -55,7 +55,7 @@ pub fn run(cli: &Cli, args: &KernelsArgs) -> Result<()> {
     let answer = Answer {
         device: info.name.clone(),
         driver: info.driver.clone(),
-        paths: tuning.for_network(config.network_moves()).reasons,
+        paths: tuning.for_network(config.method().has_network()).reasons,
         preset: config.preset.name().to_owned(),
         kernels,
     };

@@ -9,7 +9,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
-use nertca_vk::model::gaussians::Displacement;
+use nertca_vk::gaussians::field::Displacement;
 use nertca_vk::run::history::{History, Losses, Validated};
 use nertca_vk::score::eval::Evaluation;
 use plotters::style::RGBColor;

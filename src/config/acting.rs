@@ -1,74 +1,32 @@
 //! Selection of the settings that act in a configuration: those of its method, and those that all methods share.
 
-use crate::config::{Config, GaussianForm, StaticForm};
+use crate::config::Config;
+use crate::config::method::MethodKind;
 use crate::error::{Error, Result};
 
-/// Kinds of methods that read different settings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    /// A static tensor field and a dynamic network.
-    Fields,
-    /// Two networks.
-    Networks,
-    /// A static tensor field behind Gaussians.
-    Gaussians,
-    R2,
-    X,
-    Sax,
-}
-
-impl Kind {
-    fn of(config: &Config) -> Kind {
-        match config.gaussians.form {
-            GaussianForm::R2 => Kind::R2,
-            GaussianForm::X => Kind::X,
-            _ if config.is_sax() => Kind::Sax,
-            GaussianForm::None if config.static_field.form == StaticForm::Network => Kind::Networks,
-            GaussianForm::None => Kind::Fields,
-            _ => Kind::Gaussians,
-        }
-    }
-
-    fn name(self) -> &'static str {
-        match self {
-            Kind::Fields => "a tensor field and a network",
-            Kind::Networks => "two networks (static.form = \"network\")",
-            Kind::Gaussians => "Gaussians before a tensor field (gaussians.form)",
-            Kind::R2 => "R2-Gaussian",
-            Kind::X => "X-Gaussian",
-            Kind::Sax => "SAX-NeRF",
-        }
-    }
-
-    /// Tells whether the method is fitted to whole images by itself, without a static field.
-    fn is_alone(self) -> bool {
-        matches!(self, Kind::R2 | Kind::X | Kind::Sax)
-    }
-}
-
 /// Tells whether a setting acts, for settings that do not choose the method.
-fn acts(kind: Kind, section: &str, name: &str) -> bool {
+fn acts(kind: MethodKind, section: &str, name: &str) -> bool {
     match (section, name) {
         ("train", "rays" | "motion_share") => !kind.is_alone(),
-        ("march", "static_samples") => matches!(kind, Kind::Fields | Kind::Gaussians),
-        ("march", "dynamic_samples") => matches!(kind, Kind::Fields | Kind::Networks),
+        ("march", "static_samples") => matches!(kind, MethodKind::Fields | MethodKind::Gaussians),
+        ("march", "dynamic_samples") => matches!(kind, MethodKind::Fields | MethodKind::TwoNetworks),
         ("march", "render_samples") => true,
         ("march", _) => !kind.is_alone(),
         ("static", "lr" | "lr_end" | "decay") => !kind.is_alone(),
-        ("static", _) => matches!(kind, Kind::Fields | Kind::Gaussians),
-        ("dynamic", "half_extent_mm") => matches!(kind, Kind::Fields | Kind::Gaussians),
-        ("dynamic", _) => matches!(kind, Kind::Fields | Kind::Networks),
+        ("static", _) => matches!(kind, MethodKind::Fields | MethodKind::Gaussians),
+        ("dynamic", "half_extent_mm") => matches!(kind, MethodKind::Fields | MethodKind::Gaussians),
+        ("dynamic", _) => matches!(kind, MethodKind::Fields | MethodKind::TwoNetworks),
         ("loss", _) => !kind.is_alone(),
-        ("hull", "enabled" | "resolution" | "max_share") => kind == Kind::Fields,
+        ("hull", "enabled" | "resolution" | "max_share") => kind == MethodKind::Fields,
         ("hull", _) => !kind.is_alone(),
-        ("occupancy", _) => kind == Kind::Fields,
-        ("networks", _) => kind == Kind::Networks,
+        ("occupancy", _) => kind == MethodKind::Fields,
+        ("networks", _) => kind == MethodKind::TwoNetworks,
         ("adam", "decay_share") => !kind.is_alone(),
-        ("gaussians", _) => kind == Kind::Gaussians,
-        ("tree", _) => kind == Kind::Gaussians,
-        ("r2", _) => kind == Kind::R2,
-        ("x", _) => kind == Kind::X,
-        ("sax", _) => kind == Kind::Sax,
+        ("gaussians", _) => kind == MethodKind::Gaussians,
+        ("tree", _) => kind == MethodKind::Gaussians,
+        ("r2", _) => kind == MethodKind::R2Gaussian,
+        ("x", _) => kind == MethodKind::XGaussian,
+        ("sax", _) => kind == MethodKind::SaxNerf,
         _ => true,
     }
 }
@@ -82,7 +40,7 @@ impl Config {
         match key.split_once('.') {
             // The form of a field chooses the method.
             None | Some((_, "form")) => true,
-            Some((section, name)) => acts(Kind::of(self), section, name),
+            Some((section, name)) => acts(self.method(), section, name),
         }
     }
 
@@ -93,7 +51,7 @@ impl Config {
         if self.acts(key) || SCALED_FOR_ALL.contains(&key) || value == at(before, key) {
             return Ok(());
         }
-        let method = Kind::of(self).name();
+        let method = self.method().name();
         let problem =
             format!("has no effect: the method is {method}; `train --print-config` prints the settings that act");
         Err(Error::config(key, value.map_or(String::new(), ToString::to_string), problem))

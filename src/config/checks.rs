@@ -1,8 +1,9 @@
 //! Checks of a configuration.
 
 use crate::choice::Choice;
+use crate::config::method::MethodKind;
 use crate::config::sections::check_range;
-use crate::config::{Config, DynamicTarget, OcclusionRegion, StaticForm};
+use crate::config::{Config, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, StaticForm};
 use crate::error::{Error, Result};
 
 /// Maximum number of cells along a side of the hash grid's box that f32 coordinates can resolve.
@@ -59,14 +60,14 @@ impl Config {
         if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
             return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
         }
-        if self.two_networks() {
+        if self.static_field.form == StaticForm::Network {
             self.check_two_networks()?;
         }
         self.check_gaussians_alone()?;
         self.check_r2()?;
         self.check_x()?;
         self.check_sax()?;
-        if m.along_axis && self.gaussians_move() {
+        if m.along_axis && self.gaussians.form != GaussianForm::None {
             let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
             return Err(Error::config("march.along_axis", true, problem));
         }
@@ -79,7 +80,7 @@ impl Config {
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
             Err(Error::config(field, value, format!("{form}: {instead}")))
         };
-        if self.gaussians_move() {
+        if self.gaussians.form != GaussianForm::None {
             return refuse("gaussians.form", &self.gaussians.form.name(), "take \"none\", or static.form = \"tensor\"");
         }
         for (field, is_on) in [
@@ -131,8 +132,9 @@ impl Config {
     /// Refuses settings that R2-Gaussian and X-Gaussian do not support, and a run of another method without a static field.
     fn check_gaussians_alone(&self) -> Result<()> {
         let form = self.static_field.form;
-        if !self.has_gaussians_alone() {
-            if form == StaticForm::None && !self.is_sax() {
+        let is_alone = matches!(self.method(), MethodKind::R2Gaussian | MethodKind::XGaussian);
+        if !is_alone {
+            if form == StaticForm::None && self.dynamic.form != DynamicForm::Lineformer {
                 let problem = "all other methods have a still field: take \"tensor\", or gaussians.form = \"r2\" or dynamic.form = \
                                \"lineformer\"";
                 return Err(Error::config("static.form", form.name(), problem));
@@ -163,7 +165,7 @@ impl Config {
 
     /// Refuses settings of R2-Gaussian that contradict each other.
     fn check_r2(&self) -> Result<()> {
-        if !self.is_r2() {
+        if self.method() != MethodKind::R2Gaussian {
             return Ok(());
         }
         let r2 = &self.r2;
@@ -182,7 +184,7 @@ impl Config {
 
     /// Refuses settings of X-Gaussian that contradict each other.
     fn check_x(&self) -> Result<()> {
-        if !self.is_x() {
+        if self.method() != MethodKind::XGaussian {
             return Ok(());
         }
         let x = &self.x;
@@ -204,7 +206,7 @@ impl Config {
 
     /// Refuses settings that SAX-NeRF does not support.
     fn check_sax(&self) -> Result<()> {
-        if !self.is_sax() {
+        if self.dynamic.form != DynamicForm::Lineformer {
             return Ok(());
         }
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
@@ -217,7 +219,7 @@ impl Config {
                 "its field is the whole object; take \"none\"",
             );
         }
-        if self.gaussians_move() {
+        if self.gaussians.form != GaussianForm::None {
             return refuse("gaussians.form", &self.gaussians.form.name(), "one of both is the field; take \"none\"");
         }
         for (field, is_on) in [

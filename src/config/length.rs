@@ -1,6 +1,7 @@
 //! Runs of another length: schedules that keep their shares of the run, and the iterations at which they change something.
 
-use crate::config::Config;
+use crate::config::method::MethodKind;
+use crate::config::{Config, GaussianForm};
 use crate::error::Result;
 
 /// Minimum number of iterations between two density controls of a shortened run: an iteration with density control learns
@@ -25,21 +26,21 @@ impl Config {
             ("dynamic.window_iterations", of(self.dynamic.window_iterations)),
             ("occupancy.start", of(self.occupancy.start)),
         ];
-        if self.two_networks() {
+        if self.method() == MethodKind::TwoNetworks {
             schedule.extend([
                 ("networks.delay", of(self.networks.delay)),
                 ("networks.ramp", of(self.networks.ramp)),
                 ("networks.stop_after", of(self.networks.stop_after)),
             ]);
         }
-        if self.is_r2() {
+        if self.method() == MethodKind::R2Gaussian {
             schedule.extend([
                 ("r2.densify_every", densifying(self.r2.densify_every)),
                 ("r2.densify_from", of(self.r2.densify_from)),
                 ("r2.densify_until", of(self.r2.densify_until)),
             ]);
         }
-        if self.is_x() {
+        if self.method() == MethodKind::XGaussian {
             schedule.extend([
                 ("x.densify_every", densifying(self.x.densify_every)),
                 ("x.densify_from", of(self.x.densify_from)),
@@ -48,7 +49,7 @@ impl Config {
                 ("x.degree_every", of(self.x.degree_every)),
             ]);
         }
-        if self.is_sax() {
+        if self.method() == MethodKind::SaxNerf {
             schedule.push(("sax.rate_falls_at", of(self.sax.rate_falls_at)));
         }
         schedule
@@ -71,7 +72,10 @@ impl Config {
     /// # Errors
     /// [`crate::error::Error::Config`] when so short a run is refused.
     pub fn of_dry_run(&self) -> Result<Config> {
-        let iterations = if self.has_gaussians_alone() { DRY_RUN_WITH_DENSIFYING } else { DRY_RUN };
+        let iterations = match self.method() {
+            MethodKind::R2Gaussian | MethodKind::XGaussian => DRY_RUN_WITH_DENSIFYING,
+            _ => DRY_RUN,
+        };
         if self.train.iterations <= iterations {
             return Ok(self.clone());
         }
@@ -80,7 +84,7 @@ impl Config {
             // A fit of Gaussians has its own number of iterations, which does not scale with the run.
             short.train.iterations = short.gaussians.iterations.saturating_add(iterations).min(self.train.iterations);
         }
-        if short.is_sax() {
+        if short.method() == MethodKind::SaxNerf {
             // Its only event lies within the last iterations of the publication.
             short.sax.rate_falls_at = short.sax.rate_falls_at.min(iterations / 2);
         }
@@ -92,29 +96,29 @@ impl Config {
     /// Returns the iterations, in ascending order, at which the schedule changes something.
     pub fn schedule_events(&self) -> Vec<u32> {
         let mut events = Vec::new();
-        if self.network_moves() {
+        if self.method().has_network() {
             events.extend(self.restart().map(|restart| restart - 1));
             events.extend(self.restart());
             events.push(self.dynamic.delay.saturating_add(self.dynamic.window_iterations));
         }
-        if self.two_networks() {
+        if self.method() == MethodKind::TwoNetworks {
             let n = &self.networks;
             events.extend([n.delay, n.delay.saturating_add(n.ramp), n.stop_after]);
         }
-        if self.is_r2() {
+        if self.method() == MethodKind::R2Gaussian {
             events.extend([self.r2.densify_from, self.r2.densify_until]);
         }
-        if self.is_x() {
+        if self.method() == MethodKind::XGaussian {
             events.extend([self.x.degree_every, self.x.densify_from, self.x.reset_every, self.x.densify_until]);
         }
-        if self.is_sax() {
+        if self.method() == MethodKind::SaxNerf {
             events.push(self.sax.rate_falls_at);
         }
         if self.occupancy.enabled {
             events.push(self.dynamic.delay.saturating_add(self.occupancy.start));
         }
         // The fit of the static field begins where that of the Gaussians ends.
-        if self.gaussians_move() {
+        if self.gaussians.form != GaussianForm::None {
             events.push(self.gaussian_iterations());
         }
         events.retain(|event| (1..self.train.iterations).contains(event));

@@ -1,6 +1,7 @@
 //! Drawing of Gaussians along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
+use crate::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units, scales};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
@@ -10,7 +11,6 @@ use crate::kernels::layout::{Blob, Gaussian, GaussianSetup};
 use crate::kernels::push::{self, GaussianRays};
 use crate::kernels::stages::{Build, Stage, vec4_variant};
 use crate::kernels::tuning::Tuning;
-use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units, scales};
 use glam::{DMat3, DQuat, DVec3};
 use std::ops::Range;
 use std::sync::{Mutex, PoisonError};

@@ -2,6 +2,9 @@
 //! centre; its error is smaller than that of cutting Gaussians off.
 
 use crate::error::Result;
+use crate::gaussians::blending::picture::{self, BlendedPicture};
+use crate::gaussians::blending::stages::BlendKernels;
+use crate::gaussians::field::{MovingGaussians, Units};
 use crate::gaussians::stages::{FIXED_POINT_BITS, SplatStage};
 use crate::gaussians::view::SplatView;
 use crate::geometry::ViewRays;
@@ -12,9 +15,6 @@ use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch, dispatc
 use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, Splat};
 use crate::kernels::push;
 use crate::kernels::stages::{Build, Stage};
-use crate::model::gaussians::{MovingGaussians, Units};
-use crate::x_gaussian::picture::{self, BlendedPicture};
-use crate::x_gaussian::stages::XPictureKernels;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -51,7 +51,7 @@ pub struct Pictures {
     splat: SplatStage<push::GaussianSplat>,
     show: Stage<push::GaussianPicture>,
     /// Stages for Gaussians of which nearer ones hide those behind them; none where line integrals add up.
-    blend: Option<XPictureKernels>,
+    blend: Option<BlendKernels>,
     state: Mutex<State>,
 }
 
@@ -103,7 +103,7 @@ impl Pictures {
     pub fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<Pictures> {
         let state = Mutex::new(State::new(field));
         let project = Build::default().stage(gpu)?;
-        let blend = field.rows().intensities.as_ref().map(|_| XPictureKernels::new(gpu)).transpose()?;
+        let blend = field.rows().intensities.as_ref().map(|_| BlendKernels::new(gpu)).transpose()?;
         Ok(Pictures { gpu: gpu.clone(), project, splat: SplatStage::new(gpu)?, show: into_buffers(gpu)?, blend, state })
     }
 

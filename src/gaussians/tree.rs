@@ -1,6 +1,7 @@
 //! The stages of a moving tree: an iteration over all phases, and an iteration that tracks the grid at a single phase.
 
 use crate::error::Result;
+use crate::gaussians::field::basis;
 use crate::gaussians::particles::retain_marked;
 use crate::gaussians::stages::GaussianPass;
 use crate::gpu::buffer::Memory;
@@ -11,7 +12,6 @@ use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
 use crate::kernels::layout::TreeSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
-use crate::model::gaussians::basis;
 use std::ops::Range;
 
 /// Pipelines of the tree, beside those of [`crate::gaussians::stages::GaussianKernels`].

@@ -1,8 +1,8 @@
 //! A cone-beam view in the Gaussians' units: lengths are pixels at the isocentre.
 
+use crate::gaussians::field::Units;
 use crate::geometry::ViewRays;
 use crate::kernels::layout;
-use crate::model::gaussians::Units;
 use glam::{DMat3, DVec3};
 
 /// Rays and projection of a view.

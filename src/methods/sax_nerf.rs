@@ -7,19 +7,24 @@ pub mod drawing;
 pub mod field;
 pub mod lineformer;
 pub mod products;
+#[cfg(feature = "diagnostics")]
+pub mod selftest;
 pub mod setup;
 pub mod stages;
 pub mod start;
 mod tensors;
 pub mod trainer;
+pub mod twin;
 
+use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};
 use crate::error::{Error, Result};
 use crate::fitting::extent::{between_phases, volume_half};
-use crate::fitting::fit::{FieldVolume, Fit, FitData, Method, SavedAt, SavedFit};
-use crate::fitting::tensors::File;
+use crate::fitting::fit::{FieldVolume, Fit, FitData, FitField, Method, SavedAt, SavedFit};
 use crate::gpu::device::Gpu;
+use crate::kernels::tuning::Tuning;
 use crate::scan::dataset::Dataset;
+use crate::tensors::File;
 use data::SaxData;
 use field::{SaxField, SaxShape, SaxState};
 use stages::SaxKernels;
@@ -34,16 +39,12 @@ const KEY: &str = "sax";
 pub struct SaxNerf;
 
 impl Method for SaxNerf {
-    fn key(&self) -> &'static str {
-        KEY
+    fn kind(&self) -> MethodKind {
+        MethodKind::SaxNerf
     }
 
     fn checkpoint_format(&self) -> &'static str {
         "nertca-checkpoint-4"
-    }
-
-    fn is_chosen(&self, config: &Config) -> bool {
-        config.is_sax()
     }
 
     fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<Box<dyn FitData>> {
@@ -56,15 +57,15 @@ impl Method for SaxNerf {
         FieldVolume {
             half: volume_half(config.sax.half_extent_mm, dataset),
             // Volumes are kept in units of the attenuation of a density of 1.
-            attenuation: dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0),
+            attenuation: Some(dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0)),
         }
     }
 
-    fn read(&self, about: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+    fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
         let bad = |e: serde_json::Error| Error::data(file.path, KEY, e.to_string());
-        let about = serde_json::from_value(about.clone()).map_err(bad)?;
+        let about = serde_json::from_value(sections[KEY].clone()).map_err(bad)?;
         let (field, state) = tensors::read(&about, SaxShape::of(&config.sax), file, at)?;
-        Ok(SavedFit { field: Arc::new(field), state: Arc::new(state) })
+        Ok(SavedFit { field: FitField::Own(Arc::new(field)), state: Arc::new(state) })
     }
 
     fn rays_per_iteration(&self, config: &Config) -> u32 {
@@ -79,7 +80,7 @@ impl Method for SaxNerf {
         field::SMALLER_STEPS
     }
 
-    fn make_pipelines(&self, gpu: &Gpu) -> Result<()> {
+    fn make_pipelines(&self, gpu: &Gpu, _: &Config, _: &Tuning) -> Result<()> {
         SaxKernels::new(gpu).map(|_| ())
     }
 }
@@ -116,16 +117,15 @@ fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
 }
 
 impl FitData for SaxData {
-    fn begin(self: Box<Self>, gpu: &Gpu, config: &Config, saved: Option<&SavedFit>) -> Result<Box<dyn Fit>> {
+    fn begin(&self, gpu: &Gpu, config: &Config, saved: Option<&SavedFit>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
         let own = |saved: &SavedFit| -> Option<(SaxField, SaxState)> {
-            Some((
-                saved.field.as_any().downcast_ref::<SaxField>()?.clone(),
-                saved.state.as_any().downcast_ref::<SaxState>()?.clone(),
-            ))
+            let FitField::Own(field) = &saved.field else { return None };
+            let field = field.as_any().downcast_ref::<SaxField>()?;
+            Some((field.clone(), saved.state.as_any().downcast_ref::<SaxState>()?.clone()))
         };
         Ok(match saved.and_then(own) {
-            Some((field, state)) => Box::new(SaxTrainer::with(gpu, *self, config, &field, &state)?),
-            None => Box::new(SaxTrainer::new(gpu, *self, config)?),
+            Some((field, state)) => Box::new(SaxTrainer::with(gpu, self.clone(), config, &field, &state)?),
+            None => Box::new(SaxTrainer::new(gpu, self.clone(), config)?),
         })
     }
 

@@ -2,34 +2,27 @@
 //! and (as JSON in the metadata) configuration, scene, step and seed. Random numbers are a function of seed
 //! and step, so these two are the generator's whole state.
 
+use crate::config::method::MethodKind;
 use crate::config::{Config, StaticForm};
 use crate::error::{Error, Result};
 use crate::files;
-use crate::fitting::fit::{FitState, SavedAt, SavedFit};
-use crate::fitting::tensors::{File, FileTensor};
+use crate::fitting::fit::{FitField, FitState, SavedAt, SavedFit};
+use crate::gaussians::tensors::{self as gaussian_tensors, FORMAT as GAUSSIAN_FORMAT, GaussianHeader};
 use crate::geometry::CArm;
 use crate::methods;
 use crate::model::Model;
-use crate::model::gaussian_tensors::{self, GaussianHeader};
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
-use crate::model::r2::R2State;
-use crate::model::r2_tensors;
 use crate::model::scene::Scene;
-use crate::model::x_gaussian::XState;
-use crate::model::x_tensors;
+use crate::tensors::{File, FileTensor};
 use glam::DVec3;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 const FORMAT: &str = "nertca-checkpoint-2";
-/// Format of checkpoints whose dynamic field consists of Gaussians; they contain no network.
-const GAUSSIAN_FORMAT: &str = "nertca-checkpoint-3";
-/// Prefix of the names of the network's tensors.
-const NETWORK: &str = "dynamic.";
 const OCCUPANCY: &str = "occupancy.bits";
 const LAST_REPORT: &str = "report.words";
 const MAX_BYTES: u64 = 4 << 30;
@@ -52,11 +45,7 @@ pub struct Checkpoint {
     /// Words of the last [`crate::kernels::layout::StepReport`], which a run whose learning has ended repeats; empty while it
     /// learns.
     pub last_report: Vec<u32>,
-    /// State of a fit of R2-Gaussian; none for other methods.
-    pub r2: Option<R2State>,
-    /// State of a fit of X-Gaussian; none for other methods.
-    pub x: Option<XState>,
-    /// State of the fit of a method with a module of its own, beside [`Model::field`]; none for other methods.
+    /// State of the fit of a method of [`crate::methods`], beside the model's field; `None` for all other methods.
     pub fit: Option<Arc<dyn FitState>>,
     /// Fingerprint of the training data, to refuse resuming on other data.
     pub data_fingerprint: String,
@@ -107,7 +96,7 @@ struct HullHeader {
 fn format_of(config: &Config) -> &'static str {
     match methods::of(config) {
         Some(method) => method.checkpoint_format(),
-        None if config.gaussians_move() => GAUSSIAN_FORMAT,
+        None if config.method() == MethodKind::Gaussians => GAUSSIAN_FORMAT,
         None => FORMAT,
     }
 }
@@ -203,15 +192,10 @@ impl Checkpoint {
         if let Some(field) = &model.moving {
             tensors.extend(gaussian_tensors::tensors(field));
         }
-        tensors.extend(self.r2.iter().flat_map(r2_tensors::tensors));
-        tensors.extend(self.x.iter().flat_map(x_tensors::tensors));
-        if let (Some(field), Some(state)) = (&model.field, &self.fit) {
-            tensors.extend(state.tensors(field.as_ref())?);
+        if let Some(state) = &self.fit {
+            tensors.extend(state.tensors(model.field.as_deref())?);
         }
         for tensor in model.param_map.tensors() {
-            if (model.moving.is_some() || model.field.is_some()) && tensor.name.starts_with(NETWORK) {
-                continue;
-            }
             let gather = |value: &dyn Fn(usize) -> f32| -> Vec<u8> {
                 tensor.positions.iter().flat_map(|at| value(*at as usize).to_le_bytes()).collect()
             };
@@ -289,8 +273,9 @@ impl Checkpoint {
         let text = text.ok_or_else(|| bad("metadata", "is not a checkpoint of this program".into()))?;
         let header: Header = serde_json::from_str(&text).map_err(|e| bad("metadata", e.to_string()))?;
         let formats = methods::METHODS.iter().map(|method| method.checkpoint_format());
-        let known: Vec<&str> = [FORMAT, GAUSSIAN_FORMAT].into_iter().chain(formats).collect();
-        if !known.contains(&header.format.as_str()) {
+        let known: BTreeSet<&str> = [FORMAT, GAUSSIAN_FORMAT].into_iter().chain(formats).collect();
+        if !known.contains(header.format.as_str()) {
+            let known: Vec<&str> = known.into_iter().collect();
             let problem = format!("`{}`; this version reads {}", header.format, known.join(", "));
             return Err(bad("format", problem));
         }
@@ -321,7 +306,8 @@ impl Checkpoint {
             StaticForm::Network => hidden,
             StaticForm::None => 0,
         };
-        let needed = still + hidden + header.phases as u64 * u64::from(d.latent);
+        let network = hidden + header.phases as u64 * u64::from(d.latent);
+        let needed = still + if header.config.method().has_network() { network } else { 0 };
         if needed > bytes.len() as u64 / 4 {
             return Err(bad("config", format!("{needed} parameters do not fit the file's {} bytes", bytes.len())));
         }
@@ -329,9 +315,6 @@ impl Checkpoint {
         let mut params = vec![0f32; param_map.len];
         let mut moments = vec![[0f32; 2]; param_map.len];
         for tensor in param_map.tensors() {
-            if (header.gaussians.is_some() || method.is_some()) && tensor.name.starts_with(NETWORK) {
-                continue;
-            }
             for prefix in ["", "adam.m.", "adam.v."] {
                 let name = format!("{prefix}{}", tensor.name);
                 let view = tensors.tensor(&name).map_err(|e| bad(&name, e.to_string()))?;
@@ -376,29 +359,27 @@ impl Checkpoint {
                 Some(Hull { size: h.size, min: DVec3::from_array(h.min), cell: h.cell, n_phases: h.n_phases, bits })
             }
         };
+        let file = File { tensors: &tensors, path };
         let moving = match &header.gaussians {
-            Some(about) => Some(gaussian_tensors::read(about, &tensors, header.phases, path)?),
-            None => None,
+            Some(about) if method.is_none() => Some(gaussian_tensors::read(about, &file, header.phases)?),
+            _ => None,
         };
         let words = |name: &str| match tensors.tensor(name) {
             Ok(view) if view.dtype() == Dtype::U32 => to_words(view.data()),
             _ => Vec::new(),
         };
-        let (is_r2, is_x) = (header.config.is_r2(), header.config.is_x());
         let fit = match method {
             None => None,
             Some(method) => {
                 let sections: serde_json::Value =
                     serde_json::from_str(&text).map_err(|e| bad("metadata", e.to_string()))?;
-                let about = &sections[method.key()];
                 let at = SavedAt { n_phases: header.phases, step: header.step };
-                Some(method.read(about, &header.config, at, &File { tensors: &tensors, path })?)
+                Some(method.read(&sections, &header.config, at, &file)?)
             }
         };
         let (field, fit) = fit.map(|SavedFit { field, state }| (field, state)).unzip();
+        let (of_fit, field) = field.map_or((None, None), FitField::split);
         Ok(Checkpoint {
-            r2: is_r2.then(|| r2_tensors::read(&tensors, header.phases, path)).transpose()?,
-            x: is_x.then(|| x_tensors::read(&tensors, header.phases, path)).transpose()?,
             fit,
             occupancy: words(OCCUPANCY),
             last_report: words(LAST_REPORT),
@@ -407,7 +388,7 @@ impl Checkpoint {
                 scene: header.scene,
                 param_map,
                 hull,
-                moving,
+                moving: moving.or(of_fit),
                 field,
                 params,
                 step: header.step,

@@ -1,7 +1,7 @@
 //! Conversion of Gaussians to other units and of a moving tree to another grid, needed when data are added to a fitted field.
 
+use crate::gaussians::field::{Gaussians, MovingTree, Units, vector};
 use crate::kernels::layout::{Gaussian, TreeSetup};
-use crate::model::gaussians::{Gaussians, MovingTree, Units, vector};
 use glam::DVec3;
 
 impl Gaussians {
@@ -47,8 +47,8 @@ impl MovingTree {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gaussians::field::{inverse_step, scales};
     use crate::kernels::layout::GaussianSetup;
-    use crate::model::gaussians::{inverse_step, scales};
 
     const N_PHASES: usize = 3;
 

@@ -1,7 +1,7 @@
 //! Separation of connected Gaussians, which represent vessels, from isolated ones.
 
+use crate::gaussians::field::scales;
 use crate::kernels::layout::{Gaussian, GaussianSetup};
-use crate::model::gaussians::scales;
 use crate::raster::percentile;
 use glam::{DVec3, IVec3};
 use std::collections::HashMap;

@@ -63,8 +63,8 @@ pub struct ParamMap {
     pub static_len: usize,
     /// The static field, where it is a network.
     pub still: Option<NetworkMap>,
-    /// The dynamic field's network.
-    pub moving: NetworkMap,
+    /// The dynamic field's network; `None` where Gaussians or the field of another method are the dynamic field.
+    pub moving: Option<NetworkMap>,
     /// Cardiac phases.
     pub phases: usize,
     /// Number of all parameters, padding included.
@@ -192,14 +192,15 @@ impl ParamMap {
         };
         let rank4 = ranks.div_ceil(4);
         let static_len = still.as_ref().map_or(3 * (grid * grid + grid) * rank4 * 4, |network| network.len);
-        let moving = NetworkMap::new(d, static_len, d.latent as usize, phases);
-        let len = static_len + moving.len;
+        let has_network = config.method().has_network();
+        let moving = has_network.then(|| NetworkMap::new(d, static_len, d.latent as usize, phases));
+        let len = static_len + moving.as_ref().map_or(0, |network| network.len);
         ParamMap { grid, ranks, rank4, static_len, still, moving, phases, len }
     }
 
     /// Returns the existing networks, the static field's first.
     pub fn networks(&self) -> impl Iterator<Item = &NetworkMap> {
-        self.still.iter().chain([&self.moving])
+        self.still.iter().chain(&self.moving)
     }
 
     /// Returns the number of parameters of the static field's lines, padding included; they are the last ones of the static
@@ -221,7 +222,7 @@ impl ParamMap {
     /// Returns every tensor under its documented name, without padding.
     pub fn tensors(&self) -> Vec<Tensor> {
         let mut out = self.still.as_ref().map_or_else(|| self.planes_and_lines(), |network| network.tensors("static"));
-        out.extend(self.moving.tensors("dynamic"));
+        out.extend(self.moving.iter().flat_map(|network| network.tensors("dynamic")));
         out
     }
 
@@ -253,7 +254,7 @@ impl ParamMap {
         let mut params = vec![0f32; self.len];
         for (index, tensor) in self.tensors().into_iter().enumerate() {
             let is_static = tensor.name.starts_with("static.");
-            let network = if is_static { self.still.as_ref() } else { Some(&self.moving) };
+            let network = if is_static { self.still.as_ref() } else { self.moving.as_ref() };
             let inputs = network.map(|network| network.inputs(&tensor.name));
             for (i, &at) in tensor.positions.iter().enumerate() {
                 let (a, b) = (index as u32, i as u32);

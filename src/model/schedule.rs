@@ -1,6 +1,7 @@
 //! The schedules of a run as pure functions of the step.
 
-use crate::config::{Config, Decay};
+use crate::config::method::MethodKind;
+use crate::config::{Config, Decay, GaussianForm};
 use crate::kernels::layout;
 
 impl Config {
@@ -18,7 +19,7 @@ impl Config {
             static_update: self.static_update(step),
             dynamic_update: self.dynamic_update(step),
             window: (d.window_start + (bands - d.window_start) * opened).min(bands) as f32,
-            dynamic_active: u32::from(step >= d.delay && !self.gaussians_move()),
+            dynamic_active: u32::from(step >= d.delay && self.gaussians.form == GaussianForm::None),
             ..self.network_weights(step)
         }
     }
@@ -27,7 +28,8 @@ impl Config {
     /// field is there from the start. The authors' code makes its optimiser anew at the end of the first iteration with the dynamic
     /// field (`run_hybrid.py`, where `n_iter == model_delay`), not before it.
     pub(crate) fn restart(&self) -> Option<u32> {
-        (self.dynamic.delay > 0 && !self.gaussians_move()).then(|| self.dynamic.delay.saturating_add(1))
+        (self.dynamic.delay > 0 && self.gaussians.form == GaussianForm::None)
+            .then(|| self.dynamic.delay.saturating_add(1))
     }
 
     /// Returns Adam's update of the static field.
@@ -83,7 +85,7 @@ impl Config {
     /// Returns the weights of the losses of two networks.
     fn network_weights(&self, step: u32) -> layout::Schedule {
         let n = &self.networks;
-        if !self.two_networks() {
+        if self.method() != MethodKind::TwoNetworks {
             return layout::Schedule::default();
         }
         let after = |delay: u32, start: f64, end: f64| {

@@ -1,5 +1,6 @@
 //! The constants that shaders read, computed from a model.
 
+use crate::config::method::MethodKind;
 use crate::config::sections::Networks;
 use crate::config::{Config, DynamicTarget, OcclusionRegion};
 use crate::fitting::{FIXED_POINT_BITS, RING_LENGTH};
@@ -27,7 +28,7 @@ impl Scene {
         self.weigh_losses(&mut setup, config);
         self.set_occupancy(&mut setup, config);
         set_optimiser(&mut setup, config);
-        if config.two_networks() {
+        if config.method() == MethodKind::TwoNetworks {
             set_networks(&mut setup, &config.networks);
         }
         setup
@@ -100,9 +101,11 @@ fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
     setup.n_bands = config.dynamic.bands;
     setup.grid = params.grid as u32;
     setup.rank4 = params.rank4 as u32;
-    setup.latent_width = params.moving.latent as u32;
-    setup.n_layers = params.moving.layers.len() as u32;
-    setup.mlp_width = params.moving.width as u32;
+    if let Some(network) = &params.moving {
+        setup.latent_width = network.latent as u32;
+        setup.n_layers = network.layers.len() as u32;
+        setup.mlp_width = network.width as u32;
+    }
     setup.static_params = params.static_len as u32;
     setup.n_params = params.len as u32;
 }

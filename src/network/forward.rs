@@ -12,6 +12,7 @@ use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
+use crate::network::Network;
 use crate::network::chunk::{Chunk, chunks};
 use crate::network::pass::Pass;
 use std::mem::offset_of;
@@ -153,19 +154,30 @@ impl ForwardBuffers {
     }
 }
 
+impl ForwardBuffers {
+    /// Records that no ray has live samples, for passes without a network, which count none.
+    pub fn clear_samples(&self, recording: &mut Recording) {
+        for buffer in [&self.ray_counts, &self.ray_start, &self.lane_masks, &self.lane_offsets, &self.live] {
+            recording.fill(buffer, 0);
+        }
+    }
+}
+
 /// Number of bytes of all epochs of occupancy; 0 when occupancy is off.
 pub fn occupancy_bytes(setup: &Setup) -> u64 {
     if setup.occupancy_cells > 0 { u64::from(OCCUPANCY_EPOCHS) * 4 * setup.occupancy_words() as u64 } else { 0 }
 }
 
 impl Pass<'_> {
-    /// Records the live dynamic samples of a chunk: counts, then offsets, indirect arguments and positions.
+    /// Records the live dynamic samples of a chunk: counts, then offsets, indirect arguments and positions. Without a network
+    /// there are none, and nothing is recorded.
     ///
     /// # Errors
     /// Fails like [`Pass::run`].
     pub fn samples(&mut self, chunk: Chunk) -> Result<()> {
+        let Some(network) = self.network else { return Ok(()) };
         self.count(chunk)?;
-        self.place(chunk)
+        self.place(network, chunk)
     }
 
     /// Records which samples of a chunk's rays are live, and their number per ray.
@@ -182,10 +194,10 @@ impl Pass<'_> {
     }
 
     /// Records offsets, indirect arguments and positions of a chunk whose samples were counted.
-    fn place(&mut self, chunk: Chunk) -> Result<()> {
+    fn place(&mut self, network: &Network, chunk: Chunk) -> Result<()> {
         let k = self.kernels;
         let Chunk { first_ray, n_rays } = chunk;
-        self.run(&k.march_scan, Groups::Direct([1, 1, 1]), self.network.scan(chunk))?;
+        self.run(&k.march_scan, Groups::Direct([1, 1, 1]), network.scan(chunk))?;
         self.run(&k.march_emit, chunk.workgroups(k.rays_counted), push::MarchEmit { first_ray, n_rays })
     }
 
@@ -195,7 +207,8 @@ impl Pass<'_> {
     /// # Errors
     /// Fails like [`Pass::run`].
     pub fn volume(&mut self, n_rays: u32, volume: &Buffer) -> Result<()> {
-        let (k, network, buffers) = (self.kernels, self.network, self.buffers);
+        let Some(network) = self.network else { return Ok(()) };
+        let (k, buffers) = (self.kernels, self.buffers);
         network.record_weights(self)?;
         for chunk in chunks(self.setup, n_rays) {
             self.samples(chunk)?;
@@ -211,7 +224,7 @@ impl Pass<'_> {
     /// # Errors
     /// Fails like [`Pass::run`].
     pub fn weights(&mut self) -> Result<()> {
-        self.network.record_weights(self)?;
+        self.network.map_or(Ok(()), |network| network.record_weights(self))?;
         self.still.map_or(Ok(()), |still| still.record_weights(self))
     }
 
@@ -220,7 +233,7 @@ impl Pass<'_> {
     /// # Errors
     /// Fails like [`Pass::run`].
     pub fn fields(&mut self) -> Result<()> {
-        self.network.record_forward(self)?;
+        self.network.map_or(Ok(()), |network| network.record_forward(self))?;
         self.still.map_or(Ok(()), |still| still.record_forward(self))
     }
 
@@ -235,7 +248,9 @@ impl Pass<'_> {
         }
         self.weights()?;
         for chunk in chunks(self.setup, n_rays) {
-            self.count(chunk)?;
+            if self.network.is_some() {
+                self.count(chunk)?;
+            }
             self.render_chunk(chunk, maxima)?;
         }
         Ok(())
@@ -251,7 +266,9 @@ impl Pass<'_> {
     }
 
     fn render_chunk(&mut self, chunk: Chunk, maxima: bool) -> Result<()> {
-        self.place(chunk)?;
+        if let Some(network) = self.network {
+            self.place(network, chunk)?;
+        }
         self.fields()?;
         let Chunk { first_ray, n_rays } = chunk;
         match self.still {

@@ -249,21 +249,21 @@ impl FusedNetwork {
     }
 
     /// Position at which the stored activations of a layer begin, in `uvec4`s.
-    fn activations_at(&self, layer: usize, pass: &Pass<'_>) -> u32 {
+    fn activations_at(&self, map: &NetworkMap, layer: usize, pass: &Pass<'_>) -> u32 {
         let layer = (layer - self.shape.first_kept()) as u32;
-        layer * pass.setup.sample_capacity * pass.network.map().width as u32 / 8
+        layer * pass.setup.sample_capacity * map.width as u32 / 8
     }
 
     /// Returns the buffer of a part's inputs, and their position in it.
-    fn inputs(&self, part: Part, pass: &Pass<'_>) -> (&Buffer, u32) {
+    fn inputs(&self, map: &NetworkMap, part: Part, pass: &Pass<'_>) -> (&Buffer, u32) {
         match part {
-            Part::Hidden(layer) => (&self.buffers.activations16, self.activations_at(layer - 1, pass)),
+            Part::Hidden(layer) => (&self.buffers.activations16, self.activations_at(map, layer - 1, pass)),
             Part::Encoded(_) => (&self.buffers.features16, 0),
         }
     }
 
     /// Records one backward pass.
-    fn record_pass(&self, pass: &mut Pass<'_>, backward: &BackwardPass, chunk: Chunk) -> Result<()> {
+    fn record_pass(&self, map: &NetworkMap, pass: &mut Pass<'_>, backward: &BackwardPass, chunk: Chunk) -> Result<()> {
         let (shape, dz16, groups) = (&self.shape, &self.training()?.dz16, Groups::Direct([self.workgroups, 1, 1]));
         let BackwardPass { span, stage, reads, sums_dz } = backward;
         let position = |at: Option<usize>| at.map_or(NOWHERE, |at| at as u32);
@@ -290,14 +290,14 @@ impl FusedNetwork {
         };
         let layer = span.upper.layer();
         let sums_outputs = layer + 1 == shape.layers.len() && *sums_dz;
-        let (inputs, inputs_at) = self.inputs(span.upper, pass);
-        let (lower_inputs, lower_inputs_at) = span.lower.map_or((inputs, 0), |part| self.inputs(part, pass));
+        let (inputs, inputs_at) = self.inputs(map, span.upper, pass);
+        let (lower_inputs, lower_inputs_at) = span.lower.map_or((inputs, 0), |part| self.inputs(map, part, pass));
         let push = push::MlpFusedBwd {
             weights_at,
             lower_weights_at,
             inputs_at,
             lower_inputs_at,
-            outputs_at: self.activations_at(layer, pass),
+            outputs_at: self.activations_at(map, layer, pass),
             out_weights_at: shape.out_weights as u32,
             n_partials,
             bias: upper_bias,
@@ -339,21 +339,21 @@ impl Path for FusedNetwork {
     }
 
     /// Records `mlp_pack`, which writes f16 copies of the weights, with bias and latent contribution of each phase among them.
-    fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
+    fn record_weights(&self, map: &NetworkMap, pass: &mut Pass<'_>) -> Result<()> {
         let n_pairs = (self.shape.weights_len / 2) as u32;
-        let params = pass.network.map();
+        let params = map;
         let n_bias = params.layers.len() as u32 * self.shape.matrix.m * params.width as u32;
         let push = push::MlpPack { n_pairs, n_bias, latents: params.latents as u32 };
         pass.run(&self.mlp_pack, self.mlp_pack.groups_for(n_pairs + n_bias), push)
     }
 
-    fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let push = push::MlpFusedFwd { out_bias: pass.network.map().out_bias as u32 };
+    fn record_forward(&self, map: &NetworkMap, pass: &mut Pass<'_>) -> Result<()> {
+        let push = push::MlpFusedFwd { out_bias: map.out_bias as u32 };
         pass.run(&self.mlp_fused_fwd, pass.buffers.forward_tiles(), push)
     }
 
-    fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        self.training()?.passes.iter().try_for_each(|backward| self.record_pass(pass, backward, chunk))
+    fn record_backward(&self, map: &NetworkMap, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        self.training()?.passes.iter().try_for_each(|backward| self.record_pass(map, pass, backward, chunk))
     }
 
     /// Returns their positions in the partial sums, which contain them.
@@ -378,7 +378,7 @@ mod tests {
         // The weights on the input have 63 numbers and 10 phases, padded to 80 columns.
         let ledger = |pairs, recompute| {
             let backward = Backward { subgroups: 8, tile: 64, pairs, recompute };
-            let ledger = work(&params.moving, 80, 1_000_000_000, backward);
+            let ledger = work(params.moving.as_ref().unwrap(), 80, 1_000_000_000, backward);
             ["mlp_fused_fwd", "mlp_fused_bwd"].map(|stage| ledger[stage])
         };
         let [forward, backward] = ledger(true, false);
@@ -404,7 +404,7 @@ mod tests {
         let spans_of = |layers: usize, skip_layer: usize, pairs: bool| {
             let mut config = Config::preset(Preset::Paper);
             (config.dynamic.layers, config.dynamic.skip_layer) = (layers as u32, skip_layer as u32);
-            let spans = spans(&ParamMap::new(&config, 10).moving.layers, pairs);
+            let spans = spans(&ParamMap::new(&config, 10).moving.unwrap().layers, pairs);
             spans.iter().map(|span| (span.upper, span.lower)).collect::<Vec<_>>()
         };
         use Part::{Encoded, Hidden};

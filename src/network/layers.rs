@@ -103,8 +103,8 @@ impl LayerNetwork {
     }
 
     /// Records the gradient at the output neuron, and dz of the last layer.
-    fn record_output_backward(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
+    fn record_output_backward(&self, map: &NetworkMap, pass: &mut Pass<'_>) -> Result<()> {
+        let (k, params, training) = (&self.kernels, map, self.training()?);
         let groups = params.width as u32 / 4;
         let last = params.layers.len() - 1;
         let activations = (Binding::activations, (&self.activations[last]).into());
@@ -115,8 +115,8 @@ impl LayerNetwork {
     }
 
     /// Records the gradient of the output neuron's weights.
-    fn record_output_weight_gradient(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        let (k, params) = (&self.kernels, pass.network.map());
+    fn record_output_weight_gradient(&self, map: &NetworkMap, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        let (k, params) = (&self.kernels, map);
         let activations = (Binding::activations, self.below(params.layers.len()).into());
         let PartialSums { splits, len: n_partials } = self.partial_sums(params);
         let push = push::MlpOutBwdWeight {
@@ -132,9 +132,9 @@ impl LayerNetwork {
     }
 
     /// Records dz of the layer below `i`, which must exist.
-    fn record_input_gradient(&self, pass: &mut Pass<'_>, i: usize, weights: usize) -> Result<()> {
+    fn record_input_gradient(&self, map: &NetworkMap, pass: &mut Pass<'_>, i: usize, weights: usize) -> Result<()> {
         let (k, training) = (&self.kernels, self.training()?);
-        let groups = pass.network.map().width as u32 / 4;
+        let groups = map.width as u32 / 4;
         let bound = [
             (Binding::dz, (&training.dz[i % 2]).into()),
             (Binding::activations, (&self.activations[i - 1]).into()),
@@ -150,8 +150,15 @@ impl LayerNetwork {
     }
 
     /// Records the gradient of a layer's weights on each of its inputs.
-    fn record_weight_gradients(&self, pass: &mut Pass<'_>, i: usize, layer: &Layer, chunk: Chunk) -> Result<()> {
-        let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
+    fn record_weight_gradients(
+        &self,
+        map: &NetworkMap,
+        pass: &mut Pass<'_>,
+        i: usize,
+        layer: &Layer,
+        chunk: Chunk,
+    ) -> Result<()> {
+        let (k, params, training) = (&self.kernels, map, self.training()?);
         let (width, groups) = (params.width as u32, params.width as u32 / 4);
         let PartialSums { splits, len: n_partials } = self.partial_sums(params);
         let tile = k.tuning.tile();
@@ -182,8 +189,8 @@ impl LayerNetwork {
     }
 
     /// Records the sums of layer `i`'s dz over the rays of each phase.
-    fn record_phase_sum(&self, pass: &mut Pass<'_>, i: usize, chunk: Chunk) -> Result<()> {
-        let (k, params, training) = (&self.kernels, pass.network.map(), self.training()?);
+    fn record_phase_sum(&self, map: &NetworkMap, pass: &mut Pass<'_>, i: usize, chunk: Chunk) -> Result<()> {
+        let (k, params, training) = (&self.kernels, map, self.training()?);
         let groups = params.width as u32 / 4;
         let Chunk { first_ray, n_rays } = chunk;
         let rays = Groups::Direct([n_rays.div_ceil(k.mlp_ray_sum.local_size()), groups, 1]);
@@ -253,16 +260,16 @@ impl Path for LayerNetwork {
         (0..params.len as u32).collect()
     }
 
-    fn record_weights(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let (stage, params) = (&self.kernels.mlp_latent_fwd, pass.network.map());
+    fn record_weights(&self, map: &NetworkMap, pass: &mut Pass<'_>) -> Result<()> {
+        let (stage, params) = (&self.kernels.mlp_latent_fwd, map);
         let push = push::MlpLatentFwd { layers: params.layers.len() as u32, latents: params.latents as u32 };
         let rows = (params.layers.len() * params.phases * params.width) as u32;
         pass.run(stage, stage.groups_for(rows), push)
     }
 
     /// Records `encode`, `mlp_layer_fwd` of each layer and `mlp_out_fwd`.
-    fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
-        let (k, params, buffers) = (&self.kernels, pass.network.map(), pass.buffers);
+    fn record_forward(&self, map: &NetworkMap, pass: &mut Pass<'_>) -> Result<()> {
+        let (k, params, buffers) = (&self.kernels, map, pass.buffers);
         let capacity = pass.setup.sample_capacity;
         let (groups, encode_groups) = (params.width as u32 / 4, params.encode_groups as u32);
         pass.run(&k.encode, buffers.per_sample(), push::Encode {})?;
@@ -290,21 +297,21 @@ impl Path for LayerNetwork {
     }
 
     /// Records the passes that write `partials` and `phase_dz`.
-    fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
-        self.record_output_backward(pass)?;
-        for (i, layer) in pass.network.map().layers.iter().enumerate().rev() {
+    fn record_backward(&self, map: &NetworkMap, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
+        self.record_output_backward(map, pass)?;
+        for (i, layer) in map.layers.iter().enumerate().rev() {
             if let (Some(weights), true) = (layer.hidden, i > 0) {
                 // The input gradient goes first: none of the passes below writes what it reads, so that the three may overlap.
-                self.record_input_gradient(pass, i, weights)?;
+                self.record_input_gradient(map, pass, i, weights)?;
             }
-            self.record_weight_gradients(pass, i, layer, chunk)?;
+            self.record_weight_gradients(map, pass, i, layer, chunk)?;
             if layer.latent.is_some() {
-                self.record_phase_sum(pass, i, chunk)?;
+                self.record_phase_sum(map, pass, i, chunk)?;
             }
         }
         // This pass overlaps with the first layer's sums over phases. Passes of weight gradients share a buffer and wait for
         // one another.
-        self.record_output_weight_gradient(pass, chunk)
+        self.record_output_weight_gradient(map, pass, chunk)
     }
 }
 
@@ -319,7 +326,7 @@ mod tests {
     fn operations_of_the_stages_are_those_of_the_network() {
         for preset in [Preset::Paper, Preset::PublicCode, Preset::FastMlp] {
             let params = ParamMap::new(&Config::preset(preset), 10);
-            let (ledger, cost) = (work(&params.moving, 1_000_000_000), NetworkCost::of(&params));
+            let (ledger, cost) = (work(params.moving.as_ref().unwrap(), 1_000_000_000), NetworkCost::of(&params));
             let flop = |stages: &[&str]| stages.iter().map(|stage| ledger[*stage].gflop).sum::<f64>() as u64;
             assert_eq!(flop(&["mlp_layer_fwd", "mlp_out_fwd"]), cost.forward);
             assert_eq!(flop(&["mlp_layer_bwd_weight", "mlp_out_bwd_weight"]), cost.weights);

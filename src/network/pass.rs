@@ -18,8 +18,8 @@ pub struct Pass<'a> {
     pub recording: &'a mut Recording,
     /// Pipelines of every path.
     pub kernels: &'a Kernels,
-    /// The dynamic field's network.
-    pub network: &'a Network,
+    /// The dynamic field's network; `None` where Gaussians are the dynamic field, or none is drawn.
+    pub network: Option<&'a Network>,
     /// Static field, where it is a network as well.
     pub still: Option<&'a StillNetwork>,
     /// Buffers of the forward pass.
@@ -54,7 +54,7 @@ impl<'a> Pass<'a> {
     ) -> Result<()> {
         let (network, buffers, training) = (self.network, self.buffers, self.training);
         let find = |name: Binding| -> Option<&Buffer> {
-            buffers.find(name).or_else(|| network.find(name)).or_else(|| training?.find(name))
+            buffers.find(name).or_else(|| network?.find(name)).or_else(|| training?.find(name))
         };
         dispatch_finding(self.recording, stage, groups, bound, find, push)
     }

@@ -104,7 +104,7 @@ impl StillNetwork {
         let mut still = Pass {
             recording: &mut *pass.recording,
             kernels: pass.kernels,
-            network: &self.network,
+            network: Some(&self.network),
             still: None,
             buffers: &self.buffers,
             training: own.as_ref().map(|own| own as &dyn BufferSet),

@@ -2,9 +2,9 @@
 
 use crate::config::sections;
 use crate::fitting::RING_LENGTH;
+use crate::gaussians::field::inverse_step;
 use crate::gaussians::stages::{FIXED_POINT_BITS, loss_parts};
 use crate::kernels::layout::{GaussianSchedule, GaussianSetup, TreeSetup};
-use crate::model::gaussians::inverse_step;
 use crate::plan::targets::Targets;
 
 /// Decay of Adam's first and second moments, and its smallest denominator.

@@ -80,9 +80,9 @@ fn slow(left: &Image, level: &[f32]) -> Image {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gaussians::field::Units;
     use crate::gaussians::view::SplatView;
     use crate::geometry::{CArm, Geometry};
-    use crate::model::gaussians::Units;
     use crate::plan::lengths::Lengths;
 
     const SIDE: usize = 40;

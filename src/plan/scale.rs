@@ -1,8 +1,9 @@
 //! Choosing scales and boxes for a dataset.
 
+use crate::config::method::MethodKind;
 use crate::config::{Config, DynamicTarget};
 use crate::error::{Error, Result};
-use crate::fitting::extent::{box_half, field_of_view, seen_half, volume_half};
+use crate::fitting::extent::{box_half, field_of_view, seen_half};
 use crate::geometry::MM_PER_UNIT;
 use crate::methods;
 use crate::model::hull::Hull;
@@ -58,19 +59,13 @@ impl Scene {
         if config.loss.normalise {
             scene.normalise(config, dataset, motion, static_half)?;
         }
-        if config.two_networks() {
+        if config.method() == MethodKind::TwoNetworks {
             scene.hold_all_rays(config, dataset);
-        }
-        if config.is_r2() {
-            scene.hold_volume(volume_half(config.r2.half_extent_mm, dataset), seen_half(dataset));
-        }
-        if config.is_x() {
-            scene.hold_volume(volume_half(config.x.half_extent_mm, dataset), seen_half(dataset));
         }
         if let Some(method) = methods::of(config) {
             let volume = method.volume(config, dataset);
             scene.hold_volume(volume.half, seen_half(dataset));
-            scene.dynamic_gain = volume.attenuation;
+            scene.dynamic_gain = volume.attenuation.unwrap_or(scene.dynamic_gain);
         }
         Ok(scene)
     }

@@ -1,9 +1,9 @@
 //! First places of Gaussians, drawn from the hull's cells, and later places where data are missing.
 
 use crate::config::sections;
+use crate::gaussians::field::rotation_none;
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::Gaussian;
-use crate::model::gaussians::rotation_none;
 use crate::plan::targets::{Place, Targets};
 use crate::random::{STREAM_JITTER, STREAM_PLACE, uniform01};
 use glam::DVec3;

@@ -1,8 +1,8 @@
 //! f64 reference implementation (twin) of `gaussian_rays` and `gaussian_points`: plain sums over all Gaussians, and small
 //! steps along rays.
 
+use crate::gaussians::field::{MovingGaussians, Units};
 use crate::kernels::layout::{Gaussian, GaussianSetup};
-use crate::model::gaussians::{MovingGaussians, Units};
 use glam::{DMat3, DQuat, DVec3};
 
 /// Number of steps along a ray per minimum standard deviation of a Gaussian.

@@ -127,6 +127,7 @@ impl Precision {
 }
 
 /// Hidden activations of one sample, layer by layer, and the output feature.
+#[derive(Default)]
 pub struct NetworkTrace {
     /// Encoded input.
     pub encoded: Vec<f64>,

@@ -30,7 +30,7 @@ fn scale(p: &Params, setup: &GaussianSetup) -> DVec3 {
 }
 
 /// Axes as columns.
-pub(super) fn axes(p: &Params) -> DMat3 {
+pub(crate) fn axes(p: &Params) -> DMat3 {
     let norm = (p[7] * p[7] + p[8] * p[8] + p[9] * p[9] + p[10] * p[10]).sqrt();
     let [w, x, y, z] = [7, 8, 9, 10].map(|k| p[k] / norm);
     DMat3::from_cols(
@@ -203,7 +203,7 @@ pub fn gradient(p: &Params, view: &SplatView, setup: &GaussianSetup, moments: [f
 }
 
 /// Gradient of the raw quaternion from that of the axes.
-pub(super) fn rotation_gradient(p: &Params, d: DMat3) -> [f64; 4] {
+pub(crate) fn rotation_gradient(p: &Params, d: DMat3) -> [f64; 4] {
     let raw = [p[7], p[8], p[9], p[10]];
     let norm = raw.iter().map(|v| v * v).sum::<f64>().sqrt();
     let [w, x, y, z] = raw.map(|v| v / norm);

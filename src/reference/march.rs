@@ -213,17 +213,14 @@ pub fn fwd(
     let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
     let row = plan.schedule[step as usize];
     let mut out = statics(plan, params, step, ray, with_static);
-    if row.dynamic_active == 0 {
-        return out;
-    }
+    let Some(network) = p.moving.as_ref().filter(|_| row.dynamic_active != 0) else { return out };
     let samples = depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray);
     for ((t, dl), near) in samples.iter().copied().zip(near_part.marks(&samples)) {
         let x = ray.anchor + t * ray.direction;
         if !searched(plan, x, ray, |_| true) {
             continue;
         }
-        let trace =
-            field::network_fwd(&p.moving, params, &field::encode(s, row.window.into(), x), ray.shown, precision);
+        let trace = field::network_fwd(network, params, &field::encode(s, row.window.into(), x), ray.shown, precision);
         let sigma = f64::from(s.dynamic_gain) * field::softplus(trace.feature + f64::from(s.dynamic_shift));
         out.dynamic_integral += sigma * dl;
         out.occlusion += if near { sigma * dl } else { 0.0 };
@@ -264,17 +261,10 @@ pub fn sample_bwd(
     precision: Precision,
     gradient: &mut [f64],
 ) {
+    let Some(network) = &plan.params.moving else { return };
     let s = &plan.setup;
     let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
     let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
     let slope = if per_integral < 0.0 { slope.max(s.least_slope.into()) } else { slope };
-    field::network_bwd(
-        &plan.params.moving,
-        params,
-        &sample.trace,
-        shown,
-        per_integral * sample.dl * slope,
-        precision,
-        gradient,
-    );
+    field::network_bwd(network, params, &sample.trace, shown, per_integral * sample.dl * slope, precision, gradient);
 }

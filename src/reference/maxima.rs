@@ -1,8 +1,8 @@
 //! Maximum attenuation of Gaussians along rays, in f64, as used for scoring vessels.
 
+use crate::gaussians::field::Gaussians;
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::GaussianSetup;
-use crate::model::gaussians::Gaussians;
 use crate::reference::gaussians::{AlongRay, Params, params, project};
 use rayon::prelude::*;
 

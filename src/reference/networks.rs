@@ -132,8 +132,8 @@ pub fn traces(
     precision: Precision,
 ) -> [NetworkTrace; 2] {
     let encoded = field::encode(&plan.setup, plan.schedule[step as usize].window.into(), x);
-    let still = plan.params.still.as_ref().unwrap_or(&plan.params.moving);
-    [still, &plan.params.moving].map(|map| field::network_fwd(map, params, &encoded, shown, precision))
+    let mut traces = plan.params.networks().map(|map| field::network_fwd(map, params, &encoded, shown, precision));
+    std::array::from_fn(|_| traces.next().unwrap_or_default())
 }
 
 /// Attenuations of both networks, and their derivatives by the features.
@@ -158,8 +158,7 @@ pub fn sample_bwd(
     gradient: &mut [f64],
 ) {
     let slopes = attenuations(plan, traces).map(|[_, slope]| slope);
-    let still = plan.params.still.as_ref().unwrap_or(&plan.params.moving);
-    for (k, map) in [still, &plan.params.moving].into_iter().enumerate() {
+    for (k, map) in plan.params.networks().enumerate().take(by_sigma.len()) {
         field::network_bwd(map, params, &traces[k], shown, by_sigma[k] * slopes[k], precision, gradient);
     }
 }

@@ -1,9 +1,9 @@
 //! f64 reference implementation (twin) of the tree of Gaussians: their positions, the loss with its penalties, and its
 //! gradient.
 
+use crate::gaussians::field::{basis, shares};
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, TreeSetup};
-use crate::model::gaussians::{basis, shares};
 use crate::plan::targets::Targets;
 use crate::reference::gaussians::{self, N_PARAMS, Params};
 use crate::scan::gating::BeatTime;

@@ -2,6 +2,8 @@
 
 use crate::config::Config;
 use crate::error::Result;
+use crate::fitting::fit::FieldFeed;
+use crate::gaussians::field::MovingFeed;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -9,7 +11,6 @@ use crate::gpu::record::Commands;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
-use crate::model::gaussians::MovingFeed;
 use crate::model::scene::Scene;
 use crate::render::baked::Baked;
 use crate::render::quantity::Quantity;
@@ -30,16 +31,14 @@ pub struct Source {
     pub outline: Model,
     /// Parameters of the model on the device.
     pub params: Option<Buffer>,
-    /// Gaussians of the model, where they are the dynamic field.
-    pub moving: Option<MovingFeed>,
-    /// Parameters on the device of the field of a method of `crate::methods`.
-    pub fit: Option<Vec<Buffer>>,
+    /// Numbers of the field, where they are not those of `params`.
+    pub feed: Option<FieldFeed>,
 }
 
 impl Source {
     /// Returns the source of a model that does not change.
     pub fn of(model: &Model) -> Source {
-        Source { outline: model.clone(), params: None, moving: None, fit: None }
+        Source { outline: model.clone(), params: None, feed: None }
     }
 }
 
@@ -65,7 +64,7 @@ impl Live {
     pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
         let model = &source.outline;
         let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
-        if let Some(params) = &source.fit {
+        if let Some(FieldFeed::Params(params)) = &source.feed {
             renderer.follow_fit(params);
         }
         Ok(Live {
@@ -73,7 +72,10 @@ impl Live {
             config: model.config.clone(),
             scene: model.scene.clone(),
             params: source.params.clone(),
-            moving: source.moving.clone(),
+            moving: match &source.feed {
+                Some(FieldFeed::Gaussians(feed)) => Some(feed.clone()),
+                _ => None,
+            },
             moving_at: AtomicU64::new(u64::MAX),
             baked_at: vec![0; 1 + model.param_map.phases],
             rest_until: Instant::now(),

@@ -3,6 +3,7 @@
 use crate::error::{Error, Result};
 use crate::fitting::field::FieldDrawing;
 use crate::gaussians::blobs::{BlobList, Blobs};
+use crate::gaussians::field::MovingGaussians;
 use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -15,7 +16,6 @@ use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
-use crate::model::gaussians::MovingGaussians;
 use crate::model::params::ParamMap;
 use crate::model::setup::sample_capacity;
 use crate::network::chunk::{Chunk, chunk_rays, chunk_samples, packed};
@@ -87,7 +87,8 @@ impl Rendering {
 pub struct Renderer {
     pub(super) gpu: Gpu,
     pub(super) kernels: Kernels,
-    network: Network,
+    /// The dynamic field's network; none where Gaussians or another field are the dynamic field.
+    network: Option<Network>,
     /// Static field, where it is a network as well.
     pub(super) still: Option<StillNetwork>,
     pub(super) buffers: ForwardBuffers,
@@ -109,7 +110,7 @@ impl Renderer {
     /// # Errors
     /// Device errors.
     pub fn new(gpu: &Gpu, model: &Model, tuning: Tuning) -> Result<Renderer> {
-        let tuning = tuning.for_network(model.moving.is_none() && model.field.is_none());
+        let tuning = tuning.for_network(model.config.method().has_network());
         let mut setup = model.scene.setup(&model.config, &model.param_map, model.hull.as_ref());
         setup.jitter = 0;
         setup.occupancy_cells = 0;
@@ -119,9 +120,11 @@ impl Renderer {
         if model.moving.is_none() {
             setup.n_dynamic_samples = model.config.march.render_samples;
         }
-        let largest = tuning.chunk_samples.min(largest_chunk(gpu, &tuning, &model.param_map.moving));
+        let limit = model.param_map.moving.as_ref().map_or(u32::MAX, |map| largest_chunk(gpu, &tuning, map));
+        let largest = tuning.chunk_samples.min(limit);
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
-        let network = Network::new(gpu, &tuning, &setup, &model.param_map.moving, Purpose::Render)?;
+        let network = model.param_map.moving.as_ref();
+        let network = network.map(|map| Network::new(gpu, &tuning, &setup, map, Purpose::Render)).transpose()?;
         let kernels = Kernels::new(gpu, tuning, model.param_map.line_len() as u32, setup.n_static_samples)?;
         let schedule = gpu.buffer("schedule", size_of::<Schedule>() as u64, Memory::Upload)?;
         let (tuning, param_map, hull) = (&kernels.tuning, &model.param_map, model.hull.as_ref());
@@ -131,6 +134,11 @@ impl Renderer {
         let still = still.transpose()?;
         // The schedule has a single row, that of the model's step.
         gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
+        if network.is_none() {
+            let mut recording = Recording::new(gpu, "no samples")?;
+            buffers.clear_samples(&mut recording);
+            gpu.wait(recording.finish()?.submit()?)?;
+        }
         let moving = model.moving.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
         let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
         let field = model.field.as_ref().map(|field| field.drawing(gpu)).transpose()?;
@@ -178,7 +186,7 @@ impl Renderer {
         }
     }
 
-    /// Draws from numbers on the device, for the field of a method of `crate::methods`; does nothing for other methods.
+    /// Draws from parameters on the device, for a field that its method draws itself; does nothing for other fields.
     pub fn follow_fit(&self, params: &[Buffer]) {
         if let Some(drawing) = &self.field {
             drawing.follow(params.to_vec());
@@ -241,7 +249,7 @@ impl Renderer {
         buffers: &'a ForwardBuffers,
         setup: &'a Setup,
     ) -> Pass<'a> {
-        let (kernels, network, params) = (&self.kernels, &self.network, &self.param_map);
+        let (kernels, network, params) = (&self.kernels, self.network.as_ref(), &self.param_map);
         Pass { recording, kernels, network, still: self.still.as_ref(), buffers, training: None, params, setup }
     }
 
@@ -313,7 +321,7 @@ impl Renderer {
 
     /// Tells whether the network on encoded coordinates is the dynamic field.
     pub fn network_moves(&self) -> bool {
-        self.moving.is_none() && self.field.is_none()
+        self.network.is_some()
     }
 
     /// Tells whether a view of the dynamic field is drawn from the Gaussians themselves, at display rates. The maximum of their

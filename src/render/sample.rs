@@ -85,7 +85,7 @@ impl Renderer {
                 (Component::Static, _, Some(still)) => {
                     r.fill(&cells, 0);
                     let moving = self.pass(&mut r, &buffers, &setup);
-                    Pass { network: still.network(), still: None, ..moving }.volume(n, &cells)?;
+                    Pass { network: Some(still.network()), still: None, ..moving }.volume(n, &cells)?;
                 }
                 (Component::Static, _, None) => {
                     let stage = &self.kernels.volume_static;

@@ -2,12 +2,13 @@
 
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
+use crate::gaussians::field::MovingGaussians;
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
+use crate::methods::r2_gaussian::selftest as r2;
 use crate::model::Model;
 use crate::model::component::Component;
-use crate::model::gaussians::MovingGaussians;
 use crate::model::params::ParamMap;
 use crate::plan::Plan;
 use crate::reference::blobs;
@@ -17,7 +18,6 @@ use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance};
 use crate::selftest::problems::{drawn_fields, random_gaussians, small_dataset};
-use crate::selftest::r2;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 

@@ -5,7 +5,7 @@ use serde::Serialize;
 
 /// Returns the losses that iterations reported; none for a device that reports none, whose stages' results are compared
 /// nevertheless.
-pub(super) fn told<T>(losses: Result<Vec<T>>) -> Result<Vec<T>> {
+pub(crate) fn told<T>(losses: Result<Vec<T>>) -> Result<Vec<T>> {
     match losses {
         Err(Error::NoDevice(_)) => Ok(Vec::new()),
         told => told,

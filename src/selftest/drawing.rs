@@ -154,7 +154,8 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
         }
         Component::Dynamic if inside(x) => {
             let encoded = field::encode(s, window.into(), x);
-            let trace = field::network_fwd(&plan.params.moving, params, &encoded, shown, trained.precision);
+            let trace = |map| field::network_fwd(map, params, &encoded, shown, trained.precision);
+            let trace = plan.params.moving.as_ref().map(trace).unwrap_or_default();
             trained.attenuation(trace.feature)
         }
         _ => 0.0,

@@ -15,18 +15,18 @@ use crate::selftest::problems::{hard_case, with_gaussians};
 use crate::train::gaussians::GaussianTrainer;
 
 const PROJECT: &[&str] = &[push::GaussianProject::SHADER];
-pub(super) const SPLAT: &[&str] = &[push::GaussianSplat::SHADER];
+pub(crate) const SPLAT: &[&str] = &[push::GaussianSplat::SHADER];
 const UPDATE: &[&str] = &[push::GaussianUpdate::SHADER];
-pub(super) const REPORT: &[&str] = &[push::GaussianReport::SHADER];
+pub(crate) const REPORT: &[&str] = &[push::GaussianReport::SHADER];
 const RESIDUAL: &[&str] = &[push::GaussianResidual::SHADER];
 const MOMENTS: &[&str] = &[push::GaussianMoments::SHADER];
 
 /// f32 positions, and sums in steps of 1e-6.
-pub(super) const NUMBERS: Tolerance = Tolerance::OfLargest(1e-4);
+pub(crate) const NUMBERS: Tolerance = Tolerance::OfLargest(1e-4);
 /// Pixels, or shares of a splat's own size: f32 positions some hundred pixels from the source.
 const SPLAT_ERROR: f64 = 1e-3;
 /// Losses are sums of many pixels.
-pub(super) const LOSS: f64 = 2e-5;
+pub(crate) const LOSS: f64 = 2e-5;
 /// Parameters that may differ by more than [`FAR`] after ten updates: Adam divides by the gradient's size, so a tiny
 /// gradient's rounding shows in full.
 const FAR_SHARE: f64 = 0.01;
@@ -99,7 +99,7 @@ pub fn device_gradient(gpu: &Gpu, particles: &ParticleBuffers, n: usize) -> Resu
     Ok(of_rows(&gpu.download(&particles.gaussian_gradient, 0, n)?))
 }
 
-pub(super) fn f32s(values: &[f64]) -> Vec<f32> {
+pub(crate) fn f32s(values: &[f64]) -> Vec<f32> {
     values.iter().map(|v| *v as f32).collect()
 }
 
@@ -119,7 +119,7 @@ fn splat_error(got: &Splat, want: &Projection) -> f64 {
 
 /// Compares splats, each of a Gaussian in a view: size and place where the twin sees something of it; elsewhere the box must be
 /// empty. `seen` returns the twin's splat at an index, and the image it belongs to.
-pub(super) fn compare_splats(
+pub(crate) fn compare_splats(
     gpu: &Gpu,
     particles: &ParticleBuffers,
     setup: &GaussianSetup,
@@ -152,11 +152,11 @@ pub(super) fn compare_splats(
 }
 
 /// A splat as the twin sees it, and the image it belongs to; none where a view lacks the phase.
-pub(super) type Seen = Option<(usize, Option<Projection>)>;
+pub(crate) type Seen = Option<(usize, Option<Projection>)>;
 
 /// Compares residuals with those of the device's own images, and moments with those of the device's own residuals; returns the
 /// twin's loss of the images, and the device's moments.
-pub(super) fn compare_backward(
+pub(crate) fn compare_backward(
     gpu: &Gpu,
     (targets, setup): (&Targets, &GaussianSetup),
     (buffers, particles): (&TargetBuffers, &ParticleBuffers),
@@ -233,7 +233,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 }
 
 /// Part by part, so that a missing small gradient cannot hide behind a large one.
-pub(super) fn compare_gradient(got: &[Params], want: &[Params], stages: &[&'static str], findings: &mut Findings) {
+pub(crate) fn compare_gradient(got: &[Params], want: &[Params], stages: &[&'static str], findings: &mut Findings) {
     for (name, range) in TENSORS {
         let got = f32s(&numbers(got, range.clone()));
         findings.numbers(stages, &format!("gradient of {name}"), &got, &numbers(want, range), NUMBERS);

@@ -181,7 +181,7 @@ pub(super) struct Sample {
 
 impl Seen {
     fn download(gpu: &Gpu, trainer: &Trainer, loss: StepLoss) -> Result<Seen> {
-        let (forward, training, plan) = (trainer.forward(), trainer.training(), trainer.plan());
+        let (forward, training, plan) = (trainer.fields()?.forward(), trainer.fields()?.training(), trainer.plan());
         let n = plan.setup.n_rays as usize;
         let one_chunk = chunks(&plan.setup, plan.setup.n_rays).count() == 1;
         Ok(Seen {
@@ -203,7 +203,7 @@ impl Seen {
 
 /// The live samples of an iteration, which one chunk held.
 pub(super) fn samples(gpu: &Gpu, trainer: &Trainer, live: usize) -> Result<Vec<Sample>> {
-    let (forward, capacity) = (trainer.forward(), trainer.plan().setup.sample_capacity as usize);
+    let (forward, capacity) = (trainer.fields()?.forward(), trainer.plan().setup.sample_capacity as usize);
     // A larger count would be a fault of the counter, which is compared anyway.
     let live = live.min(capacity);
     let points: Vec<[f32; 4]> = gpu.download(&forward.sample_points, 0, live)?;
@@ -230,7 +230,7 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
         params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);
     }
     let mut trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
-    gpu.upload(&trainer.forward().params, 0, &params)?;
+    gpu.upload(&trainer.fields()?.forward().params, 0, &params)?;
     let mut moments = vec![[0f32; 2]; params.len()];
     for _ in 0..ITERATIONS {
         compare_stages(gpu, &mut trainer, &params, tuning, findings)?;
@@ -257,7 +257,8 @@ fn compare_stages(
     let precision = precision_of(trainer);
     let plan = trainer.plan();
     let tolerances = Tolerances::of(precision, gpu.info());
-    let computes_again = computes_again(&tuning.matrices, &plan.params.moving);
+    let network = plan.params.moving.as_ref();
+    let computes_again = network.is_some_and(|network| computes_again(&tuning.matrices, network));
     let twin =
         Twin { plan, step, params: &params, rays: march::batch(plan, step), precision, tolerances, computes_again };
     twin.compare_rays(&seen, findings);
@@ -394,7 +395,9 @@ impl Twin<'_> {
     fn trace(&self, sample: &Sample) -> field::NetworkTrace {
         let (plan, shown) = (self.plan, self.shown(sample));
         let encoded = field::encode(&plan.setup, plan.schedule[self.step as usize].window.into(), sample.x);
-        field::network_fwd(&plan.params.moving, self.params, &encoded, shown, self.precision)
+        let network = plan.params.moving.as_ref();
+        let trace = |map| field::network_fwd(map, self.params, &encoded, shown, self.precision);
+        network.map(trace).unwrap_or_default()
     }
 
     fn shown(&self, sample: &Sample) -> Shown {
@@ -547,17 +550,17 @@ struct Part {
 
 /// Splits the network's gradient by the stages that compute it: the columns of latents are apart from the weights beside them.
 fn parts(params: &ParamMap, [output, layers, latents]: [&'static [&'static str]; 3]) -> Vec<Part> {
+    let Some(network) = &params.moving else { return Vec::new() };
     let mut parts = Vec::new();
     let mut last = Vec::new();
     for tensor in params.tensors().into_iter().filter(|tensor| !is_static(tensor)) {
-        let layer = layer_of(&tensor).map(|i| &params.moving.layers[i]);
+        let layer = layer_of(&tensor).map(|i| &network.layers[i]);
         let sees_input = layer.is_some_and(|layer| layer.latent.is_some());
         let part = |stages, name: String, positions| Part { stages, name, positions };
         match tensor.name.as_str() {
             name if name.starts_with("dynamic.out") => parts.push(part(output, tensor.name, tensor.positions)),
             name if name.ends_with(".weight") => {
-                let (columns, latent) =
-                    (tensor.shape[1], params.moving.encoded_len..params.moving.encoded_len + params.moving.latent);
+                let (columns, latent) = (tensor.shape[1], network.encoded_len..network.encoded_len + network.latent);
                 let of_latent = |at: usize| sees_input && latent.contains(&(at % columns));
                 let (mut of_latents, mut of_weights) = (Vec::new(), Vec::new());
                 for (at, position) in tensor.positions.into_iter().enumerate() {
@@ -615,9 +618,9 @@ pub(super) fn compare_update(
     findings: &mut Findings,
 ) -> Result<(Vec<f32>, Vec<[f32; 2]>)> {
     let (plan, n) = (trainer.plan(), params.len());
-    let gradient: Vec<f32> = gpu.download(&trainer.training().gradient, 0, n)?;
-    let after: Vec<f32> = gpu.download(&trainer.forward().params, 0, n)?;
-    let moments_after: Vec<[f32; 2]> = gpu.download(&trainer.training().moments, 0, n)?;
+    let gradient: Vec<f32> = gpu.download(&trainer.fields()?.training().gradient, 0, n)?;
+    let after: Vec<f32> = gpu.download(&trainer.fields()?.forward().params, 0, n)?;
+    let moments_after: Vec<[f32; 2]> = gpu.download(&trainer.fields()?.training().moments, 0, n)?;
     let mut want: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
     let mut want_moments: Vec<[f64; 2]> = moments.iter().map(|m| m.map(f64::from)).collect();
     let gradient: Vec<f64> = gradient.iter().map(|v| f64::from(*v)).collect();

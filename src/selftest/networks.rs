@@ -100,7 +100,10 @@ impl Pairs {
             still.sigma_gradient().ok_or_else(|| Error::Internal("the network is not for training".into()))?;
         Ok(Pairs {
             still: gpu.download(still.sigma(), 0, n)?,
-            gradient: [gpu.download(gradient, 0, n)?, gpu.download(&trainer.training().sigma_gradient, 0, n)?],
+            gradient: [
+                gpu.download(gradient, 0, n)?,
+                gpu.download(&trainer.fields()?.training().sigma_gradient, 0, n)?,
+            ],
             moving,
         })
     }
@@ -149,9 +152,11 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
 
 impl Twin<'_> {
     fn compare(&self, gpu: &Gpu, loss: StepLoss, findings: &mut Findings) -> Result<()> {
-        let (forward, training, plan) = (self.trainer.forward(), self.trainer.training(), self.trainer.plan());
+        let (forward, training, plan) =
+            (self.trainer.fields()?.forward(), self.trainer.fields()?.training(), self.trainer.plan());
         let missing = || Error::Internal("the still field is no network".into());
-        let (still, networks) = (self.trainer.still().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
+        let (still, networks) =
+            (self.trainer.fields()?.still().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
         let n = self.rays.len();
         let seen = Seen {
             loss,

@@ -44,7 +44,7 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, tuning: &Tuning, findings: &mut Fin
 fn threshold(gpu: &Gpu, dataset: &Dataset, plan: &Plan, tuning: &Tuning) -> Result<f32> {
     let mut trainer = Trainer::new(gpu, Plan::new(&plan.config, dataset)?, dataset, tuning.clone())?;
     let live = advance(&mut trainer, 1)?.live_samples as usize;
-    let mut sigma: Vec<[f32; 2]> = gpu.download(&trainer.forward().sample_sigma, 0, live)?;
+    let mut sigma: Vec<[f32; 2]> = gpu.download(&trainer.fields()?.forward().sample_sigma, 0, live)?;
     sigma.sort_by(|a, b| a[0].total_cmp(&b[0]));
     sigma.get(live * 9 / 10).map(|s| s[0]).ok_or_else(|| Error::Internal("no sample is live".into()))
 }
@@ -58,7 +58,7 @@ fn advance(trainer: &mut Trainer, until: u32) -> Result<StepLoss> {
 }
 
 fn notes(gpu: &Gpu, trainer: &Trainer) -> Result<Vec<u32>> {
-    gpu.download(&trainer.forward().occupancy, 0, 3 * trainer.plan().setup.occupancy_words())
+    gpu.download(&trainer.fields()?.forward().occupancy, 0, 3 * trainer.plan().setup.occupancy_words())
 }
 
 /// Compares the notes of one iteration, the first of the second epoch. The epoch before is left alone.
@@ -68,10 +68,10 @@ fn compare_notes(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> R
     let live = advance(trainer, OCCUPANCY_EPOCH + 1)?.live_samples as usize;
     let after = notes(gpu, trainer)?;
     let setup = trainer.plan().setup;
-    let points: Vec<[f32; 4]> = gpu.download(&trainer.forward().sample_points, 0, live)?;
-    let rays: Vec<u32> = gpu.download(&trainer.forward().sample_rays, 0, live)?;
-    let sigma: Vec<[f32; 2]> = gpu.download(&trainer.forward().sample_sigma, 0, live)?;
-    let batch: Vec<Ray> = gpu.download(&trainer.forward().rays, 0, setup.n_rays as usize)?;
+    let points: Vec<[f32; 4]> = gpu.download(&trainer.fields()?.forward().sample_points, 0, live)?;
+    let rays: Vec<u32> = gpu.download(&trainer.fields()?.forward().sample_rays, 0, live)?;
+    let sigma: Vec<[f32; 2]> = gpu.download(&trainer.fields()?.forward().sample_sigma, 0, live)?;
+    let batch: Vec<Ray> = gpu.download(&trainer.fields()?.forward().rays, 0, setup.n_rays as usize)?;
     let words = setup.occupancy_words();
     let mut want = before[..2 * words].to_vec();
     let mut kinds = [0u32; 2];

@@ -3,10 +3,10 @@
 use crate::config::sections::{self, Tree};
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
+use crate::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
-use crate::model::gaussians::{Gaussians, MovingGaussians, MovingTree, Units};
 use crate::plan::lengths::Lengths;
 use crate::plan::targets::{Place, Targets};
 use crate::random::{STREAM_JITTER, normal};

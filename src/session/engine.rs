@@ -2,6 +2,7 @@
 
 use crate::calibrate::calibrate;
 use crate::calibrate::correction::Calibration;
+use crate::config::method::MethodKind;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
@@ -189,7 +190,11 @@ impl Shared {
             None => Trainer::start_over(gpu, fresh, &dataset, tuning, earlier.as_ref())?,
             Some(state) => {
                 // Boxes of two networks are those of the rays there are.
-                let plan = if config.two_networks() { fresh } else { fresh.in_scene(state.model.scene.clone()) };
+                let plan = if config.method() == MethodKind::TwoNetworks {
+                    fresh
+                } else {
+                    fresh.in_scene(state.model.scene.clone())
+                };
                 Trainer::carry_on(gpu, plan, &dataset, tuning, state)?
             }
         };
@@ -201,9 +206,8 @@ impl Shared {
         let took = begin.elapsed();
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.step.store(trainer.step(), Ordering::Release);
-        let params = Some(trainer.forward().params.clone());
-        let (moving, fit) = (trainer.moving_feed(), trainer.fit_params());
-        self.publish(Source { outline: trainer.outline(), params, moving, fit });
+        let params = trainer.fields().ok().map(|fields| fields.forward().params.clone());
+        self.publish(Source { outline: trainer.outline(), params, feed: trainer.feed() });
         engine.training = Some(Training::new(trainer));
         Ok(())
     }
@@ -337,7 +341,7 @@ fn holds(model: &Model, new: &Scene) -> bool {
     let slack = 0.02 * (0..3).map(|i| old.dynamic_max[i] - old.dynamic_min[i]).fold(0.0, f64::max);
     let within =
         |i: usize| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack;
-    let inside = model.config.two_networks() || (0..3).all(within);
+    let inside = model.config.method() == MethodKind::TwoNetworks || (0..3).all(within);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
     let still_alike = old.static_gain == new.static_gain || alike(old.static_gain, new.static_gain);
     inside && still_alike && alike(old.dynamic_gain, new.dynamic_gain)

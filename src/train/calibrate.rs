@@ -2,6 +2,7 @@
 //! network, and the verdict is kept.
 
 use crate::config::Config;
+use crate::config::method::MethodKind;
 use crate::error::Result;
 use crate::files;
 use crate::gpu::capabilities::DeviceInfo;
@@ -63,7 +64,7 @@ const FILE: &str = "paths.json";
 /// Key of the device, driver and network that a verdict holds for.
 fn key(info: &DeviceInfo, config: &Config) -> String {
     let (d, rays, samples) = (&config.dynamic, config.train.rays, config.march.dynamic_samples);
-    let networks = if config.two_networks() { "two networks of " } else { "" };
+    let networks = if config.method() == MethodKind::TwoNetworks { "two networks of " } else { "" };
     format!(
         "{} | {} | {} | {networks}{} layers of {}, skip {}, {} bands | {rays} rays of {samples} samples",
         info.uuid,

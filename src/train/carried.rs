@@ -2,9 +2,9 @@
 
 use crate::config::Config;
 use crate::error::Result;
+use crate::gaussians::field::MovingTree;
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
-use crate::model::gaussians::MovingTree;
 use crate::plan::fit;
 use crate::plan::targets::Targets;
 use crate::train::tree::TreeTrainer;

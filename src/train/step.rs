@@ -121,6 +121,7 @@ pub fn clear<'a>(
     for buffer in [&forward.state, &forward.params, &forward.occupancy] {
         recording.fill(buffer, 0);
     }
+    forward.clear_samples(&mut recording);
     for buffer in [&training.static_gradient, &training.gradient, &training.moments, &training.ring] {
         recording.fill(buffer, 0);
     }
@@ -136,7 +137,7 @@ pub fn clear<'a>(
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
 pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
-    let (k, network, setup) = (pass.kernels, pass.network, pass.setup);
+    let (k, setup) = (pass.kernels, pass.setup);
     pass.run(&k.batch, k.batch.groups_for(setup.n_rays), push::Batch {})?;
     pass.weights()?;
     for chunk in chunks(setup, setup.n_rays) {
@@ -147,13 +148,17 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
             // Before the network's backward passes, beside which it may run: they write none of what it does.
             record_static_gradient(pass)?;
         }
-        network.record_backward(pass, chunk)?;
+        if let Some(network) = pass.network {
+            network.record_backward(pass, chunk)?;
+        }
     }
     if let Some(still) = pass.still {
         // After the dynamic network's backward passes, which begin beside its last one.
         still.record_gradient(pass)?;
     }
-    network.record_gradient(pass)?;
+    if let Some(network) = pass.network {
+        network.record_gradient(pass)?;
+    }
     pass.run(&k.adam, k.adam.groups_over(setup.n_params), push::Adam {})?;
     pass.run(&k.report, Groups::Direct([1, 1, 1]), push::Report { n_tv_parts: tv_parts(pass.params) })
 }

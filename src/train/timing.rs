@@ -4,6 +4,7 @@ use crate::choice::Choice;
 use crate::config::Config;
 use crate::config::sections::Tree;
 use crate::error::{Error, Result};
+use crate::fitting::fit::{Fit, FitData, FitWork};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
@@ -13,8 +14,9 @@ use crate::methods;
 use crate::network::cost::NetworkCost;
 use crate::network::ledger::Ledger;
 use crate::plan::Plan;
+use crate::plan::targets::Targets;
 use crate::scan::dataset::Dataset;
-use crate::train::moving::{FitData, MovingFit};
+use crate::train::moving::MovingFit;
 use crate::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -292,11 +294,64 @@ impl Subject {
 /// Fits of Gaussians to time: real ones from their seeds on, as their work depends on how large Gaussians become.
 pub struct GaussianSubject {
     gpu: Gpu,
-    data: FitData,
+    data: TimedData,
     config: Config,
     /// Iterations of a fit that are timed.
     timed: u32,
     notes: Vec<String>,
+}
+
+/// Data of the fits that are timed.
+enum TimedData {
+    /// Bounds of the dynamic field's images, for Gaussians in front of a static field.
+    Targets(Box<Targets>),
+    /// Whole images, for a method of `crate::methods`.
+    Own(Box<dyn FitData>),
+}
+
+/// A fit that is timed.
+enum TimedGaussians {
+    Moving(MovingFit),
+    Own(Box<dyn Fit>),
+}
+
+impl TimedGaussians {
+    fn step(&self) -> u32 {
+        match self {
+            TimedGaussians::Moving(fit) => fit.step(),
+            TimedGaussians::Own(fit) => fit.step(),
+        }
+    }
+
+    /// Runs one submit and returns the number of iterations that it did.
+    fn advance(&mut self, until: u32) -> Result<usize> {
+        match self {
+            TimedGaussians::Moving(fit) => fit.advance(until).map(|losses| losses.len()),
+            TimedGaussians::Own(fit) => fit.advance(until).map(|losses| losses.len()),
+        }
+    }
+
+    fn is_prepared(&self) -> bool {
+        match self {
+            TimedGaussians::Moving(fit) => fit.preparation().is_none(),
+            TimedGaussians::Own(_) => true,
+        }
+    }
+
+    /// Returns the number of Gaussians and the work of the last iteration.
+    fn work(&self) -> Result<FitWork> {
+        match self {
+            TimedGaussians::Moving(fit) => Ok(FitWork { count: fit.count(), work: fit.work()? }),
+            TimedGaussians::Own(fit) => fit.work()?.ok_or_else(|| Error::Internal("the fit has no Gaussians".into())),
+        }
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        match self {
+            TimedGaussians::Moving(fit) => fit.profile_step(),
+            TimedGaussians::Own(fit) => fit.profile_step(),
+        }
+    }
 }
 
 /// Timed iterations of R2-Gaussian and X-Gaussian, out of thousands that come before their Gaussians become more.
@@ -307,7 +362,7 @@ const LEAST_FITS: usize = 3;
 
 /// A fit that was timed.
 struct TimedFit {
-    fit: MovingFit,
+    fit: TimedGaussians,
     preparation_s: f64,
     /// Milliseconds per iteration.
     ms: f64,
@@ -327,7 +382,7 @@ impl GaussianSubject {
         profiled: u32,
     ) -> Result<GaussianSubject> {
         let mut config = config.clone();
-        let (of_fit, is_alone) = (config.gaussians.iterations, config.has_gaussians_alone());
+        let (of_fit, is_alone) = (config.gaussians.iterations, config.method().is_alone());
         let of_fit = if is_alone { config.train.iterations.min(ALONE_TIMED) } else { of_fit };
         let timed = match length {
             Length::Iterations(n) => n,
@@ -339,12 +394,13 @@ impl GaussianSubject {
             config.train.iterations = config.train.iterations.max(least) + profiled;
         }
         let mut plan = Plan::new(&config, dataset)?;
-        let Some(data) = FitData::take(&mut plan) else {
-            return Err(Error::config(
-                "gaussians.form",
-                config.gaussians.form.name(),
-                "there are no Gaussians to time",
-            ));
+        let data = match (plan.targets.take(), plan.fit.take()) {
+            (Some(targets), _) => TimedData::Targets(Box::new(targets)),
+            (None, Some(data)) => TimedData::Own(data),
+            (None, None) => {
+                let form = config.gaussians.form.name();
+                return Err(Error::config("gaussians.form", form, "there are no Gaussians to time"));
+            }
         };
         Ok(GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes })
     }
@@ -354,10 +410,23 @@ impl GaussianSubject {
         &self.notes
     }
 
+    /// Returns the form of the Gaussians of a fit; `auto` is one of the others.
+    fn form(&self, fit: &TimedGaussians) -> &'static str {
+        match fit {
+            TimedGaussians::Moving(fit) => fit.form().name(),
+            TimedGaussians::Own(_) => self.config.gaussians.form.name(),
+        }
+    }
+
     fn fit(&self) -> Result<TimedFit> {
         let begin = Instant::now();
-        let (mut fit, _) = MovingFit::of(&self.gpu, self.data.clone(), &self.config)?;
-        while fit.preparation().is_some() {
+        let mut fit = match &self.data {
+            TimedData::Targets(targets) => {
+                TimedGaussians::Moving(MovingFit::new(&self.gpu, Targets::clone(targets), &self.config)?)
+            }
+            TimedData::Own(data) => TimedGaussians::Own(data.begin(&self.gpu, &self.config, None, &mut Vec::new())?),
+        };
+        while !fit.is_prepared() {
             fit.advance(0)?;
         }
         let preparation_s = begin.elapsed().as_secs_f64();
@@ -392,13 +461,14 @@ impl GaussianSubject {
             preparation_s.push(last.preparation_s);
         }
         let (host_cpu_share, readings) = meanwhile.end();
+        let work = last.fit.work()?;
         let timing = GaussianTiming {
-            form: last.fit.form().name().into(),
-            count: last.fit.count(),
+            form: self.form(&last.fit).into(),
+            count: work.count,
             preparation_s: median(&preparation_s),
             ms,
             host_cpu_share,
-            work: last.fit.work()?,
+            work: work.work,
             iterations: self.timed,
             readings,
         };
@@ -411,9 +481,9 @@ impl GaussianSubject {
 }
 
 /// Runs a fit up to an iteration.
-fn run_fit(fit: &mut MovingFit, until: u32) -> Result<()> {
+fn run_fit(fit: &mut TimedGaussians, until: u32) -> Result<()> {
     while fit.step() < until {
-        if fit.advance(until)?.is_empty() {
+        if fit.advance(until)? == 0 {
             return Err(Error::Internal("the timed fit is over".into()));
         }
     }

@@ -3,10 +3,10 @@
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
+use crate::gaussians::field::Gaussians;
 use crate::gaussians::particles::Particles;
 use crate::gaussians::tree::Track;
 use crate::gpu::device::Gpu;
-use crate::model::gaussians::Gaussians;
 use crate::plan::targets::Targets;
 use crate::train::gaussians::{GaussianTrainer, strong};
 use crate::train::tree::{Fit, TreeTrainer};

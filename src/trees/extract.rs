@@ -2,10 +2,10 @@
 
 use crate::error::{Error, Result};
 use crate::export::volumes::grid_over;
+use crate::gaussians::field::MovingGaussians;
 use crate::geometry::MM_PER_UNIT;
 use crate::model::Model;
 use crate::model::component::Component;
-use crate::model::gaussians::MovingGaussians;
 use crate::render::grid::PatientGrid;
 use crate::render::renderer::Renderer;
 use crate::trees::branches::chains;

@@ -1,8 +1,8 @@
 //! Positions of material points of a moving set of Gaussians at any phase.
 
+use crate::gaussians::field::{MovingTree, scales};
 use crate::geometry::{lps_mm_from_world, world_from_lps_mm};
 use crate::kernels::layout::Gaussian;
-use crate::model::gaussians::{MovingTree, scales};
 use glam::{DMat3, DQuat, DVec3};
 
 /// A set of Gaussians that moves points through the beat.
@@ -65,8 +65,8 @@ impl Carrier<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gaussians::field::{Gaussians, Units};
     use crate::kernels::layout::{GaussianSetup, TreeSetup};
-    use crate::model::gaussians::{Gaussians, Units};
 
     const PIXEL: f64 = 0.01;
 

@@ -7,10 +7,10 @@ use crate::config::sections::Sax;
 use crate::error::{Error, Result};
 use crate::fitting::field::{Field, FieldDrawing};
 use crate::fitting::fit::FitState;
-use crate::fitting::tensors::FileTensor;
 use crate::gpu::device::Gpu;
 use crate::kernels::constants::LINEFORMER_INPUT;
 use crate::kernels::layout::SaxLevel;
+use crate::tensors::FileTensor;
 use std::any::Any;
 
 /// Width of the Lineformer's layers.
@@ -207,8 +207,8 @@ impl Field for SaxField {
 }
 
 impl FitState for SaxState {
-    fn tensors(&self, field: &dyn Field) -> Result<Vec<FileTensor>> {
-        match field.as_any().downcast_ref::<SaxField>() {
+    fn tensors(&self, field: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
+        match field.and_then(|field| field.as_any().downcast_ref::<SaxField>()) {
             Some(field) => Ok(tensors::tensors(field, self)),
             None => Err(Error::Internal("a state of SAX-NeRF beside a field of another method".into())),
         }

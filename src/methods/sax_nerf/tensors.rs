@@ -2,8 +2,8 @@
 
 use crate::error::{Error, Result};
 use crate::fitting::fit::SavedAt;
-use crate::fitting::tensors::{File, FileTensor};
 use crate::methods::sax_nerf::field::{Part, SaxField, SaxShape, SaxState};
+use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 

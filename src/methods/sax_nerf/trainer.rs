@@ -2,8 +2,7 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::fitting::field::Field;
-use crate::fitting::fit::{Fit, SavedFit};
+use crate::fitting::fit::{FieldFeed, Fit, FitField, SavedFit};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::losses::StepLoss;
 use crate::fitting::ring::losses;
@@ -199,17 +198,17 @@ impl Fit for SaxTrainer {
         Ok(losses.into_iter().zip(first..).map(|(loss, step)| StepLoss::of_images(step, loss, attenuation)).collect())
     }
 
-    fn outline(&self) -> Arc<dyn Field> {
-        Arc::new(SaxTrainer::outline(self))
+    fn outline(&self) -> FitField {
+        FitField::Own(Arc::new(SaxTrainer::outline(self)))
     }
 
-    fn params(&self) -> Vec<Buffer> {
-        SaxTrainer::params(self)
+    fn feed(&self) -> FieldFeed {
+        FieldFeed::Params(self.params())
     }
 
     fn state(&self) -> Result<SavedFit> {
         let (field, state) = SaxTrainer::state(self)?;
-        Ok(SavedFit { field: Arc::new(field), state: Arc::new(state) })
+        Ok(SavedFit { field: FitField::Own(Arc::new(field)), state: Arc::new(state) })
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {

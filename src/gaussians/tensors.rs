@@ -1,0 +1,208 @@
+//! Gaussians in a checkpoint: tensors under documented names, and their section of the header.
+
+use crate::error::{Error, Result};
+use crate::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units, inverse_step};
+use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::tensors::{File, FileTensor};
+use safetensors::tensor::Dtype;
+use serde::{Deserialize, Serialize};
+
+/// Format of checkpoints whose dynamic field consists of Gaussians; they contain no network.
+pub(crate) const FORMAT: &str = "nertca-checkpoint-3";
+/// Section of the header with the properties of the Gaussians.
+pub(crate) const SECTION: &str = "gaussians";
+
+/// Maximum number of nodes along an axis of a tree's grid, and of numbers per axis of own motion, far above those of any run.
+const MOST_NODES: u32 = 512;
+const MOST_BASIS: u32 = 256;
+
+/// Properties of the Gaussians that tensors do not contain.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct GaussianHeader {
+    /// World units (100 mm) of a pixel at the isocentre, the unit of all lengths.
+    pixel: f64,
+    /// Line integral that counts as 1.
+    strongest: f64,
+    /// Number of standard deviations at which a Gaussian is cut off.
+    cut: f32,
+    /// Bounds of the scales, pixels.
+    least_scale: f32,
+    greatest_scale: f32,
+    /// Iterations of the fit.
+    step: u32,
+    /// Number of views of the fit; 0 where it is not known.
+    #[serde(default)]
+    views: u32,
+    /// The grid that moves a tree; none for a set per phase.
+    grid: Option<GridHeader>,
+    /// Whether the model consists of Gaussians alone, of which hundreds overlap.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    crowd: bool,
+    /// Whether nearer Gaussians hide those behind them, so that each has an intensity.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    blended: bool,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct GridHeader {
+    /// Nodes along each axis of a cube around the isocentre.
+    nodes: u32,
+    /// Half side of the cube, pixels.
+    half_side: f32,
+    /// Numbers per axis of a Gaussian's own motion.
+    basis: u32,
+    /// Rest phase, at which Gaussians are at their stored positions.
+    #[serde(default)]
+    rest_phase: u32,
+}
+
+/// Name of the tensor of blended Gaussians' intensities.
+const INTENSITY: &str = "gaussians.intensity";
+
+pub(crate) fn header(field: &MovingGaussians) -> GaussianHeader {
+    let sets = field.rows();
+    GaussianHeader {
+        pixel: sets.units.pixel,
+        strongest: sets.units.strongest,
+        cut: sets.setup.cut,
+        least_scale: sets.setup.least_scale,
+        greatest_scale: sets.setup.greatest_scale,
+        step: sets.step,
+        views: sets.setup.n_views,
+        crowd: sets.is_crowd,
+        blended: sets.intensities.is_some(),
+        grid: match field {
+            MovingGaussians::PerPhase(_) => None,
+            MovingGaussians::Tree(tree) => Some(GridHeader {
+                nodes: tree.setup.n_nodes,
+                half_side: tree.setup.half_side,
+                basis: tree.setup.n_basis,
+                rest_phase: tree.setup.rest_phase,
+            }),
+        },
+    }
+}
+
+pub(crate) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
+    let rows = &field.rows().rows;
+    let floats = |name: &str, width: usize, of: &dyn Fn(&Gaussian) -> Vec<f32>| -> FileTensor {
+        let bytes = rows.iter().flat_map(of).flat_map(f32::to_le_bytes).collect();
+        let shape = if width == 1 { vec![rows.len()] } else { vec![rows.len(), width] };
+        (format!("gaussians.{name}"), Dtype::F32, shape, bytes)
+    };
+    let mut all = vec![
+        floats("position", 3, &|g| g.position.to_vec()),
+        floats("log_scale", 3, &|g| g.log_scale.to_vec()),
+        floats("rotation", 4, &|g| g.rotation.to_vec()),
+        floats("log_density", 1, &|g| vec![g.log_density]),
+    ];
+    if let Some(intensities) = &field.rows().intensities {
+        let bytes = intensities.iter().flat_map(|v| v.to_le_bytes()).collect();
+        all.push((INTENSITY.into(), Dtype::F32, vec![rows.len()], bytes));
+    }
+    match field {
+        MovingGaussians::PerPhase(_) => {
+            let phases = rows.iter().flat_map(|g| g.phase.to_le_bytes()).collect();
+            all.push(("gaussians.phase".into(), Dtype::U32, vec![rows.len()], phases));
+        }
+        MovingGaussians::Tree(tree) => {
+            let vectors = |name: &str, shape: Vec<usize>, values: &[[f32; 4]]| -> FileTensor {
+                let bytes = values.iter().flat_map(|v| v[..3].to_vec()).flat_map(f32::to_le_bytes).collect();
+                (format!("gaussians.{name}"), Dtype::F32, shape, bytes)
+            };
+            let (n, basis) = (tree.setup.n_nodes as usize, tree.setup.n_basis as usize);
+            all.push(vectors("motion.grid", vec![tree.rest.n_phases, n, n, n, 3], &tree.grid));
+            all.push(vectors("motion.own", vec![rows.len(), basis, 3], &tree.own));
+        }
+    }
+    all
+}
+
+impl MovingGaussians {
+    /// Returns the number of bytes that the field takes in a checkpoint.
+    pub fn bytes(&self) -> usize {
+        tensors(self).iter().map(|(.., bytes)| bytes.len()).sum()
+    }
+}
+
+/// Reads the Gaussians of a checkpoint whose header has these `sections`.
+///
+/// # Errors
+/// [`Error::Data`] naming what is missing, misshapen or not finite.
+pub(crate) fn read_section(sections: &serde_json::Value, file: &File<'_>, n_phases: usize) -> Result<MovingGaussians> {
+    let header: GaussianHeader = serde_json::from_value(sections[SECTION].clone())
+        .map_err(|e| Error::data(file.path, SECTION, e.to_string()))?;
+    read(&header, file, n_phases)
+}
+
+/// Reads the Gaussians that [`header`] and [`tensors`] describe.
+pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) -> Result<MovingGaussians> {
+    let path = file.path;
+    let positive = [header.pixel, header.strongest, header.cut.into(), header.least_scale.into()];
+    if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || header.greatest_scale < header.least_scale {
+        return Err(Error::data(path, "gaussians", "units, cut and scales must be positive and finite"));
+    }
+    let position = file.floats("gaussians.position", &[None, Some(3)])?;
+    let n = position.len() / 3;
+    let log_scale = file.floats("gaussians.log_scale", &[Some(n), Some(3)])?;
+    let rotation = file.floats("gaussians.rotation", &[Some(n), Some(4)])?;
+    let log_density = file.floats("gaussians.log_density", &[Some(n)])?;
+    let phase = match &header.grid {
+        None => file.words("gaussians.phase", n)?,
+        Some(grid) => vec![grid.rest_phase; n],
+    };
+    if let Some(bad) = phase.iter().find(|p| **p as usize >= n_phases) {
+        let field = if header.grid.is_some() { "gaussians.grid.rest_phase" } else { "gaussians.phase" };
+        return Err(Error::data(path, field, format!("{bad} of {n_phases} phases")));
+    }
+    let row = |i: usize| Gaussian {
+        position: [0, 1, 2].map(|k| position[3 * i + k]),
+        log_density: log_density[i],
+        log_scale: [0, 1, 2].map(|k| log_scale[3 * i + k]),
+        phase: phase[i],
+        rotation: [0, 1, 2, 3].map(|k| rotation[4 * i + k]),
+    };
+    let sets = Gaussians {
+        units: Units { pixel: header.pixel, strongest: header.strongest },
+        n_phases,
+        setup: GaussianSetup {
+            n_views: header.views,
+            n_phases: n_phases as u32,
+            cut: header.cut,
+            least_scale: header.least_scale,
+            greatest_scale: header.greatest_scale,
+            ..GaussianSetup::default()
+        },
+        rows: (0..n).map(row).collect(),
+        step: header.step,
+        is_crowd: header.crowd,
+        intensities: header.blended.then(|| file.floats(INTENSITY, &[Some(n)])).transpose()?,
+    };
+    let Some(grid) = &header.grid else { return Ok(MovingGaussians::PerPhase(sets)) };
+    if !(2..=MOST_NODES).contains(&grid.nodes)
+        || grid.basis > MOST_BASIS
+        || grid.half_side.is_nan()
+        || grid.half_side <= 0.0
+    {
+        let problem = format!("{} nodes, half side {}, basis {}", grid.nodes, grid.half_side, grid.basis);
+        return Err(Error::data(path, "gaussians.grid", problem));
+    }
+    let nodes = Some(grid.nodes as usize);
+    let vectors = |name: &str, shape: &[Option<usize>]| -> Result<Vec<[f32; 4]>> {
+        let values = file.floats(name, shape)?;
+        Ok(values.chunks_exact(3).map(|v| [v[0], v[1], v[2], 0.0]).collect())
+    };
+    Ok(MovingGaussians::Tree(MovingTree {
+        setup: TreeSetup {
+            n_nodes: grid.nodes,
+            half_side: grid.half_side,
+            inverse_step: inverse_step(grid.nodes, grid.half_side),
+            n_basis: grid.basis,
+            rest_phase: grid.rest_phase,
+            ..TreeSetup::default()
+        },
+        grid: vectors("gaussians.motion.grid", &[Some(n_phases), nodes, nodes, nodes, Some(3)])?,
+        own: vectors("gaussians.motion.own", &[Some(n), Some(grid.basis as usize), Some(3)])?,
+        rest: sets,
+    }))
+}

@@ -1,0 +1,215 @@
+//! R2-Gaussian (Zha et al. 2024), a static baseline of the paper: Gaussians with corrected line integrals, fitted to whole images of
+//! each phase, or of all.
+
+pub mod data;
+pub mod densify;
+pub mod fdk;
+pub mod parameters;
+pub mod particles;
+#[cfg(feature = "diagnostics")]
+pub mod selftest;
+pub mod setup;
+pub mod stages;
+pub mod start;
+pub mod state;
+mod tensors;
+pub mod trainer;
+pub mod twin;
+pub mod twin_chords;
+
+use crate::config::method::MethodKind;
+use crate::config::{Config, StaticData};
+use crate::error::Result;
+use crate::fitting::extent::{between_phases, volume_half};
+use crate::fitting::field::Field;
+use crate::fitting::fit::{
+    FieldFeed, FieldVolume, Fit, FitData, FitField, FitState, FitWork, Method, SavedAt, SavedFit,
+};
+use crate::fitting::losses::StepLoss;
+use crate::fitting::shown::ShownGaussians;
+use crate::gaussians::blobs::BlobKernels;
+use crate::gaussians::field::MovingGaussians;
+use crate::gaussians::pictures::into_buffers;
+use crate::geometry::MM_PER_UNIT;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::PassTime;
+use crate::kernels::push;
+use crate::kernels::stages::Build;
+use crate::kernels::tuning::Tuning;
+use crate::scan::dataset::Dataset;
+use crate::tensors::{File, FileTensor};
+use data::R2Data;
+use stages::R2Kernels;
+use state::R2State;
+use std::any::Any;
+use std::sync::Arc;
+use trainer::R2Trainer;
+
+/// The method, for the registry.
+pub struct R2Gaussian;
+
+impl Method for R2Gaussian {
+    fn kind(&self) -> MethodKind {
+        MethodKind::R2Gaussian
+    }
+
+    fn checkpoint_format(&self) -> &'static str {
+        crate::gaussians::tensors::FORMAT
+    }
+
+    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<Box<dyn FitData>> {
+        Ok(Box::new(data_of(config, dataset, notes)?))
+    }
+
+    fn volume(&self, config: &Config, dataset: &Dataset) -> FieldVolume {
+        FieldVolume { half: volume_half(config.r2.half_extent_mm, dataset), attenuation: None }
+    }
+
+    fn read(&self, sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+        let gaussians = crate::gaussians::tensors::read_section(sections, file, at.n_phases)?;
+        let state = tensors::read(file, at.n_phases)?;
+        Ok(SavedFit { field: FitField::Gaussians(Box::new(gaussians)), state: Arc::new(state) })
+    }
+
+    fn rays_per_iteration(&self, _: &Config) -> u32 {
+        0
+    }
+
+    fn lower_rates(&self, config: &mut Config, factor: f64) {
+        config.r2.position_rate *= factor;
+        config.r2.position_rate_end *= factor;
+        config.r2.density_rate *= factor;
+        config.r2.density_rate_end *= factor;
+        config.r2.scale_rate *= factor;
+        config.r2.scale_rate_end *= factor;
+        config.r2.rotation_rate *= factor;
+        config.r2.rotation_rate_end *= factor;
+    }
+
+    fn smaller_steps(&self) -> &'static str {
+        state::SMALLER_STEPS
+    }
+
+    fn make_pipelines(&self, gpu: &Gpu, config: &Config, tuning: &Tuning) -> Result<()> {
+        R2Kernels::new(gpu, config.r2.integral)?;
+        // A stage of other fits draws the pictures.
+        Build::default().stage::<push::GaussianProject>(gpu)?;
+        BlobKernels::new(gpu, tuning)?;
+        into_buffers(gpu).map(|_| ())
+    }
+}
+
+/// Prepares R2-Gaussian's data, and notes about them for the user.
+fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<R2Data> {
+    let half = volume_half(config.r2.half_extent_mm, dataset);
+    let data = R2Data::new(dataset, &config.r2, half)?;
+    let side_mm = 2.0 * half * MM_PER_UNIT;
+    notes.push(match config.r2.static_data {
+        StaticData::PerPhase => format!(
+            "R2-Gaussian, a static method: each phase is reconstructed from its own images, in a cube of {side_mm:.1} mm \
+             (r2.static_data = \"per-phase\")"
+        ),
+        StaticData::Pooled => format!(
+            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} mm, \
+             is shown at each (r2.static_data = \"pooled\")"
+        ),
+    });
+    if config.r2.normalise && dataset.vessel_attenuation.is_none() {
+        notes.push(
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and what R2-Gaussian fixes of them may \
+             not fit"
+                .into(),
+        );
+    }
+    if !dataset.hidden.is_empty() {
+        notes.push(
+            "pixels that show nothing of the patient are fitted like all others: R2-Gaussian knows no masks".into(),
+        );
+    }
+    if dataset.heart_shifts() {
+        notes.push("R2-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+    }
+    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    Ok(data)
+}
+
+impl FitData for R2Data {
+    fn begin(
+        &self,
+        gpu: &Gpu,
+        config: &Config,
+        saved: Option<&SavedFit>,
+        notes: &mut Vec<String>,
+    ) -> Result<Box<dyn Fit>> {
+        let own = |saved: &SavedFit| -> Option<(R2State, u32)> {
+            let FitField::Gaussians(field) = &saved.field else { return None };
+            Some((saved.state.as_any().downcast_ref::<R2State>()?.clone(), field.rows().step))
+        };
+        let trainer = match saved.and_then(own) {
+            Some((state, step)) => R2Trainer::with(gpu, self.clone(), config, &state, step)?,
+            None => {
+                let (trainer, more) = R2Trainer::new(gpu, self.clone(), config)?;
+                notes.extend(more);
+                trainer
+            }
+        };
+        Ok(Box::new(R2GaussianFit { shown: ShownGaussians::new(trainer.model()?), trainer }))
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+}
+
+/// A fit under way, and the Gaussians that are drawn of it.
+struct R2GaussianFit {
+    trainer: R2Trainer,
+    shown: ShownGaussians,
+}
+
+impl Fit for R2GaussianFit {
+    fn step(&self) -> u32 {
+        self.trainer.step()
+    }
+
+    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+        let before = self.trainer.step();
+        let losses = self.trainer.advance(until)?;
+        if ShownGaussians::is_due(before, self.trainer.step(), until) {
+            self.shown.show(self.trainer.model()?);
+        }
+        Ok(losses.into_iter().zip(before + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
+    }
+
+    fn outline(&self) -> FitField {
+        FitField::Gaussians(Box::new(self.shown.field()))
+    }
+
+    fn feed(&self) -> FieldFeed {
+        FieldFeed::Gaussians(self.shown.feed())
+    }
+
+    fn state(&self) -> Result<SavedFit> {
+        let state = self.trainer.state()?;
+        let field = MovingGaussians::PerPhase(self.trainer.field_of(&state));
+        Ok(SavedFit { field: FitField::Gaussians(Box::new(field)), state: Arc::new(state) })
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        self.trainer.profile_step()
+    }
+
+    fn work(&self) -> Result<Option<FitWork>> {
+        Ok(Some(FitWork { count: self.trainer.count(), work: self.trainer.work()? }))
+    }
+}
+
+impl FitState for R2State {
+    fn tensors(&self, _: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
+        Ok(tensors::tensors(self))
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+}

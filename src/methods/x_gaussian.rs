@@ -1,0 +1,211 @@
+//! X-Gaussian (Cai et al. 2024), a static baseline of the paper: Gaussians of which nearer ones hide those behind them, fitted to
+//! whole normalised images of each phase, or of all.
+
+pub mod data;
+pub mod densify;
+pub mod particles;
+#[cfg(feature = "diagnostics")]
+pub mod selftest;
+pub mod setup;
+pub mod stages;
+pub mod start;
+pub mod state;
+mod tensors;
+pub mod trainer;
+pub mod twin;
+
+use crate::config::method::MethodKind;
+use crate::config::{Config, StaticData};
+use crate::error::Result;
+use crate::fitting::extent::{between_phases, volume_half};
+use crate::fitting::field::Field;
+use crate::fitting::fit::{
+    FieldFeed, FieldVolume, Fit, FitData, FitField, FitState, FitWork, Method, SavedAt, SavedFit,
+};
+use crate::fitting::losses::StepLoss;
+use crate::fitting::shown::ShownGaussians;
+use crate::gaussians::blobs::BlobKernels;
+use crate::gaussians::field::MovingGaussians;
+use crate::gaussians::pictures::into_buffers;
+use crate::gaussians::stages::SplatStage;
+use crate::geometry::MM_PER_UNIT;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::PassTime;
+use crate::kernels::push;
+use crate::kernels::stages::Build;
+use crate::kernels::tuning::Tuning;
+use crate::scan::dataset::Dataset;
+use crate::tensors::{File, FileTensor};
+use data::XData;
+use stages::XKernels;
+use state::XState;
+use std::any::Any;
+use std::sync::Arc;
+use trainer::XTrainer;
+
+/// The method, for the registry.
+pub struct XGaussian;
+
+impl Method for XGaussian {
+    fn kind(&self) -> MethodKind {
+        MethodKind::XGaussian
+    }
+
+    fn checkpoint_format(&self) -> &'static str {
+        crate::gaussians::tensors::FORMAT
+    }
+
+    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<Box<dyn FitData>> {
+        Ok(Box::new(data_of(config, dataset, notes)?))
+    }
+
+    fn volume(&self, config: &Config, dataset: &Dataset) -> FieldVolume {
+        FieldVolume { half: volume_half(config.x.half_extent_mm, dataset), attenuation: None }
+    }
+
+    fn read(&self, sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
+        let gaussians = crate::gaussians::tensors::read_section(sections, file, at.n_phases)?;
+        let state = tensors::read(file, at.n_phases)?;
+        Ok(SavedFit { field: FitField::Gaussians(Box::new(gaussians)), state: Arc::new(state) })
+    }
+
+    fn rays_per_iteration(&self, _: &Config) -> u32 {
+        0
+    }
+
+    fn lower_rates(&self, config: &mut Config, factor: f64) {
+        config.x.position_rate *= factor;
+        config.x.position_rate_end *= factor;
+        config.x.intensity_rate *= factor;
+        config.x.opacity_rate *= factor;
+        config.x.scale_rate *= factor;
+        config.x.rotation_rate *= factor;
+    }
+
+    fn smaller_steps(&self) -> &'static str {
+        state::SMALLER_STEPS
+    }
+
+    fn make_pipelines(&self, gpu: &Gpu, _: &Config, tuning: &Tuning) -> Result<()> {
+        XKernels::new(gpu)?;
+        // These fits also use the stages that draw pictures.
+        Build::default().stage::<push::GaussianProject>(gpu)?;
+        SplatStage::<push::GaussianSplat>::new(gpu)?;
+        BlobKernels::new(gpu, tuning)?;
+        into_buffers(gpu).map(|_| ())
+    }
+}
+
+/// Prepares X-Gaussian's data, and notes about them for the user.
+fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<XData> {
+    let half = volume_half(config.x.half_extent_mm, dataset);
+    let data = XData::new(dataset, &config.x, half)?;
+    let side_mm = 2.0 * half * MM_PER_UNIT;
+    let whose = match config.x.static_data {
+        StaticData::PerPhase => "each phase has Gaussians of its own images (x.static_data = \"per-phase\")",
+        StaticData::Pooled => "one set of the images of all phases is shown at each (x.static_data = \"pooled\")",
+    };
+    notes.push(format!(
+        "X-Gaussian, a static method of Gaussians that hide each other: {whose}, from a cube of {side_mm:.1} mm on, in a scene of \
+         {:.0} mm; its pictures have no unit, and its opacities are no attenuation",
+        data.extent_mm
+    ));
+    if data.clamped > 0.0 {
+        notes.push(format!(
+            "{:.1} % of the images' pixels are beyond x.clamp = {} and count as that",
+            100.0 * data.clamped,
+            config.x.clamp
+        ));
+    }
+    if !dataset.hidden.is_empty() {
+        notes.push(
+            "pixels that show nothing of the patient are fitted like all others: X-Gaussian knows no masks".into(),
+        );
+    }
+    if dataset.heart_shifts() {
+        notes.push("X-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+    }
+    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    Ok(data)
+}
+
+impl FitData for XData {
+    fn begin(
+        &self,
+        gpu: &Gpu,
+        config: &Config,
+        saved: Option<&SavedFit>,
+        notes: &mut Vec<String>,
+    ) -> Result<Box<dyn Fit>> {
+        let own = |saved: &SavedFit| -> Option<(XState, u32)> {
+            let FitField::Gaussians(field) = &saved.field else { return None };
+            Some((saved.state.as_any().downcast_ref::<XState>()?.clone(), field.rows().step))
+        };
+        let trainer = match saved.and_then(own) {
+            Some((state, step)) => XTrainer::with(gpu, self.clone(), config, &state, step)?,
+            None => {
+                let (trainer, more) = XTrainer::new(gpu, self.clone(), config)?;
+                notes.extend(more);
+                trainer
+            }
+        };
+        Ok(Box::new(XGaussianFit { shown: ShownGaussians::new(trainer.model()?), trainer }))
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+}
+
+/// A fit under way, and the Gaussians that are drawn of it.
+struct XGaussianFit {
+    trainer: XTrainer,
+    shown: ShownGaussians,
+}
+
+impl Fit for XGaussianFit {
+    fn step(&self) -> u32 {
+        self.trainer.step()
+    }
+
+    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
+        let before = self.trainer.step();
+        let losses = self.trainer.advance(until)?;
+        if ShownGaussians::is_due(before, self.trainer.step(), until) {
+            self.shown.show(self.trainer.model()?);
+        }
+        Ok(losses.into_iter().zip(before + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
+    }
+
+    fn outline(&self) -> FitField {
+        FitField::Gaussians(Box::new(self.shown.field()))
+    }
+
+    fn feed(&self) -> FieldFeed {
+        FieldFeed::Gaussians(self.shown.feed())
+    }
+
+    fn state(&self) -> Result<SavedFit> {
+        let state = self.trainer.state()?;
+        let field = MovingGaussians::PerPhase(self.trainer.field_of(&state));
+        Ok(SavedFit { field: FitField::Gaussians(Box::new(field)), state: Arc::new(state) })
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        self.trainer.profile_step()
+    }
+
+    fn work(&self) -> Result<Option<FitWork>> {
+        Ok(Some(FitWork { count: self.trainer.count(), work: self.trainer.work()? }))
+    }
+}
+
+impl FitState for XState {
+    fn tensors(&self, _: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
+        Ok(tensors::tensors(self))
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+}
