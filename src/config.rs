@@ -319,7 +319,7 @@ impl Config {
                     .map_err(|e| Error::config("preset", value, e.message().to_owned()))?,
             ),
         };
-        Config::preset(preset.or(named).unwrap_or_default()).overlaid(overlay, settings)
+        Config::preset(preset.or(named).unwrap_or_default()).overlaid(overlay, settings, &[])
     }
 
     /// Returns this configuration with `key=value` settings.
@@ -327,23 +327,43 @@ impl Config {
     /// # Errors
     /// [`Error::Config`] naming the key.
     pub fn with(&self, settings: &[String]) -> Result<Config> {
-        self.overlaid(toml::Table::new(), settings)
+        self.overlaid(toml::Table::new(), settings, &[])
     }
 
-    /// Overrides this configuration with the table of a file, then with settings; the preset is kept.
-    fn overlaid(&self, overlay: toml::Table, settings: &[String]) -> Result<Config> {
+    /// Returns this configuration with `key=value` settings that may also change constants of the program: for schedules of
+    /// another length, and for tests.
+    ///
+    /// # Errors
+    /// [`Error::Config`] naming the key.
+    pub fn with_constants(&self, constants: &[String]) -> Result<Config> {
+        self.overlaid(toml::Table::new(), &[], constants)
+    }
+
+    /// Returns this configuration with `key=value` settings, and with `constants` as in [`Config::with_constants`].
+    ///
+    /// # Errors
+    /// [`Error::Config`] naming the key.
+    pub fn with_both(&self, settings: &[String], constants: &[String]) -> Result<Config> {
+        self.overlaid(toml::Table::new(), settings, constants)
+    }
+
+    /// Overrides this configuration with the table of a file, then with settings and constants; the preset is kept. Constants of
+    /// the program are accepted in `constants` alone.
+    fn overlaid(&self, overlay: toml::Table, settings: &[String], constants: &[String]) -> Result<Config> {
         let before = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
         let (mut table, keep) = (before.clone(), before.get("preset").cloned());
         // A file with every setting was written by a program; it may also contain settings that do not act.
         let is_whole = overlay.clone().try_into::<Config>().is_ok();
         let mut given = if is_whole { Vec::new() } else { acting::keys(&overlay) };
         merge(&mut table, overlay, "")?;
-        for setting in settings {
+        for (at, setting) in settings.iter().chain(constants).enumerate() {
             let (key, value) = setting
                 .split_once('=')
                 .ok_or_else(|| Error::config("setting", setting, "write it as key=value, e.g. train.rays=512"))?;
             merge(&mut table, nested(key.trim(), parse_value(value.trim())), "")?;
-            given.push(key.trim().to_owned());
+            if at < settings.len() {
+                given.push(key.trim().to_owned());
+            }
         }
         if let Some(preset) = keep {
             table.insert("preset".into(), preset);
@@ -436,9 +456,9 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("c.toml");
         std::fs::write(&file, "preset = \"paper\"\n[train]\nrays = 100\niterations = 7\n").unwrap();
-        let config = Config::load(None, Some(&file), &["train.rays=64".into(), "adam.epsilon=1".into()]).unwrap();
+        let config = Config::load(None, Some(&file), &["train.rays=64".into(), "static.lr=1".into()]).unwrap();
         assert_eq!((config.train.rays, config.train.iterations, config.dynamic.width), (64, 7, 128));
-        assert_eq!((config.preset, config.adam.epsilon), (Preset::Paper, 1.0));
+        assert_eq!((config.preset, config.static_field.lr), (Preset::Paper, 1.0));
     }
 
     #[test]

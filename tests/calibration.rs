@@ -179,7 +179,8 @@ fn what_tells_nothing_is_left_as_stated() {
         assert_eq!(dataset.corrected(&calibration).unwrap().views[0].geometry, dataset.views[0].geometry);
     }
     assert_eq!(calibrate(&small_dataset(40, 40), &config("off")).unwrap(), Calibration::none(None));
-    let network = Config::load(None, None, &["gaussians.form=none".into(), "calibrate.mode=breathing".into()]).unwrap();
+    let network =
+        Config::load(Some(nertca_vk::config::Preset::FastMlp), None, &["calibrate.mode=breathing".into()]).unwrap();
     let refused = calibrate(&small_dataset(40, 40), &network).unwrap_err().to_string();
     assert!(refused.contains("calibrate.mode") && refused.contains("per view only"), "{refused}");
 }

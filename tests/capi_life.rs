@@ -116,11 +116,7 @@ fn pixel_formats_strides_and_intensities_mean_the_same() {
 #[test]
 fn a_reconstruction_lives_from_frames_to_scores() {
     let context = context("validation = true");
-    // A hull and smooth fields make vessels appear within few iterations.
-    let settings = SMALL.replace(
-        "march.render_samples = 32",
-        "march.render_samples = 256\nhull.noise_sigmas = 0\nhull.dilate_pixels = 1",
-    );
+    let settings = SMALL.replace("march.render_samples = 32", "march.render_samples = 256");
     let made = reconstruction(context, &settings);
     add_frames(made, 0..3);
     let pixels_of = pixels(1, 2);

@@ -5,7 +5,6 @@ mod common;
 
 use common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
 use glam::DVec3;
-use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset, sections};
 use nertca_vk::error::Error;
 use nertca_vk::gaussians::field::{Gaussians, MovingGaussians};
@@ -160,7 +159,7 @@ fn short_run(form: &str) -> Config {
     ];
     let mut all: Vec<String> = settings.map(String::from).to_vec();
     all.push(format!("gaussians.form={form}"));
-    Config::load(Preset::named("fast"), None, &all).unwrap()
+    Config::preset(Preset::Fast).with_constants(&all).unwrap()
 }
 
 #[test]

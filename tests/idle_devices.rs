@@ -44,7 +44,7 @@ fn train(config: &Config, silent_stage: Option<&str>) -> Result<u32, Error> {
 fn every_trainer_says_that_it_is_told_nothing() {
     let gaussians = |form: &str| {
         let settings = [format!("gaussians.form={form}"), "gaussians.iterations=8".into(), "gaussians.count=40".into()];
-        Config::load(Some(Preset::Fast), None, &settings).unwrap()
+        Config::preset(Preset::Fast).with_constants(&settings).unwrap()
     };
     for (stage, config) in [
         ("report", problems::small_config(Preset::FastMlp, &[]).unwrap()),

@@ -58,7 +58,7 @@ const SHORT: &[&str] = &[
 ];
 
 /// Further settings of runs whose dynamic field is a network.
-const SMALL_NETWORK: &[&str] = &["--set", "dynamic.width=16", "--set", "hull.resolution=32"];
+const SMALL_NETWORK: &[&str] = &["--set", "dynamic.width=16"];
 
 #[test]
 fn a_whole_life() {
@@ -98,7 +98,7 @@ fn a_whole_life() {
     assert!(ok(&["info", text(&run)]).contains("step: 30"));
     assert!(ok(&["info", text(&data)]).contains("phases: 3"));
     let hull = directory.path().join("hull.nrrd");
-    ok(&["train", text(&data), "-o", text(&run), "--export-hull", text(&hull), "--set", "hull.dilate_pixels=2"]);
+    ok(&["train", text(&data), "-o", text(&run), "--export-hull", text(&hull)]);
     assert!(hull.is_file());
     fails(&["render", text(&run), "--primary", "0", "--secondary", "0", "-o", "x.bmp"], 2, &["x.bmp", ".png"]);
     fails(

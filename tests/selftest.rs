@@ -160,7 +160,7 @@ fn the_inventory_is_what_a_run_builds() {
         };
         let form = format!("gaussians.form={form}");
         let settings: Vec<String> = short.iter().map(|s| (*s).to_owned()).chain([form]).collect();
-        let config = Config::load(Some(preset), None, &settings).unwrap();
+        let config = Config::preset(preset).with_constants(&settings).unwrap();
         let listed = open();
         let inventory = inventory::compile(&listed, &config, 3, &tuning(&listed)).unwrap();
         let names: BTreeSet<String> = inventory.iter().map(Compiled::name).collect();

@@ -6,7 +6,8 @@ mod known_tree;
 #[path = "common/python.rs"]
 mod python;
 
-use known_tree::{PHASES, Trained, ok, program, text, train, trained};
+use known_tree::{PHASES, Trained, ok, program, text, train, trained, whole_config};
+use nertca_vk::config::Preset;
 use nertca_vk::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::run::score::as_trained;
@@ -135,8 +136,9 @@ fn viewer_and_page_say_why_there_is_no_tree() {
     let Trained { directory, data, .. } = trained();
     // A network that starts at zero, and is not trained yet, has no vessels.
     let young = directory.path().join("young");
-    let nothing = ["--set", "dynamic.best_start=false", "--set", "dynamic.normalised_shift=-15"];
-    train(data, &young, &[&["--preset", "fast-mlp", "--iterations", "1", "--tree"], &nothing[..]].concat());
+    let nothing = ["dynamic.best_start=false", "dynamic.normalised_shift=-15"];
+    let config = whole_config(directory.path(), Preset::FastMlp, &nothing);
+    train(data, &young, &["--config", text(&config), "--iterations", "1", "--tree"]);
     let page = std::fs::read_to_string(young.join("report.html")).unwrap();
     assert!(page.contains("There is no vessel tree") && !page.contains("<script"), "a page without a tree says so");
     assert!(!young.join("tree.json").exists());

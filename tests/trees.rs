@@ -7,12 +7,13 @@ mod known_tree;
 #[path = "common/python.rs"]
 mod python;
 
-use known_tree::{PHASES, POINTS, Trained, nertca, ok, text, train, trained};
+use known_tree::{PHASES, POINTS, Trained, nertca, ok, text, train, trained, whole_config};
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::{NERTCA_ERROR_BUFFER, NERTCA_OK};
 use nertca_vk::capi::tree::nertca_reconstruction_tree;
 use nertca_vk::capi::types::{nertca_log, nertca_tree};
+use nertca_vk::config::Preset;
 use nertca_vk::model::checkpoint;
 use python::python;
 use serde_json::{Value, json};
@@ -107,8 +108,9 @@ fn what_has_no_tree_is_refused() {
     refuses(run, &out, &["--phase", "4"], &["--phase", "0 to 3"]);
     // A network that starts at zero, and is not trained yet, has no vessels.
     let young = directory.path().join("young");
-    let nothing = ["--set", "dynamic.best_start=false", "--set", "dynamic.normalised_shift=-15"];
-    train(data, &young, &[&["--preset", "fast-mlp", "--iterations", "1"], &nothing[..]].concat());
+    let nothing = ["dynamic.best_start=false", "dynamic.normalised_shift=-15"];
+    let config = whole_config(directory.path(), Preset::FastMlp, &nothing);
+    train(data, &young, &["--config", text(&config), "--iterations", "1"]);
     refuses(&young, &out, &[], &["phase 0", "no vessel", "report"]);
 }
 

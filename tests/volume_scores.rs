@@ -8,6 +8,7 @@ mod program;
 mod python;
 
 use glam::DVec3;
+use nertca_vk::config::Preset;
 use nertca_vk::formats::nrrd;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::random::uniform01;
@@ -15,7 +16,7 @@ use nertca_vk::score::metrics::ssim;
 use nertca_vk::score::shapes::compare;
 use nertca_vk::vessels::centreline::centreline;
 use nertca_vk::vessels::mask::Mask;
-use program::program;
+use program::{program, whole_config};
 use python::python;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -306,9 +307,9 @@ fn a_field_everywhere_has_no_distance_and_trains_on() {
         "loss.normalise=true",
         "dynamic.normalised_shift=8",
     ];
-    let settings: Vec<&str> = settings.iter().flat_map(|setting| ["--set", setting]).collect();
-    let train = ["train", text(&data), "-o", text(&run), "--preset", "paper", "--iterations", "2", "--no-eval"];
-    ok(&[&train[..], &settings].concat());
+    let config = whole_config(directory.path(), Preset::Paper, &settings);
+    let train = ["train", text(&data), "-o", text(&run), "--config", text(&config), "--iterations", "2", "--no-eval"];
+    ok(&train);
     let metrics = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
     let lines = metrics.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
     let validations: Vec<Value> = lines.filter(|line| line["event"] == "validation").collect();

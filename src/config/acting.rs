@@ -1,63 +1,92 @@
-//! Selection of the settings that act in a configuration: those of its method, and those that all methods share.
+//! Selection of the keys of a configuration: the settings of a preset's method that a user may change, and those that all methods
+//! share. All other numbers of a configuration are constants of the program: what a publication fixes, and what was tuned. They are
+//! recorded in checkpoints, so that a run continues with the numbers that it began with.
 
-use crate::config::Config;
-use crate::config::method::MethodKind;
+use crate::choice::Choice;
+use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
 
-/// Tells whether a setting acts, for settings that do not choose the method.
-fn acts(kind: MethodKind, section: &str, name: &str) -> bool {
+/// Constants of NeRF-CA's public code.
+const OF_NERF_CA: [&str; 7] =
+    ["gain", "change_weight", "least_change", "least_integral", "ramp", "stop_after", "stop_below"];
+/// Constants of R2-Gaussian's public code, and our choice of units and of what the total variation moves.
+const OF_R2: [&str; 6] = ["init", "normalise", "density_share", "candidate", "least_scale", "tv_moves_centres"];
+/// Constants of X-Gaussian's public code, and our choice of units.
+const OF_X: [&str; 7] = [
+    "normalise",
+    "extent_mm",
+    "first_opacity",
+    "position_rate_end",
+    "degree_every",
+    "greatest_radius",
+    "reset_opacity",
+];
+/// Constants of SAX-NeRF's public code, and our choice of units.
+const OF_SAX: [&str; 3] = ["normalise", "base", "rate_fall"];
+
+/// Tells whether a setting is a key of a preset.
+fn is_key(preset: Preset, section: &str, name: &str) -> bool {
+    use Preset::{Fast, FastMlp, NerfCa, Paper, PublicCode, R2Gaussian, SaxNerf, XGaussian};
+    let of = |presets: &[Preset]| presets.contains(&preset);
+    let is_published = of(&[Paper, PublicCode]);
+    let has_tensor_field = is_published || of(&[FastMlp, Fast]);
+    let has_network = is_published || of(&[FastMlp, NerfCa]);
     match (section, name) {
-        ("train", "rays" | "motion_share") => !kind.is_alone(),
-        ("march", "static_samples") => matches!(kind, MethodKind::Fields | MethodKind::Gaussians),
-        ("march", "dynamic_samples") => matches!(kind, MethodKind::Fields | MethodKind::TwoNetworks),
-        ("march", "render_samples") => true,
-        ("march", _) => !kind.is_alone(),
-        ("static", "lr" | "lr_end" | "decay") => !kind.is_alone(),
-        ("static", _) => matches!(kind, MethodKind::Fields | MethodKind::Gaussians),
-        ("dynamic", "half_extent_mm") => matches!(kind, MethodKind::Fields | MethodKind::Gaussians),
-        ("dynamic", _) => matches!(kind, MethodKind::Fields | MethodKind::TwoNetworks),
-        ("loss", _) => !kind.is_alone(),
-        ("hull", "enabled" | "resolution" | "max_share") => kind == MethodKind::Fields,
-        ("hull", _) => !kind.is_alone(),
-        ("occupancy", _) => kind == MethodKind::Fields,
-        ("networks", _) => kind == MethodKind::TwoNetworks,
-        ("adam", "decay_share") => !kind.is_alone(),
-        ("gaussians", _) => kind == MethodKind::Gaussians,
-        ("tree", _) => kind == MethodKind::Gaussians,
-        ("r2", _) => kind == MethodKind::R2Gaussian,
-        ("x", _) => kind == MethodKind::XGaussian,
-        ("sax", _) => kind == MethodKind::SaxNerf,
-        _ => true,
+        ("train", "rays") | ("static", "lr" | "lr_end") => has_tensor_field || has_network,
+        ("train", "motion_share") => preset == NerfCa,
+        ("train", "validate_images") => false,
+        ("train" | "calibrate", _) | ("march", "render_samples") => true,
+        ("march", "static_samples") | ("static", "grid" | "ranks" | "tv") | ("dynamic", "half_extent_mm") => {
+            has_tensor_field
+        }
+        ("march", "dynamic_samples")
+        | ("dynamic", "layers" | "width" | "bands" | "window_iterations" | "lr" | "lr_end") => has_network,
+        ("dynamic", "latent" | "window_start" | "delay") => is_published || preset == FastMlp,
+        ("dynamic", "occlusion") | ("loss", "normalise") => is_published,
+        ("dynamic", "occlusion_share") => is_published || preset == NerfCa,
+        ("loss", "dynamic_target") | ("hull", "enabled") => preset == FastMlp,
+        ("networks", name) => preset == NerfCa && !OF_NERF_CA.contains(&name),
+        ("gaussians", "form" | "iterations" | "count") => preset == Fast,
+        ("r2", name) => preset == R2Gaussian && !OF_R2.contains(&name) && !name.ends_with("_end"),
+        ("x", name) => preset == XGaussian && !OF_X.contains(&name),
+        ("sax", name) => preset == SaxNerf && !OF_SAX.contains(&name),
+        _ => false,
     }
 }
 
-/// Settings that studies scale with the length of a run for every method, so that kept results state them.
-const SCALED_FOR_ALL: [&str; 3] = ["dynamic.delay", "dynamic.window_iterations", "occupancy.start"];
+/// Tells whether a setting, by its key, is a key of a preset.
+fn is_key_of(preset: Preset, key: &str) -> bool {
+    match key.split_once('.') {
+        None => true,
+        Some((section, name)) => is_key(preset, section, name),
+    }
+}
 
 impl Config {
-    /// Tells whether a setting, by its key, acts in this configuration.
+    /// Tells whether a setting, by its key, is one that a user of this configuration's preset may change.
     pub fn acts(&self, key: &str) -> bool {
-        match key.split_once('.') {
-            // The form of a field chooses the method.
-            None | Some((_, "form")) => true,
-            Some((section, name)) => acts(self.method(), section, name),
-        }
+        is_key_of(self.preset, key)
     }
 
-    /// Refuses a setting that differs from `before` and does not act.
+    /// Refuses a setting that differs from `before` and is no key of the preset.
     pub(super) fn check_acts(&self, before: &toml::Table, key: &str) -> Result<()> {
         let now = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
         let value = at(&now, key);
-        if self.acts(key) || SCALED_FOR_ALL.contains(&key) || value == at(before, key) {
+        if self.acts(key) || value == at(before, key) {
             return Ok(());
         }
-        let method = self.method().name();
-        let problem =
-            format!("has no effect: the method is {method}; `train --print-config` prints the settings that act");
+        let preset = self.preset.name();
+        let see = format!("`train --preset {preset} --print-config` prints the settings of this preset");
+        let problem = if Preset::ALL.iter().any(|other| is_key_of(*other, key)) {
+            format!("has no effect with the preset `{preset}`; {see}")
+        } else {
+            let constant = at(before, key).map_or(String::new(), ToString::to_string);
+            format!("is a constant of the program, {constant} with the preset `{preset}`; {see}")
+        };
         Err(Error::config(key, value.map_or(String::new(), ToString::to_string), problem))
     }
 
-    /// Returns the settings that act as TOML.
+    /// Returns the settings that a user may change as TOML.
     ///
     /// # Errors
     /// [`Error::Internal`] when they cannot be written as TOML.
@@ -107,20 +136,41 @@ mod tests {
             (Preset::SaxNerf, "dynamic.lr=0.5"),
             (Preset::SaxNerf, "train.rays=7"),
             (Preset::R2Gaussian, "sax.rate=0.5"),
-            (Preset::XGaussian, "hull.noise_sigmas=3"),
+            (Preset::XGaussian, "r2.count=3"),
             (Preset::Fast, "dynamic.width=64"),
-            (Preset::Fast, "occupancy.cells=32"),
             (Preset::Paper, "gaussians.count=9"),
             (Preset::NerfCa, "static.grid=12"),
         ] {
             let message = load(preset, setting).unwrap_err().to_string();
             let key = setting.split('=').next().unwrap();
-            assert!(message.contains(key) && message.contains("has no effect"), "{setting}: {message}");
+            assert!(message.contains(key) && message.contains("has no effect with the preset"), "{setting}: {message}");
         }
-        // A value that changes nothing is no mistake, and a form chooses the method.
+        // A value that changes nothing is no mistake.
         load(Preset::SaxNerf, "loss.normalise=false").unwrap();
-        let settings = ["gaussians.form=none", "dynamic.width=64"].map(String::from);
-        Config::load(Some(Preset::Fast), None, &settings).unwrap();
+    }
+
+    #[test]
+    fn constants_are_refused_with_their_value_and_tests_may_change_them() {
+        for (preset, setting, value) in
+            [(Preset::Fast, "gaussians.cut=3", "3.2"), (Preset::Paper, "static.tv_line=1", "0.001")]
+        {
+            let message = load(preset, setting).unwrap_err().to_string();
+            assert!(message.contains("is a constant of the program") && message.contains(value), "{message}");
+            Config::preset(preset).with_constants(&[setting.to_owned()]).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_method_has_at_most_thirty_settings_and_all_have_at_most_a_hundred() {
+        let mut all = std::collections::BTreeSet::new();
+        for preset in Preset::ALL.iter().copied() {
+            let printed: toml::Table = Config::preset(preset).acting_toml().unwrap().parse().unwrap();
+            // A preset is chosen by --preset.
+            let keys: Vec<String> = keys(&printed).into_iter().filter(|key| key != "preset").collect();
+            assert!(keys.len() <= 30, "{preset:?}: {} settings {keys:?}", keys.len());
+            all.extend(keys);
+        }
+        assert!(all.len() <= 100, "{} settings", all.len());
     }
 
     #[test]

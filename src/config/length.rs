@@ -64,7 +64,7 @@ impl Config {
         config.train.iterations = iterations;
         let schedule = self.schedule_of_length(iterations);
         let settings: Vec<String> = schedule.iter().map(|(key, count)| format!("{key}={count}")).collect();
-        config.with(&settings)
+        config.with_constants(&settings)
     }
 
     /// Returns the configuration of a dry run (`train::dry_run`): its schedule keeps its order, and its batches their sizes.

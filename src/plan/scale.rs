@@ -217,7 +217,7 @@ mod tests {
 
     fn normalised(dataset: &Dataset, settings: &[&str]) -> Result<Scene> {
         let settings: Vec<String> = ["loss.normalise=true"].iter().chain(settings).map(|s| (*s).to_owned()).collect();
-        let config = Config::load(Some(Preset::Paper), None, &settings).unwrap();
+        let config = Config::preset(Preset::Paper).with_constants(&settings).unwrap();
         let motion = crate::plan::motion::analyse(dataset, &config.hull);
         Scene::new(&config, dataset, &motion, None)
     }

@@ -114,14 +114,10 @@ pub fn small_config(preset: Preset, settings: &[&str]) -> Result<Config> {
         "dynamic.window_iterations=20",
         "hull.enabled=false",
     ];
-    // Settings of the forms choose the method, and the method those that act.
-    let owned = |settings: &[&str]| -> Vec<String> { settings.iter().map(|setting| (*setting).to_owned()).collect() };
-    let forms: Vec<&str> = settings.iter().copied().filter(|setting| setting.contains(".form=")).collect();
-    let method = Config::load(Some(preset), None, &owned(&forms)).unwrap_or_else(|_| Config::preset(preset));
-    let acts = |setting: &&&str| setting.split_once('=').is_some_and(|(key, _)| method.acts(key));
-    let base: Vec<&str> = small.iter().filter(acts).copied().collect();
-    let all = [owned(&base), owned(settings)].concat();
-    Config::load(Some(preset), None, &all)
+    let config = Config::preset(preset);
+    let acts = |setting: &&&str| setting.split_once('=').is_some_and(|(key, _)| config.acts(key));
+    let all = small.iter().filter(acts).chain(settings);
+    config.with_constants(&all.map(|setting| (*setting).to_owned()).collect::<Vec<String>>())
 }
 
 /// Gaussians of all shapes within `reach` pixels of the isocentre.

@@ -235,11 +235,9 @@ fn configuration(
         given.push(key);
     }
     let own = || section.set.iter().chain(further);
-    let mut settings: Vec<String> = own().map(|setting| setting.get_ref().clone()).collect();
-    if let Some(iterations) = &section.iterations {
-        settings.extend(scaled(preset, *iterations.get_ref(), &given));
-    }
-    Config::load(Some(section.preset), None, &settings).map_err(|e| {
+    let settings: Vec<String> = own().map(|setting| setting.get_ref().clone()).collect();
+    let schedule = section.iterations.as_ref().map(|iterations| scaled(preset, *iterations.get_ref(), &given));
+    Config::preset(section.preset).with_both(&settings, &schedule.unwrap_or_default()).map_err(|e| {
         let alone = |setting: &&Spanned<String>| {
             Config::load(Some(section.preset), None, std::slice::from_ref(setting.get_ref())).is_err()
         };

@@ -100,7 +100,7 @@ impl Golden {
             format!("adam.epsilon={}", n("eps")),
             "hull.enabled=false".into(),
         ];
-        Config::load(Some(preset), None, &settings).unwrap()
+        Config::preset(preset).with_constants(&settings).unwrap()
     }
 
     /// Settings of two networks, whose losses are delayed instead of the field.
@@ -135,7 +135,7 @@ impl Golden {
         for key in ["gain", "ramp", "least_change", "least_integral", "change_weight"] {
             settings.push(format!("networks.{key}={}", n(key)));
         }
-        Config::load(Some(Preset::NerfCa), None, &settings).unwrap()
+        Config::preset(Preset::NerfCa).with_constants(&settings).unwrap()
     }
 
     pub fn scene(&self) -> Scene {

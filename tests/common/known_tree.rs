@@ -4,7 +4,7 @@
 #[path = "program.rs"]
 mod program;
 
-pub use program::program;
+pub use program::{program, whole_config};
 use serde_json::{Value, json};
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};

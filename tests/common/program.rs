@@ -2,6 +2,7 @@
 //! tests must not affect a user's next run.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "shared by tests")]
 
+use nertca_vk::config::{Config, Preset};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -17,6 +18,16 @@ fn cache() -> &'static Path {
         std::fs::create_dir_all(&cache).unwrap();
         cache
     })
+}
+
+/// Writes a whole configuration, which may have other constants than the program, for `--config`.
+#[allow(dead_code, reason = "not every test changes constants")]
+pub fn whole_config(directory: &Path, preset: Preset, constants: &[&str]) -> PathBuf {
+    let constants: Vec<String> = constants.iter().map(|setting| (*setting).to_owned()).collect();
+    let config = Config::preset(preset).with_constants(&constants).unwrap();
+    let path = directory.join("whole-config.toml");
+    std::fs::write(&path, config.to_toml().unwrap()).unwrap();
+    path
 }
 
 /// Command of the program, without arguments.

@@ -65,7 +65,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "r2.densify_every=0",
     ];
     let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
-    Config::load(Some(Preset::R2Gaussian), None, &all)
+    Config::preset(Preset::R2Gaussian).with_constants(&all)
 }
 
 /// Data and Gaussians that kernels are compared on: sizes that are no multiples of anything; centres in view, outside

@@ -66,7 +66,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "sax.rate_falls_at=30",
     ];
     let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
-    Config::load(Some(Preset::SaxNerf), None, &all)
+    Config::preset(Preset::SaxNerf).with_constants(&all)
 }
 
 /// Data, and fields without special values: a grid and normalisations that have an effect.

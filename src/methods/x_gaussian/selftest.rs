@@ -72,7 +72,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "x.reset_every=0",
     ];
     let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
-    Config::load(Some(Preset::XGaussian), None, &all)
+    Config::preset(Preset::XGaussian).with_constants(&all)
 }
 
 fn data_of(config: &Config, width: usize, height: usize) -> Result<XData> {

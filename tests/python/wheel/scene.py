@@ -17,7 +17,6 @@ SETTINGS: dict[str, object] = {
     "train.iterations": 60,
     "train.checkpoint_every": 20,
     "march.static_samples": 24,
-    "march.dynamic_samples": 40,
     "march.render_samples": 32,
     "static.grid": 9,
     "dynamic.half_extent_mm": 20,
