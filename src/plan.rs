@@ -98,10 +98,11 @@ impl Plan {
         } else {
             if dataset.heart_shifts() {
                 notes.push(
-                    "the network sees all frames of a view alike: displacements of the heart are left out".into(),
+                    "the network uses one geometry for all frames of a view: the stated displacements of the heart are \
+                     ignored".into(),
                 );
             }
-            notes.extend(between_phases(dataset, "are learned at their own time"));
+            notes.extend(between_phases(dataset, "are trained at their own time"));
             (choose_hull(config, dataset, &motion, &mut notes), None)
         };
         let mut scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
@@ -158,7 +159,8 @@ impl Plan {
             listed_rays.extend((0..n_all).filter(shown).map(|id| id as u32));
         }
         if compared && motion.iter().any(|m| m.n_phases < 2) {
-            let problem = "needs several phases in every view; use `absolute` for still objects, and where a C-arm or a table moves";
+            let problem = "needs several phases in every view; use `absolute` for static objects, and where the C-arm \
+                           or the table moves";
             return Err(Error::config("loss.dynamic_target", "temporal", problem));
         }
         let params = ParamMap::new(config, dataset.n_phases as usize);
@@ -223,25 +225,29 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     notes.extend(between_phases(
         dataset,
         match form {
-            GaussianForm::Tree => "are fitted at their own time (the mean of those that share a phase and a view)",
-            _ => "count as taken at the nearest phase",
+            GaussianForm::Tree => {
+                "are fitted at their own time (at the mean time of the frames that share a phase and a view)"
+            }
+            _ => "are used as frames of the nearest phase",
         },
     ));
     notes.extend(wide_motion(&soft));
     notes.extend(without_motion(dataset, &soft));
-    notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
+    notes.push(format!("the soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
     notes.push(match form {
         GaussianForm::Tree => match targets.rest_phase {
-            0 => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
+            0 => "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"tree\")".into(),
             phase => format!(
-                "one set of Gaussians moves over the beat (gaussians.form = \"tree\") from phase {phase} on, which shows more of the \
-                 vessels than phase 0"
+                "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"tree\"), starting from \
+                 phase {phase}, which shows more of the vessels than phase 0"
             ),
         },
         _ if targets.contrast_comes_and_goes() => {
-            "each phase has Gaussians of its own (gaussians.form = \"phase\"): contrast comes or goes during the beat".into()
+            "each phase has its own set of Gaussians (gaussians.form = \"phase\"), because contrast agent flows in or \
+             out during the beat"
+                .into()
         }
-        _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
+        _ => "each phase has its own set of Gaussians (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))
 }
@@ -257,26 +263,31 @@ fn plan_r2(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
              (r2.static_data = \"per-phase\")"
         ),
         StaticData::Pooled => format!(
-            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} mm, \
-             is shown at each (r2.static_data = \"pooled\")"
+            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} \
+             mm, is used for every phase (r2.static_data = \"pooled\")"
         ),
     });
     if config.r2.normalise && dataset.vessel_attenuation.is_none() {
         notes.push(
-            "the dataset states no attenuation of vessels: densities are per 100 mm, and what R2-Gaussian fixes of them may \
-             not fit"
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and R2-Gaussian's fixed density \
+             thresholds may not fit them"
                 .into(),
         );
     }
     if !dataset.hidden.is_empty() {
         notes.push(
-            "pixels that show nothing of the patient are fitted like all others: R2-Gaussian knows no masks".into(),
+            "pixels that show nothing of the patient are fitted like all others, because R2-Gaussian does not support \
+             masks"
+                .into(),
         );
     }
     if dataset.heart_shifts() {
-        notes.push("R2-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+        notes.push(
+            "R2-Gaussian uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
+                .into(),
+        );
     }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
     Ok(data)
 }
 
@@ -286,30 +297,37 @@ fn plan_x(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result
     let data = XData::new(dataset, &config.x, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
     let whose = match config.x.static_data {
-        StaticData::PerPhase => "each phase has Gaussians of its own images (x.static_data = \"per-phase\")",
-        StaticData::Pooled => "one set of the images of all phases is shown at each (x.static_data = \"pooled\")",
+        StaticData::PerPhase => "each phase has its own set, fitted to its images (x.static_data = \"per-phase\")",
+        StaticData::Pooled => {
+            "one set, fitted to the images of all phases, is used for every phase (x.static_data = \"pooled\")"
+        }
     };
     notes.push(format!(
-        "X-Gaussian, a static method of Gaussians that hide each other: {whose}, from a cube of {side_mm:.1} mm on, in a scene of \
-         {:.0} mm; its pictures have no unit, and its opacities are no attenuation",
+        "X-Gaussian, a static method of Gaussians that occlude each other: {whose}. Initial Gaussians fill a cube of \
+         {side_mm:.1} mm in a scene of {:.0} mm. Its pictures have no unit, and its opacities are not attenuation",
         data.extent_mm
     ));
     if data.clamped > 0.0 {
         notes.push(format!(
-            "{:.1} % of the images' pixels are beyond x.clamp = {} and count as that",
+            "{:.1} % of the images' pixels exceed x.clamp = {} and are clamped to it",
             100.0 * data.clamped,
             config.x.clamp
         ));
     }
     if !dataset.hidden.is_empty() {
         notes.push(
-            "pixels that show nothing of the patient are fitted like all others: X-Gaussian knows no masks".into(),
+            "pixels that show nothing of the patient are fitted like all others, because X-Gaussian does not support \
+             masks"
+                .into(),
         );
     }
     if dataset.heart_shifts() {
-        notes.push("X-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+        notes.push(
+            "X-Gaussian uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
+                .into(),
+        );
     }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
     Ok(data)
 }
 
@@ -319,8 +337,8 @@ fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
     let left = dataset.training().iter().filter(|frame| !fitted(frame.view)).count();
     (left > 0).then(|| {
         format!(
-            "{left} of {} frames are the only phase of their view, as where a C-arm or a table moves: they tell of what stands still, \
-             not of vessels",
+            "{left} of {} frames are the only phase of their view, e.g. because the C-arm or the table moves: only the \
+             static field is fitted to them",
             dataset.training().len()
         )
     })
@@ -329,8 +347,8 @@ fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
 /// Returns a note on the views in which more than vessels moves.
 fn wide_motion(soft: &SoftMotion) -> Option<String> {
     let views: Vec<usize> = soft.views.iter().filter(|v| v.background.drift.size().is_some()).map(|v| v.view).collect();
-    let what = "something wide moves besides vessels, as a heart, a diaphragm or lungs do: \
-                it is held still where vessels are looked for";
+    let what = "wide structures move as well as vessels, e.g. the heart, the diaphragm or the lungs: their motion is \
+                removed from the images to which vessels are fitted";
     (!views.is_empty()).then(|| format!("views {views:?}: {what}"))
 }
 
@@ -339,7 +357,7 @@ fn two_networks(config: &Config, share: f64) -> [String; 2] {
     let near = config.dynamic.occlusion_share;
     [
         format!(
-            "two networks are the fields, in no box and no hull; {:.1} % of the rays change over the beat",
+            "both fields are networks, without a box and without a hull; {:.1} % of the rays change over the beat",
             100.0 * share
         ),
         if near >= 1.0 {
@@ -347,7 +365,8 @@ fn two_networks(config: &Config, share: f64) -> [String; 2] {
                 .into()
         } else {
             format!(
-                "the dynamic field is kept small along the near {:.0} % of rays (dynamic.occlusion_share)",
+                "the dynamic field is kept small along the first {:.0} % of each ray, at the source \
+                 (dynamic.occlusion_share)",
                 100.0 * near
             )
         },
@@ -360,7 +379,7 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
     }
     let still: Vec<_> = motion.iter().filter(|m| m.n_phases < 2).map(|m| m.view).collect();
     if !still.is_empty() {
-        notes.push(format!("motion hull not used: views {still:?} have a single phase"));
+        notes.push(format!("the motion hull is not used: views {still:?} have a single phase"));
         return None;
     }
     let hull = carve::carve(
@@ -372,17 +391,17 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
     );
     let share = hull.share();
     if share == 0.0 {
-        notes.push("motion hull not used: no point moves in every view that sees it".into());
+        notes.push("the motion hull is not used: at no point is there motion in all views that see it".into());
         None
     } else if share > config.hull.max_share {
         notes.push(format!(
-            "motion hull not used: it would keep {:.0} % of the box (hull.max_share = {:.0} %), so it excludes little",
+            "the motion hull is not used: it would keep {:.0} % of the box, and hull.max_share is {:.0} %",
             100.0 * share,
             100.0 * config.hull.max_share
         ));
         None
     } else {
-        notes.push(format!("motion hull keeps {:.3} % of the box", 100.0 * share));
+        notes.push(format!("the motion hull keeps {:.3} % of the box", 100.0 * share));
         Some(hull)
     }
 }

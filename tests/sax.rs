@@ -404,7 +404,7 @@ fn what_cannot_be_fitted_is_refused() {
     assert!(refused(&dataset, &[]).contains("column 2, row 1"));
     let mut sizes = small_dataset(13, 11);
     sizes.views[0].size = [12, 11];
-    assert!(refused(&sizes, &[]).contains("one size"));
+    assert!(refused(&sizes, &[]).contains("images of equal size"));
     // A field, and a batch, too large for the device's buffers.
     let dataset = small_dataset(13, 11);
     let largest = u64::from(gpu.info().max_storage_buffer_range);
@@ -458,7 +458,7 @@ fn presets_and_notes_say_what_the_method_is() {
     let says = |part: &str| assert!(plan.notes.iter().any(|note| note.contains(part)), "{part}: {:?}", plan.notes);
     says("a static method");
     says("passes over them");
-    says("count as taken at the nearest phase");
+    says("are used as frames of the nearest phase");
     let params =
         f64s(&nertca_vk::methods::sax_nerf::start::first_params(SaxShape { levels: 2, base: 2, log2_table: 5 }, 1));
     assert!(params.iter().all(|v| v.abs() <= 2.0));

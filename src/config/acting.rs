@@ -33,7 +33,7 @@ impl Kind {
         match self {
             Kind::Fields => "a tensor field and a network",
             Kind::Networks => "two networks (static.form = \"network\")",
-            Kind::Gaussians => "Gaussians before a tensor field (gaussians.form)",
+            Kind::Gaussians => "Gaussians, then a tensor field (gaussians.form)",
             Kind::R2 => "R2-Gaussian",
             Kind::X => "X-Gaussian",
             Kind::Sax => "SAX-NeRF",

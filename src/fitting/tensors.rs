@@ -26,7 +26,7 @@ impl File<'_> {
         let fits = view.shape().len() == shape.len()
             && view.shape().iter().zip(shape).all(|(is, wanted)| wanted.is_none_or(|wanted| *is == wanted));
         if view.dtype() != dtype || !fits {
-            return Err(bad(format!("{:?} {:?} where {dtype:?} {shape:?} is needed", view.dtype(), view.shape())));
+            return Err(bad(format!("is {:?} {:?} where {dtype:?} {shape:?} is needed", view.dtype(), view.shape())));
         }
         Ok(view.data())
     }

@@ -43,7 +43,7 @@ pub(super) fn read(tensors: &SafeTensors<'_>, n_phases: usize, path: &Path) -> R
     let rotation = file.floats("r2.rotation", &[Some(n), Some(4)])?;
     let sets = file.words("r2.set", n)?;
     if let Some(bad) = sets.iter().find(|set| **set as usize >= n_phases) {
-        return Err(Error::data(path, "r2.set", format!("{bad} of at most {n_phases} sets")));
+        return Err(Error::data(path, "r2.set", format!("has set {bad}, but sets go from 0 to below {n_phases}")));
     }
     let row = |i: usize| R2Gaussian {
         position: [0, 1, 2].map(|k| position[3 * i + k]),

@@ -41,8 +41,9 @@ fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f
     if candidates.len() < count {
         let name = data.name_of_set(set);
         let note = format!(
-            "the back-projection of {name} is above {} at {} voxels, and {count} Gaussians are to begin there: they begin \
-             anywhere (r2.count, r2.voxels, r2.candidate; r2.init = \"random\" does so without asking)",
+            "the back-projection of {name} is above {} at {} voxels, which are too few for the {count} initial \
+             Gaussians: they start at random places. Lower r2.count or r2.candidate or raise r2.voxels, or set r2.init \
+             = \"random\" to choose random places",
             settings.candidate,
             candidates.len()
         );

@@ -218,7 +218,7 @@ impl MovingFit {
 }
 
 fn not_begun() -> Error {
-    Error::Internal("the tree's iterations have not begun".into())
+    Error::Internal("the iterations of the deformable set have not begun".into())
 }
 
 /// The dynamic field of a run, where it is made of Gaussians.
@@ -346,9 +346,9 @@ impl Moving {
     /// Runs one iteration of the fit with a timestamp around each pass.
     ///
     /// # Errors
-    /// [`Error::Internal`] when the fit is over; device errors.
+    /// [`Error::Internal`] when the fit has ended; device errors.
     pub(super) fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        self.fit.as_mut().ok_or_else(|| Error::Internal("the fit is over".into()))?.profile_step()
+        self.fit.as_mut().ok_or_else(|| Error::Internal("the fit has ended".into()))?.profile_step()
     }
 
     /// Iterations done of a fit that is not finished.

@@ -343,7 +343,7 @@ impl GaussianSubject {
             return Err(Error::config(
                 "gaussians.form",
                 config.gaussians.form.name(),
-                "there are no Gaussians to time",
+                "this configuration has no Gaussians to time",
             ));
         };
         Ok(GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes })
@@ -414,7 +414,7 @@ impl GaussianSubject {
 fn run_fit(fit: &mut MovingFit, until: u32) -> Result<()> {
     while fit.step() < until {
         if fit.advance(until)?.is_empty() {
-            return Err(Error::Internal("the timed fit is over".into()));
+            return Err(Error::Internal("the timed fit has ended".into()));
         }
     }
     Ok(())

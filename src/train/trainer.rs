@@ -87,7 +87,11 @@ fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
     if checkpoint.model.param_map == plan.params && same_method {
         return Ok(());
     }
-    Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
+    Err(Error::config(
+        "checkpoint",
+        checkpoint.model.param_map.len,
+        "its parameters do not have the shape that the configuration and the dataset need",
+    ))
 }
 
 /// Begins the fit of a method of `crate::methods` to the plan's data, or goes on from what was `saved` of one to the same data;
@@ -172,7 +176,7 @@ impl Trainer {
             return Err(Error::config(
                 "dataset",
                 dataset.path.display(),
-                "the checkpoint was trained on other images or geometry",
+                "the checkpoint was trained on different images or a different geometry",
             ));
         }
         check_shape(&plan, checkpoint)?;
