@@ -146,7 +146,9 @@ fn each_usual_mistake_is_named() {
         ("transposed", |d| each_image(d, |old, row, column| old[column * SIZE + row])),
         ("mirrored", |d| each_image(d, |old, row, column| old[row * SIZE + SIZE - 1 - column])),
         ("upside down", |d| each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + column])),
-        ("rotated by 180 degrees", |d| each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + SIZE - 1 - column])),
+        ("rotated by 180 degrees", |d| {
+            each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + SIZE - 1 - column])
+        }),
         ("primary angle has the wrong sign", |d| each_c_arm(d, |c| c.primary_deg *= -1.0)),
         ("secondary angle has the wrong sign", |d| each_c_arm(d, |c| c.secondary_deg *= -1.0)),
         ("primary and secondary angle are exchanged", |d| {

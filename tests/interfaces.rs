@@ -323,7 +323,7 @@ fn malformed_datasets_are_named_file_and_field() {
                 let frame = m["frames"][1].clone();
                 m["frames"].as_array_mut().unwrap().extend(vec![frame; 16]);
             },
-            &["dataset.json", "8192 columns and 8192 rows", "make the large ones smaller"],
+            &["dataset.json", "8192 columns and 8192 rows", "reduce the large images"],
         ),
         ("three axes", |d, _| npy::write(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(), &["1.npy", "two axes"]),
         ("not a number", |d, _| npy::write(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(), &["1.npy", "row 0"]),
@@ -450,7 +450,8 @@ fn measurements_and_baked_views() {
         &quick,
     ];
     let said = ok(&full.concat());
-    for part in ["before the network starts", "peaks: f32", "37:00", "whole run, measured", "network passes only", "dry run: "]
+    for part in
+        ["before the network starts", "peaks: f32", "37:00", "whole run, measured", "network passes only", "dry run: "]
     {
         assert!(said.contains(part), "`{part}` is missing: {said}");
     }

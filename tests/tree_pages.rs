@@ -138,7 +138,10 @@ fn viewer_and_page_say_why_there_is_no_tree() {
     let nothing = ["--set", "dynamic.best_start=false", "--set", "dynamic.normalised_shift=-15"];
     train(data, &young, &[&["--preset", "fast-mlp", "--iterations", "1", "--tree"], &nothing[..]].concat());
     let page = std::fs::read_to_string(young.join("report.html")).unwrap();
-    assert!(page.contains("The vessel tree could not be extracted") && !page.contains("<script"), "a page without a tree says so");
+    assert!(
+        page.contains("The vessel tree could not be extracted") && !page.contains("<script"),
+        "a page without a tree says so"
+    );
     assert!(!young.join("tree.json").exists());
     let answer = Server::of(&young).tree();
     assert_eq!(answer["state"], "failed");
@@ -185,7 +188,10 @@ fn scores_of_the_tree_are_those_of_scipy() {
     std::fs::write(out.join("evaluation.json"), &said).unwrap();
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(page.contains("Scores of the tree"));
-    assert!(ok(&["eval", text(run), "--tree"]).0.contains("vessel tree is compared with the true one"), "there is a table");
+    assert!(
+        ok(&["eval", text(run), "--tree"]).0.contains("vessel tree is compared with the true one"),
+        "there is a table"
+    );
     python_test("check_tree_scores.py", &[data, &out]);
     // Without a request, or without a truth, there are none.
     let untold: Value = serde_json::from_str(&ok(&["eval", text(run), "--json"]).0).unwrap();
