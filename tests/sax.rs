@@ -355,7 +355,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     let rays = &dataset.views[0].rays;
     let seen = renderer.render(rays, 13, 11, 1).unwrap();
     assert!(seen.dynamic_integral.iter().all(|v| v.is_finite() && *v > 0.0));
-    assert!(seen.static_integral.iter().chain(&seen.static_max).all(|v| *v == 0.0), "there is no still field");
+    assert!(seen.static_integral.iter().chain(&seen.static_max).all(|v| *v == 0.0), "there is no static field");
     assert_eq!(seen.dynamic_max, seen.total_max);
     assert_ne!(seen.dynamic_integral, renderer.render(rays, 13, 11, 0).unwrap().dynamic_integral);
     let error = renderer.render_at(rays, 13, 11, 0.5).unwrap_err().to_string();

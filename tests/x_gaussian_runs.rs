@@ -41,7 +41,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000040.safetensors")).unwrap();
     assert!(bytes(&whole) == bytes(&parts), "a resumed run comes to the same bits");
     let score: Value = serde_json::from_str(&ok(&["eval", &whole, "--json"])).unwrap();
-    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
+    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no static field");
     assert_eq!(score["dice"]["dynamic"], score["dice_published"]["paper"], "the published threshold");
     assert!(score["threshold"]["rule"].as_str().unwrap().contains("opacities"), "{score}");
     // The comparison is with images of a range from 0 to 1, as it renders them.

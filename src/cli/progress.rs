@@ -19,7 +19,7 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
         if seen.swap(true, Ordering::Relaxed) {
             std::process::exit(i32::from(super::exit::INTERRUPTED));
         }
-        eprintln!("nertca-vk: stopping after the current work; press Ctrl-C again to stop immediately");
+        eprintln!("nertca-vk: the program will stop after the current work; press Ctrl-C again to stop immediately");
     })
     .map_err(|e| Error::Internal(format!("the Ctrl-C handler could not be set: {e}")))?;
     Ok(stop)

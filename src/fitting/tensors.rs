@@ -40,7 +40,7 @@ impl File<'_> {
         let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
         match values.iter().all(|v| v.is_finite()) {
             true => Ok(values),
-            false => Err(Error::data(self.path, name, "holds a value that is not finite")),
+            false => Err(Error::data(self.path, name, "contains a value that is not finite")),
         }
     }
 

@@ -352,7 +352,7 @@ impl Checkpoint {
                 for (word, at) in view.data().chunks_exact(4).zip(&tensor.positions) {
                     let value = f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
                     if !value.is_finite() {
-                        return Err(bad(&name, "holds a value that is not finite".into()));
+                        return Err(bad(&name, "contains a value that is not finite".into()));
                     }
                     match prefix {
                         "" => params[*at as usize] = value,

@@ -153,7 +153,7 @@ impl CArmOptions {
         positive("sod_mm", sod_mm)?;
         positive("sid_mm", sid_mm)?;
         if sod_mm >= sid_mm {
-            let problem = format!("puts the isocentre behind the detector (sid_mm = {sid_mm})");
+            let problem = format!("would put the isocentre behind the detector (sid_mm = {sid_mm})");
             return Err(Error::config("sod_mm", sod_mm, problem));
         }
         if let Some(bad) = offset_mm.iter().find(|o| !o.is_finite()) {

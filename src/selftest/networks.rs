@@ -97,7 +97,7 @@ impl Pairs {
         let moving = samples(gpu, trainer, loss.live_samples as usize)?;
         let n = moving.len();
         let gradient =
-            still.sigma_gradient().ok_or_else(|| Error::Internal("the network is not for training".into()))?;
+            still.sigma_gradient().ok_or_else(|| Error::Internal("the network was not created for training".into()))?;
         Ok(Pairs {
             still: gpu.download(still.sigma(), 0, n)?,
             gradient: [gpu.download(gradient, 0, n)?, gpu.download(&trainer.training().sigma_gradient, 0, n)?],
@@ -150,7 +150,7 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
 impl Twin<'_> {
     fn compare(&self, gpu: &Gpu, loss: StepLoss, findings: &mut Findings) -> Result<()> {
         let (forward, training, plan) = (self.trainer.forward(), self.trainer.training(), self.trainer.plan());
-        let missing = || Error::Internal("the still field is no network".into());
+        let missing = || Error::Internal("the static field is not a network".into());
         let (still, networks) = (self.trainer.still().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
         let n = self.rays.len();
         let seen = Seen {
