@@ -253,7 +253,10 @@ mod tests {
         let short = check(8192, Some(99)).unwrap_err();
         assert!(matches!(short, Error::OutOfMemory { may_pass: true, .. }));
         let text = short.to_string();
-        assert!(text.contains("8192 MiB, of which 99 MiB are currently free") && text.contains("sax.log2_table"), "{text}");
+        assert!(
+            text.contains("8192 MiB, of which 99 MiB are currently free") && text.contains("sax.log2_table"),
+            "{text}"
+        );
         assert!(!text.contains("train.rays"), "{text}");
     }
 }
