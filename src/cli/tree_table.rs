@@ -6,7 +6,7 @@ use nertca_vk::score::trees::{TreeAgreement, TreeScores};
 const COLUMNS: [Column<TreeAgreement>; 9] = [
     Column { heading: ["centreline", "found"], text: |s| percent(Some(s.true_centreline_found)) },
     Column { heading: ["centreline", "true"], text: |s| percent(Some(s.our_centreline_true)) },
-    Column { heading: ["ours to true", "mm"], text: |s| mm(Some(s.ours_to_true_mm)) },
+    Column { heading: ["distance to", "true, mm"], text: |s| mm(Some(s.ours_to_true_mm)) },
     Column { heading: ["radius error", "mean, mm"], text: |s| mm(s.radius_error_mm) },
     Column { heading: ["radius error", "RMS, mm"], text: |s| mm(s.radius_rmse_mm) },
     Column { heading: ["", "components"], text: |s| format!("{:.1}", s.components) },
