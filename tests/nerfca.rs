@@ -98,7 +98,7 @@ fn arrays_of_another_shape_are_refused() {
     }
     npy::write(&image, &[14, 10], &values).unwrap();
     let message = Dataset::open(dir.path()).unwrap_err().to_string();
-    assert!(message.contains("[14, 10]") && message.contains("is [10, 14]"), "{message}");
+    assert!(message.contains("[14, 10]") && message.contains("needs [10, 14]"), "{message}");
 }
 
 /// Opens the golden dataset with other heart phases in its training and test frames.

@@ -399,7 +399,7 @@ fn what_cannot_be_fitted_is_refused() {
         other => panic!("{other:?}"),
     };
     let problem = refused(&dataset, &["sax.window=6", "sax.windows=3"]);
-    assert!(problem.contains("sax.windows") && problem.contains("room for 2 windows"), "{problem}");
+    assert!(problem.contains("sax.windows") && problem.contains("room for at most 2 windows"), "{problem}");
     dataset.frames[2].integrals[15] = f32::NAN;
     assert!(refused(&dataset, &[]).contains("column 2, row 1"));
     let mut sizes = small_dataset(13, 11);
