@@ -73,7 +73,7 @@ fn link_library() -> Result<(), Failure> {
     if env::var_os("CARGO_FEATURE_CAPI").is_none() {
         let source = fs::read_to_string("src/capi/types.rs")?;
         let version = source.split("NERTCA_ABI_VERSION: u32 = ").nth(1).and_then(|rest| rest.split(';').next());
-        let version = version.ok_or("src/capi/types.rs names no ABI version")?;
+        let version = version.ok_or("src/capi/types.rs has no NERTCA_ABI_VERSION")?;
         println!("cargo:rustc-cdylib-link-arg=-Wl,-soname,libnertca_vk.so.{version}");
     }
     println!("cargo:rerun-if-changed=src/capi/types.rs");

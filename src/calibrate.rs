@@ -61,20 +61,20 @@ pub fn calibrate(dataset: &Dataset, config: &Config) -> Result<Calibration> {
         return Ok(Calibration::none(None));
     }
     if mode == CalibrateMode::Breathing && !config.follows_breath() {
-        let problem = "networks, R2-Gaussian, X-Gaussian and SAX-NeRF take corrections per view only: choose static, or \
-                       other Gaussians as the moving field";
+        let problem = "networks, R2-Gaussian, X-Gaussian and SAX-NeRF support corrections per view only: choose \
+                       static, or other Gaussians as the dynamic field";
         return Err(Error::config("calibrate.mode", "breathing", problem));
     }
     let observed = Observed::new(dataset);
     if let Some(why) = nothing_to_tell(dataset, &observed) {
-        return Ok(Calibration::none(Some(format!("views not calibrated: {why}"))));
+        return Ok(Calibration::none(Some(format!("the views are not calibrated: {why}"))));
     }
     let mut notes = Vec::new();
     let cut: Vec<usize> = observed.cut_off().into_iter().map(|slot| observed.views[slot]).collect();
     if !cut.is_empty() {
         notes.push(format!(
-            "vessels are cut off at the border of views {cut:?}: what other views show of them has no counterpart there, so a \
-             correction is assumed only where views then agree clearly better"
+            "vessels are cut off at the border of views {cut:?}, so parts that other views show are missing there: a \
+             correction is accepted only if the views agree clearly better with it"
         ));
     }
     let candidates = candidates(mode, config.follows_breath(), &mut notes);
@@ -125,16 +125,20 @@ pub fn silhouettes(dataset: &Dataset, corrected: &Dataset) -> Vec<Silhouettes> {
 /// Returns the reason why the agreement of the views cannot be determined, if there is one.
 fn nothing_to_tell(dataset: &Dataset, observed: &Observed) -> Option<String> {
     if dataset.heart_shifts() {
-        return Some("frames state displacements of the heart already".into());
+        return Some("the dataset already states displacements of the heart for its frames".into());
     }
     let n = observed.views.len();
     if n < 2 {
-        return Some(format!("{n} training views show two phases, and it takes two to compare"));
+        return Some(format!(
+            "{n} training views show two phases, and at least two such views are needed for a comparison"
+        ));
     }
     if observed.fine.pairs.is_empty() {
-        return Some("all pairs of views look along one line, where they have no planes in common to compare".into());
+        return Some(
+            "all views look along the same line, so no two views have planes in common that can be compared".into(),
+        );
     }
-    (observed.change < LEAST_CHANGE).then(|| "nothing moves in the images: their phases are all alike".into())
+    (observed.change < LEAST_CHANGE).then(|| "there is no motion in the images: all phases look the same".into())
 }
 
 /// Returns the corrections to try, the smallest first.
@@ -145,7 +149,7 @@ fn candidates(mode: CalibrateMode, frames: bool, notes: &mut Vec<String>) -> Vec
         CalibrateMode::Breathing => vec![Correction::Stated, Correction::Breathing],
         CalibrateMode::Auto if frames => vec![Correction::Stated, Correction::Static, Correction::Breathing],
         CalibrateMode::Auto => {
-            notes.push("the network takes corrections per view only: breathing is not looked for".into());
+            notes.push("the network supports corrections per view only, so breathing is not corrected".into());
             vec![Correction::Stated, Correction::Static]
         }
     }
@@ -173,7 +177,8 @@ impl Calibrator<'_> {
         let shares: Vec<_> = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();
         if candidates[chosen] == Correction::Stated {
             self.notes.push(format!(
-                "views agree as stated: a correction does not bring phases it was not fitted to closer ({})",
+                "the views agree with the stated geometry: a correction does not reduce the residual of phases to \
+                 which it was not fitted ({})",
                 in_words(&shares)
             ));
             return Calibration { tried: shares, notes: self.notes, ..Calibration::none(None) };
@@ -190,7 +195,8 @@ impl Calibrator<'_> {
     fn without_validation(mut self, candidates: &[Correction]) -> Calibration {
         const LARGE: f64 = 0.5;
         self.notes.push(format!(
-            "{} phases are too few to test a correction on some it has not seen: only one that halves the residual is kept",
+            "{} phases are too few to test a correction on phases to which it was not fitted, so a correction is \
+             accepted only if it halves the residual",
             self.observed.n_phases()
         ));
         let all: Vec<usize> = (0..self.observed.n_phases()).collect();
@@ -200,7 +206,7 @@ impl Calibrator<'_> {
         let poses = fit(self.observed, tried, &all);
         let shares = vec![(Correction::Stated, stated), (tried, share(&poses))];
         if tried == Correction::Stated || shares[1].1 > LARGE * stated {
-            self.notes.push(format!("views are left as stated ({})", in_words(&shares)));
+            self.notes.push(format!("the stated geometry is kept ({})", in_words(&shares)));
             return Calibration { tried: shares, notes: self.notes, ..Calibration::none(None) };
         }
         self.accept(tried, &poses, None, shares)
@@ -215,8 +221,8 @@ impl Calibrator<'_> {
     ) -> Calibration {
         if let Some(what) = out_of_bounds(self.observed, poses) {
             self.notes.push(format!(
-                "views disagree, but the correction found is not to be believed ({what}): the stated geometry is kept. Check \
-                 the images' orientation, the signs of the angles and the phases"
+                "the views disagree, but the correction that was found is too large to be plausible ({what}), so the \
+                 stated geometry is kept. Check the orientation of the images, the signs of the angles and the phases"
             ));
             return Calibration { tried, notes: self.notes, ..Calibration::none(None) };
         }
@@ -224,8 +230,8 @@ impl Calibrator<'_> {
         let explained = [&stated, poses].map(|poses| silhouettes::explained(self.observed, poses));
         if !self.observed.cut_off().is_empty() && !helps_clearly(correction, &tried, explained) {
             self.notes.push(format!(
-                "views are left as stated: a correction brings what moves closer ({}), but the other views explain {:.0} % of a \
-                 view's vessel pixels with it and {:.0} % without",
+                "the stated geometry is kept: a correction reduces the residual of the moving vessels ({}), but the \
+                 other views explain {:.0} % of a view's vessel pixels with it and {:.0} % without it",
                 in_words(&tried),
                 100.0 * explained[1],
                 100.0 * explained[0]
@@ -342,17 +348,17 @@ fn out_of_bounds(observed: &Observed, poses: &Poses) -> Option<String> {
         let along = |k: usize| (pose.shift.dot(axes.col(k)) * MM_PER_UNIT).abs();
         let angle = pose.angles_deg[0].abs().max(pose.angles_deg[1].abs());
         if angle.is_nan() || angle > BOUND * ANGLE_DEG {
-            return Some(format!("view {view} by {angle:.1} deg"));
+            return Some(format!("view {view} turns by {angle:.1} deg"));
         }
         let (across, depth) = (along(0).max(along(1)), along(2));
         if across.is_nan() || across > BOUND * IN_PLANE_MM || depth.is_nan() || depth > BOUND * DEPTH_MM {
-            return Some(format!("view {view} by {:.1} mm", across.max(depth)));
+            return Some(format!("view {view} moves by {:.1} mm", across.max(depth)));
         }
         for (phase, shift) in poses.heart[slot].iter().enumerate() {
             let far = |k: usize| (shift[k] * MM_PER_UNIT).abs() > BOUND * BREATHING_MM[k];
             if (0..3).any(far) || !shift.is_finite() {
                 return Some(format!(
-                    "the heart by {:.1} mm in view {view}, phase {phase}",
+                    "the heart moves by {:.1} mm in view {view}, phase {phase}",
                     shift.length() * MM_PER_UNIT
                 ));
             }
@@ -381,10 +387,13 @@ impl Calibration {
         };
         let lengths = self.frames.iter().map(|f| DVec3::from_array(f.heart_shift_mm).length());
         let breath = lengths.fold(0.0, f64::max);
-        let breath =
-            if breath > 0.0 { format!(", the heart up to {breath:.1} mm from its mean") } else { String::new() };
+        let breath = if breath > 0.0 {
+            format!(", the heart is displaced by up to {breath:.1} mm from its mean position")
+        } else {
+            String::new()
+        };
         self.notes.push(format!(
-            "views disagree by {:.2} px; corrected: {kind}{known}{breath} ({})",
+            "the views disagree by {:.2} px; corrected: {kind}{known}{breath} ({})",
             self.disagreement_px,
             in_words(&self.tried)
         ));

@@ -85,7 +85,8 @@ pub fn check(dataset: &Dataset) -> Result<Check> {
     let observed = Observed::new(dataset);
     if observed.views.len() < 2 {
         let problem = format!(
-            "{} of its training views show two phases: two views are needed to compare what moves in them",
+            "{} of its training views show two phases: at least two such views are needed to compare the motion in \
+             them",
             observed.views.len()
         );
         return Err(Error::config("dataset", dataset.path.display(), problem));
@@ -99,12 +100,11 @@ pub fn check(dataset: &Dataset) -> Result<Check> {
     });
     let mut warnings = view_warnings(&views);
     match &stated {
-        None => warnings.push(
-            "no two views can be compared: they look from the same side, or from opposite ones".into(),
-        ),
+        None => warnings
+            .push("no two views can be compared: all views look from the same side or from opposite sides".into()),
         Some(stated) if mistakes.is_empty() && stated.coarse > DISAGREES => warnings.push(format!(
-            "views disagree ({:.0} % of what moves is not the same in two views) and none of the usual mistakes explains it: \
-             compare geometry, phases and order of the images with their source",
+            "the views disagree ({:.0} % of the moving contrast differs between two views), and none of the usual \
+             mistakes explains it: compare geometry, phases and order of the images with their source",
             100.0 * stated.coarse
         )),
         _ => (),
@@ -133,19 +133,24 @@ fn view_warnings(views: &[CheckedView]) -> Vec<String> {
     for v in views {
         if v.at_edges > CUT_OFF {
             let share = 100.0 * v.at_edges;
-            warnings.push(format!("view {}: {share:.0} % of what moves is at the edge: vessels are cut off", v.view));
+            warnings.push(format!(
+                "view {}: {share:.0} % of the moving pixels are at the edge of the image, so vessels are cut off",
+                v.view
+            ));
         }
         if v.noise > NOISY {
             let share = 100.0 * v.noise;
             warnings.push(format!(
-                "view {}: noise is {share:.0} % of the strongest vessel: thin ones will be lost",
+                "view {}: the noise is {share:.0} % of the strongest vessel, so thin vessels will be lost",
                 v.view
             ));
         }
     }
     let (least, most) = (views.iter().map(|v| v.phases).min(), views.iter().map(|v| v.phases).max());
     if least != most {
-        warnings.push("views have different numbers of phases: phases that one lacks are told by fewer views".into());
+        warnings.push(
+            "the views have different numbers of phases, so some phases are reconstructed from fewer views".into(),
+        );
     }
     warnings
 }
@@ -184,7 +189,8 @@ fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<E
     }
     for b in 0..observed.views.len() {
         for pair in (0..b).map(|a| [observed.views[a], observed.views[b]]) {
-            let advice = format!("views {} and {} are exchanged: each has the images of the other", pair[0], pair[1]);
+            let advice =
+                format!("views {} and {} are exchanged: each view has the images of the other", pair[0], pair[1]);
             if let Some(undone) = exchanged(dataset, pair) {
                 consider(advice, Observed::new(&undone).fine);
             }
@@ -201,9 +207,9 @@ fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<E
 
 fn advice_on_phases(mistake: PhaseMistake, view: usize) -> String {
     if mistake.reversed {
-        return format!("the phases of view {view} run backwards");
+        return format!("the phases of view {view} are in reverse order");
     }
-    format!("view {view} is late by {} phases: subtract them from its phases, cyclically", mistake.late)
+    format!("view {view} is late by {} phases: subtract this number from its phases, cyclically", mistake.late)
 }
 
 /// Advice on the explanations of a disagreement, best first, by the coarse look where the fine one finds none. Where

@@ -357,9 +357,9 @@ impl Config {
         let mut given = if is_whole { Vec::new() } else { acting::keys(&overlay) };
         merge(&mut table, overlay, "")?;
         for (at, setting) in settings.iter().chain(constants).enumerate() {
-            let (key, value) = setting
-                .split_once('=')
-                .ok_or_else(|| Error::config("setting", setting, "write it as key=value, e.g. train.rays=512"))?;
+            let (key, value) = setting.split_once('=').ok_or_else(|| {
+                Error::config("setting", setting, "is not of the form key=value, e.g. train.rays=512")
+            })?;
             merge(&mut table, nested(key.trim(), parse_value(value.trim())), "")?;
             if at < settings.len() {
                 given.push(key.trim().to_owned());
@@ -427,7 +427,11 @@ fn merge(base: &mut toml::Table, overlay: toml::Table, prefix: &str) -> Result<(
         let known: Vec<String> = base.keys().cloned().collect();
         match (base.get_mut(&key), value) {
             (None, value) => {
-                return Err(Error::config(name, value, format!("unknown key; known here: {}", known.join(", "))));
+                return Err(Error::config(
+                    name,
+                    value,
+                    format!("unknown key; the known keys are: {}", known.join(", ")),
+                ));
             }
             (Some(toml::Value::Table(inner)), toml::Value::Table(over)) => merge(inner, over, &name)?,
             (Some(toml::Value::Float(slot)), toml::Value::Integer(i)) => *slot = i as f64,

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 pub type Result<T> = std::result::Result<T, Error>;
 
 /// Settings that reduce the memory of most runs; see [`Error::OutOfMemory`].
-pub const SMALLER_BATCHES: &str = "a smaller train.chunk_samples or train.rays";
+pub const SMALLER_BATCHES: &str = "a lower train.chunk_samples or train.rays";
 
 /// Error of this crate: its cause, its place, and advice where there is any.
 #[derive(Debug, thiserror::Error)]

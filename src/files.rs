@@ -145,7 +145,7 @@ pub fn read_limited(path: &Path, limit: u64) -> Result<Vec<u8>> {
         return Err(Error::data(path, "file", "is not a regular file"));
     }
     if meta.len() > limit {
-        return Err(Error::data(path, "size", format!("{} bytes; at most {limit} are accepted", meta.len())));
+        return Err(Error::data(path, "size", format!("{} bytes exceed the maximum, {limit}", meta.len())));
     }
     std::fs::read(path).map_err(Error::io("read", path))
 }

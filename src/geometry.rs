@@ -161,7 +161,7 @@ impl CArm {
         if self.sod_mm >= self.sid_mm {
             return Err((
                 "sod_mm".into(),
-                format!("{} mm puts the isocentre behind the detector (sid_mm = {})", self.sod_mm, self.sid_mm),
+                format!("{} mm would put the isocentre behind the detector (sid_mm = {})", self.sod_mm, self.sid_mm),
             ));
         }
         let r = rotation(self.primary_deg, self.secondary_deg);

@@ -130,7 +130,7 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     }
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
     if all.is_empty() {
-        return Err(Error::Internal("the device was not opened to keep statistics".into()));
+        return Err(Error::Internal("the device was not opened with pipeline statistics".into()));
     }
     all.sort_by_key(|c| (c.kernel.clone(), c.lanes, c.constants.clone()));
     all.dedup_by(|a, b| a.is_build_of(b));

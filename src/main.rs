@@ -88,7 +88,7 @@ fn main() -> ExitCode {
         Err(error) => {
             eprintln!("nertca-vk: {error}");
             if let Some(hint) = cli::exit::hint(&error) {
-                eprintln!("nertca-vk: {hint}");
+                eprintln!("nertca-vk: hint: {hint}");
             }
             ExitCode::from(cli::exit::code(&error))
         }

@@ -281,5 +281,5 @@ impl Network {
 }
 
 fn built_for_rendering() -> Error {
-    Error::Internal("the network was built for rendering only".into())
+    Error::Internal("the network was created for rendering only".into())
 }

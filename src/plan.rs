@@ -86,10 +86,11 @@ impl Plan {
         } else {
             if dataset.heart_shifts() {
                 notes.push(
-                    "the network sees all frames of a view alike: displacements of the heart are left out".into(),
+                    "the network uses one geometry for all frames of a view: the stated displacements of the heart are \
+                     ignored".into(),
                 );
             }
-            notes.extend(between_phases(dataset, "are learned at their own time"));
+            notes.extend(between_phases(dataset, "are trained at their own time"));
             (choose_hull(config, dataset, &motion, &mut notes), None)
         };
         let mut scene = Scene::new(config, dataset, &motion, hull.as_ref())?;
@@ -146,7 +147,8 @@ impl Plan {
             listed_rays.extend((0..n_all).filter(shown).map(|id| id as u32));
         }
         if compared && motion.iter().any(|m| m.n_phases < 2) {
-            let problem = "needs several phases in every view; use `absolute` for still objects, and where a C-arm or a table moves";
+            let problem = "needs several phases in every view; use `absolute` for static objects, and where the C-arm \
+                           or the table moves";
             return Err(Error::config("loss.dynamic_target", "temporal", problem));
         }
         let params = ParamMap::new(config, dataset.n_phases as usize);
@@ -209,25 +211,29 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     notes.extend(between_phases(
         dataset,
         match form {
-            GaussianForm::Tree => "are fitted at their own time (the mean of those that share a phase and a view)",
-            _ => "count as taken at the nearest phase",
+            GaussianForm::Tree => {
+                "are fitted at their own time (at the mean time of the frames that share a phase and a view)"
+            }
+            _ => "are used as frames of the nearest phase",
         },
     ));
     notes.extend(wide_motion(&soft));
     notes.extend(without_motion(dataset, &soft));
-    notes.push(format!("soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
+    notes.push(format!("the soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
     notes.push(match form {
         GaussianForm::Tree => match targets.rest_phase {
-            0 => "one set of Gaussians moves over the beat (gaussians.form = \"tree\")".into(),
+            0 => "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"tree\")".into(),
             phase => format!(
-                "one set of Gaussians moves over the beat (gaussians.form = \"tree\") from phase {phase} on, which shows more of the \
-                 vessels than phase 0"
+                "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"tree\"), starting from \
+                 phase {phase}, which shows more of the vessels than phase 0"
             ),
         },
         _ if targets.contrast_comes_and_goes() => {
-            "each phase has Gaussians of its own (gaussians.form = \"phase\"): contrast comes or goes during the beat".into()
+            "each phase has its own set of Gaussians (gaussians.form = \"phase\"), because contrast agent flows in or \
+             out during the beat"
+                .into()
         }
-        _ => "each phase has Gaussians of its own (gaussians.form = \"phase\")".into(),
+        _ => "each phase has its own set of Gaussians (gaussians.form = \"phase\")".into(),
     });
     Ok((soft.hull.to_hull(), targets))
 }
@@ -238,8 +244,8 @@ fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
     let left = dataset.training().iter().filter(|frame| !fitted(frame.view)).count();
     (left > 0).then(|| {
         format!(
-            "{left} of {} frames are the only phase of their view, as where a C-arm or a table moves: they tell of what stands still, \
-             not of vessels",
+            "{left} of {} frames are the only phase of their view, e.g. because the C-arm or the table moves: only the \
+             static field is fitted to them",
             dataset.training().len()
         )
     })
@@ -248,8 +254,8 @@ fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
 /// Returns a note on the views in which more than vessels moves.
 fn wide_motion(soft: &SoftMotion) -> Option<String> {
     let views: Vec<usize> = soft.views.iter().filter(|v| v.background.drift.size().is_some()).map(|v| v.view).collect();
-    let what = "something wide moves besides vessels, as a heart, a diaphragm or lungs do: \
-                it is held still where vessels are looked for";
+    let what = "wide structures move as well as vessels, e.g. the heart, the diaphragm or the lungs: their motion is \
+                removed from the images to which vessels are fitted";
     (!views.is_empty()).then(|| format!("views {views:?}: {what}"))
 }
 
@@ -258,7 +264,7 @@ fn two_networks(config: &Config, share: f64) -> [String; 2] {
     let near = config.dynamic.occlusion_share;
     [
         format!(
-            "two networks are the fields, in no box and no hull; {:.1} % of the rays change over the beat",
+            "both fields are networks, without a box and without a hull; {:.1} % of the rays change over the beat",
             100.0 * share
         ),
         if near >= 1.0 {
@@ -266,7 +272,8 @@ fn two_networks(config: &Config, share: f64) -> [String; 2] {
                 .into()
         } else {
             format!(
-                "the dynamic field is kept small along the near {:.0} % of rays (dynamic.occlusion_share)",
+                "the dynamic field is kept small along the first {:.0} % of each ray, at the source \
+                 (dynamic.occlusion_share)",
                 100.0 * near
             )
         },
@@ -279,7 +286,7 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
     }
     let still: Vec<_> = motion.iter().filter(|m| m.n_phases < 2).map(|m| m.view).collect();
     if !still.is_empty() {
-        notes.push(format!("motion hull not used: views {still:?} have a single phase"));
+        notes.push(format!("the motion hull is not used: views {still:?} have a single phase"));
         return None;
     }
     let hull = carve::carve(
@@ -291,17 +298,17 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
     );
     let share = hull.share();
     if share == 0.0 {
-        notes.push("motion hull not used: no point moves in every view that sees it".into());
+        notes.push("the motion hull is not used: at no point is there motion in all views that see it".into());
         None
     } else if share > config.hull.max_share {
         notes.push(format!(
-            "motion hull not used: it would keep {:.0} % of the box (hull.max_share = {:.0} %), so it excludes little",
+            "the motion hull is not used: it would keep {:.0} % of the box, and hull.max_share is {:.0} %",
             100.0 * share,
             100.0 * config.hull.max_share
         ));
         None
     } else {
-        notes.push(format!("motion hull keeps {:.3} % of the box", 100.0 * share));
+        notes.push(format!("the motion hull keeps {:.3} % of the box", 100.0 * share));
         Some(hull)
     }
 }

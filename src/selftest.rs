@@ -102,7 +102,7 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
         let other_way = Tuning { matrices, ..tuning.clone() };
         let case = &iteration::MATRIX_CASES[0];
         let iteration = move |findings: &mut Findings| iteration::compare(gpu, even, case, &other_way, findings);
-        parts.push((name("iterations the other way"), Box::new(iteration)));
+        parts.push((name("iterations with the other backward pass"), Box::new(iteration)));
     }
     parts
 }
@@ -114,7 +114,7 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
         ("R2-Gaussian".into(), Box::new(move |findings| methods::r2_gaussian::selftest::compare(gpu, findings))),
         ("X-Gaussian".into(), Box::new(move |findings| methods::x_gaussian::selftest::compare(gpu, findings))),
         ("SAX-NeRF".into(), Box::new(move |findings| methods::sax_nerf::selftest::compare(gpu, findings))),
-        ("a moving tree".into(), Box::new(move |findings| trees::compare(gpu, findings))),
+        ("a deformable set of Gaussians".into(), Box::new(move |findings| trees::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
         ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_crowd(gpu, tuning, findings))),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),
@@ -150,7 +150,10 @@ pub fn run(gpu: &Gpu, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Re
     }
     let mut paths = chosen.reasons.clone();
     if !has_matrices {
-        paths.push("matrix layers are not tested: the device has no cooperative matrices our kernels can use".into());
+        paths.push(
+            "matrix layers are not tested, because the device has no cooperative matrices that our kernels can use"
+                .into(),
+        );
     }
     let rows = findings.rows().to_vec();
     Ok(Report { untested: untested(gpu, &rows), rows, errors, paths })

@@ -103,7 +103,7 @@ impl Session {
     pub fn new(gpu: Option<Gpu>, tuning: Option<Tuning>, options: SessionOptions) -> Result<Session> {
         options.config.check()?;
         if options.phases == 0 || options.phases > 4096 {
-            return Err(Error::config("phases", options.phases, "1 to 4096 are accepted"));
+            return Err(Error::config("phases", options.phases, "is out of range: 1 to 4096 phases are accepted"));
         }
         let positive = |field: &str, value: f64| {
             let ok = value.is_finite() && value > 0.0 && value < 1e5;
@@ -158,7 +158,7 @@ impl Session {
     fn change_frames(&self, change: impl FnOnce(&mut Inbox) -> Result<()>) -> Result<()> {
         let mut inbox = lock(&self.shared.inbox);
         if inbox.options.deterministic && matches!(self.state(), State::Running | State::Waiting) {
-            return Err(Error::Busy("a deterministic session takes no frames while it trains".into()));
+            return Err(Error::Busy("a deterministic session accepts no frames while it trains".into()));
         }
         change(&mut inbox)?;
         drop(inbox);
@@ -287,7 +287,7 @@ impl Session {
                 match outcome {
                     Ok(state) => control.state = state,
                     Err(error) => {
-                        tracing::error!("training in the background: {error}");
+                        tracing::error!("training in the background failed: {error}");
                         (control.state, control.failure) = (State::Failed, Some(error.to_string()));
                     }
                 }
@@ -299,7 +299,7 @@ impl Session {
             Ok(handle) => *worker = Some(handle),
             Err(e) => {
                 lock(&self.shared.control).state = State::Idle;
-                return Err(Error::Internal(format!("starting a thread: {e}")));
+                return Err(Error::Internal(format!("a thread could not be started: {e}")));
             }
         }
         Ok(())
@@ -338,12 +338,12 @@ impl Session {
             Ok(guard) => guard,
             Err(TryLockError::Poisoned(guard)) => guard.into_inner(),
             Err(TryLockError::WouldBlock) => {
-                return Err(Error::Busy("the session is training in another call".into()));
+                return Err(Error::Busy("another call is training this session".into()));
             }
         };
         // The session's state decides, since those who waited for the end go by it: the thread may take a moment longer.
         if self.state().in_background() {
-            return Err(Error::Busy("the session is training in the background already".into()));
+            return Err(Error::Busy("the session is already training in the background".into()));
         }
         join(lock(&self.worker));
         Ok(blocking)
@@ -352,7 +352,9 @@ impl Session {
     /// Refuses what would wait for the very thread it is called from.
     fn not_from_observer(&self) -> Result<()> {
         if lock(&self.shared.control).worker == Some(std::thread::current().id()) {
-            return Err(Error::Busy("an observer ends training by what it returns, and begins none".into()));
+            return Err(Error::Busy(
+                "an observer cannot start or stop training; it ends training by its return value".into(),
+            ));
         }
         Ok(())
     }
@@ -449,7 +451,7 @@ impl Session {
         let mut inbox = lock(&self.shared.inbox);
         let phases = model.param_map.phases as u32;
         if inbox.options.phases != phases && !inbox.frames.is_empty() {
-            let problem = format!("the session's frames are of {} phases", inbox.options.phases);
+            let problem = format!("the session has frames of a beat of {} phases", inbox.options.phases);
             return Err(Error::config("checkpoint: phases", phases, problem));
         }
         inbox.options.phases = phases;

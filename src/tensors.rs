@@ -26,7 +26,7 @@ impl File<'_> {
         let fits = view.shape().len() == shape.len()
             && view.shape().iter().zip(shape).all(|(is, wanted)| wanted.is_none_or(|wanted| *is == wanted));
         if view.dtype() != dtype || !fits {
-            return Err(bad(format!("{:?} {:?} where {dtype:?} {shape:?} is needed", view.dtype(), view.shape())));
+            return Err(bad(format!("is {:?} {:?} where {dtype:?} {shape:?} is needed", view.dtype(), view.shape())));
         }
         Ok(view.data())
     }
@@ -40,7 +40,7 @@ impl File<'_> {
         let values: Vec<f32> = bytes.map(|w| f32::from_le_bytes([w[0], w[1], w[2], w[3]])).collect();
         match values.iter().all(|v| v.is_finite()) {
             true => Ok(values),
-            false => Err(Error::data(self.path, name, "holds a value that is not finite")),
+            false => Err(Error::data(self.path, name, "contains a value that is not finite")),
         }
     }
 

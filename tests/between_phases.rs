@@ -70,9 +70,9 @@ fn a_moving_tree_is_fitted_to_frames_at_their_own_time() {
     let told =
         |plan: &Plan, fate: &str| plan.notes.iter().any(|n| n.starts_with(&format!("{taken} of")) && n.contains(fate));
     assert!(told(&plan, "fitted at their own time"), "{:?}", plan.notes);
-    assert!(told(&planned("phase"), "count as taken at the nearest phase"));
+    assert!(told(&planned("phase"), "are used as frames of the nearest phase"));
     let network = planned("none");
-    assert!(told(&network, "learned at their own time"), "{:?}", network.notes);
+    assert!(told(&network, "trained at their own time"), "{:?}", network.notes);
     for (row, frame) in network.frames.iter().zip(dataset.training()) {
         let own_time = if frame.phase == 1 { (1, 2, 0.25) } else { (frame.phase, (frame.phase + 1) % 3, 0.0) };
         assert_eq!((row.phase, row.beyond, row.beyond_share), own_time);

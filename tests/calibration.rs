@@ -172,7 +172,8 @@ fn what_tells_nothing_is_left_as_stated() {
     };
     let mut one_view = small_dataset(40, 40);
     one_view.frames.retain(|f| f.view == 0);
-    for (dataset, why) in [(phases_alike, "phases are all alike"), (one_view, "it takes two")] {
+    for (dataset, why) in [(phases_alike, "all phases look the same"), (one_view, "at least two such views are needed")]
+    {
         let calibration = calibrate(&dataset, &config("auto")).unwrap();
         assert_eq!(calibration.correction, Correction::Stated);
         assert!(calibration.notes.join(" ").contains(why), "{:?}", calibration.notes);

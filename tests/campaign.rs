@@ -55,7 +55,7 @@ fn a_campaign_keeps_each_step_and_goes_on() {
     std::fs::write(out.join("of.json"), of.to_string()).unwrap();
     let refused = campaign(program, &out, &[]);
     assert_eq!(refused.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&refused.stderr).contains("take another directory"));
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("choose another directory"));
     let files = std::fs::read_dir(&out).unwrap().count();
     assert!(files <= 8, "{files} files come back");
 }

@@ -45,7 +45,7 @@ impl Bench {
         if !function.ends_with("_destroy") {
             self.refuses(function, NERTCA_ERROR_HANDLE, "is null", call(null_mut()));
         }
-        self.refuses(function, NERTCA_ERROR_HANDLE, "was destroyed, or never existed", call(stale));
+        self.refuses(function, NERTCA_ERROR_HANDLE, "was destroyed or never existed", call(stale));
         for wild in [1, 8, 0xdead_beef, usize::MAX] {
             self.refuses(function, NERTCA_ERROR_HANDLE, "never existed", call(without_provenance_mut(wild)));
         }
@@ -233,8 +233,8 @@ fn reconstructions(b: &Bench) {
     let set = |times: *const f64, n| unsafe { nertca_reconstruction_set_r_peaks(b.bare, times, n) };
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "times_s", set(null(), 2));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "count", set(times.as_ptr(), usize::MAX));
-    b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "two R-peaks", set(times.as_ptr(), 1));
-    b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "must rise", set([1.0, 0.5].as_ptr(), 2));
+    b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "at least two are needed", set(times.as_ptr(), 1));
+    b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "must increase", set([1.0, 0.5].as_ptr(), 2));
     b.refuses(peaks, NERTCA_ERROR_ARGUMENT, "not a time", set([1.0, f64::INFINITY].as_ptr(), 2));
     let progress = "nertca_reconstruction_progress";
     let mut room: nertca_progress = zeroed();
@@ -551,7 +551,7 @@ fn volumes_and_scores(b: &Bench) {
     b.refuses(evaluate, NERTCA_ERROR_ARGUMENT, "scores", unsafe {
         nertca_reconstruction_evaluate(b.trained, 0.0, null_mut())
     });
-    b.refuses(evaluate, NERTCA_ERROR_DATA, "none is for validation", unsafe {
+    b.refuses(evaluate, NERTCA_ERROR_DATA, "no validation frame", unsafe {
         nertca_reconstruction_evaluate(b.trained, 0.0, &mut scores)
     });
     let set_vessels = "nertca_reconstruction_set_true_vessels";

@@ -223,7 +223,7 @@ fn scores_in_3d_are_those_of_eval() {
         unsafe { nertca_reconstruction_set_true_tree(made, &tree) }
     };
     refused(with(&|t| t.points = 3), "branch_points");
-    refused(with(&|t| t.branches -= 1), "other lines");
+    refused(with(&|t| t.branches -= 1), "another number of lines");
     refused(with(&|t| t.points_mm = std::ptr::null_mut()), "points_mm");
     refused(with(&|t| t.branches = usize::MAX), "branches");
     let mut late: Vec<u32> = lines.branch_phase.iter().map(|p| p + 1).collect();

@@ -146,7 +146,9 @@ fn each_usual_mistake_is_named() {
         ("transposed", |d| each_image(d, |old, row, column| old[column * SIZE + row])),
         ("mirrored", |d| each_image(d, |old, row, column| old[row * SIZE + SIZE - 1 - column])),
         ("upside down", |d| each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + column])),
-        ("half a turn", |d| each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + SIZE - 1 - column])),
+        ("rotated by 180 degrees", |d| {
+            each_image(d, |old, row, column| old[(SIZE - 1 - row) * SIZE + SIZE - 1 - column])
+        }),
         ("primary angle has the wrong sign", |d| each_c_arm(d, |c| c.primary_deg *= -1.0)),
         ("secondary angle has the wrong sign", |d| each_c_arm(d, |c| c.secondary_deg *= -1.0)),
         ("primary and secondary angle are exchanged", |d| {
@@ -157,7 +159,7 @@ fn each_usual_mistake_is_named() {
         ("intensities, not line integrals", |d| {
             each_image(d, |old, row, column| 4000.0 * (-old[row * SIZE + column]).exp());
         }),
-        ("phases of view 1 run backwards", |d| phases_of_view(d, 1, |phase| PHASES - 1 - phase)),
+        ("phases of view 1 are in reverse order", |d| phases_of_view(d, 1, |phase| PHASES - 1 - phase)),
         ("view 2 is late by 3 phases", |d| phases_of_view(d, 2, |phase| (phase + 3) % PHASES)),
         ("views 0 and 2 are exchanged", |d| {
             let (a, b) = (d.views[0].clone(), d.views[2].clone());
@@ -196,5 +198,5 @@ fn one_view_is_not_enough() {
     let mut single = angiograms(3, Flaws::default());
     single.frames.retain(|f| f.view == 0);
     let refusal = check(&single).unwrap_err().to_string();
-    assert!(refusal.contains("two views are needed"), "{refusal}");
+    assert!(refusal.contains("two such views are needed"), "{refusal}");
 }

@@ -97,7 +97,7 @@ fn gaussians_are_measured_as_they_run() {
     let said = ok(&[&bench[..], &["--json", file.to_str().unwrap()]].concat());
     for part in [
         "Gaussians, form tree",
-        "still field after them",
+        "static field after them",
         "pairs of a Gaussian and a pixel",
         "of the f32 peak",
         "37:00",

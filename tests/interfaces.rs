@@ -323,7 +323,7 @@ fn malformed_datasets_are_named_file_and_field() {
                 let frame = m["frames"][1].clone();
                 m["frames"].as_array_mut().unwrap().extend(vec![frame; 16]);
             },
-            &["dataset.json", "8192 columns and 8192 rows", "make the large ones smaller"],
+            &["dataset.json", "8192 columns and 8192 rows", "reduce the large images"],
         ),
         ("three axes", |d, _| npy::write(&d.join("1.npy"), &[1, 4, 5], &[0.5; 20]).unwrap(), &["1.npy", "two axes"]),
         ("not a number", |d, _| npy::write(&d.join("1.npy"), &[4, 5], &[f32::NAN; 20]).unwrap(), &["1.npy", "row 0"]),
@@ -450,7 +450,8 @@ fn measurements_and_baked_views() {
         &quick,
     ];
     let said = ok(&full.concat());
-    for part in ["before the network starts", "peaks: f32", "37:00", "really run", "network passes alone", "dry run: "]
+    for part in
+        ["before the network starts", "peaks: f32", "37:00", "whole run, measured", "network passes only", "dry run: "]
     {
         assert!(said.contains(part), "`{part}` is missing: {said}");
     }
@@ -462,7 +463,7 @@ fn measurements_and_baked_views() {
     // Four iterations at the start, and one that measures their duration.
     assert_eq!(report["after"]["learned"], 5);
     assert!(
-        said.contains("left out: ") && said.contains("repeats of 2 iterations, after 5 iterations of learning"),
+        said.contains("not included: ") && said.contains("repeats of 2 iterations, after 5 iterations of training"),
         "{said}"
     );
     assert!(report["host"]["threads"].as_u64().unwrap() > 0);
@@ -485,7 +486,7 @@ fn measurements_and_baked_views() {
     std::fs::write(&file, unscored.to_string()).unwrap();
     let compared = [&["bench", text(&data), "--kernels", "--compare", text(&file)], SHORT, SMALL_NETWORK, &quick];
     let said = ok(&compared.concat());
-    assert!(said.contains("with the network, ms") && said.contains("another configuration"), "{said}");
+    assert!(said.contains("with the network, ms") && said.contains("the configurations differ"), "{said}");
     fails(&["bench", text(&data), "--compare", text(&data.join("dataset.json"))], 1, &["dataset.json", "bench --json"]);
 
     let picture = directory.path().join("baked.npy");
@@ -560,7 +561,7 @@ fn scoring_stops_when_told_and_can_be_left_for_later() {
     let unscored = directory.path().join("unscored");
     let said = ok(&[&["train", text(&data), "-o", text(&unscored), "--json", "--no-eval"], &slow[..]].concat());
     assert!(said.lines().last().unwrap().contains("\"finished\"") && !unscored.join("report/evaluation.json").exists());
-    assert!(std::fs::read_to_string(unscored.join("report.html")).unwrap().contains("Not scored yet"));
+    assert!(std::fs::read_to_string(unscored.join("report.html")).unwrap().contains("The run is not scored yet"));
     let mut eval = program()
         .args(["eval", text(&unscored)])
         .stderr(std::process::Stdio::piped())

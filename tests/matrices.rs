@@ -228,7 +228,7 @@ fn both_paths_are_timed_and_the_verdict_is_kept() {
     {
         let applied = Verdict { f32_ms, matrices_ms }.apply(tuning.clone());
         assert_eq!(applied.layers, faster);
-        let told = format!("{f32_ms:.3} ms per iteration in f32, {matrices_ms:.3} ms on matrices");
+        let told = format!("{f32_ms:.3} ms in f32 and {matrices_ms:.3} ms on matrices");
         assert!(applied.reasons.iter().any(|r| r.contains(&told)), "{:?}", applied.reasons);
     }
     let cache = tempfile::tempdir().unwrap();

@@ -58,7 +58,7 @@ fn frames_are_of_as_many_views_as_there_were_places() {
 
     // Each frame of a rotating run is a view with the C-arm's pose.
     let (told, turning) = import("turning", &["turning.dcm"], TURNING);
-    assert!(told.contains("its 12 frames are of 12 views") && told.contains("12 views of 48 x 48 pixels"), "{told}");
+    assert!(told.contains("its 12 frames belong to 12 views") && told.contains("12 views of 48 x 48 pixels"), "{told}");
     assert_eq!(frames_of_views(&turning), [1; TURNING]);
     let (mut found, truth) = (c_arms(&turning), c_arms(&at("phantom")));
     found.sort_by(|a, b| a.primary_deg.total_cmp(&b.primary_deg));
@@ -78,7 +78,7 @@ fn frames_are_of_as_many_views_as_there_were_places() {
     // A table that rests and then moves: the frames before are one view. The other frames contain no information on
     // vessels, and the run reports that.
     let (told, panned) = import("panned", &["panned.dcm", "other.dcm"], PHASES);
-    assert!(told.contains("panned: the C-arm or the table moves: its 6 frames are of 4 views"), "{told}");
+    assert!(told.contains("panned: the C-arm or the table moves, so its 6 frames belong to 4 views"), "{told}");
     let mut counts = frames_of_views(&panned);
     counts.sort_unstable();
     assert_eq!(counts, [1, 1, 1, 3, 6]);

@@ -268,5 +268,5 @@ fn the_program_trains_resumes_scores_draws_exports_and_times_them() {
     let timed =
         ok(&[&["bench", text(&data), "--warm-up", "0", "--iterations", "1", "--repeats", "1", "--kernels"], TINY]
             .concat());
-    assert!(timed.contains("loss_samples") && timed.contains("network passes alone"), "{timed}");
+    assert!(timed.contains("loss_samples") && timed.contains("network passes only"), "{timed}");
 }

@@ -499,7 +499,7 @@ fn what_cannot_be_fitted_is_refused() {
     assert!(problem.contains("column 2, row 1"), "{problem}");
     let mut sizes = small_dataset(13, 11);
     sizes.views[0].size = [12, 11];
-    assert!(refused(&sizes).contains("one size"));
+    assert!(refused(&sizes).contains("images of equal size"));
     // A damaged checkpoint is refused.
     let saved = start(&gpu, &config(&[]), &small_dataset(13, 11)).checkpoint().unwrap();
     let damaged = |damage: &dyn Fn(&mut R2State)| {
@@ -528,5 +528,5 @@ fn presets_and_notes_say_what_the_method_is() {
     let plan = Plan::new(&config, &uneven_dataset(13, 11)).unwrap();
     let says = |part: &str| assert!(plan.notes.iter().any(|note| note.contains(part)), "{part}: {:?}", plan.notes);
     says("a static method");
-    says("count as taken at the nearest phase");
+    says("are used as frames of the nearest phase");
 }

@@ -41,7 +41,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000040.safetensors")).unwrap();
     assert!(bytes(&whole) == bytes(&parts), "a resumed run comes to the same bits");
     let score: Value = serde_json::from_str(&ok(&["eval", &whole, "--json"])).unwrap();
-    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
+    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no static field");
     let info: Value = serde_json::from_str(&ok(&["info", &whole, "--json"])).unwrap();
     assert_eq!(
         (&info["config"]["gaussians"]["form"], &info["config"]["static"]["form"]),
@@ -64,7 +64,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     ok(&["export", &whole, "--component", "dynamic", "--spacing", "3", "-o", &path("vessels.nrrd")]);
     let bench = [&["bench", &data, "--kernels", "--iterations", "2", "--repeats", "2"], &settings[..]].concat();
     let said = ok(&bench);
-    assert!(said.contains("form r2") && said.contains("ssim_columns") && !said.contains("still field"), "{said}");
+    assert!(said.contains("form r2") && said.contains("ssim_columns") && !said.contains("static field"), "{said}");
     let kernels: Value = serde_json::from_str(&ok(&["kernels", "--preset", "r2-gaussian", "--json"])).unwrap();
     let listed: Vec<&str> =
         kernels["kernels"].as_array().unwrap().iter().map(|k| k["kernel"].as_str().unwrap()).collect();

@@ -40,7 +40,7 @@ fn runs_become_a_dataset_without_a_patient() {
     let Some(files) = runs() else { return };
     let dir = tempfile::tempdir().unwrap();
     let notes = import_dicom(&files, &options(), dir.path()).unwrap().join("\n");
-    assert!(notes.contains("0.390625 mm, from FieldOfViewDimensions") && notes.contains("DISP"), "{notes}");
+    assert!(notes.contains("0.390625 mm from FieldOfViewDimensions") && notes.contains("DISP"), "{notes}");
     let dataset = Dataset::open(dir.path()).unwrap();
     assert_eq!((dataset.views.len(), dataset.n_phases, dataset.width), (4, 2, 249));
     let angles: Vec<_> = dataset.views.iter().map(|v| v.geometry.angles_deg().unwrap()).collect();

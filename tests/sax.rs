@@ -357,7 +357,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     let rays = &dataset.views[0].rays;
     let seen = renderer.render(rays, 13, 11, 1).unwrap();
     assert!(seen.dynamic_integral.iter().all(|v| v.is_finite() && *v > 0.0));
-    assert!(seen.static_integral.iter().chain(&seen.static_max).all(|v| *v == 0.0), "there is no still field");
+    assert!(seen.static_integral.iter().chain(&seen.static_max).all(|v| *v == 0.0), "there is no static field");
     assert_eq!(seen.dynamic_max, seen.total_max);
     assert_ne!(seen.dynamic_integral, renderer.render(rays, 13, 11, 0).unwrap().dynamic_integral);
     let error = renderer.render_at(rays, 13, 11, 0.5).unwrap_err().to_string();
@@ -402,12 +402,12 @@ fn what_cannot_be_fitted_is_refused() {
         other => panic!("{other:?}"),
     };
     let problem = refused(&dataset, &["sax.window=6", "sax.windows=3"]);
-    assert!(problem.contains("sax.windows") && problem.contains("room for 2 windows"), "{problem}");
+    assert!(problem.contains("sax.windows") && problem.contains("room for at most 2 windows"), "{problem}");
     dataset.frames[2].integrals[15] = f32::NAN;
     assert!(refused(&dataset, &[]).contains("column 2, row 1"));
     let mut sizes = small_dataset(13, 11);
     sizes.views[0].size = [12, 11];
-    assert!(refused(&sizes, &[]).contains("one size"));
+    assert!(refused(&sizes, &[]).contains("images of equal size"));
     // A field, and a batch, too large for the device's buffers.
     let dataset = small_dataset(13, 11);
     let largest = u64::from(gpu.info().max_storage_buffer_range);
@@ -461,7 +461,7 @@ fn presets_and_notes_say_what_the_method_is() {
     let says = |part: &str| assert!(plan.notes.iter().any(|note| note.contains(part)), "{part}: {:?}", plan.notes);
     says("a static method");
     says("passes over them");
-    says("count as taken at the nearest phase");
+    says("are used as frames of the nearest phase");
     let params =
         f64s(&nertca_vk::methods::sax_nerf::start::first_params(SaxShape { levels: 2, base: 2, log2_table: 5 }, 1));
     assert!(params.iter().all(|v| v.abs() <= 2.0));

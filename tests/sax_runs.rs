@@ -42,7 +42,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000012.safetensors")).unwrap();
     assert!(bytes(&whole) == bytes(&parts), "a resumed run comes to the same bits");
     let score: Value = serde_json::from_str(&ok(&["eval", &whole, "--json"])).unwrap();
-    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
+    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no static field");
     let info: Value = serde_json::from_str(&ok(&["info", &whole, "--json"])).unwrap();
     assert_eq!(
         (&info["config"]["dynamic"]["form"], &info["config"]["static"]["form"], &info["sax"]["fields"]),

@@ -69,7 +69,7 @@ fn a_dead_moving_field_is_told_of() {
         evaluate_model(&gpu, &tuning(&gpu), &model, &dataset, &options, &mut |_| ()).unwrap().warnings
     };
     let dead = warnings(-30.0);
-    assert!(dead.len() == 1 && dead[0].contains("moving field has died"), "{dead:?}");
+    assert!(dead.len() == 1 && dead[0].contains("dynamic field has become almost zero"), "{dead:?}");
     assert_eq!(warnings(30.0), Vec::<String>::new());
     expect_silence(gpu);
 }

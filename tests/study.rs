@@ -93,13 +93,18 @@ fn faults_have_their_line() {
         ("iterations = 12", "iterations = 0", "line 12", "train.iterations"),
         ("iterations = 12", "iteration = 12", "line 12", "iteration"),
         ("name = \"a\"", "name = \"a\"\n[[data]]\nname = \"a-3v\"\ndirectory = \"there\"", "line 10", "a-3v"),
-        ("seeds = [1]", "seeds = [1, 2, 1]", "line 2", "1 stands twice"),
+        ("seeds = [1]", "seeds = [1, 2, 1]", "line 2", "1 is given twice"),
         ("seeds = [1]", "seeds = []", "line 2", "at least one"),
         ("name = \"a\"", "name = \"a\"\ndirectory = \"missing\"", "line 9", "missing"),
-        ("name = \"a\"", "name = \"a\"\nphantom = {}\ndirectory = \"there\"", "line 9", "not both"),
+        ("name = \"a\"", "name = \"a\"\nphantom = {}\ndirectory = \"there\"", "line 9", "cannot be used together"),
         ("name = \"a\"", "name = \"a\"\nphantom = { views = [5] }", "line 9", "3, 4 or 9"),
         ("name = \"a\"", "name = \"a\"\nphantom = { tree = \"tree.json\" }", "line 9", "tree.json"),
-        ("name = \"a\"", "name = \"a\"\nphantom = { photons = 1e5, detector_photons = 1e5 }", "line 9", "not both"),
+        (
+            "name = \"a\"",
+            "name = \"a\"\nphantom = { photons = 1e5, detector_photons = 1e5 }",
+            "line 9",
+            "cannot be used together",
+        ),
         ("name = \"a\"", "name = \"a\"\nphantom = { breathing = { mm = 3 } }", "line 9", "mm"),
         ("name = \"a\"", "name = \"a\"\nphantom = { collimated_share = 2 }", "line 9", "collimated_share"),
         ("name = \"a\"", "name = \"a\"\nphantom = { volumes = false, volumes_every = 2 }", "line 9", "volumes_every"),
@@ -352,7 +357,7 @@ fn kept_results_are_of_their_studies_and_make_their_tables() {
         }
         let said = output(&["table", text(&file), "-o", text(home.path())]);
         let words = String::from_utf8_lossy(&said.stderr);
-        assert!(said.status.success() && !words.contains("left out"), "{name}, {results} results: {words}");
+        assert!(said.status.success() && !words.contains("omitted"), "{name}, {results} results: {words}");
         for table in ["table.md", "table.csv", "table.tex"] {
             let [made, there] = [home.path(), &kept].map(|dir| std::fs::read_to_string(dir.join(table)).unwrap());
             assert!(made == there, "{name}/{table} is not what its results make");

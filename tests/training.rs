@@ -90,7 +90,7 @@ fn resuming_on_other_images_is_refused() {
     dataset.frames[0].integrals[3] += 0.01;
     let plan = Plan::new(&saved.model.config, &dataset).unwrap().in_scene(saved.model.scene.clone());
     let refused = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &saved).err().unwrap().to_string();
-    assert!(refused.contains("other images"), "{refused}");
+    assert!(refused.contains("different images"), "{refused}");
 }
 
 #[test]

@@ -140,7 +140,10 @@ fn viewer_and_page_say_why_there_is_no_tree() {
     let config = whole_config(directory.path(), Preset::FastMlp, &nothing);
     train(data, &young, &["--config", text(&config), "--iterations", "1", "--tree"]);
     let page = std::fs::read_to_string(young.join("report.html")).unwrap();
-    assert!(page.contains("There is no vessel tree") && !page.contains("<script"), "a page without a tree says so");
+    assert!(
+        page.contains("The vessel tree could not be extracted") && !page.contains("<script"),
+        "a page without a tree says so"
+    );
     assert!(!young.join("tree.json").exists());
     let answer = Server::of(&young).tree();
     assert_eq!(answer["state"], "failed");
@@ -187,7 +190,10 @@ fn scores_of_the_tree_are_those_of_scipy() {
     std::fs::write(out.join("evaluation.json"), &said).unwrap();
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(page.contains("Scores of the tree"));
-    assert!(ok(&["eval", text(run), "--tree"]).0.contains("as a tree against the true one"), "there is a table");
+    assert!(
+        ok(&["eval", text(run), "--tree"]).0.contains("vessel tree is compared with the true one"),
+        "there is a table"
+    );
     python_test("check_tree_scores.py", &[data, &out]);
     // Without a request, or without a truth, there are none.
     let untold: Value = serde_json::from_str(&ok(&["eval", text(run), "--json"]).0).unwrap();

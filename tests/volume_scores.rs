@@ -280,7 +280,7 @@ fn reports_show_scores_in_3d_and_do_without() {
         || serde_json::from_str::<Value>(&ok(&["eval", text(run), "--data", text(&bare), "--ceiling", "--json"]));
     let without = evaluation().unwrap();
     assert!(without.get("volume").is_none() && without.get("ceiling").is_none());
-    assert!(without["warnings"].to_string().contains("no ceiling"), "{}", without["warnings"]);
+    assert!(without["warnings"].to_string().contains("The true vessels are not scored"), "{}", without["warnings"]);
     // A truth that cannot be used is reported, and images are scored nevertheless.
     std::fs::create_dir_all(bare.join("volumes")).unwrap();
     std::fs::write(bare.join("volumes/vessels-01.nrrd"), "NRRD0004\n").unwrap();

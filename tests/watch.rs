@@ -194,15 +194,15 @@ fn runs_are_taken_in_as_they_come() {
     // An incomplete file is named, and imported once it is complete.
     let whole = std::fs::read(&runs[0]).unwrap();
     std::fs::write(inbox.join("view0.dcm"), &whole[..whole.len() / 2]).unwrap();
-    watcher.hear("not taken in: ");
+    watcher.hear("not imported: ");
     std::fs::write(inbox.join("view0.dcm"), &whole).unwrap();
-    watcher.hear("taken in: view0 (");
+    watcher.hear("imported: view0 (");
     std::fs::write(inbox.join("broken.dcm"), [7u8; 400]).unwrap();
     dicom::angiogram(&inbox.join("scan.dcm"), |o| {
         o.put(DataElement::new(tags::MODALITY, VR::CS, PrimitiveValue::from("CT")));
     });
     std::fs::copy(&runs[1], inbox.join("view1.dcm")).unwrap();
-    watcher.hear("taken in: view1 (");
+    watcher.hear("imported: view1 (");
     std::fs::copy(&runs[1], inbox.join("again.dcm")).unwrap();
     watcher.hear("again.dcm");
     // Two views are enough to start.
@@ -217,12 +217,12 @@ fn runs_are_taken_in_as_they_come() {
     };
     assert_eq!(image::load_from_memory(&picture).unwrap().width(), 64);
     std::fs::copy(&runs[2], inbox.join("view2.dcm")).unwrap();
-    watcher.hear("taken in: view2 (");
+    watcher.hear("imported: view2 (");
     assert_eq!(watcher.about()["runs"].as_u64(), Some(3));
     let (said, well) = watcher.end();
     assert!(well, "{said}");
     for (part, times) in [
-        ("not taken in: ", 4),
+        ("not imported: ", 4),
         ("broken.dcm", 1),
         ("scan.dcm", 1),
         ("Modality", 1),
@@ -293,11 +293,11 @@ fn interrupted_after_a_third_run(iterations: u32, far: impl Fn(&Value) -> bool) 
     ]);
     for (view, file) in runs.iter().take(2).enumerate() {
         std::fs::copy(file, inbox.join(format!("view{view}.dcm"))).unwrap();
-        watcher.hear(&format!("taken in: view{view} ("));
+        watcher.hear(&format!("imported: view{view} ("));
     }
     watcher.reach(far);
     std::fs::copy(&runs[2], inbox.join("view2.dcm")).unwrap();
-    watcher.hear("taken in: view2 (");
+    watcher.hear("imported: view2 (");
     watcher.interrupt();
     let (said, well) = watcher.end();
     assert!(well, "{said}");
@@ -314,11 +314,11 @@ fn interrupted_after_a_third_run(iterations: u32, far: impl Fn(&Value) -> bool) 
 fn what_was_trained_stays_until_training_with_a_later_run_has_come_as_far() {
     let (said, left) = interrupted_after_a_third_run(400, |about| about["state"] == "trained");
     assert_eq!(left, 2, "{said}");
-    assert!(said.contains("made of the first 2 of 3 runs"), "{said}");
+    assert!(said.contains("made from the first 2 of 3 runs"), "{said}");
 }
 
 #[test]
 fn what_is_left_is_of_the_runs_that_were_trained_on() {
     let (said, left) = interrupted_after_a_third_run(4000, |about| about["runs"] == 2);
-    assert_eq!(said.contains("made of the first 2 of 3 runs"), left == 2, "{said}");
+    assert_eq!(said.contains("made from the first 2 of 3 runs"), left == 2, "{said}");
 }

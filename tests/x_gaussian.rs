@@ -377,9 +377,9 @@ fn what_cannot_be_fitted_is_refused() {
     assert!(problem.contains("column 3, row 1"), "{problem}");
     let mut sizes = small_dataset(21, 18);
     sizes.views[0].size = [20, 18];
-    assert!(refused(&sizes).contains("one size"));
+    assert!(refused(&sizes).contains("images of equal size"));
     let one = of_one_view(&small_dataset(21, 18));
-    assert!(refused(&one).contains("one place"), "{}", refused(&one));
+    assert!(refused(&one).contains("the same source position"), "{}", refused(&one));
     assert!(Plan::new(&config(&["x.extent_mm=400"]), &one).is_ok());
     // A damaged checkpoint is refused.
     let saved = start(&gpu, &config(&[]), &small_dataset(21, 18)).checkpoint().unwrap();
@@ -419,8 +419,8 @@ fn presets_and_notes_say_what_the_method_is() {
     let plan = Plan::new(&config, &dataset).unwrap();
     let says = |part: &str| assert!(plan.notes.iter().any(|note| note.contains(part)), "{part}: {:?}", plan.notes);
     says("a static method");
-    says("count as taken at the nearest phase");
-    says("are beyond x.clamp = 1");
+    says("are used as frames of the nearest phase");
+    says("exceed x.clamp = 1");
     let data = data_of(&dataset, &config);
     assert!(data.images.iter().all(|v| (0.0..=1.0).contains(v)) && data.images.contains(&1.0));
 }

@@ -41,7 +41,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     let bytes = |run: &str| std::fs::read(format!("{run}/checkpoint-0000040.safetensors")).unwrap();
     assert!(bytes(&whole) == bytes(&parts), "a resumed run comes to the same bits");
     let score: Value = serde_json::from_str(&ok(&["eval", &whole, "--json"])).unwrap();
-    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no still field");
+    assert_eq!(score["dice"]["dynamic"], score["dice"]["total"], "there is no static field");
     assert_eq!(score["dice"]["dynamic"], score["dice_published"]["paper"], "the published threshold");
     assert!(score["threshold"]["rule"].as_str().unwrap().contains("opacities"), "{score}");
     // The comparison is with images of a range from 0 to 1, as it renders them.
@@ -51,7 +51,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     let otsu: Vec<f64> = images.iter().map(|image| image["dice_otsu"].as_f64().unwrap()).collect();
     let mean = otsu.iter().sum::<f64>() / otsu.len() as f64;
     assert!((score["dice_otsu"].as_f64().unwrap() - mean).abs() < 1e-12);
-    assert!(ok(&["eval", &whole]).contains("Dice by Otsu's threshold of each image"));
+    assert!(ok(&["eval", &whole]).contains("Dice at Otsu's threshold of each image"));
     let info: Value = serde_json::from_str(&ok(&["info", &whole, "--json"])).unwrap();
     assert_eq!(
         (&info["config"]["gaussians"]["form"], &info["config"]["static"]["form"]),
@@ -65,7 +65,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     ok(&["export", &whole, "--component", "dynamic", "--spacing", "3", "-o", &path("vessels.nrrd")]);
     let bench = [&["bench", &data, "--kernels", "--iterations", "2", "--repeats", "2"], &settings[..]].concat();
     let said = ok(&bench);
-    assert!(said.contains("form x") && said.contains("x_blend_back") && !said.contains("still field"), "{said}");
+    assert!(said.contains("form x") && said.contains("x_blend_back") && !said.contains("static field"), "{said}");
     let kernels: Value = serde_json::from_str(&ok(&["kernels", "--preset", "x-gaussian", "--json"])).unwrap();
     let listed: Vec<&str> =
         kernels["kernels"].as_array().unwrap().iter().map(|k| k["kernel"].as_str().unwrap()).collect();

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What the Python package adds to the C API: renders through both, one after the other, from one checkpoint.
+"""Measures the overhead of the Python package over the C API: renders through both in turn, from one checkpoint.
 
     python3 tools/bench-python.py RUN/checkpoints/....safetensors [PAIRS]
 
-Needs the wheel (tools/wheel). The C API is called with structs made ready beforehand, so that what is measured beside it is
-all that the package does, checks and structs; both draw into an array that is there.
+Needs the wheel (tools/wheel). The structs for the C API are prepared in advance, so the difference contains all work of the
+package, i.e. its checks and structs. Both render into an existing array.
 """
 
 import statistics

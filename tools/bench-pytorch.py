@@ -98,15 +98,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--preset", choices=PRESETS, default="paper")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--rays", type=int, help="rays of a batch instead of the preset's")
+    parser.add_argument("--rays", type=int, help="rays per batch, instead of the number of the preset")
     parser.add_argument("--live", type=float, default=1.0, help="share of the dynamic samples that is evaluated")
     parser.add_argument("--compile", action="store_true", help="torch.compile the iteration's forward pass")
     parser.add_argument("--tf32", action="store_true", help="allow TF32 matrix products (CUDA)")
     parser.add_argument("--amp", action="store_true", help="f16 products and a constant loss scale (CUDA), or bf16 (CPU)")
-    parser.add_argument("--graph", action="store_true", help="replay each iteration as one CUDA graph")
+    parser.add_argument("--graph", action="store_true", help="execute each iteration as one CUDA graph")
     parser.add_argument("--threads", type=int, help="CPU threads")
-    parser.add_argument("--warm-up", type=float, default=5.0, help="seconds of iterations before any is timed")
-    parser.add_argument("--sample", type=float, default=10.0, help="seconds that all repeats take together")
+    parser.add_argument("--warm-up", type=float, default=5.0, help="seconds of iterations before the first timed one")
+    parser.add_argument("--sample", type=float, default=10.0, help="total seconds of all timed repeats")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
@@ -200,9 +200,9 @@ def main():
         chosen = [("compiled", args.compile), ("TF32", args.tf32), ("AMP", args.amp), ("CUDA graph", args.graph)]
         way = ", ".join(name for name, on in chosen if on) or "eager"
         print(f"PyTorch {torch.__version__} on {result['device']} ({result['threads']} threads), {way}, {args.preset}")
-        print(f"{median:.2f} ms per iteration (median of {len(ms)} times {iterations}; {min(ms):.2f} to {max(ms):.2f}), "
+        print(f"{median:.2f} ms per iteration (median of {len(ms)} repeats of {iterations}; {min(ms):.2f} to {max(ms):.2f}), "
               f"{rays} rays, {n_live} live samples")
-        print(f"{gflop / median:.4f} TFLOP/s over whole iterations; 30,000 of them take {30 * median / 60:.1f} minutes")
+        print(f"{gflop / median:.4f} TFLOP/s in whole iterations; 30,000 iterations take {30 * median / 60:.1f} minutes")
 
 
 if __name__ == "__main__":

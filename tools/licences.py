@@ -63,17 +63,18 @@ def main():
         found = texts(package) or of_repository.get(package["repository"], [])
         if not found:
             if not any(name in (package["license"] or "") for name in (*STANDARD, PUBLIC_DOMAIN)):
-                sys.exit(f"{package['name']}: {package['license']}, and no file with its text: it cannot be passed on so")
+                sys.exit(f"{package['name']} has no file with the text of its licence, {package['license']}, "
+                         "so it cannot be redistributed")
             bare.append(package)
         for text in found:
             by_text[text].append(package)
-    print(f"nertca-vk is linked with {len(packages)} crates and Rust's standard library (MIT OR Apache-2.0).\n")
+    print(f"nertca-vk contains {len(packages)} crates and Rust's standard library (MIT OR Apache-2.0).\n")
     for package in packages:
         print(f"{package['name']} {package['version']}: {package['license'] or 'see below'}; {package['repository'] or ''}")
     for text, of in sorted(by_text.items(), key=lambda item: names_of(item[1])):
         print(f"\n{'=' * 80}\n{names_of(of)}\n{'-' * 80}\n{text}")
     if bare:
-        print(f"\n{'=' * 80}\nWithout a file of their own: {names_of(bare)}; authors:")
+        print(f"\n{'=' * 80}\nCrates without their own licence file: {names_of(bare)}; authors:")
         for package in bare:
             print(f"  {package['name']}: {', '.join(package['authors']) or 'not stated'}")
         for path in STANDARD.values():

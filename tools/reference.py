@@ -445,7 +445,7 @@ def write_safetensors(path, tensors, metadata):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).parent.parent / "tests" / "golden")
-    parser.add_argument("--preset", action="append", choices=PRESETS, help="of these alone; repeatable")
+    parser.add_argument("--preset", action="append", choices=PRESETS, help="use only this preset; may be repeated")
     args = parser.parse_args()
     out = args.out
     out.mkdir(parents=True, exist_ok=True)

@@ -330,8 +330,9 @@ def train(name, fault=None):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).parent.parent / "tests" / "golden")
-    parser.add_argument("--preset", action="append", choices=PRESETS, help="of these alone; repeatable")
-    parser.add_argument("--fault", choices=("rates", "moments", "step"), help="plant it, print how far it shows, write nothing")
+    parser.add_argument("--preset", action="append", choices=PRESETS, help="use only this preset; may be repeated")
+    parser.add_argument("--fault", choices=("rates", "moments", "step"),
+                        help="introduce this fault, print its effect, and write no file")
     args = parser.parse_args()
     for name in args.preset or PRESETS:
         c, out = train(name, args.fault)

@@ -72,7 +72,7 @@ def constant(name: str, value: str, prefix: str) -> int:
     """The number of one of the header's constants, by the end of its name in small letters."""
     known = _constants(prefix)
     if value not in known:
-        raise wrong(name, f"{value!r} is none of {', '.join(known)}")
+        raise wrong(name, f"{value!r} is not one of {', '.join(known)}")
     return known[value]
 
 
@@ -88,7 +88,7 @@ def image(name: str, values: object, dtypes: Sequence[npt.DTypeLike]) -> "np.nda
     native = array.dtype.newbyteorder("=")
     if native not in dtypes:
         accepted = ", ".join(np.dtype(dtype).name for dtype in dtypes)
-        raise wrong(name, f"values of type {array.dtype}; {accepted} are accepted")
+        raise wrong(name, f"values of type {array.dtype} are not supported; {accepted} are accepted")
     if array.ndim != 2:
         raise wrong(name, f"an array of shape {array.shape}; (rows, columns) is needed")
     return np.ascontiguousarray(array, dtype=native)
@@ -103,7 +103,7 @@ def target(name: str, out: object, shape: tuple[int, ...]) -> "npt.NDArray[np.fl
         found = f"{out.dtype} of shape {out.shape}" if isinstance(out, np.ndarray) else type(out).__name__
         raise wrong(name, f"{found}; a float32 array of shape {shape} is needed")
     if not out.flags.carray:  # in C's order, aligned, and to be written to
-        raise wrong(name, "is read-only, or its rows do not follow each other at once")
+        raise wrong(name, "is read-only, or its rows are not contiguous")
     return out
 
 

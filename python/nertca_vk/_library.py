@@ -34,7 +34,7 @@ def _open(path: Path) -> Any:
     library = ffi.dlopen(str(path))
     ours, theirs = library.NERTCA_ABI_VERSION, library.nertca_abi_version()
     if ours != theirs:
-        raise ImportError(f"{path} has ABI {theirs}, its header {ours}: install the package anew")
+        raise ImportError(f"{path} has ABI {theirs}, its header {ours}: reinstall the package")
     return library
 
 
@@ -104,7 +104,7 @@ def _plain(key: str, value: object) -> object:
         plain: object = getattr(value, "item", lambda: value)()
         json.dumps(plain, allow_nan=False)
     except (TypeError, ValueError):
-        raise argument_error(f"{key}: {value!r} is no setting") from None
+        raise argument_error(f"{key}: {value!r} is not a setting") from None
     return plain
 
 

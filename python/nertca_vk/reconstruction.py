@@ -56,7 +56,7 @@ def _as_grid(grid: Grid) -> Any:
         raise wrong("grid.points", f"{len(grid.points)} numbers where 3 are needed")
     left, posterior, superior = (whole("grid.points", n, 1, 4096) for n in grid.points)
     if left * posterior * superior > MOST_POINTS:
-        raise wrong("grid.points", f"{left} x {posterior} x {superior}; at most 2^30 in all are accepted")
+        raise wrong("grid.points", f"{left} x {posterior} x {superior} exceeds the maximum, 2^30 points in total")
     struct = new("nertca_grid")
     struct.origin_mm = reals("grid.origin_mm", grid.origin_mm, 3)
     struct.spacing_mm = reals("grid.spacing_mm", grid.spacing_mm, 3)
@@ -244,14 +244,14 @@ class Reconstruction:
         frame.format = PIXEL_FORMATS[values.dtype]
         intensity.fill(frame)
         if (phase is None) == (time_s is None):
-            raise wrong("phase", "either it or time_s is needed")
+            raise wrong("phase", "either phase or time_s is needed, but not both")
         frame.phase = -1 if phase is None else whole("phase", phase, highest=2**31 - 1)
         frame.time_s = 0.0 if time_s is None else real("time_s", time_s)
         frame.split = constant("split", split, "NERTCA_SPLIT_")
         if mask is not None:
             marked = image("mask", mask, (np.bool_, np.uint8))
             if marked.shape != values.shape:
-                raise wrong("mask", f"an array of shape {marked.shape} for pixels of shape {values.shape}")
+                raise wrong("mask", f"has shape {marked.shape}, but the pixels have shape {values.shape}")
             kept.append(readable(marked))
             frame.mask, frame.mask_bytes = ffi.cast("uint8_t *", kept[2]), marked.nbytes
         handle = self.handle

@@ -121,8 +121,9 @@ impl Dataset {
     /// # Errors
     /// [`Error::Config`] when the correction belongs to other views.
     pub fn corrected(&self, calibration: &Calibration) -> Result<Dataset> {
-        let other =
-            |what: String| Error::config(FILE, what, "is not what the dataset states: it was made for other data");
+        let other = |what: String| {
+            Error::config(FILE, what, "does not agree with the dataset: the correction was made for other data")
+        };
         let mut corrected = self.clone();
         for c in &calibration.views {
             let view = corrected.views.get_mut(c.view).filter(|view| view.geometry == c.stated);

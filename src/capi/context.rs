@@ -48,7 +48,7 @@ impl Kind for Context {
 
 impl Context {
     pub fn device(&self) -> Outcome<&Gpu> {
-        let none = || crate::error::Error::NoDevice("the context was made without a device".into());
+        let none = || crate::error::Error::NoDevice("the context was created without a device".into());
         Ok(self.gpu.as_ref().ok_or_else(none)?)
     }
 }
@@ -121,7 +121,7 @@ fn tuning(gpu: &Gpu, layers: Option<Layers>) -> Tuning {
     let tuning = Tuning::for_device(gpu.info());
     match layers {
         None => tuning,
-        Some(layers) => tuning.with_layers(layers, format!("{layers:?} layers, as asked")),
+        Some(layers) => tuning.with_layers(layers, format!("{layers:?} layers, as requested")),
     }
 }
 
@@ -248,7 +248,7 @@ pub unsafe extern "C" fn nertca_context_adopt(
         let queue_lock: Option<Box<dyn QueueLock>> = match (theirs.lock, theirs.unlock) {
             (None, None) => None,
             (Some(lock), Some(unlock)) => Some(Box::new(CallerLock { lock, unlock, user: theirs.user })),
-            _ => return Err(Failure::argument("vulkan.lock", "needs unlock, and the other way round")),
+            _ => return Err(Failure::argument("vulkan.lock", "lock and unlock must be given together")),
         };
         let raw = |handle: *mut c_void| handle.expose_provenance() as u64;
         let adoption = Adoption {
@@ -331,11 +331,12 @@ pub unsafe extern "C" fn nertca_context_destroy(context: *mut nertca_context) ->
     }
     call(context, || {
         if handles::is_active(context) {
-            return Err(Failure::new(NERTCA_ERROR_BUSY, "context: a call on it is under way in this thread"));
+            return Err(Failure::new(NERTCA_ERROR_BUSY, "context: it is in use by a call in this thread"));
         }
         let children = handles::get::<Context, nertca_context>(context)?.children.load(Ordering::Acquire);
         if children > 0 {
-            let problem = format!("context: {children} reconstructions or buffers made from it still exist");
+            let problem =
+                format!("context: {children} reconstructions or buffers that were created from it still exist");
             return Err(Failure::new(NERTCA_ERROR_BUSY, problem));
         }
         let context = handles::remove::<Context, nertca_context>(context)?;

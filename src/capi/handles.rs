@@ -114,10 +114,10 @@ fn find<T: Kind>(handle: usize) -> Outcome<Arc<T>> {
             .and_then(|(index, generation)| table.slots.get(index).filter(|slot| slot.generation == generation));
         slot.and_then(|slot| slot.object.clone())
     };
-    let object = object.ok_or_else(|| bad("was destroyed, or never existed"))?;
+    let object = object.ok_or_else(|| bad("was destroyed or never existed"))?;
     let object = T::unwrap(object).ok_or_else(|| bad("is a handle of another type"))?;
     if object.process() != std::process::id() {
-        return Err(Failure::new(NERTCA_ERROR_FORKED, format!("{}: was made before a fork", T::NAME)));
+        return Err(Failure::new(NERTCA_ERROR_FORKED, format!("{}: was created before a fork", T::NAME)));
     }
     Ok(object)
 }
@@ -136,7 +136,7 @@ pub(super) fn remove<T: Kind, H>(handle: *const H) -> Outcome<Arc<T>> {
         let slot = &mut table.slots[index];
         if slot.generation != generation || slot.object.is_none() {
             // Another thread destroyed it first.
-            return Err(Failure::new(NERTCA_ERROR_HANDLE, format!("{}: was destroyed, or never existed", T::NAME)));
+            return Err(Failure::new(NERTCA_ERROR_HANDLE, format!("{}: was destroyed or never existed", T::NAME)));
         }
         slot.object = None;
         slot.generation = (slot.generation + 1) & (usize::MAX >> INDEX_BITS);

@@ -35,7 +35,7 @@ unsafe impl Sync for Callback {}
 pub(super) fn dispatch(log: Option<nertca_log>) -> Outcome<Dispatch> {
     let Some(log) = log else { return Ok(Dispatch::none()) };
     if log.level == 0 || log.level > NERTCA_LOG_INFO {
-        return Err(Failure::argument("log.level", format!("{}; 1 to 3 are accepted", log.level)));
+        return Err(Failure::argument("log.level", format!("{} is not in the accepted range, 1 to 3", log.level)));
     }
     let Some(call) = log.callback else { return Err(Failure::argument("log.callback", "is null")) };
     Ok(Dispatch::new(Callback { call, user: log.user, most: log.level }))

@@ -48,7 +48,7 @@ impl Options {
 
     fn push(&mut self, key: String, value: String) -> Outcome<()> {
         if self.pairs.iter().any(|(k, _)| *k == key) {
-            return Err(Failure::argument("options", format!("{key}: is given twice")));
+            return Err(Failure::argument("options", format!("{key} is given twice")));
         }
         self.pairs.push((key, value));
         Ok(())
@@ -64,7 +64,7 @@ impl Options {
             serde_json::Value::Bool(_) | serde_json::Value::Number(_) => {
                 self.push(prefix.to_owned(), value.to_string())
             }
-            _ => Err(Failure::argument("options", format!("{prefix}: {value} is no text, number or truth value"))),
+            _ => Err(Failure::argument("options", format!("{prefix}: {value} is not a text, a number or a Boolean"))),
         }
     }
 
@@ -90,7 +90,9 @@ impl Options {
     pub fn finish(self, known: &str) -> Outcome<()> {
         match self.pairs.first() {
             None => Ok(()),
-            Some((key, _)) => Err(Failure::argument("options", format!("unknown key `{key}`; known here: {known}"))),
+            Some((key, _)) => {
+                Err(Failure::argument("options", format!("unknown key `{key}`; the known keys are: {known}")))
+            }
         }
     }
 }

@@ -61,7 +61,7 @@ fn component_of(component: u32) -> Outcome<Component> {
         NERTCA_COMPONENT_TOTAL => Ok(Component::Total),
         NERTCA_COMPONENT_STATIC => Ok(Component::Static),
         NERTCA_COMPONENT_DYNAMIC => Ok(Component::Dynamic),
-        other => Err(Failure::argument("component", format!("{other} is none of NERTCA_COMPONENT_*"))),
+        other => Err(Failure::argument("component", format!("{other} is not one of NERTCA_COMPONENT_*"))),
     }
 }
 
@@ -75,12 +75,12 @@ unsafe fn checked_view(view: *const nertca_view) -> Outcome<CheckedView> {
     let projection = match view.projection {
         NERTCA_PROJECTION_DRR => Projection::Drr,
         NERTCA_PROJECTION_MIP => Projection::Mip,
-        other => return Err(Failure::argument("projection", format!("{other} is none of NERTCA_PROJECTION_*"))),
+        other => return Err(Failure::argument("projection", format!("{other} is not one of NERTCA_PROJECTION_*"))),
     };
     let exact = match view.quality {
         NERTCA_QUALITY_LIVE => false,
         NERTCA_QUALITY_EXACT => true,
-        other => return Err(Failure::argument("quality", format!("{other} is none of NERTCA_QUALITY_*"))),
+        other => return Err(Failure::argument("quality", format!("{other} is not one of NERTCA_QUALITY_*"))),
     };
     // SAFETY: callers of this function guarantee a matrix that is null or has 12 numbers.
     let geometry = unsafe { view.geometry.geometry() }?;
@@ -124,7 +124,10 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
         let image = unsafe { read(image) }?;
         let (width, height) = checked.size;
         if ![NERTCA_PIXELS_F32, NERTCA_PIXELS_U8].contains(&image.format) {
-            return Err(Failure::argument("format", format!("{} is neither F32 nor U8", image.format)));
+            return Err(Failure::argument(
+                "format",
+                format!("{} is neither NERTCA_PIXELS_F32 nor NERTCA_PIXELS_U8", image.format),
+            ));
         }
         let bytes = pixel_bytes(image.format)?;
         if image.pixels.is_null() {
@@ -132,7 +135,10 @@ pub unsafe extern "C" fn nertca_reconstruction_render(
         }
         let apart = stride("pixels", width * bytes, height, image.stride_bytes, image.pixels_bytes)?;
         if !(image.low.is_finite() && image.high.is_finite() && image.low <= image.high) {
-            return Err(Failure::argument("low, high", format!("{} to {} is no window", image.low, image.high)));
+            return Err(Failure::argument(
+                "low, high",
+                format!("{} to {} is not a valid window of intensities", image.low, image.high),
+            ));
         }
         let values = draw(reconstruction, &checked)?;
         let rows: Vec<u8> = if image.format == NERTCA_PIXELS_F32 {
@@ -191,7 +197,10 @@ fn check_target(reconstruction: &Reconstruction, target: &SharedBuffer, floats: 
     }
     let needed = floats as u64 * 4;
     if target.buffer.bytes() < needed {
-        return Err(Failure::argument("buffer", format!("{} bytes where {needed} are needed", target.buffer.bytes())));
+        return Err(Failure::argument(
+            "buffer",
+            format!("has {} bytes where {needed} are needed", target.buffer.bytes()),
+        ));
     }
     Ok(())
 }
@@ -209,7 +218,7 @@ pub(super) unsafe fn grid_of(grid: *const nertca_grid) -> Outcome<(PatientGrid, 
     };
     patient.check()?;
     if patient.size.iter().map(|n| u64::from(*n)).product::<u64>() > 1 << 30 {
-        return Err(Failure::argument("points", "more than 2^30 in all"));
+        return Err(Failure::argument("points", "more than 2^30 points in total"));
     }
     Ok((patient, component, grid.phase))
 }
@@ -234,7 +243,7 @@ pub unsafe extern "C" fn nertca_reconstruction_sample(
         }
         let needed = grid.size.iter().map(|n| *n as usize).product::<usize>();
         if count < needed {
-            return Err(Failure::argument("count", format!("{count} where {needed} are needed")));
+            return Err(Failure::argument("count", format!("is {count} where {needed} are needed")));
         }
         let cells = reconstruction.session.sample(component, phase, &grid)?;
         // SAFETY: the caller guarantees room for `count` numbers, which was checked to be enough; bytes need no alignment.
@@ -283,7 +292,7 @@ pub unsafe extern "C" fn nertca_buffer_create(
         // SAFETY: `buffer` is not null, and the header requires that it can be written.
         unsafe { buffer.write_unaligned(std::ptr::null_mut()) };
         if bytes == 0 || bytes > 1 << 40 {
-            return Err(Failure::argument("bytes", format!("{bytes} is no size of a buffer")));
+            return Err(Failure::argument("bytes", format!("{bytes} is not in the accepted range, 1 to 2^40")));
         }
         let (made, memory) = shared_memory::make(context.device()?, bytes)?;
         let shared = SharedBuffer { buffer: made, memory, claim: Claim::new(context), process: std::process::id() };
@@ -333,7 +342,7 @@ pub extern "C" fn nertca_buffer_destroy(buffer: *mut nertca_buffer) -> nertca_st
         if handles::is_active(buffer) {
             return Err(Failure::new(
                 super::status::NERTCA_ERROR_BUSY,
-                "buffer: a call on it is under way in this thread",
+                "buffer: it is in use by a call in this thread",
             ));
         }
         handles::remove::<SharedBuffer, _>(buffer).map(drop)

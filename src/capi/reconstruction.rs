@@ -71,13 +71,13 @@ fn session(context: &Context, mut options: Options) -> Outcome<Session> {
         None => None,
         Some(name) => Some(
             Preset::named(&name)
-                .ok_or_else(|| Failure::argument("preset", format!("`{name}` is none of {}", Preset::names())))?,
+                .ok_or_else(|| Failure::argument("preset", format!("`{name}` is not one of {}", Preset::names())))?,
         ),
     };
     let config = Config::load(preset, None, &options.settings())?;
     let options = SessionOptions {
         config,
-        phases: phases.ok_or_else(|| Failure::argument("phases", "is missing: how many cardiac phases are there?"))?,
+        phases: phases.ok_or_else(|| Failure::argument("phases", "is missing: give the number of cardiac phases"))?,
         depth_half_extent_mm: depth.unwrap_or(100.0),
         vessel_attenuation_per_mm: vessel,
         deterministic: context.deterministic,
@@ -138,7 +138,7 @@ pub unsafe extern "C" fn nertca_reconstruction_destroy(reconstruction: *mut nert
     }
     call(reconstruction, || {
         if handles::is_active(reconstruction) {
-            return Err(Failure::new(NERTCA_ERROR_BUSY, "reconstruction: a call on it is under way in this thread"));
+            return Err(Failure::new(NERTCA_ERROR_BUSY, "reconstruction: it is in use by a call in this thread"));
         }
         let log = {
             let found = handles::get::<Reconstruction, _>(reconstruction)?;
@@ -189,7 +189,7 @@ pub unsafe extern "C" fn nertca_reconstruction_set_r_peaks(
             return Err(Failure::argument("times_s", "is null"));
         }
         if count > 1 << 20 {
-            return Err(Failure::argument("count", format!("{count}; at most 2^20 are accepted")));
+            return Err(Failure::argument("count", format!("{count} exceeds the maximum, 2^20")));
         }
         // SAFETY: the pointer is not null, and the header requires `count` numbers, which need no alignment.
         let times = (0..count).map(|i| unsafe { times_s.add(i).read_unaligned() }).collect::<Vec<_>>();
@@ -342,7 +342,7 @@ pub unsafe extern "C" fn nertca_reconstruction_load_memory(
             return Err(Failure::argument("bytes", "is null"));
         }
         if size > 4 << 30 {
-            return Err(Failure::argument("size", format!("{size}; at most 4 GiB are accepted")));
+            return Err(Failure::argument("size", format!("{size} exceeds the maximum, 4 GiB")));
         }
         // SAFETY: the pointer is not null, and the header requires `size` bytes, which nobody changes during the call.
         let content = unsafe { std::slice::from_raw_parts(bytes.cast::<u8>(), size) };

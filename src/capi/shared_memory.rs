@@ -37,7 +37,7 @@ mod system {
     pub enum Memory {}
 
     pub fn make(_: &Gpu, _: u64) -> Result<(Buffer, Memory)> {
-        Err(Error::NoDevice("memory is shared by file descriptors, which this system does not have".into()))
+        Err(Error::NoDevice("memory is shared through file descriptors, which this system does not support".into()))
     }
 
     impl Memory {

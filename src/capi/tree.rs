@@ -53,7 +53,7 @@ pub unsafe extern "C" fn nertca_reconstruction_tree(
             return Ok(());
         }
         if asked.branches < told.branches || asked.points < told.points {
-            let needed = format!("room for {} branches and {} points is needed", told.branches, told.points);
+            let needed = format!("arrays for {} branches and {} points are needed", told.branches, told.points);
             return Err(Failure::new(NERTCA_ERROR_BUFFER, needed));
         }
         // SAFETY: no array is null, as was checked, and the header requires as many elements as were compared above.
@@ -83,7 +83,7 @@ fn wants_copies(asked: &nertca_tree) -> Outcome<bool> {
         return Ok(false);
     }
     match missing.iter().find(|(_, null)| *null) {
-        Some((name, _)) => Err(Failure::argument(name, "is null, and other arrays are not")),
+        Some((name, _)) => Err(Failure::argument(name, "is null although other arrays are not")),
         None => Ok(true),
     }
 }

@@ -40,7 +40,7 @@ pub unsafe extern "C" fn nertca_reconstruction_set_true_vessels(
         }
         let needed = grid.size.iter().map(|n| *n as usize).product::<usize>();
         if bytes < needed {
-            return Err(Failure::argument("bytes", format!("{bytes} where {needed} are needed")));
+            return Err(Failure::argument("bytes", format!("is {bytes} where {needed} are needed")));
         }
         // SAFETY: the pointer is not null, and the header requires `bytes` bytes, which are enough and which nobody changes
         // during the call.
@@ -79,7 +79,7 @@ pub unsafe extern "C" fn nertca_reconstruction_set_true_tree(
 unsafe fn lines(tree: &nertca_tree) -> Outcome<BTreeMap<u32, Vec<TrueLine>>> {
     for (name, count) in [("branches", tree.branches), ("points", tree.points)] {
         if count > MOST_ELEMENTS {
-            return Err(Failure::argument(name, format!("{count}; at most 2^24 are accepted")));
+            return Err(Failure::argument(name, format!("{count} exceeds the maximum, 2^24")));
         }
     }
     // SAFETY: callers of this function guarantee as many elements, which need no alignment.
@@ -98,7 +98,8 @@ unsafe fn lines(tree: &nertca_tree) -> Outcome<BTreeMap<u32, Vec<TrueLine>>> {
         let (first, count) = (firsts[branch] as usize, counts[branch] as usize);
         taken += count;
         if first.saturating_add(count) > tree.points || taken > tree.points {
-            let problem = format!("branch {branch} has points {first} to {first} + {count} of {}", tree.points);
+            let problem =
+                format!("branch {branch} has points {first} to {first} + {count}, but there are {}", tree.points);
             return Err(Failure::argument("branch_points", format!("{problem}, or branches share points")));
         }
         let range = first..first + count;
@@ -134,7 +135,10 @@ pub unsafe extern "C" fn nertca_reconstruction_evaluate(
 ) -> nertca_status {
     on_reconstruction(reconstruction, |reconstruction| {
         if !(threshold_per_mm.is_finite() && threshold_per_mm >= 0.0) {
-            return Err(Failure::argument("threshold_per_mm", format!("{threshold_per_mm} is no attenuation")));
+            return Err(Failure::argument(
+                "threshold_per_mm",
+                format!("{threshold_per_mm} is not a finite attenuation of at least 0"),
+            ));
         }
         if scores.is_null() {
             return Err(Failure::argument("scores", "is null"));

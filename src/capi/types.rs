@@ -419,7 +419,8 @@ unsafe impl Versioned for nertca_scores {
 fn check_size<T: Versioned>(size: usize) -> Outcome<()> {
     if size < T::FIRST || size > 4096 {
         let name = T::NAME;
-        let problem = format!("{size} where sizeof({name}) = {} is needed: was the struct set up?", size_of::<T>());
+        let problem =
+            format!("{size} where sizeof({name}) = {} is needed: set the field `size` of the struct", size_of::<T>());
         return Err(Failure::argument(&format!("{name}.size"), problem));
     }
     Ok(())
@@ -441,7 +442,10 @@ pub(super) unsafe fn read<T: Versioned>(from: *const T) -> Outcome<T> {
     // SAFETY: the struct is as long as its size says.
     let rest = unsafe { std::slice::from_raw_parts(from.cast::<u8>().add(known), size - known) };
     if rest.iter().any(|byte| *byte != 0) {
-        return Err(Failure::argument(T::NAME, "asks for what this version of the library does not know"));
+        return Err(Failure::argument(
+            T::NAME,
+            "has fields that this version of the library does not know, and they are not zero",
+        ));
     }
     let mut value = std::mem::MaybeUninit::<T>::zeroed();
     // SAFETY: the struct is as long as its size says, ours has room for as much, and every bit pattern of it is valid.
@@ -499,7 +503,7 @@ const MAX_SIDE: u32 = crate::formats::images::MAX_SIDE as u32;
 pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {
     for (name, side) in [("width", width), ("height", height)] {
         if side == 0 || side > MAX_SIDE {
-            return Err(Failure::argument(name, format!("{side}; 1 to {MAX_SIDE} are accepted")));
+            return Err(Failure::argument(name, format!("{side} is not in the accepted range, 1 to {MAX_SIDE}")));
         }
     }
     Ok((width as usize, height as usize))
@@ -509,14 +513,20 @@ pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {
 pub(super) fn stride(name: &str, row_bytes: usize, height: usize, stride: usize, bytes: usize) -> Outcome<usize> {
     let stride = if stride == 0 { row_bytes } else { stride };
     if stride < row_bytes {
-        return Err(Failure::argument(&format!("{name} stride"), format!("{stride} bytes for rows of {row_bytes}")));
+        return Err(Failure::argument(
+            &format!("{name} stride"),
+            format!("is {stride} bytes, but a row has {row_bytes} bytes"),
+        ));
     }
     let needed = stride.checked_mul(height - 1).and_then(|n| n.checked_add(row_bytes));
     match needed {
         Some(needed) if needed <= bytes => Ok(stride),
         _ => Err(Failure::argument(
             &format!("{name}_bytes"),
-            format!("{bytes} where {height} rows {stride} bytes apart need {}", needed.unwrap_or(usize::MAX)),
+            format!(
+                "is {bytes}, but {height} rows at a stride of {stride} bytes need {}",
+                needed.unwrap_or(usize::MAX)
+            ),
         )),
     }
 }
@@ -527,7 +537,7 @@ pub(super) fn pixel_bytes(format: u32) -> Outcome<usize> {
         NERTCA_PIXELS_U8 => Ok(1),
         NERTCA_PIXELS_U16 => Ok(2),
         NERTCA_PIXELS_F32 => Ok(4),
-        other => Err(Failure::argument("format", format!("{other} is none of NERTCA_PIXELS_*"))),
+        other => Err(Failure::argument("format", format!("{other} is not one of NERTCA_PIXELS_*"))),
     }
 }
 
@@ -554,7 +564,7 @@ impl nertca_frame {
             NERTCA_INTENSITY_LOG => Intensity::Integral { scale: -scale, offset: finite("i0", self.i0)? * scale },
             NERTCA_INTENSITY_LINEAR if self.i0 > 0.0 && self.i0.is_finite() => Intensity::Linear { i0: self.i0 },
             NERTCA_INTENSITY_LINEAR => return Err(Failure::argument("i0", format!("{} is not positive", self.i0))),
-            other => return Err(Failure::argument("intensity", format!("{other} is none of NERTCA_INTENSITY_*"))),
+            other => return Err(Failure::argument("intensity", format!("{other} is not one of NERTCA_INTENSITY_*"))),
         };
         let mut integrals = Vec::with_capacity(width * height);
         for row in 0..height {
@@ -588,7 +598,7 @@ impl nertca_frame {
             split: match self.split {
                 NERTCA_SPLIT_TRAIN => Split::Train,
                 NERTCA_SPLIT_VALIDATION => Split::Validation,
-                other => return Err(Failure::argument("split", format!("{other} is none of NERTCA_SPLIT_*"))),
+                other => return Err(Failure::argument("split", format!("{other} is not one of NERTCA_SPLIT_*"))),
             },
             width,
             height,

@@ -47,19 +47,21 @@ impl Mistake {
         match self {
             Mistake::Transposed => "the images are transposed: exchange rows and columns of every image",
             Mistake::Mirrored => {
-                "the images are mirrored left to right, or the primary angle has the wrong sign (LAO is positive): both \
-                 explain the data; the patient's anatomy tells which"
+                "the images are mirrored left to right, or the primary angle has the wrong sign (LAO is positive): \
+                 both explain the data; the patient's anatomy shows which one is true"
             }
             Mistake::UpsideDown => {
-                "the images are upside down, or the secondary angle has the wrong sign (cranial is positive): both explain \
-                 the data; the patient's anatomy tells which"
+                "the images are upside down, or the secondary angle has the wrong sign (cranial is positive): both \
+                 explain the data; the patient's anatomy shows which one is true"
             }
             Mistake::Turned => {
-                "the images are turned by half a turn, or both angles have the wrong sign (LAO and cranial are positive)"
+                "the images are rotated by 180 degrees, or both angles have the wrong sign (LAO and cranial are \
+                 positive)"
             }
             Mistake::AnglesExchanged => "primary and secondary angle are exchanged",
             Mistake::PitchAtIsocentre => {
-                "pixel_mm is the pitch at the isocentre: the detector's is wanted, which is sid_mm / sod_mm times as large"
+                "pixel_mm is the pixel pitch at the isocentre, but the pitch on the detector is needed, which is \
+                 sid_mm / sod_mm times as large"
             }
             Mistake::LogTwice => {
                 "the logarithm was taken twice: the images were line integrals already (intensity kind `integral`)"

@@ -40,7 +40,7 @@ pub struct Cli {
     /// Turn the Vulkan validation layers on (slow; messages make the program fail).
     #[arg(long, global = true)]
     pub validate: bool,
-    /// Print more messages on stderr.
+    /// Print more messages to stderr.
     #[arg(short, long, global = true)]
     pub verbose: bool,
     /// Command to run.
@@ -51,27 +51,27 @@ pub struct Cli {
 /// Commands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// List Vulkan devices, their limits and the code paths they get.
+    /// List the Vulkan devices, their limits, and the code paths that are used on them.
     Devices(DevicesArgs),
     /// Make a synthetic dataset with exact masks.
     Phantom(PhantomArgs),
-    /// Project voxel volumes, one per phase, into a dataset.
+    /// Make a dataset from projections of voxel volumes, one volume per phase.
     Project(ProjectArgs),
     /// Import clinical data as a dataset.
     Import(ImportArgs),
     /// Reconstruct a dataset into a run directory.
     Train(TrainArgs),
-    /// Score a run on the views it has not seen.
+    /// Score a run on views that it was not trained on.
     Eval(EvalArgs),
     /// Render a run from any angle at any phase.
     Render(RenderArgs),
     /// View a run in a browser: turn the C-arm with the mouse while the beat plays.
     View(ViewArgs),
-    /// Reconstruct DICOM runs as they appear in a folder, and view the reconstruction meanwhile in a browser.
+    /// Reconstruct DICOM runs while they appear in a folder, and view the growing reconstruction in a browser.
     Watch(WatchArgs),
     /// Export volumes or vessel surfaces of a run for other tools.
     Export(ExportArgs),
-    /// Extract the vessels of a run as trees: centrelines with radii in mm, followed over the beat.
+    /// Extract the vessels of a run as trees: centrelines with radii in mm, tracked over the beat.
     Tree(TreeArgs),
     /// Correct views whose geometry is inconsistent, from the angiograms alone.
     Calibrate(CalibrateArgs),
@@ -79,13 +79,13 @@ pub enum Command {
     Convert(ConvertArgs),
     /// Measure iterations, passes and renderings against device limits and the 37 minutes of the paper.
     Bench(BenchArgs),
-    /// Compare every compute stage with its f64 twin on this device; run this first on an unknown device.
+    /// Compare every compute stage on this device with its f64 reference; run this first on an unknown device.
     Selftest(SelftestArgs),
     /// List every pipeline that a preset uses, as the device's driver compiles it: registers, spills, size.
     Kernels(KernelsArgs),
-    /// Run a study: data sets x methods x seeds, and tables of their results beside published ones.
+    /// Run a study of data sets x methods x seeds, and write tables of its results next to published ones.
     Study(StudyArgs),
-    /// Tell whether a dataset is consistent, and which of the usual mistakes it has.
+    /// Check whether a dataset is consistent, and name the usual mistakes that it has.
     Check(CheckArgs),
     /// Describe a dataset or a run.
     Info(InfoArgs),
@@ -96,7 +96,7 @@ pub enum Command {
 /// Returns a parser for the names of a choice.
 pub(super) fn choice<T: Choice>() -> impl TypedValueParser<Value = T> {
     PossibleValuesParser::new(T::ALL.iter().map(|choice| choice.name()))
-        .try_map(|name| T::named(&name).ok_or("is none of the choices"))
+        .try_map(|name| T::named(&name).ok_or("is not one of the choices"))
 }
 
 /// Parses `A,B`.
@@ -108,11 +108,11 @@ pub(super) fn pair(text: &str) -> Option<[f64; 2]> {
 /// Hyper-parameters, for every command that trains.
 #[derive(Debug, Args)]
 pub struct ConfigArgs {
-    /// Set of defaults: `fast` (moving Gaussians; normalised, tuned), `fast-mlp` (a dynamic network; normalised,
-    /// tuned), `paper` (as described in the paper), `public-code` (as in the authors' code), `nerf-ca` (two networks; a
-    /// method that the paper compares with), `r2-gaussian`, `x-gaussian` or `sax-nerf` (static methods that the paper
-    /// compares with, fitted to each phase: Gaussians, Gaussians that occlude each other, or a hash grid with a
-    /// network); `fast`, unless a configuration file names one.
+    /// Set of defaults: `fast` (deformable set of Gaussians; normalised, tuned), `fast-mlp` (a dynamic network;
+    /// normalised, tuned), `paper` (as described in the paper), `public-code` (as in the authors' code), `nerf-ca` (two
+    /// networks; a method that the paper compares with), `r2-gaussian`, `x-gaussian` or `sax-nerf` (static methods that
+    /// the paper compares with, fitted to each phase: Gaussians, Gaussians that occlude each other, or a hash grid with
+    /// a network); `fast`, unless a configuration file names one.
     #[arg(long, value_parser = choice::<Preset>())]
     pub preset: Option<Preset>,
     /// TOML file with hyper-parameters.
@@ -134,5 +134,5 @@ impl ConfigArgs {
 /// Parses `X,Y,Z`.
 pub(super) fn triple<T: std::str::FromStr>(text: &str) -> std::result::Result<[T; 3], String> {
     let parts: Vec<T> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
-    parts.try_into().map_err(|_| "three numbers are needed, as X,Y,Z".to_owned())
+    parts.try_into().map_err(|_| "three numbers are needed, written as X,Y,Z".to_owned())
 }

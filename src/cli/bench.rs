@@ -77,12 +77,12 @@ const PROFILED: u32 = 8;
 /// Longest time for a measurement, seconds: one hour.
 const MOST_SECONDS: f64 = 3600.0;
 /// Work that times of iterations do not include.
-const LEFT_OUT: &str = "opening the device and compiling, reading data, calibration, hull, validation, checkpoints";
+const LEFT_OUT: &str = "opening the device, compiling, reading data, calibration, hull, validation, checkpoints";
 
 fn seconds(text: &str) -> std::result::Result<f64, String> {
     match text.parse::<f64>() {
         Ok(seconds) if (0.0..=MOST_SECONDS).contains(&seconds) => Ok(seconds),
-        _ => Err(format!("a number of seconds from 0 to {MOST_SECONDS} is needed")),
+        _ => Err(format!("is not a number of seconds from 0 to {MOST_SECONDS}")),
     }
 }
 
@@ -135,7 +135,7 @@ fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
 fn dry_run_of(cli: &Cli, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<DryRun> {
     let done = dry_run(gpu, config, dataset, &cli.training_tuning(gpu, config, dataset)?)?;
     out!(
-        "dry run: {} iterations through the schedule's events at {:?} in {:.1} s, loss {:.3e} after the last",
+        "dry run: {} iterations around the schedule's events at {:?} in {:.1} s; the last loss is {:.3e}",
         done.iterations,
         done.events,
         done.seconds,
@@ -146,7 +146,8 @@ fn dry_run_of(cli: &Cli, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Resul
 
 fn read_report(file: &Path) -> Result<Report> {
     let text = std::fs::read(file).map_err(Error::io("read", file))?;
-    serde_json::from_slice(&text).map_err(|e| Error::data(file, "JSON", format!("{e}; is it from `bench --json`?")))
+    serde_json::from_slice(&text)
+        .map_err(|e| Error::data(file, "JSON", format!("{e}; a file that `bench --json` wrote is needed")))
 }
 
 /// Makes the default phantom of `nertca-vk phantom`.

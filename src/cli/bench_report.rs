@@ -119,14 +119,14 @@ fn clock(seconds: f64) -> String {
 pub fn print(report: &Report, kernels: bool) {
     out!("{} ({}), nertca-vk {} {}", report.device, report.driver, report.version, report.commit);
     let Host { processor, threads, system } = &report.host;
-    let processor = processor.as_deref().unwrap_or("a processor that the system does not name");
-    out!("on {system}, {processor}, {} threads", threads.map_or("unknown".into(), |n| n.to_string()));
+    let processor = processor.as_deref().unwrap_or("unknown processor");
+    out!("host: {system}, {processor}, {} threads", threads.map_or("unknown".into(), |n| n.to_string()));
     report.paths.iter().for_each(|p| out!("- {p}"));
     let p = &report.peaks;
     let matrix = p.matrix_tflops.map_or("none".to_owned(), |t| format!("{t:.3} TFLOP/s"));
     let clock = if p.by_timestamps { "device" } else { "host" };
     out!(
-        "peaks: f32 {:.3} TFLOP/s, f16 matrices {matrix}, copy {:.1} GB/s, by the {clock}'s clock",
+        "peaks: f32 {:.3} TFLOP/s, f16 matrices {matrix}, copy {:.1} GB/s, measured with the {clock}'s clock",
         p.f32_tflops,
         p.copy_gb_per_s
     );
@@ -139,7 +139,7 @@ pub fn print(report: &Report, kernels: bool) {
         print_gaussians(report, gaussians);
     }
     if let Some(before) = &report.before {
-        let name = if report.gaussians.is_some() { "still field after them" } else { "before the network starts" };
+        let name = if report.gaussians.is_some() { "static field after them" } else { "before the network starts" };
         print_times(name, &before.ms, before.median(), before.host_cpu_share);
         print_conditions(before.iterations, Some(before.learned), before.readings.as_ref());
     }
@@ -162,7 +162,7 @@ const GROWING: [&str; 2] = ["r2", "x"];
 fn print_whole_run(report: &Report) {
     let (time, speedup) = (clock(report.whole_run_s), PAPER_SECONDS / report.whole_run_s);
     if report.of_the_paper {
-        out!("whole run: {time} against 37:00 of the paper, extrapolated: {speedup:.3} x as fast");
+        out!("whole run, extrapolated: {time}; the paper needs 37:00, so this is {speedup:.3} x as fast");
     } else {
         let least = if report.gaussians.as_ref().is_some_and(|g| GROWING.contains(&g.form.as_str())) {
             "at least "
@@ -170,11 +170,12 @@ fn print_whole_run(report: &Report) {
             ""
         };
         out!(
-            "whole run: {least}{time}, extrapolated; not the paper's iterations, whose 37:00 say nothing without a Dice (--full)"
+            "whole run, extrapolated: {least}{time}; its iterations differ from the paper's, so a comparison with the \
+             paper's 37:00 needs a Dice (--full)"
         );
     }
     if !report.left_out.is_empty() {
-        out!("  left out: {}", report.left_out);
+        out!("  not included: {}", report.left_out);
     }
 }
 
@@ -183,7 +184,7 @@ fn print_full(full: &FullRun) {
     let speedup = PAPER_SECONDS / full.train_s;
     let compared = full.dice.map_or(String::new(), |_| format!(" ({speedup:.2} x as fast as 37:00)"));
     out!(
-        "whole run, really run: {:.1} s of training{compared}, {:.1} s in all; Dice {}, PSNR {} dB",
+        "whole run, measured: {:.1} s of training{compared}, {:.1} s in total; Dice {}, PSNR {} dB",
         full.train_s,
         full.elapsed_s,
         number(full.dice, 3),
@@ -201,7 +202,7 @@ fn print_passes(report: &Report) {
     passes.sort_by(|a, b| b.1.total_cmp(a.1));
     let sum: f64 = report.passes_ms.values().sum();
     let [gflop, megabytes, of_limit] = ["GFLOP", "MB", "of limit"];
-    out!("{:32} times        ms   share {gflop:>9} {megabytes:>9} {of_limit:>8}", "pass, each kept apart");
+    out!("{:32} times        ms   share {gflop:>9} {megabytes:>9} {of_limit:>8}", "pass, executed separately");
     for (name, &ms) in passes {
         let times = report.passes_per_iteration.get(name).map_or("-".into(), |n| format!("{n:.0}"));
         let work = of_pass(&report.work, name).map_or(String::new(), |work| {
@@ -216,9 +217,9 @@ fn print_passes(report: &Report) {
         Some(after) => after.median(),
         None => medians.into_iter().flatten().sum(),
     };
-    out!("{:32} {count:5.0} {sum:9.3}   (iterations, with overlap: {iterations:.3} ms)", "all of them");
+    out!("{:32} {count:5.0} {sum:9.3}   (iterations, with overlap: {iterations:.3} ms)", "all passes");
     if let Some(barriers) = report.barriers_per_iteration {
-        out!("  {barriers} barriers between those of an iteration of the network or the still field");
+        out!("  {barriers} barriers between the passes of an iteration of the network or the static field");
     }
     let samples = report.after.as_ref().map_or(0, |after| after.live_samples);
     if let (Some(bytes), true) = (bytes_per_sample(report, samples), samples > 0) {
@@ -242,7 +243,7 @@ fn bytes_per_sample(report: &Report, live_samples: u64) -> Option<f64> {
 /// Prints the conditions of the times: iterations of a repeat, iterations that the fields had learned, and the device's
 /// sensors.
 fn print_conditions(iterations: u32, learned: Option<u32>, readings: Option<&Readings>) {
-    let learned = learned.map_or(String::new(), |n| format!(", after {n} iterations of learning"));
+    let learned = learned.map_or(String::new(), |n| format!(", after {n} iterations of training"));
     let span = |span: &Option<Span>, unit: &str| {
         span.map_or(String::new(), |s| format!("; {:.0} {unit} ({:.0} to {:.0})", s.mean, s.least, s.greatest))
     };
@@ -256,7 +257,7 @@ fn print_conditions(iterations: u32, learned: Option<u32>, readings: Option<&Rea
 /// Prints the times of an iteration on one line.
 fn print_times(name: &str, ms: &[f64], median: f64, host_cpu_share: Option<f64>) {
     let (low, high) = ms.iter().fold((f64::INFINITY, 0f64), |(l, h), ms| (l.min(*ms), h.max(*ms)));
-    let cpu = host_cpu_share.map_or(String::new(), |s| format!(", process uses {s:.2} CPUs"));
+    let cpu = host_cpu_share.map_or(String::new(), |s| format!(", the process uses {s:.2} CPUs"));
     out!("{name:25}: {median:.3} ms per iteration (median of {}; {low:.3} to {high:.3}){cpu}", ms.len());
 }
 
@@ -267,12 +268,12 @@ fn ms_of(report: &Report, belongs: impl Fn(&str) -> bool) -> f64 {
 
 fn print_gaussians(report: &Report, gaussians: &GaussianTiming) {
     let GaussianTiming { form, count, work, .. } = gaussians;
-    out!("{count} Gaussians, form {form}; {:.2} s before their first iteration", gaussians.preparation_s);
+    out!("{count} Gaussians, form {form}; their preparation takes {:.2} s", gaussians.preparation_s);
     let ms = gaussians.median();
     print_times("Gaussians", &gaussians.ms, ms, gaussians.host_cpu_share);
     print_conditions(gaussians.iterations, None, gaussians.readings.as_ref());
     out!(
-        "  {} pairs of a Gaussian and a pixel: {:.3e} pairs/s, {:.4} TFLOP/s and {:.2} GB/s over whole iterations",
+        "  {} pairs of a Gaussian and a pixel: {:.3e} pairs/s, {:.4} TFLOP/s and {:.2} GB/s in whole iterations",
         work.pairs,
         work.pairs as f64 / ms * 1e3,
         work.gflop / ms,
@@ -282,7 +283,7 @@ fn print_gaussians(report: &Report, gaussians: &GaussianTiming) {
     if pairs_ms > 0.0 {
         let tflops = work.gflop / pairs_ms;
         let share = 100.0 * tflops / report.peaks.f32_tflops;
-        out!("  passes over pairs alone: {tflops:.4} TFLOP/s: {share:.0} % of the f32 peak");
+        out!("  passes over pairs only: {tflops:.4} TFLOP/s, {share:.0} % of the f32 peak");
     }
 }
 
@@ -297,7 +298,7 @@ fn print_network(report: &Report, after: &Timing) {
     }
     let live = after.live_samples;
     out!(
-        "  {live} live samples: {:.3e} samples/s, {:.4} TFLOP/s over whole iterations",
+        "  {live} live samples: {:.3e} samples/s, {:.4} TFLOP/s in whole iterations",
         live as f64 / ms * 1e3,
         after.network_gflop / ms
     );
@@ -307,10 +308,7 @@ fn print_network(report: &Report, after: &Timing) {
         let of = |peak: f64| 100.0 * tflops / peak;
         let matrices = report.peaks.matrix_tflops;
         let share = matrices.map_or(String::new(), |m| format!(", {:.0} % of the matrix peak", of(m)));
-        out!(
-            "  network passes alone: {tflops:.4} TFLOP/s: {:.0} % of the f32 peak{share}",
-            of(report.peaks.f32_tflops)
-        );
+        out!("  network passes only: {tflops:.4} TFLOP/s, {:.0} % of the f32 peak{share}", of(report.peaks.f32_tflops));
     }
 }
 
@@ -318,15 +316,15 @@ fn print_network(report: &Report, after: &Timing) {
 pub fn compare(this: &Report, other: &Report) {
     out!("compared with {} on {} (ratios: this / other):", other.commit, other.device);
     if (&this.device, &this.driver) != (&other.device, &other.driver) {
-        out!("  another device or driver");
+        out!("  the other file is from another device or driver");
     }
     if this.config != other.config || this.rays != other.rays {
-        out!("  another configuration: see both files");
+        out!("  the configurations differ: see both files");
     }
     let ratio = |name: &str, a: f64, b: f64| out!("  {name:32} {:6.3}  ({a:.3} / {b:.3})", a / b);
     if let (Some(a), Some(b)) = (&this.gaussians, &other.gaussians) {
         ratio("Gaussians, ms", a.median(), b.median());
-        ratio("before the first of them, s", a.preparation_s, b.preparation_s);
+        ratio("preparation of Gaussians, s", a.preparation_s, b.preparation_s);
     }
     if let (Some(a), Some(b)) = (&this.before, &other.before) {
         ratio("without the network, ms", a.median(), b.median());

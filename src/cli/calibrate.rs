@@ -20,7 +20,7 @@ pub struct CalibrateArgs {
     /// Parameters to correct.
     #[arg(long, value_parser = choice::<CalibrateMode>(), default_value = "auto")]
     pub mode: CalibrateMode,
-    /// Dataset directory to make: the same images with corrected geometry; pictures of the changes are in its folder
+    /// Dataset directory to write: the same images with corrected geometry; pictures of the changes are in its folder
     /// `calibration`.
     #[arg(short, long)]
     pub out: PathBuf,
@@ -36,7 +36,7 @@ const FOLDER: &str = "calibration";
 pub fn run(args: &CalibrateArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
     if args.out.join(MANIFEST).exists() {
-        return Err(Error::config("--out", args.out.display(), "already holds a dataset; choose another directory"));
+        return Err(Error::config("--out", args.out.display(), "already contains a dataset; choose another directory"));
     }
     let mut config = Config::preset(Preset::Fast);
     config.calibrate.mode = args.mode;
@@ -52,7 +52,7 @@ pub fn run(args: &CalibrateArgs) -> Result<()> {
         out!("{}", files::pretty_json(&calibration)?);
     } else {
         calibration_table::print(&calibration);
-        out!("dataset: {}, before and after: {}", args.out.display(), folder.display());
+        out!("dataset: {}, pictures before and after the correction: {}", args.out.display(), folder.display());
     }
     Ok(())
 }

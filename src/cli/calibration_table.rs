@@ -32,8 +32,8 @@ pub fn rows(calibration: &Calibration) -> Vec<Vec<String>> {
 pub fn legend(calibration: &Calibration) -> String {
     let [before, after] = calibration.explained.map(|share| 100.0 * share);
     format!(
-        "Views disagreed by {:.2} pixels. All other views explain {before:.0} % of a view's vessel pixels before, and \
-         {after:.0} % after.",
+        "The views disagreed by {:.2} pixels. All other views together explain {before:.0} % of a view's vessel pixels \
+         before the correction, and {after:.0} % after it.",
         calibration.disagreement_px
     )
 }

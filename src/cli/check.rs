@@ -36,14 +36,14 @@ pub fn run(args: &CheckArgs) -> Result<()> {
     if let Some(directory) = &args.pictures {
         match Plan::new(&Config::preset(Preset::Fast), &dataset)?.hull {
             Some(hull) => hull_pictures::write(directory, &dataset, &hull)?,
-            None => eprintln!("no pictures: views agree on nothing that moves"),
+            None => eprintln!("no pictures were written: no motion is consistent between the views"),
         }
     }
     if found.sound() {
         return Ok(());
     }
     let problem = match found.mistakes.first() {
-        Some(mistake) => format!("its views agree without one mistake: {mistake}"),
+        Some(mistake) => format!("its views agree once one mistake is corrected: {mistake}"),
         None => "its views do not show the same object".to_owned(),
     };
     Err(Error::data(&dataset.path, "dataset", problem))
@@ -59,7 +59,7 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
         out!("{:4} {primary:>7} {secondary:>9} {:6} {noise:7.1}% {edge:11.1}% {wide:>12}", v.view, v.phases);
     }
     if let Some(agreement) = &found.agreement {
-        out!("disagreement of views (0: one object, 100: unrelated): {:.1}", 100.0 * agreement.fine);
+        out!("disagreement of the views (0: the same object, 100: unrelated images): {:.1}", 100.0 * agreement.fine);
         for pair in &agreement.pairs {
             let [a, b] = pair.views.map(|v| found.views[v].view);
             out!("  views {a} and {b}: {:.1}", 100.0 * pair.residual);
@@ -69,7 +69,7 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
         [] => (),
         [one] => out!("mistake: {one}"),
         several => {
-            out!("one of these mistakes:");
+            out!("one of these mistakes was made:");
             several.iter().for_each(|m| out!("  - {m}"));
         }
     }
@@ -77,7 +77,7 @@ fn print(dataset: &Dataset, found: &Check) -> Result<()> {
     if found.sound() {
         let config = Config::preset(Preset::Fast);
         calibrate(dataset, &config)?.notes.iter().for_each(|note| out!("{note}"));
-        out!("the views show one object");
+        out!("the views show the same object");
     }
     Ok(())
 }

@@ -34,7 +34,7 @@ pub struct ImportDicomArgs {
     /// One file per view.
     #[arg(required = true, value_name = "FILE")]
     pub files: Vec<PathBuf>,
-    /// Directory to make.
+    /// Directory to write.
     #[arg(short, long)]
     pub out: PathBuf,
     /// Options of reading runs.
@@ -58,14 +58,15 @@ pub fn bar() -> impl FnMut(&str, u64, u64) {
 /// Tells the user that the authors' layout cannot store times between phases.
 fn tell_of_times(layout: Layout, degradations: &Degradations) {
     if layout == Layout::Nerfca && degradations.rhythm.is_some() {
-        eprintln!("this layout numbers phases: frames between two get the nearest");
+        eprintln!("this layout has whole phases only: frames between two phases get the nearest phase");
     }
 }
 
 /// Makes a phantom.
 pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
     if args.tree.is_none() && !args.c_arm.is_default() {
-        let problem = "--sod, --sid, --fov, --pixel and --offset are for --tree; a published set-up has its own C-arm";
+        let problem = "--sod, --sid, --fov, --pixel and --offset need --tree, because a published set-up has its own \
+                       C-arm";
         return Err(Error::config("--tree", "none", problem));
     }
     let gpu = cli.open_device()?;

@@ -31,8 +31,8 @@ impl Cli {
             };
         };
         let reason = match layers {
-            Layers::F32 => "f32 layers, as asked",
-            Layers::Matrices => "matrix layers, as asked: f16 operands, f32 sums",
+            Layers::F32 => "f32 layers, as requested",
+            Layers::Matrices => "matrix layers, as requested: f16 operands, f32 sums",
         };
         tuning.with_layers(layers, reason.into())
     }
@@ -49,7 +49,7 @@ impl Cli {
             // The driver may offer matrices but reject their kernels. If the cause is different, the f32 path reports it as
             // well.
             Err(error @ (Error::Vulkan { .. } | Error::Config { .. })) => {
-                let reason = format!("f32 layers: those on matrices fail on this device ({error})");
+                let reason = format!("f32 layers, because layers on matrices fail on this device ({error})");
                 return Ok(tuning.with_layers(Layers::F32, reason));
             }
             verdict => verdict?,
@@ -69,7 +69,9 @@ impl Cli {
         }
         match gpu.validation_messages().len() {
             0 => Ok(()),
-            n => Err(nertca_vk::error::Error::Internal(format!("{n} Vulkan validation messages, printed above"))),
+            n => Err(nertca_vk::error::Error::Internal(format!(
+                "there were {n} Vulkan validation messages, which are printed above"
+            ))),
         }
     }
 }

@@ -16,7 +16,8 @@ pub struct DicomArgs {
     /// Number of cardiac phases.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=4096))]
     pub phases: u32,
-    /// The object does not move: average each run. Phase 0 is the object, phase 1 the same without vessels.
+    /// The object does not move: average each run. Phase 0 is the object, and phase 1 is the same object without
+    /// vessels.
     #[arg(long, conflicts_with_all = ["r_peaks", "heart_rate", "phase_list"])]
     pub still: bool,
     /// R-peaks in seconds from the first frame, one per line, instead of the files' ECG.
@@ -25,8 +26,8 @@ pub struct DicomArgs {
     /// Heart rate, beats per minute, of a regular rhythm with an R-peak at the first frame.
     #[arg(long, value_name = "PER_MIN", conflicts_with = "phase_list")]
     pub heart_rate: Option<f64>,
-    /// No ECG: find the beat of each run from the motion of its vessels. A regular rhythm is assumed; at least one and a half
-    /// beats must be filled with contrast.
+    /// Find the beat of each run from the motion of its vessels, without an ECG. A regular rhythm is assumed; at least
+    /// one and a half beats must be filled with contrast.
     #[arg(long, conflicts_with_all = ["still", "r_peaks", "heart_rate", "phase_list"])]
     pub gate_by_images: bool,
     /// Conversion of times between R-peaks to phases.
@@ -45,7 +46,7 @@ pub struct DicomArgs {
     /// Longest side of the images, pixels: larger images are reduced by averaging.
     #[arg(long)]
     pub size: Option<usize>,
-    /// Depth to search in front of and behind the isocentre, mm.
+    /// Depth range to reconstruct in front of and behind the isocentre, mm.
     #[arg(long, default_value_t = 100.0, value_name = "MM")]
     pub depth: f64,
 }
@@ -84,7 +85,7 @@ fn frame_range(text: &str) -> std::result::Result<std::ops::RangeInclusive<usize
     let (first, last) = text.split_once('-').unwrap_or((text, text));
     match (first.trim().parse(), last.trim().parse()) {
         (Ok(first), Ok(last)) if first <= last => Ok(first..=last),
-        _ => Err("write it as FIRST-LAST, as in 5-12".into()),
+        _ => Err("is not of the form FIRST-LAST, e.g. 5-12".into()),
     }
 }
 

@@ -51,7 +51,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
         None => RunInfo::read(&args.run)?.dataset,
     };
     if args.threshold.is_some_and(|t| !(t.is_finite() && t >= 0.0)) {
-        return Err(Error::config("--threshold", args.threshold.unwrap_or_default(), "must not be negative"));
+        return Err(Error::config("--threshold", args.threshold.unwrap_or_default(), "is negative"));
     }
     let dataset = as_trained(Dataset::open(&data)?, &args.run)?;
     let gpu = cli.open_device()?;
@@ -98,15 +98,16 @@ fn add_ceiling(data: &Path, evaluation: &mut Evaluation, cancel: &AtomicBool) ->
     let without = match found {
         // The truth is faulty: the model is scored nevertheless.
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => Some(error.to_string()),
-        Ok(None) => {
-            Some(format!("no unseen image of {} has a mask and a true volume (volumes/) of its phase", data.display()))
-        }
+        Ok(None) => Some(format!(
+            "no unseen image of {} has both a mask and a true volume (volumes/) of its phase",
+            data.display()
+        )),
         found => {
             evaluation.ceiling = found?;
             None
         }
     };
-    evaluation.warnings.extend(without.map(|why| format!("There is no ceiling: {why}.")));
+    evaluation.warnings.extend(without.map(|why| format!("The true vessels are not scored: {why}.")));
     Ok(())
 }
 
@@ -146,7 +147,8 @@ pub fn print_table(evaluation: &Evaluation) {
     );
     if let Some(stated) = &evaluation.dice_as_stated {
         out!(
-            "unseen views from where the calibrated reconstruction has them; as stated, Dice is {} / {}",
+            "the unseen views are scored in the frame of the calibrated reconstruction; with the stated geometry, Dice \
+             is {} / {}",
             dice(stated.dynamic),
             dice(stated.total)
         );
@@ -162,12 +164,16 @@ pub fn print_table(evaluation: &Evaluation) {
         None => "-".into(),
     };
     let BestDices { dynamic, total } = evaluation.best_dice;
-    out!("best Dice over thresholds, found with the masks: {} / {}", best(dynamic), best(total));
+    out!("best Dice of all thresholds, which needs the masks: {} / {}", best(dynamic), best(total));
     if let Some(ceiling) = evaluation.ceiling {
-        out!("the true vessels by the same rule: {:.3}; best over thresholds {}", ceiling.dice, best(ceiling.best));
+        out!(
+            "Dice of the true vessels by the same rule: {:.3}; best of all thresholds: {}",
+            ceiling.dice,
+            best(ceiling.best)
+        );
     }
     if let Some(otsu) = evaluation.dice_otsu {
-        out!("Dice by Otsu's threshold of each image: {otsu:.3}");
+        out!("Dice at Otsu's threshold of each image: {otsu:.3}");
     }
     let published = evaluation.dice_published;
     out!(

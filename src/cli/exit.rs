@@ -27,13 +27,16 @@ pub fn code(error: &Error) -> u8 {
 pub fn hint(error: &Error) -> Option<&'static str> {
     match error {
         Error::DeviceLost { .. } => Some(
-            "a run that was training goes on from its last checkpoint with --resume; \
-             --set train.iterations_per_submit=N and --device choose smaller submits and another device",
+            "`train --resume` continues a run from its last checkpoint; --set train.iterations_per_submit=N makes \
+             submits smaller, and --device chooses another device",
         ),
-        Error::OutOfMemory { instead: SMALLER_BATCHES, .. } => {
-            Some("--set train.chunk_samples=N, --set train.rays=N and --device need less or offer more")
+        Error::OutOfMemory { instead: SMALLER_BATCHES, .. } => Some(
+            "lower values of --set train.chunk_samples=N and --set train.rays=N need less memory, and --device chooses \
+             another device",
+        ),
+        Error::Diverged { .. } => {
+            Some("--set key=value changes a setting; `train --print-config` prints the current values")
         }
-        Error::Diverged { .. } => Some("settings are given as --set key=value; --print-config prints today's values"),
         _ => None,
     }
 }

@@ -22,7 +22,7 @@ use std::path::PathBuf;
 pub struct ExportArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
-    /// Field to export: both, the static background or the moving vessels.
+    /// Field to export: both, the static background or the dynamic vessels.
     #[arg(long, value_parser = choice::<Component>(), default_value = Component::Dynamic.name())]
     pub component: Component,
     /// Phase from 0, or `all`: as a fourth axis, or one file per phase.
@@ -44,10 +44,10 @@ pub struct ExportArgs {
     /// Attenuation of the surface, 1/mm; by default the Dice threshold.
     #[arg(long, requires = "mesh", value_name = "PER_MM")]
     pub iso: Option<f64>,
-    /// Export motion instead of volumes: displacements from the reference phase (mostly 0) at the nodes of the grid that moves
-    /// the Gaussians, mm, where one set moves (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion along a vessel is
-    /// not observed in projections: displacements along vessels come from smoothness alone, and no strain can be derived from
-    /// them.
+    /// Export motion instead of volumes: displacements from the reference phase (mostly 0) at the nodes of the motion
+    /// grid, mm, for one deformable set of Gaussians (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion
+    /// along a vessel is not observed in projections: displacements along vessels come from the smoothness of the
+    /// motion only, and no strain can be derived from them.
     #[arg(long, conflicts_with_all = ["mesh", "format", "component", "spacing"])]
     pub motion: bool,
     /// With --motion: write the path of each Gaussian over the beat, including its own motion, as lines in a .vtk.
@@ -66,7 +66,7 @@ pub struct ConvertArgs {
     /// Layout to write: `native` (`dataset.json`), or `nerfca`, the layout of the NeRF-CA and NerT-CA authors.
     #[arg(long, value_parser = choice::<Layout>())]
     pub layout: Layout,
-    /// Directory to make.
+    /// Directory to write.
     #[arg(short, long)]
     pub out: PathBuf,
 }
@@ -78,7 +78,7 @@ pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
         text => match text.parse() {
             Ok(phase) if phase < n_phases => Ok((vec![phase], false)),
             _ => {
-                Err(Error::config("--phase", text, format!("`all` or a phase from 0 to {} is accepted", n_phases - 1)))
+                Err(Error::config("--phase", text, format!("is neither `all` nor a phase from 0 to {}", n_phases - 1)))
             }
         },
     }
@@ -92,9 +92,13 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
         return export_motion(args, &model, phases, all);
     }
     if args.mesh && args.component.has_static() {
-        return Err(Error::config("--component", "", "surfaces are those of the moving vessels: --component dynamic"));
+        return Err(Error::config(
+            "--component",
+            "",
+            "surfaces are extracted from the dynamic field only: use --component dynamic",
+        ));
     }
-    let unknown = |known: &str| Error::config("--out", args.out.display(), format!("ends in none of {known}"));
+    let unknown = |known: &str| Error::config("--out", args.out.display(), format!("does not end in one of {known}"));
     let grid = grid_over(&model.scene, args.component, args.spacing)?;
     let gpu = cli.open_device()?;
     let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?;
@@ -116,7 +120,7 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
             // The static background is the same at every phase.
             sequence: all && args.component.has_dynamic(),
             phases: if args.component.has_dynamic() { phases } else { vec![0] },
-            format: format.ok_or_else(|| unknown(".nrrd .nii .nii.gz .mha .npy .vtk; say which with --format"))?,
+            format: format.ok_or_else(|| unknown(".nrrd .nii .nii.gz .mha .npy .vtk; choose one with --format"))?,
             compression: if compressed { Compression::Gzip } else { Compression::None },
         };
         export.write(&renderer, &args.out, |n, of| progress("volume", n, of))?
@@ -136,7 +140,7 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
 fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: bool) -> Result<()> {
     let tree = moving_tree(model)?;
     let format = MotionFormat::of(&args.out);
-    let unknown = |known: &str| Error::config("--out", args.out.display(), format!("ends in none of {known}"));
+    let unknown = |known: &str| Error::config("--out", args.out.display(), format!("does not end in one of {known}"));
     let made = if args.trajectories {
         if format != Some(MotionFormat::Vtk) {
             return Err(unknown(".vtk"));
@@ -150,7 +154,8 @@ fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: b
     };
     made.iter().for_each(|path| out!("{}", path.display()));
     eprintln!(
-        "motion along a vessel is not observed in projections: displacements along vessels come from smoothness alone"
+        "motion along a vessel is not observed in projections: displacements along vessels come from the smoothness of \
+         the motion only"
     );
     Ok(())
 }
@@ -160,7 +165,9 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
     let dataset = Dataset::open(&args.data)?;
     let between = dataset.frames.iter().filter(|frame| frame.after_phase != 0.0).count();
     if args.layout == Layout::Nerfca && between > 0 {
-        eprintln!("{between} frames lie between two phases; this layout numbers phases, and gives them the nearest");
+        eprintln!(
+            "{between} frames lie between two phases; this layout has whole phases only, so they get the nearest phase"
+        );
     }
     nertca_vk::scan::writer::convert(&dataset, args.layout, &args.out)?;
     out!("{}", args.out.display());

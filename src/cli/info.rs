@@ -40,7 +40,7 @@ pub fn info(args: &InfoArgs) -> Result<()> {
     let is_run = path.is_file() || checkpoint::list(path).is_ok_and(|found| !found.is_empty());
     if let Some(picture) = &args.picture {
         if is_run {
-            let problem = format!("shows the geometry of a dataset, and {} is a run", path.display());
+            let problem = format!("needs a dataset, whose geometry the picture shows, but {} is a run", path.display());
             return Err(Error::config("--picture", picture.display(), problem));
         }
         geometry_picture::write(&Dataset::open(path)?, picture)?;

@@ -22,7 +22,7 @@ pub struct KernelsArgs {
     /// Print JSON instead of text.
     #[arg(long)]
     pub json: bool,
-    /// Compare with the file of an earlier --json, and fail if a kernel newly spills or is much larger.
+    /// Compare with the file of an earlier --json, and fail if a kernel spills that did not before or is much larger.
     #[arg(long, value_name = "FILE")]
     pub compare: Option<PathBuf>,
 }
@@ -70,7 +70,8 @@ pub fn run(cli: &Cli, args: &KernelsArgs) -> Result<()> {
 
 fn read(file: &Path) -> Result<Answer> {
     let text = std::fs::read(file).map_err(Error::io("read", file))?;
-    serde_json::from_slice(&text).map_err(|e| Error::data(file, "JSON", format!("{e}; is it from `kernels --json`?")))
+    serde_json::from_slice(&text)
+        .map_err(|e| Error::data(file, "JSON", format!("{e}; a file that `kernels --json` wrote is needed")))
 }
 
 fn print(answer: &Answer, told: bool) {
@@ -78,7 +79,8 @@ fn print(answer: &Answer, told: bool) {
     answer.paths.iter().for_each(|path| out!("- {path}"));
     if !told {
         out!(
-            "- the driver tells nothing of what it compiles (it lacks VK_KHR_pipeline_executable_properties): no numbers below"
+            "- the driver gives no statistics of the kernels that it compiles (it lacks \
+             VK_KHR_pipeline_executable_properties), so the numbers are missing below"
         );
     }
     out!("lanes subgroup registers   spills shared resident     code   cycles kernel and constants");
@@ -110,7 +112,9 @@ fn compare(file: &Path, before: &Answer, now: &Answer) -> Result<()> {
         return Ok(());
     }
     let (n, percent) = (found.worse.len(), 100.0 * GROWTH);
-    let problem =
-        format!("{n} numbers of today's, above, are worse: they spill, or are off by more than {percent:.0} %");
+    let problem = format!(
+        "{n} of the current numbers, listed above, are worse: kernels spill, or numbers differ by more than \
+         {percent:.0} %"
+    );
     Err(Error::data(file, "kernels", problem))
 }

@@ -121,7 +121,7 @@ impl Page<'_> {
             @if plots.iter().any(|svg| !svg.is_empty()) { h2 { "Over time" } }
             @for svg in plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } }
             @if curve.is_empty() && !losses.is_empty() && self.evaluation.is_some() {
-                p.lead { "Scores over time are told of runs that validate on the way: --set train.validate_every=100." }
+                p.lead { "Scores over time need validation during training: --set train.validate_every=100." }
             }
         })
     }
@@ -164,9 +164,10 @@ impl Page<'_> {
                 div { b { (format!("{:.3}", e.ssim)) } "SSIM" }
             }
             h2 { "Scores of " (e.images.len()) " unseen images" }
-            p.lead { "Vessel where attenuation exceeds " (format!("{:.3e}", e.threshold.dynamic_per_mm)) " per mm (" (e.threshold.rule) ")."
+            p.lead { "A pixel is vessel where the attenuation exceeds \
+                      " (format!("{:.3e}", e.threshold.dynamic_per_mm)) " per mm (" (e.threshold.rule) ")."
                 @if let Some(best) = e.best_dice.dynamic {
-                    " No threshold gives the dynamic field more than Dice " (format!("{:.3}", best.dice)) " (at "
+                    " The best threshold gives the dynamic field a Dice of " (format!("{:.3}", best.dice)) " (at "
                     (format!("{:.3e}", best.threshold_per_mm)) " per mm, found with the masks)."
                 }
             }
@@ -246,8 +247,9 @@ impl Page<'_> {
         let pictures = by_view("hull", &self.hull)?;
         Ok(html! {
             @if !self.hull.is_empty() {
-                h2 { "Where vessels may be" }
-                p.lead { "Training views at their first phase, and in orange what the motion hull covers of them: a vessel outside was lost before training." }
+                h2 { "Motion hull" }
+                p.lead { "Training views at their first phase; the motion hull covers the orange regions. Vessels \
+                          outside them cannot be reconstructed." }
                 (pictures)
             }
         })
@@ -256,14 +258,16 @@ impl Page<'_> {
     fn calibration(&self) -> Result<Markup> {
         let Some(calibration) = self.calibration.as_ref().filter(|c| !c.views.is_empty()) else { return Ok(html! {}) };
         Ok(html! {
-            h2 { "How views were corrected" }
-            p.lead { "Added to what the dataset states. " (calibration_table::legend(calibration)) }
+            h2 { "Correction of the views" }
+            p.lead { "These corrections are added to the geometry that the dataset states. \
+                      " (calibration_table::legend(calibration)) }
             div.scroll { table {
                 tr { @for column in &calibration_table::COLUMNS { th { (column.heading.join(" ").trim()) } } }
                 @for cells in calibration_table::rows(calibration) { tr { @for cell in cells { td { (cell) } } } }
             } }
             @if !self.silhouettes.is_empty() {
-                p.lead { "What each training view shows of vessels, as stated (left) and corrected (right): green where all other views show vessels on the ray, too, red where they do not." }
+                p.lead { "Vessel pixels of each training view with the stated (left) and the corrected geometry \
+                          (right): green where all other views also show vessels on the ray, red where they do not." }
                 (by_view("silhouettes", &self.silhouettes)?)
             }
         })
@@ -276,7 +280,7 @@ impl Page<'_> {
                 h2 { "Motion of the Gaussians" }
                 p.lead { "Distance from phase 0. Motion along a vessel is not observed in projections." }
                 table.bars {
-                    tr { th { "phase" } th { "mean, mm" } th { "largest, mm" } th {} }
+                    tr { th { "phase" } th { "mean, mm" } th { "maximum, mm" } th {} }
                     @for (phase, d) in self.motion.iter().enumerate() {
                         tr { td { (phase) } td { (format!("{:.2}", d.mean_mm)) } td { (format!("{:.2}", d.largest_mm)) }
                             td style="width:20rem" { div style=(format!("width:{:.1}%", 100.0 * d.mean_mm / largest)) {} } }
@@ -313,7 +317,7 @@ impl Page<'_> {
                     (self.hull()?)
                     (self.motion())
                     (self.kernels())
-                    h2 { "What ran on what" }
+                    h2 { "Device and run" }
                     table.facts { @for (name, value) in &self.facts { tr { td { (name) } td { (value) } } } }
                     details { summary { "Configuration" } pre { (self.config) } }
                 }

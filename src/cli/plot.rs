@@ -60,7 +60,7 @@ pub fn plot(title: &str, lines: &[Line], log_y: bool) -> Result<String> {
         chart
             .draw_series(std::iter::once(PathElement::new(paper, RGBColor(180, 40, 30).stroke_width(1))))
             .map_err(|e| fault(&e))?
-            .label("the paper: 37 minutes of an RTX A5000")
+            .label("the paper: 37 minutes on an RTX A5000")
             .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], RGBColor(180, 40, 30)));
         for line in lines.iter().filter(|l| !l.points.is_empty()) {
             let colour = line.colour;

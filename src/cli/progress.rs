@@ -19,9 +19,9 @@ pub fn stop_flag() -> Result<Arc<AtomicBool>> {
         if seen.swap(true, Ordering::Relaxed) {
             std::process::exit(i32::from(super::exit::INTERRUPTED));
         }
-        eprintln!("nertca-vk: stopping after the work under way; once more to stop at once");
+        eprintln!("nertca-vk: the program will stop after the current work; press Ctrl-C again to stop immediately");
     })
-    .map_err(|e| Error::Internal(format!("Ctrl-C handler: {e}")))?;
+    .map_err(|e| Error::Internal(format!("the Ctrl-C handler could not be set: {e}")))?;
     Ok(stop)
 }
 
@@ -55,7 +55,7 @@ pub fn show_progress() -> impl FnMut(&Event) {
             say(&bar, format!("{device}: {parameters} parameters"));
             notes.iter().for_each(|n| say(&bar, format!("- {n}")));
         }
-        Event::Preparing { share } => bar.set_message(format!("seeking Gaussians, {:.0} %", 100.0 * share)),
+        Event::Preparing { share } => bar.set_message(format!("initialising Gaussians, {:.0} %", 100.0 * share)),
         Event::Progress { loss, psnr, iterations_per_s, left_s, .. } => {
             bar.set_position(u64::from(loss.step));
             // Gaussians are fitted to bounds, which have no PSNR.
@@ -82,8 +82,8 @@ pub fn show_progress() -> impl FnMut(&Event) {
                 say(
                     &bar,
                     format!(
-                        "warning: the moving field leaves {:.0} % of the loss that there is without one: it has died, or views \
-                         disagree; `nertca-vk check` tells which",
+                        "warning: with the dynamic field, {:.0} % of the loss without a dynamic field is left: the \
+                         dynamic field has become zero, or the views disagree, which `nertca-vk check` tests",
                         100.0 * share
                     ),
                 );

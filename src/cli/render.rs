@@ -31,14 +31,14 @@ pub struct RenderArgs {
     /// Secondary angle, degrees, cranial positive.
     #[arg(long, allow_negative_numbers = true, value_name = "DEG", default_value_t = 0.0)]
     pub secondary: f64,
-    /// Phase from 0, or `all`; a fraction such as 3.4 lies between two phases, where a network or one set of Gaussians moves
-    /// (all but gaussians.form = "phase" of the preset `fast`).
+    /// Phase from 0, or `all`; a fraction such as 3.4 lies between two phases, which a network or one deformable set of
+    /// Gaussians supports (not gaussians.form = "phase" of the preset `fast`).
     #[arg(long, default_value = "0", allow_negative_numbers = true)]
     pub phase: String,
     /// Number of pictures between neighbouring phases, for smooth animations with --phase all.
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=32))]
     pub between: u32,
-    /// Field to show: both, the static background or the moving vessels.
+    /// Field to show: both, the static background or the dynamic vessels.
     #[arg(long, value_parser = choice::<Component>(), default_value = Component::Total.name())]
     pub component: Component,
     /// Line integral (`drr`) or maximum attenuation along the ray (`mip`).
@@ -50,8 +50,8 @@ pub struct RenderArgs {
     /// Render from volumes baked from the fields: faster, with the resolution of their cells.
     #[arg(long)]
     pub baked: bool,
-    /// Measure frames per second, including the read-back to the host, of the chosen component turning about the patient: from
-    /// the fields and from baked volumes, at 200 x 200, 512 x 512, and --size.
+    /// Measure frames per second, including the read-back to the host, of the chosen component seen from a rotating
+    /// C-arm: from the fields and from baked volumes, at 200 x 200, 512 x 512 and --size.
     #[arg(long)]
     pub fps: bool,
     /// Output: .png, .npy (floats; all phases stacked), .gif (all phases) or .dcm (line integrals as an X-ray angiogram,
@@ -106,7 +106,7 @@ impl Renders {
         let image = match self {
             Renders::Fields(renderer) => renderer.render_at(rays, width, height, phase)?.show(quantity),
             Renders::Baked(_) if phase.fract() != 0.0 => {
-                return Err(Error::config("--baked", phase, "volumes are baked at whole phases: leave --baked away"));
+                return Err(Error::config("--baked", phase, "volumes are baked at whole phases only: omit --baked"));
             }
             Renders::Baked(baked) => baked.render(rays, width, height, phase as u32, quantity)?,
         };
@@ -127,11 +127,13 @@ fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoi
     let beat_frames = model.param_map.phases as u32 * (args.between + 1);
     let mut seeds = [[0u8; 16]; 3];
     for seed in &mut seeds {
-        getrandom::fill(seed).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
+        getrandom::fill(seed).map_err(|e| Error::Internal(format!("random numbers could not be obtained: {e}")))?;
     }
     let shown = args.component.name();
-    let description =
-        format!("Reconstruction of {} iterations rendered: {shown} attenuation, phase {}", model.step, args.phase);
+    let description = format!(
+        "Rendering of a reconstruction of {} iterations: {shown} attenuation, phase {}",
+        model.step, args.phase
+    );
     let view = DicomView {
         c_arm: &turned(model, args.primary, args.secondary, size),
         size,
@@ -157,7 +159,7 @@ fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
     let last = if model.is_continuous() { n_phases } else { n_phases - 1 };
     match args.phase.parse::<f64>() {
         Ok(phase) if (0.0..=f64::from(last)).contains(&phase) => Ok(vec![phase]),
-        _ => Err(Error::config("--phase", &args.phase, format!("`all` or a phase from 0 to {last} is accepted"))),
+        _ => Err(Error::config("--phase", &args.phase, format!("is neither `all` nor a phase from 0 to {last}"))),
     }
 }
 
@@ -166,23 +168,23 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     let mut model = newest_model(&args.run)?;
     let size = args.size.map_or(model.image_size, |n| [n, n]);
     if !(1..=MAX_SIDE).contains(&size[0]) {
-        return Err(Error::config("--size", size[0], format!("1 to {} is accepted", MAX_SIDE)));
+        return Err(Error::config("--size", size[0], format!("is not in the accepted range, 1 to {}", MAX_SIDE)));
     }
     let Some(out) = &args.out else { return print_measured(cli, args, &model) };
     let extension = out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
     if !["png", "npy", "gif", "dcm"].contains(&extension.as_str()) {
-        return Err(Error::config("--out", out.display(), "ends in none of .png .npy .gif .dcm"));
+        return Err(Error::config("--out", out.display(), "does not end in one of .png .npy .gif .dcm"));
     }
     if extension == "dcm" && args.projection != Projection::Drr {
         return Err(Error::config(
             "--projection",
             args.projection.name(),
-            "an angiogram (.dcm) has line integrals: `drr`",
+            "is not supported in an angiogram (.dcm), which holds line integrals: use `drr`",
         ));
     }
     let phases = moments(args, &model)?;
     if extension == "png" && phases.len() > 1 {
-        return Err(Error::config("--phase", "all", "a .png holds one phase; use .gif or .npy"));
+        return Err(Error::config("--phase", "all", "a .png holds one phase only; use .gif or .npy"));
     }
     if extension == "dcm" {
         // The file format can state neither the offset of the detector's middle nor the position of the table.

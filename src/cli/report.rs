@@ -73,7 +73,7 @@ impl Report<'_> {
             facts.extend(tuning.reasons.iter().map(|reason| ("note".to_owned(), reason.clone())));
         }
         if let Some(s) = latest("finished").and_then(|line| line["train_s"].as_f64()) {
-            facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s of an RTX A5000")));
+            facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s on an RTX A5000")));
         }
         let frames = dataset.validation().iter();
         let tree = model.moving.as_ref().and_then(MovingGaussians::tree);
@@ -107,26 +107,32 @@ impl Report<'_> {
 
         let mut warnings = Vec::new();
         if model.step < model.config.train.iterations {
-            warnings.push(format!("Not finished: {} of {} iterations.", model.step, model.config.train.iterations));
+            warnings.push(format!(
+                "The run is not finished: {} of {} iterations.",
+                model.step, model.config.train.iterations
+            ));
         }
         if model.config.hull.enabled && model.hull.is_none() && model.moving.is_none() {
-            warnings.push("No motion hull was used: views may not agree, or too much moves.".to_owned());
+            warnings.push(
+                "No motion hull was used: the views may disagree, or there is motion in too much of the images."
+                    .to_owned(),
+            );
         }
         if let Some(hull) = model.hull.as_ref().filter(|h| h.share() < 5e-5) {
             warnings.push(format!(
-                "The motion hull keeps {:.4} % of the box: views hardly agree. Check geometry and phases, or raise \
-             hull.dilate_pixels.",
+                "The motion hull keeps only {:.4} % of the box, so the views hardly agree. Check geometry and phases, \
+                 or raise hull.dilate_pixels.",
                 100.0 * hull.share()
             ));
         }
         if self.evaluation.is_none() {
             warnings.push(match dataset.validation().is_empty() {
-                true => "The dataset has no validation frames: nothing was scored.".to_owned(),
-                false => "Not scored yet: `nertca-vk eval` does it.".to_owned(),
+                true => "The dataset has no validation frames, so nothing was scored.".to_owned(),
+                false => "The run is not scored yet: use `nertca-vk eval`.".to_owned(),
             });
         }
         if !dataset.validation().is_empty() && dataset.validation().iter().all(|f| f.mask.is_none()) {
-            warnings.push("The validation frames have no vessel masks: there is no Dice.".to_owned());
+            warnings.push("The validation frames have no vessel masks, so there is no Dice.".to_owned());
         }
         warnings.extend(self.warnings.iter().cloned());
         warnings
@@ -135,8 +141,8 @@ impl Report<'_> {
 
 fn gaussians_of(field: &MovingGaussians) -> String {
     let form = match field {
-        MovingGaussians::PerPhase(_) => "each phase has its own",
-        MovingGaussians::Tree(_) => "one set that moves",
+        MovingGaussians::PerPhase(_) => "one set per phase",
+        MovingGaussians::Tree(_) => "one deformable set",
     };
     let kib = field.bytes() as f64 / 1024.0;
     format!("{}, {form} (gaussians.form = \"{}\"), {kib:.0} KiB", field.rows().rows.len(), field.form().name())
@@ -144,7 +150,7 @@ fn gaussians_of(field: &MovingGaussians) -> String {
 
 fn images_of(dataset: &Dataset) -> String {
     format!(
-        "{}, {} to train on from {} views, {} to score with, {} phases",
+        "{}; {} for training from {} views, {} for validation, {} phases",
         in_words(&dataset.sizes()),
         dataset.training().len(),
         dataset.training_views().len(),

@@ -21,8 +21,8 @@ pub fn percent(share: Option<f64>) -> String {
 }
 
 /// Remark under tables whose truth was moved by the common motion of the calibrated views.
-const CARRIED: &str = "The truth was carried by the motion that all calibrated views share, which no image tells; without \
-    that, means are as stated.";
+const CARRIED: &str = "The truth was moved by the common displacement of all calibrated views, which images cannot \
+                       show; the row `as stated` has the means without it.";
 
 /// A table with one row for each phase and one for their mean.
 pub struct ScoreTable {

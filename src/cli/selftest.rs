@@ -76,8 +76,9 @@ fn fault(device: &DeviceInfo, report: &Report) -> String {
         (None, None) => "nothing was compared".to_owned(),
     };
     format!(
-        "{failed} of {all} comparisons failed on {} ({}), {first}. Do not trust what this device computes: try another driver \
-         or --device. A report needs the output of `nertca-vk selftest --json` and of `nertca-vk devices --json`",
+        "{failed} of {all} comparisons failed on {} ({}), {first}. Do not rely on results of this device: try another \
+         driver or --device. Please report this with the output of `nertca-vk selftest --json` and of `nertca-vk \
+         devices --json`",
         device.name, device.driver
     )
 }

@@ -33,15 +33,16 @@ pub struct StudyArgs {
 /// Operations on a study.
 #[derive(Debug, Subcommand)]
 pub enum StudyCommand {
-    /// Do all runs that have no result yet, and continue interrupted runs.
+    /// Execute all runs that have no result yet, and continue interrupted runs.
     Run(RunArgs),
-    /// Do one run: for schedulers. Exit code 0: the run has its result, which may be a failure; 75: try again.
+    /// Execute one run, for use by schedulers. Exit code 0: the run has its result, which may be a failure; 75: try
+    /// again.
     One(OneArgs),
     /// List the runs.
     List(ListArgs),
     /// Write table.md, table.csv and table.tex into DIR, and the first to stdout.
     Table(PlaceArgs),
-    /// Write report.html into DIR: table, Dice over time, pictures side by side.
+    /// Write report.html into DIR: the table, Dice over time, and pictures of all methods.
     Report(PlaceArgs),
 }
 
@@ -68,7 +69,7 @@ pub struct PlaceArgs {
     pub out: PathBuf,
 }
 
-/// Options of doing runs.
+/// Options of executing runs.
 #[derive(Debug, Args)]
 pub struct DoingArgs {
     /// Study and its directory.
@@ -77,7 +78,8 @@ pub struct DoingArgs {
     /// Also repeat runs that failed.
     #[arg(long)]
     pub retry_failed: bool,
-    /// Count results of other commits of this program as done, if their data and configuration are those of the study.
+    /// Also count results of other commits of this program as done, if their data and configuration are those of the
+    /// study.
     #[arg(long)]
     pub any_commit: bool,
     /// Print one JSON object per line on stdout instead of progress.
@@ -88,7 +90,7 @@ pub struct DoingArgs {
 /// Arguments of `study run`.
 #[derive(Debug, Args)]
 pub struct RunArgs {
-    /// Options of doing runs.
+    /// Options of executing runs.
     #[command(flatten)]
     pub doing: DoingArgs,
 }
@@ -96,10 +98,10 @@ pub struct RunArgs {
 /// Arguments of `study one`.
 #[derive(Debug, Args)]
 pub struct OneArgs {
-    /// Options of doing runs.
+    /// Options of executing runs.
     #[command(flatten)]
     pub doing: DoingArgs,
-    /// Run to do, by its name in `study list`.
+    /// Run to execute, by its name in `study list`.
     #[arg(value_name = "RUN")]
     pub run: String,
 }
@@ -164,7 +166,10 @@ fn at_work<T>(
 /// edits.
 fn warn_of_edits() {
     if COMMIT == "unknown" || COMMIT.ends_with("-dirty") {
-        eprintln!("warning: built from sources that no commit has ({COMMIT}): results of other edits count as done");
+        eprintln!(
+            "warning: this program was built from uncommitted sources ({COMMIT}), so results of other uncommitted \
+             sources also count as done"
+        );
     }
 }
 
@@ -172,7 +177,7 @@ fn queue(cli: &Cli, args: &DoingArgs) -> Result<()> {
     let summary = at_work(cli, args, |study, place, observe| work_off(study, place, observe))?;
     if summary.failed > 0 {
         eprintln!(
-            "warning: {} of {} runs failed, and the table says why; --retry-failed",
+            "warning: {} of {} runs failed; the table has the reasons, and --retry-failed repeats them",
             summary.failed, summary.runs
         );
     }
@@ -274,7 +279,7 @@ fn duration(seconds: f64) -> String {
 fn show() -> impl FnMut(&StudyEvent<'_>) {
     let (mut making, mut training) = (None, None);
     move |event| match event {
-        StudyEvent::Begun { runs, done } => eprintln!("{runs} runs, {done} with their result"),
+        StudyEvent::Begun { runs, done } => eprintln!("{runs} runs, {done} of them have results"),
         StudyEvent::RunBegun { run, number, of, left_s } => {
             let left = left_s.map_or(String::new(), |s| format!(", about {} left", duration(s)));
             eprintln!("[{number} of {of}] {run}{left}");
@@ -296,10 +301,10 @@ fn show() -> impl FnMut(&StudyEvent<'_>) {
         }
         StudyEvent::RunPutOff { run, why } => {
             training = None;
-            eprintln!("{run} is put off: {why}");
+            eprintln!("{run} is postponed: {why}");
         }
         StudyEvent::Ended { runs, done, failed } => {
-            eprintln!("{done} of {runs} runs have their result, {failed} failed")
+            eprintln!("{done} of {runs} runs have results, {failed} failed")
         }
     }
 }

@@ -113,7 +113,7 @@ fn curves(study: &Study, finished: &[&Finished]) -> Result<Markup> {
     }
     let distances = lines(study, finished, |point| point.chamfer_mm);
     let plots = [
-        plot("Dice of the moving field on some unseen images", &dice, false)?,
+        plot("Dice of the dynamic field on some unseen images", &dice, false)?,
         plot(DISTANCE_TITLE, &distances, false)?,
     ];
     Ok(html! { @for svg in plots { @if !svg.is_empty() { div.plot { (PreEscaped(svg)) } } } })

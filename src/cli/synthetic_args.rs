@@ -17,7 +17,7 @@ use std::path::PathBuf;
 /// Arguments of `phantom`.
 #[derive(Debug, Args)]
 pub struct PhantomArgs {
-    /// Directory to make.
+    /// Directory to write.
     pub out: PathBuf,
     /// C-arm and volume of a published set-up: `xcat` (DSD 2500, DSO 450) or `magix` (DSD 2000, DSO 600).
     #[arg(long, value_parser = choice::<Setting>(), default_value = Setting::Xcat.name())]
@@ -71,7 +71,7 @@ pub struct ProjectArgs {
     /// Volumes, one per phase in order: .npy .nii .nii.gz .nrrd .mha or raw binaries.
     #[arg(required = true, value_name = "VOLUME")]
     pub volumes: Vec<PathBuf>,
-    /// Directory to make.
+    /// Directory to write.
     #[arg(short, long)]
     pub out: PathBuf,
     /// Columns and rows of the images.
@@ -263,27 +263,30 @@ impl CArmArgs {
 
 /// Parses `DEG,MM`.
 fn geometry_error(text: &str) -> std::result::Result<GeometryError, String> {
-    let [angle_deg, position_mm] = pair(text).ok_or("degrees and mm are needed, as DEG,MM")?;
+    let [angle_deg, position_mm] = pair(text).ok_or("degrees and mm are needed, written as DEG,MM")?;
     Ok(GeometryError { angle_deg, position_mm })
 }
 
 /// Parses `MM` or `MM,PERIOD_S`.
 fn breathing(text: &str) -> std::result::Result<Breathing, String> {
     let both = pair(text).or_else(|| Some([text.trim().parse().ok()?, USUAL_BREATH_S]));
-    let [peak_to_peak_mm, period_s] = both.ok_or("mm are needed, or mm and seconds as MM,PERIOD_S")?;
+    let [peak_to_peak_mm, period_s] =
+        both.ok_or("mm are needed, written as MM, or mm and seconds, written as MM,PERIOD_S")?;
     Ok(Breathing { peak_to_peak_mm, period_s, background: false })
 }
 
 /// Parses a detector offset, `U,V`.
 fn offset(text: &str) -> std::result::Result<[f64; 2], String> {
-    pair(text).ok_or_else(|| "two lengths in mm are needed, as U,V".to_owned())
+    pair(text).ok_or_else(|| "two lengths in mm are needed, written as U,V".to_owned())
 }
 
 /// Parses `P,S[;P,S...]`.
 fn view_angles(text: &str) -> std::result::Result<AngleList, String> {
     let view = |view: &str| match pair(view) {
         Some([primary_deg, secondary_deg]) => Ok(Angles { primary_deg, secondary_deg }),
-        None => Err(format!("`{view}`: write primary and secondary angle as P,S and views as P,S;P,S")),
+        None => Err(format!(
+            "`{view}` is not of the form P,S (primary and secondary angle); several views are written as P,S;P,S"
+        )),
     };
     text.split(';').map(view).collect::<std::result::Result<_, _>>().map(AngleList)
 }

@@ -79,7 +79,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
         return Ok(());
     }
     let (Some(data), Some(run)) = (&args.data, &args.out) else {
-        return Err(Error::Internal("clap lets no run without DATA and --out pass".into()));
+        return Err(Error::Internal("clap requires DATA and --out".into()));
     };
     let dataset = Dataset::open(data)?;
     if let Some(file) = &args.export_hull {
@@ -107,7 +107,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
         let outcome = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut observer);
         if let Err(Error::Interrupted) = outcome {
             let (run, report) = (run.display(), report.display());
-            eprintln!("the run is complete; to score it: nertca-vk eval \"{run}\" --images \"{report}\"");
+            eprintln!("the run is complete, but not scored; use: nertca-vk eval \"{run}\" --images \"{report}\"");
         }
         let scores = outcome?;
         // The scores are written now, and again with those of the tree, because finding the tree may fail or be
@@ -164,7 +164,7 @@ fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {
         return Err(Error::config(
             "--out",
             run.display(),
-            "already holds a run: continue it with --resume, or start over with --force",
+            "already contains a run: continue it with --resume, or start over with --force",
         ));
     }
     for (_, path) in old {
@@ -176,6 +176,12 @@ fn prepare_directory(run: &Path, args: &TrainArgs) -> Result<()> {
 fn export_hull(config: &Config, dataset: &Dataset, file: &Path) -> Result<()> {
     let plan = Plan::new(config, dataset)?;
     plan.notes.iter().for_each(|note| eprintln!("{note}"));
-    let hull = plan.hull.ok_or_else(|| Error::config("hull", "", "this configuration and dataset give no hull"))?;
-    nrrd::write(file, &hull.to_volume(), "phases at which a cell may move")
+    let hull = plan.hull.ok_or_else(|| {
+        Error::config(
+            "hull",
+            "",
+            "this configuration does not use a motion hull, or none can be computed for this dataset",
+        )
+    })?;
+    nrrd::write(file, &hull.to_volume(), "phases at which a cell may contain moving vessels")
 }

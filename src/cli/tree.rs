@@ -24,19 +24,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub struct TreeArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
-    /// Phase from 0, or `all`. Where one set of Gaussians moves (gaussians.form = "tree"), point i of branch b is the same
-    /// material point at every phase; otherwise each phase has its own tree, and program and file say "not tracked".
+    /// Phase from 0, or `all`. With one deformable set of Gaussians (gaussians.form = "tree"), point i of branch b is
+    /// the same material point at every phase; otherwise each phase has its own tree, and program and file say "not
+    /// tracked".
     #[arg(long, default_value = "all")]
     pub phase: String,
-    /// Attenuation from which the dynamic field is vessel, 1/mm; by default the Dice threshold.
+    /// Attenuation threshold above which the dynamic field is vessel, 1/mm; by default the Dice threshold.
     #[arg(long, value_name = "PER_MM")]
     pub threshold: Option<f64>,
     /// Minimum length by which a branch must extend beyond the vessel it leaves, mm; shorter end branches are spurs and
     /// omitted. By default three times the field's resolution.
     #[arg(long, value_name = "MM")]
     pub min_branch: Option<f64>,
-    /// Output: .json (all phases), .vtp (one file per phase and a .pvd of them all, for ParaView, 3D Slicer and VMTK), .swc
-    /// (one file per phase), in millimetres along (left, posterior, superior); or .glb (tubes, animated over the beat; metres).
+    /// Output: .json (all phases), .vtp (one file per phase, and a .pvd that lists them, for ParaView, 3D Slicer and
+    /// VMTK), .swc (one file per phase), in millimetres along (left, posterior, superior); or .glb (tubes, animated
+    /// over the beat; metres).
     #[arg(short, long, value_name = "FILE")]
     pub out: PathBuf,
 }
@@ -62,7 +64,7 @@ pub fn of_page(
             Ok(Some(beat))
         }
         Err(error @ Error::Config { .. }) => {
-            warnings.push(format!("There is no vessel tree: {error}."));
+            warnings.push(format!("The vessel tree could not be extracted: {error}."));
             remove_old(directory, warnings);
             Ok(None)
         }
@@ -74,7 +76,7 @@ pub fn of_page(
 fn leave(beat: &BeatTree, directory: &Path, warnings: &mut Vec<String>) -> Result<()> {
     match write(beat, &directory.join(TREE_FILE), TreeFormat::Json, true) {
         Err(error @ Error::Io { .. }) => {
-            warnings.push(format!("There is no file of the vessel tree: {error}."));
+            warnings.push(format!("The file of the vessel tree could not be written: {error}."));
             remove_old(directory, warnings);
             Ok(())
         }
@@ -88,7 +90,8 @@ pub fn remove_old(directory: &Path, warnings: &mut Vec<String>) {
     let file = directory.join(TREE_FILE);
     match std::fs::remove_file(&file) {
         Err(error) if error.kind() != ErrorKind::NotFound => {
-            warnings.push(format!("{} is not of this page and could not be removed: {error}.", file.display()));
+            warnings
+                .push(format!("{} does not belong to this page and could not be removed: {error}.", file.display()));
         }
         _ => {}
     }
@@ -99,7 +102,7 @@ pub fn score(tree: Option<&BeatTree>, dataset: &Dataset, evaluation: &mut Evalua
     let Some(tree) = tree else { return Ok(()) };
     match score_tree(tree, dataset) {
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
-            evaluation.warnings.push(format!("There are no scores of the tree: {error}."));
+            evaluation.warnings.push(format!("The vessel tree could not be scored: {error}."));
         }
         scores => evaluation.tree = scores?,
     }
@@ -117,7 +120,7 @@ fn find(cli: &Cli, gpu: &Gpu, model: &Model, cancel: &AtomicBool, options: &Tree
 
 /// Finds the vessels of a run as trees and writes them.
 pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
-    let unknown = || Error::config("--out", args.out.display(), "ends in none of .json .vtp .swc .glb");
+    let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb");
     let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
@@ -137,7 +140,8 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
         );
     }
     eprintln!(
-        "vessel above {:.4e} per mm; the field resolves {:.2} mm and was looked at every {:.2} mm; {}",
+        "a point is vessel above {:.4e} per mm; the resolution of the field is {:.2} mm, and it was sampled every \
+         {:.2} mm; {}",
         beat.threshold_per_mm,
         beat.resolution_mm,
         beat.spacing_mm,

@@ -58,9 +58,10 @@ impl TreeSection {
     pub fn markup(&self) -> Markup {
         html! {
             h2 { "Vessels as a tree" }
-            p.lead { "Centrelines over the angiograms that were reconstructed from; " (self.note) "." }
+            p.lead { "Centrelines over the angiograms of the training views; " (self.note) "." }
             style { (PreEscaped(STYLE)) }
-            noscript { p.warn { "The lines are drawn by a script of this page, which is switched off." } }
+            noscript { p.warn { "A script of this page draws the lines, but scripts are switched off in this \
+                                 browser." } }
             p {
                 label for="tree-phase" { "Phase " span #tree-phase-text {} " " }
                 input #tree-phase type="range" min="0" value="0" step="1";
@@ -116,7 +117,8 @@ fn table(name: &str, tree: &PhaseTree) -> Markup {
         div {
             h3 { (name) " (phase " (tree.phase) ")" }
             table {
-                tr { th { "branch" } th { "leaves" } th { "length, mm" } th { "mean diameter, mm" } th { "least, mm" } }
+                tr { th { "branch" } th { "parent" } th { "length, mm" } th { "mean diameter, mm" } th { "minimum, \
+                                                                                                          mm" } }
                 @for (index, branch) in tree.branches.iter().enumerate() {
                     tr data-branch=(index) data-phase=(tree.phase) {
                         td { i data-colour=(index) {} (index) }

@@ -6,7 +6,7 @@ use nertca_vk::score::trees::{TreeAgreement, TreeScores};
 const COLUMNS: [Column<TreeAgreement>; 9] = [
     Column { heading: ["centreline", "found"], text: |s| percent(Some(s.true_centreline_found)) },
     Column { heading: ["centreline", "true"], text: |s| percent(Some(s.our_centreline_true)) },
-    Column { heading: ["ours to true", "mm"], text: |s| mm(Some(s.ours_to_true_mm)) },
+    Column { heading: ["distance to", "true, mm"], text: |s| mm(Some(s.ours_to_true_mm)) },
     Column { heading: ["radius error", "mean, mm"], text: |s| mm(s.radius_error_mm) },
     Column { heading: ["radius error", "RMS, mm"], text: |s| mm(s.radius_rmse_mm) },
     Column { heading: ["", "components"], text: |s| format!("{:.1}", s.components) },
@@ -18,8 +18,9 @@ const COLUMNS: [Column<TreeAgreement>; 9] = [
 /// Returns the table of all phases and their mean.
 pub fn table(tree: &TreeScores) -> ScoreTable {
     let legend = format!(
-        "The vessels as a tree against the true one. Centrelines count within {} mm, and radii are compared there; in images \
-         by their mean distance at the isocentre; motion by where points have come since the phase that is followed (mostly 0).",
+        "The extracted vessel tree is compared with the true one. Centrelines agree where their distance is at most {} \
+         mm, and radii are compared there. In images, the score is the mean distance at the isocentre. The motion \
+         error compares the displacements of points since the reference phase (mostly 0).",
         tree.within_mm
     );
     let phases = tree.phases.iter().map(|p| (p.phase, &p.scores));

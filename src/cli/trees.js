@@ -62,8 +62,8 @@ const trees = (() => {
   // Returns the text about a clicked branch.
   function told(branches, place) {
     const m = measure(branches[place.branch], place), mm = v => v.toFixed(2) + " mm";
-    return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; diameter ${mm(m.least_mm)} at least, `
-      + `${mm(m.mean_mm)} in the mean, ${mm(m.here_mm)} here, ${m.along_mm.toFixed(1)} mm from its beginning`;
+    return `Branch ${place.branch}: ${m.length_mm.toFixed(1)} mm long; minimum diameter ${mm(m.least_mm)}, `
+      + `mean ${mm(m.mean_mm)}, ${mm(m.here_mm)} at this point, ${m.along_mm.toFixed(1)} mm from its start`;
   }
 
   // Draws lines over one picture, in an SVG element whose units are the picture's pixels.

@@ -119,17 +119,21 @@ struct PictureQuery {
 
 /// Returns the value that a query names.
 fn chosen<T: Choice>(field: &str, name: &str) -> Result<T> {
-    T::named(name).ok_or_else(|| Error::config(field, name, format!("one of {} is accepted", T::names())))
+    T::named(name).ok_or_else(|| Error::config(field, name, format!("is not one of {}", T::names())))
 }
 
 impl Viewer {
     /// Draws a grey PNG with dark vessels, as in an angiogram. `low` and `high` are shares of the typical range.
     fn picture(&self, query: &PictureQuery) -> Result<Vec<u8>> {
         if !(query.low.is_finite() && query.high.is_finite() && query.low < query.high) {
-            return Err(Error::config("low, high", format!("{} to {}", query.low, query.high), "is no window"));
+            return Err(Error::config(
+                "low, high",
+                format!("{} to {}", query.low, query.high),
+                "is not a valid window of intensities",
+            ));
         }
         if !SIDES.contains(&query.size) {
-            let problem = format!("{} to {} is accepted", SIDES.start(), SIDES.end());
+            let problem = format!("is not in the accepted range, {} to {}", SIDES.start(), SIDES.end());
             return Err(Error::config("size", query.size, problem));
         }
         let quantity = Quantity {
@@ -239,7 +243,8 @@ impl Server {
     /// [`Error::Io`] for a port that is in use.
     pub fn open(port: u16, shown: Arc<dyn Shown>, tree: Arc<TreeWork>) -> Result<Server> {
         let mut secret = [0u8; 16];
-        getrandom::fill(&mut secret).map_err(|e| Error::Internal(format!("random numbers: {e}")))?;
+        getrandom::fill(&mut secret)
+            .map_err(|e| Error::Internal(format!("random numbers could not be obtained: {e}")))?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .enable_all()

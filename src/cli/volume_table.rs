@@ -25,8 +25,8 @@ pub fn table(volume: &VolumeScores) -> ScoreTable {
 /// Describes the numbers of the table.
 fn legend(volume: &VolumeScores) -> String {
     format!(
-        "Vessel where the moving field exceeds {:.4e} per mm. Centrelines count within {} mm, components from {:.3} mm³ on; \
-         a pixel at the isocentre is {:.3} mm.",
+        "A voxel is vessel where the dynamic field exceeds {:.4e} per mm. Centrelines agree where their distance is at \
+         most {} mm, and components count if they have at least {:.3} mm³; a pixel at the isocentre is {:.3} mm wide.",
         volume.threshold_per_mm, volume.within_mm, volume.smallest_component_mm3, volume.pixel_mm
     )
 }

@@ -71,7 +71,7 @@ pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     let tree = Arc::new(TreeWork::new(&gpu, tuning.clone()));
     let server = Server::open(args.port, live.clone(), tree.clone())?;
     out!("{}", server.url());
-    eprintln!("watching {}; Ctrl-C ends", args.directory.display());
+    eprintln!("watching {}; press Ctrl-C to end", args.directory.display());
     let (end, ended) = oneshot::channel::<()>();
     let serving = std::thread::spawn(move || {
         server.serve(async {
@@ -139,7 +139,7 @@ impl Watch<'_> {
                 // The folder may become readable again, as network shares do.
                 Err(error @ Error::Io { .. }) => {
                     if !unreadable {
-                        eprintln!("{error}; it is looked at again");
+                        eprintln!("{error}; the folder will be read again");
                     }
                     unreadable = true;
                     Vec::new()
@@ -172,7 +172,7 @@ impl Watch<'_> {
     fn trains(&mut self) -> bool {
         let Some(UnderWay { session, .. }) = &self.under_way else { return false };
         if let Some(problem) = session.failure().filter(|_| !self.failed) {
-            eprintln!("training ended: {problem}; it begins anew with the next run");
+            eprintln!("training failed: {problem}; it starts again with the next run");
             self.failed = true;
         }
         let trains = session.state() == State::Running;
@@ -187,7 +187,9 @@ impl Watch<'_> {
     /// Reads a file; returns whether it could be used.
     fn take(&mut self, file: &Path) -> Result<bool> {
         let read = Run::read(file, self.options.pixel_mm).and_then(|run| match self.intake.copy_of(&run) {
-            Some(first) => Err(Error::data(file, "SOPInstanceUID", format!("is that of {first}, which was taken in"))),
+            Some(first) => {
+                Err(Error::data(file, "SOPInstanceUID", format!("is the same as that of {first}, which was imported")))
+            }
             None => Ok(run),
         });
         let taken = read.and_then(|run| {
@@ -204,12 +206,12 @@ impl Watch<'_> {
                     .map(|frame| frame.taken.phase.to_string())
                     .collect();
                 self.feed()?;
-                eprintln!("taken in: {told}, phases {}", phases.join(" "));
+                eprintln!("imported: {told}, phases {}", phases.join(" "));
                 Ok(true)
             }
             // Other files may be usable, so the program continues.
             Err(error @ (Error::Data { .. } | Error::Config { .. } | Error::Io { .. })) => {
-                eprintln!("not taken in: {error}");
+                eprintln!("not imported: {error}");
                 Ok(false)
             }
             Err(error) => Err(error),
@@ -292,12 +294,12 @@ impl Watch<'_> {
             let why = match nothing {
                 Some(Error::NotReady(why)) if self.failed => why,
                 Some(error) if !matches!(error, Error::NotReady(_)) => return Err(error),
-                _ => "runs from two angles are needed".into(),
+                _ => "runs from at least two angles are needed".into(),
             };
             return Err(Error::NotReady(format!("nothing was reconstructed: {why}")));
         };
         if let Some(error) = nothing {
-            eprintln!("what was reconstructed before is left: {error}");
+            eprintln!("the earlier reconstruction is written: {error}");
         }
         let saved = kept.leave(&self.intake, (self.gpu, &self.tuning), run)?;
         eprintln!("{} of {} iterations", kept.step(), self.config.train.iterations);

@@ -26,7 +26,7 @@ pub fn prepare(run: &Path) -> Result<()> {
         let log = run.join("metrics.jsonl");
         let checkpoint = checkpoint::list(run)?.pop().map(|(_, path)| path);
         if let Some(old) = checkpoint.into_iter().chain([log, run.join(DATA)]).find(|path| path.exists()) {
-            let problem = format!("already holds `{}`: choose another directory", old.display());
+            let problem = format!("already contains `{}`: choose another directory", old.display());
             return Err(Error::config("--out", run.display(), problem));
         }
     }
@@ -107,7 +107,7 @@ impl Kept {
                 if runs < intake.runs() {
                     let all = intake.runs();
                     eprintln!(
-                        "what is left was made of the first {runs} of {all} runs: later ones came too late for it"
+                        "the reconstruction was made from the first {runs} of {all} runs; later runs came too late"
                     );
                 }
                 std::fs::rename(&partial, &data).map_err(Error::io("rename into place", &data))?;
@@ -115,7 +115,10 @@ impl Kept {
             }
         }
         eprintln!("{}", write_anew(intake, self.runs, &partial)?);
-        eprintln!("warning: {} is not exactly what was trained on: `train --resume` will refuse it", data.display());
+        eprintln!(
+            "warning: {} is not exactly the dataset of the training, so `train --resume` will refuse it",
+            data.display()
+        );
         std::fs::rename(&partial, &data).map_err(Error::io("rename into place", &data))?;
         Ok(data)
     }

@@ -47,7 +47,7 @@ impl Live {
     }
 
     fn session(&self) -> Result<Arc<Session>> {
-        self.under_way().session.clone().ok_or_else(|| Error::NotReady("no run has come yet".into()))
+        self.under_way().session.clone().ok_or_else(|| Error::NotReady("no run was imported yet".into()))
     }
 }
 
@@ -64,7 +64,7 @@ fn told(state: State) -> &'static str {
 
 impl Shown for Live {
     fn taken(&self) -> Result<Taken> {
-        self.under_way().taken.clone().ok_or_else(|| Error::NotReady("no run has come yet".into()))
+        self.under_way().taken.clone().ok_or_else(|| Error::NotReady("no run was imported yet".into()))
     }
 
     fn phases(&self) -> u32 {

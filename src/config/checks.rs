@@ -38,23 +38,23 @@ impl Config {
         check_range("dynamic.skip_layer", d.skip_layer.into(), 0.0, d.layers.into())?;
         check_range("dynamic.window_start", d.window_start, 0.0, d.bands.into())?;
         if d.width % 16 != 0 {
-            return Err(Error::config("dynamic.width", d.width, "a multiple of 16 is needed"));
+            return Err(Error::config("dynamic.width", d.width, "is not a multiple of 16"));
         }
         if d.latent % 4 != 0 {
-            return Err(Error::config("dynamic.latent", d.latent, "a multiple of 4 is needed"));
+            return Err(Error::config("dynamic.latent", d.latent, "is not a multiple of 4"));
         }
         if d.skip_layer == 1 {
             return Err(Error::config(
                 "dynamic.skip_layer",
                 1,
-                "the first layer sees the input anyway; 0 or 2.. is accepted",
+                "the first layer always receives the input; accepted are 0 (no skip connection) and layers from 2 on",
             ));
         }
         if m.static_samples.max(m.dynamic_samples).max(m.render_samples) > t.chunk_samples {
             return Err(Error::config(
                 "train.chunk_samples",
                 t.chunk_samples,
-                "at least the samples of one ray are needed",
+                "is less than the number of samples of one ray (march.static_samples, dynamic_samples, render_samples)",
             ));
         }
         if u64::from(t.iterations) * u64::from(t.rays) > u64::from(u32::MAX) {
@@ -68,7 +68,8 @@ impl Config {
         self.check_x()?;
         self.check_sax()?;
         if m.along_axis && self.gaussians.form != GaussianForm::None {
-            let problem = "Gaussians are counted along rays; take false, or gaussians.form = \"none\"";
+            let problem = "is not supported with Gaussians, which are integrated along rays; set it to false, or set \
+                           gaussians.form = \"none\"";
             return Err(Error::config("march.along_axis", true, problem));
         }
         Ok(())
@@ -76,12 +77,16 @@ impl Config {
 
     /// Refuses settings that two networks do not support.
     fn check_two_networks(&self) -> Result<()> {
-        let form = "does not go with static.form = \"network\"";
+        let form = "is not supported with static.form = \"network\"";
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
             Err(Error::config(field, value, format!("{form}: {instead}")))
         };
         if self.gaussians.form != GaussianForm::None {
-            return refuse("gaussians.form", &self.gaussians.form.name(), "take \"none\", or static.form = \"tensor\"");
+            return refuse(
+                "gaussians.form",
+                &self.gaussians.form.name(),
+                "set it to \"none\", or set static.form = \"tensor\"",
+            );
         }
         for (field, is_on) in [
             ("hull.enabled", self.hull.enabled),
@@ -92,11 +97,15 @@ impl Config {
             ("march.fit_static_range", self.march.fit_static_range),
         ] {
             if is_on {
-                return refuse(field, &true, "both fields are asked everywhere, in world units; take false");
+                return refuse(field, &true, "both fields are evaluated everywhere, in world units; set it to false");
             }
         }
         if self.loss.dynamic_target != DynamicTarget::Absolute {
-            return refuse("loss.dynamic_target", &"temporal", "one residual drives both fields; take \"absolute\"");
+            return refuse(
+                "loss.dynamic_target",
+                &"temporal",
+                "both fields are trained on the same residual; set it to \"absolute\"",
+            );
         }
         for (field, value) in [
             ("dynamic.delay", f64::from(self.dynamic.delay)),
@@ -104,7 +113,8 @@ impl Config {
             ("dynamic.occlusion", self.dynamic.occlusion),
         ] {
             if value != 0.0 {
-                let instead = "take 0 (networks.near_integral weighs what is near, networks.delay and ramp say when)";
+                let instead = "set it to 0 (networks.near_integral is the weight near the source; networks.delay and \
+                               networks.ramp are its times)";
                 return refuse(field, &value, instead);
             }
         }
@@ -112,7 +122,7 @@ impl Config {
             return refuse(
                 "dynamic.occlusion_region",
                 &"last-ray",
-                "it is that of dynamic.occlusion; take \"depth-range\"",
+                "it belongs to dynamic.occlusion, which is not used; set it to \"depth-range\"",
             );
         }
         let preset = Config::preset(self.preset);
@@ -122,7 +132,7 @@ impl Config {
             ("march.static_samples", self.march.static_samples.into(), preset.march.static_samples.into()),
         ] {
             if value != unused {
-                let instead = format!("it has no effect there; leave it at the preset's {unused}");
+                let instead = format!("it has no effect there; leave it at the preset's value, {unused}");
                 return refuse(field, &value, &instead);
             }
         }
@@ -135,18 +145,18 @@ impl Config {
         let is_alone = matches!(self.method(), MethodKind::R2Gaussian | MethodKind::XGaussian);
         if !is_alone {
             if form == StaticForm::None && self.dynamic.form != DynamicForm::Lineformer {
-                let problem = "all other methods have a still field: take \"tensor\", or gaussians.form = \"r2\" or dynamic.form = \
-                               \"lineformer\"";
+                let problem = "only methods without a static field accept it; set it to \"tensor\", or set \
+                               gaussians.form = \"r2\" or \"x\" or dynamic.form = \"lineformer\"";
                 return Err(Error::config("static.form", form.name(), problem));
             }
             return Ok(());
         }
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
             let form = self.gaussians.form.name();
-            Err(Error::config(field, value, format!("does not go with gaussians.form = \"{form}\": {instead}")))
+            Err(Error::config(field, value, format!("is not supported with gaussians.form = \"{form}\": {instead}")))
         };
         if form != StaticForm::None {
-            return refuse("static.form", &form.name(), "its Gaussians are the whole object; take \"none\"");
+            return refuse("static.form", &form.name(), "its Gaussians represent the whole object; set it to \"none\"");
         }
         for (field, is_on) in [
             ("hull.enabled", self.hull.enabled),
@@ -154,11 +164,15 @@ impl Config {
             ("loss.normalise", self.loss.normalise),
         ] {
             if is_on {
-                return refuse(field, &true, "it knows none; take false");
+                return refuse(field, &true, "this method does not use it; set it to false");
             }
         }
         if self.loss.dynamic_target != DynamicTarget::Absolute {
-            return refuse("loss.dynamic_target", &"temporal", "it is fitted to whole images; take \"absolute\"");
+            return refuse(
+                "loss.dynamic_target",
+                &"temporal",
+                "this method is fitted to whole images; set it to \"absolute\"",
+            );
         }
         Ok(())
     }
@@ -193,12 +207,14 @@ impl Config {
         }
         let count = u64::from(x.voxels.div_ceil(x.interval)).pow(3);
         if count > u64::from(x.most) {
-            let problem =
-                format!("x.voxels = {} and x.interval = {} begin with {count} Gaussians", x.voxels, x.interval);
+            let problem = format!(
+                "is less than the {count} initial Gaussians that x.voxels = {} and x.interval = {} give",
+                x.voxels, x.interval
+            );
             return Err(Error::config("x.most", x.most, problem));
         }
         if x.first_opacity < x.weakest {
-            let problem = format!("is below x.weakest = {}: none would stay", x.weakest);
+            let problem = format!("is below x.weakest = {}: all Gaussians would be pruned", x.weakest);
             return Err(Error::config("x.first_opacity", x.first_opacity, problem));
         }
         Ok(())
@@ -210,17 +226,21 @@ impl Config {
             return Ok(());
         }
         let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
-            Err(Error::config(field, value, format!("does not go with dynamic.form = \"lineformer\": {instead}")))
+            Err(Error::config(field, value, format!("is not supported with dynamic.form = \"lineformer\": {instead}")))
         };
         if self.static_field.form != StaticForm::None {
             return refuse(
                 "static.form",
                 &self.static_field.form.name(),
-                "its field is the whole object; take \"none\"",
+                "its field represents the whole object; set it to \"none\"",
             );
         }
         if self.gaussians.form != GaussianForm::None {
-            return refuse("gaussians.form", &self.gaussians.form.name(), "one of both is the field; take \"none\"");
+            return refuse(
+                "gaussians.form",
+                &self.gaussians.form.name(),
+                "only one of the two settings can choose the field; set it to \"none\"",
+            );
         }
         for (field, is_on) in [
             ("hull.enabled", self.hull.enabled),
@@ -229,22 +249,27 @@ impl Config {
             ("march.along_axis", self.march.along_axis),
         ] {
             if is_on {
-                return refuse(field, &true, "it knows none; take false");
+                return refuse(field, &true, "this method does not use it; set it to false");
             }
         }
         if self.loss.dynamic_target != DynamicTarget::Absolute {
-            return refuse("loss.dynamic_target", &"temporal", "it is fitted to whole images; take \"absolute\"");
+            return refuse(
+                "loss.dynamic_target",
+                &"temporal",
+                "this method is fitted to whole images; set it to \"absolute\"",
+            );
         }
         let sax = &self.sax;
         for (field, value) in [("sax.levels", sax.levels), ("sax.samples", sax.samples)] {
             if value % 2 != 0 {
-                return Err(Error::config(field, value, "an even number is needed"));
+                return Err(Error::config(field, value, "is not an even number"));
             }
         }
         let finest = u64::from(sax.base) << (sax.levels - 1);
         if finest > MOST_CELLS {
             let problem = format!(
-                "the finest of {} levels has {finest} cells a side, at most {MOST_CELLS} are told apart",
+                "the finest of {} levels would have {finest} cells along a side; at most {MOST_CELLS} are supported: \
+                 lower sax.base or sax.levels",
                 sax.levels
             );
             return Err(Error::config("sax.base", sax.base, problem));

@@ -34,7 +34,7 @@ pub(super) fn check_range(field: &str, value: f64, low: f64, high: f64) -> Resul
     if value >= low && value <= high {
         return Ok(());
     }
-    Err(Error::config(field, value, format!("{low} to {high} is accepted")))
+    Err(Error::config(field, value, format!("is not in the accepted range, {low} to {high}")))
 }
 
 fn whole_run() -> f64 {

@@ -57,14 +57,22 @@ pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
     let [width, height] = view.size;
     let (columns, rows) = (u16::try_from(width), u16::try_from(height));
     let (Ok(columns), Ok(rows)) = (columns, rows) else {
-        return Err(Error::config("size", format!("{width} x {height}"), "sides of 1 to 65535 pixels are accepted"));
+        return Err(Error::config(
+            "size",
+            format!("{width} x {height}"),
+            "is out of range: sides of 1 to 65535 pixels are accepted",
+        ));
     };
     if view.frames.is_empty() || view.frames.len() * width * height * 2 > MOST_BYTES {
-        return Err(Error::config("frames", view.frames.len(), "the pixels of 1 frame to 4 GiB are accepted"));
+        return Err(Error::config(
+            "frames",
+            view.frames.len(),
+            "is out of range: at least 1 frame and at most 4 GiB of pixels are accepted",
+        ));
     }
     let secondary_deg = view.c_arm.secondary_deg;
     if secondary_deg.abs() > 90.0 {
-        let problem = "DICOM has angles of -90 to 90 deg here: turn the primary angle by 180 deg instead";
+        let problem = "is out of range: DICOM supports -90 to 90 deg here; change the primary angle by 180 deg instead";
         return Err(Error::config("secondary angle", secondary_deg, problem));
     }
     let mut object = InMemDicomObject::new_empty();

@@ -60,8 +60,8 @@ pub fn moving_tree(model: &Model) -> Result<&MovingTree> {
             "gaussians.form",
             form.name(),
             format!(
-                "the moving field is {made_of}, which shows every phase and carries no point from one to the next: train \
-                 one set of Gaussians that moves (preset fast with gaussians.form = \"tree\")"
+                "the dynamic field is {made_of}, which does not track points from phase to phase: train one deformable \
+                 set of Gaussians (preset fast with gaussians.form = \"tree\")"
             ),
         )
     })
@@ -96,13 +96,13 @@ impl MotionExport<'_> {
     pub fn write(&self, path: &Path) -> Result<Vec<PathBuf>> {
         let n_phases = self.tree.rest.n_phases;
         if let Some(bad) = self.phases.iter().find(|phase| **phase as usize >= n_phases) {
-            return Err(Error::config("phase", bad, format!("phases go from 0 to {}", n_phases - 1)));
+            return Err(Error::config("phase", bad, format!("is out of range: phases go from 0 to {}", n_phases - 1)));
         }
         match (self.format, self.encoding) {
             (MotionFormat::Nrrd, _) => self.write_nrrd(path).map(|()| vec![path.to_path_buf()]),
             (MotionFormat::Vtk, Encoding::Raw) => self.write_vtk(path),
             (MotionFormat::Vtk, Encoding::Gzip) => {
-                Err(Error::config("compression", path.display(), "of motion, only NRRD can be compressed"))
+                Err(Error::config("compression", path.display(), "only NRRD files of motion can be compressed"))
             }
         }
     }

@@ -82,7 +82,11 @@ pub fn write_meshes(
         progress(meshes.len() as u64, phases.len() as u64);
     }
     if meshes.iter().all(|(_, mesh)| mesh.triangles.is_empty()) {
-        return Err(Error::config("iso_per_mm", iso_per_mm, "no vessel attenuates as much at any phase"));
+        return Err(Error::config(
+            "iso_per_mm",
+            iso_per_mm,
+            "is too high: no vessel has this attenuation at any phase",
+        ));
     }
     if format == MeshFormat::Glb {
         files::write_atomic(path, &gltf::to_glb(&meshes)?)?;

@@ -73,10 +73,10 @@ impl Format {
     fn check(self, compression: Compression, path: &Path) -> Result<()> {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
         let problem = match (self, compression, name.ends_with(".gz")) {
-            (Format::Nifti, Compression::Gzip, false) => "compressed NIfTI is called .nii.gz",
-            (Format::Nifti, Compression::None, true) => "what is called .nii.gz is compressed",
+            (Format::Nifti, Compression::Gzip, false) => "the name of a compressed NIfTI file must end in .nii.gz",
+            (Format::Nifti, Compression::None, true) => "a file whose name ends in .nii.gz must be compressed",
             (Format::Nifti | Format::Nrrd, _, false) | (Format::Nifti, Compression::Gzip, true) => return Ok(()),
-            (_, _, true) => "only NIfTI is called .gz when it is compressed",
+            (_, _, true) => "only the name of a compressed NIfTI file can end in .gz",
             (_, Compression::None, false) => return Ok(()),
             (_, Compression::Gzip, false) => "only NIfTI and NRRD can be compressed",
         };
@@ -132,7 +132,7 @@ pub fn grid_over(scene: &Scene, component: Component, spacing_mm: f64) -> Result
         return Err(Error::config(
             "spacing_mm",
             spacing_mm,
-            format!("gives too many points: at least {smallest:.3} mm"),
+            format!("gives too many points: at least {smallest:.3} mm are needed"),
         ));
     }
     let origin_mm = 0.5 * (low + high) - 0.5 * (size - 1.0) * spacing_mm;

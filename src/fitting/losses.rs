@@ -108,8 +108,8 @@ impl std::fmt::Display for LargeLoss {
         let LargeLoss { step, loss, ratio } = self;
         write!(
             f,
-            "the loss of iteration {step} is {loss:.3e}, {ratio:.0e} times the first one; training goes on \
-             (train.stop_at_loss_ratio ends it at such a loss)"
+            "the loss of iteration {step} is {loss:.3e}, {ratio:.0e} times the first loss; training continues (set \
+             train.stop_at_loss_ratio to end it at such a loss)"
         )
     }
 }

@@ -35,10 +35,13 @@ pub(crate) fn losses(gpu: &Gpu, ring: &Buffer, steps: Range<u32>, advice: &'stat
 
 /// Returns the error for a device whose submit ended without having written a loss.
 pub(crate) fn tells_nothing(gpu: &Gpu, step: u32) -> Error {
-    counts_wrongly(gpu, &format!("was to do iteration {step} and tells nothing of it"))
+    counts_wrongly(gpu, &format!("was to execute iteration {step} and has written no loss for it"))
 }
 
 /// Returns the error for a device that does not execute, or does not count, the requested iterations.
 pub(crate) fn counts_wrongly(gpu: &Gpu, what: &str) -> Error {
-    Error::NoDevice(format!("{} {what}; `nertca-vk selftest` tells which stages it computes wrongly", gpu.info().name))
+    Error::NoDevice(format!(
+        "{} {what}; `nertca-vk selftest` shows which stages this device computes wrongly",
+        gpu.info().name
+    ))
 }

@@ -16,7 +16,7 @@ pub(crate) fn sets_of(dataset: &Dataset, static_data: StaticData, key: &str) -> 
     let of_phase = |phase: u32| (0..training.len()).filter(|i| training[*i].phase == phase).collect::<Vec<_>>();
     let unseen: Vec<u32> = (0..n_phases).filter(|phase| of_phase(*phase).is_empty()).collect();
     if static_data == StaticData::PerPhase && !unseen.is_empty() {
-        let problem = format!("no image shows the phases {unseen:?}: take {key} = \"pooled\"");
+        let problem = format!("no image shows the phases {unseen:?}: set {key} = \"pooled\"");
         return Err(Error::config("dataset", dataset.path.display(), problem));
     }
     Ok(match static_data {

@@ -19,7 +19,7 @@ pub fn read_image(path: &Path) -> Result<Image> {
         Some("npy") => {
             let npy::Array { shape, values } = npy::read(path, MAX_FILE_BYTES)?;
             let [height, width] = shape[..] else {
-                return Err(Error::data(path, "shape", format!("{shape:?}; an image has two axes")));
+                return Err(Error::data(path, "shape", format!("is {shape:?}, but an image has two axes")));
             };
             Image { width, height, values }
         }
@@ -28,7 +28,8 @@ pub fn read_image(path: &Path) -> Result<Image> {
     };
     let sides = 1..=MAX_SIDE;
     if !(sides.contains(&image.width) && sides.contains(&image.height)) {
-        let problem = format!("{} x {}; sides go from 1 to {MAX_SIDE}", image.width, image.height);
+        let problem =
+            format!("{} x {} is out of range: sides of 1 to {MAX_SIDE} pixels are accepted", image.width, image.height);
         return Err(Error::data(path, "shape", problem));
     }
     Ok(image)

@@ -46,12 +46,12 @@ pub fn read(path: &Path) -> Result<Volume> {
     let need = |name: &str| field(name).ok_or_else(|| bad(name, "is missing".into()));
     let says_true = |name: &str| field(name).is_some_and(|v| v.eq_ignore_ascii_case("true"));
     if need(DATA)? != "LOCAL" {
-        return Err(bad(DATA, "detached data is not read; use .mha with LOCAL data".into()));
+        return Err(bad(DATA, "data in a separate file are not supported; use .mha with LOCAL data".into()));
     }
     let sizes: Vec<u64> = numbers(path, "DimSize", &need("DimSize")?)?.iter().map(|v| *v as u64).collect();
     let size = Volume::check_size(path, "DimSize", &sizes)?;
     let kind = need("ElementType")?;
-    let element = element_of(&kind).ok_or_else(|| bad("ElementType", format!("`{kind}` is not read")))?;
+    let element = element_of(&kind).ok_or_else(|| bad("ElementType", format!("`{kind}` is not supported")))?;
     let voxels = size.iter().product::<usize>();
     let body = &bytes[end + 1..];
     let data = match says_true("CompressedData") {
@@ -67,7 +67,7 @@ pub fn read(path: &Path) -> Result<Volume> {
         None => vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
     };
     if spacing.len() != 3 || rotation.len() != 9 {
-        return Err(bad("ElementSpacing", "needs three numbers and TransformMatrix nine".into()));
+        return Err(bad("ElementSpacing", "three numbers are needed, and nine for TransformMatrix".into()));
     }
     let columns: Vec<f64> = (0..9).map(|i| rotation[i] * spacing[i / 3]).collect();
     let origin = match field("Offset").or_else(|| field("Position")) {

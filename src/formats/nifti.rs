@@ -85,13 +85,13 @@ pub fn read(path: &Path) -> Result<Volume> {
     let header = NiftiHeader::from_file(path).map_err(|e| bad("header", e.to_string()))?;
     let axes = header.dim[0] as usize;
     if !(3..=7).contains(&axes) || header.dim[4..=axes.max(4)].iter().any(|n| *n > 1) && axes > 3 {
-        return Err(bad("dim", format!("{:?}; one 3D volume per file is read", header.dim)));
+        return Err(bad("dim", format!("{:?} is not supported: a file must have one 3D volume", header.dim)));
     }
     let size = Volume::check_size(path, "dim", &[header.dim[1].into(), header.dim[2].into(), header.dim[3].into()])?;
     let object = ReaderOptions::new().read_file(path).map_err(|e| bad("data", e.to_string()))?;
     let volume: InMemNiftiVolume = object.into_volume();
     if volume.dim().len() != axes {
-        return Err(bad("dim", format!("{:?} disagrees with the header", volume.dim())));
+        return Err(bad("dim", format!("{:?} does not agree with the header", volume.dim())));
     }
     let mut values = Vec::with_capacity(size.iter().product());
     let mut index = vec![0u16; axes];

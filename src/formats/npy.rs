@@ -21,20 +21,24 @@ pub struct Array {
 pub fn read(path: &Path, limit: u64) -> Result<Array> {
     let bytes = files::read_limited(path, limit)?;
     let bad = |problem: String| Error::data(path, "npy", problem);
-    check_shape(&bytes).map_err(|shape| bad(format!("absurd shape ({shape})")))?;
+    check_shape(&bytes).map_err(|shape| bad(format!("the shape is too large ({shape})")))?;
     let npy = npyz::NpyFile::new(&bytes[..]).map_err(|e| bad(format!("header: {e}")))?;
     let mut shape = Vec::new();
     let mut elements: u64 = 1;
     for &axis in npy.shape() {
-        elements = elements.checked_mul(axis).ok_or_else(|| bad(format!("absurd shape {:?}", npy.shape())))?;
+        elements =
+            elements.checked_mul(axis).ok_or_else(|| bad(format!("the shape {:?} is too large", npy.shape())))?;
         shape.push(axis as usize);
     }
     if elements > bytes.len() as u64 {
-        return Err(bad(format!("shape {shape:?} needs more than the file's {} bytes: truncated?", bytes.len())));
+        return Err(bad(format!(
+            "the shape {shape:?} needs more than the file's {} bytes; it may be truncated",
+            bytes.len()
+        )));
     }
     let fortran = npy.order() == npyz::Order::Fortran && shape.len() > 1;
     let npyz::DType::Plain(dtype) = npy.dtype() else {
-        return Err(bad("a structured array; numbers are needed".into()));
+        return Err(bad("a structured array is not supported; an array of numbers is needed".into()));
     };
     let name = dtype.to_string();
     macro_rules! read_as {
@@ -53,12 +57,14 @@ pub fn read(path: &Path, limit: u64) -> Result<Array> {
         "i4" => read_as!(i32),
         "b1" => npy.into_vec::<bool>().map(|v| v.into_iter().map(|b| f32::from(u8::from(b))).collect()),
         other => {
-            return Err(bad(format!("element type {other}; floats, integers up to 32 bit and booleans are read")));
+            return Err(bad(format!(
+                "the element type {other} is not supported; floats, integers of up to 32 bits and Booleans are"
+            )));
         }
     };
-    let values = values.map_err(|e| bad(format!("{e}: truncated?")))?;
+    let values = values.map_err(|e| bad(format!("{e}; the file may be truncated")))?;
     if values.len() as u64 != elements {
-        return Err(bad(format!("{} elements for shape {shape:?}", values.len())));
+        return Err(bad(format!("has {} elements, which do not fit the shape {shape:?}", values.len())));
     }
     let values = if fortran { fortran_to_c(&shape, &values) } else { values };
     Ok(Array { shape, values })

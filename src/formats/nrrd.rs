@@ -162,19 +162,19 @@ pub fn read(path: &Path) -> Result<Volume> {
     };
     let need = |name: &str| field(name).ok_or_else(|| bad(name, "is missing".into()));
     if field("data file").is_some() || field("datafile").is_some() {
-        return Err(bad("data file", "detached data is not read; attach it".into()));
+        return Err(bad("data file", "data in a separate file are not supported; put them into this file".into()));
     }
     let sizes: Vec<u64> = numbers(path, "sizes", &need("sizes")?)?.iter().map(|v| *v as u64).collect();
     let size = Volume::check_size(path, "sizes", &sizes)?;
     let kind = need("type")?;
-    let element = element_of(&kind).ok_or_else(|| bad("type", format!("`{kind}` is not read")))?;
+    let element = element_of(&kind).ok_or_else(|| bad("type", format!("`{kind}` is not supported")))?;
     let voxels = size.iter().product::<usize>();
     let body = &bytes[end + 2..];
     let data = match need("encoding")?.as_str() {
         "raw" => body.to_vec(),
         "gzip" | "gz" => raw::read_at_most(flate2::read::MultiGzDecoder::new(body), voxels * element.bytes())
             .map_err(|e| bad("gzip", e.to_string()))?,
-        other => return Err(bad("encoding", format!("`{other}`; raw and gzip are read"))),
+        other => return Err(bad("encoding", format!("`{other}` is not supported; raw and gzip are"))),
     };
     let order = if field("endian").as_deref() == Some("big") { ByteOrder::Big } else { ByteOrder::Little };
     let values = element.decode(path, order, &data, voxels)?;
@@ -183,7 +183,7 @@ pub fn read(path: &Path) -> Result<Volume> {
         "right-anterior-superior" | "ras" => DVec3::new(-1.0, -1.0, 1.0),
         "left-anterior-superior" | "las" => DVec3::new(1.0, -1.0, 1.0),
         other => {
-            return Err(bad("space", format!("`{other}`; LPS, RAS and LAS are read")));
+            return Err(bad("space", format!("`{other}` is not supported; LPS, RAS and LAS are")));
         }
     };
     let directions = numbers(path, "space directions", &need("space directions")?)?;

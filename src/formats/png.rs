@@ -25,7 +25,11 @@ pub fn read(path: &Path) -> Result<Image> {
         DynamicImage::ImageLuma8(grey) => grey.into_raw().into_iter().map(f32::from).collect(),
         DynamicImage::ImageLuma16(grey) => grey.into_raw().into_iter().map(f32::from).collect(),
         other => {
-            return Err(Error::data(path, "png", format!("{:?} pixels; grey of 8 or 16 bit is needed", other.color())));
+            return Err(Error::data(
+                path,
+                "png",
+                format!("{:?} pixels are not supported; grey values of 8 or 16 bits are needed", other.color()),
+            ));
         }
     };
     Ok(Image { width, height, values })
@@ -37,7 +41,7 @@ pub fn read(path: &Path) -> Result<Image> {
 /// [`Error::Io`] or [`Error::Internal`].
 pub fn write_grey16(path: &Path, width: usize, height: usize, codes: Vec<u16>) -> Result<()> {
     let buffer = image::ImageBuffer::<image::Luma<u16>, _>::from_raw(width as u32, height as u32, codes)
-        .ok_or_else(|| Error::Internal("png buffer has the wrong size".into()))?;
+        .ok_or_else(|| Error::Internal("the PNG buffer has the wrong size".into()))?;
     write(path, &DynamicImage::ImageLuma16(buffer))
 }
 
@@ -47,7 +51,7 @@ pub fn write_grey16(path: &Path, width: usize, height: usize, codes: Vec<u16>) -
 /// [`Error::Internal`] where there are not `width` x `height` codes.
 pub fn grey8(width: usize, height: usize, codes: &[u8]) -> Result<Vec<u8>> {
     if codes.len() != width * height {
-        return Err(Error::Internal("png buffer has the wrong size".into()));
+        return Err(Error::Internal("the PNG buffer has the wrong size".into()));
     }
     let mut png = Vec::new();
     PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub)

@@ -67,7 +67,8 @@ impl Element {
         let wanted = n * self.bytes();
         let Some(bytes) = bytes.get(..wanted) else {
             let kind = self.name();
-            let problem = format!("{} bytes where {n} voxels of {kind} need {wanted}: truncated?", bytes.len());
+            let problem =
+                format!("has {} bytes where {n} voxels of {kind} need {wanted}; it may be truncated", bytes.len());
             return Err(Error::data(path, "data", problem));
         };
         macro_rules! numbers {
@@ -101,7 +102,7 @@ pub fn read(path: &Path, hints: &VolumeHints) -> Result<Volume> {
     let size = Volume::check_size(path, "size", &stated.map(|n| n as u64))?;
     let kind = hints.raw_type.as_deref().unwrap_or(Element::F32.name());
     let element = Element::named(kind)
-        .ok_or_else(|| Error::data(path, "type", format!("`{kind}`; {} are read", Element::names())))?;
+        .ok_or_else(|| Error::data(path, "type", format!("`{kind}` is not supported; {} are", Element::names())))?;
     let bytes = files::read_limited(path, MAX_BYTES)?;
     let values = element.decode(path, ByteOrder::Little, &bytes, size.iter().product())?;
     Ok(Volume { size, values, index_to_lps: Volume::axis_aligned(size, hints.spacing(path)?) })

@@ -142,7 +142,7 @@ impl Volume {
             return Err(Error::data(
                 path,
                 "extension",
-                "is none of .npy .nii .nii.gz .nrrd .mha; of a raw binary the size must be given",
+                "is not one of .npy .nii .nii.gz .nrrd .mha; for a raw binary, the size must be given",
             ));
         };
         let m = volume.index_to_lps.matrix3;
@@ -173,7 +173,10 @@ impl Volume {
             Error::data(
                 path,
                 field,
-                format!("{size:?}; three axes of at least one voxel, {MAX_VOXELS} in all, are accepted"),
+                format!(
+                    "{size:?} is not supported: three axes of at least one voxel, with at most {MAX_VOXELS} voxels in \
+                     total, are accepted"
+                ),
             )
         };
         let [x, y, z] = size[..] else {
@@ -200,7 +203,7 @@ impl VolumeHints {
         match self.spacing_mm {
             Some(s) if s.iter().all(|v| v.is_finite() && *v > 0.0) => Ok(s),
             Some(s) => Err(Error::data(path, "spacing", format!("{s:?} is not positive"))),
-            None => Err(Error::data(path, "spacing", "this format does not carry it; it must be given, in mm")),
+            None => Err(Error::data(path, "spacing", "this format does not store it; it must be given, in mm")),
         }
     }
 }

@@ -62,14 +62,15 @@ impl<'a> Arrays<'a> {
         let root = document.root_element();
         let found = root.attribute("type").unwrap_or_default();
         if root.tag_name().name() != ROOT || found != kind {
-            let problem = format!("is `{found}` of a `{}`; `{kind}` of a `{ROOT}` is needed", root.tag_name().name());
+            let problem =
+                format!("is `{found}` in a `{}`, but `{kind}` in a `{ROOT}` is needed", root.tag_name().name());
             return Err(Error::data(file, "type", problem));
         }
         let zlib = match root.attribute("compressor") {
             None => false,
             Some(ZLIB) => true,
             Some(other) => {
-                let problem = format!("{other} is not read: write the file with {ZLIB}, or without a compressor");
+                let problem = format!("{other} is not supported: write the file with {ZLIB}, or without a compressor");
                 return Err(Error::data(file, "compressor", problem));
             }
         };
@@ -92,22 +93,23 @@ impl<'a> Arrays<'a> {
         let text = array.text().unwrap_or_default();
         let mut stream = match array.attribute("format").unwrap_or("ascii") {
             "ascii" => {
-                let number = |word: &str| word.parse().map_err(|_| fail(format!("`{word}` is no number")));
+                let number = |word: &str| word.parse().map_err(|_| fail(format!("`{word}` is not a number")));
                 return text.split_ascii_whitespace().map(number).collect();
             }
             "binary" => Stream { rest: text.as_bytes(), base64: true, decoded: Vec::new() },
             "appended" => {
                 let offset = array.attribute("offset").and_then(|offset| offset.trim().parse::<usize>().ok());
                 let data = self.appended.and_then(|all| Some((all.base64, all.data.get(offset?..)?)));
-                let (base64, rest) = data.ok_or_else(|| fail("its offset leaves the appended data".into()))?;
+                let (base64, rest) = data.ok_or_else(|| fail("its offset is outside the appended data".into()))?;
                 Stream { rest, base64, decoded: Vec::new() }
             }
-            other => return Err(fail(format!("format `{other}` is none of ascii, binary, appended"))),
+            other => return Err(fail(format!("the format `{other}` is not one of ascii, binary, appended"))),
         };
-        let short = || fail("ends before its length, or is not what its encoding says".into());
+        let short = || fail("ends before its stated length, or does not agree with its encoding".into());
         let bytes = self.bytes(&mut stream).ok_or_else(short)?;
         let kind = array.attribute("type").unwrap_or_default();
-        self.numbers(&bytes, kind).ok_or_else(|| fail(format!("{} bytes are no values of type `{kind}`", bytes.len())))
+        self.numbers(&bytes, kind)
+            .ok_or_else(|| fail(format!("{} bytes are not a whole number of values of type `{kind}`", bytes.len())))
     }
 
     /// Reads a length or a number of blocks.

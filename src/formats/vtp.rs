@@ -140,11 +140,11 @@ pub fn read(path: &Path) -> Result<ReadLines> {
     let data = child(document.root_element(), "PolyData");
     let mut pieces = data.into_iter().flat_map(|data| data.children().filter(|piece| piece.has_tag_name("Piece")));
     let (Some(piece), None) = (pieces.next(), pieces.next()) else {
-        return Err(Error::data(path, "Piece", "is not there once: files of one piece are read"));
+        return Err(Error::data(path, "Piece", "does not occur exactly once: only files of one piece are supported"));
     };
     let points = data_arrays(child(piece, "Points")).next().map_or(Ok(Vec::new()), |points| arrays.values(points))?;
     let (points, []) = points.as_chunks::<3>() else {
-        return Err(Error::data(path, "Points", "are not three numbers each"));
+        return Err(Error::data(path, "Points", "do not have three numbers each"));
     };
     let of_lines = |name: &str| -> Result<Vec<f64>> {
         let mut found = data_arrays(child(piece, "Lines")).filter(|array| array.attribute("Name") == Some(name));
@@ -160,12 +160,13 @@ pub fn read(path: &Path) -> Result<ReadLines> {
         }
         let values = arrays.values(array)?;
         if values.len() != points.len() {
-            let problem = format!("{} values for {} points", values.len(), points.len());
+            let problem = format!("has {} values for {} points", values.len(), points.len());
             return Err(Error::data(path, format!("DataArray {name}"), problem));
         }
         of_points.push((name.to_owned(), values));
     }
-    let lines = lines.ok_or_else(|| Error::data(path, "Lines", "leave the points or their own list"))?;
+    let lines = lines
+        .ok_or_else(|| Error::data(path, "Lines", "refer to points that do not exist, or exceed their own list"))?;
     Ok(ReadLines { points: points.to_vec(), lines, of_points })
 }
 
@@ -204,7 +205,7 @@ pub fn read_collection(path: &Path) -> Result<Vec<PathBuf>> {
     }
     files.sort_by(|a, b| a.0.total_cmp(&b.0));
     match files.windows(2).find(|pair| pair[0].0 == pair[1].0) {
-        Some(pair) => Err(Error::data(path, "timestep", format!("{} is that of two files", pair[0].0))),
+        Some(pair) => Err(Error::data(path, "timestep", format!("two files have the timestep {}", pair[0].0))),
         None if files.is_empty() => Err(Error::data(path, "Collection", "has no file")),
         None => Ok(files.into_iter().map(|(_, file)| file).collect()),
     }

@@ -136,7 +136,7 @@ impl Blobs {
     /// [`Error::Internal`] for a phase the field does not have.
     pub fn at(&self, phase: u32) -> Result<BlobList> {
         let set = self.set.lock().unwrap_or_else(PoisonError::into_inner);
-        let missing = || Error::Internal(format!("no Gaussians of phase {phase}"));
+        let missing = || Error::Internal(format!("there are no Gaussians of phase {phase}"));
         Ok(BlobList { blobs: set.blobs.clone(), range: set.phases.get(phase as usize).ok_or_else(missing)?.clone() })
     }
 

@@ -9,8 +9,8 @@ use serde::Serialize;
 use std::sync::{Arc, Mutex};
 
 /// Settings that make the steps of a fit smaller.
-pub const SMALLER_STEPS: &str = "lower rates of section `gaussians`: gaussians.position_rate, gaussians.scale_rate, gaussians.rotation_rate, \
-     gaussians.density_rate";
+pub const SMALLER_STEPS: &str = "lower learning rates in section `gaussians`: gaussians.position_rate, \
+                                 gaussians.scale_rate, gaussians.rotation_rate, gaussians.density_rate";
 
 /// Units of Gaussians, for conversion from and to world units and line integrals.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -75,7 +75,7 @@ impl Gaussians {
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
             Some(bad) => {
                 let step = u64::from(self.step);
-                let (quantity, value) = ("parameter of a Gaussian", f64::from(bad));
+                let (quantity, value) = ("a parameter of a Gaussian", f64::from(bad));
                 Err(Error::Diverged { step, quantity, value, advice: SMALLER_STEPS })
             }
             None => Ok(()),

@@ -140,7 +140,12 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
     let path = file.path;
     let positive = [header.pixel, header.strongest, header.cut.into(), header.least_scale.into()];
     if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || header.greatest_scale < header.least_scale {
-        return Err(Error::data(path, "gaussians", "units, cut and scales must be positive and finite"));
+        return Err(Error::data(
+            path,
+            "gaussians",
+            "pixel, strongest, cut, least_scale and greatest_scale must be positive and finite, and greatest_scale at \
+             least least_scale",
+        ));
     }
     let position = file.floats("gaussians.position", &[None, Some(3)])?;
     let n = position.len() / 3;
@@ -153,7 +158,7 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
     };
     if let Some(bad) = phase.iter().find(|p| **p as usize >= n_phases) {
         let field = if header.grid.is_some() { "gaussians.grid.rest_phase" } else { "gaussians.phase" };
-        return Err(Error::data(path, field, format!("{bad} of {n_phases} phases")));
+        return Err(Error::data(path, field, format!("has phase {bad}, but phases go from 0 to below {n_phases}")));
     }
     let row = |i: usize| Gaussian {
         position: [0, 1, 2].map(|k| position[3 * i + k]),
@@ -184,7 +189,10 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         || grid.half_side.is_nan()
         || grid.half_side <= 0.0
     {
-        let problem = format!("{} nodes, half side {}, basis {}", grid.nodes, grid.half_side, grid.basis);
+        let problem = format!(
+            "{} nodes, half side {} and {} basis functions are out of range",
+            grid.nodes, grid.half_side, grid.basis
+        );
         return Err(Error::data(path, "gaussians.grid", problem));
     }
     let nodes = Some(grid.nodes as usize);

@@ -113,7 +113,7 @@ impl Gpu {
         };
         if bytes > u64::from(info.max_storage_buffer_range) {
             let most = info.max_storage_buffer_range;
-            return beyond(format!("one buffer of {} is limited to {most} bytes", info.name));
+            return beyond(format!("a buffer of {} has at most {most} bytes", info.name));
         }
         if texel && bytes / 16 > u64::from(info.max_texel_buffer_elements) {
             let most = info.max_texel_buffer_elements;
@@ -131,7 +131,10 @@ impl Gpu {
     pub fn exported_buffer(&self, name: &str, bytes: u64) -> Result<(Buffer, std::os::fd::OwnedFd)> {
         let info = self.info();
         if !info.external_memory_fd {
-            return Err(Error::NoDevice(format!("{}: no VK_KHR_external_memory_fd", info.name)));
+            return Err(Error::NoDevice(format!(
+                "{}: the device does not support VK_KHR_external_memory_fd",
+                info.name
+            )));
         }
         let bytes = rounded(bytes);
         let mut external = vk::ExternalMemoryBufferCreateInfo::default().handle_types(EXPORTED);
@@ -233,7 +236,9 @@ impl Inner {
             .max_by_key(|i| {
                 memories.memory_types[*i as usize].property_flags.contains(vk::MemoryPropertyFlags::DEVICE_LOCAL)
             })
-            .ok_or_else(|| Error::NoDevice(format!("{}: no memory can be exported", gpu.info.name)))?;
+            .ok_or_else(|| {
+                Error::NoDevice(format!("{}: the device has no memory that can be exported", gpu.info.name))
+            })?;
         let mut export = vk::ExportMemoryAllocateInfo::default().handle_types(EXPORTED);
         let mut dedicated = vk::MemoryDedicatedAllocateInfo::default().buffer(self.raw);
         let allocate = vk::MemoryAllocateInfo::default()
@@ -296,7 +301,7 @@ impl Buffer {
         match offset.checked_add(bytes) {
             Some(end) if end <= self.inner.bytes => Ok(()),
             _ => Err(Error::Internal(format!(
-                "{} bytes at {offset} do not fit buffer `{}` of {} bytes",
+                "{} bytes at {offset} do not fit into buffer `{}` of {} bytes",
                 bytes, self.inner.name, self.inner.bytes
             ))),
         }
@@ -331,7 +336,7 @@ impl Buffer {
     }
 
     fn not_mapped(&self) -> Error {
-        Error::Internal(format!("buffer `{}` is not host-visible", self.inner.name))
+        Error::Internal(format!("buffer `{}` is not visible to the host", self.inner.name))
     }
 }
 

@@ -389,7 +389,7 @@ pub(super) fn describe(
     } else if f12.timeline_semaphore == vk::FALSE {
         Some("timeline semaphores are needed".to_owned())
     } else if compute_family(instance, physical).is_none() {
-        Some("it has no compute queue".to_owned())
+        Some("the device has no compute queue".to_owned())
     } else {
         None
     };

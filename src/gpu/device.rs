@@ -76,7 +76,7 @@ impl Adoption {
             let lacking: Vec<&str> = features.iter().filter(|(_, offered)| !offered).map(|(name, _)| *name).collect();
             if is_claimed && !lacking.is_empty() {
                 let problem = format!(
-                    "{device} does not offer {}, so the device was not made with it: leave the field out",
+                    "{device} does not offer {}, so the device cannot have been created with it: omit the field",
                     lacking.join(", ")
                 );
                 return Err(Error::config(field, is_claimed, problem));
@@ -191,7 +191,7 @@ fn choose(
 ) -> Result<(vk::PhysicalDevice, DeviceInfo)> {
     let names = || {
         if all.is_empty() {
-            format!("the loader offers none: install a driver ({DRIVER_PACKAGES})")
+            format!("the Vulkan loader finds no device: install a driver ({DRIVER_PACKAGES})")
         } else {
             let one = |d: &DeviceInfo| match &d.unusable {
                 None => format!("{} = {}", d.index, d.name),
@@ -357,7 +357,7 @@ impl Gpu {
         }
         info.int64_atomics &= !options.without_int64_atomics;
         let queue_family = compute_family(&instance, physical)
-            .ok_or_else(|| Error::NoDevice(format!("{}: no compute queue", info.name)))?
+            .ok_or_else(|| Error::NoDevice(format!("{}: the device has no compute queue", info.name)))?
             .index;
         let device = Device::create(instance, physical, &info, queue_family, options.statistics)?;
         // SAFETY: the device was made with one queue of this family.
@@ -377,7 +377,7 @@ impl Gpu {
     /// Others may use the queue only while they hold the lock.
     pub unsafe fn adopt(adoption: Adoption, options: &DeviceOptions) -> Result<Gpu> {
         if adoption.cooperative_matrix && !adoption.subgroup_size_control {
-            let problem = "needs subgroup_size_control as well: kernels on matrices ask for full subgroups";
+            let problem = "also needs subgroup_size_control, because kernels on matrices require full subgroups";
             return Err(Error::config("cooperative_matrix", true, problem));
         }
         let loader = adoption.get_instance_proc_addr.map(|function| {
@@ -398,7 +398,7 @@ impl Gpu {
         // SAFETY: the device is the caller's, as in the line above; the name ends with a zero.
         let wait = unsafe { instance.get_device_proc_addr(adoption.device, c"vkWaitSemaphores".as_ptr()) };
         if wait.is_none() {
-            return Err(Error::NoDevice(format!("{}: the device was not made for Vulkan 1.2", info.name)));
+            return Err(Error::NoDevice(format!("{}: the device was not created for Vulkan 1.2", info.name)));
         }
         // Vulkan has no query for the features a device was made with.
         info.buffer_device_address &= adoption.buffer_device_address;
@@ -502,7 +502,7 @@ impl Shared {
         Err(Error::OutOfMemory {
             object: object.into(),
             bytes,
-            detail: format!("{before} bytes of the limit of {} are in use", self.taken.limit),
+            detail: format!("{before} bytes of the limit of {} bytes are in use", self.taken.limit),
             may_pass: false,
             instead: SMALLER_BATCHES,
         })

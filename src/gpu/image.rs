@@ -36,7 +36,7 @@ impl Gpu {
     pub fn image_3d(&self, name: &str, size: [u32; 3]) -> Result<Image3d> {
         let n: u64 = size.iter().map(|s| u64::from(*s)).product();
         if n == 0 {
-            return Err(Error::Internal(format!("{name}: an image of {size:?} cells")));
+            return Err(Error::Internal(format!("{name}: an image cannot have {size:?} cells")));
         }
         let mut inner = Inner::new(&self.shared, name, size, CELL_BYTES * n)?;
         inner.create()?;

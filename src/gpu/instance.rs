@@ -11,8 +11,8 @@ const VALIDATION_LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
 /// Packages to install where there is no loader.
 const LOADER_PACKAGES: &str = "Debian, Ubuntu: libvulkan1; Fedora: vulkan-loader; Arch: vulkan-icd-loader";
 /// Packages to install where there is no driver.
-pub(super) const DRIVER_PACKAGES: &str = "the GPU vendor's, or Mesa's, which has one for CPUs as well: Debian, Ubuntu, \
-                                          Fedora: mesa-vulkan-drivers; Arch: vulkan-swrast";
+pub(super) const DRIVER_PACKAGES: &str = "that of the GPU vendor, or that of Mesa, which also supports CPUs; Debian, \
+                                          Ubuntu, Fedora: mesa-vulkan-drivers; Arch: vulkan-swrast";
 
 /// A Vulkan loader that an application supplies in place of the system's.
 #[derive(Debug, Clone, Copy)]
@@ -92,8 +92,7 @@ fn require_validation_layer(entry: &ash::Entry) -> Result<()> {
         return Ok(());
     }
     Err(Error::NoDevice(
-        "validation was asked for, but VK_LAYER_KHRONOS_validation is not installed \
-         (Debian: vulkan-validationlayers)"
+        "validation was requested, but VK_LAYER_KHRONOS_validation is not installed (Debian: vulkan-validationlayers)"
             .into(),
     ))
 }

@@ -20,7 +20,7 @@ impl fmt::Display for DeviceMemory {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} MiB", self.bytes / MIB)?;
         match self.free {
-            Some(free) => write!(f, ", of which {} MiB are free to this process now", free / MIB),
+            Some(free) => write!(f, ", of which {} MiB are currently free for this process", free / MIB),
             None => Ok(()),
         }
     }
@@ -90,6 +90,6 @@ mod tests {
     fn people_are_told_both_numbers() {
         let memory = |free| DeviceMemory { bytes: 8 << 30, free }.to_string();
         assert_eq!(memory(None), "8192 MiB");
-        assert_eq!(memory(Some(100 << 20)), "8192 MiB, of which 100 MiB are free to this process now");
+        assert_eq!(memory(Some(100 << 20)), "8192 MiB, of which 100 MiB are currently free for this process");
     }
 }

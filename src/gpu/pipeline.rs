@@ -102,7 +102,11 @@ impl Gpu {
         spec: &[(&str, u32)],
     ) -> Result<Pipeline> {
         if self.info().matrices.is_empty() {
-            return Err(Error::Internal(format!("kernel {}: {} has no matrices", code.name, self.info().name)));
+            return Err(Error::Internal(format!(
+                "kernel {}: {} has no cooperative matrices",
+                code.name,
+                self.info().name
+            )));
         }
         self.make_pipeline(code, local_size, spec, Subgroups::Full(self.info().matrix_subgroup))
     }
@@ -127,7 +131,7 @@ impl Gpu {
             || !local_size.is_multiple_of(size)
             || local_size / size > info.max_workgroup_subgroups
         {
-            let problem = format!("{local_size} invocations are no full subgroups of {size}");
+            let problem = format!("{local_size} invocations are not a multiple of the subgroup size, {size}");
             return Err(Error::Internal(format!("kernel {}: {problem}", code.name)));
         }
         self.make_pipeline(code, local_size, spec, Subgroups::Full(size))
@@ -146,19 +150,22 @@ impl Gpu {
             || code.all_push_bytes() > info.max_push_constants
         {
             return Err(Error::Internal(format!(
-                "kernel {}: {local_size} invocations and {} bytes of push constants exceed {}",
+                "kernel {}: {local_size} invocations and {} bytes of push constants exceed the limits of {}",
                 code.name,
                 code.all_push_bytes(),
                 info.name
             )));
         }
         if !code.addresses.is_empty() && !info.buffer_device_address {
-            return Err(Error::Internal(format!("kernel {}: {} has no buffer addresses", code.name, info.name)));
+            return Err(Error::Internal(format!(
+                "kernel {}: {} does not support buffer addresses",
+                code.name, info.name
+            )));
         }
         let buffers = code.bindings.iter().filter(|b| descriptor_type(b) == vk::DescriptorType::STORAGE_BUFFER).count();
         if buffers > info.max_storage_buffers as usize {
             return Err(Error::NoDevice(format!(
-                "{}: kernel {} binds {buffers} storage buffers, the device allows {}",
+                "{}: kernel {} binds {buffers} storage buffers, but the device allows {}",
                 info.name, code.name, info.max_storage_buffers
             )));
         }

@@ -99,7 +99,7 @@ impl Descriptor {
             (_, Bound::Image(_)) => "an image",
         };
         let (kernel, slot) = (pipeline.code.name, binding.name);
-        Err(Error::Internal(format!("kernel {kernel}: `{name}` is not {:?}, as `{slot}` must be", binding.kind)))
+        Err(Error::Internal(format!("kernel {kernel}: `{name}` is bound to `{slot}`, but is not {:?}", binding.kind)))
     }
 
     fn write(&self, binding: &BindingCode, set: vk::DescriptorSet) -> vk::WriteDescriptorSet<'_> {
@@ -243,7 +243,11 @@ impl Recording {
         let code = pipeline.code;
         let fault = |problem: String| Error::Internal(format!("kernel {}: {problem}", code.name));
         if size_of::<P>() as u32 != code.push_bytes {
-            return Err(fault(format!("{} bytes of push constants, expected {}", size_of::<P>(), code.push_bytes)));
+            return Err(fault(format!(
+                "{} bytes of push constants were given where {} are expected",
+                size_of::<P>(),
+                code.push_bytes
+            )));
         }
         if let Some((name, _)) = given.iter().find(|(n, _)| !code.bindings.iter().any(|b| b.name == *n)) {
             return Err(fault(format!("it has no binding `{name}`")));
@@ -259,7 +263,10 @@ impl Recording {
         if let Groups::Direct([x, y, z]) = groups
             && (x > self.commands.gpu.info.max_workgroup_count || y.max(z) > MOST_GROUPS)
         {
-            return Err(fault(format!("{x} x {y} x {z} workgroups, more than {} takes", self.commands.gpu.info.name)));
+            return Err(fault(format!(
+                "{x} x {y} x {z} workgroups exceed the limits of {}",
+                self.commands.gpu.info.name
+            )));
         }
         let mut reads: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.reads).filter_map(|(_, x)| x.buffer()).collect();
         let writes: Vec<&Buffer> = bound.iter().filter(|(b, _)| b.writes).filter_map(|(_, x)| x.buffer()).collect();
@@ -278,7 +285,7 @@ impl Recording {
                 .iter()
                 .find(|(b, _)| b.name == *name)
                 .and_then(|(_, what)| what.buffer())
-                .ok_or_else(|| fault(format!("it wants the address of `{name}`, which it does not bind")))?;
+                .ok_or_else(|| fault(format!("it needs the address of `{name}`, which is not bound")))?;
             pushed[*offset as usize..][..8].copy_from_slice(&buffer.address().to_le_bytes());
         }
         self.begin_pass(code.name)?;

@@ -70,7 +70,11 @@ impl Image3d {
     pub fn fill(&self, cells: &[half::f16]) -> Result<Commands> {
         let bytes: &[u8] = bytemuck::cast_slice(cells);
         if bytes.len() as u64 != self.bytes() {
-            return Err(Error::Internal(format!("{} bytes for an image of {}", bytes.len(), self.bytes())));
+            return Err(Error::Internal(format!(
+                "{} bytes were given for an image of {} bytes",
+                bytes.len(),
+                self.bytes()
+            )));
         }
         let gpu = self.gpu();
         let staging = gpu.buffer("image staging", self.bytes(), Memory::Upload)?;

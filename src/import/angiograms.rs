@@ -66,7 +66,7 @@ pub struct ImportOptions {
 /// written.
 pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
     if files.is_empty() || files.len() > MOST_RUNS {
-        return Err(Error::config("FILE", files.len(), format!("1 to {MOST_RUNS} runs are accepted")));
+        return Err(Error::config("FILE", files.len(), format!("is out of range: 1 to {MOST_RUNS} runs are accepted")));
     }
     let runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
     let mut intake = Intake::new(options.clone());
@@ -102,12 +102,16 @@ impl Prepared {
         let factor = options.size.map_or(1, |size| columns.len().max(rows.len()).div_ceil(size.max(1)));
         let (width, height) = (columns.len() / factor, rows.len() / factor);
         if width < 16 || height < 16 {
-            let problem = format!("leaves {width} x {height} pixels of {}", run.name());
+            let problem = format!("is too small: {width} x {height} pixels would be left of {}", run.name());
             return Err(Error::config("size", options.size.unwrap_or_default(), problem));
         }
         let text = burnt_in_text(run);
         if !text.is_empty() {
-            notes.push(format!("{}: {} pixels of burnt-in text were filled from beside them", run.name(), text.len()));
+            notes.push(format!(
+                "{}: {} pixels of burnt-in text were replaced by values of neighbouring pixels",
+                run.name(),
+                text.len()
+            ));
         }
         let integral = intensity(run);
         let frames: Vec<Image> = run
@@ -143,7 +147,7 @@ impl Prepared {
         let views = chosen.stands_of(&selected).len();
         if views > 1 {
             notes.push(format!(
-                "{}: the C-arm or the table moves: its {} frames are of {views} views",
+                "{}: the C-arm or the table moves, so its {} frames belong to {views} views",
                 run.name(),
                 selected.len()
             ));
@@ -183,7 +187,8 @@ impl Chosen<'_> {
         let taken: Vec<Option<BeatTime>> = match &options.gating {
             Gating::Still => {
                 notes.push(format!(
-                    "{}: {} frames averaged; phase 1 is the image without structures up to {WIDEST_VESSEL_MM} mm wide",
+                    "{}: {} frames were averaged; phase 1 is the image without structures up to {WIDEST_VESSEL_MM} mm \
+                     wide",
                     run.name(),
                     selected.len()
                 ));
@@ -196,12 +201,12 @@ impl Chosen<'_> {
             }
             Gating::Phases(list) if list.len() == selected.len() => {
                 if let Some(bad) = list.iter().find(|p| !(0.0..f64::from(n_phases)).contains(*p)) {
-                    return Err(none(&format!("{bad} is given where phases go from 0 to {}", n_phases - 1)));
+                    return Err(none(&format!("phase {bad} is given, but phases go from 0 to {}", n_phases - 1)));
                 }
                 list.iter().map(|p| Some(BeatTime::of(*p, n_phases))).collect()
             }
             Gating::Phases(list) => {
-                return Err(none(&format!("{} are given for {} selected frames", list.len(), selected.len())));
+                return Err(none(&format!("{} phases are given for {} selected frames", list.len(), selected.len())));
             }
             timed => {
                 let peaks = self.r_peaks(timed, notes)?;
@@ -222,7 +227,7 @@ impl Chosen<'_> {
             }
         }
         if seen < 2 {
-            return Err(none(&format!("{seen} of {n_phases} are seen; at least two are needed")));
+            return Err(none(&format!("only {seen} of {n_phases} phases are seen; at least two are needed")));
         }
         notes.push(format!("{}: {seen} of {n_phases} phases from {} frames", run.name(), selected.len()));
         Ok(images)
@@ -240,8 +245,8 @@ impl Chosen<'_> {
                 let found = image_beat::beat(&images, &times_s, self.vessel)
                     .map_err(|e| Error::data(&run.path, "phases", e.to_string()))?;
                 notes.push(format!(
-                    "{}: {:.0} beats per minute, by the images (vessels move like a contracting ventricle with a correlation of \
-                     {:.2}); taken to be steady",
+                    "{}: {:.0} beats per minute, found in the images (the motion of the vessels has a correlation of \
+                     {:.2} with a contracting ventricle); a regular rhythm is assumed",
                     run.name(),
                     found.beats_per_min,
                     found.likeness
@@ -249,8 +254,8 @@ impl Chosen<'_> {
                 Ok(found.r_peaks)
             }
             _ => run.r_peaks.clone().ok_or_else(|| {
-                let problem = "the file has no ECG: give R-peaks, a heart rate or a list of phases, have the beat found in the \
-                               images, or say that the object is at rest";
+                let problem = "the file has no ECG: give R-peaks, a heart rate or a list of phases, find the beat in \
+                               the images, or state that the object is static";
                 Error::data(&run.path, "phases", problem)
             }),
         }
@@ -309,7 +314,7 @@ fn select(
         }
     }
     notes.push(format!(
-        "{}: frames {} to {} of {n} are filled with contrast; others can be chosen",
+        "{}: frames {} to {} of {n} are filled with contrast agent and are used; --frames chooses others",
         run.name(),
         best.start + 1,
         best.end

@@ -83,7 +83,7 @@ impl Reader<'_> {
 
     fn numbers(&self, tag: Tag, name: &str) -> Result<Option<Vec<f64>>> {
         let Some(element) = self.object.get(tag).filter(|e| !e.is_empty()) else { return Ok(None) };
-        let numbers = element.to_multi_float64().map_err(|e| self.bad(tag, name, format!("is no number: {e}")))?;
+        let numbers = element.to_multi_float64().map_err(|e| self.bad(tag, name, format!("is not a number: {e}")))?;
         match numbers.iter().find(|v| !v.is_finite()) {
             Some(bad) => Err(self.bad(tag, name, format!("{bad} is not finite"))),
             None => Ok(Some(numbers).filter(|n| !n.is_empty())),
@@ -104,7 +104,7 @@ impl Reader<'_> {
             Some(steps) if steps.len() == frames => steps.iter().map(|s| base + s).collect(),
             Some(steps) if steps.len() == 1 => (0..frames).map(|i| base + i as f64 * steps[0]).collect(),
             Some(steps) => {
-                return Err(self.bad(tag, name, format!("{} values for {frames} frames", steps.len())));
+                return Err(self.bad(tag, name, format!("has {} values for {frames} frames", steps.len())));
             }
             None => vec![base; frames],
         })
@@ -119,7 +119,8 @@ impl Run {
     pub fn read(path: &Path, pixel_mm: Option<[f64; 2]>) -> Result<Run> {
         let meta = std::fs::metadata(path).map_err(Error::io("read", path))?;
         if !meta.is_file() || meta.len() > MAX_FILE_BYTES || meta.len() < 132 {
-            let problem = format!("{} bytes; a DICOM file of 132 bytes to 4 GiB is accepted", meta.len());
+            let problem =
+                format!("{} bytes are not in the accepted range of DICOM files, 132 bytes to 4 GiB", meta.len());
             return Err(Error::data(path, "size", problem));
         }
         lengths::check(path)?;
@@ -134,18 +135,22 @@ impl Run {
             if n.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE)).contains(&n) {
                 Ok(n as usize)
             } else {
-                Err(r.bad(tag, name, format!("{n}; 1 to {MAX_SIDE} are accepted")))
+                Err(r.bad(tag, name, format!("{n} is not in the accepted range, 1 to {MAX_SIDE}")))
             }
         };
         let (width, height) = (side(tags::COLUMNS, "Columns")?, side(tags::ROWS, "Rows")?);
         let n = r.number(tags::NUMBER_OF_FRAMES, "NumberOfFrames")?.unwrap_or(1.0);
         if n.fract() != 0.0 || !(1.0..=f64::from(MAX_FRAMES)).contains(&n) {
-            let problem = format!("{n}; 1 to {MAX_FRAMES} are accepted");
+            let problem = format!("{n} is not in the accepted range, 1 to {MAX_FRAMES}");
             return Err(r.bad(tags::NUMBER_OF_FRAMES, "NumberOfFrames", problem));
         }
         let n = n as usize;
         if (width * height * n) as u64 > MAX_PIXELS {
-            return Err(r.bad(tags::NUMBER_OF_FRAMES, "NumberOfFrames", "frames hold more pixels than are accepted"));
+            return Err(r.bad(
+                tags::NUMBER_OF_FRAMES,
+                "NumberOfFrames",
+                "all frames together have more pixels than the accepted maximum",
+            ));
         }
         let c_arms = r.c_arms(n, [width, height], pixel_mm, &mut notes)?;
         let times_s = r.times(n, &mut notes)?;
@@ -194,13 +199,14 @@ impl Reader<'_> {
     fn check_modality(&self) -> Result<()> {
         let modality = self.text(tags::MODALITY).unwrap_or_default();
         if !["XA", "RF"].contains(&modality.as_str()) {
-            let problem = format!("`{modality}`; X-ray angiography (XA) or fluoroscopy (RF) is accepted");
+            let problem = format!("`{modality}` is neither X-ray angiography (XA) nor fluoroscopy (RF)");
             return Err(self.bad(tags::MODALITY, "Modality", problem));
         }
         let samples = self.number(tags::SAMPLES_PER_PIXEL, "SamplesPerPixel")?.unwrap_or(1.0);
         let colour = self.text(tags::PHOTOMETRIC_INTERPRETATION).unwrap_or_default();
         if samples != 1.0 || !["MONOCHROME1", "MONOCHROME2"].contains(&colour.as_str()) {
-            let problem = format!("`{colour}` with {samples} samples per pixel; grey values are accepted");
+            let problem =
+                format!("`{colour}` with {samples} samples per pixel is not supported; grey values are needed");
             return Err(self.bad(tags::PHOTOMETRIC_INTERPRETATION, "PhotometricInterpretation", problem));
         }
         Ok(())
@@ -229,12 +235,13 @@ impl Reader<'_> {
             (None, _, Some(field)) if field[0] > 0.0 => {
                 let pitch = field[0] / size[0].max(size[1]) as f64;
                 notes.push(format!(
-                    "ImagerPixelSpacing is missing: {pitch:.6} mm, from FieldOfViewDimensions; a pixel spacing that is given overrides it"
+                    "ImagerPixelSpacing is missing: {pitch:.6} mm from FieldOfViewDimensions are used; --pixel-spacing \
+                     overrides this value"
                 ));
                 [pitch; 2]
             }
             _ => {
-                let problem = "is missing; the pixel spacing at the detector must be given, in mm";
+                let problem = "is missing; give the pixel spacing at the detector, in mm";
                 return Err(self.bad(tags::IMAGER_PIXEL_SPACING, "ImagerPixelSpacing", problem));
             }
         };
@@ -246,8 +253,9 @@ impl Reader<'_> {
         let along = self.per_frame(0.0, tags::TABLE_LONGITUDINAL_INCREMENT, "TableLongitudinalIncrement", n)?;
         let position = self.text(tags::PATIENT_POSITION).unwrap_or_default();
         if !["HFS", ""].contains(&position.as_str()) {
-            notes
-                .push(format!("patient position {position}: axes are named as for a patient supine, head first (HFS)"));
+            notes.push(format!(
+                "the patient position is {position}, but axes are named as for a supine patient, head first (HFS)"
+            ));
         }
         let arms: Vec<CArm> = (0..n)
             .map(|i| CArm {
@@ -269,7 +277,7 @@ impl Reader<'_> {
         let vector = tags::FRAME_TIME_VECTOR;
         if let Some(steps) = self.numbers(vector, "FrameTimeVector")? {
             if steps.len() != n {
-                return Err(self.bad(vector, "FrameTimeVector", format!("{} values for {n} frames", steps.len())));
+                return Err(self.bad(vector, "FrameTimeVector", format!("has {} values for {n} frames", steps.len())));
             }
             let mut now = 0.0;
             return Ok(steps
@@ -286,7 +294,7 @@ impl Reader<'_> {
             None => match self.number(tags::CINE_RATE, "CineRate")? {
                 Some(rate) if rate > 0.0 => 1e3 / rate,
                 _ => {
-                    notes.push("no frame times: 15 frames per second are assumed".into());
+                    notes.push("frame times are missing: 15 frames per second are assumed".into());
                     1e3 / 15.0
                 }
             },
@@ -304,7 +312,8 @@ impl Reader<'_> {
             other => {
                 let said = other.unwrap_or("missing");
                 notes.push(format!(
-                    "PixelIntensityRelationship {said}: taken as logarithmic of unknown scale; attenuation is relative"
+                    "PixelIntensityRelationship is {said}: pixels are assumed to be logarithmic with an unknown scale, \
+                     so attenuation is relative"
                 ));
                 Relationship::Display
             }
@@ -319,14 +328,18 @@ impl Reader<'_> {
         }
         let bits = self.number(tags::BITS_STORED, "BitsStored")?.unwrap_or(8.0);
         if !(1.0..=16.0).contains(&bits) {
-            return Err(self.bad(tags::BITS_STORED, "BitsStored", format!("{bits}; 8 to 16 are accepted")));
+            return Err(self.bad(
+                tags::BITS_STORED,
+                "BitsStored",
+                format!("{bits} is not in the accepted range, 1 to 16"),
+            ));
         }
         let signed = self.number(tags::PIXEL_REPRESENTATION, "PixelRepresentation")?.unwrap_or(0.0) != 0.0;
         let slope = self.number(tags::RESCALE_SLOPE, "RescaleSlope")?.unwrap_or(1.0);
         let intercept = self.number(tags::RESCALE_INTERCEPT, "RescaleIntercept")?.unwrap_or(0.0);
         let has_table = self.object.get(tags::MODALITY_LUT_SEQUENCE).is_some();
         if has_table || slope != 1.0 || intercept != 0.0 {
-            notes.push("the modality LUT was applied; VOI LUT and window were not".into());
+            notes.push("the modality LUT was applied, but not the VOI LUT and the window".into());
         }
         // A decoder may panic on malformed data; the panic becomes an ordinary error of this file.
         let decode = |frame: usize| -> std::result::Result<Vec<f32>, String> {
@@ -345,7 +358,7 @@ impl Reader<'_> {
                 let values = decode(i).map_err(bad)?;
                 match values.len() {
                     found if found == pixels && values.iter().all(|v| v.is_finite()) => Ok(values),
-                    found => Err(bad(format!("{found} finite values, {pixels} are needed"))),
+                    found => Err(bad(format!("has {found} finite values where {pixels} are needed"))),
                 }
             })
             .collect::<Result<Vec<Vec<f32>>>>()?;
@@ -356,7 +369,7 @@ impl Reader<'_> {
             (low, white) = (all().fold(f32::MAX, f32::min), all().fold(f32::MIN, f32::max));
         }
         if self.text(tags::PHOTOMETRIC_INTERPRETATION).as_deref() == Some("MONOCHROME1") {
-            notes.push("MONOCHROME1: inverted, so that brighter is less absorbed".into());
+            notes.push("MONOCHROME1: the images were inverted, so that brighter pixels mean less absorption".into());
             frames.iter_mut().flatten().for_each(|v| *v = low + white - *v);
         }
         Ok((frames, white))
@@ -373,7 +386,7 @@ impl Reader<'_> {
         let top = edge(tags::SHUTTER_UPPER_HORIZONTAL_EDGE, "ShutterUpperHorizontalEdge", 0, height)?;
         let bottom = edge(tags::SHUTTER_LOWER_HORIZONTAL_EDGE, "ShutterLowerHorizontalEdge", height + 1, height)?;
         if right < left + 2 || bottom < top + 2 {
-            let problem = format!("columns {left} to {right}, rows {top} to {bottom} leave nothing open");
+            let problem = format!("columns {left} to {right} and rows {top} to {bottom} leave no open area");
             return Err(self.bad(tags::SHUTTER_LEFT_VERTICAL_EDGE, "ShutterLeftVerticalEdge", problem));
         }
         Ok((left..right - 1, top..bottom - 1))

@@ -14,10 +14,10 @@ const QRS_S: f64 = 0.12;
 /// [`Error::Config`] for an unusable trace, or one with fewer than two R-peaks.
 pub fn r_peaks(trace: &[f64], rate_hz: f64) -> Result<RPeaks> {
     if !(rate_hz.is_finite() && (20.0..=20_000.0).contains(&rate_hz)) {
-        return Err(Error::config("ECG", rate_hz, "20 to 20000 samples per second are accepted"));
+        return Err(Error::config("ECG", rate_hz, "is not in the accepted range, 20 to 20000 samples per second"));
     }
     if trace.len() < (2.0 * SHORTEST_BEAT_S * rate_hz) as usize || trace.iter().any(|v| !v.is_finite()) {
-        return Err(Error::config("ECG", trace.len(), "samples do not hold two beats, or are not all finite"));
+        return Err(Error::config("ECG", trace.len(), "samples do not cover two beats, or are not all finite"));
     }
     let slope: Vec<f64> = trace.windows(2).map(|w| (w[1] - w[0]).powi(2)).collect();
     let half = ((0.5 * QRS_S * rate_hz) as usize).max(1);

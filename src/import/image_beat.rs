@@ -44,17 +44,17 @@ pub fn beat(images: &[&Image], times_s: &[f64], vessel_pixels: usize) -> Result<
     let n = images.len();
     let frame_s = match (times_s.first(), times_s.last()) {
         (Some(first), Some(last)) if n > 2 && last > first => (last - first) / (n - 1) as f64,
-        _ => return Err(refused(format!("{n} images show no beat"))),
+        _ => return Err(refused(format!("{n} images are too few to show a beat"))),
     };
     let uneven = times_s.windows(2).any(|w| (w[1] - w[0] - frame_s).abs() > 0.5 * frame_s);
     if uneven {
-        return Err(refused("images are not taken at equal times: give R-peaks or a heart rate".into()));
+        return Err(refused("the times of the images are not equally spaced: give R-peaks or a heart rate".into()));
     }
     let vessels: Vec<Vec<f32>> = images.par_iter().map(|image| vessels(image, vessel_pixels)).collect();
     let frames = period(&likeness(&centred(&vessels, n)), frame_s).ok_or_else(|| {
         refused(format!(
-            "{n} images in {:.1} s do not return to what they were, as one and a half steady beats would: give R-peaks or a heart \
-             rate, or choose other frames",
+            "{n} images in {:.1} s do not repeat, as they would in one and a half beats of a regular rhythm: give \
+             R-peaks or a heart rate, or choose other frames",
             times_s[n - 1] - times_s[0]
         ))
     })?;
@@ -243,9 +243,9 @@ mod tests {
         let refused = |images: &[&Image], times: &[f64]| beat(images, times, 3).unwrap_err().to_string();
         let all: Vec<&Image> = images.iter().collect();
         assert!(refused(&all[..14], &times[..14]).contains("one and a half"), "fewer than one and a half beats");
-        assert!(refused(&[&images[0]; 40], &times).contains("do not return"), "nothing moves");
+        assert!(refused(&[&images[0]; 40], &times).contains("do not repeat"), "nothing moves");
         assert!(refused(&all[..1], &times[..1]).contains("1 images"));
         let uneven: Vec<f64> = times.iter().map(|t| if *t > 3.0 { t + 1.0 } else { *t }).collect();
-        assert!(refused(&all, &uneven).contains("equal times"));
+        assert!(refused(&all, &uneven).contains("not equally spaced"));
     }
 }

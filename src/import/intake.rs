@@ -80,7 +80,11 @@ impl Intake {
     /// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option.
     pub fn take(&mut self, mut runs: Vec<Run>) -> Result<Vec<String>> {
         if self.runs() + runs.len() > MOST_RUNS {
-            return Err(Error::config("FILE", self.runs() + runs.len(), format!("1 to {MOST_RUNS} runs are accepted")));
+            return Err(Error::config(
+                "FILE",
+                self.runs() + runs.len(),
+                format!("is out of range: 1 to {MOST_RUNS} runs are accepted"),
+            ));
         }
         let mut notes: Vec<String> =
             runs.iter().flat_map(|run| run.notes.iter().map(|note| format!("{}: {note}", run.name()))).collect();
@@ -120,7 +124,7 @@ impl Intake {
     /// # Errors
     /// Errors of [`Intake::write`].
     pub fn write_first(&self, runs: usize, out: &Path) -> Result<String> {
-        let none = || Error::NotReady("no run was taken in".into());
+        let none = || Error::NotReady("no run was imported".into());
         let runs = runs.min(self.runs());
         let first = self.first().ok_or_else(none)?;
         let about = About {
@@ -167,20 +171,20 @@ fn check(run: &Run, before: &[Taken]) -> Vec<String> {
     let (mut notes, name, this) = (Vec::new(), run.name(), Taken::of(run));
     let Some(first) = before.first() else { return notes };
     if this.identity[0] != first.identity[0] {
-        notes.push(format!("warning: {name} is of another patient than {}", first.name));
+        notes.push(format!("warning: {name} belongs to another patient than {}", first.name));
     } else if this.identity[1] != first.identity[1] {
-        notes.push(format!("warning: {name} is of another study than {}", first.name));
+        notes.push(format!("warning: {name} belongs to another study than {}", first.name));
     }
     let [left, down, along] = [0, 1, 2].map(|k| this.table_mm[k] - first.table_mm[k]);
     if [left, down, along] != [0.0; 3] {
         notes.push(format!(
-            "{name}: the table moved by {left} mm to the left and {down} mm down since {}, which was taken into account; a move \
-             along the patient is not in public tags",
+            "{name}: the table moved by {left} mm to the left and {down} mm down since {}, which was corrected; a \
+             motion along the patient is not stored in public tags",
             first.name
         ));
     }
     let near = |other: &&Taken| (0..2).all(|k| (other.angles_deg[k] - this.angles_deg[k]).abs() < SAME_ANGLE_DEG);
     let near = before.iter().filter(near);
-    notes.extend(near.map(|other| format!("warning: {} and {name} look from almost the same angle", other.name)));
+    notes.extend(near.map(|other| format!("warning: {} and {name} have almost the same viewing angle", other.name)));
     notes
 }

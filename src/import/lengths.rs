@@ -31,7 +31,7 @@ pub(super) fn check(path: &Path) -> Result<()> {
     let mut w = Walker { file: BufReader::new(file), at: 0, end, path, big_endian: false, implicit: false };
     let head = w.take(132)?;
     if &head[128..] != b"DICM" {
-        return Err(Error::data(path, "DICOM", "has no DICM after its preamble: is it a DICOM file?"));
+        return Err(Error::data(path, "DICOM", "has no DICM after its preamble, so it is not a DICOM file"));
     }
     // The meta information group is always little endian with explicit types.
     let mut syntax = String::new();
@@ -57,7 +57,7 @@ pub(super) fn check(path: &Path) -> Result<()> {
 
 impl Walker<'_> {
     fn short(&self) -> Error {
-        Error::data(self.path, "DICOM", format!("ends inside an element at byte {}: truncated?", self.at))
+        Error::data(self.path, "DICOM", format!("ends inside an element at byte {}; it may be truncated", self.at))
     }
 
     fn take(&mut self, n: usize) -> Result<Vec<u8>> {
@@ -108,7 +108,8 @@ impl Walker<'_> {
                 _ => 1,
             };
             if length % number != 0 {
-                let problem = format!("{length} bytes hold no whole numbers of {number} bytes");
+                let problem =
+                    format!("has {length} bytes, which is not a multiple of {number}, the size of its numbers");
                 return Err(Error::data(self.path, format!("({group:04X},{element:04X})"), problem));
             }
             return Ok((group, element, length.into()));
@@ -121,7 +122,8 @@ impl Walker<'_> {
         if u64::from(length) <= self.end - self.at {
             return Ok(());
         }
-        let problem = format!("claims {length} bytes where the file has {} left: truncated?", self.end - self.at);
+        let problem =
+            format!("states {length} bytes, but the file has only {} left; it may be truncated", self.end - self.at);
         Err(Error::data(self.path, format!("({group:04X},{element:04X})"), problem))
     }
 
@@ -160,7 +162,7 @@ impl Walker<'_> {
     /// Checks items, or fragments of pixel data, up to a position in the file or the delimiter of their sequence.
     fn items(&mut self, end: u64, depth: u32, fragments: bool) -> Result<()> {
         if depth > DEEPEST {
-            return Err(Error::data(self.path, "DICOM", format!("sequences more than {DEEPEST} deep")));
+            return Err(Error::data(self.path, "DICOM", format!("sequences are nested more than {DEEPEST} deep")));
         }
         while self.at < end {
             let (group, element, length) = self.header()?;
@@ -177,7 +179,7 @@ impl Walker<'_> {
                 }
                 _ => {
                     let field = format!("({group:04X},{element:04X})");
-                    return Err(Error::data(self.path, field, "stands where an item is expected"));
+                    return Err(Error::data(self.path, field, "was found where an item is expected"));
                 }
             }
         }

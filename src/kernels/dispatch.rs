@@ -76,7 +76,7 @@ pub fn dispatch_finding<'a, P: PushConstants>(
         let direct = bound.iter().find(|(n, _)| *n == name).map(|(_, what)| *what);
         let source = direct.or_else(|| find(name).map(Bound::Buffer));
         let source = source.ok_or_else(|| {
-            Error::Internal(format!("kernel {}: nothing is there to bind to `{}`", P::SHADER, name.name()))
+            Error::Internal(format!("kernel {}: there is no buffer to bind to `{}`", P::SHADER, name.name()))
         })?;
         Ok((name.name(), source))
     };

@@ -19,7 +19,7 @@ include!(concat!(env!("OUT_DIR"), "/table.rs"));
 /// # Errors
 /// [`Error::Internal`] for a name that no kernel has.
 pub fn kernel_code(name: &str) -> Result<&'static KernelCode> {
-    KERNEL_TABLE.iter().find(|k| k.name == name).ok_or_else(|| Error::Internal(format!("no kernel is called `{name}`")))
+    KERNEL_TABLE.iter().find(|k| k.name == name).ok_or_else(|| Error::Internal(format!("there is no kernel `{name}`")))
 }
 
 /// Returns the names of all shaders; variants are not counted separately.

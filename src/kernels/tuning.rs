@@ -205,27 +205,38 @@ impl Tuning {
         let old_lavapipe = info.is_llvmpipe && info.mesa_major.is_some_and(|v| v < 24);
         let mut reasons = Vec::new();
         let (operands, why) = if old_lavapipe {
-            (Operands::Texel, "operands through texel buffers: this llvmpipe reads storage buffers lane by lane")
+            (
+                Operands::Texel,
+                "operands through texel buffers, because this llvmpipe reads storage buffers lane by lane",
+            )
         } else if info.is_llvmpipe && info.buffer_device_address {
-            (Operands::Address, "operands through addresses: spares this llvmpipe bounds checks")
+            (Operands::Address, "operands through addresses, which avoids bounds checks of this llvmpipe")
         } else {
             (Operands::Storage, "operands through storage buffers")
         };
         reasons.push(why.to_owned());
         let (layer_lanes, weight_lanes, splits) = if info.is_llvmpipe {
-            reasons.push("one subgroup per workgroup and few splits: a CPU has few workgroups in flight".into());
+            reasons.push(
+                "one subgroup per workgroup and few splits, because a CPU executes few workgroups at a time".into(),
+            );
             (info.subgroup_size.clamp(4, 16), info.subgroup_size.clamp(4, 16), 4)
         } else {
             (64, 32, 16)
         };
         let (layers, why) = match info.matrices.first() {
-            None => (Layers::F32, "f32 layers: the device has no cooperative matrices our kernels can use".to_owned()),
-            Some(_) if info.is_cpu() => {
-                (Layers::F32, "f32 layers: a CPU emulates cooperative matrices, several times slower".to_owned())
-            }
-            Some(s) if !s.f16_sums => {
-                (Layers::F32, "f32 layers: cooperative matrices without f16 sums go by way of shared memory".to_owned())
-            }
+            None => (
+                Layers::F32,
+                "f32 layers, because the device has no cooperative matrices that our kernels can use".to_owned(),
+            ),
+            Some(_) if info.is_cpu() => (
+                Layers::F32,
+                "f32 layers, because a CPU emulates cooperative matrices, which is several times slower".to_owned(),
+            ),
+            Some(s) if !s.f16_sums => (
+                Layers::F32,
+                "f32 layers, because cooperative matrices without f16 sums need copies through shared memory"
+                    .to_owned(),
+            ),
             Some(s) => (Layers::Matrices, format!("matrix layers, {}x{}x{}: f16 operands, f32 sums", s.m, s.n, s.k)),
         };
         reasons.push(why);
@@ -245,8 +256,8 @@ impl Tuning {
         let private_line_bytes = if info.is_cpu() { 0 } else { info.max_shared_memory / 2 };
         // Kernels that read through texel buffers have no variants with 64-bit integers.
         let bits = if info.int64_atomics && operands != Operands::Texel { 64 } else { 32 };
-        let lines = if private_line_bytes == 0 { "" } else { ", lines in shared memory first" };
-        reasons.push(format!("static gradients through {bits}-bit integer atomics{lines}: exact sums"));
+        let lines = if private_line_bytes == 0 { "" } else { ", with lines summed in shared memory first" };
+        reasons.push(format!("static gradients by {bits}-bit integer atomics{lines}, so sums are exact"));
         Tuning {
             layers,
             operands,
@@ -305,7 +316,11 @@ impl Tuning {
 
     /// Returns this tuning, with the simplest path of the layers where the network is never evaluated.
     pub fn for_network(self, asked: bool) -> Tuning {
-        if asked { self } else { self.with_layers(Layers::F32, "no layers: the network is not asked".into()) }
+        if asked {
+            self
+        } else {
+            self.with_layers(Layers::F32, "no layers, because the network is not evaluated".into())
+        }
     }
 
     /// Number of samples that one workgroup of the layer kernels covers.

@@ -110,26 +110,31 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
              (r2.static_data = \"per-phase\")"
         ),
         StaticData::Pooled => format!(
-            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} mm, \
-             is shown at each (r2.static_data = \"pooled\")"
+            "R2-Gaussian, a static method: one reconstruction from the images of all phases, in a cube of {side_mm:.1} \
+             mm, is used for every phase (r2.static_data = \"pooled\")"
         ),
     });
     if config.r2.normalise && dataset.vessel_attenuation.is_none() {
         notes.push(
-            "the dataset states no attenuation of vessels: densities are per 100 mm, and what R2-Gaussian fixes of them may \
-             not fit"
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and R2-Gaussian's fixed density \
+             thresholds may not fit them"
                 .into(),
         );
     }
     if !dataset.hidden.is_empty() {
         notes.push(
-            "pixels that show nothing of the patient are fitted like all others: R2-Gaussian knows no masks".into(),
+            "pixels that show nothing of the patient are fitted like all others, because R2-Gaussian does not support \
+             masks"
+                .into(),
         );
     }
     if dataset.heart_shifts() {
-        notes.push("R2-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+        notes.push(
+            "R2-Gaussian uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
+                .into(),
+        );
     }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
     Ok(data)
 }
 

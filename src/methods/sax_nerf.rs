@@ -91,28 +91,35 @@ fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
     let passes = config.train.iterations as usize / images;
     let mut notes = vec![match config.sax.static_data {
         StaticData::PerPhase => format!(
-            "SAX-NeRF, a static method: each phase is reconstructed from its own images, of which an iteration sees one: \
+            "SAX-NeRF, a static method: each phase is reconstructed from its own images, one image per iteration, in \
              {passes} passes over them (sax.static_data = \"per-phase\")"
         ),
         StaticData::Pooled => format!(
-            "SAX-NeRF, a static method: one reconstruction from the images of all phases, of which an iteration sees one \
-             ({passes} passes over them), is shown at each (sax.static_data = \"pooled\")"
+            "SAX-NeRF, a static method: one reconstruction from the images of all phases, one image per iteration, in \
+             {passes} passes over them, is used for every phase (sax.static_data = \"pooled\")"
         ),
     }];
     if config.sax.normalise && dataset.vessel_attenuation.is_none() {
         notes.push(
-            "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF shows none above 1"
+            "the dataset states no attenuation of vessels: densities are per 100 mm, and SAX-NeRF cannot represent \
+             densities above 1"
                 .into(),
         );
     }
     if !dataset.hidden.is_empty() {
-        notes
-            .push("pixels that show nothing of the patient are fitted like all others: SAX-NeRF knows no masks".into());
+        notes.push(
+            "pixels that show nothing of the patient are fitted like all others, because SAX-NeRF does not support \
+             masks"
+                .into(),
+        );
     }
     if dataset.heart_shifts() {
-        notes.push("SAX-NeRF sees all frames of a view alike: displacements of the heart are left out".into());
+        notes.push(
+            "SAX-NeRF uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
+                .into(),
+        );
     }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
     notes
 }
 

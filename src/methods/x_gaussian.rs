@@ -102,30 +102,37 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
     let data = XData::new(dataset, &config.x, half)?;
     let side_mm = 2.0 * half * MM_PER_UNIT;
     let whose = match config.x.static_data {
-        StaticData::PerPhase => "each phase has Gaussians of its own images (x.static_data = \"per-phase\")",
-        StaticData::Pooled => "one set of the images of all phases is shown at each (x.static_data = \"pooled\")",
+        StaticData::PerPhase => "each phase has its own set, fitted to its images (x.static_data = \"per-phase\")",
+        StaticData::Pooled => {
+            "one set, fitted to the images of all phases, is used for every phase (x.static_data = \"pooled\")"
+        }
     };
     notes.push(format!(
-        "X-Gaussian, a static method of Gaussians that hide each other: {whose}, from a cube of {side_mm:.1} mm on, in a scene of \
-         {:.0} mm; its pictures have no unit, and its opacities are no attenuation",
+        "X-Gaussian, a static method of Gaussians that occlude each other: {whose}. Initial Gaussians fill a cube of \
+         {side_mm:.1} mm in a scene of {:.0} mm. Its pictures have no unit, and its opacities are not attenuation",
         data.extent_mm
     ));
     if data.clamped > 0.0 {
         notes.push(format!(
-            "{:.1} % of the images' pixels are beyond x.clamp = {} and count as that",
+            "{:.1} % of the images' pixels exceed x.clamp = {} and are clamped to it",
             100.0 * data.clamped,
             config.x.clamp
         ));
     }
     if !dataset.hidden.is_empty() {
         notes.push(
-            "pixels that show nothing of the patient are fitted like all others: X-Gaussian knows no masks".into(),
+            "pixels that show nothing of the patient are fitted like all others, because X-Gaussian does not support \
+             masks"
+                .into(),
         );
     }
     if dataset.heart_shifts() {
-        notes.push("X-Gaussian sees all frames of a view alike: displacements of the heart are left out".into());
+        notes.push(
+            "X-Gaussian uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
+                .into(),
+        );
     }
-    notes.extend(between_phases(dataset, "count as taken at the nearest phase"));
+    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
     Ok(data)
 }
 

@@ -140,10 +140,13 @@ pub fn newest(run: &Path) -> Result<PathBuf> {
     if !run.is_dir() {
         return Err(Error::data(run, "run", "is neither a run directory nor a checkpoint"));
     }
-    list(run)?
-        .pop()
-        .map(|(_, path)| path)
-        .ok_or_else(|| Error::data(run, "checkpoint", "no checkpoint-*.safetensors: has this run saved anything yet?"))
+    list(run)?.pop().map(|(_, path)| path).ok_or_else(|| {
+        Error::data(
+            run,
+            "checkpoint",
+            "there is no checkpoint-*.safetensors in this directory: the run may not have saved any checkpoint yet",
+        )
+    })
 }
 
 /// Returns the model of a run's newest checkpoint, or of a checkpoint file.
@@ -276,23 +279,28 @@ impl Checkpoint {
         let known: BTreeSet<&str> = [FORMAT, GAUSSIAN_FORMAT].into_iter().chain(formats).collect();
         if !known.contains(header.format.as_str()) {
             let known: Vec<&str> = known.into_iter().collect();
-            let problem = format!("`{}`; this version reads {}", header.format, known.join(", "));
+            let problem = format!("`{}` is not supported; this version reads {}", header.format, known.join(", "));
             return Err(bad("format", problem));
         }
         if header.format != format_of(&header.config) {
-            let problem = format!("`{}` where the configuration needs `{}`", header.format, format_of(&header.config));
+            let problem =
+                format!("is `{}`, but the file's configuration needs `{}`", header.format, format_of(&header.config));
             return Err(bad("format", problem));
         }
         if header.gaussians.is_some() != (header.format == GAUSSIAN_FORMAT) {
             return Err(bad(
                 "gaussians",
-                format!("the header of a `{}` has them, or lacks them, by mistake", header.format),
+                format!(
+                    "the header has this field although the format `{}` does not allow it, or lacks it although the \
+                     format needs it",
+                    header.format
+                ),
             ));
         }
         header.config.check()?;
         let method = methods::of(&header.config);
         if let Some(LossScale { scale, .. }) = header.loss_scale.filter(|s| !(s.scale.is_finite() && s.scale >= 1.0)) {
-            return Err(bad("loss_scale", format!("{scale} where at least 1 is needed")));
+            return Err(bad("loss_scale", format!("is {scale} where at least 1 is needed")));
         }
         if header.phases == 0 || header.phases > 4096 {
             return Err(bad("phases", header.phases.to_string()));
@@ -309,7 +317,7 @@ impl Checkpoint {
         let network = hidden + header.phases as u64 * u64::from(d.latent);
         let needed = still + if header.config.method().has_network() { network } else { 0 };
         if needed > bytes.len() as u64 / 4 {
-            return Err(bad("config", format!("{needed} parameters do not fit the file's {} bytes", bytes.len())));
+            return Err(bad("config", format!("{needed} parameters do not fit into the file's {} bytes", bytes.len())));
         }
         let param_map = ParamMap::new(&header.config, header.phases);
         let mut params = vec![0f32; param_map.len];
@@ -321,13 +329,13 @@ impl Checkpoint {
                 if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
                     return Err(bad(
                         &name,
-                        format!("{:?} {:?} where F32 {:?} is needed", view.dtype(), view.shape(), tensor.shape),
+                        format!("is {:?} {:?} where F32 {:?} is needed", view.dtype(), view.shape(), tensor.shape),
                     ));
                 }
                 for (word, at) in view.data().chunks_exact(4).zip(&tensor.positions) {
                     let value = f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
                     if !value.is_finite() {
-                        return Err(bad(&name, "holds a value that is not finite".into()));
+                        return Err(bad(&name, "contains a value that is not finite".into()));
                     }
                     match prefix {
                         "" => params[*at as usize] = value,
@@ -352,7 +360,7 @@ impl Checkpoint {
                 {
                     return Err(bad(
                         "hull.bits",
-                        format!("{:?} does not fit a hull of {:?} cells", view.shape(), h.size),
+                        format!("a tensor of shape {:?} does not fit a hull of {:?} cells", view.shape(), h.size),
                     ));
                 }
                 let bits = to_words(view.data());

@@ -56,7 +56,9 @@ pub fn packed(live: &[u32], room: u32) -> Result<Vec<Chunk>> {
     let (mut first_ray, mut taken) = (0, 0u64);
     for (ray, samples) in (0u32..).zip(live) {
         if *samples > room {
-            return Err(Error::Internal(format!("ray {ray} has {samples} live samples, a chunk has room for {room}")));
+            return Err(Error::Internal(format!(
+                "ray {ray} has {samples} live samples, but a chunk has room for {room}"
+            )));
         }
         let n_rays = ray - first_ray;
         if n_rays == MOST_GROUPS || taken + u64::from(*samples) > u64::from(room) {

@@ -244,7 +244,7 @@ impl Pass<'_> {
     /// [`Error::Internal`] for jittered depths; otherwise fails like [`Pass::run`].
     pub fn render(&mut self, n_rays: u32, maxima: bool) -> Result<()> {
         if self.setup.jitter != 0 {
-            return Err(Error::Internal("rendering wants regular depths".into()));
+            return Err(Error::Internal("rendering needs regular depths".into()));
         }
         self.weights()?;
         for chunk in chunks(self.setup, n_rays) {

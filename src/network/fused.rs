@@ -202,7 +202,7 @@ impl FusedNetwork {
     ) -> Result<FusedNetwork> {
         let info = gpu.info();
         let matrix = *info.matrices.first().ok_or_else(|| {
-            let problem = "this device has no cooperative matrices our kernels can use: take f32 or auto";
+            let problem = "this device has no cooperative matrices that our kernels can use: choose f32 or auto";
             Error::config("layers", "matrices", format!("{}: {problem}", info.name))
         })?;
         let shape = Shape::new(info, matrix, &tuning.matrices, params)?;

@@ -147,7 +147,7 @@ struct Shooting<'a> {
 /// [`Error::Config`] for impossible options, [`Error::Data`] for unreadable anatomy, device errors.
 pub fn make(gpu: &Gpu, options: &PhantomOptions, out: &Path, mut progress: impl FnMut(&str, u64, u64)) -> Result<()> {
     if !(1..=200).contains(&options.phases) {
-        return Err(Error::config("phases", options.phases, "1 to 200 is accepted"));
+        return Err(Error::config("phases", options.phases, "is not in the accepted range, 1 to 200"));
     }
     let shooting = Shooting {
         size: options.size,
@@ -188,11 +188,11 @@ pub fn project_volumes(
     };
     shooting.check(out)?;
     if options.vessel_per_mm.is_some_and(|v| !(v.is_finite() && v > 0.0)) {
-        return Err(Error::config("vessel_per_mm", options.vessel_per_mm.unwrap_or_default(), "must be positive"));
+        return Err(Error::config("vessel_per_mm", options.vessel_per_mm.unwrap_or_default(), "is not positive"));
     }
     check_vessels(&options.degradations, options.vessel_per_mm)?;
     if options.volumes.is_empty() {
-        return Err(Error::config("volumes", 0, "at least one is needed, for one phase"));
+        return Err(Error::config("volumes", 0, "at least one volume, for one phase, is needed"));
     }
     let c_arms = options.c_arms.c_arms(&options.views, options.size)?;
     let projector = Projector::new(gpu, options.size, options.size)?;
@@ -207,7 +207,7 @@ pub fn project_volumes(
     let breathing = options.degradations.breathing.is_some();
     let volumes = Volumes::read(&projector, &reading, breathing, |done| progress("volumes", done, total))?;
     let stage = Stage {
-        description: format!("projected from {} volumes", options.volumes.len()),
+        description: format!("projections of {} volumes", options.volumes.len()),
         depth_half_extent_mm: volumes.axial_radius_mm().min(largest_depth_mm(&c_arms)),
         c_arms,
         vessel_attenuation: options.vessel_per_mm,
@@ -220,7 +220,8 @@ pub fn project_volumes(
 
 /// Rejects degradations that need properties the volumes do not have.
 fn check_vessels(degradations: &Degradations, vessel_per_mm: Option<f64>) -> Result<()> {
-    const WITHOUT_OSTIUM: &str = "volumes do not say where the ostium is; phantoms do";
+    const WITHOUT_OSTIUM: &str = "is not supported with volumes, in which the position of the ostium is unknown; use a \
+                                  phantom";
     if degradations.catheter {
         return Err(Error::config("catheter", true, WITHOUT_OSTIUM));
     }
@@ -230,7 +231,9 @@ fn check_vessels(degradations: &Degradations, vessel_per_mm: Option<f64>) -> Res
     let of_vessels =
         [("contrast_variation", degradations.contrast_variation), ("collimated_share", degradations.collimated_share)];
     match of_vessels.into_iter().find(|(_, value)| *value > 0.0 && vessel_per_mm.is_none()) {
-        Some((field, value)) => Err(Error::config(field, value, "needs vessel_per_mm, to tell vessels from the rest")),
+        Some((field, value)) => {
+            Err(Error::config(field, value, "needs vessel_per_mm, the attenuation threshold of vessels"))
+        }
         None => Ok(()),
     }
 }
@@ -250,11 +253,15 @@ impl Shooting<'_> {
     /// Rejects impossible images, and directories that already hold a dataset, before any work is done.
     fn check(&self, out: &Path) -> Result<()> {
         if !(16..=2048).contains(&self.size) {
-            return Err(Error::config("size", self.size, "16 to 2048 is accepted"));
+            return Err(Error::config("size", self.size, "is not in the accepted range, 16 to 2048"));
         }
         for name in [MANIFEST, nerfca::GENERAL] {
             if out.join(name).exists() {
-                return Err(Error::config("OUT", out.display(), "already holds a dataset; choose another directory"));
+                return Err(Error::config(
+                    "OUT",
+                    out.display(),
+                    "already contains a dataset; choose another directory",
+                ));
             }
         }
         self.degradations.check(self.views.training.len(), self.layout)
@@ -479,7 +486,7 @@ fn procedural(options: &PhantomOptions) -> Result<Stage> {
 fn from_files(options: &PhantomOptions, anatomy: &Anatomy) -> Result<Stage> {
     let vessel_per_mm = anatomy.iodine_per_mm;
     if !(vessel_per_mm.is_finite() && vessel_per_mm > 0.0) {
-        return Err(Error::config("iodine_per_mm", vessel_per_mm, "must be positive"));
+        return Err(Error::config("iodine_per_mm", vessel_per_mm, "is not positive"));
     }
     let patient = Patient::read(&anatomy.tree, anatomy.background.as_deref(), vessel_per_mm, options.phases)?;
     let c_arms = anatomy.c_arms.c_arms(&options.views, options.size)?;

@@ -105,7 +105,7 @@ fn within(field: &str, value: f64, accepted: std::ops::RangeInclusive<f64>, unit
     match accepted.contains(&value) {
         true => Ok(()),
         false => {
-            let problem = format!("{} to {}{unit} is accepted", accepted.start(), accepted.end());
+            let problem = format!("is not in the accepted range, {} to {}{unit}", accepted.start(), accepted.end());
             Err(Error::config(field, value, problem))
         }
     }
@@ -121,7 +121,8 @@ impl Degradations {
             within("geometry_error.angle_deg", angle_deg, 0.0..=45.0, " degrees")?;
             within("geometry_error.position_mm", position_mm, 0.0..=100.0, " mm")?;
             if layout == Layout::Nerfca && position_mm > 0.0 {
-                let problem = "the layout `nerfca` cannot state where the patient lies; 0, or the native layout";
+                let problem = "the layout `nerfca` cannot store the position of the patient; use 0, or the native \
+                               layout";
                 return Err(Error::config("geometry_error.position_mm", position_mm, problem));
             }
         }
@@ -147,7 +148,10 @@ impl Rhythm {
     fn check(&self, training_views: usize) -> Result<()> {
         let rates = self.beats_per_min.len();
         if rates != 1 && rates != training_views {
-            let problem = format!("rates for {training_views} training views: one or {training_views} are needed");
+            let problem = format!(
+                "is the number of rates, but one or {training_views} are needed: one for all training views, or one \
+                 for each"
+            );
             return Err(Error::config("heart_rate", rates, problem));
         }
         for rate in &self.beats_per_min {

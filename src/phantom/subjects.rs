@@ -256,8 +256,8 @@ impl Reading<'_> {
         for path in paths {
             let volume = self.volume(path)?;
             if volume.size != least.size || volume.index_to_lps != least.index_to_lps {
-                let problem = "differs from the first volume's; breathing needs volumes of one grid, to tell the heart \
-                               from what stands still";
+                let problem = "differs from the grid of the first volume; breathing needs volumes on the same grid, to \
+                               separate the heart from static tissue";
                 return Err(Error::data(path, "grid", problem));
             }
             least.values.iter_mut().zip(&volume.values).for_each(|(a, b)| *a = a.min(*b));

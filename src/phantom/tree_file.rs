@@ -59,7 +59,8 @@ impl TreeFile {
         let named = |name: &&str| rest.of_points.iter().find(|(found, _)| found == *name);
         let radii = RADII.iter().find_map(named).ok_or_else(|| {
             let found: Vec<&str> = rest.of_points.iter().map(|(name, _)| name.as_str()).collect();
-            let problem = format!("has none of the radii {}; its arrays are: {}", RADII.join(", "), found.join(", "));
+            let problem =
+                format!("has none of the arrays of radii {}; its arrays are: {}", RADII.join(", "), found.join(", "));
             Error::data(first_file, "PointData", problem)
         })?;
         let mut first = 0;
@@ -73,7 +74,7 @@ impl TreeFile {
         for (file, lines) in phases {
             if count(lines) != count(rest) {
                 let problem = format!(
-                    "are others than those of {}: the lines of a beat must be followed, point by point",
+                    "differ from those of {}: all files of a beat must have the same lines and the same points",
                     first_file.display()
                 );
                 return Err(Error::data(file, "Lines", problem));
@@ -145,7 +146,7 @@ impl TreeFile {
     fn check(&self, path: &Path) -> Result<()> {
         let n = self.radius_mm.len();
         if self.points_mm.is_empty() || self.branches.is_empty() {
-            return Err(Error::data(path, "points_mm", "no phase or no branch"));
+            return Err(Error::data(path, "points_mm", "has no phase or no branch"));
         }
         if let Some(i) = self.radius_mm.iter().position(|r| !(r.is_finite() && *r > 0.0)) {
             return Err(Error::data(path, format!("radius_mm[{i}]"), "is not a positive length"));
@@ -155,7 +156,7 @@ impl TreeFile {
                 return Err(Error::data(
                     path,
                     format!("points_mm[{p}]"),
-                    format!("{} points for {n} radii", points.len()),
+                    format!("has {} points for {n} radii", points.len()),
                 ));
             }
             if let Some(i) = points.iter().position(|x| x.iter().any(|v| !v.is_finite())) {
@@ -167,7 +168,7 @@ impl TreeFile {
                 return Err(Error::data(
                     path,
                     format!("branches[{i}]"),
-                    "its range leaves the point array or is shorter than 2",
+                    "its range exceeds the point array or has fewer than 2 points",
                 ));
             }
         }

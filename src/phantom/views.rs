@@ -66,11 +66,7 @@ impl ViewAngles {
                 all.filter(|a| !VALIDATION_ANGLES.iter().any(|v| v.is_near(a))).collect()
             }
             other => {
-                return Err(Error::config(
-                    "views",
-                    other,
-                    "3, 4 or 9 is accepted; other views are given by their angles",
-                ));
+                return Err(Error::config("views", other, "is not 3, 4 or 9; state the angles of other views"));
             }
         };
         Ok(ViewAngles { training, validation: VALIDATION_ANGLES.to_vec() })
@@ -127,8 +123,10 @@ fn of_view<T: Copy>(field: &str, list: &[T], view: usize, views: usize) -> Resul
         [one] => Ok(*one),
         list if list.len() == views => Ok(list[view]),
         list => {
-            let problem =
-                format!("values for {views} views (training first, then validation): one or {views} are needed");
+            let problem = format!(
+                "is the number of values, but one or {views} are needed: one for all views, or one for each view \
+                 (training first, then validation)"
+            );
             Err(Error::config(field, list.len(), problem))
         }
     }
@@ -150,16 +148,16 @@ impl CArmOptions {
         let offset_mm = of_view("offset_mm", &self.offset_mm, view, views)?;
         let positive = |field: &str, value: f64| match value.is_finite() && value > 0.0 {
             true => Ok(value),
-            false => Err(Error::config(field, value, "must be a positive length in mm")),
+            false => Err(Error::config(field, value, "is not a positive length in mm")),
         };
         positive("sod_mm", sod_mm)?;
         positive("sid_mm", sid_mm)?;
         if sod_mm >= sid_mm {
-            let problem = format!("puts the isocentre behind the detector (sid_mm = {sid_mm})");
+            let problem = format!("would put the isocentre behind the detector (sid_mm = {sid_mm})");
             return Err(Error::config("sod_mm", sod_mm, problem));
         }
         if let Some(bad) = offset_mm.iter().find(|o| !o.is_finite()) {
-            return Err(Error::config("offset_mm", bad, "must be a length in mm"));
+            return Err(Error::config("offset_mm", bad, "is not a length in mm"));
         }
         let pixel_mm = match self.pixel {
             PixelPitch::FieldOfView(field) => [positive("field_mm", field)? / size as f64 * sid_mm / sod_mm; 2],

@@ -108,7 +108,10 @@ impl Scene {
             return Err(Error::data(
                 &dataset.path,
                 "images",
-                format!("their mean line integral is {mean}; it must be positive (is the intensity model right?)"),
+                format!(
+                    "their mean line integral is {mean}, but it must be positive: check the kind of intensities that \
+                     was stated"
+                ),
             ));
         }
         // softplus(ln(e - 1)) = 1: a feature of zero is the mean attenuation.

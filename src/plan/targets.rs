@@ -81,9 +81,8 @@ fn check_finite(dataset: &Dataset, series: &Series) -> Result<()> {
         };
         let (column, row) = (pixel % width, pixel / width);
         let at = format!("{}, view {}, phase {phase}", dataset.path.display(), series.view);
-        let problem = format!(
-            "the line integral at column {column}, row {row} is not finite: leave the image out, or correct it"
-        );
+        let problem =
+            format!("the line integral at column {column}, row {row} is not finite: remove or correct the image");
         return Err(Error::config("dataset", at, problem));
     }
     Ok(())
@@ -102,19 +101,21 @@ impl Targets {
     /// [`Error::Config`] when nothing moves, too little is known to tell, or a pixel is not a number.
     pub fn new(dataset: &Dataset, motion: &SoftMotion, settings: &sections::Gaussians) -> Result<Targets> {
         if motion.views.is_empty() {
-            let problem = "no training view has two phases, so what stands still behind the vessels is not known, as where a C-arm or \
-                           a table moves from image to image: the preset paper trains on whole images, and so does \
-                           fast-mlp with loss.dynamic_target = absolute, which is for still objects, too";
+            let problem = "no training view has two phases, e.g. because the C-arm or the table moves from image to \
+                           image, so the static background behind the vessels is not known. Try the preset paper, \
+                           which trains on whole images, or the preset fast-mlp with loss.dynamic_target = absolute, \
+                           which also suits static objects";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
         if motion.views.len() == 1 {
-            let problem = "a single training view has two phases: two are needed to tell where along a ray a vessel is";
+            let problem = "only one training view has two phases; two such views are needed to locate a vessel along a \
+                           ray";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
         Series::of(dataset).iter().try_for_each(|s| check_finite(dataset, s))?;
         let strongest = median(motion.views.iter().map(|v| f64::from(v.background.strongest)).collect());
         if strongest.is_nan() || strongest <= 0.0 || motion.hull.share() == 0.0 {
-            let problem = "nothing moves that several views agree on: check geometry, phases and noise";
+            let problem = "no motion is consistent between several views: check geometry, phases and noise";
             return Err(Error::config("dataset", dataset.path.display(), problem));
         }
         let pixel = |v: usize| {

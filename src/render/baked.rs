@@ -146,7 +146,7 @@ impl Baked {
         if !self.has(field, phase) {
             self.bake(field, phase)?;
         }
-        self.volume(field, phase).ok_or_else(|| Error::Internal(format!("{field:?} was baked into nothing")))
+        self.volume(field, phase).ok_or_else(|| Error::Internal(format!("{field:?} was not baked")))
     }
 
     /// Renders a `width` x `height` view at a phase, rows first.
@@ -267,7 +267,7 @@ impl Baked {
         let still = shown(Component::Static, component.has_static())?;
         let moving = shown(Component::Dynamic, component.has_dynamic())?;
         let any = still.as_ref().or(moving.as_ref());
-        let any = any.ok_or_else(|| Error::Internal("no volume to render".into()))?;
+        let any = any.ok_or_else(|| Error::Internal("there is no volume to render".into()))?;
         let bound = [
             (Binding::setup, (&self.renderer.buffers.setup).into()),
             (Binding::views, view.into()),

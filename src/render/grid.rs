@@ -58,7 +58,11 @@ impl PatientGrid {
             return Err(Error::config("grid", spacing, "origin and spacing must be finite, spacing positive"));
         }
         if self.size.iter().any(|n| *n == 0 || *n > 4096) {
-            return Err(Error::config("grid", format!("{:?}", self.size), "1 to 4096 points along each axis"));
+            return Err(Error::config(
+                "grid",
+                format!("{:?}", self.size),
+                "is out of range: 1 to 4096 points along each axis are accepted",
+            ));
         }
         Ok(())
     }

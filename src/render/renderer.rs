@@ -161,7 +161,9 @@ impl Renderer {
         let same_method =
             model.moving.is_some() == self.moving.is_some() && model.field.is_some() == self.field.is_some();
         if model.param_map != self.param_map || !same_method {
-            return Err(Error::Internal("the model has other parameters than the renderer".into()));
+            return Err(Error::Internal(
+                "the parameters of the model do not have the shape that the renderer was created for".into(),
+            ));
         }
         if let Some(field) = &model.moving {
             self.set_gaussians(field)?;
@@ -182,7 +184,7 @@ impl Renderer {
                 pictures.replace(field);
                 blobs.replace(field)
             }
-            _ => Err(Error::Internal("the network is the moving field of this model".into())),
+            _ => Err(Error::Internal("the dynamic field of this model is a network".into())),
         }
     }
 
@@ -221,7 +223,7 @@ impl Renderer {
         if phase < self.setup.n_phases {
             return Ok(());
         }
-        Err(Error::config("phase", phase, format!("phases go from 0 to {}", self.setup.n_phases - 1)))
+        Err(Error::config("phase", phase, format!("is out of range: phases go from 0 to {}", self.setup.n_phases - 1)))
     }
 
     /// Gaussians interpolated between two phases.
@@ -231,8 +233,9 @@ impl Renderer {
             None => Err(Error::config(
                 "phase",
                 phase,
-                "lies between two phases, and the moving field of this model knows whole ones alone: ask for a whole \
-                 phase, or train one set of Gaussians that moves (preset fast with gaussians.form = \"tree\") or a network",
+                "lies between two phases, and the dynamic field of this model has whole phases only: choose a whole \
+                 phase, or train one deformable set of Gaussians (preset fast with gaussians.form = \"tree\") or a \
+                 network",
             )),
         }
     }
@@ -299,7 +302,8 @@ impl Renderer {
         in_front: bool,
     ) -> Result<()> {
         self.check_phase(phase)?;
-        let pictures = self.pictures.as_ref().ok_or_else(|| Error::Internal("no Gaussians to draw".into()))?;
+        let pictures =
+            self.pictures.as_ref().ok_or_else(|| Error::Internal("there are no Gaussians to draw".into()))?;
         pictures.draw_into(target, rays, size, phase, in_front)
     }
 
@@ -368,7 +372,7 @@ impl Renderer {
     pub fn render_at(&self, rays: &ViewRays, width: usize, height: usize, phase: f64) -> Result<Rendering> {
         let last = self.last_moment();
         if !(0.0..=f64::from(self.setup.n_phases)).contains(&phase) {
-            return Err(Error::config("phase", phase, format!("phases go from 0 to {last}")));
+            return Err(Error::config("phase", phase, format!("is out of range: phases go from 0 to {last}")));
         }
         if phase.fract() != 0.0 {
             let all = Parts { still: true, maxima: true };

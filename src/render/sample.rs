@@ -41,7 +41,11 @@ impl Renderer {
     fn sample_field(&self, field: Component, phase: u32, grid: &Grid, away: f32) -> Result<Vec<f32>> {
         let [nx, ny, nz] = grid.size;
         if nx < 2 || nx > self.largest_row() {
-            return Err(Error::config("grid", nx, format!("2 to {} points along x are accepted", self.largest_row())));
+            return Err(Error::config(
+                "grid",
+                nx,
+                format!("is out of range: 2 to {} points along x are accepted", self.largest_row()),
+            ));
         }
         // Rows along x are rays: the depth is x.
         let f = |v: DVec3| [v.x as f32, v.y as f32, v.z as f32, 0.0];

@@ -91,7 +91,7 @@ pub fn reconstruct(
     let distance = match Distance::new(dataset, carried.as_ref()) {
         // Images are scored nevertheless.
         Err(error @ (Error::Data { .. } | Error::Io { .. })) => {
-            notes.push(format!("there are no distances on the way: {error}"));
+            notes.push(format!("distances to the true vessels are not measured during training: {error}"));
             None
         }
         distance => distance?,
@@ -277,7 +277,7 @@ impl<'a> Loop<'a> {
 
     fn await_answers(&mut self, answers: &Receiver<Answer>) -> Result<()> {
         while self.waiting > 0 {
-            let gone = |_| Error::Internal("the worker that saves snapshots is gone".into());
+            let gone = |_| Error::Internal("the thread that saves snapshots has ended".into());
             self.take(answers.recv().map_err(gone)?)?;
         }
         Ok(())

@@ -57,7 +57,7 @@ pub fn evaluate_model(
         return Err(Error::config(
             "dataset",
             dataset.path.display(),
-            format!("has {} phases, the run {}", dataset.n_phases, model.param_map.phases),
+            format!("has {} phases, but the run has {}", dataset.n_phases, model.param_map.phases),
         ));
     }
     let renderer = Renderer::new(gpu, model, tuning.clone())?;

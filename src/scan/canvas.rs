@@ -43,8 +43,10 @@ pub(crate) fn onto_canvas(views: &[View], frames: &mut [Frame]) -> Result<Option
     }
     let [width, height] = canvas;
     if frames.len() * width * height > MOST_PIXELS {
-        let value = format!("{} images, the largest of {width} columns and {height} rows", frames.len());
-        let problem = format!("more than {MOST_PIXELS} pixels once all are as large: make the large ones smaller");
+        let value = format!("{} images, of which the largest has {width} columns and {height} rows", frames.len());
+        let problem = format!(
+            "would have more than {MOST_PIXELS} pixels in total if all had the largest size: reduce the large images"
+        );
         return Err(Complaint::new("size", value, problem));
     }
     for frame in frames {

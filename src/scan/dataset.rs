@@ -61,7 +61,7 @@ impl Intensity {
             Intensity::Log { i0 } => ("i0", i0.is_finite()),
             Intensity::Linear { i0 } => ("i0", i0.is_finite() && *i0 > 0.0),
         };
-        if ok { Ok(()) } else { Err((format!("intensity.{field}"), "is not usable".into())) }
+        if ok { Ok(()) } else { Err((format!("intensity.{field}"), "is not finite or is outside its range".into())) }
     }
 
     /// Line integral of a stored value. The values of a linear detector are clamped from below at 1e-7 of `i0`.
@@ -287,7 +287,7 @@ impl Dataset {
         Err(Error::data(
             path,
             "dataset",
-            format!("holds neither {MANIFEST} (native layout) nor {} (NeRF-CA layout)", nerfca::GENERAL),
+            format!("contains neither {MANIFEST} (native layout) nor {} (NeRF-CA layout)", nerfca::GENERAL),
         ))
     }
 
@@ -300,7 +300,10 @@ impl Dataset {
             return Err(Error::data(
                 &file,
                 "format",
-                format!("`{}` version {}; expected `nertca-dataset` version 1", manifest.format, manifest.version),
+                format!(
+                    "is `{}` version {}, but `nertca-dataset` version 1 is expected",
+                    manifest.format, manifest.version
+                ),
             ));
         }
         let half = manifest.depth_half_extent_mm / MM_PER_UNIT;
@@ -321,7 +324,7 @@ impl Dataset {
                 Some(name) => {
                     let mask = images::read_image(&path.join(name))?;
                     if (mask.width, mask.height) != (image.width, image.height) {
-                        return Err(Error::data(path.join(name), "shape", "differs from its image's"));
+                        return Err(Error::data(path.join(name), "shape", "differs from the shape of its image"));
                     }
                     Some(mask.values.iter().map(|v| *v != 0.0).collect())
                 }
@@ -428,7 +431,11 @@ impl Builder {
         vessel_attenuation: Option<f64>,
     ) -> Result<Builder> {
         if n_phases == 0 || n_phases > MAX_PHASES {
-            return Err(Error::data(file, "phases", format!("{n_phases}; 1 to {MAX_PHASES} are accepted")));
+            return Err(Error::data(
+                file,
+                "phases",
+                format!("{n_phases} is not in the accepted range, 1 to {MAX_PHASES}"),
+            ));
         }
         if vessel_attenuation.is_some_and(|a| !(a.is_finite() && a > 0.0)) {
             return Err(Error::data(file, "vessel_attenuation_per_mm", "is not a positive number"));
@@ -447,7 +454,7 @@ impl Builder {
     pub(super) fn add<F: Fn(f32) -> f32>(&mut self, new: NewFrame<'_, F>) -> Result<()> {
         let field = |name: &str| format!("frames[{}].{name}", new.index);
         if self.frames.len() >= MAX_FRAMES {
-            return Err(Error::data(&self.file, "frames", format!("more than {MAX_FRAMES}")));
+            return Err(Error::data(&self.file, "frames", format!("has more than {MAX_FRAMES} frames")));
         }
         if !new.heart_shift_mm.iter().all(|s| s.is_finite() && s.abs() < 1e3) {
             return Err(Error::data(&self.file, field("heart_shift_mm"), "is not a displacement in mm"));
@@ -491,7 +498,7 @@ impl Builder {
             return Err(Error::data(&self.file, "frames", "is empty"));
         };
         if !self.frames.iter().any(|f| f.split == Split::Train) {
-            return Err(Error::data(&self.file, "frames", "none is for training"));
+            return Err(Error::data(&self.file, "frames", "has no training frame"));
         }
         self.frames.sort_by_key(|f| f.split);
         self.notes.extend(untrained_phases(&self.frames, self.n_phases));
@@ -518,8 +525,12 @@ fn untrained_phases(frames: &[Frame], n_phases: u32) -> Option<String> {
     let mut seen = vec![false; n_phases as usize];
     frames.iter().filter(|f| f.split == Split::Train).for_each(|f| seen[f.phase as usize] = true);
     let unseen: Vec<u32> = (0..n_phases).filter(|p| !seen[*p as usize]).collect();
-    (!unseen.is_empty())
-        .then(|| format!("no training frame shows phase {}: the moving field is a guess there", list_of(&unseen)))
+    (!unseen.is_empty()).then(|| {
+        format!(
+            "no training frame shows phase {}, so the dynamic field is not determined by images there",
+            list_of(&unseen)
+        )
+    })
 }
 
 /// Formats numbers as a list in which consecutive numbers are written as first-last.

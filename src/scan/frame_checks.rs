@@ -36,7 +36,7 @@ pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complai
         return Ok(());
     }
     let problem = format!(
-        "phases go from 0 to {}, and what lies between two from 0 to below {n_phases}",
+        "is out of range: phases go from 0 to {}, and times between two phases from 0 to below {n_phases}",
         n_phases.saturating_sub(1)
     );
     Err(Complaint::new("phase", time_phases, problem))
@@ -47,7 +47,8 @@ pub(crate) fn check_phase(time_phases: f64, n_phases: u32) -> Result<(), Complai
 pub(crate) fn checked_view(geometry: Geometry, size: [usize; 2], depth_before: f64) -> Result<View, Complaint> {
     let view = View::new(geometry, size).map_err(|(field, problem)| Complaint::new(&field, "", problem))?;
     if view.rays.sod <= depth_before {
-        let problem = format!("the source stands inside the depth range of {:.0} mm", depth_before * MM_PER_UNIT);
+        let problem =
+            format!("is too small: the source is inside the depth range of {:.0} mm", depth_before * MM_PER_UNIT);
         return Err(Complaint::new("sod_mm", format!("{:.0}", view.rays.sod * MM_PER_UNIT), problem));
     }
     Ok(view)

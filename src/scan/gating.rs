@@ -133,13 +133,13 @@ impl RPeaks {
     /// [`Error::Config`] for fewer than two times, and for times that are not finite or do not increase.
     pub fn new(times_s: &[f64]) -> Result<RPeaks> {
         if times_s.len() < 2 {
-            return Err(Error::config("r_peaks", times_s.len(), "at least two R-peaks bound a beat"));
+            return Err(Error::config("r_peaks", times_s.len(), "R-peaks are given, but at least two are needed"));
         }
         if let Some(bad) = times_s.iter().find(|t| !t.is_finite()) {
             return Err(Error::config("r_peaks", bad, "is not a time in seconds"));
         }
         if let Some(w) = times_s.windows(2).find(|w| w[1] <= w[0]) {
-            return Err(Error::config("r_peaks", w[1], format!("does not follow {}: times must rise", w[0])));
+            return Err(Error::config("r_peaks", w[1], format!("is not after {}: times must increase", w[0])));
         }
         Ok(RPeaks { times_s: times_s.to_vec() })
     }
@@ -150,7 +150,11 @@ impl RPeaks {
     /// [`Error::Config`] for a rate outside 20 to 300 beats per minute.
     pub fn steady(beats_per_min: f64, start_s: f64, end_s: f64) -> Result<RPeaks> {
         if !(20.0..=300.0).contains(&beats_per_min) {
-            return Err(Error::config("heart rate", beats_per_min, "20 to 300 beats per minute are accepted"));
+            return Err(Error::config(
+                "heart rate",
+                beats_per_min,
+                "is not in the accepted range, 20 to 300 beats per minute",
+            ));
         }
         let beat = 60.0 / beats_per_min;
         let n = ((end_s - start_s).max(0.0) / beat).floor() as usize + 2;
@@ -261,7 +265,7 @@ mod tests {
     #[test]
     fn r_peaks_must_rise() {
         assert!(RPeaks::new(&[1.0]).is_err());
-        assert!(RPeaks::new(&[1.0, 1.0]).unwrap_err().to_string().contains("must rise"));
+        assert!(RPeaks::new(&[1.0, 1.0]).unwrap_err().to_string().contains("must increase"));
         assert!(RPeaks::new(&[1.0, f64::NAN]).is_err());
         assert_eq!(phase(&RPeaks::steady(60.0, 0.5, 3.0).unwrap(), 1.75, Linear), Some(2));
     }

@@ -32,7 +32,8 @@ impl Dataset {
             let count = hidden.iter().filter(|h| **h).count();
             if count > 0 {
                 self.notes.push(format!(
-                    "view {view}: {:.0} % of the pixels are hidden, as behind a collimator's blade: nothing is learned from them",
+                    "view {view}: {:.0} % of the pixels show nothing of the patient, e.g. behind a blade of the \
+                     collimator, and are ignored",
                     100.0 * count as f64 / hidden.len() as f64
                 ));
             }

@@ -124,14 +124,14 @@ pub fn open(path: &Path) -> Result<Dataset> {
         let frame = &entry.frame;
         let read = |field: &str, name: &str| -> Result<(PathBuf, Image)> {
             let found = resolve(path, &by_name, name)
-                .ok_or_else(|| entry.bad(field, format!("{name} is not below {}", path.display())))?;
+                .ok_or_else(|| entry.bad(field, format!("{name} was not found in {}", path.display())))?;
             let image = read_picture(&found, width, height)?;
             Ok((found, image))
         };
         let (source, image) = read("file_path", &frame.file_path)?;
         let [low, high] = frame.img_min_max;
         if !(low.is_finite() && high.is_finite() && high > low) {
-            return Err(entry.bad("img_min_max", format!("[{low}, {high}] is not a range")));
+            return Err(entry.bad("img_min_max", format!("[{low}, {high}] is not a valid range")));
         }
         let mask = match &frame.mask_file_path {
             None => None,
@@ -221,7 +221,7 @@ fn heart_phases(entries: &[Entry]) -> Result<Vec<u32>> {
         if phase.fract() == 0.0 && (0.0..f64::from(MAX_PHASES)).contains(&phase) {
             return Ok(phase as u32);
         }
-        let problem = format!("{phase}; phases count from 0 in whole numbers, up to {}", MAX_PHASES - 1);
+        let problem = format!("{phase} is not a whole number from 0 to {}", MAX_PHASES - 1);
         Err(entry.bad("heart_phase", problem))
     };
     entries.iter().map(check).collect()
@@ -236,7 +236,7 @@ fn number_phases(phases: &[u32]) -> (Vec<u32>, Option<String>) {
     let missing: Vec<u32> = (0..last).filter(|p| found.binary_search(p).is_err()).collect();
     let note = (!missing.is_empty()).then(|| {
         format!(
-            "no frame has heart_phase {}: those that occur, {}, are numbered 0-{}",
+            "no frame has heart_phase {}: the phases that occur, {}, are renumbered as 0-{}",
             list_of(&missing),
             list_of(&found),
             found.len() - 1
@@ -252,7 +252,8 @@ fn read_picture(path: &Path, width: usize, height: usize) -> Result<Image> {
     let wanted: Vec<usize> = [height, width].into_iter().filter(|n| *n != 1).collect();
     // A flat list of pixels is in row-major order.
     if long != wanted && shape[..] != [height * width] {
-        let problem = format!("{shape:?}; a picture of {height} rows and {width} columns is [{height}, {width}]");
+        let problem =
+            format!("is {shape:?}, but a picture of {height} rows and {width} columns needs [{height}, {width}]");
         return Err(Error::data(path, "shape", problem));
     }
     Ok(Image { width, height, values })

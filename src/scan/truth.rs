@@ -79,7 +79,10 @@ impl Truth {
         let truth: Truth = serde_json::from_slice(&files::read_limited(&file, MAX_BYTES)?)
             .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
         if truth.format != FORMAT || truth.version != VERSION {
-            let found = format!("`{}` version {}; expected `{FORMAT}` version {VERSION}", truth.format, truth.version);
+            let found = format!(
+                "is `{}` version {}, but `{FORMAT}` version {VERSION} is expected",
+                truth.format, truth.version
+            );
             return Err(Error::data(&file, "format", found));
         }
         Ok(truth)

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 /// ln(8.670397): the value of an unattenuated pixel in the authors' images.
 pub const I0_LOG: f64 = 2.159_914_6;
 /// Message for a dataset with images of different sizes, which the authors' layout cannot hold.
-const ONE_SIZE: &str = "has one size for all images, and this dataset has several";
+const ONE_SIZE: &str = "supports one size for all images only, and this dataset has several";
 
 /// Properties of a dataset other than its frames.
 #[derive(Debug, Clone)]
@@ -171,7 +171,7 @@ impl<'a> Writer<'a> {
             return Err(Error::config(
                 "layout",
                 "nerfca",
-                "has no displacements of the heart, as breathing makes them",
+                "does not support displacements of the heart, which this dataset has",
             ));
         }
         if let Some(frame) = self.manifest.frames.last_mut() {
@@ -185,12 +185,17 @@ impl<'a> Writer<'a> {
         let c_arm = match geometry {
             Geometry::CArm(c_arm) => c_arm,
             Geometry::Matrix(_) => {
-                return Err(Error::config("layout", "nerfca", "has angles and distances, no projection matrices"));
+                return Err(Error::config(
+                    "layout",
+                    "nerfca",
+                    "does not support projection matrices, only angles and distances",
+                ));
             }
         };
         let common = CArm { primary_deg: c_arm.primary_deg, secondary_deg: c_arm.secondary_deg, ..self.c_arm.clone() };
         if *c_arm != common {
-            let problem = "has distances, pixels and table once for all views, and those of this dataset differ";
+            let problem = "supports the same distances, pixels and table position for all views only, and they differ \
+                           in this dataset";
             return Err(Error::config("layout", "nerfca", problem));
         }
         Ok((c_arm.primary_deg, c_arm.secondary_deg))

@@ -14,9 +14,9 @@ use serde::Serialize;
 use std::borrow::Cow;
 
 /// Description of the Dice threshold for X-Gaussian, whose opacities are no attenuation.
-const OPACITY_RULE: &str = "the sum of opacities, by the published threshold of 0.05";
+const OPACITY_RULE: &str = "the published threshold of 0.05 on the sum of opacities";
 /// Description of the Dice threshold where no attenuation is stated.
-const VESSEL_RULE: &str = "Otsu on the predicted maximum projections, held at their 99.5th percentile";
+const VESSEL_RULE: &str = "Otsu's threshold of the predicted maximum projections, clipped at their 99.5th percentile";
 /// Share of an image's pixels whose change may exceed the one that counts as its strongest.
 const STRONGEST: f64 = 0.005;
 /// A dynamic field whose line integrals stay below this share of the strongest change in the data has vanished.
@@ -232,7 +232,7 @@ pub fn evaluate(
     mut observe: impl FnMut(Scoring<'_>) -> Result<()>,
 ) -> Result<Evaluation> {
     if frames.is_empty() {
-        return Err(Error::data(&dataset.path, "frames", "none is for validation"));
+        return Err(Error::data(&dataset.path, "frames", "has no validation frame"));
     }
     let mut seen = Vec::new();
     for frame in frames {
@@ -323,12 +323,12 @@ pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Op
     let strongest = f64::from(seen.dynamic_integral.iter().copied().fold(0.0, f32::max));
     let why = match (renderer.network_moves(), renderer.has_hull()) {
         (true, false) => {
-            "The run may be too short, or dynamic.lr too high: a longer one, a lower rate or another seed may help; check \
-             geometry and phases, too"
+            "The run may be too short, or dynamic.lr too high: try a longer run, a lower rate or another seed, and \
+             check geometry and phases"
         }
         (true, true) => {
-            "Views may disagree by more than the motion hull allows: check geometry and phases; a smaller hull.dilate_pixels, a \
-             lower dynamic.lr or another seed may help"
+            "Views may disagree by more than the motion hull allows: check geometry and phases, or try a smaller \
+             hull.dilate_pixels, a lower dynamic.lr or another seed"
         }
         (false, _) => {
             "Views may disagree by more than the motion hull allows: check geometry, phases and noise of the views"
@@ -336,8 +336,8 @@ pub fn moving_field_warning(renderer: &Renderer, dataset: &Dataset) -> Result<Op
     };
     Ok((strongest < DEAD_SHARE * change).then(|| {
         format!(
-            "The moving field has died: its line integrals reach {strongest:.2e} where the images change by {change:.2e}. \
-             Dice says nothing here. {why}."
+            "The dynamic field has become almost zero: its maximum line integral is {strongest:.2e}, but the images \
+             change by {change:.2e}. Dice is meaningless here. {why}."
         )
     }))
 }

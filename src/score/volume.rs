@@ -244,8 +244,8 @@ impl TrueVessels {
         if grown.element_product() > MOST_VOXELS as f64 {
             let [x, y, z] = grown.to_array();
             let problem = format!(
-                "these vessels and the moving field span {x} x {y} x {z} voxels of this size; {MOST_VOXELS} at most are \
-                 compared"
+                "these vessels and the dynamic field together cover {x} x {y} x {z} voxels of this size, but at most \
+                 {MOST_VOXELS} are compared"
             );
             return Err(Error::data(file, "sizes", problem));
         }

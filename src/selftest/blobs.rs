@@ -58,7 +58,7 @@ fn form(field: &MovingGaussians) -> &'static str {
     if field.tree().is_some() { "tree" } else { "phase" }
 }
 
-/// Compares integrals and largest values along rays, and pictures.
+/// Compares integrals and maximum values along rays, and pictures.
 ///
 /// # Errors
 /// Device errors.
@@ -76,7 +76,7 @@ pub fn compare_rays(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Resu
         let integrals: Vec<f64> = want.iter().map(|w| w.integral).collect();
         let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
         findings.numbers(RAYS, "integrals", &seen.dynamic_integral, &integrals, INTEGRAL);
-        findings.numbers(RAYS, "largest values", &seen.dynamic_max, &maxima, MAXIMUM);
+        findings.numbers(RAYS, "maximum values", &seen.dynamic_max, &maxima, MAXIMUM);
         let line = Quantity { component: Component::Dynamic, projection: Projection::Drr };
         let quick = renderer.show(rays, (width, height), phase, line)?;
         findings.numbers(PICTURES, "integrals", &quick, &integrals, PICTURE);
@@ -97,7 +97,7 @@ pub fn compare_rays(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Resu
     Ok(())
 }
 
-/// Compares the largest values along rays where more Gaussians overlap than peaks are kept of.
+/// Compares the maximum values along rays where more Gaussians overlap than peaks are kept of.
 ///
 /// # Errors
 /// Device errors.
@@ -116,7 +116,7 @@ pub fn compare_crowd(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Res
     let ray = |pixel: usize| rays.pixel((pixel % width) as f64, (pixel / width) as f64);
     let want: Vec<blobs::Along> = (0..width * height).map(|pixel| blobs::along(&set, ray(pixel))).collect();
     let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
-    findings.numbers(CROWD, "largest values", &seen.dynamic_max, &maxima, MAXIMUM.times(CROWD_SEARCH));
+    findings.numbers(CROWD, "maximum values", &seen.dynamic_max, &maxima, MAXIMUM.times(CROWD_SEARCH));
     Ok(())
 }
 
@@ -130,7 +130,7 @@ const CROWD_WIDTHS: [f64; 2] = [0.004, 0.1];
 /// Gaussians of phase 0, narrow and wide ones, in a model of R2-Gaussian.
 fn crowd(model: &Model) -> Result<MovingGaussians> {
     let Some(MovingGaussians::PerPhase(mut field)) = model.moving.clone() else {
-        return Err(Error::Internal("the model has no sets of Gaussians".into()));
+        return Err(Error::Internal("the model has no Gaussians".into()));
     };
     let pixels = model.scene.static_max[0] / field.units.pixel;
     let mut rows = random_gaussians(600, 1, 0.5 * pixels, 6);

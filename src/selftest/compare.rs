@@ -121,7 +121,7 @@ impl Findings {
         tolerance: Tolerance,
     ) {
         if want.iter().all(|w| *w == 0.0) {
-            return self.add(stages, &format!("{quantity}: nothing but zeros to compare with"), f64::INFINITY, 1.0);
+            return self.add(stages, &format!("{quantity}: all reference values are zero"), f64::INFINITY, 1.0);
         }
         match tolerance {
             Tolerance::OfNorm(most) => self.add(stages, quantity, relative_distance(got, want), most),

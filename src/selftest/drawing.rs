@@ -110,7 +110,7 @@ pub fn compare_views(gpu: &Gpu, preset: Preset, tuning: &Tuning, findings: &mut 
     let stages = if two_networks { VIEW_OF_TWO } else { VIEW };
     findings.numbers(stages, "static integrals", &seen.static_integral, &statics, PIXEL);
     findings.numbers(stages, "dynamic integrals", &seen.dynamic_integral, &dynamics, PIXEL);
-    findings.numbers(stages, "largest values", &seen.dynamic_max, &largest, PIXEL);
+    findings.numbers(stages, "maximum values", &seen.dynamic_max, &largest, PIXEL);
     Ok(())
 }
 

@@ -388,7 +388,7 @@ impl Twin<'_> {
         }
         strays += samples.iter().filter(|sample| sample.ray >= self.rays.len()).count();
         strays += samples.len().abs_diff(seen.loss.live_samples as usize);
-        findings.add(SAMPLES, "live samples too many or few", strays as f64, STRAY_SAMPLES);
+        findings.add(SAMPLES, "difference of the number of live samples", strays as f64, STRAY_SAMPLES);
         findings.add(SAMPLES, "places of samples", worst, POSITION);
     }
 
@@ -568,7 +568,7 @@ fn parts(params: &ParamMap, [output, layers, latents]: [&'static [&'static str];
                 }
                 parts.push(part(layers, tensor.name.clone(), of_weights));
                 if sees_input {
-                    last.push(part(latents, format!("{} on the latent", tensor.name), of_latents));
+                    last.push(part(latents, format!("{} on the latent vector", tensor.name), of_latents));
                 }
             }
             // Biases of layers without latents are summed with the weights; the others come from the sums per phase.

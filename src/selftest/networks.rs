@@ -97,7 +97,7 @@ impl Pairs {
         let moving = samples(gpu, trainer, loss.live_samples as usize)?;
         let n = moving.len();
         let gradient =
-            still.sigma_gradient().ok_or_else(|| Error::Internal("the network is not for training".into()))?;
+            still.sigma_gradient().ok_or_else(|| Error::Internal("the network was not created for training".into()))?;
         Ok(Pairs {
             still: gpu.download(still.sigma(), 0, n)?,
             gradient: [
@@ -154,7 +154,7 @@ impl Twin<'_> {
     fn compare(&self, gpu: &Gpu, loss: StepLoss, findings: &mut Findings) -> Result<()> {
         let (forward, training, plan) =
             (self.trainer.fields()?.forward(), self.trainer.fields()?.training(), self.trainer.plan());
-        let missing = || Error::Internal("the still field is no network".into());
+        let missing = || Error::Internal("the static field is not a network".into());
         let (still, networks) =
             (self.trainer.fields()?.still().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
         let n = self.rays.len();

@@ -32,7 +32,7 @@ const SETTINGS: &[&str] =
 /// # Errors
 /// Device errors.
 pub fn compare(gpu: &Gpu, dataset: &Dataset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
-    findings.begin(path_name(tuning.layers), "fast-mlp, a field at rest");
+    findings.begin(path_name(tuning.layers), "fast-mlp, a field that does not change");
     let mut plan = Plan::new(&small_config(Preset::FastMlp, SETTINGS)?, dataset)?;
     plan.setup.occupancy_threshold = threshold(gpu, dataset, &plan, tuning)?;
     let mut trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
@@ -54,7 +54,7 @@ fn advance(trainer: &mut Trainer, until: u32) -> Result<StepLoss> {
     while trainer.step() < until {
         last = trainer.advance(until)?.last().copied().or(last);
     }
-    last.ok_or_else(|| Error::Internal(format!("no iteration up to {until} left a loss")))
+    last.ok_or_else(|| Error::Internal(format!("no iteration up to {until} has written a loss")))
 }
 
 fn notes(gpu: &Gpu, trainer: &Trainer) -> Result<Vec<u32>> {
@@ -88,7 +88,7 @@ fn compare_notes(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> R
         }
     }
     let wrong = after.iter().zip(&want).filter(|(after, want)| after != want).count();
-    findings.add(NOTES, &format!("words with other bits, of {}", want.len()), wrong as f64, 0.5);
+    findings.add(NOTES, &format!("words that differ, of {}", want.len()), wrong as f64, 0.5);
     findings.require(NOTES, "cells of both kinds", kinds.iter().all(|n| *n > 10));
     Ok(())
 }
@@ -111,7 +111,7 @@ fn compare_use(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> Res
     }
     // A sample on a cell face may fall either way in f32.
     let strays = 1.0 + (kept / 50) as f64;
-    findings.add(HEEDED, "live samples too many or few", live.abs_diff(kept) as f64, strays);
-    findings.require(HEEDED, "samples that are left out", kept * 10 < all * 9);
+    findings.add(HEEDED, "difference of the number of live samples", live.abs_diff(kept) as f64, strays);
+    findings.require(HEEDED, "samples that are omitted", kept * 10 < all * 9);
     Ok(())
 }

@@ -44,7 +44,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     for (view, image) in projector.project(&loaded, &views, DVec3::ZERO)?.iter().enumerate() {
         let want = twin(&volume, &views[view]);
         findings.numbers(PROJECT, &format!("view {view}"), image, &want, PIXEL);
-        findings.require(PROJECT, "rays that miss", want.contains(&0.0));
+        findings.require(PROJECT, "rays that miss the volume", want.contains(&0.0));
     }
     // Moving the volume moves the image: the same as a volume with another origin.
     let shift_mm = DVec3::new(4.0, -3.0, 8.0);

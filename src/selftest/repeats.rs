@@ -15,7 +15,7 @@ use crate::train::gaussians::GaussianTrainer;
 use crate::train::trainer::Trainer;
 use crate::train::tree::TreeTrainer;
 
-const REPEATS: &[&str] = &["equal runs, equal bits"];
+const REPEATS: &[&str] = &["equal runs have equal bits"];
 
 /// Iterations of each run.
 const ITERATIONS: u32 = 24;
@@ -25,7 +25,7 @@ const STOPS: [&[u32]; 2] = [&[ITERATIONS], &[5, 6, ITERATIONS]];
 /// Records how many numbers of two equal runs differ. Losses come first.
 fn compare_runs(run: impl Fn(&[u32]) -> Result<Vec<u64>>, findings: &mut Findings) -> Result<()> {
     let [whole, parts] = [run(STOPS[0])?, run(STOPS[1])?];
-    findings.require(REPEATS, "losses that change", whole.first() != whole.get(1));
+    findings.require(REPEATS, "losses that differ", whole.first() != whole.get(1));
     let differ = whole.iter().zip(&parts).filter(|(a, b)| a != b).count() + whole.len().abs_diff(parts.len());
     findings.add(REPEATS, &format!("numbers that differ, of {}", whole.len()), differ as f64, 0.5);
     Ok(())

@@ -87,7 +87,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     compare_gradient(&device_gradient(gpu, trainer.particles(), n)?, &want, GRADIENT, findings);
     let got = vectors(gpu, &trainer.own_motion().place_gradient, places.len())?;
     let want: Vec<f64> = places.iter().flat_map(DVec3::to_array).collect();
-    findings.numbers(GRADIENT, "gradient of places", &got, &want, NUMBERS);
+    findings.numbers(GRADIENT, "gradient of positions", &got, &want, NUMBERS);
     let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
     compare_motion(gpu, &trainer, &tree, (&p, &gradient), findings)?;
     findings.add(REPORT, "loss", (loss / twin_loss - 1.0).abs(), LOSS);

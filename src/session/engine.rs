@@ -88,7 +88,7 @@ pub(super) struct Control {
 }
 
 pub(super) fn nothing_yet() -> Error {
-    Error::NotReady("there is no reconstruction yet: train, or load a checkpoint".into())
+    Error::NotReady("there is no reconstruction yet: train first, or load a checkpoint".into())
 }
 
 impl Engine {
@@ -114,7 +114,7 @@ impl Shared {
     pub(super) fn device(&self) -> Result<(&Gpu, &Tuning)> {
         match (&self.gpu, &self.tuning) {
             (Some(gpu), Some(tuning)) => Ok((gpu, tuning)),
-            _ => Err(Error::NoDevice("the context was made without a device".into())),
+            _ => Err(Error::NoDevice("the context was created without a device".into())),
         }
     }
 
@@ -180,7 +180,9 @@ impl Shared {
             let mut state = training.trainer_mut().checkpoint()?;
             let fits = holds(&state.model, &fresh.scene);
             if !fits {
-                tracing::warn!("new frames show vessels outside the box trained so far: training starts over");
+                tracing::warn!(
+                    "new frames show vessels outside the box that was trained so far, so training starts again"
+                );
                 earlier = state.model.moving.take();
             }
             engine.saved = fits.then_some(state);
@@ -198,7 +200,7 @@ impl Shared {
                 Trainer::carry_on(gpu, plan, &dataset, tuning, state)?
             }
         };
-        tracing::info!("training on {} frames from iteration {}", dataset.training().len(), trainer.step());
+        tracing::info!("training on {} frames starts at iteration {}", dataset.training().len(), trainer.step());
         trainer.plan().notes.iter().for_each(|note| tracing::info!("{note}"));
         *lock(&self.calibration) = Some(calibration);
         engine.frames = dataset.training().len() as u32;

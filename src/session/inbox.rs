@@ -76,13 +76,17 @@ impl Inbox {
         let pixels = new.width.checked_mul(new.height).filter(|n| *n > 0);
         if pixels != Some(new.integrals.len()) || new.mask.as_ref().is_some_and(|m| Some(m.len()) != pixels) {
             let size = format!("{} x {}", new.width, new.height);
-            return Err(bad("size", size, "does not fit its pixels or mask".into()));
+            return Err(bad("size", size, "does not agree with the number of pixels, or with that of the mask".into()));
         }
         check_values(&new.integrals, new.width).map_err(told)?;
         match new.moment {
             Moment::Phase(phase) => check_phase(phase.into(), self.options.phases).map_err(told)?,
             Moment::Beat(BeatTime { after_phase, .. }) if !(-0.5..=0.5).contains(&after_phase) => {
-                return Err(bad("time", after_phase.to_string(), "phases after the nearest phase: -0.5 to 0.5".into()));
+                return Err(bad(
+                    "time",
+                    after_phase.to_string(),
+                    "is out of range: -0.5 to 0.5 phases after the nearest phase are accepted".into(),
+                ));
             }
             Moment::Beat(taken) => check_phase(taken.phase.into(), self.options.phases).map_err(told)?,
             Moment::TimeS(time) if !time.is_finite() => {
@@ -114,7 +118,13 @@ impl Inbox {
 
     /// A frame, counted from 0 as they were added.
     pub(super) fn frame(&self, index: usize) -> Result<&(Frame, Moment)> {
-        let none = || Error::config("frame", index, format!("{} were added; they count from 0", self.frames.len()));
+        let none = || {
+            Error::config(
+                "frame",
+                index,
+                format!("there is no such frame: {} were added, and they are counted from 0", self.frames.len()),
+            )
+        };
         self.frames.get(index).ok_or_else(none)
     }
 
@@ -153,7 +163,8 @@ impl Inbox {
         let Some([width, height]) = onto_canvas(&self.views, &mut frames).map_err(told)? else {
             let n = self.frames.len();
             return Err(Error::NotReady(format!(
-                "none of {n} frames can be used: a phase, or a time stamp and R-peaks, is needed, and two phases of a view"
+                "none of {n} frames can be used: a frame needs a phase, or a time stamp and R-peaks, and its view \
+                 needs frames of two phases"
             )));
         };
         let half = self.options.depth_half_extent_mm / MM_PER_UNIT;
@@ -184,8 +195,9 @@ impl Inbox {
         let views = dataset.training_views().len();
         if temporal && views < 2 {
             return Err(Error::NotReady(format!(
-                "{views} views at two phases or more, where at least two are needed (where the C-arm turns or the table moves, \
-                 each frame is a view: the preset paper goes by whole images instead)"
+                "{views} views have frames of two or more phases, and at least two such views are needed (if the C-arm \
+                 turns or the table moves, each frame is a view of its own: use the preset paper, which is trained on \
+                 whole images)"
             )));
         }
         Ok(dataset)

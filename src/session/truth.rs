@@ -31,11 +31,15 @@ impl Session {
         vessels.grid.check()?;
         let voxels = vessels.grid.size.iter().map(|n| u64::from(*n)).product::<u64>();
         if voxels != vessels.inside.len() as u64 {
-            let problem = format!("{voxels} voxels are needed for this grid");
+            let problem = format!("is not the number of voxels of this grid, {voxels}");
             return Err(Error::config("vessels", vessels.inside.len(), problem));
         }
         if voxels > MOST_VOXELS {
-            return Err(Error::config("vessels", voxels, format!("{MOST_VOXELS} voxels at most are compared")));
+            return Err(Error::config(
+                "vessels",
+                voxels,
+                format!("exceeds the maximum number of voxels, {MOST_VOXELS}"),
+            ));
         }
         lock(&self.known).volumes.insert(phase, vessels);
         Ok(())
@@ -60,7 +64,7 @@ impl Session {
         if phase < phases {
             return Ok(());
         }
-        Err(Error::config("phase", phase, format!("phases go from 0 to {}", phases.saturating_sub(1))))
+        Err(Error::config("phase", phase, format!("is out of range: phases go from 0 to {}", phases.saturating_sub(1))))
     }
 
     /// Scores the frames that were added for validation, and the reconstruction against the true vessels where these are known,
@@ -112,19 +116,19 @@ fn check_lines(trees: &BTreeMap<u32, Vec<TrueLine>>) -> Result<()> {
     let lengths = |lines: &[TrueLine]| lines.iter().map(|line| line.points_mm.len()).collect::<Vec<_>>();
     let Some((first, rest)) = trees.first_key_value() else { return Ok(()) };
     if *first != 0 {
-        return bad(0, "has no line, and others are compared with it");
+        return bad(0, "has no line, but the other phases are compared with phase 0");
     }
     for (phase, lines) in trees {
         if lengths(lines) != lengths(rest) {
-            return bad(*phase, "has other lines, or other numbers of points on them, than phase 0");
+            return bad(*phase, "has another number of lines, or of points on a line, than phase 0");
         }
         for line in lines {
             let numbers = line.points_mm.iter().flat_map(|p| p.to_array()).chain(line.radius_mm.iter().copied());
             if line.points_mm.len() < 2 || line.radius_mm.len() != line.points_mm.len() {
-                return bad(*phase, "has a line without two points, or without a radius at each");
+                return bad(*phase, "has a line of fewer than two points, or not exactly one radius per point");
             }
             if !numbers.into_iter().all(f64::is_finite) || line.radius_mm.iter().any(|r| *r < 0.0) {
-                return bad(*phase, "has a point or a radius that cannot be");
+                return bad(*phase, "has a point or a radius that is not finite, or a negative radius");
             }
         }
     }

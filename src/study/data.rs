@@ -98,7 +98,7 @@ impl PhantomSection {
 
     fn degradations(&self) -> std::result::Result<Degradations, String> {
         let photons = match (self.photons, self.detector_photons) {
-            (Some(_), Some(_)) => return Err("either `photons` or `detector_photons`, not both".into()),
+            (Some(_), Some(_)) => return Err("`photons` and `detector_photons` cannot be used together".into()),
             (open, detector) => open.map(Photons::Unattenuated).or(detector.map(Photons::Detector)),
         };
         Ok(Degradations {
@@ -116,12 +116,14 @@ impl PhantomSection {
     fn anatomy(&self, places: &Places<'_>) -> std::result::Result<Option<Anatomy>, String> {
         let Some(tree) = &self.tree else {
             return match self.background.is_some() || self.iodine_per_mm.is_some() {
-                true => Err("`background` and `iodine_per_mm` belong to a `tree`".into()),
+                true => Err("`background` and `iodine_per_mm` need a `tree`".into()),
                 false => Ok(None),
             };
         };
         if self.geometry.is_some() {
-            return Err("`geometry` is a published set-up with a tree of its own; not with `tree`".into());
+            return Err(
+                "`geometry` is a published set-up with its own tree and cannot be used together with `tree`".into()
+            );
         }
         let [sod_mm, sid_mm, field_mm] = USUAL_C_ARM_MM;
         Ok(Some(Anatomy {
@@ -221,11 +223,11 @@ pub(super) fn phantoms(
     let anatomy = section.anatomy(places)?;
     let degradations = section.degradations()?;
     if section.volumes == Some(false) && section.volumes_every.is_some() {
-        return Err("`volumes_every` says which volumes are written, `volumes` that none is: either".into());
+        return Err("`volumes_every` and `volumes = false` contradict each other".into());
     }
     let numbers = section.views.clone().unwrap_or_else(|| vec![USUAL_VIEWS]);
     if let Some(i) = (1..numbers.len()).find(|i| numbers[..*i].contains(&numbers[*i])) {
-        return Err(format!("views: {} stands twice", numbers[i]));
+        return Err(format!("views: {} is given twice", numbers[i]));
     }
     let mut files = Fingerprint::default();
     for file in anatomy.iter().flat_map(|a| [Some(&a.tree), a.background.as_ref()]).flatten() {

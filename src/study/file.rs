@@ -91,7 +91,7 @@ pub fn read(file: &Path, data_directory: Option<&Path>) -> Result<Study> {
         let sets = data_sets(&text, &places, section, &read.phantom)?;
         if let Some(set) = sets.iter().find(|set| data.iter().any(|other| other.id == set.id)) {
             return Err(
-                text.fault(&section.name.span(), format!("another data set's runs are called `{}`, too", set.id))
+                text.fault(&section.name.span(), format!("the runs of another data set are also called `{}`", set.id))
             );
         }
         data.extend(sets);
@@ -105,12 +105,12 @@ pub fn read(file: &Path, data_directory: Option<&Path>) -> Result<Study> {
     let published = read.published.as_ref().map(|path| published(&text, &places, path, &read.method)).transpose()?;
     for (what, none) in [("[[data]]", data.is_empty()), ("[[method]]", methods.is_empty())] {
         if none {
-            return Err(Error::data(file, what, "at least one is needed"));
+            return Err(Error::data(file, what, "is missing: at least one is needed"));
         }
     }
     let runs = data.len() * methods.len() * read.seeds.get_ref().len();
     if runs > MAX_RUNS {
-        return Err(Error::data(file, "runs", format!("{runs}; at most {MAX_RUNS} are accepted")));
+        return Err(Error::data(file, "runs", format!("{runs} exceeds the maximum, {MAX_RUNS}")));
     }
     let table = layout(&text, read.table)?;
     Ok(Study { title: read.title, seeds: read.seeds.into_inner(), data, methods, table, published })
@@ -124,7 +124,8 @@ fn layout(text: &Text<'_>, section: TableSection) -> Result<TableLayout> {
             let at = columns.span();
             let columns = columns.into_inner();
             if (1..columns.len()).any(|i| columns[..i].contains(&columns[i])) || columns.len() > 2 {
-                let problem = "columns: at most two of data, views and method, each once; rows are the rest";
+                let problem = "columns: at most two of data, views and method are accepted, each once; the others are \
+                               rows";
                 return Err(text.fault(&at, problem));
             }
             columns
@@ -146,7 +147,7 @@ fn seeds(text: &Text<'_>, seeds: &Spanned<Vec<u32>>) -> Result<()> {
         return Err(text.fault(&seeds.span(), "seeds: at least one is needed"));
     }
     match (1..list.len()).find(|i| list[..*i].contains(&list[*i])) {
-        Some(i) => Err(text.fault(&seeds.span(), format!("seeds: {} stands twice", list[i]))),
+        Some(i) => Err(text.fault(&seeds.span(), format!("seeds: {} is given twice", list[i]))),
         None => Ok(()),
     }
 }
@@ -155,11 +156,11 @@ fn seeds(text: &Text<'_>, seeds: &Spanned<Vec<u32>>) -> Result<()> {
 fn check_name(text: &Text<'_>, name: &Spanned<String>, seen: &mut HashSet<String>, what: &str) -> Result<()> {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     if name.get_ref().is_empty() || !name.get_ref().chars().all(plain) {
-        let problem = format!("name `{}`: ASCII letters, digits, `-` and `_` are accepted", name.get_ref());
+        let problem = format!("name `{}`: only ASCII letters, digits, `-` and `_` are accepted", name.get_ref());
         return Err(text.fault(&name.span(), problem));
     }
     if !seen.insert(name.get_ref().clone()) {
-        return Err(text.fault(&name.span(), format!("name `{}`: another {what} has it", name.get_ref())));
+        return Err(text.fault(&name.span(), format!("name `{}`: another {what} has the same name", name.get_ref())));
     }
     Ok(())
 }
@@ -173,9 +174,8 @@ fn data_sets(
     let name = section.name.get_ref();
     let label = section.label.as_ref().unwrap_or(name);
     match (&section.directory, &section.phantom) {
-        (Some(_), Some(phantom)) => {
-            Err(text.fault(&phantom.span(), format!("data set `{name}`: either `phantom` or `directory`, not both")))
-        }
+        (Some(_), Some(phantom)) => Err(text
+            .fault(&phantom.span(), format!("data set `{name}`: `phantom` and `directory` cannot be used together"))),
         (Some(path), None) => {
             let at = path.span();
             let found = places.find(path.get_ref()).map_err(|e| text.fault(&at, format!("data set `{name}`: {e}")))?;
@@ -224,7 +224,7 @@ fn configuration(
         let fault = |problem: String| text.fault(&setting.span(), format!("method `{name}`: {problem}"));
         let key = setting.get_ref().split('=').next().unwrap_or_default().trim();
         if let Some((_, owner)) = OWNED.iter().find(|(owned, _)| *owned == key) {
-            return Err(fault(format!("`{key}` comes from {owner}")));
+            return Err(fault(format!("`{key}` is set by {owner}")));
         }
         if key == ITERATIONS && section.iterations.is_some() {
             return Err(fault(format!("`{key}` contradicts the method's `iterations`")));
@@ -267,7 +267,7 @@ fn published(
     let known = published.methods();
     let mut asked = methods.iter().filter_map(|method| method.published.as_ref());
     if let Some(name) = asked.find(|name| !known.contains(&name.get_ref().as_str())) {
-        let problem = format!("published = `{}`: its values are for {}", name.get_ref(), known.join(", "));
+        let problem = format!("published = `{}`: the file has values for {} only", name.get_ref(), known.join(", "));
         return Err(text.fault(&name.span(), problem));
     }
     Ok(published)

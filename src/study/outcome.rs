@@ -191,7 +191,11 @@ impl Outcome {
             .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
         if outcome.format != FORMAT || outcome.version != VERSION {
             let found = format!("`{}` version {}", outcome.format, outcome.version);
-            return Err(Error::data(&file, "format", format!("{found}; expected `{FORMAT}` version {VERSION}")));
+            return Err(Error::data(
+                &file,
+                "format",
+                format!("is {found}, but `{FORMAT}` version {VERSION} is expected"),
+            ));
         }
         Ok(Some(outcome))
     }

@@ -49,14 +49,14 @@ impl Score {
     fn look(self) -> Look {
         let (name, heading, meaning, digits, more_is_better) = match self {
             Score::Dice => {
-                let meaning = "moving field on all unseen images, a fifth of the stated attenuation counts as vessel \
-                               (Otsu's threshold where none is stated, 0.05 of X-Gaussian's opacities)";
+                let meaning = "dynamic field on all unseen images, thresholded at a fifth of the stated attenuation of \
+                               vessels (at Otsu's threshold where none is stated, at 0.05 for X-Gaussian's opacities)";
                 ("dice", "Dice", meaning, 3, true)
             }
-            Score::DiceTotal => ("dice-total", "Dice, total", "both fields, otherwise as Dice", 3, true),
+            Score::DiceTotal => ("dice-total", "Dice, total", "both fields, otherwise like Dice", 3, true),
             Score::DicePaper => {
-                let meaning = "as the paper describes it: moving field on all unseen images, at the authors' threshold \
-                               of 0.05 per 100 mm";
+                let meaning = "as the paper describes it: dynamic field on all unseen images, at the authors' \
+                               threshold of 0.05 per 100 mm";
                 ("dice-paper", "Dice, paper's way", meaning, 3, true)
             }
             Score::DiceAuthors => {
@@ -64,9 +64,15 @@ impl Score {
                                100 mm";
                 ("dice-authors", "Dice, authors' code", meaning, 3, true)
             }
-            Score::DiceBest => ("dice-best", "best Dice", "at the threshold found with the masks; no score", 3, true),
+            Score::DiceBest => (
+                "dice-best",
+                "best Dice",
+                "at the best threshold, which needs the masks and is therefore not a score",
+                3,
+                true,
+            ),
             Score::DiceOtsu => {
-                let meaning = "of X-Gaussian alone: Otsu's threshold of each unseen image's own sums of opacities";
+                let meaning = "for X-Gaussian only: Otsu's threshold of the sums of opacities of each unseen image";
                 ("dice-otsu", "Dice, Otsu", meaning, 3, true)
             }
             Score::Psnr => ("psnr", "PSNR", "dB, unseen images", 2, true),
@@ -75,7 +81,13 @@ impl Score {
             Score::Hausdorff95Mm => ("hausdorff95-mm", "Hausdorff 95 %, mm", "distance to the true vessels", 2, false),
             Score::ClDice => ("cl-dice", "clDice", "centrelines in 3D", 3, true),
             Score::Minutes => ("minutes", "minutes", "of training", 2, false),
-            Score::Fps => ("fps", "FPS", "renderings of all that is scored, at the size of the images", 2, true),
+            Score::Fps => (
+                "fps",
+                "FPS",
+                "frames per second of renderings of all scored fields, at the size of the images",
+                2,
+                true,
+            ),
         };
         Look { name, heading, meaning, digits, more_is_better }
     }

@@ -280,7 +280,7 @@ impl Gathered {
             notes.push(format!("Made by {}.", self.made_by.join("; ")));
         }
         if self.others > 0 {
-            let problem = "of other data or another configuration than the study's, and left out";
+            let problem = "from data or a configuration that differ from the study's, and are omitted";
             notes.push(format!("{} results in this directory are {problem}.", self.others));
         }
         notes.extend(self.failures.into_iter().chain(self.warnings));

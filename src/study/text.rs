@@ -38,7 +38,7 @@ impl<'a> Places<'a> {
         let found = self.0.iter().map(|place| place.join(path)).find(|path| path.exists());
         found.ok_or_else(|| {
             let places: Vec<String> = self.0.iter().map(|place| place.display().to_string()).collect();
-            format!("`{}` is missing; looked for in {}", path.display(), places.join(" and "))
+            format!("`{}` was not found in {}", path.display(), places.join(" and "))
         })
     }
 }

@@ -90,7 +90,7 @@ impl Workplace<'_> {
     /// lost device, memory occupied by others, no device; errors of writing results.
     pub fn work(&self, study: &Study, run: &Run, observe: Observe<'_>) -> Result<Outcome> {
         let Some(_alone) = Lock::take(&self.directory.join("locks").join(format!("run-{}", run.id)))? else {
-            return Err(Error::Busy(format!("another process is at the run {}", run.id)));
+            return Err(Error::Busy(format!("another process is executing the run {}", run.id)));
         };
         if let Some(outcome) = self.done(study, run)? {
             return Ok(outcome);

@@ -32,7 +32,7 @@ impl Verdict {
     /// Returns `tuning` on the faster path, with the reason.
     pub fn apply(&self, tuning: Tuning) -> Tuning {
         let text = format!(
-            "{} layers: {:.3} ms per iteration in f32, {:.3} ms on matrices, timed once on this device",
+            "{} layers: an iteration takes {:.3} ms in f32 and {:.3} ms on matrices, timed once on this device",
             match self.layers() {
                 Layers::F32 => "f32",
                 Layers::Matrices => "matrix",

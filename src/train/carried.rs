@@ -48,10 +48,16 @@ impl Carried {
         let explained = least_explained(trainer.targets(), &trainer.images()?).unwrap_or(0.0);
         let percent = 100.0 * explained;
         if explained < LEAST_EXPLAINED {
-            tracing::info!("Gaussians are fitted anew: those so far explain {percent:.0} % of some view or phase");
+            tracing::info!(
+                "Gaussians are fitted from the start, because the earlier ones explain only {percent:.0} % of some \
+                 view or phase"
+            );
             return Ok(Carried::anew(trainer.into_targets()));
         }
-        tracing::info!("Gaussians go on from those so far, which explain {percent:.0} % of every view and phase");
+        tracing::info!(
+            "the fit continues from the earlier Gaussians, which explain at least {percent:.0} % of every view and \
+             phase"
+        );
         Ok(Carried::On(Box::new(trainer)))
     }
 }

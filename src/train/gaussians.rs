@@ -249,10 +249,11 @@ pub(super) fn strong(rows: &[Gaussian], setup: &GaussianSetup, weakest: f64) -> 
 pub(super) fn check_count(particles: &Particles) -> Result<u32> {
     let n = particles.rows.len();
     if n == 0 {
-        let problem = "no Gaussian is left: nothing in the images moves, or gaussians.weakest is too high";
+        let problem = "no Gaussian is left: there is no motion in the images, or the pruning threshold \
+                       gaussians.weakest is too high";
         return Err(Error::config("gaussians.count", n, problem));
     }
-    u32::try_from(n).map_err(|_| Error::config("gaussians.count", n, "too many Gaussians"))
+    u32::try_from(n).map_err(|_| Error::config("gaussians.count", n, "is too many Gaussians"))
 }
 
 fn record(

@@ -152,7 +152,7 @@ impl MovingFit {
 }
 
 fn not_begun() -> Error {
-    Error::Internal("the tree's iterations have not begun".into())
+    Error::Internal("the iterations of the deformable set have not begun".into())
 }
 
 /// The dynamic field of a run, where it is made of Gaussians.

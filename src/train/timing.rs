@@ -399,7 +399,7 @@ impl GaussianSubject {
             (None, Some(data)) => TimedData::Own(data),
             (None, None) => {
                 let form = config.gaussians.form.name();
-                return Err(Error::config("gaussians.form", form, "there are no Gaussians to time"));
+                return Err(Error::config("gaussians.form", form, "this configuration has no Gaussians to time"));
             }
         };
         Ok(GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes })

@@ -50,7 +50,11 @@ fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
     if checkpoint.model.param_map == plan.params && same_method {
         return Ok(());
     }
-    Err(Error::config("checkpoint", checkpoint.model.param_map.len, "its fields have another shape"))
+    Err(Error::config(
+        "checkpoint",
+        checkpoint.model.param_map.len,
+        "its parameters do not have the shape that the configuration and the dataset need",
+    ))
 }
 
 /// Returns the field and state of a fit that was saved; none for fields that rays are marched through.
@@ -133,7 +137,7 @@ impl Trainer {
             return Err(Error::config(
                 "dataset",
                 dataset.path.display(),
-                "the checkpoint was trained on other images or geometry",
+                "the checkpoint was trained on different images or a different geometry",
             ));
         }
         check_shape(&plan, checkpoint)?;

@@ -311,8 +311,8 @@ impl TreeTrainer {
         let own: Vec<[f32; 4]> = self.gpu.download(&self.own.own_motion, 0, n * tree.n_basis as usize)?;
         if let Some(bad) = grid.iter().chain(&own).flatten().find(|v| !v.is_finite()) {
             let step = u64::from(self.step);
-            let (quantity, value) = ("motion of the tree", f64::from(*bad));
-            return Err(Error::Diverged { step, quantity, value, advice: "lower tree.grid_rate and tree.own_rate" });
+            let (quantity, value) = ("the motion of the deformable set", f64::from(*bad));
+            return Err(Error::Diverged { step, quantity, value, advice: "a lower tree.grid_rate and tree.own_rate" });
         }
         let rest = Gaussians {
             units: self.targets.units,

@@ -70,7 +70,9 @@ impl TreeStart {
                 under_way.trainer.track(&under_way.fit, &track)?;
                 self.stage = Stage::Tracking(under_way);
             }
-            Stage::Over => return Err(Error::Internal("a tree that has begun cannot begin again".into())),
+            Stage::Over => {
+                return Err(Error::Internal("the fit of a deformable set that has started cannot start again".into()));
+            }
         }
         Ok(None)
     }
@@ -113,7 +115,7 @@ impl TreeStart {
         match &self.stage {
             Stage::Warming(first) => first.model(),
             Stage::Tracking(under_way) => Ok(under_way.meanwhile.clone()),
-            Stage::Over => Err(Error::Internal("the tree has been handed over".into())),
+            Stage::Over => Err(Error::Internal("the deformable set was handed over already".into())),
         }
     }
 

@@ -135,8 +135,8 @@ impl Finder<'_> {
 
     fn no_vessels(&self, phase: u32) -> Error {
         let problem = format!(
-            "at phase {phase} the moving field has no vessel above it that is longer than {:.2} mm: try a lower one, or \
-             see in the run's report whether the moving field shows vessels at all",
+            "at phase {phase}, the dynamic field has no vessel above this threshold that is longer than {:.2} mm: try \
+             a lower threshold, or check in the run's report whether the dynamic field shows vessels",
             self.least_branch_mm
         );
         Error::config("threshold_per_mm", format!("{:.3e}", self.threshold_per_mm), problem)

@@ -98,7 +98,10 @@ pub fn note(beat: &BeatTree) -> &'static str {
             "tracked: a point of a branch is the same material point at every phase; motion along a vessel is not \
              observed in projections"
         }
-        None => "not tracked: each phase has a tree of its own, whose branches and points belong to no other phase's",
+        None => {
+            "not tracked: each phase has its own tree, whose branches and points do not correspond to those of other \
+             phases"
+        }
     }
 }
 

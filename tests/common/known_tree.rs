@@ -4,6 +4,7 @@
 #[path = "program.rs"]
 mod program;
 
+#[allow(unused_imports, reason = "not every test uses all")]
 pub use program::{program, whole_config};
 use serde_json::{Value, json};
 use std::f64::consts::PI;

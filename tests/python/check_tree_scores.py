@@ -63,7 +63,7 @@ for row, found in zip(tree, scores["phases"]):
     print(f"phase {row['phase']}")
     close("true centreline found", found["true_centreline_found"], wanted["true_near"], 0.005)
     close("our centreline true", found["our_centreline_true"], wanted["ours_near"], 0.005)
-    close("ours to true, mm", found["ours_to_true_mm"], wanted["ours_to_true_mm"], 0.005)
+    close("distance to true, mm", found["ours_to_true_mm"], wanted["ours_to_true_mm"], 0.005)
     close("radius error, mm", found["radius_error_mm"], wanted["radius_bias_mm"], 0.005)
     close("radius RMSE, mm", found["radius_rmse_mm"], wanted["radius_rmse_mm"], 0.005)
     close("components", found["components"], wanted["components"], 0)

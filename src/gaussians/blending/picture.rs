@@ -35,8 +35,8 @@ pub fn first_capacity(n: u32, limit: u32) -> u32 {
 pub fn more_capacity(needed: u32, limit: u32, asked: (&str, u64)) -> Result<u32> {
     if needed > limit {
         let problem = format!(
-            "the Gaussians cover {needed} tiles of 16 x 16 pixels, and a buffer of this device has room for {limit}: take \
-             smaller pictures, a larger x.interval, or x.static_data = \"pooled\""
+            "the Gaussians cover {needed} tiles of 16 x 16 pixels, and the largest buffer of this device has room for \
+             {limit}: use smaller pictures, a larger x.interval, or x.static_data = \"pooled\""
         );
         let (field, value) = asked;
         return Err(Error::config(field, value, problem));

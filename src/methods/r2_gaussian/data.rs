@@ -52,7 +52,10 @@ impl R2Data {
     pub fn new(dataset: &Dataset, settings: &R2, half: f64) -> Result<R2Data> {
         let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
         if dataset.sizes().len() > 1 {
-            return refuse("R2-Gaussian compares images of one size; these differ: take the preset fast".into());
+            return refuse(
+                "R2-Gaussian needs images of equal size, and these images have several sizes: use the preset fast"
+                    .into(),
+            );
         }
         let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
         let units = Units { pixel: half, strongest: half * attenuation };

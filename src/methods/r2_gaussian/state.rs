@@ -5,7 +5,7 @@ use crate::kernels::layout::R2Gaussian;
 
 /// Settings that make the steps of a fit smaller.
 pub const SMALLER_STEPS: &str =
-    "lower rates of section `r2`: r2.position_rate, r2.density_rate, r2.scale_rate, r2.rotation_rate";
+    "lower learning rates in section `r2`: r2.position_rate, r2.density_rate, r2.scale_rate, r2.rotation_rate";
 
 /// Stored Gaussians with the optimiser's moments and the statistics of density control. Together with the iteration's number,
 /// this is all that a resumed fit needs.
@@ -59,7 +59,7 @@ impl R2State {
         let numbers = |g: &R2Gaussian| g.position.into_iter().chain(g.scale).chain(g.rotation).chain([g.density]);
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
             Some(bad) => {
-                let quantity = "parameter of a Gaussian";
+                let quantity = "a parameter of a Gaussian";
                 Err(Error::Diverged { step: step.into(), quantity, value: bad.into(), advice: SMALLER_STEPS })
             }
             None => Ok(()),

@@ -41,7 +41,7 @@ pub(super) fn read(file: &File<'_>, n_phases: usize) -> Result<R2State> {
     let rotation = file.floats("r2.rotation", &[Some(n), Some(4)])?;
     let sets = file.words("r2.set", n)?;
     if let Some(bad) = sets.iter().find(|set| **set as usize >= n_phases) {
-        return Err(Error::data(file.path, "r2.set", format!("{bad} of at most {n_phases} sets")));
+        return Err(Error::data(file.path, "r2.set", format!("has set {bad}, but sets go from 0 to below {n_phases}")));
     }
     let row = |i: usize| R2Gaussian {
         position: [0, 1, 2].map(|k| position[3 * i + k]),

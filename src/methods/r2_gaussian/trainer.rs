@@ -48,7 +48,8 @@ impl R2Trainer {
         let most = most_of_set(gpu, &data);
         if most < config.r2.most {
             notes.push(format!(
-                "at most {most} Gaussians a set instead of r2.most = {}: a buffer holds no more on this device",
+                "a set has at most {most} Gaussians instead of r2.most = {}, because a buffer of this device has no \
+                 room for more",
                 config.r2.most
             ));
         }
@@ -167,7 +168,7 @@ impl R2Trainer {
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         // The schedule has one more row than iterations for this.
         if self.step > self.config.train.iterations {
-            return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
+            return Err(Error::Internal("the fit has ended, so no iteration is left to be timed".into()));
         }
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of R2-Gaussian", MAX_PASSES)?;
         let parts = (&self.kernels, &self.buffers, &self.particles);
@@ -206,18 +207,22 @@ fn check_count(state: &R2State, data: &R2Data) -> Result<u32> {
         match counts.get_mut(g.set as usize) {
             Some(count) => *count += 1,
             None => {
-                return Err(Error::config("checkpoint", g.set, "its sets of Gaussians are not those of the images"));
+                return Err(Error::config(
+                    "checkpoint",
+                    g.set,
+                    "has a set of Gaussians that does not belong to the dataset",
+                ));
             }
         }
     }
     if let Some(empty) = counts.iter().position(|count| *count == 0) {
         let problem = format!(
-            "no Gaussian of {} is left: r2.weakest is too high, or the images show nothing",
+            "no Gaussian of {} is left: the pruning threshold r2.weakest is too high, or the images are empty",
             data.name_of_set(empty)
         );
         return Err(Error::config("r2.count", 0, problem));
     }
-    u32::try_from(state.rows.len()).map_err(|_| Error::config("r2.count", state.rows.len(), "too many Gaussians"))
+    u32::try_from(state.rows.len()).map_err(|_| Error::config("r2.count", state.rows.len(), "is too many Gaussians"))
 }
 
 fn buffers(

@@ -58,8 +58,8 @@ impl SaxMemory {
         let mib = |bytes: u64| bytes.div_ceil(MIB);
         if self.of_field_buffer > largest {
             let problem = format!(
-                "the moments of a field take a buffer of {} MiB, and one of this device holds {} MiB: take fewer \
-                 entries or fewer sax.levels",
+                "Adam's moments of a field need a buffer of {} MiB, and the largest buffer of this device has {} MiB: \
+                 lower sax.log2_table or sax.levels",
                 mib(self.of_field_buffer),
                 mib(largest)
             );
@@ -67,8 +67,8 @@ impl SaxMemory {
         }
         if self.of_batch_buffer > largest {
             let problem = format!(
-                "a batch takes a buffer of {} MiB, and one of this device holds {} MiB: take fewer, fewer sax.rays or \
-                 fewer sax.windows",
+                "a batch needs a buffer of {} MiB, and the largest buffer of this device has {} MiB: lower \
+                 sax.samples, sax.rays or sax.windows",
                 mib(self.of_batch_buffer),
                 mib(largest)
             );
@@ -80,8 +80,8 @@ impl SaxMemory {
     fn check_total(&self, device: &str, memory: DeviceMemory, log2_table: u32, n_sets: usize) -> Result<()> {
         if self.total > memory.bytes {
             let problem = format!(
-                "{n_sets} fields take {} MiB, and this device has {memory}: take fewer entries, fewer sax.levels, or one \
-                 field for all phases (sax.static_data = \"pooled\")",
+                "{n_sets} fields need {} MiB, and this device has {memory}: lower sax.log2_table or sax.levels, or use \
+                 one field for all phases (sax.static_data = \"pooled\")",
                 self.total.div_ceil(MIB)
             );
             return Err(Error::config("sax.log2_table", log2_table, problem));
@@ -92,8 +92,8 @@ impl SaxMemory {
                 bytes: self.total,
                 detail: format!("{device} has {memory}"),
                 may_pass: true,
-                instead: "again when others have given memory back, a smaller sax.log2_table, fewer sax.levels, one field \
-                          for all phases (sax.static_data = \"pooled\")",
+                instead: "again when other programs have freed memory, a lower sax.log2_table, a lower sax.levels, one \
+                          field for all phases (sax.static_data = \"pooled\")",
             }),
             _ => Ok(()),
         }
@@ -249,11 +249,14 @@ mod tests {
         };
         assert!(check(100, None).is_ok() && check(100, Some(100)).is_ok());
         let Err(Error::Config { problem, .. }) = check(99, Some(99)) else { panic!("there is too little") };
-        assert!(problem.contains("10 fields take 100 MiB") && problem.contains("99 MiB, of which 99 MiB"), "{problem}");
+        assert!(problem.contains("10 fields need 100 MiB") && problem.contains("99 MiB, of which 99 MiB"), "{problem}");
         let short = check(8192, Some(99)).unwrap_err();
         assert!(matches!(short, Error::OutOfMemory { may_pass: true, .. }));
         let text = short.to_string();
-        assert!(text.contains("8192 MiB, of which 99 MiB are free") && text.contains("sax.log2_table"), "{text}");
+        assert!(
+            text.contains("8192 MiB, of which 99 MiB are currently free") && text.contains("sax.log2_table"),
+            "{text}"
+        );
         assert!(!text.contains("train.rays"), "{text}");
     }
 }

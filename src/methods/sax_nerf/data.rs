@@ -47,7 +47,9 @@ impl SaxData {
     pub fn new(dataset: &Dataset, settings: &Sax, half: f64) -> Result<SaxData> {
         let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
         if dataset.sizes().len() > 1 {
-            return refuse("SAX-NeRF takes images of one size; these differ: take the preset fast".into());
+            return refuse(
+                "SAX-NeRF needs images of equal size, and these images have several sizes: use the preset fast".into(),
+            );
         }
         check_windows(settings, [dataset.width, dataset.height])?;
         let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
@@ -118,7 +120,9 @@ fn check_windows(settings: &Sax, [width, height]: [usize; 2]) -> Result<()> {
     let side = settings.window as usize;
     let room = (width / side) * (height / side);
     if settings.windows as usize > room {
-        let problem = format!("images of {width} x {height} pixels have room for {room} windows of {side} x {side}");
+        let problem = format!(
+            "an image of {width} x {height} pixels has room for at most {room} windows of {side} x {side} pixels"
+        );
         return Err(Error::config("sax.windows", settings.windows, problem));
     }
     Ok(())

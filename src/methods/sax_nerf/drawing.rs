@@ -58,7 +58,9 @@ impl SaxDrawing {
 
     fn replace_field(&self, field: &SaxField) -> Result<()> {
         if field.shape != self.field.shape || field.n_sets != self.field.n_sets {
-            return Err(Error::Internal("the field has other sizes than the one that is drawn".into()));
+            return Err(Error::Internal(
+                "the field has a different shape from the field that the drawing was created for".into(),
+            ));
         }
         if !field.params.is_empty() {
             let upload = |set: &Vec<f32>| params_buffer(&self.gpu, "sax_params that are drawn", set);
@@ -80,7 +82,7 @@ impl SaxDrawing {
         target: Target<'_>,
     ) -> Result<()> {
         let all = self.params.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let missing = || Error::Internal(format!("no numbers of SAX-NeRF's field at phase {phase}"));
+        let missing = || Error::Internal(format!("there are no parameters of SAX-NeRF's field at phase {phase}"));
         let params = all.get(self.field.set_of(phase)).ok_or_else(missing)?;
         let sampling = SaxSampling { kernels: &self.kernels, buffers, setup, shape: self.field.shape, params, rays };
         let attenuation = self.field.attenuation as f32;
@@ -104,7 +106,9 @@ impl FieldDrawing for SaxDrawing {
     fn replace(&self, field: &dyn Field) -> Result<()> {
         match field.as_any().downcast_ref::<SaxField>() {
             Some(field) => self.replace_field(field),
-            None => Err(Error::Internal("a field of another method than the one that is drawn".into())),
+            None => Err(Error::Internal(
+                "the field belongs to another method than the field that the drawing was created for".into(),
+            )),
         }
     }
 

@@ -194,7 +194,7 @@ impl Field for SaxField {
     }
 
     fn fact(&self) -> (String, String) {
-        ("SAX-NeRF".into(), format!("{} fields of {} numbers each", self.n_sets, self.shape.n_meant()))
+        ("SAX-NeRF".into(), format!("{} fields of {} parameters each", self.n_sets, self.shape.n_meant()))
     }
 
     fn drawing(&self, gpu: &Gpu) -> Result<Box<dyn FieldDrawing>> {
@@ -210,7 +210,9 @@ impl FitState for SaxState {
     fn tensors(&self, field: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
         match field.and_then(|field| field.as_any().downcast_ref::<SaxField>()) {
             Some(field) => Ok(tensors::tensors(field, self)),
-            None => Err(Error::Internal("a state of SAX-NeRF beside a field of another method".into())),
+            None => {
+                Err(Error::Internal("a training state of SAX-NeRF was combined with a field of another method".into()))
+            }
         }
     }
 
@@ -230,7 +232,7 @@ pub fn check_params(params: &[Vec<f32>], step: u32) -> Result<()> {
     match params.iter().flatten().find(|v| !v.is_finite()) {
         Some(bad) => Err(Error::Diverged {
             step: step.into(),
-            quantity: "parameter of SAX-NeRF",
+            quantity: "a parameter of SAX-NeRF",
             value: f64::from(*bad),
             advice: SMALLER_STEPS,
         }),

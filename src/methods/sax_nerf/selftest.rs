@@ -268,7 +268,7 @@ impl Iteration<'_> {
             findings.numbers(PRODUCTS, part.name, &got, &gradient[range], GRADIENTS);
         }
         let got = self.floats(&self.fit.buffers().1.gradient, n)?;
-        findings.numbers(WEIGHT_GRADIENT, "gradient by the Lineformer's numbers", &got, &sums, NUMBERS);
+        findings.numbers(WEIGHT_GRADIENT, "gradient by the Lineformer's parameters", &got, &sums, NUMBERS);
         Ok(())
     }
 
@@ -311,7 +311,7 @@ impl Iteration<'_> {
             (i64::from(*high) << 32 | i64::from(*low)) as f64 * 2f64.powi(-(setup.fixed_point_bits as i32))
         };
         let left = cleared.iter().filter(|sum| **sum != [0, 0]).count();
-        findings.add(GRID_GRADIENT, "sums that are not cleared", left as f64, 0.5);
+        findings.add(GRID_GRADIENT, "sums that were not cleared", left as f64, 0.5);
         let difference: Vec<f64> = added.iter().zip(&cleared).map(|(a, b)| number(a) - number(b)).collect();
         let got: Vec<f32> = difference.iter().map(|v| *v as f32).collect();
         findings.numbers(ENCODE_BWD, "sums of the grid's gradient", &got, &want, NUMBERS);
@@ -377,7 +377,7 @@ fn compare_drawing(gpu: &Gpu, data: &SaxData, field: &SaxField, findings: &mut F
     let got: Vec<f32> = seen.iter().map(|ray| ray.dynamic_integral).collect();
     findings.numbers(VIEW, "line integrals", &got, &rows().map(sum).collect::<Vec<f64>>(), DRAWN);
     let largest: Vec<f64> = rows().map(largest).collect();
-    for (what, of) in [("largest values", 0), ("largest values of all", 1)] {
+    for (what, of) in [("maximum values", 0), ("maximum of all values", 1)] {
         let got: Vec<f32> = seen.iter().map(|ray| [ray.dynamic_max, ray.total_max][of]).collect();
         findings.numbers(VIEW, what, &got, &largest, DRAWN);
     }

@@ -68,10 +68,18 @@ pub(super) fn read(
     let is_positive = |v: f64| v.is_finite() && v > 0.0;
     if !is_positive(header.bound) || !is_positive(header.attenuation) || !is_positive(far - near) || header.samples < 2
     {
-        return Err(Error::data(path, "sax", "box, depths, samples and attenuation must be positive and finite"));
+        return Err(Error::data(
+            path,
+            "sax",
+            "bound, attenuation and the extent of depths must be positive and finite, and samples at least 2",
+        ));
     }
     if header.sets != 1 && header.sets != n_phases {
-        return Err(Error::data(path, "sax.sets", format!("{} of {n_phases} phases", header.sets)));
+        return Err(Error::data(
+            path,
+            "sax.sets",
+            format!("is {} where 1 or {n_phases}, the number of phases, is needed", header.sets),
+        ));
     }
     let n_sets = header.sets;
     // Memory is allocated only for data that the file really holds, in case it is damaged.

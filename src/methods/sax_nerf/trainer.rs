@@ -75,7 +75,7 @@ impl SaxTrainer {
             return Err(Error::config(
                 "checkpoint",
                 field.n_sets,
-                "its fields of SAX-NeRF are not those of the images",
+                "has another number of SAX-NeRF fields than the dataset needs",
             ));
         }
         let setup = fit_setup(&outline, &data, &config.sax);
@@ -168,7 +168,7 @@ impl SaxTrainer {
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         // The schedule has one row more than there are iterations, for this iteration.
         if self.step > self.config.train.iterations {
-            return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
+            return Err(Error::Internal("the fit has ended, so no iteration is left to be timed".into()));
         }
         let n_chunks = chunks(self.setup.n_rays, self.setup.n_samples).len() as u32;
         let max_passes = (MAX_PASSES + CHUNK_PASSES * n_chunks) * (self.setup.n_sets + 1);

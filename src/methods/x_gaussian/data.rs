@@ -76,7 +76,10 @@ impl XData {
     pub fn new(dataset: &Dataset, settings: &X, half: f64) -> Result<XData> {
         let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
         if dataset.sizes().len() > 1 {
-            return refuse("X-Gaussian compares images of one size; these differ: take the preset fast".into());
+            return refuse(
+                "X-Gaussian needs images of equal size, and these images have several sizes: use the preset fast"
+                    .into(),
+            );
         }
         let unit = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
         let greatest = if settings.clamp > 0.0 { settings.clamp } else { f64::INFINITY };
@@ -94,7 +97,8 @@ impl XData {
         let views: Vec<_> = training.iter().map(|f| SplatView::new(&dataset.views[f.view].rays, units)).collect();
         let extent_mm = if settings.extent_mm > 0.0 { settings.extent_mm } else { extent_of(&views) };
         if extent_mm <= 0.0 {
-            let problem = "all views have their source at one place: state the extent of the scene, mm";
+            let problem = "the extent of the scene cannot be computed, because all views have the same source \
+                           position: set it, in mm";
             return Err(Error::config("x.extent_mm", settings.extent_mm, problem));
         }
         let (images_of_set, phase_of_set) = sets_of(dataset, settings.static_data, "x.static_data")?;

@@ -5,8 +5,8 @@ use crate::gaussians::blending::opacity::stored_opacity;
 use crate::kernels::layout::{XGaussian, XStatistics};
 
 /// Settings that make the steps of a fit smaller.
-pub const SMALLER_STEPS: &str =
-    "lower rates of section `x`: x.position_rate, x.intensity_rate, x.opacity_rate, x.scale_rate, x.rotation_rate";
+pub const SMALLER_STEPS: &str = "lower learning rates in section `x`: x.position_rate, x.intensity_rate, \
+                                 x.opacity_rate, x.scale_rate, x.rotation_rate";
 
 /// Stored Gaussians with the optimiser's moments and the statistics of density control. Together with the iteration's number,
 /// this is all that a resumed fit needs.
@@ -82,7 +82,7 @@ impl XState {
             |g: &XGaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.opacity, g.intensity]);
         match self.rows.iter().flat_map(numbers).find(|v| !v.is_finite()) {
             Some(bad) => {
-                let quantity = "parameter of a Gaussian";
+                let quantity = "a parameter of a Gaussian";
                 Err(Error::Diverged { step: step.into(), quantity, value: bad.into(), advice: SMALLER_STEPS })
             }
             None => Ok(()),

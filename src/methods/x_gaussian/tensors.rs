@@ -42,7 +42,7 @@ pub(super) fn read(file: &File<'_>, n_phases: usize) -> Result<XState> {
     let rotation = file.floats("x.rotation", &[Some(n), Some(4)])?;
     let sets = file.words("x.set", n)?;
     if let Some(bad) = sets.iter().find(|set| **set as usize >= n_phases) {
-        return Err(Error::data(file.path, "x.set", format!("{bad} of at most {n_phases} sets")));
+        return Err(Error::data(file.path, "x.set", format!("has set {bad}, but sets go from 0 to below {n_phases}")));
     }
     let row = |i: usize| XGaussian {
         position: [0, 1, 2].map(|k| position[3 * i + k]),

@@ -62,7 +62,8 @@ impl XTrainer {
         let (most, mut notes) = (most_of_set(gpu, &data), Vec::new());
         if most < config.x.most {
             notes.push(format!(
-                "at most {most} Gaussians a set instead of x.most = {}: a buffer holds no more on this device",
+                "a set has at most {most} Gaussians instead of x.most = {}, because a buffer of this device has no \
+                 room for more",
                 config.x.most
             ));
         }
@@ -173,7 +174,7 @@ impl XTrainer {
         let step = self.step;
         counts_wrongly(
             &self.gpu,
-            &format!("was to go from iteration {first} on, to {stop} at most, and says it is at {step}"),
+            &format!("was to execute iterations from {first} to at most {stop}, and reports iteration {step}"),
         )
     }
 
@@ -273,7 +274,7 @@ impl XTrainer {
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         // The schedule has one more row than iterations for this.
         if self.step > self.config.train.iterations {
-            return Err(Error::Internal("the fit is over: no iteration is left to be timed".into()));
+            return Err(Error::Internal("the fit has ended, so no iteration is left to be timed".into()));
         }
         loop {
             let mut recording = Recording::timed(&self.gpu, "profiled iteration of X-Gaussian", MAX_PASSES)?;
@@ -317,16 +318,16 @@ fn capacity_limit(gpu: &Gpu) -> u32 {
 /// Returns the number of Gaussians; refuses a set without any.
 fn check_count(state: &XState, data: &XData, weakest: f64) -> Result<u32> {
     if let Some(bad) = state.sets.iter().find(|set| **set as usize >= data.n_sets()) {
-        return Err(Error::config("checkpoint", bad, "its sets of Gaussians are not those of the images"));
+        return Err(Error::config("checkpoint", bad, "has a set of Gaussians that does not belong to the dataset"));
     }
     if let Some(empty) = state.counts(data.n_sets()).iter().position(|count| *count == 0) {
         let problem = format!(
-            "no Gaussian of {} is left: x.weakest is too high, or the images show nothing",
+            "no Gaussian of {} is left: the pruning threshold x.weakest is too high, or the images are empty",
             data.name_of_set(empty)
         );
         return Err(Error::config("x.weakest", weakest, problem));
     }
-    u32::try_from(state.rows.len()).map_err(|_| Error::config("x.most", state.rows.len(), "too many Gaussians"))
+    u32::try_from(state.rows.len()).map_err(|_| Error::config("x.most", state.rows.len(), "is too many Gaussians"))
 }
 
 fn scene_buffers(

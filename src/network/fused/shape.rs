@@ -133,7 +133,10 @@ impl Shape {
             [1, 2, 4].iter().filter_map(|times| backward(times * subgroups)).take_while(fits).collect();
         let backward = backwards.iter().find(|b| few_sums(b)).or(backwards.last());
         let (Some(fwd_tile), Some(&backward)) = (fwd_tile, backward) else {
-            return Err(unfit(format!("needs more than the {} KiB of shared memory", info.max_shared_memory >> 10)));
+            return Err(unfit(format!(
+                "needs more than the {} KiB of shared memory of this device",
+                info.max_shared_memory >> 10
+            )));
         };
         let mut next = 0;
         let mut take = |len: usize| {
