@@ -10,7 +10,6 @@ pub mod method;
 mod presets;
 pub mod sections;
 
-use crate::choice::Choice;
 use crate::error::{Error, Result};
 pub use forms::{DynamicForm, OcclusionRegion};
 use method::MethodKind;
@@ -20,10 +19,12 @@ use sections::{
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use strum::{IntoStaticStr, VariantArray};
 
 /// A named set of defaults.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum Preset {
     /// Moving Gaussians in front of a static tensor field; the default.
     #[default]
@@ -44,35 +45,10 @@ pub enum Preset {
     SaxNerf,
 }
 
-impl Choice for Preset {
-    const ALL: &'static [Preset] = &[
-        Preset::Fast,
-        Preset::FastMlp,
-        Preset::Paper,
-        Preset::PublicCode,
-        Preset::NerfCa,
-        Preset::R2Gaussian,
-        Preset::XGaussian,
-        Preset::SaxNerf,
-    ];
-
-    fn name(self) -> &'static str {
-        match self {
-            Preset::Fast => "fast",
-            Preset::FastMlp => "fast-mlp",
-            Preset::Paper => "paper",
-            Preset::PublicCode => "public-code",
-            Preset::NerfCa => "nerf-ca",
-            Preset::R2Gaussian => "r2-gaussian",
-            Preset::XGaussian => "x-gaussian",
-            Preset::SaxNerf => "sax-nerf",
-        }
-    }
-}
-
 /// Representation of the static field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum StaticForm {
     /// Planes and lines.
     #[default]
@@ -81,18 +57,6 @@ pub enum StaticForm {
     Network,
     /// No static field: the model consists of the dynamic field alone.
     None,
-}
-
-impl Choice for StaticForm {
-    const ALL: &'static [StaticForm] = &[StaticForm::Tensor, StaticForm::Network, StaticForm::None];
-
-    fn name(self) -> &'static str {
-        match self {
-            StaticForm::Tensor => "tensor",
-            StaticForm::Network => "network",
-            StaticForm::None => "none",
-        }
-    }
 }
 
 /// Course of a learning rate from its start value to its end value.
@@ -106,8 +70,9 @@ pub enum Decay {
 }
 
 /// Representation of the dynamic field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum GaussianForm {
     /// The network, without Gaussians.
     None,
@@ -124,31 +89,10 @@ pub enum GaussianForm {
     X,
 }
 
-impl Choice for GaussianForm {
-    const ALL: &'static [GaussianForm] = &[
-        GaussianForm::None,
-        GaussianForm::Phase,
-        GaussianForm::Tree,
-        GaussianForm::Auto,
-        GaussianForm::R2,
-        GaussianForm::X,
-    ];
-
-    fn name(self) -> &'static str {
-        match self {
-            GaussianForm::None => "none",
-            GaussianForm::Phase => "phase",
-            GaussianForm::Tree => "tree",
-            GaussianForm::Auto => "auto",
-            GaussianForm::R2 => "r2",
-            GaussianForm::X => "x",
-        }
-    }
-}
-
 /// Images of a moving object to which a static method is fitted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum StaticData {
     /// A set of parameters for each phase, fitted to the images of that phase.
     PerPhase,
@@ -156,20 +100,10 @@ pub enum StaticData {
     Pooled,
 }
 
-impl Choice for StaticData {
-    const ALL: &'static [StaticData] = &[StaticData::PerPhase, StaticData::Pooled];
-
-    fn name(self) -> &'static str {
-        match self {
-            StaticData::PerPhase => "per-phase",
-            StaticData::Pooled => "pooled",
-        }
-    }
-}
-
 /// Initial positions of the Gaussians in a fit of R2-Gaussian.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum R2Start {
     /// Voxels of a filtered back-projection.
     Fdk,
@@ -177,20 +111,10 @@ pub enum R2Start {
     Random,
 }
 
-impl Choice for R2Start {
-    const ALL: &'static [R2Start] = &[R2Start::Fdk, R2Start::Random];
-
-    fn name(self) -> &'static str {
-        match self {
-            R2Start::Fdk => "fdk",
-            R2Start::Random => "random",
-        }
-    }
-}
-
 /// Line integral of one Gaussian at a pixel, for R2-Gaussian.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum R2Integral {
     /// The line integral of the Gaussian under a projection linearised around its centre, as published.
     #[default]
@@ -199,20 +123,10 @@ pub enum R2Integral {
     Exact,
 }
 
-impl Choice for R2Integral {
-    const ALL: &'static [R2Integral] = &[R2Integral::Affine, R2Integral::Exact];
-
-    fn name(self) -> &'static str {
-        match self {
-            R2Integral::Affine => "affine",
-            R2Integral::Exact => "exact",
-        }
-    }
-}
-
 /// Corrections of the views' stated geometry.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum CalibrateMode {
     /// The mode that best predicts phases left out of the calibration: none, static, or breathing.
     Auto,
@@ -222,20 +136,6 @@ pub enum CalibrateMode {
     Static,
     /// Angles and position of each view and a displacement of the heart in each frame, where this improves the agreement.
     Breathing,
-}
-
-impl Choice for CalibrateMode {
-    const ALL: &'static [CalibrateMode] =
-        &[CalibrateMode::Auto, CalibrateMode::Off, CalibrateMode::Static, CalibrateMode::Breathing];
-
-    fn name(self) -> &'static str {
-        match self {
-            CalibrateMode::Auto => "auto",
-            CalibrateMode::Off => "off",
-            CalibrateMode::Static => "static",
-            CalibrateMode::Breathing => "breathing",
-        }
-    }
 }
 
 /// Data that the dynamic field is fitted to.
@@ -447,6 +347,7 @@ fn merge(base: &mut toml::Table, overlay: toml::Table, prefix: &str) -> Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::choice::Choice;
 
     #[test]
     fn more_first_gaussians_than_there_is_room_for_are_refused_however_many() {

@@ -1,7 +1,6 @@
 //! Exports volumes of a reconstruction for common tools: NRRD (3D Slicer plays phases as a sequence), NIfTI, MetaImage, npy and
 //! VTK. Patient coordinates, mm; attenuation per mm; sampled and written slab by slab.
 
-use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::nrrd::Encoding;
@@ -18,9 +17,11 @@ use glam::DVec3;
 use std::io::Write;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use strum::{IntoStaticStr, VariantArray};
 
 /// File format of a volume.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Format {
     /// NRRD with phases as a list axis, which 3D Slicer loads as a sequence (`.seq.nrrd`).
     Nrrd,
@@ -32,20 +33,6 @@ pub enum Format {
     Npy,
     /// Legacy VTK structured points; one file per phase, which ParaView groups.
     Vtk,
-}
-
-impl Choice for Format {
-    const ALL: &'static [Format] = &[Format::Nrrd, Format::Nifti, Format::Mha, Format::Npy, Format::Vtk];
-
-    fn name(self) -> &'static str {
-        match self {
-            Format::Nrrd => "nrrd",
-            Format::Nifti => "nifti",
-            Format::Mha => "mha",
-            Format::Npy => "npy",
-            Format::Vtk => "vtk",
-        }
-    }
 }
 
 impl Format {

@@ -6,10 +6,12 @@ use crate::files;
 use crate::formats::volume::{MAX_BYTES, Volume, VolumeHints};
 use std::io::{Read, Write};
 use std::path::Path;
+use strum::{IntoStaticStr, VariantArray};
 
 /// Type of the numbers in a file, named after the Rust type.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr, VariantArray)]
 #[allow(missing_docs, reason = "named after the types they stand for")]
+#[strum(serialize_all = "kebab-case")]
 pub enum Element {
     F32,
     F64,
@@ -19,24 +21,6 @@ pub enum Element {
     U16,
     I32,
     U32,
-}
-
-impl Choice for Element {
-    const ALL: &'static [Element] =
-        &[Element::F32, Element::F64, Element::I8, Element::U8, Element::I16, Element::U16, Element::I32, Element::U32];
-
-    fn name(self) -> &'static str {
-        match self {
-            Element::F32 => "f32",
-            Element::F64 => "f64",
-            Element::I8 => "i8",
-            Element::U8 => "u8",
-            Element::I16 => "i16",
-            Element::U16 => "u16",
-            Element::I32 => "i32",
-            Element::U32 => "u32",
-        }
-    }
 }
 
 /// Byte order of numbers.

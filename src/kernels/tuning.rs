@@ -1,12 +1,12 @@
 //! Sizes and variants of the kernels, chosen for a device, with the reasons.
 
-use crate::choice::Choice;
 use crate::gpu::buffer::Operands;
 use crate::gpu::capabilities::{DeviceInfo, DeviceKind, Vendor};
 use crate::gpu::pace::longest_submit_s;
 use crate::kernels::constants;
 use crate::kernels::push::{MarchLoss, PushConstants};
 use serde::Serialize;
+use strum::{IntoStaticStr, VariantArray};
 
 /// Returns the register tile of three kernels that work together, from the numbers that their text defines.
 macro_rules! lane_tile {
@@ -23,24 +23,14 @@ macro_rules! lane_tile {
 }
 
 /// Computation path of the network's layers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum Layers {
     /// f32 throughout.
     F32,
     /// Cooperative matrices: f16 operands, f32 sums.
     Matrices,
-}
-
-impl Choice for Layers {
-    const ALL: &'static [Layers] = &[Layers::F32, Layers::Matrices];
-
-    fn name(self) -> &'static str {
-        match self {
-            Layers::F32 => "f32",
-            Layers::Matrices => "matrices",
-        }
-    }
 }
 
 /// Sizes of the passes on cooperative matrices.

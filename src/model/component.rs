@@ -1,9 +1,10 @@
 //! Selection among a model's fields.
 
-use crate::choice::Choice;
+use strum::{IntoStaticStr, VariantArray};
 
 /// Selection among the fields of a model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Component {
     /// The sum of both fields.
     Total,
@@ -31,17 +32,5 @@ impl Component {
     /// Tells whether the dynamic field is part of the selection.
     pub fn has_dynamic(self) -> bool {
         self != Component::Static
-    }
-}
-
-impl Choice for Component {
-    const ALL: &'static [Component] = &[Component::Total, Component::Static, Component::Dynamic];
-
-    fn name(self) -> &'static str {
-        match self {
-            Component::Total => "total",
-            Component::Static => "static",
-            Component::Dynamic => "dynamic",
-        }
     }
 }

@@ -1,6 +1,5 @@
 //! Phantom datasets: projects moving volumes, makes exact masks, applies degradations and writes the dataset.
 
-use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::formats::volume::VolumeHints;
 use crate::geometry::{CArm, Geometry, ViewRays};
@@ -25,6 +24,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
+use strum::{IntoStaticStr, VariantArray};
 
 /// Threshold of a vessel pixel: its line integral through vessels alone exceeds this share of that of one pixel width of
 /// vessel.
@@ -33,24 +33,14 @@ const MASK_SHARE: f64 = 0.05;
 const BLADE_DENSITY: f32 = 2.0;
 
 /// Published set-up of C-arm and volume.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "kebab-case")]
 pub enum Setting {
     /// The authors' XCAT set-up: DSD 2500, DSO 450, 0.25 mm voxels.
     Xcat,
     /// The authors' MAGIX set-up: DSD 2000, DSO 600, 0.9 mm voxels.
     Magix,
-}
-
-impl Choice for Setting {
-    const ALL: &'static [Setting] = &[Setting::Xcat, Setting::Magix];
-
-    fn name(self) -> &'static str {
-        match self {
-            Setting::Xcat => "xcat",
-            Setting::Magix => "magix",
-        }
-    }
 }
 
 /// Options of a phantom dataset.

@@ -1,6 +1,5 @@
 //! Dataset in memory and its native layout on disk (`dataset.json` + images; see `docs/formats.md`).
 
-use crate::choice::Choice;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::formats::images;
@@ -14,6 +13,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize, Serializer};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use strum::{IntoStaticStr, VariantArray};
 
 /// Name of the manifest inside a native dataset.
 pub const MANIFEST: &str = "dataset.json";
@@ -198,24 +198,14 @@ impl View {
 }
 
 /// Layout of a dataset on disk.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "snake_case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum Layout {
     /// `dataset.json`.
     Native,
     /// The NeRF-CA / NerT-CA authors' `general.json`.
     Nerfca,
-}
-
-impl Choice for Layout {
-    const ALL: &'static [Layout] = &[Layout::Native, Layout::Nerfca];
-
-    fn name(self) -> &'static str {
-        match self {
-            Layout::Native => "native",
-            Layout::Nerfca => "nerfca",
-        }
-    }
 }
 
 /// Angiograms with geometry and phase, validated.

@@ -1,8 +1,8 @@
 //! Cardiac phases from time stamps and R-peaks.
 
-use crate::choice::Choice;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
+use strum::{IntoStaticStr, VariantArray};
 
 /// Time from the R-peak to the end of systole, seconds. Coronary arteries are at rest 280 to 340 ms after R at heart rates of
 /// 60 to 80 per minute.
@@ -14,25 +14,15 @@ pub const SYSTOLE_SHARE: f64 = 0.35;
 const LONGEST_SYSTOLE: f64 = 0.6;
 
 /// Conversion of the time since the R-peak to a fraction of the beat, for different heart rates.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum BeatScaling {
     /// The whole beat is stretched uniformly.
     Linear,
     /// Systole keeps its length ([`SYSTOLE_S`]); diastole fills the rest of the beat.
     #[default]
     TwoSegment,
-}
-
-impl Choice for BeatScaling {
-    const ALL: &'static [BeatScaling] = &[BeatScaling::Linear, BeatScaling::TwoSegment];
-
-    fn name(self) -> &'static str {
-        match self {
-            BeatScaling::Linear => "linear",
-            BeatScaling::TwoSegment => "two-segment",
-        }
-    }
 }
 
 impl BeatScaling {

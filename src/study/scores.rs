@@ -1,12 +1,13 @@
 //! Scores of a run that tables can show.
 
-use crate::choice::Choice;
 use crate::study::outcome::Outcome;
 use serde::{Deserialize, Serialize};
+use strum::{IntoStaticStr, VariantArray};
 
 /// A number of a run that a table can show.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
 #[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
 pub enum Score {
     /// Dice of the dynamic field, by the rule of `eval`.
     Dice,
@@ -38,7 +39,6 @@ pub enum Score {
 
 /// Presentation of a score.
 struct Look {
-    name: &'static str,
     heading: &'static str,
     meaning: &'static str,
     digits: usize,
@@ -47,49 +47,41 @@ struct Look {
 
 impl Score {
     fn look(self) -> Look {
-        let (name, heading, meaning, digits, more_is_better) = match self {
+        let (heading, meaning, digits, more_is_better) = match self {
             Score::Dice => {
                 let meaning = "dynamic field on all unseen images, thresholded at a fifth of the stated attenuation of \
                                vessels (at Otsu's threshold where none is stated, at 0.05 for X-Gaussian's opacities)";
-                ("dice", "Dice", meaning, 3, true)
+                ("Dice", meaning, 3, true)
             }
-            Score::DiceTotal => ("dice-total", "Dice, total", "both fields, otherwise like Dice", 3, true),
+            Score::DiceTotal => ("Dice, total", "both fields, otherwise like Dice", 3, true),
             Score::DicePaper => {
                 let meaning = "as the paper describes it: dynamic field on all unseen images, at the authors' \
                                threshold of 0.05 per 100 mm";
-                ("dice-paper", "Dice, paper's way", meaning, 3, true)
+                ("Dice, paper's way", meaning, 3, true)
             }
             Score::DiceAuthors => {
                 let meaning = "as the authors' code does it: sum of both fields on the first unseen image, at 0.05 per \
                                100 mm";
-                ("dice-authors", "Dice, authors' code", meaning, 3, true)
+                ("Dice, authors' code", meaning, 3, true)
             }
-            Score::DiceBest => (
-                "dice-best",
-                "best Dice",
-                "at the best threshold, which needs the masks and is therefore not a score",
-                3,
-                true,
-            ),
+            Score::DiceBest => {
+                ("best Dice", "at the best threshold, which needs the masks and is therefore not a score", 3, true)
+            }
             Score::DiceOtsu => {
                 let meaning = "for X-Gaussian only: Otsu's threshold of the sums of opacities of each unseen image";
-                ("dice-otsu", "Dice, Otsu", meaning, 3, true)
+                ("Dice, Otsu", meaning, 3, true)
             }
-            Score::Psnr => ("psnr", "PSNR", "dB, unseen images", 2, true),
-            Score::Ssim => ("ssim", "SSIM", "unseen images", 3, true),
-            Score::ChamferMm => ("chamfer-mm", "Chamfer, mm", "mean distance to the true vessels", 2, false),
-            Score::Hausdorff95Mm => ("hausdorff95-mm", "Hausdorff 95 %, mm", "distance to the true vessels", 2, false),
-            Score::ClDice => ("cl-dice", "clDice", "centrelines in 3D", 3, true),
-            Score::Minutes => ("minutes", "minutes", "of training", 2, false),
-            Score::Fps => (
-                "fps",
-                "FPS",
-                "frames per second of renderings of all scored fields, at the size of the images",
-                2,
-                true,
-            ),
+            Score::Psnr => ("PSNR", "dB, unseen images", 2, true),
+            Score::Ssim => ("SSIM", "unseen images", 3, true),
+            Score::ChamferMm => ("Chamfer, mm", "mean distance to the true vessels", 2, false),
+            Score::Hausdorff95Mm => ("Hausdorff 95 %, mm", "distance to the true vessels", 2, false),
+            Score::ClDice => ("clDice", "centrelines in 3D", 3, true),
+            Score::Minutes => ("minutes", "of training", 2, false),
+            Score::Fps => {
+                ("FPS", "frames per second of renderings of all scored fields, at the size of the images", 2, true)
+            }
         };
-        Look { name, heading, meaning, digits, more_is_better }
+        Look { heading, meaning, digits, more_is_better }
     }
 
     /// Heading of the score's column.
@@ -135,27 +127,5 @@ impl Score {
             Score::Minutes => Some(outcome.seconds.training / 60.0),
             Score::Fps => scores.fps,
         }
-    }
-}
-
-impl Choice for Score {
-    const ALL: &'static [Score] = &[
-        Score::Dice,
-        Score::DiceTotal,
-        Score::DicePaper,
-        Score::DiceAuthors,
-        Score::DiceBest,
-        Score::DiceOtsu,
-        Score::Psnr,
-        Score::Ssim,
-        Score::ChamferMm,
-        Score::Hausdorff95Mm,
-        Score::ClDice,
-        Score::Minutes,
-        Score::Fps,
-    ];
-
-    fn name(self) -> &'static str {
-        self.look().name
     }
 }
