@@ -1,4 +1,4 @@
-//! Compiles `glsl/*.comp`, with every variant listed in `glsl/variants.txt`, to SPIR-V.
+//! Compiles `glsl/*/*.comp`, a folder for each method and for what methods share, with every variant listed in `glsl/variants.txt`, to SPIR-V.
 
 use crate::Failure;
 use std::collections::BTreeMap;
@@ -28,11 +28,15 @@ pub struct Kernel {
 pub fn kernels(glsl: &Path) -> Result<Vec<Kernel>, Failure> {
     let variants = read_variants(&glsl.join("variants.txt"))?;
     let compiler = shaderc::Compiler::new()?;
-    let mut sources: Vec<PathBuf> = fs::read_dir(glsl)?
-        .filter_map(|entry| entry.ok().map(|e| e.path()))
-        .filter(|path| path.extension().is_some_and(|e| e == "comp"))
-        .collect();
-    sources.sort();
+    let entries = |folder: &Path| -> Result<Vec<PathBuf>, Failure> {
+        Ok(fs::read_dir(folder)?.filter_map(|entry| entry.ok().map(|e| e.path())).collect())
+    };
+    let mut sources = Vec::new();
+    for folder in entries(glsl)?.into_iter().filter(|path| path.is_dir()) {
+        sources.extend(entries(&folder)?.into_iter().filter(|path| path.extension().is_some_and(|e| e == "comp")));
+    }
+    // Tables of stages are in the order of names, whatever the folders.
+    sources.sort_by_key(|path| path.file_name().map(ToOwned::to_owned));
     let mut kernels = Vec::new();
     for path in sources {
         let shader = path.file_stem().and_then(|s| s.to_str()).ok_or("shader name is not UTF-8")?.to_owned();

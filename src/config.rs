@@ -14,8 +14,8 @@ use crate::error::{Error, Result};
 pub use forms::{DynamicForm, OcclusionRegion};
 use method::MethodKind;
 use sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
-    Tree, X,
+    Adam, Calibrate, Deformable, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField,
+    Train, X,
 };
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -79,8 +79,9 @@ pub enum GaussianForm {
     /// A separate set of Gaussians per phase; the sets share nothing.
     Phase,
     /// One set of Gaussians that moves over the beat.
-    Tree,
-    /// `Tree` where the data allow it, otherwise `Phase`.
+    #[serde(alias = "tree")]
+    Deformable,
+    /// `Deformable` where the data allow it, otherwise `Phase`.
     Auto,
     /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all phases, without a static field.
     R2,
@@ -183,8 +184,8 @@ pub struct Config {
     #[serde(default = "presets::gaussians")]
     pub gaussians: Gaussians,
     /// One moving set of Gaussians; absent from older checkpoints.
-    #[serde(default = "presets::tree")]
-    pub tree: Tree,
+    #[serde(default = "presets::deformable", rename = "tree")]
+    pub deformable: Deformable,
     /// Gaussians as R2-Gaussian fits them; absent from older checkpoints.
     #[serde(default = "presets::r2")]
     pub r2: R2,

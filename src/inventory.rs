@@ -4,9 +4,9 @@ use crate::config::method::MethodKind;
 use crate::config::{Config, GaussianForm};
 use crate::error::{Error, Result};
 use crate::gaussians::blobs::BlobKernels;
+use crate::gaussians::deformable::DeformableKernels;
 use crate::gaussians::pictures::into_buffers;
 use crate::gaussians::stages::GaussianKernels;
-use crate::gaussians::tree::TreeKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
 use crate::kernels::layout::Setup;
@@ -120,7 +120,7 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     if config.method() == MethodKind::Gaussians {
         GaussianKernels::new(gpu)?;
         if config.gaussians.form != GaussianForm::Phase {
-            TreeKernels::new(gpu)?;
+            DeformableKernels::new(gpu)?;
         }
         BlobKernels::new(gpu, &tuning)?;
         into_buffers(gpu)?;

@@ -9,7 +9,7 @@
 //!    [`plan`]: everything a run needs: static backgrounds, the motion hull, scales and boxes
 //! 3. [`train::step`]: one iteration, in this order: rays -> samples -> [`network`] -> loss -> gradients -> Adam
 //! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses. Beside it, [`train::gaussians`] and
-//!    [`train::tree`] fit [`gaussians`] as the dynamic field to [`plan::targets`]; the fit starts from [`plan::seeds`] in a
+//!    [`train::deformable`] fit [`gaussians`] as the dynamic field to [`plan::targets`]; the fit starts from [`plan::seeds`] in a
 //!    [`plan::soft_hull`]
 //! 5. [`model`]: parameters, scales, hull and configuration; [`model::checkpoint`] keeps them in one safetensors file
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
@@ -178,13 +178,13 @@ pub mod gaussians {
     pub mod blending;
     pub mod blobs;
     pub mod comparison;
+    pub mod deformable;
     pub mod field;
     pub mod particles;
     pub mod pictures;
     pub mod spacing;
     pub mod stages;
     pub(crate) mod tensors;
-    pub mod tree;
     pub mod view;
     pub mod work;
 }
@@ -210,6 +210,8 @@ pub mod render {
 pub mod train {
     pub mod calibrate;
     mod carried;
+    pub mod deformable;
+    pub mod deformable_start;
     pub mod dry_run;
     pub mod fields;
     pub mod gaussians;
@@ -220,8 +222,6 @@ pub mod train {
     pub mod timing;
     pub mod trainer;
     pub mod training;
-    pub mod tree;
-    pub mod tree_start;
 }
 
 /// Export of a model for other tools: volumes, surfaces and motion.
@@ -333,6 +333,7 @@ pub mod bench;
 /// depends on them.
 pub mod reference {
     pub mod blobs;
+    pub mod deformable;
     pub mod field;
     pub mod gaussians;
     pub mod march;
@@ -342,7 +343,6 @@ pub mod reference {
     pub mod projector;
     pub mod ssim;
     pub mod step;
-    pub mod tree;
 }
 
 #[cfg(feature = "diagnostics")]

@@ -50,6 +50,6 @@ impl Model {
     /// Tells whether the dynamic field has values between phases, as a network or one moving set of Gaussians has. Sets per
     /// phase and fields of methods with a module of their own have none.
     pub fn is_continuous(&self) -> bool {
-        self.field.is_none() && self.moving.as_ref().is_none_or(|field| field.tree().is_some())
+        self.field.is_none() && self.moving.as_ref().is_none_or(|field| field.deformable().is_some())
     }
 }

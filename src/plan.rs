@@ -211,7 +211,7 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     notes.extend(between_phases(
         dataset,
         match form {
-            GaussianForm::Tree => {
+            GaussianForm::Deformable => {
                 "are fitted at their own time (at the mean time of the frames that share a phase and a view)"
             }
             _ => "are used as frames of the nearest phase",
@@ -221,10 +221,10 @@ fn plan_gaussians(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -
     notes.extend(without_motion(dataset, &soft));
     notes.push(format!("the soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
     notes.push(match form {
-        GaussianForm::Tree => match targets.rest_phase {
-            0 => "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"tree\")".into(),
+        GaussianForm::Deformable => match targets.rest_phase {
+            0 => "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"deformable\")".into(),
             phase => format!(
-                "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"tree\"), starting from \
+                "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"deformable\"), starting from \
                  phase {phase}, which shows more of the vessels than phase 0"
             ),
         },

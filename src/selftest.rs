@@ -3,12 +3,13 @@
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
 //! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
-//!    [`gaussians`], [`trees`], [`mod@r2`], [`x_gaussian`] and [`blobs`] about Gaussians; [`mod@sax`] about SAX-NeRF,
+//!    [`gaussians`], [`deformable`], [`mod@r2`], [`x_gaussian`] and [`blobs`] about Gaussians; [`mod@sax`] about SAX-NeRF,
 //!    [`projections`] about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 
 pub mod blobs;
 pub mod compare;
+pub mod deformable;
 pub mod drawing;
 pub mod gaussians;
 pub mod iteration;
@@ -17,7 +18,6 @@ pub mod occupancy;
 pub mod problems;
 pub mod projections;
 pub mod repeats;
-pub mod trees;
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
@@ -114,7 +114,7 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
         ("R2-Gaussian".into(), Box::new(move |findings| methods::r2_gaussian::selftest::compare(gpu, findings))),
         ("X-Gaussian".into(), Box::new(move |findings| methods::x_gaussian::selftest::compare(gpu, findings))),
         ("SAX-NeRF".into(), Box::new(move |findings| methods::sax_nerf::selftest::compare(gpu, findings))),
-        ("a deformable set of Gaussians".into(), Box::new(move |findings| trees::compare(gpu, findings))),
+        ("a deformable set of Gaussians".into(), Box::new(move |findings| deformable::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
         ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_crowd(gpu, tuning, findings))),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),

@@ -34,7 +34,7 @@ fn gpu() -> Gpu {
 /// All parameters of Gaussians and of the grid that moves them.
 fn parameters(field: &MovingGaussians) -> Vec<f32> {
     let of = |g: &Gaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.log_density]);
-    let moves = field.tree().map_or(Vec::new(), |tree| [&tree.grid[..], &tree.own].concat());
+    let moves = field.deformable().map_or(Vec::new(), |tree| [&tree.grid[..], &tree.own].concat());
     field.rows().rows.iter().flat_map(of).chain(moves.into_iter().flatten()).collect()
 }
 

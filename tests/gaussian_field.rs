@@ -201,7 +201,7 @@ fn resume_equals_no_interruption() {
         }
         let read = Checkpoint::from_bytes(&whole, Path::new("whole")).unwrap();
         assert_eq!(read.model.step, 32);
-        assert_eq!(matches!(read.model.moving, Some(MovingGaussians::Tree(_))), form == "tree");
+        assert_eq!(matches!(read.model.moving, Some(MovingGaussians::Deformable(_))), form == "tree");
     }
     expect_silence(gpu);
 }

@@ -121,14 +121,20 @@ fn gaussians_are_measured_as_they_run() {
     assert_eq!((&gaussians["iterations"], &report["before"]["iterations"]), (&json!(2), &json!(2)));
     // Passes of both parts, and none of the network or of tracking.
     let passes = report["passes_ms"].as_object().unwrap();
-    for name in ["tree_project", "gaussian_splat", "gaussian_residual", "gaussian_moments", "tree_grid_update", "adam"]
-    {
+    for name in [
+        "deformable_project",
+        "gaussian_splat",
+        "gaussian_residual",
+        "gaussian_moments",
+        "deformable_grid_update",
+        "adam",
+    ] {
         // The variant depends on the device.
         assert!(passes.iter().any(|(pass, ms)| pass.starts_with(name) && ms.as_f64().unwrap() > 0.0), "{name}");
     }
-    assert!(!passes.contains_key("tree_guess") && !passes.contains_key("gaussian_update"));
+    assert!(!passes.contains_key("deformable_guess") && !passes.contains_key("gaussian_update"));
     // A tree has two rounds over splats, each once per iteration.
-    assert_eq!(report["passes_per_iteration"]["tree_grid_update"], 1.0);
+    assert_eq!(report["passes_per_iteration"]["deformable_grid_update"], 1.0);
     assert_eq!(report["passes_per_iteration"].as_object().unwrap().len(), passes.len());
     // A report of a version without Gaussians.
     let mut older = report.clone();

@@ -20,18 +20,18 @@ use nertca_vk::plan::fit;
 use nertca_vk::plan::scale::dynamic_half;
 use nertca_vk::plan::soft_hull::carve::SoftMotion;
 use nertca_vk::plan::targets::Targets;
+use nertca_vk::reference::deformable::{DeformableParams, loss_and_gradient};
 use nertca_vk::reference::gaussians::{self as reference, N_PARAMS, Params, params};
 use nertca_vk::reference::maxima::maxima;
-use nertca_vk::reference::tree::{TreeParams, loss_and_gradient};
 use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::score::metrics;
+use nertca_vk::selftest::deformable;
 use nertca_vk::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
 use nertca_vk::selftest::problems::{
-    self, ANGLES_DEG, moving_tree, random_gaussians, tree_case, units, with_gaussians,
+    self, ANGLES_DEG, deformable_case, deformable_set, random_gaussians, units, with_gaussians,
 };
-use nertca_vk::selftest::trees;
+use nertca_vk::train::deformable::DeformableTrainer;
 use nertca_vk::train::gaussians::GaussianTrainer;
-use nertca_vk::train::tree::TreeTrainer;
 use nertca_vk::vessels::threshold::VESSEL_SHARE;
 use std::time::Instant;
 
@@ -342,11 +342,11 @@ fn train_phases(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussian
 
 fn train_tree(gpu: &Gpu, targets: Targets, config: &Config) -> Result<Gaussians> {
     let until = config.gaussians.iterations;
-    let mut trainer = TreeTrainer::new(gpu, targets, config)?;
+    let mut trainer = DeformableTrainer::new(gpu, targets, config)?;
     while trainer.step() < until {
         trainer.advance(until)?;
     }
-    Ok(trainer.tree()?.expand())
+    Ok(trainer.deformable()?.expand())
 }
 
 /// Mean Dice over the validation images, where the maximum attenuation along the ray is at least a fifth of the vessel's.
@@ -463,12 +463,12 @@ fn maxima_are_those_of_the_field() {
 
 #[test]
 fn tree_twin_gradient_is_the_derivative_of_its_loss() {
-    let (targets, rows, Config { tree: settings, .. }) = tree_case().unwrap();
+    let (targets, rows, Config { deformable: settings, .. }) = deformable_case().unwrap();
     let setup = GaussianSetup { cut: 12.0, ..fit::gaussian_setup(&targets, &config().gaussians) };
-    let tree = fit::tree_setup(&targets, &settings);
-    let p = moving_tree(&rows[..7], &tree, targets.n_phases);
+    let tree = fit::deformable_setup(&targets, &settings);
+    let p = deformable_set(&rows[..7], &tree, targets.n_phases);
     let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
-    let check = |what: &str, want: f64, change: &dyn Fn(&mut TreeParams, f64)| {
+    let check = |what: &str, want: f64, change: &dyn Fn(&mut DeformableParams, f64)| {
         let loss = |h: f64| {
             let mut moved = p.clone();
             change(&mut moved, h);
@@ -497,10 +497,10 @@ fn tree_twin_gradient_is_the_derivative_of_its_loss() {
 #[test]
 fn tree_kernels_match_their_twin() {
     let gpu = gpu();
-    expect_agreement(|findings| trees::compare(&gpu, findings));
-    let (targets, rows, config) = tree_case().unwrap();
-    let trainer = TreeTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
-    assert_eq!(trainer.tree().unwrap().expand().rows.len(), rows.len() * targets.n_phases);
+    expect_agreement(|findings| deformable::compare(&gpu, findings));
+    let (targets, rows, config) = deformable_case().unwrap();
+    let trainer = DeformableTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
+    assert_eq!(trainer.deformable().unwrap().expand().rows.len(), rows.len() * targets.n_phases);
     drop(trainer);
     expect_silence(gpu);
 }

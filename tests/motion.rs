@@ -10,9 +10,9 @@ mod python;
 use common::{expect_silence, gpu, small_config, small_dataset, tuning};
 use glam::{DMat3, DVec3};
 use nertca_vk::formats::npy;
-use nertca_vk::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units};
+use nertca_vk::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units};
 use nertca_vk::gaussians::view::SplatView;
-use nertca_vk::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use nertca_vk::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::plan::Plan;
@@ -67,7 +67,7 @@ fn place(i: usize, phase: f64) -> DVec3 {
     x + moved + own_at(before).lerp(own_at(before + 1), share)
 }
 
-fn tree() -> MovingTree {
+fn tree() -> DeformableGaussians {
     let step = 2.0 * HALF_SIDE / f64::from(NODES - 1);
     let n = NODES as usize;
     let node = |i: usize| DVec3::new((i % n) as f64, (i / n % n) as f64, (i / n / n) as f64) * step - HALF_SIDE;
@@ -79,7 +79,7 @@ fn tree() -> MovingTree {
         phase: REST as u32,
         rotation: [1.0, 0.2 * i as f32, -0.3, 0.5],
     };
-    MovingTree {
+    DeformableGaussians {
         rest: Gaussians {
             units: UNITS,
             n_phases: PHASES,
@@ -90,13 +90,13 @@ fn tree() -> MovingTree {
             is_crowd: false,
             intensities: None,
         },
-        setup: TreeSetup {
+        setup: DeformableSetup {
             n_nodes: NODES,
             half_side: HALF_SIDE as f32,
             inverse_step: (1.0 / step) as f32,
             n_basis: 2,
             rest_phase: REST as u32,
-            ..TreeSetup::default()
+            ..DeformableSetup::default()
         },
         grid: (0..PHASES).flat_map(|t| (0..n.pow(3)).map(move |i| pack(displacement(node(i), t)))).collect(),
         own: (0..6).flat_map(|i| own(i).map(pack)).collect(),
@@ -123,7 +123,7 @@ fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
 }
 
 fn moving_model() -> Model {
-    model("fast", Some(MovingGaussians::Tree(tree())))
+    model("fast", Some(MovingGaussians::Deformable(tree())))
 }
 
 fn saved(model: Model, path: &Path) -> String {
@@ -204,7 +204,7 @@ fn any_moment_of_the_beat_can_be_rendered() {
     // After a change, the new field is rendered from the next picture, also between phases.
     let mut other = tree();
     other.rest.rows.iter_mut().for_each(|g| g.log_density = -30.0);
-    renderer.set_gaussians(&MovingGaussians::Tree(other)).unwrap();
+    renderer.set_gaussians(&MovingGaussians::Deformable(other)).unwrap();
     assert!(at(0.5).dynamic_integral.iter().all(|v| *v < 1e-9));
     // Fields that are known at whole phases only give an error.
     renderer.set_gaussians(&MovingGaussians::PerPhase(tree().expand())).unwrap();
@@ -258,7 +258,7 @@ fn the_program_renders_between_phases() {
     let sets =
         saved(model("fast", Some(MovingGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
-    refuses(&["render", &sets, "--out", "x.npy", "--phase", "0.5"], &["between two phases", "whole", "tree"]);
+    refuses(&["render", &sets, "--out", "x.npy", "--phase", "0.5"], &["between two phases", "whole", "deformable"]);
     refuses(&["render", &sets, "--out", "x.npy", "--phase", "3"], &["--phase", "0 to 2"]);
     // A network has latents between those of two phases.
     let [first, between, last, closed] = ["0", "2.5", "2", "3"].map(|phase| {
@@ -347,7 +347,7 @@ fn a_run_of_gaussians_is_described() {
     let run = saved(moving_model(), &dir.path().join("tree.safetensors"));
     let info: Value = serde_json::from_str(&ok(&["info", &run, "--json"])).unwrap();
     let told = &info["gaussians"];
-    assert_eq!((&told["form"], &told["count"], &told["rest_phase"]), (&json!("tree"), &json!(6), &json!(REST)));
+    assert_eq!((&told["form"], &told["count"], &told["rest_phase"]), (&json!("deformable"), &json!(6), &json!(REST)));
     // There are 11 values per Gaussian, two vectors of own motion, and the grid.
     assert_eq!(told["bytes"], 4 * (6 * 11 + 6 * 2 * 3 + PHASES * 125 * 3));
     for phase in 0..PHASES {

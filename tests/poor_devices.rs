@@ -19,7 +19,7 @@ use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::selftest::{drawing, gaussians, repeats, trees};
+use nertca_vk::selftest::{deformable, drawing, gaussians, repeats};
 use nertca_vk::train::trainer::Trainer;
 use shim::Poor;
 
@@ -54,7 +54,7 @@ fn the_least_of_devices_computes_what_others_do() {
     let dataset = small_dataset(13, 11);
     let path = Tuning::for_device(info);
     expect_agreement(|findings| gaussians::compare(&gpu, findings));
-    expect_agreement(|findings| trees::compare(&gpu, findings));
+    expect_agreement(|findings| deformable::compare(&gpu, findings));
     expect_agreement(|findings| repeats::compare_network(&gpu, &dataset, &path, findings));
     expect_agreement(|findings| drawing::compare_views(&gpu, Preset::FastMlp, &path, findings));
     // Passes are not timed, and peaks are timed by the host.

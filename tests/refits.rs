@@ -45,7 +45,7 @@ fn phantom(gpu: &Gpu) -> (tempfile::TempDir, Dataset) {
 }
 
 fn session(gpu: &Gpu, dataset: &Dataset) -> Session {
-    session_of(gpu, dataset, GaussianForm::Tree, GAUSSIAN_ITERATIONS + 1)
+    session_of(gpu, dataset, GaussianForm::Deformable, GAUSSIAN_ITERATIONS + 1)
 }
 
 fn session_of(gpu: &Gpu, dataset: &Dataset, form: GaussianForm, iterations: u32) -> Session {
@@ -141,7 +141,7 @@ fn short_runs_take_in_frames_as_well() {
     const ITERATIONS: u32 = 30;
     let gpu = gpu();
     let (_directory, dataset) = phantom(&gpu);
-    for form in [GaussianForm::Phase, GaussianForm::Tree] {
+    for form in [GaussianForm::Phase, GaussianForm::Deformable] {
         let [at_once, grown] = [(); 2].map(|()| session_of(&gpu, &dataset, form, ITERATIONS));
         add(&at_once, &dataset, |_| true);
         assert_eq!(train(&at_once), ITERATIONS);
@@ -175,7 +175,7 @@ fn what_was_there_is_shown_until_there_is_better() {
         before += 1;
     }
     assert!(before > 3, "sets per phase and tracking come first");
-    assert!(shown() != earlier && shown().tree().is_some());
+    assert!(shown() != earlier && shown().deformable().is_some());
     drop(trainer);
     expect_silence(gpu);
 }

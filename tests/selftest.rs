@@ -27,7 +27,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::selftest::compare::Findings;
 use nertca_vk::selftest::iteration::F32_CASES;
-use nertca_vk::selftest::{blobs, gaussians, iteration, networks, problems, trees};
+use nertca_vk::selftest::{blobs, deformable, gaussians, iteration, networks, problems};
 use nertca_vk::train::trainer::Trainer;
 use program::program;
 use serde_json::Value;
@@ -77,7 +77,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("gaussian_moments", wrong_sign, gaussians::compare),
         fault("gaussian_update", wrong_sign, gaussians::compare),
         fault("gaussian_report", no_stores, gaussians::compare),
-        fault("tree_grid_gradient", wrong_sign, trees::compare),
+        fault("deformable_grid_gradient", wrong_sign, deformable::compare),
         fault("march_count", difference_for_sum, an_iteration),
         fault("march_scan", differences, an_iteration),
         fault("march_emit", difference_for_sum, an_iteration),

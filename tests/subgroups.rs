@@ -9,7 +9,7 @@ use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::selftest::iteration::{self, F32_CASES};
-use nertca_vk::selftest::{gaussians, repeats, trees};
+use nertca_vk::selftest::{deformable, gaussians, repeats};
 
 fn open(without_subgroups: bool) -> Gpu {
     Gpu::open(&DeviceOptions { validation: true, statistics: true, without_subgroups, ..DeviceOptions::default() })
@@ -47,7 +47,7 @@ fn every_stage_matches_with_and_without_subgroups() {
             });
         }
         expect_agreement(|findings| gaussians::compare(&gpu, findings));
-        expect_agreement(|findings| trees::compare(&gpu, findings));
+        expect_agreement(|findings| deformable::compare(&gpu, findings));
         expect_agreement(|findings| repeats::compare_gaussians(&gpu, findings));
         expect_agreement(|findings| repeats::compare_network(&gpu, &dataset, &paths[0], findings));
         let built = gpu.pipeline_statistics();

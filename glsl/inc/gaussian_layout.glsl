@@ -54,8 +54,8 @@ struct GaussianSchedule {
     float bias2;                // 1 - beta2^t
 };
 
-// The grid of displacements of a moving tree, and what keeps its motion plain.
-struct TreeSetup {
+// The grid of displacements of a deformable set, and what keeps its motion plain.
+struct DeformableSetup {
     uint n_nodes;               // nodes along each axis of a cube around the isocentre
     float half_side;            // half the cube's side
     float inverse_step;         // nodes per pixel

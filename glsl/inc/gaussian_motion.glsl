@@ -1,4 +1,4 @@
-// Where a Gaussian of the tree is; needs `gaussian_setup`, `tree_setup`, `motion_grid`, `own_motion` and `motion_basis`.
+// Where a Gaussian of the deformable set is; needs `gaussian_setup`, `deformable_setup`, `motion_grid`, `own_motion` and `motion_basis`.
 
 // The phase that lies beyond a time between two: after the phase, or before it. The beat closes.
 uint phase_beyond(uint phase, float after_phase) {
@@ -8,23 +8,23 @@ uint phase_beyond(uint phase, float after_phase) {
 
 // Where an image shows it that was taken so long after a phase: on the straight way from there to the phase beyond.
 vec3 position_at(uint i, vec3 rest, uint phase, float after_phase) {
-    vec3 place = on_grid(rest, tree_setup);
+    vec3 place = on_grid(rest, deformable_setup);
     uvec3 first = uvec3(floor(place));
-    uint n_nodes = tree_setup.n_nodes * tree_setup.n_nodes * tree_setup.n_nodes;
+    uint n_nodes = deformable_setup.n_nodes * deformable_setup.n_nodes * deformable_setup.n_nodes;
     uint beyond = phase_beyond(phase, after_phase);
     float share = abs(after_phase);
     vec3 x = rest;
     for (uint corner = 0u; corner < 8u; corner++) {
         uvec3 node = first + uvec3(corner & 1u, (corner >> 1) & 1u, corner >> 2);
-        uint at = node_index(node, tree_setup);
+        uint at = node_index(node, deformable_setup);
         vec3 way = motion_grid[phase * n_nodes + at].xyz;
         if (share > 0.0) way = mix(way, motion_grid[beyond * n_nodes + at].xyz, share);
         x += node_share(place, node) * way;
     }
-    for (uint k = 0u; k < tree_setup.n_basis; k++) {
-        float weight = motion_basis[phase * tree_setup.n_basis + k];
-        if (share > 0.0) weight = mix(weight, motion_basis[beyond * tree_setup.n_basis + k], share);
-        x += weight * own_motion[i * tree_setup.n_basis + k].xyz;
+    for (uint k = 0u; k < deformable_setup.n_basis; k++) {
+        float weight = motion_basis[phase * deformable_setup.n_basis + k];
+        if (share > 0.0) weight = mix(weight, motion_basis[beyond * deformable_setup.n_basis + k], share);
+        x += weight * own_motion[i * deformable_setup.n_basis + k].xyz;
     }
     return x;
 }

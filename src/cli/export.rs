@@ -5,7 +5,7 @@ use super::data::bar;
 use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
-use nertca_vk::export::motion::{MotionExport, MotionFormat, moving_tree, write_trajectories};
+use nertca_vk::export::motion::{MotionExport, MotionFormat, deformable_set, write_trajectories};
 use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
 use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
 use nertca_vk::formats::nrrd::Encoding;
@@ -45,7 +45,7 @@ pub struct ExportArgs {
     #[arg(long, requires = "mesh", value_name = "PER_MM")]
     pub iso: Option<f64>,
     /// Export motion instead of volumes: displacements from the reference phase (mostly 0) at the nodes of the motion
-    /// grid, mm, for one deformable set of Gaussians (gaussians.form = "tree"); --out ends in .nrrd or .vtk. Motion
+    /// grid, mm, for one deformable set of Gaussians (gaussians.form = "deformable"); --out ends in .nrrd or .vtk. Motion
     /// along a vessel is not observed in projections: displacements along vessels come from the smoothness of the
     /// motion only, and no strain can be derived from them.
     #[arg(long, conflicts_with_all = ["mesh", "format", "component", "spacing"])]
@@ -138,7 +138,7 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
 
 /// Exports displacements, or the paths of the Gaussians; needs no device.
 fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: bool) -> Result<()> {
-    let tree = moving_tree(model)?;
+    let tree = deformable_set(model)?;
     let format = MotionFormat::of(&args.out);
     let unknown = |known: &str| Error::config("--out", args.out.display(), format!("does not end in one of {known}"));
     let made = if args.trajectories {
@@ -150,7 +150,7 @@ fn export_motion(args: &ExportArgs, model: &Model, phases: Vec<u32>, sequence: b
     } else {
         let encoding = if args.compress { Encoding::Gzip } else { Encoding::Raw };
         let format = format.ok_or_else(|| unknown(".nrrd .vtk"))?;
-        MotionExport { tree, phases, sequence, format, encoding }.write(&args.out)?
+        MotionExport { deformable: tree, phases, sequence, format, encoding }.write(&args.out)?
     };
     made.iter().for_each(|path| out!("{}", path.display()));
     eprintln!(

@@ -83,8 +83,8 @@ fn describe_gaussians(field: &MovingGaussians) -> serde_json::Value {
         "form": field.form().name(),
         "count": field.rows().rows.len(),
         "bytes": field.bytes(),
-        "rest_phase": field.tree().map(|tree| tree.setup.rest_phase),
-        "displacement_from_phase_0": field.tree().map(|tree| phases.map(|p| tree.displacement(p as f64)).collect::<Vec<_>>()),
+        "rest_phase": field.deformable().map(|set| set.setup.rest_phase),
+        "displacement_from_phase_0": field.deformable().map(|set| phases.map(|p| set.displacement(p as f64)).collect::<Vec<_>>()),
     })
 }
 

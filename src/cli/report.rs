@@ -76,7 +76,7 @@ impl Report<'_> {
             facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s on an RTX A5000")));
         }
         let frames = dataset.validation().iter();
-        let tree = model.moving.as_ref().and_then(MovingGaussians::tree);
+        let tree = model.moving.as_ref().and_then(MovingGaussians::deformable);
         let of_views = |file: fn(&Path, usize) -> PathBuf| {
             let files = dataset.training_views().into_iter().map(|view| (view, file(&run.join("report"), view)));
             files.filter(|(_, file)| file.is_file()).collect()
@@ -142,7 +142,7 @@ impl Report<'_> {
 fn gaussians_of(field: &MovingGaussians) -> String {
     let form = match field {
         MovingGaussians::PerPhase(_) => "one set per phase",
-        MovingGaussians::Tree(_) => "one deformable set",
+        MovingGaussians::Deformable(_) => "one deformable set",
     };
     let kib = field.bytes() as f64 / 1024.0;
     format!("{}, {form} (gaussians.form = \"{}\"), {kib:.0} KiB", field.rows().rows.len(), field.form().name())

@@ -24,7 +24,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub struct TreeArgs {
     /// Run directory or checkpoint file.
     pub run: PathBuf,
-    /// Phase from 0, or `all`. With one deformable set of Gaussians (gaussians.form = "tree"), point i of branch b is
+    /// Phase from 0, or `all`. With one deformable set of Gaussians (gaussians.form = "deformable"), point i of branch b is
     /// the same material point at every phase; otherwise each phase has its own tree, and program and file say "not
     /// tracked".
     #[arg(long, default_value = "all")]

@@ -27,7 +27,7 @@ impl Config {
         self.networks.check_ranges()?;
         self.adam.check_ranges()?;
         self.gaussians.check_ranges()?;
-        self.tree.check_ranges()?;
+        self.deformable.check_ranges()?;
         self.r2.check_ranges()?;
         self.x.check_ranges()?;
         self.sax.check_ranges()?;

@@ -28,7 +28,7 @@ impl MethodKind {
             _ if config.dynamic.form == DynamicForm::Lineformer => MethodKind::SaxNerf,
             GaussianForm::None if config.static_field.form == StaticForm::Network => MethodKind::TwoNetworks,
             GaussianForm::None => MethodKind::Fields,
-            GaussianForm::Auto | GaussianForm::Phase | GaussianForm::Tree => MethodKind::Gaussians,
+            GaussianForm::Auto | GaussianForm::Phase | GaussianForm::Deformable => MethodKind::Gaussians,
         }
     }
 

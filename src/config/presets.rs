@@ -1,8 +1,8 @@
 //! The presets.
 
 use crate::config::sections::{
-    Adam, Calibrate, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField, Train,
-    Tree, X,
+    Adam, Calibrate, Deformable, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField,
+    Train, X,
 };
 use crate::config::{
     CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, Preset, R2Integral,
@@ -102,7 +102,7 @@ fn paper() -> Config {
         networks: networks(),
         adam: Adam { beta1: 0.9, beta2: 0.99, epsilon: 1e-8, decay_share: 1.0 },
         gaussians: gaussians(),
-        tree: tree(),
+        deformable: deformable(),
         r2: r2(),
         x: x(),
         sax: sax(),
@@ -143,9 +143,9 @@ pub(super) fn gaussians() -> Gaussians {
     }
 }
 
-/// Returns the defaults of the moving tree for all presets; the paper does not use it.
-pub(super) fn tree() -> Tree {
-    Tree {
+/// Returns the defaults of the deformable set of Gaussians for all presets; the paper does not use it.
+pub(super) fn deformable() -> Deformable {
+    Deformable {
         warm_iterations: 60,
         take: 0.03,
         node: 18.0,

@@ -287,7 +287,7 @@ section! {
     /// Gaussians as the dynamic field. Lengths are in pixels at the isocentre for images whose smaller side has 100 pixels, and
     /// scale with the image size; line integrals are shares of the views' strongest change.
     Gaussians, "gaussians" {
-        /// Representation of the dynamic field: "none" (the network), "phase", "tree", "auto", or "r2" and "x" (configured in
+        /// Representation of the dynamic field: "none" (the network), "phase", "deformable", "auto", or "r2" and "x" (configured in
         /// the sections `r2` and `x`; no other setting of this section applies then).
         form: GaussianForm,
         /// Iterations, each over all images.
@@ -342,10 +342,10 @@ section! {
 
 section! {
     /// One set of Gaussians that moves over the beat. Lengths are in the unit of section `gaussians`.
-    Tree, "tree" {
-        /// Iterations that fit a set per phase, before the tree is made from one of these sets.
+    Deformable, "tree" {
+        /// Iterations that fit a set per phase, before the deformable set is made from one of these sets.
         warm_iterations: u32 in 1.0 to 1e6,
-        /// Minimum amplitude at which a Gaussian of the rest phase is taken into the tree, as a share of the views' strongest
+        /// Minimum amplitude at which a Gaussian of the rest phase is taken into the deformable set, as a share of the views' strongest
         /// change.
         take: f64 in 0.0 to 1e3,
         /// Distance between nodes of the displacement grid.

@@ -12,7 +12,7 @@ use crate::formats::nrrd::{self, Encoding};
 use crate::formats::raw::{self, ByteOrder};
 use crate::formats::volume::VolumeHeader;
 use crate::formats::vtk::{self, Lines, PointValues};
-use crate::gaussians::field::{MovingGaussians, MovingTree, scales};
+use crate::gaussians::field::{DeformableGaussians, MovingGaussians, scales};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::Gaussian;
 use crate::model::Model;
@@ -49,9 +49,9 @@ impl MotionFormat {
 /// # Errors
 /// [`Error::Config`] where the dynamic field is one set of Gaussians per phase or a network, because neither follows a point
 /// over time.
-pub fn moving_tree(model: &Model) -> Result<&MovingTree> {
+pub fn deformable_set(model: &Model) -> Result<&DeformableGaussians> {
     let form = model.moving.as_ref().map_or(GaussianForm::None, MovingGaussians::form);
-    model.moving.as_ref().and_then(MovingGaussians::tree).ok_or_else(|| {
+    model.moving.as_ref().and_then(MovingGaussians::deformable).ok_or_else(|| {
         let made_of = match form {
             GaussianForm::None => "a network",
             _ => "a set of Gaussians per phase",
@@ -61,21 +61,21 @@ pub fn moving_tree(model: &Model) -> Result<&MovingTree> {
             form.name(),
             format!(
                 "the dynamic field is {made_of}, which does not track points from phase to phase: train one deformable \
-                 set of Gaussians (preset fast with gaussians.form = \"tree\")"
+                 set of Gaussians (preset fast with gaussians.form = \"deformable\")"
             ),
         )
     })
 }
 
 /// Converts a length or position along (posterior, left, superior) in the Gaussians' pixels to LPS mm.
-fn lps_mm(tree: &MovingTree, x: DVec3) -> DVec3 {
-    DVec3::new(x.y, x.x, x.z) * tree.rest.units.pixel * MM_PER_UNIT
+fn lps_mm(deformable: &DeformableGaussians, x: DVec3) -> DVec3 {
+    DVec3::new(x.y, x.x, x.z) * deformable.rest.units.pixel * MM_PER_UNIT
 }
 
-/// Export of the displacements on a tree's grid.
+/// Export of the displacements on a deformable set's grid.
 pub struct MotionExport<'a> {
-    /// The moving tree of Gaussians.
-    pub tree: &'a MovingTree,
+    /// The deformable set of Gaussians.
+    pub deformable: &'a DeformableGaussians,
     /// Phases to export, from 0.
     pub phases: Vec<u32>,
     /// Whether a phase axis, or a number in each file name, is also written for a single phase.
@@ -94,7 +94,7 @@ impl MotionExport<'_> {
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have, and for gzip in VTK; [`Error::Io`].
     pub fn write(&self, path: &Path) -> Result<Vec<PathBuf>> {
-        let n_phases = self.tree.rest.n_phases;
+        let n_phases = self.deformable.rest.n_phases;
         if let Some(bad) = self.phases.iter().find(|phase| **phase as usize >= n_phases) {
             return Err(Error::config("phase", bad, format!("is out of range: phases go from 0 to {}", n_phases - 1)));
         }
@@ -109,11 +109,11 @@ impl MotionExport<'_> {
 
     /// Header of a file with vectors on the grid.
     fn header(&self) -> VolumeHeader {
-        let setup = &self.tree.setup;
+        let setup = &self.deformable.setup;
         let (first, step) = (-f64::from(setup.half_side), 1.0 / f64::from(setup.inverse_step));
         VolumeHeader {
-            origin_mm: lps_mm(self.tree, DVec3::splat(first)),
-            spacing_mm: lps_mm(self.tree, DVec3::splat(step)),
+            origin_mm: lps_mm(self.deformable, DVec3::splat(first)),
+            spacing_mm: lps_mm(self.deformable, DVec3::splat(step)),
             size: [setup.n_nodes; 3],
             phases: self.sequence.then(|| self.phases.clone()),
             quantity: format!("displacement from phase {}, mm", setup.rest_phase),
@@ -122,11 +122,11 @@ impl MotionExport<'_> {
 
     /// Displacements at a phase in the order of the files.
     fn vectors(&self, phase: u32) -> Vec<f32> {
-        let n = self.tree.setup.n_nodes as usize;
-        let nodes = &self.tree.grid[phase as usize * n.pow(3)..][..n.pow(3)];
+        let n = self.deformable.setup.n_nodes as usize;
+        let nodes = &self.deformable.grid[phase as usize * n.pow(3)..][..n.pow(3)];
         // The grid's axes are (posterior, left, superior); the first varies fastest.
         let node = |i: usize| nodes[(i / (n * n) * n + i % n) * n + i / n % n];
-        let vector = |[x, y, z, _]: [f32; 4]| lps_mm(self.tree, DVec3::new(x.into(), y.into(), z.into()));
+        let vector = |[x, y, z, _]: [f32; 4]| lps_mm(self.deformable, DVec3::new(x.into(), y.into(), z.into()));
         (0..n.pow(3)).flat_map(|i| vector(node(i)).as_vec3().to_array()).collect()
     }
 
@@ -171,9 +171,9 @@ impl MotionExport<'_> {
 ///
 /// # Errors
 /// [`Error::Io`].
-pub fn write_trajectories(tree: &MovingTree, path: &Path) -> Result<()> {
-    let n_phases = tree.rest.n_phases;
-    let units = tree.rest.units;
+pub fn write_trajectories(deformable: &DeformableGaussians, path: &Path) -> Result<()> {
+    let n_phases = deformable.rest.n_phases;
+    let units = deformable.rest.units;
     let mut lines = Lines {
         title: format!("trajectories of Gaussians over a closed beat, LPS mm; {CAVEAT}"),
         points_per_line: n_phases,
@@ -182,15 +182,15 @@ pub fn write_trajectories(tree: &MovingTree, path: &Path) -> Result<()> {
     };
     let (mut phases, mut scale_mm, mut attenuation) = (Vec::new(), Vec::new(), Vec::new());
     let deviations_mm = |g: &Gaussian| {
-        let mut sorted = (scales(g, &tree.rest.setup) * units.pixel * MM_PER_UNIT).to_array();
+        let mut sorted = (scales(g, &deformable.rest.setup) * units.pixel * MM_PER_UNIT).to_array();
         sorted.sort_by(f64::total_cmp);
         sorted.map(|v| v as f32)
     };
-    for (index, g) in tree.rest.rows.iter().enumerate() {
+    for (index, g) in deformable.rest.rows.iter().enumerate() {
         let scale = deviations_mm(g);
         let per_mm = f64::from(g.log_density).exp() * units.attenuation() / MM_PER_UNIT;
         for phase in 0..n_phases {
-            lines.points.push(lps_mm(tree, tree.position(index, phase as f64)).as_vec3().to_array());
+            lines.points.push(lps_mm(deformable, deformable.position(index, phase as f64)).as_vec3().to_array());
             phases.push(phase as f32);
             scale_mm.extend(scale);
             attenuation.push(per_mm as f32);

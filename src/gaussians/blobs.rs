@@ -1,7 +1,7 @@
 //! Drawing of Gaussians along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units, scales};
+use crate::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units, scales};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
@@ -79,8 +79,8 @@ struct BlobSet {
     blobs: Buffer,
     /// Range of each phase's Gaussians in the buffer.
     phases: Vec<Range<u32>>,
-    /// The moving tree, if the field is one.
-    tree: Option<MovingTree>,
+    /// The deformable set, if the field is one.
+    deformable: Option<DeformableGaussians>,
     /// Whether so many Gaussians overlap that the strongest ones of a ray do not determine the maximum of their sum.
     is_crowd: bool,
 }
@@ -93,7 +93,12 @@ impl BlobSet {
             all.extend(field.at(phase).iter().map(|g| Blob::of(g, sets.units, &sets.setup)));
             phases.push(first..all.len() as u32);
         }
-        Ok(BlobSet { blobs: upload(gpu, all)?, phases, tree: field.tree().cloned(), is_crowd: sets.is_crowd })
+        Ok(BlobSet {
+            blobs: upload(gpu, all)?,
+            phases,
+            deformable: field.deformable().cloned(),
+            is_crowd: sets.is_crowd,
+        })
     }
 }
 
@@ -142,10 +147,10 @@ impl Blobs {
 
     /// Tells whether the field is known between phases.
     pub fn move_between_phases(&self) -> bool {
-        self.set.lock().unwrap_or_else(PoisonError::into_inner).tree.is_some()
+        self.set.lock().unwrap_or_else(PoisonError::into_inner).deformable.is_some()
     }
 
-    /// Returns the Gaussians of a tree at a phase, which may be fractional; none for another field, which is known only at
+    /// Returns the Gaussians of a deformable set at a phase, which may be fractional; none for another field, which is known only at
     /// whole phases.
     ///
     /// # Errors
@@ -153,9 +158,9 @@ impl Blobs {
     pub fn between(&self, phase: f64) -> Result<Option<BlobList>> {
         let blobs: Vec<Blob> = {
             let set = self.set.lock().unwrap_or_else(PoisonError::into_inner);
-            let Some(tree) = &set.tree else { return Ok(None) };
-            let Gaussians { units, setup, .. } = &tree.rest;
-            tree.at(phase).iter().map(|g| Blob::of(g, *units, setup)).collect()
+            let Some(deformable) = &set.deformable else { return Ok(None) };
+            let Gaussians { units, setup, .. } = &deformable.rest;
+            deformable.at(phase).iter().map(|g| Blob::of(g, *units, setup)).collect()
         };
         let range = 0..blobs.len() as u32;
         Ok(Some(BlobList { blobs: upload(&self.gpu, blobs)?, range }))

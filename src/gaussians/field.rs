@@ -3,7 +3,7 @@
 use crate::config::GaussianForm;
 use crate::error::{Error, Result};
 use crate::geometry::MM_PER_UNIT;
-use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use glam::DVec3;
 use serde::Serialize;
 use std::sync::{Arc, Mutex};
@@ -129,7 +129,7 @@ pub fn dense(rows: &[Gaussian], setup: &GaussianSetup, share: f64) -> Vec<bool> 
     rows.iter().map(|g| density(g) >= least).collect()
 }
 
-/// Returns the nodes per pixel of a tree's grid of `n_nodes` nodes along each axis, which reaches `half_side` pixels to either
+/// Returns the nodes per pixel of a deformable set's grid of `n_nodes` nodes along each axis, which reaches `half_side` pixels to either
 /// side. It is computed from values that checkpoints keep exactly, so that a loaded field draws the same pictures as the saved
 /// one.
 pub fn inverse_step(n_nodes: u32, half_side: f32) -> f32 {
@@ -138,11 +138,11 @@ pub fn inverse_step(n_nodes: u32, half_side: f32) -> f32 {
 
 /// One set of Gaussians for the whole beat.
 #[derive(Debug, Clone, PartialEq)]
-pub struct MovingTree {
+pub struct DeformableGaussians {
     /// Gaussians at the rest phase.
     pub rest: Gaussians,
     /// The grid.
-    pub setup: TreeSetup,
+    pub setup: DeformableSetup,
     /// `[phase][node]`: displacement (x, y, z, 0), pixels at the isocentre; zero at the rest phase.
     pub grid: Vec<[f32; 4]>,
     /// `[Gaussian][basis function]`: own motion (x, y, z, 0), pixels at the isocentre.
@@ -155,26 +155,26 @@ pub enum MovingGaussians {
     /// A separate set per phase; the sets share nothing.
     PerPhase(Gaussians),
     /// One moving set for the whole beat.
-    Tree(MovingTree),
+    Deformable(DeformableGaussians),
 }
 
 /// Current Gaussians of a run in training, and the number of their changes so far.
 pub type MovingFeed = Arc<Mutex<(u64, MovingGaussians)>>;
 
 impl MovingGaussians {
-    /// Returns the Gaussians; for a tree, those at its rest phase.
+    /// Returns the Gaussians; for a deformable set, those at its rest phase.
     pub fn rows(&self) -> &Gaussians {
         match self {
             MovingGaussians::PerPhase(sets) => sets,
-            MovingGaussians::Tree(tree) => &tree.rest,
+            MovingGaussians::Deformable(deformable) => &deformable.rest,
         }
     }
 
-    /// Returns the tree, if the field is one.
-    pub fn tree(&self) -> Option<&MovingTree> {
+    /// Returns the deformable set, if the field is one.
+    pub fn deformable(&self) -> Option<&DeformableGaussians> {
         match self {
             MovingGaussians::PerPhase(_) => None,
-            MovingGaussians::Tree(tree) => Some(tree),
+            MovingGaussians::Deformable(deformable) => Some(deformable),
         }
     }
 
@@ -184,7 +184,7 @@ impl MovingGaussians {
             MovingGaussians::PerPhase(sets) if sets.intensities.is_some() => GaussianForm::X,
             MovingGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
             MovingGaussians::PerPhase(_) => GaussianForm::Phase,
-            MovingGaussians::Tree(_) => GaussianForm::Tree,
+            MovingGaussians::Deformable(_) => GaussianForm::Deformable,
         }
     }
 
@@ -197,7 +197,7 @@ impl MovingGaussians {
     pub fn at_time(&self, phases: f64) -> Vec<Gaussian> {
         match self {
             MovingGaussians::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
-            MovingGaussians::Tree(tree) => tree.at(phases),
+            MovingGaussians::Deformable(deformable) => deformable.at(phases),
         }
     }
 
@@ -219,7 +219,7 @@ pub fn basis(n_basis: usize, fraction: f64) -> Vec<f64> {
 }
 
 /// Returns the nodes around a point with their interpolation weights.
-pub fn shares(setup: &TreeSetup, x: DVec3) -> [(usize, f64); 8] {
+pub fn shares(setup: &DeformableSetup, x: DVec3) -> [(usize, f64); 8] {
     let n = setup.n_nodes as usize;
     let last = DVec3::splat(f64::from(setup.n_nodes) - 1.001);
     let place = (x + f64::from(setup.half_side)) * f64::from(setup.inverse_step);
@@ -248,7 +248,7 @@ pub(crate) fn vector(v: &[f32; 4]) -> DVec3 {
     DVec3::new(v[0].into(), v[1].into(), v[2].into())
 }
 
-impl MovingTree {
+impl DeformableGaussians {
     /// Returns the position at a phase to which the grid moves a point of the rest phase. The phase may be fractional; the
     /// motion is periodic.
     pub fn carried(&self, x: DVec3, phase: f64) -> DVec3 {
@@ -326,7 +326,7 @@ mod tests {
 
     #[test]
     fn shares_are_trilinear() {
-        let setup = TreeSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, ..TreeSetup::default() };
+        let setup = DeformableSetup { n_nodes: 4, half_side: 30.0, inverse_step: 0.05, ..DeformableSetup::default() };
         let x = DVec3::new(-17.0, 3.0, 22.0);
         let all = shares(&setup, x);
         assert!((all.iter().map(|s| s.1).sum::<f64>() - 1.0).abs() < 1e-12);

@@ -1,8 +1,8 @@
 //! Gaussians in a checkpoint: tensors under documented names, and their section of the header.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units, inverse_step};
-use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units, inverse_step};
+use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
@@ -12,7 +12,7 @@ pub(crate) const FORMAT: &str = "nertca-checkpoint-3";
 /// Section of the header with the properties of the Gaussians.
 pub(crate) const SECTION: &str = "gaussians";
 
-/// Maximum number of nodes along an axis of a tree's grid, and of numbers per axis of own motion, far above those of any run.
+/// Maximum number of nodes along an axis of a deformable set's grid, and of numbers per axis of own motion, far above those of any run.
 const MOST_NODES: u32 = 512;
 const MOST_BASIS: u32 = 256;
 
@@ -33,7 +33,7 @@ pub(crate) struct GaussianHeader {
     /// Number of views of the fit; 0 where it is not known.
     #[serde(default)]
     views: u32,
-    /// The grid that moves a tree; none for a set per phase.
+    /// The grid that moves a deformable set; none for a set per phase.
     grid: Option<GridHeader>,
     /// Whether the model consists of Gaussians alone, of which hundreds overlap.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -73,11 +73,11 @@ pub(crate) fn header(field: &MovingGaussians) -> GaussianHeader {
         blended: sets.intensities.is_some(),
         grid: match field {
             MovingGaussians::PerPhase(_) => None,
-            MovingGaussians::Tree(tree) => Some(GridHeader {
-                nodes: tree.setup.n_nodes,
-                half_side: tree.setup.half_side,
-                basis: tree.setup.n_basis,
-                rest_phase: tree.setup.rest_phase,
+            MovingGaussians::Deformable(deformable) => Some(GridHeader {
+                nodes: deformable.setup.n_nodes,
+                half_side: deformable.setup.half_side,
+                basis: deformable.setup.n_basis,
+                rest_phase: deformable.setup.rest_phase,
             }),
         },
     }
@@ -105,14 +105,14 @@ pub(crate) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
             let phases = rows.iter().flat_map(|g| g.phase.to_le_bytes()).collect();
             all.push(("gaussians.phase".into(), Dtype::U32, vec![rows.len()], phases));
         }
-        MovingGaussians::Tree(tree) => {
+        MovingGaussians::Deformable(deformable) => {
             let vectors = |name: &str, shape: Vec<usize>, values: &[[f32; 4]]| -> FileTensor {
                 let bytes = values.iter().flat_map(|v| v[..3].to_vec()).flat_map(f32::to_le_bytes).collect();
                 (format!("gaussians.{name}"), Dtype::F32, shape, bytes)
             };
-            let (n, basis) = (tree.setup.n_nodes as usize, tree.setup.n_basis as usize);
-            all.push(vectors("motion.grid", vec![tree.rest.n_phases, n, n, n, 3], &tree.grid));
-            all.push(vectors("motion.own", vec![rows.len(), basis, 3], &tree.own));
+            let (n, basis) = (deformable.setup.n_nodes as usize, deformable.setup.n_basis as usize);
+            all.push(vectors("motion.grid", vec![deformable.rest.n_phases, n, n, n, 3], &deformable.grid));
+            all.push(vectors("motion.own", vec![rows.len(), basis, 3], &deformable.own));
         }
     }
     all
@@ -200,14 +200,14 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         let values = file.floats(name, shape)?;
         Ok(values.chunks_exact(3).map(|v| [v[0], v[1], v[2], 0.0]).collect())
     };
-    Ok(MovingGaussians::Tree(MovingTree {
-        setup: TreeSetup {
+    Ok(MovingGaussians::Deformable(DeformableGaussians {
+        setup: DeformableSetup {
             n_nodes: grid.nodes,
             half_side: grid.half_side,
             inverse_step: inverse_step(grid.nodes, grid.half_side),
             n_basis: grid.basis,
             rest_phase: grid.rest_phase,
-            ..TreeSetup::default()
+            ..DeformableSetup::default()
         },
         grid: vectors("gaussians.motion.grid", &[Some(n_phases), nodes, nodes, nodes, Some(3)])?,
         own: vectors("gaussians.motion.own", &[Some(n), Some(grid.basis as usize), Some(3)])?,

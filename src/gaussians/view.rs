@@ -16,7 +16,7 @@ pub struct SplatView {
     pub direction: [DVec3; 3],
     /// The X-ray source.
     pub source: DVec3,
-    /// Time of the image after its phase, in phases from -0.5 to 0.5. A moving tree is interpolated towards the next or the
+    /// Time of the image after its phase, in phases from -0.5 to 0.5. A deformable set is interpolated towards the next or the
     /// previous phase.
     pub after_phase: f64,
 }

@@ -32,7 +32,7 @@ const BYTES_PER_SPLAT: u64 = 3 * (size_of::<Splat>() as u64 + 4);
 /// Work of one iteration over all images. Parameters, gradients and the optimiser are not counted.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GaussianWork {
-    /// Splats: one per Gaussian and view; for a tree, one per Gaussian, view and phase.
+    /// Splats: one per Gaussian and view; for a deformable set, one per Gaussian, view and phase.
     pub splats: u64,
     /// Pairs of a splat and a pixel of its box.
     pub pairs: u64,

@@ -1,7 +1,7 @@
-//! Conversion of Gaussians to other units and of a moving tree to another grid, needed when data are added to a fitted field.
+//! Conversion of Gaussians to other units and of a deformable set to another grid, needed when data are added to a fitted field.
 
-use crate::gaussians::field::{Gaussians, MovingTree, Units, vector};
-use crate::kernels::layout::{Gaussian, TreeSetup};
+use crate::gaussians::field::{DeformableGaussians, Gaussians, Units, vector};
+use crate::kernels::layout::{DeformableSetup, Gaussian};
 use glam::DVec3;
 
 impl Gaussians {
@@ -19,10 +19,10 @@ impl Gaussians {
     }
 }
 
-impl MovingTree {
-    /// Returns this tree in the units of `rest` on another grid with the same number of basis functions of own motion.
+impl DeformableGaussians {
+    /// Returns this deformable set in the units of `rest` on another grid with the same number of basis functions of own motion.
     /// Displacements are evaluated at the new nodes; outside the old grid they have the values on its faces.
-    pub fn on_grid(&self, rest: Gaussians, setup: TreeSetup) -> MovingTree {
+    pub fn on_grid(&self, rest: Gaussians, setup: DeformableSetup) -> DeformableGaussians {
         let pixels = self.rest.units.pixel / rest.units.pixel;
         let pack = |v: DVec3| {
             let [x, y, z] = (v * pixels).as_vec3().to_array();
@@ -35,7 +35,7 @@ impl MovingTree {
         };
         let at = |phase: usize, i: usize| pack(self.carried(node(i), phase as f64) - node(i));
         let grid = (0..rest.n_phases).flat_map(|phase| (0..setup.nodes()).map(move |i| (phase, i)));
-        MovingTree {
+        DeformableGaussians {
             grid: grid.map(|(phase, i)| at(phase, i)).collect(),
             own: self.own.iter().map(|v| pack(vector(v))).collect(),
             rest,
@@ -52,19 +52,19 @@ mod tests {
 
     const N_PHASES: usize = 3;
 
-    fn grid(n_nodes: u32, half_side: f32) -> TreeSetup {
-        TreeSetup {
+    fn grid(n_nodes: u32, half_side: f32) -> DeformableSetup {
+        DeformableSetup {
             n_nodes,
             half_side,
             inverse_step: inverse_step(n_nodes, half_side),
             n_basis: 2,
             rest_phase: 1,
-            ..TreeSetup::default()
+            ..DeformableSetup::default()
         }
     }
 
-    /// Returns a tree whose displacements are linear in position, so that any grid represents them exactly.
-    fn tree() -> MovingTree {
+    /// Returns a deformable set whose displacements are linear in position, so that any grid represents them exactly.
+    fn deformable() -> DeformableGaussians {
         let setup = grid(5, 40.0);
         let node = |i: usize| DVec3::new((i % 5) as f64, (i / 5 % 5) as f64, (i / 25) as f64) * 20.0 - 40.0;
         let displacement = |phase: usize, x: DVec3| {
@@ -78,7 +78,7 @@ mod tests {
             phase: 1,
             rotation: [1.0, 0.1, 0.2, 0.3],
         };
-        MovingTree {
+        DeformableGaussians {
             rest: Gaussians {
                 units: Units { pixel: 0.01, strongest: 0.5 },
                 n_phases: N_PHASES,
@@ -96,20 +96,22 @@ mod tests {
 
     #[test]
     fn a_tree_is_the_same_in_other_units_on_another_grid() {
-        let tree = tree();
+        let deformable = deformable();
         let units = Units { pixel: 0.016, strongest: 0.7 };
-        let other = tree.on_grid(tree.rest.in_units(units), grid(7, 31.0));
+        let other = deformable.on_grid(deformable.rest.in_units(units), grid(7, 31.0));
         for phase in [0.0, 0.4, 1.0, 2.0, 2.5] {
             for i in 0..4 {
-                let [was, is] = [(&tree, 0.01), (&other, 0.016)].map(|(tree, pixel)| tree.position(i, phase) * pixel);
+                let [was, is] = [(&deformable, 0.01), (&other, 0.016)]
+                    .map(|(deformable, pixel)| deformable.position(i, phase) * pixel);
                 assert!(was.distance(is) < 1e-6, "Gaussian {i} at phase {phase}: {is}, not {was}");
             }
         }
-        for (was, is) in tree.rest.rows.iter().zip(&other.rest.rows) {
-            let width = |g, of: &MovingTree| scales(g, &of.rest.setup) * of.rest.units.pixel;
-            let density = |g: &Gaussian, of: &MovingTree| f64::from(g.log_density).exp() * of.rest.units.attenuation();
-            assert!(width(was, &tree).distance(width(is, &other)) < 1e-8);
-            assert!((density(was, &tree) / density(is, &other) - 1.0).abs() < 1e-6);
+        for (was, is) in deformable.rest.rows.iter().zip(&other.rest.rows) {
+            let width = |g, of: &DeformableGaussians| scales(g, &of.rest.setup) * of.rest.units.pixel;
+            let density =
+                |g: &Gaussian, of: &DeformableGaussians| f64::from(g.log_density).exp() * of.rest.units.attenuation();
+            assert!(width(was, &deformable).distance(width(is, &other)) < 1e-8);
+            assert!((density(was, &deformable) / density(is, &other) - 1.0).abs() < 1e-6);
         }
     }
 }

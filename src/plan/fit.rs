@@ -4,7 +4,7 @@ use crate::config::sections;
 use crate::fitting::RING_LENGTH;
 use crate::gaussians::field::inverse_step;
 use crate::gaussians::stages::{FIXED_POINT_BITS, loss_parts};
-use crate::kernels::layout::{GaussianSchedule, GaussianSetup, TreeSetup};
+use crate::kernels::layout::{DeformableSetup, GaussianSchedule, GaussianSetup};
 use crate::plan::targets::Targets;
 
 /// Decay of Adam's first and second moments, and its smallest denominator.
@@ -46,8 +46,8 @@ pub fn gaussian_setup(targets: &Targets, settings: &sections::Gaussians) -> Gaus
     }
 }
 
-/// Constants while the motion of a tree is tracked, a phase at a time.
-pub fn track_setup(setup: &GaussianSetup, settings: &sections::Tree) -> GaussianSetup {
+/// Constants while the motion of a deformable set is tracked, a phase at a time.
+pub fn track_setup(setup: &GaussianSetup, settings: &sections::Deformable) -> GaussianSetup {
     GaussianSetup {
         blur: settings.track_blur as f32,
         loss_weight: 1.0,
@@ -58,14 +58,14 @@ pub fn track_setup(setup: &GaussianSetup, settings: &sections::Tree) -> Gaussian
     }
 }
 
-/// Constants of a tree's grid, which encloses the hull.
-pub fn tree_setup(targets: &Targets, settings: &sections::Tree) -> TreeSetup {
+/// Constants of a deformable set's grid, which encloses the hull.
+pub fn deformable_setup(targets: &Targets, settings: &sections::Deformable) -> DeformableSetup {
     let reach = targets.places.iter().flatten().map(|p| p.position.abs().max_element()).fold(0.0, f64::max);
     let half_side = reach + MARGIN;
     let n_nodes = (2.0 * half_side / settings.node).ceil() as u32 + 1;
     // Harmonics beyond half the number of phases cannot be told apart.
     let harmonics = settings.harmonics.min((targets.n_phases as u32).saturating_sub(1) / 2);
-    TreeSetup {
+    DeformableSetup {
         n_nodes,
         half_side: half_side as f32,
         inverse_step: inverse_step(n_nodes, half_side as f32),
@@ -84,7 +84,7 @@ pub fn schedule(settings: &sections::Gaussians) -> Vec<GaussianSchedule> {
 }
 
 /// One row per iteration of a tracked phase.
-pub fn track_schedule(settings: &sections::Tree) -> Vec<GaussianSchedule> {
+pub fn track_schedule(settings: &sections::Deformable) -> Vec<GaussianSchedule> {
     let n = settings.track_iterations.max(1);
     let rate = |step: u32| 1.0 - (1.0 - TRACK_LAST_RATE) * f64::from(step) / f64::from(n);
     (0..n).map(|step| row(step, rate(step), TRACK_BETAS)).collect()

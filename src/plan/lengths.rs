@@ -1,7 +1,7 @@
 //! Lengths of the settings, in pixels, adapted to the images at hand: larger images show the same field, and noise asks for
 //! smoother vessels.
 
-use crate::config::sections::{Gaussians, Tree};
+use crate::config::sections::{Deformable, Gaussians};
 use crate::evidence::background::blur;
 use crate::raster::{Image, percentile};
 
@@ -52,8 +52,8 @@ impl Lengths {
     }
 
     /// Settings with lengths in pixels of the images. Penalties stay: squared lengths grow as the number of pixels does.
-    pub fn tree(self, settings: &Tree) -> Tree {
-        Tree {
+    pub fn deformable(self, settings: &Deformable) -> Deformable {
+        Deformable {
             node: self.factor * settings.node,
             grid_rate: self.factor * settings.grid_rate,
             own_rate: self.factor * settings.own_rate,

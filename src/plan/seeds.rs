@@ -97,9 +97,9 @@ pub fn additions(targets: &Targets, settings: &sections::Gaussians, seed: u32, i
     all
 }
 
-/// New Gaussians of a tree, at places of its rest phase where, moved along by `carried` (place, phase), every view lacks line
+/// New Gaussians of a deformable set, at places of its rest phase where, moved along by `carried` (place, phase), every view lacks line
 /// integral at half of the phases or more; phases may lie between two.
-pub fn tree_additions(
+pub fn deformable_additions(
     targets: &Targets,
     settings: &sections::Gaussians,
     seed: u32,

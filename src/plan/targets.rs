@@ -63,7 +63,7 @@ pub struct Targets {
     pub noise: Vec<f32>,
     /// Lengths of the settings on these images.
     pub lengths: Lengths,
-    /// Phase at which the Gaussians of a tree rest.
+    /// Phase at which the Gaussians of a deformable set rest.
     pub rest_phase: usize,
     /// Cells of the hull, per phase.
     pub places: Vec<Vec<Place>>,
@@ -189,7 +189,7 @@ impl Targets {
         Ok(targets)
     }
 
-    /// Returns the form of the dynamic field that suits the data where `asked` leaves it open. A tree shares one set of
+    /// Returns the form of the dynamic field that suits the data where `asked` leaves it open. A deformable set shares one set of
     /// Gaussians over the beat; it needs enough phases to be followed from one to the next, a rest phase that two views show,
     /// and vessels that are filled all the time.
     pub fn form(&self, asked: GaussianForm) -> GaussianForm {
@@ -197,7 +197,7 @@ impl Targets {
         let rests = self.views_at(self.rest_phase).count() >= LEAST_VIEWS;
         match asked {
             GaussianForm::Auto if self.n_phases >= LEAST_PHASES && rests && !self.contrast_comes_and_goes() => {
-                GaussianForm::Tree
+                GaussianForm::Deformable
             }
             GaussianForm::Auto => GaussianForm::Phase,
             asked => asked,

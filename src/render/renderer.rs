@@ -234,7 +234,7 @@ impl Renderer {
                 "phase",
                 phase,
                 "lies between two phases, and the dynamic field of this model has whole phases only: choose a whole \
-                 phase, or train one deformable set of Gaussians (preset fast with gaussians.form = \"tree\") or a \
+                 phase, or train one deformable set of Gaussians (preset fast with gaussians.form = \"deformable\") or a \
                  network",
             )),
         }

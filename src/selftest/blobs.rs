@@ -55,7 +55,7 @@ pub fn model(gpu: &Gpu, dataset: &Dataset, field: MovingGaussians, tuning: &Tuni
 }
 
 fn form(field: &MovingGaussians) -> &'static str {
-    if field.tree().is_some() { "tree" } else { "phase" }
+    if field.deformable().is_some() { "deformable" } else { "phase" }
 }
 
 /// Compares integrals and maximum values along rays, and pictures.

@@ -1,17 +1,17 @@
 //! Problems small enough for f64 twins: angiograms, configurations and Gaussians that need no file.
 
-use crate::config::sections::{self, Tree};
+use crate::config::sections::{self, Deformable};
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
-use crate::gaussians::field::{Gaussians, MovingGaussians, MovingTree, Units};
+use crate::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry, ViewRays};
-use crate::kernels::layout::{Gaussian, GaussianSetup, TreeSetup};
+use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use crate::plan::lengths::Lengths;
 use crate::plan::targets::{Place, Targets};
 use crate::random::{STREAM_JITTER, normal};
+use crate::reference::deformable::DeformableParams;
 use crate::reference::gaussians::params;
-use crate::reference::tree::TreeParams;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use glam::DVec3;
 use std::path::PathBuf;
@@ -210,11 +210,11 @@ pub fn with_gaussians(gaussians: sections::Gaussians) -> Config {
     Config { gaussians, ..Config::preset(Preset::Fast) }
 }
 
-/// A tree's targets, Gaussians and settings.
+/// A deformable set's targets, Gaussians and settings.
 ///
 /// # Errors
 /// As [`targets`].
-pub fn tree_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
+pub fn deformable_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
     let mut targets = targets(33, 27, 5)?;
     // Some images were taken between two phases.
     targets
@@ -229,22 +229,22 @@ pub fn tree_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
     let mut rows = random_gaussians(31, 1, 11.0, 8);
     rows[3].position = [300.0, 0.0, 0.0];
     let preset = Config::preset(Preset::Fast);
-    let tree = Tree { node: 12.0, smoothness: 0.5, own_penalty: 0.7, ..preset.tree };
+    let deformable = Deformable { node: 12.0, smoothness: 0.5, own_penalty: 0.7, ..preset.deformable };
     let gaussians = sections::Gaussians { grow_at: 0, ..preset.gaussians.clone() };
-    Ok((targets, rows, Config { tree, gaussians, ..preset }))
+    Ok((targets, rows, Config { deformable, gaussians, ..preset }))
 }
 
-/// A tree that already moves: Gaussians at rest, own motion, and a grid filled with waves where it does not rest.
-pub fn moving_tree(rows: &[Gaussian], tree: &TreeSetup, n_phases: usize) -> TreeParams {
+/// A deformable set that already moves: Gaussians at rest, own motion, and a grid filled with waves where it does not rest.
+pub fn deformable_set(rows: &[Gaussian], deformable: &DeformableSetup, n_phases: usize) -> DeformableParams {
     let wave = |i: usize, k: f64| {
         let at = |c: f64| f64::from((0.4 * (k * (i as f64 + c)).sin()) as f32);
         DVec3::new(at(0.0), at(0.3), at(0.9))
     };
-    let nodes = tree.nodes();
-    let rests = |i: usize| i / nodes == tree.rest_phase as usize;
+    let nodes = deformable.nodes();
+    let rests = |i: usize| i / nodes == deformable.rest_phase as usize;
     let grid = (0..n_phases * nodes).map(|i| if rests(i) { DVec3::ZERO } else { wave(i, 0.61) }).collect();
-    let own = (0..rows.len() * tree.n_basis as usize).map(|i| 0.5 * wave(i, 0.47)).collect();
-    TreeParams { rows: rows.iter().map(params).collect(), own, grid }
+    let own = (0..rows.len() * deformable.n_basis as usize).map(|i| 0.5 * wave(i, 0.47)).collect();
+    DeformableParams { rows: rows.iter().map(params).collect(), own, grid }
 }
 
 /// Pixel at the isocentre and strongest change of [`drawn_fields`], world units.
@@ -273,15 +273,15 @@ fn drawn_set(n: usize, n_phases: u32) -> Gaussians {
 }
 
 /// One set of Gaussians that moves, to be drawn.
-fn drawn_tree(n: usize, n_phases: u32) -> MovingTree {
+fn drawn_deformable(n: usize, n_phases: u32) -> DeformableGaussians {
     const REST_PHASE: u32 = 1;
-    let setup = TreeSetup {
+    let setup = DeformableSetup {
         n_nodes: 4,
         half_side: 30.0,
         inverse_step: 0.05,
         n_basis: 4,
         rest_phase: REST_PHASE,
-        ..TreeSetup::default()
+        ..DeformableSetup::default()
     };
     let wave = |i: usize| [0.7, 1.1, 1.9].map(|k| (1.5 * (k * i as f64).sin()) as f32);
     let vector = |i: usize| [wave(i)[0], wave(i)[1], wave(i)[2], 0.0];
@@ -289,10 +289,10 @@ fn drawn_tree(n: usize, n_phases: u32) -> MovingTree {
     let grid = (0..n_phases as usize * 64).map(|i| if rests(i) { [0.0; 4] } else { vector(i) }).collect();
     let mut rest = drawn_set(n, 1);
     (rest.n_phases, rest.setup.n_phases) = (n_phases as usize, n_phases);
-    MovingTree { rest, setup, grid, own: (0..n * 4).map(vector).collect() }
+    DeformableGaussians { rest, setup, grid, own: (0..n * 4).map(vector).collect() }
 }
 
 /// Dynamic fields of three phases to be drawn, one of each form.
 pub fn drawn_fields() -> [MovingGaussians; 2] {
-    [MovingGaussians::PerPhase(drawn_set(231, 3)), MovingGaussians::Tree(drawn_tree(77, 3))]
+    [MovingGaussians::PerPhase(drawn_set(231, 3)), MovingGaussians::Deformable(drawn_deformable(77, 3))]
 }

@@ -10,10 +10,10 @@ use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
 use crate::selftest::iteration::path_name;
-use crate::selftest::problems::{hard_case, small_config, tree_case, with_gaussians};
+use crate::selftest::problems::{deformable_case, hard_case, small_config, with_gaussians};
+use crate::train::deformable::DeformableTrainer;
 use crate::train::gaussians::GaussianTrainer;
 use crate::train::trainer::Trainer;
-use crate::train::tree::TreeTrainer;
 
 const REPEATS: &[&str] = &["equal runs have equal bits"];
 
@@ -84,15 +84,15 @@ pub fn compare_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
         Ok(bits)
     };
     compare_runs(run, findings)?;
-    findings.begin("tree", "24 iterations, losses, Gaussians and their motion");
-    let (targets, rows, config) = tree_case()?;
+    findings.begin("deformable", "24 iterations, losses, Gaussians and their motion");
+    let (targets, rows, config) = deformable_case()?;
     let config = Config { gaussians: settings(config.clone()), ..config };
     let run = |stops: &[u32]| -> Result<Vec<u64>> {
-        let mut trainer = TreeTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+        let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
         let mut bits = losses(stops, |stop| trainer.advance(stop))?;
-        let tree = trainer.tree()?;
-        bits.extend(bits_of(&tree.rest.rows));
-        bits.extend(tree.grid.iter().chain(&tree.own).flatten().map(|v| u64::from(v.to_bits())));
+        let deformable = trainer.deformable()?;
+        bits.extend(bits_of(&deformable.rest.rows));
+        bits.extend(deformable.grid.iter().chain(&deformable.own).flatten().map(|v| u64::from(v.to_bits())));
         Ok(bits)
     };
     compare_runs(run, findings)

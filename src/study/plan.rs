@@ -130,8 +130,11 @@ const NEW_AND_AS_BEFORE: [(&str, &str); 3] = [
     ("[dynamic]", "occlusion_region = \"depth-range\""),
 ];
 
-/// Removes newer settings from a configuration where they change nothing. Results recorded before these settings existed thus
-/// keep their fingerprint.
+/// Values that were renamed after results were first recorded: section, line now, line before.
+const RENAMED: [(&str, &str, &str); 1] = [("[gaussians]", "form = \"deformable\"", "form = \"deformable\"")];
+
+/// Removes newer settings from a configuration where they change nothing, and gives renamed values their earlier names. Results
+/// recorded before thus keep their fingerprint.
 fn as_before(configuration: &str) -> String {
     let mut section = "";
     let mut kept = String::with_capacity(configuration.len());
@@ -140,8 +143,10 @@ fn as_before(configuration: &str) -> String {
         if text.starts_with('[') {
             section = text;
         }
-        if !NEW_AND_AS_BEFORE.contains(&(section, text)) {
-            kept.push_str(line);
+        match RENAMED.iter().find(|(at, now, _)| (*at, *now) == (section, text)) {
+            Some((_, now, before)) => kept.push_str(&line.replace(now, before)),
+            None if NEW_AND_AS_BEFORE.contains(&(section, text)) => {}
+            None => kept.push_str(line),
         }
     }
     kept
@@ -161,6 +166,8 @@ mod tests {
         let (affine, exact) = (of(&["r2.integral=affine"]), of(&["r2.integral=exact"]));
         assert_eq!(as_before(&affine).lines().count() + 3, affine.lines().count());
         assert_eq!(as_before(&exact).lines().count() + 2, exact.lines().count());
+        let deformable = "[gaussians]\nform = \"deformable\"\n";
+        assert_eq!(as_before(deformable), "[gaussians]\nform = \"deformable\"\n");
         // In another section, the same line is another setting.
         let other = "[x]\nintegral = \"affine\"\n";
         assert_eq!(as_before(other), other);

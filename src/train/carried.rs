@@ -1,22 +1,22 @@
-//! Goes on from a tree that was fitted before frames were added, or geometry stated anew, instead of beginning from seeds.
+//! Goes on from a deformable set that was fitted before frames were added, or geometry stated anew, instead of beginning from seeds.
 
 use crate::config::Config;
 use crate::error::Result;
-use crate::gaussians::field::MovingTree;
+use crate::gaussians::field::DeformableGaussians;
 use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::plan::fit;
 use crate::plan::targets::Targets;
-use crate::train::tree::TreeTrainer;
+use crate::train::deformable::DeformableTrainer;
 
-/// Minimum share of the images of each view and phase that an earlier tree must explain to be carried over.
+/// Minimum share of the images of each view and phase that an earlier deformable set must explain to be carried over.
 const LEAST_EXPLAINED: f64 = 0.7;
 
 /// Result of an attempt to go on.
 pub(super) enum Carried {
-    /// The fit goes on from the earlier tree.
-    On(Box<TreeTrainer>),
-    /// The earlier tree does not explain these images: they are to be fitted anew.
+    /// The fit goes on from the earlier deformable set.
+    On(Box<DeformableTrainer>),
+    /// The earlier deformable set does not explain these images: they are to be fitted anew.
     Anew(Box<Targets>),
 }
 
@@ -25,11 +25,11 @@ impl Carried {
         Carried::Anew(Box::new(targets))
     }
 
-    /// Goes on from an earlier tree, unless it has another shape or leaves much of a view or a phase unexplained.
+    /// Goes on from an earlier deformable set, unless it has another shape or leaves much of a view or a phase unexplained.
     ///
     /// # Errors
-    /// As [`TreeTrainer::with`].
-    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config, earlier: &MovingTree) -> Result<Carried> {
+    /// As [`DeformableTrainer::with`].
+    pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config, earlier: &DeformableGaussians) -> Result<Carried> {
         let (was, phases_alike) = (&earlier.rest.setup, earlier.rest.n_phases == targets.n_phases);
         let rests_alike = earlier.setup.rest_phase as usize == targets.rest_phase;
         let has_room = fit::carried_step(&config.gaussians) < config.gaussian_iterations();
@@ -39,8 +39,8 @@ impl Carried {
             return Ok(Carried::anew(targets));
         }
         let rest = earlier.rest.in_units(targets.units);
-        let mut trainer = TreeTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
-        let setup = *trainer.tree_setup();
+        let mut trainer = DeformableTrainer::with(gpu, targets, config, &Particles::fresh(rest.rows.clone()))?;
+        let setup = *trainer.deformable_setup();
         if setup.n_basis != earlier.setup.n_basis {
             return Ok(Carried::anew(trainer.into_targets()));
         }

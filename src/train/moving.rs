@@ -13,9 +13,9 @@ use crate::plan::Plan;
 use crate::plan::targets::Targets;
 use crate::scan::dataset::{Dataset, Frame};
 use crate::train::carried::Carried;
+use crate::train::deformable::DeformableTrainer;
+use crate::train::deformable_start::DeformableStart;
 use crate::train::gaussians::GaussianTrainer;
-use crate::train::tree::TreeTrainer;
-use crate::train::tree_start::TreeStart;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// A fit under way.
@@ -23,19 +23,19 @@ pub(super) enum MovingFit {
     /// A set per phase.
     PerPhase(Box<GaussianTrainer>),
     /// One set for the beat, in preparation.
-    Start(Box<TreeStart>),
+    Start(Box<DeformableStart>),
     /// One set for the beat.
-    Tree(Box<TreeTrainer>),
+    Deformable(Box<DeformableTrainer>),
 }
 
 impl MovingFit {
     /// Begins a fit of the form that configuration and data ask for.
     ///
     /// # Errors
-    /// As [`GaussianTrainer::new`] and [`TreeStart::new`].
+    /// As [`GaussianTrainer::new`] and [`DeformableStart::new`].
     pub(super) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<MovingFit> {
         Ok(match targets.form(config.gaussians.form) {
-            GaussianForm::Tree => MovingFit::Start(Box::new(TreeStart::new(gpu, targets, config)?)),
+            GaussianForm::Deformable => MovingFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?)),
             _ => MovingFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
         })
     }
@@ -45,9 +45,11 @@ impl MovingFit {
     /// # Errors
     /// As [`MovingFit::new`] and [`Carried::new`].
     fn after(gpu: &Gpu, mut targets: Targets, config: &Config, earlier: &MovingGaussians) -> Result<MovingFit> {
-        if let (GaussianForm::Tree, Some(tree)) = (targets.form(config.gaussians.form), earlier.tree()) {
-            match Carried::new(gpu, targets, config, tree)? {
-                Carried::On(fit) => return Ok(MovingFit::Tree(fit)),
+        if let (GaussianForm::Deformable, Some(deformable)) =
+            (targets.form(config.gaussians.form), earlier.deformable())
+        {
+            match Carried::new(gpu, targets, config, deformable)? {
+                Carried::On(fit) => return Ok(MovingFit::Deformable(fit)),
                 Carried::Anew(same) => targets = *same,
             }
         }
@@ -59,7 +61,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(fit) => fit.step() >= end / 2,
             MovingFit::Start(_) => false,
-            MovingFit::Tree(_) => true,
+            MovingFit::Deformable(_) => true,
         }
     }
 
@@ -68,7 +70,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(fit) => fit.step(),
             MovingFit::Start(_) => 0,
-            MovingFit::Tree(fit) => fit.step(),
+            MovingFit::Deformable(fit) => fit.step(),
         }
     }
 
@@ -76,24 +78,24 @@ impl MovingFit {
     pub(super) fn preparation(&self) -> Option<f64> {
         match self {
             MovingFit::Start(start) => Some(start.share()),
-            MovingFit::PerPhase(_) | MovingFit::Tree(_) => None,
+            MovingFit::PerPhase(_) | MovingFit::Deformable(_) => None,
         }
     }
 
-    /// Runs some iterations towards `until`; returns their losses, none while a tree is in preparation.
+    /// Runs some iterations towards `until`; returns their losses, none while a deformable set is in preparation.
     ///
     /// # Errors
-    /// As [`GaussianTrainer::advance`] and [`TreeStart::advance`].
+    /// As [`GaussianTrainer::advance`] and [`DeformableStart::advance`].
     pub(super) fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
         match self {
             MovingFit::PerPhase(fit) => fit.advance(until),
             MovingFit::Start(start) => {
-                if let Some(tree) = start.advance()? {
-                    *self = MovingFit::Tree(Box::new(tree));
+                if let Some(deformable) = start.advance()? {
+                    *self = MovingFit::Deformable(Box::new(deformable));
                 }
                 Ok(Vec::new())
             }
-            MovingFit::Tree(fit) => fit.advance(until),
+            MovingFit::Deformable(fit) => fit.advance(until),
         }
     }
 
@@ -105,7 +107,7 @@ impl MovingFit {
         Ok(match self {
             MovingFit::PerPhase(fit) => MovingGaussians::PerPhase(fit.model()?),
             MovingFit::Start(start) => MovingGaussians::PerPhase(start.field()?),
-            MovingFit::Tree(fit) => MovingGaussians::Tree(fit.tree()?),
+            MovingFit::Deformable(fit) => MovingGaussians::Deformable(fit.deformable()?),
         })
     }
 
@@ -114,7 +116,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(fit) => fit.count(),
             MovingFit::Start(start) => start.count(),
-            MovingFit::Tree(fit) => fit.count(),
+            MovingFit::Deformable(fit) => fit.count(),
         }
     }
 
@@ -122,7 +124,7 @@ impl MovingFit {
     pub(super) fn form(&self) -> GaussianForm {
         match self {
             MovingFit::PerPhase(_) => GaussianForm::Phase,
-            MovingFit::Start(_) | MovingFit::Tree(_) => GaussianForm::Tree,
+            MovingFit::Start(_) | MovingFit::Deformable(_) => GaussianForm::Deformable,
         }
     }
 
@@ -134,7 +136,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(fit) => fit.profile_step(),
             MovingFit::Start(_) => Err(not_begun()),
-            MovingFit::Tree(fit) => fit.profile_step(),
+            MovingFit::Deformable(fit) => fit.profile_step(),
         }
     }
 
@@ -146,7 +148,7 @@ impl MovingFit {
         match self {
             MovingFit::PerPhase(fit) => fit.work(),
             MovingFit::Start(_) => Err(not_begun()),
-            MovingFit::Tree(fit) => fit.work(),
+            MovingFit::Deformable(fit) => fit.work(),
         }
     }
 }
@@ -169,11 +171,11 @@ pub(super) struct Moving {
 impl Moving {
     /// Begins a fit to the plan's targets, or takes over what was `saved` of one to the same targets; none where a network is
     /// the dynamic field. A fit that was saved half way is repeated up to there: that takes seconds and gives the same bits,
-    /// however many iterations go into a submit (except for one that had gone on from an earlier tree, which begins from
+    /// however many iterations go into a submit (except for one that had gone on from an earlier deformable set, which begins from
     /// seeds). A field that was fitted to `earlier` data is shown, and gone on from, where it can be.
     ///
     /// # Errors
-    /// As [`MovingFit::new`], and as [`TreeStart::advance`] for what is done again.
+    /// As [`MovingFit::new`], and as [`DeformableStart::advance`] for what is done again.
     pub(super) fn begin(
         gpu: &Gpu,
         plan: &mut Plan,

@@ -2,7 +2,7 @@
 
 use crate::choice::Choice;
 use crate::config::Config;
-use crate::config::sections::Tree;
+use crate::config::sections::Deformable;
 use crate::error::{Error, Result};
 use crate::fitting::fit::{Fit, FitData, FitWork};
 use crate::gaussians::work::GaussianWork;
@@ -74,11 +74,11 @@ impl Timing {
 /// Times and work of a fit of Gaussians.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct GaussianTiming {
-    /// Form of the field: "phase" or "tree".
+    /// Form of the field: "phase" or "deformable set".
     pub form: String,
     /// Gaussians after the timed iterations.
     pub count: u32,
-    /// Seconds from targets to the first iteration, median of the repeats: seeds, and of a tree the sets per phase and the
+    /// Seconds from targets to the first iteration, median of the repeats: seeds, and of a deformable set the sets per phase and the
     /// tracking of its grid.
     pub preparation_s: f64,
     /// Milliseconds per iteration of each repeat, which is a fit of its own.
@@ -196,7 +196,7 @@ impl Subject {
         }
         // The minimum number of Gaussians' iterations, which leave the static field the same work.
         config.gaussians.iterations = 1;
-        config.tree = Tree { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.tree };
+        config.deformable = Deformable { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.deformable };
         config.dynamic.delay = if with_network { 0 } else { config.train.iterations };
         let plan = Plan::new(&config, dataset)?;
         let (cost, n_rays) = (NetworkCost::of(&plan.params), plan.setup.n_rays);

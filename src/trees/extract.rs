@@ -65,7 +65,7 @@ pub fn vessel_trees(
     let all = options.phases.len() as u64;
     progress(0, all)?;
     let mut finder = Finder::new(renderer, model, options)?;
-    let moving = model.moving.as_ref().and_then(MovingGaussians::tree);
+    let moving = model.moving.as_ref().and_then(MovingGaussians::deformable);
     let mut phases = Vec::new();
     if let Some(tree) = moving {
         let reference = finder.tree(tree.setup.rest_phase)?;

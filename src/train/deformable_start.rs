@@ -1,18 +1,18 @@
-//! Start of a moving tree: a set of Gaussians per phase, of which that of the rest phase becomes the tree; then the grid is
+//! Start of a deformable set: a set of Gaussians per phase, of which that of the rest phase becomes the deformable set; then the grid is
 //! tracked from phase to phase.
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
+use crate::gaussians::deformable::Track;
 use crate::gaussians::field::Gaussians;
 use crate::gaussians::particles::Particles;
-use crate::gaussians::tree::Track;
 use crate::gpu::device::Gpu;
 use crate::plan::targets::Targets;
+use crate::train::deformable::{DeformableTrainer, Fit};
 use crate::train::gaussians::{GaussianTrainer, strong};
-use crate::train::tree::{Fit, TreeTrainer};
 
-/// A tree in preparation.
-pub struct TreeStart {
+/// A deformable set in preparation.
+pub struct DeformableStart {
     gpu: Gpu,
     config: Config,
     stage: Stage,
@@ -23,12 +23,12 @@ enum Stage {
     Warming(Box<GaussianTrainer>),
     /// Tracking of the grid from phase to phase.
     Tracking(Box<Tracking>),
-    /// The tree has been handed over, or lost to an error.
+    /// The deformable set has been handed over, or lost to an error.
     Over,
 }
 
 struct Tracking {
-    trainer: TreeTrainer,
+    trainer: DeformableTrainer,
     fit: Fit,
     /// Tracks that are left, the last one first.
     left: Vec<Track>,
@@ -36,26 +36,29 @@ struct Tracking {
     meanwhile: Gaussians,
 }
 
-impl TreeStart {
+impl DeformableStart {
     /// Seeds a set of Gaussians per phase.
     ///
     /// # Errors
     /// As [`GaussianTrainer::new`].
-    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<TreeStart> {
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<DeformableStart> {
         // Strays are dropped when all iterations are done: a stray may find its vessel before.
-        let warm =
-            sections::Gaussians { iterations: config.tree.warm_iterations, link: 0.0, ..config.gaussians.clone() };
+        let warm = sections::Gaussians {
+            iterations: config.deformable.warm_iterations,
+            link: 0.0,
+            ..config.gaussians.clone()
+        };
         let warm = Config { gaussians: warm, ..config.clone() };
         let warming = GaussianTrainer::new(gpu, targets, &warm)?;
-        Ok(TreeStart { gpu: gpu.clone(), config: config.clone(), stage: Stage::Warming(Box::new(warming)) })
+        Ok(DeformableStart { gpu: gpu.clone(), config: config.clone(), stage: Stage::Warming(Box::new(warming)) })
     }
 
-    /// Does some of the work, a submit or two; returns the tree when it is ready to be fitted as a whole.
+    /// Does some of the work, a submit or two; returns the deformable set when it is ready to be fitted as a whole.
     ///
     /// # Errors
     /// [`Error::Config`] when the phase of rest shows nothing; [`Error::Diverged`]; device errors.
-    pub fn advance(&mut self) -> Result<Option<TreeTrainer>> {
-        let warm_iterations = self.config.tree.warm_iterations;
+    pub fn advance(&mut self) -> Result<Option<DeformableTrainer>> {
+        let warm_iterations = self.config.deformable.warm_iterations;
         match std::mem::replace(&mut self.stage, Stage::Over) {
             Stage::Warming(mut first) if first.step() < warm_iterations => {
                 first.advance(warm_iterations)?;
@@ -77,19 +80,19 @@ impl TreeStart {
         Ok(None)
     }
 
-    /// Makes a tree of the Gaussians of the rest phase.
+    /// Makes a deformable set of the Gaussians of the rest phase.
     fn plant(&self, mut first: GaussianTrainer) -> Result<Tracking> {
         if self.config.gaussians.background_every > 0 {
             first.renew_background()?;
         }
         let meanwhile = first.model()?;
         let mut found = Particles::fresh(meanwhile.rows.clone());
-        let strong = strong(&found.rows, first.setup(), self.config.tree.take);
+        let strong = strong(&found.rows, first.setup(), self.config.deformable.take);
         let rest_phase = first.targets().rest_phase as u32;
         let keep: Vec<bool> =
             found.rows.iter().zip(strong).map(|(g, strong)| strong && g.phase == rest_phase).collect();
         found.retain(&keep);
-        let trainer = TreeTrainer::with(&self.gpu, first.into_targets(), &self.config, &found)?;
+        let trainer = DeformableTrainer::with(&self.gpu, first.into_targets(), &self.config, &found)?;
         let (fit, mut left) = (trainer.tracking()?, tracks(trainer.targets()));
         left.reverse();
         Ok(Tracking { trainer, fit, left, meanwhile })
@@ -98,7 +101,9 @@ impl TreeStart {
     /// Share that is done, 0 to 1: one half is the sets per phase, the other the tracking.
     pub fn share(&self) -> f64 {
         match &self.stage {
-            Stage::Warming(first) => 0.5 * f64::from(first.step()) / f64::from(self.config.tree.warm_iterations.max(1)),
+            Stage::Warming(first) => {
+                0.5 * f64::from(first.step()) / f64::from(self.config.deformable.warm_iterations.max(1))
+            }
             Stage::Tracking(under_way) => {
                 let all = under_way.trainer.targets().n_phases.max(1) as f64;
                 1.0 - 0.5 * under_way.left.len() as f64 / all

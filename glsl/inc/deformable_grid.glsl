@@ -2,9 +2,9 @@
 // its own. Twin: src/reference/tree.rs.
 
 // Position on the grid, in steps from its first node.
-vec3 on_grid(vec3 position, TreeSetup tree) {
-    float last = float(tree.n_nodes) - 1.001;
-    return clamp((position + tree.half_side) * tree.inverse_step, vec3(0.0), vec3(last));
+vec3 on_grid(vec3 position, DeformableSetup deformable) {
+    float last = float(deformable.n_nodes) - 1.001;
+    return clamp((position + deformable.half_side) * deformable.inverse_step, vec3(0.0), vec3(last));
 }
 
 // Share of a node's displacement at a place on the grid.
@@ -13,6 +13,6 @@ float node_share(vec3 place, uvec3 node) {
     return w.x * w.y * w.z;
 }
 
-uint node_index(uvec3 node, TreeSetup tree) {
-    return (node.z * tree.n_nodes + node.y) * tree.n_nodes + node.x;
+uint node_index(uvec3 node, DeformableSetup deformable) {
+    return (node.z * deformable.n_nodes + node.y) * deformable.n_nodes + node.x;
 }

@@ -6,26 +6,26 @@ use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
 use crate::kernels::dispatch::{BufferSet, dispatch_finding};
-use crate::kernels::layout::{GaussianSetup, TreeSetup};
+use crate::kernels::layout::{DeformableSetup, GaussianSetup};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::plan::targets::Targets;
+use crate::reference::deformable::{DeformableParams, loss_and_gradient, phases_shown, shown};
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
-use crate::reference::tree::{TreeParams, loss_and_gradient, phases_shown, shown};
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::gaussians::{
     LOSS, NUMBERS, REPORT, SPLAT, Seen, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
 };
-use crate::selftest::problems::{moving_tree, tree_case};
-use crate::train::tree::TreeTrainer;
+use crate::selftest::problems::{deformable_case, deformable_set};
+use crate::train::deformable::DeformableTrainer;
 use glam::DVec3;
 
-const PROJECT: &[&str] = &[push::TreeProject::SHADER];
-const GRADIENT: &[&str] = &[push::TreeGradient::SHADER];
-const GRID_GRADIENT: &[&str] = &[push::TreeGridGradient::SHADER];
-const UPDATE: &[&str] = &[push::TreeUpdate::SHADER];
-const GRID_UPDATE: &[&str] = &[push::TreeGridUpdate::SHADER];
-const GUESS: &[&str] = &[push::TreeGuess::SHADER];
+const PROJECT: &[&str] = &[push::DeformableProject::SHADER];
+const GRADIENT: &[&str] = &[push::DeformableGradient::SHADER];
+const GRID_GRADIENT: &[&str] = &[push::DeformableGridGradient::SHADER];
+const UPDATE: &[&str] = &[push::DeformableUpdate::SHADER];
+const GRID_UPDATE: &[&str] = &[push::DeformableGridUpdate::SHADER];
+const GUESS: &[&str] = &[push::DeformableGuess::SHADER];
 
 /// First steps of Adam, all of nearly the same length, which f32 displacements lose a little of.
 const FIRST_STEP: Tolerance = Tolerance::OfLargest(2e-3);
@@ -50,11 +50,11 @@ fn upload(gpu: &Gpu, buffer: &Buffer, all: &[DVec3]) -> Result<()> {
 /// # Errors
 /// Device errors.
 pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
-    findings.begin("tree", "31 Gaussians, 14 images of 33 x 27 pixels");
-    let (targets, rows, config) = tree_case()?;
-    let mut trainer = TreeTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
-    let (setup, tree) = (*trainer.setup(), *trainer.tree_setup());
-    let p = moving_tree(&rows, &tree, targets.n_phases);
+    findings.begin("deformable", "31 Gaussians, 14 images of 33 x 27 pixels");
+    let (targets, rows, config) = deformable_case()?;
+    let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+    let (setup, deformable) = (*trainer.setup(), *trainer.deformable_setup());
+    let p = deformable_set(&rows, &deformable, targets.n_phases);
     upload(gpu, &trainer.grid().motion_grid, &p.grid)?;
     upload(gpu, &trainer.own_motion().own_motion, &p.own)?;
     let images = trainer.images()?;
@@ -62,7 +62,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let shown_at = |splat: usize| {
         let (phase_and_view, i) = (splat / n, splat % n);
         let (phase, image) = (phase_and_view / n_views, targets.image_of[phase_and_view]?);
-        Some((phase, image, shown(&tree, &p, i, phase, &targets.views[image], n_phases)))
+        Some((phase, image, shown(&deformable, &p, i, phase, &targets.views[image], n_phases)))
     };
     let shown: Vec<Option<(usize, usize, Params)>> = (0..n_phases * n_views * n).map(shown_at).collect();
     let project = |(image, moved): (usize, &Params)| reference::project(moved, &targets.views[image], &setup);
@@ -88,8 +88,8 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let got = vectors(gpu, &trainer.own_motion().place_gradient, places.len())?;
     let want: Vec<f64> = places.iter().flat_map(DVec3::to_array).collect();
     findings.numbers(GRADIENT, "gradient of positions", &got, &want, NUMBERS);
-    let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
-    compare_motion(gpu, &trainer, &tree, (&p, &gradient), findings)?;
+    let (_, _, gradient) = loss_and_gradient(&targets, &setup, &deformable, &p);
+    compare_motion(gpu, &trainer, &deformable, (&p, &gradient), findings)?;
     findings.add(REPORT, "loss", (loss / twin_loss - 1.0).abs(), LOSS);
     compare_guess(gpu, &trainer, &p, n_phases, findings)
 }
@@ -108,9 +108,9 @@ fn drawn(targets: &Targets, setup: &GaussianSetup, seen: &[Seen]) -> Vec<f64> {
 /// Compares gradients of grid and own motion, and the first step along them.
 fn compare_motion(
     gpu: &Gpu,
-    trainer: &TreeTrainer,
-    tree: &TreeSetup,
-    (p, gradient): (&TreeParams, &TreeParams),
+    trainer: &DeformableTrainer,
+    deformable: &DeformableSetup,
+    (p, gradient): (&DeformableParams, &DeformableParams),
     findings: &mut Findings,
 ) -> Result<()> {
     let (grid, own) = (trainer.grid(), trainer.own_motion());
@@ -125,9 +125,9 @@ fn compare_motion(
     let got_first = vectors(gpu, &grid.motion_grid_first, p.grid.len())?;
     let got_own = vectors(gpu, &own.own_motion, p.own.len())?;
     let got_grid = vectors(gpu, &grid.motion_grid, p.grid.len())?;
-    compare_step(UPDATE, &got_own, (&p.own, &gradient.own), tree.own_rate.into(), findings);
+    compare_step(UPDATE, &got_own, (&p.own, &gradient.own), deformable.own_rate.into(), findings);
     findings.numbers(GRID_UPDATE, "first moments of the grid", &got_first, &first, NUMBERS);
-    compare_step(GRID_UPDATE, &got_grid, (&p.grid, &gradient.grid), tree.grid_rate.into(), findings);
+    compare_step(GRID_UPDATE, &got_grid, (&p.grid, &gradient.grid), deformable.grid_rate.into(), findings);
     Ok(())
 }
 
@@ -149,16 +149,16 @@ fn compare_step(
 /// Compares where tracking begins: at the position of the phase before, plus half of its last step.
 fn compare_guess(
     gpu: &Gpu,
-    trainer: &TreeTrainer,
-    p: &TreeParams,
+    trainer: &DeformableTrainer,
+    p: &DeformableParams,
     n_phases: usize,
     findings: &mut Findings,
 ) -> Result<()> {
     let (grid, nodes) = (trainer.grid(), p.grid.len() / n_phases);
     upload(gpu, &grid.motion_grid, &p.grid)?;
-    let stage: Stage<push::TreeGuess> = Build::default().stage(gpu)?;
+    let stage: Stage<push::DeformableGuess> = Build::default().stage(gpu)?;
     let mut recording = Recording::new(gpu, "guess")?;
-    let push = push::TreeGuess { phase: 3, before: 2, before_that: 1 };
+    let push = push::DeformableGuess { phase: 3, before: 2, before_that: 1 };
     dispatch_finding(&mut recording, &stage, stage.groups_for(nodes as u32), &[], |name| grid.find(name), push)?;
     gpu.wait(recording.finish()?.submit()?)?;
     let mut want = p.grid.clone();

@@ -1,12 +1,12 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adam on the tree's Gaussians and their own motion. One invocation per Gaussian.
+// Adam on the deformable set's Gaussians and their own motion. One invocation per Gaussian.
 #include "inc/gaussian.glsl"
-#include "inc/gaussian_tree.glsl"
+#include "inc/deformable_grid.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { TreeSetup tree_setup; };
+layout(binding = 1) uniform B1 { DeformableSetup deformable_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianSchedule gaussian_schedule[]; };
 layout(binding = 3) readonly buffer B3 { uint gaussian_step; };
 layout(binding = 4) readonly buffer B4 { vec4 gaussian_gradient[]; };
@@ -37,13 +37,13 @@ void main() {
     gaussians[i].log_density -= steps[0].w;
     gaussians[i].log_scale -= steps[1].xyz;
     gaussians[i].rotation -= steps[2];
-    for (uint k = 0u; k < tree_setup.n_basis; k++) {
-        uint at = i * tree_setup.n_basis + k;
-        vec4 g = 2.0 * tree_setup.own_penalty * own_motion[at];
+    for (uint k = 0u; k < deformable_setup.n_basis; k++) {
+        uint at = i * deformable_setup.n_basis + k;
+        vec4 g = 2.0 * deformable_setup.own_penalty * own_motion[at];
         for (uint phase = 0u; phase < gaussian_setup.n_phases; phase++)
-            g += motion_basis[phase * tree_setup.n_basis + k] * place_gradient[phase * push.n_gaussians + i];
+            g += motion_basis[phase * deformable_setup.n_basis + k] * place_gradient[phase * push.n_gaussians + i];
         vec4 first = own_motion_first[at], second = own_motion_second[at];
-        own_motion[at] -= adam(g, vec4(tree_setup.own_rate), now, first, second);
+        own_motion[at] -= adam(g, vec4(deformable_setup.own_rate), now, first, second);
         own_motion_first[at] = first;
         own_motion_second[at] = second;
     }

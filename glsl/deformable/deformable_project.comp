@@ -1,13 +1,13 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// How every view sees every Gaussian of the tree at each of some phases. One invocation per Gaussian (x), phase and
+// How every view sees every Gaussian of the deformable set at each of some phases. One invocation per Gaussian (x), phase and
 // view (y).
 #include "inc/gaussian.glsl"
-#include "inc/gaussian_tree.glsl"
+#include "inc/deformable_grid.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { TreeSetup tree_setup; };
+layout(binding = 1) uniform B1 { DeformableSetup deformable_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { Gaussian gaussians[]; };
 // [phase][node]: displacement; none at the phase of rest.

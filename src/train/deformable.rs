@@ -1,4 +1,4 @@
-//! Fits a moving tree: Gaussians of one phase, carried through the beat by a grid, all of it together. [`TreeStart`] prepares
+//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`DeformableStart`] prepares
 //! it.
 
 use crate::config::{Config, sections};
@@ -6,31 +6,33 @@ use crate::error::{Error, Result};
 use crate::evidence::background::blur;
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{losses, ring};
-use crate::gaussians::field::{Gaussians, MovingTree, SMALLER_STEPS, dense};
+use crate::gaussians::deformable::{
+    DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
+};
+use crate::gaussians::deformable::{record_guess, record_images, record_step, record_track};
+use crate::gaussians::field::{DeformableGaussians, Gaussians, SMALLER_STEPS, dense};
 use crate::gaussians::particles::{ParticleBuffers, Particles};
 use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
-use crate::gaussians::tree::{GridBuffers, OwnMotion, OwnMotionBuffers, Track, TreeKernels, TreePass};
-use crate::gaussians::tree::{record_guess, record_images, record_step, record_track};
 use crate::gaussians::view::SplatView;
 use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{PassTime, Recording};
-use crate::kernels::layout::{Gaussian, GaussianSetup, GaussianView, TreeSetup};
+use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup, GaussianView};
 use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
+use crate::train::deformable_start::DeformableStart;
 use crate::train::gaussians::{MAX_PASSES, check_count, strong};
 use crate::train::targets::{padded, renew_bounds, take_images, target_buffers};
-use crate::train::tree_start::TreeStart;
 use glam::DVec3;
 
 /// A run on a device.
-pub struct TreeTrainer {
+pub struct DeformableTrainer {
     gpu: Gpu,
     targets: Targets,
     config: Config,
-    kernels: (GaussianKernels, TreeKernels),
+    kernels: (GaussianKernels, DeformableKernels),
     joint: Fit,
     particles: ParticleBuffers,
     own: OwnMotionBuffers,
@@ -42,7 +44,7 @@ pub struct TreeTrainer {
 /// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
 pub(super) struct Fit {
     setup: GaussianSetup,
-    tree: TreeSetup,
+    deformable: DeformableSetup,
     targets: TargetBuffers,
     grid: GridBuffers,
 }
@@ -52,15 +54,15 @@ impl Fit {
     fn joint(gpu: &Gpu, targets: &Targets, config: &Config) -> Result<Fit> {
         let settings = targets.lengths.gaussians(&config.gaussians);
         let setup = fit::gaussian_setup(targets, &settings);
-        let tree = fit::tree_setup(targets, &targets.lengths.tree(&config.tree));
+        let deformable = fit::deformable_setup(targets, &targets.lengths.deformable(&config.deformable));
         let buffers = target_buffers(gpu, targets, &setup, &fit::schedule(&settings))?;
-        Ok(Fit { setup, tree, targets: buffers, grid: GridBuffers::new(gpu, &tree, targets.n_phases)? })
+        Ok(Fit { setup, deformable, targets: buffers, grid: GridBuffers::new(gpu, &deformable, targets.n_phases)? })
     }
 
     /// A fit of the same grid to the same images, blurred, a phase at a time.
-    fn tracking(&self, gpu: &Gpu, targets: &Targets, settings: &sections::Tree) -> Result<Fit> {
+    fn tracking(&self, gpu: &Gpu, targets: &Targets, settings: &sections::Deformable) -> Result<Fit> {
         let setup = fit::track_setup(&self.setup, settings);
-        let tree = TreeSetup { grid_rate: settings.track_rate as f32, ..self.tree };
+        let deformable = DeformableSetup { grid_rate: settings.track_rate as f32, ..self.deformable };
         let blurred = |values: &[f32]| {
             let images = values.chunks(targets.n_pixels()).flat_map(|image| {
                 let image = Image { width: targets.width, height: targets.height, values: image.to_vec() };
@@ -81,17 +83,17 @@ impl Fit {
             gaussian_ring: ring(gpu, "gaussian_ring of tracking")?,
             ..self.targets.clone()
         };
-        Ok(Fit { setup, tree, targets: buffers, grid: self.grid.under(gpu, &tree)? })
+        Ok(Fit { setup, deformable, targets: buffers, grid: self.grid.under(gpu, &deformable)? })
     }
 }
 
-impl TreeTrainer {
-    /// Starts from targets alone, all of [`TreeStart`] at once.
+impl DeformableTrainer {
+    /// Starts from targets alone, all of [`DeformableStart`] at once.
     ///
     /// # Errors
-    /// As [`TreeStart::new`] and [`TreeStart::advance`].
-    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<TreeTrainer> {
-        let mut start = TreeStart::new(gpu, targets, config)?;
+    /// As [`DeformableStart::new`] and [`DeformableStart::advance`].
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<DeformableTrainer> {
+        let mut start = DeformableStart::new(gpu, targets, config)?;
         loop {
             if let Some(trainer) = start.advance()? {
                 return Ok(trainer);
@@ -102,34 +104,34 @@ impl TreeTrainer {
     /// Starts from given Gaussians at rest.
     ///
     /// # Errors
-    /// As [`TreeTrainer::new`].
-    pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<TreeTrainer> {
+    /// As [`DeformableTrainer::new`].
+    pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<DeformableTrainer> {
         config.check()?;
         let n = check_count(particles)?;
-        let kernels = (GaussianKernels::new(gpu)?, TreeKernels::new(gpu)?);
+        let kernels = (GaussianKernels::new(gpu)?, DeformableKernels::new(gpu)?);
         let joint = Fit::joint(gpu, &targets, config)?;
-        let own = OwnMotion::fresh(vec![[0.0; 4]; n as usize * joint.tree.n_basis as usize]);
+        let own = OwnMotion::fresh(vec![[0.0; 4]; n as usize * joint.deformable.n_basis as usize]);
         let (particles, own) = upload(gpu, &joint.setup, particles, &own)?;
         let iterations = record(gpu, &kernels, &joint, (&particles, &own), n, config.train.iterations_per_submit)?;
         let (gpu, config) = (gpu.clone(), config.clone());
-        Ok(TreeTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
+        Ok(DeformableTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
     }
 
     /// Returns the fit by which the grid is tracked.
     pub(super) fn tracking(&self) -> Result<Fit> {
-        self.joint.tracking(&self.gpu, &self.targets, &self.targets.lengths.tree(&self.config.tree))
+        self.joint.tracking(&self.gpu, &self.targets, &self.targets.lengths.deformable(&self.config.deformable))
     }
 
     /// Tracks the grid to a phase from those before it, on blurred images, in submits as long as those of the fit.
     pub(super) fn track(&self, tracking: &Fit, track: &Track) -> Result<()> {
-        let submit = |record: &dyn Fn(&mut TreePass<'_>) -> Result<()>| {
+        let submit = |record: &dyn Fn(&mut DeformablePass<'_>) -> Result<()>| {
             let mut recording = Recording::new(&self.gpu, "tracking")?;
             let bound = (&self.particles, &self.own);
             record(&mut pass(&mut recording, &self.kernels, tracking, bound, self.n))?;
             self.gpu.wait(recording.finish()?.submit()?)
         };
         submit(&|pass| record_guess(pass, track))?;
-        let mut left = if track.images.is_empty() { 0 } else { self.config.tree.track_iterations };
+        let mut left = if track.images.is_empty() { 0 } else { self.config.deformable.track_iterations };
         while left > 0 {
             let n = left.min(self.config.train.iterations_per_submit);
             submit(&|pass| record_track(pass, track, n))?;
@@ -151,7 +153,7 @@ impl TreeTrainer {
         self.step
     }
 
-    /// Number of Gaussians of the tree.
+    /// Number of Gaussians of the deformable set.
     pub fn count(&self) -> u32 {
         self.n
     }
@@ -166,11 +168,11 @@ impl TreeTrainer {
         self.targets
     }
 
-    /// Gives the Gaussians, which were fitted before, the motion of a tree of the same Gaussians on the same grid; iterations
+    /// Gives the Gaussians, which were fitted before, the motion of a deformable set of the same Gaussians on the same grid; iterations
     /// go on from where the background is estimated anew.
-    pub(super) fn move_as(&mut self, tree: &MovingTree) -> Result<()> {
-        self.gpu.upload(&self.joint.grid.motion_grid, 0, &tree.grid)?;
-        self.gpu.upload(&self.own.own_motion, 0, &tree.own)?;
+    pub(super) fn move_as(&mut self, deformable: &DeformableGaussians) -> Result<()> {
+        self.gpu.upload(&self.joint.grid.motion_grid, 0, &deformable.grid)?;
+        self.gpu.upload(&self.own.own_motion, 0, &deformable.own)?;
         self.step = fit::carried_step(&self.config.gaussians);
         self.gpu.upload(&self.joint.targets.gaussian_step, 0, &[self.step])
     }
@@ -181,8 +183,8 @@ impl TreeTrainer {
     }
 
     /// Constants of the grid.
-    pub fn tree_setup(&self) -> &TreeSetup {
-        &self.joint.tree
+    pub fn deformable_setup(&self) -> &DeformableSetup {
+        &self.joint.deformable
     }
 
     /// The Gaussians on the device, for rendering while training and for tests.
@@ -195,12 +197,12 @@ impl TreeTrainer {
         &self.joint.targets
     }
 
-    /// The grid on the device, as [`TreeTrainer::particles`].
+    /// The grid on the device, as [`DeformableTrainer::particles`].
     pub fn grid(&self) -> &GridBuffers {
         &self.joint.grid
     }
 
-    /// Own motion on the device, as [`TreeTrainer::particles`].
+    /// Own motion on the device, as [`DeformableTrainer::particles`].
     pub fn own_motion(&self) -> &OwnMotionBuffers {
         &self.own
     }
@@ -242,15 +244,15 @@ impl TreeTrainer {
     fn grow(&mut self) -> Result<()> {
         let (weakest, setup) = (self.config.gaussians.weakest, self.joint.setup);
         let (mut particles, mut own) = self.retain(|rows| strong(rows, &setup, weakest))?;
-        let tree = self.tree()?;
-        let carried = |x: DVec3, phase: f64| tree.carried(x, phase);
+        let deformable = self.deformable()?;
+        let carried = |x: DVec3, phase: f64| deformable.carried(x, phase);
         let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
-        let additions = seeds::tree_additions(&self.targets, &settings, seed, &self.images()?, carried);
+        let additions = seeds::deformable_additions(&self.targets, &settings, seed, &self.images()?, carried);
         // New Gaussians move as their nearest neighbours do.
-        let n_basis = self.joint.tree.n_basis as usize;
+        let n_basis = self.joint.deformable.n_basis as usize;
         for g in &additions {
-            let nearest = tree.nearest(DVec3::from_array(g.position.map(f64::from)));
-            own.append(tree.own[nearest * n_basis..][..n_basis].to_vec());
+            let nearest = deformable.nearest(DVec3::from_array(g.position.map(f64::from)));
+            own.append(deformable.own[nearest * n_basis..][..n_basis].to_vec());
         }
         particles.append(additions);
         self.replace(&particles, &own)
@@ -272,7 +274,7 @@ impl TreeTrainer {
     fn retain(&mut self, kept: impl Fn(&[Gaussian]) -> Vec<bool>) -> Result<(Particles, OwnMotion)> {
         let n = self.n as usize;
         let mut particles = self.particles.download(&self.gpu, n)?;
-        let mut own = self.own.download(&self.gpu, n * self.joint.tree.n_basis as usize)?;
+        let mut own = self.own.download(&self.gpu, n * self.joint.deformable.n_basis as usize)?;
         let keep = kept(&particles.rows);
         particles.retain(&keep);
         own.retain(&keep);
@@ -293,26 +295,31 @@ impl TreeTrainer {
     /// # Errors
     /// Device errors.
     pub fn images(&self) -> Result<Vec<f32>> {
-        let mut recording = Recording::new(&self.gpu, "images of a tree")?;
+        let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
         let mut pass = pass(&mut recording, &self.kernels, &self.joint, (&self.particles, &self.own), self.n);
         record_images(&mut pass, 0..self.joint.setup.n_phases)?;
         self.gpu.wait(recording.finish()?.submit()?)?;
         take_images(&self.gpu, &self.joint.targets, &self.targets, &self.joint.setup)
     }
 
-    /// The tree after the iterations done.
+    /// The deformable set after the iterations done.
     ///
     /// # Errors
     /// [`Error::Diverged`] when a parameter is not finite; device errors.
-    pub fn tree(&self) -> Result<MovingTree> {
-        let (n, tree) = (self.n as usize, self.joint.tree);
+    pub fn deformable(&self) -> Result<DeformableGaussians> {
+        let (n, deformable) = (self.n as usize, self.joint.deformable);
         let grid: Vec<[f32; 4]> =
-            self.gpu.download(&self.joint.grid.motion_grid, 0, self.targets.n_phases * tree.nodes())?;
-        let own: Vec<[f32; 4]> = self.gpu.download(&self.own.own_motion, 0, n * tree.n_basis as usize)?;
+            self.gpu.download(&self.joint.grid.motion_grid, 0, self.targets.n_phases * deformable.nodes())?;
+        let own: Vec<[f32; 4]> = self.gpu.download(&self.own.own_motion, 0, n * deformable.n_basis as usize)?;
         if let Some(bad) = grid.iter().chain(&own).flatten().find(|v| !v.is_finite()) {
             let step = u64::from(self.step);
             let (quantity, value) = ("the motion of the deformable set", f64::from(*bad));
-            return Err(Error::Diverged { step, quantity, value, advice: "a lower tree.grid_rate and tree.own_rate" });
+            return Err(Error::Diverged {
+                step,
+                quantity,
+                value,
+                advice: "a lower deformable.grid_rate and deformable.own_rate",
+            });
         }
         let rest = Gaussians {
             units: self.targets.units,
@@ -324,7 +331,7 @@ impl TreeTrainer {
             intensities: None,
         };
         rest.check()?;
-        Ok(MovingTree { rest, setup: tree, grid, own })
+        Ok(DeformableGaussians { rest, setup: deformable, grid, own })
     }
 
     /// Runs one iteration with a timestamp around each pass.
@@ -332,7 +339,7 @@ impl TreeTrainer {
     /// # Errors
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        let mut recording = Recording::timed(&self.gpu, "profiled iteration of a tree", MAX_PASSES)?;
+        let mut recording = Recording::timed(&self.gpu, "profiled iteration of a deformable", MAX_PASSES)?;
         let bound = (&self.particles, &self.own);
         record_step(&mut pass(&mut recording, &self.kernels, &self.joint, bound, self.n))?;
         self.step += 1;
@@ -365,31 +372,31 @@ fn upload(
 
 fn pass<'a>(
     recording: &'a mut Recording,
-    kernels: &'a (GaussianKernels, TreeKernels),
+    kernels: &'a (GaussianKernels, DeformableKernels),
     fit: &'a Fit,
     (particles, own): Bound<'a>,
     n: u32,
-) -> TreePass<'a> {
+) -> DeformablePass<'a> {
     let (common, kernels) = kernels;
-    TreePass {
+    DeformablePass {
         gaussians: GaussianPass { recording, kernels: common, targets: &fit.targets, particles, setup: &fit.setup, n },
         kernels,
         grid: &fit.grid,
         own,
-        setup: &fit.tree,
+        setup: &fit.deformable,
     }
 }
 
 fn record(
     gpu: &Gpu,
-    kernels: &(GaussianKernels, TreeKernels),
+    kernels: &(GaussianKernels, DeformableKernels),
     fit: &Fit,
     bound: Bound<'_>,
     n: u32,
     per_submit: u32,
 ) -> Result<Iterations> {
     Iterations::record(gpu, per_submit, |iterations| {
-        let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a tree"))?;
+        let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a deformable"))?;
         let mut pass = pass(&mut recording, kernels, fit, bound, n);
         for _ in 0..iterations {
             record_step(&mut pass)?;

@@ -1,4 +1,4 @@
-//! The stages of a moving tree: an iteration over all phases, and an iteration that tracks the grid at a single phase.
+//! The stages of a deformable set: an iteration over all phases, and an iteration that tracks the grid at a single phase.
 
 use crate::error::Result;
 use crate::gaussians::field::basis;
@@ -9,35 +9,35 @@ use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
 use crate::kernels::constants;
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set};
-use crate::kernels::layout::TreeSetup;
+use crate::kernels::layout::DeformableSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use std::ops::Range;
 
-/// Pipelines of the tree, beside those of [`crate::gaussians::stages::GaussianKernels`].
-pub struct TreeKernels {
+/// Pipelines of the deformable set, beside those of [`crate::gaussians::stages::GaussianKernels`].
+pub struct DeformableKernels {
     /// Projection of the Gaussians into every view at some phases.
-    pub project: Stage<push::TreeProject>,
+    pub project: Stage<push::DeformableProject>,
     /// Gradients of shapes and positions.
-    pub gradient: Stage<push::TreeGradient>,
+    pub gradient: Stage<push::DeformableGradient>,
     /// The optimiser on Gaussians and their own motion.
-    pub update: Stage<push::TreeUpdate>,
+    pub update: Stage<push::DeformableUpdate>,
     /// Gradient of the grid.
-    pub grid_gradient: Stage<push::TreeGridGradient>,
+    pub grid_gradient: Stage<push::DeformableGridGradient>,
     /// The optimiser on the grid.
-    pub grid_update: Stage<push::TreeGridUpdate>,
+    pub grid_update: Stage<push::DeformableGridUpdate>,
     /// Initial guess of the grid for tracking.
-    pub guess: Stage<push::TreeGuess>,
+    pub guess: Stage<push::DeformableGuess>,
 }
 
-impl TreeKernels {
+impl DeformableKernels {
     /// Builds the pipelines.
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn new(gpu: &Gpu) -> Result<TreeKernels> {
+    pub fn new(gpu: &Gpu) -> Result<DeformableKernels> {
         let plain = Build::default();
-        Ok(TreeKernels {
+        Ok(DeformableKernels {
             project: plain.stage(gpu)?,
             gradient: plain.stage(gpu)?,
             update: plain.stage(gpu)?,
@@ -51,8 +51,8 @@ impl TreeKernels {
 buffer_set! {
     /// Motion that all Gaussians share: displacements of a grid.
     pub struct GridBuffers {
-        /// [`TreeSetup`].
-        tree_setup,
+        /// [`DeformableSetup`].
+        deformable_setup,
         /// `[phase][basis function]`.
         motion_basis,
         /// `[phase][node]`: displacement.
@@ -71,14 +71,14 @@ impl GridBuffers {
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
-    pub fn new(gpu: &Gpu, tree: &TreeSetup, n_phases: usize) -> Result<GridBuffers> {
-        let since_rest = |phase: usize| (phase as f64 - f64::from(tree.rest_phase)) / n_phases as f64;
-        let basis_at = |phase: usize| basis(tree.n_basis as usize, since_rest(phase));
+    pub fn new(gpu: &Gpu, deformable: &DeformableSetup, n_phases: usize) -> Result<GridBuffers> {
+        let since_rest = |phase: usize| (phase as f64 - f64::from(deformable.rest_phase)) / n_phases as f64;
+        let basis_at = |phase: usize| basis(deformable.n_basis as usize, since_rest(phase));
         let basis: Vec<f32> = (0..n_phases).flat_map(basis_at).map(|v| v as f32).collect();
-        let at_rest = vec![[0f32; 4]; n_phases * tree.nodes()];
+        let at_rest = vec![[0f32; 4]; n_phases * deformable.nodes()];
         let grid = |name: Binding| gpu.buffer_with(name.name(), &at_rest);
         Ok(GridBuffers {
-            tree_setup: gpu.buffer_with("tree_setup", &[*tree])?,
+            deformable_setup: gpu.buffer_with("deformable_setup", &[*deformable])?,
             motion_basis: gpu.buffer_with("motion_basis", &basis)?,
             motion_grid: grid(Binding::motion_grid)?,
             motion_grid_first: grid(Binding::motion_grid_first)?,
@@ -91,8 +91,8 @@ impl GridBuffers {
     ///
     /// # Errors
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
-    pub fn under(&self, gpu: &Gpu, tree: &TreeSetup) -> Result<GridBuffers> {
-        Ok(GridBuffers { tree_setup: gpu.buffer_with("tree_setup", &[*tree])?, ..self.clone() })
+    pub fn under(&self, gpu: &Gpu, deformable: &DeformableSetup) -> Result<GridBuffers> {
+        Ok(GridBuffers { deformable_setup: gpu.buffer_with("deformable_setup", &[*deformable])?, ..self.clone() })
     }
 }
 
@@ -171,21 +171,21 @@ impl OwnMotionBuffers {
     }
 }
 
-/// A recording of stages on a tree.
-pub struct TreePass<'a> {
-    /// The tree's Gaussians at rest, and their target data.
+/// A recording of stages on a deformable set.
+pub struct DeformablePass<'a> {
+    /// The deformable set's Gaussians at rest, and their target data.
     pub gaussians: GaussianPass<'a>,
-    /// The tree's own stages.
-    pub kernels: &'a TreeKernels,
+    /// The deformable set's own stages.
+    pub kernels: &'a DeformableKernels,
     /// The grid.
     pub grid: &'a GridBuffers,
     /// Own motion.
     pub own: &'a OwnMotionBuffers,
     /// Constants on the host.
-    pub setup: &'a TreeSetup,
+    pub setup: &'a DeformableSetup,
 }
 
-impl TreePass<'_> {
+impl DeformablePass<'_> {
     fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
         let more: [&dyn BufferSet; 2] = [self.grid, self.own];
         self.gaussians.run(stage, groups, &more, push)
@@ -207,18 +207,18 @@ impl TreePass<'_> {
         record_images(self, phases.clone())?;
         let n_splats = self.n_splats(&phases);
         self.gaussians.residual(images, n_splats)?;
-        let TreeKernels { gradient, grid_gradient, .. } = self.kernels;
+        let DeformableKernels { gradient, grid_gradient, .. } = self.kernels;
         let (first_phase, n_phases) = (phases.start, phases.len() as u32);
-        let push = push::TreeGradient { n_gaussians, first_phase, n_phases };
+        let push = push::DeformableGradient { n_gaussians, first_phase, n_phases };
         self.run(gradient, gradient.groups_for(n_gaussians), push)?;
-        let push = push::TreeGridGradient { n_gaussians, first_phase, n_phases };
-        let groups = phases.len().div_ceil(constants::tree_grid_gradient::PHASES as usize);
+        let push = push::DeformableGridGradient { n_gaussians, first_phase, n_phases };
+        let groups = phases.len().div_ceil(constants::deformable_grid_gradient::PHASES as usize);
         self.run(grid_gradient, self.nodes(grid_gradient, groups), push)
     }
 
     fn grid_update(&mut self, phases: Range<u32>) -> Result<()> {
         let update = &self.kernels.grid_update;
-        let push = push::TreeGridUpdate { first_phase: phases.start };
+        let push = push::DeformableGridUpdate { first_phase: phases.start };
         self.run(update, self.nodes(update, phases.len()), push)
     }
 }
@@ -227,11 +227,11 @@ impl TreePass<'_> {
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_images(pass: &mut TreePass<'_>, phases: Range<u32>) -> Result<()> {
+pub fn record_images(pass: &mut DeformablePass<'_>, phases: Range<u32>) -> Result<()> {
     let (project, n_gaussians) = (&pass.kernels.project, pass.gaussians.n);
     let n_seen = phases.len() as u32 * pass.gaussians.setup.n_views;
     let groups = Groups::Direct([n_gaussians.div_ceil(project.local_size()), n_seen, 1]);
-    pass.run(project, groups, push::TreeProject { n_gaussians, first_phase: phases.start })?;
+    pass.run(project, groups, push::DeformableProject { n_gaussians, first_phase: phases.start })?;
     pass.gaussians.splats(pass.n_splats(&phases))
 }
 
@@ -239,10 +239,10 @@ pub fn record_images(pass: &mut TreePass<'_>, phases: Range<u32>) -> Result<()> 
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_step(pass: &mut TreePass<'_>) -> Result<()> {
+pub fn record_step(pass: &mut DeformablePass<'_>) -> Result<()> {
     let (update, setup, n_gaussians) = (&pass.kernels.update, pass.gaussians.setup, pass.gaussians.n);
     pass.gradient(0..setup.n_phases, 0..setup.n_images)?;
-    pass.run(update, update.groups_for(n_gaussians), push::TreeUpdate { n_gaussians })?;
+    pass.run(update, update.groups_for(n_gaussians), push::DeformableUpdate { n_gaussians })?;
     pass.grid_update(0..setup.n_phases)?;
     pass.gaussians.report()
 }
@@ -265,11 +265,11 @@ pub struct Track {
 ///
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
-pub fn record_guess(pass: &mut TreePass<'_>, track: &Track) -> Result<()> {
+pub fn record_guess(pass: &mut DeformablePass<'_>, track: &Track) -> Result<()> {
     let Track { phase, before, before_that, .. } = *track;
     let guess = &pass.kernels.guess;
     let groups = guess.groups_for(pass.setup.nodes() as u32);
-    pass.run(guess, groups, push::TreeGuess { phase, before, before_that })?;
+    pass.run(guess, groups, push::DeformableGuess { phase, before, before_that })?;
     pass.gaussians.recording.fill(&pass.gaussians.targets.gaussian_step, 0);
     Ok(())
 }
@@ -278,7 +278,7 @@ pub fn record_guess(pass: &mut TreePass<'_>, track: &Track) -> Result<()> {
 ///
 /// # Errors
 /// Errors of [`record_guess`].
-pub fn record_track(pass: &mut TreePass<'_>, track: &Track, iterations: u32) -> Result<()> {
+pub fn record_track(pass: &mut DeformablePass<'_>, track: &Track, iterations: u32) -> Result<()> {
     let phase = track.phase;
     for _ in 0..iterations {
         pass.gradient(phase..phase + 1, track.images.clone())?;

@@ -4,28 +4,28 @@
 // penalty on squared differences of neighbouring nodes; none at the phase of rest. One invocation per node (x) and PHASES phases (y):
 // a Gaussian's share of a node is the same at all of them.
 #include "inc/gaussian.glsl"
-#include "inc/gaussian_tree.glsl"
+#include "inc/deformable_grid.glsl"
 #ifndef PHASES
 #define PHASES 5u
 #endif
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; uint n_phases; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { TreeSetup tree_setup; };
+layout(binding = 1) uniform B1 { DeformableSetup deformable_setup; };
 layout(binding = 2) readonly buffer B2 { Gaussian gaussians[]; };
 layout(binding = 3) readonly buffer B3 { vec4 place_gradient[]; };
 layout(binding = 4) readonly buffer B4 { vec4 motion_grid[]; };
 layout(binding = 5) writeonly buffer B5 { vec4 motion_grid_gradient[]; };
 
 void main() {
-    uint n = tree_setup.n_nodes, index = gl_GlobalInvocationID.x, n_nodes = n * n * n;
+    uint n = deformable_setup.n_nodes, index = gl_GlobalInvocationID.x, n_nodes = n * n * n;
     if (index >= n_nodes) return;
     uint begin = gl_WorkGroupID.y * PHASES, end = min(begin + PHASES, push.n_phases);
     uvec3 node = uvec3(index % n, index / n % n, index / (n * n));
     vec4 sums[PHASES];
     for (uint t = 0u; t < PHASES; t++) sums[t] = vec4(0.0);
     for (uint i = 0u; i < push.n_gaussians; i++) {
-        float share = node_share(on_grid(gaussians[i].position, tree_setup), node);
+        float share = node_share(on_grid(gaussians[i].position, deformable_setup), node);
         if (share == 0.0) continue;
         for (uint t = begin; t < end; t++)
             sums[t - begin] += share * place_gradient[(push.first_phase + t) * push.n_gaussians + i];
@@ -39,7 +39,7 @@ void main() {
             if (node[axis] + 1u < n) bend += here - motion_grid[at + stride];
             stride *= n;
         }
-        bool rests = push.first_phase + t == tree_setup.rest_phase;
-        motion_grid_gradient[at] = rests ? vec4(0.0) : sums[t - begin] + 2.0 * tree_setup.smoothness * bend;
+        bool rests = push.first_phase + t == deformable_setup.rest_phase;
+        motion_grid_gradient[at] = rests ? vec4(0.0) : sums[t - begin] + 2.0 * deformable_setup.smoothness * bend;
     }
 }

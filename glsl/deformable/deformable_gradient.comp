@@ -1,14 +1,14 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of each Gaussian of the tree from its moments in the views of some phases, in their order: of its shape and
+// Gradient of each Gaussian of the deformable set from its moments in the views of some phases, in their order: of its shape and
 // place at rest, and of its place at each phase; an image between two phases counts for both. One invocation per Gaussian.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
-#include "inc/gaussian_tree.glsl"
+#include "inc/deformable_grid.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; uint first_phase; uint n_phases; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-layout(binding = 1) uniform B1 { TreeSetup tree_setup; };
+layout(binding = 1) uniform B1 { DeformableSetup deformable_setup; };
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { Gaussian gaussians[]; };
 layout(binding = 4) readonly buffer B4 { vec4 motion_grid[]; };
