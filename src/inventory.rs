@@ -10,7 +10,7 @@ use crate::gaussians::stages::GaussianKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
 use crate::kernels::layout::Setup;
-use crate::kernels::stages::{Kernels, StillKernels};
+use crate::kernels::stages::{Kernels, StaticNetworkKernels};
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::model::params::ParamMap;
@@ -111,8 +111,8 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     for purpose in [Purpose::Train, Purpose::Render] {
         params.networks().try_for_each(|map| Network::new(gpu, &tuning, &setup, map, purpose).map(|_| ()))?;
     }
-    if params.still.is_some() {
-        StillKernels::new(gpu)?;
+    if params.static_network.is_some() {
+        StaticNetworkKernels::new(gpu)?;
     }
     for samples in [config.march.static_samples, config.march.render_samples] {
         Kernels::new(gpu, tuning.clone(), params.line_len() as u32, samples)?;

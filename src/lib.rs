@@ -215,7 +215,7 @@ pub mod train {
     pub mod dry_run;
     pub mod fields;
     pub mod gaussians;
-    pub mod moving;
+    pub mod run_gaussians;
     pub mod snapshot;
     pub mod step;
     mod targets;

@@ -12,7 +12,7 @@ pub mod setup;
 
 use crate::config::Config;
 use crate::fitting::field::Field;
-use crate::gaussians::field::MovingGaussians;
+use crate::gaussians::field::DynamicGaussians;
 use crate::geometry::CArm;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
@@ -31,7 +31,7 @@ pub struct Model {
     /// Motion hull, when the run uses one.
     pub hull: Option<Hull>,
     /// Gaussians, where they are the dynamic field; none where it is the network.
-    pub moving: Option<MovingGaussians>,
+    pub gaussians: Option<DynamicGaussians>,
     /// Field of a method with a module of its own ([`crate::methods`]); the model then has no other field.
     pub field: Option<Arc<dyn Field>>,
     /// Parameters, padded as [`ParamMap`] says.
@@ -50,6 +50,6 @@ impl Model {
     /// Tells whether the dynamic field has values between phases, as a network or one moving set of Gaussians has. Sets per
     /// phase and fields of methods with a module of their own have none.
     pub fn is_continuous(&self) -> bool {
-        self.field.is_none() && self.moving.as_ref().is_none_or(|field| field.deformable().is_some())
+        self.field.is_none() && self.gaussians.as_ref().is_none_or(|field| field.deformable().is_some())
     }
 }

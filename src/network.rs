@@ -8,7 +8,7 @@ pub mod fused;
 pub mod layers;
 pub mod ledger;
 pub mod pass;
-pub mod still;
+pub mod static_network;
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::{Buffer, Memory};

@@ -284,9 +284,9 @@ fn choose_hull(config: &Config, dataset: &Dataset, motion: &[ViewMotion], notes:
     if !config.hull.enabled {
         return None;
     }
-    let still: Vec<_> = motion.iter().filter(|m| m.n_phases < 2).map(|m| m.view).collect();
-    if !still.is_empty() {
-        notes.push(format!("the motion hull is not used: views {still:?} have a single phase"));
+    let single_phase: Vec<_> = motion.iter().filter(|m| m.n_phases < 2).map(|m| m.view).collect();
+    if !single_phase.is_empty() {
+        notes.push(format!("the motion hull is not used: views {single_phase:?} have a single phase"));
         return None;
     }
     let hull = carve::carve(

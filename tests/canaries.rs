@@ -6,7 +6,7 @@ mod common;
 mod shim;
 
 use common::{expect_silence, run, small_config, small_dataset};
-use nertca_vk::gaussians::field::MovingGaussians;
+use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::kernels::layout::Gaussian;
@@ -32,7 +32,7 @@ fn gpu() -> Gpu {
 }
 
 /// All parameters of Gaussians and of the grid that moves them.
-fn parameters(field: &MovingGaussians) -> Vec<f32> {
+fn parameters(field: &DynamicGaussians) -> Vec<f32> {
     let of = |g: &Gaussian| g.position.into_iter().chain(g.log_scale).chain(g.rotation).chain([g.log_density]);
     let moves = field.deformable().map_or(Vec::new(), |tree| [&tree.grid[..], &tree.own].concat());
     field.rows().rows.iter().flat_map(of).chain(moves.into_iter().flatten()).collect()
@@ -64,7 +64,7 @@ fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning
     assert_eq!(broken, Vec::<String>::new());
     let numbers = checkpoint.model.params.iter().chain(checkpoint.moments.as_flattened());
     let pictures = exact.static_integral.iter().chain(&exact.dynamic_integral).chain(&quick);
-    let gaussians = checkpoint.model.moving.as_ref().map_or(Vec::new(), parameters);
+    let gaussians = checkpoint.model.gaussians.as_ref().map_or(Vec::new(), parameters);
     let numbers: Vec<f32> =
         numbers.chain(pictures).copied().chain(gaussians).chain(losses.iter().map(|l| *l as f32)).collect();
     assert!(numbers.iter().all(|v| v.is_finite()), "something that was never written was read");

@@ -7,7 +7,7 @@ use common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
 use glam::DVec3;
 use nertca_vk::config::{Config, Preset, sections};
 use nertca_vk::error::Error;
-use nertca_vk::gaussians::field::{Gaussians, MovingGaussians};
+use nertca_vk::gaussians::field::{DynamicGaussians, Gaussians};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::model::Model;
@@ -26,7 +26,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Creates a model of a dataset with the dynamic field `field`.
-fn model(gpu: &Gpu, dataset: &Dataset, field: MovingGaussians) -> Model {
+fn model(gpu: &Gpu, dataset: &Dataset, field: DynamicGaussians) -> Model {
     blobs::model(gpu, dataset, field, &tuning(gpu)).unwrap()
 }
 
@@ -105,7 +105,7 @@ fn checkpoints_keep_every_bit() {
         let read = Checkpoint::from_bytes(&bytes, Path::new("test")).unwrap();
         assert_eq!(read.to_bytes().unwrap(), bytes);
         for phase in 0..3 {
-            let at = |c: &Checkpoint| c.model.moving.as_ref().unwrap().at(phase);
+            let at = |c: &Checkpoint| c.model.gaussians.as_ref().unwrap().at(phase);
             assert_eq!(at(&read), at(&saved));
         }
         let statics = saved.model.param_map.static_len;
@@ -121,7 +121,7 @@ fn damaged_gaussians_are_refused_by_name() {
     let moments = vec![[0.0; 2]; model.param_map.len];
     let refused = |change: &dyn Fn(&mut Gaussians)| {
         let mut model = model.clone();
-        if let Some(MovingGaussians::PerPhase(sets)) = &mut model.moving {
+        if let Some(DynamicGaussians::PerPhase(sets)) = &mut model.gaussians {
             change(sets);
         }
         let saved = Checkpoint {
@@ -201,7 +201,7 @@ fn resume_equals_no_interruption() {
         }
         let read = Checkpoint::from_bytes(&whole, Path::new("whole")).unwrap();
         assert_eq!(read.model.step, 32);
-        assert_eq!(matches!(read.model.moving, Some(MovingGaussians::Deformable(_))), form == "tree");
+        assert_eq!(matches!(read.model.gaussians, Some(DynamicGaussians::Deformable(_))), form == "tree");
     }
     expect_silence(gpu);
 }

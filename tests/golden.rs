@@ -46,7 +46,7 @@ fn terms_of_twin(losses: &step::Losses) -> Terms {
 }
 
 fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
-    let two_networks = plan.params.still.is_some();
+    let two_networks = plan.params.static_network.is_some();
     let gpu = gpu();
     let mut trainer = Trainer::new(&gpu, plan, dataset, tuning(&gpu)).unwrap();
     let initial: Vec<f32> = gather(golden, trainer.plan(), "initial").iter().map(|v| *v as f32).collect();

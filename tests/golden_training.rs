@@ -45,7 +45,7 @@ impl Worst {
 
     /// Compares the parameters of each field, or of two networks together.
     fn compare_parameters(&mut self, golden: &Golden, iteration: u32, params: &[f32], plan: &Plan) {
-        let fields: &[(&str, &str)] = match plan.params.still {
+        let fields: &[(&str, &str)] = match plan.params.static_network {
             Some(_) => &[("fields", "")],
             None => &[("static", "static"), ("dynamic", "dynamic")],
         };

@@ -18,7 +18,7 @@ fn plan(preset: &str, settings: &[&str]) -> Plan {
 
 fn start(plan: &Plan) -> Vec<f64> {
     let mut params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
-    if plan.params.still.is_none() {
+    if plan.params.static_network.is_none() {
         params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);
     }
     params
@@ -38,7 +38,7 @@ fn a_sleeping_field_is_called_back() {
         }
         let rays = march::batch(&plan, 0);
         let (_, gradient) = step::loss_and_gradient(&plan, &start(&plan), 0, &rays, Precision::Exact);
-        gradient[plan.params.moving.as_ref().unwrap().out_bias]
+        gradient[plan.params.dynamic_network.as_ref().unwrap().out_bias]
     };
     let (deaf, hears) = (of("0", true), of("1e-3", true));
     assert!(deaf < 0.0 && hears < 0.0, "rays ask for more: {deaf}, {hears}");
@@ -118,7 +118,7 @@ fn temporal_residual_is_flat_between_its_bounds() {
         march::fwd(&plan, &params, 0, &ray, march::NearPart::Depth(0.0), true, Precision::Exact).dynamic_integral;
     let gradient_with = |ray: &march::Ray| {
         let (_, g) = step::loss_and_gradient(&plan, &params, 0, std::slice::from_ref(ray), Precision::Exact);
-        g[plan.params.moving.as_ref().unwrap().out_bias]
+        g[plan.params.dynamic_network.as_ref().unwrap().out_bias]
     };
     ray.temporal = [seen - 1.0, seen + 1.0];
     assert_eq!(gradient_with(&ray), 0.0);
@@ -166,7 +166,7 @@ fn line_integrals_and_their_backward_pass_are_adjoint() {
     let rays = march::batch(&plan, 1);
     let random = |a: u32, b: usize| random::uniform01(11, 78, a, b as u32) - 0.5;
     let planes = 0..p.line(0, 0, 0);
-    let network = p.moving.as_ref().unwrap();
+    let network = p.dynamic_network.as_ref().unwrap();
     let out_neuron = (network.out_weights..network.out_weights + network.width).chain([network.out_bias]);
     let mut direction = vec![0.0; p.len];
     planes.chain(out_neuron).for_each(|i| direction[i] = random(0, i));

@@ -10,7 +10,7 @@ mod python;
 use common::{expect_silence, gpu, small_config, small_dataset, tuning};
 use glam::{DMat3, DVec3};
 use nertca_vk::formats::npy;
-use nertca_vk::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units};
+use nertca_vk::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units};
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use nertca_vk::model::Model;
@@ -104,7 +104,7 @@ fn tree() -> DeformableGaussians {
 }
 
 /// An untrained model with a dynamic field.
-fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
+fn model(preset: &str, moving: Option<DynamicGaussians>) -> Model {
     let dataset = small_dataset(SIZE[0], SIZE[1]);
     let plan = Plan::new(&small_config(preset, &[]), &dataset).unwrap();
     Model {
@@ -113,7 +113,7 @@ fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
         scene: plan.scene,
         param_map: plan.params,
         hull: None,
-        moving,
+        gaussians: moving,
         field: None,
         step: 40,
         vessel_attenuation: None,
@@ -123,7 +123,7 @@ fn model(preset: &str, moving: Option<MovingGaussians>) -> Model {
 }
 
 fn moving_model() -> Model {
-    model("fast", Some(MovingGaussians::Deformable(tree())))
+    model("fast", Some(DynamicGaussians::Deformable(tree())))
 }
 
 fn saved(model: Model, path: &Path) -> String {
@@ -204,10 +204,10 @@ fn any_moment_of_the_beat_can_be_rendered() {
     // After a change, the new field is rendered from the next picture, also between phases.
     let mut other = tree();
     other.rest.rows.iter_mut().for_each(|g| g.log_density = -30.0);
-    renderer.set_gaussians(&MovingGaussians::Deformable(other)).unwrap();
+    renderer.set_gaussians(&DynamicGaussians::Deformable(other)).unwrap();
     assert!(at(0.5).dynamic_integral.iter().all(|v| *v < 1e-9));
     // Fields that are known at whole phases only give an error.
-    renderer.set_gaussians(&MovingGaussians::PerPhase(tree().expand())).unwrap();
+    renderer.set_gaussians(&DynamicGaussians::PerPhase(tree().expand())).unwrap();
     assert_eq!(at(2.0).dynamic_integral, whole(2).dynamic_integral);
     let between = renderer.render_at(rays, width, height, 0.5).unwrap_err().to_string();
     assert!(between.contains("between two phases") && between.contains("gaussians.form = \"tree\""), "{between}");
@@ -256,7 +256,7 @@ fn the_program_renders_between_phases() {
     refuses(&[&render[..], &["1", "--between", "2"]].concat(), &["--between", "--phase all"]);
     refuses(&[&render[..], &["1.5", "--baked"]].concat(), &["--baked", "whole phases"]);
     let sets =
-        saved(model("fast", Some(MovingGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
+        saved(model("fast", Some(DynamicGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
     refuses(&["render", &sets, "--out", "x.npy", "--phase", "0.5"], &["between two phases", "whole", "deformable"]);
     refuses(&["render", &sets, "--out", "x.npy", "--phase", "3"], &["--phase", "0 to 2"]);
@@ -323,7 +323,7 @@ fn motion_that_is_not_known_is_not_exported() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("x.nrrd");
     let sets =
-        saved(model("fast", Some(MovingGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
+        saved(model("fast", Some(DynamicGaussians::PerPhase(tree().expand()))), &dir.path().join("sets.safetensors"));
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
     let moves = saved(moving_model(), &dir.path().join("tree.safetensors"));
     let export = |run: &str, extra: &[&str], parts: &[&str]| {

@@ -174,8 +174,8 @@ fn fields_of_one_number_are_drawn_as_such() {
     let mut model = trainer.model().unwrap();
     model.params.fill(0.0);
     let [still, moving] = [1.0f32, -1.0];
-    model.params[model.param_map.still.as_ref().unwrap().out_bias] = still;
-    model.params[model.param_map.moving.as_ref().unwrap().out_bias] = moving;
+    model.params[model.param_map.static_network.as_ref().unwrap().out_bias] = still;
+    model.params[model.param_map.dynamic_network.as_ref().unwrap().out_bias] = moving;
     let renderer = Renderer::new(&gpu, &model, tuning(&gpu)).unwrap();
     let view = renderer.render(&dataset.views[1].rays, 13, 11, 1).unwrap();
     let attenuation = |feature: f32| 0.5 * (1.0 + feature.exp()).ln();

@@ -6,15 +6,15 @@
 mod common;
 #[path = "common/golden_file.rs"]
 mod golden_file;
-#[path = "common/still.rs"]
-mod still;
+#[path = "common/one_phase.rs"]
+mod one_phase;
 
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
-use nertca_vk::gaussians::field::MovingGaussians;
+use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{R2Gaussian, R2Turn};
 use nertca_vk::methods::r2_gaussian::data::R2Data;
@@ -36,9 +36,9 @@ use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, View};
 use nertca_vk::selftest::gaussians::{TENSORS, numbers, of_rows};
 use nertca_vk::train::trainer::Trainer;
+use one_phase::dataset;
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use still::dataset;
 
 fn config(settings: &[&str]) -> Config {
     small_config(settings).unwrap()
@@ -287,7 +287,7 @@ fn gaussians_are_seen_and_drawn_as_the_closed_form_has_them() {
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let mut saved = trainer.checkpoint().unwrap();
     let fit = R2Trainer::with(&gpu, data_of(&dataset, &config), &config, &R2State::fresh(rows), 0).unwrap();
-    saved.model.moving = Some(MovingGaussians::PerPhase(fit.model().unwrap()));
+    saved.model.gaussians = Some(DynamicGaussians::PerPhase(fit.model().unwrap()));
     let renderer = Renderer::new(&gpu, &saved.model, tuning(&gpu)).unwrap();
     for (frame, view) in dataset.frames.iter().zip(&dataset.views) {
         let drawn = renderer.render(&view.rays, 33, 27, 0).unwrap();
@@ -390,7 +390,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             let mut again = run(&mut parts, stop);
             let saved = parts.checkpoint().unwrap();
             let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
-            assert_eq!((state_of(&read), &read.model.moving), (state_of(&saved), &saved.model.moving));
+            assert_eq!((state_of(&read), &read.model.gaussians), (state_of(&saved), &saved.model.gaussians));
             let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
             let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
             assert_eq!(resumed.step(), stop);
@@ -398,7 +398,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             assert_eq!(losses, again, "{static_data}, stopped at {stop}");
             let (want, got) = (whole.checkpoint().unwrap(), resumed.checkpoint().unwrap());
             assert!(
-                state_of(&want) == state_of(&got) && want.model.moving == got.model.moving,
+                state_of(&want) == state_of(&got) && want.model.gaussians == got.model.gaussians,
                 "{static_data}, {stop}"
             );
         }
@@ -421,7 +421,7 @@ fn each_phase_sees_its_own_images_alone_unless_all_are_pooled() {
         let [fields, others] = [&dataset, &other].map(|dataset| {
             let mut trainer = start(&gpu, &config, dataset);
             run(&mut trainer, 8);
-            let field = trainer.model().unwrap().moving.unwrap();
+            let field = trainer.model().unwrap().gaussians.unwrap();
             [0, 1, 2].map(|phase| field.at(phase))
         });
         let same: Vec<bool> = fields.iter().zip(&others).map(|(a, b)| a == b).collect();

@@ -7,7 +7,7 @@ mod common;
 use common::{expect_silence, gpu, tuning};
 use nertca_vk::config::{Config, GaussianForm, Preset};
 use nertca_vk::fitting::fit::FieldFeed;
-use nertca_vk::gaussians::field::MovingGaussians;
+use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::model::checkpoint::Checkpoint;
@@ -82,8 +82,8 @@ fn train(session: &Session) -> u32 {
     session.train(u32::MAX, &mut |_| true).unwrap()
 }
 
-fn field(session: &Session) -> MovingGaussians {
-    session.checkpoint().unwrap().model.moving.unwrap()
+fn field(session: &Session) -> DynamicGaussians {
+    session.checkpoint().unwrap().model.gaussians.unwrap()
 }
 
 /// Dice of the dynamic field on unseen images.

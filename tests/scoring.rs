@@ -28,7 +28,7 @@ fn dataset() -> Dataset {
 fn model(gpu: &nertca_vk::gpu::device::Gpu, dataset: &Dataset, bias: f32) -> Model {
     let plan = Plan::new(&small_config("fast-mlp", &[]), dataset).unwrap();
     let mut model = Trainer::new(gpu, plan, dataset, tuning(gpu)).unwrap().model().unwrap();
-    let bias_at = model.param_map.moving.as_ref().unwrap().out_bias;
+    let bias_at = model.param_map.dynamic_network.as_ref().unwrap().out_bias;
     model.params[bias_at] = bias;
     model
 }

@@ -6,8 +6,8 @@
 mod common;
 #[path = "common/golden_file.rs"]
 mod golden_file;
-#[path = "common/still.rs"]
-mod still;
+#[path = "common/one_phase.rs"]
+mod one_phase;
 
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
 use golden_file::Golden;
@@ -28,8 +28,8 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
+use one_phase::dataset;
 use std::sync::Arc;
-use still::dataset;
 
 fn config(settings: &[&str]) -> Config {
     small_config(settings).unwrap()
@@ -259,7 +259,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             let mut again = run(&mut parts, stop);
             let saved = parts.checkpoint().unwrap();
             let read = Checkpoint::from_bytes(&saved.to_bytes().unwrap(), "checkpoint".as_ref()).unwrap();
-            assert_eq!((state_of(&read), &read.model.moving), (state_of(&saved), &saved.model.moving));
+            assert_eq!((state_of(&read), &read.model.gaussians), (state_of(&saved), &saved.model.gaussians));
             let plan = Plan::new(&config, &dataset).unwrap().in_scene(read.model.scene.clone());
             let mut resumed = Trainer::resume(&gpu, plan, &dataset, tuning(&gpu), &read).unwrap();
             assert_eq!(resumed.step(), stop);
@@ -267,7 +267,7 @@ fn runs_repeat_and_resume_bit_by_bit_across_density_control() {
             assert_eq!(losses, again, "{static_data}, stopped at {stop}");
             let (want, got) = (whole.checkpoint().unwrap(), resumed.checkpoint().unwrap());
             assert!(
-                state_of(&want) == state_of(&got) && want.model.moving == got.model.moving,
+                state_of(&want) == state_of(&got) && want.model.gaussians == got.model.gaussians,
                 "{static_data}, {stop}"
             );
         }
@@ -321,7 +321,7 @@ fn each_phase_sees_its_own_images_alone_unless_all_are_pooled() {
         let [fields, others] = [&dataset, &other].map(|dataset| {
             let mut trainer = start(&gpu, &config, dataset);
             run(&mut trainer, 8);
-            let field = trainer.model().unwrap().moving.unwrap();
+            let field = trainer.model().unwrap().gaussians.unwrap();
             [0, 1, 2].map(|phase| field.rows().blended_at(phase))
         });
         let same: Vec<bool> = fields.iter().zip(&others).map(|(a, b)| a == b).collect();

@@ -52,15 +52,15 @@ void main() {
     if (pixel >= push.n_pixels) return;
     Line line = line_through(views[0], pixel, push.image_width);
     float norm = setup.along_axis != 0u ? 1.0 : length(line.direction);
-    vec2 still = vec2(0.0);
-    vec2 moving = vec2(0.0);
+    vec2 of_static = vec2(0.0);
+    vec2 of_dynamic = vec2(0.0);
     if (push.with_static != 0u) {
-        still = setup.static_gain * along(static_volume, line, norm, setup.static_min, setup.static_max,
+        of_static = setup.static_gain * along(static_volume, line, norm, setup.static_min, setup.static_max,
                                           vec2(setup.static_near, setup.static_far));
     }
     if (push.with_dynamic != 0u) {
-        moving = setup.dynamic_gain * along(dynamic_volume, line, norm, setup.dynamic_min, setup.dynamic_max,
+        of_dynamic = setup.dynamic_gain * along(dynamic_volume, line, norm, setup.dynamic_min, setup.dynamic_max,
                                             vec2(setup.dynamic_near, setup.dynamic_far));
     }
-    image[pixel] = push.maximum != 0u ? max(still.y, moving.y) : still.x + moving.x;
+    image[pixel] = push.maximum != 0u ? max(of_static.y, of_dynamic.y) : of_static.x + of_dynamic.x;
 }

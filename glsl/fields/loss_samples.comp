@@ -7,7 +7,7 @@
 //   ray entropy    mean over rays of -sum p ln(p + e), p = sigma_s dl / D, where D or the ray's change is large enough
 //   near           mean over rays of the sum of sigma_s dl over near samples
 //   static size    sum over rays and samples of sigma_l dl + (sigma_l dl)^2
-//   still_gradient[s] = dL/d sigma_l;  sigma_gradient[s] = dL/d sigma_s;
+//   static_network_gradient[s] = dL/d sigma_l;  sigma_gradient[s] = dL/d sigma_s;
 //   ray_loss[ray] = photometric, the same, near, (S + D - y)^2;  ray_regularisers[ray] = favour static, ray entropy, static
 //   size, each not yet weighted.
 #include "inc/layout.glsl"
@@ -22,10 +22,10 @@ layout(binding = 4) readonly buffer B4 { uint ray_start[]; };
 layout(binding = 5) readonly buffer B5 { vec4 sample_points[]; };
 layout(binding = 6) readonly buffer B6 { uint sample_rays[]; };
 layout(binding = 7) readonly buffer B7 { vec2 sample_sigma[]; };
-layout(binding = 8) readonly buffer B8 { vec2 still_sigma[]; };
+layout(binding = 8) readonly buffer B8 { vec2 static_sigma[]; };
 layout(binding = 9) readonly buffer B9 { RayOut ray_out[]; };
 layout(binding = 10) writeonly buffer B10 { float sigma_gradient[]; };
-layout(binding = 11) writeonly buffer B11 { float still_gradient[]; };
+layout(binding = 11) writeonly buffer B11 { float static_network_gradient[]; };
 layout(binding = 12) writeonly buffer B12 { vec4 ray_loss[]; };
 layout(binding = 13) writeonly buffer B13 { vec4 ray_regularisers[]; };
 #include "inc/reduce.glsl"
@@ -40,16 +40,16 @@ float log_share(float a, float rest) {
 }
 
 // Entropy of the shares of both fields, and its derivatives by sigma_l and sigma_s.
-vec3 share_entropy(float still, float moving) {
-    float sum = still + moving + SMALL;
-    float b = max(moving / sum, SMALLEST);
+vec3 share_entropy(float of_static, float of_dynamic) {
+    float sum = of_static + of_dynamic + SMALL;
+    float b = max(of_dynamic / sum, SMALLEST);
     // 1 - b, of which f32 would keep nothing where the static field is faint.
-    float rest = max((still + SMALL) / sum, SMALLEST);
+    float rest = max((of_static + SMALL) / sum, SMALLEST);
     bool clipped = b <= SMALLEST || rest <= SMALLEST;
     float log_b = log_share(b, rest);
     float log_rest = log_share(rest, b);
     float slope = clipped ? 0.0 : (log_rest - log_b) / sum;
-    return vec3(-b * log_b - rest * log_rest, -slope * (moving / sum), slope * ((still + SMALL) / sum));
+    return vec3(-b * log_b - rest * log_rest, -slope * (of_dynamic / sum), slope * ((of_static + SMALL) / sum));
 }
 
 // What a sample's share p of a ray's integral adds to the entropy along it, and its negative derivative.
@@ -71,8 +71,8 @@ void main() {
         float dl = sample_points[s].w;
         float p = sample_sigma[s].x * dl / integral;
         vec2 entropy = ray_entropy(p);
-        float still = still_sigma[s].x * dl;
-        sums += vec4(share_entropy(still_sigma[s].x, sample_sigma[s].x).x, entropy.x, p * entropy.y, still + still * still);
+        float of_static = static_sigma[s].x * dl;
+        sums += vec4(share_entropy(static_sigma[s].x, sample_sigma[s].x).x, entropy.x, p * entropy.y, of_static + of_static * of_static);
     }
     sums = workgroup_sum(sums);
     float per_ray = 1.0 / float(setup.n_rays);
@@ -86,10 +86,10 @@ void main() {
     float photometric = 2.0 * per_ray * weight * residual;
     for (uint s = first; s < end; s += gl_WorkGroupSize.x) {
         float dl = sample_points[s].w;
-        vec3 shares = share_entropy(still_sigma[s].x, sample_sigma[s].x);
-        float still = still_sigma[s].x * dl;
-        still_gradient[s] = photometric * dl + now.favour_static * per_depth * shares.y
-                          + now.static_size * dl * (1.0 + 2.0 * still);
+        vec3 shares = share_entropy(static_sigma[s].x, sample_sigma[s].x);
+        float of_static = static_sigma[s].x * dl;
+        static_network_gradient[s] = photometric * dl + now.favour_static * per_depth * shares.y
+                          + now.static_size * dl * (1.0 + 2.0 * of_static);
         float along = ray_entropy(sample_sigma[s].x * dl / integral).y - mean;
         sigma_gradient[s] = photometric * dl + now.favour_static * per_depth * shares.z
                           - now.ray_entropy * entropy_scale * dl / integral * along

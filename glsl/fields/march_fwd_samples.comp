@@ -10,7 +10,7 @@ layout(binding = 0) readonly buffer B0 { uint ray_start[]; };
 layout(binding = 1) readonly buffer B1 { vec4 sample_points[]; };
 layout(binding = 2) readonly buffer B2 { uint sample_rays[]; };
 layout(binding = 3) readonly buffer B3 { vec2 sample_sigma[]; };
-layout(binding = 4) readonly buffer B4 { vec2 still_sigma[]; };
+layout(binding = 4) readonly buffer B4 { vec2 static_sigma[]; };
 layout(binding = 5) writeonly buffer B5 { RayOut ray_out[]; };
 #include "inc/reduce.glsl"
 
@@ -19,11 +19,11 @@ void main() {
     vec3 largest = vec3(0.0);
     uint end = ray_start[gl_WorkGroupID.x + 1u];
     for (uint s = ray_start[gl_WorkGroupID.x] + gl_LocalInvocationID.x; s < end; s += gl_WorkGroupSize.x) {
-        float still = still_sigma[s].x;
-        float moving = sample_sigma[s].x;
-        float near = is_near(sample_rays[s]) ? moving : 0.0;
-        integrals += sample_points[s].w * vec4(still, moving, near, 0.0);
-        largest = max(largest, vec3(still, moving, still + moving));
+        float of_static = static_sigma[s].x;
+        float of_dynamic = sample_sigma[s].x;
+        float near = is_near(sample_rays[s]) ? of_dynamic : 0.0;
+        integrals += sample_points[s].w * vec4(of_static, of_dynamic, near, 0.0);
+        largest = max(largest, vec3(of_static, of_dynamic, of_static + of_dynamic));
     }
     integrals = workgroup_sum(integrals);
     if (push.with_maxima != 0u) {

@@ -148,7 +148,7 @@ struct Ray {
     vec3 direction;             // towards the detector, of unit depth
     float norm;                 // path length per unit of depth
     float target;               // measured line integral
-    float temporal_low;         // bounds of the integral above the pixel's still background
+    float temporal_low;         // bounds of the integral above the pixel's static background
     uint id;                    // frame * pixels + pixel
     float temporal_high;        // see `temporal_low`
     uint beyond;                // phase on the other side of when it was taken

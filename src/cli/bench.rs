@@ -338,21 +338,21 @@ fn time_gaussians(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Datase
             work: Ledger::new(),
         });
     }
-    let mut still = Subject::new(gpu, config, dataset, tuning, false)?;
-    let before = still.time(&pace)?;
-    passes.extend(still.passes(profiled)?);
+    let mut static_fit = Subject::new(gpu, config, dataset, tuning, false)?;
+    let before = static_fit.time(&pace)?;
+    passes.extend(static_fit.passes(profiled)?);
     let first = config.gaussian_iterations();
     let whole_run_s = whole_fit_s(first) + 1e-3 * before.median() * f64::from(config.train.iterations - first);
     Ok(Timings {
-        paths: still.notes(),
-        rays: still.rays(),
+        paths: static_fit.notes(),
+        rays: static_fit.rays(),
         network_cost: None,
         gaussians: Some(gaussians),
         before: Some(before),
         after: None,
         whole_run_s,
         passes,
-        barriers: still.barriers(),
+        barriers: static_fit.barriers(),
         // The passes after the Gaussians are those of the static field, whose stages have no counted work except the optimiser;
         // the network is not evaluated and has no samples.
         work: Ledger::new(),

@@ -5,7 +5,7 @@ use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
-use nertca_vk::gaussians::field::MovingGaussians;
+use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
@@ -67,7 +67,7 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
         "parameters": model.param_map.len,
         "phases": model.param_map.phases,
         "hull_share": model.hull.as_ref().map(|h| h.share()),
-        "gaussians": model.moving.as_ref().map(describe_gaussians),
+        "gaussians": model.gaussians.as_ref().map(describe_gaussians),
         "scene": model.scene,
         "config": model.config,
     });
@@ -77,7 +77,7 @@ fn describe_run(path: &Path) -> Result<serde_json::Value> {
     Ok(described)
 }
 
-fn describe_gaussians(field: &MovingGaussians) -> serde_json::Value {
+fn describe_gaussians(field: &DynamicGaussians) -> serde_json::Value {
     let phases = 0..field.rows().n_phases;
     serde_json::json!({
         "form": field.form().name(),

@@ -5,7 +5,7 @@ use super::tree_section::TreeSection;
 use nertca_vk::calibrate::correction::Calibration;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
-use nertca_vk::gaussians::field::MovingGaussians;
+use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::model::Model;
@@ -61,7 +61,7 @@ impl Report<'_> {
         if let Some(hull) = &model.hull {
             facts.push(("hull".into(), format!("{:.3} % of the box", 100.0 * hull.share())));
         }
-        if let Some(field) = &model.moving {
+        if let Some(field) = &model.gaussians {
             facts.push(("Gaussians".into(), gaussians_of(field)));
         }
         facts.extend(model.field.as_ref().map(|field| field.fact()));
@@ -76,7 +76,7 @@ impl Report<'_> {
             facts.push(("training".into(), format!("{s:.1} s; the paper: 2220 s on an RTX A5000")));
         }
         let frames = dataset.validation().iter();
-        let tree = model.moving.as_ref().and_then(MovingGaussians::deformable);
+        let tree = model.gaussians.as_ref().and_then(DynamicGaussians::deformable);
         let of_views = |file: fn(&Path, usize) -> PathBuf| {
             let files = dataset.training_views().into_iter().map(|view| (view, file(&run.join("report"), view)));
             files.filter(|(_, file)| file.is_file()).collect()
@@ -112,7 +112,7 @@ impl Report<'_> {
                 model.step, model.config.train.iterations
             ));
         }
-        if model.config.hull.enabled && model.hull.is_none() && model.moving.is_none() {
+        if model.config.hull.enabled && model.hull.is_none() && model.gaussians.is_none() {
             warnings.push(
                 "No motion hull was used: the views may disagree, or there is motion in too much of the images."
                     .to_owned(),
@@ -139,10 +139,10 @@ impl Report<'_> {
     }
 }
 
-fn gaussians_of(field: &MovingGaussians) -> String {
+fn gaussians_of(field: &DynamicGaussians) -> String {
     let form = match field {
-        MovingGaussians::PerPhase(_) => "one set per phase",
-        MovingGaussians::Deformable(_) => "one deformable set",
+        DynamicGaussians::PerPhase(_) => "one set per phase",
+        DynamicGaussians::Deformable(_) => "one deformable set",
     };
     let kib = field.bytes() as f64 / 1024.0;
     format!("{}, {form} (gaussians.form = \"{}\"), {kib:.0} KiB", field.rows().rows.len(), field.form().name())

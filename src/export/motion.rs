@@ -12,7 +12,7 @@ use crate::formats::nrrd::{self, Encoding};
 use crate::formats::raw::{self, ByteOrder};
 use crate::formats::volume::VolumeHeader;
 use crate::formats::vtk::{self, Lines, PointValues};
-use crate::gaussians::field::{DeformableGaussians, MovingGaussians, scales};
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, scales};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::Gaussian;
 use crate::model::Model;
@@ -50,8 +50,8 @@ impl MotionFormat {
 /// [`Error::Config`] where the dynamic field is one set of Gaussians per phase or a network, because neither follows a point
 /// over time.
 pub fn deformable_set(model: &Model) -> Result<&DeformableGaussians> {
-    let form = model.moving.as_ref().map_or(GaussianForm::None, MovingGaussians::form);
-    model.moving.as_ref().and_then(MovingGaussians::deformable).ok_or_else(|| {
+    let form = model.gaussians.as_ref().map_or(GaussianForm::None, DynamicGaussians::form);
+    model.gaussians.as_ref().and_then(DynamicGaussians::deformable).ok_or_else(|| {
         let made_of = match form {
             GaussianForm::None => "a network",
             _ => "a set of Gaussians per phase",

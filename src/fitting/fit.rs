@@ -5,7 +5,7 @@ use crate::config::method::MethodKind;
 use crate::error::Result;
 use crate::fitting::field::Field;
 use crate::fitting::losses::StepLoss;
-use crate::gaussians::field::{MovingFeed, MovingGaussians};
+use crate::gaussians::field::{DynamicGaussians, GaussianFeed};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -78,14 +78,14 @@ pub struct SavedAt {
 #[derive(Debug, Clone)]
 pub enum FitField {
     /// Gaussians, which are drawn and exported like those of all methods.
-    Gaussians(Box<MovingGaussians>),
+    Gaussians(Box<DynamicGaussians>),
     /// Field that its method draws itself.
     Own(Arc<dyn Field>),
 }
 
 impl FitField {
     /// Returns the Gaussians, or the field that its method draws; one of the two is `None`.
-    pub fn split(self) -> (Option<MovingGaussians>, Option<Arc<dyn Field>>) {
+    pub fn split(self) -> (Option<DynamicGaussians>, Option<Arc<dyn Field>>) {
         match self {
             FitField::Gaussians(gaussians) => (Some(*gaussians), None),
             FitField::Own(field) => (None, Some(field)),
@@ -97,7 +97,7 @@ impl FitField {
 #[derive(Clone)]
 pub enum FieldFeed {
     /// Gaussians, on the host.
-    Gaussians(MovingFeed),
+    Gaussians(GaussianFeed),
     /// Parameters on the device.
     Params(Vec<Buffer>),
 }

@@ -1,7 +1,7 @@
 //! Drawing of Gaussians along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units, scales};
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units, scales};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
@@ -86,7 +86,7 @@ struct BlobSet {
 }
 
 impl BlobSet {
-    fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<BlobSet> {
+    fn new(gpu: &Gpu, field: &DynamicGaussians) -> Result<BlobSet> {
         let (sets, mut all, mut phases) = (field.rows(), Vec::new(), Vec::new());
         for phase in 0..sets.n_phases {
             let first = all.len() as u32;
@@ -120,7 +120,7 @@ impl Blobs {
     ///
     /// # Errors
     /// [`Error::OutOfMemory`]; other device errors.
-    pub fn new(gpu: &Gpu, tuning: &Tuning, field: &MovingGaussians) -> Result<Blobs> {
+    pub fn new(gpu: &Gpu, tuning: &Tuning, field: &DynamicGaussians) -> Result<Blobs> {
         let set = Mutex::new(BlobSet::new(gpu, field)?);
         Ok(Blobs { gpu: gpu.clone(), kernels: BlobKernels::new(gpu, tuning)?, set })
     }
@@ -129,7 +129,7 @@ impl Blobs {
     ///
     /// # Errors
     /// Errors of [`Blobs::new`].
-    pub fn replace(&self, field: &MovingGaussians) -> Result<()> {
+    pub fn replace(&self, field: &DynamicGaussians) -> Result<()> {
         let new = BlobSet::new(&self.gpu, field)?;
         *self.set.lock().unwrap_or_else(PoisonError::into_inner) = new;
         Ok(())

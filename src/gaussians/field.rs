@@ -151,7 +151,7 @@ pub struct DeformableGaussians {
 
 /// Gaussians as the dynamic field of a model.
 #[derive(Debug, Clone, PartialEq)]
-pub enum MovingGaussians {
+pub enum DynamicGaussians {
     /// A separate set per phase; the sets share nothing.
     PerPhase(Gaussians),
     /// One moving set for the whole beat.
@@ -159,32 +159,32 @@ pub enum MovingGaussians {
 }
 
 /// Current Gaussians of a run in training, and the number of their changes so far.
-pub type MovingFeed = Arc<Mutex<(u64, MovingGaussians)>>;
+pub type GaussianFeed = Arc<Mutex<(u64, DynamicGaussians)>>;
 
-impl MovingGaussians {
+impl DynamicGaussians {
     /// Returns the Gaussians; for a deformable set, those at its rest phase.
     pub fn rows(&self) -> &Gaussians {
         match self {
-            MovingGaussians::PerPhase(sets) => sets,
-            MovingGaussians::Deformable(deformable) => &deformable.rest,
+            DynamicGaussians::PerPhase(sets) => sets,
+            DynamicGaussians::Deformable(deformable) => &deformable.rest,
         }
     }
 
     /// Returns the deformable set, if the field is one.
     pub fn deformable(&self) -> Option<&DeformableGaussians> {
         match self {
-            MovingGaussians::PerPhase(_) => None,
-            MovingGaussians::Deformable(deformable) => Some(deformable),
+            DynamicGaussians::PerPhase(_) => None,
+            DynamicGaussians::Deformable(deformable) => Some(deformable),
         }
     }
 
     /// Returns the form of the field: a set per phase as in X-Gaussian, in R2-Gaussian or in neither, or one moving set.
     pub fn form(&self) -> GaussianForm {
         match self {
-            MovingGaussians::PerPhase(sets) if sets.intensities.is_some() => GaussianForm::X,
-            MovingGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
-            MovingGaussians::PerPhase(_) => GaussianForm::Phase,
-            MovingGaussians::Deformable(_) => GaussianForm::Deformable,
+            DynamicGaussians::PerPhase(sets) if sets.intensities.is_some() => GaussianForm::X,
+            DynamicGaussians::PerPhase(sets) if sets.is_crowd => GaussianForm::R2,
+            DynamicGaussians::PerPhase(_) => GaussianForm::Phase,
+            DynamicGaussians::Deformable(_) => GaussianForm::Deformable,
         }
     }
 
@@ -196,8 +196,8 @@ impl MovingGaussians {
     /// Returns the Gaussians at a time counted in phases; those of the nearest phase where each phase has its own set.
     pub fn at_time(&self, phases: f64) -> Vec<Gaussian> {
         match self {
-            MovingGaussians::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
-            MovingGaussians::Deformable(deformable) => deformable.at(phases),
+            DynamicGaussians::PerPhase(sets) => sets.at(phases.round() as usize % sets.n_phases).copied().collect(),
+            DynamicGaussians::Deformable(deformable) => deformable.at(phases),
         }
     }
 

@@ -4,7 +4,7 @@
 use crate::error::Result;
 use crate::gaussians::blending::picture::{self, BlendedPicture};
 use crate::gaussians::blending::stages::BlendKernels;
-use crate::gaussians::field::{MovingGaussians, Units};
+use crate::gaussians::field::{DynamicGaussians, Units};
 use crate::gaussians::stages::{FIXED_POINT_BITS, SplatStage};
 use crate::gaussians::view::SplatView;
 use crate::geometry::ViewRays;
@@ -57,13 +57,13 @@ pub struct Pictures {
 
 /// The field, and pictures recorded of it.
 struct State {
-    field: MovingGaussians,
+    field: DynamicGaussians,
     recorded: HashMap<Key, Arc<Picture>>,
     blended: HashMap<Key, Arc<Mutex<BlendedPicture>>>,
 }
 
 impl State {
-    fn new(field: &MovingGaussians) -> State {
+    fn new(field: &DynamicGaussians) -> State {
         State { field: field.clone(), recorded: HashMap::new(), blended: HashMap::new() }
     }
 }
@@ -100,7 +100,7 @@ impl Pictures {
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn new(gpu: &Gpu, field: &MovingGaussians) -> Result<Pictures> {
+    pub fn new(gpu: &Gpu, field: &DynamicGaussians) -> Result<Pictures> {
         let state = Mutex::new(State::new(field));
         let project = Build::default().stage(gpu)?;
         let blend = field.rows().intensities.as_ref().map(|_| BlendKernels::new(gpu)).transpose()?;
@@ -108,7 +108,7 @@ impl Pictures {
     }
 
     /// Replaces the field to be drawn.
-    pub fn replace(&self, field: &MovingGaussians) {
+    pub fn replace(&self, field: &DynamicGaussians) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         *state = State::new(field);
     }
@@ -217,7 +217,7 @@ impl Pictures {
         Ok((units, picture))
     }
 
-    fn record(&self, field: &MovingGaussians, key: Key) -> Result<Picture> {
+    fn record(&self, field: &DynamicGaussians, key: Key) -> Result<Picture> {
         let (gpu, sets) = (&self.gpu, field.rows());
         let (width, height) = (key.columns, key.rows);
         let rows = field.at_time(f64::from_bits(key.time));

@@ -1,7 +1,7 @@
 //! Gaussians in a checkpoint: tensors under documented names, and their section of the header.
 
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units, inverse_step};
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units, inverse_step};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
@@ -59,7 +59,7 @@ struct GridHeader {
 /// Name of the tensor of blended Gaussians' intensities.
 const INTENSITY: &str = "gaussians.intensity";
 
-pub(crate) fn header(field: &MovingGaussians) -> GaussianHeader {
+pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
     let sets = field.rows();
     GaussianHeader {
         pixel: sets.units.pixel,
@@ -72,8 +72,8 @@ pub(crate) fn header(field: &MovingGaussians) -> GaussianHeader {
         crowd: sets.is_crowd,
         blended: sets.intensities.is_some(),
         grid: match field {
-            MovingGaussians::PerPhase(_) => None,
-            MovingGaussians::Deformable(deformable) => Some(GridHeader {
+            DynamicGaussians::PerPhase(_) => None,
+            DynamicGaussians::Deformable(deformable) => Some(GridHeader {
                 nodes: deformable.setup.n_nodes,
                 half_side: deformable.setup.half_side,
                 basis: deformable.setup.n_basis,
@@ -83,7 +83,7 @@ pub(crate) fn header(field: &MovingGaussians) -> GaussianHeader {
     }
 }
 
-pub(crate) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
+pub(crate) fn tensors(field: &DynamicGaussians) -> Vec<FileTensor> {
     let rows = &field.rows().rows;
     let floats = |name: &str, width: usize, of: &dyn Fn(&Gaussian) -> Vec<f32>| -> FileTensor {
         let bytes = rows.iter().flat_map(of).flat_map(f32::to_le_bytes).collect();
@@ -101,11 +101,11 @@ pub(crate) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
         all.push((INTENSITY.into(), Dtype::F32, vec![rows.len()], bytes));
     }
     match field {
-        MovingGaussians::PerPhase(_) => {
+        DynamicGaussians::PerPhase(_) => {
             let phases = rows.iter().flat_map(|g| g.phase.to_le_bytes()).collect();
             all.push(("gaussians.phase".into(), Dtype::U32, vec![rows.len()], phases));
         }
-        MovingGaussians::Deformable(deformable) => {
+        DynamicGaussians::Deformable(deformable) => {
             let vectors = |name: &str, shape: Vec<usize>, values: &[[f32; 4]]| -> FileTensor {
                 let bytes = values.iter().flat_map(|v| v[..3].to_vec()).flat_map(f32::to_le_bytes).collect();
                 (format!("gaussians.{name}"), Dtype::F32, shape, bytes)
@@ -118,7 +118,7 @@ pub(crate) fn tensors(field: &MovingGaussians) -> Vec<FileTensor> {
     all
 }
 
-impl MovingGaussians {
+impl DynamicGaussians {
     /// Returns the number of bytes that the field takes in a checkpoint.
     pub fn bytes(&self) -> usize {
         tensors(self).iter().map(|(.., bytes)| bytes.len()).sum()
@@ -129,14 +129,14 @@ impl MovingGaussians {
 ///
 /// # Errors
 /// [`Error::Data`] naming what is missing, misshapen or not finite.
-pub(crate) fn read_section(sections: &serde_json::Value, file: &File<'_>, n_phases: usize) -> Result<MovingGaussians> {
+pub(crate) fn read_section(sections: &serde_json::Value, file: &File<'_>, n_phases: usize) -> Result<DynamicGaussians> {
     let header: GaussianHeader = serde_json::from_value(sections[SECTION].clone())
         .map_err(|e| Error::data(file.path, SECTION, e.to_string()))?;
     read(&header, file, n_phases)
 }
 
 /// Reads the Gaussians that [`header`] and [`tensors`] describe.
-pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) -> Result<MovingGaussians> {
+pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) -> Result<DynamicGaussians> {
     let path = file.path;
     let positive = [header.pixel, header.strongest, header.cut.into(), header.least_scale.into()];
     if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || header.greatest_scale < header.least_scale {
@@ -183,7 +183,7 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         is_crowd: header.crowd,
         intensities: header.blended.then(|| file.floats(INTENSITY, &[Some(n)])).transpose()?,
     };
-    let Some(grid) = &header.grid else { return Ok(MovingGaussians::PerPhase(sets)) };
+    let Some(grid) = &header.grid else { return Ok(DynamicGaussians::PerPhase(sets)) };
     if !(2..=MOST_NODES).contains(&grid.nodes)
         || grid.basis > MOST_BASIS
         || grid.half_side.is_nan()
@@ -200,7 +200,7 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         let values = file.floats(name, shape)?;
         Ok(values.chunks_exact(3).map(|v| [v[0], v[1], v[2], 0.0]).collect())
     };
-    Ok(MovingGaussians::Deformable(DeformableGaussians {
+    Ok(DynamicGaussians::Deformable(DeformableGaussians {
         setup: DeformableSetup {
             n_nodes: grid.nodes,
             half_side: grid.half_side,

@@ -207,21 +207,21 @@ impl Kernels {
 }
 
 /// Pipelines of a static field that is a network.
-pub struct StillKernels {
+pub struct StaticNetworkKernels {
     /// Computes line integrals of two networks, and maxima.
     pub march_fwd_samples: Stage<push::MarchFwdSamples>,
     /// Computes the losses of two networks and their gradient at each sample.
     pub loss_samples: Stage<push::LossSamples>,
 }
 
-impl StillKernels {
+impl StaticNetworkKernels {
     /// Builds the pipelines.
     ///
     /// # Errors
     /// Errors of [`Gpu::pipeline`].
-    pub fn new(gpu: &Gpu) -> Result<StillKernels> {
+    pub fn new(gpu: &Gpu) -> Result<StaticNetworkKernels> {
         let sums = Build { exchanges: true, ..Build::default() };
-        Ok(StillKernels { march_fwd_samples: sums.stage(gpu)?, loss_samples: sums.stage(gpu)? })
+        Ok(StaticNetworkKernels { march_fwd_samples: sums.stage(gpu)?, loss_samples: sums.stage(gpu)? })
     }
 }
 

@@ -25,7 +25,7 @@ use crate::fitting::fit::{
 use crate::fitting::losses::StepLoss;
 use crate::fitting::shown::ShownGaussians;
 use crate::gaussians::blobs::BlobKernels;
-use crate::gaussians::field::MovingGaussians;
+use crate::gaussians::field::DynamicGaussians;
 use crate::gaussians::pictures::into_buffers;
 use crate::gaussians::stages::SplatStage;
 use crate::geometry::MM_PER_UNIT;
@@ -194,7 +194,7 @@ impl Fit for XGaussianFit {
 
     fn state(&self) -> Result<SavedFit> {
         let state = self.trainer.state()?;
-        let field = MovingGaussians::PerPhase(self.trainer.field_of(&state));
+        let field = DynamicGaussians::PerPhase(self.trainer.field_of(&state));
         Ok(SavedFit { field: FitField::Gaussians(Box::new(field)), state: Arc::new(state) })
     }
 

@@ -192,7 +192,7 @@ impl Checkpoint {
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
         let model = &self.model;
         let mut tensors: Vec<FileTensor> = Vec::new();
-        if let Some(field) = &model.moving {
+        if let Some(field) = &model.gaussians {
             tensors.extend(gaussian_tensors::tensors(field));
         }
         if let Some(state) = &self.fit {
@@ -222,7 +222,7 @@ impl Checkpoint {
         }
         let header = Header {
             format: format_of(&model.config).into(),
-            gaussians: model.moving.as_ref().map(gaussian_tensors::header),
+            gaussians: model.gaussians.as_ref().map(gaussian_tensors::header),
             config: model.config.clone(),
             scene: model.scene.clone(),
             phases: model.param_map.phases,
@@ -309,13 +309,13 @@ impl Checkpoint {
         let (s, d) = (&header.config.static_field, &header.config.dynamic);
         let [grid, ranks, layers, width] = [s.grid, s.ranks, d.layers, d.width].map(u64::from);
         let hidden = layers * width * width;
-        let still = match header.config.static_field.form {
+        let static_len = match header.config.static_field.form {
             StaticForm::Tensor => 3 * ranks * grid * (grid + 1),
             StaticForm::Network => hidden,
             StaticForm::None => 0,
         };
         let network = hidden + header.phases as u64 * u64::from(d.latent);
-        let needed = still + if header.config.method().has_network() { network } else { 0 };
+        let needed = static_len + if header.config.method().has_network() { network } else { 0 };
         if needed > bytes.len() as u64 / 4 {
             return Err(bad("config", format!("{needed} parameters do not fit into the file's {} bytes", bytes.len())));
         }
@@ -368,7 +368,7 @@ impl Checkpoint {
             }
         };
         let file = File { tensors: &tensors, path };
-        let moving = match &header.gaussians {
+        let gaussians = match &header.gaussians {
             Some(about) if method.is_none() => Some(gaussian_tensors::read(about, &file, header.phases)?),
             _ => None,
         };
@@ -396,7 +396,7 @@ impl Checkpoint {
                 scene: header.scene,
                 param_map,
                 hull,
-                moving: moving.or(of_fit),
+                gaussians: gaussians.or(of_fit),
                 field,
                 params,
                 step: header.step,

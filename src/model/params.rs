@@ -62,9 +62,9 @@ pub struct ParamMap {
     /// Number of parameters of the static field; those of the dynamic field follow.
     pub static_len: usize,
     /// The static field, where it is a network.
-    pub still: Option<NetworkMap>,
+    pub static_network: Option<NetworkMap>,
     /// The dynamic field's network; `None` where Gaussians or the field of another method are the dynamic field.
-    pub moving: Option<NetworkMap>,
+    pub dynamic_network: Option<NetworkMap>,
     /// Cardiac phases.
     pub phases: usize,
     /// Number of all parameters, padding included.
@@ -185,22 +185,22 @@ impl ParamMap {
     /// Returns the map for a configuration and a number of phases.
     pub fn new(config: &Config, phases: usize) -> ParamMap {
         let (s, d) = (&config.static_field, &config.dynamic);
-        let (grid, ranks, still) = match s.form {
+        let (grid, ranks, static_network) = match s.form {
             StaticForm::Tensor => (s.grid as usize, s.ranks as usize, None),
             StaticForm::Network => (0, 0, Some(NetworkMap::new(d, 0, 0, phases))),
             StaticForm::None => (0, 0, None),
         };
         let rank4 = ranks.div_ceil(4);
-        let static_len = still.as_ref().map_or(3 * (grid * grid + grid) * rank4 * 4, |network| network.len);
+        let static_len = static_network.as_ref().map_or(3 * (grid * grid + grid) * rank4 * 4, |network| network.len);
         let has_network = config.method().has_network();
-        let moving = has_network.then(|| NetworkMap::new(d, static_len, d.latent as usize, phases));
-        let len = static_len + moving.as_ref().map_or(0, |network| network.len);
-        ParamMap { grid, ranks, rank4, static_len, still, moving, phases, len }
+        let dynamic_network = has_network.then(|| NetworkMap::new(d, static_len, d.latent as usize, phases));
+        let len = static_len + dynamic_network.as_ref().map_or(0, |network| network.len);
+        ParamMap { grid, ranks, rank4, static_len, static_network, dynamic_network, phases, len }
     }
 
     /// Returns the existing networks, the static field's first.
     pub fn networks(&self) -> impl Iterator<Item = &NetworkMap> {
-        self.still.iter().chain(&self.moving)
+        self.static_network.iter().chain(&self.dynamic_network)
     }
 
     /// Returns the number of parameters of the static field's lines, padding included; they are the last ones of the static
@@ -221,8 +221,9 @@ impl ParamMap {
 
     /// Returns every tensor under its documented name, without padding.
     pub fn tensors(&self) -> Vec<Tensor> {
-        let mut out = self.still.as_ref().map_or_else(|| self.planes_and_lines(), |network| network.tensors("static"));
-        out.extend(self.moving.iter().flat_map(|network| network.tensors("dynamic")));
+        let mut out =
+            self.static_network.as_ref().map_or_else(|| self.planes_and_lines(), |network| network.tensors("static"));
+        out.extend(self.dynamic_network.iter().flat_map(|network| network.tensors("dynamic")));
         out
     }
 
@@ -254,7 +255,7 @@ impl ParamMap {
         let mut params = vec![0f32; self.len];
         for (index, tensor) in self.tensors().into_iter().enumerate() {
             let is_static = tensor.name.starts_with("static.");
-            let network = if is_static { self.still.as_ref() } else { self.moving.as_ref() };
+            let network = if is_static { self.static_network.as_ref() } else { self.dynamic_network.as_ref() };
             let inputs = network.map(|network| network.inputs(&tensor.name));
             for (i, &at) in tensor.positions.iter().enumerate() {
                 let (a, b) = (index as u32, i as u32);

@@ -101,7 +101,7 @@ fn shape_fields(setup: &mut Setup, config: &Config, params: &ParamMap) {
     setup.n_bands = config.dynamic.bands;
     setup.grid = params.grid as u32;
     setup.rank4 = params.rank4 as u32;
-    if let Some(network) = &params.moving {
+    if let Some(network) = &params.dynamic_network {
         setup.latent_width = network.latent as u32;
         setup.n_layers = network.layers.len() as u32;
         setup.mlp_width = network.width as u32;

@@ -225,7 +225,7 @@ impl Pass<'_> {
     /// Fails like [`Pass::run`].
     pub fn weights(&mut self) -> Result<()> {
         self.network.map_or(Ok(()), |network| network.record_weights(self))?;
-        self.still.map_or(Ok(()), |still| still.record_weights(self))
+        self.static_network.map_or(Ok(()), |static_network| static_network.record_weights(self))
     }
 
     /// Records the networks at the live samples.
@@ -234,7 +234,7 @@ impl Pass<'_> {
     /// Fails like [`Pass::run`].
     pub fn fields(&mut self) -> Result<()> {
         self.network.map_or(Ok(()), |network| network.record_forward(self))?;
-        self.still.map_or(Ok(()), |still| still.record_forward(self))
+        self.static_network.map_or(Ok(()), |static_network| static_network.record_forward(self))
     }
 
     /// Records a rendering of `n_rays` rays that are already in `rays`: integrals and, on demand, maxima are written to
@@ -271,12 +271,12 @@ impl Pass<'_> {
         }
         self.fields()?;
         let Chunk { first_ray, n_rays } = chunk;
-        match self.still {
+        match self.static_network {
             None => {
                 let push = push::MarchFwd { first_ray, n_rays, with_maxima: u32::from(maxima) };
                 self.run(&self.kernels.march_fwd, chunk.workgroups(self.kernels.rays_marched), push)
             }
-            Some(still) => still.record_integrals(self, chunk, maxima),
+            Some(static_network) => static_network.record_integrals(self, chunk, maxima),
         }
     }
 }

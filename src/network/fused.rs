@@ -378,7 +378,7 @@ mod tests {
         // The weights on the input have 63 numbers and 10 phases, padded to 80 columns.
         let ledger = |pairs, recompute| {
             let backward = Backward { subgroups: 8, tile: 64, pairs, recompute };
-            let ledger = work(params.moving.as_ref().unwrap(), 80, 1_000_000_000, backward);
+            let ledger = work(params.dynamic_network.as_ref().unwrap(), 80, 1_000_000_000, backward);
             ["mlp_fused_fwd", "mlp_fused_bwd"].map(|stage| ledger[stage])
         };
         let [forward, backward] = ledger(true, false);
@@ -404,7 +404,7 @@ mod tests {
         let spans_of = |layers: usize, skip_layer: usize, pairs: bool| {
             let mut config = Config::preset(Preset::Paper);
             (config.dynamic.layers, config.dynamic.skip_layer) = (layers as u32, skip_layer as u32);
-            let spans = spans(&ParamMap::new(&config, 10).moving.unwrap().layers, pairs);
+            let spans = spans(&ParamMap::new(&config, 10).dynamic_network.unwrap().layers, pairs);
             spans.iter().map(|span| (span.upper, span.lower)).collect::<Vec<_>>()
         };
         use Part::{Encoded, Hidden};

@@ -326,7 +326,8 @@ mod tests {
     fn operations_of_the_stages_are_those_of_the_network() {
         for preset in [Preset::Paper, Preset::PublicCode, Preset::FastMlp] {
             let params = ParamMap::new(&Config::preset(preset), 10);
-            let (ledger, cost) = (work(params.moving.as_ref().unwrap(), 1_000_000_000), NetworkCost::of(&params));
+            let (ledger, cost) =
+                (work(params.dynamic_network.as_ref().unwrap(), 1_000_000_000), NetworkCost::of(&params));
             let flop = |stages: &[&str]| stages.iter().map(|stage| ledger[*stage].gflop).sum::<f64>() as u64;
             assert_eq!(flop(&["mlp_layer_fwd", "mlp_out_fwd"]), cost.forward);
             assert_eq!(flop(&["mlp_layer_bwd_weight", "mlp_out_bwd_weight"]), cost.weights);

@@ -10,7 +10,7 @@ use crate::kernels::stages::{Kernels, Stage};
 use crate::model::params::ParamMap;
 use crate::network::Network;
 use crate::network::forward::ForwardBuffers;
-use crate::network::still::StillNetwork;
+use crate::network::static_network::StaticNetwork;
 
 /// Recording of stages, with all that they work with.
 pub struct Pass<'a> {
@@ -21,7 +21,7 @@ pub struct Pass<'a> {
     /// The dynamic field's network; `None` where Gaussians are the dynamic field, or none is drawn.
     pub network: Option<&'a Network>,
     /// Static field, where it is a network as well.
-    pub still: Option<&'a StillNetwork>,
+    pub static_network: Option<&'a StaticNetwork>,
     /// Buffers of the forward pass.
     pub buffers: &'a ForwardBuffers,
     /// Further buffers for training.

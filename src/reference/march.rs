@@ -213,7 +213,7 @@ pub fn fwd(
     let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
     let row = plan.schedule[step as usize];
     let mut out = statics(plan, params, step, ray, with_static);
-    let Some(network) = p.moving.as_ref().filter(|_| row.dynamic_active != 0) else { return out };
+    let Some(network) = p.dynamic_network.as_ref().filter(|_| row.dynamic_active != 0) else { return out };
     let samples = depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray);
     for ((t, dl), near) in samples.iter().copied().zip(near_part.marks(&samples)) {
         let x = ray.anchor + t * ray.direction;
@@ -261,7 +261,7 @@ pub fn sample_bwd(
     precision: Precision,
     gradient: &mut [f64],
 ) {
-    let Some(network) = &plan.params.moving else { return };
+    let Some(network) = &plan.params.dynamic_network else { return };
     let s = &plan.setup;
     let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
     let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };

@@ -37,11 +37,11 @@ pub struct PairIntegrals {
 /// Line integrals and maxima (twin of `march_fwd_samples`).
 pub fn integrals(samples: &[PairSample]) -> PairIntegrals {
     let mut seen = PairIntegrals { fields: [0.0; 2], near: 0.0, largest: [0.0; 3] };
-    for PairSample { dl, near, sigma: [still, moving] } in samples.iter().copied() {
-        seen.fields[0] += still * dl;
-        seen.fields[1] += moving * dl;
-        seen.near += if near { moving * dl } else { 0.0 };
-        for (largest, value) in seen.largest.iter_mut().zip([still, moving, still + moving]) {
+    for PairSample { dl, near, sigma: [of_static, of_dynamic] } in samples.iter().copied() {
+        seen.fields[0] += of_static * dl;
+        seen.fields[1] += of_dynamic * dl;
+        seen.near += if near { of_dynamic * dl } else { 0.0 };
+        for (largest, value) in seen.largest.iter_mut().zip([of_static, of_dynamic, of_static + of_dynamic]) {
             *largest = largest.max(value);
         }
     }
@@ -93,22 +93,22 @@ pub fn ray_loss(
         ..PairLoss::default()
     };
     for sample in samples {
-        let PairSample { dl, near, sigma: [still, moving] } = *sample;
-        let sum = still + moving + SMALL;
-        let (b, rest) = ((moving / sum).max(SMALLEST), ((still + SMALL) / sum).max(SMALLEST));
+        let PairSample { dl, near, sigma: [of_static, of_dynamic] } = *sample;
+        let sum = of_static + of_dynamic + SMALL;
+        let (b, rest) = ((of_dynamic / sum).max(SMALLEST), ((of_static + SMALL) / sum).max(SMALLEST));
         let by_share = if b > SMALLEST && rest > SMALLEST { (rest / b).ln() } else { 0.0 };
-        let (p, size) = (share(sample), still * dl);
+        let (p, size) = (share(sample), of_static * dl);
         loss.favour_static -= per_depth * (b * b.ln() + rest * rest.ln());
         loss.ray_entropy -= entropy_scale * p * (p + SMALL).ln();
-        loss.near += if near { per_ray * moving * dl } else { 0.0 };
+        loss.near += if near { per_ray * of_dynamic * dl } else { 0.0 };
         loss.static_size += size + size * size;
         let photometric = 2.0 * per_ray * weight * residual * dl;
         let favour = f64::from(row.favour_static) * per_depth * by_share / (sum * sum);
         let along = f64::from(row.ray_entropy) * entropy_scale * dl / integral * (slope(p) - mean);
         let near = if near { f64::from(row.near_integral) * per_ray * dl } else { 0.0 };
         loss.gradient.push([
-            photometric - favour * moving + f64::from(row.static_size) * dl * (1.0 + 2.0 * size),
-            photometric + favour * (still + SMALL) - along + near,
+            photometric - favour * of_dynamic + f64::from(row.static_size) * dl * (1.0 + 2.0 * size),
+            photometric + favour * (of_static + SMALL) - along + near,
         ]);
     }
     loss
@@ -139,12 +139,12 @@ pub fn traces(
 /// Attenuations of both networks, and their derivatives by the features.
 pub fn attenuations(plan: &Plan, traces: &[NetworkTrace; 2]) -> [[f64; 2]; 2] {
     let s = &plan.setup;
-    let [still, moving] = [(s.static_gain, s.static_shift), (s.dynamic_gain, s.dynamic_shift)];
+    let [of_static, of_dynamic] = [(s.static_gain, s.static_shift), (s.dynamic_gain, s.dynamic_shift)];
     let of = |trace: &NetworkTrace, (gain, shift): (f32, f32)| {
         let x = trace.feature + f64::from(shift);
         [f64::from(gain) * field::softplus(x), f64::from(gain) * field::sigmoid(x)]
     };
-    [of(&traces[0], still), of(&traces[1], moving)]
+    [of(&traces[0], of_static), of(&traces[1], of_dynamic)]
 }
 
 /// Adds the gradient of a sample, given the derivative of the objective by both attenuations.

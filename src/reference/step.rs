@@ -85,7 +85,7 @@ pub fn loss_and_gradient(
     rays: &[Ray],
     precision: Precision,
 ) -> (Losses, Vec<f64>) {
-    if plan.params.still.is_some() {
+    if plan.params.static_network.is_some() {
         return networks::loss_and_gradient(plan, params, step, rays, precision);
     }
     let s = &plan.setup;

@@ -29,8 +29,8 @@ const LEAST_BAKED_CELLS: u32 = 32;
 /// baked when first needed, or when asked for.
 pub struct Baked {
     renderer: Arc<Renderer>,
-    still: Grid,
-    moving: Grid,
+    static_grid: Grid,
+    dynamic_grid: Grid,
     /// The static field, then each phase.
     volumes: Mutex<Vec<Option<Image3d>>>,
     /// Recorded commands by size, phase and quantity: a frame only writes a view, submits, and reads a picture.
@@ -66,8 +66,8 @@ impl Baked {
     pub fn new(renderer: Arc<Renderer>, cells: u32) -> Result<Baked> {
         let baked = Self::empty(renderer, cells, cells);
         baked.bake(Component::Static, 0)?;
-        let moving = if baked.renderer.moving.is_some() { 0 } else { baked.renderer.setup.n_phases };
-        for phase in 0..moving {
+        let n_baked = if baked.renderer.blobs.is_some() { 0 } else { baked.renderer.setup.n_phases };
+        for phase in 0..n_baked {
             baked.bake(Component::Dynamic, phase)?;
         }
         Ok(baked)
@@ -78,23 +78,23 @@ impl Baked {
     pub fn for_display(renderer: Arc<Renderer>, model: &Model, cell_mm: f64) -> Baked {
         let scene = &model.scene;
         let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
-        let moving_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(LEAST_BAKED_CELLS, BAKED_CELLS);
-        let still_cells = match model.config.static_field.form {
+        let dynamic_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(LEAST_BAKED_CELLS, BAKED_CELLS);
+        let static_cells = match model.config.static_field.form {
             StaticForm::Tensor => (2 * model.config.static_field.grid).clamp(LEAST_BAKED_CELLS, BAKED_CELLS),
-            StaticForm::Network => moving_cells,
+            StaticForm::Network => dynamic_cells,
             StaticForm::None => LEAST_BAKED_CELLS,
         };
-        Self::empty(renderer, still_cells, moving_cells)
+        Self::empty(renderer, static_cells, dynamic_cells)
     }
 
-    /// Prepares volumes of `still_cells` and `moving_cells` cells along the longest side of each box; bakes none yet.
-    fn empty(renderer: Arc<Renderer>, still_cells: u32, moving_cells: u32) -> Baked {
+    /// Prepares volumes of `static_cells` and `dynamic_cells` cells along the longest side of each box; bakes none yet.
+    fn empty(renderer: Arc<Renderer>, static_cells: u32, dynamic_cells: u32) -> Baked {
         let s = &renderer.setup;
         let corner = |at: [f32; 3]| Vec3::from(at).as_dvec3();
-        let still = Grid::over(corner(s.static_min), corner(s.static_max), still_cells);
-        let moving = Grid::over(corner(s.dynamic_min), corner(s.dynamic_max), moving_cells);
+        let static_grid = Grid::over(corner(s.static_min), corner(s.static_max), static_cells);
+        let dynamic_grid = Grid::over(corner(s.dynamic_min), corner(s.dynamic_max), dynamic_cells);
         let volumes = Mutex::new(vec![None; 1 + s.n_phases as usize]);
-        Baked { still, moving, volumes, renderer, recorded: Mutex::default() }
+        Baked { static_grid, dynamic_grid, volumes, renderer, recorded: Mutex::default() }
     }
 
     /// Renderer whose fields are baked.
@@ -115,8 +115,8 @@ impl Baked {
     fn bake_field(&self, field: Component, phase: u32) -> Result<Commands> {
         let setup = &self.renderer.setup;
         let (grid, gain) = match field {
-            Component::Static => (&self.still, setup.static_gain),
-            _ => (&self.moving, setup.dynamic_gain),
+            Component::Static => (&self.static_grid, setup.static_gain),
+            _ => (&self.dynamic_grid, setup.dynamic_gain),
         };
         // In units of the field's scale, values are near 1 and f16 loses a thousandth at most.
         let cells = self.renderer.sample(field, phase, grid)?;
@@ -185,8 +185,8 @@ impl Baked {
         let of = |component| Quantity { component, ..quantity };
         let mut image = self.renderer.show(rays, (width, height), phase, of(Component::Dynamic))?;
         if quantity.component.has_static() {
-            let still = self.render(rays, width, height, phase, of(Component::Static))?;
-            image.iter_mut().zip(&still).for_each(|(sum, still)| *sum += still);
+            let static_image = self.render(rays, width, height, phase, of(Component::Static))?;
+            image.iter_mut().zip(&static_image).for_each(|(sum, static_image)| *sum += static_image);
         }
         Ok(image)
     }
@@ -264,15 +264,15 @@ impl Baked {
         // A field that is not shown is bound, since the kernel names it, but not read.
         let component = quantity.component;
         let shown = |field, wanted| if wanted { self.volume_or_bake(field, phase).map(Some) } else { Ok(None) };
-        let still = shown(Component::Static, component.has_static())?;
-        let moving = shown(Component::Dynamic, component.has_dynamic())?;
-        let any = still.as_ref().or(moving.as_ref());
+        let static_volume = shown(Component::Static, component.has_static())?;
+        let dynamic_volume = shown(Component::Dynamic, component.has_dynamic())?;
+        let any = static_volume.as_ref().or(dynamic_volume.as_ref());
         let any = any.ok_or_else(|| Error::Internal("there is no volume to render".into()))?;
         let bound = [
             (Binding::setup, (&self.renderer.buffers.setup).into()),
             (Binding::views, view.into()),
-            (Binding::static_volume, still.as_ref().unwrap_or(any).into()),
-            (Binding::dynamic_volume, moving.as_ref().unwrap_or(any).into()),
+            (Binding::static_volume, static_volume.as_ref().unwrap_or(any).into()),
+            (Binding::dynamic_volume, dynamic_volume.as_ref().unwrap_or(any).into()),
             (Binding::image, image.into()),
         ];
         let push = push::BakedMarch {

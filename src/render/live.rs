@@ -3,7 +3,7 @@
 use crate::config::Config;
 use crate::error::Result;
 use crate::fitting::fit::FieldFeed;
-use crate::gaussians::field::MovingFeed;
+use crate::gaussians::field::GaussianFeed;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -48,9 +48,9 @@ pub struct Live {
     config: Config,
     scene: Scene,
     params: Option<Buffer>,
-    moving: Option<MovingFeed>,
+    gaussians: Option<GaussianFeed>,
     /// Count of the feed's changes at the field that is drawn.
-    moving_at: AtomicU64,
+    gaussians_at: AtomicU64,
     /// Iteration the static field and each phase were baked at.
     baked_at: Vec<u32>,
     rest_until: Instant,
@@ -72,11 +72,11 @@ impl Live {
             config: model.config.clone(),
             scene: model.scene.clone(),
             params: source.params.clone(),
-            moving: match &source.feed {
+            gaussians: match &source.feed {
                 Some(FieldFeed::Gaussians(feed)) => Some(feed.clone()),
                 _ => None,
             },
-            moving_at: AtomicU64::new(u64::MAX),
+            gaussians_at: AtomicU64::new(u64::MAX),
             baked_at: vec![0; 1 + model.param_map.phases],
             rest_until: Instant::now(),
         })
@@ -122,10 +122,10 @@ impl Live {
         let mut under_way = Vec::new();
         self.baked.renderer().check_phase(phase)?;
         let component = quantity.component;
-        let still = (component.has_static(), Component::Static, 0);
+        let static_field = (component.has_static(), Component::Static, 0);
         let baked = component.has_dynamic() && !self.baked.renderer().draws_gaussians(quantity);
-        let moving = (baked, Component::Dynamic, 1 + phase as usize);
-        for (wanted, field, slot) in [still, moving] {
+        let dynamic_field = (baked, Component::Dynamic, 1 + phase as usize);
+        for (wanted, field, slot) in [static_field, dynamic_field] {
             let old = || self.baked_at[slot] != step && Instant::now() >= self.rest_until;
             if wanted && (!self.baked.has(field, phase) || old()) {
                 let begin = Instant::now();
@@ -169,16 +169,16 @@ impl Live {
 
     /// Takes the source's Gaussians if they have changed.
     fn follow_gaussians(&self) -> Result<()> {
-        let Some(feed) = &self.moving else { return Ok(()) };
+        let Some(feed) = &self.gaussians else { return Ok(()) };
         let (change, field) = {
             let now = feed.lock().unwrap_or_else(PoisonError::into_inner);
-            if now.0 == self.moving_at.load(Ordering::Relaxed) {
+            if now.0 == self.gaussians_at.load(Ordering::Relaxed) {
                 return Ok(());
             }
             now.clone()
         };
         self.baked.renderer().set_gaussians(&field)?;
-        self.moving_at.store(change, Ordering::Relaxed);
+        self.gaussians_at.store(change, Ordering::Relaxed);
         Ok(())
     }
 }

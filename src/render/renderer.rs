@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::fitting::field::FieldDrawing;
 use crate::gaussians::blobs::{BlobList, Blobs};
-use crate::gaussians::field::MovingGaussians;
+use crate::gaussians::field::DynamicGaussians;
 use crate::gaussians::pictures::Pictures;
 use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
@@ -21,7 +21,7 @@ use crate::model::setup::sample_capacity;
 use crate::network::chunk::{Chunk, chunk_rays, chunk_samples, packed};
 use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
-use crate::network::still::StillNetwork;
+use crate::network::static_network::StaticNetwork;
 use crate::network::{Network, Purpose, largest_chunk};
 use crate::render::quantity::{Projection, Quantity};
 use crate::scan::gating::BeatTime;
@@ -90,12 +90,12 @@ pub struct Renderer {
     /// The dynamic field's network; none where Gaussians or another field are the dynamic field.
     network: Option<Network>,
     /// Static field, where it is a network as well.
-    pub(super) still: Option<StillNetwork>,
+    pub(super) static_network: Option<StaticNetwork>,
     pub(super) buffers: ForwardBuffers,
     pub(super) setup: Setup,
     param_map: ParamMap,
     /// Gaussians, where they are the dynamic field.
-    pub(super) moving: Option<Blobs>,
+    pub(super) blobs: Option<Blobs>,
     pictures: Option<Pictures>,
     /// Field of a method of `crate::methods`, which is then the only field.
     pub(super) field: Option<Box<dyn FieldDrawing>>,
@@ -117,21 +117,22 @@ impl Renderer {
         // Nothing is penalised, and a rendering has no batch whose last ray could decide.
         setup.occlusion_share = 0.0;
         setup.n_static_samples = model.config.march.render_samples;
-        if model.moving.is_none() {
+        if model.gaussians.is_none() {
             setup.n_dynamic_samples = model.config.march.render_samples;
         }
-        let limit = model.param_map.moving.as_ref().map_or(u32::MAX, |map| largest_chunk(gpu, &tuning, map));
+        let limit = model.param_map.dynamic_network.as_ref().map_or(u32::MAX, |map| largest_chunk(gpu, &tuning, map));
         let largest = tuning.chunk_samples.min(limit);
         setup.sample_capacity = setup.sample_capacity.min(sample_capacity(largest));
-        let network = model.param_map.moving.as_ref();
+        let network = model.param_map.dynamic_network.as_ref();
         let network = network.map(|map| Network::new(gpu, &tuning, &setup, map, Purpose::Render)).transpose()?;
         let kernels = Kernels::new(gpu, tuning, model.param_map.line_len() as u32, setup.n_static_samples)?;
         let schedule = gpu.buffer("schedule", size_of::<Schedule>() as u64, Memory::Upload)?;
         let (tuning, param_map, hull) = (&kernels.tuning, &model.param_map, model.hull.as_ref());
         let buffers = ForwardBuffers::new(gpu, tuning, &setup, param_map, RAYS_PER_SUBMIT, schedule, hull)?;
-        let still = param_map.still.as_ref();
-        let still = still.map(|map| StillNetwork::new(gpu, tuning, &setup, map, &buffers, Purpose::Render));
-        let still = still.transpose()?;
+        let static_network = param_map.static_network.as_ref();
+        let static_network =
+            static_network.map(|map| StaticNetwork::new(gpu, tuning, &setup, map, &buffers, Purpose::Render));
+        let static_network = static_network.transpose()?;
         // The schedule has a single row, that of the model's step.
         gpu.upload(&buffers.state, 0, &[DeviceState::default()])?;
         if network.is_none() {
@@ -139,16 +140,28 @@ impl Renderer {
             buffers.clear_samples(&mut recording);
             gpu.wait(recording.finish()?.submit()?)?;
         }
-        let moving = model.moving.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
-        let pictures = model.moving.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
+        let blobs = model.gaussians.as_ref().map(|field| Blobs::new(gpu, tuning, field)).transpose()?;
+        let pictures = model.gaussians.as_ref().map(|field| Pictures::new(gpu, field)).transpose()?;
         let field = model.field.as_ref().map(|field| field.drawing(gpu)).transpose()?;
         let param_map = model.param_map.clone();
         let gpu = gpu.clone();
         let pace = |_| SubmitPace::new(kernels.tuning.longest_submit_s, FIRST_RAYS, RAYS_PER_SUBMIT);
         let paces = std::array::from_fn(pace);
         let drawn = Mutex::default();
-        let renderer =
-            Renderer { gpu, kernels, network, still, buffers, setup, param_map, moving, pictures, field, paces, drawn };
+        let renderer = Renderer {
+            gpu,
+            kernels,
+            network,
+            static_network,
+            buffers,
+            setup,
+            param_map,
+            blobs,
+            pictures,
+            field,
+            paces,
+            drawn,
+        };
         renderer.set_params(model)?;
         Ok(renderer)
     }
@@ -159,13 +172,13 @@ impl Renderer {
     /// [`Error::Internal`] for other parameters; device errors.
     pub fn set_model(&self, model: &Model) -> Result<()> {
         let same_method =
-            model.moving.is_some() == self.moving.is_some() && model.field.is_some() == self.field.is_some();
+            model.gaussians.is_some() == self.blobs.is_some() && model.field.is_some() == self.field.is_some();
         if model.param_map != self.param_map || !same_method {
             return Err(Error::Internal(
                 "the parameters of the model do not have the shape that the renderer was created for".into(),
             ));
         }
-        if let Some(field) = &model.moving {
+        if let Some(field) = &model.gaussians {
             self.set_gaussians(field)?;
         }
         if let (Some(field), Some(drawing)) = (&model.field, &self.field) {
@@ -178,8 +191,8 @@ impl Renderer {
     ///
     /// # Errors
     /// [`Error::Internal`] where a network is the dynamic field; device errors.
-    pub fn set_gaussians(&self, field: &MovingGaussians) -> Result<()> {
-        match (&self.moving, &self.pictures) {
+    pub fn set_gaussians(&self, field: &DynamicGaussians) -> Result<()> {
+        match (&self.blobs, &self.pictures) {
             (Some(blobs), Some(pictures)) => {
                 pictures.replace(field);
                 blobs.replace(field)
@@ -228,7 +241,7 @@ impl Renderer {
 
     /// Gaussians interpolated between two phases.
     fn between(&self, phase: f64) -> Result<BlobList> {
-        match self.moving.as_ref().map(|blobs| blobs.between(phase)).transpose()?.flatten() {
+        match self.blobs.as_ref().map(|blobs| blobs.between(phase)).transpose()?.flatten() {
             Some(list) => Ok(list),
             None => Err(Error::config(
                 "phase",
@@ -253,7 +266,16 @@ impl Renderer {
         setup: &'a Setup,
     ) -> Pass<'a> {
         let (kernels, network, params) = (&self.kernels, self.network.as_ref(), &self.param_map);
-        Pass { recording, kernels, network, still: self.still.as_ref(), buffers, training: None, params, setup }
+        Pass {
+            recording,
+            kernels,
+            network,
+            static_network: self.static_network.as_ref(),
+            buffers,
+            training: None,
+            params,
+            setup,
+        }
     }
 
     /// Renders a `width` x `height` view at a phase.
@@ -261,7 +283,7 @@ impl Renderer {
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have; device errors.
     pub fn render(&self, rays: &ViewRays, width: usize, height: usize, phase: u32) -> Result<Rendering> {
-        self.render_parts(rays, (width, height), phase, Parts { still: true, maxima: true })
+        self.render_parts(rays, (width, height), phase, Parts { static_field: true, maxima: true })
     }
 
     /// Renders the quantity that a `width` x `height` view shows at a phase, rows first; maxima per world unit. Where Gaussians
@@ -283,8 +305,8 @@ impl Renderer {
             self.check_phase(phase)?;
             return pictures.draw(rays, (width, height), phase);
         }
-        let still = self.moving.is_none() || quantity.component.has_static();
-        let parts = Parts { still, maxima: quantity.projection == Projection::Mip };
+        let static_field = self.blobs.is_none() || quantity.component.has_static();
+        let parts = Parts { static_field, maxima: quantity.projection == Projection::Mip };
         Ok(self.render_parts(rays, (width, height), phase, parts)?.show(quantity))
     }
 
@@ -315,7 +337,7 @@ impl Renderer {
 
     /// Tells whether Gaussians are the dynamic field, not a network.
     pub fn gaussians_move(&self) -> bool {
-        self.moving.is_some()
+        self.blobs.is_some()
     }
 
     /// Tells whether a motion hull bounds the dynamic field.
@@ -332,7 +354,7 @@ impl Renderer {
     /// sum with the static field is not the sum of the maxima: it takes the rays' samples, or volumes.
     pub fn draws_gaussians(&self, quantity: Quantity) -> bool {
         let summed = quantity.projection == Projection::Drr || quantity.component == Component::Dynamic;
-        self.moving.is_some() && quantity.component.has_dynamic() && summed
+        self.blobs.is_some() && quantity.component.has_dynamic() && summed
     }
 
     fn render_parts(
@@ -343,7 +365,7 @@ impl Renderer {
         parts: Parts,
     ) -> Result<Rendering> {
         self.check_phase(phase)?;
-        let blobs = self.moving.as_ref().map(|blobs| blobs.at(phase)).transpose()?;
+        let blobs = self.blobs.as_ref().map(|blobs| blobs.at(phase)).transpose()?;
         self.draw(rays, (width, height), BeatTime::at_phase(phase), blobs.as_ref(), parts)
     }
 
@@ -375,9 +397,9 @@ impl Renderer {
             return Err(Error::config("phase", phase, format!("is out of range: phases go from 0 to {last}")));
         }
         if phase.fract() != 0.0 {
-            let all = Parts { still: true, maxima: true };
+            let all = Parts { static_field: true, maxima: true };
             let taken = BeatTime::of(phase, self.setup.n_phases);
-            let whole_phases = self.moving.is_some() || self.field.is_some();
+            let whole_phases = self.blobs.is_some() || self.field.is_some();
             let blobs = whole_phases.then(|| self.between(phase)).transpose()?;
             return self.draw(rays, (width, height), taken, blobs.as_ref(), all);
         }
@@ -387,7 +409,7 @@ impl Renderer {
 
     /// Last phase that can be rendered: for a field that is continuous in time, the first phase of the next beat.
     fn last_moment(&self) -> u32 {
-        let continuous = self.field.is_none() && self.moving.as_ref().is_none_or(Blobs::move_between_phases);
+        let continuous = self.field.is_none() && self.blobs.as_ref().is_none_or(Blobs::move_between_phases);
         if continuous { self.setup.n_phases } else { self.setup.n_phases - 1 }
     }
 
@@ -401,7 +423,7 @@ impl Renderer {
         parts: Parts,
     ) -> Result<Rendering> {
         let (pixels, image_width) = ((width * height) as u32, width as u32);
-        let pace = &self.paces[usize::from(parts.still) + 2 * usize::from(parts.maxima)];
+        let pace = &self.paces[usize::from(parts.static_field) + 2 * usize::from(parts.maxima)];
         // One view at a time: its rays and what they see have one place on the device.
         let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
         let (mut out, mut first_pixel) = (Rendering::default(), 0);
@@ -469,10 +491,10 @@ impl Renderer {
         if let Some(field) = &self.field {
             let (rays, out) = (&self.buffers.rays, &self.buffers.ray_out);
             field.record_rays(&mut recording, rays, out, taken.phase, n_rays)?;
-        } else if parts.still {
+        } else if parts.static_field {
             self.pass(&mut recording, &self.buffers, &self.setup).render(n_rays, parts.maxima)?;
         }
-        if let (Some(kernels), Some(list)) = (&self.moving, blobs) {
+        if let (Some(kernels), Some(list)) = (&self.blobs, blobs) {
             let row = image_width.min(n_rays);
             kernels.record_rays(&mut recording, &self.buffers, list, n_rays, row, parts.maxima)?;
         }
@@ -550,7 +572,7 @@ pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32) -> Pose {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 struct Parts {
     /// The static field.
-    still: bool,
+    static_field: bool,
     /// Maxima along rays.
     maxima: bool,
 }

@@ -11,7 +11,7 @@ use crate::kernels::push;
 use crate::model::component::Component;
 use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
-use crate::network::still::still_setup;
+use crate::network::static_network::static_setup;
 use crate::render::grid::{Grid, PatientGrid};
 use crate::render::renderer::{RAYS_PER_SUBMIT, Renderer, pose};
 use crate::scan::gating::BeatTime;
@@ -61,9 +61,9 @@ impl Renderer {
         setup.n_dynamic_samples = nx;
         setup.dynamic_near = grid.origin.x as f32;
         setup.dynamic_far = (grid.origin.x + grid.spacing.x * f64::from(nx - 1)) as f32;
-        let still = self.still.as_ref().filter(|_| field == Component::Static);
-        if still.is_some() {
-            setup = still_setup(&setup);
+        let static_network = self.static_network.as_ref().filter(|_| field == Component::Static);
+        if static_network.is_some() {
+            setup = static_setup(&setup);
         }
         let rows = ny * nz;
         let rows_at_once = RAYS_PER_SUBMIT.min((CELLS_PER_SUBMIT / nx).max(1)).min(rows);
@@ -85,11 +85,11 @@ impl Renderer {
             let buffers = ForwardBuffers { setup: setup_buffer, ..self.buffers.clone() };
             let push = push::PoseRays { n_rays: n, image_width: ny, along_axis: setup.along_axis };
             buffers.record_pose(&mut r, &self.kernels, &of, push)?;
-            match (field, &self.moving, still) {
-                (Component::Static, _, Some(still)) => {
+            match (field, &self.blobs, static_network) {
+                (Component::Static, _, Some(static_network)) => {
                     r.fill(&cells, 0);
-                    let moving = self.pass(&mut r, &buffers, &setup);
-                    Pass { network: Some(still.network()), still: None, ..moving }.volume(n, &cells)?;
+                    let pass = self.pass(&mut r, &buffers, &setup);
+                    Pass { network: Some(static_network.network()), static_network: None, ..pass }.volume(n, &cells)?;
                 }
                 (Component::Static, _, None) => {
                     let stage = &self.kernels.volume_static;
@@ -154,7 +154,7 @@ impl Renderer {
     /// # Errors
     /// As [`Renderer::sample_patient`].
     pub fn bound_patient(&self, phase: u32, grid: &PatientGrid, away_mm: f64) -> Result<Option<[Vec<f32>; 2]>> {
-        if self.moving.is_none() {
+        if self.blobs.is_none() {
             return Ok(None);
         }
         grid.check()?;

@@ -8,7 +8,7 @@ use crate::scan::dataset::Dataset;
 use crate::scan::gating::SYSTOLE_SHARE;
 use crate::score::shapes::chamfer_mm;
 use crate::score::volume::{TrueVessels, VOLUMES, on_one_grid, pixel_mm, read, truth_file};
-use crate::vessels::field::MovingField;
+use crate::vessels::field::VesselField;
 use std::path::PathBuf;
 
 /// The true vessels at the phase nearest to the end of systole, where their displacement is largest.
@@ -46,7 +46,7 @@ impl Distance {
     /// Device errors.
     pub fn chamfer_mm(&self, renderer: &Renderer, scene: &Scene, threshold_per_mm: f64) -> Result<Option<f64>> {
         let Distance { truth, file, phase, pixel_mm } = self;
-        let field = MovingField { renderer, scene, phase: *phase, pixel_mm: *pixel_mm, threshold_per_mm };
+        let field = VesselField { renderer, scene, phase: *phase, pixel_mm: *pixel_mm, threshold_per_mm };
         match on_one_grid(&field, &field.coarse()?, truth, file) {
             Err(Error::Data { .. }) => Ok(None),
             grid => grid.map(|(_, [truth, ours])| chamfer_mm(&truth, &ours)),

@@ -10,7 +10,7 @@ use crate::render::renderer::Renderer;
 use crate::scan::dataset::Dataset;
 use crate::score::shapes::{Agreement, WITHIN_MM, compare};
 use crate::vessels::distances::DistanceMap;
-use crate::vessels::field::{CoarseField, Corners, MovingField};
+use crate::vessels::field::{CoarseField, Corners, VesselField};
 use crate::vessels::mask::Mask;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
@@ -102,12 +102,12 @@ pub fn score(
             continue;
         }
         let volume = read(&file)?;
-        let moving = MovingField { renderer, scene, phase, pixel_mm, threshold_per_mm };
-        let coarse = moving.coarse()?;
+        let field = VesselField { renderer, scene, phase, pixel_mm, threshold_per_mm };
+        let coarse = field.coarse()?;
         let mut against = |volume: &Volume| -> Result<PhaseScores> {
             proceed()?;
             let truth = TrueVessels::new(volume, dataset);
-            Ok(PhaseScores { phase, scores: scores(&moving, &coarse, &truth, &file, least_mm3)? })
+            Ok(PhaseScores { phase, scores: scores(&field, &coarse, &truth, &file, least_mm3)? })
         };
         match carried {
             None => phases.push(against(&volume)?),
@@ -136,10 +136,10 @@ pub fn score_known(
     pixel_mm: f64,
 ) -> Result<Option<VolumeScores>> {
     let of_phase = |(phase, truth): (&u32, &TrueVessels)| -> Result<PhaseScores> {
-        let moving = MovingField { renderer, scene, phase: *phase, pixel_mm, threshold_per_mm };
+        let field = VesselField { renderer, scene, phase: *phase, pixel_mm, threshold_per_mm };
         let of = PathBuf::from(format!("true vessels of phase {phase}"));
         let least_mm3 = smallest_component_mm3(pixel_mm);
-        Ok(PhaseScores { phase: *phase, scores: scores(&moving, &moving.coarse()?, truth, &of, least_mm3)? })
+        Ok(PhaseScores { phase: *phase, scores: scores(&field, &field.coarse()?, truth, &of, least_mm3)? })
     };
     let phases = known.iter().map(of_phase).collect::<Result<Vec<_>>>()?;
     Ok((!phases.is_empty()).then(|| VolumeScores::of(phases, threshold_per_mm, pixel_mm)))
@@ -300,7 +300,7 @@ impl Mass {
 
 /// True vessels, and those of a field, on a grid with the truth's voxels that contains both.
 pub(super) fn on_one_grid(
-    field: &MovingField<'_>,
+    field: &VesselField<'_>,
     coarse: &CoarseField,
     truth: &TrueVessels,
     file: &Path,
@@ -315,7 +315,7 @@ pub(super) fn on_one_grid(
 
 /// Scores of a field against the truth.
 fn scores(
-    field: &MovingField<'_>,
+    field: &VesselField<'_>,
     coarse: &CoarseField,
     truth: &TrueVessels,
     file: &Path,

@@ -2,7 +2,7 @@
 
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
-use crate::gaussians::field::MovingGaussians;
+use crate::gaussians::field::DynamicGaussians;
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
@@ -45,16 +45,23 @@ const CELL_STRIDE: usize = 17;
 ///
 /// # Errors
 /// Device errors.
-pub fn model(gpu: &Gpu, dataset: &Dataset, field: MovingGaussians, tuning: &Tuning) -> Result<Model> {
+pub fn model(gpu: &Gpu, dataset: &Dataset, field: DynamicGaussians, tuning: &Tuning) -> Result<Model> {
     let config = Config::load(Some(Preset::FastMlp), None, &["hull.enabled=false".into()])?;
     let mut trainer = Trainer::new(gpu, Plan::new(&config, dataset)?, dataset, tuning.clone())?;
     let of_network = trainer.model()?;
     let config = Config::preset(Preset::Fast);
     let param_map = ParamMap::new(&config, dataset.n_phases as usize);
-    Ok(Model { params: param_map.initial(&config), param_map, config, moving: Some(field), hull: None, ..of_network })
+    Ok(Model {
+        params: param_map.initial(&config),
+        param_map,
+        config,
+        gaussians: Some(field),
+        hull: None,
+        ..of_network
+    })
 }
 
-fn form(field: &MovingGaussians) -> &'static str {
+fn form(field: &DynamicGaussians) -> &'static str {
     if field.deformable().is_some() { "deformable" } else { "phase" }
 }
 
@@ -109,7 +116,7 @@ pub fn compare_crowd(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Res
     let mut trainer = Trainer::new(gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
     let mut model = trainer.model()?;
     let crowd = crowd(&model)?;
-    model.moving = Some(crowd.clone());
+    model.gaussians = Some(crowd.clone());
     let rays = &dataset.views[1].rays;
     let seen = Renderer::new(gpu, &model, tuning.clone())?.render(rays, width, height, 0)?;
     let set = blobs::field(&crowd, 0);
@@ -128,8 +135,8 @@ const CROWD_SEARCH: f64 = 4.0;
 const CROWD_WIDTHS: [f64; 2] = [0.004, 0.1];
 
 /// Gaussians of phase 0, narrow and wide ones, in a model of R2-Gaussian.
-fn crowd(model: &Model) -> Result<MovingGaussians> {
-    let Some(MovingGaussians::PerPhase(mut field)) = model.moving.clone() else {
+fn crowd(model: &Model) -> Result<DynamicGaussians> {
+    let Some(DynamicGaussians::PerPhase(mut field)) = model.gaussians.clone() else {
         return Err(Error::Internal("the model has no Gaussians".into()));
     };
     let pixels = model.scene.static_max[0] / field.units.pixel;
@@ -141,7 +148,7 @@ fn crowd(model: &Model) -> Result<MovingGaussians> {
         g.log_scale = g.log_scale.map(|log| log + width as f32);
     }
     field.rows = rows;
-    Ok(MovingGaussians::PerPhase(field))
+    Ok(DynamicGaussians::PerPhase(field))
 }
 
 /// Compares cells of volumes.

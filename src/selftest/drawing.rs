@@ -145,17 +145,17 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
         let traces = networks::traces(plan, params, trained.model.step, Place { x, shown }, trained.precision);
         networks::attenuations(plan, &traces).map(|[sigma, _]| sigma)
     };
-    let still = plan.params.still.is_some();
+    let of_two_networks = plan.params.static_network.is_some();
     let inside = |x: DVec3| march::dynamic_inside(plan, x, phase as usize);
     let want = |field: Component, x: DVec3| match field {
-        Component::Static if still && inside(x) => of_two(x)[0],
-        Component::Static if !still && field::static_inside(s, x) => {
+        Component::Static if of_two_networks && inside(x) => of_two(x)[0],
+        Component::Static if !of_two_networks && field::static_inside(s, x) => {
             field::static_attenuation(s, &plan.params, params, x)
         }
         Component::Dynamic if inside(x) => {
             let encoded = field::encode(s, window.into(), x);
             let trace = |map| field::network_fwd(map, params, &encoded, shown, trained.precision);
-            let trace = plan.params.moving.as_ref().map(trace).unwrap_or_default();
+            let trace = plan.params.dynamic_network.as_ref().map(trace).unwrap_or_default();
             trained.attenuation(trace.feature)
         }
         _ => 0.0,
@@ -166,7 +166,7 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
         .collect();
     let on_matrices = trained.precision != Precision::Exact;
     let dynamic = if on_matrices { CELL_ON_MATRICES } else { CELL }.times(sine_factor);
-    let statics = if still { (DYNAMIC_CELLS, dynamic) } else { (STATIC_CELLS, CELL) };
+    let statics = if of_two_networks { (DYNAMIC_CELLS, dynamic) } else { (STATIC_CELLS, CELL) };
     for (field, stages, tolerance) in
         [(Component::Static, statics.0, statics.1), (Component::Dynamic, DYNAMIC_CELLS, dynamic)]
     {

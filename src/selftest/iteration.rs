@@ -257,7 +257,7 @@ fn compare_stages(
     let precision = precision_of(trainer);
     let plan = trainer.plan();
     let tolerances = Tolerances::of(precision, gpu.info());
-    let network = plan.params.moving.as_ref();
+    let network = plan.params.dynamic_network.as_ref();
     let computes_again = network.is_some_and(|network| computes_again(&tuning.matrices, network));
     let twin =
         Twin { plan, step, params: &params, rays: march::batch(plan, step), precision, tolerances, computes_again };
@@ -280,7 +280,7 @@ fn compare_stages(
 
 /// Precision of the path that a run takes, for as long as its loss scale is the first.
 pub(super) fn precision_of(trainer: &Trainer) -> Precision {
-    let of_two = trainer.plan().params.still.is_some();
+    let of_two = trainer.plan().params.static_network.is_some();
     match trainer.tuning().layers {
         Layers::F32 => Precision::Exact,
         Layers::Matrices if of_two => Precision::F16 { loss_scale: FIRST_LOSS_SCALE_OF_TWO.into() },
@@ -395,7 +395,7 @@ impl Twin<'_> {
     fn trace(&self, sample: &Sample) -> field::NetworkTrace {
         let (plan, shown) = (self.plan, self.shown(sample));
         let encoded = field::encode(&plan.setup, plan.schedule[self.step as usize].window.into(), sample.x);
-        let network = plan.params.moving.as_ref();
+        let network = plan.params.dynamic_network.as_ref();
         let trace = |map| field::network_fwd(map, self.params, &encoded, shown, self.precision);
         network.map(trace).unwrap_or_default()
     }
@@ -550,7 +550,7 @@ struct Part {
 
 /// Splits the network's gradient by the stages that compute it: the columns of latents are apart from the weights beside them.
 fn parts(params: &ParamMap, [output, layers, latents]: [&'static [&'static str]; 3]) -> Vec<Part> {
-    let Some(network) = &params.moving else { return Vec::new() };
+    let Some(network) = &params.dynamic_network else { return Vec::new() };
     let mut parts = Vec::new();
     let mut last = Vec::new();
     for tensor in params.tensors().into_iter().filter(|tensor| !is_static(tensor)) {

@@ -7,7 +7,7 @@ use crate::gpu::device::Gpu;
 use crate::kernels::layout::{Ray, RayOut};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
-use crate::network::still::StillNetwork;
+use crate::network::static_network::StaticNetwork;
 use crate::reference::field::NetworkTrace;
 use crate::reference::march;
 use crate::reference::networks::{self, PairLoss, PairSample, Place};
@@ -86,34 +86,35 @@ struct Seen {
 
 /// Live samples of the device.
 struct Pairs {
-    moving: Vec<Sample>,
-    still: Vec<[f32; 2]>,
+    of_dynamic: Vec<Sample>,
+    of_static: Vec<[f32; 2]>,
     /// Gradients of the attenuations of the static and of the dynamic field.
     gradient: [Vec<f32>; 2],
 }
 
 impl Pairs {
-    fn download(gpu: &Gpu, trainer: &Trainer, still: &StillNetwork, loss: &StepLoss) -> Result<Pairs> {
-        let moving = samples(gpu, trainer, loss.live_samples as usize)?;
-        let n = moving.len();
-        let gradient =
-            still.sigma_gradient().ok_or_else(|| Error::Internal("the network was not created for training".into()))?;
+    fn download(gpu: &Gpu, trainer: &Trainer, static_network: &StaticNetwork, loss: &StepLoss) -> Result<Pairs> {
+        let of_dynamic = samples(gpu, trainer, loss.live_samples as usize)?;
+        let n = of_dynamic.len();
+        let gradient = static_network
+            .sigma_gradient()
+            .ok_or_else(|| Error::Internal("the network was not created for training".into()))?;
         Ok(Pairs {
-            still: gpu.download(still.sigma(), 0, n)?,
+            of_static: gpu.download(static_network.sigma(), 0, n)?,
             gradient: [
                 gpu.download(gradient, 0, n)?,
                 gpu.download(&trainer.fields()?.training().sigma_gradient, 0, n)?,
             ],
-            moving,
+            of_dynamic,
         })
     }
 
     /// Samples of a ray, and where they are among all.
     fn of_ray(&self, ray: usize) -> (Vec<usize>, Vec<PairSample>) {
-        let own = (0..self.moving.len()).filter(|s| self.moving[*s].ray == ray);
+        let own = (0..self.of_dynamic.len()).filter(|s| self.of_dynamic[*s].ray == ray);
         let pair = |s: usize| {
-            let sample = &self.moving[s];
-            let sigma = [self.still[s][0], sample.sigma[0]].map(f64::from);
+            let sample = &self.of_dynamic[s];
+            let sigma = [self.of_static[s][0], sample.sigma[0]].map(f64::from);
             (s, PairSample { dl: sample.path_length, near: sample.near, sigma })
         };
         own.map(pair).unzip()
@@ -155,8 +156,8 @@ impl Twin<'_> {
         let (forward, training, plan) =
             (self.trainer.fields()?.forward(), self.trainer.fields()?.training(), self.trainer.plan());
         let missing = || Error::Internal("the static field is not a network".into());
-        let (still, networks) =
-            (self.trainer.fields()?.still().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
+        let (static_network, networks) =
+            (self.trainer.fields()?.static_network().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
         let n = self.rays.len();
         let seen = Seen {
             loss,
@@ -170,7 +171,7 @@ impl Twin<'_> {
         let changes = seen.rays.iter().zip(&self.rays).map(|(got, want)| (f64::from(got.change) - want.change).abs());
         findings.add(RAYS, "changes of pixels", changes.fold(0.0, f64::max), CHANGE);
         if crate::network::chunk::chunks(&plan.setup, plan.setup.n_rays).count() == 1 {
-            let pairs = Pairs::download(gpu, self.trainer, still, &loss)?;
+            let pairs = Pairs::download(gpu, self.trainer, static_network, &loss)?;
             let traces = self.traces(&pairs);
             self.compare_forward(&pairs, &traces, findings);
             self.compare_integrals(&pairs, &seen, findings);
@@ -189,16 +190,16 @@ impl Twin<'_> {
     fn traces(&self, pairs: &Pairs) -> Vec<[NetworkTrace; 2]> {
         let (plan, precision) = (self.trainer.plan(), precision_of(self.trainer));
         let at = |sample: &Sample| networks::traces(plan, self.params, self.step, self.place(sample), precision);
-        pairs.moving.iter().map(at).collect()
+        pairs.of_dynamic.iter().map(at).collect()
     }
 
     /// Compares attenuations and their slopes at the device's samples.
     fn compare_forward(&self, pairs: &Pairs, traces: &[[NetworkTrace; 2]], findings: &mut Findings) {
         let want: Vec<_> = traces.iter().map(|traces| networks::attenuations(self.trainer.plan(), traces)).collect();
         for (k, what) in ["attenuation", "slope"].into_iter().enumerate() {
-            let moving: Vec<f32> = pairs.moving.iter().map(|sample| sample.sigma[k]).collect();
-            let still: Vec<f32> = pairs.still.iter().map(|sigma| sigma[k]).collect();
-            for (field, got) in [(0, still), (1, moving)] {
+            let of_dynamic: Vec<f32> = pairs.of_dynamic.iter().map(|sample| sample.sigma[k]).collect();
+            let of_static: Vec<f32> = pairs.of_static.iter().map(|sigma| sigma[k]).collect();
+            for (field, got) in [(0, of_static), (1, of_dynamic)] {
                 let want: Vec<f64> = want.iter().map(|of| of[field][k]).collect();
                 let name = format!("{what} of the {} field", ["static", "dynamic"][field]);
                 findings.numbers(FORWARD, &name, &got, &want, self.tolerances.sigma);
@@ -222,7 +223,7 @@ impl Twin<'_> {
     /// Compares losses of the device's integrals and samples, and their gradient at each.
     fn compare_losses(&self, pairs: &Pairs, seen: &Seen, findings: &mut Findings) {
         let (plan, n) = (self.trainer.plan(), self.rays.len());
-        let mut gradient = [vec![0.0; pairs.moving.len()], vec![0.0; pairs.moving.len()]];
+        let mut gradient = [vec![0.0; pairs.of_dynamic.len()], vec![0.0; pairs.of_dynamic.len()]];
         let mut losses: Vec<PairLoss> = Vec::new();
         for (r, ray) in self.rays.iter().enumerate() {
             let (at, own) = pairs.of_ray(r);
@@ -255,7 +256,7 @@ impl Twin<'_> {
     fn compare_backward(&self, pairs: &Pairs, traces: &[[NetworkTrace; 2]], seen: &Seen, findings: &mut Findings) {
         let (plan, precision) = (self.trainer.plan(), precision_of(self.trainer));
         let mut want = vec![0.0; plan.params.len];
-        for (s, (sample, traces)) in pairs.moving.iter().zip(traces).enumerate() {
+        for (s, (sample, traces)) in pairs.of_dynamic.iter().zip(traces).enumerate() {
             let by_sigma = [0, 1].map(|field| f64::from(pairs.gradient[field][s]));
             networks::sample_bwd(plan, self.params, self.place(sample), traces, by_sigma, precision, &mut want);
         }

@@ -3,7 +3,7 @@
 use crate::config::sections::{self, Deformable};
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
-use crate::gaussians::field::{DeformableGaussians, Gaussians, MovingGaussians, Units};
+use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
@@ -293,6 +293,6 @@ fn drawn_deformable(n: usize, n_phases: u32) -> DeformableGaussians {
 }
 
 /// Dynamic fields of three phases to be drawn, one of each form.
-pub fn drawn_fields() -> [MovingGaussians; 2] {
-    [MovingGaussians::PerPhase(drawn_set(231, 3)), MovingGaussians::Deformable(drawn_deformable(77, 3))]
+pub fn drawn_fields() -> [DynamicGaussians; 2] {
+    [DynamicGaussians::PerPhase(drawn_set(231, 3)), DynamicGaussians::Deformable(drawn_deformable(77, 3))]
 }

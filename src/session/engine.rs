@@ -183,7 +183,7 @@ impl Shared {
                 tracing::warn!(
                     "new frames show vessels outside the box that was trained so far, so training starts again"
                 );
-                earlier = state.model.moving.take();
+                earlier = state.model.gaussians.take();
             }
             engine.saved = fits.then_some(state);
         }
@@ -345,6 +345,6 @@ fn holds(model: &Model, new: &Scene) -> bool {
         |i: usize| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack;
     let inside = model.config.method() == MethodKind::TwoNetworks || (0..3).all(within);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
-    let still_alike = old.static_gain == new.static_gain || alike(old.static_gain, new.static_gain);
-    inside && still_alike && alike(old.dynamic_gain, new.dynamic_gain)
+    let static_alike = old.static_gain == new.static_gain || alike(old.static_gain, new.static_gain);
+    inside && static_alike && alike(old.dynamic_gain, new.dynamic_gain)
 }

@@ -5,7 +5,7 @@ use crate::error::Result;
 use crate::fitting::RING_LENGTH;
 use crate::fitting::losses::{NetworkLosses, StepLoss};
 use crate::fitting::ring::tells_nothing;
-use crate::gaussians::field::{MovingFeed, MovingGaussians};
+use crate::gaussians::field::{DynamicGaussians, GaussianFeed};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::pace::SubmitPace;
@@ -18,11 +18,11 @@ use crate::model::setup::sample_capacity;
 use crate::network::forward::{ForwardBuffers, occupancy_bytes};
 use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
-use crate::network::still::StillNetwork;
+use crate::network::static_network::StaticNetwork;
 use crate::network::{F32_BYTES, Network, Purpose, largest_chunk};
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
-use crate::train::moving::Moving;
+use crate::train::run_gaussians::RunGaussians;
 use crate::train::snapshot::{FieldsSnapshot, REPORT_BYTES};
 use crate::train::step::{TrainingBuffers, clear, forward_buffers, record_step};
 use std::collections::VecDeque;
@@ -46,11 +46,11 @@ pub struct FieldsFit {
     /// The dynamic field's network; none where Gaussians are the dynamic field.
     network: Option<Network>,
     /// The static field, where it is a network as well.
-    still: Option<StillNetwork>,
+    static_network: Option<StaticNetwork>,
     forward: ForwardBuffers,
     training: TrainingBuffers,
     /// Gaussians, where they are the dynamic field.
-    moving: Option<Moving>,
+    gaussians: Option<RunGaussians>,
     pace: SubmitPace,
     /// When the last submit was done, or the one under way began.
     last_completion: Instant,
@@ -91,20 +91,21 @@ impl FieldsFit {
         tuning: Tuning,
         saved: Option<&Checkpoint>,
         of_these_data: Option<&Checkpoint>,
-        earlier: Option<&MovingGaussians>,
+        earlier: Option<&DynamicGaussians>,
     ) -> Result<FieldsFit> {
-        let moving = plan.params.moving.clone();
-        let limit = moving.as_ref().map_or(u32::MAX, |map| largest_chunk(gpu, &tuning, map));
+        let dynamic_network = plan.params.dynamic_network.clone();
+        let limit = dynamic_network.as_ref().map_or(u32::MAX, |map| largest_chunk(gpu, &tuning, map));
         let largest = tuning.chunk_samples.min(limit);
         plan.setup.sample_capacity = plan.setup.sample_capacity.min(sample_capacity(largest));
-        let network = moving.map(|map| Network::new(gpu, &tuning, &plan.setup, &map, Purpose::Train)).transpose()?;
+        let network =
+            dynamic_network.map(|map| Network::new(gpu, &tuning, &plan.setup, &map, Purpose::Train)).transpose()?;
         let kernels = Kernels::new(gpu, tuning, plan.params.line_len() as u32, plan.setup.n_static_samples)?;
         let (forward, training) = (forward_buffers(gpu, &kernels.tuning, plan)?, TrainingBuffers::new(gpu, plan)?);
-        let still = plan.params.still.as_ref();
-        let still =
-            still.map(|map| StillNetwork::new(gpu, &kernels.tuning, &plan.setup, map, &forward, Purpose::Train));
-        let still = still.transpose()?;
-        let networks = still.iter().map(StillNetwork::network).chain(&network);
+        let static_network = plan.params.static_network.as_ref();
+        let static_network = static_network
+            .map(|map| StaticNetwork::new(gpu, &kernels.tuning, &plan.setup, map, &forward, Purpose::Train));
+        let static_network = static_network.transpose()?;
+        let networks = static_network.iter().map(StaticNetwork::network).chain(&network);
         clear(gpu, networks, &forward, &training)?;
         match saved {
             Some(saved) => gpu.upload(&forward.params, 0, &saved.model.params)?,
@@ -133,8 +134,8 @@ impl FieldsFit {
             }
         }
         let per_submit = kernels.tuning.iterations_per_submit.unwrap_or(plan.config.train.iterations_per_submit);
-        let moving = Moving::begin(gpu, plan, dataset, of_these_data, earlier, per_submit)?;
-        let step = moving.as_ref().and_then(Moving::step).unwrap_or(now.step);
+        let gaussians = RunGaussians::begin(gpu, plan, dataset, of_these_data, earlier, per_submit)?;
+        let step = gaussians.as_ref().and_then(RunGaussians::step).unwrap_or(now.step);
         // The static field's iterations follow those of Gaussians, which may have begun anew.
         now.step = step.max(plan.config.gaussian_iterations());
         gpu.upload(&forward.state, 0, &[now])?;
@@ -144,7 +145,7 @@ impl FieldsFit {
                 recording: &mut recording,
                 kernels: &kernels,
                 network: network.as_ref(),
-                still: still.as_ref(),
+                static_network: static_network.as_ref(),
                 buffers: &forward,
                 training: Some(&training),
                 params: &plan.params,
@@ -157,10 +158,10 @@ impl FieldsFit {
             gpu: gpu.clone(),
             kernels,
             network,
-            still,
+            static_network,
             forward,
             training,
-            moving,
+            gaussians,
             last_completion: Instant::now(),
             single,
             several: None,
@@ -170,8 +171,8 @@ impl FieldsFit {
             reported: step,
         };
         // A field that was fitted before has left its images already.
-        if fit.moving.as_ref().is_some_and(|m| !m.is_fitting()) {
-            fit.leave_to_still_field(plan)?;
+        if fit.gaussians.as_ref().is_some_and(|m| !m.is_fitting()) {
+            fit.leave_to_static_field(plan)?;
         }
         Ok(fit)
     }
@@ -207,8 +208,8 @@ impl FieldsFit {
     }
 
     /// Network of the static field, where it is one, for tests.
-    pub fn still(&self) -> Option<&StillNetwork> {
-        self.still.as_ref()
+    pub fn static_network(&self) -> Option<&StaticNetwork> {
+        self.static_network.as_ref()
     }
 
     /// Returns the number of barriers of an iteration.
@@ -220,7 +221,7 @@ impl FieldsFit {
     /// field stay in caches, so its stages over samples are not included.
     pub fn work(&self, params: u64, live_samples: u64) -> Ledger {
         let mut ledger = Ledger::new();
-        let networks = self.network.iter().chain(self.still.iter().map(StillNetwork::network));
+        let networks = self.network.iter().chain(self.static_network.iter().map(StaticNetwork::network));
         for (stage, work) in networks.flat_map(|network| network.work(live_samples)) {
             add(&mut ledger, &stage, work);
         }
@@ -235,7 +236,7 @@ impl FieldsFit {
     /// # Errors
     /// Device errors.
     pub(super) fn advance(&mut self, plan: &Plan, until: u32) -> Result<Advanced> {
-        if self.moving.as_ref().is_some_and(Moving::is_fitting) && self.completed < until {
+        if self.gaussians.as_ref().is_some_and(RunGaussians::is_fitting) && self.completed < until {
             return self.advance_gaussians(plan, until);
         }
         self.record_several(plan)?;
@@ -294,7 +295,7 @@ impl FieldsFit {
             recording,
             kernels: &self.kernels,
             network: self.network.as_ref(),
-            still: self.still.as_ref(),
+            static_network: self.static_network.as_ref(),
             buffers: &self.forward,
             training: Some(&self.training),
             params: &plan.params,
@@ -304,26 +305,26 @@ impl FieldsFit {
 
     /// Share done of the preparation before the first iteration; none when that has begun.
     pub(super) fn preparation(&self) -> Option<f64> {
-        self.moving.as_ref().and_then(Moving::preparation)
+        self.gaussians.as_ref().and_then(RunGaussians::preparation)
     }
 
     /// The dynamic field as it is now, for those who draw it; none where a network is the dynamic field.
-    pub(super) fn moving_feed(&self) -> Option<MovingFeed> {
-        self.moving.as_ref().map(Moving::feed)
+    pub(super) fn gaussian_feed(&self) -> Option<GaussianFeed> {
+        self.gaussians.as_ref().map(RunGaussians::feed)
     }
 
     /// Returns the Gaussians as they are drawn now; none where a network is the dynamic field.
-    pub(super) fn gaussians(&self) -> Option<MovingGaussians> {
-        self.moving.as_ref().map(Moving::field)
+    pub(super) fn gaussians(&self) -> Option<DynamicGaussians> {
+        self.gaussians.as_ref().map(RunGaussians::field)
     }
 
     /// Runs some iterations of the Gaussians' fit; after its last, the static field begins with what they leave of the images.
     fn advance_gaussians(&mut self, plan: &Plan, until: u32) -> Result<Advanced> {
-        let Some(moving) = &mut self.moving else { return Ok(Advanced::default()) };
-        let losses = moving.advance(until, plan.config.gaussian_iterations())?;
-        let ends_gaussians = !moving.is_fitting();
+        let Some(gaussians) = &mut self.gaussians else { return Ok(Advanced::default()) };
+        let losses = gaussians.advance(until, plan.config.gaussian_iterations())?;
+        let ends_gaussians = !gaussians.is_fitting();
         if ends_gaussians {
-            self.leave_to_still_field(plan)?;
+            self.leave_to_static_field(plan)?;
         }
         let first = self.completed;
         self.count(losses.len() as u32);
@@ -339,9 +340,9 @@ impl FieldsFit {
     }
 
     /// Lets the static field be trained on the images minus the dynamic field.
-    fn leave_to_still_field(&self, plan: &Plan) -> Result<()> {
-        let Some(moving) = &self.moving else { return Ok(()) };
-        let remains = moving.what_remains(&self.gpu, plan)?;
+    fn leave_to_static_field(&self, plan: &Plan) -> Result<()> {
+        let Some(gaussians) = &self.gaussians else { return Ok(()) };
+        let remains = gaussians.what_remains(&self.gpu, plan)?;
         self.gpu.upload(&self.training.images, 0, &remains)
     }
 
@@ -364,7 +365,7 @@ impl FieldsFit {
                 squared_error: report.squared_error.into(),
                 live_samples: report.live_samples.into(),
                 loss_scale: report.loss_scale.into(),
-                networks: self.still.as_ref().map(|_| NetworkLosses::of(&report)),
+                networks: self.static_network.as_ref().map(|_| NetworkLosses::of(&report)),
             };
             losses.push(loss);
         }

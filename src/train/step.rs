@@ -66,7 +66,7 @@ impl TrainingBuffers {
     /// [`crate::error::Error::OutOfMemory`] naming the buffer.
     pub fn new(gpu: &Gpu, plan: &Plan) -> Result<TrainingBuffers> {
         let n_rays = u64::from(plan.setup.n_rays);
-        let two_networks = plan.params.still.is_some();
+        let two_networks = plan.params.static_network.is_some();
         // Bound by kernels that do not read them then.
         let if_two = |bytes: u64| if two_networks { bytes } else { 16 };
         let static_len = if two_networks { 4 } else { plan.params.static_len as u64 };
@@ -144,7 +144,7 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
         pass.samples(chunk)?;
         pass.fields()?;
         record_losses(pass, chunk)?;
-        if chunk.is_last(setup.n_rays) && pass.still.is_none() {
+        if chunk.is_last(setup.n_rays) && pass.static_network.is_none() {
             // Before the network's backward passes, beside which it may run: they write none of what it does.
             record_static_gradient(pass)?;
         }
@@ -152,9 +152,9 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
             network.record_backward(pass, chunk)?;
         }
     }
-    if let Some(still) = pass.still {
+    if let Some(static_network) = pass.static_network {
         // After the dynamic network's backward passes, which begin beside its last one.
-        still.record_gradient(pass)?;
+        static_network.record_gradient(pass)?;
     }
     if let Some(network) = pass.network {
         network.record_gradient(pass)?;
@@ -165,16 +165,20 @@ pub fn record_step(pass: &mut Pass<'_>) -> Result<()> {
 
 /// Number of parts of the total variation, one per workgroup of `gradient_static`; 0 where the static field is a network.
 pub fn tv_parts(params: &ParamMap) -> u32 {
-    if params.still.is_some() { 0 } else { (params.static_len as u32).div_ceil(push::GradientStatic::LOCAL_SIZE) }
+    if params.static_network.is_some() {
+        0
+    } else {
+        (params.static_len as u32).div_ceil(push::GradientStatic::LOCAL_SIZE)
+    }
 }
 
 /// Records integrals and losses of a chunk, and the backward pass of the static field up to sums over its samples.
 fn record_losses(pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
     let (k, Chunk { first_ray, n_rays }) = (pass.kernels, chunk);
-    if let Some(still) = pass.still {
-        still.record_integrals(pass, chunk, false)?;
-        still.record_losses(pass, chunk)?;
-        return still.record_backward(pass, chunk);
+    if let Some(static_network) = pass.static_network {
+        static_network.record_integrals(pass, chunk, false)?;
+        static_network.record_losses(pass, chunk)?;
+        return static_network.record_backward(pass, chunk);
     }
     pass.run(&k.march_loss, chunk.workgroups(k.rays_marched), push::MarchLoss { first_ray, n_rays })
 }

@@ -16,7 +16,7 @@ use crate::network::ledger::Ledger;
 use crate::plan::Plan;
 use crate::plan::targets::Targets;
 use crate::scan::dataset::Dataset;
-use crate::train::moving::MovingFit;
+use crate::train::run_gaussians::GaussianFit;
 use crate::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -186,11 +186,11 @@ impl Subject {
         let mut config = config.clone();
         let most = MOST_ITERATIONS.min(u32::MAX / config.train.rays);
         config.train.iterations = most;
-        let (dynamic, still) = (&mut config.dynamic, &mut config.static_field);
+        let (dynamic, static_field) = (&mut config.dynamic, &mut config.static_field);
         dynamic.window_start = dynamic.bands.into();
         dynamic.lr_end *= SLOWLY;
-        still.lr_end *= SLOWLY;
-        (dynamic.lr, still.lr) = (dynamic.lr_end, still.lr_end);
+        static_field.lr_end *= SLOWLY;
+        (dynamic.lr, static_field.lr) = (dynamic.lr_end, static_field.lr_end);
         if let Some(method) = methods::of(&config) {
             method.lower_rates(&mut config, SLOWLY);
         }
@@ -311,14 +311,14 @@ enum TimedData {
 
 /// A fit that is timed.
 enum TimedGaussians {
-    Moving(MovingFit),
+    Run(GaussianFit),
     Own(Box<dyn Fit>),
 }
 
 impl TimedGaussians {
     fn step(&self) -> u32 {
         match self {
-            TimedGaussians::Moving(fit) => fit.step(),
+            TimedGaussians::Run(fit) => fit.step(),
             TimedGaussians::Own(fit) => fit.step(),
         }
     }
@@ -326,14 +326,14 @@ impl TimedGaussians {
     /// Runs one submit and returns the number of iterations that it did.
     fn advance(&mut self, until: u32) -> Result<usize> {
         match self {
-            TimedGaussians::Moving(fit) => fit.advance(until).map(|losses| losses.len()),
+            TimedGaussians::Run(fit) => fit.advance(until).map(|losses| losses.len()),
             TimedGaussians::Own(fit) => fit.advance(until).map(|losses| losses.len()),
         }
     }
 
     fn is_prepared(&self) -> bool {
         match self {
-            TimedGaussians::Moving(fit) => fit.preparation().is_none(),
+            TimedGaussians::Run(fit) => fit.preparation().is_none(),
             TimedGaussians::Own(_) => true,
         }
     }
@@ -341,14 +341,14 @@ impl TimedGaussians {
     /// Returns the number of Gaussians and the work of the last iteration.
     fn work(&self) -> Result<FitWork> {
         match self {
-            TimedGaussians::Moving(fit) => Ok(FitWork { count: fit.count(), work: fit.work()? }),
+            TimedGaussians::Run(fit) => Ok(FitWork { count: fit.count(), work: fit.work()? }),
             TimedGaussians::Own(fit) => fit.work()?.ok_or_else(|| Error::Internal("the fit has no Gaussians".into())),
         }
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         match self {
-            TimedGaussians::Moving(fit) => fit.profile_step(),
+            TimedGaussians::Run(fit) => fit.profile_step(),
             TimedGaussians::Own(fit) => fit.profile_step(),
         }
     }
@@ -413,7 +413,7 @@ impl GaussianSubject {
     /// Returns the form of the Gaussians of a fit; `auto` is one of the others.
     fn form(&self, fit: &TimedGaussians) -> &'static str {
         match fit {
-            TimedGaussians::Moving(fit) => fit.form().name(),
+            TimedGaussians::Run(fit) => fit.form().name(),
             TimedGaussians::Own(_) => self.config.gaussians.form.name(),
         }
     }
@@ -422,7 +422,7 @@ impl GaussianSubject {
         let begin = Instant::now();
         let mut fit = match &self.data {
             TimedData::Targets(targets) => {
-                TimedGaussians::Moving(MovingFit::new(&self.gpu, Targets::clone(targets), &self.config)?)
+                TimedGaussians::Run(GaussianFit::new(&self.gpu, Targets::clone(targets), &self.config)?)
             }
             TimedData::Own(data) => TimedGaussians::Own(data.begin(&self.gpu, &self.config, None, &mut Vec::new())?),
         };

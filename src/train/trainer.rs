@@ -7,7 +7,7 @@ use crate::fingerprint::Fingerprint;
 use crate::fitting::field::Field;
 use crate::fitting::fit::{FieldFeed, Fit, FitField, SavedFit};
 use crate::fitting::losses::{LargeLoss, LossWatch, SMALLER_STEPS, StepLoss};
-use crate::gaussians::field::{self, MovingGaussians};
+use crate::gaussians::field::{self, DynamicGaussians};
 use crate::geometry::CArm;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
@@ -46,7 +46,7 @@ pub struct Trainer {
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
     let same_method = checkpoint.fit.is_some() == plan.fit.is_some()
-        && (plan.fit.is_some() || checkpoint.model.moving.is_some() == plan.targets.is_some());
+        && (plan.fit.is_some() || checkpoint.model.gaussians.is_some() == plan.targets.is_some());
     if checkpoint.model.param_map == plan.params && same_method {
         return Ok(());
     }
@@ -59,7 +59,7 @@ fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
 
 /// Returns the field and state of a fit that was saved; none for fields that rays are marched through.
 fn saved_fit(saved: &Checkpoint) -> Option<SavedFit> {
-    let field = match (&saved.model.moving, &saved.model.field) {
+    let field = match (&saved.model.gaussians, &saved.model.field) {
         (_, Some(field)) => FitField::Own(field.clone()),
         (Some(gaussians), None) => FitField::Gaussians(Box::new(gaussians.clone())),
         (None, None) => return None,
@@ -117,7 +117,7 @@ impl Trainer {
         plan: Plan,
         dataset: &Dataset,
         tuning: Tuning,
-        earlier: Option<&MovingGaussians>,
+        earlier: Option<&DynamicGaussians>,
     ) -> Result<Trainer> {
         Self::start(gpu, plan, dataset, tuning, None, earlier)
     }
@@ -157,7 +157,7 @@ impl Trainer {
         checkpoint: &Checkpoint,
     ) -> Result<Trainer> {
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), checkpoint.model.moving.as_ref())
+        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), checkpoint.model.gaussians.as_ref())
     }
 
     fn start(
@@ -166,7 +166,7 @@ impl Trainer {
         dataset: &Dataset,
         tuning: Tuning,
         saved: Option<&Checkpoint>,
-        earlier: Option<&MovingGaussians>,
+        earlier: Option<&DynamicGaussians>,
     ) -> Result<Trainer> {
         let tuning = tuning.for_network(plan.config.method().has_network());
         let data_fingerprint = data_fingerprint(dataset);
@@ -289,7 +289,7 @@ impl Trainer {
     /// [`FieldsFit::forward`].
     pub fn feed(&self) -> Option<FieldFeed> {
         match &self.fit {
-            RunFit::Fields(fit) => fit.moving_feed().map(FieldFeed::Gaussians),
+            RunFit::Fields(fit) => fit.gaussian_feed().map(FieldFeed::Gaussians),
             RunFit::Own(fit) => Some(fit.feed()),
         }
     }
@@ -320,21 +320,21 @@ impl Trainer {
 
     /// Returns the model without its parameters, which are on the device, for a renderer that follows the run.
     pub fn outline(&self) -> Model {
-        let (moving, field) = match &self.fit {
+        let (gaussians, field) = match &self.fit {
             RunFit::Fields(fit) => (fit.gaussians(), None),
             RunFit::Own(fit) => fit.outline().split(),
         };
-        self.model_of(moving, field)
+        self.model_of(gaussians, field)
     }
 
-    fn model_of(&self, moving: Option<MovingGaussians>, field: Option<Arc<dyn Field>>) -> Model {
+    fn model_of(&self, gaussians: Option<DynamicGaussians>, field: Option<Arc<dyn Field>>) -> Model {
         Model {
             config: self.plan.config.clone(),
             scene: self.plan.scene.clone(),
             param_map: self.plan.params.clone(),
             // Gaussians need no hull once they are seeded.
-            hull: self.plan.hull.clone().filter(|_| moving.is_none()),
-            moving,
+            hull: self.plan.hull.clone().filter(|_| gaussians.is_none()),
+            gaussians,
             field,
             params: Vec::new(),
             step: self.submitted(),
@@ -354,8 +354,8 @@ impl Trainer {
             RunFit::Fields(fit) => (self.outline(), Some(fit.snapshot(&self.plan)?), None),
             RunFit::Own(fit) => {
                 let SavedFit { field, state } = fit.state()?;
-                let (moving, field) = field.split();
-                (self.model_of(moving, field), None, Some(state))
+                let (gaussians, field) = field.split();
+                (self.model_of(gaussians, field), None, Some(state))
             }
         };
         Ok(Snapshot { model, fields, fit, data_fingerprint: self.data_fingerprint.clone() })

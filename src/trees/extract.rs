@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::export::volumes::grid_over;
-use crate::gaussians::field::MovingGaussians;
+use crate::gaussians::field::DynamicGaussians;
 use crate::geometry::MM_PER_UNIT;
 use crate::model::Model;
 use crate::model::component::Component;
@@ -18,7 +18,7 @@ use crate::trees::tidy::{bridge_gaps, drop_specks, prune_spurs};
 use crate::trees::tree::{BeatTree, Branch, PhaseTree};
 use crate::vessels::centreline::centreline;
 use crate::vessels::distances::DistanceMap;
-use crate::vessels::field::{Corners, MovingField};
+use crate::vessels::field::{Corners, VesselField};
 use crate::vessels::mask::Mask;
 use crate::vessels::threshold::vessel_threshold_per_mm;
 use glam::DVec3;
@@ -65,9 +65,9 @@ pub fn vessel_trees(
     let all = options.phases.len() as u64;
     progress(0, all)?;
     let mut finder = Finder::new(renderer, model, options)?;
-    let moving = model.moving.as_ref().and_then(MovingGaussians::deformable);
+    let deformable = model.gaussians.as_ref().and_then(DynamicGaussians::deformable);
     let mut phases = Vec::new();
-    if let Some(tree) = moving {
+    if let Some(tree) = deformable {
         let reference = finder.tree(tree.setup.rest_phase)?;
         let carrier = Carrier::new(tree);
         for phase in &options.phases {
@@ -81,7 +81,7 @@ pub fn vessel_trees(
         }
     }
     Ok(BeatTree {
-        reference_phase: moving.map(|tree| tree.setup.rest_phase),
+        reference_phase: deformable.map(|tree| tree.setup.rest_phase),
         threshold_per_mm: finder.threshold_per_mm,
         resolution_mm: finder.resolution_mm,
         spacing_mm: finder.spacing_mm,
@@ -113,8 +113,8 @@ impl Finder<'_> {
     fn new<'a>(renderer: &'a Renderer, model: &'a Model, options: &TreeOptions) -> Result<Finder<'a>> {
         let c_arm = &model.c_arm;
         let pixel_mm = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
-        let least_deviation_mm = model.moving.as_ref().map_or(0.0, |moving| {
-            let rows = moving.rows();
+        let least_deviation_mm = model.gaussians.as_ref().map_or(0.0, |gaussians| {
+            let rows = gaussians.rows();
             f64::from(rows.setup.least_scale) * rows.units.pixel * MM_PER_UNIT
         });
         let resolution_mm = pixel_mm.max(RESOLVED_DEVIATIONS * least_deviation_mm);
@@ -143,9 +143,9 @@ impl Finder<'_> {
     }
 
     /// Returns the dynamic field at a phase.
-    fn moving(&self, phase: u32) -> MovingField<'_> {
+    fn vessel_field(&self, phase: u32) -> VesselField<'_> {
         let Finder { renderer, model, pixel_mm, threshold_per_mm, .. } = *self;
-        MovingField { renderer, scene: &model.scene, phase, pixel_mm, threshold_per_mm }
+        VesselField { renderer, scene: &model.scene, phase, pixel_mm, threshold_per_mm }
     }
 
     /// Samples the field of a phase inside boxes; `None` without boxes.
@@ -158,14 +158,14 @@ impl Finder<'_> {
         let size = ((extent_mm / spacing_mm).ceil().as_uvec3() + 1).to_array();
         let grid = PatientGrid { origin_mm: reach.low_mm, spacing_mm: DVec3::splat(spacing_mm), size };
         let mut values = vec![0f32; size.iter().map(|n| *n as usize).product()];
-        self.moving(phase).rows(boxes, &grid, |first, row| values[first..][..row.len()].copy_from_slice(row))?;
+        self.vessel_field(phase).rows(boxes, &grid, |first, row| values[first..][..row.len()].copy_from_slice(row))?;
         Ok(Some(SampledField { grid, values }))
     }
 
     /// Extracts the tree of a single phase.
     fn tree(&mut self, phase: u32) -> Result<PhaseTree> {
-        let moving = self.moving(phase);
-        let boxes = moving.boxes(&moving.coarse()?);
+        let field = self.vessel_field(phase);
+        let boxes = field.boxes(&field.coarse()?);
         let field = self.field(phase, &boxes)?.ok_or_else(|| self.no_vessels(phase))?;
         let lines = centrelines(&field, self.threshold_per_mm, self.resolution_mm, self.least_branch_mm);
         if lines.is_empty() {

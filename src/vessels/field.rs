@@ -52,7 +52,7 @@ impl Corners {
 }
 
 /// The dynamic field at a phase.
-pub(crate) struct MovingField<'a> {
+pub(crate) struct VesselField<'a> {
     pub(crate) renderer: &'a Renderer,
     pub(crate) scene: &'a Scene,
     pub(crate) phase: u32,
@@ -61,7 +61,7 @@ pub(crate) struct MovingField<'a> {
     pub(crate) threshold_per_mm: f64,
 }
 
-impl MovingField<'_> {
+impl VesselField<'_> {
     /// Samples the whole field at points [`COARSE_PIXELS`] apart, or further for large fields.
     pub(crate) fn coarse(&self) -> Result<CoarseField> {
         let [low, high] = self.scene.region_of(Component::Dynamic).map(DVec3::from_array);
@@ -117,7 +117,7 @@ impl MovingField<'_> {
         undecided
     }
 
-    /// Passes the field at the points of a grid inside blocks to `put`, as [`MovingField::rows`] does.
+    /// Passes the field at the points of a grid inside blocks to `put`, as [`VesselField::rows`] does.
     fn sample(&self, blocks: Vec<Block>, grid: &PatientGrid, mut put: impl FnMut(usize, &[f32])) -> Result<()> {
         let [nx, ny, _] = grid.size.map(|n| n as usize);
         for block in blocks {

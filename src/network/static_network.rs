@@ -8,7 +8,7 @@ use crate::gpu::device::Gpu;
 use crate::kernels::dispatch::{Binding, BufferSet};
 use crate::kernels::layout::Setup;
 use crate::kernels::push;
-use crate::kernels::stages::StillKernels;
+use crate::kernels::stages::StaticNetworkKernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
@@ -17,16 +17,16 @@ use crate::network::pass::Pass;
 use crate::network::{Network, Purpose, built_for_rendering};
 
 /// Network of the static field: kernels and buffers.
-pub struct StillNetwork {
-    kernels: StillKernels,
+pub struct StaticNetwork {
+    kernels: StaticNetworkKernels,
     network: Network,
     /// Forward buffers shared with the dynamic field; setup and attenuations are its own.
     buffers: ForwardBuffers,
-    training: Option<StillTraining>,
+    training: Option<StaticTraining>,
 }
 
 /// Buffers that only the backward pass needs.
-struct StillTraining {
+struct StaticTraining {
     /// Gradient of each sample's attenuation.
     gradient: Buffer,
 }
@@ -47,12 +47,12 @@ impl BufferSet for Own<'_> {
 }
 
 /// Returns the constants with which the stages of a network compute the static field.
-pub fn still_setup(setup: &Setup) -> Setup {
+pub fn static_setup(setup: &Setup) -> Setup {
     Setup { dynamic_gain: setup.static_gain, dynamic_shift: setup.static_shift, ..*setup }
 }
 
-impl StillNetwork {
-    /// Builds kernels and buffers; `moving` are the buffers of the dynamic field.
+impl StaticNetwork {
+    /// Builds kernels and buffers; `dynamic` are the buffers of the dynamic field.
     ///
     /// # Errors
     /// Fails like [`Network::new`].
@@ -61,22 +61,22 @@ impl StillNetwork {
         tuning: &Tuning,
         setup: &Setup,
         params: &NetworkMap,
-        moving: &ForwardBuffers,
+        dynamic: &ForwardBuffers,
         purpose: Purpose,
-    ) -> Result<StillNetwork> {
+    ) -> Result<StaticNetwork> {
         let capacity = u64::from(setup.sample_capacity);
         let new = |name: &str, bytes: u64| gpu.buffer(name, bytes, Memory::Device);
         let buffers = ForwardBuffers {
-            setup: gpu.buffer_with("still_setup", &[still_setup(setup)])?,
-            sample_sigma: new("still_sigma", capacity * 8)?,
-            ..moving.clone()
+            setup: gpu.buffer_with("static_setup", &[static_setup(setup)])?,
+            sample_sigma: new("static_sigma", capacity * 8)?,
+            ..dynamic.clone()
         };
         let training = match purpose {
             Purpose::Render => None,
-            Purpose::Train => Some(StillTraining { gradient: new("still_gradient", capacity * 4)? }),
+            Purpose::Train => Some(StaticTraining { gradient: new("static_network_gradient", capacity * 4)? }),
         };
-        Ok(StillNetwork {
-            kernels: StillKernels::new(gpu)?,
+        Ok(StaticNetwork {
+            kernels: StaticNetworkKernels::new(gpu)?,
             network: Network::new(gpu, tuning, setup, params, purpose)?,
             buffers,
             training,
@@ -101,17 +101,17 @@ impl StillNetwork {
     /// Records `stages` for this network, with the buffers of `pass` except its own.
     fn with(&self, pass: &mut Pass<'_>, stages: impl FnOnce(&Network, &mut Pass<'_>) -> Result<()>) -> Result<()> {
         let own = self.training.as_ref().map(|training| Own { gradient: &training.gradient, rest: pass.training });
-        let mut still = Pass {
+        let mut own = Pass {
             recording: &mut *pass.recording,
             kernels: pass.kernels,
             network: Some(&self.network),
-            still: None,
+            static_network: None,
             buffers: &self.buffers,
             training: own.as_ref().map(|own| own as &dyn BufferSet),
             params: pass.params,
             setup: pass.setup,
         };
-        stages(&self.network, &mut still)
+        stages(&self.network, &mut own)
     }
 
     /// Records the stages that depend on parameters alone.
@@ -125,7 +125,7 @@ impl StillNetwork {
     /// Records the network over the live samples.
     ///
     /// # Errors
-    /// Fails like [`StillNetwork::record_weights`].
+    /// Fails like [`StaticNetwork::record_weights`].
     pub fn record_forward(&self, pass: &mut Pass<'_>) -> Result<()> {
         self.with(pass, Network::record_forward)
     }
@@ -133,23 +133,23 @@ impl StillNetwork {
     /// Records the line integrals of both fields, and on demand their maxima, written to `ray_out`.
     ///
     /// # Errors
-    /// Fails like [`StillNetwork::record_weights`].
+    /// Fails like [`StaticNetwork::record_weights`].
     pub fn record_integrals(&self, pass: &mut Pass<'_>, chunk: Chunk, maxima: bool) -> Result<()> {
         let Chunk { first_ray, n_rays } = chunk;
-        let bound = [(Binding::still_sigma, self.sigma().into())];
+        let bound = [(Binding::static_sigma, self.sigma().into())];
         let push = push::MarchFwdSamples { first_ray, n_rays, with_maxima: u32::from(maxima) };
         pass.run_with(&self.kernels.march_fwd_samples, chunk.per_ray(), &bound, push)
     }
 
-    /// Records the losses of a chunk and their gradient at each sample of both fields; [`StillNetwork::record_integrals`] must
+    /// Records the losses of a chunk and their gradient at each sample of both fields; [`StaticNetwork::record_integrals`] must
     /// come first.
     ///
     /// # Errors
-    /// Fails like [`StillNetwork::record_weights`].
+    /// Fails like [`StaticNetwork::record_weights`].
     pub fn record_losses(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         let gradient = self.sigma_gradient().ok_or_else(built_for_rendering)?;
         let Chunk { first_ray, n_rays } = chunk;
-        let bound = [(Binding::still_sigma, self.sigma().into()), (Binding::still_gradient, gradient.into())];
+        let bound = [(Binding::static_sigma, self.sigma().into()), (Binding::static_network_gradient, gradient.into())];
         let push = push::LossSamples { first_ray, n_rays };
         pass.run_with(&self.kernels.loss_samples, chunk.per_ray(), &bound, push)
     }
@@ -157,7 +157,7 @@ impl StillNetwork {
     /// Records the backward pass of a chunk.
     ///
     /// # Errors
-    /// Fails like [`StillNetwork::record_weights`].
+    /// Fails like [`StaticNetwork::record_weights`].
     pub fn record_backward(&self, pass: &mut Pass<'_>, chunk: Chunk) -> Result<()> {
         self.with(pass, |network, pass| network.record_backward(pass, chunk))
     }
@@ -165,7 +165,7 @@ impl StillNetwork {
     /// Records the gradient of its parameters.
     ///
     /// # Errors
-    /// Fails like [`StillNetwork::record_weights`].
+    /// Fails like [`StaticNetwork::record_weights`].
     pub fn record_gradient(&self, pass: &mut Pass<'_>) -> Result<()> {
         self.with(pass, Network::record_gradient)
     }
