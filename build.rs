@@ -27,7 +27,6 @@ fn main() -> Result<(), Failure> {
     println!("cargo:rerun-if-changed=glsl");
     println!("cargo:rerun-if-env-changed=SHADERC_LIB_DIR");
     println!("cargo:rustc-env=NERTCA_COMMIT={}", commit());
-    link_library()?;
     let out = PathBuf::from(env::var("OUT_DIR")?);
     write_shaders(Path::new("glsl"), &out)
 }
@@ -59,24 +58,6 @@ fn write_shaders(glsl: &Path, out: &Path) -> Result<(), Failure> {
         let constants = source::constants(&include(name)?);
         fs::write(out.join(format!("constants_{name}.rs")), generate::constants(&constants))?;
     }
-    Ok(())
-}
-
-/// Sets the linker options of the shared library: its soname carries the ABI version, and it is never unmapped, because its own
-/// threads and those of drivers it loaded may outlive a `dlclose`.
-fn link_library() -> Result<(), Failure> {
-    if env::var("CARGO_CFG_TARGET_OS")? != "linux" {
-        return Ok(());
-    }
-    println!("cargo:rustc-cdylib-link-arg=-Wl,-z,nodelete");
-    // cargo-c sets a soname of its own.
-    if env::var_os("CARGO_FEATURE_CAPI").is_none() {
-        let source = fs::read_to_string("src/capi/types.rs")?;
-        let version = source.split("NERTCA_ABI_VERSION: u32 = ").nth(1).and_then(|rest| rest.split(';').next());
-        let version = version.ok_or("src/capi/types.rs has no NERTCA_ABI_VERSION")?;
-        println!("cargo:rustc-cdylib-link-arg=-Wl,-soname,libnertca_vk.so.{version}");
-    }
-    println!("cargo:rerun-if-changed=src/capi/types.rs");
     Ok(())
 }
 

@@ -61,7 +61,7 @@ fn the_page_tells_of_gaussians_and_their_motion() {
     let page = std::fs::read_to_string(run.join("report.html")).unwrap();
     let info: Value = serde_json::from_str(&ok(&["info", run.to_str().unwrap(), "--json"])).unwrap();
     let told = &info["gaussians"];
-    assert!(page.contains(&format!("<td>{}, one set that moves", told["count"])), "their number is missing");
+    assert!(page.contains(&format!("<td>{}, one deformable set", told["count"])), "their number is missing");
     for phase in 0..PHASES as usize {
         let of = |key: &str| told["displacement_from_phase_0"][phase][key].as_f64().unwrap();
         let row = format!("<td>{phase}</td><td>{:.2}</td><td>{:.2}</td>", of("mean_mm"), of("largest_mm"));

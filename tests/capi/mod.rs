@@ -4,11 +4,14 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+/// Root of the project, which may be above the crate of the test.
 pub fn root() -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+    let root =
+        Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().find(|folder| folder.join("include/nertca_vk.h").is_file());
+    root.unwrap().to_path_buf()
 }
 
-/// The shared library built along with this test.
+/// The shared library, which is built along with the tests of its crate.
 pub fn library() -> PathBuf {
     let deps = std::env::current_exe().unwrap().parent().unwrap().to_path_buf();
     let library = deps.join("libnertca_vk.so");

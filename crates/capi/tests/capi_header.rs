@@ -2,6 +2,7 @@
 //! `tests/capi/abi.txt` holds every exported symbol, constant and struct layout. `tools/bless` rewrites both files.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
+#[path = "../../../tests/capi/mod.rs"]
 mod capi;
 
 use capi::{compile, library, root};

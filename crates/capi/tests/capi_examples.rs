@@ -2,8 +2,9 @@
 //! and undefined-behaviour sanitizers, under valgrind; in C++ and in Python.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
+#[path = "../../../tests/capi/mod.rs"]
 mod capi;
-#[path = "common/python.rs"]
+#[path = "../../../tests/common/python.rs"]
 mod python;
 
 use capi::{compile, library, library_directory, root};
