@@ -554,7 +554,7 @@ fn a_callback_may_draw_but_not_destroy() {
 #[test]
 fn memory_has_a_ceiling() {
     let limited = context("memory_limit_mib = 4");
-    let made = reconstruction(limited, &SMALL.replace("train.chunk_samples = 1024", "train.chunk_samples = 65536"));
+    let made = reconstruction(limited, &SMALL.replace("train.chunk_samples = 1024", "train.chunk_samples = 262144"));
     add_frames(made, 0..3);
     let status = unsafe { nertca_reconstruction_train(made, 1, None, null_mut(), null_mut()) };
     assert_eq!(status, NERTCA_ERROR_MEMORY);
