@@ -7,7 +7,7 @@ use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::dicom::{self, DicomView};
-use nertca_vk::formats::images::MAX_SIDE;
+use nertca_vk::formats::image_limits::MAX_SIDE;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::Model;
