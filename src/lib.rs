@@ -121,6 +121,7 @@ pub mod kernels {
 /// Files that other tools read and write.
 pub mod formats {
     pub mod gltf;
+    pub mod image_limits;
     pub mod images;
     pub mod mesh;
     pub mod metaimage;
@@ -131,6 +132,7 @@ pub mod formats {
     pub mod raw;
     pub mod swc;
     pub mod volume;
+    pub mod volume_files;
     pub mod vtk;
     mod vtk_arrays;
     pub mod vtp;

@@ -9,12 +9,12 @@ macro_rules! out {
 }
 
 mod cli {
-    pub mod args;
     pub mod bench;
     pub mod bench_report;
     pub mod calibrate;
     pub mod calibration_table;
     pub mod check;
+    pub mod commands;
     pub mod data;
     pub mod device;
     pub mod devices;
@@ -27,6 +27,7 @@ mod cli {
     pub mod info;
     pub mod kernels;
     pub mod lettering;
+    pub mod options;
     pub mod page;
     pub mod plot;
     pub mod progress;
@@ -44,6 +45,7 @@ mod cli {
     pub mod view;
     pub mod view_server;
     pub mod view_tree;
+    pub mod viewpoint;
     pub mod volume_table;
     pub mod watch;
     pub mod watch_leave;
@@ -51,39 +53,21 @@ mod cli {
 }
 
 use clap::Parser;
-use cli::args::{Cli, Command};
+use cli::commands::Cli;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
-        .with_env_filter(tracing_subscriber::EnvFilter::new(if cli.verbose { "info,nertca_vk=debug" } else { "error" }))
+        .with_env_filter(tracing_subscriber::EnvFilter::new(if cli.global.verbose {
+            "info,nertca_vk=debug"
+        } else {
+            "error"
+        }))
         .without_time()
         .init();
-    let outcome = match &cli.command {
-        Command::Devices(args) => cli::devices::run(args),
-        Command::Phantom(args) => cli::data::phantom(&cli, args),
-        Command::Project(args) => cli::data::project(&cli, args),
-        Command::Import(args) => cli::data::import(args),
-        Command::Train(args) => cli::train::run(&cli, args),
-        Command::Eval(args) => cli::eval::eval(&cli, args),
-        Command::Render(args) => cli::render::render(&cli, args),
-        Command::View(args) => cli::view::view(&cli, args),
-        Command::Watch(args) => cli::watch::run(&cli, args),
-        Command::Export(args) => cli::export::export(&cli, args),
-        Command::Tree(args) => cli::tree::run(&cli, args),
-        Command::Calibrate(args) => cli::calibrate::run(args),
-        Command::Convert(args) => cli::export::convert(args),
-        Command::Bench(args) => cli::bench::run(&cli, args),
-        Command::Kernels(args) => cli::kernels::run(&cli, args),
-        Command::Selftest(args) => cli::selftest::run(&cli, args),
-        Command::Study(args) => cli::study::run(&cli, args),
-        Command::Check(args) => cli::check::run(args),
-        Command::Info(args) => cli::info::info(args),
-        Command::Completions(args) => cli::devices::completions(args),
-    };
-    match outcome {
+    match cli.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("nertca-vk: {error}");

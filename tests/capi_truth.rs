@@ -17,7 +17,8 @@ use nertca_vk::capi::reconstruction::*;
 use nertca_vk::capi::status::*;
 use nertca_vk::capi::truth::*;
 use nertca_vk::capi::types::*;
-use nertca_vk::formats::volume::{Volume, VolumeHints};
+use nertca_vk::formats::volume::VolumeHints;
+use nertca_vk::formats::volume_files;
 use nertca_vk::geometry::Geometry;
 use nertca_vk::model::checkpoint;
 use nertca_vk::phantom::tree_file::{TREE, TreeFile};
@@ -65,7 +66,7 @@ fn add_frames(to: *mut nertca_reconstruction, dataset: &Dataset) {
 
 /// Voxels with at least half of the vessels' attenuation, on their grid.
 fn true_vessels(data: &Path, phase: u32, vessel_per_mm: f64) -> (nertca_grid, Vec<u8>) {
-    let volume = Volume::read(&truth_file(&data.join(VOLUMES), phase), &VolumeHints::default()).unwrap();
+    let volume = volume_files::read(&truth_file(&data.join(VOLUMES), phase), &VolumeHints::default()).unwrap();
     let axes = volume.index_to_lps.matrix3;
     let grid = nertca_grid {
         size: size_of::<nertca_grid>(),

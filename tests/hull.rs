@@ -7,6 +7,7 @@ use common::{expect_silence, gpu, run, small_config, small_dataset, tuning};
 use glam::DVec3;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::formats::volume::{Volume, VolumeHints};
+use nertca_vk::formats::volume_files;
 use nertca_vk::geometry::world_from_lps_mm;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
@@ -52,7 +53,7 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
     let vessels = (0..PHASES)
         .map(|phase| {
             let file = out.join(format!("volumes/vessels-{phase:02}.nrrd"));
-            Volume::read(&file, &VolumeHints::default()).unwrap()
+            volume_files::read(&file, &VolumeHints::default()).unwrap()
         })
         .collect();
     Phantom { dataset: Dataset::open(&out).unwrap(), vessels }

@@ -111,7 +111,7 @@ fn compressed_exports_hold_the_same() {
     // Files that others read are also read by the library.
     let volume = |name: &str| {
         let hints = nertca_vk::formats::volume::VolumeHints::default();
-        nertca_vk::formats::volume::Volume::read(&out.join(name), &hints).unwrap()
+        nertca_vk::formats::volume_files::read(&out.join(name), &hints).unwrap()
     };
     assert_eq!(volume("one.nrrd").values, volume("zipped.nrrd").values);
     for (name, extra) in [

@@ -11,6 +11,7 @@ use glam::DVec3;
 use nertca_vk::formats::images;
 use nertca_vk::formats::npy;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
+use nertca_vk::formats::volume_files;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::import::ecg;
 use nertca_vk::model::checkpoint::Checkpoint;
@@ -178,7 +179,7 @@ fn volume_file(header: &str) -> Vec<u8> {
 
 fn reads_volume(path: &Path) -> bool {
     let hints = VolumeHints { spacing_mm: Some([1.0; 3]), ..VolumeHints::default() };
-    Volume::read(path, &hints).is_ok()
+    volume_files::read(path, &hints).is_ok()
 }
 
 #[test]

@@ -5,7 +5,8 @@ mod common;
 
 use common::{drop_first_view, gpu, phantom, whiten};
 use glam::DVec3;
-use nertca_vk::formats::volume::{Volume, VolumeHints};
+use nertca_vk::formats::volume::VolumeHints;
+use nertca_vk::formats::volume_files;
 use nertca_vk::plan::soft_hull::carve::{SoftHull, SoftMotion};
 use nertca_vk::random::{STREAM_PHOTON, normal};
 use std::collections::{HashMap, HashSet};
@@ -25,7 +26,7 @@ struct Truth {
 /// Finds voxels at least half full, and classifies them as thick or thin.
 fn truth(directory: &Path, phase: usize, hull: &SoftHull) -> Truth {
     let path = directory.join(format!("volumes/vessels-{phase:02}.nrrd"));
-    let volume = Volume::read(&path, &VolumeHints::default()).unwrap();
+    let volume = volume_files::read(&path, &VolumeHints::default()).unwrap();
     let [nx, ny, nz] = volume.size;
     let most = volume.values.iter().copied().fold(0f32, f32::max);
     let full: Vec<bool> = volume.values.iter().map(|v| *v > 0.5 * most).collect();

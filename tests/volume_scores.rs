@@ -11,6 +11,7 @@ use glam::DVec3;
 use nertca_vk::config::Preset;
 use nertca_vk::formats::nrrd;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
+use nertca_vk::formats::volume_files;
 use nertca_vk::random::uniform01;
 use nertca_vk::score::metrics::ssim;
 use nertca_vk::score::shapes::compare;
@@ -128,7 +129,7 @@ fn trained() -> &'static Trained {
             let (spacing, number) = (SPACING_MM.to_string(), phase.to_string());
             let what = ["--component", "dynamic", "--spacing", &spacing, "--phase", &number];
             ok(&[&["export", text(&run), "-o", text(&file)], &what[..]].concat());
-            Volume::read(&file, &VolumeHints::default()).unwrap()
+            volume_files::read(&file, &VolumeHints::default()).unwrap()
         };
         let fields = (0..PHASES).map(export).collect();
         Trained { directory, data, run, fields }

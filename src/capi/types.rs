@@ -497,7 +497,7 @@ impl nertca_geometry {
 }
 
 /// Largest side of an image.
-const MAX_SIDE: u32 = crate::formats::images::MAX_SIDE as u32;
+const MAX_SIDE: u32 = crate::formats::image_limits::MAX_SIDE as u32;
 
 /// Checks width and height of an image.
 pub(super) fn sides(width: u32, height: u32) -> Outcome<(usize, usize)> {

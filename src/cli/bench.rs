@@ -1,8 +1,8 @@
 //! `bench`: compares iterations, passes and renderings with the device's own limits and with the paper's 37 minutes.
 
-use super::args::{Cli, ConfigArgs};
 use super::bench_report::{FullRun, Host, Report, compare, print};
 use super::frame_rates::{FrameRate, measure_frame_rates};
+use super::options::{ConfigArgs, GlobalOptions};
 use clap::Args;
 use nertca_vk::bench::peaks::peaks;
 use nertca_vk::choice::Choice;
@@ -100,23 +100,23 @@ impl BenchArgs {
 }
 
 /// Measures, prints the results and writes the report.
-pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
+pub fn run(global: &GlobalOptions, args: &BenchArgs) -> Result<()> {
     let config = args.config.load([])?;
     let compared = args.compare.as_deref().map(read_report).transpose()?;
-    let gpu = cli.open_device()?;
+    let gpu = global.open_device()?;
     let scratch = tempfile::tempdir().map_err(Error::io("create", std::env::temp_dir()))?;
     let dataset = match &args.data {
         Some(path) => Dataset::open(path)?,
         None => default_phantom(&gpu, scratch.path())?,
     };
     if args.dry_run {
-        let done = dry_run_of(cli, &gpu, &config, &dataset)?;
+        let done = dry_run_of(global, &gpu, &config, &dataset)?;
         if let Some(file) = &args.json {
             write_json(file, &done)?;
         }
-        return cli.close_device(&gpu);
+        return global.close_device(&gpu);
     }
-    let report = measure(cli, args, &gpu, &config, &dataset, scratch.path())?;
+    let report = measure(global, args, &gpu, &config, &dataset, scratch.path())?;
     print(&report, args.kernels);
     if let Some(other) = compared {
         compare(&report, &other);
@@ -124,7 +124,7 @@ pub fn run(cli: &Cli, args: &BenchArgs) -> Result<()> {
     if let Some(file) = &args.json {
         write_json(file, &report)?;
     }
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
@@ -132,8 +132,8 @@ fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
 }
 
 /// Performs a dry run, and prints a line about the events it covered.
-fn dry_run_of(cli: &Cli, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<DryRun> {
-    let done = dry_run(gpu, config, dataset, &cli.training_tuning(gpu, config, dataset)?)?;
+fn dry_run_of(global: &GlobalOptions, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<DryRun> {
+    let done = dry_run(gpu, config, dataset, &global.training_tuning(gpu, config, dataset)?)?;
     out!(
         "dry run: {} iterations around the schedule's events at {:?} in {:.1} s; the last loss is {:.3e}",
         done.iterations,
@@ -169,15 +169,15 @@ fn default_phantom(gpu: &Gpu, scratch: &Path) -> Result<Dataset> {
 }
 
 fn measure(
-    cli: &Cli,
+    global: &GlobalOptions,
     args: &BenchArgs,
     gpu: &Gpu,
     config: &Config,
     dataset: &Dataset,
     scratch: &Path,
 ) -> Result<Report> {
-    let dry_run = args.full.then(|| dry_run_of(cli, gpu, config, dataset)).transpose()?;
-    let tuning = cli.training_tuning(gpu, config, dataset)?;
+    let dry_run = args.full.then(|| dry_run_of(global, gpu, config, dataset)).transpose()?;
+    let tuning = global.training_tuning(gpu, config, dataset)?;
     let timings = match config.gaussians.form != GaussianForm::None {
         true => time_gaussians(args, gpu, config, dataset, &tuning)?,
         false => time_network(args, gpu, config, dataset, &tuning)?,

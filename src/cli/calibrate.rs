@@ -1,7 +1,7 @@
 //! `calibrate`: makes a dataset with consistent views.
 
-use super::args::choice;
 use super::calibration_table;
+use super::options::choice;
 use clap::Args;
 use nertca_vk::calibrate::calibrate;
 use nertca_vk::config::{CalibrateMode, Config, Preset};

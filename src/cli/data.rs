@@ -1,7 +1,7 @@
 //! The commands `phantom`, `project` and `import`.
 
-use super::args::Cli;
 use super::dicom_args::DicomArgs;
+use super::options::GlobalOptions;
 use super::synthetic_args::{PhantomArgs, ProjectArgs};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -63,13 +63,13 @@ fn tell_of_times(layout: Layout, degradations: &Degradations) {
 }
 
 /// Makes a phantom.
-pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
+pub fn phantom(global: &GlobalOptions, args: &PhantomArgs) -> Result<()> {
     if args.tree.is_none() && !args.c_arm.is_default() {
         let problem = "--sod, --sid, --fov, --pixel and --offset need --tree, because a published set-up has its own \
                        C-arm";
         return Err(Error::config("--tree", "none", problem));
     }
-    let gpu = cli.open_device()?;
+    let gpu = global.open_device()?;
     let options = PhantomOptions {
         setting: args.geometry,
         size: args.size,
@@ -89,12 +89,12 @@ pub fn phantom(cli: &Cli, args: &PhantomArgs) -> Result<()> {
     tell_of_times(options.layout, &options.degradations);
     make(&gpu, &options, &args.out, bar())?;
     out!("{}", args.out.display());
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 /// Projects volumes.
-pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
-    let gpu = cli.open_device()?;
+pub fn project(global: &GlobalOptions, args: &ProjectArgs) -> Result<()> {
+    let gpu = global.open_device()?;
     let options = VolumeOptions {
         volumes: args.volumes.clone(),
         hints: VolumeHints {
@@ -116,7 +116,7 @@ pub fn project(cli: &Cli, args: &ProjectArgs) -> Result<()> {
     tell_of_times(options.layout, &options.degradations);
     project_volumes(&gpu, &options, &args.out, bar())?;
     out!("{}", args.out.display());
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 /// Imports clinical data.

@@ -1,6 +1,6 @@
 //! Selection of the device and of the computation paths by the options.
 
-use super::args::Cli;
+use super::options::GlobalOptions;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
@@ -9,7 +9,7 @@ use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::calibrate;
 use std::path::PathBuf;
 
-impl Cli {
+impl GlobalOptions {
     /// Opens the device selected by the options.
     pub fn open_device(&self) -> Result<Gpu> {
         Gpu::open(&DeviceOptions {
@@ -37,7 +37,7 @@ impl Cli {
         tuning.with_layers(layers, reason.into())
     }
 
-    /// Returns the tuning of [`Cli::tuning`], after timing both paths of the layers if they have not been timed yet.
+    /// Returns the tuning of [`Self::tuning`], after timing both paths of the layers if they have not been timed yet.
     pub fn training_tuning(&self, gpu: &Gpu, config: &Config, dataset: &Dataset) -> Result<Tuning> {
         let tuning = Tuning::for_device(gpu.info());
         let either = self.layers.is_none() && Tuning::has_choice(gpu.info()) && config.method().has_network();

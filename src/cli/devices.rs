@@ -1,7 +1,6 @@
 //! The commands `devices` and `completions`.
 
-use super::args::Cli;
-use clap::{Args, CommandFactory};
+use clap::Args;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
 use nertca_vk::gpu::details::{DeviceDetails, list_details};
@@ -73,8 +72,8 @@ pub fn run(args: &DevicesArgs) -> Result<()> {
     Ok(())
 }
 
-/// Prints shell completions.
-pub fn completions(args: &CompletionsArgs) -> Result<()> {
-    clap_complete::generate(args.shell, &mut Cli::command(), "nertca-vk", &mut std::io::stdout());
+/// Prints shell completions for the program's command line.
+pub fn completions(args: &CompletionsArgs, program: &mut clap::Command) -> Result<()> {
+    clap_complete::generate(args.shell, program, "nertca-vk", &mut std::io::stdout());
     Ok(())
 }

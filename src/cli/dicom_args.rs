@@ -1,6 +1,6 @@
 //! Options of reading X-ray angiography runs, shared by `import dicom` and `watch`.
 
-use super::args::choice;
+use super::options::choice;
 use super::synthetic_args::pitch;
 use clap::Args;
 use nertca_vk::choice::Choice;

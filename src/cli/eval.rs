@@ -1,6 +1,6 @@
 //! The command `eval`.
 
-use super::args::Cli;
+use super::options::GlobalOptions;
 use super::progress::{show_evaluation, stop_flag};
 use super::report::Report;
 use super::tree::{of_page as tree_of_page, score as score_tree_of_page};
@@ -45,7 +45,7 @@ pub struct EvalArgs {
 }
 
 /// Scores a run.
-pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
+pub fn eval(global: &GlobalOptions, args: &EvalArgs) -> Result<()> {
     let data = match &args.data {
         Some(path) => path.clone(),
         None => RunInfo::read(&args.run)?.dataset,
@@ -54,9 +54,9 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
         return Err(Error::config("--threshold", args.threshold.unwrap_or_default(), "is negative"));
     }
     let dataset = as_trained(Dataset::open(&data)?, &args.run)?;
-    let gpu = cli.open_device()?;
+    let gpu = global.open_device()?;
     let model = newest_model(&args.run)?;
-    let tuning = cli.tuning(&gpu, &model.config);
+    let tuning = global.tuning(&gpu, &model.config);
     let cancel = stop_flag()?;
     let scoring = ScoreOptions { threshold_per_mm: args.threshold, pictures: args.images.as_deref(), cancel: &cancel };
     let mut evaluation = evaluate_model(&gpu, &tuning, &model, &dataset, &scoring, &mut show_evaluation())?;
@@ -70,7 +70,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     };
     let beside = page.parent().unwrap_or(Path::new(""));
     let warnings = &mut evaluation.warnings;
-    let found = if args.tree { tree_of_page(cli, &gpu, &model, &cancel, beside, warnings) } else { Ok(None) };
+    let found = if args.tree { tree_of_page(global, &gpu, &model, &cancel, beside, warnings) } else { Ok(None) };
     // If the tree fails or is stopped, the scores are still printed.
     let tree = found.or_else(|error| print_scores(args, &evaluation).and(Err(error)))?;
     score_tree_of_page(tree.as_ref(), &dataset, &mut evaluation)?;
@@ -88,7 +88,7 @@ pub fn eval(cli: &Cli, args: &EvalArgs) -> Result<()> {
     .write(&page)?;
     print_scores(args, &evaluation)?;
     evaluation.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 /// Scores the true vessels of a dataset as the model was scored, with the geometry that the dataset states.

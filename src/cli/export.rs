@@ -1,7 +1,7 @@
 //! The commands `export` and `convert`.
 
-use super::args::{Cli, choice};
 use super::data::bar;
+use super::options::{GlobalOptions, choice};
 use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
@@ -85,7 +85,7 @@ pub fn phases(text: &str, n_phases: u32) -> Result<(Vec<u32>, bool)> {
 }
 
 /// Exports volumes or surfaces.
-pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
+pub fn export(global: &GlobalOptions, args: &ExportArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
     if args.motion {
@@ -100,8 +100,8 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
     }
     let unknown = |known: &str| Error::config("--out", args.out.display(), format!("does not end in one of {known}"));
     let grid = grid_over(&model.scene, args.component, args.spacing)?;
-    let gpu = cli.open_device()?;
-    let renderer = Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?;
+    let gpu = global.open_device()?;
+    let renderer = Renderer::new(&gpu, &model, global.tuning(&gpu, &model.config))?;
     let mut progress = bar();
     let made = if args.mesh {
         let format = MeshFormat::of(&args.out).ok_or_else(|| unknown(".stl .ply .obj .glb"))?;
@@ -133,7 +133,7 @@ pub fn export(cli: &Cli, args: &ExportArgs) -> Result<()> {
         args.spacing, o.x, o.y, o.z
     );
     drop(renderer);
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 /// Exports displacements, or the paths of the Gaussians; needs no device.

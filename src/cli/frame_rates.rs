@@ -1,7 +1,6 @@
 //! Frames per second of renderings.
 
-use super::args::Cli;
-use super::render::{RenderArgs, viewpoint};
+use super::viewpoint::viewpoint;
 use nertca_vk::error::Result;
 use nertca_vk::model::Model;
 use nertca_vk::model::component::Component;
@@ -66,17 +65,4 @@ pub fn print_frame_rates(rates: &[FrameRate]) {
     for r in rates {
         out!("{:6} {:4} x {:<4} {:9.1} frames/s ({} frames)", r.way, r.size, r.size, r.fps, r.frames);
     }
-}
-
-/// Measures frame rates and prints them.
-pub fn print_measured(cli: &Cli, args: &RenderArgs, model: &Model) -> Result<()> {
-    let gpu = cli.open_device()?;
-    let renderer = Arc::new(Renderer::new(&gpu, model, cli.tuning(&gpu, &model.config))?);
-    let mut sizes = vec![200, 512];
-    sizes.extend(args.size.filter(|n| ![200, 512].contains(n)));
-    let rates = measure_frame_rates(&renderer, model, args.component, &sizes, 2.0)?;
-    out!("{}, {:?}", gpu.info().name, args.component);
-    print_frame_rates(&rates);
-    drop(renderer);
-    cli.close_device(&gpu)
 }

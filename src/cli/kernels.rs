@@ -1,6 +1,6 @@
 //! `kernels`: lists the driver's compiler statistics of every pipeline that a preset uses.
 
-use super::args::{Cli, ConfigArgs};
+use super::options::{ConfigArgs, GlobalOptions};
 use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
@@ -39,17 +39,17 @@ struct Answer {
 }
 
 /// Compiles, prints a table, and compares.
-pub fn run(cli: &Cli, args: &KernelsArgs) -> Result<()> {
+pub fn run(global: &GlobalOptions, args: &KernelsArgs) -> Result<()> {
     let config = args.config.load([])?;
     let before = args.compare.as_deref().map(|file| Ok((file, read(file)?))).transpose()?;
     // No pipeline cache is used, because a pipeline from a cache is not compiled.
     let gpu = Gpu::open(&DeviceOptions {
-        select: cli.device.clone(),
-        validation: cli.validate,
+        select: global.device.clone(),
+        validation: global.validate,
         statistics: true,
         ..DeviceOptions::default()
     })?;
-    let tuning = cli.tuning(&gpu, &config);
+    let tuning = global.tuning(&gpu, &config);
     let kernels = inventory::compile(&gpu, &config, args.phases as usize, &tuning)?;
     let info = gpu.info();
     let answer = Answer {
@@ -64,7 +64,7 @@ pub fn run(cli: &Cli, args: &KernelsArgs) -> Result<()> {
     } else {
         print(&answer, info.pipeline_statistics);
     }
-    cli.close_device(&gpu)?;
+    global.close_device(&gpu)?;
     before.map_or(Ok(()), |(file, before)| compare(file, &before, &answer))
 }
 

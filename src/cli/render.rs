@@ -1,14 +1,15 @@
 //! The command `render`.
 
-use super::args::{Cli, choice};
-use super::frame_rates::print_measured;
+use super::frame_rates::{measure_frame_rates, print_frame_rates};
+use super::options::{GlobalOptions, choice};
+use super::viewpoint::{Viewpoint, turned, viewpoint};
 use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::dicom::{self, DicomView};
-use nertca_vk::formats::images::MAX_SIDE;
+use nertca_vk::formats::image_limits::MAX_SIDE;
 use nertca_vk::formats::npy;
-use nertca_vk::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays};
+use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::Model;
 use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
@@ -58,39 +59,6 @@ pub struct RenderArgs {
     /// derived and for research only, with the detector centred).
     #[arg(short, long, value_name = "FILE", required_unless_present = "fps")]
     pub out: Option<PathBuf>,
-}
-
-/// Rays and image size of a rendering.
-pub struct Viewpoint {
-    pub rays: ViewRays,
-    pub width: usize,
-    pub height: usize,
-}
-
-/// Returns the model's C-arm at other angles, with the same field of view on `width` x `height` pixels.
-fn turned(model: &Model, primary_deg: f64, secondary_deg: f64, [width, height]: [usize; 2]) -> CArm {
-    CArm {
-        primary_deg,
-        secondary_deg,
-        pixel_mm: [
-            model.c_arm.pixel_mm[0] * model.image_size[0] as f64 / width as f64,
-            model.c_arm.pixel_mm[1] * model.image_size[1] as f64 / height as f64,
-        ],
-        ..model.c_arm.clone()
-    }
-}
-
-/// Returns a view of the model's C-arm at other angles, with the same field of view on `width` x `height` pixels.
-pub fn viewpoint(
-    model: &Model,
-    primary_deg: f64,
-    secondary_deg: f64,
-    [width, height]: [usize; 2],
-) -> Result<Viewpoint> {
-    let c_arm = turned(model, primary_deg, secondary_deg, [width, height]);
-    let rays =
-        Geometry::CArm(c_arm).rays(width, height).map_err(|(field, problem)| Error::config(field, "", problem))?;
-    Ok(Viewpoint { rays, width, height })
 }
 
 /// Renderer of the fields themselves, or of volumes baked from them.
@@ -163,14 +131,27 @@ fn moments(args: &RenderArgs, model: &Model) -> Result<Vec<f64>> {
     }
 }
 
+/// Measures frame rates and prints them.
+fn print_measured(global: &GlobalOptions, args: &RenderArgs, model: &Model) -> Result<()> {
+    let gpu = global.open_device()?;
+    let renderer = Arc::new(Renderer::new(&gpu, model, global.tuning(&gpu, &model.config))?);
+    let mut sizes = vec![200, 512];
+    sizes.extend(args.size.filter(|n| ![200, 512].contains(n)));
+    let rates = measure_frame_rates(&renderer, model, args.component, &sizes, 2.0)?;
+    out!("{}, {:?}", gpu.info().name, args.component);
+    print_frame_rates(&rates);
+    drop(renderer);
+    global.close_device(&gpu)
+}
+
 /// Renders a run.
-pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
+pub fn render(global: &GlobalOptions, args: &RenderArgs) -> Result<()> {
     let mut model = newest_model(&args.run)?;
     let size = args.size.map_or(model.image_size, |n| [n, n]);
     if !(1..=MAX_SIDE).contains(&size[0]) {
         return Err(Error::config("--size", size[0], format!("is not in the accepted range, 1 to {}", MAX_SIDE)));
     }
-    let Some(out) = &args.out else { return print_measured(cli, args, &model) };
+    let Some(out) = &args.out else { return print_measured(global, args, &model) };
     let extension = out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_lowercase();
     if !["png", "npy", "gif", "dcm"].contains(&extension.as_str()) {
         return Err(Error::config("--out", out.display(), "does not end in one of .png .npy .gif .dcm"));
@@ -192,8 +173,8 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
     }
     let viewpoint = viewpoint(&model, args.primary, args.secondary, size)?;
     let (width, height) = (viewpoint.width, viewpoint.height);
-    let gpu = cli.open_device()?;
-    let renderer = Arc::new(Renderer::new(&gpu, &model, cli.tuning(&gpu, &model.config))?);
+    let gpu = global.open_device()?;
+    let renderer = Arc::new(Renderer::new(&gpu, &model, global.tuning(&gpu, &model.config))?);
     let renders = match args.baked {
         false => Renders::Fields(renderer),
         true => Renders::Baked(Box::new(Baked::new(renderer, BAKED_CELLS)?)),
@@ -215,5 +196,5 @@ pub fn render(cli: &Cli, args: &RenderArgs) -> Result<()> {
         _ => pictures::write_grey(out, &frames[0], width, window)?,
     }
     drop(renders);
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }

@@ -1,6 +1,6 @@
 //! `selftest`: compares every compute stage with its f64 twin.
 
-use super::args::Cli;
+use super::options::GlobalOptions;
 use clap::Args;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::capabilities::DeviceInfo;
@@ -29,8 +29,8 @@ struct Answer<'a> {
 }
 
 /// Runs the comparisons, prints a table, and fails when a stage differs from its twin.
-pub fn run(cli: &Cli, args: &SelftestArgs) -> Result<()> {
-    let gpu = cli.open_device()?;
+pub fn run(global: &GlobalOptions, args: &SelftestArgs) -> Result<()> {
+    let gpu = global.open_device()?;
     let begin = Instant::now();
     let report = selftest::run(&gpu, &mut |part, done, of| eprintln!("{} of {of}: {part}", done + 1))?;
     let seconds = begin.elapsed().as_secs_f64();
@@ -42,7 +42,7 @@ pub fn run(cli: &Cli, args: &SelftestArgs) -> Result<()> {
     } else {
         print(gpu.info(), &report, seconds);
     }
-    cli.close_device(&gpu)?;
+    global.close_device(&gpu)?;
     if report.is_ok() { Ok(()) } else { Err(Error::NoDevice(fault(gpu.info(), &report))) }
 }
 

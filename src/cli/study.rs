@@ -1,7 +1,7 @@
 //! `study`: many runs described by one file, and tables of their results.
 
-use super::args::Cli;
 use super::data::bar;
+use super::options::GlobalOptions;
 use super::progress::{show_progress, stop_flag};
 use super::study_page;
 use clap::{Args, Subcommand};
@@ -131,10 +131,10 @@ impl FileArgs {
 }
 
 /// Executes the operation.
-pub fn run(cli: &Cli, args: &StudyArgs) -> Result<()> {
+pub fn run(global: &GlobalOptions, args: &StudyArgs) -> Result<()> {
     match &args.command {
-        StudyCommand::Run(args) => queue(cli, &args.doing),
-        StudyCommand::One(args) => one(cli, args),
+        StudyCommand::Run(args) => queue(global, &args.doing),
+        StudyCommand::One(args) => one(global, args),
         StudyCommand::List(args) => list(args),
         StudyCommand::Table(args) => table(args),
         StudyCommand::Report(args) => report(args),
@@ -143,7 +143,7 @@ pub fn run(cli: &Cli, args: &StudyArgs) -> Result<()> {
 
 /// Executes work at the place where a study's runs are done.
 fn at_work<T>(
-    cli: &Cli,
+    global: &GlobalOptions,
     args: &DoingArgs,
     work: impl FnOnce(&Study, &Workplace<'_>, &mut dyn FnMut(&StudyEvent<'_>)) -> Result<T>,
 ) -> Result<T> {
@@ -152,9 +152,9 @@ fn at_work<T>(
     let cancel = stop_flag()?;
     let place = Workplace {
         directory: &args.place.out,
-        open: &|| cli.open_device(),
-        close: &|gpu| cli.close_device(gpu),
-        tune: &|gpu, config, dataset| cli.training_tuning(gpu, config, dataset),
+        open: &|| global.open_device(),
+        close: &|gpu| global.close_device(gpu),
+        tune: &|gpu, config, dataset| global.training_tuning(gpu, config, dataset),
         cancel: &cancel,
         retry_failed: args.retry_failed,
         any_commit: args.any_commit,
@@ -173,8 +173,8 @@ fn warn_of_edits() {
     }
 }
 
-fn queue(cli: &Cli, args: &DoingArgs) -> Result<()> {
-    let summary = at_work(cli, args, |study, place, observe| work_off(study, place, observe))?;
+fn queue(global: &GlobalOptions, args: &DoingArgs) -> Result<()> {
+    let summary = at_work(global, args, |study, place, observe| work_off(study, place, observe))?;
     if summary.failed > 0 {
         eprintln!(
             "warning: {} of {} runs failed; the table has the reasons, and --retry-failed repeats them",
@@ -184,8 +184,8 @@ fn queue(cli: &Cli, args: &DoingArgs) -> Result<()> {
     Ok(())
 }
 
-fn one(cli: &Cli, args: &OneArgs) -> Result<()> {
-    let (run, outcome) = at_work(cli, &args.doing, |study, place, observe| {
+fn one(global: &GlobalOptions, args: &OneArgs) -> Result<()> {
+    let (run, outcome) = at_work(global, &args.doing, |study, place, observe| {
         let run = study.run(&args.run)?;
         let outcome = place.work(study, &run, observe)?;
         Ok((run, outcome))

@@ -1,6 +1,6 @@
 //! Options of synthetic data: views, C-arms, degradations.
 
-use super::args::{choice, pair, triple};
+use super::options::{choice, pair, triple};
 use clap::Args;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;

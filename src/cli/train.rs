@@ -1,7 +1,7 @@
 //! `train`: performs a run and writes its report.
 
-use super::args::{Cli, ConfigArgs};
 use super::eval::print_table;
+use super::options::{ConfigArgs, GlobalOptions};
 use super::progress::{print_json, show_progress, stop_flag};
 use super::report::Report;
 use super::tree::{of_page as tree_of_page, remove_old as remove_old_tree, score as score_tree_of_page};
@@ -72,7 +72,7 @@ fn config(args: &TrainArgs) -> Result<Config> {
 }
 
 /// Trains and writes the report.
-pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
+pub fn run(global: &GlobalOptions, args: &TrainArgs) -> Result<()> {
     let config = config(args)?;
     if args.print_config {
         out!("{}", config.acting_toml()?.trim_end());
@@ -87,11 +87,11 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     }
     prepare_directory(run, args)?;
     let cancel = stop_flag()?;
-    let gpu = cli.open_device()?;
+    let gpu = global.open_device()?;
     RunInfo { dataset: dataset.path.canonicalize().unwrap_or_else(|_| dataset.path.clone()) }.write(run)?;
     // A resumed run keeps its own configuration, for which the paths are chosen.
     let config = if args.resume { newest_model(run)?.config } else { config };
-    let tuning = cli.training_tuning(&gpu, &config, &dataset)?;
+    let tuning = global.training_tuning(&gpu, &config, &dataset)?;
     let options = RunOptions { tuning: &tuning, run, resume: args.resume, stop_at: args.stop_at, cancel: &cancel };
     let mut observer: Box<dyn FnMut(&Event)> = if args.json { Box::new(print_json) } else { Box::new(show_progress()) };
     reconstruct(&gpu, &config, &dataset, &options, &mut observer)?;
@@ -117,7 +117,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
     }
     drop(observer);
     let tree = if args.tree {
-        tree_of_page(cli, &gpu, &model, &cancel, run, &mut warnings)?
+        tree_of_page(global, &gpu, &model, &cancel, run, &mut warnings)?
     } else {
         remove_old_tree(run, &mut warnings);
         None
@@ -145,7 +145,7 @@ pub fn run(cli: &Cli, args: &TrainArgs) -> Result<()> {
         out!("report: {}, pictures: {}", page.display(), report.display());
     }
     warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 fn write_scores(report: &Path, scores: &Evaluation) -> Result<()> {

@@ -1,8 +1,8 @@
 //! The command `tree`.
 
-use super::args::Cli;
 use super::data::bar;
 use super::export::phases;
+use super::options::GlobalOptions;
 use clap::Args;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::Gpu;
@@ -49,7 +49,7 @@ const TREE_FILE: &str = "tree.json";
 /// Finds the tree of all phases of a model for a run's page, and writes it to a file beside the page. If the model has no
 /// vessels or the file cannot be written, a warning is added.
 pub fn of_page(
-    cli: &Cli,
+    global: &GlobalOptions,
     gpu: &Gpu,
     model: &Model,
     cancel: &AtomicBool,
@@ -58,7 +58,7 @@ pub fn of_page(
 ) -> Result<Option<BeatTree>> {
     let phases = (0..model.param_map.phases as u32).collect();
     let options = TreeOptions { phases, threshold_per_mm: None, least_branch_mm: None };
-    match find(cli, gpu, model, cancel, &options) {
+    match find(global, gpu, model, cancel, &options) {
         Ok(beat) => {
             leave(&beat, directory, warnings)?;
             Ok(Some(beat))
@@ -109,8 +109,14 @@ pub fn score(tree: Option<&BeatTree>, dataset: &Dataset, evaluation: &mut Evalua
     Ok(())
 }
 
-fn find(cli: &Cli, gpu: &Gpu, model: &Model, cancel: &AtomicBool, options: &TreeOptions) -> Result<BeatTree> {
-    let renderer = Renderer::new(gpu, model, cli.tuning(gpu, &model.config))?;
+fn find(
+    global: &GlobalOptions,
+    gpu: &Gpu,
+    model: &Model,
+    cancel: &AtomicBool,
+    options: &TreeOptions,
+) -> Result<BeatTree> {
+    let renderer = Renderer::new(gpu, model, global.tuning(gpu, &model.config))?;
     let mut progress = bar();
     vessel_trees(&renderer, model, options, |n, of| {
         progress("trees", n, of);
@@ -119,15 +125,15 @@ fn find(cli: &Cli, gpu: &Gpu, model: &Model, cancel: &AtomicBool, options: &Tree
 }
 
 /// Finds the vessels of a run as trees and writes them.
-pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
+pub fn run(global: &GlobalOptions, args: &TreeArgs) -> Result<()> {
     let unknown = || Error::config("--out", args.out.display(), "does not end in one of .json .vtp .swc .glb");
     let format = TreeFormat::of(&args.out).ok_or_else(unknown)?;
     let model = newest_model(&args.run)?;
     let (phases, all) = phases(&args.phase, model.param_map.phases as u32)?;
-    let gpu = cli.open_device()?;
+    let gpu = global.open_device()?;
     let options = TreeOptions { phases, threshold_per_mm: args.threshold, least_branch_mm: args.min_branch };
     // Ctrl-C may end the program at once, because no partial result has been written here.
-    let beat = find(cli, &gpu, &model, &AtomicBool::new(false), &options)?;
+    let beat = find(global, &gpu, &model, &AtomicBool::new(false), &options)?;
     let made = write(&beat, &args.out, format, all)?;
     made.iter().for_each(|path| out!("{}", path.display()));
     for tree in &beat.phases {
@@ -147,5 +153,5 @@ pub fn run(cli: &Cli, args: &TreeArgs) -> Result<()> {
         beat.spacing_mm,
         note(&beat)
     );
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }

@@ -1,6 +1,6 @@
 //! `view`: shows a run in a browser.
 
-use super::args::Cli;
+use super::options::GlobalOptions;
 use super::view_server::{Server, Shown, TYPICAL_SIDE, Taken};
 use super::view_tree::TreeWork;
 use clap::Args;
@@ -68,10 +68,10 @@ impl Shown for Finished {
 }
 
 /// Serves the page until Ctrl-C.
-pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
+pub fn view(global: &GlobalOptions, args: &ViewArgs) -> Result<()> {
     let model = newest_model(&args.run)?;
-    let gpu = cli.open_device()?;
-    let tuning = cli.tuning(&gpu, &model.config);
+    let gpu = global.open_device()?;
+    let tuning = global.tuning(&gpu, &model.config);
     let renderer = Arc::new(Renderer::new(&gpu, &model, tuning.clone())?);
     eprintln!("preparing {} phases on {} ...", model.param_map.phases, gpu.info().name);
     let mut shown = Finished {
@@ -87,7 +87,7 @@ pub fn view(cli: &Cli, args: &ViewArgs) -> Result<()> {
         // Without a handler, Ctrl-C ends the process at once, and there is nothing to wait for.
         let _ = tokio::signal::ctrl_c().await;
     })?;
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 /// Returns the largest value of each kind of picture from the model's own angle. As a side effect, every phase is

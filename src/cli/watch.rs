@@ -1,7 +1,7 @@
 //! `watch`: reconstructs DICOM runs as they appear in a folder.
 
-use super::args::{Cli, ConfigArgs};
 use super::dicom_args::DicomArgs;
+use super::options::{ConfigArgs, GlobalOptions};
 use super::progress::stop_flag;
 use super::view_server::{Server, Taken};
 use super::view_tree::TreeWork;
@@ -58,14 +58,14 @@ fn seconds(text: &str) -> std::result::Result<Duration, String> {
 }
 
 /// Reads runs until a signal ends it, and writes a run directory.
-pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
+pub fn run(global: &GlobalOptions, args: &WatchArgs) -> Result<()> {
     let (config, options) = (args.config.load([])?, args.reading.options()?);
     let mut folder = Folder::new(&args.directory);
     folder.look()?;
     prepare(&args.out)?;
     let stop = stop_flag()?;
-    let gpu = cli.open_device()?;
-    let tuning = cli.tuning(&gpu, &config);
+    let gpu = global.open_device()?;
+    let tuning = global.tuning(&gpu, &config);
     let intake = Intake::new(options.clone());
     let live = Arc::new(Live::new(intake.phases(), config.train.iterations));
     let tree = Arc::new(TreeWork::new(&gpu, tuning.clone()));
@@ -102,7 +102,7 @@ pub fn run(cli: &Cli, args: &WatchArgs) -> Result<()> {
     watched?;
     left?;
     served?;
-    cli.close_device(&gpu)
+    global.close_device(&gpu)
 }
 
 /// State of the command.

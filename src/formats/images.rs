@@ -1,14 +1,10 @@
 //! Reads 2D arrays from files of any supported format: float `.npy` and grey `.png`.
 
 use crate::error::{Error, Result};
+use crate::formats::image_limits::{MAX_FILE_BYTES, MAX_SIDE};
 use crate::formats::{npy, png};
 use crate::raster::Image;
 use std::path::Path;
-
-/// Largest accepted file, bytes: an 8192 x 8192 image of 64-bit floats with its header.
-pub(crate) const MAX_FILE_BYTES: u64 = (8192 * 8192 * 8) + 4096;
-/// Largest accepted side of an image, pixels.
-pub const MAX_SIDE: usize = 8192;
 
 /// Reads an image; the file name's extension selects the format.
 ///

@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::formats::images::{MAX_FILE_BYTES, MAX_SIDE};
+use crate::formats::image_limits::{MAX_FILE_BYTES, MAX_SIDE};
 use crate::raster::Image;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{DynamicImage, ExtendedColorType, ImageEncoder};

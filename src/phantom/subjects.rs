@@ -3,6 +3,7 @@
 use crate::error::{Error, Result};
 use crate::formats::nrrd;
 use crate::formats::volume::{Volume, VolumeHints};
+use crate::formats::volume_files;
 use crate::phantom::catheter;
 use crate::phantom::projector::{LoadedVolume, Projector};
 use crate::phantom::tree::{Bounds, Heart, Tree};
@@ -179,7 +180,7 @@ impl Patient {
     pub(super) fn read(tree: &Path, background: Option<&Path>, vessel_per_mm: f64, phases: u32) -> Result<Patient> {
         let tree = TreeFile::read(tree)?;
         let bounds = Bounds::over_the_beat(phases, |fraction| tree.at(fraction));
-        let still = background.map(|path| Volume::read(path, &VolumeHints::default())).transpose()?;
+        let still = background.map(|path| volume_files::read(path, &VolumeHints::default())).transpose()?;
         let still = still.map(|mut volume| {
             voxels::attenuation_from_hounsfield(&mut volume);
             volume
@@ -238,7 +239,7 @@ pub(super) struct Reading<'a> {
 
 impl Reading<'_> {
     fn volume(&self, path: &Path) -> Result<Volume> {
-        let mut volume = Volume::read(path, self.hints)?;
+        let mut volume = volume_files::read(path, self.hints)?;
         volume.values.iter_mut().for_each(|v| *v *= self.scale);
         if self.hounsfield {
             voxels::attenuation_from_hounsfield(&mut volume);

@@ -6,7 +6,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::formats::images::{MAX_FILE_BYTES, MAX_SIDE};
+use crate::formats::image_limits::{MAX_FILE_BYTES, MAX_SIDE};
 use crate::formats::npy;
 use crate::geometry::{CArm, Geometry};
 use crate::raster::Image;

@@ -2,6 +2,7 @@
 
 use crate::error::Result;
 use crate::formats::volume::{Volume, VolumeHints};
+use crate::formats::volume_files;
 use crate::geometry::ViewRays;
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::eval::{BestDice, mean, overlap};
@@ -45,7 +46,7 @@ pub fn truth_dice(
         if !file.is_file() {
             continue;
         }
-        let volume = Volume::read(&file, &VolumeHints::default())?;
+        let volume = volume_files::read(&file, &VolumeHints::default())?;
         for frame in frames {
             proceed()?;
             let view = &dataset.views[frame.view];

@@ -3,6 +3,7 @@
 use crate::calibrate::gauge::RigidMotion;
 use crate::error::{Error, Result};
 use crate::formats::volume::{Volume, VolumeHints};
+use crate::formats::volume_files;
 use crate::geometry::MM_PER_UNIT;
 use crate::model::scene::Scene;
 use crate::render::grid::PatientGrid;
@@ -203,7 +204,7 @@ pub struct TrueVessels {
 
 /// Reads the true attenuation per mm on a grid along the patient's axes.
 pub(super) fn read(file: &Path) -> Result<Volume> {
-    let volume = Volume::read(file, &VolumeHints::default())?;
+    let volume = volume_files::read(file, &VolumeHints::default())?;
     let spacing_mm = spacing_mm(&volume);
     if volume.index_to_lps.matrix3 != DMat3::from_diagonal(spacing_mm) || spacing_mm.min_element() <= 0.0 {
         return Err(Error::data(file, "space directions", "are not left, posterior and superior, in this order"));
