@@ -170,6 +170,7 @@ pub mod evidence {
     mod filters;
     pub mod noise;
     pub mod ratios;
+    pub mod series;
 }
 
 pub mod calibrate;
@@ -263,6 +264,7 @@ pub mod trees {
 pub mod score {
     pub mod calibrated;
     pub mod ceiling;
+    pub mod dice;
     pub mod distance;
     pub mod eval;
     pub mod metrics;
@@ -338,6 +340,7 @@ pub mod reference {
     pub mod deformable;
     pub mod field;
     pub mod gaussians;
+    pub mod losses;
     pub mod march;
     pub mod maxima;
     pub mod networks;

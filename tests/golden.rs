@@ -34,7 +34,7 @@ fn check(preset: Preset, name: &str) {
     check_plan(&golden, plan, &dataset, name);
 }
 
-fn terms_of_twin(losses: &step::Losses) -> Terms {
+fn terms_of_twin(losses: &losses::Losses) -> Terms {
     vec![
         ("data", losses.data),
         ("tv", losses.tv),

@@ -7,7 +7,8 @@ mod dicom;
 
 use dicom_core::{DataElement, PrimitiveValue, VR};
 use dicom_dictionary_std::tags;
-use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
+use nertca_vk::import::angiograms::{Gating, ImportOptions};
+use nertca_vk::import::intake::import_dicom;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::scan::gating::BeatScaling;
 use std::ops::RangeInclusive;

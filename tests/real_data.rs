@@ -7,7 +7,8 @@ mod shared;
 
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
-use nertca_vk::import::angiograms::{Gating, ImportOptions, import_dicom};
+use nertca_vk::import::angiograms::{Gating, ImportOptions};
+use nertca_vk::import::intake::import_dicom;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;

@@ -2,8 +2,8 @@
 
 use crate::calibrate::pose::Stand;
 use crate::calibrate::profiles::{Moving, Views};
-use crate::evidence::background::Series;
 use crate::evidence::ratios::ViewEvidence;
+use crate::evidence::series::Series;
 use crate::raster::widened;
 use crate::scan::dataset::{Dataset, Frame, View};
 use glam::DVec3;

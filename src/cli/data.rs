@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::formats::volume::VolumeHints;
-use nertca_vk::import::angiograms::import_dicom;
+use nertca_vk::import::intake::import_dicom;
 use nertca_vk::phantom::dataset::{Anatomy, PhantomOptions, VolumeOptions, make, project_volumes};
 use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::scan::dataset::Layout;

@@ -13,7 +13,8 @@ use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::score::{ScoreOptions, as_trained, evaluate_model};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::score::ceiling::truth_dice;
-use nertca_vk::score::eval::{BestDice, BestDices, Evaluation};
+use nertca_vk::score::dice::BestDice;
+use nertca_vk::score::eval::{BestDices, Evaluation};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -1,19 +1,17 @@
 //! The static background of a view without its vessels, and the noise of its pixels.
 
 use crate::evidence::drift::Drift;
-use crate::evidence::filters::{gaussian, map2, separable};
+use crate::evidence::filters::map2;
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
+use crate::evidence::series::{LEAST_NOISE_SHARE, Series, blur, opening_radius};
 use crate::raster::{Image, dilate, median, opening, percentile};
 use crate::scan::canvas::continued;
-use crate::scan::dataset::Dataset;
 use rayon::prelude::*;
 
 /// Values within this many standard deviations of the background belong to it.
 const BACKGROUND_SIGMAS: f32 = 2.0;
 /// Number of iterations that select the phases belonging to the background.
 const BACKGROUND_ROUNDS: usize = 4;
-/// Minimum noise, as a share of the strongest change: models have errors, too.
-pub(super) const LEAST_NOISE_SHARE: f32 = 0.01;
 /// Blur before the strongest change is measured, pixels.
 const STRONGEST_BLUR: f32 = 0.7;
 /// Percentile of the changes that counts as the strongest change.
@@ -24,43 +22,6 @@ const STRONGEST_PERCENTILE: f64 = 0.995;
 const OPENING_SHARE: f64 = 0.03;
 /// Radius of the opening that separates a moving heart or diaphragm from vessels, junctions and crossings.
 const WIDE_SHARE: f64 = 0.06;
-/// Minimum radius of an opening, pixels.
-const LEAST_OPENING_RADIUS: usize = 2;
-
-/// Line integrals of one training view over the beat.
-#[derive(Debug, Clone)]
-pub struct Series {
-    /// Index into [`Dataset::views`].
-    pub view: usize,
-    /// An image per phase of the dataset, as large as the view's; `None` where the view has none.
-    pub images: Vec<Option<Image>>,
-}
-
-impl Series {
-    /// Returns the training images of each view that has at least two phases; several images of one phase are averaged.
-    pub fn of(dataset: &Dataset) -> Vec<Series> {
-        let series = dataset.training_views().into_iter().map(|view| Series {
-            view,
-            images: (0..dataset.n_phases).map(|phase| mean_image(dataset, view, phase)).collect(),
-        });
-        series.filter(|s| s.seen().count() > 1).collect()
-    }
-
-    /// Images of the phases the view has.
-    pub fn seen(&self) -> impl Iterator<Item = &Image> {
-        self.images.iter().flatten()
-    }
-}
-
-fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
-    let frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view && f.phase == phase).collect();
-    let scale = 1.0 / frames.len() as f32;
-    let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
-    let [width, height] = dataset.views[view].size;
-    let value = |p: usize| images.iter().map(|image| image[p]).sum::<f32>() * scale;
-    let values = (0..width * height).map(value).collect();
-    (!frames.is_empty()).then_some(Image { width, height, values })
-}
 
 /// The static background of a view, and the changes above it.
 #[derive(Debug, Clone)]
@@ -161,11 +122,6 @@ impl Background {
     }
 }
 
-/// Radius of an opening, from its share of an image's smaller side.
-pub fn opening_radius(share: f64, width: usize, height: usize) -> usize {
-    ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
-}
-
 /// Change above the level, minus its wide part: the part that an opening by `radius` retains.
 fn narrow_change(seen: &Image, level: &Image, radius: usize) -> Image {
     let change = map2(seen, level, |y, b| y - b);
@@ -176,9 +132,4 @@ fn narrow_change(seen: &Image, level: &Image, radius: usize) -> Image {
 /// Maximum within `radius` pixels along both axes.
 pub fn largest_within(image: &Image, radius: usize) -> Image {
     dilate(image, radius)
-}
-
-/// Gaussian blur; outside, the border's pixels are continued.
-pub fn blur(image: &Image, sigma: f32) -> Image {
-    separable(image, &gaussian(sigma))
 }

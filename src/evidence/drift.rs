@@ -3,8 +3,8 @@
 //! found in the images after a median filter wider than any vessel. Each course has a mode, the line integral it adds to
 //! each pixel.
 
-use crate::evidence::background::{LEAST_NOISE_SHARE, Series, blur, opening_radius};
 use crate::evidence::filters::map2;
+use crate::evidence::series::{LEAST_NOISE_SHARE, Series, blur, opening_radius};
 use crate::raster::{Image, median, median_filter, percentile};
 use rayon::prelude::*;
 

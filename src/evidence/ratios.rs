@@ -3,8 +3,9 @@
 //! The steps are: background, change above it, the smallest filter with low enough noise for the weakest vessel, ratio.
 //! Ratios are clipped, so that no single view can reject or confirm a cell.
 
-use crate::evidence::background::{Background, Series, largest_within};
+use crate::evidence::background::{Background, largest_within};
 use crate::evidence::filters::{Estimate, LineFilter, blob, map2};
+use crate::evidence::series::Series;
 use crate::raster::Image;
 use crate::scan::canvas::continued;
 use rayon::prelude::*;

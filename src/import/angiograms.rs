@@ -4,14 +4,12 @@ use crate::error::{Error, Result};
 use crate::geometry::CArm;
 use crate::import::dicom::{Relationship, Run};
 use crate::import::image_beat;
-use crate::import::intake::{Intake, MOST_RUNS};
 use crate::import::stands::stands;
 use crate::raster::{Image, dilate, opening, percentile};
 use crate::scan::gating::{BeatScaling, BeatTime, RPeaks};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
-use std::path::{Path, PathBuf};
 
 /// Width of the widest vessel that is searched, mm at the isocentre.
 const WIDEST_VESSEL_MM: f64 = 6.0;
@@ -57,22 +55,6 @@ pub struct ImportOptions {
     pub size: Option<usize>,
     /// Depth searched before and behind the isocentre, mm.
     pub depth_half_extent_mm: f64,
-}
-
-/// Imports runs as a dataset and returns notes for the user.
-///
-/// # Errors
-/// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. In these cases no dataset is
-/// written.
-pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
-    if files.is_empty() || files.len() > MOST_RUNS {
-        return Err(Error::config("FILE", files.len(), format!("is out of range: 1 to {MOST_RUNS} runs are accepted")));
-    }
-    let runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
-    let mut intake = Intake::new(options.clone());
-    let mut notes = intake.take(runs)?;
-    notes.push(intake.write(out)?);
-    Ok(notes)
 }
 
 /// An image of a run, ready for training.

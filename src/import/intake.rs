@@ -9,7 +9,7 @@ use crate::scan::dataset::{Layout, Split};
 use crate::scan::frame_checks::{check_values, checked_view};
 use crate::scan::writer::{About, Writer};
 use rayon::prelude::*;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Largest accepted number of runs.
 pub const MOST_RUNS: usize = 64;
@@ -187,4 +187,20 @@ fn check(run: &Run, before: &[Taken]) -> Vec<String> {
     let near = before.iter().filter(near);
     notes.extend(near.map(|other| format!("warning: {} and {name} have almost the same viewing angle", other.name)));
     notes
+}
+
+/// Imports runs as a dataset and returns notes for the user.
+///
+/// # Errors
+/// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. In these cases no dataset is
+/// written.
+pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
+    if files.is_empty() || files.len() > MOST_RUNS {
+        return Err(Error::config("FILE", files.len(), format!("is out of range: 1 to {MOST_RUNS} runs are accepted")));
+    }
+    let runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
+    let mut intake = Intake::new(options.clone());
+    let mut notes = intake.take(runs)?;
+    notes.push(intake.write(out)?);
+    Ok(notes)
 }

@@ -16,6 +16,7 @@ mod tensors;
 pub mod trainer;
 pub mod twin;
 pub mod twin_chords;
+pub(crate) mod twin_shape;
 
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};

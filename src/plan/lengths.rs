@@ -2,7 +2,7 @@
 //! smoother vessels.
 
 use crate::config::sections::{Deformable, Gaussians};
-use crate::evidence::background::blur;
+use crate::evidence::series::blur;
 use crate::raster::{Image, percentile};
 
 /// Smaller side, pixels, of the images to which the settings' lengths refer.

@@ -1,7 +1,7 @@
 //! Estimates the static background anew from what a dynamic field leaves of the images: where a vessel covers a pixel at most
 //! phases, the lowest phases do not show the background, but the images minus the vessels do.
 
-use crate::evidence::background::{blur, opening_radius};
+use crate::evidence::series::{blur, opening_radius};
 use crate::plan::targets::Targets;
 use crate::raster::{Image, median_filter};
 use rayon::prelude::*;

@@ -2,8 +2,8 @@
 
 use crate::config::{GaussianForm, sections};
 use crate::error::{Error, Result};
-use crate::evidence::background::Series;
 use crate::evidence::ratios::ViewEvidence;
+use crate::evidence::series::Series;
 use crate::gaussians::field::Units;
 use crate::gaussians::view::SplatView;
 use crate::plan::lengths::{Lengths, vessel_width};

@@ -3,8 +3,8 @@
 
 use crate::plan::Plan;
 use crate::reference::field::{self, NetworkTrace, Precision, Shown};
+use crate::reference::losses::Losses;
 use crate::reference::march::{self, Ray};
-use crate::reference::step::Losses;
 use glam::DVec3;
 
 /// Offset against division by zero and logarithms of zero, as in `loss_samples`.

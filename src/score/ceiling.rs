@@ -5,7 +5,7 @@ use crate::formats::volume::{Volume, VolumeHints};
 use crate::formats::volume_files;
 use crate::geometry::ViewRays;
 use crate::scan::dataset::{Dataset, Frame};
-use crate::score::eval::{BestDice, mean, overlap};
+use crate::score::dice::{BestDice, mean, overlap};
 use crate::score::metrics;
 use crate::score::volume::{VOLUMES, truth_file};
 use glam::{DAffine3, DVec3};

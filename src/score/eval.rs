@@ -6,6 +6,7 @@ use crate::raster::percentile;
 use crate::render::renderer::{Renderer, Rendering};
 use crate::scan::dataset::{Dataset, Frame};
 use crate::score::ceiling::TruthDice;
+use crate::score::dice::{BestDice, mean, overlap};
 use crate::score::metrics;
 use crate::score::trees::TreeScores;
 use crate::score::volume::VolumeScores;
@@ -75,16 +76,6 @@ pub struct Thresholds {
     pub total_per_mm: f64,
     /// Rule by which the thresholds were chosen.
     pub rule: &'static str,
-}
-
-/// Maximum of the mean Dice over all thresholds, which distinguishes a bad field from a bad threshold. It is found with the
-/// masks of the scored images themselves, so it is no valid score.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct BestDice {
-    /// Mean over images with a mask.
-    pub dice: f64,
-    /// The threshold at this maximum, per mm.
-    pub threshold_per_mm: f64,
 }
 
 /// Best Dice over thresholds; `None` without masks.
@@ -180,22 +171,9 @@ fn choose_thresholds(
     }
 }
 
-/// Dice between the values above a threshold and the mask of a frame; `None` without a mask.
-pub(super) fn overlap(frame: &Frame, values: &[f32], threshold: f64) -> Option<f64> {
-    let mask = frame.mask.as_ref()?;
-    let predicted: Vec<bool> = values.iter().map(|v| f64::from(*v) > threshold).collect();
-    Some(metrics::dice(&predicted, mask))
-}
-
 /// Dice between the values above an image's own Otsu threshold and the mask; `None` without a mask.
 fn otsu_dice(frame: &Frame, values: &[f32]) -> Option<f64> {
     overlap(frame, values, threshold::vessel_threshold(values).into())
-}
-
-/// Mean of values; `None` if there are none.
-pub(super) fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (n, sum) = values.fold((0usize, 0.0), |(n, sum), value| (n + 1, sum + value));
-    (n > 0).then(|| sum / n as f64)
 }
 
 fn published_dice(frames: &[&Frame], seen: &[Rendering]) -> PublishedDice {

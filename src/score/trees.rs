@@ -7,6 +7,7 @@ use crate::scan::dataset::{Dataset, Frame, Split};
 use crate::scan::gating::BeatTime;
 use crate::scan::truth::Truth;
 use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
+use crate::score::dice::mean;
 use crate::score::nearest::{Lines, Place};
 use crate::score::shapes::WITHIN_MM;
 use crate::trees::tree::{BeatTree, PhaseTree};
@@ -114,12 +115,6 @@ pub fn score(
     });
     let phases = phases.collect::<Result<Vec<PhaseTreeScores>>>()?;
     Ok(TreeScores { within_mm: WITHIN_MM, mean: means(&phases), mean_as_stated: None, phases })
-}
-
-/// Mean of values; `None` if there are none.
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (n, sum) = values.fold((0usize, 0.0), |(n, sum), value| (n + 1, sum + value));
-    (n > 0).then(|| sum / n as f64)
 }
 
 fn means(phases: &[PhaseTreeScores]) -> TreeAgreement {

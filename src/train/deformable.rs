@@ -1,9 +1,9 @@
-//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`DeformableStart`] prepares
+//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`crate::train::deformable_start`] prepares
 //! it.
 
 use crate::config::{Config, sections};
 use crate::error::{Error, Result};
-use crate::evidence::background::blur;
+use crate::evidence::series::blur;
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{losses, ring};
 use crate::gaussians::deformable::{
@@ -22,7 +22,6 @@ use crate::model::groups::vessels;
 use crate::plan::targets::Targets;
 use crate::plan::{fit, seeds};
 use crate::raster::Image;
-use crate::train::deformable_start::DeformableStart;
 use crate::train::gaussians::{MAX_PASSES, check_count, strong};
 use crate::train::targets::{padded, renew_bounds, take_images, target_buffers};
 use glam::DVec3;
@@ -88,23 +87,10 @@ impl Fit {
 }
 
 impl DeformableTrainer {
-    /// Starts from targets alone, all of [`DeformableStart`] at once.
-    ///
-    /// # Errors
-    /// As [`DeformableStart::new`] and [`DeformableStart::advance`].
-    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<DeformableTrainer> {
-        let mut start = DeformableStart::new(gpu, targets, config)?;
-        loop {
-            if let Some(trainer) = start.advance()? {
-                return Ok(trainer);
-            }
-        }
-    }
-
     /// Starts from given Gaussians at rest.
     ///
     /// # Errors
-    /// As [`DeformableTrainer::new`].
+    /// [`Error::Config`] for impossible settings; device errors.
     pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<DeformableTrainer> {
         config.check()?;
         let n = check_count(particles)?;

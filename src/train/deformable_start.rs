@@ -151,3 +151,18 @@ fn tracks(targets: &Targets) -> Vec<Track> {
     };
     forward.chain(backward).map(track).collect()
 }
+
+impl DeformableTrainer {
+    /// Starts from targets alone, all of [`DeformableStart`] at once.
+    ///
+    /// # Errors
+    /// As [`DeformableStart::new`] and [`DeformableStart::advance`].
+    pub fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<DeformableTrainer> {
+        let mut start = DeformableStart::new(gpu, targets, config)?;
+        loop {
+            if let Some(trainer) = start.advance()? {
+                return Ok(trainer);
+            }
+        }
+    }
+}

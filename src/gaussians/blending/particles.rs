@@ -1,11 +1,19 @@
 //! Gaussians of which nearer ones hide those behind them, on the device.
 
 use crate::error::Result;
-use crate::gaussians::blending::stages::sort_blocks;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::kernels::dispatch::{Binding, buffer_set};
 use crate::kernels::layout::{Splat, XGaussian, XKey, XSet, XSpan};
+use crate::kernels::push::{self, PushConstants};
+
+/// Number of keys of a block of the sort.
+const KEYS_OF_BLOCK: u32 = 16 * push::XSortCount::LOCAL_SIZE;
+const _: () = assert!(push::XSortMove::LOCAL_SIZE == push::XSortCount::LOCAL_SIZE);
+/// Blocks of the sort of `n` keys.
+pub fn sort_blocks(n: u32) -> u32 {
+    n.div_ceil(KEYS_OF_BLOCK)
+}
 
 /// Values of the four bits that a pass sorts by.
 const DIGITS: u64 = 16;

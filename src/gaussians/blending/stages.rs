@@ -3,7 +3,7 @@
 //! x_project -> (x_sort_count -> x_sort_scan -> x_sort_move) of each four bits -> x_lists -> x_blend
 
 use crate::error::Result;
-use crate::gaussians::blending::particles::BlendedGaussians;
+use crate::gaussians::blending::particles::{BlendedGaussians, sort_blocks};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch_finding};
@@ -11,19 +11,11 @@ use crate::kernels::layout::XSetup;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage, along_two_axes};
 
-/// Number of keys of a block of the sort.
-const KEYS_OF_BLOCK: u32 = 16 * push::XSortCount::LOCAL_SIZE;
-const _: () = assert!(push::XSortMove::LOCAL_SIZE == push::XSortCount::LOCAL_SIZE);
 /// Bits that a pass sorts by, and values that these have.
 const BITS_OF_PASS: u32 = 4;
 const DIGITS: u32 = 1 << BITS_OF_PASS;
 /// Bits of a depth.
 const DEPTH_BITS: u32 = 32;
-
-/// Blocks of the sort of `n` keys.
-pub fn sort_blocks(n: u32) -> u32 {
-    n.div_ceil(KEYS_OF_BLOCK)
-}
 
 /// Passes of the sort: over depths, then over the sets' numbers.
 fn sort_passes(n_sets: u32) -> u32 {

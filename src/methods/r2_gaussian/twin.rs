@@ -5,6 +5,7 @@ use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Schedule, R2Setup};
 use crate::methods::r2_gaussian::parameters::{ScaleBounds, softplus};
 use crate::methods::r2_gaussian::twin_chords::Chords;
+use crate::methods::r2_gaussian::twin_shape::{bounds, pixels_within, position, scale};
 use crate::reference::gaussians::{N_PARAMS, Params, axes, rotation_gradient};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
@@ -21,18 +22,6 @@ pub fn params(g: &R2Gaussian) -> Params {
     let all = g.position.iter().chain([&g.density]).chain(&g.scale).chain(&g.rotation);
     out.iter_mut().zip(all).for_each(|(p, v)| *p = f64::from(*v));
     out
-}
-
-pub(super) fn position(p: &Params) -> DVec3 {
-    DVec3::new(p[0], p[1], p[2])
-}
-
-fn bounds(setup: &GaussianSetup) -> ScaleBounds {
-    ScaleBounds { least: setup.least_scale.into(), greatest: setup.greatest_scale.into() }
-}
-
-pub(super) fn scale(p: &Params, setup: &GaussianSetup) -> DVec3 {
-    DVec3::new(p[4], p[5], p[6]).map(|stored| bounds(setup).scale(stored))
 }
 
 fn sigmoid(x: f64) -> f64 {
@@ -103,21 +92,6 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Pr
         slopes,
         alpha,
         beta,
-    })
-}
-
-/// Index and offset from the centre of every pixel of a box with these half sides.
-pub(super) fn pixels_within(
-    middle: DVec2,
-    half: DVec2,
-    setup: &GaussianSetup,
-) -> impl Iterator<Item = (usize, DVec2)> + use<> {
-    let (width, height) = (i64::from(setup.width), i64::from(setup.height));
-    let (first, last) = ((middle - half).ceil(), (middle + half).floor());
-    let along = |first: f64, last: f64, n: i64| first.max(0.0) as i64..(last.max(-1.0) as i64 + 1).min(n);
-    let (columns, rows) = (along(first.x, last.x, width), along(first.y, last.y, height));
-    rows.flat_map(move |y| {
-        columns.clone().map(move |x| ((y * width + x) as usize, DVec2::new(x as f64, y as f64) - middle))
     })
 }
 

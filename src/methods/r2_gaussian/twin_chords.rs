@@ -5,7 +5,7 @@
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::GaussianSetup;
 use crate::methods::r2_gaussian::parameters::softplus;
-use crate::methods::r2_gaussian::twin::{pixels_within, position, scale};
+use crate::methods::r2_gaussian::twin_shape::{pixels_within, position, scale};
 use crate::reference::gaussians::{Params, axes};
 use glam::{DMat3, DVec2, DVec3};
 

@@ -5,8 +5,10 @@ use crate::gaussians::blending::particles::BlendedGaussians;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::kernels::dispatch::{Binding, buffer_set};
-use crate::methods::x_gaussian::stages::SUMS;
 use crate::methods::x_gaussian::state::XState;
+
+/// Sums of a Gaussian over the pixels of a tile.
+pub const SUMS: u32 = 7;
 
 buffer_set! {
     /// State of the optimiser and statistics of each Gaussian.

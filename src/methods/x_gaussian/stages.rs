@@ -15,8 +15,6 @@ use crate::kernels::push::{self, PushConstants};
 use crate::kernels::stages::{Build, Stage};
 use crate::methods::x_gaussian::particles::XLearningBuffers;
 
-/// Sums of a Gaussian over the pixels of a tile.
-pub const SUMS: u32 = 7;
 /// Pipelines of a fit.
 pub struct XKernels {
     /// Pictures.

@@ -16,9 +16,9 @@ use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{GaussianSetup, R2Setup, XCounts, XEnd, XGaussian, XList, XSetup, XStatus};
 use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::densify::{densified, densifies, resets};
-use crate::methods::x_gaussian::particles::{XLearningBuffers, download};
+use crate::methods::x_gaussian::particles::{SUMS, XLearningBuffers, download};
 use crate::methods::x_gaussian::setup::{comparing_setup, gaussian_setup, schedule, turns, x_setup};
-use crate::methods::x_gaussian::stages::{SUMS, XFitBuffers, XKernels, XParts};
+use crate::methods::x_gaussian::stages::{XFitBuffers, XKernels, XParts};
 use crate::methods::x_gaussian::start::first_state;
 use crate::methods::x_gaussian::state::{SMALLER_STEPS, XState};
 

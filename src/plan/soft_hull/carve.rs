@@ -1,7 +1,7 @@
 //! Combines the views' evidence at pixels into evidence at cells: sums over views, and support from the neighbouring phases.
 
-use crate::evidence::background::Series;
 use crate::evidence::ratios::{LEAST, MOST, ViewEvidence};
+use crate::evidence::series::Series;
 use crate::geometry::ViewRays;
 use crate::model::hull::Hull;
 use crate::plan::carve::Projector;

@@ -1,0 +1,55 @@
+//! Images of a view over the beat, and the filters that background and drift share.
+
+use crate::evidence::filters::{gaussian, separable};
+use crate::raster::Image;
+use crate::scan::dataset::Dataset;
+
+/// Minimum noise, as a share of the strongest change: models have errors, too.
+pub(super) const LEAST_NOISE_SHARE: f32 = 0.01;
+/// Minimum radius of an opening, pixels.
+const LEAST_OPENING_RADIUS: usize = 2;
+
+/// Line integrals of one training view over the beat.
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// Index into [`Dataset::views`].
+    pub view: usize,
+    /// An image per phase of the dataset, as large as the view's; `None` where the view has none.
+    pub images: Vec<Option<Image>>,
+}
+
+impl Series {
+    /// Returns the training images of each view that has at least two phases; several images of one phase are averaged.
+    pub fn of(dataset: &Dataset) -> Vec<Series> {
+        let series = dataset.training_views().into_iter().map(|view| Series {
+            view,
+            images: (0..dataset.n_phases).map(|phase| mean_image(dataset, view, phase)).collect(),
+        });
+        series.filter(|s| s.seen().count() > 1).collect()
+    }
+
+    /// Images of the phases the view has.
+    pub fn seen(&self) -> impl Iterator<Item = &Image> {
+        self.images.iter().flatten()
+    }
+}
+
+fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
+    let frames: Vec<_> = dataset.training().iter().filter(|f| f.view == view && f.phase == phase).collect();
+    let scale = 1.0 / frames.len() as f32;
+    let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
+    let [width, height] = dataset.views[view].size;
+    let value = |p: usize| images.iter().map(|image| image[p]).sum::<f32>() * scale;
+    let values = (0..width * height).map(value).collect();
+    (!frames.is_empty()).then_some(Image { width, height, values })
+}
+
+/// Radius of an opening, from its share of an image's smaller side.
+pub fn opening_radius(share: f64, width: usize, height: usize) -> usize {
+    ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
+}
+
+/// Gaussian blur; outside, the border's pixels are continued.
+pub fn blur(image: &Image, sigma: f32) -> Image {
+    separable(image, &gaussian(sigma))
+}
