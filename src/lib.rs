@@ -312,6 +312,7 @@ pub mod session;
 #[allow(non_camel_case_types, reason = "types have the names they have in C")]
 #[allow(unreachable_pub, reason = "what the modules share among themselves")]
 pub mod capi {
+    pub mod boundary;
     pub mod calibration;
     mod callsites;
     pub mod context;

@@ -5,6 +5,7 @@ mod capi;
 
 use capi::root;
 use capi::scene::*;
+use nertca_vk::capi::boundary::nertca_last_error;
 use nertca_vk::capi::calibration::*;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;

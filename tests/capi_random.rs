@@ -7,6 +7,7 @@
 mod capi;
 
 use capi::scene::*;
+use nertca_vk::capi::boundary::nertca_last_error;
 use nertca_vk::capi::calibration::*;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;

@@ -1,9 +1,10 @@
 //! Contexts: a device, a log, limits.
 
-use crate::capi::handles::{self, Kind, Object};
+use crate::capi::boundary::call;
+use crate::capi::handles::{self, Kind};
 use crate::capi::log;
 use crate::capi::options::{Options, text};
-use crate::capi::status::{Failure, NERTCA_ERROR_BUSY, Outcome, call, copy_text, nertca_status};
+use crate::capi::status::{Failure, NERTCA_ERROR_BUSY, Outcome, copy_text, nertca_status};
 use crate::capi::types::{nertca_log, nertca_vulkan, read};
 use crate::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
 use crate::kernels::tuning::{Layers, Tuning};
@@ -32,14 +33,6 @@ pub(super) struct Context {
 
 impl Kind for Context {
     const NAME: &'static str = "context";
-
-    fn wrap(this: Arc<Self>) -> Object {
-        Object::Context(this)
-    }
-
-    fn unwrap(object: Object) -> Option<Arc<Self>> {
-        if let Object::Context(context) = object { Some(context) } else { None }
-    }
 
     fn process(&self) -> u32 {
         self.process

@@ -2,10 +2,8 @@
 //! another type or is arbitrary can therefore be recognised without touching memory. The table is the only process-wide
 //! state of the ABI's objects.
 
-use crate::capi::context::Context;
-use crate::capi::output::SharedBuffer;
-use crate::capi::reconstruction::Reconstruction;
 use crate::capi::status::{Failure, NERTCA_ERROR_FORKED, NERTCA_ERROR_HANDLE, Outcome};
+use std::any::Any;
 use std::cell::RefCell;
 use std::sync::{Arc, PoisonError, RwLock};
 
@@ -13,12 +11,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 const INDEX_BITS: u32 = 20;
 
 /// Object behind a handle.
-#[derive(Clone)]
-pub(super) enum Object {
-    Context(Arc<Context>),
-    Reconstruction(Arc<Reconstruction>),
-    Buffer(Arc<SharedBuffer>),
-}
+type Object = Arc<dyn Any + Send + Sync>;
 
 struct Slot {
     generation: usize,
@@ -38,10 +31,8 @@ thread_local! {
 }
 
 /// Type of objects that have handles.
-pub(super) trait Kind: Sized {
+pub(super) trait Kind: Any + Send + Sync {
     const NAME: &'static str;
-    fn wrap(this: Arc<Self>) -> Object;
-    fn unwrap(object: Object) -> Option<Arc<Self>>;
     /// Returns the id of the process that made the object.
     fn process(&self) -> u32;
 }
@@ -54,7 +45,7 @@ fn parts(handle: usize) -> Option<(usize, usize)> {
 /// Makes a handle for an object.
 pub(super) fn insert<T: Kind>(object: Arc<T>) -> Outcome<usize> {
     let mut table = TABLE.write().unwrap_or_else(PoisonError::into_inner);
-    let object = Some(T::wrap(object));
+    let object: Option<Object> = Some(object);
     let index = match table.free.pop() {
         Some(index) => index,
         None if table.slots.len() + 1 < 1 << INDEX_BITS => {
@@ -115,7 +106,7 @@ fn find<T: Kind>(handle: usize) -> Outcome<Arc<T>> {
         slot.and_then(|slot| slot.object.clone())
     };
     let object = object.ok_or_else(|| bad("was destroyed or never existed"))?;
-    let object = T::unwrap(object).ok_or_else(|| bad("is a handle of another type"))?;
+    let object = object.downcast::<T>().map_err(|_| bad("is a handle of another type"))?;
     if object.process() != std::process::id() {
         return Err(Failure::new(NERTCA_ERROR_FORKED, format!("{}: was created before a fork", T::NAME)));
     }

@@ -16,10 +16,6 @@ pub const NERTCA_LOG_WARNING: u32 = 2;
 /// Severity of a log message: information on the work being done, and the reasons.
 pub const NERTCA_LOG_INFO: u32 = 3;
 
-/// Receives log messages: level, UTF-8 text, and the caller's pointer. It is called on the thread on which a message arises,
-/// which may be the training thread, and possibly on several threads at once. It must not call into the library.
-pub type nertca_log_callback = Option<unsafe extern "C" fn(level: u32, text: *const c_char, user: *mut c_void)>;
-
 struct Callback {
     call: unsafe extern "C" fn(u32, *const c_char, *mut c_void),
     user: *mut c_void,

@@ -1,10 +1,11 @@
 //! Output: views, volumes, scores, and buffers shared with other APIs.
 
+use crate::capi::boundary::call;
 use crate::capi::context::{Claim, Context, nertca_context, on_context};
-use crate::capi::handles::{self, Kind, Object};
+use crate::capi::handles::{self, Kind};
 use crate::capi::reconstruction::{Reconstruction, nertca_reconstruction, on_reconstruction};
 use crate::capi::shared_memory;
-use crate::capi::status::{Failure, NERTCA_OK, Outcome, call, nertca_status};
+use crate::capi::status::{Failure, NERTCA_OK, Outcome, nertca_status};
 use crate::capi::types::{
     NERTCA_COMPONENT_DYNAMIC, NERTCA_COMPONENT_STATIC, NERTCA_COMPONENT_TOTAL, NERTCA_PIXELS_F32, NERTCA_PIXELS_U8,
     NERTCA_PROJECTION_DRR, NERTCA_PROJECTION_MIP, NERTCA_QUALITY_EXACT, NERTCA_QUALITY_LIVE, nertca_grid, nertca_image,
@@ -33,14 +34,6 @@ pub(super) struct SharedBuffer {
 
 impl Kind for SharedBuffer {
     const NAME: &'static str = "buffer";
-
-    fn wrap(this: Arc<Self>) -> Object {
-        Object::Buffer(this)
-    }
-
-    fn unwrap(object: Object) -> Option<Arc<Self>> {
-        if let Object::Buffer(buffer) = object { Some(buffer) } else { None }
-    }
 
     fn process(&self) -> u32 {
         self.process

@@ -1,13 +1,13 @@
 //! Reconstructions: adding frames, saving and loading checkpoints.
 
+use crate::capi::boundary::call;
 use crate::capi::context::{Claim, Context, nertca_context, on_context};
-use crate::capi::handles::{self, Kind, Object};
+use crate::capi::handles::{self, Kind};
 use crate::capi::options::{Options, text};
 use crate::capi::status::{
-    Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_OK, Outcome, call, copy_text, nertca_status,
+    Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_OK, Outcome, copy_text, nertca_status,
 };
-use crate::capi::training::state_code;
-use crate::capi::types::{nertca_frame, nertca_progress, read, write};
+use crate::capi::types::{nertca_frame, nertca_progress, read, state_code, write};
 use crate::choice::Choice;
 use crate::config::{Config, Preset};
 use crate::model::checkpoint::Checkpoint;
@@ -36,14 +36,6 @@ pub(super) struct Reconstruction {
 
 impl Kind for Reconstruction {
     const NAME: &'static str = "reconstruction";
-
-    fn wrap(this: Arc<Self>) -> Object {
-        Object::Reconstruction(this)
-    }
-
-    fn unwrap(object: Object) -> Option<Arc<Self>> {
-        if let Object::Reconstruction(reconstruction) = object { Some(reconstruction) } else { None }
-    }
 
     fn process(&self) -> u32 {
         self.process

@@ -2,27 +2,11 @@
 
 use crate::capi::reconstruction::{nertca_reconstruction, on_reconstruction};
 use crate::capi::status::{Failure, nertca_status};
-use crate::capi::types::{
-    NERTCA_STATE_CANCELLED, NERTCA_STATE_FAILED, NERTCA_STATE_FINISHED, NERTCA_STATE_IDLE, NERTCA_STATE_PAUSED,
-    NERTCA_STATE_RUNNING, NERTCA_STATE_WAITING, nertca_progress, nertca_progress_callback,
-};
-use crate::session::{Progress, State};
+use crate::capi::types::{NERTCA_STATE_RUNNING, nertca_progress, nertca_progress_callback};
+use crate::session::Progress;
 use std::ffi::c_void;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
-
-/// Converts a state to its number.
-pub(super) fn state_code(state: State) -> u32 {
-    match state {
-        State::Idle => NERTCA_STATE_IDLE,
-        State::Running => NERTCA_STATE_RUNNING,
-        State::Paused => NERTCA_STATE_PAUSED,
-        State::Waiting => NERTCA_STATE_WAITING,
-        State::Finished => NERTCA_STATE_FINISHED,
-        State::Cancelled => NERTCA_STATE_CANCELLED,
-        State::Failed => NERTCA_STATE_FAILED,
-    }
-}
 
 /// A progress callback with the caller's pointer.
 struct Callback {

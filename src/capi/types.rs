@@ -3,7 +3,7 @@
 use crate::capi::status::{Failure, Outcome};
 use crate::geometry::{CArm, Geometry, Matrix};
 use crate::scan::dataset::{Intensity, Split};
-use crate::session::{Moment, NewFrame};
+use crate::session::{Moment, NewFrame, State};
 use std::ffi::{c_char, c_void};
 
 /// Unsigned 8-bit pixels.
@@ -58,6 +58,10 @@ pub const NERTCA_STATE_CANCELLED: u32 = 5;
 /// An error ended training.
 pub const NERTCA_STATE_FAILED: u32 = 6;
 
+/// Receives log messages: level, UTF-8 text, and the caller's pointer. It is called on the thread on which a message arises,
+/// which may be the training thread, and possibly on several threads at once. It must not call into the library.
+pub type nertca_log_callback = Option<unsafe extern "C" fn(level: u32, text: *const c_char, user: *mut c_void)>;
+
 /// Receiver of log messages.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -65,7 +69,7 @@ pub struct nertca_log {
     /// `sizeof(nertca_log)`.
     pub size: usize,
     /// Called for each message.
-    pub callback: super::log::nertca_log_callback,
+    pub callback: nertca_log_callback,
     /// Passed to the callback unchanged.
     pub user: *mut c_void,
     /// Lowest severity to report, one of `NERTCA_LOG_*`.
@@ -382,6 +386,19 @@ pub struct nertca_scores {
 /// same reconstruction.
 pub type nertca_progress_callback =
     Option<unsafe extern "C" fn(progress: *const nertca_progress, user: *mut c_void) -> i32>;
+
+/// Converts a state to its number.
+pub(super) fn state_code(state: State) -> u32 {
+    match state {
+        State::Idle => NERTCA_STATE_IDLE,
+        State::Running => NERTCA_STATE_RUNNING,
+        State::Paused => NERTCA_STATE_PAUSED,
+        State::Waiting => NERTCA_STATE_WAITING,
+        State::Finished => NERTCA_STATE_FINISHED,
+        State::Cancelled => NERTCA_STATE_CANCELLED,
+        State::Failed => NERTCA_STATE_FAILED,
+    }
+}
 
 /// A struct that begins with its size and for which every bit pattern is valid.
 ///

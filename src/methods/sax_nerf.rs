@@ -5,6 +5,7 @@ pub mod buffers;
 pub mod data;
 pub mod drawing;
 pub mod field;
+mod interface;
 pub mod lineformer;
 pub mod products;
 #[cfg(feature = "diagnostics")]
@@ -27,13 +28,11 @@ use crate::scan::dataset::Dataset;
 use crate::tensors::File;
 use data::SaxData;
 use field::{SaxField, SaxShape, SaxState};
+use interface::KEY;
 use stages::SaxKernels;
 use std::any::Any;
 use std::sync::Arc;
 use trainer::SaxTrainer;
-
-/// Key of the settings, and of the field in headers of checkpoints.
-const KEY: &str = "sax";
 
 /// The method, for the registry.
 pub struct SaxNerf;

@@ -5,6 +5,7 @@ use crate::files;
 use crate::run::history::Validated;
 use crate::score::eval::Evaluation;
 use crate::study::plan::{Run, RunFingerprint, Study};
+use crate::study::scores::Score;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -217,5 +218,25 @@ impl Outcome {
         let wanted = study.fingerprint(run)?;
         let found = Outcome::read(&run_directory(directory, run))?;
         Ok(found.filter(|outcome| outcome.fingerprint.asks_the_same(&wanted)))
+    }
+
+    /// Value of a score, if the run has it.
+    pub fn score(&self, score: Score) -> Option<f64> {
+        let scores = self.scores.as_ref()?;
+        match score {
+            Score::Dice => scores.dice,
+            Score::DiceTotal => scores.dice_total,
+            Score::DicePaper => scores.dice_paper,
+            Score::DiceAuthors => scores.dice_authors,
+            Score::DiceBest => scores.dice_best,
+            Score::DiceOtsu => scores.dice_otsu,
+            Score::Psnr => scores.psnr,
+            Score::Ssim => scores.ssim,
+            Score::ChamferMm => scores.chamfer_mm,
+            Score::Hausdorff95Mm => scores.hausdorff95_mm,
+            Score::ClDice => scores.cl_dice,
+            Score::Minutes => Some(self.seconds.training / 60.0),
+            Score::Fps => scores.fps,
+        }
     }
 }

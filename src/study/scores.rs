@@ -1,6 +1,5 @@
-//! Scores of a run that tables can show.
+//! Names of the scores that tables can show, and their presentation.
 
-use crate::study::outcome::Outcome;
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
 
@@ -107,25 +106,5 @@ impl Score {
     /// Formats a value as tables show it.
     pub fn text(self, value: f64) -> String {
         format!("{value:.*}", self.digits())
-    }
-
-    /// Value of the score in an outcome, if it has one.
-    pub fn of(self, outcome: &Outcome) -> Option<f64> {
-        let scores = outcome.scores.as_ref()?;
-        match self {
-            Score::Dice => scores.dice,
-            Score::DiceTotal => scores.dice_total,
-            Score::DicePaper => scores.dice_paper,
-            Score::DiceAuthors => scores.dice_authors,
-            Score::DiceBest => scores.dice_best,
-            Score::DiceOtsu => scores.dice_otsu,
-            Score::Psnr => scores.psnr,
-            Score::Ssim => scores.ssim,
-            Score::ChamferMm => scores.chamfer_mm,
-            Score::Hausdorff95Mm => scores.hausdorff95_mm,
-            Score::ClDice => scores.cl_dice,
-            Score::Minutes => Some(outcome.seconds.training / 60.0),
-            Score::Fps => scores.fps,
-        }
     }
 }

@@ -101,7 +101,7 @@ struct Results {
 
 impl Results {
     fn state(&self, score: Score) -> State {
-        let values: Vec<f64> = self.outcomes.iter().filter_map(|outcome| score.of(outcome)).collect();
+        let values: Vec<f64> = self.outcomes.iter().filter_map(|outcome| outcome.score(score)).collect();
         if let Some((mean, deviation)) = spread(&values) {
             return State::Scored { mean, deviation, runs: values.len(), of: self.of };
         }

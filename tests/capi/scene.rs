@@ -2,6 +2,7 @@
 #![allow(dead_code, missing_docs, clippy::unwrap_used, clippy::expect_used, reason = "each test file uses its part")]
 #![allow(clippy::missing_safety_doc, clippy::undocumented_unsafe_blocks, reason = "tests of C functions")]
 
+use nertca_vk::capi::boundary::nertca_last_error;
 use nertca_vk::capi::context::*;
 use nertca_vk::capi::output::*;
 use nertca_vk::capi::reconstruction::*;

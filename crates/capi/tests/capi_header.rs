@@ -33,8 +33,19 @@ fn expect_file(path: &str, wanted: &str) {
 fn the_header_is_generated() {
     let config = cbindgen::Config::from_file(root().join("cbindgen.toml")).unwrap();
     let mut header = Vec::new();
-    let sources =
-        ["status", "types", "log", "context", "reconstruction", "calibration", "training", "output", "tree", "truth"];
+    let sources = [
+        "boundary",
+        "status",
+        "types",
+        "log",
+        "context",
+        "reconstruction",
+        "calibration",
+        "training",
+        "output",
+        "tree",
+        "truth",
+    ];
     let builder = sources.iter().fold(cbindgen::Builder::new().with_config(config), |builder, name| {
         builder.with_src(root().join(format!("src/capi/{name}.rs")))
     });

@@ -1,17 +1,9 @@
 //! SAX-NeRF's field as plain data: a hash grid and a Lineformer for each phase, or one of each for all phases.
 
-use super::KEY;
-use super::drawing::SaxDrawing;
-use super::tensors;
 use crate::config::sections::Sax;
 use crate::error::{Error, Result};
-use crate::fitting::field::{Field, FieldDrawing};
-use crate::fitting::fit::FitState;
-use crate::gpu::device::Gpu;
 use crate::kernels::constants::LINEFORMER_INPUT;
 use crate::kernels::layout::SaxLevel;
-use crate::tensors::FileTensor;
-use std::any::Any;
 
 /// Width of the Lineformer's layers.
 pub const WIDTH: usize = 32;
@@ -172,53 +164,6 @@ impl SaxField {
 pub struct SaxState {
     /// `[set]`: first and second moment of Adam of each number.
     pub moments: Vec<Vec<[f32; 2]>>,
-}
-
-impl Field for SaxField {
-    fn key(&self) -> &'static str {
-        KEY
-    }
-
-    fn header(&self) -> Result<String> {
-        serde_json::to_string(&tensors::header(self)).map_err(|e| Error::Internal(e.to_string()))
-    }
-
-    fn describe(&self) -> serde_json::Value {
-        serde_json::json!({
-            "fields": self.n_sets,
-            "parameters": self.n_sets * self.shape.n_meant(),
-            "grid": self.shape.n_grid(),
-            "lineformer": self.shape.n_meant() - self.shape.n_grid(),
-            "samples": self.samples,
-        })
-    }
-
-    fn fact(&self) -> (String, String) {
-        ("SAX-NeRF".into(), format!("{} fields of {} parameters each", self.n_sets, self.shape.n_meant()))
-    }
-
-    fn drawing(&self, gpu: &Gpu) -> Result<Box<dyn FieldDrawing>> {
-        Ok(Box::new(SaxDrawing::new(gpu, self)?))
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
-    }
-}
-
-impl FitState for SaxState {
-    fn tensors(&self, field: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
-        match field.and_then(|field| field.as_any().downcast_ref::<SaxField>()) {
-            Some(field) => Ok(tensors::tensors(field, self)),
-            None => {
-                Err(Error::Internal("a training state of SAX-NeRF was combined with a field of another method".into()))
-            }
-        }
-    }
-
-    fn as_any(&self) -> &dyn Any {
-        self
-    }
 }
 
 /// Settings that make the steps of a fit smaller.

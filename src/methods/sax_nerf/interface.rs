@@ -1,0 +1,61 @@
+//! SAX-NeRF's field and the state of its fit behind the interfaces that all methods share.
+
+use crate::error::{Error, Result};
+use crate::fitting::field::{Field, FieldDrawing};
+use crate::fitting::fit::FitState;
+use crate::gpu::device::Gpu;
+use crate::methods::sax_nerf::drawing::SaxDrawing;
+use crate::methods::sax_nerf::field::{SaxField, SaxState};
+use crate::methods::sax_nerf::tensors;
+use crate::tensors::FileTensor;
+use std::any::Any;
+
+/// Key of the settings, and of the field in headers of checkpoints.
+pub(super) const KEY: &str = "sax";
+
+impl Field for SaxField {
+    fn key(&self) -> &'static str {
+        KEY
+    }
+
+    fn header(&self) -> Result<String> {
+        serde_json::to_string(&tensors::header(self)).map_err(|e| Error::Internal(e.to_string()))
+    }
+
+    fn describe(&self) -> serde_json::Value {
+        serde_json::json!({
+            "fields": self.n_sets,
+            "parameters": self.n_sets * self.shape.n_meant(),
+            "grid": self.shape.n_grid(),
+            "lineformer": self.shape.n_meant() - self.shape.n_grid(),
+            "samples": self.samples,
+        })
+    }
+
+    fn fact(&self) -> (String, String) {
+        ("SAX-NeRF".into(), format!("{} fields of {} parameters each", self.n_sets, self.shape.n_meant()))
+    }
+
+    fn drawing(&self, gpu: &Gpu) -> Result<Box<dyn FieldDrawing>> {
+        Ok(Box::new(SaxDrawing::new(gpu, self)?))
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+}
+
+impl FitState for SaxState {
+    fn tensors(&self, field: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
+        match field.and_then(|field| field.as_any().downcast_ref::<SaxField>()) {
+            Some(field) => Ok(tensors::tensors(field, self)),
+            None => {
+                Err(Error::Internal("a training state of SAX-NeRF was combined with a field of another method".into()))
+            }
+        }
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+}
