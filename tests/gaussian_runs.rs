@@ -96,7 +96,7 @@ fn gaussians_are_measured_as_they_run() {
     let bench = [&["bench", data(), "--kernels", "--preset", "fast"], &TIMES[..], SHORT].concat();
     let said = ok(&[&bench[..], &["--json", file.to_str().unwrap()]].concat());
     for part in [
-        "Gaussians, form tree",
+        "Gaussians, form deformable",
         "static field after them",
         "pairs of a Gaussian and a pixel",
         "of the f32 peak",

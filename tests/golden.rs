@@ -14,7 +14,7 @@ use golden_file::Golden;
 use nertca_vk::config::Preset;
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::field::Precision;
-use nertca_vk::reference::{march, step};
+use nertca_vk::reference::{losses, march, step};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;
 
