@@ -140,7 +140,7 @@
 /**
  * Version of this header, second number (minor).
  */
-#define NERTCA_VERSION_MINOR 2
+#define NERTCA_VERSION_MINOR 3
 
 /**
  * Version of this header, third number (patch).

@@ -11,7 +11,10 @@ mod presets;
 pub mod sections;
 
 use crate::error::{Error, Result};
-pub use forms::{DynamicForm, OcclusionRegion};
+pub use forms::{
+    CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
+    StaticForm,
+};
 use method::MethodKind;
 use sections::{
     Adam, Calibrate, Deformable, DynamicField, Gaussians, Hull, Loss, March, Networks, Occupancy, R2, Sax, StaticField,
@@ -43,110 +46,6 @@ pub enum Preset {
     XGaussian,
     /// SAX-NeRF, a static baseline of the paper: a hash grid and a Lineformer, fitted to each phase separately.
     SaxNerf,
-}
-
-/// Representation of the static field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum StaticForm {
-    /// Planes and lines.
-    #[default]
-    Tensor,
-    /// A network like that of the dynamic field, but without latents; the attenuations of both are added at the same samples.
-    Network,
-    /// No static field: the model consists of the dynamic field alone.
-    None,
-}
-
-/// Course of a learning rate from its start value to its end value.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Decay {
-    /// A straight line that ends with the run.
-    Linear,
-    /// A constant factor per iteration, chosen so that the rate reaches its end value with the end of the run.
-    Exponential,
-}
-
-/// Representation of the dynamic field.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum GaussianForm {
-    /// The network, without Gaussians.
-    None,
-    /// A separate set of Gaussians per phase; the sets share nothing.
-    Phase,
-    /// One set of Gaussians that moves over the beat.
-    #[serde(alias = "tree")]
-    Deformable,
-    /// `Deformable` where the data allow it, otherwise `Phase`.
-    Auto,
-    /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all phases, without a static field.
-    R2,
-    /// Static sets as X-Gaussian fits them to normalised images, without a static field; nearer Gaussians hide those behind
-    /// them.
-    X,
-}
-
-/// Images of a moving object to which a static method is fitted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum StaticData {
-    /// A set of parameters for each phase, fitted to the images of that phase.
-    PerPhase,
-    /// One set of parameters, fitted to all images and rendered at every phase.
-    Pooled,
-}
-
-/// Initial positions of the Gaussians in a fit of R2-Gaussian.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum R2Start {
-    /// Voxels of a filtered back-projection.
-    Fdk,
-    /// Random positions in the volume.
-    Random,
-}
-
-/// Line integral of one Gaussian at a pixel, for R2-Gaussian.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum R2Integral {
-    /// The line integral of the Gaussian under a projection linearised around its centre, as published.
-    #[default]
-    Affine,
-    /// The line integral along the pixel's own ray.
-    Exact,
-}
-
-/// Corrections of the views' stated geometry.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
-#[serde(rename_all = "kebab-case")]
-#[strum(serialize_all = "kebab-case")]
-pub enum CalibrateMode {
-    /// The mode that best predicts phases left out of the calibration: none, static, or breathing.
-    Auto,
-    /// No correction.
-    Off,
-    /// Angles and position of each view, where this improves the agreement.
-    Static,
-    /// Angles and position of each view and a displacement of the heart in each frame, where this improves the agreement.
-    Breathing,
-}
-
-/// Data that the dynamic field is fitted to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum DynamicTarget {
-    /// The shared residual of both fields (paper).
-    Absolute,
-    /// The line integral minus that of the pixel's static background; everything that does not move cancels.
-    Temporal,
 }
 
 /// All settings of a run.
@@ -277,9 +176,16 @@ impl Config {
         Ok(config)
     }
 
-    /// Returns the method that the configuration chooses.
+    /// Returns the method that the forms of the fields choose.
     pub fn method(&self) -> MethodKind {
-        MethodKind::of(self)
+        match self.gaussians.form {
+            GaussianForm::R2 => MethodKind::R2Gaussian,
+            GaussianForm::X => MethodKind::XGaussian,
+            _ if self.dynamic.form == DynamicForm::Lineformer => MethodKind::SaxNerf,
+            GaussianForm::None if self.static_field.form == StaticForm::Network => MethodKind::TwoNetworks,
+            GaussianForm::None => MethodKind::Fields,
+            GaussianForm::Auto | GaussianForm::Phase | GaussianForm::Deformable => MethodKind::Gaussians,
+        }
     }
 
     /// Tells whether the dynamic field supports a displacement of the heart in each frame; methods fitted to whole images do

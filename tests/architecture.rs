@@ -2,7 +2,7 @@
 //! files outside its own room, and doc comments are sentences.
 #![allow(missing_docs, clippy::unwrap_used)]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 fn root() -> &'static Path {
@@ -82,6 +82,80 @@ fn rooms_use_only_rooms_above_them() {
     // A new arrow is seen.
     let planted = [("src/scan/dataset.rs".to_owned(), "use crate::render::renderer::Renderer;\n".to_owned())];
     assert_eq!(arrows_up(&planted, &rooms).len(), 1);
+}
+
+/// Paths that a `use` names, without the keyword: `a::{b, c::d}` names `a::b` and `a::c::d`.
+fn expanded(tree: &str) -> Vec<String> {
+    let Some(open) = tree.find('{') else { return vec![tree.split(" as ").next().unwrap().to_owned()] };
+    let (head, body) = (&tree[..open], &tree[open + 1..tree.rfind('}').unwrap()]);
+    let (mut depth, mut parts) = (0, vec![String::new()]);
+    for c in body.chars() {
+        match c {
+            ',' if depth == 0 => parts.push(String::new()),
+            _ => {
+                depth += i32::from(c == '{') - i32::from(c == '}');
+                parts.last_mut().unwrap().push(c);
+            }
+        }
+    }
+    let parts = parts.iter().map(|part| part.trim()).filter(|part| !part.is_empty());
+    parts.flat_map(|part| expanded(&format!("{head}{part}"))).collect()
+}
+
+/// Modules that each module of `src` uses by a path from the root of the crate.
+fn uses(sources: &[(String, String)]) -> BTreeMap<String, BTreeSet<String>> {
+    let name = |path: &str| path.trim_start_matches("src/").trim_end_matches(".rs").replace('/', "::");
+    let known: BTreeSet<String> = sources.iter().map(|(path, _)| name(path)).collect();
+    let module = |path: &str| {
+        let mut parts: Vec<&str> = path.split("::").collect();
+        while !parts.is_empty() && !known.contains(&parts.join("::")) {
+            parts.pop();
+        }
+        (!parts.is_empty()).then(|| parts.join("::"))
+    };
+    let of_file = |(path, text): &(String, String)| {
+        let text = code(text).collect::<Vec<_>>().join(" ");
+        let paths = text.split("crate::").skip(1).flat_map(|rest| {
+            let end = rest.find(|c: char| !(c.is_alphanumeric() || "_:".contains(c))).unwrap_or(rest.len());
+            let is_list = rest[..end].ends_with("::") && rest[end..].starts_with('{');
+            expanded(if is_list { rest.split(';').next().unwrap() } else { &rest[..end] })
+        });
+        let own = name(path);
+        let used = paths.filter_map(|path| module(&path)).filter(|used| *used != own).collect();
+        (own, used)
+    };
+    sources.iter().map(of_file).collect()
+}
+
+/// Groups of modules that use each other, directly or through others.
+fn circles(uses: &BTreeMap<String, BTreeSet<String>>) -> BTreeSet<BTreeSet<String>> {
+    let reach = |from: &String| {
+        let (mut open, mut seen) = (vec![from], BTreeSet::new());
+        while let Some(at) = open.pop() {
+            open.extend(uses[at].iter().filter(|to| uses.contains_key(*to) && seen.insert((*to).clone())));
+        }
+        seen
+    };
+    let reached: BTreeMap<&String, BTreeSet<String>> = uses.keys().map(|module| (module, reach(module))).collect();
+    let circle = |module: &&String| -> BTreeSet<String> {
+        reached[*module].iter().filter(|other| reached[*other].contains(*module)).cloned().collect()
+    };
+    uses.keys().collect::<Vec<_>>().iter().map(circle).filter(|circle| circle.len() > 1).collect()
+}
+
+#[test]
+fn few_rooms_have_circles_inside() {
+    let sources = files("src");
+    let found: Vec<String> = circles(&uses(&sources))
+        .iter()
+        .map(|circle| circle.first().unwrap().split("::").next().unwrap().to_owned())
+        .collect();
+    assert_eq!(found, ["calibrate", "gpu", "kernels", "network", "scan", "session"]);
+    // A new circle is seen.
+    let planted =
+        [("src/a/b.rs", "use crate::a::{c::D, e};"), ("src/a/c.rs", "use crate::a::b::F;"), ("src/a/e.rs", "")];
+    let planted = planted.map(|(path, text)| (path.to_owned(), text.to_owned()));
+    assert_eq!(circles(&uses(&planted)).len(), 1);
 }
 
 /// Methods with a room of their own, and a word that names each in code.

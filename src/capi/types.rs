@@ -632,7 +632,7 @@ pub const NERTCA_ABI_VERSION: u32 = 0;
 /// Version of this header, first number (major).
 pub const NERTCA_VERSION_MAJOR: u32 = 0;
 /// Version of this header, second number (minor).
-pub const NERTCA_VERSION_MINOR: u32 = 2;
+pub const NERTCA_VERSION_MINOR: u32 = 3;
 /// Version of this header, third number (patch).
 pub const NERTCA_VERSION_PATCH: u32 = 0;
 

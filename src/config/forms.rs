@@ -1,4 +1,4 @@
-//! Choices about the fields: their representation, and the regions in which they are penalised.
+//! Choices of a configuration by name: representations of the fields, data of a fit, regions of losses, corrections.
 
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
@@ -27,4 +27,108 @@ pub enum OcclusionRegion {
     /// Samples whose path length from the first depth, their own included, is less than the stated share of the path length of
     /// the batch's last ray, as NerT-CA's public code has it (`compute_occl_loss`).
     LastRay,
+}
+
+/// Representation of the static field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum StaticForm {
+    /// Planes and lines.
+    #[default]
+    Tensor,
+    /// A network like that of the dynamic field, but without latents; the attenuations of both are added at the same samples.
+    Network,
+    /// No static field: the model consists of the dynamic field alone.
+    None,
+}
+
+/// Course of a learning rate from its start value to its end value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Decay {
+    /// A straight line that ends with the run.
+    Linear,
+    /// A constant factor per iteration, chosen so that the rate reaches its end value with the end of the run.
+    Exponential,
+}
+
+/// Representation of the dynamic field.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum GaussianForm {
+    /// The network, without Gaussians.
+    None,
+    /// A separate set of Gaussians per phase; the sets share nothing.
+    Phase,
+    /// One set of Gaussians that moves over the beat.
+    #[serde(alias = "tree")]
+    Deformable,
+    /// `Deformable` where the data allow it, otherwise `Phase`.
+    Auto,
+    /// Static sets as R2-Gaussian fits them to whole images, one per phase or one for all phases, without a static field.
+    R2,
+    /// Static sets as X-Gaussian fits them to normalised images, without a static field; nearer Gaussians hide those behind
+    /// them.
+    X,
+}
+
+/// Images of a moving object to which a static method is fitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum StaticData {
+    /// A set of parameters for each phase, fitted to the images of that phase.
+    PerPhase,
+    /// One set of parameters, fitted to all images and rendered at every phase.
+    Pooled,
+}
+
+/// Initial positions of the Gaussians in a fit of R2-Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum R2Start {
+    /// Voxels of a filtered back-projection.
+    Fdk,
+    /// Random positions in the volume.
+    Random,
+}
+
+/// Line integral of one Gaussian at a pixel, for R2-Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum R2Integral {
+    /// The line integral of the Gaussian under a projection linearised around its centre, as published.
+    #[default]
+    Affine,
+    /// The line integral along the pixel's own ray.
+    Exact,
+}
+
+/// Corrections of the views' stated geometry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray)]
+#[serde(rename_all = "kebab-case")]
+#[strum(serialize_all = "kebab-case")]
+pub enum CalibrateMode {
+    /// The mode that best predicts phases left out of the calibration: none, static, or breathing.
+    Auto,
+    /// No correction.
+    Off,
+    /// Angles and position of each view, where this improves the agreement.
+    Static,
+    /// Angles and position of each view and a displacement of the heart in each frame, where this improves the agreement.
+    Breathing,
+}
+
+/// Data that the dynamic field is fitted to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum DynamicTarget {
+    /// The shared residual of both fields (paper).
+    Absolute,
+    /// The line integral minus that of the pixel's static background; everything that does not move cancels.
+    Temporal,
 }

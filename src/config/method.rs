@@ -1,7 +1,5 @@
 //! Methods of reconstruction, as a configuration chooses them.
 
-use crate::config::{Config, DynamicForm, GaussianForm, StaticForm};
-
 /// A method of reconstruction. Each has settings of its own beside those that all methods share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MethodKind {
@@ -20,18 +18,6 @@ pub enum MethodKind {
 }
 
 impl MethodKind {
-    /// Returns the method that a configuration chooses by the forms of its fields.
-    pub fn of(config: &Config) -> MethodKind {
-        match config.gaussians.form {
-            GaussianForm::R2 => MethodKind::R2Gaussian,
-            GaussianForm::X => MethodKind::XGaussian,
-            _ if config.dynamic.form == DynamicForm::Lineformer => MethodKind::SaxNerf,
-            GaussianForm::None if config.static_field.form == StaticForm::Network => MethodKind::TwoNetworks,
-            GaussianForm::None => MethodKind::Fields,
-            GaussianForm::Auto | GaussianForm::Phase | GaussianForm::Deformable => MethodKind::Gaussians,
-        }
-    }
-
     /// Returns the name of the method, for messages.
     pub fn name(self) -> &'static str {
         match self {

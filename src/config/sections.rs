@@ -1,6 +1,6 @@
 //! The sections of a configuration: each hyper-parameter with its meaning and accepted range.
 
-use crate::config::{
+use crate::config::forms::{
     CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
     StaticForm,
 };
