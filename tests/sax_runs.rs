@@ -54,7 +54,7 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
     ok(&["export", &whole, "--component", "dynamic", "--spacing", "3", "-o", &path("vessels.nrrd")]);
     let bench = [&["bench", &data, "--kernels", "--iterations", "2", "--repeats", "2"], &settings[..]].concat();
     let said = ok(&bench);
-    assert!(said.contains("sax_times_back") && said.contains("sax_encode") && !said.contains("march_fwd"), "{said}");
+    assert!(said.contains("sax_linear_back") && said.contains("sax_encode") && !said.contains("march_fwd"), "{said}");
     let kernels: Value = serde_json::from_str(&ok(&["kernels", "--preset", "sax-nerf", "--json"])).unwrap();
     let listed: Vec<&str> =
         kernels["kernels"].as_array().unwrap().iter().map(|k| k["kernel"].as_str().unwrap()).collect();

@@ -25,7 +25,7 @@ pub struct BlobKernels {
     /// Line integrals and maxima.
     pub rays_maxima: Stage<push::GaussianRays>,
     /// Maxima where many Gaussians overlap.
-    pub crowd: Stage<push::GaussianCrowd>,
+    pub crowd: Stage<push::GaussianMaxima>,
     /// Attenuation at the cells of rows.
     pub points: Stage<push::GaussianPoints>,
 }
@@ -191,7 +191,7 @@ impl Blobs {
         dispatch_finding(recording, stage, groups(), &bound, find, push)?;
         if is_crowd {
             let GaussianRays { n_rays, image_width, first_blob, n_blobs } = push;
-            let push = push::GaussianCrowd { n_rays, image_width, first_blob, n_blobs };
+            let push = push::GaussianMaxima { n_rays, image_width, first_blob, n_blobs };
             dispatch_finding(recording, &self.kernels.crowd, groups(), &bound, find, push)?;
         }
         Ok(())

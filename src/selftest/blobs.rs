@@ -22,7 +22,7 @@ use crate::train::trainer::Trainer;
 use glam::DVec3;
 
 const RAYS: &[&str] = &[push::GaussianRays::SHADER];
-const CROWD: &[&str] = &[push::GaussianCrowd::SHADER];
+const CROWD: &[&str] = &[push::GaussianMaxima::SHADER];
 const POINTS: &[&str] = &[push::GaussianPoints::SHADER];
 const PICTURES: &[&str] = &["pictures at display rates"];
 

@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
 use crate::kernels::constants as at;
-use crate::kernels::push::{self, PushConstants, SaxTimes, SaxTimesBack};
+use crate::kernels::push::{self, PushConstants, SaxLinear, SaxLinearBack};
 use crate::kernels::stages::{Build, Stage, vec4_variant};
 use crate::kernels::tuning::Tuning;
 use crate::methods::sax_nerf::field::{SaxShape, WIDTH};
@@ -65,7 +65,7 @@ pub fn chunks(n_rays: u32, row: u32) -> Vec<Chunk> {
 
 /// Pipelines of the forward pass.
 pub struct LineformerKernels {
-    times: Stage<push::SaxTimes>,
+    linear: Stage<push::SaxLinear>,
     norm: Stage<push::SaxNorm>,
     attend: Stage<push::SaxAttend>,
     density: Stage<push::SaxDensity>,
@@ -73,11 +73,11 @@ pub struct LineformerKernels {
 
 /// Pipelines of the backward pass.
 pub struct LineformerBackKernels {
-    times: Stage<push::SaxTimesBack>,
+    linear: Stage<push::SaxLinearBack>,
     norm: Stage<push::SaxNormBack>,
     attend: Stage<push::SaxAttendBack>,
     density: Stage<push::SaxDensityBack>,
-    products: Stage<push::SaxProducts>,
+    gradient: Stage<push::SaxLinearGradient>,
 }
 
 /// Returns the build options for a device: of stages on samples, and of stages on parameters.
@@ -95,7 +95,7 @@ impl LineformerKernels {
     pub fn new(gpu: &Gpu) -> Result<LineformerKernels> {
         let (samples, _) = builds(gpu);
         Ok(LineformerKernels {
-            times: samples.stage(gpu)?,
+            linear: samples.stage(gpu)?,
             norm: samples.stage(gpu)?,
             attend: samples.stage(gpu)?,
             density: samples.stage(gpu)?,
@@ -111,11 +111,11 @@ impl LineformerBackKernels {
     pub fn new(gpu: &Gpu) -> Result<LineformerBackKernels> {
         let (samples, numbers) = builds(gpu);
         Ok(LineformerBackKernels {
-            times: samples.stage(gpu)?,
+            linear: samples.stage(gpu)?,
             norm: samples.stage(gpu)?,
             attend: samples.stage(gpu)?,
             density: samples.stage(gpu)?,
-            products: numbers.stage(gpu)?,
+            gradient: numbers.stage(gpu)?,
         })
     }
 }
@@ -167,8 +167,8 @@ impl Lineformer {
     }
 
     /// Returns a product of vectors, without features, bias or activation.
-    fn times(&self, to: u32, from: u32, columns: u32, weights: u32) -> SaxTimes {
-        SaxTimes {
+    fn linear(&self, to: u32, from: u32, columns: u32, weights: u32) -> SaxLinear {
+        SaxLinear {
             n_samples: self.chunk.n,
             capacity: self.capacity,
             features4: 0,
@@ -186,9 +186,15 @@ impl Lineformer {
         }
     }
 
-    fn run_times(&self, run: &mut impl Recorder, stage: &Stage<SaxTimes>, vectors: u32, push: SaxTimes) -> Result<()> {
+    fn run_linear(
+        &self,
+        run: &mut impl Recorder,
+        stage: &Stage<SaxLinear>,
+        vectors: u32,
+        push: SaxLinear,
+    ) -> Result<()> {
         let samples = stage.local_size() * run.lane_samples();
-        let rows = vectors * WIDTH as u32 / at::sax_times::OUTPUTS;
+        let rows = vectors * WIDTH as u32 / at::sax_linear::OUTPUTS;
         run.run(stage, Groups::Direct([self.chunk.n.div_ceil(samples), rows, 1]), push)
     }
 
@@ -202,30 +208,30 @@ impl Lineformer {
     /// Errors of [`Recorder::run`].
     pub fn layers(&self, run: &mut impl Recorder, kernels: &LineformerKernels) -> Result<()> {
         let (n_samples, capacity) = (self.chunk.n, self.capacity);
-        let (times, norm) = (&kernels.times, &kernels.norm);
+        let (linear, norm) = (&kernels.linear, &kernels.norm);
         let [input, joint] = self.outer();
         let features4 = self.features4();
-        let with = |bias: u32, push: SaxTimes| SaxTimes { bias, has_bias: 1, ..push };
-        let push = with(at::LINEFORMER_INPUT_BIAS, self.times(at::SAX_X1, at::SAX_NONE, 0, input.first));
-        self.run_times(run, times, 1, SaxTimes { features4, activation: at::SAX_LEAKY, ..push })?;
+        let with = |bias: u32, push: SaxLinear| SaxLinear { bias, has_bias: 1, ..push };
+        let push = with(at::LINEFORMER_INPUT_BIAS, self.linear(at::SAX_X1, at::SAX_NONE, 0, input.first));
+        self.run_linear(run, linear, 1, SaxLinear { features4, activation: at::SAX_LEAKY, ..push })?;
         let (from, to, scales) = (at::SAX_X1, at::SAX_NORMAL1, at::LINEFORMER_NORM1);
         self.each(run, norm, push::SaxNorm { n_samples, capacity, from, to, scales })?;
-        self.run_times(run, times, 3, self.times(at::SAX_QUERY, at::SAX_NORMAL1, WIDTH4, at::LINEFORMER_QUERY))?;
+        self.run_linear(run, linear, 3, self.linear(at::SAX_QUERY, at::SAX_NORMAL1, WIDTH4, at::LINEFORMER_QUERY))?;
         let push = push::SaxAttend { n_samples, capacity, first: self.chunk.along, row: self.row };
         self.each(run, &kernels.attend, push)?;
-        let push = with(at::LINEFORMER_OUT + SQUARE, self.times(at::SAX_X2, at::SAX_SEEN, WIDTH4, at::LINEFORMER_OUT));
-        self.run_times(run, times, 1, SaxTimes { added: at::SAX_X1, ..push })?;
+        let push = with(at::LINEFORMER_OUT + SQUARE, self.linear(at::SAX_X2, at::SAX_SEEN, WIDTH4, at::LINEFORMER_OUT));
+        self.run_linear(run, linear, 1, SaxLinear { added: at::SAX_X1, ..push })?;
         let (from, to, scales) = (at::SAX_X2, at::SAX_NORMAL2, at::LINEFORMER_NORM2);
         self.each(run, norm, push::SaxNorm { n_samples, capacity, from, to, scales })?;
-        let gelu = |activated: u32, push: SaxTimes| SaxTimes { activation: at::SAX_GELU, activated, ..push };
-        let push = self.times(at::SAX_BEFORE_FIRST, at::SAX_NORMAL2, WIDTH4, at::LINEFORMER_EXPAND);
-        self.run_times(run, times, WIDE, gelu(at::SAX_FIRST, push))?;
-        let push = self.times(at::SAX_BEFORE_SECOND, at::SAX_FIRST, WIDE * WIDTH4, at::LINEFORMER_MIX);
-        self.run_times(run, times, WIDE, gelu(at::SAX_SECOND, push))?;
-        let push = self.times(at::SAX_BLOCK, at::SAX_SECOND, WIDE * WIDTH4, at::LINEFORMER_CONTRACT);
-        self.run_times(run, times, 1, SaxTimes { added: at::SAX_X2, activation: at::SAX_LEAKY, ..push })?;
-        let push = with(at::LINEFORMER_JOINT_BIAS, self.times(at::SAX_X3, at::SAX_BLOCK, WIDTH4, joint.first));
-        self.run_times(run, times, 1, SaxTimes { features4, activation: at::SAX_LEAKY, ..push })
+        let gelu = |activated: u32, push: SaxLinear| SaxLinear { activation: at::SAX_GELU, activated, ..push };
+        let push = self.linear(at::SAX_BEFORE_FIRST, at::SAX_NORMAL2, WIDTH4, at::LINEFORMER_EXPAND);
+        self.run_linear(run, linear, WIDE, gelu(at::SAX_FIRST, push))?;
+        let push = self.linear(at::SAX_BEFORE_SECOND, at::SAX_FIRST, WIDE * WIDTH4, at::LINEFORMER_MIX);
+        self.run_linear(run, linear, WIDE, gelu(at::SAX_SECOND, push))?;
+        let push = self.linear(at::SAX_BLOCK, at::SAX_SECOND, WIDE * WIDTH4, at::LINEFORMER_CONTRACT);
+        self.run_linear(run, linear, 1, SaxLinear { added: at::SAX_X2, activation: at::SAX_LEAKY, ..push })?;
+        let push = with(at::LINEFORMER_JOINT_BIAS, self.linear(at::SAX_X3, at::SAX_BLOCK, WIDTH4, joint.first));
+        self.run_linear(run, linear, 1, SaxLinear { features4, activation: at::SAX_LEAKY, ..push })
     }
 
     /// Records attenuation, times `scale`, from these layers' results.
@@ -244,8 +250,8 @@ impl Lineformer {
     }
 
     /// Returns a product with a transposed matrix, without an activation.
-    fn back(&self, to: u32, columns: u32, (from, rows4): (u32, u32), matrix: Matrix) -> SaxTimesBack {
-        SaxTimesBack {
+    fn back(&self, to: u32, columns: u32, (from, rows4): (u32, u32), matrix: Matrix) -> SaxLinearBack {
+        SaxLinearBack {
             n_samples: self.chunk.n,
             capacity: self.capacity,
             first_feature: self.chunk.first,
@@ -265,9 +271,9 @@ impl Lineformer {
         }
     }
 
-    fn run_back(&self, run: &mut impl Recorder, stage: &Stage<SaxTimesBack>, push: SaxTimesBack) -> Result<()> {
+    fn run_back(&self, run: &mut impl Recorder, stage: &Stage<SaxLinearBack>, push: SaxLinearBack) -> Result<()> {
         let samples = stage.local_size() * run.lane_samples();
-        let tiles = push.columns.div_ceil(at::sax_times_back::GROUPS);
+        let tiles = push.columns.div_ceil(at::sax_linear_back::GROUPS);
         run.run(stage, Groups::Direct([self.chunk.n.div_ceil(samples), tiles, 1]), push)
     }
 
@@ -277,23 +283,23 @@ impl Lineformer {
     /// Errors of [`Recorder::run`].
     pub fn backward(&self, run: &mut impl Recorder, kernels: &LineformerBackKernels) -> Result<()> {
         let (n_samples, capacity) = (self.chunk.n, self.capacity);
-        let (times, wide) = (&kernels.times, WIDE * WIDTH4);
+        let (linear, wide) = (&kernels.linear, WIDE * WIDTH4);
         let [input, joint] = self.outer();
         let matrix = |first: u32, stride: u32| Matrix { first, stride };
         let through =
-            |activation: u32, slope_of: u32, push: SaxTimesBack| SaxTimesBack { activation, slope_of, ..push };
+            |activation: u32, slope_of: u32, push: SaxLinearBack| SaxLinearBack { activation, slope_of, ..push };
         let push = push::SaxDensityBack { n_samples, capacity, first: self.chunk.first };
         self.each(run, &kernels.density, push)?;
         let of_block = matrix(joint.first + self.features4(), joint.stride);
         let push = self.back(at::SAX_BY_BLOCK, WIDTH4, (at::SAX_BY_JOINT, WIDTH4), of_block);
-        self.run_back(run, times, through(at::SAX_LEAKY, at::SAX_BLOCK, push))?;
+        self.run_back(run, linear, through(at::SAX_LEAKY, at::SAX_BLOCK, push))?;
         let contract = matrix(at::LINEFORMER_CONTRACT, wide);
         let push = self.back(at::SAX_BY_SECOND, wide, (at::SAX_BY_BLOCK, WIDTH4), contract);
-        self.run_back(run, times, through(at::SAX_GELU, at::SAX_BEFORE_SECOND, push))?;
+        self.run_back(run, linear, through(at::SAX_GELU, at::SAX_BEFORE_SECOND, push))?;
         let push = self.back(at::SAX_BY_FIRST, wide, (at::SAX_BY_SECOND, wide), matrix(at::LINEFORMER_MIX, wide));
-        self.run_back(run, times, through(at::SAX_GELU, at::SAX_BEFORE_FIRST, push))?;
+        self.run_back(run, linear, through(at::SAX_GELU, at::SAX_BEFORE_FIRST, push))?;
         let expand = matrix(at::LINEFORMER_EXPAND, WIDTH4);
-        self.run_back(run, times, self.back(at::SAX_BY_NORMAL, WIDTH4, (at::SAX_BY_FIRST, wide), expand))?;
+        self.run_back(run, linear, self.back(at::SAX_BY_NORMAL, WIDTH4, (at::SAX_BY_FIRST, wide), expand))?;
         let push = push::SaxNormBack {
             n_samples,
             capacity,
@@ -306,12 +312,12 @@ impl Lineformer {
         };
         self.each(run, &kernels.norm, push)?;
         let out = matrix(at::LINEFORMER_OUT, WIDTH4);
-        self.run_back(run, times, self.back(at::SAX_BY_SEEN, WIDTH4, (at::SAX_BY_OUT, WIDTH4), out))?;
+        self.run_back(run, linear, self.back(at::SAX_BY_SEEN, WIDTH4, (at::SAX_BY_OUT, WIDTH4), out))?;
         let push = push::SaxAttendBack { n_samples, capacity, first: self.chunk.along, row: self.row };
         self.each(run, &kernels.attend, push)?;
         let query_key_value = (at::SAX_BY_QUERY, 3 * WIDTH4);
         let push = self.back(at::SAX_BY_NORMAL, WIDTH4, query_key_value, matrix(at::LINEFORMER_QUERY, WIDTH4));
-        self.run_back(run, times, push)?;
+        self.run_back(run, linear, push)?;
         let push = push::SaxNormBack {
             n_samples,
             capacity,
@@ -324,14 +330,14 @@ impl Lineformer {
         };
         self.each(run, &kernels.norm, push)?;
         let push = self.back(at::SAX_FEATURES, self.features4(), (at::SAX_BY_JOINT, WIDTH4), joint);
-        let push = SaxTimesBack {
+        let push = SaxLinearBack {
             other: at::SAX_BY_INPUT,
             other_rows4: WIDTH4,
             other_weights: input.first,
             other_stride: input.stride,
             ..push
         };
-        self.run_back(run, times, push)
+        self.run_back(run, linear, push)
     }
 
     /// Records the chunk's gradients of the Lineformer's parameters, in `n_parts` parts: added to those of earlier chunks if
@@ -339,14 +345,14 @@ impl Lineformer {
     ///
     /// # Errors
     /// Errors of [`Recorder::run`].
-    pub fn products(
+    pub fn gradient(
         &self,
         run: &mut impl Recorder,
         kernels: &LineformerBackKernels,
         n_parts: u32,
         adds: bool,
     ) -> Result<()> {
-        let push = push::SaxProducts {
+        let push = push::SaxLinearGradient {
             n_samples: self.chunk.n,
             capacity: self.capacity,
             first_feature: self.chunk.first,
@@ -354,7 +360,7 @@ impl Lineformer {
             part_samples: PART_SAMPLES,
             adds: u32::from(adds),
         };
-        run.run(&kernels.products, Groups::Direct([n_parts, at::SAX_PRODUCTS, 1]), push)
+        run.run(&kernels.gradient, Groups::Direct([n_parts, at::SAX_PRODUCTS, 1]), push)
     }
 }
 

@@ -26,11 +26,15 @@ const BATCH: &[&str] = &[push::SaxBatch::SHADER];
 const POINTS: &[&str] = &[push::SaxPoints::SHADER];
 const ENCODE: &[&str] = &[push::SaxEncode::SHADER];
 const LINEFORMER: &[&str] =
-    &[push::SaxTimes::SHADER, push::SaxNorm::SHADER, push::SaxAttend::SHADER, push::SaxDensity::SHADER];
+    &[push::SaxLinear::SHADER, push::SaxNorm::SHADER, push::SaxAttend::SHADER, push::SaxDensity::SHADER];
 const LOSS: &[&str] = &[push::SaxLoss::SHADER];
-const LINEFORMER_BWD: &[&str] =
-    &[push::SaxTimesBack::SHADER, push::SaxNormBack::SHADER, push::SaxAttendBack::SHADER, push::SaxDensityBack::SHADER];
-const PRODUCTS: &[&str] = &[push::SaxProducts::SHADER];
+const LINEFORMER_BWD: &[&str] = &[
+    push::SaxLinearBack::SHADER,
+    push::SaxNormBack::SHADER,
+    push::SaxAttendBack::SHADER,
+    push::SaxDensityBack::SHADER,
+];
+const PRODUCTS: &[&str] = &[push::SaxLinearGradient::SHADER];
 const WEIGHT_GRADIENT: &[&str] = &[push::SaxWeightGradient::SHADER];
 const ENCODE_BWD: &[&str] = &[push::SaxEncodeBwd::SHADER];
 const GRID_GRADIENT: &[&str] = &[push::SaxGridGradient::SHADER];

@@ -1,6 +1,6 @@
 //! The stages of SAX-NeRF, their buffers, and one iteration. For each field, the stages run in this order,
 //!
-//! sax_batch -> sax_points -> sax_encode -> the Lineformer's layers -> sax_loss -> back through them -> sax_products ->
+//! sax_batch -> sax_points -> sax_encode -> the Lineformer's layers -> sax_loss -> back through them -> sax_linear_gradient ->
 //! sax_weight_gradient -> sax_encode_bwd -> sax_grid_gradient -> adam
 //!
 //! in buffers that all fields share except for their parameters; sax_report follows.
@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::{Groups, Recording};
-use crate::kernels::constants::{sax_times, sax_times_texel};
+use crate::kernels::constants::{sax_linear, sax_linear_texel};
 use crate::kernels::dispatch::{Binding, BufferSet, buffer_set, dispatch_finding};
 use crate::kernels::layout::SaxSetup;
 use crate::kernels::push::{self, PushConstants};
@@ -54,7 +54,7 @@ impl SaxFieldKernels {
 /// Returns the number of samples per lane of the tiled stages on a device; forward and backward stages have the same.
 fn lane_samples(gpu: &Gpu) -> u32 {
     let is_plain = vec4_variant(&Tuning::for_device(gpu.info())).is_empty();
-    if is_plain { sax_times::SAMPLES } else { sax_times_texel::SAMPLES }
+    if is_plain { sax_linear::SAMPLES } else { sax_linear_texel::SAMPLES }
 }
 
 /// Pipelines of a fit.
@@ -324,7 +324,7 @@ impl SaxPass<'_> {
                 lineformer.layers(&mut run, &kernels.field.lineformer)?;
             }
             lineformer.backward(&mut run, &kernels.lineformer_bwd)?;
-            lineformer.products(&mut run, &kernels.lineformer_bwd, setup.n_groups, index > 0)?;
+            lineformer.gradient(&mut run, &kernels.lineformer_bwd, setup.n_groups, index > 0)?;
         }
         let weights = &kernels.weight_gradient;
         self.run(set, weights, weights.groups_over(setup.n_weights), push::SaxWeightGradient {})

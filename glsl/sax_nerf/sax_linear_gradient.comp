@@ -11,7 +11,7 @@
 #define INPUTS 2u
 #endif
 layout(local_size_x = 16, local_size_x_id = 0) in;
-// `first_feature` and `feature_stride` as of `sax_times`; a part has `part_samples`.
+// `first_feature` and `feature_stride` as of `sax_linear`; a part has `part_samples`.
 layout(push_constant) uniform Push {
     uint n_samples; uint capacity; uint first_feature; uint feature_stride; uint part_samples; uint adds;
 } push;

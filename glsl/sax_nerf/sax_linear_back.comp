@@ -13,7 +13,7 @@
 #endif
 layout(local_size_x = 32, local_size_x_id = 0) in;
 // Vectors; numbers of a matrix from `weights` on, `stride` from row to row, both vec4; `rows4` of its rows in fours. `slope_of`:
-// the activation's result (leaky) or argument (GELU). To SAX_FEATURES: as `sax_times` reads them.
+// the activation's result (leaky) or argument (GELU). To SAX_FEATURES: as `sax_linear` reads them.
 layout(push_constant) uniform Push {
     uint n_samples; uint capacity; uint first_feature; uint feature_stride; uint from; uint rows4; uint weights; uint stride;
     uint other; uint other_rows4; uint other_weights; uint other_stride; uint to; uint columns; uint activation;
