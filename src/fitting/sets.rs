@@ -2,6 +2,7 @@
 
 use crate::config::StaticData;
 use crate::error::{Error, Result};
+use crate::fitting::extent::between_phases;
 use crate::scan::dataset::{Dataset, Frame};
 
 /// Images of each set of a static method, and the phase of each set if it belongs to one.
@@ -34,6 +35,23 @@ pub(crate) fn check_finite(dataset: &Dataset, frame: &Frame) -> Result<()> {
     let (column, row) = (p % dataset.width, p / dataset.width);
     let problem = format!("{}: column {column}, row {row} is not a finite number", frame.name);
     Err(Error::config("dataset", dataset.path.display(), problem))
+}
+
+/// Returns notes for the user about what a static method, by its name, ignores of a dataset.
+pub(crate) fn ignored(dataset: &Dataset, method: &str) -> Vec<String> {
+    let mut notes = Vec::new();
+    if !dataset.hidden.is_empty() {
+        notes.push(format!(
+            "pixels that show nothing of the patient are fitted like all others, because {method} does not support masks"
+        ));
+    }
+    if dataset.heart_shifts() {
+        notes.push(format!(
+            "{method} uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
+        ));
+    }
+    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
+    notes
 }
 
 /// Returns the random seed of a set.

@@ -21,16 +21,15 @@ pub(crate) mod twin_shape;
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};
 use crate::error::Result;
-use crate::fitting::extent::{between_phases, volume_half};
+use crate::fitting::extent::volume_half;
 use crate::fitting::field::Field;
-use crate::fitting::fit::{
-    FieldFeed, FieldVolume, Fit, FitData, FitField, FitState, FitWork, Method, SavedAt, SavedFit,
-};
-use crate::fitting::losses::StepLoss;
-use crate::fitting::shown::ShownGaussians;
+use crate::fitting::fit::{FieldVolume, Fit, FitData, FitField, FitState, Method, SavedAt, SavedFit};
+use crate::fitting::sets::ignored;
+use crate::fitting::shown::{SetsFit, ShownFit};
 use crate::gaussians::blobs::BlobKernels;
-use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::field::Gaussians;
 use crate::gaussians::pictures::into_buffers;
+use crate::gaussians::work::GaussianWork;
 use crate::geometry::MM_PER_UNIT;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
@@ -122,20 +121,7 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
                 .into(),
         );
     }
-    if !dataset.hidden.is_empty() {
-        notes.push(
-            "pixels that show nothing of the patient are fitted like all others, because R2-Gaussian does not support \
-             masks"
-                .into(),
-        );
-    }
-    if dataset.heart_shifts() {
-        notes.push(
-            "R2-Gaussian uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
-                .into(),
-        );
-    }
-    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
+    notes.extend(ignored(dataset, "R2-Gaussian"));
     Ok(data)
 }
 
@@ -159,7 +145,7 @@ impl FitData for R2Data {
                 trainer
             }
         };
-        Ok(Box::new(R2GaussianFit { shown: ShownGaussians::new(trainer.model()?), trainer }))
+        Ok(Box::new(ShownFit::new(trainer)?))
     }
 
     fn as_any(&self) -> &dyn Any {
@@ -167,46 +153,35 @@ impl FitData for R2Data {
     }
 }
 
-/// A fit under way, and the Gaussians that are drawn of it.
-struct R2GaussianFit {
-    trainer: R2Trainer,
-    shown: ShownGaussians,
-}
+impl SetsFit for R2Trainer {
+    type State = R2State;
 
-impl Fit for R2GaussianFit {
     fn step(&self) -> u32 {
-        self.trainer.step()
+        self.step()
     }
 
-    fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
-        let before = self.trainer.step();
-        let losses = self.trainer.advance(until)?;
-        if ShownGaussians::is_due(before, self.trainer.step(), until) {
-            self.shown.show(self.trainer.model()?);
-        }
-        Ok(losses.into_iter().zip(before + 1..).map(|(loss, step)| StepLoss::of_gaussians(step, loss)).collect())
+    fn count(&self) -> u32 {
+        self.count()
     }
 
-    fn outline(&self) -> FitField {
-        FitField::Gaussians(Box::new(self.shown.field()))
+    fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        self.advance(until)
     }
 
-    fn feed(&self) -> FieldFeed {
-        FieldFeed::Gaussians(self.shown.feed())
+    fn state(&self) -> Result<R2State> {
+        self.state()
     }
 
-    fn state(&self) -> Result<SavedFit> {
-        let state = self.trainer.state()?;
-        let field = DynamicGaussians::PerPhase(self.trainer.field_of(&state));
-        Ok(SavedFit { field: FitField::Gaussians(Box::new(field)), state: Arc::new(state) })
+    fn field_of(&self, state: &R2State) -> Gaussians {
+        self.field_of(state)
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        self.trainer.profile_step()
+        self.profile_step()
     }
 
-    fn work(&self) -> Result<Option<FitWork>> {
-        Ok(Some(FitWork { count: self.trainer.count(), work: self.trainer.work()? }))
+    fn work(&self) -> Result<GaussianWork> {
+        self.work()
     }
 }
 

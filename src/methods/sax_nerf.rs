@@ -20,8 +20,9 @@ pub mod twin;
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};
 use crate::error::{Error, Result};
-use crate::fitting::extent::{between_phases, volume_half};
+use crate::fitting::extent::volume_half;
 use crate::fitting::fit::{FieldVolume, Fit, FitData, FitField, Method, SavedAt, SavedFit};
+use crate::fitting::sets::ignored;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::scan::dataset::Dataset;
@@ -105,20 +106,7 @@ fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
                 .into(),
         );
     }
-    if !dataset.hidden.is_empty() {
-        notes.push(
-            "pixels that show nothing of the patient are fitted like all others, because SAX-NeRF does not support \
-             masks"
-                .into(),
-        );
-    }
-    if dataset.heart_shifts() {
-        notes.push(
-            "SAX-NeRF uses one geometry for all frames of a view: the stated displacements of the heart are ignored"
-                .into(),
-        );
-    }
-    notes.extend(between_phases(dataset, "are used as frames of the nearest phase"));
+    notes.extend(ignored(dataset, "SAX-NeRF"));
     notes
 }
 
