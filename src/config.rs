@@ -8,6 +8,7 @@ mod forms;
 mod length;
 pub mod method;
 mod presets;
+pub(crate) mod renamed;
 pub mod sections;
 
 use crate::error::{Error, Result};
@@ -152,6 +153,8 @@ impl Config {
     fn overlaid(&self, overlay: toml::Table, settings: &[String], constants: &[String]) -> Result<Config> {
         let before = toml::Table::try_from(self).map_err(|e| Error::Internal(e.to_string()))?;
         let (mut table, keep) = (before.clone(), before.get("preset").cloned());
+        let mut overlay = overlay;
+        renamed::rename(&mut overlay);
         // A file with every setting was written by a program; it may also contain settings that do not act.
         let is_whole = overlay.clone().try_into::<Config>().is_ok();
         let mut given = if is_whole { Vec::new() } else { acting::keys(&overlay) };
@@ -160,9 +163,10 @@ impl Config {
             let (key, value) = setting.split_once('=').ok_or_else(|| {
                 Error::config("setting", setting, "is not of the form key=value, e.g. train.rays=512")
             })?;
-            merge(&mut table, nested(key.trim(), parse_value(value.trim())), "")?;
+            let key = renamed::current(key.trim());
+            merge(&mut table, nested(&key, parse_value(value.trim())), "")?;
             if at < settings.len() {
-                given.push(key.trim().to_owned());
+                given.push(key);
             }
         }
         if let Some(preset) = keep {
@@ -260,7 +264,7 @@ mod tests {
     fn more_first_gaussians_than_there_is_room_for_are_refused_however_many() {
         let mut config = Config::preset(Preset::XGaussian);
         (config.x.voxels, config.x.interval) = (2048, 1);
-        assert!(config.check().unwrap_err().to_string().contains("x.most"));
+        assert!(config.check().unwrap_err().to_string().contains("x.max_gaussians"));
     }
 
     #[test]
@@ -291,9 +295,9 @@ mod tests {
             ("networks.gain=-1", "networks.gain"),
             ("static.form=none", "static.form"),
             ("gaussians.form=r2", "static.form"),
-            ("r2.count=0", "r2.count"),
+            ("r2.n_points=0", "r2.n_points"),
             ("dynamic.form=lineformer", "static.form"),
-            ("sax.levels=0", "sax.levels"),
+            ("sax.num_levels=0", "sax.num_levels"),
         ] {
             let message = Config::load(None, None, &[setting.into()]).unwrap_err().to_string();
             assert!(message.contains(part), "{setting}: {message}");
@@ -330,16 +334,16 @@ mod tests {
             ("loss.normalise=true", "loss.normalise"),
             ("loss.dynamic_target=temporal", "loss.dynamic_target"),
             ("march.along_axis=true", "march.along_axis"),
-            ("r2.tv_box=300", "r2.tv_box"),
-            ("r2.least_scale=0.6", "r2.least_scale"),
-            ("r2.most=10", "r2.count"),
+            ("r2.tv_vol_size=300", "r2.tv_vol_size"),
+            ("r2.scale_min=0.6", "r2.scale_min"),
+            ("r2.max_num_gaussians=10", "r2.n_points"),
             ("r2.static_data=both", "both"),
         ];
         let x = [
             ("static.form=tensor", "static.form"),
             ("hull.enabled=true", "gaussians.form = \"x\""),
             ("x.interval=300", "x.interval"),
-            ("x.most=10", "x.most"),
+            ("x.max_gaussians=10", "x.max_gaussians"),
             ("x.first_opacity=0.001", "x.first_opacity"),
         ];
         let all = r2.map(|case| (Preset::R2Gaussian, case)).into_iter().chain(x.map(|case| (Preset::XGaussian, case)));

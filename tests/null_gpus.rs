@@ -121,12 +121,12 @@ fn training_fails_in_words_on_devices_that_compute_nothing() {
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let small = [
         "r2.voxels=24",
-        "r2.tv_box=8",
-        "r2.count=200",
-        "sax.windows=1",
-        "sax.window=4",
-        "sax.rays=8",
-        "sax.samples=16",
+        "r2.tv_vol_size=8",
+        "r2.n_points=200",
+        "sax.window_num=1",
+        "sax.window_size=4",
+        "sax.n_rays=8",
+        "sax.n_samples=16",
     ];
     for (chip, _) in CHIPS {
         for preset in [&PRESETS[..], &["nerf-ca"]].concat() {

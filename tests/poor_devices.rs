@@ -146,11 +146,11 @@ fn memory_that_others_hold_is_told_before_a_fit_takes_any() {
         let plan = Plan::new(&sax::small_config(settings).unwrap(), &dataset).unwrap();
         Trainer::new(&gpu, plan, &dataset, Tuning::for_device(gpu.info())).map(|_| ())
     };
-    let error = begin(&["sax.levels=8", "sax.base=16", "sax.log2_table=16"]).unwrap_err();
+    let error = begin(&["sax.num_levels=8", "sax.base_resolution=16", "sax.log2_hashmap_size=16"]).unwrap_err();
     assert!(matches!(error, Error::OutOfMemory { may_pass: true, .. }), "{error}");
     let (text, whole) =
         (error.to_string(), format!("{} MiB, of which 8 MiB are currently free", info.device_memory >> 20));
-    assert!(text.contains("3 fields") && text.contains(&whole) && text.contains("sax.log2_table"), "{text}");
+    assert!(text.contains("3 fields") && text.contains(&whole) && text.contains("sax.log2_hashmap_size"), "{text}");
     begin(&[]).unwrap();
     expect_silence(gpu);
 }

@@ -58,7 +58,7 @@ fn with_sets(rows: &[R2Gaussian]) -> Vec<(Params, usize)> {
 #[test]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     for integral in ["r2.integral=affine", "r2.integral=exact"] {
-        expect_derivatives(&config(&["r2.tv_moves_centres=true", "r2.tv=3", "r2.tv_box=9", integral]));
+        expect_derivatives(&config(&["r2.tv_moves_centres=true", "r2.lambda_tv=3", "r2.tv_vol_size=9", integral]));
     }
 }
 
@@ -193,7 +193,7 @@ fn expect_golden(file: &str, integral: &str) {
         format!("train.iterations={}", number("iterations")),
         format!("r2.half_extent_mm={}", number("half_mm")),
         format!("r2.voxels={}", number("voxels")),
-        format!("r2.tv_box={}", number("tv_box")),
+        format!("r2.tv_vol_size={}", number("tv_box")),
         format!("r2.integral={integral}"),
         "r2.tv_moves_centres=true".into(),
     ];
@@ -314,11 +314,11 @@ fn a_fit_finds_what_gaussians_can_show() {
     let gpu = gpu();
     let (dataset, config, _) = phantom_of_gaussians(&[
         "r2.init=random",
-        "r2.count=40",
-        "r2.density_rate=0.05",
-        "r2.position_rate=3e-3",
-        "r2.scale_rate=0.02",
-        "r2.tv=0",
+        "r2.n_points=40",
+        "r2.density_lr_init=0.05",
+        "r2.position_lr_init=3e-3",
+        "r2.scaling_lr_init=0.02",
+        "r2.lambda_tv=0",
     ]);
     let mut trainer = Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
     let losses = run(&mut trainer, 300);
@@ -363,12 +363,12 @@ fn short(static_data: &str) -> Config {
     config(&[
         &data,
         "train.iterations=60",
-        "r2.densify_every=10",
-        "r2.densify_from=5",
-        "r2.densify_until=45",
-        "r2.densify_gradient=1e-7",
-        "r2.candidate=0.01",
-        "r2.size_limit=0.15",
+        "r2.densification_interval=10",
+        "r2.densify_from_iter=5",
+        "r2.densify_until_iter=45",
+        "r2.densify_grad_threshold=1e-7",
+        "r2.density_thresh=0.01",
+        "r2.densify_scale_threshold=0.15",
     ])
 }
 
@@ -477,12 +477,12 @@ fn a_start_without_candidates_is_said() {
         let config = config(settings);
         first_rows(&data_of(&dataset, &config), &config.r2, 1)
     };
-    let (rows, notes) = of(&["r2.candidate=900"]);
+    let (rows, notes) = of(&["r2.density_thresh=900"]);
     assert_eq!((rows.len(), notes.len()), (180, 3), "{notes:?}");
     assert!(notes[1].contains("phase 1") && notes[1].contains("at 0 voxels"), "{notes:?}");
     let (random, silent) = of(&["r2.init=random"]);
     assert!(silent.is_empty() && random == rows);
-    let (from_images, silent) = of(&["r2.candidate=0.01"]);
+    let (from_images, silent) = of(&["r2.density_thresh=0.01"]);
     assert!(silent.is_empty() && from_images != rows && from_images.len() == 180, "{silent:?}");
 }
 
@@ -513,7 +513,12 @@ fn what_cannot_be_fitted_is_refused() {
     assert!(damaged(&|state| state.rows[3].set = 3).unwrap().contains("r2.set"));
     assert!(damaged(&|state| state.second[3][5] = f32::NAN).unwrap().contains("r2.adam.v"));
     // All Gaussians are too weak.
-    let config = config(&["r2.weakest=1000", "r2.densify_every=2", "r2.densify_from=0", "r2.densify_until=30"]);
+    let config = config(&[
+        "r2.density_min_threshold=1000",
+        "r2.densification_interval=2",
+        "r2.densify_from_iter=0",
+        "r2.densify_until_iter=30",
+    ]);
     let mut trainer = start(&gpu, &config, &small_dataset(13, 11));
     let error = (0..9).find_map(|_| trainer.advance(9).err()).unwrap().to_string();
     assert!(error.contains("phase 0 is left"), "{error}");

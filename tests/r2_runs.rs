@@ -25,12 +25,12 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
         "train.iterations=40",
         "train.validate_every=20",
         "train.checkpoint_every=20",
-        "r2.count=60",
+        "r2.n_points=60",
         "r2.voxels=24",
-        "r2.tv_box=8",
-        "r2.densify_every=8",
-        "r2.densify_from=4",
-        "r2.densify_until=30",
+        "r2.tv_vol_size=8",
+        "r2.densification_interval=8",
+        "r2.densify_from_iter=4",
+        "r2.densify_until_iter=30",
     ] {
         settings.extend(["--set", setting]);
     }

@@ -230,7 +230,7 @@ fn dense_levels_have_an_entry_for_each_corner() {
 
 #[test]
 fn a_batch_is_windows_and_pixels_outside_of_them_that_show_something() {
-    for settings in [&[][..], &["sax.windows=10", "sax.rays=60"], &["sax.windows=0", "sax.rays=31"]] {
+    for settings in [&[][..], &["sax.window_num=10", "sax.n_rays=60"], &["sax.window_num=0", "sax.n_rays=31"]] {
         let config = config(settings);
         let (mut data, ..) = hard_case(&config).unwrap();
         // A third of the pixels is empty.
@@ -296,7 +296,7 @@ fn runs_fit_their_images_and_repeat_and_resume_bit_by_bit() {
     let dataset = uneven_dataset(13, 11);
     for static_data in ["per-phase", "pooled"] {
         let data = format!("sax.static_data={static_data}");
-        let config = config(&[&data, "train.iterations=24", "sax.rate_falls_at=20", "sax.rate=1e-2"]);
+        let config = config(&[&data, "train.iterations=24", "sax.lrate_step=20", "sax.lrate=1e-2"]);
         let mut whole = start(&gpu, &config, &dataset);
         let losses = run(&mut whole, 24);
         let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
@@ -401,8 +401,8 @@ fn what_cannot_be_fitted_is_refused() {
         Err(Error::Config { problem, field, .. }) => format!("{field}: {problem}"),
         other => panic!("{other:?}"),
     };
-    let problem = refused(&dataset, &["sax.window=6", "sax.windows=3"]);
-    assert!(problem.contains("sax.windows") && problem.contains("room for at most 2 windows"), "{problem}");
+    let problem = refused(&dataset, &["sax.window_size=6", "sax.window_num=3"]);
+    assert!(problem.contains("sax.window_num") && problem.contains("room for at most 2 windows"), "{problem}");
     dataset.frames[2].integrals[15] = f32::NAN;
     assert!(refused(&dataset, &[]).contains("column 2, row 1"));
     let mut sizes = small_dataset(13, 11);
@@ -417,10 +417,13 @@ fn what_cannot_be_fitted_is_refused() {
             let plan = Plan::new(&config, &dataset).unwrap();
             Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).map(|_| ()).unwrap_err().to_string()
         };
-        let error = too_large(&["sax.levels=16", "sax.base=16", "sax.log2_table=22"]);
-        assert!(error.contains("sax.log2_table") && error.contains("MiB") && error.contains("sax.levels"), "{error}");
-        let error = too_large(&["sax.samples=4096", "sax.rays=65535"]);
-        assert!(error.contains("sax.samples") && error.contains("sax.rays"), "{error}");
+        let error = too_large(&["sax.num_levels=16", "sax.base_resolution=16", "sax.log2_hashmap_size=22"]);
+        assert!(
+            error.contains("sax.log2_hashmap_size") && error.contains("MiB") && error.contains("sax.num_levels"),
+            "{error}"
+        );
+        let error = too_large(&["sax.n_samples=4096", "sax.n_rays=65535"]);
+        assert!(error.contains("sax.n_samples") && error.contains("sax.n_rays"), "{error}");
     }
     // A damaged checkpoint, and one of other fields.
     let saved = start(&gpu, &config(&[]), &dataset).checkpoint().unwrap();

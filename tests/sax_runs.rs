@@ -25,13 +25,13 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
         "train.iterations=12",
         "train.validate_every=6",
         "train.checkpoint_every=6",
-        "sax.levels=4",
-        "sax.log2_table=10",
-        "sax.windows=1",
-        "sax.window=4",
-        "sax.rays=16",
-        "sax.samples=8",
-        "sax.rate_falls_at=10",
+        "sax.num_levels=4",
+        "sax.log2_hashmap_size=10",
+        "sax.window_num=1",
+        "sax.window_size=4",
+        "sax.n_rays=16",
+        "sax.n_samples=8",
+        "sax.lrate_step=10",
     ] {
         settings.extend(["--set", setting]);
     }

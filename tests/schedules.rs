@@ -71,10 +71,16 @@ fn every_preset_trains_past_the_last_event_of_its_schedule() {
             _ => vec!["train.rays=32", "train.chunk_samples=8192"],
         };
         settings.extend(match preset {
-            Preset::R2Gaussian => vec!["r2.count=300", "r2.voxels=16", "r2.tv_box=8"],
+            Preset::R2Gaussian => vec!["r2.n_points=300", "r2.voxels=16", "r2.tv_vol_size=8"],
             Preset::XGaussian => vec!["x.voxels=16", "x.interval=2"],
             Preset::SaxNerf => {
-                vec!["sax.rays=16", "sax.samples=16", "sax.window=4", "sax.log2_table=10", "sax.levels=4"]
+                vec![
+                    "sax.n_rays=16",
+                    "sax.n_samples=16",
+                    "sax.window_size=4",
+                    "sax.log2_hashmap_size=10",
+                    "sax.num_levels=4",
+                ]
             }
             Preset::NerfCa => vec!["march.dynamic_samples=32", "dynamic.width=16"],
             Preset::Fast => vec!["gaussians.count=100"],

@@ -153,9 +153,11 @@ fn the_inventory_is_what_a_run_builds() {
             Preset::Fast => {
                 &["gaussians.iterations=2", "gaussians.count=20", "tree.warm_iterations=2", "tree.track_iterations=1"][..]
             }
-            Preset::R2Gaussian => &["train.iterations=2", "r2.count=20", "r2.voxels=16", "r2.tv_box=8"],
+            Preset::R2Gaussian => &["train.iterations=2", "r2.n_points=20", "r2.voxels=16", "r2.tv_vol_size=8"],
             Preset::XGaussian => &["train.iterations=2", "x.voxels=8", "x.interval=2"],
-            Preset::SaxNerf => &["train.iterations=2", "sax.log2_table=8", "sax.windows=2", "sax.window=4"],
+            Preset::SaxNerf => {
+                &["train.iterations=2", "sax.log2_hashmap_size=8", "sax.window_num=2", "sax.window_size=4"]
+            }
             _ => &[],
         };
         let form = format!("gaussians.form={form}");

@@ -45,7 +45,7 @@ fn every_stage_of_an_iteration_matches() {
 #[test]
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     let gpu = gpu();
-    let config = config(&["x.ssim=0.4"]);
+    let config = config(&["x.lambda_dssim=0.4"]);
     let (data, state) = hard_case(&config).unwrap();
     let fit = XTrainer::with(&gpu, data, &config, &state, 0).unwrap();
     let n_sets = fit.data().n_sets();
@@ -184,11 +184,11 @@ fn a_fit_shows_discs_that_hide_each_other_and_models_draw_what_fits_see() {
         "x.half_extent_mm=15",
         "x.voxels=24",
         "x.interval=2",
-        "x.position_rate=5e-4",
-        "x.position_rate_end=5e-4",
-        "x.opacity_rate=0.05",
-        "x.scale_rate=0.02",
-        "x.intensity_rate=0.05",
+        "x.position_lr_init=5e-4",
+        "x.position_lr_final=5e-4",
+        "x.opacity_lr=0.05",
+        "x.scaling_lr=0.02",
+        "x.feature_lr=0.05",
     ]);
     let mut trainer = start(&gpu, &config, &dataset);
     let losses = run(&mut trainer, 300);
@@ -236,11 +236,11 @@ fn short(static_data: &str) -> Config {
     config(&[
         &data,
         "train.iterations=60",
-        "x.densify_every=10",
-        "x.densify_from=5",
-        "x.densify_until=45",
-        "x.densify_gradient=1e-7",
-        "x.reset_every=25",
+        "x.densification_interval=10",
+        "x.densify_from_iter=5",
+        "x.densify_until_iter=45",
+        "x.densify_grad_threshold=1e-7",
+        "x.opacity_reset_interval=25",
         "x.degree_every=7",
     ])
 }
@@ -303,8 +303,9 @@ fn lists_that_outgrow_their_room_get_more_and_nothing_is_lost() {
         assert!(got.2 > capacity, "{}", got.2);
     }
     // The device has no buffer of this size.
-    let error =
-        nertca_vk::gaussians::blending::picture::more_capacity(1001, 1000, ("x.most", 7)).unwrap_err().to_string();
+    let error = nertca_vk::gaussians::blending::picture::more_capacity(1001, 1000, ("x.max_gaussians", 7))
+        .unwrap_err()
+        .to_string();
     assert!(error.contains("1001") && error.contains("x.interval"), "{error}");
     expect_silence(gpu);
 }
@@ -394,7 +395,12 @@ fn what_cannot_be_fitted_is_refused() {
     assert!(damaged(&|state| state.sets[3] = 3).unwrap().contains("x.set"));
     assert!(damaged(&|state| state.second[3][5] = f32::NAN).unwrap().contains("x.adam.v"));
     // All are too faint: opacities are reset below the pruning threshold.
-    let config = config(&["x.reset_every=2", "x.reset_opacity=0.001", "x.densify_every=3", "x.densify_from=0"]);
+    let config = config(&[
+        "x.opacity_reset_interval=2",
+        "x.reset_opacity=0.001",
+        "x.densification_interval=3",
+        "x.densify_from_iter=0",
+    ]);
     let mut trainer = start(&gpu, &config, &small_dataset(21, 18));
     let error = (0..9).find_map(|_| trainer.advance(9).err()).unwrap().to_string();
     assert!(error.contains("phase 0 is left"), "{error}");

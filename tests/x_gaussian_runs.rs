@@ -27,10 +27,10 @@ fn the_program_trains_resumes_scores_draws_exports_and_times() {
         "train.checkpoint_every=20",
         "x.voxels=8",
         "x.interval=2",
-        "x.densify_every=8",
-        "x.densify_from=4",
-        "x.densify_until=30",
-        "x.reset_every=20",
+        "x.densification_interval=8",
+        "x.densify_from_iter=4",
+        "x.densify_until_iter=30",
+        "x.opacity_reset_interval=20",
     ] {
         settings.extend(["--set", setting]);
     }

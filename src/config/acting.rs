@@ -10,19 +10,19 @@ use crate::error::{Error, Result};
 const OF_NERF_CA: [&str; 7] =
     ["gain", "change_weight", "least_change", "least_integral", "ramp", "stop_after", "stop_below"];
 /// Constants of R2-Gaussian's public code, and our choice of units and of what the total variation moves.
-const OF_R2: [&str; 6] = ["init", "normalise", "density_share", "candidate", "least_scale", "tv_moves_centres"];
+const OF_R2: [&str; 6] = ["init", "normalise", "density_rescale", "density_thresh", "scale_min", "tv_moves_centres"];
 /// Constants of X-Gaussian's public code, and our choice of units.
 const OF_X: [&str; 7] = [
     "normalise",
     "extent_mm",
     "first_opacity",
-    "position_rate_end",
+    "position_lr_final",
     "degree_every",
-    "greatest_radius",
+    "max_screen_size",
     "reset_opacity",
 ];
 /// Constants of SAX-NeRF's public code, and our choice of units.
-const OF_SAX: [&str; 3] = ["normalise", "base", "rate_fall"];
+const OF_SAX: [&str; 3] = ["normalise", "base_resolution", "lrate_gamma"];
 
 /// Tells whether a setting is a key of a preset.
 fn is_key(preset: Preset, section: &str, name: &str) -> bool {
@@ -47,7 +47,7 @@ fn is_key(preset: Preset, section: &str, name: &str) -> bool {
         ("loss", "dynamic_target") | ("hull", "enabled") => preset == FastMlp,
         ("networks", name) => preset == NerfCa && !OF_NERF_CA.contains(&name),
         ("gaussians", "form" | "iterations" | "count") => preset == Fast,
-        ("r2", name) => preset == R2Gaussian && !OF_R2.contains(&name) && !name.ends_with("_end"),
+        ("r2", name) => preset == R2Gaussian && !OF_R2.contains(&name) && !name.ends_with("_lr_final"),
         ("x", name) => preset == XGaussian && !OF_X.contains(&name),
         ("sax", name) => preset == SaxNerf && !OF_SAX.contains(&name),
         _ => false,
@@ -135,8 +135,8 @@ mod tests {
         for (preset, setting) in [
             (Preset::SaxNerf, "dynamic.lr=0.5"),
             (Preset::SaxNerf, "train.rays=7"),
-            (Preset::R2Gaussian, "sax.rate=0.5"),
-            (Preset::XGaussian, "r2.count=3"),
+            (Preset::R2Gaussian, "sax.lrate=0.5"),
+            (Preset::XGaussian, "r2.n_points=3"),
             (Preset::Fast, "dynamic.width=64"),
             (Preset::Paper, "gaussians.count=9"),
             (Preset::NerfCa, "static.grid=12"),

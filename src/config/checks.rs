@@ -184,14 +184,14 @@ impl Config {
         }
         let r2 = &self.r2;
         if r2.tv_box > r2.voxels {
-            return Err(Error::config("r2.tv_box", r2.tv_box, format!("exceeds r2.voxels = {}", r2.voxels)));
+            return Err(Error::config("r2.tv_vol_size", r2.tv_box, format!("exceeds r2.voxels = {}", r2.voxels)));
         }
         if r2.least_scale >= r2.greatest_scale {
-            let problem = format!("is not below r2.greatest_scale = {}", r2.greatest_scale);
-            return Err(Error::config("r2.least_scale", r2.least_scale, problem));
+            let problem = format!("is not below r2.scale_max = {}", r2.greatest_scale);
+            return Err(Error::config("r2.scale_min", r2.least_scale, problem));
         }
         if r2.count > r2.most {
-            return Err(Error::config("r2.count", r2.count, format!("exceeds r2.most = {}", r2.most)));
+            return Err(Error::config("r2.n_points", r2.count, format!("exceeds r2.max_num_gaussians = {}", r2.most)));
         }
         Ok(())
     }
@@ -211,10 +211,10 @@ impl Config {
                 "is less than the {count} initial Gaussians that x.voxels = {} and x.interval = {} give",
                 x.voxels, x.interval
             );
-            return Err(Error::config("x.most", x.most, problem));
+            return Err(Error::config("x.max_gaussians", x.most, problem));
         }
         if x.first_opacity < x.weakest {
-            let problem = format!("is below x.weakest = {}: all Gaussians would be pruned", x.weakest);
+            let problem = format!("is below x.min_opacity = {}: all Gaussians would be pruned", x.weakest);
             return Err(Error::config("x.first_opacity", x.first_opacity, problem));
         }
         Ok(())
@@ -260,7 +260,7 @@ impl Config {
             );
         }
         let sax = &self.sax;
-        for (field, value) in [("sax.levels", sax.levels), ("sax.samples", sax.samples)] {
+        for (field, value) in [("sax.num_levels", sax.levels), ("sax.n_samples", sax.samples)] {
             if value % 2 != 0 {
                 return Err(Error::config(field, value, "is not an even number"));
             }
@@ -269,10 +269,10 @@ impl Config {
         if finest > MOST_CELLS {
             let problem = format!(
                 "the finest of {} levels would have {finest} cells along a side; at most {MOST_CELLS} are supported: \
-                 lower sax.base or sax.levels",
+                 lower sax.base_resolution or sax.num_levels",
                 sax.levels
             );
-            return Err(Error::config("sax.base", sax.base, problem));
+            return Err(Error::config("sax.base_resolution", sax.base, problem));
         }
         Ok(())
     }
@@ -293,11 +293,11 @@ mod tests {
             ("loss.normalise=true", "loss.normalise"),
             ("loss.dynamic_target=temporal", "loss.dynamic_target"),
             ("march.along_axis=true", "march.along_axis"),
-            ("sax.levels=3", "sax.levels"),
-            ("sax.samples=7", "sax.samples"),
-            ("sax.base=65536", "sax.base"),
-            ("sax.log2_table=30", "sax.log2_table"),
-            ("sax.window=0", "sax.window"),
+            ("sax.num_levels=3", "sax.num_levels"),
+            ("sax.n_samples=7", "sax.n_samples"),
+            ("sax.base_resolution=65536", "sax.base_resolution"),
+            ("sax.log2_hashmap_size=30", "sax.log2_hashmap_size"),
+            ("sax.window_size=0", "sax.window_size"),
             ("sax.static_data=both", "both"),
         ] {
             let message = Config::load(Some(Preset::SaxNerf), None, &[setting.into()]).unwrap_err().to_string();

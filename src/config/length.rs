@@ -35,22 +35,22 @@ impl Config {
         }
         if self.method() == MethodKind::R2Gaussian {
             schedule.extend([
-                ("r2.densify_every", densifying(self.r2.densify_every)),
-                ("r2.densify_from", of(self.r2.densify_from)),
-                ("r2.densify_until", of(self.r2.densify_until)),
+                ("r2.densification_interval", densifying(self.r2.densify_every)),
+                ("r2.densify_from_iter", of(self.r2.densify_from)),
+                ("r2.densify_until_iter", of(self.r2.densify_until)),
             ]);
         }
         if self.method() == MethodKind::XGaussian {
             schedule.extend([
-                ("x.densify_every", densifying(self.x.densify_every)),
-                ("x.densify_from", of(self.x.densify_from)),
-                ("x.densify_until", of(self.x.densify_until)),
-                ("x.reset_every", of(self.x.reset_every)),
+                ("x.densification_interval", densifying(self.x.densify_every)),
+                ("x.densify_from_iter", of(self.x.densify_from)),
+                ("x.densify_until_iter", of(self.x.densify_until)),
+                ("x.opacity_reset_interval", of(self.x.reset_every)),
                 ("x.degree_every", of(self.x.degree_every)),
             ]);
         }
         if self.method() == MethodKind::SaxNerf {
-            schedule.push(("sax.rate_falls_at", of(self.sax.rate_falls_at)));
+            schedule.push(("sax.lrate_step", of(self.sax.rate_falls_at)));
         }
         schedule
     }

@@ -4,6 +4,7 @@ use crate::config::forms::{
     CalibrateMode, Decay, DynamicForm, DynamicTarget, GaussianForm, OcclusionRegion, R2Integral, R2Start, StaticData,
     StaticForm,
 };
+use crate::config::renamed;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -34,7 +35,7 @@ pub(super) fn check_range(field: &str, value: f64, low: f64, high: f64) -> Resul
     if value >= low && value <= high {
         return Ok(());
     }
-    Err(Error::config(field, value, format!("is not in the accepted range, {low} to {high}")))
+    Err(Error::config(renamed::current(field), value, format!("is not in the accepted range, {low} to {high}")))
 }
 
 fn whole_run() -> f64 {
@@ -389,53 +390,76 @@ section! {
         /// Voxels along each side of the volume, for the back-projection and the box of total variation.
         voxels: u32 in 8.0 to 512.0,
         /// Gaussians of a set at the start.
+        #[serde(rename = "n_points", alias = "count")]
         count: u32 in 1.0 to 1_048_576.0,
         /// Density of a Gaussian at the start, as a share of the back-projection there.
+        #[serde(rename = "density_rescale", alias = "density_share")]
         density_share: f64 in 1e-6 to 1e3,
         /// Threshold of the back-projection above which a Gaussian may be seeded at a voxel.
+        #[serde(rename = "density_thresh", alias = "candidate")]
         candidate: f64 in 0.0 to 1e3,
         /// Minimum standard deviation.
+        #[serde(rename = "scale_min", alias = "least_scale")]
         least_scale: f64 in 1e-6 to 1.0,
         /// Maximum standard deviation.
+        #[serde(rename = "scale_max", alias = "greatest_scale")]
         greatest_scale: f64 in 1e-6 to 10.0,
         /// Adam's rate of positions at the start; rates fall by a constant factor per iteration.
+        #[serde(rename = "position_lr_init", alias = "position_rate")]
         position_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of positions at the end.
+        #[serde(rename = "position_lr_final", alias = "position_rate_end")]
         position_rate_end: f64 in 1e-12 to 100.0,
         /// Adam's rate of densities, before the softplus, at the start.
+        #[serde(rename = "density_lr_init", alias = "density_rate")]
         density_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of densities at the end.
+        #[serde(rename = "density_lr_final", alias = "density_rate_end")]
         density_rate_end: f64 in 1e-12 to 100.0,
         /// Adam's rate of scales, before the sigmoid, at the start.
+        #[serde(rename = "scaling_lr_init", alias = "scale_rate")]
         scale_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of scales at the end.
+        #[serde(rename = "scaling_lr_final", alias = "scale_rate_end")]
         scale_rate_end: f64 in 1e-12 to 100.0,
         /// Adam's rate of quaternions at the start.
+        #[serde(rename = "rotation_lr_init", alias = "rotation_rate")]
         rotation_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of quaternions at the end.
+        #[serde(rename = "rotation_lr_final", alias = "rotation_rate_end")]
         rotation_rate_end: f64 in 1e-12 to 100.0,
         /// Weight of 1 - SSIM; the mean absolute difference has weight 1.
+        #[serde(rename = "lambda_dssim", alias = "ssim")]
         ssim: f64 in 0.0 to 1e3,
         /// Weight of total variation in a box of voxels.
+        #[serde(rename = "lambda_tv", alias = "tv")]
         tv: f64 in 0.0 to 1e3,
         /// Voxels along each side of that box, which is placed anew in each iteration.
+        #[serde(rename = "tv_vol_size", alias = "tv_box")]
         tv_box: u32 in 2.0 to 128.0,
         /// Let total variation move Gaussians. The public code computes this gradient, but mistakenly scales it by the square
         /// of a voxel's side, so that it has no effect.
         tv_moves_centres: bool,
         /// Interval of density control, in iterations: Gaussians are added and pruned; 0 = never.
+        #[serde(rename = "densification_interval", alias = "densify_every")]
         densify_every: u32 in 0.0 to 1e6,
         /// Iteration after which density control begins.
+        #[serde(rename = "densify_from_iter", alias = "densify_from")]
         densify_from: u32 in 0.0 to 1e6,
         /// Iteration at which density control ends.
+        #[serde(rename = "densify_until_iter", alias = "densify_until")]
         densify_until: u32 in 0.0 to 1e6,
         /// Mean gradient of the loss with respect to a centre, in half images, at or above which a Gaussian is cloned or split.
+        #[serde(rename = "densify_grad_threshold", alias = "densify_gradient")]
         densify_gradient: f64 in 0.0 to 1e6,
         /// Threshold of the largest standard deviation up to which a Gaussian is cloned, and above which it is split.
+        #[serde(rename = "densify_scale_threshold", alias = "size_limit")]
         size_limit: f64 in 0.0 to 10.0,
         /// Maximum number of Gaussians of a set.
+        #[serde(rename = "max_num_gaussians", alias = "most")]
         most: u32 in 1.0 to 1_048_576.0,
         /// Density threshold below which a Gaussian is pruned.
+        #[serde(rename = "density_min_threshold", alias = "weakest")]
         weakest: f64 in 0.0 to 1e3,
     }
 }
@@ -463,43 +487,60 @@ section! {
         /// Initial opacity.
         first_opacity: f64 in 1e-6 to 0.99,
         /// Adam's rate of positions at the start, extents; it falls by a constant factor per iteration.
+        #[serde(rename = "position_lr_init", alias = "position_rate")]
         position_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of positions at the end.
+        #[serde(rename = "position_lr_final", alias = "position_rate_end")]
         position_rate_end: f64 in 1e-12 to 100.0,
         /// Adam's rate of colours' first coefficients; those of higher degrees have a twentieth.
+        #[serde(rename = "feature_lr", alias = "intensity_rate")]
         intensity_rate: f64 in 1e-12 to 100.0,
         /// Interval, in iterations, after which colours gain a degree, up to three, which makes intensities change faster; 0 =
         /// never.
         degree_every: u32 in 0.0 to 1e6,
         /// Adam's rate of opacities, before the sigmoid.
+        #[serde(rename = "opacity_lr", alias = "opacity_rate")]
         opacity_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of logarithms of scales.
+        #[serde(rename = "scaling_lr", alias = "scale_rate")]
         scale_rate: f64 in 1e-12 to 100.0,
         /// Adam's rate of quaternions.
+        #[serde(rename = "rotation_lr", alias = "rotation_rate")]
         rotation_rate: f64 in 1e-12 to 100.0,
         /// Weight of 1 - SSIM; the mean absolute difference has the rest of 1.
+        #[serde(rename = "lambda_dssim", alias = "ssim")]
         ssim: f64 in 0.0 to 0.99,
         /// Interval of density control, in iterations: Gaussians are added and pruned; 0 = never.
+        #[serde(rename = "densification_interval", alias = "densify_every")]
         densify_every: u32 in 0.0 to 1e6,
         /// Iteration after which density control begins.
+        #[serde(rename = "densify_from_iter", alias = "densify_from")]
         densify_from: u32 in 0.0 to 1e6,
         /// Iteration at which density control ends.
+        #[serde(rename = "densify_until_iter", alias = "densify_until")]
         densify_until: u32 in 0.0 to 1e6,
         /// Mean gradient of the loss with respect to a centre, in half images, at or above which a Gaussian is cloned or split.
+        #[serde(rename = "densify_grad_threshold", alias = "densify_gradient")]
         densify_gradient: f64 in 0.0 to 1e6,
         /// Threshold of the largest standard deviation, in extents, up to which a Gaussian is cloned, and above which it is
         /// split.
+        #[serde(rename = "percent_dense", alias = "size_limit")]
         size_limit: f64 in 0.0 to 10.0,
         /// Maximum number of Gaussians of a set.
+        #[serde(rename = "max_gaussians", alias = "most")]
         most: u32 in 1.0 to 16_777_216.0,
         /// Opacity threshold below which a Gaussian is pruned.
+        #[serde(rename = "min_opacity", alias = "weakest")]
         weakest: f64 in 0.0 to 1.0,
         /// Maximum standard deviation, in extents; larger Gaussians are pruned once opacities have been reset.
+        #[serde(rename = "max_scale", alias = "greatest_scale")]
         greatest_scale: f64 in 0.0 to 1e6,
         /// Maximum radius in an image, pixels; larger Gaussians are pruned once opacities have been reset; 0 = no limit. The
         /// public code sets 20, but clears the radii before it reads them.
+        #[serde(rename = "max_screen_size", alias = "greatest_radius")]
         greatest_radius: f64 in 0.0 to 1e6,
         /// Interval, in iterations, at which opacities are reset while density control is active; 0 = never.
+        #[serde(rename = "opacity_reset_interval", alias = "reset_every")]
         reset_every: u32 in 0.0 to 1e6,
         /// Value that larger opacities are reset to.
         reset_opacity: f64 in 1e-6 to 0.99,
@@ -521,24 +562,34 @@ section! {
         /// Half side of the box that the hash grid divides, mm; outside the box, the field has the values at its faces.
         bound_mm: f64 in 1.0 to 1e5,
         /// Levels of the hash grid, an even number; each has two features.
+        #[serde(rename = "num_levels", alias = "levels")]
         levels: u32 in 2.0 to 16.0,
         /// Cells along each side of the box in the first level; each further one has twice as many.
+        #[serde(rename = "base_resolution", alias = "base")]
         base: u32 in 1.0 to 65_536.0,
         /// Logarithm to base 2 of the maximum number of entries of a level.
+        #[serde(rename = "log2_hashmap_size", alias = "log2_table")]
         log2_table: u32 in 4.0 to 24.0,
         /// Windows of a batch.
+        #[serde(rename = "window_num", alias = "windows")]
         windows: u32 in 0.0 to 4096.0,
         /// Side of a window, pixels.
+        #[serde(rename = "window_size", alias = "window")]
         window: u32 in 1.0 to 256.0,
         /// Single rays of a batch, through pixels outside the windows that show something.
+        #[serde(rename = "n_rays", alias = "rays")]
         rays: u32 in 1.0 to 65_535.0,
         /// Samples of a ray, an even number.
+        #[serde(rename = "n_samples", alias = "samples")]
         samples: u32 in 2.0 to 4096.0,
         /// Adam's learning rate.
+        #[serde(rename = "lrate", alias = "rate")]
         rate: f64 in 1e-12 to 100.0,
         /// Iteration after which the learning rate falls; 0 = never.
+        #[serde(rename = "lrate_step", alias = "rate_falls_at")]
         rate_falls_at: u32 in 0.0 to 1e6,
         /// Learning rate after its fall, as a share of the initial rate.
+        #[serde(rename = "lrate_gamma", alias = "rate_fall")]
         rate_fall: f64 in 0.0 to 1.0,
     }
 }

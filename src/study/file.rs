@@ -1,7 +1,7 @@
 //! A study as it is written: a TOML file. What cannot be run is refused before anything is, with the line it stands on.
 
 use crate::choice::Choice;
-use crate::config::{Config, Preset};
+use crate::config::{Config, Preset, renamed};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::study::data::{DataSet, PhantomSection, Source, phantoms};
@@ -219,10 +219,10 @@ fn configuration(
     further: &[Spanned<String>],
 ) -> Result<Config> {
     let name = section.name.get_ref();
-    let mut given: Vec<&str> = Vec::new();
+    let mut given: Vec<String> = Vec::new();
     for setting in section.set.iter().chain(further) {
         let fault = |problem: String| text.fault(&setting.span(), format!("method `{name}`: {problem}"));
-        let key = setting.get_ref().split('=').next().unwrap_or_default().trim();
+        let key = renamed::current(setting.get_ref().split('=').next().unwrap_or_default().trim());
         if let Some((_, owner)) = OWNED.iter().find(|(owned, _)| *owned == key) {
             return Err(fault(format!("`{key}` is set by {owner}")));
         }
@@ -250,8 +250,9 @@ fn configuration(
 
 const ITERATIONS: &str = "train.iterations";
 /// Settings of a run of another length: the schedule keeps its shares of the run, but for what was `given`.
-fn scaled(preset: &Config, iterations: u32, given: &[&str]) -> Vec<String> {
-    let moved = preset.schedule_of_length(iterations).into_iter().filter(|(key, _)| !given.contains(key));
+fn scaled(preset: &Config, iterations: u32, given: &[String]) -> Vec<String> {
+    let moved =
+        preset.schedule_of_length(iterations).into_iter().filter(|(key, _)| !given.iter().any(|name| name == key));
     let moved = moved.map(|(key, count)| format!("{key}={count}"));
     moved.chain([format!("{ITERATIONS}={iterations}")]).collect()
 }
@@ -281,15 +282,26 @@ mod tests {
     fn shortened_runs_keep_the_shares_of_density_control_but_not_every_iteration() {
         let preset = Config::preset(Preset::R2Gaussian);
         let of = |iterations: u32, key: &str| {
-            let all = scaled(&preset, iterations, &["r2.densify_until"]);
+            let all = scaled(&preset, iterations, &["r2.densify_until_iter".to_owned()]);
             all.iter().find_map(|setting| setting.strip_prefix(key)?.strip_prefix('=').map(str::to_owned))
         };
         let value = |text: &str| Some(text.to_owned());
-        assert_eq!((of(6000, "r2.densify_every"), of(6000, "r2.densify_from")), (value("20"), value("100")));
-        assert_eq!((of(1000, "r2.densify_every"), of(1000, "r2.densify_from")), (value("10"), value("17")));
-        assert_eq!((of(1000, "r2.densify_until"), of(1000, "train.iterations")), (None, value("1000")));
+        assert_eq!(
+            (of(6000, "r2.densification_interval"), of(6000, "r2.densify_from_iter")),
+            (value("20"), value("100"))
+        );
+        assert_eq!(
+            (of(1000, "r2.densification_interval"), of(1000, "r2.densify_from_iter")),
+            (value("10"), value("17"))
+        );
+        assert_eq!((of(1000, "r2.densify_until_iter"), of(1000, "train.iterations")), (None, value("1000")));
         let x = scaled(&Config::preset(Preset::XGaussian), 2000, &[]);
-        for setting in ["x.densify_every=20", "x.densify_from=50", "x.densify_until=800", "x.reset_every=400"] {
+        for setting in [
+            "x.densification_interval=20",
+            "x.densify_from_iter=50",
+            "x.densify_until_iter=800",
+            "x.opacity_reset_interval=400",
+        ] {
             assert!(x.iter().any(|s| s == setting), "{setting}: {x:?}");
         }
         assert!(x.contains(&"x.degree_every=100".to_owned()), "{x:?}");

@@ -1,6 +1,6 @@
 //! A validated study and its runs.
 
-use crate::config::Config;
+use crate::config::{Config, renamed};
 use crate::error::{Error, Result};
 use crate::fingerprint::Fingerprint;
 use crate::study::COMMIT;
@@ -142,6 +142,11 @@ fn as_before(configuration: &str) -> String {
         let text = line.trim_end();
         if text.starts_with('[') {
             section = text;
+        }
+        let key = text.split_once(" = ").map_or("", |(key, _)| key);
+        if let Some(before) = renamed::earlier(section.trim_matches(['[', ']']), key) {
+            kept.push_str(&line.replacen(key, before, 1));
+            continue;
         }
         match RENAMED.iter().find(|(at, now, _)| (*at, *now) == (section, text)) {
             Some((_, now, before)) => kept.push_str(&line.replace(now, before)),

@@ -59,10 +59,10 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
     let small = [
         "train.iterations=40",
         "train.iterations_per_submit=4",
-        "r2.count=60",
+        "r2.n_points=60",
         "r2.voxels=24",
-        "r2.tv_box=7",
-        "r2.densify_every=0",
+        "r2.tv_vol_size=7",
+        "r2.densification_interval=0",
     ];
     let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
     Config::preset(Preset::R2Gaussian).with_constants(&all)
@@ -172,7 +172,7 @@ pub fn twin(
 pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     for (path, case, settings) in [
         ("r2", "77 Gaussians of 3 phases, 33 x 27 pixels", &["r2.tv_moves_centres=true"][..]),
-        ("r2", "77 Gaussians, all phases together", &["r2.static_data=pooled", "r2.tv=0.7"]),
+        ("r2", "77 Gaussians, all phases together", &["r2.static_data=pooled", "r2.lambda_tv=0.7"]),
         ("r2 exact", "77 Gaussians of 3 phases, 33 x 27 pixels", &["r2.integral=exact"]),
     ] {
         findings.begin(path, case);
@@ -418,7 +418,12 @@ fn worst_of(errors: impl Iterator<Item = f64>) -> f64 {
 fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("r2", "77 Gaussians, ten updates");
     // Density control would come after the fourth iteration, but finds nothing to do: it takes no step.
-    let config = small_config(&["r2.densify_every=4", "r2.densify_from=0", "r2.densify_until=5", "r2.most=60"])?;
+    let config = small_config(&[
+        "r2.densification_interval=4",
+        "r2.densify_from_iter=0",
+        "r2.densify_until_iter=5",
+        "r2.max_num_gaussians=60",
+    ])?;
     let (data, mut rows) = hard_case(&config)?;
     // Only Gaussians that density control keeps.
     rows.retain(|g| g.position.iter().all(|x| x.abs() < 0.95) && g.density > -9.0);

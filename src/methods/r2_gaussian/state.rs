@@ -4,8 +4,7 @@ use crate::error::{Error, Result};
 use crate::kernels::layout::R2Gaussian;
 
 /// Settings that make the steps of a fit smaller.
-pub const SMALLER_STEPS: &str =
-    "lower learning rates in section `r2`: r2.position_rate, r2.density_rate, r2.scale_rate, r2.rotation_rate";
+pub const SMALLER_STEPS: &str = "lower learning rates in section `r2`: r2.position_lr_init, r2.density_lr_init, r2.scaling_lr_init, r2.rotation_lr_init";
 
 /// Stored Gaussians with the optimiser's moments and the statistics of density control. Together with the iteration's number,
 /// this is all that a resumed fit needs.

@@ -48,7 +48,7 @@ impl R2Trainer {
         let most = most_of_set(gpu, &data);
         if most < config.r2.most {
             notes.push(format!(
-                "a set has at most {most} Gaussians instead of r2.most = {}, because a buffer of this device has no \
+                "a set has at most {most} Gaussians instead of r2.max_num_gaussians = {}, because a buffer of this device has no \
                  room for more",
                 config.r2.most
             ));
@@ -217,12 +217,12 @@ fn check_count(state: &R2State, data: &R2Data) -> Result<u32> {
     }
     if let Some(empty) = counts.iter().position(|count| *count == 0) {
         let problem = format!(
-            "no Gaussian of {} is left: the pruning threshold r2.weakest is too high, or the images are empty",
+            "no Gaussian of {} is left: the pruning threshold r2.density_min_threshold is too high, or the images are empty",
             data.name_of_set(empty)
         );
-        return Err(Error::config("r2.count", 0, problem));
+        return Err(Error::config("r2.n_points", 0, problem));
     }
-    u32::try_from(state.rows.len()).map_err(|_| Error::config("r2.count", state.rows.len(), "is too many Gaussians"))
+    u32::try_from(state.rows.len()).map_err(|_| Error::config("r2.n_points", state.rows.len(), "is too many Gaussians"))
 }
 
 fn buffers(

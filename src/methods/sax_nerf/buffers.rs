@@ -59,20 +59,20 @@ impl SaxMemory {
         if self.of_field_buffer > largest {
             let problem = format!(
                 "Adam's moments of a field need a buffer of {} MiB, and the largest buffer of this device has {} MiB: \
-                 lower sax.log2_table or sax.levels",
+                 lower sax.log2_hashmap_size or sax.num_levels",
                 mib(self.of_field_buffer),
                 mib(largest)
             );
-            return Err(Error::config("sax.log2_table", sax.log2_table, problem));
+            return Err(Error::config("sax.log2_hashmap_size", sax.log2_table, problem));
         }
         if self.of_batch_buffer > largest {
             let problem = format!(
                 "a batch needs a buffer of {} MiB, and the largest buffer of this device has {} MiB: lower \
-                 sax.samples, sax.rays or sax.windows",
+                 sax.n_samples, sax.n_rays or sax.window_num",
                 mib(self.of_batch_buffer),
                 mib(largest)
             );
-            return Err(Error::config("sax.samples", sax.samples, problem));
+            return Err(Error::config("sax.n_samples", sax.samples, problem));
         }
         self.check_total(&info.name, gpu.memory(), sax.log2_table, n_sets)
     }
@@ -80,11 +80,11 @@ impl SaxMemory {
     fn check_total(&self, device: &str, memory: DeviceMemory, log2_table: u32, n_sets: usize) -> Result<()> {
         if self.total > memory.bytes {
             let problem = format!(
-                "{n_sets} fields need {} MiB, and this device has {memory}: lower sax.log2_table or sax.levels, or use \
+                "{n_sets} fields need {} MiB, and this device has {memory}: lower sax.log2_hashmap_size or sax.num_levels, or use \
                  one field for all phases (sax.static_data = \"pooled\")",
                 self.total.div_ceil(MIB)
             );
-            return Err(Error::config("sax.log2_table", log2_table, problem));
+            return Err(Error::config("sax.log2_hashmap_size", log2_table, problem));
         }
         match memory.free {
             Some(free) if self.total > free => Err(Error::OutOfMemory {
@@ -92,7 +92,7 @@ impl SaxMemory {
                 bytes: self.total,
                 detail: format!("{device} has {memory}"),
                 may_pass: true,
-                instead: "again when other programs have freed memory, a lower sax.log2_table, a lower sax.levels, one \
+                instead: "again when other programs have freed memory, a lower sax.log2_hashmap_size, a lower sax.num_levels, one \
                           field for all phases (sax.static_data = \"pooled\")",
             }),
             _ => Ok(()),
@@ -254,7 +254,7 @@ mod tests {
         assert!(matches!(short, Error::OutOfMemory { may_pass: true, .. }));
         let text = short.to_string();
         assert!(
-            text.contains("8192 MiB, of which 99 MiB are currently free") && text.contains("sax.log2_table"),
+            text.contains("8192 MiB, of which 99 MiB are currently free") && text.contains("sax.log2_hashmap_size"),
             "{text}"
         );
         assert!(!text.contains("train.rays"), "{text}");

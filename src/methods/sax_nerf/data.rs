@@ -123,7 +123,7 @@ fn check_windows(settings: &Sax, [width, height]: [usize; 2]) -> Result<()> {
         let problem = format!(
             "an image of {width} x {height} pixels has room for at most {room} windows of {side} x {side} pixels"
         );
-        return Err(Error::config("sax.windows", settings.windows, problem));
+        return Err(Error::config("sax.window_num", settings.windows, problem));
     }
     Ok(())
 }

@@ -167,7 +167,7 @@ pub struct SaxState {
 }
 
 /// Settings that make the steps of a fit smaller.
-pub const SMALLER_STEPS: &str = "a lower sax.rate";
+pub const SMALLER_STEPS: &str = "a lower sax.lrate";
 
 /// Refuses parameters that are not finite.
 ///

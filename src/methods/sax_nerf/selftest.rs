@@ -59,15 +59,15 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
     let small = [
         "train.iterations=40",
         "train.iterations_per_submit=4",
-        "sax.levels=6",
-        "sax.base=3",
-        "sax.log2_table=9",
-        "sax.windows=2",
-        "sax.window=4",
-        "sax.rays=13",
-        "sax.samples=6",
+        "sax.num_levels=6",
+        "sax.base_resolution=3",
+        "sax.log2_hashmap_size=9",
+        "sax.window_num=2",
+        "sax.window_size=4",
+        "sax.n_rays=13",
+        "sax.n_samples=6",
         "sax.bound_mm=60",
-        "sax.rate_falls_at=30",
+        "sax.lrate_step=30",
     ];
     let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
     Config::preset(Preset::SaxNerf).with_constants(&all)
@@ -113,7 +113,10 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     for (case, settings) in [
         ("fields of 3 phases, 33 x 27 pixels, 6 levels", &[][..]),
         // Windows take whole rows, and points go beyond the box.
-        ("one field, 4 levels, clamped", &["sax.static_data=pooled", "sax.levels=4", "sax.window=5", "sax.bound_mm=7"]),
+        (
+            "one field, 4 levels, clamped",
+            &["sax.static_data=pooled", "sax.num_levels=4", "sax.window_size=5", "sax.bound_mm=7"],
+        ),
     ] {
         findings.begin("sax", case);
         let config = small_config(settings)?;

@@ -68,8 +68,8 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
         "train.iterations_per_submit=4",
         "x.voxels=8",
         "x.interval=2",
-        "x.densify_every=0",
-        "x.reset_every=0",
+        "x.densification_interval=0",
+        "x.opacity_reset_interval=0",
     ];
     let all: Vec<String> = small.iter().chain(settings).map(|setting| (*setting).to_owned()).collect();
     Config::preset(Preset::XGaussian).with_constants(&all)
@@ -177,7 +177,7 @@ pub fn numbers(all: &[Params], range: Range<usize>) -> Vec<f64> {
 /// Device errors.
 pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     for (case, settings) in [
-        ("97 Gaussians of 3 phases, 37 x 27 pixels", &["x.ssim=0.4"][..]),
+        ("97 Gaussians of 3 phases, 37 x 27 pixels", &["x.lambda_dssim=0.4"][..]),
         ("97 Gaussians, all phases together", &["x.static_data=pooled"]),
     ] {
         findings.begin("x", case);
@@ -446,12 +446,12 @@ fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     findings.begin("x", "97 Gaussians, ten updates");
     // Density control would come after the fourth iteration, but finds nothing to do: it takes no step.
     let config = small_config(&[
-        "x.densify_every=4",
-        "x.densify_from=0",
-        "x.densify_until=5",
-        "x.densify_gradient=1e6",
-        "x.weakest=0",
-        "x.greatest_scale=1e6",
+        "x.densification_interval=4",
+        "x.densify_from_iter=0",
+        "x.densify_until_iter=5",
+        "x.densify_grad_threshold=1e6",
+        "x.min_opacity=0",
+        "x.max_scale=1e6",
         "x.degree_every=3",
     ])?;
     let (data, before) = hard_case(&config)?;

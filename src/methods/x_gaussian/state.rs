@@ -5,8 +5,8 @@ use crate::gaussians::blending::opacity::stored_opacity;
 use crate::kernels::layout::{XGaussian, XStatistics};
 
 /// Settings that make the steps of a fit smaller.
-pub const SMALLER_STEPS: &str = "lower learning rates in section `x`: x.position_rate, x.intensity_rate, \
-                                 x.opacity_rate, x.scale_rate, x.rotation_rate";
+pub const SMALLER_STEPS: &str = "lower learning rates in section `x`: x.position_lr_init, x.feature_lr, \
+                                 x.opacity_lr, x.scaling_lr, x.rotation_lr";
 
 /// Stored Gaussians with the optimiser's moments and the statistics of density control. Together with the iteration's number,
 /// this is all that a resumed fit needs.

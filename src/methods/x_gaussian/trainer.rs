@@ -62,7 +62,7 @@ impl XTrainer {
         let (most, mut notes) = (most_of_set(gpu, &data), Vec::new());
         if most < config.x.most {
             notes.push(format!(
-                "a set has at most {most} Gaussians instead of x.most = {}, because a buffer of this device has no \
+                "a set has at most {most} Gaussians instead of x.max_gaussians = {}, because a buffer of this device has no \
                  room for more",
                 config.x.most
             ));
@@ -163,7 +163,7 @@ impl XTrainer {
             self.set_capacity(more_capacity(
                 status[0].entries,
                 capacity_limit(&self.gpu),
-                ("x.most", self.config.x.most.into()),
+                ("x.max_gaussians", self.config.x.most.into()),
             )?)?;
         }
         Ok(had_room)
@@ -322,12 +322,13 @@ fn check_count(state: &XState, data: &XData, weakest: f64) -> Result<u32> {
     }
     if let Some(empty) = state.counts(data.n_sets()).iter().position(|count| *count == 0) {
         let problem = format!(
-            "no Gaussian of {} is left: the pruning threshold x.weakest is too high, or the images are empty",
+            "no Gaussian of {} is left: the pruning threshold x.min_opacity is too high, or the images are empty",
             data.name_of_set(empty)
         );
-        return Err(Error::config("x.weakest", weakest, problem));
+        return Err(Error::config("x.min_opacity", weakest, problem));
     }
-    u32::try_from(state.rows.len()).map_err(|_| Error::config("x.most", state.rows.len(), "is too many Gaussians"))
+    u32::try_from(state.rows.len())
+        .map_err(|_| Error::config("x.max_gaussians", state.rows.len(), "is too many Gaussians"))
 }
 
 fn scene_buffers(
