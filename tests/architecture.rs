@@ -102,7 +102,7 @@ fn expanded(tree: &str) -> Vec<String> {
     parts.flat_map(|part| expanded(&format!("{head}{part}"))).collect()
 }
 
-/// Modules that each module of `src` uses by a path from the root of the crate.
+/// Modules that each module of `src` uses.
 fn uses(sources: &[(String, String)]) -> BTreeMap<String, BTreeSet<String>> {
     let name = |path: &str| path.trim_start_matches("src/").trim_end_matches(".rs").replace('/', "::");
     let known: BTreeSet<String> = sources.iter().map(|(path, _)| name(path)).collect();
@@ -114,14 +114,19 @@ fn uses(sources: &[(String, String)]) -> BTreeMap<String, BTreeSet<String>> {
         (!parts.is_empty()).then(|| parts.join("::"))
     };
     let of_file = |(path, text): &(String, String)| {
-        let text = code(text).collect::<Vec<_>>().join(" ");
-        let paths = text.split("crate::").skip(1).flat_map(|rest| {
+        let (own, text) = (name(path), code(text).collect::<Vec<_>>().join(" "));
+        let parent = own.rsplit_once("::").map_or(String::new(), |(parent, _)| format!("{parent}::"));
+        let listed = |rest: &str| {
             let end = rest.find(|c: char| !(c.is_alphanumeric() || "_:".contains(c))).unwrap_or(rest.len());
             let is_list = rest[..end].ends_with("::") && rest[end..].starts_with('{');
             expanded(if is_list { rest.split(';').next().unwrap() } else { &rest[..end] })
-        });
-        let own = name(path);
-        let used = paths.filter_map(|path| module(&path)).filter(|used| *used != own).collect();
+        };
+        let of = |marker: &str, prefix: &str| -> Vec<String> {
+            text.split(marker).skip(1).flat_map(listed).map(|path| format!("{prefix}{path}")).collect()
+        };
+        // From the root, from the parent, and of a child.
+        let paths = [of("crate::", ""), of("super::", &parent), of("use ", &format!("{own}::"))].concat();
+        let used = paths.iter().filter_map(|path| module(path)).filter(|used| *used != own).collect();
         (own, used)
     };
     sources.iter().map(of_file).collect()
