@@ -34,7 +34,7 @@ from .intensity import Integral, Intensity
 from .results import Branch, Correction, CorrectionKind, Grid, Progress, Scores, Tree
 
 Component = Literal["total", "static", "dynamic"]
-"""Both fields, the still background, or the moving vessels."""
+"""Both fields, the static background, or the dynamic field."""
 Projection = Literal["drr", "mip"]
 """Line integrals of attenuation, or the largest attenuation along each ray (1/mm)."""
 Quality = Literal["live", "exact"]
@@ -477,7 +477,7 @@ class Reconstruction:
     def tree(self, *, threshold_per_mm: float = 0.0, least_branch_mm: float = 0.0) -> Tree:
         """Finds the vessels at all phases as trees of centrelines with radii. Takes seconds.
 
-        threshold_per_mm: the moving field is vessel above this, 1/mm; 0 for the threshold that scores take.
+        threshold_per_mm: the threshold above which the dynamic field counts as vessel, 1/mm; 0 for the threshold that scores take.
         least_branch_mm: branches that end without reaching so far beyond the vessel they leave are left out; 0 for three
             times what the field resolves.
 
@@ -572,7 +572,7 @@ class Reconstruction:
         """Scores the frames that were added for validation, of which there must be one, and what was reconstructed against the
         true vessels, where `set_true_vessels` or `set_true_tree` said where they are.
 
-        threshold_per_mm: attenuation from which the moving field counts as vessel; 0 for a fifth of
+        threshold_per_mm: attenuation above which the dynamic field counts as vessel; 0 for a fifth of
         `vessel_attenuation_per_mm`, or Otsu's where that is unknown.
 
         Raises DataError without such frames; NotReadyError before anything was trained or loaded.

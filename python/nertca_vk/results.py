@@ -69,7 +69,7 @@ class Scores:
     ssim: float
     """Mean structural similarity."""
     threshold_per_mm: float
-    """Attenuation from which the moving field counts as vessel, 1/mm."""
+    """Attenuation above which the dynamic field counts as vessel, 1/mm."""
     volume_phases: int
     """Phases whose true vessels are known as voxels (`set_true_vessels`); what follows are means over them, NaN without."""
     tree_phases: int
@@ -144,7 +144,7 @@ class Tree:
     """Vessels at all phases as trees of centrelines with radii."""
 
     threshold_per_mm: float
-    """The moving field was taken as vessel above this, 1/mm."""
+    """Threshold above which the dynamic field counted as vessel, 1/mm."""
     followed: bool
     """Whether all phases have the same branches, and point i of each is the same material point at every phase."""
     branches: list[Branch]
