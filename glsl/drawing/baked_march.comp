@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Integral or maximum of baked volumes along the rays of a pose, sampled by the hardware. One invocation per pixel.
-//   image[pixel]: line integral, or largest attenuation per world unit, of the fields asked for.
+// Line integrals or maxima of baked volumes along the rays of a pose, sampled by the hardware. One invocation per pixel.
+//   image[pixel]: line integral, or maximum attenuation per world unit, of the selected fields.
 #include "inc/layout.glsl"
 #include "inc/pixel_ray.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -24,13 +24,14 @@ vec2 crossing(Line line, vec3 low, vec3 high) {
     return vec2(max(max(near.x, near.y), near.z), min(min(far.x, far.y), far.z));
 }
 
-// Integral and maximum of a volume over the box, within a range of depths, in steps of about a cell, at their middles.
+// Integral and maximum of a volume over the box within a range of depths. The samples are the middles of steps of about one
+// cell.
 vec2 along(sampler3D volume, Line line, float norm, vec3 low, vec3 high, vec2 depths) {
     vec2 span = crossing(line, low, high);
     span = vec2(max(span.x, depths.x), min(span.y, depths.y));
     if (!(span.y > span.x)) return vec2(0.0);
     vec3 cells = vec3(textureSize(volume, 0));
-    // Cell centres of the first and last cells lie on the faces of the box.
+    // The centres of the first and the last cells lie on the faces of the box.
     vec3 per_unit = (cells - 1.0) / (high - low);
     float crossed = length(line.direction * per_unit) * (span.y - span.x);
     uint n = uint(ceil(max(crossed, 1.0)));

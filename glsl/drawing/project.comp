@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Line integrals through a voxel volume: one invocation per pixel, trilinear samples at mid-points of
-// equal depth steps between near and far, zero outside.
+// Line integrals through a voxel volume, with trilinear samples at the mid-points of equal depth steps between near and far.
+// The volume is zero outside. One invocation per pixel.
 //   integrals[first_pixel + pixel] += scale * sum sigma * path length
 #include "inc/layout.glsl"
 #include "inc/pixel_ray.glsl"
@@ -38,7 +38,7 @@ void main() {
     uint pixel = invocation();
     if (pixel >= push.n_pixels) return;
     Line line = line_through(views[push.view], pixel, push.image_width);
-    // March in index space; skip to the slab where the ray meets the volume.
+    // The march is in index space. It is restricted to the depths at which the ray is inside the volume.
     vec3 start = vec3(dot(push.row_x.xyz, line.anchor) + push.row_x.w, dot(push.row_y.xyz, line.anchor) + push.row_y.w,
                       dot(push.row_z.xyz, line.anchor) + push.row_z.w);
     vec3 rate = vec3(dot(push.row_x.xyz, line.direction), dot(push.row_y.xyz, line.direction),

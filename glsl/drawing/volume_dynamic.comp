@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Puts the attenuation of live samples into the rows of a volume whose cells they are. One invocation per sample.
-//   volume[row][n_dynamic_samples], cleared before; row = ray of the batch.
+// Writes the attenuation of live samples to the rows of a volume, whose cells are the samples. One invocation per sample.
+//   volume[row][n_dynamic_samples] must be cleared before; row: index of the ray in the batch.
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

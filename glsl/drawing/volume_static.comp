@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Attenuation of the static field at the cells of a volume's rows; zero outside its box. One invocation per cell.
-//   volume[row][n_dynamic_samples]; row = ray of the batch.
+// Attenuation of the static field at the cells of a volume's rows; zero outside the field's box. One invocation per cell.
+//   volume[row][n_dynamic_samples]; row: index of the ray in the batch.
 #include "inc/operands.glsl"
 #include "inc/layout.glsl"
 #include "inc/random.glsl"

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adam in f32. One invocation per parameter. The dynamic field's parameters stay while it is delayed. Moments are zero
-// before an update where the schedule says so, for each field by itself.
+// Adam's update of the parameters in f32. One invocation per parameter. The parameters of the dynamic field do not change while
+// its start is delayed. The schedule sets the moments to zero before an update, for each field separately.
 #include "inc/layout.glsl"
 layout(local_size_x = 128, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
@@ -18,7 +18,7 @@ void main() {
     Schedule now = schedule[state.step];
     bool is_static = i < setup.static_params;
     if (state.stopped != 0u) return;
-    // A network's gradient overflowed, so this update is skipped.
+    // The update of a network is skipped while the dynamic field is delayed or if the gradient overflowed.
     bool of_network = !is_static || setup.two_networks != 0u;
     if (of_network && (now.dynamic_active == 0u || state.overflowed != 0u)) return;
     float g = gradient[i];

@@ -1,8 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Draws the rays of one iteration. One invocation per ray.
-//   rays[n_rays] <- permutations of the rays that meet the hull (two networks: of those that change), and of all training rays or
-//   those listed as shown, without replacement.
+//   rays[n_rays]: the first n_motion_rays rays follow a permutation of the rays that meet the motion hull (two networks: of the
+//     rays whose pixels change); the others follow a permutation of all training rays or of the second part of `listed_rays`.
+//     Both draws are without replacement.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/pixel_ray.glsl"

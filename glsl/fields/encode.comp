@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Positional encoding of the live samples. One invocation per padded sample.
-//   sample_times[s] = when the sample's ray was taken;
-//   features[q * capacity + s] = vec4 of numbers 4q..4q+3 of the encoding, zero-padded.
+// Positional encoding of the live samples, at which the dynamic field is evaluated. One invocation per padded sample.
+//   sample_times[s]: acquisition time of the sample's ray;
+//   features[q * capacity + s]: vec4 of the numbers 4q..4q+3 of the encoding, padded with zeros.
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -32,7 +32,8 @@ void main() {
     sample_times[s] = SampleTime(ray.phase, ray.beyond, ray.beyond_share);
     float window = schedule[state.step].window;
     vec3 x = encoded_point(sample_points[s].xyz);
-    // Two bands make 12 numbers, so three whole vec4 leave the carry (x, y, z) as it was.
+    // Two bands have 12 numbers, which fill three vec4: after each pair of bands, `carry` again holds three numbers to be
+    // written.
     vec3 carry = x;
     for (uint k = 0u; k < setup.n_bands; k += 2u) {
         vec3 sin0, cos0;

@@ -1,14 +1,14 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adds up the partial sums of the network's gradient in a fixed order and takes the loss scale out: of [first, first + count)
-// of `gradient`, then of `phase_sums` sums of dz over a phase. `parts` invocations share out the partial sums of an element. A sum
-// that is not finite is flagged in state.overflowed.
-//   source[i]: where element i lies in partials[split][n_partials]; NOWHERE: zero.
+// Adds up the partial sums of the network's gradient in a fixed order and divides the sums by the loss scale. The elements are
+// [first, first + count) of `gradient`, followed by `phase_sums` sums of dz over the samples of a phase. `parts` invocations
+// share the partial sums of an element. A sum that is not finite sets state.overflowed.
+//   source[i]: position of element i in partials[split][n_partials]; NOWHERE: the element is zero.
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
 layout(local_size_x = 128, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
-layout(constant_id = 1) const uint parts = 1u;  // a divisor of the workgroup
+layout(constant_id = 1) const uint parts = 1u;  // a divisor of the workgroup's size
 layout(push_constant) uniform Push { uint first; uint count; uint phase_sums; uint splits; uint n_partials; } push;
 layout(binding = 0) readonly buffer B0 { uint source[]; };
 layout(binding = 1) readonly buffer B1 { float partials[]; };
@@ -18,7 +18,7 @@ layout(binding = 4) buffer B4 { DeviceState state; };
 
 shared float part_sums[gl_WorkGroupSize.x];
 
-// Neighbouring invocations have neighbouring elements.
+// Number of elements of a workgroup. Neighbouring invocations sum neighbouring elements.
 const uint elements = gl_WorkGroupSize.x / parts;
 
 void main() {
@@ -39,7 +39,7 @@ void main() {
         for (uint part = 1u; part < parts; part++) sum += part_sums[part * elements + element];
     }
     if (!is_element) return;
-    // All bits of the exponent: a compiler may assume that isinf and isnan are false.
+    // The test reads all bits of the exponent, because a compiler may assume that isinf and isnan are always false.
     if ((floatBitsToUint(sum) & 0x7f800000u) == 0x7f800000u) atomicOr(state.overflowed, 1u);
     if (i < push.count) {
         gradient[push.first + i] = sum / state.loss_scale;

@@ -1,10 +1,10 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of the static field: fixed-point sums (then cleared for the next iteration) and that of the total variation of planes
-// and lines (paper, L_TV). One invocation per parameter.
+// Gradient of the static field: the sum of the fixed-point gradient of the rays (which is then cleared for the next iteration)
+// and the gradient of the total variation of planes and lines (paper, L_TV). One invocation per parameter.
 //   planes: tv_plane * 2 * (mean squared difference along v + along u); lines: tv_line * 2 * mean squared difference.
-//   Each neighbour pair belongs to its lower element.
-//   tv_parts[workgroup]: its share of the total variation.
+//   The value of each pair of neighbours is counted at its lower element.
+//   tv_parts[workgroup]: the workgroup's part of the total variation.
 #include "inc/layout.glsl"
 #include "inc/fixed_point.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -17,13 +17,13 @@ layout(binding = 3) writeonly buffer B3 { float gradient[]; };
 layout(binding = 4) writeonly buffer B4 { float tv_parts[]; };
 #include "inc/reduce.glsl"
 
-// A parameter's part in the total variation, and the gradient by it.
+// Contribution of a parameter to the total variation, and the derivative of the total variation with respect to it.
 struct Variation {
     float value;
     float slope;
 };
 
-// Adds the pair terms of element i at position `at` along an axis with `stride`.
+// Adds the terms of the pairs that contain element i, at position `at` along an axis with `stride`.
 void add_pairs(inout Variation sum, uint i, uint at, uint stride, float weight) {
     if (at + 1u < setup.grid) {
         float difference = params[i + stride] - params[i];

@@ -1,15 +1,15 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Losses of two networks whose attenuations add up (NeRF-CA), and their gradient at each sample: one workgroup per ray. With
-// path lengths dl, N rays and K depths a ray:
+// Losses of two networks whose attenuations add up (NeRF-CA), and their gradients at each sample. One workgroup per ray. With
+// path lengths dl, N rays, K depths per ray and the line integrals S and D of the static and the dynamic field:
 //   photometric    mean over rays of w (S + D - y)^2, w = 1 + change_weight * change
 //   favour static  mean over rays and depths of H(b) = -b ln b - (1 - b) ln(1 - b), b = sigma_s / (sigma_l + sigma_s + e)
-//   ray entropy    mean over rays of -sum p ln(p + e), p = sigma_s dl / D, where D or the ray's change is large enough
+//   ray entropy    mean over rays of -sum p ln(p + e), p = sigma_s dl / D, for rays whose D or change is above its threshold
 //   near           mean over rays of the sum of sigma_s dl over near samples
 //   static size    sum over rays and samples of sigma_l dl + (sigma_l dl)^2
 //   static_network_gradient[s] = dL/d sigma_l;  sigma_gradient[s] = dL/d sigma_s;
-//   ray_loss[ray] = photometric, the same, near, (S + D - y)^2;  ray_regularisers[ray] = favour static, ray entropy, static
-//   size, each not yet weighted.
+//   ray_loss[ray] = (photometric, photometric, near, unweighted (S + D - y)^2);
+//   ray_regularisers[ray] = (favour static, ray entropy, static size), without the weights of the schedule.
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
@@ -31,19 +31,20 @@ layout(binding = 13) writeonly buffer B13 { vec4 ray_regularisers[]; };
 #include "inc/reduce.glsl"
 
 const float SMALL = 1e-10;       // e
-const float SMALLEST = 1e-19;    // least share, and least D to divide by
-const float SERIES = 1e-3;       // share below which a series is closer than a logarithm
+const float SMALLEST = 1e-19;    // minimum of a share, and minimum of D as a divisor
+const float SERIES = 1e-3;       // threshold of a share below which the series is more accurate than the logarithm
 
-// ln(a), where a + rest = 1. Near 1 a logarithm may be off by 2^-21, and a itself by 2^-24: more than a faint field's entropy.
+// Computes ln(a), where a + rest = 1. Near 1 the error of the logarithm may be 2^-21, and that of a itself 2^-24. Both are
+// larger than the entropy of a faint field.
 float log_share(float a, float rest) {
     return rest < SERIES ? -rest - 0.5 * rest * rest : log(a);
 }
 
-// Entropy of the shares of both fields, and its derivatives by sigma_l and sigma_s.
+// Entropy of the shares of both fields, and its derivatives with respect to sigma_l and sigma_s.
 vec3 share_entropy(float of_static, float of_dynamic) {
     float sum = of_static + of_dynamic + SMALL;
     float b = max(of_dynamic / sum, SMALLEST);
-    // 1 - b, of which f32 would keep nothing where the static field is faint.
+    // This is 1 - b. The difference in f32 would be 0 where the static field is faint.
     float rest = max((of_static + SMALL) / sum, SMALLEST);
     bool clipped = b <= SMALLEST || rest <= SMALLEST;
     float log_b = log_share(b, rest);
@@ -52,7 +53,7 @@ vec3 share_entropy(float of_static, float of_dynamic) {
     return vec3(-b * log_b - rest * log_rest, -slope * (of_dynamic / sum), slope * ((of_static + SMALL) / sum));
 }
 
-// What a sample's share p of a ray's integral adds to the entropy along it, and its negative derivative.
+// Contribution of a sample with share p of a ray's integral to the entropy along the ray, and the negative of its derivative.
 vec2 ray_entropy(float p) {
     float logarithm = log(p + SMALL);
     return vec2(-p * logarithm, logarithm + p / (p + SMALL));
@@ -81,7 +82,7 @@ void main() {
     float residual = seen.static_integral + seen.dynamic_integral - rays[r].target;
     bool entropy_counts = seen.dynamic_integral >= setup.least_integral || change > setup.least_change;
     float entropy_scale = entropy_counts ? per_ray : 0.0;
-    // Where D is too small to divide by, it is a constant.
+    // Where D is too small to be a divisor, the constant SMALLEST replaces it and has no derivative.
     float mean = seen.dynamic_integral > SMALLEST ? sums.z : 0.0;
     float photometric = 2.0 * per_ray * weight * residual;
     for (uint s = first; s < end; s += gl_WorkGroupSize.x) {

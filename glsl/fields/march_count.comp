@@ -1,8 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Finds and counts the live dynamic samples of each ray of a chunk; what it writes of a ray lies at the ray's place in the batch.
-//   lane_masks: which depths are live;  lane_offsets[ray][lane] = live samples of the lanes before;
-//   ray_counts[ray] = live samples of the ray.
+// Finds and counts the live samples of the dynamic field on each ray of a chunk. Its output for a ray is at the ray's index in
+// the batch.
+//   lane_masks: one bit per depth, set for live samples;  lane_offsets[ray][lane]: live samples of the preceding lanes;
+//   ray_counts[ray]: live samples of the ray.
 #include "inc/march_samples.glsl"
 layout(binding = 3) readonly buffer B3 { uint hull[]; };
 layout(binding = 4) readonly buffer B4 { uint occupancy[]; };
@@ -14,7 +15,7 @@ layout(binding = 7) writeonly buffer B7 { uint ray_counts[]; };
 
 PREFIX(live_before, counts, ray_lanes)
 
-// Whether the field is evaluated at a point of a ray: where it may exist at one of the phases that the ray shows.
+// Whether the dynamic field is evaluated at a point of a ray: it may exist there at one of the phases that the ray shows.
 bool searched(vec3 x, Ray ray) {
     if (dynamic_inside(x, ray.phase) && occupied(x, ray.phase, state.step)) return true;
     if (ray.beyond_share == 0.0) return false;

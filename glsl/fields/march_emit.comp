@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Writes the live dynamic samples of a chunk, in ray and depth order.
-//   sample_points[s] = (x, y, z, path length);  sample_rays[s] = ray of the batch, and whether near.
+// Writes the live samples of the dynamic field of a chunk in the order of rays and depths.
+//   sample_points[s] = (x, y, z, path length);  sample_rays[s]: index of the ray in the batch, and whether the sample is near.
 #include "inc/march_samples.glsl"
 #include "inc/sample_rays.glsl"
 layout(binding = 3) readonly buffer B3 { LiveSamples live; };
@@ -11,12 +11,12 @@ layout(binding = 6) readonly buffer B6 { uint ray_start[]; };
 layout(binding = 7) writeonly buffer B7 { vec4 sample_points[]; };
 layout(binding = 8) writeonly buffer B8 { uint sample_rays[]; };
 
-// Path length of a ray from its first depth to the end of the sample at `depth`, which stands for `dl`.
+// Path length of a ray from its first depth to the end of the sample at `depth`, whose own path length is `dl`.
 float path_so_far(Ray ray, float depth, float dl) {
     return (depth - dynamic_depth(0u, ray)) * ray.norm + dl;
 }
 
-// Path length up to which all rays count as near, by the last ray of the batch.
+// Path length up to which the samples of all rays count as near. It is computed from the last ray of the batch.
 float near_path() {
     Ray last = rays[setup.n_rays - 1u];
     return setup.occlusion_share * path_so_far(last, dynamic_depth(setup.n_dynamic_samples - 1u, last), 1e-10 * last.norm);

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What rays see: integrals and, on demand, maxima. Training takes march_loss.
-//   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term, maxima along the ray or 0.
+// Line integrals of rays and, if requested, maxima along them. Training uses march_loss instead.
+//   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term, and maxima along the ray or 0.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/depths.glsl"

@@ -1,7 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Linear Beer-Lambert march where both fields are networks, at the same samples: one workgroup per ray.
-//   ray_out[ray] = integrals of sigma_l and sigma_s, that of near samples of sigma_s, on demand maxima along the ray.
+// Linear Beer-Lambert march where both fields are networks, which are evaluated at the same samples. One workgroup per ray.
+//   ray_out[ray] = integrals of sigma_l and sigma_s, integral of sigma_s over near samples, and, if requested, maxima along the
+//     ray.
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

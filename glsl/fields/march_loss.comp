@@ -1,15 +1,16 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// A ray of a batch from its samples to the gradient:
+// Line integrals, loss and gradient of the rays of a batch:
 //   ray_out[ray] = integrals of sigma_l and sigma_s, occlusion term;
-//   ray_gradient[ray], ray_loss[ray]: its loss by them (inc/ray_loss.glsl);
-//   static_gradient[2 * parameter] = low, high word of dL/d sigma_l scattered to planes and lines.
-// Where samples of the dynamic field were empty is noted on the way (inc/occupancy.glsl).
+//   ray_gradient[ray], ray_loss[ray]: derivatives of the ray's loss with respect to the integrals, and the loss
+//     (inc/ray_loss.glsl);
+//   static_gradient[2 * parameter] = low and high word of the gradient of the static field's planes and lines.
+// The kernel also records which cells of the occupancy were empty or occupied (inc/occupancy.glsl).
 //
-// The scatter is summed as 64-bit fixed point in integer atomics, pairs of 32 bits or whole, which is exact and hence
-// independent of order. Every sample of every ray meets the few texels of the lines: with `private_lines` a workgroup sums its own in shared
-// memory first, so that they reach memory once for its rays.
+// The gradient of planes and lines is summed in 64-bit fixed point by integer atomics, on two words of 32 bits or on one of 64
+// bits. These sums are exact and hence independent of the order. Every sample of every ray adds to the few texels of the lines.
+// With `private_lines`, a workgroup therefore sums the lines in shared memory first and adds them to memory once.
 #include "inc/fixed_point.glsl"
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
@@ -18,7 +19,7 @@
 #include "inc/sample_rays.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
-layout(constant_id = 1) const uint private_lines = 0u;  // numbers on all lines, or 0: straight to memory
+layout(constant_id = 1) const uint private_lines = 0u;  // numbers of all lines; 0: direct sums in memory
 layout(push_constant) uniform Push { uint first_ray; uint n_rays; } push;
 layout(binding = 0) SETUP B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
@@ -51,8 +52,8 @@ void note_cell(uint entry, uint bits) {
     atomicOr(occupancy[word], bits << (2u * (entry % CELLS_PER_WORD)));
 }
 
-// Notes for the cell of a live sample, at the phases that it shows, that it was seen, and whether it was occupied: of a phase
-// that it shows little of, only that it was occupied.
+// Records in the occupancy, for the cell of a live sample and the phases that the sample shows, that the cell was evaluated and
+// whether it was occupied. For a phase with a small share of the sample, only an occupied cell is recorded.
 void note_sample(vec3 x, Ray ray, float sigma) {
     bool full = sigma > setup.occupancy_threshold;
     uint bits = SEEN | (full ? OCCUPIED : 0u);
@@ -105,7 +106,7 @@ void add_to_line(uint texel, vec4 value, float scale_high) {
     }
 }
 
-// Whether any ray of the workgroup has something to scatter; the same for all lanes.
+// Whether any ray of the workgroup has a gradient to scatter. The result is equal in all lanes.
 bool any_scatters(bool scatters) {
     if (rays_of_workgroup == 1u) return scatters;
     if (ray_lane() == 0u) rays_that_scatter[ray_of_workgroup()] = uint(scatters);
@@ -115,7 +116,8 @@ bool any_scatters(bool scatters) {
     return any != 0u;
 }
 
-// Scatters the gradient by the ray's static integral. All lanes of the workgroup take part, those without a gradient, too.
+// Scatters the gradient with respect to the ray's static integral. All lanes of the workgroup must call it, also those without
+// a gradient.
 void scatter(Ray ray, float gradient) {
     uint lane = gl_LocalInvocationID.x;
     for (uint i = lane; i < 2u * private_lines; i += gl_WorkGroupSize.x) line_sums[i] = 0u;
@@ -159,7 +161,7 @@ void main() {
         ray_gradient[r] = loss.gradient;
         ray_loss[r] = loss.terms;
     }
-    // Rays that leave the static field out have none, too.
+    // The gradient is also zero for rays that skip the static field.
     float gradient = has_ray() ? loss.gradient.x : 0.0;
     if (any_scatters(gradient != 0.0)) scatter(ray, gradient);
 }

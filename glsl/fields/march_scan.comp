@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Turns the counts of a chunk into offsets (exclusive prefix sum over rays, one workgroup) and writes the
-// indirect arguments of all passes over live samples. While the dynamic field is delayed, and when learning has ended, nothing
-// is live.
-//   ray_counts of the chunk's rays -> ray_start[n_rays + 1];  live: how many.
+// Converts the sample counts of a chunk's rays to offsets (exclusive prefix sum over rays, one workgroup) and writes the
+// indirect arguments of all passes over live samples. No sample is live while the dynamic field is delayed or after training
+// has stopped.
+//   ray_counts of the chunk's rays -> ray_start[n_rays + 1];  live: numbers of live samples.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {

@@ -1,25 +1,26 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Backward through a hidden layer, or through two at once, for all live samples in tiles: gradient to their input and
-// gradient of their weights in one pass. Workgroups persist: each walks every gl_NumWorkGroups-th tile and keeps its
-// weight gradients in registers; the partial sums of all workgroups are added up later in a fixed order.
-//   dz16[s][width]: gradient at the upper layer's neurons, times the loss scale; for the last layer formed here.
-//   inputs16[s][upper_columns]: what the upper layer sees, activations of the layer below or the encoding;
-//   lower_inputs16[s][lower_columns]: the same of the layer below, whose dz stays in shared memory.
-//   dz_in16[s][width] = (W^T dz) where the input was on, if `with_input`: of the lower layer where there is one.
-//   partials[workgroup][n_partials]: weight gradients [width][inputs] at `weights_at` and `lower_weights_at`, bias
-//   gradients at `bias` and `lower_bias`, and for the last layer those of the output neuron at `out_weights` and `out_bias`;
-//   NOWHERE skips one.
+// Backward pass through one hidden layer, or through two at once, for all live samples in tiles: the gradient of the layer's
+// input and the weight gradient. Each workgroup processes every gl_NumWorkGroups-th tile and keeps its weight gradients in
+// registers. The partial sums of all workgroups are added up later in a fixed order.
+//   dz16[s][width]: gradient of the upper layer's neurons times the loss scale; this kernel computes it itself for the last
+//     layer.
+//   inputs16[s][upper_columns]: input of the upper layer, which is the activations of the layer below or the encoding;
+//   lower_inputs16[s][lower_columns]: input of the lower layer, whose dz stays in shared memory.
+//   dz_in16[s][width] = (W^T dz) where the input is positive, if `with_input`; W is that of the lower layer if there is one.
+//   partials[workgroup][n_partials]: weight gradients [width][inputs] at `weights_at` and `lower_weights_at`, bias gradients at
+//     `bias` and `lower_bias`, and for the last layer the gradients of the output neuron at `out_weights` and `out_bias`. An
+//     output at NOWHERE is skipped.
 #include "inc/matrices.glsl"
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
 #include "inc/sample_rays.glsl"
-layout(constant_id = 7) const uint upper_columns = 128u; // inputs of the upper layer
-layout(constant_id = 8) const uint lower_columns = 0u;  // inputs of the lower layer; 0: there is none
-layout(constant_id = 9) const uint shares = 2u;         // of the columns; a divisor of subgroups
-layout(constant_id = 10) const uint lower_shares = 1u;  // the same of lower_columns
+layout(constant_id = 7) const uint upper_columns = 128u; // number of inputs of the upper layer
+layout(constant_id = 8) const uint lower_columns = 0u;  // number of inputs of the lower layer; 0: no lower layer
+layout(constant_id = 9) const uint shares = 2u;         // parts of the columns; a divisor of subgroups
+layout(constant_id = 10) const uint lower_shares = 1u;  // parts of the lower layer's columns; a divisor of subgroups
 layout(constant_id = 11) const uint with_input = 1u;
-layout(constant_id = 12) const uint from_output = 0u;   // the upper layer is the last
+layout(constant_id = 12) const uint from_output = 0u;   // 1: the upper layer is the last hidden layer
 layout(push_constant) uniform Push {
     uint weights_at; uint lower_weights_at; uint inputs_at; uint lower_inputs_at; uint outputs_at; uint out_weights_at;
     uint n_partials; uint bias; uint lower_bias; uint out_weights; uint out_bias; uint accumulate;
@@ -40,12 +41,12 @@ layout(binding = 12) writeonly buffer B12 { uvec4 dz_in16[]; };
 layout(binding = 13) buffer B13 { float partials[]; };
 layout(binding = 14) readonly buffer B14 { float sigma_gradient[]; };
 #include "inc/sample_gradient.glsl"
-// The last layer's activations, the upper layer's input, and the lower's take each other's places.
+// Shared memory holds in turn the last layer's activations, the input of the upper layer and the input of the lower layer.
 #define INPUTS_SIZE tile * (longest_stride > dz_stride ? longest_stride : dz_stride)
 #include "inc/fused_backward.glsl"
 
 shared float tile_gradient[tile];
-// Gradient of the output neuron.
+// Gradients of the output neuron's weights and bias.
 float out_sum[lane_neurons];
 float out_bias_sum;
 
@@ -73,7 +74,7 @@ void add_outputs() {
     }
 }
 
-// Eight numbers of the last layer's dz of a sample, in a row of the tile.
+// Eight numbers of the last layer's dz of a sample, from a row of the tile.
 uvec4 output_dz(uint row, uint q) {
     uvec4 out_weights = weights16[push.out_weights_at / 8u + q];
     uvec4 outputs = tile_in[row * dz_stride + q];
@@ -87,7 +88,7 @@ uvec4 output_dz(uint row, uint q) {
     return packed;
 }
 
-// Forms the last layer's dz from its activations, which lie where its input comes to lie later.
+// Computes the last layer's dz from its activations. These occupy the memory that holds the layer's input later.
 void form_dz(uint first) {
     stage_output_gradient(first);
     if (push.out_weights != NOWHERE) add_outputs();

@@ -1,19 +1,19 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Backward through the second hidden layer and the first, like mlp_fused_bwd: the encoding and the first layer's activations
-// are computed again, not read, so that nobody has to keep them.
-//   dz16[s][width]: gradient at the second layer's neurons, times the loss scale.
+// Backward pass through the second and the first hidden layer, like mlp_fused_bwd. The encoding and the first layer's
+// activations are recomputed here, so that the forward pass need not store them.
+//   dz16[s][width]: gradient of the second layer's neurons times the loss scale.
 //   partials[workgroup][n_partials]: weight gradients [width][width] at `weights_at` and [width][lower_columns] at
-//   `lower_weights_at`, bias gradients at `bias` and `lower_bias`; NOWHERE skips one.
+//     `lower_weights_at`, bias gradients at `bias` and `lower_bias`. An output at NOWHERE is skipped.
 #include "inc/matrices.glsl"
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
 #include "inc/sample_rays.glsl"
 #include "inc/phase_share.glsl"
 #define upper_columns width
-layout(constant_id = 7) const uint lower_columns = 80u; // numbers of encoding and shares of phases, padded
-layout(constant_id = 8) const uint shares = 2u;         // of the columns; a divisor of subgroups
-layout(constant_id = 9) const uint lower_shares = 1u;   // the same of lower_columns
+layout(constant_id = 7) const uint lower_columns = 80u; // numbers of the encoding and shares of the phases, padded
+layout(constant_id = 8) const uint shares = 2u;         // parts of the columns; a divisor of subgroups
+layout(constant_id = 9) const uint lower_shares = 1u;   // parts of the lower layer's columns; a divisor of subgroups
 layout(push_constant) uniform Push {
     uint weights_at; uint lower_weights_at; uint n_partials; uint bias; uint lower_bias; uint accumulate;
 } push;
@@ -29,7 +29,7 @@ layout(binding = 8) readonly buffer B8 { float bias_rows[]; };
 layout(binding = 9) readonly buffer B9 { uvec4 dz16[]; };
 layout(binding = 10) buffer B10 { float partials[]; };
 #include "inc/encode_tile.glsl"
-// Activations, then the encoding.
+// Activations, followed by the encoding.
 #define INPUTS_SIZE tile * (input_stride + lower_stride)
 #include "inc/fused_backward.glsl"
 
@@ -45,7 +45,7 @@ void stage(uint first) {
     PLACE(dz, tile_dz, width8, dz_stride, dz_size);
 }
 
-// The first layer's activations, as in the forward pass.
+// Computes the first layer's activations as in the forward pass.
 void activate() {
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
         uint column = gradient_column(c);

@@ -1,22 +1,23 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// The whole network for a tile of samples, in shared memory and registers: encoding, hidden layers, output,
-// activation. Bias and latent of a layer that sees the input are columns of its weights, one per phase, picked by the shares
-// of the phases behind the encoding, so that their gradients come out of the weight gradient.
-//   features16[s][encoded], activations16_i[s][width]: f16, kept for the backward pass where it does not compute them again;
+// Forward pass of the whole network for a tile of samples in shared memory and registers: encoding, hidden layers, output
+// neuron and activation. The bias and the latent of a layer that reads the encoding are columns of its weights, one per phase.
+// They are multiplied by the shares of the phases, which follow the encoding. Their gradients are therefore part of the weight
+// gradient.
+//   features16[s][encoded], activations16_i[s][width]: f16, stored where the backward pass does not recompute them;
 //   sample_sigma[s] = (sigma_s, d sigma_s / d feature).
-//   weights16: per layer [width][encoded] if it sees the input, then [width][width] unless it is the first; at last
-//   the output weights, n rows of which the first counts.
+//   weights16: per layer [width][encoded] if it reads the encoding, then [width][width] unless it is the first; at the end the
+//     output weights, n rows of which only the first is used.
 #include "inc/matrices.glsl"
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 #include "inc/softplus.glsl"
 #include "inc/phase_share.glsl"
-layout(constant_id = 7) const uint encoded = 80u;     // numbers of encoding and shares of phases, padded
-layout(constant_id = 8) const uint layers = 4u;       // hidden layers
-layout(constant_id = 9) const uint skip = 0u;         // layer (from 0) that sees the input again; 0: none
+layout(constant_id = 7) const uint encoded = 80u;     // numbers of the encoding and shares of the phases, padded
+layout(constant_id = 8) const uint layers = 4u;       // number of hidden layers
+layout(constant_id = 9) const uint skip = 0u;         // layer (from 0) that reads the encoding again; 0: none
 layout(constant_id = 10) const uint keep_features = 1u;
-layout(constant_id = 11) const uint keep_from = 0u;   // first layer whose activations are kept; `layers`: none
+layout(constant_id = 11) const uint keep_from = 0u;   // first layer whose activations are stored; `layers`: none
 layout(push_constant) uniform Push { uint out_bias; } push;
 layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
@@ -35,10 +36,11 @@ layout(binding = 12) writeonly buffer B12 { vec2 sample_sigma[]; };
 
 const uint width8 = width / 8u;
 const uint encoded8 = encoded / 8u;
-// One more uvec4 a row keeps rows off the same banks. A row has room for the n sums that take its place in the end.
+// One additional uvec4 per row avoids bank conflicts. A row must also hold the n sums of the output neuron that replace it at
+// the end.
 const uint hidden_stride = width8 + 1u > n / 4u ? width8 + 1u : n / 4u;
 const uint encoded_stride = encoded8 + 1u;
-// Without a skip layer nothing needs the encoding after the first layer, which may overwrite it.
+// Without a skip layer the encoding is not used after the first layer, whose activations may overwrite it.
 const uint encoded_at = skip > 0u ? tile * hidden_stride : 0u;
 const uint shared_size = skip > 0u ? encoded_at + tile * encoded_stride
                                    : tile * (hidden_stride > encoded_stride ? hidden_stride : encoded_stride);
@@ -46,7 +48,7 @@ const uint row_tiles = tile / m;
 const uint column_tiles = width / n / subgroups;
 shared uvec4 tile16[shared_size];
 
-// One invocation writes eight numbers of a sample at a time.
+// Each invocation writes eight numbers of a sample at a time.
 void encode_tile(uint first) {
     for (uint e = gl_LocalInvocationIndex; e < tile * encoded8; e += gl_WorkGroupSize.x) {
         uvec4 numbers = encoded_numbers(first + e / encoded8, e % encoded8);
@@ -57,7 +59,7 @@ void encode_tile(uint first) {
 
 SUM sums[row_tiles * column_tiles];
 
-// sums += input [tile][depth] times weights [width][depth] transposed.
+// Computes sums += input [tile][depth] times the transpose of weights [width][depth].
 void multiply(uint input_at, uint input_stride, uint weights_at, uint depth, uint column0) {
     STEPS for (uint step = 0u; step < depth / k; step++) {
         [[unroll]] for (uint c = 0u; c < column_tiles; c++) {
@@ -72,7 +74,7 @@ void multiply(uint input_at, uint input_stride, uint weights_at, uint depth, uin
     }
 }
 
-// From the tile, where whole rows lie: fragments of matrices would be stored a few bytes at a time.
+// Copies activations from the tile, which has whole rows. Stores from matrices would write only a few bytes at a time.
 void keep_activations(uint kept, uint first) {
     uint at = (kept * setup.sample_capacity + first) * width8;
     for (uint e = gl_LocalInvocationIndex; e < tile * width8; e += gl_WorkGroupSize.x) {
@@ -113,7 +115,8 @@ void main() {
         if (layer >= keep_from) keep_activations(layer - keep_from, first);
     }
     if (keep_from < layers) barrier();
-    // The output neuron: row tiles are shared out among subgroups, which alone see their rows from here on.
+    // Output neuron: the row tiles are distributed among the subgroups, and each subgroup accesses only its own rows from here
+    // on.
     for (uint r = gl_SubgroupID; r < row_tiles; r += subgroups) {
         SUM sum = SUM(0.0);
         STEPS for (uint step = 0u; step < width / k; step++) {

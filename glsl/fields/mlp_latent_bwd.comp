@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// From the per-phase sums of dz of a layer that sees the input: gradients of its bias and latent weights, and
-// (one dispatch per such layer, added up) of the latents. One invocation per element of
+// Gradients of the bias and the latent weights of a layer that reads the encoding, and of the latents, from the layer's sums of
+// dz per phase. There is one dispatch per such layer; the gradients of the latents are added up. One invocation per element of
 // [bias | latent_weight | latents].
 #include "inc/layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

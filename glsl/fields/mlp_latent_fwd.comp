@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Bias and latent of all phases, as the layers in f32 read them: inc/phase_bias.glsl. One invocation per (layer, phase, neuron).
+// Bias plus latent term of all phases for the layers in f32 (inc/phase_bias.glsl). One invocation per (layer, phase, neuron).
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

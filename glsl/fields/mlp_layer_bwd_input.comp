@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Gradient through one hidden layer to its hidden input: dz_in = (W_b^T dz) where the input neuron was on.
-// A lane keeps SAMPLES samples x GROUPS vec4 of inputs; weights are uniform loads.
+// Gradient of the hidden input of one hidden layer: dz_in = (W_b^T dz) where the input neuron is positive. A lane keeps SAMPLES
+// samples x GROUPS vec4 of inputs; the loads of the weights are uniform.
 #include "inc/operands.glsl"
 #include "inc/layout.glsl"
 #ifndef SAMPLES
@@ -37,13 +37,13 @@ void main() {
         }
         uint row = push.weights4 + 4u * q * push.in_groups;
         [[unroll]] for (uint i = 0u; i < GROUPS; i++) {
-            // A tile may overhang the width and then repeats the last inputs, unstored.
+            // A tile may extend beyond the width. It then repeats the last inputs and does not store them.
             uint at = row + min(first + i, push.in_groups - 1u);
             vec4 w0 = FETCH(params, at);
             vec4 w1 = FETCH(params, at + push.in_groups);
             vec4 w2 = FETCH(params, at + 2u * push.in_groups);
             vec4 w3 = FETCH(params, at + 3u * push.in_groups);
-            // One update of a sum for four products: sums live in memory when a device runs out of registers.
+            // Each update of a sum adds four products, because the sums are in memory on a device with too few registers.
             [[unroll]] for (uint t = 0u; t < SAMPLES; t++) {
                 sum[i][t] += g[t].x * w0 + g[t].y * w1 + g[t].z * w2 + g[t].w * w3;
             }

@@ -1,11 +1,11 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Weight gradient dW[j][k] = sum_s dz[j][s] x[k][s], partial sums per split. A lane keeps INPUTS inputs (one per
-// lane and step of a workgroup) x NEURONS4 vec4 of neurons and walks its split's samples; dz are uniform loads.
-// One workgroup per (4 * NEURONS4 neurons, INPUTS * workgroup inputs, split). The workgroups of the first inputs
-// sum dz itself as well: the gradient of a bias.
-//   partials[split][parameter]; later chunks of an iteration add to what the first wrote.
+// Weight gradient dW[j][k] = sum_s dz[j][s] x[k][s], as partial sums per split of the samples. A lane keeps INPUTS inputs (one
+// per lane and step of a workgroup) x NEURONS4 vec4 of neurons and processes the samples of its split; the loads of dz are
+// uniform. One workgroup per (4 * NEURONS4 neurons, INPUTS * workgroup inputs, split). The workgroups of the first inputs also
+// sum dz itself, which is the gradient of a bias.
+//   partials[split][parameter]; later chunks of an iteration add to the values of the first chunk.
 #include "inc/operands.glsl"
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
@@ -15,12 +15,12 @@
 #ifndef INPUTS
 #define INPUTS 4u
 #endif
-// One update of a sum for four products: sums live in memory when a device runs out of registers.
+// Each update of a sum adds four products, because the sums are in memory on a device with too few registers.
 #define STEP 4u
 layout(local_size_x = 16, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {
     uint in_groups; uint weights; uint capacity; uint splits; uint n_partials; uint accumulate;
-    uint bias;  // also sum dz into this parameter, unless it is NOWHERE
+    uint bias;  // parameter that receives the sum of dz; NOWHERE: none
     uint out_groups;
     ADDRESS_OF(dz) ADDRESS_OF(inputs)
 } push;
@@ -37,7 +37,7 @@ void put(uint parameter, float total) {
     partials[at] = total + (push.accumulate != 0u ? partials[at] : 0.0);
 }
 
-// Tiles may overhang both ways and then repeat the last vec4, unstored.
+// Tiles may extend beyond both sides. They then repeat the last vec4 and do not store it.
 void walk(bool with_bias, uint j4, uint k0, uint begin, uint end) {
     uint row[NEURONS4];
     uint column[INPUTS];

@@ -1,11 +1,11 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// One hidden layer: activations = relu(W_a input_a + W_b input_b + bias), the bias that of the sample's phase, or between those
-// of two phases: phase_bias[phase].
-// A lane keeps SAMPLES samples x OUTPUTS neurons in registers; weights are uniform loads.
+// One hidden layer: activations = relu(W_a input_a + W_b input_b + bias). The bias is that of the sample's phase,
+// phase_bias[phase], or an interpolation between two phases. A lane keeps SAMPLES samples x OUTPUTS neurons in registers; the
+// loads of the weights are uniform.
 //   input_*[q * capacity + s], activations[q * capacity + s]: vec4 of 4 consecutive features.
-//   weights row-major [out][in], 4 inputs to a vec4.
+//   The weights are row-major [out][in], with 4 inputs per vec4.
 #include "inc/operands.glsl"
 #include "inc/layout.glsl"
 #ifndef SAMPLES
@@ -27,7 +27,7 @@ layout(binding = 4) readonly buffer B4 { SampleTime sample_times[]; };
 layout(binding = 5) readonly buffer B5 { vec4 phase_bias[]; };
 layout(binding = 6) writeonly buffer B6 { vec4 activations[]; };
 
-// Widths are multiples of 16; a wider tile may overhang and then repeats the last neuron, unstored.
+// Widths are multiples of 16. A wider tile may extend beyond the width; it then repeats the last neuron and does not store it.
 #define ROW(J) min(first + (J), push.width - 1u)
 #define ADD_INPUT(INPUT, GROUPS, WEIGHTS4)                                                                  \
     [[dont_unroll]] for (uint q = 0u; q < GROUPS; q++) {                                                    \
@@ -46,7 +46,7 @@ uint sample_of(uint t) {
     return min(base + t * gl_WorkGroupSize.x, padded - 1u);
 }
 
-// Where four neurons' biases of a phase are, from a neuron on.
+// Position of the biases of four neurons of a phase, from `neuron` on.
 uint bias_at(uint phase, uint neuron) {
     return (push.bias + phase * push.width + min(neuron, push.width - 4u)) / 4u;
 }

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 // Gradient at the output neuron and at the last hidden layer. One invocation per padded sample.
-//   sample_feature_gradient[s] = dL/df;  dz[q * capacity + s] = w_out * dL/df where the neuron was on.
+//   sample_feature_gradient[s] = dL/df;  dz[q * capacity + s] = w_out * dL/df where the neuron is positive.
 #include "inc/layout.glsl"
 #include "inc/sample_rays.glsl"
 #include "inc/operands.glsl"

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Weight and bias gradient of the output neuron, partial sums per split. One workgroup per (4 weights, split).
-//   partials[split][parameter]; later chunks of an iteration add to what the first wrote.
+// Gradients of the output neuron's weights and bias, as partial sums per split. One workgroup per (4 weights, split).
+//   partials[split][parameter]; later chunks of an iteration add to the values of the first chunk.
 #include "inc/layout.glsl"
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

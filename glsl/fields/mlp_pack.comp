@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// f16 copies of the network's weights as the fused kernels read them, bias and latent of each phase among them
-// (inc/phase_bias.glsl), and f32 biases repeated over the rows of a product. One invocation per pair of f16, then one per bias
-// element.
-//   pack_source[i]: where element i comes from: a parameter; PHASE_BIAS | element of [layer][phase][neuron]; or NOWHERE, zero.
+// Copies in f16 of the network's weights for the fused kernels, including the bias plus latent term of each phase
+// (inc/phase_bias.glsl), and biases in f32, repeated over the rows of a matrix product. One invocation per pair of f16,
+// followed by one per bias element.
+//   pack_source[i]: source of element i: a parameter; PHASE_BIAS | element of [layer][phase][neuron]; or NOWHERE for zero.
 #include "inc/layout.glsl"
 #include "inc/positions.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Sums ray_dz over the rays of each phase: phase_dz[layer][phase][4 neurons]. A ray between two phases counts for both. One
-// workgroup per (4 neurons, phase), fixed order; later chunks of an iteration add.
+// Sums ray_dz over the rays of each phase: phase_dz[layer][phase][4 neurons]. A ray between two phases contributes its shares
+// to both. One workgroup per (4 neurons, phase). The order of the sums is fixed, and later chunks of an iteration add to them.
 #include "inc/layout.glsl"
 #include "inc/phase_share.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Closes an iteration: sums the losses into a ring the host reads now and then, adapts the loss scale, and counts
-// the step. On the way, a slice of the next epoch's occupancy is cleared: all of it within one epoch.
-//   ring[step % ring_length]: what the iteration came to; once learning has ended, what the last one came to.
+// Completes an iteration: sums the losses into a ring buffer that the host reads from time to time, adapts the loss scale and
+// increments the step. It also clears a slice of the next epoch's occupancy, so that the whole of it is clear after one epoch.
+//   ring[step % ring_length]: results of the iteration; after training has stopped, the results of the last iteration.
 #include "inc/layout.glsl"
 layout(local_size_x = 256, local_size_x_id = 0) in;
 layout(constant_id = 1) const uint loss_scaling = 0u;
@@ -24,8 +24,9 @@ const uint UPDATES_TO_RETURN = 20u;
 const uint UPDATES_TO_GROW = 500u;
 const float LARGEST_SCALE = 16777216.0;
 
-// Overflows lower the scale at once. It returns quickly to half of the scale that overflowed first, since gradients that were large
-// for a few iterations, as when the dynamic field starts, would otherwise leave the later ones among f16's subnormals for thousands.
+// Overflows reduce the scale immediately. It then returns quickly to half of the scale at which the first overflow occurred:
+// gradients that were large for only a few iterations, for example when the dynamic field starts, would otherwise leave later
+// gradients among the subnormal numbers of f16 for thousands of iterations.
 void adapt_scale(float scale) {
     uint good = state.good_updates;
     if (state.overflowed != 0u) {
@@ -45,7 +46,7 @@ void adapt_scale(float scale) {
     state.good_updates = good;
 }
 
-// The losses of two networks beside those that every iteration has.
+// Adds the losses that only two networks have.
 StepReport with_regularisers(StepReport result, vec4 regularisers) {
     Schedule now = schedule[state.step];
     float vanishing = min(regularisers.x, regularisers.y);
