@@ -1,11 +1,12 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// The largest attenuation along each ray where far more Gaussians overlap than gaussian_rays keeps peaks of, and where
-// there is no still field: their sum at regular depths, then uphill from the largest and from the three strongest
-// Gaussians, which may lie between these depths, over all of them each time. One workgroup per tile of 8 x 8 pixels, one invocation per ray.
+// Maximum attenuation along each ray, for models in which far more Gaussians overlap than gaussian_rays keeps peaks of, and
+// without a static field. The sum of the Gaussians is evaluated at regular depths. A fixed-point iteration then climbs from the
+// maximum of these samples and from the peaks of the three strongest Gaussians, which may lie between the depths. Each step of
+// it sums over all Gaussians. One workgroup per tile of 8 x 8 pixels, one invocation per ray.
 //   ray_out[ray].dynamic_max, total_max
-// Twin: reference::blobs.
+// Reference implementation: reference::blobs.
 #include "inc/layout.glsl"
 #include "inc/gaussian_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -18,22 +19,22 @@ layout(binding = 3) buffer B3 { RayOut ray_out[]; };
 #include "inc/blobs.glsl"
 #include "inc/blob_rays.glsl"
 
-// Depths at which the sum is taken.
+// Number of depths at which the sum is evaluated.
 const uint DEPTHS = 128u;
-// Steps towards the peak.
+// Number of steps of the iteration towards the peak.
 const uint CLIMBS = 12u;
-// Standard deviations along the ray beyond which a Gaussian adds nothing that counts.
+// Distance along the ray, in standard deviations, beyond which a Gaussian's contribution is negligible.
 const float REACH = 4.0;
 
 float sums[DEPTHS];
 
-// Marks which of the Gaussians from `begin` on are near the tile; then `near_blobs` holds for all lanes.
+// Marks the Gaussians from `begin` on that are near the tile; afterwards `near_blobs` is valid in all lanes.
 void mark_from(uint begin, Tile tile) {
     uint at = begin + gl_LocalInvocationID.x;
     mark_near(at < push.n_blobs && is_near(blobs[push.first_blob + min(at, push.n_blobs - 1u)], tile));
 }
 
-// Keeps the three strongest Gaussians of a ray, strongest first: `heights` and where they peak.
+// Keeps the three strongest Gaussians of a ray in descending order: their `heights` and the depths of their peaks (`places`).
 void keep_strongest(float height, float at, inout vec3 heights, inout vec3 places) {
     if (height <= heights.z) return;
     if (height > heights.x) {
@@ -92,7 +93,7 @@ void main() {
             }
         }
         largest = max(largest, max(max(value.x, value.y), max(value.z, value.w)));
-        // Far from all there is nothing to climb.
+        // Where no Gaussian contributes, the depth does not change.
         depth = mix(depth, pull / max(weight, vec4(1e-30)), greaterThan(weight, vec4(0.0)));
     }
     if (!own.wanted) return;

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What the gradient of a Gaussian needs of an image: sums over its box of h = dL/dD times its value there, plain and
-// weighted by du, dv, du^2, du dv, dv^2, each in the order of the pixels. One invocation per splat, or as many as share
-// one, as in gaussian_splat.
+// Moments of an image from which the gradient of a Gaussian is computed. With h = dL/dD times the Gaussian's value at a pixel,
+// they are the sums over its box of h and of h times du, dv, du^2, du dv and dv^2, each in the order of the pixels. One
+// invocation per splat, or several that share one, as in gaussian_splat.
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/splat_lanes.glsl"
@@ -11,7 +11,7 @@ layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { Splat splats[]; };
 layout(binding = 2) readonly buffer B2 { int image_of_splat[]; };
 layout(binding = 3) readonly buffer B3 { float splat_image_gradient[]; };
-// Per splat: (h, h du, h dv, -), (h du^2, h du dv, h dv^2, -).
+// [splat][2]: (h, h du, h dv, -), (h du^2, h du dv, h dv^2, -).
 layout(binding = 4) writeonly buffer B4 { vec4 splat_moments[]; };
 
 void main() {

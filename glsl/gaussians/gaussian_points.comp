@@ -1,11 +1,11 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Attenuation of the moving field's Gaussians at the cells of a volume's rows; or what it is at most or at least anywhere
-// within `away` of them. One workgroup per 64 cells of rows (x) and four rows (y), one invocation per cell of each row:
-// devices that read a Gaussian lane by lane do so for four cells at once.
-//   volume[row][n_dynamic_samples]; row = ray of the batch. Twin: reference::blobs.
-// Rows of a workgroup.
+// Attenuation of the dynamic field's Gaussians at the cells of a volume's rows, or a bound of its values at all points within a
+// distance `away`. One workgroup per 64 cells of rows (x) and four rows (y), one invocation per cell of each row. A device that
+// reads a Gaussian separately in each lane thus reads it once for four cells.
+//   volume[row][n_dynamic_samples]; row: index of the ray in the batch. Reference implementation: reference::blobs.
+// Number of rows of a workgroup.
 #ifndef ROWS
 #define ROWS 4u
 #endif
@@ -14,7 +14,7 @@
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
-// away: world units; above 0 for what the sum is at most so near, below for what it is at least.
+// `away`: distance in world units; above 0 for an upper bound of the sum within it, below 0 for a lower bound.
 layout(push_constant) uniform Push { uint first_row; uint n_rows; uint first_blob; uint n_blobs; float away; } push;
 layout(binding = 0) uniform B0 { Setup setup; };
 layout(binding = 1) readonly buffer B1 { Ray rays[]; };

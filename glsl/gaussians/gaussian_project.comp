@@ -1,17 +1,17 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// How every view sees every Gaussian of a set per phase. One invocation per Gaussian (x) and view (y).
+// Projects every Gaussian of each phase's set into every view. One invocation per Gaussian (x) and view (y).
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) readonly buffer B1 { GaussianView gaussian_views[]; };
 layout(binding = 2) readonly buffer B2 { Gaussian gaussians[]; };
-// [phase][view] -> image, or -1.
+// [phase][view]: index of the image, or -1.
 layout(binding = 3) readonly buffer B3 { int image_of_view[]; };
 // [view][Gaussian]
 layout(binding = 4) writeonly buffer B4 { Splat splats[]; };
-// Image each belongs to.
+// [view][Gaussian]: image of each splat, or -1.
 layout(binding = 5) writeonly buffer B5 { int image_of_splat[]; };
 
 void main() {
