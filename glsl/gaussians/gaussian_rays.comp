@@ -1,9 +1,10 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Exact line integrals of the moving field's Gaussians, and the largest attenuation along each ray: a sum of Gaussians
-// is one along any ray, in closed form. One workgroup per tile of 8 x 8 pixels of an image, one invocation per ray.
+// Exact line integrals of the dynamic field's Gaussians in closed form, and the maximum attenuation along each ray. Along any
+// ray the field is a sum of one-dimensional Gaussians. One workgroup per tile of 8 x 8 pixels of an image, one invocation per
+// ray.
 //   ray_out[ray].dynamic_integral; with_maxima: also dynamic_max and total_max
-// Reads what march_fwd left of the static field. Twin: reference::blobs.
+// The static field's maximum is that of march_fwd in ray_out. Reference implementation: reference::blobs.
 #include "inc/operands.glsl"
 #include "inc/layout.glsl"
 #include "inc/gaussian_layout.glsl"
@@ -21,13 +22,13 @@ layout(binding = 4) buffer B4 { RayOut ray_out[]; };
 #include "inc/blobs.glsl"
 #include "inc/blob_rays.glsl"
 
-// Most Gaussians of a ray that its maximum is sought among; the strongest are kept.
+// Maximum number of Gaussians of a ray among which its maximum is searched; the strongest are kept.
 const uint MOST_PEAKS = 32u;
-// Steps from a Gaussian's peak towards the peak of the sum.
+// Number of steps of the iteration from a Gaussian's peak towards the peak of the sum.
 const uint CLIMBS = 4u;
 const float TWO_PI = 6.28318530718;
 
-// Along the ray: peak exp(-steepness (depth - at)^2 / 2).
+// Gaussians along the ray: peak_height exp(-peak_steepness (depth - peak_at)^2 / 2).
 float peak_at[MOST_PEAKS];
 float peak_steepness[MOST_PEAKS];
 float peak_height[MOST_PEAKS];
@@ -48,7 +49,7 @@ void keep_peak(float at, float steepness, float height) {
     peak_height[slot] = height;
 }
 
-// Attenuation of the kept Gaussians at a depth, and where the next step of a climb leads.
+// Attenuation of the kept Gaussians at a depth, and the depth of the iteration's next step.
 float sum_at(float depth, out float next) {
     float sum = 0.0, pull = 0.0, weight = 0.0;
     for (uint i = 0u; i < n_peaks; i++) {

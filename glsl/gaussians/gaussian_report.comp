@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Loss of the iteration into a ring, and the iteration's count. One workgroup.
+// Writes the iteration's loss to a ring buffer and increments the count of iterations. One workgroup.
 #include "inc/gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/reduce.glsl"

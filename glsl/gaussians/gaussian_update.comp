@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of each Gaussian from its moments in all views, in their order, and Adam. One invocation per Gaussian.
+// Gradient of each Gaussian from its moments, summed over the views in their order, and Adam's update. One invocation per
+// Gaussian.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -12,10 +13,10 @@ layout(binding = 3) readonly buffer B3 { vec4 splat_moments[]; };
 layout(binding = 4) readonly buffer B4 { GaussianSchedule gaussian_schedule[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
 layout(binding = 6) buffer B6 { Gaussian gaussians[]; };
-// First and second moments of Adam, laid out as Gaussians: position and log-density, log-scale, rotation.
+// First and second moments of Adam, in the layout of the Gaussians: position and log-density, log-scale, rotation.
 layout(binding = 7) buffer B7 { vec4 gaussian_adam_first[]; };
 layout(binding = 8) buffer B8 { vec4 gaussian_adam_second[]; };
-// The gradient, laid out alike.
+// Gradient in this layout.
 layout(binding = 9) writeonly buffer B9 { vec4 gaussian_gradient[]; };
 
 #include "inc/gaussian_adam.glsl"

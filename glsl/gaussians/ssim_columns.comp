@@ -1,9 +1,10 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Second pass of SSIM: along columns; its value v at each pixel, and the factors of its gradient
+// Second pass of SSIM, along columns: the SSIM value v of each pixel and the factors of its gradient
 //   P = 2 m2 (A2 - A1) / (B1 B2) + 2 m1 v (1 / B2 - 1 / B1),  Q = -v / B2,  T = 2 A1 / (B1 B2)
-// with A1 = 2 m1 m2 + C1, A2 = 2 s12 + C2, B1 = m1^2 + m2^2 + C1, B2 = s1 + s2 + C2, from windowed means and variances.
-// The loss of each set is the mean of |x - y| + ssim_weight (1 - v). One invocation per pixel (x) and set (y).
+// with A1 = 2 m1 m2 + C1, A2 = 2 s12 + C2, B1 = m1^2 + m2^2 + C1, B2 = s1 + s2 + C2, where the means m and the variances s are
+// those of the window. The loss of each set is the mean of |x - y| + ssim_weight (1 - v). One invocation per pixel (x) and set
+// (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/r2_layout.glsl"
 #include "inc/ssim.glsl"
@@ -19,10 +20,10 @@ layout(binding = 6) readonly buffer B6 { vec4 ssim_row_sums[]; };
 layout(binding = 7) readonly buffer B7 { float ssim_row_products[]; };
 // [set][pixel]: P, Q, T and v.
 layout(binding = 8) writeonly buffer B8 { vec4 ssim_factors[]; };
-// One per workgroup.
+// Partial sum of the loss of each workgroup.
 layout(binding = 9) writeonly buffer B9 { float gaussian_loss_parts[]; };
 
-// Loss of a pixel; its factors go to the next pass.
+// Computes the loss of a pixel and writes its gradient factors for the next pass.
 float compare(uint p, uint set) {
     uint stride = gaussian_setup.image_stride;
     int width = int(gaussian_setup.width), row = int(p) / width;

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// First pass of SSIM between each set's picture x and its image y: along rows, the window's sums of x, y, x^2, y^2 and
-// x y. One invocation per pixel (x) and set (y).
+// First pass of SSIM between the picture x and the image y of each set: windowed sums of x, y, x^2, y^2 and x y along rows. One
+// invocation per pixel (x) and set (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/r2_layout.glsl"
 #include "inc/ssim.glsl"
@@ -10,13 +10,13 @@ layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { R2Turn r2_turns[]; };
 layout(binding = 3) readonly buffer B3 { uint gaussian_step; };
-// [set][pixel], fixed point.
+// [set][pixel] in fixed point.
 layout(binding = 4) readonly buffer B4 { int splat_images[]; };
 // [image][pixel]
 layout(binding = 5) readonly buffer B5 { float r2_targets[]; };
-// [set][pixel]: of x, y, x^2, y^2.
+// [set][pixel]: sums of x, y, x^2, y^2.
 layout(binding = 6) writeonly buffer B6 { vec4 ssim_row_sums[]; };
-// [set][pixel]: of x y.
+// [set][pixel]: sums of x y.
 layout(binding = 7) writeonly buffer B7 { float ssim_row_products[]; };
 
 void main() {

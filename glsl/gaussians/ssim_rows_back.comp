@@ -1,14 +1,14 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Third pass of SSIM: along rows, the window's sums of the factors of its gradient; with zeros beyond the image the
-// window is its own adjoint. One invocation per pixel (x) and set (y).
+// Third pass of SSIM: windowed sums of the gradient factors along rows. With zeros outside the image, the window's operator is
+// its own adjoint. One invocation per pixel (x) and set (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/ssim.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
-// [set][pixel]: P, Q, T and another number.
+// [set][pixel]: P, Q, T and a number that is not used.
 layout(binding = 1) readonly buffer B1 { vec4 ssim_factors[]; };
-// [set][pixel]: of P, Q, T; then nothing.
+// [set][pixel]: sums of P, Q and T, followed by 0.
 layout(binding = 2) writeonly buffer B2 { vec4 ssim_row_factors[]; };
 
 void main() {

@@ -1,8 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What the gradient of a Gaussian needs of its picture where pixels' own rays are integrated along: sums over its box of
-// h = dL/dD times its line integral there, plain and weighted by c and by c c^T + b b^T, with c the way from its centre to the
-// nearest point of the ray and b the ray's direction, both along its axes.
+// Moments of a picture from which the gradient of a Gaussian is computed, if the line integrals are those along the pixels' own
+// rays. With h = dL/dD times the Gaussian's line integral at a pixel, they are the sums over its box of h, of h c and of h (c
+// c^T + b b^T). Here c is the vector from the Gaussian's centre to the nearest point of the ray and b the ray's direction, both
+// in the coordinates of the Gaussian's axes.
 #include "inc/r2.glsl"
 #include "inc/r2_chord.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -16,7 +17,7 @@ layout(binding = 4) readonly buffer B4 { R2Turn r2_turns[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
 layout(binding = 6) readonly buffer B6 { Splat splats[]; };
 layout(binding = 7) readonly buffer B7 { float splat_image_gradient[]; };
-// Per Gaussian, as r2_voxel_moments: (h c, h), (xx, yy, zz, -), (xy, xz, yz, -).
+// [Gaussian][3], as r2_voxel_moments: (h c, h), (xx, yy, zz, -), (xy, xz, yz, -).
 layout(binding = 8) writeonly buffer B8 { vec4 splat_moments[]; };
 
 void main() {

@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// As gaussian_splat, with the exact line integral along each pixel's own ray instead of the affine picture's.
+// Images of Gaussians as in gaussian_splat, but with the exact line integral along each pixel's own ray instead of the affine
+// approximation.
 #include "inc/r2.glsl"
 #include "inc/r2_chord.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -13,7 +14,7 @@ layout(binding = 3) readonly buffer B3 { R2Gaussian r2_gaussians[]; };
 layout(binding = 4) readonly buffer B4 { R2Turn r2_turns[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
 layout(binding = 6) readonly buffer B6 { Splat splats[]; };
-// [set][row][column], fixed point; a picture takes image_stride numbers.
+// [set][row][column] in fixed point; image_stride numbers per picture.
 layout(binding = 7) buffer B7 { int splat_images[]; };
 
 void main() {

@@ -1,7 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// How each Gaussian of R2-Gaussian is seen by the view that its set looks at in this iteration. One invocation per
-// Gaussian.
+// Projects each Gaussian of R2-Gaussian into the view that its set uses in this iteration. One invocation per Gaussian.
 #include "inc/r2.glsl"
 #include "inc/r2_chord.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -9,14 +8,14 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) uniform B1 { R2Setup r2_setup; };
-// Of each image.
+// View of each image.
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { R2Gaussian r2_gaussians[]; };
 // [iteration][set]
 layout(binding = 4) readonly buffer B4 { R2Turn r2_turns[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
 layout(binding = 6) writeonly buffer B6 { Splat splats[]; };
-// The picture each belongs to: one per set.
+// Picture of each splat; there is one picture per set.
 layout(binding = 7) writeonly buffer B7 { int image_of_splat[]; };
 
 void main() {

@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Last pass of SSIM, along columns, and the gradient of each set's loss by its picture x, of N pixels, whose image is
-// y:
+// Last pass of SSIM, along columns, and the gradient of each set's loss with respect to its picture x with N pixels, compared
+// with the image y:
 //   (sign(x - y) - ssim_weight (G P + 2 x G Q + y G T)) / N
-// with G the window. One invocation per pixel (x) and set (y).
+// where G is the window's operator. One invocation per pixel (x) and set (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/r2_layout.glsl"
 #include "inc/ssim.glsl"

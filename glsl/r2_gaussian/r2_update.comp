@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of each Gaussian of R2-Gaussian from its moments in the view and in the box of voxels, down to what is
-// stored; the statistic of density control, how strongly the image pulls at its centre; and Adam. One invocation per
-// Gaussian.
+// Gradient of each Gaussian of R2-Gaussian with respect to its stored numbers, from its moments in the view and in the box of
+// voxels; the statistic of density control, which is the norm of the image gradient at its centre; and Adam's update. One
+// invocation per Gaussian.
 #include "inc/r2.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
@@ -13,21 +13,22 @@ layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
 layout(binding = 4) readonly buffer B4 { R2Schedule r2_schedule[]; };
 layout(binding = 5) readonly buffer B5 { uint gaussian_step; };
-// Two per Gaussian of gaussian_moments, or three of r2_chord_moments.
+// [Gaussian][2] of gaussian_moments, or [Gaussian][3] of r2_chord_moments.
 layout(binding = 6) readonly buffer B6 { vec4 splat_moments[]; };
 layout(binding = 7) readonly buffer B7 { vec4 r2_voxel_moments[]; };
 layout(binding = 8) buffer B8 { R2Gaussian r2_gaussians[]; };
-// First and second moments of Adam, laid out as Gaussians: position and density, scale, rotation.
+// First and second moments of Adam, in the layout of the Gaussians: position and density, scale, rotation.
 layout(binding = 9) buffer B9 { vec4 gaussian_adam_first[]; };
 layout(binding = 10) buffer B10 { vec4 gaussian_adam_second[]; };
-// The gradient, laid out alike.
+// Gradient in this layout.
 layout(binding = 11) writeonly buffer B11 { vec4 gaussian_gradient[]; };
-// Per Gaussian: the sum over iterations of the gradient by its centre, in half images, and how often it was seen.
+// [Gaussian]: sum over iterations of the norm of the gradient with respect to the centre, in half images, and number of
+// iterations in which the Gaussian was seen.
 layout(binding = 12) buffer B12 { vec2 r2_statistics[]; };
 layout(binding = 13) readonly buffer B13 { Splat splats[]; };
 
-// Adds the gradient of what Gaussians add at points or along rays: sums of h times (c, 1), and times the squares and the mixed
-// products of what is told along their axes.
+// Adds the gradient from contributions at points or along rays, given as sums of h times (c, 1), of h times the squares and of
+// h times the mixed products of coordinates along the Gaussian's axes.
 void add_along_axes(vec4 linear, vec3 square, vec3 mixed, R2Gaussian g, R2Projection p, inout GaussianGradient sum) {
     sum.position += p.axes * (linear.xyz / p.scale);
     sum.log_density += linear.w;
@@ -38,14 +39,14 @@ void add_along_axes(vec4 linear, vec3 square, vec3 mixed, R2Gaussian g, R2Projec
     sum.rotation += rotation_gradient(g.rotation, d_axes);
 }
 
-// Adds the gradient of total variation.
+// Adds the gradient of the total variation.
 void add_voxels(uint i, R2Gaussian g, R2Projection p, inout GaussianGradient sum) {
     vec4 linear = r2_voxel_moments[3u * i];
     if (r2_setup.tv_moves_centres == 0u) linear.xyz = vec3(0.0);
     add_along_axes(linear, r2_voxel_moments[3u * i + 1u].xyz, r2_voxel_moments[3u * i + 2u].xyz, g, p, sum);
 }
 
-// Adds the gradient of the picture; gives that by the centre's column and row.
+// Adds the gradient of the picture. Returns the gradient with respect to the centre's column and row.
 vec2 add_picture(uint i, R2Gaussian g, R2Projection p, GaussianView view, inout GaussianGradient sum) {
     if (r2_setup.exact != 0u) {
         vec4 linear = splat_moments[3u * i];

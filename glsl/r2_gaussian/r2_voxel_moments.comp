@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What the gradient of a Gaussian needs of the voxels near it: sums of h = dL/d(attenuation) times its value there,
-// plain and weighted by c and c c^T, with c the way from its centre in standard deviations along its axes. One
-// invocation per Gaussian, or as many as share one.
+// Moments of the voxels near a Gaussian from which its gradient is computed: with h = dL/d(attenuation) times the Gaussian's
+// value at a voxel, the sums of h, h c and h c c^T. Here c is the vector from the Gaussian's centre in standard deviations
+// along its axes. One invocation per Gaussian, or several that share one.
 #include "inc/r2.glsl"
 #include "inc/r2_voxels.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -14,7 +14,7 @@ layout(binding = 2) readonly buffer B2 { R2Gaussian r2_gaussians[]; };
 layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
 layout(binding = 4) readonly buffer B4 { uint gaussian_step; };
 layout(binding = 5) readonly buffer B5 { float r2_voxel_gradient[]; };
-// Per Gaussian: (h c, h), (h cx^2, h cy^2, h cz^2, -), (h cx cy, h cx cz, h cy cz, -).
+// [Gaussian][3]: (h c, h), (h cx^2, h cy^2, h cz^2, -), (h cx cy, h cx cz, h cy cz, -).
 layout(binding = 6) writeonly buffer B6 { vec4 r2_voxel_moments[]; };
 
 void main() {

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Attenuation at the voxels of each set's box: each Gaussian adds itself to those near it, in integers of a fixed
-// point, so that runs repeat bit by bit. One invocation per Gaussian, or as many as share one, as in gaussian_splat.
+// Attenuation at the voxels of each set's box. Each Gaussian is added to the voxels near it in fixed-point integers, so that
+// runs are bit-identical. One invocation per Gaussian, or several that share one, as in gaussian_splat.
 #include "inc/r2.glsl"
 #include "inc/r2_voxels.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -12,7 +12,7 @@ layout(binding = 1) uniform B1 { R2Setup r2_setup; };
 layout(binding = 2) readonly buffer B2 { R2Gaussian r2_gaussians[]; };
 layout(binding = 3) readonly buffer B3 { R2Turn r2_turns[]; };
 layout(binding = 4) readonly buffer B4 { uint gaussian_step; };
-// [set][z][y][x], fixed point.
+// [set][z][y][x] in fixed point.
 layout(binding = 5) buffer B5 { int r2_voxel_sums[]; };
 
 void main() {

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Total variation of each set's box of s^3 voxels: the mean of |difference| over the 3 (s - 1) s^2 pairs of neighbours,
-// and its gradient by each voxel. One invocation per voxel (x) and set (y).
+// Total variation of each set's box of s^3 voxels, which is the mean of |difference| over the 3 (s - 1) s^2 pairs of
+// neighbours, and its gradient with respect to each voxel. One invocation per voxel (x) and set (y).
 #include "inc/gaussian_layout.glsl"
 #include "inc/r2_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -9,11 +9,11 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint first_part; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) uniform B1 { R2Setup r2_setup; };
-// [set][z][y][x], fixed point.
+// [set][z][y][x] in fixed point.
 layout(binding = 2) readonly buffer B2 { int r2_voxel_sums[]; };
-// Alike.
+// [set][z][y][x]
 layout(binding = 3) writeonly buffer B3 { float r2_voxel_gradient[]; };
-// From first_part on, one per workgroup.
+// Partial sum of the loss of each workgroup, from `first_part` on.
 layout(binding = 4) writeonly buffer B4 { float gaussian_loss_parts[]; };
 
 void main() {
