@@ -1,7 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of each Gaussian of the deformable set from its moments in the views of some phases, in their order: of its shape and
-// place at rest, and of its place at each phase; an image between two phases counts for both. One invocation per Gaussian.
+// Gradient of each Gaussian of the deformable set from its moments in the views of some phases, summed in their order: of its
+// shape and its position at rest, and of its position at each phase. An image between two phases contributes to both. One
+// invocation per Gaussian.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
 #include "inc/deformable_grid.glsl"
@@ -18,10 +19,10 @@ layout(binding = 7) readonly buffer B7 { int image_of_splat[]; };
 layout(binding = 8) readonly buffer B8 { vec4 splat_moments[]; };
 // [Gaussian]: position and log-density, log-scale, rotation.
 layout(binding = 9) writeonly buffer B9 { vec4 gaussian_gradient[]; };
-// [phase][Gaussian]
+// [phase][Gaussian]: gradient of the position.
 layout(binding = 10) buffer B10 { vec4 place_gradient[]; };
 #include "inc/gaussian_motion.glsl"
-// No time after a phase.
+// Value that differs from every time after a phase.
 const float NEVER = 2.0;
 
 void main() {
@@ -35,7 +36,7 @@ void main() {
     for (uint t = 0u; t < push.n_phases; t++) {
         uint phase = push.first_phase + t;
         sum.position = vec3(0.0);
-        // Most images of a phase were taken at the same time.
+        // Most images of a phase have the same acquisition time, so the position is recomputed only when the time changes.
         vec3 x;
         float x_after_phase = NEVER;
         for (uint view = 0u; view < gaussian_setup.n_views; view++) {

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of the grid's displacements: of the Gaussians around each node, in their order, and of the smoothness
-// penalty on squared differences of neighbouring nodes; none at the phase of rest. One invocation per node (x) and PHASES phases (y):
-// a Gaussian's share of a node is the same at all of them.
+// Gradient of the grid's displacements: the contributions of the Gaussians around each node, in their order, and of the
+// smoothness penalty on squared differences of neighbouring nodes. It is zero at the rest phase. One invocation per node (x)
+// and PHASES phases (y), because a Gaussian's share of a node is equal at all phases.
 #include "inc/gaussian.glsl"
 #include "inc/deformable_grid.glsl"
 #ifndef PHASES

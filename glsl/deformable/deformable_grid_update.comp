@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adam on the grid's displacements, which rests at one phase. One invocation per node (x) and phase (y).
+// Adam's update of the grid's displacements, except at the rest phase. One invocation per node (x) and phase (y).
 #include "inc/gaussian.glsl"
 #include "inc/deformable_grid.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

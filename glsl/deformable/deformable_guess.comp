@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Where tracking begins at a phase: as at the phase before, and half its last step on. One invocation per node.
+// Initial displacements of a phase for tracking: those of the phase before plus half of their last change. One invocation per
+// node.
 #include "inc/gaussian.glsl"
 #include "inc/deformable_grid.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Adam on the deformable set's Gaussians and their own motion. One invocation per Gaussian.
+// Adam's update of the deformable set's Gaussians and their own motion. One invocation per Gaussian.
 #include "inc/gaussian.glsl"
 #include "inc/deformable_grid.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,5 +1,5 @@
 #version 450
-// What the device's memory can do: reads and writes 16 bytes per invocation.
+// Benchmark of the device's memory bandwidth: reads and writes 16 bytes per invocation.
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint count; } push;
 layout(binding = 0) readonly buffer B0 { vec4 from[]; };

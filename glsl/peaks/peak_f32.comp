@@ -1,7 +1,7 @@
 #version 450
 #extension GL_EXT_control_flow_attributes : require
-// What the device's f32 units can do: twelve independent chains of multiply-adds,
-// which leave room in the sixteen vector registers of a CPU.
+// Benchmark of the device's f32 units: twelve independent chains of multiply-adds, which leave some of the sixteen vector
+// registers of a CPU free.
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint steps; float a; float b; } push;
 layout(binding = 0) writeonly buffer B0 { vec4 sink[]; };

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What the device's matrix units can do: independent chains of products in registers, four to a step, on operands that
-// are not constant (power limits depend on the bits that flip).
+// Benchmark of the device's matrix units: independent chains of matrix products in registers, four per step. The operands are
+// not constant, because the power limit depends on the number of bits that change.
 #include "inc/matrices.glsl"
 layout(push_constant) uniform Push { uint steps; } push;
 layout(binding = 0) readonly buffer B0 { uvec4 operands16[]; };

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// The Lineformer's attention: what each sample sees of its own values and of those of the other of its pair. One invocation per
-// sample of the chunk.
+// Attention of the Lineformer: the weighted mean of a sample's own values and the values of the other sample of its pair. One
+// invocation per sample of the chunk.
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_samples; uint capacity; uint first; uint row; } push;

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Back through the Lineformer's attention: gradients by a sample's query, key and values, of what it sees and of what the other
-// of its pair sees of it; and by the positions' biases. One invocation per sample of the chunk.
+// Backward pass of the Lineformer's attention: gradients with respect to a sample's query, key and values, from the results of
+// both samples of its pair, and with respect to the position biases. One invocation per sample of the chunk.
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_samples; uint capacity; uint first; uint row; } push;
@@ -25,7 +25,8 @@ void main() {
         vec4 d = operand(SAX_BY_SEEN, head, s), other_d = operand(SAX_BY_SEEN, head, o);
         float share = own_share(query, key, other_key, positions, pair.is_second);
         float other_share = own_share(other_query, other_key, key, positions, !pair.is_second);
-        // By the likeness to this sample, less that to the other: of this one, and of the other one.
+        // Derivatives with respect to the score of this sample's key minus that of the other key: for this sample and for the
+        // other one.
         float by = share * (1.0 - share) * dot(d, apart);
         float other_by = other_share * (1.0 - other_share) * dot(other_d, apart);
         sax_vectors[place_of(SAX_BY_QUERY, head, s)] = 0.5 * by * (key - other_key);

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Draws the rays of an iteration of one field, all of the image whose turn it is (images go in their order): windows
-// of the image's tiling, then single pixels outside of them that show something; neither twice in an iteration, unless
-// there are fewer. One invocation per ray.
+// Draws the rays of an iteration of one field, all from the image that is next in the order of images. The first rays are the
+// pixels of windows of the image's tiling, the others are single non-empty pixels outside these windows. No window or pixel is
+// drawn twice in an iteration, unless there are too few. One invocation per ray.
 #include "inc/layout.glsl"
 #include "inc/sax_layout.glsl"
 #include "inc/random.glsl"
@@ -11,16 +11,16 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint seed; uint first_turn; uint n_turns; } push;
 layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { DeviceState state; };
-layout(binding = 2) readonly buffer B2 { uint sax_turns[]; };     // images of the fields, in their order
-layout(binding = 3) readonly buffer B3 { View sax_views[]; };     // of each image
-layout(binding = 4) readonly buffer B4 { SaxList sax_lists[]; };  // of each image
+layout(binding = 2) readonly buffer B2 { uint sax_turns[]; };     // images of the fields, in the order of their use
+layout(binding = 3) readonly buffer B3 { View sax_views[]; };     // view of each image
+layout(binding = 4) readonly buffer B4 { SaxList sax_lists[]; };  // list of each image
 layout(binding = 5) readonly buffer B5 { uint sax_listed[]; };    // pixels
 layout(binding = 6) readonly buffer B6 { float sax_images[]; };   // [image][pixel]
 layout(binding = 7) writeonly buffer B7 { Ray rays[]; };
 
 uint columns() { return sax_setup.width / sax_setup.window; }
 
-// Tile of the image that is window `k`.
+// Tile of the image that is the `k`-th window.
 uint tile_of(uint k) {
     uint n_tiles = columns() * (sax_setup.height / sax_setup.window);
     return permute(k, n_tiles, push.seed, state.step, STREAM_SAX_WINDOW);
@@ -39,8 +39,8 @@ bool in_a_window(uint pixel) {
     return false;
 }
 
-// Each ray has a share of the shuffled pixels of its own, the first of which that is in no window it takes; if there is
-// none, the last.
+// Each ray has its own part of the permuted pixels and takes the first of them outside all windows, or the last one if all are
+// inside.
 uint single_pixel(uint ray, uint n_single, SaxList list) {
     uint pixel = 0u;
     for (uint at = ray % list.n; at < list.n; at += n_single) {

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Attenuation from the Lineformer's last layer: scale times a sigmoid. One invocation per sample of the chunk.
+// Attenuation from the Lineformer's last layer, which is the scale times a sigmoid. One invocation per sample of the chunk.
 //   sax_sigma[first_out + sample]
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

@@ -1,8 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// From the gradient by line integrals to that by the layer before the Lineformer's last, through its activation; leaves the
-// gradients by the last one's weights and bias. One invocation per sample of the chunk, which begins with sample `first` of all.
+// Backward pass of the Lineformer's last layer: the gradient with respect to the input of the layer before, through its
+// activation, from the gradient with respect to the line integrals. The kernel also writes each sample's gradients of the last
+// layer's weights and bias. One invocation per sample of the chunk, whose first sample has index `first` among all samples.
 #include "inc/operands.glsl"
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

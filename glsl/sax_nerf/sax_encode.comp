@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// The hash grid at samples: two features of each level, between eight entries. One invocation per sample and pair of
-// levels.
+// Features of the hash grid at samples: two numbers per level, interpolated between eight entries. One invocation per sample
+// and pair of levels.
 //   sax_encoding[pair of levels][sample]
 #include "inc/sax_layout.glsl"
 #include "inc/sax_hash.glsl"
@@ -11,7 +11,7 @@ layout(push_constant) uniform Push { uint n_samples; } push;
 layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) readonly buffer B1 { SaxLevel sax_levels[]; };
 layout(binding = 2) readonly buffer B2 { vec4 sax_points[]; };
-layout(binding = 3) readonly buffer B3 { vec2 sax_params[]; };   // the Lineformer's, then the grid's entries
+layout(binding = 3) readonly buffer B3 { vec2 sax_params[]; };   // numbers of the Lineformer, followed by the grid's entries
 layout(binding = 4) writeonly buffer B4 { vec4 sax_encoding[]; };
 
 vec2 features(SaxLevel level, vec3 unit) {

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Scatters the gradient by samples' features to the grid's entries, in 64-bit fixed point. One invocation per sample
-// and pair of levels.
-//   sax_grid_sums[2 * number] = low, high word
+// Scatters the gradient with respect to the samples' features to the grid's entries, in 64-bit fixed point. One invocation per
+// sample and pair of levels.
+//   sax_grid_sums[2 * number] = low and high word
 #include "inc/fixed_point.glsl"
 #include "inc/sax_layout.glsl"
 #include "inc/sax_hash.glsl"

@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of the grid's numbers from its sums in fixed point, which it clears for the next field. One invocation per
+// Gradient of the grid's numbers from the fixed-point sums, which are then cleared for the next field. One invocation per
 // number.
 #include "inc/sax_layout.glsl"
 #include "inc/fixed_point.glsl"
@@ -8,7 +8,7 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(binding = 0) uniform B0 { SaxSetup sax_setup; };
 layout(binding = 1) buffer B1 { uint sax_grid_sums[]; };
-layout(binding = 2) writeonly buffer B2 { float gradient[]; };  // the Lineformer's, then the grid's
+layout(binding = 2) writeonly buffer B2 { float gradient[]; };  // numbers of the Lineformer, followed by those of the grid
 
 void main() {
     uint i = invocation();

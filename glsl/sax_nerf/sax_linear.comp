@@ -1,8 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// A layer of the Lineformer on a chunk of samples: to = activation(added + bias + W_f features + W from). Features come first
-// among a row's weights. A lane keeps SAMPLES samples x OUTPUTS numbers in registers; weights are uniform loads.
+// A linear layer of the Lineformer on a chunk of samples: to = activation(added + bias + W_f features + W from). The weights of
+// the features come first in each row. A lane keeps SAMPLES samples x OUTPUTS numbers in registers; the loads of the weights
+// are uniform.
 #include "inc/operands.glsl"
 #ifndef SAMPLES
 #define SAMPLES 4u
@@ -11,7 +12,8 @@
 #define OUTPUTS 16u
 #endif
 layout(local_size_x = 32, local_size_x_id = 0) in;
-// Vectors; numbers from `weights` and `bias` on, vec4. `first_feature`: place of the chunk's first sample among `feature_stride`.
+// `from`, `added`, `to` and `activated` are vectors of inc/lineformer_layout.glsl. `weights` and `bias` are positions in vec4.
+// `first_feature` is the position of the chunk's first sample in a row of `feature_stride` samples.
 layout(push_constant) uniform Push {
     uint n_samples; uint capacity; uint features4; uint first_feature; uint feature_stride; uint from; uint columns;
     uint weights; uint bias; uint has_bias; uint added; uint to; uint activation; uint activated;

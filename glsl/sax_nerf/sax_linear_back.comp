@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Back through one layer of the Lineformer, or through the two that read the same: to = slope (W^T from + V^T other), on a chunk
-// of samples. The slope is that of the activation that made what the layer read. A lane keeps SAMPLES samples x GROUPS vec4 of
-// inputs; weights are uniform loads.
+// Backward pass through one linear layer of the Lineformer, or through two with the same input, on a chunk of samples: to =
+// slope (W^T from + V^T other). The slope is that of the activation before the layer's input. A lane keeps SAMPLES samples x
+// GROUPS vec4 of inputs; the loads of the weights are uniform.
 #include "inc/operands.glsl"
 #ifndef SAMPLES
 #define SAMPLES 4u
@@ -12,8 +12,9 @@
 #define GROUPS 4u
 #endif
 layout(local_size_x = 32, local_size_x_id = 0) in;
-// Vectors; numbers of a matrix from `weights` on, `stride` from row to row, both vec4; `rows4` of its rows in fours. `slope_of`:
-// the activation's result (leaky) or argument (GELU). To SAX_FEATURES: as `sax_linear` reads them.
+// `from`, `other`, `to` and `slope_of` are vectors. A matrix begins at `weights`, with `stride` from row to row, both in vec4,
+// and has `rows4` groups of four rows. `slope_of` is the activation's result (leaky) or its argument (GELU). With `to` =
+// SAX_FEATURES the output has the layout in which `sax_linear` reads the features.
 layout(push_constant) uniform Push {
     uint n_samples; uint capacity; uint first_feature; uint feature_stride; uint from; uint rows4; uint weights; uint stride;
     uint other; uint other_rows4; uint other_weights; uint other_stride; uint to; uint columns; uint activation;
@@ -36,7 +37,7 @@ void add(uint from, uint rows4, uint weights, uint stride) {
             g[t] = operand(from, q, min(base + t * gl_WorkGroupSize.x, push.n_samples - 1u));
         uint row = weights + 4u * q * stride;
         [[unroll]] for (uint i = 0u; i < GROUPS; i++) {
-            // A tile may overhang and then repeats the last inputs, unstored.
+            // A tile may extend beyond the columns. It then repeats the last inputs and does not store them.
             uint at = row + min(first + i, push.columns - 1u);
             vec4 w0 = FETCH(sax_params, at);
             vec4 w1 = FETCH(sax_params, at + stride);

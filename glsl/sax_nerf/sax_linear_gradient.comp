@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// What a chunk of samples says of the Lineformer's numbers: products of their vectors, added up in the samples' order, to what
-// chunks before said. A lane has INPUTS of a product's columns at once, all rows of each; rows are uniform loads. One workgroup
-// per part of the samples (x) and product (y).
+// Weight gradients of the Lineformer from a chunk of samples: products of two of the samples' vectors, summed in the order of
+// the samples and added to the sums of earlier chunks. A lane processes INPUTS columns of a product at once with all of their
+// rows; the loads of the rows are uniform. One workgroup per part of the samples (x) and product (y).
 //   sax_weight_parts[part][number]
 #include "inc/operands.glsl"
 #include "inc/sax_layout.glsl"
@@ -11,7 +11,7 @@
 #define INPUTS 2u
 #endif
 layout(local_size_x = 16, local_size_x_id = 0) in;
-// `first_feature` and `feature_stride` as of `sax_linear`; a part has `part_samples`.
+// `first_feature` and `feature_stride` are those of `sax_linear`; `part_samples` is the number of samples of a part.
 layout(push_constant) uniform Push {
     uint n_samples; uint capacity; uint first_feature; uint feature_stride; uint part_samples; uint adds;
 } push;
@@ -36,7 +36,7 @@ float column_of(SaxProduct product, uint k, uint s) {
     return operand(product.right, k / 4u, s)[k % 4u];
 }
 
-// Columns from `first` on, one and one more a workgroup further.
+// Computes a lane's INPUTS columns: `first` and further ones at distances of the workgroup's size.
 void add_product(SaxProduct product, uint first) {
     vec4 sums[WIDTH4][INPUTS];
     [[unroll]] for (uint j = 0u; j < WIDTH4; j++) {
@@ -61,7 +61,7 @@ void add_product(SaxProduct product, uint first) {
     }
 }
 
-// The sum of a vector.
+// Computes the sum of one vector over the samples.
 void add_vector(SaxProduct product) {
     for (uint i = gl_LocalInvocationID.x; i < WIDTH4; i += gl_WorkGroupSize.x) {
         vec4 sum = vec4(0.0);

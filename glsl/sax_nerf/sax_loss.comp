@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Line integrals of a batch, their squared residuals, and the gradient of the mean of these. One workgroup per ray.
+// Line integrals of a batch, their squared residuals, and the gradient of the mean squared residual. One workgroup per ray.
 #include "inc/layout.glsl"
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

@@ -1,8 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// A normalisation of the Lineformer: each sample's 32 numbers less their mean, over their standard deviation, times scales, plus
-// shifts. One invocation per sample of the chunk.
+// Layer normalisation of the Lineformer: each sample's 32 numbers minus their mean, divided by their standard deviation, times
+// scales, plus shifts. One invocation per sample of the chunk.
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_samples; uint capacity; uint from; uint to; uint scales; } push;

@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
-// Back through a normalisation of the Lineformer, from SAX_BY_NORMAL, and beside it: to = slope (added + that). The slope is that
-// of the activation before, where there is one. Leaves the gradients by scales and by shifts. One invocation per sample of the
-// chunk.
+// Backward pass of a layer normalisation of the Lineformer with its parallel path: to = slope (added + gradient through the
+// normalisation from SAX_BY_NORMAL). The slope is that of the activation before, if there is one. The kernel also writes each
+// sample's gradients of the scales and the shifts. One invocation per sample of the chunk.
 #include "inc/operands.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;
 layout(push_constant) uniform Push {

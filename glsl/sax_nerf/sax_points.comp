@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Samples along rays: points of the unit cube that the grid's box is, at its faces where rays are beyond them, and the
-// path that each stands for. One invocation per sample.
+// Samples along rays: their points in the unit cube, which corresponds to the grid's box, and their path lengths. Points
+// outside the box are moved to its faces. One invocation per sample.
 #include "inc/layout.glsl"
 #include "inc/sax_layout.glsl"
 #include "inc/random.glsl"
@@ -14,7 +14,7 @@ layout(binding = 1) readonly buffer B1 { DeviceState state; };
 layout(binding = 2) readonly buffer B2 { Ray rays[]; };
 layout(binding = 3) writeonly buffer B3 { vec4 sax_points[]; };  // [ray][sample]
 
-// How far inside of the faces points stay, in box sides.
+// Distance that points keep from the faces, in sides of the box.
 const float INSIDE = 1.7e-6;
 
 void main() {

@@ -1,6 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Loss of the iteration, the mean over the fields, into a ring, and the iteration's count. One workgroup.
+// Writes the iteration's loss, the mean over the fields, to a ring buffer and increments the count of iterations. One
+// workgroup.
 #include "inc/layout.glsl"
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What rays of a view see: line integrals and largest values, of the one field that there is. One workgroup per ray.
+// Line integrals and maxima along the rays of a view through the single field. One workgroup per ray.
 #include "inc/layout.glsl"
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 32, local_size_x_id = 0) in;

@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of the Lineformer's numbers: the workgroups' parts in their order. One invocation per number.
+// Gradient of the Lineformer's numbers: the sum of the workgroups' parts in their order. One invocation per number.
 #include "inc/sax_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"

@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Pictures of X-Gaussian: at each pixel the sum of c a T over its tile's Gaussians from the nearest on, with c the
-// intensity, a the opacity there and T the light that those in front leave, (1 - a) each. What is less opaque than
-// 1/255 counts as nothing; a pixel ends before less than 1e-4 is left. One workgroup per tile column (x), row (y) and
-// set (z).
+// Pictures of X-Gaussian. The value of a pixel is the sum of c a T over the Gaussians of its tile, starting from the nearest.
+// Here c is the intensity, a the opacity at the pixel, and T the transmittance of the Gaussians in front, which is the product
+// of their (1 - a). An opacity below 1/255 counts as 0. The sum of a pixel ends before T falls below 1e-4. One workgroup per
+// tile column (x), row (y) and set (z).
 #include "inc/x_gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
@@ -13,18 +13,18 @@ layout(binding = 3) readonly buffer B3 { Splat splats[]; };
 // [set][tile row][tile column]
 layout(binding = 4) readonly buffer B4 { XList x_lists[]; };
 layout(binding = 5) readonly buffer B5 { uint x_list_items[]; };
-// [set][pixel], fixed point: what stages after it read.
+// [set][pixel] in fixed point, as read by later stages.
 layout(binding = 6) writeonly buffer B6 { int splat_images[]; };
 // [set][pixel]
 layout(binding = 7) writeonly buffer B7 { XEnd x_ends[]; };
 #include "inc/x_tile.glsl"
 
-// Mean, opacity and intensity; conic.
+// Mean, opacity and intensity of the Gaussians in shared memory, followed by their conics.
 shared vec4 places[LANES];
 shared vec3 conics[LANES];
 shared uint going;
 
-// The picture's largest value, far beyond what targets have: sums stay integers.
+// Maximum value of a picture, far above the values of targets. It keeps the fixed-point numbers in range.
 const float BRIGHTEST = 256.0;
 
 struct Pixel {

@@ -1,9 +1,9 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// What the gradient of each Gaussian in a tile's list needs of the tile's pixels, from the last to the first. With g
-// the gradient by the picture, T the light in front of a Gaussian, a its opacity, c its intensity and B what is seen
-// behind it, h = g T (c - B) a where a follows the parameters: sums of h, h (du, dv), h (du^2, du dv, dv^2), and of g T
-// a. One workgroup per tile column (x), row (y) and set (z).
+// Sums over a tile's pixels from which the gradient of each Gaussian in the tile's list is computed, from the last Gaussian to
+// the first. Here g is the gradient with respect to the picture, T the transmittance in front of a Gaussian, a its opacity, c
+// its intensity and B the value of the picture behind it. With h = g T (c - B) a where a depends on the parameters, the sums
+// are those of h, h (du, dv), h (du^2, du dv, dv^2) and g T a. One workgroup per tile column (x), row (y) and set (z).
 #include "inc/x_gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
@@ -17,23 +17,23 @@ layout(binding = 6) readonly buffer B6 { uint x_list_items[]; };
 // [set][pixel]
 layout(binding = 7) readonly buffer B7 { XEnd x_ends[]; };
 layout(binding = 8) readonly buffer B8 { float splat_image_gradient[]; };
-// [entry][7]
+// [entry][7 sums]
 layout(binding = 9) writeonly buffer B9 { float x_entries[]; };
 #include "inc/x_tile.glsl"
 
-// Gaussians whose sums are taken at once.
+// Number of Gaussians whose sums are computed at once.
 const uint BATCH = 8u;
 const uint SUMS = 7u;
-// From the numbers of one sum to those of the next: banks of memory take turns.
+// Distance from the numbers of one sum to those of the next; its odd value avoids conflicts between memory banks.
 const uint SUM_STRIDE = LANES + 1u;
 
 // [Gaussian][sum][lane]
 shared float parts[BATCH * SUMS * SUM_STRIDE];
-// Mean, opacity and intensity; conic; where sums go.
+// Mean, opacity and intensity of the batch's Gaussians, followed by their conics and the entries of their sums.
 shared vec4 places[BATCH];
 shared vec3 conics[BATCH];
 shared uint entries[BATCH];
-// One more than the place of the last Gaussian that shows anywhere in the tile.
+// One more than the position of the last Gaussian that is visible in any pixel of the tile.
 shared uint last_shown;
 
 struct Pixel {
@@ -58,7 +58,7 @@ uint entry_of(uint i) {
     return span.first_entry + from_first.y * columns_and_rows(span).x + from_first.x;
 }
 
-// Gaussians behind all that shows have no part in it.
+// Writes zeros for the Gaussians behind the last visible one, which do not contribute.
 void clear_hidden(XList list) {
     for (uint k = last_shown + gl_LocalInvocationID.x; k < list.count; k += LANES) {
         uint entry = entry_of(x_list_items[list.first + k]);
@@ -66,7 +66,7 @@ void clear_hidden(XList list) {
     }
 }
 
-// Goes from behind the `j`-th Gaussian of the batch to before it.
+// Moves a pixel's state from behind the `j`-th Gaussian of the batch to in front of it.
 void pass(uint j, inout Pixel pixel, inout float sums[SUMS]) {
     vec2 d = pixel.at - places[j].xy;
     XAlpha here = alpha_of(conics[j], places[j].z, d);

@@ -1,12 +1,12 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Each tile's Gaussians, nearest first: those of its set, which are in that order, that may show in it. Nothing is
-// listed where not all have a place. One workgroup per tile column (x), row (y) and set (z).
+// Lists of each tile's Gaussians, nearest first: the Gaussians of the tile's set that may be visible in it, in the sorted
+// order. All lists are empty if the entries exceed the capacity. One workgroup per tile column (x), row (y) and set (z).
 #include "inc/x_gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(binding = 0) uniform B0 { XSetup x_setup; };
 layout(binding = 1) readonly buffer B1 { XSet x_sets[]; };
-// By set and depth.
+// Sorted by set and depth.
 layout(binding = 2) readonly buffer B2 { XKey x_keys[]; };
 layout(binding = 3) readonly buffer B3 { XSpan x_spans[]; };
 // [set][tile row][tile column]
@@ -16,7 +16,7 @@ layout(binding = 5) buffer B5 { XCounts x_counts; };
 layout(binding = 6) writeonly buffer B6 { XList x_lists[]; };
 layout(binding = 7) writeonly buffer B7 { uint x_list_items[]; };
 
-// Gaussians that a lane looks at before all tell what they found.
+// Number of Gaussians that a lane tests before all lanes exchange their counts.
 const uint GAUSSIANS_OF_LANE = 16u;
 
 shared uint found_by[gl_WorkGroupSize.x];
@@ -27,7 +27,7 @@ bool holds(XSpan span, uvec2 tile) {
     return all(lessThanEqual(begin, tile)) && all(lessThan(tile, end));
 }
 
-// Which of the Gaussians from `begin` to before `end` may show, a bit each.
+// Tests which of the Gaussians in [begin, end) may be visible in the tile; one bit per Gaussian.
 uint found_from(uint begin, uint end, uvec2 tile) {
     uint found = 0u;
     for (uint k = 0u; k < GAUSSIANS_OF_LANE && begin + k < end; k++) {
@@ -43,7 +43,7 @@ void main() {
     uint at = (set * x_setup.tile_rows + tile.y) * x_setup.tile_columns + tile.x;
     uint count = x_counts.entries <= x_setup.capacity ? x_tile_counts[at] : 0u;
     if (lane == 0u) {
-        // Where lists lie does not change what is shown.
+        // The position of a list in memory does not change the picture.
         first = atomicAdd(x_counts.listed, count);
         x_lists[at] = XList(first, count);
     }

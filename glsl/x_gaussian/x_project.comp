@@ -1,18 +1,18 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// How each Gaussian of X-Gaussian is seen by the view that its set looks at in this iteration: its splat, the tiles of
-// 16 x 16 pixels that it may show in, how deep it is, and where its gradients go. Tiles count their Gaussians. One
-// invocation per Gaussian.
+// Projects each Gaussian of X-Gaussian into the view that its set uses in this iteration: its splat, the tiles of 16 x 16
+// pixels in which it may be visible, its depth, and the position of its gradients. It also counts the Gaussians of each tile.
+// One invocation per Gaussian.
 #include "inc/x_gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
 layout(push_constant) uniform Push { uint n_gaussians; } push;
 layout(binding = 0) uniform B0 { GaussianSetup gaussian_setup; };
 layout(binding = 1) uniform B1 { XSetup x_setup; };
-// Of each image.
+// View of each image.
 layout(binding = 2) readonly buffer B2 { GaussianView gaussian_views[]; };
 layout(binding = 3) readonly buffer B3 { XGaussian x_gaussians[]; };
-// The set of each.
+// Set of each Gaussian.
 layout(binding = 4) readonly buffer B4 { uint x_set_of[]; };
 // [iteration][set]
 layout(binding = 5) readonly buffer B5 { R2Turn r2_turns[]; };
@@ -27,7 +27,7 @@ layout(binding = 11) buffer B11 { XCounts x_counts; };
 shared uint n_entries[gl_WorkGroupSize.x];
 shared uint first_of_all;
 
-// Counts a Gaussian in the tiles from .xy to before .zw; how many these are.
+// Adds a Gaussian to the counts of the tiles from .xy to before .zw and returns the number of these tiles.
 uint count_in(uvec4 tiles, uint set) {
     for (uint row = tiles.y; row < tiles.w; row++)
         for (uint column = tiles.x; column < tiles.z; column++)
@@ -57,7 +57,7 @@ void main() {
         if (k < lane) before += n_entries[k];
         all += n_entries[k];
     }
-    // Whoever comes first gets the first places: where gradients lie does not change them.
+    // The positions depend on the order in which workgroups arrive, but the gradients do not depend on their positions.
     if (lane == 0u) first_of_all = atomicAdd(x_counts.entries, all);
     barrier();
     if (exists) x_spans[i] = XSpan(tiles.x | tiles.y << 16, tiles.z | tiles.w << 16, first_of_all + before);

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Loss of the iteration into a ring, and the iteration's count; neither where lists had no room, of which the host
-// hears. One workgroup.
+// Writes the iteration's loss to a ring buffer and increments the count of iterations. Neither happens if the tiles' lists
+// exceeded the capacity; the host reads this from `x_status`. One workgroup.
 #include "inc/gaussian_layout.glsl"
 #include "inc/x_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;

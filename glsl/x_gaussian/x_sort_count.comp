@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Sort by four bits, first pass: how often each digit is in each block of 1024 keys. One workgroup per block.
+// First pass of the sort by four bits: counts of each digit in each block of 1024 keys. One workgroup per block.
 #include "inc/x_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"

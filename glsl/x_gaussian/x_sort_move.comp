@@ -1,6 +1,6 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Sort by four bits, last pass: keys go where they belong, those of equal digits in the order they had. One workgroup
+// Last pass of the sort by four bits: moves the keys to their positions. Keys with equal digits keep their order. One workgroup
 // per block of 1024 keys.
 #include "inc/x_layout.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
@@ -8,7 +8,7 @@ layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_keys; uint n_blocks; uint shift; } push;
 layout(binding = 0) readonly buffer B0 { XKey x_keys[]; };
 layout(binding = 1) readonly buffer B1 { uint x_set_of[]; };
-// [digit][block]: sums of what is before.
+// [digit][block]: sums of the preceding counts.
 layout(binding = 2) readonly buffer B2 { uint x_sort_counts[]; };
 layout(binding = 3) writeonly buffer B3 { XKey x_keys_moved[]; };
 #include "inc/x_sort.glsl"

@@ -1,7 +1,7 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Sort by four bits, second pass: each count becomes the sum of those before it, which is where the first key of its
-// digit and block goes. One workgroup.
+// Second pass of the sort by four bits: replaces each count by the sum of the counts before it, which is the position of the
+// first key of its digit and block. One workgroup.
 layout(local_size_x = 64, local_size_x_id = 0) in;
 layout(push_constant) uniform Push { uint n_counts; } push;
 // [digit][block]

@@ -1,7 +1,8 @@
 #version 450
 #extension GL_GOOGLE_include_directive : require
-// Gradient of each Gaussian of X-Gaussian from its sums in the tiles that it shows in, in their order, down to what is
-// stored; what density control goes by; and Adam. Nothing where lists had no room. One invocation per Gaussian.
+// Gradient of each Gaussian of X-Gaussian with respect to its stored numbers, from its sums in the tiles in which it is
+// visible, in their order; the statistics of density control; and Adam's update. The kernel does nothing if the lists exceeded
+// the capacity. One invocation per Gaussian.
 #include "inc/x_gaussian.glsl"
 layout(local_size_x = 64, local_size_x_id = 0) in;
 #include "inc/workgroup.glsl"
@@ -15,13 +16,13 @@ layout(binding = 5) readonly buffer B5 { XSchedule x_schedule[]; };
 layout(binding = 6) readonly buffer B6 { uint gaussian_step; };
 layout(binding = 7) readonly buffer B7 { XSpan x_spans[]; };
 layout(binding = 8) readonly buffer B8 { XCounts x_counts; };
-// [entry][7]
+// [entry][7 sums]
 layout(binding = 9) readonly buffer B9 { float x_entries[]; };
 layout(binding = 10) buffer B10 { XGaussian x_gaussians[]; };
-// First and second moments of Adam, laid out as Gaussians: position and opacity, scale and intensity, rotation.
+// First and second moments of Adam, in the layout of the Gaussians: position and opacity, scale and intensity, rotation.
 layout(binding = 11) buffer B11 { vec4 gaussian_adam_first[]; };
 layout(binding = 12) buffer B12 { vec4 gaussian_adam_second[]; };
-// The gradient, laid out alike.
+// Gradient in this layout.
 layout(binding = 13) writeonly buffer B13 { vec4 gaussian_gradient[]; };
 layout(binding = 14) buffer B14 { XStatistics x_statistics[]; };
 
