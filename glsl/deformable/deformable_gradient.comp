@@ -36,7 +36,7 @@ void main() {
     for (uint t = 0u; t < push.n_phases; t++) {
         uint phase = push.first_phase + t;
         sum.position = vec3(0.0);
-        // Most images of a phase have the same acquisition time, so the position is recomputed only when the time changes.
+        // The images of a phase usually have the same acquisition time; the position is recomputed only if the time changes.
         vec3 x;
         float x_after_phase = NEVER;
         for (uint view = 0u; view < gaussian_setup.n_views; view++) {

@@ -5,7 +5,7 @@
 // distance `away`. One workgroup per 64 cells of rows (x) and four rows (y), one invocation per cell of each row. A device that
 // reads a Gaussian separately in each lane thus reads it once for four cells.
 //   volume[row][n_dynamic_samples]; row: index of the ray in the batch. Reference implementation: reference::blobs.
-// Number of rows of a workgroup.
+// `ROWS` is the number of rows of a workgroup.
 #ifndef ROWS
 #define ROWS 4u
 #endif

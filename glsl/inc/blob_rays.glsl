@@ -1,14 +1,14 @@
-// Gaussians along the rays of a tile of 8 x 8 pixels, one invocation per ray. Needs `push`, `rays`, "inc/blobs.glsl"
-// and "inc/reduce.glsl".
+// Gaussians along the rays of a tile of 8 x 8 pixels, one invocation per ray. The including file must declare `push` and `rays`
+// and include "inc/blobs.glsl" and "inc/reduce.glsl".
 
-// A tile's first ray, and how far others stray from it at depth 0 and per depth.
+// First ray of a tile, and the maximum distance of the tile's other rays from it at depth 0 and per unit of depth.
 struct Tile {
     Ray first;
     float spread;
     float spread_per_depth;
 };
 
-// The ray of this lane, or the tile's first where the image has none.
+// Ray of this lane, or the tile's first ray if the lane's pixel is outside the image.
 struct TileRay {
     Ray ray;
     uint index;
@@ -40,11 +40,11 @@ bool is_near(Blob b, Tile tile) {
     vec3 w = b.centre - tile.first.anchor;
     float depth = dot(w, tile.first.direction) / dot(tile.first.direction, tile.first.direction);
     float away = length(w - depth * tile.first.direction);
-    // A ray's closest point is not at the first ray's depth: a tenth more covers that.
+    // The nearest points of other rays are not at the depth of the first ray; the factor 1.1 covers this difference.
     return away <= b.reach + 1.1 * (tile.spread + (abs(depth) + b.reach) * tile.spread_per_depth);
 }
 
-// Along a ray: height exp(-steepness (depth - at)^2 / 2); the height is 0 where the ray passes beyond the cut.
+// Gaussian along a ray: height exp(-steepness (depth - at)^2 / 2). The height is 0 where the ray passes outside the cut.
 struct Profile {
     float at;
     float steepness;
@@ -53,7 +53,7 @@ struct Profile {
 
 Profile profile_of(Blob b, Ray ray) {
     vec3 w = b.centre - ray.anchor;
-    // From the ray's point nearest to the centre: numbers stay small.
+    // The vector starts at the ray's point nearest to the centre, so that its components are small.
     float depth = dot(w, ray.direction) / dot(ray.direction, ray.direction);
     w -= depth * ray.direction;
     vec3 along = blob_times(b, ray.direction);

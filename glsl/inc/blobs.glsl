@@ -1,6 +1,6 @@
-// Which Gaussians a workgroup's points or rays can meet, 64 at a time. Needs `blobs`.
+// Selection of the Gaussians that a workgroup's points or rays can meet, 64 at a time. The including file must declare `blobs`.
 
-// A bit for each of 64 Gaussians; read in order, so that sums repeat bit by bit.
+// One bit for each of 64 Gaussians. The bits are read in order, so that sums are bit-identical between runs.
 shared uint near_blobs[2];
 
 vec3 blob_times(Blob b, vec3 v) {
@@ -9,14 +9,14 @@ vec3 blob_times(Blob b, vec3 v) {
                 b.mixed.y * v.x + b.mixed.z * v.y + b.diagonal.z * v.z);
 }
 
-// At least as much as any length grows when it is divided by the Gaussian's deviations.
+// Upper bound of the factor by which a length increases when it is divided by the Gaussian's standard deviations.
 float stretch_of(Blob b) {
     vec3 mixed = abs(b.mixed);
     vec3 sums = b.diagonal + vec3(mixed.x + mixed.y, mixed.x + mixed.z, mixed.y + mixed.z);
     return sqrt(max(sums.x, max(sums.y, sums.z)));
 }
 
-// Says for the Gaussian of this lane whether it is near; then `near_blobs` holds for all lanes.
+// Records whether the Gaussian of this lane is near; afterwards `near_blobs` is valid in all lanes.
 void mark_near(bool near) {
     uint lane = gl_LocalInvocationID.x;
     barrier();

@@ -1,7 +1,7 @@
-// REDUCE makes a function that combines the values of LANES neighbouring lanes, a power of two, all of which get the result, in a fixed
-// order: runs repeat bit by bit on a device. With SUBGROUP, lanes of a subgroup exchange values, and subgroups, all of them full,
-// through shared memory; else all goes through shared memory, with any size of subgroups. PREFIX makes one that adds up the values of
-// those among the LANES that come before.
+// REDUCE defines a function that combines the values of LANES neighbouring lanes, a power of two, and returns the result in all
+// of them. The order is fixed, so that runs on a device are bit-identical. With SUBGROUP, the lanes of a subgroup exchange
+// values directly and the subgroups, all of them full, use shared memory. Otherwise all lanes use shared memory, for any size
+// of subgroups. PREFIX defines a function that returns the sum of the values of the preceding lanes among the LANES.
 #ifdef SUBGROUP
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
@@ -78,7 +78,7 @@
 
 #define SUM_OF(A, B) ((A) + (B))
 
-// This lane's place among those of the workgroup: lanes that exchange values are neighbours.
+// Index of this lane in the workgroup; lanes that exchange values are neighbours.
 uint workgroup_lane() {
 #ifdef SUBGROUP
     return gl_SubgroupID * gl_SubgroupSize + gl_SubgroupInvocationID;

@@ -1,5 +1,5 @@
-// Stratified depths: each is jittered within its own interval between the mid-points of a regular
-// grid that includes both ends; without jitter, the grid itself.
+// Stratified depths. Each depth is jittered within its own interval between the mid-points of a regular grid that includes both
+// ends. Without jitter, the depths are those of the grid.
 
 float grid_depth(uint k, uint n, float near, float far) {
     return near + (far - near) * (float(k) / float(n - 1u));
@@ -13,7 +13,7 @@ float depth_at(uint k, uint n, float near, float far, uint jitter, uint seed, ui
     return lower + (upper - lower) * uniform01(seed, STREAM_DEPTH + (ray << 4u), step, k);
 }
 
-// Path length that depth `here` of index k stands for; the last sample stands for (almost) none.
+// Path length of the sample at depth `here` with index k; almost zero for the last sample.
 float path_length(float here, uint k, uint n, float near, float far, uint jitter, uint seed, uint step, uint ray,
                   float norm) {
     if (k == n - 1u) return 1e-10 * norm;

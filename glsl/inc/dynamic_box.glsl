@@ -1,5 +1,5 @@
-// Where the dynamic field may exist: its box and, when enabled, the motion hull.
-// Needs `setup` and `hull`.
+// Region in which the dynamic field may exist: its box and, if enabled, the motion hull. The including file must declare
+// `setup` and `hull`.
 bool dynamic_inside(vec3 x, uint phase) {
     if (any(lessThan(x, setup.dynamic_min)) || any(greaterThan(x, setup.dynamic_max))) return false;
     if (setup.hull_enabled == 0u) return true;

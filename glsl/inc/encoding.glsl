@@ -1,8 +1,8 @@
-// Windowed positional encoding (paper section 2.3): [x, y, z, then per band k: a_k sin(2^k (x,y,z)), a_k cos(...)].
-// Needs `setup`.
+// Windowed positional encoding (paper section 2.3): [x, y, z, then per band k: a_k sin(2^k (x,y,z)), a_k cos(...)]. The
+// including file must declare `setup`.
 
-// Vulkan's sin is exact only near 0: subtract the nearest multiple of 2 pi in three parts, of which n times the first two are exact. To be
-// done as written: compilers may add the parts up first.
+// The sin of Vulkan is accurate only near 0, so this function subtracts the nearest multiple n of 2 pi in three parts. The
+// products of n with the first two parts are exact. `precise` prevents compilers from adding the parts up first.
 vec3 reduce_angle(vec3 a) {
     vec3 n = round(a * 0.15915494309189535);
     precise vec3 less = a - n * 6.28125;

@@ -1,6 +1,6 @@
-// Sums in 64-bit fixed point, a pair of words each, low and high: integers add up exactly, so the order of additions
-// does not matter. With INT64, what adds to memory takes a pair for one integer, for devices that add these atomically: the
-// same bits come out. To be included before what is no directive: an extension precedes all else.
+// Sums in 64-bit fixed point, each a pair of a low and a high word. Sums of integers are exact, so the order of additions does
+// not matter. With INT64, additions to memory use one integer of 64 bits instead of a pair, on devices with such atomics; the
+// results are bit-identical. This file must be included before all code other than directives, because it contains extensions.
 #ifdef INT64
 #extension GL_EXT_shader_explicit_arithmetic_types_int64 : require
 #extension GL_EXT_shader_atomic_int64 : require
@@ -11,8 +11,8 @@
 #define ADD_FIXED_TO_MEMORY(SUMS, AT, VALUE) ADD_FIXED(SUMS, AT, VALUE)
 #endif
 
-// A number in 64-bit fixed point, by 2 to the (bits behind the point - 32); the magnitude is split exactly into words,
-// then negated in two's complement.
+// Converts a number to 64-bit fixed point. `scale_high` is 2^(fractional bits - 32). The magnitude is split exactly into two
+// words and then negated in two's complement if necessary.
 uvec2 to_fixed(float value, float scale_high) {
     float scaled = abs(value) * scale_high;
     float whole = floor(scaled);
@@ -25,7 +25,7 @@ uvec2 to_fixed(float value, float scale_high) {
     return uvec2(low, high);
 }
 
-// The number that a sum stands for.
+// Converts a sum in fixed point to a number.
 float from_fixed(uvec2 sum, uint bits) {
     uint low = sum.x;
     uint high = sum.y;
@@ -38,7 +38,7 @@ float from_fixed(uvec2 sum, uint bits) {
     return negative ? -magnitude : magnitude;
 }
 
-// Adds a number in fixed point to sum AT of SUMS, words in memory or shared by a workgroup.
+// Adds a fixed-point number to element AT of SUMS, which are words in memory or in shared memory.
 #define ADD_FIXED(SUMS, AT, VALUE)                                                                                     \
     {                                                                                                                  \
         uvec2 addend = VALUE;                                                                                          \

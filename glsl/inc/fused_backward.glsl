@@ -1,35 +1,37 @@
-// What the backward passes on matrices share: a tile of samples, gradients to its input and of its weights, sums. What includes
-// this declares the constants `upper_columns` and `lower_columns` (inputs of the upper layer, and of the layer below it that the pass goes
-// on to, or 0), `shares` and `lower_shares`, the size of `tile_in`, the push constants, and `weights16` and `partials`.
+// Common parts of the backward passes on matrices: a tile of samples, input gradients, weight gradients, and sums. The
+// including file must declare the constants `upper_columns` and `lower_columns` (numbers of inputs of the upper layer, and of
+// the layer below it, or 0 if the pass ends at the upper layer), `shares` and `lower_shares`, the size of `tile_in`, the push
+// constants, `weights16` and `partials`.
 
 const uint width8 = width / 8u;
 const uint upper_columns8 = upper_columns / 8u;
 const uint lower_columns8 = lower_columns / 8u;
-// One more uvec4 a row keeps rows off the same banks.
+// One additional uvec4 per row avoids bank conflicts.
 const uint dz_stride = width8 + 1u;
 const uint input_stride = upper_columns8 + 1u;
 const uint lower_stride = lower_columns8 + 1u;
 const uint longest_stride = input_stride > lower_stride ? input_stride : lower_stride;
 const uint row_tiles = tile / m;
 const uint column_tiles = width / n;
-// Weight gradient: subgroups are laid out in bands over neurons times shares of the inputs.
+// Weight gradient: the subgroups form bands over neurons times shares of the inputs.
 const uint bands = subgroups / shares;
 const uint grad_rows = (width / m + bands - 1u) / bands;
 const uint grad_columns = (upper_columns / n + shares - 1u) / shares;
 const uint lower_bands = subgroups / lower_shares;
 const uint lower_rows = (width / m + lower_bands - 1u) / lower_bands;
 const uint lower_grad_columns = (lower_columns / n + lower_shares - 1u) / lower_shares;
-// Whether tiles of the last band or share lie beyond the gradient. Constants, so that drivers drop the tests where none does.
+// Whether tiles of the last band or share are outside the gradient. These are constants, so that drivers can remove the tests
+// where no tile is outside.
 const bool overhangs = bands * grad_rows * m > width || shares * grad_columns * n > upper_columns;
 const bool lower_overhangs = lower_bands * lower_rows * m > width || lower_shares * lower_grad_columns * n > lower_columns;
 const uint most_rows = grad_rows > lower_rows ? grad_rows : lower_rows;
 const uint upper_tiles = grad_rows * grad_columns;
-// Input gradient, which only hidden inputs have: subgroups are dealt columns of tiles, and where there are more of them, shares
-// of the rows.
+// Input gradient, which only hidden inputs have: the columns of tiles are distributed among the subgroups; if there are more
+// subgroups than columns, the rows are divided into shares, too.
 const uint row_shares = subgroups > column_tiles ? subgroups / column_tiles : 1u;
 const uint input_rows = row_tiles / row_shares;
 const uint input_columns = column_tiles * row_shares / subgroups;
-// Sums over samples: an invocation has a neuron, or every so many of them, and of the rows one part.
+// Sums over samples: an invocation sums one neuron, or several at regular distances, over one part of the rows.
 const uint row_parts = gl_WorkGroupSize.x / width > 0u ? gl_WorkGroupSize.x / width : 1u;
 const uint lane_neurons = (width + gl_WorkGroupSize.x - 1u) / gl_WorkGroupSize.x;
 const uint scratch = 2u * gl_WorkGroupSize.x;
@@ -39,12 +41,13 @@ shared uvec4 tile_in[INPUTS_SIZE];
 SUM weight_gradient[upper_tiles + lower_rows * lower_grad_columns];
 float bias_sum[lane_neurons];
 float lower_bias_sum[lane_neurons];
-// Largest gradient in f16: what is larger than any becomes infinite on some devices, the largest there is on others.
+// Maximum magnitude of a gradient in f16. A conversion of a larger number gives infinity on some devices and the maximum of f16
+// on others.
 float largest;
 shared uint overflowed;
 
-// Copies of rows to shared memory in parts, of which an invocation has one of each: all of its loads are under way before the first is
-// waited for, where a loop would wait for each of them.
+// Copies of rows to shared memory in parts, of which an invocation has one each. All loads of an invocation are issued before
+// the first result is used; a loop would wait for each load.
 #define PARTS(size) ((size) > 0u ? ((size) - 1u) / gl_WorkGroupSize.x + 1u : 1u)
 #define IN_PART(e, size) ((size) > 0u && (size) % gl_WorkGroupSize.x == 0u || e < (size))
 #define FETCH(parts, rows, at, size) \
@@ -61,13 +64,13 @@ const uint dz_size = tile * width8;
 const uint input_size = tile * upper_columns8;
 const uint lower_size = tile * lower_columns8;
 
-// Of eight neurons' numbers, that of one.
+// Selects one neuron's number from the numbers of eight neurons.
 float neuron_of(uvec4 packed, uint neuron) {
     vec2 pair = unpackHalf2x16(packed[(neuron & 7u) / 2u]);
     return (neuron & 1u) == 0u ? pair.x : pair.y;
 }
 
-// Adds up an invocation's share of the dz in shared memory.
+// Adds an invocation's part of the dz in shared memory to its sums.
 void add_dz(inout float sums[lane_neurons]) {
     uint part = gl_LocalInvocationIndex / width;
     [[unroll]] for (uint i = 0u; i < lane_neurons; i++) {
@@ -83,7 +86,7 @@ void put(uint at, float value) {
     partials[at] = value + (push.accumulate != 0u ? partials[at] : 0.0);
 }
 
-// Adds the sums of each invocation over the parts of the rows, in their order.
+// Adds each invocation's sums over the parts of the rows in their order and writes the results.
 void put_neuron_sums(float sums[lane_neurons], uint at) {
     barrier();
     tile_dz[gl_LocalInvocationIndex].x = floatBitsToUint(sums[0]);
@@ -96,7 +99,7 @@ void put_neuron_sums(float sums[lane_neurons], uint at) {
     }
 }
 
-// Where the tiles of an input gradient lie that a subgroup has.
+// Position of a subgroup's tiles of an input gradient.
 uint gradient_row(uint r) {
     return (gl_SubgroupID / column_tiles + r * row_shares) * m;
 }
@@ -105,7 +108,8 @@ uint gradient_column(uint c) {
     return (gl_SubgroupID % column_tiles + c * subgroups) * n;
 }
 
-// A tile of the gradient to a layer's input where that was on, whose f16 numbers begin at `on_at` in shared memory.
+// A tile of the gradient of a layer's input, set to zero where the input is not positive. The input's f16 numbers begin at
+// `on_at` in shared memory.
 #ifdef F32_SUMS
 GRADIENT where_on(SUM sum, uint on_at) {
     share_sums(sum);
@@ -120,7 +124,7 @@ GRADIENT where_on(SUM sum, uint on_at) {
     return sum;
 }
 #else
-// Element order may differ between component types, so the mask is applied between equal types.
+// The order of elements may differ between component types, so the mask is applied to operands of equal type.
 GRADIENT where_on(SUM sum, uint on_at) {
     SUM16 gradient = SUM16(sum), on;
     coopMatLoad(on, tile_in, on_at, dz_stride, ROWS);
@@ -132,8 +136,9 @@ GRADIENT where_on(SUM sum, uint on_at) {
 }
 #endif
 
-// The gradient to a layer's input in a subgroup's tiles of a column, from the dz and the input in shared memory. Weights are read once for
-// all rows; beside the sums of two layers, operands of all steps at once would not fit the registers.
+// Computes the gradient of a layer's input in a subgroup's tiles of a column from the dz and the input in shared memory.
+// Weights are read once for all rows. The loop is not unrolled, because the operands of all steps and the sums of two layers
+// together exceed the registers.
 void input_gradient(uint weights_at, uint column, out GRADIENT gradient[input_rows]) {
     SUM sums[input_rows];
     [[unroll]] for (uint r = 0u; r < input_rows; r++) sums[r] = SUM(0.0);
@@ -151,7 +156,7 @@ void input_gradient(uint weights_at, uint column, out GRADIENT gradient[input_ro
     }
 }
 
-// The gradient to the upper layer's input takes the place of its dz: it is the lower layer's.
+// Replaces the upper layer's dz by the gradient of its input, which is the dz of the lower layer.
 void descend() {
     GRADIENT gradients[input_columns * input_rows];
     [[unroll]] for (uint c = 0u; c < input_columns; c++) {
@@ -168,7 +173,7 @@ void descend() {
     }
 }
 
-// A weight gradient's share of a subgroup: so many tiles of rows and columns, from `first_tile` of `weight_gradient` on.
+// Share of a subgroup of a weight gradient: numbers of tile rows and columns, stored from `first_tile` of `weight_gradient` on.
 struct Share {
     uint first_tile;
     uint rows;
@@ -225,7 +230,7 @@ void put_weight_gradient(Share share, uint at, uint stride) {
             if (is_tile(share, r, c)) {
                 uint tile_at = at + (share.row0 + r * m) * stride + share.column0 + c * n;
                 SUM sum = weight_gradient[share.first_tile + r * share.columns + c];
-                // An overflow must show in the sums, for the loss scale to give way.
+                // An overflow must be visible in the sums, so that the loss scale is reduced.
                 if (r == 0u && c == 0u && overflowed != 0u) sum[0] = uintBitsToFloat(0x7f800000u);
                 if (push.accumulate != 0u) {
                     SUM before;
@@ -248,12 +253,12 @@ void clear_sums() {
     overflowed = 0u;
 }
 
-// Tiles of the live samples.
+// Number of tiles of the live samples.
 uint tiles_of(uint padded) {
     return (padded + tile - 1u) / tile;
 }
 
-// After the last tile: what a workgroup has summed.
+// Writes the workgroup's sums after the last tile.
 void put_sums() {
     barrier();
     if (largest >= LARGEST) overflowed = 1u;

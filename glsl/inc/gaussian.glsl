@@ -1,14 +1,14 @@
-// How a cone beam sees Gaussians. Twin: src/reference/gaussians.rs.
+// Projection of Gaussians in a cone beam. Reference implementation: src/reference/gaussians.rs.
 #include "inc/gaussian_layout.glsl"
 
-// Splat, and what its gradient needs of the way there.
+// Splat of a Gaussian, and the intermediate results from which its gradient is computed.
 struct Projection {
     Splat splat;
     float depth;
     vec3 ray;
     vec3 column_slope;
     vec3 row_slope;
-    // Slopes along the Gaussian's axes, times its scales.
+    // Slopes along the Gaussian's axes times its scales.
     vec3 alpha;
     vec3 beta;
     vec3 scale;
@@ -24,7 +24,7 @@ mat3 rotation_matrix(vec4 unit) {
 
 const float SQRT_TWO_PI = 2.50662827463;
 
-// Affine in the neighbourhood of the centre: the difference from the exact cone beam is below that of the cut.
+// The projection is affine around the centre. Its difference from the exact cone beam is below the effect of the cut.
 Projection project(Gaussian g, vec3 position, GaussianView view, GaussianSetup setup) {
     Projection p;
     vec4 x = vec4(position, 1.0);
@@ -36,7 +36,7 @@ Projection project(Gaussian g, vec3 position, GaussianView view, GaussianSetup s
     p.ray = view.d0.xyz + mean.x * view.du.xyz + mean.y * view.dv.xyz;
     p.axes = rotation_matrix(normalize(g.rotation));
     vec3 sharp = clamp(exp(g.log_scale), setup.least_scale, setup.greatest_scale);
-    // Blurred images show the same mass on wider Gaussians.
+    // Blurred images have equal mass in wider Gaussians.
     p.scale = setup.blur > 0.0 ? sqrt(sharp * sharp + setup.blur * setup.blur) : sharp;
     p.alpha = p.scale * (p.column_slope * p.axes);
     p.beta = p.scale * (p.row_slope * p.axes);
@@ -47,12 +47,12 @@ Projection project(Gaussian g, vec3 position, GaussianView view, GaussianSetup s
     float volume = sharp.x * sharp.y * sharp.z;
     p.splat.amplitude = exp(g.log_density) * SQRT_TWO_PI * volume * length(p.ray) * view.d0.w / (z * z * sqrt(det));
     p.splat.half_box = setup.cut * sqrt(variance.xz);
-    // Behind the source nothing is seen.
+    // A Gaussian behind the source is not visible.
     if (!(z > 0.0)) p.splat.half_box = vec2(-1.0);
     return p;
 }
 
-// First and last column and row (inclusive) of the box inside the image; empty where last < first.
+// First and last column and row (inclusive) of the box inside the image; the box is empty if last < first.
 ivec4 pixels_of(Splat splat, GaussianSetup setup) {
     vec2 first = max(ceil(splat.mean - splat.half_box), vec2(0.0));
     vec2 last = min(floor(splat.mean + splat.half_box), vec2(float(setup.width) - 1.0, float(setup.height) - 1.0));
@@ -64,7 +64,7 @@ uint n_pixels(ivec4 box) {
     return uint(max(box.z - box.x + 1, 0) * max(box.w - box.y + 1, 0));
 }
 
-// exp(-q / 2) at a pixel; `half_log2` is the conic times -log2(e) / 2.
+// Value exp(-q / 2) at a pixel; `half_log2` is the conic times -log2(e) / 2.
 float falloff(vec3 half_log2, vec2 d) {
     return exp2(d.x * (half_log2.x * d.x + 2.0 * half_log2.y * d.y) + half_log2.z * d.y * d.y);
 }

@@ -1,12 +1,15 @@
-// Where a Gaussian of the deformable set is; needs `gaussian_setup`, `deformable_setup`, `motion_grid`, `own_motion` and `motion_basis`.
+// Positions of the Gaussians of the deformable set. The including file must declare `gaussian_setup`, `deformable_setup`,
+// `motion_grid`, `own_motion` and `motion_basis`.
 
-// The phase that lies beyond a time between two: after the phase, or before it. The beat closes.
+// Second phase of a time between two phases: the phase after `phase`, or the one before it if `after_phase` is negative. The
+// beat is periodic.
 uint phase_beyond(uint phase, float after_phase) {
     uint n = gaussian_setup.n_phases;
     return (phase + (after_phase < 0.0 ? n - 1u : 1u)) % n;
 }
 
-// Where an image shows it that was taken so long after a phase: on the straight way from there to the phase beyond.
+// Position in an image taken `after_phase` after a phase: a linear interpolation between the positions at that phase and at the
+// second phase.
 vec3 position_at(uint i, vec3 rest, uint phase, float after_phase) {
     vec3 place = on_grid(rest, deformable_setup);
     uvec3 first = uvec3(floor(place));

@@ -1,11 +1,11 @@
-// Parts of SAX-NeRF's Lineformer on vectors of a chunk of samples. Needs `push.capacity`, `sax_operands` to read vectors from
-// and `sax_vectors` to write them to, which are the same memory.
+// Operations of SAX-NeRF's Lineformer on vectors of a chunk of samples. The including file must declare `push.capacity`,
+// `sax_operands` for reading vectors and `sax_vectors` for writing them; both are the same memory.
 //   sax_vectors[(8 * vector + number / 4) * capacity + sample]
 #include "inc/lineformer_layout.glsl"
 
 const float LEAK = 0.01;
 const float LEAST_VARIANCE = 1e-5;
-const uint WIDTH4 = 8u;         // 32 numbers
+const uint WIDTH4 = 8u;         // vec4 of a vector of 32 numbers
 
 uint place_of(uint vector, uint i, uint s) { return (WIDTH4 * vector + i) * push.capacity + s; }
 
@@ -13,10 +13,10 @@ vec4 operand(uint vector, uint i, uint s) { return FETCH(sax_operands, place_of(
 
 vec4 leaky(vec4 x) { return max(x, LEAK * x); }
 
-// Of the activation, whose result has its argument's sign.
+// Slope of the activation from its result, which has the sign of its argument.
 vec4 leaky_slope(vec4 result) { return mix(vec4(LEAK), vec4(1.0), greaterThan(result, vec4(0.0))); }
 
-// Share of a standard normal below x (Abramowitz and Stegun 7.1.26, off by 8e-8 at most).
+// Cumulative standard normal distribution (Abramowitz and Stegun 7.1.26, maximum error 8e-8).
 vec4 normal_share(vec4 x) {
     vec4 t = 1.0 / (1.0 + 0.2316418882663604 * abs(x));
     vec4 tail = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));

@@ -1,5 +1,5 @@
-// Shared by march_count and march_emit: each lane of a ray owns a run of consecutive depths, so that live samples come out in
-// depth order. lane_masks[ray][lane][word]: one bit per depth of the run.
+// Common parts of march_count and march_emit. Each lane of a ray has a range of consecutive depths, so that live samples are in
+// the order of depths. lane_masks[ray][lane][word]: one bit per depth of the range.
 #include "inc/layout.glsl"
 #include "inc/random.glsl"
 #include "inc/depths.glsl"
@@ -14,7 +14,7 @@ uint run_length() {
     return (setup.n_dynamic_samples + ray_lanes - 1u) / ray_lanes;
 }
 
-// Words of a lane's mask.
+// Number of words of a lane's mask.
 uint mask_words() {
     return (run_length() + 31u) / 32u;
 }

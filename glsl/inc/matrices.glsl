@@ -1,6 +1,6 @@
-// Cooperative matrices: f16 operands, f32 sums, subgroup scope. Shapes are those the device reports.
-// Arrays of f16 are declared as uvec4, eight to an element, for wide copies; offsets and strides count uvec4.
-// To be included first: extensions precede all else.
+// Cooperative matrices: f16 operands, f32 sums, subgroup scope. The shapes are among those that the device reports. Arrays of
+// f16 are declared as uvec4 with eight numbers per element, for wide copies; offsets and strides are in uvec4. This file must
+// be included first, because it contains extensions.
 #pragma use_vulkan_memory_model
 #extension GL_KHR_memory_scope_semantics : require
 #extension GL_KHR_cooperative_matrix : require
@@ -11,26 +11,26 @@ layout(local_size_x_id = 0) in;
 layout(constant_id = 1) const uint m = 16u;           // shape of a product: m x k times k x n
 layout(constant_id = 2) const uint n = 16u;
 layout(constant_id = 3) const uint k = 16u;
-layout(constant_id = 4) const uint tile = 64u;        // samples of a workgroup's tile
-layout(constant_id = 5) const uint subgroups = 8u;    // of a workgroup
-layout(constant_id = 6) const uint width = 128u;      // neurons of a hidden layer
+layout(constant_id = 4) const uint tile = 64u;        // number of samples of a workgroup's tile
+layout(constant_id = 5) const uint subgroups = 8u;    // number of subgroups of a workgroup
+layout(constant_id = 6) const uint width = 128u;      // number of neurons of a hidden layer
 #define SUM coopmat<float, gl_ScopeSubgroup, m, n, gl_MatrixUseAccumulator>
 #define SUM16 coopmat<float16_t, gl_ScopeSubgroup, m, n, gl_MatrixUseAccumulator>
 #define LEFT coopmat<float16_t, gl_ScopeSubgroup, m, k, gl_MatrixUseA>
 #define RIGHT coopmat<float16_t, gl_ScopeSubgroup, k, n, gl_MatrixUseB>
 #define ROWS gl_CooperativeMatrixLayoutRowMajor
 #define COLUMNS gl_CooperativeMatrixLayoutColumnMajor
-// Unrolled, a CPU driver compiles these loops for minutes; a GPU keeps their operands in registers.
+// A CPU driver needs minutes to compile these loops if they are unrolled; a GPU then keeps their operands in registers.
 #ifdef UNROLL
 #define STEPS [[unroll]]
 #else
 #define STEPS [[dont_unroll]]
 #endif
-// Largest f16; activations saturate rather than overflow.
+// Maximum of f16. Activations are limited to it to avoid an overflow.
 const float LARGEST = 65504.0;
 
-// Sums become f16 in registers, and go to an array of uvec4 in rows; where a device has no matrices of f16 sums, which cannot
-// even be declared then, by way of shared memory.
+// STORE_F16 converts sums to f16 in registers and stores them in the rows of an array of uvec4. On a device without matrices of
+// f16 sums, which must not even be declared there, it converts them in shared memory.
 #ifdef F32_SUMS
 #define GRADIENT SUM
 shared float sum_tile[subgroups * m * n];
@@ -41,7 +41,7 @@ void share_sums(SUM sum) {
     subgroupBarrier();
 }
 
-// Eight neighbours in a row of the sums that were shared last, of which there are n / 8 to a row.
+// Eight neighbours in a row of the sums in shared memory; a row has n / 8 such groups.
 uvec4 shared_sums(uint e) {
     uint at = gl_SubgroupID * m * n + 8u * e;
     uvec4 packed;

@@ -1,14 +1,14 @@
-// Where the dynamic field has been seen empty while training. Two bits per cell and phase, for three epochs in turn:
-// bit 0, a sample was evaluated there; bit 1, one was not empty. The present epoch and the one before it decide, the
-// third is being cleared. Needs `setup` and `occupancy`.
+// Record of the cells in which the dynamic field was empty during training. Each cell and phase has two bits in each of three
+// epochs: bit 0, a sample was evaluated there; bit 1, a sample was not empty. The present and the previous epoch determine
+// whether a cell is evaluated, while the third epoch is cleared. The including file must declare `setup` and `occupancy`.
 const uint OCCUPANCY_EPOCH = 64u;    // iterations of an epoch
-const uint SEEN = 1u;                // a sample was evaluated in the cell
-const uint OCCUPIED = 2u;            // one was not empty
-const uint OCCUPANCY_EPOCHS = 3u;    // kept, in turn
-const uint CELLS_PER_WORD = 16u;     // of occupancy, two bits each
-const float LITTLE_SHOWN = 0.25;     // share of a phase below which an empty sample tells nothing of it
+const uint SEEN = 1u;                // bit of a cell in which a sample was evaluated
+const uint OCCUPIED = 2u;            // bit of a cell in which a sample was not empty
+const uint OCCUPANCY_EPOCHS = 3u;    // epochs kept in turn
+const uint CELLS_PER_WORD = 16u;     // cells of a word of the occupancy, two bits each
+const float LITTLE_SHOWN = 0.25;     // share of a phase below which an empty sample is not recorded for it
 
-// Words of one epoch.
+// Number of words of one epoch.
 uint occupancy_words() {
     uint n = setup.occupancy_cells;
     return (setup.n_phases * n * n * n + CELLS_PER_WORD - 1u) / CELLS_PER_WORD;

@@ -1,4 +1,4 @@
-// Whether a sample is evaluated. Cells seen empty still get every eighth iteration, so that vessels can come back.
+// Whether a sample is evaluated. Empty cells are evaluated in one of eight iterations on average, so that vessels can reappear.
 #include "inc/occupancy.glsl"
 
 bool occupied(vec3 x, uint phase, uint step) {

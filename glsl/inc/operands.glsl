@@ -1,9 +1,9 @@
-// Read-only vec4 arrays, read the way that is fastest on a device (chosen in src/kernels/tuning.rs):
+// Read-only vec4 arrays with the access that is fastest on a device (chosen in src/kernels/tuning.rs):
 //   storage buffers           GPUs
 //   -DTEXEL: texel buffers    lavapipe before Mesa 24, which reads storage buffers lane by lane
-//   -DADDRESS: addresses      newer lavapipe, which then checks no bounds; for kernels whose push constants end in
-//                             ADDRESS_OF(NAME) for each array
-// To be included first: extensions precede all else.
+//   -DADDRESS: addresses      newer lavapipe, which does not check bounds then; for kernels whose push constants end with
+//     ADDRESS_OF(NAME) for each array
+// This file must be included first, because it contains extensions.
 #ifdef ADDRESS
 #extension GL_EXT_buffer_reference : require
 #extension GL_EXT_buffer_reference_uvec2 : require
@@ -13,8 +13,8 @@ layout(buffer_reference, std430, buffer_reference_align = 16) readonly buffer Ve
 #else
 #define ADDRESS_OF(NAME)
 #endif
-// SETUP: what a setup is, a uniform buffer, but for that old lavapipe where there are texel buffers: march_loss would take 1.6 times as
-// long.
+// SETUP is the storage class of a setup: a uniform buffer, except with texel buffers, because march_loss takes 1.6 times as
+// long with a uniform buffer on the old lavapipe.
 #ifdef TEXEL
 #define SETUP readonly buffer
 #define READ_VEC4(SLOT, BLOCK, NAME) layout(binding = SLOT) uniform samplerBuffer NAME

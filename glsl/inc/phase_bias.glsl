@@ -1,8 +1,9 @@
-// Bias and latent act as one row per phase, and between two phases as what lies between their rows:
+// The bias and the latent of a layer together form one row per phase; between two phases, the rows are interpolated:
 //   row[layer][phase][j] = bias[j] + sum_l latent_weight[j][l] * latent[phase][l].
-// Needs `setup`, `params`, and network_layers[layer]: where its bias and its weights on latents are; NOWHERE: it has none of these.
+// The including file must declare `setup`, `params`, and network_layers[layer]: positions of the layer's bias and of its
+// weights of the latents; NOWHERE if it has no weights of latents.
 
-// Element i of [layer][phase][neuron], with the network's latents from parameter `latents` on.
+// Element i of [layer][phase][neuron]; the network's latents begin at parameter `latents`.
 float phase_bias_at(uint i, uint latents) {
     uvec2 layer = network_layers[i / (setup.n_phases * setup.mlp_width)];
     uint phase = i / setup.mlp_width % setup.n_phases;

@@ -1,4 +1,4 @@
-// The ray through a pixel's centre: anchor at the isocentre plane, direction of unit depth. Needs `View`.
+// Ray through a pixel's centre: anchor at the isocentre plane, direction of unit depth. The including file must declare `View`.
 struct Line {
     vec3 anchor;
     vec3 direction;

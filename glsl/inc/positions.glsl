@@ -1,3 +1,3 @@
-// Positions that the host lists or pushes.
-const uint NOWHERE = 0xffffffffu;       // comes from nowhere: zero; goes nowhere: not written
-const uint PHASE_BIAS = 0x80000000u;    // in `pack_source`: an element of `[layer][phase][neuron]`, not of `params`
+// Special values in the positions that the host lists or pushes.
+const uint NOWHERE = 0xffffffffu;       // position without a source or target: a zero is read, or nothing is written
+const uint PHASE_BIAS = 0x80000000u;    // flag in `pack_source` of an element of `[layer][phase][neuron]` instead of `params`

@@ -1,22 +1,23 @@
-// How a cone beam sees the Gaussians of R2-Gaussian, and what of it their gradient needs. Twin: src/reference/r2.rs.
+// Projection of the Gaussians of R2-Gaussian in a cone beam, with the intermediate results from which their gradient is
+// computed. Reference implementation: src/methods/r2_gaussian/twin.rs.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
 #include "inc/r2_layout.glsl"
 #include "inc/softplus.glsl"
 
-// The slopes of a projection are those at the image's border, this many half images from its middle, for all that is
-// beyond.
+// Distance from the image's middle, in half images, at which the slopes of a projection are limited. A centre further outside
+// has the slopes at this border.
 const float SLOPES_END = 1.3;
-// Least squared difference of a splat's variances along its axes, pixels^4, when its radius is found.
+// Minimum squared difference of a splat's variances along its axes, pixels^4, in the computation of its radius.
 const float LEAST_SPREAD = 0.1;
-// Below this, softplus is the exponential to all digits.
+// Threshold below which softplus equals the exponential function in f32.
 const float LOWEST = -80.0;
 
 float density_of(R2Gaussian g) {
     return softplus(g.density);
 }
 
-// Slope of the density's logarithm by what is stored.
+// Derivative of the density's logarithm with respect to the stored number.
 float density_slope(R2Gaussian g) {
     float x = max(g.density, LOWEST);
     return sigmoid(x) / softplus(x);
@@ -30,7 +31,7 @@ vec3 scale_of(R2Gaussian g, GaussianSetup setup) {
     return setup.least_scale + (setup.greatest_scale - setup.least_scale) * share_of_range(g);
 }
 
-// Slopes of the scales' logarithms by what is stored.
+// Derivatives of the scales' logarithms with respect to the stored numbers.
 vec3 scale_slope(R2Gaussian g, GaussianSetup setup) {
     vec3 share = share_of_range(g);
     return (setup.greatest_scale - setup.least_scale) * share * (1.0 - share) / scale_of(g, setup);
@@ -39,19 +40,20 @@ vec3 scale_slope(R2Gaussian g, GaussianSetup setup) {
 struct R2Projection {
     Splat splat;
     float depth;
-    // 1 along image axes where slopes are those at the centre itself, 0 where they are the border's.
+    // Per image axis, 1 if the slopes are those at the centre itself, 0 if they are those at the border.
     vec2 follows;
     vec3 ray;
     vec3 column_slope;
     vec3 row_slope;
-    // Slopes along the Gaussian's axes, times its scales.
+    // Slopes along the Gaussian's axes times its scales.
     vec3 alpha;
     vec3 beta;
     vec3 scale;
     mat3 axes;
 };
 
-// Affine around the centre; the amplitude is the line integral of the affine Gaussian along the ray of its slopes.
+// The projection is affine around the centre. The amplitude is the line integral of the affine Gaussian along the ray of its
+// slopes.
 R2Projection project_r2(R2Gaussian g, GaussianView view, GaussianSetup setup) {
     R2Projection p;
     vec4 x = vec4(g.position, 1.0);
@@ -78,24 +80,24 @@ R2Projection project_r2(R2Gaussian g, GaussianView view, GaussianSetup setup) {
     float half_sum = 0.5 * (variance.x + variance.z);
     float largest = half_sum + sqrt(max(LEAST_SPREAD, half_sum * half_sum - det));
     p.splat.half_box = vec2(ceil(setup.cut * sqrt(largest)));
-    // Behind the source nothing is seen.
+    // A Gaussian behind the source is not visible.
     if (!(z > 0.0)) p.splat.half_box = vec2(-1.0);
     return p;
 }
 
-// Gradient by position, by the logarithms of density and scales, and by the raw quaternion. `linear` = h (1, du, dv),
+// Gradient with respect to position, logarithms of density and scales, and raw quaternion. `linear` = h (1, du, dv) and
 // `square` = h (du^2, du dv, dv^2), summed over the pixels.
 GaussianGradient gradient_r2(R2Gaussian g, R2Projection p, GaussianView view, vec3 linear, vec3 square) {
     mat2 conic = mat2(p.splat.conic.x, p.splat.conic.y, p.splat.conic.y, p.splat.conic.z);
     mat2 second = mat2(square.x, square.y, square.y, square.z);
-    // dL / d(2D variance), the determinant in the amplitude included.
+    // This is dL / d(2D variance), including the determinant in the amplitude.
     mat2 variance = 0.5 * (conic * second * conic - linear.x * conic);
     vec3 d_alpha = 2.0 * (variance[0][0] * p.alpha + variance[0][1] * p.beta);
     vec3 d_beta = 2.0 * (variance[0][1] * p.alpha + variance[1][1] * p.beta);
     vec3 d_column_slope = p.axes * (p.scale * d_alpha);
     vec3 d_row_slope = p.axes * (p.scale * d_beta);
     float z = p.depth;
-    // Through the slopes and the ray, where these follow the centre.
+    // Contribution of the slopes and the ray where they depend on the centre.
     vec2 d_held = -vec2(dot(view.depth.xyz, d_column_slope), dot(view.depth.xyz, d_row_slope)) / z;
     d_held += linear.x / dot(p.ray, p.ray) * vec2(dot(p.ray, view.du.xyz), dot(p.ray, view.dv.xyz));
     vec2 d_mean = conic * linear.yz + p.follows * d_held;

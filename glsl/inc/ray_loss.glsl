@@ -1,16 +1,17 @@
-// Photometric loss of a ray and its gradient: one number per ray and field, since the march is linear.
-//   absolute target: both fields share the residual S + D - y (paper, L_p).
-//   temporal target: D lies between the bounds of the integral above the pixel's still background (outside
-//   them it is pulled to the nearer one), S fits what D leaves of y.
-// Each term is a mean over the rays that take part in it. Needs `setup` and inc/static_rays.glsl.
+// Photometric loss of a ray and its gradient, which is one number per ray and field, because the march is linear.
+//   absolute target: both fields have the residual S + D - y (paper, L_p).
+//   temporal target: the target of D is an interval, the bounds of the integral above the pixel's static background; outside
+//     the interval the residual is the distance from the nearer bound. S fits y - D.
+// Each term is a mean over the rays that contribute to it. The including file must declare `setup` and include
+// inc/static_rays.glsl.
 
 struct RayLoss {
-    vec2 gradient;   // dL/dS, dL/dD
-    vec4 terms;      // L_p share, its dynamic part, occlusion, (S + D - y)^2
+    vec2 gradient;   // derivatives dL/dS and dL/dD
+    vec4 terms;      // contribution to L_p, its dynamic part, occlusion, (S + D - y)^2
 };
 
-// Charbonnier: r^2 near 0, linear beyond robust_scale, so that thick vessels do not drown thin ones.
-// Value, and half its derivative.
+// Charbonnier loss: r^2 near 0, linear beyond robust_scale, so that thick vessels do not dominate thin ones. Returns the value
+// and half its derivative.
 vec2 robust_square(float r) {
     if (setup.robust_scale == 0.0) return vec2(r * r, r);
     float s2 = setup.robust_scale * setup.robust_scale;

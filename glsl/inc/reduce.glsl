@@ -1,4 +1,4 @@
-// Sums and maxima over a workgroup, which every lane gets, in a fixed order.
+// Sums and maxima over a workgroup in a fixed order; every lane gets the result.
 #include "inc/combine.glsl"
 
 REDUCE(float, workgroup_sum, sum_scratch, SUM_OF, gl_WorkGroupSize.x)

@@ -1,6 +1,7 @@
-// dL/d feature of a sample of a network; what includes this declares the buffers of samples and rays first.
-// Where the softplus is flat nothing would tell the network that a ray asks for more: there the slope is at least
-// `least_slope`. A ray that asks for less needs no such help. Of two networks, `sigma_gradient` has dL/d sigma of each sample.
+// Gradient dL/d feature of a sample of a network. The including file must declare the buffers of samples and rays first. Where
+// the softplus is flat, its gradient would vanish although a ray needs more attenuation; the slope is therefore at minimum
+// `least_slope` there. A ray that needs less attenuation keeps the softplus's own slope. For two networks, `sigma_gradient` has
+// dL/d sigma of each sample.
 float feature_gradient(uint s) {
     float slope = sample_sigma[s].y;
     if (setup.two_networks != 0u) return sigma_gradient[s] * slope;

@@ -1,12 +1,13 @@
-// The hash grid of SAX-NeRF: which entries a point lies between, and its shares of them. Needs `SaxLevel`.
+// Hash grid of SAX-NeRF: the entries around a point, and their interpolation weights. The including file must declare
+// `SaxLevel`.
 
 struct SaxCell {
-    uvec3 corner;               // the lower one
-    vec3 share;                 // of the upper one along each axis
+    uvec3 corner;               // lower corner of the cell
+    vec3 share;                 // share of the upper corner along each axis
 };
 
-// Where a point of the unit cube lies in a level. Exact to the last bit, since fine levels have half a million cells:
-// no multiplication may be joined with an addition.
+// Cell of a level that contains a point of the unit cube. The result must be exact to the last bit, because fine levels have
+// half a million cells: a multiplication must not be fused with an addition.
 SaxCell cell_at(SaxLevel level, vec3 unit) {
     precise vec3 scaled = unit * float(level.cells - 1u);
     precise vec3 position = scaled + 0.5;
@@ -14,7 +15,7 @@ SaxCell cell_at(SaxLevel level, vec3 unit) {
     return SaxCell(uvec3(corner), position - corner);
 }
 
-// The entry of a corner, counted over all levels.
+// Entry of a corner, counted over all levels.
 uint entry_of(SaxLevel level, uvec3 corner) {
     uint side = level.cells + 1u;
     uint index = level.dense != 0u ? corner.x + side * (corner.y + side * corner.z)
@@ -22,7 +23,7 @@ uint entry_of(SaxLevel level, uvec3 corner) {
     return level.first + index % level.entries;
 }
 
-// Entry and share of one of a cell's eight corners.
+// Entry of one of a cell's eight corners, and its interpolation weight.
 uint tap(SaxLevel level, SaxCell cell, uint corner, out float share) {
     uvec3 upper = uvec3(corner & 1u, (corner >> 1u) & 1u, corner >> 2u);
     vec3 shares = mix(1.0 - cell.share, cell.share, vec3(upper));

@@ -1,5 +1,5 @@
-// Softplus that keeps the precision of small values, where log(1 + y) loses it: there log1p by its
-// series. torch switches to the identity at 20 as well.
+// Softplus that is accurate for small values, for which log(1 + y) is not: the function then uses the series of log1p. torch
+// switches to the identity at 20 as well.
 float softplus(float x) {
     if (x > 20.0) return x;
     float y = exp(x);

@@ -1,12 +1,12 @@
-// Which splat an invocation works on, and which pixels of its box. With SUBGROUP, lanes of a full subgroup share a splat.
-// Included behind the layout that gives the size of the workgroup, without which it would count as 1.
+// Assignment of splats and of their boxes' pixels to invocations. With SUBGROUP, lanes of a full subgroup share a splat. This
+// file must be included after the layout with the size of the workgroup, which would count as 1 otherwise.
 
 #include "inc/workgroup.glsl"
 
 #ifdef SUBGROUP
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_shuffle : require
-layout(constant_id = 1) const uint lanes_per_splat = 8u;    // power of two, at most a subgroup
+layout(constant_id = 1) const uint lanes_per_splat = 8u;    // power of two, up to the size of a subgroup
 
 uint splat_index() {
     uint invocation = (workgroup() * gl_NumSubgroups + gl_SubgroupID) * gl_SubgroupSize + gl_SubgroupInvocationID;
@@ -15,7 +15,7 @@ uint splat_index() {
 
 uint splat_lane() { return gl_SubgroupInvocationID % lanes_per_splat; }
 
-// Sum over the lanes of a splat, in a fixed order; all get it.
+// Sum over the lanes of a splat in a fixed order; all lanes get the result.
 vec3 splat_sum(vec3 value) {
     for (uint apart = lanes_per_splat / 2u; apart > 0u; apart /= 2u) value += subgroupShuffleXor(value, apart);
     return value;
@@ -28,11 +28,11 @@ uint splat_lane() { return 0u; }
 vec3 splat_sum(vec3 value) { return value; }
 #endif
 
-// Pixels of a box in their order, as far as they are this lane's.
+// Iteration over those pixels of a box that belong to this lane, in their order.
 struct Walk {
-    uint k;         // number of the pixel in the box
-    ivec2 at;       // where it is
-    ivec2 stride;   // to the lane's next, but for the end of the row
+    uint k;         // index of the pixel in the box
+    ivec2 at;       // column and row of the pixel
+    ivec2 stride;   // step to the lane's next pixel, without the change at the end of the row
 };
 
 Walk walk_from(ivec4 box) {

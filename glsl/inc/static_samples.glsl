@@ -1,4 +1,4 @@
-// Samples of the static field along a ray. Needs `setup`, `state` and inc/depths.glsl.
+// Samples of the static field along a ray. The including file must declare `setup` and `state` and include inc/depths.glsl.
 
 struct StaticSample {
     vec3 x;

@@ -1,7 +1,7 @@
-// Static field (paper section 2.1): three vector-matrix modes, plane (first axis fast) x line.
+// Static field (paper section 2.1): three vector-matrix modes, each a plane (first axis fast) times a line.
 //   mode 0: plane XY, line Z;  mode 1: plane XZ, line Y;  mode 2: plane YZ, line X.
-// Parameters: planes [mode][v][u][rank4] vec4, then lines [mode][w][rank4] vec4.
-// Needs `setup` and FETCH(static_params, i).
+// Parameters: planes [mode][v][u][rank4] vec4, then lines [mode][w][rank4] vec4. The including file must declare `setup` and
+// FETCH(static_params, i).
 
 struct VmTaps {
     uint plane[4];
@@ -14,7 +14,7 @@ bool static_inside(vec3 x) {
     return all(greaterThanEqual(x, setup.static_min)) && all(lessThanEqual(x, setup.static_max));
 }
 
-// Grid coordinate in [0, grid - 1], corners aligned with the box faces.
+// Grid coordinate in [0, grid - 1]; the corners coincide with those of the box.
 vec3 vm_coordinate(vec3 x) {
     return (x - setup.static_min) / (setup.static_max - setup.static_min) * float(setup.grid - 1u);
 }
@@ -60,7 +60,7 @@ vec4 vm_line(VmTaps taps, uint r) {
          + taps.line_weight[1] * FETCH(static_params, taps.line[1] * n + r);
 }
 
-// Sum over modes and ranks, before the activation.
+// Sum over modes and ranks before the activation.
 float vm_feature(vec3 x) {
     vec3 coordinate = vm_coordinate(x);
     float sum = 0.0;

@@ -1,5 +1,5 @@
-// Counts workgroups and invocations that lie along two axes: there may be more than one axis takes.
-// Included behind the layout that gives the size of the workgroup, without which it would count as 1.
+// Indices of workgroups and invocations that are distributed over two axes, because one axis may be too short. This file must
+// be included after the layout with the size of the workgroup, which would count as 1 otherwise.
 
 uint workgroup() {
     return gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;

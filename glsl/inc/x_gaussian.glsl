@@ -1,46 +1,46 @@
-// How a cone beam sees the Gaussians of X-Gaussian, and what of it their gradient needs. Twin:
-// src/reference/x_gaussian.rs.
+// Projection of the Gaussians of X-Gaussian in a cone beam, with the intermediate results from which their gradient is
+// computed. Reference implementation: src/methods/x_gaussian/twin.rs.
 #include "inc/gaussian.glsl"
 #include "inc/gaussian_gradient.glsl"
 #include "inc/r2_layout.glsl"
 #include "inc/softplus.glsl"
 #include "inc/x_layout.glsl"
 
-// The slopes of a projection are those at the image's border, this many half images from its middle, for all that is
-// beyond.
+// Distance from the image's middle, in half images, at which the slopes of a projection are limited. A centre further outside
+// has the slopes at this border.
 const float SLOPES_END = 1.3;
-// Least squared difference of a splat's variances along its axes, pixels^4, when its radius is found.
+// Minimum squared difference of a splat's variances along its axes, pixels^4, in the computation of its radius.
 const float LEAST_SPREAD = 0.1;
-// Variance that each splat gains, pixels^2.
+// Variance that is added to each splat, pixels^2.
 const float LOW_PASS = 0.3;
-// Standard deviations along its longest axis that a splat reaches.
+// Radius of a splat in standard deviations along its longest axis.
 const float REACH = 3.0;
 // Pixels along each side of a tile.
 const uint TILE = 16u;
-// Sorts behind all depths.
+// Sort key of a Gaussian that is not visible, behind all depths.
 const uint UNSEEN = 0xffffffffu;
-// A Gaussian lets this share of light through at least.
+// Maximum opacity of a Gaussian in a pixel.
 const float MOST_OPAQUE = 0.99;
-// Less is not shown.
+// Opacity below which a Gaussian is not drawn in a pixel.
 const float LEAST_ALPHA = 1.0 / 255.0;
-// A pixel ends before less light than this is left.
+// Transmittance below which the sum of a pixel ends.
 const float LEAST_LIGHT = 1e-4;
 
 struct XProjection {
     Splat splat;
     float depth;
-    // 1 along image axes where slopes are those at the centre itself, 0 where they are the border's.
+    // Per image axis, 1 if the slopes are those at the centre itself, 0 if they are those at the border.
     vec2 follows;
     vec3 column_slope;
     vec3 row_slope;
-    // Slopes along the Gaussian's axes, times its scales.
+    // Slopes along the Gaussian's axes times its scales.
     vec3 alpha;
     vec3 beta;
     vec3 scale;
     mat3 axes;
 };
 
-// The splat's amplitude is its opacity, its box the square of its radius.
+// The splat's amplitude is its opacity, and its box is the square of its radius.
 XProjection project_x(XGaussian g, GaussianView view, GaussianSetup setup, XSetup x_setup) {
     XProjection p;
     vec4 x = vec4(g.position, 1.0);
@@ -67,12 +67,12 @@ XProjection project_x(XGaussian g, GaussianView view, GaussianSetup setup, XSetu
     float half_sum = 0.5 * (variance.x + variance.z);
     float largest = half_sum + sqrt(max(LEAST_SPREAD, half_sum * half_sum - det));
     p.splat.half_box = vec2(ceil(REACH * sqrt(largest)));
-    // At the source and behind it nothing is seen.
+    // A Gaussian at the source or behind it is not visible.
     if (!(z > x_setup.nearest)) p.splat.half_box = vec2(-1.0);
     return p;
 }
 
-// First tile (column, row) and one more than the last that the splat's square touches; none where these are equal.
+// First tile (column, row) that the splat's square touches, and one more than the last; they are equal if it touches none.
 uvec4 tiles_of(Splat splat, XSetup x_setup) {
     if (!(splat.half_box.x > 0.0)) return uvec4(0u);
     vec2 tiles = vec2(float(x_setup.tile_columns), float(x_setup.tile_rows));
@@ -85,21 +85,22 @@ uvec2 columns_and_rows(XSpan span) {
     return uvec2((span.end & 0xffffu) - (span.first & 0xffffu), (span.end >> 16) - (span.first >> 16));
 }
 
-// What a splat adds to a pixel: its opacity there, and whether that follows its parameters.
+// Opacity of a splat in a pixel, and whether the opacity depends on the splat's parameters there.
 struct XAlpha {
     float alpha;
     bool follows;
 };
 
-// `d` from the centre to the pixel.
+// `d` is the vector from the centre to the pixel.
 XAlpha alpha_of(vec3 conic, float opacity, vec2 d) {
     float alpha = opacity * falloff(-HALF_LOG2_E * conic, d);
     if (alpha > MOST_OPAQUE) return XAlpha(MOST_OPAQUE, false);
     return XAlpha(alpha < LEAST_ALPHA ? 0.0 : alpha, true);
 }
 
-// Gradient by position, opacity (in `log_density`), logs of scales and the raw quaternion. With h = dL/d(ln alpha)
-// where alpha follows parameters: `linear` = h (1, du, dv), `square` = h (du^2, du dv, dv^2), summed over the pixels.
+// Gradient with respect to position, opacity (in `log_density`), logarithms of scales, and raw quaternion. With h = dL/d(ln
+// alpha) where alpha depends on the parameters, `linear` = h (1, du, dv) and `square` = h (du^2, du dv, dv^2), summed over the
+// pixels.
 GaussianGradient gradient_x(XGaussian g, XProjection p, GaussianView view, vec3 linear, vec3 square) {
     mat2 conic = mat2(p.splat.conic.x, p.splat.conic.y, p.splat.conic.y, p.splat.conic.z);
     mat2 second = mat2(square.x, square.y, square.y, square.z);
@@ -109,7 +110,7 @@ GaussianGradient gradient_x(XGaussian g, XProjection p, GaussianView view, vec3 
     vec3 d_column_slope = p.axes * (p.scale * d_alpha);
     vec3 d_row_slope = p.axes * (p.scale * d_beta);
     float z = p.depth;
-    // Through the slopes, where these follow the centre.
+    // Contribution of the slopes where they depend on the centre.
     vec2 d_held = -vec2(dot(view.depth.xyz, d_column_slope), dot(view.depth.xyz, d_row_slope)) / z;
     vec2 d_mean = conic * linear.yz + p.follows * d_held;
     float d_depth = -(dot(p.column_slope, d_column_slope) + dot(p.row_slope, d_row_slope)) / z;

@@ -1,12 +1,12 @@
-// A pass of the sort of Gaussians by set and depth: stable, by four bits. A workgroup has a block of 1024 keys, each
-// lane 16 of them in order. Needs `push` with n_keys, n_blocks and shift, `x_keys` and `x_set_of`.
+// One pass of the sort of Gaussians by set and depth: stable, by four bits. A workgroup has a block of 1024 keys, and each lane
+// has 16 consecutive keys. The including file must declare `push` with n_keys, n_blocks and shift, `x_keys` and `x_set_of`.
 
-// Keys of a lane, and of a block.
+// Number of keys of a lane, and of a block.
 const uint KEYS_OF_LANE = 16u;
 const uint KEYS_OF_BLOCK = KEYS_OF_LANE * gl_WorkGroupSize.x;
-// Values of four bits.
+// Number of values of four bits.
 const uint DIGITS = 16u;
-// Bits of the depth; those of the set follow.
+// Number of bits of the depth; the bits of the set follow.
 const uint DEPTH_BITS = 32u;
 
 // [digit][lane]
@@ -23,7 +23,7 @@ uvec2 keys_of_lane() {
     return min(uvec2(first, first + KEYS_OF_LANE), uvec2(push.n_keys));
 }
 
-// Counts the digits of each lane; then all lanes see the counts.
+// Counts the digits of each lane; afterwards the counts are valid in all lanes.
 void count_digits() {
     uint lane = gl_LocalInvocationID.x;
     for (uint digit = 0u; digit < DIGITS; digit++) of_lanes[digit * gl_WorkGroupSize.x + lane] = 0u;

@@ -1,8 +1,8 @@
-// A tile of 16 x 16 pixels, of which each of 64 lanes has four. Needs `gaussian_setup` and `x_setup`.
+// Tile of 16 x 16 pixels with four pixels in each of 64 lanes. The including file must declare `gaussian_setup` and `x_setup`.
 const uint LANES = 64u;
 const uint PIXELS_OF_LANE = 4u;
 
-// Place in x_lists of the workgroup's tile: column (x), row (y) and set (z).
+// Position in x_lists of the workgroup's tile: column (x), row (y) and set (z).
 uint list_of_workgroup() {
     uvec3 at = gl_WorkGroupID;
     return (at.z * x_setup.tile_rows + at.y) * x_setup.tile_columns + at.x;
@@ -18,7 +18,7 @@ bool is_in_image(uvec2 pixel) {
     return pixel.x < gaussian_setup.width && pixel.y < gaussian_setup.height;
 }
 
-// Place of a pixel in the pictures.
+// Position of a pixel in the pictures.
 uint place_of(uvec2 pixel) {
     return gl_WorkGroupID.z * gaussian_setup.image_stride + pixel.y * gaussian_setup.width + pixel.x;
 }
