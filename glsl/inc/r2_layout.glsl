@@ -1,40 +1,40 @@
-// Structures of R2-Gaussian shared with the host: build.rs makes Rust's from them, comments included. Lengths are half
-// sides of the volume, which is the cube from -1 to 1; densities are 1 where vessels attenuate as they are said to;
-// line integrals are their product.
+// Structures of R2-Gaussian that shaders share with the host: build.rs generates the Rust structures from them, including the
+// comments. Lengths are in half sides of the volume, which is the cube from -1 to 1. A density of 1 is the given attenuation of
+// vessels, and line integrals are products of these units.
 
-// A Gaussian as R2-Gaussian stores it: its density is softplus(density), a sigmoid keeps each scale between its bounds.
+// A Gaussian as R2-Gaussian stores it: its density is softplus(density), and a sigmoid keeps each scale within its bounds.
 struct R2Gaussian {
-    vec3 position;              // centre, along the world's axes
-    float density;              // of the centre, before the softplus
-    vec3 scale;                 // standard deviations along its own axes, before the sigmoid
-    uint set;                   // set it belongs to: each has images of its own
-    vec4 rotation;              // quaternion (w, x, y, z) of its axes; its length does not matter
+    vec3 position;              // Centre in world axes.
+    float density;              // Density at the centre, before the softplus.
+    vec3 scale;                 // Standard deviations along its own axes, before the sigmoid.
+    uint set;                   // Set to which it belongs; each set has its own images.
+    vec4 rotation;              // Quaternion (w, x, y, z) of its axes; its length does not matter.
 };
 
-// What stays fixed during a fit, beside GaussianSetup, whose lengths are half sides here, too.
+// Constants of a fit in addition to GaussianSetup, whose lengths are in half sides of the volume here, too.
 struct R2Setup {
-    uint n_sets;                // sets of Gaussians, each fitted by itself
-    uint box_side;              // voxels along each side of the box whose total variation counts
-    float voxel;                // side of a voxel
-    float ssim_weight;          // weight of 1 - SSIM
-    float tv_weight;            // weight of total variation
-    uint tv_moves_centres;      // 1: the gradient of total variation moves Gaussians, too
-    uint exact;                 // 1: line integrals are those along pixels' own rays, not of the affine picture
+    uint n_sets;                // Number of sets of Gaussians, each fitted separately.
+    uint box_side;              // Number of voxels along each side of the box whose total variation counts.
+    float voxel;                // Side of a voxel.
+    float ssim_weight;          // Weight of 1 - SSIM.
+    float tv_weight;            // Weight of the total variation.
+    uint tv_moves_centres;      // Flag: 1 if the gradient of the total variation includes the centres.
+    uint exact;                 // Flag: 1 for line integrals along pixels' own rays, 0 for those of the affine picture.
 };
 
-// One row per iteration.
+// Row of the schedule; there is one per iteration.
 struct R2Schedule {
-    float position_rate;        // Adam's rate of positions
-    float density_rate;         // Adam's rate of densities
-    float scale_rate;           // Adam's rate of scales
-    float rotation_rate;        // Adam's rate of quaternions
-    float bias1;                // 1 - beta1^t of the t updates up to this one
-    float bias2;                // 1 - beta2^t
-    uint updates;               // 0: Gaussians are added and taken away after it, and no parameter is updated
+    float position_rate;        // Adam's rate of positions.
+    float density_rate;         // Adam's rate of densities.
+    float scale_rate;           // Adam's rate of scales.
+    float rotation_rate;        // Adam's rate of quaternions.
+    float bias1;                // Bias correction 1 - beta1^t after t updates, including this one.
+    float bias2;                // Bias correction 1 - beta2^t.
+    uint updates;               // Flag: 0 if Gaussians are added and pruned after this iteration and no parameter is updated.
 };
 
-// What a set sees in an iteration.
+// Image and box of a set in an iteration.
 struct R2Turn {
-    vec3 corner;                // centre of the first voxel of the box
-    uint image;                 // training image
+    vec3 corner;                // Centre of the first voxel of the box.
+    uint image;                 // Index of the training image.
 };

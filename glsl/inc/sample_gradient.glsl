@@ -1,7 +1,7 @@
 // Gradient dL/d feature of a sample of a network. The including file must declare the buffers of samples and rays first. Where
-// the softplus is flat, its gradient would vanish although a ray needs more attenuation; the slope is therefore at minimum
-// `least_slope` there. A ray that needs less attenuation keeps the softplus's own slope. For two networks, `sigma_gradient` has
-// dL/d sigma of each sample.
+// the softplus is flat, the gradient would vanish even if a ray needs more attenuation. For such a ray, `least_slope` is
+// therefore the lower limit of the slope. A ray that needs less attenuation has the softplus's own slope. For two networks,
+// `sigma_gradient` has dL/d sigma of each sample.
 float feature_gradient(uint s) {
     float slope = sample_sigma[s].y;
     if (setup.two_networks != 0u) return sigma_gradient[s] * slope;

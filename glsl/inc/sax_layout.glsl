@@ -1,46 +1,46 @@
-// Structures of SAX-NeRF shared with the host: build.rs makes Rust's from them, comments included. Lengths are world
-// units; attenuations are shares of what vessels attenuate, per world unit.
+// Structures of SAX-NeRF that shaders share with the host: build.rs generates the Rust structures from them, including the
+// comments. Lengths are in world units. Attenuations are relative to the attenuation of vessels, per world unit.
 
-// What stays fixed of a fit, or of what is drawn.
+// Constants of a fit or of a rendering.
 struct SaxSetup {
-    uint n_levels;              // levels of the hash grid, an even number; each has two features
-    float bound;                // half side of the grid's box
-    float near;                 // first depth along rays
-    float far;                  // last depth along rays
-    uint n_samples;             // samples of a ray
-    uint jitter;                // 0: depths on a regular grid (drawing)
-    uint n_rays;                // rays of a batch: those of windows, then single ones
-    uint n_windows;             // windows of a batch
-    uint window;                // side of a window, pixels
-    uint width;                 // columns of an image
-    uint height;                // rows of an image
-    uint n_sets;                // fields, each fitted by itself
-    uint n_weights;             // numbers of the Lineformer, which come before those of the grid
-    uint n_grid;                // numbers of the grid
-    uint n_groups;              // parts that a chunk of samples is cut into for sums of the Lineformer's gradients
-    uint fixed_point_bits;      // behind the point, of the grid's gradient
-    uint ring_length;           // iterations whose losses are kept
+    uint n_levels;              // Number of levels of the hash grid, which is even; each level has two features.
+    float bound;                // Half side of the grid's box.
+    float near;                 // First depth along rays.
+    float far;                  // Last depth along rays.
+    uint n_samples;             // Number of samples of a ray.
+    uint jitter;                // Flag: 0 for depths on a regular grid (rendering).
+    uint n_rays;                // Number of rays of a batch: rays of windows, followed by single ones.
+    uint n_windows;             // Number of windows of a batch.
+    uint window;                // Side of a window, pixels.
+    uint width;                 // Number of columns of an image.
+    uint height;                // Number of rows of an image.
+    uint n_sets;                // Number of fields, each fitted separately.
+    uint n_weights;             // Number of the Lineformer's parameters, which precede those of the grid.
+    uint n_grid;                // Number of the grid's parameters.
+    uint n_groups;              // Number of parts of a chunk's samples for the sums of the Lineformer's gradients.
+    uint fixed_point_bits;      // Fractional bits of the sums of the grid's gradient.
+    uint ring_length;           // Number of iterations whose losses are kept.
 };
 
 // A level of the hash grid.
 struct SaxLevel {
-    uint cells;                 // along each side of the box
-    uint first;                 // entry it begins with
-    uint entries;               // entries it has
-    uint dense;                 // 1: an entry for each corner of each cell; 0: corners share entries by their hash
+    uint cells;                 // Number of cells along each side of the box.
+    uint first;                 // Index of the first entry.
+    uint entries;               // Number of entries.
+    uint dense;                 // Flag: 1 if each corner of a cell has its own entry; 0 if corners share entries by their hash.
 };
 
-// Pixels of an image that single rays are drawn from: those that show something.
+// Non-empty pixels of an image, from which single rays are drawn.
 struct SaxList {
-    uint first;                 // place in the list of all images
-    uint n;                     // how many
+    uint first;                 // Position in the list of all images.
+    uint n;                     // Number of pixels.
 };
 
-// A gradient of numbers of the Lineformer: the sum over samples of a product of two vectors that they leave, or of one.
+// Gradient of the Lineformer's numbers: the sum over samples of a product of two of their vectors, or of one vector.
 struct SaxProduct {
-    uint left;                  // vector that has a number for each row
-    uint right;                 // vector that has one for each column
-    uint first;                 // where the numbers begin, vec4
-    uint stride;                // from row to row, vec4
-    uint columns;               // vec4; 0: a sum of `left` alone
+    uint left;                  // Vector with a number for each row.
+    uint right;                 // Vector with a number for each column.
+    uint first;                 // Position of the first number, vec4.
+    uint stride;                // Distance from row to row, vec4.
+    uint columns;               // Number of columns, vec4; 0: the sum of `left` alone.
 };

@@ -1,83 +1,83 @@
-// Structures of X-Gaussian shared with the host: build.rs makes Rust's from them, comments included. Lengths are mm in
-// fits, pixels at the isocentre where pictures are drawn of a model.
+// Structures of X-Gaussian that shaders share with the host: build.rs generates the Rust structures from them, including the
+// comments. Lengths are in mm in fits, and in pixels at the isocentre where pictures of a model are drawn.
 
-// A Gaussian as X-Gaussian stores it: its opacity is sigmoid(opacity), at its centre.
+// A Gaussian as X-Gaussian stores it: the opacity at its centre is sigmoid(opacity).
 struct XGaussian {
-    vec3 position;              // centre, along the world's axes
-    float opacity;              // before the sigmoid
-    vec3 log_scale;             // logs of the standard deviations along its own axes
-    float intensity;            // what it shows; nothing below 0
-    vec4 rotation;              // quaternion (w, x, y, z) of its axes; its length does not matter
+    vec3 position;              // Centre in world axes.
+    float opacity;              // Opacity before the sigmoid.
+    vec3 log_scale;             // Logarithms of the standard deviations along its own axes.
+    float intensity;            // Intensity in pictures; values below 0 count as 0.
+    vec4 rotation;              // Quaternion (w, x, y, z) of its axes; its length does not matter.
 };
 
-// What stays fixed while the number of Gaussians does, beside GaussianSetup.
+// Constants between changes of the number of Gaussians, in addition to GaussianSetup.
 struct XSetup {
-    float nearest;              // depth up to which nothing is seen
-    uint n_sets;                // sets of Gaussians, each fitted by itself
-    uint tile_columns;          // tiles of 16 x 16 pixels along a row of a picture
-    uint tile_rows;             // along a column
-    uint capacity;              // Gaussians in all tiles' lists that there is room for
-    float absolute_weight;      // weight of the absolute difference in the loss
+    float nearest;              // Depth up to which Gaussians are not visible.
+    uint n_sets;                // Number of sets of Gaussians, each fitted separately.
+    uint tile_columns;          // Number of tiles of 16 x 16 pixels along a row of a picture.
+    uint tile_rows;             // Number of tiles along a column of a picture.
+    uint capacity;              // Maximum number of Gaussians in all tiles' lists.
+    float absolute_weight;      // Weight of the absolute difference in the loss.
 };
 
-// Gaussians of a set, when all are sorted: by set, then by depth.
+// Range of a set's Gaussians among all Gaussians, which are sorted by set and then by depth.
 struct XSet {
-    uint first;                 // place of the nearest
-    uint count;                 // how many
+    uint first;                 // Position of the nearest Gaussian.
+    uint count;                 // Number of Gaussians.
 };
 
-// One row per iteration.
+// Row of the schedule; there is one per iteration.
 struct XSchedule {
-    float position_rate;        // Adam's rate of positions
-    float opacity_rate;         // of opacities
-    float scale_rate;           // of logs of scales
-    float intensity_rate;       // of intensities
-    float rotation_rate;        // of quaternions
-    float bias1;                // 1 - beta1^t of the t updates up to this one
-    float bias2;                // 1 - beta2^t
-    uint updates;               // 0: Gaussians are added and taken away after it, and no parameter is updated
+    float position_rate;        // Adam's rate of positions.
+    float opacity_rate;         // Adam's rate of opacities.
+    float scale_rate;           // Adam's rate of log-scales.
+    float intensity_rate;       // Adam's rate of intensities.
+    float rotation_rate;        // Adam's rate of quaternions.
+    float bias1;                // Bias correction 1 - beta1^t after t updates, including this one.
+    float bias2;                // Bias correction 1 - beta2^t.
+    uint updates;               // Flag: 0 if Gaussians are added and pruned after this iteration and no parameter is updated.
 };
 
-// Tiles that a Gaussian may show in: column in the lower half of a word, row in the upper one.
+// Tiles in which a Gaussian may be visible; a word has the column in its lower half and the row in its upper half.
 struct XSpan {
-    uint first;                 // first tile
-    uint end;                   // one more than the last column and row
-    uint first_entry;           // where its gradient in the first tile goes; those of others follow row by row
+    uint first;                 // First tile.
+    uint end;                   // End of the tiles: one more than the last column and row.
+    uint first_entry;           // Position of its gradient in the first tile; the other tiles follow row by row.
 };
 
-// What Gaussians are sorted by.
+// Sort key of a Gaussian.
 struct XKey {
-    uint depth;                 // bits of the depth as f32, which are in its order; all set where it is not seen
-    uint index;                 // the Gaussian
+    uint depth;                 // Bits of the depth as f32, in the order of depths; all are set if it is not visible.
+    uint index;                 // Index of the Gaussian.
 };
 
-// A tile's list.
+// List of a tile's Gaussians.
 struct XList {
-    uint first;                 // where it begins
-    uint count;                 // its Gaussians, nearest first
+    uint first;                 // Position of the first Gaussian.
+    uint count;                 // Number of Gaussians, which are sorted from the nearest on.
 };
 
-// Where a pixel ends.
+// State of a pixel behind its last Gaussian.
 struct XEnd {
-    float left;                 // share of light that passes all Gaussians
-    uint last;                  // one more than the place in the list of the last that shows
+    float left;                 // Transmittance of all its Gaussians.
+    uint last;                  // One more than the position in the list of the last visible Gaussian.
 };
 
-// Counted anew in each iteration.
+// Counts that start from zero in each iteration.
 struct XCounts {
-    uint entries;               // Gaussians in all tiles' lists
-    uint listed;                // of those, how many have a place
+    uint entries;               // Number of Gaussians in all tiles' lists.
+    uint listed;                // Number of these Gaussians whose lists already have a position.
 };
 
-// What the host asks after iterations.
+// Status that the host reads after iterations.
 struct XStatus {
-    uint entries;               // Gaussians in all tiles' lists of the last one; beyond the capacity it did nothing
-    uint step;                  // iterations done
+    uint entries;               // Number of Gaussians in the last iteration's lists; above the capacity it had no effect.
+    uint step;                  // Number of completed iterations.
 };
 
-// What density control goes by, since it came last.
+// Statistics of a Gaussian since the last density control.
 struct XStatistics {
-    float pull;                 // sum over iterations of the gradient by the centre, in half images
-    float seen;                 // iterations in which a view saw it
-    float radius;               // its largest radius in a picture, pixels
+    float pull;                 // Sum over iterations of the norm of the gradient by the centre, in half images.
+    float seen;                 // Number of iterations in which it was visible.
+    float radius;               // Maximum radius in a picture, pixels.
 };
