@@ -153,7 +153,7 @@ struct Ray {
     float temporal_high;        // Upper bound, see `temporal_low`.
     uint beyond;                // Phase on the other side of the acquisition time.
     float beyond_share;         // Share of the phase `beyond` in the ray: 0 to 0.5.
-    float change;               // Change of the pixel over the beat due to contrast agent: 0 to 1 in each view.
+    float change;               // Change of the pixel's transmission over the beat: 0 to 1 in each view.
 };
 
 // Rays of a view as affine functions of pixel column and row.

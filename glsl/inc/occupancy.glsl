@@ -1,11 +1,11 @@
 // Record of the cells in which the dynamic field was empty during training. Each cell and phase has two bits in each of three
 // epochs: bit 0, a sample was evaluated there; bit 1, a sample was not empty. The present and the previous epoch determine
 // whether a cell is evaluated, while the third epoch is cleared. The including file must declare `setup` and `occupancy`.
-const uint OCCUPANCY_EPOCH = 64u;    // iterations of an epoch
+const uint OCCUPANCY_EPOCH = 64u;    // number of iterations of an epoch
 const uint SEEN = 1u;                // bit of a cell in which a sample was evaluated
 const uint OCCUPIED = 2u;            // bit of a cell in which a sample was not empty
-const uint OCCUPANCY_EPOCHS = 3u;    // epochs kept in turn
-const uint CELLS_PER_WORD = 16u;     // cells of a word of the occupancy, two bits each
+const uint OCCUPANCY_EPOCHS = 3u;    // number of epochs kept in turn
+const uint CELLS_PER_WORD = 16u;     // number of cells of a word of the occupancy, two bits each
 const float LITTLE_SHOWN = 0.25;     // share of a phase below which an empty sample is not recorded for it
 
 // Number of words of one epoch.
