@@ -13,6 +13,8 @@ mod linear;
 pub mod observed;
 pub mod pose;
 pub mod profiles;
+#[cfg(test)]
+mod samples;
 mod sight;
 pub mod silhouettes;
 pub mod solve;

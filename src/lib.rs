@@ -140,12 +140,14 @@ pub mod formats {
 
 /// Angiograms with their geometry and phase.
 pub mod scan {
+    mod builder;
     pub mod canvas;
     pub mod dataset;
     pub(crate) mod frame_checks;
     pub mod gating;
     pub(crate) mod hidden;
     pub mod nerfca;
+    mod reading;
     pub mod truth;
     pub mod writer;
 }

@@ -1,5 +1,5 @@
 //! A field's network within an iteration, computed on one of two paths: [`layers`] or [`fused`]. The dynamic field is a
-//! network; the static field may be another one ([`still`]).
+//! network; the static field may be another one ([`static_network`]).
 
 pub mod chunk;
 pub mod cost;

@@ -3,7 +3,7 @@
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
 //! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
-//!    [`gaussians`], [`deformable`], [`mod@r2`], [`x_gaussian`] and [`blobs`] about Gaussians; [`mod@sax`] about SAX-NeRF,
+//!    [`gaussians`], [`deformable`] and [`blobs`] about Gaussians; methods have self-tests in their rooms,
 //!    [`projections`] about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 

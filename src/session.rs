@@ -7,11 +7,12 @@
 mod corrected;
 mod engine;
 mod inbox;
+mod known;
+mod progress;
 mod truth;
 
 use crate::calibrate::correction::Calibration;
 use crate::error::{Error, Result};
-use crate::fitting::losses::StepLoss;
 use crate::geometry::{Geometry, ViewRays};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -26,65 +27,18 @@ use crate::scan::gating::RPeaks;
 use crate::trees::extract::{TreeOptions, vessel_trees};
 use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;
-use engine::{Control, Shared, nothing_yet};
+use engine::{Control, Shared, lock, nothing_yet};
 use inbox::Inbox;
 pub use inbox::{Moment, NewFrame, SessionOptions};
+use known::Known;
+pub use progress::{Observer, Progress, State};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use truth::Known;
 
 /// Name of the thread that trains in the background.
 pub const TRAINING_THREAD: &str = "nertca-train";
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// State of a session.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum State {
-    /// Not training.
-    Idle,
-    /// Training in the background.
-    Running,
-    /// Held by [`Session::pause`].
-    Paused,
-    /// Training in the background as soon as there are frames enough.
-    Waiting,
-    /// All iterations are done.
-    Finished,
-    /// The observer ended it.
-    Cancelled,
-    /// An error ended it: see [`Session::failure`].
-    Failed,
-}
-
-impl State {
-    /// Tells whether training in the background goes on, or will again.
-    fn in_background(self) -> bool {
-        matches!(self, State::Running | State::Paused | State::Waiting)
-    }
-}
-
-/// Progress of training.
-#[derive(Debug, Clone, Copy)]
-pub struct Progress {
-    /// Losses of the last iteration.
-    pub loss: StepLoss,
-    /// Length of the run.
-    pub iterations: u32,
-    /// Training frames it uses.
-    pub frames: u32,
-    /// PSNR of the training rays of the last iteration, dB.
-    pub psnr_db: f64,
-    /// Iterations per second since training was last begun.
-    pub iterations_per_s: f64,
-}
-
-/// Callback that receives the progress of training now and then; returns whether to go on.
-pub type Observer<'a> = dyn FnMut(&Progress) -> bool + 'a;
 
 /// A reconstruction in memory that grows with its frames (see the module).
 pub struct Session {
@@ -181,6 +135,11 @@ impl Session {
             inbox.beat_time(*moment).map(|taken| taken.phase),
             &calibration,
         )
+    }
+
+    /// Returns the corrections of the views that training uses; none before it begins, and for a checkpoint that was loaded.
+    pub fn calibration(&self) -> Option<Calibration> {
+        lock(&self.shared.calibration).clone()
     }
 
     /// Gives the R-peaks by which frames with time stamps get their phase; replaces earlier ones.

@@ -165,7 +165,7 @@ fn degradations_that_cannot_be_are_named() {
     refused(&["--detector-photons", "0"], &["detector_photons = 0"]);
     refused(&["--contrast-variation", "-20"], &["contrast_variation = -0.2"]);
     refused(&["--inflow", "-1"], &["inflow_s = -1"]);
-    refused(&["--heart-rate", "60,70"], &["heart_rate = 2", "3 training views"]);
+    refused(&["--heart-rate", "60,70"], &["heart_rate = 2", "one or 3 are needed"]);
     refused(&["--heart-rate", "6"], &["heart_rate = 6", "20 to 300"]);
     refused(&["--heart-rate", "60", "--fps", "0"], &["frames_per_s = 0"]);
     refused(&["--heart-rate", "60", "--beats", "0"], &["beats = 0"]);

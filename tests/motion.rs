@@ -210,7 +210,7 @@ fn any_moment_of_the_beat_can_be_rendered() {
     renderer.set_gaussians(&DynamicGaussians::PerPhase(tree().expand())).unwrap();
     assert_eq!(at(2.0).dynamic_integral, whole(2).dynamic_integral);
     let between = renderer.render_at(rays, width, height, 0.5).unwrap_err().to_string();
-    assert!(between.contains("between two phases") && between.contains("gaussians.form = \"tree\""), "{between}");
+    assert!(between.contains("between two phases") && between.contains("gaussians.form = \"deformable\""), "{between}");
     assert!(renderer.render_at(rays, width, height, 3.0).unwrap_err().to_string().contains("0 to 2"));
     drop(renderer);
     expect_silence(gpu);
@@ -330,8 +330,8 @@ fn motion_that_is_not_known_is_not_exported() {
         refuses(&[&["export", run, "--motion", "--out", out.to_str().unwrap()], extra].concat(), parts);
         assert!(!out.exists());
     };
-    export(&sets, &[], &["gaussians.form", "per phase", "\"tree\""]);
-    export(&network, &[], &["gaussians.form", "network", "\"tree\""]);
+    export(&sets, &[], &["gaussians.form", "per phase", "\"deformable\""]);
+    export(&network, &[], &["gaussians.form", "network", "\"deformable\""]);
     export(&moves, &["--phase", "3"], &["--phase", "0 to 2"]);
     export(&moves, &["--trajectories"], &["--out", ".vtk"]);
     export(&moves, &["--mesh"], &["--mesh"]);
@@ -359,7 +359,7 @@ fn a_run_of_gaussians_is_described() {
         assert!((of["largest_mm"].as_f64().unwrap() - largest).abs() < 1e-4, "{of} at phase {phase}, not {largest}");
     }
     let text = ok(&["info", &run]);
-    assert!(text.contains("form: \"tree\"") && text.contains("count: 6") && !text.contains("hull_share"), "{text}");
+    assert!(text.contains("form: \"deformable\"") && text.contains("count: 6") && !text.contains("hull_share"), "{text}");
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
     let info: Value = serde_json::from_str(&ok(&["info", &network, "--json"])).unwrap();
     assert_eq!(info["gaussians"], Value::Null);

@@ -381,6 +381,7 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     renderer.set_model(&model).unwrap();
     let Some(FieldFeed::Params(params)) = trainer.feed() else { panic!("no parameters") };
     renderer.follow_fit(&params);
+    drop(params);
     assert_eq!(renderer.render(rays, 13, 11, 1).unwrap().dynamic_integral, after.dynamic_integral);
     let baked = Baked::new(Arc::new(renderer), 12).unwrap();
     let quantity = Quantity { projection: Projection::Mip, component: Component::Dynamic };

@@ -172,7 +172,7 @@ pub fn common_motion(frames: &[FrameRays], points: &[DVec3], n_phases: usize, ea
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibrate::solve::tests::{ANGLES, SIZE, views};
+    use crate::calibrate::samples::{ANGLES, SIZE, views};
 
     #[test]
     fn a_common_motion_is_found() {

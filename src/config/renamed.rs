@@ -72,6 +72,7 @@ pub(super) fn rename(table: &mut toml::Table) {
 }
 
 /// Returns the earlier name of a key of a section; `None` for a key that was not renamed.
+#[cfg(feature = "study")]
 pub(crate) fn earlier(section: &str, key: &str) -> Option<&'static str> {
     RENAMED.iter().find(|(of, _, now)| *of == section && *now == key).map(|(_, earlier, _)| *earlier)
 }

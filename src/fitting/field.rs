@@ -54,7 +54,7 @@ pub trait FieldDrawing: Send + Sync {
     /// [`crate::error::Error::Internal`] for a field of another method or of other sizes; device errors.
     fn replace(&self, field: &dyn Field) -> Result<()>;
 
-    /// Draws numbers that are on the device, as [`crate::fitting::fit::Fit::params`] returns them.
+    /// Draws numbers that are on the device, as a [`crate::fitting::fit::FieldFeed`] has them.
     fn follow(&self, params: Vec<Buffer>);
 
     /// Records the rendering of `n_rays` of `rays` at a phase into `ray_out`.

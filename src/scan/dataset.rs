@@ -1,26 +1,15 @@
 //! Dataset in memory and its native layout on disk (`dataset.json` + images; see `docs/formats.md`).
 
-use crate::error::{Error, Result};
-use crate::files;
-use crate::formats::images;
 use crate::geometry::{CArm, Geometry, MM_PER_UNIT, ViewRays, is_at_rest};
-use crate::raster::Image;
-use crate::scan::canvas::onto_canvas;
-use crate::scan::frame_checks::{Complaint, check_phase, check_values, checked_view};
 use crate::scan::gating::BeatTime;
-use crate::scan::nerfca;
 use glam::DVec3;
 use serde::{Deserialize, Serialize, Serializer};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use strum::{IntoStaticStr, VariantArray};
 
 /// Name of the manifest inside a native dataset.
 pub const MANIFEST: &str = "dataset.json";
-const MAX_MANIFEST_BYTES: u64 = 256 << 20;
-const MAX_FRAMES: usize = 100_000;
-/// Largest accepted number of cardiac phases.
-pub(super) const MAX_PHASES: u32 = 4096;
 
 /// Meaning of the pixel values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -53,7 +42,7 @@ fn one() -> f64 {
 }
 
 impl Intensity {
-    fn check(&self) -> std::result::Result<(), (String, String)> {
+    pub(super) fn check(&self) -> std::result::Result<(), (String, String)> {
         let (field, ok) = match self {
             Intensity::Integral { scale, offset } => {
                 ("scale", scale.is_finite() && *scale != 0.0 && offset.is_finite())
@@ -260,80 +249,6 @@ impl Dataset {
         self.training().iter().any(|f| f.heart_shift_mm != [0.0; 3])
     }
 
-    /// Reads a dataset and detects its layout.
-    ///
-    /// # Errors
-    /// [`Error::Data`] or [`Error::Io`] naming file and field.
-    pub fn open(path: &Path) -> Result<Dataset> {
-        if path.join(MANIFEST).is_file() {
-            return Self::open_native(path);
-        }
-        if path.join(nerfca::GENERAL).is_file() {
-            return nerfca::open(path);
-        }
-        if !path.is_dir() {
-            return Err(Error::data(path, "dataset", "is not a directory"));
-        }
-        Err(Error::data(
-            path,
-            "dataset",
-            format!("contains neither {MANIFEST} (native layout) nor {} (NeRF-CA layout)", nerfca::GENERAL),
-        ))
-    }
-
-    fn open_native(path: &Path) -> Result<Dataset> {
-        let file = path.join(MANIFEST);
-        let text = files::read_limited(&file, MAX_MANIFEST_BYTES)?;
-        let manifest: Manifest = serde_json::from_slice(&text)
-            .map_err(|e| Error::data(&file, format!("line {}", e.line()), e.to_string()))?;
-        if manifest.format != "nertca-dataset" || manifest.version != 1 {
-            return Err(Error::data(
-                &file,
-                "format",
-                format!(
-                    "is `{}` version {}, but `nertca-dataset` version 1 is expected",
-                    manifest.format, manifest.version
-                ),
-            ));
-        }
-        let half = manifest.depth_half_extent_mm / MM_PER_UNIT;
-        if !(half.is_finite() && half > 0.0 && half < 1e3) {
-            return Err(Error::data(&file, "depth_half_extent_mm", "is not a positive length in mm"));
-        }
-        let vessel = manifest.vessel_attenuation_per_mm.map(|a| a * MM_PER_UNIT);
-        let mut builder = Builder::new(&file, manifest.phases, (-half, half), vessel)?;
-        for (index, frame) in manifest.frames.iter().enumerate() {
-            frame
-                .intensity
-                .check()
-                .map_err(|(field, problem)| Error::data(&file, format!("frames[{index}].{field}"), problem))?;
-            let image_path = path.join(&frame.image);
-            let image = images::read_image(&image_path)?;
-            let mask = match &frame.mask {
-                None => None,
-                Some(name) => {
-                    let mask = images::read_image(&path.join(name))?;
-                    if (mask.width, mask.height) != (image.width, image.height) {
-                        return Err(Error::data(path.join(name), "shape", "differs from the shape of its image"));
-                    }
-                    Some(mask.values.iter().map(|v| *v != 0.0).collect())
-                }
-            };
-            builder.add(NewFrame {
-                index,
-                source: &image_path,
-                geometry: frame.geometry.clone(),
-                time_phases: frame.phase,
-                split: frame.split,
-                image,
-                to_integral: |v| frame.intensity.integral(v),
-                mask,
-                heart_shift_mm: frame.heart_shift_mm,
-            })?;
-        }
-        builder.finish(path, Layout::Native)
-    }
-
     /// Frames that the reconstruction may use; they come first in [`Dataset::frames`].
     pub fn training(&self) -> &[Frame] {
         &self.frames[..self.n_training()]
@@ -388,149 +303,6 @@ impl Dataset {
         views.dedup();
         views
     }
-}
-
-/// Collects frames and checks each one.
-pub(super) struct Builder {
-    file: PathBuf,
-    n_phases: u32,
-    depth_range: (f64, f64),
-    vessel_attenuation: Option<f64>,
-    views: Vec<View>,
-    frames: Vec<Frame>,
-    pub(super) notes: Vec<String>,
-}
-
-pub(super) struct NewFrame<'a, F: Fn(f32) -> f32> {
-    pub index: usize,
-    pub source: &'a Path,
-    pub geometry: Geometry,
-    pub time_phases: f64,
-    pub split: Split,
-    pub image: Image,
-    pub to_integral: F,
-    pub mask: Option<Vec<bool>>,
-    pub heart_shift_mm: [f64; 3],
-}
-
-impl Builder {
-    pub(super) fn new(
-        file: &Path,
-        n_phases: u32,
-        depth_range: (f64, f64),
-        vessel_attenuation: Option<f64>,
-    ) -> Result<Builder> {
-        if n_phases == 0 || n_phases > MAX_PHASES {
-            return Err(Error::data(
-                file,
-                "phases",
-                format!("{n_phases} is not in the accepted range, 1 to {MAX_PHASES}"),
-            ));
-        }
-        if vessel_attenuation.is_some_and(|a| !(a.is_finite() && a > 0.0)) {
-            return Err(Error::data(file, "vessel_attenuation_per_mm", "is not a positive number"));
-        }
-        Ok(Builder {
-            file: file.to_path_buf(),
-            n_phases,
-            depth_range,
-            vessel_attenuation,
-            views: Vec::new(),
-            frames: Vec::new(),
-            notes: Vec::new(),
-        })
-    }
-
-    pub(super) fn add<F: Fn(f32) -> f32>(&mut self, new: NewFrame<'_, F>) -> Result<()> {
-        let field = |name: &str| format!("frames[{}].{name}", new.index);
-        if self.frames.len() >= MAX_FRAMES {
-            return Err(Error::data(&self.file, "frames", format!("has more than {MAX_FRAMES} frames")));
-        }
-        if !new.heart_shift_mm.iter().all(|s| s.is_finite() && s.abs() < 1e3) {
-            return Err(Error::data(&self.file, field("heart_shift_mm"), "is not a displacement in mm"));
-        }
-        let told = |file: &Path, Complaint { field: name, value, problem }: Complaint| {
-            Error::data(file, field(&name), format!("{value} {problem}").trim_start())
-        };
-        check_phase(new.time_phases, self.n_phases).map_err(|c| told(&self.file, c))?;
-        let taken = BeatTime::of(new.time_phases, self.n_phases);
-        let size = [new.image.width, new.image.height];
-        check_values(&new.image.values, size[0]).map_err(|c| told(new.source, c))?;
-        let view = match self.views.iter().position(|v| v.geometry == new.geometry && v.size == size) {
-            Some(view) => view,
-            None => {
-                let of_geometry = |c: Complaint| Complaint { field: format!("geometry.{}", c.field), ..c };
-                let view = checked_view(new.geometry, size, -self.depth_range.0);
-                self.views.push(view.map_err(|c| told(&self.file, of_geometry(c)))?);
-                self.views.len() - 1
-            }
-        };
-        self.frames.push(Frame {
-            name: new
-                .source
-                .file_stem()
-                .map_or_else(|| format!("frame-{}", new.index), |s| s.to_string_lossy().into_owned()),
-            view,
-            phase: taken.phase,
-            after_phase: taken.after_phase,
-            split: new.split,
-            integrals: new.image.values.iter().map(|v| (new.to_integral)(*v)).collect(),
-            mask: new.mask,
-            heart_shift_mm: new.heart_shift_mm,
-        });
-        Ok(())
-    }
-
-    pub(super) fn finish(mut self, path: &Path, layout: Layout) -> Result<Dataset> {
-        let canvas = onto_canvas(&self.views, &mut self.frames);
-        let canvas = canvas.map_err(|c| Error::data(&self.file, "frames", format!("{}: {}", c.value, c.problem)))?;
-        let Some([width, height]) = canvas else {
-            return Err(Error::data(&self.file, "frames", "is empty"));
-        };
-        if !self.frames.iter().any(|f| f.split == Split::Train) {
-            return Err(Error::data(&self.file, "frames", "has no training frame"));
-        }
-        self.frames.sort_by_key(|f| f.split);
-        self.notes.extend(untrained_phases(&self.frames, self.n_phases));
-        let mut dataset = Dataset {
-            path: path.to_path_buf(),
-            layout,
-            views: self.views,
-            frames: self.frames,
-            hidden: BTreeMap::new(),
-            width,
-            height,
-            n_phases: self.n_phases,
-            depth_range: self.depth_range,
-            vessel_attenuation: self.vessel_attenuation,
-            notes: self.notes,
-        };
-        dataset.hide();
-        Ok(dataset)
-    }
-}
-
-/// Note on the phases that no training frame shows.
-fn untrained_phases(frames: &[Frame], n_phases: u32) -> Option<String> {
-    let mut seen = vec![false; n_phases as usize];
-    frames.iter().filter(|f| f.split == Split::Train).for_each(|f| seen[f.phase as usize] = true);
-    let unseen: Vec<u32> = (0..n_phases).filter(|p| !seen[*p as usize]).collect();
-    (!unseen.is_empty()).then(|| {
-        format!(
-            "no training frame shows phase {}, so the dynamic field is not determined by images there",
-            list_of(&unseen)
-        )
-    })
-}
-
-/// Formats numbers as a list in which consecutive numbers are written as first-last.
-pub(super) fn list_of(numbers: &[u32]) -> String {
-    let runs = numbers.chunk_by(|a, b| a + 1 == *b).map(|run| match run {
-        [first, .., last] => format!("{first}-{last}"),
-        [one] => one.to_string(),
-        [] => String::new(),
-    });
-    runs.collect::<Vec<_>>().join(", ")
 }
 
 /// JSON schema of the manifest.

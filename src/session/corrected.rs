@@ -5,7 +5,6 @@ use crate::calibrate::correction::{Calibration, ViewCorrection};
 use crate::error::{Error, Result};
 use crate::geometry::world_from_lps_mm;
 use crate::scan::dataset::{Frame, View};
-use crate::session::{Session, lock};
 use glam::DVec3;
 
 /// A frame as calibration sees it.
@@ -20,13 +19,6 @@ pub struct CorrectedFrame {
     /// Projection from patient mm (left, posterior, superior) to homogeneous pixels (column, row; integers are pixel centres),
     /// rows first: it draws the vessels where this frame shows them.
     pub projection: [[f64; 4]; 3],
-}
-
-impl Session {
-    /// Returns the corrections of the views that training uses; none before it begins, and for a checkpoint that was loaded.
-    pub fn calibration(&self) -> Option<Calibration> {
-        lock(&self.shared.calibration).clone()
-    }
 }
 
 impl CorrectedFrame {

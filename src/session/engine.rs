@@ -12,7 +12,7 @@ use crate::model::scene::Scene;
 use crate::plan::Plan;
 use crate::render::live::{Live, Source};
 use crate::session::inbox::Inbox;
-use crate::session::{Observer, Progress, State, lock};
+use crate::session::progress::{Observer, Progress, State};
 use crate::train::trainer::Trainer;
 use crate::train::training::Training;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
@@ -26,6 +26,10 @@ const SETTLE: u32 = 4;
 const QUIET: Duration = Duration::from_millis(300);
 /// Interval at which training looks again while others wait for the engine.
 const GIVE_WAY: Duration = Duration::from_micros(200);
+
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// State that the threads of a session share.
 pub(super) struct Shared {

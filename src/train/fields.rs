@@ -83,7 +83,8 @@ impl FieldsFit {
     /// otherwise Gaussians go on from `earlier` ones where they can.
     ///
     /// # Errors
-    /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of all.
+    /// [`crate::error::Error::Config`] when `tuning` asks for what the device lacks; [`crate::error::Error::OutOfMemory`]; other device
+    /// errors.
     pub(super) fn start(
         gpu: &Gpu,
         plan: &mut Plan,

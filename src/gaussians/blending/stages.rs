@@ -60,7 +60,7 @@ impl BlendKernels {
 buffer_set! {
     /// Views and their pictures.
     pub struct BlendBuffers {
-        /// [`GaussianSetup`].
+        /// [`crate::kernels::layout::GaussianSetup`].
         gaussian_setup,
         /// [`XSetup`].
         x_setup,
