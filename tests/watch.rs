@@ -226,7 +226,7 @@ fn runs_are_taken_in_as_they_come() {
         ("broken.dcm", 1),
         ("scan.dcm", 1),
         ("Modality", 1),
-        ("again.dcm: SOPInstanceUID: is that of view1", 1),
+        ("again.dcm: SOPInstanceUID: is the same as that of view1", 1),
         ("), 6 frames, phases 0 1 2 3 4 5\n", 3),
     ] {
         assert_eq!(said.matches(part).count(), times, "`{part}` in {said}");
