@@ -359,7 +359,10 @@ fn a_run_of_gaussians_is_described() {
         assert!((of["largest_mm"].as_f64().unwrap() - largest).abs() < 1e-4, "{of} at phase {phase}, not {largest}");
     }
     let text = ok(&["info", &run]);
-    assert!(text.contains("form: \"deformable\"") && text.contains("count: 6") && !text.contains("hull_share"), "{text}");
+    assert!(
+        text.contains("form: \"deformable\"") && text.contains("count: 6") && !text.contains("hull_share"),
+        "{text}"
+    );
     let network = saved(model("fast-mlp", None), &dir.path().join("network.safetensors"));
     let info: Value = serde_json::from_str(&ok(&["info", &network, "--json"])).unwrap();
     assert_eq!(info["gaussians"], Value::Null);
