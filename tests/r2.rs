@@ -14,6 +14,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
+use nertca_vk::fitting::shown::SetsFit;
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{R2Gaussian, R2Turn};

@@ -13,6 +13,7 @@ use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_d
 use golden_file::Golden;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
+use nertca_vk::fitting::shown::SetsFit;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{R2Turn, XGaussian, XStatistics};
 use nertca_vk::methods::x_gaussian::data::XData;

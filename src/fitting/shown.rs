@@ -23,11 +23,13 @@ pub trait SetsFit: Send {
     /// Returns the number of Gaussians of all sets.
     fn count(&self) -> u32;
 
-    /// Runs one submit of iterations towards `until` and returns their losses, each the mean over the sets; none when `until` was
-    /// reached before.
+    /// Runs one submit of iterations towards `until`, at most to where the number of Gaussians changes, and returns their losses,
+    /// each the mean over the sets; none when `until` was reached before.
     ///
     /// # Errors
-    /// [`crate::error::Error::Diverged`] on a loss that is not finite; device errors.
+    /// [`crate::error::Error::Diverged`] on a loss that is not finite; [`crate::error::Error::Config`] where no buffer of the
+    /// device holds what an iteration needs; [`crate::error::Error::NoDevice`] of a device that does not count its iterations;
+    /// device errors.
     fn advance(&mut self, until: u32) -> Result<Vec<f64>>;
 
     /// Returns the state after the iterations done.
@@ -38,6 +40,14 @@ pub trait SetsFit: Send {
 
     /// Returns the Gaussians of a state in the units that they are drawn and exported in.
     fn field_of(&self, state: &Self::State) -> Gaussians;
+
+    /// Returns the Gaussians after the iterations done, in the units that they are drawn and exported in.
+    ///
+    /// # Errors
+    /// Errors of [`SetsFit::state`].
+    fn model(&self) -> Result<Gaussians> {
+        Ok(self.field_of(&self.state()?))
+    }
 
     /// Runs one iteration with a timestamp around each pass.
     ///
@@ -64,7 +74,7 @@ impl<T: SetsFit> ShownFit<T> {
     /// # Errors
     /// Errors of [`SetsFit::state`].
     pub fn new(fit: T) -> Result<ShownFit<T>> {
-        let field = fit.field_of(&fit.state()?);
+        let field = fit.model()?;
         Ok(ShownFit { fit, feed: Arc::new(Mutex::new((0, DynamicGaussians::PerPhase(field)))) })
     }
 }
@@ -84,7 +94,7 @@ impl<T: SetsFit> Fit for ShownFit<T> {
         let before = self.fit.step();
         let losses = self.fit.advance(until)?;
         if is_due(before, self.fit.step(), until) {
-            let field = self.fit.field_of(&self.fit.state()?);
+            let field = self.fit.model()?;
             let mut feed = self.feed.lock().unwrap_or_else(PoisonError::into_inner);
             *feed = (feed.0 + 1, DynamicGaussians::PerPhase(field));
         }

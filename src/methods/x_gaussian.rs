@@ -21,15 +21,12 @@ use crate::fitting::extent::volume_half;
 use crate::fitting::field::Field;
 use crate::fitting::fit::{FieldVolume, Fit, FitData, FitField, FitState, Method, SavedAt, SavedFit};
 use crate::fitting::sets::ignored;
-use crate::fitting::shown::{SetsFit, ShownFit};
+use crate::fitting::shown::ShownFit;
 use crate::gaussians::blobs::BlobKernels;
-use crate::gaussians::field::Gaussians;
 use crate::gaussians::pictures::into_buffers;
 use crate::gaussians::stages::SplatStage;
-use crate::gaussians::work::GaussianWork;
 use crate::geometry::MM_PER_UNIT;
 use crate::gpu::device::Gpu;
-use crate::gpu::record::PassTime;
 use crate::kernels::push;
 use crate::kernels::stages::Build;
 use crate::kernels::tuning::Tuning;
@@ -147,38 +144,6 @@ impl FitData for XData {
 
     fn as_any(&self) -> &dyn Any {
         self
-    }
-}
-
-impl SetsFit for XTrainer {
-    type State = XState;
-
-    fn step(&self) -> u32 {
-        self.step()
-    }
-
-    fn count(&self) -> u32 {
-        self.count()
-    }
-
-    fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
-        self.advance(until)
-    }
-
-    fn state(&self) -> Result<XState> {
-        self.state()
-    }
-
-    fn field_of(&self, state: &XState) -> Gaussians {
-        self.field_of(state)
-    }
-
-    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        self.profile_step()
-    }
-
-    fn work(&self) -> Result<GaussianWork> {
-        self.work()
     }
 }
 

@@ -3,6 +3,7 @@
 
 use crate::config::{Config, Preset};
 use crate::error::Result;
+use crate::fitting::shown::SetsFit;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Setup, R2Turn, Splat};

@@ -4,6 +4,7 @@ use crate::config::{Config, R2Integral};
 use crate::error::{Error, Result};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{losses, ring};
+use crate::fitting::shown::SetsFit;
 use crate::gaussians::field::Gaussians;
 use crate::gaussians::work::{GaussianWork, SplatCost};
 use crate::gpu::buffer::Memory;
@@ -76,16 +77,6 @@ impl R2Trainer {
         Ok(R2Trainer { gpu, data, config, setup, r2, kernels, buffers, particles, n, iterations, step })
     }
 
-    /// Iterations done.
-    pub fn step(&self) -> u32 {
-        self.step
-    }
-
-    /// Number of Gaussians of all sets.
-    pub fn count(&self) -> u32 {
-        self.n
-    }
-
     /// Data of the run.
     pub fn data(&self) -> &R2Data {
         &self.data
@@ -106,12 +97,31 @@ impl R2Trainer {
         &self.buffers
     }
 
-    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
-    /// losses of the iterations done, each the mean over the sets. An empty list means the target was reached before.
-    ///
-    /// # Errors
-    /// [`Error::Diverged`] on a loss that is not finite; device errors.
-    pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+    /// Adds and removes Gaussians. This is rare enough for the host, which draws children in f64.
+    fn densify(&mut self) -> Result<()> {
+        let (r2, n_sets) = (&self.config.r2, self.data.n_sets());
+        let state = densified(&self.state()?, n_sets, r2, self.config.seed, self.step);
+        self.n = check_count(&state, &self.data)?;
+        self.particles = R2ParticleBuffers::new(&self.gpu, &state)?;
+        let parts = (&self.kernels, &self.buffers, &self.particles);
+        let per_submit = self.config.train.iterations_per_submit;
+        self.iterations = record(&self.gpu, parts, (&self.setup, &self.r2), self.n, per_submit)?;
+        Ok(())
+    }
+}
+
+impl SetsFit for R2Trainer {
+    type State = R2State;
+
+    fn step(&self) -> u32 {
+        self.step
+    }
+
+    fn count(&self) -> u32 {
+        self.n
+    }
+
+    fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
         let until = until.min(self.config.train.iterations);
         if self.step >= until {
             return Ok(Vec::new());
@@ -126,46 +136,17 @@ impl R2Trainer {
         Ok(losses)
     }
 
-    /// Adds and removes Gaussians. This is rare enough for the host, which draws children in f64.
-    fn densify(&mut self) -> Result<()> {
-        let (r2, n_sets) = (&self.config.r2, self.data.n_sets());
-        let state = densified(&self.state()?, n_sets, r2, self.config.seed, self.step);
-        self.n = check_count(&state, &self.data)?;
-        self.particles = R2ParticleBuffers::new(&self.gpu, &state)?;
-        let parts = (&self.kernels, &self.buffers, &self.particles);
-        let per_submit = self.config.train.iterations_per_submit;
-        self.iterations = record(&self.gpu, parts, (&self.setup, &self.r2), self.n, per_submit)?;
-        Ok(())
-    }
-
-    /// The state after the iterations done, from which a resumed run goes on.
-    ///
-    /// # Errors
-    /// [`Error::Diverged`] when a parameter is not finite; device errors.
-    pub fn state(&self) -> Result<R2State> {
+    fn state(&self) -> Result<R2State> {
         let state = self.particles.download(&self.gpu, self.n as usize)?;
         state.check(self.step)?;
         Ok(state)
     }
 
-    /// The field that a state stands for, after the iterations done.
-    pub fn field_of(&self, state: &R2State) -> Gaussians {
+    fn field_of(&self, state: &R2State) -> Gaussians {
         self.data.field(&state.rows, ScaleBounds::of(&self.config.r2), self.step)
     }
 
-    /// The field after the iterations done.
-    ///
-    /// # Errors
-    /// As [`R2Trainer::state`].
-    pub fn model(&self) -> Result<Gaussians> {
-        Ok(self.field_of(&self.state()?))
-    }
-
-    /// Runs one iteration with a timestamp around each pass.
-    ///
-    /// # Errors
-    /// [`Error::Internal`] when the fit is over; device errors.
-    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         // The schedule has one more row than iterations for this.
         if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit has ended, so no iteration is left to be timed".into()));
@@ -182,10 +163,7 @@ impl R2Trainer {
     }
 
     /// Work of the last iteration, without voxels.
-    ///
-    /// # Errors
-    /// Device errors.
-    pub fn work(&self) -> Result<GaussianWork> {
+    fn work(&self) -> Result<GaussianWork> {
         let splats = (&self.particles.splats, &self.particles.image_of_splat);
         let cost = match self.config.r2.integral {
             R2Integral::Affine => SplatCost::AFFINE,

@@ -3,6 +3,7 @@
 
 use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
+use crate::fitting::shown::SetsFit;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{R2Turn, Splat, XEnd, XGaussian, XKey, XList, XSpan, XStatistics};

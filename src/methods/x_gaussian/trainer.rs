@@ -4,6 +4,7 @@ use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::ring::{counts_wrongly, losses, ring};
+use crate::fitting::shown::SetsFit;
 use crate::gaussians::blending::particles::BlendedGaussians;
 use crate::gaussians::blending::picture::{first_capacity, more_capacity};
 use crate::gaussians::blending::stages::BlendBuffers;
@@ -90,16 +91,6 @@ impl XTrainer {
         let (gpu, sets) = (gpu.clone(), state.sets.clone());
         let iterations = None;
         Ok(XTrainer { gpu, data, config, setup, x, kernels, scene, fit, seen, learning, sets, iterations, step })
-    }
-
-    /// Iterations done.
-    pub fn step(&self) -> u32 {
-        self.step
-    }
-
-    /// Number of Gaussians of all sets.
-    pub fn count(&self) -> u32 {
-        self.sets.len() as u32
     }
 
     /// Data of the run.
@@ -199,25 +190,6 @@ impl XTrainer {
         }
     }
 
-    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
-    /// losses of the iterations done, each the mean over the sets. An empty list means the target was reached before.
-    ///
-    /// # Errors
-    /// [`Error::Diverged`] on a loss that is not finite; [`Error::Config`] where no buffer holds the tiles' lists;
-    /// [`Error::NoDevice`] of a device that does not count its iterations; device errors.
-    pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
-        let until = until.min(self.config.train.iterations);
-        if self.step >= until {
-            return Ok(Vec::new());
-        }
-        let first = self.step;
-        let stop = (first + 1..until).find(|step| self.changes(*step)).unwrap_or(until);
-        self.run(stop)?;
-        let losses = losses(&self.gpu, &self.fit.gaussian_ring, first..self.step, SMALLER_STEPS)?;
-        self.control_density()?;
-        Ok(losses)
-    }
-
     fn changes(&self, step: u32) -> bool {
         densifies(&self.config.x, step) || resets(&self.config.x, step)
     }
@@ -243,35 +215,43 @@ impl XTrainer {
         self.iterations = None;
         Ok(())
     }
+}
 
-    /// The state after the iterations done, from which a resumed run goes on.
-    ///
-    /// # Errors
-    /// [`Error::Diverged`] when a parameter is not finite; device errors.
-    pub fn state(&self) -> Result<XState> {
+impl SetsFit for XTrainer {
+    type State = XState;
+
+    fn step(&self) -> u32 {
+        self.step
+    }
+
+    fn count(&self) -> u32 {
+        self.sets.len() as u32
+    }
+
+    fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        let until = until.min(self.config.train.iterations);
+        if self.step >= until {
+            return Ok(Vec::new());
+        }
+        let first = self.step;
+        let stop = (first + 1..until).find(|step| self.changes(*step)).unwrap_or(until);
+        self.run(stop)?;
+        let losses = losses(&self.gpu, &self.fit.gaussian_ring, first..self.step, SMALLER_STEPS)?;
+        self.control_density()?;
+        Ok(losses)
+    }
+
+    fn state(&self) -> Result<XState> {
         let state = download(&self.gpu, &self.seen, &self.learning, &self.sets)?;
         state.check(self.step)?;
         Ok(state)
     }
 
-    /// The field that a state stands for, after the iterations done.
-    pub fn field_of(&self, state: &XState) -> Gaussians {
+    fn field_of(&self, state: &XState) -> Gaussians {
         self.data.field(state, self.step)
     }
 
-    /// The field after the iterations done.
-    ///
-    /// # Errors
-    /// As [`XTrainer::state`].
-    pub fn model(&self) -> Result<Gaussians> {
-        Ok(self.field_of(&self.state()?))
-    }
-
-    /// Runs one iteration with a timestamp around each pass.
-    ///
-    /// # Errors
-    /// [`Error::Internal`] when the fit is over; device errors.
-    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         // The schedule has one more row than iterations for this.
         if self.step > self.config.train.iterations {
             return Err(Error::Internal("the fit has ended, so no iteration is left to be timed".into()));
@@ -288,10 +268,7 @@ impl XTrainer {
     }
 
     /// Work of the last iteration: pairs of a Gaussian in a tile's list and a pixel of that tile.
-    ///
-    /// # Errors
-    /// Device errors.
-    pub fn work(&self) -> Result<GaussianWork> {
+    fn work(&self) -> Result<GaussianWork> {
         let mut status = [XStatus::default()];
         self.fit.x_status.read(&mut status)?;
         let (splats, entries) = (u64::from(self.count()), u64::from(status[0].entries));
