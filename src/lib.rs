@@ -339,6 +339,7 @@ pub mod bench;
 /// Reference implementations of the compute stages in f64: plain loops, no device. They serve tests and `selftest`; no result
 /// depends on them.
 pub mod reference {
+    pub mod adam;
     pub mod blobs;
     pub mod deformable;
     pub mod field;

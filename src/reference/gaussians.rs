@@ -2,7 +2,8 @@
 //! cone-beam integral, which the affine one of the stages approximates.
 
 use crate::gaussians::view::SplatView;
-use crate::kernels::layout::{Gaussian, GaussianSetup};
+use crate::kernels::layout::{Gaussian, GaussianSchedule, GaussianSetup};
+use crate::reference::adam::Adam;
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
 /// Parameters of a Gaussian: position (3), log-density, log-scale (3), quaternion (4).
@@ -236,25 +237,22 @@ pub fn residual(setup: &GaussianSetup, image: &[f64], low: &[f32], high: &[f32],
     (loss, gradient)
 }
 
-/// Adam's state of one Gaussian.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct AdamState {
-    first: Params,
-    second: Params,
-}
-
-/// Applies one Adam update; `rate` is the schedule's factor, `bias` the bias corrections.
-pub fn adam(setup: &GaussianSetup, rate: f64, bias: [f64; 2], g: &Params, p: &mut Params, state: &mut AdamState) {
-    let (beta1, beta2) = (f64::from(setup.beta1), f64::from(setup.beta2));
+/// Applies one Adam update by a row of the schedule to a Gaussian and its moments.
+pub fn adam(
+    setup: &GaussianSetup,
+    row: &GaussianSchedule,
+    g: &Params,
+    p: &mut Params,
+    moments: &mut [[f64; 2]; N_PARAMS],
+) {
+    let adam = Adam::new([setup.beta1, setup.beta2], setup.epsilon, [row.bias1, row.bias2]);
     for k in 0..N_PARAMS {
-        let own = f64::from(match k {
+        let rate = match k {
             0..3 => setup.position_rate,
             3 => setup.density_rate,
             4..7 => setup.scale_rate,
             _ => setup.rotation_rate,
-        });
-        state.first[k] = beta1 * state.first[k] + (1.0 - beta1) * g[k];
-        state.second[k] = beta2 * state.second[k] + (1.0 - beta2) * g[k] * g[k];
-        p[k] -= rate * own / bias[0] * state.first[k] / ((state.second[k] / bias[1]).sqrt() + f64::from(setup.epsilon));
+        };
+        adam.update(f64::from(row.rate) * f64::from(rate), g[k], &mut p[k], &mut moments[k]);
     }
 }

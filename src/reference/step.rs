@@ -1,6 +1,7 @@
 //! f64 reference implementation (twin) of one training iteration: loss, gradient, Adam.
 
 use crate::plan::Plan;
+use crate::reference::adam::Adam;
 use crate::reference::field::Precision;
 use crate::reference::losses::Losses;
 use crate::reference::march::{self, NearPart, Ray};
@@ -114,20 +115,17 @@ pub fn total_variation(plan: &Plan, params: &[f64], gradient: &mut [f64]) -> f64
 /// One Adam update (twin of `adam`).
 pub fn adam(plan: &Plan, step: u32, gradient: &[f64], params: &mut [f64], moments: &mut [[f64; 2]]) {
     let (s, row) = (&plan.setup, plan.schedule[step as usize]);
-    let (beta1, beta2) = (f64::from(s.beta1), f64::from(s.beta2));
     for (i, g) in gradient.iter().enumerate() {
         let is_static = i < plan.params.static_len;
         if !is_static && row.dynamic_active == 0 {
             continue;
         }
-        let m = &mut moments[i];
         let update = if is_static { row.static_update } else { row.dynamic_update };
         if update.restart != 0 {
-            *m = [0.0; 2];
+            moments[i] = [0.0; 2];
         }
-        m[0] = beta1 * m[0] + (1.0 - beta1) * g;
-        m[1] = beta2 * m[1] + (1.0 - beta2) * g * g;
-        let denominator = (m[1] / f64::from(update.bias_correction2)).sqrt() + f64::from(s.epsilon);
-        params[i] -= f64::from(update.rate) / f64::from(update.bias_correction1) * m[0] / denominator;
+        let bias_corrections = [update.bias_correction1, update.bias_correction2];
+        let adam = Adam::new([s.beta1, s.beta2], s.epsilon, bias_corrections);
+        adam.update(f64::from(update.rate), *g, &mut params[i], &mut moments[i]);
     }
 }

@@ -9,7 +9,7 @@ use crate::kernels::layout::{GaussianSetup, Splat};
 use crate::kernels::push::{self, PushConstants};
 use crate::plan::fit;
 use crate::plan::targets::Targets;
-use crate::reference::gaussians::{self as reference, AdamState, N_PARAMS, Params, Projection, params};
+use crate::reference::gaussians::{self as reference, N_PARAMS, Params, Projection, params};
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::problems::{hard_case, with_gaussians};
 use crate::train::gaussians::GaussianTrainer;
@@ -251,12 +251,11 @@ fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     }
     let setup = *trainer.setup();
     let mut all: Vec<(Params, usize)> = rows.iter().map(|g| (params(g), g.phase as usize)).collect();
-    let mut states = vec![AdamState::default(); all.len()];
+    let mut moments = vec![[[0.0; 2]; N_PARAMS]; all.len()];
     for row in &fit::schedule(&config.gaussians)[..10] {
         let (_, _, gradient) = twin(&targets, &setup, &all);
-        for (((p, _), g), state) in all.iter_mut().zip(&gradient).zip(&mut states) {
-            let bias = [row.bias1, row.bias2].map(f64::from);
-            reference::adam(&setup, f64::from(row.rate), bias, g, p, state);
+        for (((p, _), g), moments) in all.iter_mut().zip(&gradient).zip(&mut moments) {
+            reference::adam(&setup, row, g, p, moments);
         }
     }
     let (mut far, mut moved) = (0, 0);

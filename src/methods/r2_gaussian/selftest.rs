@@ -12,7 +12,7 @@ use crate::methods::r2_gaussian::data::R2Data;
 use crate::methods::r2_gaussian::setup::{schedule, turns};
 use crate::methods::r2_gaussian::state::R2State;
 use crate::methods::r2_gaussian::trainer::R2Trainer;
-use crate::methods::r2_gaussian::twin::{self as reference, AdamState, Projection, Sight, VoxelBox, params};
+use crate::methods::r2_gaussian::twin::{self as reference, Projection, Sight, VoxelBox, params};
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::gaussians::{N_PARAMS, Params};
@@ -435,11 +435,11 @@ fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     }
     let (shown, schedule, data) = (turns(fit.data(), &settings), schedule(&settings), fit.data());
     let mut all: Vec<(Params, usize)> = rows.iter().map(|g| (params(g), g.set as usize)).collect();
-    let mut states = vec![AdamState::default(); all.len()];
+    let mut moments = vec![[[0.0; 2]; N_PARAMS]; all.len()];
     for (row, shown) in schedule.iter().zip(shown.chunks(data.n_sets())).take(UPDATES as usize) {
         let (_, gradients) = twin(data, fit.setups(), shown, &all);
-        for (((p, _), g), state) in all.iter_mut().zip(&gradients).zip(&mut states) {
-            reference::adam(fit.setups().0, row, g, p, state);
+        for (((p, _), g), moments) in all.iter_mut().zip(&gradients).zip(&mut moments) {
+            reference::adam(fit.setups().0, row, g, p, moments);
         }
     }
     let (mut far, mut moved) = (0, 0);

@@ -6,6 +6,7 @@ use crate::kernels::layout::{GaussianSetup, R2Gaussian, R2Schedule, R2Setup};
 use crate::methods::r2_gaussian::parameters::{ScaleBounds, softplus};
 use crate::methods::r2_gaussian::twin_chords::Chords;
 use crate::methods::r2_gaussian::twin_shape::{bounds, pixels_within, position, scale};
+use crate::reference::adam::Adam;
 use crate::reference::gaussians::{N_PARAMS, Params, axes, rotation_gradient};
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
@@ -324,29 +325,19 @@ fn plane([h, u, v, uu, uv, vv, ..]: [f64; 10]) -> [f64; 6] {
     [h, u, v, uu, uv, vv]
 }
 
-/// Adam's state of one Gaussian.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct AdamState {
-    first: Params,
-    second: Params,
-}
-
-/// Applies one Adam update by a row of the schedule.
-pub fn adam(setup: &GaussianSetup, row: &R2Schedule, g: &Params, p: &mut Params, state: &mut AdamState) {
+/// Applies one Adam update by a row of the schedule to a Gaussian and its moments.
+pub fn adam(setup: &GaussianSetup, row: &R2Schedule, g: &Params, p: &mut Params, moments: &mut [[f64; 2]; N_PARAMS]) {
     if row.updates == 0 {
         return;
     }
-    let (beta1, beta2) = (f64::from(setup.beta1), f64::from(setup.beta2));
+    let adam = Adam::new([setup.beta1, setup.beta2], setup.epsilon, [row.bias1, row.bias2]);
     for k in 0..N_PARAMS {
-        let rate = f64::from(match k {
+        let rate = match k {
             0..3 => row.position_rate,
             3 => row.density_rate,
             4..7 => row.scale_rate,
             _ => row.rotation_rate,
-        });
-        state.first[k] = beta1 * state.first[k] + (1.0 - beta1) * g[k];
-        state.second[k] = beta2 * state.second[k] + (1.0 - beta2) * g[k] * g[k];
-        let [bias1, bias2] = [row.bias1, row.bias2].map(f64::from);
-        p[k] -= rate * state.first[k] / bias1 / ((state.second[k] / bias2).sqrt() + f64::from(setup.epsilon));
+        };
+        adam.update(f64::from(rate), g[k], &mut p[k], &mut moments[k]);
     }
 }

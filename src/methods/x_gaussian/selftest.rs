@@ -12,9 +12,7 @@ use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::setup::{schedule, turns};
 use crate::methods::x_gaussian::state::XState;
 use crate::methods::x_gaussian::trainer::XTrainer;
-use crate::methods::x_gaussian::twin::{
-    self as reference, AdamState, Blot, N_PARAMS, Params, Projection, Sums, params,
-};
+use crate::methods::x_gaussian::twin::{self as reference, Blot, N_PARAMS, Params, Projection, Sums, params};
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::ssim::picture_loss;
@@ -463,11 +461,11 @@ fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let (shown, schedule, n_sets) =
         (turns(fit.data(), &config), schedule(&config, fit.data().extent_mm), fit.data().n_sets());
     let mut all = with_sets(&before);
-    let mut states = vec![AdamState::default(); all.len()];
+    let mut moments = vec![[[0.0; 2]; N_PARAMS]; all.len()];
     for (row, shown) in schedule.iter().zip(shown.chunks(n_sets)).take(UPDATES as usize) {
         let (_, gradients) = twin(&fit, shown, &all);
-        for (((p, _), g), state) in all.iter_mut().zip(&gradients).zip(&mut states) {
-            reference::adam(fit.setups().0, row, g, p, state);
+        for (((p, _), g), moments) in all.iter_mut().zip(&gradients).zip(&mut moments) {
+            reference::adam(fit.setups().0, row, g, p, moments);
         }
     }
     let rates = rates(&config, fit.data().extent_mm);

@@ -2,6 +2,7 @@
 
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{GaussianSetup, Splat, XGaussian, XSchedule, XSetup};
+use crate::reference::adam::Adam;
 use crate::reference::gaussians;
 use glam::{DMat2, DMat3, DVec2, DVec3};
 
@@ -249,30 +250,20 @@ pub fn tile_lists(seen: &[Option<Projection>], x: &XSetup) -> Vec<Vec<usize>> {
     lists
 }
 
-/// Adam's state of one Gaussian.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct AdamState {
-    first: Params,
-    second: Params,
-}
-
-/// Applies one Adam update by a row of the schedule.
-pub fn adam(setup: &GaussianSetup, row: &XSchedule, g: &Params, p: &mut Params, state: &mut AdamState) {
+/// Applies one Adam update by a row of the schedule to a Gaussian and its moments.
+pub fn adam(setup: &GaussianSetup, row: &XSchedule, g: &Params, p: &mut Params, moments: &mut [[f64; 2]; N_PARAMS]) {
     if row.updates == 0 {
         return;
     }
-    let (beta1, beta2) = (f64::from(setup.beta1), f64::from(setup.beta2));
+    let adam = Adam::new([setup.beta1, setup.beta2], setup.epsilon, [row.bias1, row.bias2]);
     for k in 0..N_PARAMS {
-        let rate = f64::from(match k {
+        let rate = match k {
             0..3 => row.position_rate,
             3 => row.opacity_rate,
             4..7 => row.scale_rate,
             7 => row.intensity_rate,
             _ => row.rotation_rate,
-        });
-        state.first[k] = beta1 * state.first[k] + (1.0 - beta1) * g[k];
-        state.second[k] = beta2 * state.second[k] + (1.0 - beta2) * g[k] * g[k];
-        let [bias1, bias2] = [row.bias1, row.bias2].map(f64::from);
-        p[k] -= rate * state.first[k] / bias1 / ((state.second[k] / bias2).sqrt() + f64::from(setup.epsilon));
+        };
+        adam.update(f64::from(rate), g[k], &mut p[k], &mut moments[k]);
     }
 }
