@@ -250,7 +250,7 @@ fn a_batch_is_windows_and_pixels_outside_of_them_that_show_something() {
         for step in 0..12 {
             let rays = reference::batch(&data, &setup, 1, seed_of_set(1, 1), step);
             assert_eq!(rays.len(), setup.n_rays as usize);
-            let image = data.images_of_set[1][step as usize % data.images_of_set[1].len()];
+            let image = data.sets.images(1)[step as usize % data.sets.images(1).len()];
             assert!(rays.iter().all(|id| id / n == image));
             let pixels: Vec<usize> = rays.iter().map(|id| id % n).collect();
             let (windows, singles) = pixels.split_at(of_windows);

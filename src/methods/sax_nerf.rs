@@ -87,7 +87,7 @@ impl Method for SaxNerf {
 
 /// Returns notes for the user about decisions on the data.
 fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
-    let images = data.images_of_set.iter().map(Vec::len).max().unwrap_or(1);
+    let images = (0..data.n_sets()).map(|set| data.sets.images(set).len()).max().unwrap_or(1);
     let passes = config.train.iterations as usize / images;
     let mut notes = vec![match config.sax.static_data {
         StaticData::PerPhase => format!(

@@ -2,8 +2,8 @@
 //! images each set of Gaussians is fitted to.
 
 use crate::config::sections::R2;
-use crate::error::{Error, Result};
-use crate::fitting::sets::{check_finite, sets_of};
+use crate::error::Result;
+use crate::fitting::sets::{Sets, check_finite, check_sizes};
 use crate::gaussians::field::{Gaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::kernels::layout::{Gaussian, GaussianSetup, R2Gaussian};
@@ -39,9 +39,7 @@ pub struct R2Data {
     /// `[image][pixel]`: line integrals.
     pub images: Vec<f32>,
     /// Images of each set.
-    pub images_of_set: Vec<Vec<usize>>,
-    /// Phase of each set; none where there is one for all phases.
-    phase_of_set: Vec<Option<u32>>,
+    pub sets: Sets,
 }
 
 impl R2Data {
@@ -50,13 +48,7 @@ impl R2Data {
     /// # Errors
     /// [`Error::Config`] for images of several sizes, and for a pixel that is not a number.
     pub fn new(dataset: &Dataset, settings: &R2, half: f64) -> Result<R2Data> {
-        let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
-        if dataset.sizes().len() > 1 {
-            return refuse(
-                "R2-Gaussian needs images of equal size, and these images have several sizes: use the preset fast"
-                    .into(),
-            );
-        }
+        check_sizes(dataset, "R2-Gaussian")?;
         let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
         let units = Units { pixel: half, strongest: half * attenuation };
         let training = dataset.training();
@@ -65,7 +57,6 @@ impl R2Data {
             check_finite(dataset, frame)?;
             images.extend(frame.integrals.iter().map(|v| (f64::from(*v) / units.strongest) as f32));
         }
-        let (images_of_set, phase_of_set) = sets_of(dataset, settings.static_data, "r2.static_data")?;
         Ok(R2Data {
             half,
             attenuation,
@@ -75,8 +66,7 @@ impl R2Data {
             n_phases: dataset.n_phases as usize,
             views: training.iter().map(|f| SplatView::new(&dataset.views[f.view].rays, units)).collect(),
             images,
-            images_of_set,
-            phase_of_set,
+            sets: Sets::of(dataset, settings.static_data, "r2.static_data")?,
         })
     }
 
@@ -88,19 +78,16 @@ impl R2Data {
         images: Vec<f32>,
         images_of_set: Vec<Vec<usize>>,
     ) -> R2Data {
-        let n_phases = images_of_set.len();
-        let phase_of_set = (0..n_phases as u32).map(Some).collect();
         R2Data {
             half: 1.0,
             attenuation: 1.0,
             pixel: 1.0,
             width,
             height,
-            n_phases,
+            n_phases: images_of_set.len(),
             views,
             images,
-            images_of_set,
-            phase_of_set,
+            sets: Sets::per_phase(images_of_set),
         }
     }
 
@@ -111,12 +98,7 @@ impl R2Data {
 
     /// Number of sets of Gaussians.
     pub fn n_sets(&self) -> usize {
-        self.images_of_set.len()
-    }
-
-    /// Name of a set in messages.
-    pub fn name_of_set(&self, set: usize) -> String {
-        self.phase_of_set[set].map_or("all phases".into(), |phase| format!("phase {phase}"))
+        self.sets.len()
     }
 
     /// Returns the attenuation of a drawn density of 1 over that of a stored one. It is so large that pictures, which are sums
@@ -136,11 +118,7 @@ impl R2Data {
             phase,
             rotation: g.rotation,
         };
-        let all_phases = 0..self.n_phases as u32;
-        let rows = match self.phase_of_set.first() {
-            Some(None) => all_phases.flat_map(|phase| rows.iter().map(move |g| convert(g, phase))).collect(),
-            _ => rows.iter().filter_map(|g| Some(convert(g, self.phase_of_set[g.set as usize]?))).collect(),
-        };
+        let of_phases = self.sets.gaussians_of_phases(rows.iter().map(|g| g.set), self.n_phases);
         Gaussians {
             units: Units { pixel: self.pixel, strongest: self.pixel * self.attenuation * scale },
             n_phases: self.n_phases,
@@ -151,7 +129,7 @@ impl R2Data {
                 greatest_scale: (bounds.greatest * pixels * (1.0 + SLACK)) as f32,
                 ..GaussianSetup::default()
             },
-            rows,
+            rows: of_phases.into_iter().map(|(i, phase)| convert(&rows[i], phase)).collect(),
             step,
             is_crowd: true,
             intensities: None,

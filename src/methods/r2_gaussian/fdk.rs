@@ -65,7 +65,7 @@ impl<'a> Filtered<'a> {
 
 /// Back-projects the images of a set onto `side`^3 voxels of the volume, x fastest.
 pub fn back_projection(data: &R2Data, set: usize, side: usize) -> Vec<f32> {
-    let images = &data.images_of_set[set];
+    let images = data.sets.images(set);
     let filtered: Vec<Filtered<'_>> = images
         .iter()
         .map(|image| {

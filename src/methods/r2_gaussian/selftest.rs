@@ -95,7 +95,7 @@ pub fn hard_case(config: &Config) -> Result<(R2Data, Vec<R2Gaussian>)> {
     rows[4].position = [-0.7, -0.6, 0.9];
     rows[4].scale = [-0.3, -0.9, -0.5];
     rows[5].position = [40.0, 0.0, 0.0];
-    let view = &data.views[data.images_of_set[0][0]];
+    let view = &data.views[data.sets.images(0)[0]];
     rows[6].position = (view.source - view.ray(16.0, 13.0) * 3.0).as_vec3().to_array();
     rows[6].set = 0;
     rows[7].density = -30.0;

@@ -10,7 +10,7 @@ use crate::methods::r2_gaussian::data::R2Data;
 use crate::methods::r2_gaussian::densify::densifies;
 use crate::methods::r2_gaussian::parameters::ScaleBounds;
 use crate::methods::r2_gaussian::stages::box_parts;
-use crate::random::{STREAM_R2_BOX, STREAM_R2_VIEW, permute, uniform01};
+use crate::random::{STREAM_R2_BOX, uniform01};
 
 /// Half side of the square in which a Gaussian is seen, standard deviations along its longest axis.
 const CUT: f32 = 3.0;
@@ -88,13 +88,9 @@ pub fn turns(data: &R2Data, config: &Config) -> Vec<R2Turn> {
     let voxel = 2.0 / f64::from(r2.voxels);
     let room = 2.0 - voxel * f64::from(r2.tv_box);
     let turn = |step: u32, set: usize| {
-        let (images, seed) = (&data.images_of_set[set], seed_of_set(config.seed, set));
-        let n = images.len() as u32;
+        let seed = seed_of_set(config.seed, set);
         let corner = |axis: u32| -1.0 + room * uniform01(seed, STREAM_R2_BOX, step, axis) + 0.5 * voxel;
-        R2Turn {
-            corner: [0, 1, 2].map(|axis| corner(axis) as f32),
-            image: images[permute(step % n, n, seed, step / n, STREAM_R2_VIEW) as usize] as u32,
-        }
+        R2Turn { corner: [0, 1, 2].map(|axis| corner(axis) as f32), image: data.sets.image_of_turn(set, seed, step) }
     };
     (0..=config.train.iterations).flat_map(|step| (0..data.n_sets()).map(move |set| turn(step, set))).collect()
 }
@@ -134,7 +130,7 @@ mod tests {
         let images_of_set = vec![vec![0, 2, 4, 5], vec![1, 3, 6]];
         let data = R2Data::of_images([2, 1], vec![view; 7], vec![0.0; 14], images_of_set);
         let turns = turns(&data, &config);
-        for (set, images) in data.images_of_set.iter().enumerate() {
+        for (set, images) in (0..data.n_sets()).map(|set| (set, data.sets.images(set))) {
             let shown: Vec<usize> = turns.iter().skip(set).step_by(2).map(|turn| turn.image as usize).collect();
             let mut orders = std::collections::BTreeSet::new();
             for epoch in shown.chunks_exact(images.len()).take(100) {

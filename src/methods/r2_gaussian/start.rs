@@ -35,7 +35,7 @@ fn places(data: &R2Data, settings: &R2, seed: u32, set: usize) -> (Vec<(DVec3, f
     let volume = back_projection(data, set, side);
     let candidates: Vec<usize> = (0..volume.len()).filter(|k| f64::from(volume[*k]) > settings.candidate).collect();
     if candidates.len() < count {
-        let name = data.name_of_set(set);
+        let name = data.sets.name(set);
         let note = format!(
             "the back-projection of {name} is above {} at {} voxels, and {count} Gaussians are to begin there: they begin \
              anywhere (r2.n_points, r2.voxels, r2.density_thresh; r2.init = \"random\" does so without asking)",

@@ -196,7 +196,7 @@ fn check_count(state: &R2State, data: &R2Data) -> Result<u32> {
     if let Some(empty) = counts.iter().position(|count| *count == 0) {
         let problem = format!(
             "no Gaussian of {} is left: the pruning threshold r2.density_min_threshold is too high, or the images are empty",
-            data.name_of_set(empty)
+            data.sets.name(empty)
         );
         return Err(Error::config("r2.n_points", 0, problem));
     }

@@ -204,7 +204,7 @@ pub fn set_buffers(
             params: params_buffer(gpu, &format!("sax_params of {index}"), &field.params[index])?,
             moments: gpu.buffer_with(&format!("moments of {index}"), &state.moments[index])?,
             seed: seed_of_set(seed, index),
-            turns: (first_turns[index], data.images_of_set[index].len() as u32),
+            turns: (first_turns[index], data.sets.images(index).len() as u32),
         })
     };
     (0..field.n_sets).map(set).collect()

@@ -3,7 +3,7 @@
 
 use crate::config::sections::Sax;
 use crate::error::{Error, Result};
-use crate::fitting::sets::{check_finite, sets_of};
+use crate::fitting::sets::{Sets, check_finite, check_sizes};
 use crate::geometry::MM_PER_UNIT;
 use crate::kernels::layout::{SaxList, View};
 use crate::scan::dataset::Dataset;
@@ -35,7 +35,7 @@ pub struct SaxData {
     /// Pixels that show something; all of an image that shows nothing.
     pub listed: Vec<u32>,
     /// Images of each set.
-    pub images_of_set: Vec<Vec<usize>>,
+    pub sets: Sets,
 }
 
 impl SaxData {
@@ -45,12 +45,7 @@ impl SaxData {
     /// [`Error::Config`] for images of several sizes or without room for the windows, for a pixel that is not finite, and for
     /// phases that no image shows.
     pub fn new(dataset: &Dataset, settings: &Sax, half: f64) -> Result<SaxData> {
-        let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
-        if dataset.sizes().len() > 1 {
-            return refuse(
-                "SAX-NeRF needs images of equal size, and these images have several sizes: use the preset fast".into(),
-            );
-        }
+        check_sizes(dataset, "SAX-NeRF")?;
         check_windows(settings, [dataset.width, dataset.height])?;
         let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
         let (training, n_pixels) = (dataset.training(), dataset.n_pixels());
@@ -65,13 +60,12 @@ impl SaxData {
             images: Vec::with_capacity(training.len() * n_pixels),
             lists: Vec::new(),
             listed: Vec::new(),
-            images_of_set: Vec::new(),
+            sets: Sets::of(dataset, settings.static_data, "sax.static_data")?,
         };
         for frame in training {
             check_finite(dataset, frame)?;
             data.add_image(frame.integrals.iter().map(|v| (f64::from(*v) / attenuation) as f32).collect());
         }
-        (data.images_of_set, _) = sets_of(dataset, settings.static_data, "sax.static_data")?;
         Ok(data)
     }
 
@@ -93,18 +87,19 @@ impl SaxData {
 
     /// Returns the number of fields, each fitted separately.
     pub fn n_sets(&self) -> usize {
-        self.images_of_set.len()
+        self.sets.len()
     }
 
     /// Returns the images of all sets in their order, and the index of each set's first image.
     pub fn turns(&self) -> (Vec<u32>, Vec<u32>) {
-        let turns = self.images_of_set.iter().flatten().map(|image| *image as u32).collect();
+        let images = || (0..self.sets.len()).map(|set| self.sets.images(set));
+        let turns = images().flatten().map(|image| *image as u32).collect();
         let mut first = 0;
-        let begin = |images: &Vec<usize>| {
+        let begin = |images: &[usize]| {
             first += images.len() as u32;
             first - images.len() as u32
         };
-        (turns, self.images_of_set.iter().map(begin).collect())
+        (turns, images().map(begin).collect())
     }
 }
 

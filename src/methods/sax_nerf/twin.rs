@@ -24,7 +24,7 @@ const LAST_PATH: f64 = 1e-10;
 
 /// Rays of iteration `step` of a set, as image * pixels + pixel (twin of `sax_batch`).
 pub fn batch(data: &SaxData, setup: &SaxSetup, set: usize, seed: u32, step: u32) -> Vec<usize> {
-    let images = &data.images_of_set[set];
+    let images = data.sets.images(set);
     let image = images[step as usize % images.len()];
     let side = setup.window as usize;
     let columns = data.width / side;

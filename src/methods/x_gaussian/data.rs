@@ -3,7 +3,7 @@
 
 use crate::config::sections::X;
 use crate::error::{Error, Result};
-use crate::fitting::sets::{check_finite, sets_of};
+use crate::fitting::sets::{Sets, check_finite, check_sizes};
 use crate::gaussians::field::{Gaussians, Units};
 use crate::gaussians::view::SplatView;
 use crate::geometry::MM_PER_UNIT;
@@ -41,9 +41,7 @@ pub struct XData {
     /// Share of the images' pixels that were beyond what they are clamped to.
     pub clamped: f64,
     /// Images of each set.
-    pub images_of_set: Vec<Vec<usize>>,
-    /// Phase of each set; none where there is one for all phases.
-    phase_of_set: Vec<Option<u32>>,
+    pub sets: Sets,
 }
 
 /// Scales an image from its minimum, which becomes 0, to its maximum, which becomes 1; a constant image becomes 0.
@@ -74,13 +72,7 @@ impl XData {
     /// [`Error::Config`] for images of several sizes, for a pixel that is not a number, and where all sources are at one
     /// place and no extent is stated.
     pub fn new(dataset: &Dataset, settings: &X, half: f64) -> Result<XData> {
-        let refuse = |problem: String| Err(Error::config("dataset", dataset.path.display(), problem));
-        if dataset.sizes().len() > 1 {
-            return refuse(
-                "X-Gaussian needs images of equal size, and these images have several sizes: use the preset fast"
-                    .into(),
-            );
-        }
+        check_sizes(dataset, "X-Gaussian")?;
         let unit = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
         let greatest = if settings.clamp > 0.0 { settings.clamp } else { f64::INFINITY };
         let training = dataset.training();
@@ -101,7 +93,6 @@ impl XData {
                            position: set it, in mm";
             return Err(Error::config("x.extent_mm", settings.extent_mm, problem));
         }
-        let (images_of_set, phase_of_set) = sets_of(dataset, settings.static_data, "x.static_data")?;
         Ok(XData {
             half_mm: half * MM_PER_UNIT,
             extent_mm,
@@ -112,8 +103,7 @@ impl XData {
             clamped: beyond as f64 / images.len().max(1) as f64,
             views,
             images,
-            images_of_set,
-            phase_of_set,
+            sets: Sets::of(dataset, settings.static_data, "x.static_data")?,
         })
     }
 
@@ -124,12 +114,7 @@ impl XData {
 
     /// Number of sets of Gaussians.
     pub fn n_sets(&self) -> usize {
-        self.images_of_set.len()
-    }
-
-    /// Name of a set in messages.
-    pub fn name_of_set(&self, set: usize) -> String {
-        self.phase_of_set[set].map_or("all phases".into(), |phase| format!("phase {phase}"))
+        self.sets.len()
     }
 
     /// The field of stored Gaussians after `step` iterations, in the units that Gaussians are drawn and exported in:
@@ -147,15 +132,8 @@ impl XData {
             };
             (drawn, g.intensity)
         };
-        let (rows, intensities) = match self.phase_of_set.first() {
-            Some(None) => (0..self.n_phases as u32)
-                .flat_map(|phase| (0..state.rows.len()).map(move |row| (row, phase)))
-                .map(|(row, phase)| convert(row, phase))
-                .unzip(),
-            _ => (0..state.rows.len())
-                .filter_map(|row| Some(convert(row, self.phase_of_set[state.sets[row] as usize]?)))
-                .unzip(),
-        };
+        let of_phases = self.sets.gaussians_of_phases(state.sets.iter().copied(), self.n_phases);
+        let (rows, intensities) = of_phases.into_iter().map(|(row, phase)| convert(row, phase)).unzip();
         Gaussians {
             units: Units { pixel: self.pixel, strongest: self.pixel },
             n_phases: self.n_phases,

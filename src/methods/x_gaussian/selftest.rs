@@ -111,7 +111,7 @@ pub fn hard_case(config: &Config) -> Result<(XData, XState)> {
     rows[4].position = [-0.7 * half, -0.6 * half, 0.9 * half];
     rows[4].log_scale = [(0.3 * half).ln(), (0.1 * half).ln(), (0.2 * half).ln()];
     rows[5].position = [40.0 * half, 0.0, 0.0];
-    let view = &data.views[data.images_of_set[0][0]];
+    let view = &data.views[data.sets.images(0)[0]];
     rows[6].position = (view.source - view.ray(16.0, 13.0) * 3.0).as_vec3().to_array();
     state.sets[6] = 0;
     rows[7].opacity = -9.0;

@@ -9,7 +9,6 @@ use crate::gaussians::comparison::picture_parts;
 use crate::kernels::layout::{GaussianSetup, R2Setup, R2Turn, XSchedule, XSetup};
 use crate::methods::x_gaussian::data::XData;
 use crate::methods::x_gaussian::densify::{densifies, resets};
-use crate::random::{STREAM_R2_VIEW, permute};
 
 /// Rates of an intensity by the colours' degree, as shares of that of their first coefficients. A colour of degree d is
 /// one half plus the sum of (d + 1)^2 coefficients, each times a constant, whatever the direction, and each has Adam's
@@ -98,11 +97,9 @@ pub fn schedule(config: &Config, extent_mm: f64) -> Vec<XSchedule> {
 
 /// Turns of each set in each iteration of the schedule: an image, in an order that is drawn anew when all have been seen.
 pub fn turns(data: &XData, config: &Config) -> Vec<R2Turn> {
-    let turn = |step: u32, set: usize| {
-        let (images, seed) = (&data.images_of_set[set], seed_of_set(config.seed, set));
-        let n = images.len() as u32;
-        let image = images[permute(step % n, n, seed, step / n, STREAM_R2_VIEW) as usize] as u32;
-        R2Turn { image, ..R2Turn::default() }
+    let turn = |step: u32, set: usize| R2Turn {
+        image: data.sets.image_of_turn(set, seed_of_set(config.seed, set), step),
+        ..R2Turn::default()
     };
     (0..=config.train.iterations).flat_map(|step| (0..data.n_sets()).map(move |set| turn(step, set))).collect()
 }

@@ -300,7 +300,7 @@ fn check_count(state: &XState, data: &XData, weakest: f64) -> Result<u32> {
     if let Some(empty) = state.counts(data.n_sets()).iter().position(|count| *count == 0) {
         let problem = format!(
             "no Gaussian of {} is left: the pruning threshold x.min_opacity is too high, or the images are empty",
-            data.name_of_set(empty)
+            data.sets.name(empty)
         );
         return Err(Error::config("x.min_opacity", weakest, problem));
     }
