@@ -116,7 +116,7 @@ fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
         ("SAX-NeRF".into(), Box::new(move |findings| methods::sax_nerf::selftest::compare(gpu, findings))),
         ("a deformable set of Gaussians".into(), Box::new(move |findings| deformable::compare(gpu, findings))),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
-        ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_crowd(gpu, tuning, findings))),
+        ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_maxima(gpu, tuning, findings))),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),
         ("equal runs of Gaussians".into(), Box::new(move |findings| repeats::compare_gaussians(gpu, findings))),
         ("projections of volumes".into(), Box::new(move |findings| projections::compare(gpu, findings))),

@@ -67,7 +67,7 @@ fn two_networks(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
 }
 
 fn many_gaussians(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
-    blobs::compare_crowd(gpu, &Tuning::for_device(gpu.info()), findings)
+    blobs::compare_maxima(gpu, &Tuning::for_device(gpu.info()), findings)
 }
 
 /// Faults in the shader code that the driver receives: each is found in the row of its stage, and in no earlier row.
@@ -92,7 +92,7 @@ fn faults_in_shaders_are_found_in_the_rows_of_their_stages() {
         fault("r2_project", wrong_sign, r2::compare),
         fault("ssim_rows", sum_for_product, r2::compare),
         fault("ssim_columns", wrong_sign, r2::compare),
-        fault("r2_residual", wrong_sign, r2::compare),
+        fault("picture_residual", wrong_sign, r2::compare),
         fault("r2_voxel_splat", wrong_sign, r2::compare),
         fault("r2_voxel_tv", sum_for_product, r2::compare),
         fault("r2_voxel_moments", wrong_sign, r2::compare),

@@ -25,7 +25,7 @@ pub struct BlobKernels {
     /// Line integrals and maxima.
     pub rays_maxima: Stage<push::GaussianRays>,
     /// Maxima where many Gaussians overlap.
-    pub crowd: Stage<push::GaussianMaxima>,
+    pub maxima: Stage<push::GaussianMaxima>,
     /// Attenuation at the cells of rows.
     pub points: Stage<push::GaussianPoints>,
 }
@@ -41,7 +41,7 @@ impl BlobKernels {
             rays: Build { variant: vec4_variant(tuning), ..plain }.stage(gpu)?,
             rays_maxima: Build { variant: vec4_variant(tuning), constants: &[("with_maxima", 1)], ..plain }
                 .stage(gpu)?,
-            crowd: Build { exchanges: true, ..plain }.stage(gpu)?,
+            maxima: Build { exchanges: true, ..plain }.stage(gpu)?,
             points: plain.stage(gpu)?,
         })
     }
@@ -192,7 +192,7 @@ impl Blobs {
         if is_crowd {
             let GaussianRays { n_rays, image_width, first_blob, n_blobs } = push;
             let push = push::GaussianMaxima { n_rays, image_width, first_blob, n_blobs };
-            dispatch_finding(recording, &self.kernels.crowd, groups(), &bound, find, push)?;
+            dispatch_finding(recording, &self.kernels.maxima, groups(), &bound, find, push)?;
         }
         Ok(())
     }

@@ -20,7 +20,7 @@ pub struct ComparisonKernels {
     /// SSIM's gradient, first pass.
     pub ssim_rows_back: Stage<push::SsimRowsBack>,
     /// SSIM's gradient, second pass, and that of the loss.
-    pub residual: Stage<push::R2Residual>,
+    pub picture_residual: Stage<push::PictureResidual>,
 }
 
 /// A stage of the comparison, ready to be recorded.
@@ -43,7 +43,7 @@ impl ComparisonKernels {
             ssim_rows: plain.stage(gpu)?,
             ssim_columns: Build { exchanges: true, ..plain }.stage(gpu)?,
             ssim_rows_back: plain.stage(gpu)?,
-            residual: plain.stage(gpu)?,
+            picture_residual: plain.stage(gpu)?,
         })
     }
 
@@ -58,6 +58,6 @@ impl ComparisonKernels {
         pass.record(&self.ssim_rows, pixels(&self.ssim_rows, n_pixels, n_sets), push::SsimRows {})?;
         pass.record(&self.ssim_columns, pixels(&self.ssim_columns, n_pixels, n_sets), push::SsimColumns {})?;
         pass.record(&self.ssim_rows_back, pixels(&self.ssim_rows_back, n_pixels, n_sets), push::SsimRowsBack {})?;
-        pass.record(&self.residual, pixels(&self.residual, n_pixels, n_sets), push::R2Residual {})
+        pass.record(&self.picture_residual, pixels(&self.picture_residual, n_pixels, n_sets), push::PictureResidual {})
     }
 }

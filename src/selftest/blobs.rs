@@ -22,7 +22,7 @@ use crate::train::trainer::Trainer;
 use glam::DVec3;
 
 const RAYS: &[&str] = &[push::GaussianRays::SHADER];
-const CROWD: &[&str] = &[push::GaussianMaxima::SHADER];
+const MAXIMA: &[&str] = &[push::GaussianMaxima::SHADER];
 const POINTS: &[&str] = &[push::GaussianPoints::SHADER];
 const PICTURES: &[&str] = &["pictures at display rates"];
 
@@ -108,40 +108,40 @@ pub fn compare_rays(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Resu
 ///
 /// # Errors
 /// Device errors.
-pub fn compare_crowd(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
+pub fn compare_maxima(gpu: &Gpu, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin("r2", "600 Gaussians that overlap, view of 37 x 29 pixels");
     let (width, height) = (37, 29);
     let dataset = small_dataset(width, height, 3)?;
     let config = r2::small_config(&[])?;
     let mut trainer = Trainer::new(gpu, Plan::new(&config, &dataset)?, &dataset, tuning.clone())?;
     let mut model = trainer.model()?;
-    let crowd = crowd(&model)?;
-    model.gaussians = Some(crowd.clone());
+    let overlapping = overlapping(&model)?;
+    model.gaussians = Some(overlapping.clone());
     let rays = &dataset.views[1].rays;
     let seen = Renderer::new(gpu, &model, tuning.clone())?.render(rays, width, height, 0)?;
-    let set = blobs::field(&crowd, 0);
+    let set = blobs::field(&overlapping, 0);
     let ray = |pixel: usize| rays.pixel((pixel % width) as f64, (pixel / width) as f64);
     let want: Vec<blobs::Along> = (0..width * height).map(|pixel| blobs::along(&set, ray(pixel))).collect();
     let maxima: Vec<f64> = want.iter().map(|w| w.maximum).collect();
-    findings.numbers(CROWD, "maximum values", &seen.dynamic_max, &maxima, MAXIMUM.times(CROWD_SEARCH));
+    findings.numbers(MAXIMA, "maximum values", &seen.dynamic_max, &maxima, MAXIMUM.times(SEARCH_MARGIN));
     Ok(())
 }
 
-/// Factor on the tolerance of the search in a crowd: peaks between others may be missed, which costs 2 % on one ray of a
+/// Factor on the tolerance of the search where many Gaussians overlap: peaks between others may be missed, which costs 2 % on one ray of a
 /// thousand here.
-const CROWD_SEARCH: f64 = 4.0;
-/// Widths of the Gaussians of a crowd, from narrowest to widest, shares of the volume's half side: the narrowest lie between
+const SEARCH_MARGIN: f64 = 4.0;
+/// Widths of the overlapping Gaussians, from narrowest to widest, shares of the volume's half side: the narrowest lie between
 /// the depths that the kernel looks at.
-const CROWD_WIDTHS: [f64; 2] = [0.004, 0.1];
+const WIDTHS: [f64; 2] = [0.004, 0.1];
 
 /// Gaussians of phase 0, narrow and wide ones, in a model of R2-Gaussian.
-fn crowd(model: &Model) -> Result<DynamicGaussians> {
+fn overlapping(model: &Model) -> Result<DynamicGaussians> {
     let Some(DynamicGaussians::PerPhase(mut field)) = model.gaussians.clone() else {
         return Err(Error::Internal("the model has no Gaussians".into()));
     };
     let pixels = model.scene.static_max[0] / field.units.pixel;
     let mut rows = random_gaussians(600, 1, 0.5 * pixels, 6);
-    let [narrowest, widest] = CROWD_WIDTHS.map(|share| (share * pixels).ln());
+    let [narrowest, widest] = WIDTHS.map(|share| (share * pixels).ln());
     let n = rows.len() as f64;
     for (i, g) in rows.iter_mut().enumerate() {
         let width = narrowest + (widest - narrowest) * i as f64 / n;

@@ -1,6 +1,6 @@
 //! The stages of a fit as R2-Gaussian does it, what they bind, and one iteration of all sets, top to bottom:
 //!
-//! r2_project -> gaussian_splat -> ssim_rows -> ssim_columns -> ssim_rows_back -> r2_residual -> gaussian_moments ->
+//! r2_project -> gaussian_splat -> ssim_rows -> ssim_columns -> ssim_rows_back -> picture_residual -> gaussian_moments ->
 //! r2_voxel_splat -> r2_voxel_tv -> r2_voxel_moments -> r2_update -> gaussian_report
 //!
 //! Where line integrals are exact, r2_chord_splat and r2_chord_moments take the places of gaussian_splat and gaussian_moments.

@@ -27,7 +27,7 @@ const SORT: &[&str] = &[push::XSortCount::SHADER, push::XSortScan::SHADER, push:
 const LISTS: &[&str] = &[push::XLists::SHADER];
 const BLEND: &[&str] = &[push::XBlend::SHADER];
 const COMPARE: &[&str] =
-    &[push::SsimRows::SHADER, push::SsimColumns::SHADER, push::SsimRowsBack::SHADER, push::R2Residual::SHADER];
+    &[push::SsimRows::SHADER, push::SsimColumns::SHADER, push::SsimRowsBack::SHADER, push::PictureResidual::SHADER];
 const BLEND_BACK: &[&str] = &[push::XBlendBack::SHADER];
 const UPDATE: &[&str] = &[push::XUpdate::SHADER];
 const REPORT: &[&str] = &[push::XReport::SHADER];

@@ -1,7 +1,7 @@
 //! The stages of a fit as X-Gaussian does it, what they bind, and one iteration of all sets, top to bottom:
 //!
 //! x_project -> (x_sort_count -> x_sort_scan -> x_sort_move) of each four bits -> x_lists -> x_blend -> ssim_rows ->
-//! ssim_columns -> ssim_rows_back -> r2_residual -> x_blend_back -> x_update -> x_report
+//! ssim_columns -> ssim_rows_back -> picture_residual -> x_blend_back -> x_update -> x_report
 
 use crate::error::Result;
 use crate::gaussians::blending::particles::BlendedGaussians;
