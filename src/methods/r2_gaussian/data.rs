@@ -46,7 +46,8 @@ impl R2Data {
     /// Brings a dataset into a volume of half a side `half` each way, world units.
     ///
     /// # Errors
-    /// [`Error::Config`] for images of several sizes, and for a pixel that is not a number.
+    /// [`crate::error::Error::Config`] for images of several sizes, for a pixel that is not a finite number, and for phases that no
+    /// image shows.
     pub fn new(dataset: &Dataset, settings: &R2, half: f64) -> Result<R2Data> {
         check_sizes(dataset, "R2-Gaussian")?;
         let attenuation = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
