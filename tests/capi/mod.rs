@@ -3,6 +3,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 
 /// Root of the project, which may be above the crate of the test.
 pub fn root() -> PathBuf {
@@ -11,10 +12,27 @@ pub fn root() -> PathBuf {
     root.unwrap().to_path_buf()
 }
 
-/// The shared library, which is built along with the tests of its crate.
+/// Returns the path of the shared library of this build, up to date with its sources.
+///
+/// `cargo test` does not build a library that tests cannot link as Rust code, so this function builds it. `--test` makes
+/// cargo choose the features of dependencies as it did for this test, so that only the shared library itself is made.
 pub fn library() -> PathBuf {
-    let deps = std::env::current_exe().unwrap().parent().unwrap().to_path_buf();
-    let library = deps.join("libnertca_vk.so");
+    static LIBRARY: OnceLock<PathBuf> = OnceLock::new();
+    LIBRARY.get_or_init(build_library).clone()
+}
+
+fn build_library() -> PathBuf {
+    let test = std::env::current_exe().unwrap();
+    let profile = test.parent().and_then(Path::parent).unwrap();
+    let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    cargo.args(["build", "--locked", "--quiet", "--lib", "--test", "capi_examples"]).current_dir(root());
+    cargo.arg("--target-dir").arg(profile.parent().unwrap());
+    if !cfg!(debug_assertions) {
+        cargo.arg("--release");
+    }
+    let outcome = cargo.output().unwrap_or_else(|e| panic!("cargo is needed to build the C library: {e}"));
+    assert!(outcome.status.success(), "{cargo:?}: {}", String::from_utf8_lossy(&outcome.stderr));
+    let library = profile.join("libnertca_vk.so");
     assert!(library.is_file(), "{} was not built", library.display());
     library
 }
