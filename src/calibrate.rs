@@ -48,7 +48,7 @@ const WELL_EXPLAINED: f64 = 0.96;
 /// the stated geometry.
 const LEFT_UNEXPLAINED: f64 = 0.75;
 /// Changes over the beat below this share of the images' range are rounding errors.
-const LEAST_CHANGE: f64 = 1e-5;
+const MIN_CHANGE: f64 = 1e-5;
 /// Half side of the cube that represents the heart when corrections are compared, as a share of half the field of view.
 const HEART_SHARE: f64 = 0.5;
 
@@ -140,7 +140,7 @@ fn nothing_to_tell(dataset: &Dataset, observed: &Observed) -> Option<String> {
             "all views look along the same line, so no two views have planes in common that can be compared".into(),
         );
     }
-    (observed.change < LEAST_CHANGE).then(|| "there is no motion in the images: all phases look the same".into())
+    (observed.change < MIN_CHANGE).then(|| "there is no motion in the images: all phases look the same".into())
 }
 
 /// Returns the corrections to try, the smallest first.
@@ -165,7 +165,7 @@ struct Calibrator<'a> {
 
 impl Calibrator<'_> {
     fn choose(mut self, candidates: &[Correction]) -> Calibration {
-        if self.observed.n_phases() < choose::LEAST_PHASES {
+        if self.observed.n_phases() < choose::MIN_PHASES {
             return self.without_validation(candidates);
         }
         let tried: Vec<Validated> = candidates.iter().map(|c| validate(self.observed, *c)).collect();
@@ -173,7 +173,7 @@ impl Calibrator<'_> {
         // Displacements of frames compensate for cut-off vessels more than positions of views do.
         let gain = |k: usize| match candidates[k] {
             Correction::Breathing if !self.observed.cut_off().is_empty() => choose::LARGE_GAIN,
-            _ => choose::LEAST_GAIN,
+            _ => choose::MIN_GAIN,
         };
         let chosen = best(&residuals, gain);
         let shares: Vec<_> = candidates.iter().copied().zip(residuals.iter().map(|r| r.sqrt())).collect();

@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::evidence::background::Background;
 use crate::evidence::series::Series;
 use crate::scan::dataset::Dataset;
-use agreement::{Agreement, Comparison, Look, agreement};
+use agreement::{Agreement, Comparison, Sharpness, agreement};
 use mistakes::{MISTAKES, Mistake, PhaseMistake, exchanged};
 use serde::Serialize;
 
@@ -147,8 +147,8 @@ fn view_warnings(views: &[CheckedView]) -> Vec<String> {
             ));
         }
     }
-    let (least, most) = (views.iter().map(|v| v.phases).min(), views.iter().map(|v| v.phases).max());
-    if least != most {
+    let (min, max) = (views.iter().map(|v| v.phases).min(), views.iter().map(|v| v.phases).max());
+    if min != max {
         warnings.push(
             "the views have different numbers of phases, so some phases are reconstructed from fewer views".into(),
         );
@@ -176,7 +176,7 @@ fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<E
     let mut all = Vec::new();
     let mut consider = |advice: String, views: Views| {
         if !views.pairs.is_empty() {
-            let fine = Comparison::of(&views, Look::Fine).residual();
+            let fine = Comparison::of(&views, Sharpness::Fine).residual();
             all.push(Explanation { advice, views, fine });
         }
     };
@@ -197,7 +197,7 @@ fn explanations(dataset: &Dataset, observed: &Observed, inverted: bool) -> Vec<E
             }
         }
     }
-    let stated = Comparison::of(&observed.fine, Look::Fine);
+    let stated = Comparison::of(&observed.fine, Sharpness::Fine);
     all.extend(PhaseMistake::all(observed.views.len(), observed.fine.n_phases).map(|mistake| {
         let views = mistake.undone(&observed.fine);
         let fine = stated.after_change(&views, mistake.view).residual();
@@ -221,7 +221,8 @@ fn named(stated: &Agreement, explanations: &[Explanation], inverted: bool) -> Ve
     if !by_fine.is_empty() || stated.coarse <= DISAGREES {
         return by_fine;
     }
-    let coarse: Vec<f64> = explanations.iter().map(|e| Comparison::of(&e.views, Look::Coarse).residual()).collect();
+    let coarse: Vec<f64> =
+        explanations.iter().map(|e| Comparison::of(&e.views, Sharpness::Coarse).residual()).collect();
     best_of(explanations, &coarse, stated.coarse)
 }
 

@@ -4,12 +4,20 @@
 
 mod acting;
 mod checks;
+mod dynamic_gaussians;
+mod fields;
 mod forms;
 mod length;
 pub mod method;
+mod nerf_ca;
+mod nert_ca;
 mod presets;
+mod r2_gaussian;
 pub(crate) mod renamed;
+mod sax_nerf;
+mod section;
 pub mod sections;
+mod x_gaussian;
 
 use crate::error::{Error, Result};
 pub use forms::{
@@ -60,7 +68,7 @@ pub struct Config {
     /// The training loop.
     pub train: Train,
     /// Self-calibration of the views; absent from older checkpoints.
-    #[serde(default = "presets::uncalibrated")]
+    #[serde(default = "nert_ca::uncalibrated")]
     pub calibrate: Calibrate,
     /// Sampling along rays.
     pub march: March,
@@ -76,24 +84,24 @@ pub struct Config {
     /// Occupancy grid learned during training.
     pub occupancy: Occupancy,
     /// Two networks as the fields; absent from older checkpoints.
-    #[serde(default = "presets::networks")]
+    #[serde(default = "nerf_ca::networks")]
     pub networks: Networks,
     /// The optimiser.
     pub adam: Adam,
     /// Gaussians as the dynamic field; absent from older checkpoints.
-    #[serde(default = "presets::gaussians")]
+    #[serde(default = "dynamic_gaussians::gaussians")]
     pub gaussians: Gaussians,
     /// One moving set of Gaussians; absent from older checkpoints.
-    #[serde(default = "presets::deformable", rename = "tree")]
+    #[serde(default = "dynamic_gaussians::deformable", rename = "tree")]
     pub deformable: Deformable,
     /// Gaussians as R2-Gaussian fits them; absent from older checkpoints.
-    #[serde(default = "presets::r2")]
+    #[serde(default = "r2_gaussian::r2")]
     pub r2: R2,
     /// Gaussians as X-Gaussian fits them; absent from older checkpoints.
-    #[serde(default = "presets::x")]
+    #[serde(default = "x_gaussian::x")]
     pub x: X,
     /// A hash grid and a Lineformer as SAX-NeRF fits them; absent from older checkpoints.
-    #[serde(default = "presets::sax")]
+    #[serde(default = "sax_nerf::sax")]
     pub sax: Sax,
 }
 
@@ -186,16 +194,16 @@ impl Config {
             GaussianForm::R2 => MethodKind::R2Gaussian,
             GaussianForm::X => MethodKind::XGaussian,
             _ if self.dynamic.form == DynamicForm::Lineformer => MethodKind::SaxNerf,
-            GaussianForm::None if self.static_field.form == StaticForm::Network => MethodKind::TwoNetworks,
-            GaussianForm::None => MethodKind::Fields,
-            GaussianForm::Auto | GaussianForm::Phase | GaussianForm::Deformable => MethodKind::Gaussians,
+            GaussianForm::None if self.static_field.form == StaticForm::Network => MethodKind::NerfCa,
+            GaussianForm::None => MethodKind::NertCa,
+            GaussianForm::Auto | GaussianForm::Phase | GaussianForm::Deformable => MethodKind::DynamicGaussians,
         }
     }
 
     /// Tells whether the dynamic field supports a displacement of the heart in each frame; methods fitted to whole images do
     /// not.
     pub fn follows_breath(&self) -> bool {
-        self.method() == MethodKind::Gaussians
+        self.method() == MethodKind::DynamicGaussians
     }
 
     /// Returns the number of iterations at the start of the run that fit Gaussians; the others fit the static field.
@@ -285,7 +293,7 @@ mod tests {
             ("train.rays=0", "train.rays"),
             ("dynamic.width=20", "dynamic.width"),
             ("dynamic.lr=nan", "dynamic.lr"),
-            ("gaussians.least_scale=4", "gaussians.least_scale"),
+            ("gaussians.min_scale=4", "gaussians.min_scale"),
             ("gaussians.bend=nan", "gaussians.bend"),
             ("gaussians.count=0", "gaussians.count"),
             ("tree.track_blur=0", "tree.track_blur"),
@@ -341,7 +349,7 @@ mod tests {
         ];
         let x = [
             ("static.form=tensor", "static.form"),
-            ("hull.enabled=true", "gaussians.form = \"x\""),
+            ("hull.enabled=true", "X-Gaussian"),
             ("x.interval=300", "x.interval"),
             ("x.max_gaussians=10", "x.max_gaussians"),
             ("x.first_opacity=0.001", "x.first_opacity"),

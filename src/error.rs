@@ -1,5 +1,6 @@
 //! The error type of the crate, with one variant per case that a caller can handle.
 
+use nertca_vk_gpu as gpu;
 use std::path::{Path, PathBuf};
 
 /// Result of every fallible function of this crate.
@@ -123,17 +124,22 @@ impl Error {
         let path = path.as_ref().to_path_buf();
         move |source| Error::Io { action, path, source }
     }
+}
 
-    /// Returns a function that wraps a Vulkan code with the call and the object it concerned.
-    pub(crate) fn vulkan(call: &'static str, object: impl Into<String>) -> impl FnOnce(ash::vk::Result) -> Self {
-        let object = object.into();
-        move |code| match code {
-            ash::vk::Result::ERROR_DEVICE_LOST => Error::DeviceLost { pass: object },
-            ash::vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | ash::vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
-                let (detail, instead) = (format!("{call}: {code}"), SMALLER_BATCHES);
-                Error::OutOfMemory { object, bytes: 0, detail, may_pass: true, instead }
+/// Adds what can be changed in this program to the errors of Vulkan compute.
+impl From<gpu::error::Error> for Error {
+    fn from(error: gpu::error::Error) -> Error {
+        use gpu::error::Error as Gpu;
+        match error {
+            Gpu::NoDevice(why) => Error::NoDevice(why),
+            Gpu::Vulkan { call, object, code } => Error::Vulkan { call, object, code },
+            Gpu::DeviceLost { pass } => Error::DeviceLost { pass },
+            Gpu::OutOfMemory { object, bytes, detail, may_pass } => {
+                Error::OutOfMemory { object, bytes, detail, may_pass, instead: SMALLER_BATCHES }
             }
-            code => Error::Vulkan { call, object, code },
+            Gpu::Claim { field, value, problem } => Error::config(field, value, problem),
+            Gpu::Internal(fault) => Error::Internal(fault),
+            other => Error::Internal(other.to_string()),
         }
     }
 }

@@ -1,9 +1,9 @@
 //! Code that the fits of all methods share: traits of fits and fields, recorded iterations, losses, sets of static methods. It depends on no method.
 
 pub(crate) mod extent;
-pub mod field;
 pub mod fit;
 pub(crate) mod iterations;
+pub mod ledger;
 pub mod losses;
 pub(crate) mod ring;
 pub mod sets;

@@ -1,16 +1,11 @@
 //! Lists every pipeline that runs of a configuration use on a device, with the statistics of its driver's compiler.
 
-use crate::config::method::MethodKind;
-use crate::config::{Config, GaussianForm};
+use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::gaussians::blobs::BlobKernels;
-use crate::gaussians::deformable::DeformableKernels;
-use crate::gaussians::pictures::into_buffers;
-use crate::gaussians::stages::GaussianKernels;
 use crate::gpu::device::Gpu;
 use crate::gpu::statistics::PipelineStatistics;
 use crate::kernels::layout::Setup;
-use crate::kernels::stages::{Kernels, StaticNetworkKernels};
+use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::model::params::ParamMap;
@@ -45,19 +40,22 @@ pub struct Compiled {
 }
 
 /// Driver names of one quantity. The values of all names of one list are added up.
-struct Names(&'static [&'static [&'static str]]);
+struct DriverNames(&'static [&'static [&'static str]]);
 
 /// Names used by Mesa's drivers NVK, RADV and ANV, compared without regard to case. The first list of which a driver has any
 /// name counts.
-const REGISTERS: Names = Names(&[&["Number of GPRs"], &["VGPRs"], &["Max live registers"]]);
-const SPILLS: Names =
-    Names(&[&["Spills to memory", "Fills from memory"], &["Spilled VGPRs", "Spilled SGPRs"], &["Spills", "Fills"]]);
-const SHARED: Names = Names(&[&["LDS size"], &["Workgroup memory size"]]);
-const RESIDENT: Names = Names(&[&["Max warps/SM"], &["Subgroups per SIMD"]]);
-const CODE: Names = Names(&[&["Code size"], &["Instruction count", "Instructions"]]);
-const CYCLES: Names = Names(&[&["Static cycle count"], &["Inverse Throughput"], &["Cycles"]]);
+const REGISTERS: DriverNames = DriverNames(&[&["Number of GPRs"], &["VGPRs"], &["Max live registers"]]);
+const SPILLS: DriverNames = DriverNames(&[
+    &["Spills to memory", "Fills from memory"],
+    &["Spilled VGPRs", "Spilled SGPRs"],
+    &["Spills", "Fills"],
+]);
+const SHARED: DriverNames = DriverNames(&[&["LDS size"], &["Workgroup memory size"]]);
+const RESIDENT: DriverNames = DriverNames(&[&["Max warps/SM"], &["Subgroups per SIMD"]]);
+const CODE: DriverNames = DriverNames(&[&["Code size"], &["Instruction count", "Instructions"]]);
+const CYCLES: DriverNames = DriverNames(&[&["Static cycle count"], &["Inverse Throughput"], &["Cycles"]]);
 
-impl Names {
+impl DriverNames {
     fn of(&self, numbers: &BTreeMap<String, f64>) -> Option<f64> {
         let number = |name: &&str| numbers.iter().find(|(n, _)| n.eq_ignore_ascii_case(name)).map(|(_, value)| *value);
         let sum = |names: &&[&str]| names.iter().filter_map(number).reduce(|a, b| a + b);
@@ -111,23 +109,10 @@ pub fn compile(gpu: &Gpu, config: &Config, n_phases: usize, tuning: &Tuning) -> 
     for purpose in [Purpose::Train, Purpose::Render] {
         params.networks().try_for_each(|map| Network::new(gpu, &tuning, &setup, map, purpose).map(|_| ()))?;
     }
-    if params.static_network.is_some() {
-        StaticNetworkKernels::new(gpu)?;
-    }
     for samples in [config.march.static_samples, config.march.render_samples] {
         Kernels::new(gpu, tuning.clone(), params.line_len() as u32, samples)?;
     }
-    if config.method() == MethodKind::Gaussians {
-        GaussianKernels::new(gpu)?;
-        if config.gaussians.form != GaussianForm::Phase {
-            DeformableKernels::new(gpu)?;
-        }
-        BlobKernels::new(gpu, &tuning)?;
-        into_buffers(gpu)?;
-    }
-    if let Some(method) = methods::of(config) {
-        method.make_pipelines(gpu, config, &tuning)?;
-    }
+    methods::of(config).make_pipelines(gpu, config, &tuning)?;
     let mut all: Vec<Compiled> = gpu.pipeline_statistics().iter().map(Compiled::of).collect();
     if all.is_empty() {
         return Err(Error::Internal("the device was not opened with pipeline statistics".into()));
@@ -237,7 +222,7 @@ mod tests {
 
     #[test]
     fn drivers_name_numbers_in_their_own_ways() {
-        let of = |numbers: &[(&str, f64)], names: &Names| {
+        let of = |numbers: &[(&str, f64)], names: &DriverNames| {
             names.of(&numbers.iter().map(|(name, value)| ((*name).to_owned(), *value)).collect())
         };
         assert_eq!(of(&[("Spilled VGPRs", 2.0), ("Spilled SGPRs", 1.0)], &SPILLS), Some(3.0));

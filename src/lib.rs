@@ -6,12 +6,11 @@
 //!    clinical runs)
 //! 2. [`evidence`]: static background, noise and possible vessels of each single view. From it, [`calibrate`] corrects the
 //!    geometry of views that disagree, and [`mod@check`] names the mistake where they cannot be made to agree;
-//!    [`plan`]: everything a run needs: static backgrounds, the motion hull, scales and boxes
-//! 3. [`train::step`]: one iteration, in this order: rays -> samples -> [`network`] -> loss -> gradients -> Adam
-//! 4. [`train::trainer`]: many iterations per submit, two submits in flight -> losses. Beside it, [`train::gaussians`] and
-//!    [`train::deformable`] fit [`gaussians`] as the dynamic field to [`plan::targets`]; the fit starts from [`plan::seeds`] in a
-//!    [`plan::soft_hull`]
-//! 5. [`model`]: parameters, scales, hull and configuration; [`model::checkpoint`] keeps them in one safetensors file
+//!    [`plan`]: everything a run needs, which the method of the configuration prepares (a room of [`methods`] each)
+//! 3. [`fields::step`]: one iteration of fields that rays are marched through, in this order: rays -> samples -> [`network`] -> loss
+//!    -> gradients -> Adam. [`methods::dynamic_gaussians`] fits [`gaussians`] as the dynamic field instead
+//! 4. [`train::trainer`]: a run of any method, many iterations per submit -> losses
+//! 5. [`model`]: parameters, scales, hull and configuration; [`checkpoint`] keeps them and the state of the fit in one safetensors file
 //! 6. [`render`]: any pose and phase -> projections and samples of the fields
 //! 7. [`export`] writes them for other tools, [`score`] compares them with the images, [`trees`] extracts centrelines from them
 //!
@@ -87,29 +86,15 @@ pub mod random;
 pub mod raster;
 pub mod tensors;
 
-/// Vulkan compute, independent of angiography.
-pub mod gpu {
-    pub mod buffer;
-    pub mod capabilities;
-    pub mod details;
-    pub mod device;
-    pub mod image;
-    pub mod instance;
-    mod lock;
-    pub mod memory;
-    pub mod pace;
-    pub mod pipeline;
-    pub mod record;
-    pub mod sensors;
-    pub mod statistics;
-    mod transfer;
-}
+/// Vulkan compute, independent of angiography: a crate of its own.
+pub use nertca_vk_gpu as gpu;
 
 pub mod config;
 pub mod geometry;
 
 /// The compute stages.
 pub mod kernels {
+    pub mod cache;
     pub mod constants;
     pub mod dispatch;
     pub mod layout;
@@ -183,7 +168,6 @@ pub mod gaussians {
     pub mod blending;
     pub mod blobs;
     pub mod comparison;
-    pub mod deformable;
     pub mod field;
     pub mod particles;
     pub mod pictures;
@@ -194,10 +178,19 @@ pub mod gaussians {
     pub mod work;
 }
 
-pub mod fitting;
-pub mod methods;
+// A module uses only modules above it. Blank lines keep the formatter from sorting these.
+
 pub mod model;
+
+pub mod fitting;
+
 pub mod network;
+
+pub mod fields;
+
+pub mod methods;
+
+pub mod checkpoint;
 
 pub mod plan;
 
@@ -214,16 +207,8 @@ pub mod render {
 /// Training: from a plan to a checkpoint.
 pub mod train {
     pub mod calibrate;
-    mod carried;
-    pub mod deformable;
-    pub mod deformable_start;
     pub mod dry_run;
-    pub mod fields;
-    pub mod gaussians;
-    pub mod run_gaussians;
     pub mod snapshot;
-    pub mod step;
-    mod targets;
     pub mod timing;
     pub mod trainer;
     pub mod training;
@@ -341,7 +326,6 @@ pub mod bench;
 pub mod reference {
     pub mod adam;
     pub mod blobs;
-    pub mod deformable;
     pub mod field;
     pub mod gaussians;
     pub mod losses;

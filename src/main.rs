@@ -61,7 +61,7 @@ fn main() -> ExitCode {
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .with_env_filter(tracing_subscriber::EnvFilter::new(if cli.global.verbose {
-            "info,nertca_vk=debug"
+            "info,nertca_vk=debug,nertca_vk_gpu=debug"
         } else {
             "error"
         }))

@@ -1,19 +1,17 @@
 //! A reconstruction: parameters with everything needed to evaluate them, independent of any dataset.
 
-pub mod checkpoint;
 pub mod component;
 mod conversions;
+pub mod field;
 pub mod groups;
 pub mod hull;
 pub mod params;
 pub mod scene;
-mod schedule;
-pub mod setup;
 
 use crate::config::Config;
-use crate::fitting::field::Field;
 use crate::gaussians::field::DynamicGaussians;
 use crate::geometry::CArm;
+use crate::model::field::Field;
 use crate::model::hull::Hull;
 use crate::model::params::ParamMap;
 use crate::model::scene::Scene;

@@ -6,11 +6,11 @@ pub mod cost;
 pub mod forward;
 pub mod fused;
 pub mod layers;
-pub mod ledger;
 pub mod pass;
 pub mod static_network;
 
 use crate::error::{Error, Result};
+use crate::fitting::ledger::{Ledger, StageWork, add};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::kernels::constants::NOWHERE;
@@ -22,7 +22,6 @@ use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
 use crate::network::fused::FusedNetwork;
 use crate::network::layers::LayerNetwork;
-use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
 
 /// Initial loss scale of a run on matrices.

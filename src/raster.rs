@@ -128,14 +128,14 @@ mod tests {
                 let rows = within(y, radius, h).flat_map(|y| within(x, radius, w).map(move |x| (x, y)));
                 rows.map(|(x, y)| image.values[y * w + x]).fold(first, pick)
             };
-            let (largest, least) = (dilate(&image, radius), filter(&image, radius, f32::INFINITY, f32::min));
+            let (largest, min) = (dilate(&image, radius), filter(&image, radius, f32::INFINITY, f32::min));
             for (x, y) in (0..h).flat_map(|y| (0..w).map(move |x| (x, y))) {
                 assert_eq!(
                     largest.values[y * w + x],
                     picked(x, y, f32::NEG_INFINITY, f32::max),
                     "{x}, {y} of {radius}"
                 );
-                assert_eq!(least.values[y * w + x], picked(x, y, f32::INFINITY, f32::min), "{x}, {y} of {radius}");
+                assert_eq!(min.values[y * w + x], picked(x, y, f32::INFINITY, f32::min), "{x}, {y} of {radius}");
             }
         }
     }

@@ -3,13 +3,12 @@
 //!
 //! 1. [`problems`] are small, seeded, and need no file; [`compare`] keeps how far the device was off, a row per stage
 //! 2. [`iteration`], [`networks`], [`occupancy`] and [`drawing`] are about the two fields, on f32 layers and on matrices;
-//!    [`gaussians`], [`deformable`] and [`blobs`] about Gaussians; methods have self-tests in their rooms,
+//!    [`gaussians`] and [`blobs`] about Gaussians; methods have self-tests in their rooms,
 //!    [`projections`] about phantoms
 //! 3. [`repeats`] are runs that must come to the same bits
 
 pub mod blobs;
 pub mod compare;
-pub mod deformable;
 pub mod drawing;
 pub mod gaussians;
 pub mod iteration;
@@ -68,10 +67,10 @@ impl Report {
 }
 
 /// A part of the test.
-type Part<'a> = (String, Box<dyn Fn(&mut Findings) -> Result<()> + 'a>);
+type TestPart<'a> = (String, Box<dyn Fn(&mut Findings) -> Result<()> + 'a>);
 
 /// The parts for a path through the network's layers, on images at phases (`even`) and between them (`dataset`).
-fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuning: &'a Tuning) -> Vec<Part<'a>> {
+fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
     let name = |what: &str| format!("{what} ({})", iteration::path_name(tuning.layers));
     let cases = match tuning.layers {
         Layers::F32 => vec![(dataset, iteration::F32_CASES)],
@@ -88,7 +87,7 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
         let presets = [Preset::Paper, Preset::PublicCode, Preset::FastMlp, Preset::NerfCa];
         presets.into_iter().try_for_each(|preset| drawing::compare_views(gpu, preset, tuning, findings))
     };
-    let mut parts: Vec<Part<'a>> = vec![
+    let mut parts: Vec<TestPart<'a>> = vec![
         (name("iterations"), Box::new(iterations)),
         (name("two networks"), Box::new(both)),
         (name("empty cells"), Box::new(move |findings| occupancy::compare(gpu, dataset, tuning, findings))),
@@ -108,13 +107,16 @@ fn network_parts<'a>(gpu: &'a Gpu, even: &'a Dataset, dataset: &'a Dataset, tuni
 }
 
 /// The parts about Gaussians and phantoms, which have no choice of layers.
-fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<Part<'a>> {
+fn other_parts<'a>(gpu: &'a Gpu, tuning: &'a Tuning) -> Vec<TestPart<'a>> {
     vec![
         ("Gaussians per phase".into(), Box::new(move |findings| gaussians::compare(gpu, findings))),
         ("R2-Gaussian".into(), Box::new(move |findings| methods::r2_gaussian::selftest::compare(gpu, findings))),
         ("X-Gaussian".into(), Box::new(move |findings| methods::x_gaussian::selftest::compare(gpu, findings))),
         ("SAX-NeRF".into(), Box::new(move |findings| methods::sax_nerf::selftest::compare(gpu, findings))),
-        ("a deformable set of Gaussians".into(), Box::new(move |findings| deformable::compare(gpu, findings))),
+        (
+            "a deformable set of Gaussians".into(),
+            Box::new(move |findings| methods::dynamic_gaussians::selftest::compare(gpu, findings)),
+        ),
         ("views of Gaussians".into(), Box::new(move |findings| blobs::compare_rays(gpu, tuning, findings))),
         ("views of many Gaussians".into(), Box::new(move |findings| blobs::compare_maxima(gpu, tuning, findings))),
         ("volumes of Gaussians".into(), Box::new(move |findings| blobs::compare_cells(gpu, tuning, findings))),

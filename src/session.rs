@@ -12,12 +12,12 @@ mod progress;
 mod truth;
 
 use crate::calibrate::correction::Calibration;
+use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::geometry::{Geometry, ViewRays};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
-use crate::model::checkpoint::Checkpoint;
 use crate::model::component::Component;
 use crate::render::grid::PatientGrid;
 use crate::render::live::Source;
@@ -29,8 +29,8 @@ use crate::trees::tree::BeatTree;
 pub use corrected::CorrectedFrame;
 use engine::{Control, Shared, lock, nothing_yet};
 use inbox::Inbox;
-pub use inbox::{Moment, NewFrame, SessionOptions};
-use known::Known;
+pub use inbox::{FrameTime, NewFrame, SessionOptions};
+use known::TrueShapes;
 pub use progress::{Observer, Progress, State};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError};
@@ -46,7 +46,7 @@ pub struct Session {
     worker: Mutex<Option<JoinHandle<()>>>,
     /// Held by training in a caller's thread.
     blocking: Mutex<()>,
-    known: Mutex<Known>,
+    known: Mutex<TrueShapes>,
 }
 
 impl Session {

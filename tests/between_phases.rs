@@ -5,7 +5,9 @@ mod common;
 
 use common::{gpu, tuning};
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::fields::data::FieldData;
 use nertca_vk::gaussians::pictures::Pictures;
+use nertca_vk::methods::dynamic_gaussians::data::GaussianData;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout, Split};
@@ -61,7 +63,7 @@ fn a_moving_tree_is_fitted_to_frames_at_their_own_time() {
     let config = |form: &str| Config::load(Some(Preset::Fast), None, &[format!("gaussians.form={form}")]).unwrap();
     let planned = |form: &str| Plan::new(&config(form), &dataset).unwrap();
     let plan = planned("tree");
-    let targets = plan.targets.as_ref().unwrap();
+    let targets = &plan.data::<GaussianData>().unwrap().targets;
     for phase in 0..targets.n_phases {
         let wanted = if phase == 1 { 0.25 } else { 0.0 };
         assert!(targets.views_at(phase).count() > 1);
@@ -73,7 +75,7 @@ fn a_moving_tree_is_fitted_to_frames_at_their_own_time() {
     assert!(told(&planned("phase"), "are used as frames of the nearest phase"));
     let network = planned("none");
     assert!(told(&network, "trained at their own time"), "{:?}", network.notes);
-    for (row, frame) in network.frames.iter().zip(dataset.training()) {
+    for (row, frame) in network.data::<FieldData>().unwrap().frames.iter().zip(dataset.training()) {
         let own_time = if frame.phase == 1 { (1, 2, 0.25) } else { (frame.phase, (frame.phase + 1) % 3, 0.0) };
         assert_eq!((row.phase, row.beyond, row.beyond_share), own_time);
     }
@@ -85,8 +87,8 @@ fn pictures_and_views_show_the_field_at_their_time() {
     let dataset = common::small_dataset(37, 29);
     let rays = &dataset.views[1].rays;
     let far = |a: &[f32], b: &[f32]| {
-        let most = b.iter().fold(1e-9f32, |m, v| m.max(*v));
-        a.iter().zip(b).map(|(a, b)| (a - b).abs() / most).fold(0.0, f32::max)
+        let max = b.iter().fold(1e-9f32, |m, v| m.max(*v));
+        a.iter().zip(b).map(|(a, b)| (a - b).abs() / max).fold(0.0, f32::max)
     };
     let [sets, tree] = drawn_fields();
     for (field, moves) in [(sets, false), (tree, true)] {

@@ -21,7 +21,7 @@ use nertca_vk::scan::dataset::{Dataset, Layout};
 use nertca_vk::scan::writer;
 use nertca_vk::score::calibrated::in_calibrated_frame;
 use nertca_vk::score::eval::evaluate;
-use nertca_vk::session::{Moment, NewFrame, Session, SessionOptions};
+use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
 use nertca_vk::train::trainer::Trainer;
 use std::time::Instant;
 
@@ -64,10 +64,10 @@ fn views_are_brought_together() {
         (4, Wrong { breathing_mm: 3.0, angle_deg: 0.25, shift_mm: 0.5, ..none }, Correction::Breathing, 0.3),
     ];
     let mut failures = Vec::new();
-    for (n_views, wrong, correction, most) in cases {
+    for (n_views, wrong, correction, max) in cases {
         let shot = studio.shoot(n_views, false, wrong);
         let (calibration, error) = calibrated(&shot, "auto");
-        if calibration.correction != correction || error.is_nan() || error > most {
+        if calibration.correction != correction || error.is_nan() || error > max {
             failures.push(format!("{n_views} views, {wrong:?}: {:?}, {error:.3} px", calibration.correction));
         }
         let all: Vec<usize> = (0..PHASES as usize).collect();
@@ -108,7 +108,7 @@ fn blades_do_not_pull_views_apart() {
     let none = Wrong { seed: 11, ..Wrong::default() };
     let moved = Wrong { angle_deg: 0.5, shift_mm: 1.0, ..none };
     let mut failures = Vec::new();
-    for (n_views, blades, share, wrong, most) in [
+    for (n_views, blades, share, wrong, max) in [
         (3, 3, 0.35, none, 0.05),
         (4, 4, 0.35, none, 0.05),
         (3, 3, 0.2, none, 0.05),
@@ -118,7 +118,7 @@ fn blades_do_not_pull_views_apart() {
         let mut shot = studio.shoot(n_views, false, wrong);
         with_blades(&mut shot, blades, share);
         let (calibration, error) = calibrated(&shot, "auto");
-        if error.is_nan() || error > most {
+        if error.is_nan() || error > max {
             let chosen = calibration.correction;
             failures.push(format!("{n_views} views, {blades} blades of {share}, {wrong:?}: {chosen:?}, {error:.3} px"));
         }
@@ -145,7 +145,7 @@ fn a_calibrated_run_is_as_good_as_one_with_true_geometry() {
     let truth = dice(&gpu, &studio.shoot(4, true, none).dataset);
     let moved = Wrong { angle_deg: 0.5, shift_mm: 1.0, ..none };
     let breathing = Wrong { angle_deg: 0.25, shift_mm: 0.5, breathing_mm: 3.0, ..none };
-    for (wrong, least) in [(moved, truth - 0.03), (breathing, truth - 0.06)] {
+    for (wrong, min) in [(moved, truth - 0.03), (breathing, truth - 0.06)] {
         let mut shot = studio.shoot(4, true, wrong);
         let directory = tempfile::tempdir().unwrap();
         shot.write_truth(directory.path());
@@ -155,7 +155,7 @@ fn a_calibrated_run_is_as_good_as_one_with_true_geometry() {
         let carried = in_calibrated_frame(&corrected).unwrap().expect("unseen views are elsewhere than stated");
         let (got, stated) = (dice(&gpu, &carried), dice(&gpu, &shot.dataset));
         println!("true geometry {truth:.3}, calibrated {got:.3} ({error:.2} px), stated {stated:.3}");
-        assert!(got >= least && got > stated + 0.1, "{wrong:?}: {got:.3}, stated {stated:.3}, true {truth:.3}");
+        assert!(got >= min && got > stated + 0.1, "{wrong:?}: {got:.3}, stated {stated:.3}, true {truth:.3}");
     }
 }
 
@@ -225,7 +225,7 @@ fn a_session_tells_how_it_sees_its_frames() {
     for f in training {
         let new = NewFrame {
             geometry: shot.dataset.views[f.view].geometry.clone(),
-            moment: Moment::Phase(f.phase),
+            moment: FrameTime::Phase(f.phase),
             split: f.split,
             width: shot.dataset.width,
             height: shot.dataset.height,

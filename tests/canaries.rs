@@ -6,6 +6,7 @@ mod common;
 mod shim;
 
 use common::{expect_silence, run, small_config, small_dataset};
+use nertca_vk::fields::state::FieldsState;
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::gpu::buffer::Operands;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
@@ -62,13 +63,14 @@ fn everything(word: u32, preset: &str, settings: &[&str], choose: &dyn Fn(Tuning
     let (filled, unreachable, broken) = shim::end_poison();
     assert!(filled > 60 && unreachable == 0, "{filled} buffers were filled, {unreachable} could not be");
     assert_eq!(broken, Vec::<String>::new());
-    let numbers = checkpoint.model.params.iter().chain(checkpoint.moments.as_flattened());
+    let state = checkpoint.state::<FieldsState>().cloned().unwrap_or_else(|_| FieldsState::fresh(0, 0));
+    let numbers = checkpoint.model.params.iter().chain(state.moments.as_flattened());
     let pictures = exact.static_integral.iter().chain(&exact.dynamic_integral).chain(&quick);
     let gaussians = checkpoint.model.gaussians.as_ref().map_or(Vec::new(), parameters);
     let numbers: Vec<f32> =
         numbers.chain(pictures).copied().chain(gaussians).chain(losses.iter().map(|l| *l as f32)).collect();
     assert!(numbers.iter().all(|v| v.is_finite()), "something that was never written was read");
-    numbers.iter().map(|v| v.to_bits()).chain(checkpoint.occupancy).collect()
+    numbers.iter().map(|v| v.to_bits()).chain(state.occupancy).collect()
 }
 
 #[track_caller]

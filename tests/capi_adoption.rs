@@ -108,7 +108,7 @@ impl Application {
             instance.get_physical_device_features2(physical, &mut of_device);
             let addresses = with != With::Least && offered.buffer_device_address == vk::TRUE;
             let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(0).queue_priorities(&[1.0])];
-            let is_with = |least| with == With::Matrices || with == least;
+            let is_with = |min| with == With::Matrices || with == min;
             let on_matrices = is_with(With::Matrices);
             let mut features = vk::PhysicalDeviceVulkan12Features::default()
                 .timeline_semaphore(true)
@@ -263,8 +263,8 @@ fn a_device_made_with_subgroups_and_matrices_computes_as_ours_does() {
 
 #[test]
 fn what_is_not_said_is_not_used() {
-    let least = Application::new(With::Least).unwrap();
-    let mut vulkan = least.describe();
+    let min = Application::new(With::Least).unwrap();
+    let mut vulkan = min.describe();
     // A caller of the previous version: memory behind its struct is not read.
     vulkan.size = std::mem::offset_of!(nertca_vulkan, subgroup_size_control);
     (vulkan.subgroup_size_control, vulkan.cooperative_matrix) = (77, 77);
@@ -272,13 +272,13 @@ fn what_is_not_said_is_not_used() {
     assert!(described["device"]["full_subgroups"].is_null());
     assert_eq!(described["device"]["matrices"], serde_json::json!([]));
     // These claims cannot be true.
-    let vulkan = nertca_vulkan { cooperative_matrix: 1, ..least.describe() };
+    let vulkan = nertca_vulkan { cooperative_matrix: 1, ..min.describe() };
     assert!(refused(&vulkan).contains("needs subgroup_size_control"), "{}", refused(&vulkan));
     if Application::new(With::Matrices).map(Application::close).is_none() {
         let said = refused(&nertca_vulkan { subgroup_size_control: 1, ..vulkan });
         assert!(said.contains("cooperative_matrix") && said.contains("does not offer cooperativeMatrix"), "{said}");
     }
-    least.close();
+    min.close();
 }
 
 #[test]

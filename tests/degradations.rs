@@ -210,8 +210,8 @@ fn thorax_image(pictures: &Pictures, c_arm: &CArm, fraction: f64) -> Vec<f32> {
 
 /// Maximum difference as a share of the maximum value.
 fn difference(a: &[f32], b: &[f32]) -> f32 {
-    let most = b.iter().fold(0f32, |m, v| m.max(v.abs()));
-    a.iter().zip(b).fold(0f32, |m, (a, b)| m.max((a - b).abs())) / most
+    let max = b.iter().fold(0f32, |m, v| m.max(v.abs()));
+    a.iter().zip(b).fold(0f32, |m, (a, b)| m.max((a - b).abs())) / max
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {
@@ -622,8 +622,8 @@ fn volumes_are_degraded_like_phantoms() {
     let gained = project(Degradations { contrast_variation: 0.2, ..Degradations::default() });
     let (frame, truth) = gained.training().next().unwrap();
     let ratio = frame.integrals.iter().zip(&held.same(frame).integrals).map(|(a, b)| a / b);
-    let most = ratio.fold(0f32, |m, r| m.max((r - 1.0).abs()));
-    assert!(most > 0.3 * (truth.contrast_gain as f32 - 1.0).abs() && truth.contrast_gain != 1.0, "{most}");
+    let max = ratio.fold(0f32, |m, r| m.max((r - 1.0).abs()));
+    assert!(max > 0.3 * (truth.contrast_gain as f32 - 1.0).abs() && truth.contrast_gain != 1.0, "{max}");
     let refused = |degradations, part: &str| {
         let out = sources.path().join("none");
         let error = project_volumes(&gpu, &options(degradations, None), &out, |_, _, _| ()).unwrap_err().to_string();

@@ -10,9 +10,9 @@ mod python;
 mod said;
 
 use dicom_dictionary_std::tags;
+use nertca_vk::checkpoint::newest_model;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::Geometry;
-use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::scan::dataset::Dataset;
 use python::python;
 use said::{run, text};

@@ -5,13 +5,15 @@ mod common;
 
 use common::{expect_agreement, expect_silence, gpu, phantom, run, tuning};
 use glam::DVec3;
+use nertca_vk::checkpoint::{self, Checkpoint};
 use nertca_vk::config::{Config, Preset, sections};
 use nertca_vk::error::Error;
+use nertca_vk::fields::state::FieldsState;
 use nertca_vk::gaussians::field::{DynamicGaussians, Gaussians};
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
+use nertca_vk::methods::dynamic_gaussians::trainer::GaussiansFit;
 use nertca_vk::model::Model;
-use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::model::component::Component;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::grid::PatientGrid;
@@ -23,6 +25,7 @@ use nertca_vk::selftest::blobs;
 use nertca_vk::selftest::problems::drawn_fields;
 use nertca_vk::train::trainer::Trainer;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Creates a model of a dataset with the dynamic field `field`.
@@ -68,18 +71,18 @@ fn bounds_hold_all_around_their_points() {
     for field in drawn_fields() {
         let renderer = Renderer::new(&gpu, &model(&gpu, &dataset, field), tuning(&gpu)).unwrap();
         let values = renderer.sample_patient(Component::Dynamic, 1, &fine).unwrap();
-        let [least, most] = renderer.bound_patient(1, &coarse, away_mm).unwrap().unwrap();
+        let [min, max] = renderer.bound_patient(1, &coarse, away_mm).unwrap().unwrap();
         let largest = values.iter().copied().fold(0.0, f32::max);
         for (i, value) in values.iter().enumerate() {
             let n = n as usize;
             let [x, y, z] = [i % n, i / n % n, i / (n * n)].map(|k| k / 4);
             let at = (z * (n / 4) + y) * (n / 4) + x;
             let rounding = 1e-5 * largest;
-            assert!(least[at] <= value + rounding, "{i}: at least {} instead of {value}", least[at]);
-            assert!(most[at] >= value - rounding, "{i}: at most {} instead of {value}", most[at]);
+            assert!(min[at] <= value + rounding, "{i}: at least {} instead of {value}", min[at]);
+            assert!(max[at] >= value - rounding, "{i}: at most {} instead of {value}", max[at]);
         }
         // The bounds are informative.
-        assert!(least.iter().any(|v| *v > 0.01 * largest) && most.contains(&0.0), "nothing is told");
+        assert!(min.iter().any(|v| *v > 0.01 * largest) && max.contains(&0.0), "nothing is told");
     }
     expect_silence(gpu);
 }
@@ -91,16 +94,8 @@ fn checkpoints_keep_every_bit() {
     for field in drawn_fields() {
         let model = model(&gpu, &dataset, field);
         let moments = vec![[0.25, 0.5]; model.param_map.len];
-        let saved = Checkpoint {
-            model,
-            moments,
-            occupancy: Vec::new(),
-            loss_scale: None,
-            stopped: false,
-            last_report: Vec::new(),
-            fit: None,
-            data_fingerprint: "x".into(),
-        };
+        let state = FieldsState { moments, ..FieldsState::fresh(model.step, 0) };
+        let saved = Checkpoint { model, fit: Arc::new(state), data_fingerprint: "x".into() };
         let bytes = saved.to_bytes().unwrap();
         let read = Checkpoint::from_bytes(&bytes, Path::new("test")).unwrap();
         assert_eq!(read.to_bytes().unwrap(), bytes);
@@ -118,22 +113,13 @@ fn checkpoints_keep_every_bit() {
 fn damaged_gaussians_are_refused_by_name() {
     let gpu = gpu();
     let model = model(&gpu, &common::small_dataset(13, 11), drawn_fields()[0].clone());
-    let moments = vec![[0.0; 2]; model.param_map.len];
+    let state = FieldsState::fresh(model.step, model.param_map.len);
     let refused = |change: &dyn Fn(&mut Gaussians)| {
         let mut model = model.clone();
         if let Some(DynamicGaussians::PerPhase(sets)) = &mut model.gaussians {
             change(sets);
         }
-        let saved = Checkpoint {
-            model,
-            moments: moments.clone(),
-            occupancy: Vec::new(),
-            loss_scale: None,
-            stopped: false,
-            last_report: Vec::new(),
-            fit: None,
-            data_fingerprint: String::new(),
-        };
+        let saved = Checkpoint { model, fit: Arc::new(state.clone()), data_fingerprint: String::new() };
         Checkpoint::from_bytes(&saved.to_bytes().unwrap(), Path::new("test")).err().unwrap().to_string()
     };
     assert!(refused(&|s| s.rows[3].log_density = f32::NAN).contains("gaussians.log_density"));
@@ -254,7 +240,8 @@ fn other_images_begin_the_fit_anew_and_keep_device_and_host_in_step() {
     assert_eq!(losses.len(), 32);
     assert!(losses.iter().all(|l| l.is_finite() && *l > 0.0), "{losses:?}");
     // Schedules and losses are indexed by the device's count.
-    let state: Vec<DeviceState> = gpu.download(&trainer.fields().unwrap().forward().state, 0, 1).unwrap();
+    let state: Vec<DeviceState> =
+        gpu.download(&trainer.fit::<GaussiansFit>().unwrap().fields().forward().state, 0, 1).unwrap();
     assert_eq!(state[0].step, 32);
     drop(trainer);
     expect_silence(gpu);

@@ -11,27 +11,27 @@ use golden_file::Golden;
 use nertca_vk::config::sections;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Result;
+use nertca_vk::fields::scale::dynamic_half;
 use nertca_vk::gaussians::field::Gaussians;
 use nertca_vk::gaussians::particles::Particles;
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::{Gaussian, GaussianSetup};
-use nertca_vk::plan::fit;
-use nertca_vk::plan::scale::dynamic_half;
-use nertca_vk::plan::soft_hull::carve::SoftMotion;
-use nertca_vk::plan::targets::Targets;
-use nertca_vk::reference::deformable::{DeformableParams, loss_and_gradient};
+use nertca_vk::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use nertca_vk::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use nertca_vk::methods::dynamic_gaussians::selftest;
+use nertca_vk::methods::dynamic_gaussians::setup;
+use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
+use nertca_vk::methods::dynamic_gaussians::targets::Targets;
+use nertca_vk::methods::dynamic_gaussians::twin::{DeformableParams, loss_and_gradient};
 use nertca_vk::reference::gaussians::{self as reference, N_PARAMS, Params, params};
 use nertca_vk::reference::maxima::maxima;
 use nertca_vk::scan::dataset::{Dataset, Frame};
 use nertca_vk::score::metrics;
-use nertca_vk::selftest::deformable;
 use nertca_vk::selftest::gaussians::{self, TENSORS, device_gradient, numbers, twin};
 use nertca_vk::selftest::problems::{
     self, ANGLES_DEG, deformable_case, deformable_set, random_gaussians, units, with_gaussians,
 };
-use nertca_vk::train::deformable::DeformableTrainer;
-use nertca_vk::train::gaussians::GaussianTrainer;
 use nertca_vk::vessels::threshold::VESSEL_SHARE;
 use std::time::Instant;
 
@@ -55,7 +55,7 @@ fn with_phases(rows: &[Gaussian]) -> Vec<(Params, usize)> {
 #[test]
 fn exact_integrals_are_those_of_quadrature() {
     let targets = targets(17, 14, 2);
-    let setup = fit::gaussian_setup(&targets, &config().gaussians);
+    let setup = setup::gaussian_setup(&targets, &config().gaussians);
     for g in random_gaussians(30, 2, 8.0, 1) {
         let p = params(&g);
         for view in &targets.views {
@@ -75,7 +75,7 @@ fn exact_integrals_are_those_of_quadrature() {
 #[test]
 fn the_affine_projection_is_as_good_as_the_cut() {
     let targets = targets(61, 52, 2);
-    let setup = fit::gaussian_setup(&targets, &config().gaussians);
+    let setup = setup::gaussian_setup(&targets, &config().gaussians);
     let mut worst = 0f64;
     for g in random_gaussians(40, 2, 14.0, 2) {
         let p = params(&g);
@@ -99,7 +99,7 @@ fn the_affine_projection_is_as_good_as_the_cut() {
 fn twin_gradient_is_the_derivative_of_the_twin_loss() {
     let targets = targets(17, 14, 2);
     // With this cut no pixel crosses the boundary.
-    let setup = GaussianSetup { cut: 12.0, ..fit::gaussian_setup(&targets, &config().gaussians) };
+    let setup = GaussianSetup { cut: 12.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
     let mut all = with_phases(&random_gaussians(9, 2, 5.0, 3));
     // A scale beyond its bound has no gradient.
     all[0].0[4] = 2.0;
@@ -318,8 +318,8 @@ fn degenerate_data_are_fitted_or_refused_in_words() {
         broken.frames[0].integrals[5] = f32::NAN;
         let view = broken.frames[0].view;
         refused(&broken, &config, &format!("view {view}"));
-        let none = with_gaussians(sections::Gaussians { weakest: 1e3, ..config.gaussians.clone() });
-        refused(&all, &none, "gaussians.weakest");
+        let none = with_gaussians(sections::Gaussians { prune_threshold: 1e3, ..config.gaussians.clone() });
+        refused(&all, &none, "gaussians.prune_threshold");
     }
     expect_silence(gpu);
 }
@@ -380,13 +380,13 @@ fn the_default_phantom_is_reconstructed() {
         if n_views == 3 {
             drop_first_view(&mut dataset);
         }
-        for ((form, train), least) in FORMS.into_iter().zip([PHASE_DICE, TREE_DICE]) {
+        for ((form, train), min) in FORMS.into_iter().zip([PHASE_DICE, TREE_DICE]) {
             let start = Instant::now();
             let model = train(&gpu, targets_of(&dataset), &config()).unwrap();
             let seconds = start.elapsed().as_secs_f64();
             let dice = dice(&model, &dataset);
             println!("{form}, {n_views} views: Dice {dice:.3}, {} Gaussians, {seconds:.1} s", model.rows.len());
-            assert!(dice >= least[index], "{form}, {n_views} views: {dice}");
+            assert!(dice >= min[index], "{form}, {n_views} views: {dice}");
         }
     }
     expect_silence(gpu);
@@ -433,7 +433,7 @@ fn forms_on_data() {
 #[test]
 fn maxima_are_those_of_the_field() {
     let targets = targets(33, 27, 2);
-    let setup = GaussianSetup { cut: 6.0, ..fit::gaussian_setup(&targets, &config().gaussians) };
+    let setup = GaussianSetup { cut: 6.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
     let model = Gaussians {
         units: units(),
         n_phases: 2,
@@ -464,8 +464,8 @@ fn maxima_are_those_of_the_field() {
 #[test]
 fn tree_twin_gradient_is_the_derivative_of_its_loss() {
     let (targets, rows, Config { deformable: settings, .. }) = deformable_case().unwrap();
-    let setup = GaussianSetup { cut: 12.0, ..fit::gaussian_setup(&targets, &config().gaussians) };
-    let tree = fit::deformable_setup(&targets, &settings);
+    let setup = GaussianSetup { cut: 12.0, ..setup::gaussian_setup(&targets, &config().gaussians) };
+    let tree = setup::deformable_setup(&targets, &settings);
     let p = deformable_set(&rows[..7], &tree, targets.n_phases);
     let (_, _, gradient) = loss_and_gradient(&targets, &setup, &tree, &p);
     let check = |what: &str, want: f64, change: &dyn Fn(&mut DeformableParams, f64)| {
@@ -497,7 +497,7 @@ fn tree_twin_gradient_is_the_derivative_of_its_loss() {
 #[test]
 fn tree_kernels_match_their_twin() {
     let gpu = gpu();
-    expect_agreement(|findings| deformable::compare(&gpu, findings));
+    expect_agreement(|findings| selftest::compare(&gpu, findings));
     let (targets, rows, config) = deformable_case().unwrap();
     let trainer = DeformableTrainer::with(&gpu, targets.clone(), &config, &Particles::fresh(rows.clone())).unwrap();
     assert_eq!(trainer.deformable().unwrap().expand().rows.len(), rows.len() * targets.n_phases);

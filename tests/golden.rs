@@ -12,6 +12,7 @@ use common::{expect_silence, gpu, relative_error, tuning};
 use golden_fields::{Terms, gather, terms_of_engine};
 use golden_file::Golden;
 use nertca_vk::config::Preset;
+use nertca_vk::fields::data::FieldData;
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::field::Precision;
 use nertca_vk::reference::{losses, march, step};
@@ -22,15 +23,16 @@ fn check(preset: Preset, name: &str) {
     let golden = Golden::open(name, "tools/reference.py");
     let (config, dataset) = (golden.config(preset), golden.dataset());
     let mut plan = Plan::new(&config, &dataset).unwrap().in_scene(golden.scene());
-    plan.backgrounds = (0..dataset.views.len())
+    let data = plan.data_mut::<FieldData>().unwrap();
+    data.backgrounds = (0..dataset.views.len())
         .flat_map(|v| {
             let bound = |which: &str| golden.get(&format!("background/{v}/{which}"));
             bound("low").into_iter().zip(bound("high")).map(|(l, h)| [l as f32, h as f32]).collect::<Vec<_>>()
         })
         .collect();
-    plan.listed_rays = (0..plan.setup.n_all_rays).step_by(3).collect();
-    plan.setup.n_motion_list = plan.listed_rays.len() as u32;
-    plan.setup.n_motion_rays = golden.number("n_motion") as u32;
+    data.listed_rays = (0..data.setup.n_all_rays).step_by(3).collect();
+    data.setup.n_motion_list = data.listed_rays.len() as u32;
+    data.setup.n_motion_rays = golden.number("n_motion") as u32;
     check_plan(&golden, plan, &dataset, name);
 }
 
@@ -57,13 +59,9 @@ fn check_plan(golden: &Golden, plan: Plan, dataset: &Dataset, name: &str) {
         // reference's parameters are loaded where gradients are compared.
         if compared.contains(&step) {
             let params = gather(golden, trainer.plan(), &format!("params{step}"));
-            let (losses, gradient) = step::loss_and_gradient(
-                trainer.plan(),
-                &params,
-                step,
-                &march::batch(trainer.plan(), step),
-                Precision::Exact,
-            );
+            let data = trainer.fields().unwrap().data();
+            let (losses, gradient) =
+                step::loss_and_gradient(data, &params, step, &march::batch(data, step), Precision::Exact);
             let reference = gather(golden, trainer.plan(), &format!("gradient{step}"));
             assert_eq!(losses.live as f64, golden.get(&format!("loss{step}/live"))[0], "{name} step {step}");
             for (term, value) in terms_of_twin(&losses).into_iter().take(if two_networks { 6 } else { 3 }) {

@@ -13,6 +13,7 @@ use common::{expect_silence, gpu, tuning};
 use golden_fields::{gather, terms_of_engine};
 use golden_file::Golden;
 use nertca_vk::config::Preset;
+use nertca_vk::fields::data::FieldData;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::Schedule;
 use nertca_vk::kernels::tuning::{Layers, Tuning};
@@ -101,7 +102,7 @@ fn check(golden: &Golden, plan: impl Fn() -> Plan, faults: &[(&str, Fault)]) {
     assert!(spreads <= SPREADS, "{key}: off by {spreads:.1} spreads");
     for (fault, plant) in faults {
         let mut plan = plan();
-        plant(&mut plan.schedule, golden.number("delay") as usize);
+        plant(&mut plan.data_mut::<FieldData>().unwrap().schedule, golden.number("delay") as usize);
         let Worst { spreads, key } = train(&gpu, golden, plan);
         assert!(spreads > 100.0 * SPREADS, "{fault}: seen by {spreads:.1} spreads at most, in {key}");
     }

@@ -11,6 +11,7 @@ use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::gpu::image::Image3d;
 use nertca_vk::gpu::pipeline::{BindingKind, KernelCode, Pipeline};
 use nertca_vk::gpu::record::{Bound, Groups, Recording};
+use nertca_vk::kernels::cache::save_pipeline_cache;
 use nertca_vk::kernels::stages::kernel_code;
 use shim::{Failing, Outcome};
 use std::path::Path;
@@ -52,7 +53,7 @@ fn record_idle(
     macro_rules! with_words {
         ($($words:literal)*) => {
             match code.push_bytes / 4 {
-                $($words => recording.dispatch(pipeline, none(), &given, &[0u32; $words]),)*
+                $($words => Ok(recording.dispatch(pipeline, none(), &given, &[0u32; $words])?),)*
                 more => panic!("{more} words of push constants"),
             }
         };
@@ -94,7 +95,7 @@ fn use_device(gpu: &Gpu) -> Result<()> {
     gpu.wait(commands.submit()?)?;
     assert_eq!(commands.pass_times()?.len(), 1 + IDLE_KERNELS.len());
     assert_eq!(gpu.download::<u32>(&copied, 0, 64)?, numbers);
-    gpu.save_pipeline_cache()
+    save_pipeline_cache(gpu)
 }
 
 /// Runs a session on its own device; `cache` is the directory of its pipelines.

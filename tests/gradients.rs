@@ -6,17 +6,19 @@ mod common;
 
 use common::{small_config, uneven_dataset};
 use glam::DVec3;
+use nertca_vk::fields::data::FieldData;
 use nertca_vk::plan::Plan;
 use nertca_vk::random;
 use nertca_vk::reference::field::{self, Precision};
 use nertca_vk::reference::{march, step};
 use nertca_vk::selftest::networks::LARGE;
 
-fn plan(preset: &str, settings: &[&str]) -> Plan {
-    Plan::new(&small_config(preset, settings), &uneven_dataset(9, 8)).unwrap()
+fn plan(preset: &str, settings: &[&str]) -> FieldData {
+    let plan = Plan::new(&small_config(preset, settings), &uneven_dataset(9, 8)).unwrap();
+    plan.data::<FieldData>().unwrap().clone()
 }
 
-fn start(plan: &Plan) -> Vec<f64> {
+fn start(plan: &FieldData) -> Vec<f64> {
     let mut params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
     if plan.params.static_network.is_none() {
         params[..plan.params.static_len].iter_mut().for_each(|p| *p *= 30.0);
@@ -29,8 +31,8 @@ fn start(plan: &Plan) -> Vec<f64> {
 #[test]
 fn a_sleeping_field_is_called_back() {
     let asleep = ["dynamic.best_start=false", "dynamic.normalised_shift=-14"];
-    let of = |least_slope: &str, more: bool| {
-        let slope = format!("dynamic.least_slope={least_slope}");
+    let of = |min_slope: &str, more: bool| {
+        let slope = format!("dynamic.min_slope={min_slope}");
         let mut plan = plan("fast-mlp", &[asleep[0], asleep[1], &slope]);
         if !more {
             // No ray requires positive attenuation.
@@ -54,16 +56,16 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
         ("paper", &["dynamic.occlusion=1e-3", "loss.normalise=true"][..]),
         ("public-code", &["dynamic.occlusion=1e-3", "loss.normalise=true"]),
         // A minimum slope differs from that of the loss, so it is switched off.
-        ("fast-mlp", &["dynamic.least_slope=0", "loss.dynamic_target=absolute"]),
-        ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0"]),
-        ("fast-mlp", &["dynamic.least_slope=0", "loss.robust=0.3"]),
+        ("fast-mlp", &["dynamic.min_slope=0", "loss.dynamic_target=absolute"]),
+        ("fast-mlp", &["dynamic.min_slope=0", "loss.robust=0"]),
+        ("fast-mlp", &["dynamic.min_slope=0", "loss.robust=0.3"]),
         ("nerf-ca", LARGE),
         // Almost vanishing fields whose entropies still count; the near part of rays alone.
         (
             "nerf-ca",
             &[
                 "networks.gain=1e-4",
-                "networks.least_integral=0",
+                "networks.min_integral=0",
                 "networks.ray_entropy=1",
                 "networks.favour_static=1",
                 "networks.delay=0",

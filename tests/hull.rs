@@ -6,6 +6,9 @@ mod common;
 use common::{expect_silence, gpu, run, small_config, small_dataset, tuning};
 use glam::DVec3;
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::fields::carve::carve;
+use nertca_vk::fields::motion;
+use nertca_vk::fields::scale::dynamic_half;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::formats::volume_files;
 use nertca_vk::geometry::world_from_lps_mm;
@@ -17,9 +20,6 @@ use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::projector::Projector;
 use nertca_vk::phantom::views::ViewAngles;
 use nertca_vk::plan::Plan;
-use nertca_vk::plan::carve::carve;
-use nertca_vk::plan::motion;
-use nertca_vk::plan::scale::dynamic_half;
 use nertca_vk::raster::{Image, dilate};
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};
@@ -61,9 +61,9 @@ fn phantom(gpu: &Gpu, views: u32) -> Phantom {
 
 /// Voxels that are entirely vessel, in world units; those at the wall have less contrast.
 fn inside_vessels(volume: &Volume) -> Vec<DVec3> {
-    let most = volume.values.iter().copied().fold(0.0, f32::max);
+    let max = volume.values.iter().copied().fold(0.0, f32::max);
     let [nx, ny, _] = volume.size;
-    let full = volume.values.iter().enumerate().filter(|(_, v)| **v > 0.5 * most);
+    let full = volume.values.iter().enumerate().filter(|(_, v)| **v > 0.5 * max);
     full.map(|(i, _)| {
         let lps = volume.index_to_lps.transform_point3(DVec3::new(
             (i % nx) as f64,
@@ -107,12 +107,12 @@ fn changes(gpu: &Gpu, phantom: &Phantom) -> Vec<Vec<Vec<f32>>> {
         .collect();
     (0..rays.len())
         .map(|view| {
-            let least = |p: usize| images.iter().map(|phase| phase[view][p]).fold(f32::INFINITY, f32::min);
-            let least: Vec<f32> = (0..dataset.n_pixels()).map(least).collect();
-            let change = |phase: &Vec<Vec<f32>>| phase[view].iter().zip(&least).map(|(v, l)| v - l).collect();
+            let min = |p: usize| images.iter().map(|phase| phase[view][p]).fold(f32::INFINITY, f32::min);
+            let min: Vec<f32> = (0..dataset.n_pixels()).map(min).collect();
+            let change = |phase: &Vec<Vec<f32>>| phase[view].iter().zip(&min).map(|(v, l)| v - l).collect();
             let mut changes: Vec<Vec<f32>> = images.iter().map(change).collect();
-            let most = changes.iter().flatten().copied().fold(0.0, f32::max);
-            changes.iter_mut().flatten().for_each(|c| *c /= most);
+            let max = changes.iter().flatten().copied().fold(0.0, f32::max);
+            changes.iter_mut().flatten().for_each(|c| *c /= max);
             changes
         })
         .collect()
@@ -145,7 +145,7 @@ const VISIBLE_OVER_THE_BEAT: f32 = 0.1;
 const VISIBLE_AT_A_PHASE: f32 = 0.2;
 /// Maximum lost share of all vessels, including those as thin as a pixel and those that hardly move. Measured: 0.028 with
 /// three views and 0.009 with four for hulls per phase, 0.011 and 0.001 for those of the whole beat.
-const MOST_LOST: f64 = 0.04;
+const MAX_LOST: f64 = 0.04;
 
 #[test]
 fn no_vessel_that_moves_is_carved_away() {
@@ -164,7 +164,7 @@ fn no_vessel_that_moves_is_carved_away() {
             assert_eq!(gone, 0, "of {shown} voxels with {views} views, per phase: {per_phase}");
             let (all, gone) = lost(&phantom, &changes, &hull, half, 0.0);
             println!("{views} views, per phase {per_phase}: {gone} of {all} lost, {:.4} of the box kept", hull.share());
-            assert!((gone as f64) < MOST_LOST * all as f64, "{gone} of {all} voxels with {views} views");
+            assert!((gone as f64) < MAX_LOST * all as f64, "{gone} of {all} voxels with {views} views");
             assert!(hull.share() < 0.05, "a hull that keeps everything loses nothing: {}", hull.share());
         }
     }

@@ -56,10 +56,10 @@ fn imperfect_angiograms_cost_little() {
     let perfect = measured(&[]);
     println!("perfect: Dice {perfect:.3}");
     assert!(perfect > 0.85, "{perfect}");
-    for (name, imperfection, most) in IMPERFECTIONS {
+    for (name, imperfection, max) in IMPERFECTIONS {
         let dice = measured(imperfection);
         println!("{name}: Dice {dice:.3}, {:.3} less", perfect - dice);
-        assert!(perfect - dice < most, "{name} ({imperfection:?}): {dice} where perfect angiograms give {perfect}");
+        assert!(perfect - dice < max, "{name} ({imperfection:?}): {dice} where perfect angiograms give {perfect}");
     }
 }
 

@@ -7,6 +7,7 @@ mod program;
 mod said;
 
 use nertca_vk::config::{Config, Preset};
+use nertca_vk::methods::dynamic_gaussians::data::GaussianData;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::dataset::Dataset;
 use said::{run, text};
@@ -29,7 +30,7 @@ fn phantom(directory: &Path, extra: &[&str]) -> PathBuf {
 fn rest_phase(data: &Path, form: &str) -> (usize, Vec<String>) {
     let config = Config::load(Some(Preset::Fast), None, &[format!("gaussians.form={form}")]).unwrap();
     let plan = Plan::new(&config, &Dataset::open(data).unwrap()).unwrap();
-    (plan.targets.unwrap().rest_phase, plan.notes)
+    (plan.data::<GaussianData>().unwrap().targets.rest_phase, plan.notes)
 }
 
 #[test]

@@ -431,8 +431,8 @@ fn ctrl_c_saves_and_exits_130() {
     Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     lines.for_each(drop);
     assert_eq!(child.wait().unwrap().code(), Some(130));
-    let saved = nertca_vk::model::checkpoint::newest(&run).unwrap();
-    assert!(nertca_vk::model::checkpoint::Checkpoint::read(&saved).unwrap().model.step > 0);
+    let saved = nertca_vk::checkpoint::newest(&run).unwrap();
+    assert!(nertca_vk::checkpoint::Checkpoint::read(&saved).unwrap().model.step > 0);
 }
 
 #[test]
@@ -554,8 +554,8 @@ fn scoring_stops_when_told_and_can_be_left_for_later() {
         signal(&child, name);
         lines.for_each(drop);
         assert_eq!(child.wait().unwrap().code(), Some(130), "{name}");
-        let saved = nertca_vk::model::checkpoint::newest(&run).unwrap();
-        assert_eq!(nertca_vk::model::checkpoint::Checkpoint::read(&saved).unwrap().model.step, 30);
+        let saved = nertca_vk::checkpoint::newest(&run).unwrap();
+        assert_eq!(nertca_vk::checkpoint::Checkpoint::read(&saved).unwrap().model.step, 30);
         assert!(!run.join("report/evaluation.json").exists(), "what was not scored has no scores");
     }
     let unscored = directory.path().join("unscored");
@@ -589,7 +589,7 @@ fn a_run_killed_at_random_ends_in_the_same_file() {
     let mut kills = 0;
     let last = killed.join("checkpoint-0000030.safetensors");
     for _ in 0..40 {
-        let saved = nertca_vk::model::checkpoint::list(&killed).is_ok_and(|found| !found.is_empty());
+        let saved = nertca_vk::checkpoint::list(&killed).is_ok_and(|found| !found.is_empty());
         let begin = if saved { vec!["--resume", "--no-eval"] } else { [&settings[..], &["--force"]].concat() };
         let (mut child, mut lines) = training(&data, &killed, &begin);
         random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);

@@ -80,7 +80,7 @@ fn exports_open_in_the_tools_people_use() {
     std::fs::copy(run.join("checkpoint-0000150.safetensors"), to("checkpoint.safetensors")).unwrap();
     std::fs::copy(run.join("report/evaluation.json"), to("evaluation.json")).unwrap();
     // The expected content of the files is computed by the library itself.
-    let model = nertca_vk::model::checkpoint::Checkpoint::read(&to("checkpoint.safetensors")).unwrap().model;
+    let model = nertca_vk::checkpoint::Checkpoint::read(&to("checkpoint.safetensors")).unwrap().model;
     let grid =
         nertca_vk::export::volumes::grid_over(&model.scene, nertca_vk::model::component::Component::Dynamic, 1.5)
             .unwrap();

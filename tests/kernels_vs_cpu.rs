@@ -4,6 +4,7 @@
 mod common;
 
 use common::{expect_agreement, expect_silence, gpu, small_config, small_dataset, tuning, uneven_dataset};
+use nertca_vk::fields::data::FieldData;
 use nertca_vk::gpu::buffer::{Memory, Operands};
 use nertca_vk::gpu::record::Recording;
 use nertca_vk::kernels::layout::Ray;
@@ -69,7 +70,7 @@ fn rays_and_depths_match() {
     assert!(plan.hull.is_some(), "this case is about the hull");
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let losses = trainer.advance(1).unwrap();
-    let plan = trainer.plan();
+    let plan = trainer.fields().unwrap().data();
     let got: Vec<Ray> = gpu.download(&trainer.fields().unwrap().forward().rays, 0, plan.setup.n_rays as usize).unwrap();
     let want = march::batch(plan, losses.last().unwrap().step - 1);
     let params: Vec<f64> = plan.params.initial(&plan.config).iter().map(|v| f64::from(*v)).collect();
@@ -156,7 +157,7 @@ fn ten_updates_across_the_delay_match() {
         while trainer.step() < 10 {
             trainer.advance(10).unwrap();
         }
-        let plan = trainer.plan();
+        let plan = trainer.fields().unwrap().data();
         for step in 0..10 {
             let (_, gradient) =
                 step::loss_and_gradient(plan, &params, step, &march::batch(plan, step), Precision::Exact);
@@ -186,10 +187,11 @@ fn hidden_pixels_are_never_drawn() {
     dataset.hidden.insert(0, blade.clone());
     let settings = ["hull.enabled=true", "hull.max_share=1", "hull.resolution=24", "train.rays=400"];
     let plan = Plan::new(&small_config("fast-mlp", &settings), &dataset).unwrap();
-    assert!(plan.setup.n_motion_list > 0 && plan.setup.n_shown_list > 0, "the case is about both lists");
+    let setup = plan.data::<FieldData>().unwrap().setup;
+    assert!(setup.n_motion_list > 0 && setup.n_shown_list > 0, "the case is about both lists");
     let mut trainer = Trainer::new(&gpu, plan, &dataset, tuning(&gpu)).unwrap();
     let step = trainer.advance(1).unwrap().last().unwrap().step - 1;
-    let plan = trainer.plan();
+    let plan = trainer.fields().unwrap().data();
     let got: Vec<Ray> = gpu.download(&trainer.fields().unwrap().forward().rays, 0, plan.setup.n_rays as usize).unwrap();
     let want = march::batch(plan, step);
     let mut of_view = [0, 0];

@@ -8,13 +8,13 @@ mod common;
 mod dicom;
 
 use glam::DVec3;
+use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::formats::images;
 use nertca_vk::formats::npy;
 use nertca_vk::formats::volume::{Volume, VolumeHints};
 use nertca_vk::formats::volume_files;
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
 use nertca_vk::import::ecg;
-use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::plan::Plan;
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::trainer::Trainer;

@@ -12,6 +12,7 @@ use common::{expect_agreement, expect_silence, gpu, run, small_config, small_dat
 use faults::{fault, instructions, less_for_greater, sum_for_product};
 use nertca_vk::config::Preset;
 use nertca_vk::error::Result;
+use nertca_vk::fields::state::FieldsState;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::DeviceState;
 use nertca_vk::kernels::stages::kernel_code;
@@ -152,7 +153,8 @@ fn training_repeats_bit_by_bit_resumes_and_follows_f32() {
     again.extend(run(&mut resumed, 120));
     assert_eq!(losses, again, "losses differ between equal runs");
     assert_eq!(whole.model().unwrap().params, resumed.model().unwrap().params);
-    assert_eq!(whole.checkpoint().unwrap().loss_scale, resumed.checkpoint().unwrap().loss_scale);
+    let scale = |trainer: &mut Trainer| trainer.checkpoint().unwrap().state::<FieldsState>().unwrap().loss_scale;
+    assert_eq!(scale(&mut whole), scale(&mut resumed));
     let f32_losses = run(&mut start(Layers::F32), 120);
     let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
     let (end, f32_end) = (mean(&losses[100..]), mean(&f32_losses[100..]));

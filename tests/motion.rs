@@ -9,12 +9,13 @@ mod python;
 
 use common::{expect_silence, gpu, small_config, small_dataset, tuning};
 use glam::{DMat3, DVec3};
+use nertca_vk::checkpoint::Checkpoint;
+use nertca_vk::fields::state::FieldsState;
 use nertca_vk::formats::npy;
 use nertca_vk::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, Units};
 use nertca_vk::gaussians::view::SplatView;
 use nertca_vk::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
 use nertca_vk::model::Model;
-use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::gaussians::{Params, exact_integral, params};
 use nertca_vk::render::renderer::Renderer;
@@ -23,6 +24,7 @@ use python::python;
 use serde_json::{Value, json};
 use std::path::Path;
 use std::process::Output;
+use std::sync::Arc;
 
 const PHASES: usize = 3;
 const UNITS: Units = Units { pixel: 0.012, strongest: 0.7 };
@@ -84,7 +86,7 @@ fn tree() -> DeformableGaussians {
             units: UNITS,
             n_phases: PHASES,
             // The cut is so far out that the truncated part is negligible.
-            setup: GaussianSetup { cut: 6.0, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() },
+            setup: GaussianSetup { cut: 6.0, min_scale: 0.4, max_scale: 3.0, ..GaussianSetup::default() },
             rows: (0..6).map(gaussian).collect(),
             step: 1,
             is_crowd: false,
@@ -127,17 +129,8 @@ fn moving_model() -> Model {
 }
 
 fn saved(model: Model, path: &Path) -> String {
-    let moments = vec![[0.0; 2]; model.param_map.len];
-    let checkpoint = Checkpoint {
-        model,
-        moments,
-        occupancy: Vec::new(),
-        loss_scale: None,
-        stopped: false,
-        last_report: Vec::new(),
-        fit: None,
-        data_fingerprint: "none".into(),
-    };
+    let fit = Arc::new(FieldsState::fresh(model.step, model.param_map.len));
+    let checkpoint = Checkpoint { model, fit, data_fingerprint: "none".into() };
     checkpoint.write(path).unwrap();
     path.to_str().unwrap().to_owned()
 }

@@ -16,10 +16,11 @@ use nertca_vk::kernels::dispatch::{Binding, dispatch};
 use nertca_vk::kernels::push;
 use nertca_vk::kernels::stages::{Build, Stage};
 use nertca_vk::kernels::tuning::Tuning;
+use nertca_vk::methods::dynamic_gaussians::selftest as deformable;
 use nertca_vk::methods::sax_nerf::selftest as sax;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
-use nertca_vk::selftest::{deformable, drawing, gaussians, repeats};
+use nertca_vk::selftest::{drawing, gaussians, repeats};
 use nertca_vk::train::trainer::Trainer;
 use shim::Poor;
 
@@ -42,7 +43,7 @@ const LEAST: Poor = Poor {
 fn open(poor: Poor) -> Result<Gpu, Error> {
     shim::impoverish(poor);
     let loader = Some(shim::loader());
-    Gpu::open(&DeviceOptions { loader, validation: true, ..DeviceOptions::default() })
+    Ok(Gpu::open(&DeviceOptions { loader, validation: true, ..DeviceOptions::default() })?)
 }
 
 #[test]
@@ -109,7 +110,7 @@ fn adopt(poor: Poor, subgroup_size_control: bool, cooperative_matrix: bool) -> R
         let adopted = Gpu::adopt(adoption, &DeviceOptions::default()).map(drop);
         device.destroy_device(None);
         instance.destroy_instance(None);
-        adopted
+        Ok(adopted?)
     }
 }
 

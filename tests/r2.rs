@@ -12,6 +12,7 @@ mod one_phase;
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use golden_file::Golden;
+use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fitting::shown::SetsFit;
@@ -29,7 +30,6 @@ use nertca_vk::methods::r2_gaussian::state::R2State;
 use nertca_vk::methods::r2_gaussian::trainer::R2Trainer;
 use nertca_vk::methods::r2_gaussian::twin::{self as reference, params};
 use nertca_vk::methods::r2_gaussian::twin_chords::Chords;
-use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::plan::Plan;
 use nertca_vk::reference::gaussians::{N_PARAMS, Params};
 use nertca_vk::reference::ssim;
@@ -157,8 +157,8 @@ fn exact_line_integrals_are_sums_along_rays() {
                 let (a, b) = (whitened(view.source - centre), whitened(view.ray(seen.mean.x + d.x, seen.mean.y + d.y)));
                 (a - a.dot(b) / b.length_squared() * b).length()
             };
-            let least = offsets.map(near).fold(f64::INFINITY, f64::min);
-            assert!((least - f64::from(setup.cut)).abs() < 1e-3, "{least} at the box's side");
+            let min = offsets.map(near).fold(f64::INFINITY, f64::min);
+            assert!((min - f64::from(setup.cut)).abs() < 1e-3, "{min} at the box's side");
         }
     }
     assert!(compared > 20, "{compared}");
@@ -166,12 +166,11 @@ fn exact_line_integrals_are_sums_along_rays() {
 
 /// State of the fit in a checkpoint.
 fn state_of(checkpoint: &Checkpoint) -> R2State {
-    checkpoint.fit.as_ref().unwrap().as_any().downcast_ref::<R2State>().unwrap().clone()
+    checkpoint.state::<R2State>().unwrap().clone()
 }
 
 fn data_of(dataset: &Dataset, config: &Config) -> R2Data {
-    let planned = Plan::new(config, dataset).unwrap().fit.unwrap();
-    planned.as_any().downcast_ref::<R2Data>().unwrap().clone()
+    Plan::new(config, dataset).unwrap().data::<R2Data>().unwrap().clone()
 }
 
 #[test]
@@ -296,9 +295,9 @@ fn gaussians_are_seen_and_drawn_as_the_closed_form_has_them() {
         let off = drawn.dynamic_integral.iter().zip(&frame.integrals).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 1e-3 * peak, "{off} of {peak}");
         assert!(drawn.static_integral.iter().all(|v| *v == 0.0) && drawn.static_max.iter().all(|v| *v == 0.0));
-        let most = drawn.total_max.iter().fold(0f32, |m, v| m.max(*v));
+        let max = drawn.total_max.iter().fold(0f32, |m, v| m.max(*v));
         // The peak of the denser Gaussian between pixels, plus a small contribution of the other.
-        assert!((0.93..0.98).contains(&most), "{most}");
+        assert!((0.93..0.98).contains(&max), "{max}");
     }
     // The fit agrees: its remaining loss is due to the affine approximation.
     let turns = turns(fit.data(), &config);
@@ -507,7 +506,7 @@ fn what_cannot_be_fitted_is_refused() {
         let mut other = saved.clone();
         let mut state = state_of(&saved);
         damage(&mut state);
-        other.fit = Some(Arc::new(state));
+        other.fit = Arc::new(state);
         Checkpoint::from_bytes(&other.to_bytes().unwrap(), "checkpoint".as_ref()).err().map(|e| e.to_string())
     };
     assert_eq!(damaged(&|_| ()), None);

@@ -5,12 +5,11 @@
 mod common;
 
 use common::{expect_silence, gpu, tuning};
+use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::config::{Config, GaussianForm, Preset};
-use nertca_vk::fitting::fit::FieldFeed;
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::gpu::device::Gpu;
-use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::views::ViewAngles;
@@ -18,7 +17,7 @@ use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Frame, Layout, Split};
 use nertca_vk::score::eval::evaluate;
-use nertca_vk::session::{Moment, NewFrame, Session, SessionOptions};
+use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions};
 use nertca_vk::train::trainer::Trainer;
 
 const PHASES: u32 = 10;
@@ -66,7 +65,7 @@ fn add(session: &Session, dataset: &Dataset, wanted: impl Fn(&Frame) -> bool) {
     for f in dataset.training().iter().filter(|f| f.split == Split::Train && wanted(f)) {
         let new = NewFrame {
             geometry: dataset.views[f.view].geometry.clone(),
-            moment: Moment::Phase(f.phase),
+            moment: FrameTime::Phase(f.phase),
             split: f.split,
             width: dataset.width,
             height: dataset.height,
@@ -166,7 +165,7 @@ fn what_was_there_is_shown_until_there_is_better() {
     };
     let plan = Plan::new(&Config::preset(Preset::Fast), &dataset).unwrap();
     let mut trainer = Trainer::start_over(&gpu, plan, &dataset, tuning(&gpu), Some(&earlier)).unwrap();
-    let Some(FieldFeed::Gaussians(feed)) = trainer.feed() else { panic!("no Gaussians") };
+    let feed = trainer.feed().gaussians.unwrap();
     let shown = || feed.lock().unwrap().1.clone();
     let mut before = 0;
     while trainer.preparation().is_some() {

@@ -8,10 +8,10 @@ mod golden_file;
 
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
 use golden_file::Golden;
+use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::config::method::MethodKind;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
-use nertca_vk::fitting::fit::FieldFeed;
 use nertca_vk::fitting::sets::seed_of_set;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::layout::SaxLevel;
@@ -22,7 +22,6 @@ use nertca_vk::methods::sax_nerf::setup::{fit_setup, outline};
 use nertca_vk::methods::sax_nerf::trainer::SaxTrainer;
 use nertca_vk::methods::sax_nerf::twin::{self as reference, Lineformer, SampledRay, entry, objective};
 use nertca_vk::model::Model;
-use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::model::component::Component;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::baked::Baked;
@@ -276,7 +275,7 @@ fn field_of(model: &Model) -> SaxField {
 
 /// State of a fit in a checkpoint, as SAX-NeRF's own type.
 fn state_of(checkpoint: &Checkpoint) -> SaxState {
-    checkpoint.fit.as_ref().unwrap().as_any().downcast_ref::<SaxState>().unwrap().clone()
+    checkpoint.state::<SaxState>().unwrap().clone()
 }
 
 /// Changes the field of a checkpoint.
@@ -379,7 +378,8 @@ fn a_model_is_drawn_sampled_and_baked_at_whole_phases() {
     let after = renderer.render(rays, 13, 11, 1).unwrap();
     assert_ne!(after.dynamic_integral, seen.dynamic_integral);
     renderer.set_model(&model).unwrap();
-    let Some(FieldFeed::Params(params)) = trainer.feed() else { panic!("no parameters") };
+    let params = trainer.feed().own;
+    assert!(!params.is_empty());
     renderer.follow_fit(&params);
     drop(params);
     assert_eq!(renderer.render(rays, 13, 11, 1).unwrap().dynamic_integral, after.dynamic_integral);
@@ -440,7 +440,7 @@ fn what_cannot_be_fitted_is_refused() {
         damaged(&|c| {
             let mut state = state_of(c);
             state.moments[2][0][1] = f32::NAN;
-            c.fit = Some(Arc::new(state));
+            c.fit = Arc::new(state);
         })
         .unwrap()
         .contains("sax.adam.v.norm1")
@@ -449,8 +449,7 @@ fn what_cannot_be_fitted_is_refused() {
     assert!(damaged(&|c| c.model.config.sax.levels = 4).unwrap().contains("sax.grid"));
     let other = SaxState { moments: state_of(&saved).moments[..2].to_vec() };
     let (field, config) = (field_of(&saved.model), config(&[]));
-    let planned = Plan::new(&config, &dataset).unwrap().fit.unwrap();
-    let data = planned.as_any().downcast_ref::<SaxData>().unwrap().clone();
+    let data = Plan::new(&config, &dataset).unwrap().data::<SaxData>().unwrap().clone();
     let error = SaxTrainer::with(&gpu, data, &config, &field, &other).map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("checkpoint"), "{error}");
     expect_silence(gpu);

@@ -5,9 +5,10 @@
 mod common;
 
 use common::{expect_silence, gpu, phantom, run, small_config, small_dataset, tuning};
+use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::{Config, Preset};
-use nertca_vk::model::checkpoint::Checkpoint;
+use nertca_vk::fields::state::FieldsState;
 use nertca_vk::plan::Plan;
 use nertca_vk::train::dry_run::dry_run;
 use nertca_vk::train::trainer::Trainer;
@@ -107,7 +108,7 @@ fn runs_resumed_around_the_delay_are_bit_equal() {
         let config = small_config(preset, &["dynamic.delay=5", "dynamic.occlusion=1e-3"]);
         let start = || Trainer::new(&gpu, Plan::new(&config, &dataset).unwrap(), &dataset, tuning(&gpu)).unwrap();
         let bits = |checkpoint: &Checkpoint| -> Vec<u32> {
-            let moments = checkpoint.moments.iter().flatten();
+            let moments = checkpoint.state::<FieldsState>().unwrap().moments.iter().flatten();
             checkpoint.model.params.iter().chain(moments).map(|v| v.to_bits()).collect()
         };
         let mut whole = start();

@@ -5,7 +5,7 @@
 mod common;
 
 use common::{expect_silence, gpu, small_config, small_dataset, tuning};
-use nertca_vk::session::{Moment, NewFrame, Session, SessionOptions, State};
+use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions, State};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -54,7 +54,7 @@ fn who_waited_for_the_end_may_start_and_train_at_once() {
     for frame in dataset.training() {
         let new = NewFrame {
             geometry: dataset.views[frame.view].geometry.clone(),
-            moment: Moment::Phase(frame.phase),
+            moment: FrameTime::Phase(frame.phase),
             split: frame.split,
             width: dataset.width,
             height: dataset.height,

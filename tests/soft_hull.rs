@@ -7,7 +7,7 @@ use common::{drop_first_view, gpu, phantom, whiten};
 use glam::DVec3;
 use nertca_vk::formats::volume::VolumeHints;
 use nertca_vk::formats::volume_files;
-use nertca_vk::plan::soft_hull::carve::{SoftHull, SoftMotion};
+use nertca_vk::methods::dynamic_gaussians::soft_hull::carve::{SoftHull, SoftMotion};
 use nertca_vk::random::{STREAM_PHOTON, normal};
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -28,8 +28,8 @@ fn truth(directory: &Path, phase: usize, hull: &SoftHull) -> Truth {
     let path = directory.join(format!("volumes/vessels-{phase:02}.nrrd"));
     let volume = volume_files::read(&path, &VolumeHints::default()).unwrap();
     let [nx, ny, nz] = volume.size;
-    let most = volume.values.iter().copied().fold(0f32, f32::max);
-    let full: Vec<bool> = volume.values.iter().map(|v| *v > 0.5 * most).collect();
+    let max = volume.values.iter().copied().fold(0f32, f32::max);
+    let full: Vec<bool> = volume.values.iter().map(|v| *v > 0.5 * max).collect();
     let thick = thick(&full, volume.size);
     let mut cells: HashMap<u32, (f64, f64)> = HashMap::new();
     for index in (0..nx * ny * nz).filter(|i| full[*i]) {
@@ -184,6 +184,6 @@ fn the_hull_as_bits_is_the_same_hull() {
         assert!(*covered && near, "column {column}, row {row}");
     }
     let volume = hull.to_volume();
-    let most = volume.values.iter().copied().fold(0f32, f32::max);
-    assert!(most >= 1.0 && most <= soft.cells.len() as f32);
+    let max = volume.values.iter().copied().fold(0f32, f32::max);
+    assert!(max >= 1.0 && max <= soft.cells.len() as f32);
 }

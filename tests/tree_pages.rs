@@ -7,9 +7,9 @@ mod known_tree;
 mod python;
 
 use known_tree::{PHASES, Trained, ok, program, text, train, trained, whole_config};
+use nertca_vk::checkpoint::newest_model;
 use nertca_vk::config::Preset;
 use nertca_vk::geometry::{CArm, Geometry, ViewRays, world_from_lps_mm};
-use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::run::score::as_trained;
 use nertca_vk::scan::dataset::Dataset;
 use python::python;

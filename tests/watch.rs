@@ -41,12 +41,12 @@ fn runs(directory: &Path) -> Vec<PathBuf> {
     let data = directory.join("phantom");
     ok(&["phantom", text(&data), "--size", "48", "--phases", &PHASES.to_string(), "--views", "3", "--no-volumes"]);
     let dataset = Dataset::open(&data).unwrap();
-    let most = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(0.0, f32::max);
+    let max = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(0.0, f32::max);
     let write = |view: usize| {
         let file = directory.join(format!("view{view}.dcm"));
         let Geometry::CArm(c_arm) = &dataset.views[view].geometry else { panic!("phantoms have C-arms") };
         let frames = dataset.training().iter().filter(|f| f.view == view);
-        let grey = |v: &f32| (65535.0 * (1.0 - 0.8 * v / most / SPAN)).round() as u16;
+        let grey = |v: &f32| (65535.0 * (1.0 - 0.8 * v / max / SPAN)).round() as u16;
         let pixels: Vec<u16> = frames.flat_map(|f| f.integrals.iter().map(grey)).collect();
         assert_eq!(pixels.len(), PHASES * 48 * 48);
         dicom::angiogram(&file, |o| {
@@ -301,7 +301,7 @@ fn interrupted_after_a_third_run(iterations: u32, far: impl Fn(&Value) -> bool) 
     watcher.interrupt();
     let (said, well) = watcher.end();
     assert!(well, "{said}");
-    let (saved, data) = (nertca_vk::model::checkpoint::list(&run).unwrap(), run.join("data"));
+    let (saved, data) = (nertca_vk::checkpoint::list(&run).unwrap(), run.join("data"));
     let (next, left) = ((saved[0].0 + 1).to_string(), Dataset::open(&data).unwrap().training_views().len());
     ok(&["train", text(&data), "-o", text(&run), "--resume", "--stop-at", &next, "--no-eval"]);
     let refused = program().args(["watch", text(&inbox), "-o", text(&run)]).output().unwrap();

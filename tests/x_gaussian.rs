@@ -11,6 +11,7 @@ mod one_phase;
 
 use common::{expect_agreement, expect_silence, gpu, relative_error, run, small_dataset, tuning, uneven_dataset};
 use golden_file::Golden;
+use nertca_vk::checkpoint::Checkpoint;
 use nertca_vk::config::{Config, Preset};
 use nertca_vk::error::Error;
 use nertca_vk::fitting::shown::SetsFit;
@@ -24,7 +25,6 @@ use nertca_vk::methods::x_gaussian::start::first_state;
 use nertca_vk::methods::x_gaussian::state::XState;
 use nertca_vk::methods::x_gaussian::trainer::XTrainer;
 use nertca_vk::methods::x_gaussian::twin::{N_PARAMS, Params, params};
-use nertca_vk::model::checkpoint::Checkpoint;
 use nertca_vk::plan::Plan;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::Dataset;
@@ -80,12 +80,11 @@ fn twin_gradient_is_the_derivative_of_the_twin_loss() {
 
 /// State of the fit in a checkpoint.
 fn state_of(checkpoint: &Checkpoint) -> XState {
-    checkpoint.fit.as_ref().unwrap().as_any().downcast_ref::<XState>().unwrap().clone()
+    checkpoint.state::<XState>().unwrap().clone()
 }
 
 fn data_of(dataset: &Dataset, config: &Config) -> XData {
-    let planned = Plan::new(config, dataset).unwrap().fit.unwrap();
-    planned.as_any().downcast_ref::<XData>().unwrap().clone()
+    Plan::new(config, dataset).unwrap().data::<XData>().unwrap().clone()
 }
 
 #[test]
@@ -350,7 +349,7 @@ fn clones_and_children_show_more() {
     state.statistics = vec![XStatistics { pull: 1.0, seen: 1.0, radius: 0.0 }; state.rows.len()];
     let extent = data.extent_mm;
     let after = |limit: f64| {
-        let x = nertca_vk::config::sections::X { size_limit: limit, weakest: 0.0, ..config.x.clone() };
+        let x = nertca_vk::config::sections::X { size_limit: limit, min_opacity: 0.0, ..config.x.clone() };
         densified(&state, data.n_sets(), &x, extent, (1, 600))
     };
     // The opacity doubles where a clone lies on its original.
@@ -389,7 +388,7 @@ fn what_cannot_be_fitted_is_refused() {
         let mut other = saved.clone();
         let mut state = state_of(&saved);
         damage(&mut state);
-        other.fit = Some(Arc::new(state));
+        other.fit = Arc::new(state);
         Checkpoint::from_bytes(&other.to_bytes().unwrap(), "checkpoint".as_ref()).err().map(|e| e.to_string())
     };
     assert_eq!(damaged(&|_| ()), None);

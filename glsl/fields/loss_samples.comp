@@ -80,7 +80,7 @@ void main() {
     float per_depth = per_ray / float(setup.n_dynamic_samples);
     float weight = 1.0 + setup.change_weight * change;
     float residual = seen.static_integral + seen.dynamic_integral - rays[r].target;
-    bool entropy_counts = seen.dynamic_integral >= setup.least_integral || change > setup.least_change;
+    bool entropy_counts = seen.dynamic_integral >= setup.min_integral || change > setup.min_change;
     float entropy_scale = entropy_counts ? per_ray : 0.0;
     // Where D is too small to be a divisor, the constant SMALLEST replaces it and has no derivative.
     float mean = seen.dynamic_integral > SMALLEST ? sums.z : 0.0;

@@ -23,22 +23,22 @@ layout(binding = 4) buffer B4 { RayOut ray_out[]; };
 #include "inc/blob_rays.glsl"
 
 // Maximum number of Gaussians of a ray among which its maximum is searched; the strongest are kept.
-const uint MOST_PEAKS = 32u;
+const uint MAX_PEAKS = 32u;
 // Number of steps of the iteration from a Gaussian's peak towards the peak of the sum.
 const uint CLIMBS = 4u;
 const float TWO_PI = 6.28318530718;
 
 // Gaussians along the ray: peak_height exp(-peak_steepness (depth - peak_at)^2 / 2).
-float peak_at[MOST_PEAKS];
-float peak_steepness[MOST_PEAKS];
-float peak_height[MOST_PEAKS];
+float peak_at[MAX_PEAKS];
+float peak_steepness[MAX_PEAKS];
+float peak_height[MAX_PEAKS];
 uint n_peaks = 0u;
 
 void keep_peak(float at, float steepness, float height) {
     uint slot = n_peaks;
-    if (slot == MOST_PEAKS) {
+    if (slot == MAX_PEAKS) {
         slot = 0u;
-        for (uint i = 1u; i < MOST_PEAKS; i++)
+        for (uint i = 1u; i < MAX_PEAKS; i++)
             if (peak_height[i] < peak_height[slot]) slot = i;
         if (height <= peak_height[slot]) return;
     } else {

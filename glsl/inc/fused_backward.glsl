@@ -24,7 +24,7 @@ const uint lower_grad_columns = (lower_columns / n + lower_shares - 1u) / lower_
 // where no tile is outside.
 const bool overhangs = bands * grad_rows * m > width || shares * grad_columns * n > upper_columns;
 const bool lower_overhangs = lower_bands * lower_rows * m > width || lower_shares * lower_grad_columns * n > lower_columns;
-const uint most_rows = grad_rows > lower_rows ? grad_rows : lower_rows;
+const uint max_rows = grad_rows > lower_rows ? grad_rows : lower_rows;
 const uint upper_tiles = grad_rows * grad_columns;
 // Input gradient, which only hidden inputs have: the columns of tiles are distributed among the subgroups; if there are more
 // subgroups than columns, the rows are divided into shares, too.
@@ -205,7 +205,7 @@ Share lower_share() {
 
 void add_weight_gradient(Share share, uint inputs_at, uint stride) {
     STEPS for (uint step = 0u; step < tile / k; step++) {
-        LEFT dz[most_rows];
+        LEFT dz[max_rows];
         [[unroll]] for (uint r = 0u; r < share.rows; r++) {
             if (is_row(share, r)) {
                 coopMatLoad(dz[r], tile_dz, step * k * dz_stride + (share.row0 + r * m) / 8u, dz_stride, COLUMNS);

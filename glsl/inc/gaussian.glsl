@@ -35,7 +35,7 @@ Projection project(Gaussian g, vec3 position, GaussianView view, GaussianSetup s
     p.row_slope = (view.row.xyz - mean.y * view.depth.xyz) / z;
     p.ray = view.d0.xyz + mean.x * view.du.xyz + mean.y * view.dv.xyz;
     p.axes = rotation_matrix(normalize(g.rotation));
-    vec3 sharp = clamp(exp(g.log_scale), setup.least_scale, setup.greatest_scale);
+    vec3 sharp = clamp(exp(g.log_scale), setup.min_scale, setup.max_scale);
     // Blurred images have equal mass in wider Gaussians.
     p.scale = setup.blur > 0.0 ? sqrt(sharp * sharp + setup.blur * setup.blur) : sharp;
     p.alpha = p.scale * (p.column_slope * p.axes);

@@ -48,7 +48,7 @@ void add_gradient(Gaussian g, Projection p, GaussianView view, GaussianSetup set
     sum.position += d_mean.x * p.column_slope + d_mean.y * p.row_slope + d_depth * view.depth.xyz;
     sum.log_density += linear.x;
     vec3 free = exp(g.log_scale);
-    vec3 inside = vec3(greaterThan(free, vec3(setup.least_scale))) * vec3(lessThan(free, vec3(setup.greatest_scale)));
+    vec3 inside = vec3(greaterThan(free, vec3(setup.min_scale))) * vec3(lessThan(free, vec3(setup.max_scale)));
     sum.log_scale += inside * (p.alpha * d_alpha + p.beta * d_beta + linear.x);
     mat3 d_axes;
     for (int k = 0; k < 3; k++)

@@ -28,8 +28,8 @@ struct GaussianSetup {
     uint width;                 // Number of columns of an image.
     uint height;                // Number of rows of an image.
     float cut;                  // Distance in standard deviations at which a Gaussian is cut.
-    float least_scale;          // Minimum of a standard deviation.
-    float greatest_scale;       // Maximum of a standard deviation.
+    float min_scale;          // Minimum of a standard deviation.
+    float max_scale;       // Maximum of a standard deviation.
     float fixed_point;          // Number of units of the integer sums per unit of line integral.
     float bend;                 // Residual at which the loss changes from quadratic to linear.
     float loss_weight;          // Factor of the loss.

@@ -41,7 +41,7 @@ struct Setup {
     float static_gain;          // Gain of the static field, see `static_shift`.
     float dynamic_shift;        // Shift of the dynamic field: sigma_s = gain * softplus(feature + shift).
     float dynamic_gain;         // Gain of the dynamic field, see `dynamic_shift`.
-    float least_slope;          // Minimum derivative of sigma_s by its feature where a ray needs more; 0: that of the softplus.
+    float min_slope;          // Minimum derivative of sigma_s by its feature where a ray needs more; 0: that of the softplus.
     float static_weight;        // Weight of a squared residual: 1 / (mean integral)^2, or 1 without normalisation.
     float dynamic_weight;       // Weight of a squared residual of the dynamic field.
     float robust_scale;         // Residual of the dynamic field above which the loss is linear; 0: the loss is quadratic.
@@ -68,8 +68,8 @@ struct Setup {
     uint two_networks;          // Flag: 1 if the static field is a network, too, with gradients per sample (`loss_samples`).
     uint along_axis;            // Flag: 1 if path lengths are along the source-detector axis instead of the ray.
     float change_weight;        // Factor of a ray's change in its weight 1 + change_weight * ray.change.
-    float least_change;         // Threshold of a ray's change above which its entropy counts for any integral.
-    float least_integral;       // Threshold of the dynamic field's integral from which a ray's entropy counts.
+    float min_change;         // Threshold of a ray's change above which its entropy counts for any integral.
+    float min_integral;       // Threshold of the dynamic field's integral from which a ray's entropy counts.
     uint stop_after;            // Number of iterations after which a vanished entropy stops training; 0: never.
     float stop_below;           // Threshold below which the entropy counts as vanished.
 };

@@ -4,7 +4,7 @@
 #include "inc/lineformer_layout.glsl"
 
 const float LEAK = 0.01;
-const float LEAST_VARIANCE = 1e-5;
+const float MIN_VARIANCE = 1e-5;
 const uint WIDTH4 = 8u;         // vec4 of a vector of 32 numbers
 
 uint place_of(uint vector, uint i, uint s) { return (WIDTH4 * vector + i) * push.capacity + s; }
@@ -34,5 +34,5 @@ vec2 moments_of(vec4 x[WIDTH4]) {
     [[unroll]] for (uint i = 0u; i < WIDTH4; i++) sum += x[i];
     float mean = dot(sum, vec4(1.0 / 32.0));
     [[unroll]] for (uint i = 0u; i < WIDTH4; i++) squares += (x[i] - mean) * (x[i] - mean);
-    return vec2(mean, inversesqrt(dot(squares, vec4(1.0 / 32.0)) + LEAST_VARIANCE));
+    return vec2(mean, inversesqrt(dot(squares, vec4(1.0 / 32.0)) + MIN_VARIANCE));
 }

@@ -9,7 +9,7 @@
 // has the slopes at this border.
 const float SLOPES_END = 1.3;
 // Minimum squared difference of a splat's variances along its axes, pixels^4, in the computation of its radius.
-const float LEAST_SPREAD = 0.1;
+const float MIN_SPREAD = 0.1;
 // Threshold below which softplus equals the exponential function in f32.
 const float LOWEST = -80.0;
 
@@ -28,13 +28,13 @@ vec3 share_of_range(R2Gaussian g) {
 }
 
 vec3 scale_of(R2Gaussian g, GaussianSetup setup) {
-    return setup.least_scale + (setup.greatest_scale - setup.least_scale) * share_of_range(g);
+    return setup.min_scale + (setup.max_scale - setup.min_scale) * share_of_range(g);
 }
 
 // Derivatives of the scales' logarithms with respect to the stored numbers.
 vec3 scale_slope(R2Gaussian g, GaussianSetup setup) {
     vec3 share = share_of_range(g);
-    return (setup.greatest_scale - setup.least_scale) * share * (1.0 - share) / scale_of(g, setup);
+    return (setup.max_scale - setup.min_scale) * share * (1.0 - share) / scale_of(g, setup);
 }
 
 struct R2Projection {
@@ -78,7 +78,7 @@ R2Projection project_r2(R2Gaussian g, GaussianView view, GaussianSetup setup) {
     float volume = p.scale.x * p.scale.y * p.scale.z;
     p.splat.amplitude = density_of(g) * SQRT_TWO_PI * volume * length(p.ray) * view.d0.w / (z * z * sqrt(det));
     float half_sum = 0.5 * (variance.x + variance.z);
-    float largest = half_sum + sqrt(max(LEAST_SPREAD, half_sum * half_sum - det));
+    float largest = half_sum + sqrt(max(MIN_SPREAD, half_sum * half_sum - det));
     p.splat.half_box = vec2(ceil(setup.cut * sqrt(largest)));
     // A Gaussian behind the source is not visible.
     if (!(z > 0.0)) p.splat.half_box = vec2(-1.0);

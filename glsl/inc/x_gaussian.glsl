@@ -10,7 +10,7 @@
 // has the slopes at this border.
 const float SLOPES_END = 1.3;
 // Minimum squared difference of a splat's variances along its axes, pixels^4, in the computation of its radius.
-const float LEAST_SPREAD = 0.1;
+const float MIN_SPREAD = 0.1;
 // Variance that is added to each splat, pixels^2.
 const float LOW_PASS = 0.3;
 // Radius of a splat in standard deviations along its longest axis.
@@ -20,11 +20,11 @@ const uint TILE = 16u;
 // Sort key of a Gaussian that is not visible, behind all depths.
 const uint UNSEEN = 0xffffffffu;
 // Maximum opacity of a Gaussian in a pixel.
-const float MOST_OPAQUE = 0.99;
+const float MAX_OPAQUE = 0.99;
 // Opacity below which a Gaussian is not drawn in a pixel.
-const float LEAST_ALPHA = 1.0 / 255.0;
+const float MIN_ALPHA = 1.0 / 255.0;
 // Transmittance below which the sum of a pixel ends.
-const float LEAST_LIGHT = 1e-4;
+const float MIN_LIGHT = 1e-4;
 
 struct XProjection {
     Splat splat;
@@ -65,7 +65,7 @@ XProjection project_x(XGaussian g, GaussianView view, GaussianSetup setup, XSetu
     p.splat.conic = vec3(variance.z, -variance.y, variance.x) / det;
     p.splat.amplitude = sigmoid(g.opacity);
     float half_sum = 0.5 * (variance.x + variance.z);
-    float largest = half_sum + sqrt(max(LEAST_SPREAD, half_sum * half_sum - det));
+    float largest = half_sum + sqrt(max(MIN_SPREAD, half_sum * half_sum - det));
     p.splat.half_box = vec2(ceil(REACH * sqrt(largest)));
     // A Gaussian at the source or behind it is not visible.
     if (!(z > x_setup.nearest)) p.splat.half_box = vec2(-1.0);
@@ -94,8 +94,8 @@ struct XAlpha {
 // `d` is the vector from the centre to the pixel.
 XAlpha alpha_of(vec3 conic, float opacity, vec2 d) {
     float alpha = opacity * falloff(-HALF_LOG2_E * conic, d);
-    if (alpha > MOST_OPAQUE) return XAlpha(MOST_OPAQUE, false);
-    return XAlpha(alpha < LEAST_ALPHA ? 0.0 : alpha, true);
+    if (alpha > MAX_OPAQUE) return XAlpha(MAX_OPAQUE, false);
+    return XAlpha(alpha < MIN_ALPHA ? 0.0 : alpha, true);
 }
 
 // Gradient with respect to position, opacity (in `log_density`), logarithms of scales, and raw quaternion. With h = dL/d(ln

@@ -38,7 +38,7 @@ void add(uint j, uint place, vec2 at, inout Pixel pixel) {
     float alpha = alpha_of(conics[j], places[j].z, at - places[j].xy).alpha;
     if (alpha == 0.0) return;
     float left = pixel.left * (1.0 - alpha);
-    if (left < LEAST_LIGHT) {
+    if (left < MIN_LIGHT) {
         pixel.ended = true;
         return;
     }

@@ -19,15 +19,15 @@ const STEPS: [usize; 2] = [2, 3];
 const TEMPER: f64 = 10.0;
 /// A correction must remove at least this share of the squared residual at phases it was not fitted to; chance removes
 /// less.
-pub const LEAST_GAIN: f64 = 0.02;
+pub const MIN_GAIN: f64 = 0.02;
 /// The squared residual must also drop by at least this share of the profiles' squares: without errors and noise it varies
 /// by less. An error of 0.03 pixels adds this much.
-pub const LEAST_DROP: f64 = 5e-4;
+pub const MIN_DROP: f64 = 5e-4;
 /// Where vessels are cut off, breathing must remove this share: displacements of frames compensate for cut-off vessels more
 /// than positions of views do.
 pub const LARGE_GAIN: f64 = 0.3;
 /// Minimum number of phases that can be split into two halves.
-pub const LEAST_PHASES: usize = 4;
+pub const MIN_PHASES: usize = 4;
 
 /// Kind of correction of the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -112,11 +112,11 @@ pub fn validate(observed: &Observed, correction: Correction) -> Validated {
 }
 
 /// Returns the candidate that predicts unseen phases best. A later candidate must be better than those before it by the
-/// share `gain` of the squared residual, and by [`LEAST_DROP`].
+/// share `gain` of the squared residual, and by [`MIN_DROP`].
 pub fn best(residuals: &[f64], gain: impl Fn(usize) -> f64) -> usize {
     let mut best = 0;
     for (k, residual) in residuals.iter().enumerate() {
-        if *residual < (1.0 - gain(k)) * residuals[best] && residuals[best] - residual > LEAST_DROP {
+        if *residual < (1.0 - gain(k)) * residuals[best] && residuals[best] - residual > MIN_DROP {
             best = k;
         }
     }
@@ -137,7 +137,7 @@ mod tests {
 
     #[test]
     fn a_correction_must_be_clearly_better() {
-        let gain = |_| LEAST_GAIN;
+        let gain = |_| MIN_GAIN;
         assert_eq!(best(&[1.0, 0.99, 0.985], gain), 0);
         assert_eq!(best(&[1.0, 0.5, 0.495], gain), 1);
         assert_eq!(best(&[1.0, 0.5, 0.4], gain), 2);

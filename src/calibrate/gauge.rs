@@ -2,7 +2,7 @@
 //! minimum corrections are chosen; where the truth is known, the motion can be found.
 
 use crate::calibrate::linear::Symmetric;
-use crate::calibrate::pose::{Poses, Stand};
+use crate::calibrate::pose::{Poses, StatedView};
 use crate::geometry::{ViewRays, lps_mm_from_world, world_from_lps_mm};
 use glam::{DAffine3, DMat3, DVec3};
 
@@ -28,7 +28,7 @@ impl Across {
 /// Removes the common motion from the corrections, so that they are the minimum ones that make the views agree: the mean
 /// primary angle, the translation common to all views and, with `breathing`, the common translation of each phase. The
 /// consistency of the images does not change.
-pub fn fix(stands: &[Stand], poses: &mut Poses, breathing: bool) {
+pub fn fix(stands: &[StatedView], poses: &mut Poses, breathing: bool) {
     let n = stands.len() as f64;
     let mean = poses.views.iter().map(|p| p.angles_deg[0]).sum::<f64>() / n;
     // The primary angle turns about -z.

@@ -1,6 +1,6 @@
 //! The evidence of moving vessels in the angiograms, as far as the self-calibration needs it.
 
-use crate::calibrate::pose::Stand;
+use crate::calibrate::pose::StatedView;
 use crate::calibrate::profiles::{Moving, Views};
 use crate::evidence::ratios::ViewEvidence;
 use crate::evidence::series::Series;
@@ -12,7 +12,7 @@ use rayon::prelude::*;
 /// Number of pixels that longer sides are binned to, approximately.
 const SIDE: usize = 128;
 /// Minimum side of a view's binned images, pixels.
-const LEAST_SIDE: usize = 32;
+const MIN_SIDE: usize = 32;
 /// Log-likelihood ratio of "a vessel is here" from which, at any phase, a pixel takes part; near the maximum of a single
 /// view.
 const LIKELY: f32 = 2.0;
@@ -33,7 +33,7 @@ pub struct Observed {
     /// Indices into [`Dataset::views`].
     pub views: Vec<usize>,
     /// Geometry of each view.
-    pub stands: Vec<Stand>,
+    pub stands: Vec<StatedView>,
     /// Pixels of the dataset along the side of one binned pixel.
     pub factor: usize,
     /// Positive differences from the static background, for the coarse stages.
@@ -76,8 +76,8 @@ fn binned_hidden(hidden: &[bool], width: usize, factor: usize) -> Vec<bool> {
 /// Number of pixels along one binned pixel that makes the training images about [`SIDE`] wide, and none too small.
 fn factor(dataset: &Dataset) -> usize {
     let sides = || dataset.training_views().into_iter().flat_map(|view| dataset.views[view].size);
-    let (least, most) = (sides().min().unwrap_or(0), sides().max().unwrap_or(0));
-    ((most as f64 / SIDE as f64).round() as usize).min(least / LEAST_SIDE).max(1)
+    let (min, max) = (sides().min().unwrap_or(0), sides().max().unwrap_or(0));
+    ((max as f64 / SIDE as f64).round() as usize).min(min / MIN_SIDE).max(1)
 }
 
 /// Bins the training frames.
@@ -104,8 +104,8 @@ fn coarsened(dataset: &Dataset, factor: usize) -> Dataset {
 }
 
 /// Evidence of one view.
-struct Seen {
-    stand: Stand,
+struct ObservedView {
+    stand: StatedView,
     /// Pixels that change.
     mask: Vec<bool>,
     /// Pixels that change, with a margin.
@@ -123,16 +123,16 @@ struct Seen {
 
 /// `[phase]`: pixels that are likely to show a vessel and change clearly; a moving heart or diaphragm is wider.
 fn shown(evidence: &ViewEvidence) -> Vec<Option<Vec<bool>>> {
-    let least = SHOWN_SHARE * evidence.background.strongest;
+    let min = SHOWN_SHARE * evidence.background.strongest;
     let phases = evidence.ratios.iter().zip(&evidence.background.changes).map(|(ratio, change)| {
         let pixels = ratio.as_ref()?.values.iter().zip(&change.as_ref()?.values);
-        Some(pixels.map(|(ratio, change)| *ratio > LIKELY && *change > least).collect())
+        Some(pixels.map(|(ratio, change)| *ratio > LIKELY && *change > min).collect())
     });
     phases.collect()
 }
 
-impl Seen {
-    fn new(data: &Dataset, series: &Series) -> Seen {
+impl ObservedView {
+    fn new(data: &Dataset, series: &Series) -> ObservedView {
         let evidence = ViewEvidence::new(series).on_canvas(data.canvas());
         let level = &evidence.background.level.values;
         let visible: Vec<bool> = (0..data.n_pixels()).map(|p| data.shows(series.view, p)).collect();
@@ -150,12 +150,12 @@ impl Seen {
         for pixels in shown.iter_mut().flatten() {
             pixels.iter_mut().zip(&visible).for_each(|(s, v)| *s &= *v);
         }
-        let stand = Stand::new(&view.geometry, &view.rays);
+        let stand = StatedView::new(&view.geometry, &view.rays);
         let values = series.seen().flat_map(|image| &image.values);
-        let [least, most] = values.fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
-        let change = f64::from(evidence.background.strongest) / f64::from(most - least).max(f64::MIN_POSITIVE);
+        let [min, max] = values.fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
+        let change = f64::from(evidence.background.strongest) / f64::from(max - min).max(f64::MIN_POSITIVE);
         let noise = evidence.background.noise.values;
-        let mut seen = Seen { stand, mask, wide_mask, above, shown, visible, noise, change, at_border: 0.0 };
+        let mut seen = ObservedView { stand, mask, wide_mask, above, shown, visible, noise, change, at_border: 0.0 };
         seen.at_border = seen.share_at_border(&border(&seen.visible, [data.width, data.height]));
         seen
     }
@@ -190,12 +190,12 @@ impl Observed {
         let size = [data.width, data.height];
         let n_phases = data.n_phases as usize;
         let series = Series::of(&data);
-        let seen: Vec<Seen> = series.par_iter().map(|s| Seen::new(&data, s)).collect();
-        let positive = |s: &Seen| {
+        let seen: Vec<ObservedView> = series.par_iter().map(|s| ObservedView::new(&data, s)).collect();
+        let positive = |s: &ObservedView| {
             let above = s.above.iter().map(|y| Some(y.as_ref()?.iter().map(|v| v.max(0.0)).collect()));
             Moving::new(s.stand.clone(), size, &s.mask, &above.collect::<Vec<_>>())
         };
-        let signed = |s: &Seen| Moving::new(s.stand.clone(), size, &s.wide_mask, &s.above);
+        let signed = |s: &ObservedView| Moving::new(s.stand.clone(), size, &s.wide_mask, &s.above);
         Observed {
             views: series.iter().map(|s| s.view).collect(),
             coarse: Views::new(seen.iter().map(positive).collect(), n_phases),
@@ -222,7 +222,7 @@ impl Observed {
         let mut other = self.clone();
         for (stand, view) in other.stands.iter_mut().zip(&self.views) {
             let view = &dataset.views[*view];
-            *stand = Stand::new(&view.geometry, &view.rays.binned(self.factor));
+            *stand = StatedView::new(&view.geometry, &view.rays.binned(self.factor));
         }
         let shift = |view: usize, t: usize| {
             let frame = dataset.training().iter().find(|f| f.view == view && f.phase as usize == t);

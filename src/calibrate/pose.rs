@@ -5,7 +5,7 @@ use glam::{DMat3, DVec3};
 
 /// A view with its stated geometry.
 #[derive(Debug, Clone)]
-pub struct Stand {
+pub struct StatedView {
     /// Rays of the images, as stated.
     pub rays: ViewRays,
     angles_deg: [f64; 2],
@@ -45,15 +45,15 @@ impl Poses {
     }
 }
 
-impl Stand {
+impl StatedView {
     /// Creates a view whose images have these rays. A projection matrix is treated as a C-arm with the same viewing
     /// direction.
-    pub fn new(geometry: &Geometry, rays: &ViewRays) -> Stand {
+    pub fn new(geometry: &Geometry, rays: &ViewRays) -> StatedView {
         let (angles_deg, table) = match geometry {
             Geometry::CArm(c) => ([c.primary_deg, c.secondary_deg], world_from_lps_mm(DVec3::from_array(c.table_mm))),
             Geometry::Matrix(_) => (angles_deg_of(rays.axis()), DVec3::ZERO),
         };
-        Stand { rays: rays.clone(), angles_deg, axes: rotation(angles_deg[0], angles_deg[1]), table }
+        StatedView { rays: rays.clone(), angles_deg, axes: rotation(angles_deg[0], angles_deg[1]), table }
     }
 
     /// Displacement of the patient by the table, world units.
@@ -130,7 +130,7 @@ mod tests {
     fn a_correction_is_a_c_arm() {
         let stated = Geometry::CArm(c_arm());
         let pose = ViewPose { angles_deg: [0.7, -0.4], shift: DVec3::new(0.01, -0.02, 0.03) };
-        let stand = Stand::new(&stated, &stated.rays(64, 48).unwrap());
+        let stand = StatedView::new(&stated, &stated.rays(64, 48).unwrap());
         let corrected = stated.corrected(pose.angles_deg, pose.shift);
         let (want, got) = (corrected.rays(64, 48).unwrap(), stand.corrected_rays(&pose, DVec3::ZERO));
         for (a, b) in numbers(&want).iter().zip(numbers(&got)) {

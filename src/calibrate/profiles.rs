@@ -6,7 +6,7 @@
 //! `b = n2.d` across; its weight is `solid angle / cos^2 latitude`. All slopes of a profile follow from three sums over the
 //! pixels of a plane: of the weight, and of the weight times `s a / (a^2 + b^2)` and `s b / (a^2 + b^2)`.
 
-use crate::calibrate::pose::{Poses, Stand};
+use crate::calibrate::pose::{Poses, StatedView};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -15,7 +15,7 @@ use std::ops::Range;
 const SHORTEST_BASELINE: f64 = 0.1;
 /// Minimum distance between baseline and isocentre, as a share of the distance from source to isocentre. The baseline of
 /// opposite views runs through the heart, where planes cannot be told apart.
-const LEAST_DISTANCE: f64 = 0.35;
+const MIN_DISTANCE: f64 = 0.35;
 /// Bins per pixel.
 const BINS_PER_PIXEL: f64 = 2.0;
 /// Reach of a kernel in standard deviations.
@@ -38,7 +38,7 @@ pub struct Pixel {
 #[derive(Debug, Clone)]
 pub struct Moving {
     /// Geometry of the view.
-    pub stand: Stand,
+    pub stand: StatedView,
     /// Columns and rows of its images.
     pub size: [usize; 2],
     /// Pixels that take part.
@@ -49,7 +49,7 @@ pub struct Moving {
 
 impl Moving {
     /// Creates the data from a view's images, within `mask`.
-    pub fn new(stand: Stand, size: [usize; 2], mask: &[bool], images: &[Option<Vec<f32>>]) -> Moving {
+    pub fn new(stand: StatedView, size: [usize; 2], mask: &[bool], images: &[Option<Vec<f32>>]) -> Moving {
         let [d0, du, dv] = stand.rays.direction;
         let area = d0.dot(du.cross(dv)).abs();
         let kept: Vec<usize> = (0..mask.len()).filter(|p| mask[*p]).collect();
@@ -243,12 +243,12 @@ impl Views {
 }
 
 /// Tells whether a pair's baseline distinguishes planes of the heart.
-fn tells(a: &Stand, b: &Stand) -> bool {
+fn tells(a: &StatedView, b: &StatedView) -> bool {
     let (from, to) = (a.rays.source(), b.rays.source());
     let sod = 0.5 * (a.sod() + b.sod());
     let Some(along) = (to - from).try_normalize() else { return false };
     let distance = (from - from.dot(along) * along).length();
-    (to - from).length() > SHORTEST_BASELINE * sod && distance > LEAST_DISTANCE * sod
+    (to - from).length() > SHORTEST_BASELINE * sod && distance > MIN_DISTANCE * sod
 }
 
 /// Sums over the pixels of each plane: of the weight, and of the weight times `s a / (a^2 + b^2)` and `s b / (a^2 + b^2)`.

@@ -1,6 +1,6 @@
 //! Views of known blobs, for tests.
 
-use crate::calibrate::pose::Stand;
+use crate::calibrate::pose::StatedView;
 use crate::calibrate::profiles::{Moving, Views};
 use crate::geometry::{CArm, Geometry};
 use glam::DVec3;
@@ -37,7 +37,7 @@ pub(super) fn views(angles: &[(f64, f64)]) -> Views {
             Some((0..SIZE[0] * SIZE[1]).map(value).collect::<Vec<f32>>())
         };
         let images: Vec<_> = (0..PHASES).map(image).collect();
-        Moving::new(Stand::new(&geometry, &rays), SIZE, &vec![true; SIZE[0] * SIZE[1]], &images)
+        Moving::new(StatedView::new(&geometry, &rays), SIZE, &vec![true; SIZE[0] * SIZE[1]], &images)
     };
     Views::new(angles.iter().enumerate().map(view).collect(), PHASES)
 }

@@ -11,7 +11,7 @@ const DEPTHS_PER_SIDE: f64 = 0.5;
 
 /// Evidence of a view for a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Look {
+enum Evidence {
     /// The point is beyond the image's edge, or hidden.
     Unseen,
     /// A vessel is possible at the point.
@@ -21,7 +21,7 @@ enum Look {
 }
 
 /// Vessels of a view at a phase.
-struct Sight<'a> {
+struct ViewVessels<'a> {
     source: DVec3,
     inverse: DMat3,
     size: [usize; 2],
@@ -29,19 +29,19 @@ struct Sight<'a> {
     vessels: Vec<bool>,
 }
 
-impl Sight<'_> {
-    fn look(&self, point: DVec3) -> Look {
+impl ViewVessels<'_> {
+    fn look(&self, point: DVec3) -> Evidence {
         let h = self.inverse * (point - self.source);
         let (i, j) = ((h.x / h.z).round(), (h.y / h.z).round());
         let inside = h.z > 0.0 && i >= 0.0 && j >= 0.0 && i < self.size[0] as f64 && j < self.size[1] as f64;
         if !inside {
-            return Look::Unseen;
+            return Evidence::Unseen;
         }
         let pixel = j as usize * self.size[0] + i as usize;
         match (self.visible[pixel], self.vessels[pixel]) {
-            (false, _) => Look::Unseen,
-            (true, true) => Look::Vessel,
-            (true, false) => Look::Nothing,
+            (false, _) => Evidence::Unseen,
+            (true, true) => Evidence::Vessel,
+            (true, false) => Evidence::Nothing,
         }
     }
 }
@@ -50,7 +50,7 @@ impl Sight<'_> {
 pub(super) struct Others<'a> {
     /// Columns and rows of the images.
     pub(super) size: [usize; 2],
-    sights: Vec<Sight<'a>>,
+    sights: Vec<ViewVessels<'a>>,
 }
 
 impl<'a> Others<'a> {
@@ -67,7 +67,7 @@ impl<'a> Others<'a> {
         let sight = |v: usize| {
             let rays = rays(v);
             let basis = DMat3::from_cols(rays.direction[1], rays.direction[2], rays.direction[0]);
-            Some(Sight {
+            Some(ViewVessels {
                 source: rays.source(),
                 inverse: basis.inverse(),
                 size,
@@ -75,7 +75,7 @@ impl<'a> Others<'a> {
                 vessels: widened(observed.shown[v][phase].as_ref()?, size, near),
             })
         };
-        let sights: Vec<Sight> = (0..observed.views.len()).filter(|v| *v != view).filter_map(sight).collect();
+        let sights: Vec<ViewVessels> = (0..observed.views.len()).filter(|v| *v != view).filter_map(sight).collect();
         (!sights.is_empty()).then_some(Others { size, sights })
     }
 
@@ -90,8 +90,8 @@ impl<'a> Others<'a> {
             let mut vessel = false;
             let contradicted = self.sights.iter().any(|sight| {
                 let look = sight.look(point);
-                vessel |= look == Look::Vessel;
-                look == Look::Nothing
+                vessel |= look == Evidence::Vessel;
+                look == Evidence::Nothing
             });
             vessel && !contradicted
         })

@@ -408,7 +408,7 @@ pub fn misfit(views: &Views, poses: &Poses, blur: f64, phases: &[usize]) -> Misf
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibrate::pose::Stand;
+    use crate::calibrate::pose::StatedView;
     use crate::calibrate::samples::{ANGLES, PHASES, views};
 
     fn stage() -> Stage {
@@ -484,7 +484,7 @@ mod tests {
     fn a_common_motion_changes_no_residual() {
         let views = views(&ANGLES);
         let poses = off(3);
-        let stands: Vec<Stand> = views.views.iter().map(|v| v.stand.clone()).collect();
+        let stands: Vec<StatedView> = views.views.iter().map(|v| v.stand.clone()).collect();
         let mut fixed = poses.clone();
         crate::calibrate::gauge::fix(&stands, &mut fixed, true);
         let moved = (poses.views[0].shift - fixed.views[0].shift).length();
@@ -494,8 +494,8 @@ mod tests {
             let (before, after) =
                 (residuals(&views, pair, &poses, &unknowns), residuals(&views, pair, &fixed, &unknowns));
             for (a, b) in before.iter().zip(&after) {
-                let most = a.value.iter().copied().fold(0.0, |m: f64, v| m.max(v.abs()));
-                assert!(most > 0.0 && a.value.iter().zip(&b.value).all(|(a, b)| (a - b).abs() < 1e-9 * most));
+                let max = a.value.iter().copied().fold(0.0, |m: f64, v| m.max(v.abs()));
+                assert!(max > 0.0 && a.value.iter().zip(&b.value).all(|(a, b)| (a - b).abs() < 1e-9 * max));
             }
         }
         let mean: f64 = fixed.views.iter().map(|p| p.angles_deg[0]).sum();

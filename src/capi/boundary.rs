@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Once;
 
 /// Number of texts kept per thread; beyond it, texts of destroyed handles are discarded.
-const MOST_TEXTS: usize = 64;
+const MAX_TEXTS: usize = 64;
 
 thread_local! {
     /// Text of the last failure by handle; key 0 has the last failure of any handle.
@@ -24,7 +24,7 @@ fn remember(handle: usize, text: &str) {
     // A thread that is ending has no texts.
     let _ = LAST.try_with(|last| {
         let mut last = last.borrow_mut();
-        if last.len() >= MOST_TEXTS {
+        if last.len() >= MAX_TEXTS {
             last.retain(|handle, _| *handle == 0 || handles::exists(*handle));
         }
         last.insert(handle, text.to_owned());

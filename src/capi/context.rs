@@ -7,6 +7,7 @@ use crate::capi::options::{Options, text};
 use crate::capi::status::{Failure, NERTCA_ERROR_BUSY, Outcome, copy_text, nertca_status};
 use crate::capi::types::{nertca_log, nertca_vulkan, read};
 use crate::gpu::device::{Adoption, DeviceOptions, Gpu, QueueLock, list_devices};
+use crate::kernels::cache::save_pipeline_cache;
 use crate::kernels::tuning::{Layers, Tuning};
 use ash::vk::{self, Handle};
 use std::ffi::{c_char, c_void};
@@ -333,7 +334,7 @@ pub unsafe extern "C" fn nertca_context_destroy(context: *mut nertca_context) ->
             return Err(Failure::new(NERTCA_ERROR_BUSY, problem));
         }
         let context = handles::remove::<Context, nertca_context>(context)?;
-        if let Some(Err(error)) = context.gpu.as_ref().map(Gpu::save_pipeline_cache) {
+        if let Some(Err(error)) = context.gpu.as_ref().map(save_pipeline_cache) {
             // Without the cache, the next start only takes longer.
             tracing::dispatcher::with_default(&context.log, || tracing::warn!("{error}"));
         }

@@ -19,7 +19,7 @@ pub const NERTCA_LOG_INFO: u32 = 3;
 struct Callback {
     call: unsafe extern "C" fn(u32, *const c_char, *mut c_void),
     user: *mut c_void,
-    most: u32,
+    max: u32,
 }
 
 // SAFETY: the header requires a callback and a pointer that may be used on any thread.
@@ -34,7 +34,7 @@ pub(super) fn dispatch(log: Option<nertca_log>) -> Outcome<Dispatch> {
         return Err(Failure::argument("log.level", format!("{} is not in the accepted range, 1 to 3", log.level)));
     }
     let Some(call) = log.callback else { return Err(Failure::argument("log.callback", "is null")) };
-    Ok(Dispatch::new(Callback { call, user: log.user, most: log.level }))
+    Ok(Dispatch::new(Callback { call, user: log.user, max: log.level }))
 }
 
 fn severity(level: Level) -> u32 {
@@ -67,7 +67,7 @@ impl Subscriber for Callback {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
         metadata.is_event()
             && metadata.target().starts_with("nertca") | (metadata.target() == "vulkan")
-            && severity(*metadata.level()) <= self.most
+            && severity(*metadata.level()) <= self.max
     }
 
     fn new_span(&self, _: &Attributes<'_>) -> Id {

@@ -8,9 +8,9 @@ use crate::capi::status::{
     Failure, NERTCA_ERROR_BUFFER, NERTCA_ERROR_BUSY, NERTCA_OK, Outcome, copy_text, nertca_status,
 };
 use crate::capi::types::{nertca_frame, nertca_progress, read, state_code, write};
+use crate::checkpoint::Checkpoint;
 use crate::choice::Choice;
 use crate::config::{Config, Preset};
-use crate::model::checkpoint::Checkpoint;
 use crate::scan::gating::RPeaks;
 use crate::session::{Progress, Session, SessionOptions};
 use crate::trees::tree::BeatTree;

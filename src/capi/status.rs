@@ -56,6 +56,12 @@ impl Failure {
     }
 }
 
+impl From<crate::gpu::error::Error> for Failure {
+    fn from(error: crate::gpu::error::Error) -> Failure {
+        Error::from(error).into()
+    }
+}
+
 impl From<Error> for Failure {
     fn from(error: Error) -> Failure {
         let status = match &error {

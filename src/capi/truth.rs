@@ -11,7 +11,7 @@ use glam::DVec3;
 use std::collections::BTreeMap;
 
 /// Maximum number of points and of branches of a true tree.
-const MOST_ELEMENTS: usize = 1 << 24;
+const MAX_ELEMENTS: usize = 1 << 24;
 
 /// Sets the true vessel voxels at the phase of `grid`, in place of those set before for that phase. `vessels` has one byte for
 /// each point of the grid, left fastest, non-zero inside a vessel; the grid's component is ignored.
@@ -78,7 +78,7 @@ pub unsafe extern "C" fn nertca_reconstruction_set_true_tree(
 /// The arrays must be readable for as many elements as the struct says.
 unsafe fn lines(tree: &nertca_tree) -> Outcome<BTreeMap<u32, Vec<TrueLine>>> {
     for (name, count) in [("branches", tree.branches), ("points", tree.points)] {
-        if count > MOST_ELEMENTS {
+        if count > MAX_ELEMENTS {
             return Err(Failure::argument(name, format!("{count} exceeds the maximum, 2^24")));
         }
     }

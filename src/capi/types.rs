@@ -3,7 +3,7 @@
 use crate::capi::status::{Failure, Outcome};
 use crate::geometry::{CArm, Geometry, Matrix};
 use crate::scan::dataset::{Intensity, Split};
-use crate::session::{Moment, NewFrame, State};
+use crate::session::{FrameTime, NewFrame, State};
 use std::ffi::{c_char, c_void};
 
 /// Unsigned 8-bit pixels.
@@ -611,7 +611,7 @@ impl nertca_frame {
         Ok(NewFrame {
             // SAFETY: the header requires that the geometry's matrix is null or has 12 numbers.
             geometry: unsafe { self.geometry.geometry() }?,
-            moment: u32::try_from(self.phase).map_or(Moment::TimeS(self.time_s), Moment::Phase),
+            moment: u32::try_from(self.phase).map_or(FrameTime::TimeS(self.time_s), FrameTime::Phase),
             split: match self.split {
                 NERTCA_SPLIT_TRAIN => Split::Train,
                 NERTCA_SPLIT_VALIDATION => Split::Validation,

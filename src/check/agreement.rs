@@ -8,18 +8,18 @@ use serde::Serialize;
 
 /// Sharpness of the comparison: blur of the profiles, in bins of half a pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Look {
+pub enum Sharpness {
     /// Sharp enough to tell a turned image from an upright one.
     Fine,
     /// So blurred that an error of geometry hardly matters.
     Coarse,
 }
 
-impl Look {
+impl Sharpness {
     fn blur(self) -> Blur {
         Blur::gaussian(match self {
-            Look::Fine => 6.0,
-            Look::Coarse => 24.0,
+            Sharpness::Fine => 6.0,
+            Sharpness::Coarse => 24.0,
         })
     }
 }
@@ -45,10 +45,10 @@ pub struct Agreement {
 }
 
 /// Squared difference and squares of profiles.
-type Parts = (f64, f64);
+type SquareSums = (f64, f64);
 
 /// Parts of a pair over all phases. The mean over the phases is subtracted: it is an error of the static background.
-fn parts(phases: &[PairAtPhase]) -> Parts {
+fn parts(phases: &[PairAtPhase]) -> SquareSums {
     let Some(first) = phases.first() else { return (0.0, 0.0) };
     let mean = |side: usize, bin: usize| {
         phases.iter().map(|at| at.profiles[side].value[bin]).sum::<f64>() / phases.len() as f64
@@ -64,7 +64,7 @@ fn parts(phases: &[PairAtPhase]) -> Parts {
     sum
 }
 
-fn share(parts: impl Iterator<Item = Parts>) -> f64 {
+fn share(parts: impl Iterator<Item = SquareSums>) -> f64 {
     let (difference, squares) = parts.fold((0.0, 0.0), |sum, p| (sum.0 + p.0, sum.1 + p.1));
     if squares > 0.0 { difference / squares } else { 0.0 }
 }
@@ -72,20 +72,20 @@ fn share(parts: impl Iterator<Item = Parts>) -> f64 {
 /// Comparison of all pairs of views at one sharpness.
 #[derive(Debug, Clone)]
 pub struct Comparison {
-    look: Look,
-    by_pair: Vec<Parts>,
+    look: Sharpness,
+    by_pair: Vec<SquareSums>,
 }
 
 impl Comparison {
     /// Compares all pairs at all phases both views have.
-    pub fn of(views: &Views, look: Look) -> Comparison {
+    pub fn of(views: &Views, look: Sharpness) -> Comparison {
         let by_pair = views.pairs.par_iter().map(|pair| compare(views, *pair, look)).collect();
         Comparison { look, by_pair }
     }
 
     /// Returns the comparison after a change of one view: only its pairs are compared again.
     pub fn after_change(&self, views: &Views, changed: usize) -> Comparison {
-        let again = |(pair, before): (&Pair, &Parts)| {
+        let again = |(pair, before): (&Pair, &SquareSums)| {
             if pair.views.contains(&changed) { compare(views, *pair, self.look) } else { *before }
         };
         Comparison { look: self.look, by_pair: views.pairs.par_iter().zip(&self.by_pair).map(again).collect() }
@@ -97,7 +97,7 @@ impl Comparison {
     }
 }
 
-fn compare(views: &Views, pair: Pair, look: Look) -> Parts {
+fn compare(views: &Views, pair: Pair, look: Sharpness) -> SquareSums {
     let poses = Poses::stated(views.views.len(), views.n_phases);
     let phases: Vec<usize> = (0..views.n_phases).collect();
     parts(&views.profiles(pair, &poses, &phases, &look.blur()))
@@ -105,12 +105,14 @@ fn compare(views: &Views, pair: Pair, look: Look) -> Parts {
 
 /// Agreement of views over the pairs that constrain each other; `None` when there is no such pair.
 pub fn agreement(views: &Views) -> Option<Agreement> {
-    let fine = Comparison::of(views, Look::Fine);
-    let pair =
-        |(pair, parts): (&Pair, &Parts)| PairAgreement { views: pair.views, residual: share(std::iter::once(*parts)) };
+    let fine = Comparison::of(views, Sharpness::Fine);
+    let pair = |(pair, parts): (&Pair, &SquareSums)| PairAgreement {
+        views: pair.views,
+        residual: share(std::iter::once(*parts)),
+    };
     (!views.pairs.is_empty()).then(|| Agreement {
         fine: fine.residual(),
-        coarse: Comparison::of(views, Look::Coarse).residual(),
+        coarse: Comparison::of(views, Sharpness::Coarse).residual(),
         pairs: views.pairs.iter().zip(&fine.by_pair).map(pair).collect(),
     })
 }

@@ -90,9 +90,9 @@ impl Mistake {
             Mistake::LogTwice => Some(revalued(dataset, |v| (-v).exp())),
             Mistake::LogMissing => {
                 let brightest = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(0f32, f32::max);
-                let least = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(f32::INFINITY, f32::min);
+                let min = dataset.training().iter().flat_map(|f| &f.integrals).copied().fold(f32::INFINITY, f32::min);
                 // Intensities are never negative.
-                (brightest > 0.0 && least >= 0.0).then(|| revalued(dataset, |v| -(v / brightest).max(DARKEST).ln()))
+                (brightest > 0.0 && min >= 0.0).then(|| revalued(dataset, |v| -(v / brightest).max(DARKEST).ln()))
             }
         }
     }

@@ -5,17 +5,17 @@ use super::frame_rates::{FrameRate, measure_frame_rates};
 use super::options::{ConfigArgs, GlobalOptions};
 use clap::Args;
 use nertca_vk::bench::peaks::peaks;
+use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::config::sections::Train;
 use nertca_vk::config::{Config, GaussianForm, Preset};
 use nertca_vk::error::{Error, Result};
+use nertca_vk::fitting::ledger::Ledger;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::methods;
-use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::network::cost::NetworkCost;
-use nertca_vk::network::ledger::Ledger;
 use nertca_vk::phantom::dataset::{PhantomOptions, Setting, make};
 use nertca_vk::phantom::degradations::Degradations;
 use nertca_vk::phantom::views::ViewAngles;
@@ -75,14 +75,14 @@ pub struct BenchArgs {
 /// Maximum number of iterations timed pass by pass.
 const PROFILED: u32 = 8;
 /// Longest time for a measurement, seconds: one hour.
-const MOST_SECONDS: f64 = 3600.0;
+const MAX_SECONDS: f64 = 3600.0;
 /// Work that times of iterations do not include.
 const LEFT_OUT: &str = "opening the device, compiling, reading data, calibration, hull, validation, checkpoints";
 
 fn seconds(text: &str) -> std::result::Result<f64, String> {
     match text.parse::<f64>() {
-        Ok(seconds) if (0.0..=MOST_SECONDS).contains(&seconds) => Ok(seconds),
-        _ => Err(format!("is not a number of seconds from 0 to {MOST_SECONDS}")),
+        Ok(seconds) if (0.0..=MAX_SECONDS).contains(&seconds) => Ok(seconds),
+        _ => Err(format!("is not a number of seconds from 0 to {MAX_SECONDS}")),
     }
 }
 
@@ -304,7 +304,7 @@ fn time_network(args: &BenchArgs, gpu: &Gpu, config: &Config, dataset: &Dataset,
             + after.median() * f64::from(config.train.iterations - delay));
     Ok(Timings {
         paths: subject.notes(),
-        rays: methods::of(config).map_or_else(|| subject.rays(), |method| method.rays_per_iteration(config)),
+        rays: methods::of(config).rays_per_iteration(config),
         network_cost: config.method().has_network().then(|| subject.cost()),
         work: if config.method().has_network() { subject.work(after.live_samples) } else { Ledger::new() },
         gaussians: None,

@@ -3,9 +3,9 @@
 use super::frame_rates::{FrameRate, print_frame_rates};
 use nertca_vk::bench::PAPER_SECONDS;
 use nertca_vk::bench::peaks::Peaks;
+use nertca_vk::fitting::ledger::{Ledger, StageWork, of_pass};
 use nertca_vk::gpu::sensors::{Readings, Span, host_processor};
 use nertca_vk::network::cost::NetworkCost;
-use nertca_vk::network::ledger::{Ledger, StageWork, of_pass};
 use nertca_vk::train::dry_run::DryRun;
 use nertca_vk::train::timing::{GaussianTiming, Timing};
 use serde::{Deserialize, Serialize};
@@ -164,13 +164,13 @@ fn print_whole_run(report: &Report) {
     if report.of_the_paper {
         out!("whole run, extrapolated: {time}; the paper needs 37:00, so this is {speedup:.3} x as fast");
     } else {
-        let least = if report.gaussians.as_ref().is_some_and(|g| GROWING.contains(&g.form.as_str())) {
+        let min = if report.gaussians.as_ref().is_some_and(|g| GROWING.contains(&g.form.as_str())) {
             "at least "
         } else {
             ""
         };
         out!(
-            "whole run, extrapolated: {least}{time}; its iterations differ from the paper's, so a comparison with the \
+            "whole run, extrapolated: {min}{time}; its iterations differ from the paper's, so a comparison with the \
              paper's 37:00 needs a Dice (--full)"
         );
     }
@@ -206,8 +206,8 @@ fn print_passes(report: &Report) {
     for (name, &ms) in passes {
         let times = report.passes_per_iteration.get(name).map_or("-".into(), |n| format!("{n:.0}"));
         let work = of_pass(&report.work, name).map_or(String::new(), |work| {
-            let least = work.least_ms(peak_of(name, &report.peaks), report.peaks.copy_gb_per_s);
-            format!(" {:9.3} {:9.2} {:6.0} %", work.gflop, work.megabytes, 100.0 * least / ms)
+            let min = work.min_ms(peak_of(name, &report.peaks), report.peaks.copy_gb_per_s);
+            format!(" {:9.3} {:9.2} {:6.0} %", work.gflop, work.megabytes, 100.0 * min / ms)
         });
         out!("{name:32} {times:>5} {ms:9.3} {:5.1} %{work}", 100.0 * ms / sum);
     }
@@ -245,7 +245,7 @@ fn bytes_per_sample(report: &Report, live_samples: u64) -> Option<f64> {
 fn print_conditions(iterations: u32, learned: Option<u32>, readings: Option<&Readings>) {
     let learned = learned.map_or(String::new(), |n| format!(", after {n} iterations of training"));
     let span = |span: &Option<Span>, unit: &str| {
-        span.map_or(String::new(), |s| format!("; {:.0} {unit} ({:.0} to {:.0})", s.mean, s.least, s.greatest))
+        span.map_or(String::new(), |s| format!("; {:.0} {unit} ({:.0} to {:.0})", s.mean, s.min, s.max))
     };
     let told = readings.map_or(String::new(), |r| {
         let quantities = [(&r.clock_mhz, "MHz"), (&r.power_w, "W"), (&r.temperature_c, "°C")];

@@ -4,6 +4,7 @@ use super::options::GlobalOptions;
 use nertca_vk::config::Config;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::gpu::device::{DeviceOptions, Gpu};
+use nertca_vk::kernels::cache::save_pipeline_cache;
 use nertca_vk::kernels::tuning::{Layers, Tuning};
 use nertca_vk::scan::dataset::Dataset;
 use nertca_vk::train::calibrate;
@@ -12,12 +13,12 @@ use std::path::PathBuf;
 impl GlobalOptions {
     /// Opens the device selected by the options.
     pub fn open_device(&self) -> Result<Gpu> {
-        Gpu::open(&DeviceOptions {
+        Ok(Gpu::open(&DeviceOptions {
             select: self.device.clone(),
             validation: self.validate,
             cache_dir: cache_dir(),
             ..DeviceOptions::default()
-        })
+        })?)
     }
 
     /// Returns the computation paths for a configuration: those that the options name, or those that an earlier training on
@@ -63,7 +64,7 @@ impl GlobalOptions {
 
     /// Saves the pipeline cache and turns validation messages into a failure.
     pub fn close_device(&self, gpu: &Gpu) -> Result<()> {
-        if let Err(error) = gpu.save_pipeline_cache() {
+        if let Err(error) = save_pipeline_cache(gpu) {
             // Without the cache, the next start only takes longer.
             tracing::warn!("{error}");
         }

@@ -3,6 +3,7 @@
 use super::data::bar;
 use super::options::{GlobalOptions, choice};
 use clap::Args;
+use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::motion::{MotionExport, MotionFormat, deformable_set, write_trajectories};
@@ -10,7 +11,6 @@ use nertca_vk::export::surfaces::{MeshFormat, write_meshes};
 use nertca_vk::export::volumes::{Compression, Format, VolumeExport, grid_over};
 use nertca_vk::formats::nrrd::Encoding;
 use nertca_vk::model::Model;
-use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::renderer::Renderer;
 use nertca_vk::scan::dataset::{Dataset, Layout};

@@ -15,13 +15,13 @@ const MARGIN: f64 = 45.0;
 /// Length of the patient's axes, as a share of the field's reach.
 const AXIS_SHARE: f64 = 0.55;
 /// Minimum reach of a field: the distance from its middle to its edge, mm.
-const LEAST_REACH_MM: f64 = 300.0;
+const MIN_REACH_MM: f64 = 300.0;
 /// Source-to-detector distance of a projection matrix, which does not define it, in units of the source-to-isocentre
 /// distance.
 const MATRIX_SID: f64 = 1.5;
 /// Distance of a detector's number beyond the detector's middle, pixels.
 const BEYOND: f64 = 24.0;
-const MOST_NAMED: usize = 24;
+const MAX_NAMED: usize = 24;
 const WHITE: Rgb<u8> = Rgb([255, 255, 255]);
 const INK: Rgb<u8> = Rgb([40, 42, 48]);
 const GREY: Rgb<u8> = Rgb([165, 168, 175]);
@@ -52,7 +52,7 @@ const SIDES: [Side; 3] = [
 ];
 
 /// A C-arm in patient coordinates, mm.
-struct Stand {
+struct DrawnCArm {
     source_mm: DVec3,
     /// Middle of the detector, where the central ray ends.
     middle_mm: DVec3,
@@ -61,8 +61,8 @@ struct Stand {
     colour: Rgb<u8>,
 }
 
-impl Stand {
-    fn of(dataset: &Dataset, view: usize, colour: Rgb<u8>) -> Stand {
+impl DrawnCArm {
+    fn of(dataset: &Dataset, view: usize, colour: Rgb<u8>) -> DrawnCArm {
         let seen = &dataset.views[view];
         let sid = match &seen.geometry {
             Geometry::CArm(c_arm) => c_arm.sid_mm / MM_PER_UNIT,
@@ -74,7 +74,7 @@ impl Stand {
         let angle = |value: f64, plus: &str, minus: &str| {
             format!("{} {:.0}°", if value >= -0.5 { plus } else { minus }, value.abs())
         };
-        Stand {
+        DrawnCArm {
             source_mm: lps_mm_from_world(source),
             middle_mm: at(0.5 * (right - 0.5), 0.5 * (bottom - 0.5)),
             corners_mm: [at(-0.5, -0.5), at(right, -0.5), at(right, bottom), at(-0.5, bottom)],
@@ -139,7 +139,7 @@ impl Field<'_> {
         self.text(self.place(DVec3::ZERO) - DVec2::new(46.0, 20.0), "ISO", INK);
     }
 
-    fn stand(&mut self, stand: &Stand) {
+    fn stand(&mut self, stand: &DrawnCArm) {
         self.line(stand.source_mm, stand.middle_mm, 0, stand.colour);
         for (k, corner) in stand.corners_mm.into_iter().enumerate() {
             self.line(corner, stand.corners_mm[(k + 1) % 4], 1, stand.colour);
@@ -159,15 +159,16 @@ pub fn drawn(dataset: &Dataset) -> RgbImage {
     let colour = |view: usize| {
         training.iter().position(|training| *training == view).map_or(GREY, |place| COLOURS[place % COLOURS.len()])
     };
-    let stands: Vec<Stand> = (0..dataset.views.len()).map(|view| Stand::of(dataset, view, colour(view))).collect();
+    let stands: Vec<DrawnCArm> =
+        (0..dataset.views.len()).map(|view| DrawnCArm::of(dataset, view, colour(view))).collect();
     let reach_mm =
-        stands.iter().flat_map(Stand::places_mm).map(|p| p.abs().max_element()).fold(LEAST_REACH_MM, f64::max);
+        stands.iter().flat_map(DrawnCArm::places_mm).map(|p| p.abs().max_element()).fold(MIN_REACH_MM, f64::max);
     let mut picture = RgbImage::from_pixel(2 * FIELD, 2 * FIELD, WHITE);
     for side in &SIDES {
         let mut field = Field { picture: &mut picture, side, reach_mm };
         field.axes();
         // Training views are drawn over the others.
-        let (unseen, seen): (Vec<&Stand>, Vec<&Stand>) = stands.iter().partition(|stand| stand.colour == GREY);
+        let (unseen, seen): (Vec<&DrawnCArm>, Vec<&DrawnCArm>) = stands.iter().partition(|stand| stand.colour == GREY);
         unseen.into_iter().chain(seen).for_each(|stand| field.stand(stand));
     }
     let left = i64::from(FIELD) + 12;
@@ -177,11 +178,11 @@ pub fn drawn(dataset: &Dataset) -> RgbImage {
         top += i64::from(lettering::HEIGHT) + 5;
     };
     line("VIEWS: SQUARE SOURCE, FRAMED DETECTOR", INK);
-    for stand in stands.iter().take(MOST_NAMED) {
+    for stand in stands.iter().take(MAX_NAMED) {
         line(&format!("{}{}", stand.name, if stand.colour == GREY { ", UNSEEN" } else { "" }), stand.colour);
     }
-    if stands.len() > MOST_NAMED {
-        line(&format!("AND {} MORE", stands.len() - MOST_NAMED), INK);
+    if stands.len() > MAX_NAMED {
+        line(&format!("AND {} MORE", stands.len() - MAX_NAMED), INK);
     }
     picture
 }

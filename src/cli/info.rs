@@ -2,12 +2,12 @@
 
 use super::geometry_picture;
 use clap::Args;
+use nertca_vk::checkpoint::{self, Checkpoint};
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files::pretty_json;
 use nertca_vk::gaussians::field::DynamicGaussians;
 use nertca_vk::geometry::MM_PER_UNIT;
-use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::scan::dataset::{Dataset, Split, manifest_schema};
 use nertca_vk::score::pictures::Window;
 use std::path::{Path, PathBuf};

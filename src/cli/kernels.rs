@@ -41,7 +41,7 @@ struct Answer {
 /// Compiles, prints a table, and compares.
 pub fn run(global: &GlobalOptions, args: &KernelsArgs) -> Result<()> {
     let config = args.config.load([])?;
-    let before = args.compare.as_deref().map(|file| Ok((file, read(file)?))).transpose()?;
+    let before = args.compare.as_deref().map(|file| Ok::<_, Error>((file, read(file)?))).transpose()?;
     // No pipeline cache is used, because a pipeline from a cache is not compiled.
     let gpu = Gpu::open(&DeviceOptions {
         select: global.device.clone(),

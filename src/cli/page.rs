@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Maximum number of embedded pictures.
-const MOST_PICTURES: usize = 120;
+const MAX_PICTURES: usize = 120;
 
 /// Title of the plot of distances during training.
 pub(super) const DISTANCE_TITLE: &str = "Distance to the true vessels at the end of systole, mm";
@@ -197,7 +197,7 @@ impl Page<'_> {
     fn views(&self) -> Result<Markup> {
         let mut by_view: BTreeMap<usize, Vec<(u32, &PathBuf)>> = BTreeMap::new();
         // Too many pictures are thinned out evenly.
-        let step = self.pictures.len().div_ceil(MOST_PICTURES).max(1);
+        let step = self.pictures.len().div_ceil(MAX_PICTURES).max(1);
         for (view, phase, path) in self.pictures.iter().step_by(step) {
             by_view.entry(*view).or_default().push((*phase, path));
         }

@@ -4,6 +4,7 @@ use super::frame_rates::{measure_frame_rates, print_frame_rates};
 use super::options::{GlobalOptions, choice};
 use super::viewpoint::{Viewpoint, turned, viewpoint};
 use clap::Args;
+use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::{Error, Result};
 use nertca_vk::export::dicom::{self, DicomView};
@@ -11,7 +12,6 @@ use nertca_vk::formats::image_limits::MAX_SIDE;
 use nertca_vk::formats::npy;
 use nertca_vk::geometry::MM_PER_UNIT;
 use nertca_vk::model::Model;
-use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::baked::{BAKED_CELLS, Baked};
 use nertca_vk::render::quantity::{Projection, Quantity};
@@ -87,7 +87,7 @@ impl Renders {
 
 /// Milliseconds between the phases of an animation, and the minimum that viewers respect.
 const PHASE_MS: u32 = 90;
-const LEAST_MS: u32 = 20;
+const MIN_MS: u32 = 20;
 
 /// Writes frames as an angiogram of a heart of 68 beats per minute; the true heart rate is not stored.
 fn write_dicom(args: &RenderArgs, out: &Path, model: &Model, viewpoint: &Viewpoint, frames: &[Vec<f32>]) -> Result<()> {
@@ -189,7 +189,7 @@ pub fn render(global: &GlobalOptions, args: &RenderArgs) -> Result<()> {
             npy::write(out, &shape, &frames.concat())?;
         }
         "gif" => {
-            let ms = (PHASE_MS / (args.between + 1)).max(LEAST_MS);
+            let ms = (PHASE_MS / (args.between + 1)).max(MIN_MS);
             pictures::write_gif(out, &frames, width, window, ms)?;
         }
         "dcm" => write_dicom(args, out, &model, &viewpoint, &frames)?,

@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 
 const SCRIPT: &str = include_str!("report_trees.js");
 /// Maximum number of embedded angiograms.
-const MOST_PICTURES: usize = 120;
+const MAX_PICTURES: usize = 120;
 const STYLE: &str = "
 #tree-views svg{width:100%;display:block}#tree-views image{image-rendering:pixelated}
 #tree-views polyline{fill:none;stroke-width:2px;vector-effect:non-scaling-stroke;stroke-linejoin:round;cursor:pointer}
@@ -39,7 +39,7 @@ impl TreeSection {
     /// [`Error::Internal`] for values that JSON or a picture cannot represent.
     pub fn new(beat: &BeatTree, dataset: &Dataset) -> Result<TreeSection> {
         // Too many angiograms are thinned out evenly.
-        let step = dataset.training().len().div_ceil(MOST_PICTURES).max(1);
+        let step = dataset.training().len().div_ceil(MAX_PICTURES).max(1);
         let views = dataset.training_views().into_iter().map(|view| view_data(dataset, view, step));
         let views = json!(views.collect::<Result<Vec<_>>>()?).to_string();
         let systole = (SYSTOLE_SHARE * f64::from(dataset.n_phases)).round() as u32;
@@ -125,7 +125,7 @@ fn table(name: &str, tree: &PhaseTree) -> Markup {
                         td { @match branch.parent { Some(parent) => (parent), None => "-" } }
                         td { (format!("{:.1}", branch.length_mm())) }
                         td { (format!("{:.2}", branch.mean_diameter_mm())) }
-                        td { (format!("{:.2}", branch.least_diameter_mm())) }
+                        td { (format!("{:.2}", branch.min_diameter_mm())) }
                     }
                 }
                 tr { td { "all" } td {} td { (format!("{:.1}", tree.length_mm())) } td {} td {} }

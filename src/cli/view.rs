@@ -1,14 +1,14 @@
 //! `view`: shows a run in a browser.
 
 use super::options::GlobalOptions;
-use super::view_server::{Server, Shown, TYPICAL_SIDE, Taken};
+use super::view_server::{AngiogramGeometry, PictureSource, Server, TYPICAL_SIDE};
 use super::view_tree::TreeWork;
 use clap::Args;
+use nertca_vk::checkpoint::newest_model;
 use nertca_vk::choice::Choice;
 use nertca_vk::error::Result;
 use nertca_vk::geometry::ViewRays;
 use nertca_vk::model::Model;
-use nertca_vk::model::checkpoint::newest_model;
 use nertca_vk::model::component::Component;
 use nertca_vk::render::baked::Baked;
 use nertca_vk::render::quantity::{Projection, Quantity};
@@ -34,15 +34,15 @@ const CELL_MM: f64 = 0.5;
 /// A run that does not change.
 struct Finished {
     model: Model,
-    taken: Taken,
+    taken: AngiogramGeometry,
     /// Baked volumes. The lock allows one picture at a time, because pictures share the device.
     baked: Mutex<Baked>,
     /// Largest value of each kind of picture.
     ranges: HashMap<Quantity, f32>,
 }
 
-impl Shown for Finished {
-    fn taken(&self) -> Result<Taken> {
+impl PictureSource for Finished {
+    fn taken(&self) -> Result<AngiogramGeometry> {
         Ok(self.taken.clone())
     }
 
@@ -75,7 +75,7 @@ pub fn view(global: &GlobalOptions, args: &ViewArgs) -> Result<()> {
     let renderer = Arc::new(Renderer::new(&gpu, &model, tuning.clone())?);
     eprintln!("preparing {} phases on {} ...", model.param_map.phases, gpu.info().name);
     let mut shown = Finished {
-        taken: Taken { c_arm: model.c_arm.clone(), image_size: model.image_size },
+        taken: AngiogramGeometry { c_arm: model.c_arm.clone(), image_size: model.image_size },
         baked: Mutex::new(Baked::for_display(renderer, &model, CELL_MM)),
         ranges: HashMap::new(),
         model,
@@ -93,7 +93,7 @@ pub fn view(global: &GlobalOptions, args: &ViewArgs) -> Result<()> {
 /// Returns the largest value of each kind of picture from the model's own angle. As a side effect, every phase is
 /// baked.
 fn typical_ranges(shown: &Finished) -> Result<HashMap<Quantity, f32>> {
-    let Taken { c_arm, .. } = &shown.taken;
+    let AngiogramGeometry { c_arm, .. } = &shown.taken;
     let rays = shown.taken.turned(c_arm.primary_deg, c_arm.secondary_deg, TYPICAL_SIDE)?;
     let mut ranges = HashMap::new();
     for &component in Component::ALL {
@@ -101,11 +101,11 @@ fn typical_ranges(shown: &Finished) -> Result<HashMap<Quantity, f32>> {
         let phases = if component.has_dynamic() { shown.phases() } else { 1 };
         for &projection in Projection::ALL {
             let quantity = Quantity { component, projection };
-            let mut most = f32::MIN_POSITIVE;
+            let mut max = f32::MIN_POSITIVE;
             for phase in 0..phases {
-                most = shown.render(&rays, TYPICAL_SIDE, phase, quantity)?.into_iter().fold(most, f32::max);
+                max = shown.render(&rays, TYPICAL_SIDE, phase, quantity)?.into_iter().fold(max, f32::max);
             }
-            ranges.insert(quantity, most);
+            ranges.insert(quantity, max);
         }
     }
     Ok(ranges)

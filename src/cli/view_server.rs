@@ -36,14 +36,14 @@ pub const TYPICAL_SIDE: usize = 64;
 
 /// Geometry of the angiograms, from which the viewer's pictures are derived.
 #[derive(Debug, Clone)]
-pub struct Taken {
+pub struct AngiogramGeometry {
     /// C-arm of the first view.
     pub c_arm: CArm,
     /// Number of columns and rows.
     pub image_size: [usize; 2],
 }
 
-impl Taken {
+impl AngiogramGeometry {
     /// Returns the side of the detector square that pictures show, mm.
     fn extent_mm(&self) -> f64 {
         let ([w, h], [across, down]) = (self.image_size, self.c_arm.pixel_mm);
@@ -62,12 +62,12 @@ impl Taken {
 }
 
 /// Source of a viewer's pictures.
-pub trait Shown: Send + Sync {
+pub trait PictureSource: Send + Sync {
     /// Returns the geometry of the angiograms.
     ///
     /// # Errors
     /// [`Error::NotReady`] before there is anything to show.
-    fn taken(&self) -> Result<Taken>;
+    fn taken(&self) -> Result<AngiogramGeometry>;
 
     /// Returns the number of cardiac phases.
     fn phases(&self) -> u32;
@@ -84,18 +84,18 @@ pub trait Shown: Send + Sync {
     /// Returns the largest value of a typical picture.
     ///
     /// # Errors
-    /// Fails like [`Shown::render`].
+    /// Fails like [`PictureSource::render`].
     fn range(&self, quantity: Quantity, phase: u32) -> Result<f32>;
 
     /// Returns the current fields.
     ///
     /// # Errors
-    /// Fails like [`Shown::render`].
+    /// Fails like [`PictureSource::render`].
     fn model(&self) -> Result<Model>;
 }
 
 struct Viewer {
-    shown: Arc<dyn Shown>,
+    shown: Arc<dyn PictureSource>,
     /// Tree of the vessels, which is found when the page first requests it.
     tree: Arc<TreeWork>,
     token: String,
@@ -241,7 +241,7 @@ impl Server {
     ///
     /// # Errors
     /// [`Error::Io`] for a port that is in use.
-    pub fn open(port: u16, shown: Arc<dyn Shown>, tree: Arc<TreeWork>) -> Result<Server> {
+    pub fn open(port: u16, shown: Arc<dyn PictureSource>, tree: Arc<TreeWork>) -> Result<Server> {
         let mut secret = [0u8; 16];
         getrandom::fill(&mut secret)
             .map_err(|e| Error::Internal(format!("random numbers could not be obtained: {e}")))?;

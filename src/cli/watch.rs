@@ -3,9 +3,9 @@
 use super::dicom_args::DicomArgs;
 use super::options::{ConfigArgs, GlobalOptions};
 use super::progress::stop_flag;
-use super::view_server::{Server, Taken};
+use super::view_server::{AngiogramGeometry, Server};
 use super::view_tree::TreeWork;
-use super::watch_leave::{Kept, prepare, remove_empty};
+use super::watch_leave::{TrainedRun, prepare, remove_empty};
 use super::watch_live::Live;
 use clap::Args;
 use nertca_vk::config::Config;
@@ -18,7 +18,7 @@ use nertca_vk::import::folder::Folder;
 use nertca_vk::import::intake::Intake;
 use nertca_vk::kernels::tuning::Tuning;
 use nertca_vk::scan::dataset::Split;
-use nertca_vk::session::{Moment, NewFrame, Session, SessionOptions, State};
+use nertca_vk::session::{FrameTime, NewFrame, Session, SessionOptions, State};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -117,7 +117,7 @@ struct Watch<'a> {
     /// Session that trains, or has trained.
     under_way: Option<UnderWay>,
     /// Reconstruction from before training started again.
-    kept: Option<Kept>,
+    kept: Option<TrainedRun>,
     /// Whether the user was told that training has failed.
     failed: bool,
     /// Whether training was running at the last check.
@@ -222,7 +222,8 @@ impl Watch<'_> {
     /// remaining iterations would not suffice for the new one.
     fn feed(&mut self) -> Result<()> {
         let Some(first) = self.intake.first() else { return Ok(()) };
-        let taken = Taken { c_arm: first.c_arm.clone(), image_size: [first.image.width, first.image.height] };
+        let taken =
+            AngiogramGeometry { c_arm: first.c_arm.clone(), image_size: [first.image.width, first.image.height] };
         let young = |session: &Session| {
             let state = session.state();
             matches!(state, State::Running | State::Waiting) && 2 * session.step() <= self.config.train.iterations
@@ -261,7 +262,7 @@ impl Watch<'_> {
         self.intake.frames(run).iter().try_for_each(|frame| {
             session.add_frame(NewFrame {
                 geometry: Geometry::CArm(frame.c_arm.clone()),
-                moment: Moment::Beat(frame.taken),
+                moment: FrameTime::Beat(frame.taken),
                 split: Split::Train,
                 width: frame.image.width,
                 height: frame.image.height,
@@ -275,7 +276,7 @@ impl Watch<'_> {
     /// result.
     fn keep(&mut self) -> Option<Error> {
         let UnderWay { session, runs, .. } = self.under_way.take()?;
-        match Kept::of(&session, runs) {
+        match TrainedRun::of(&session, runs) {
             Ok(kept) => {
                 if self.kept.as_ref().is_none_or(|before| kept.replaces(before)) {
                     self.kept = Some(kept);

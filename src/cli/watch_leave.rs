@@ -2,12 +2,12 @@
 
 use super::report::Report;
 use nertca_vk::calibrate::correction::Calibration;
+use nertca_vk::checkpoint::{self, Checkpoint};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::files;
 use nertca_vk::gpu::device::Gpu;
 use nertca_vk::import::intake::Intake;
 use nertca_vk::kernels::tuning::Tuning;
-use nertca_vk::model::checkpoint::{self, Checkpoint};
 use nertca_vk::run::info::RunInfo;
 use nertca_vk::run::score::as_trained;
 use nertca_vk::scan::dataset::Dataset;
@@ -42,25 +42,25 @@ pub fn remove_empty(run: &Path) {
 }
 
 /// Result of training.
-pub struct Kept {
+pub struct TrainedRun {
     checkpoint: Checkpoint,
     calibration: Option<Calibration>,
     /// Number of runs handed to training; it may not have taken in the last ones.
     runs: usize,
 }
 
-impl Kept {
+impl TrainedRun {
     /// Stops training, which was handed `runs` runs, and keeps its result.
     ///
     /// # Errors
     /// [`Error::NotReady`] where there is no result; device errors.
-    pub fn of(session: &Session, runs: usize) -> Result<Kept> {
+    pub fn of(session: &Session, runs: usize) -> Result<TrainedRun> {
         session.stop()?;
-        Ok(Kept { checkpoint: session.checkpoint()?, calibration: session.calibration(), runs })
+        Ok(TrainedRun { checkpoint: session.checkpoint()?, calibration: session.calibration(), runs })
     }
 
     /// Tells whether this result is better than `before`. A training that has barely started again is not, even with more runs.
-    pub fn replaces(&self, before: &Kept) -> bool {
+    pub fn replaces(&self, before: &TrainedRun) -> bool {
         2 * self.checkpoint.model.step >= before.checkpoint.model.step
     }
 

@@ -1,6 +1,6 @@
 //! Source of the viewer's pictures while runs come in: the current session, with its current fields.
 
-use super::view_server::{Shown, TYPICAL_SIDE, Taken};
+use super::view_server::{AngiogramGeometry, PictureSource, TYPICAL_SIDE};
 use nertca_vk::error::{Error, Result};
 use nertca_vk::geometry::ViewRays;
 use nertca_vk::model::Model;
@@ -18,7 +18,7 @@ const TYPICAL_FOR: Duration = Duration::from_secs(2);
 #[derive(Default)]
 struct UnderWay {
     session: Option<Arc<Session>>,
-    taken: Option<Taken>,
+    taken: Option<AngiogramGeometry>,
     runs: usize,
     /// Largest values of typical pictures, and when they were computed.
     ranges: HashMap<Quantity, (Instant, f32)>,
@@ -42,7 +42,7 @@ impl Live {
     }
 
     /// Shows a session of `runs` runs from now on.
-    pub fn follow(&self, session: Option<Arc<Session>>, taken: Option<Taken>, runs: usize) {
+    pub fn follow(&self, session: Option<Arc<Session>>, taken: Option<AngiogramGeometry>, runs: usize) {
         *self.under_way() = UnderWay { session, taken, runs, ranges: HashMap::new() };
     }
 
@@ -62,8 +62,8 @@ fn told(state: State) -> &'static str {
     }
 }
 
-impl Shown for Live {
-    fn taken(&self) -> Result<Taken> {
+impl PictureSource for Live {
+    fn taken(&self) -> Result<AngiogramGeometry> {
         self.under_way().taken.clone().ok_or_else(|| Error::NotReady("no run was imported yet".into()))
     }
 

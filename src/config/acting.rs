@@ -3,62 +3,24 @@
 //! recorded in checkpoints, so that a run continues with the numbers that it began with.
 
 use crate::choice::Choice;
-use crate::config::{Config, Preset};
+use crate::config::method::MethodKind;
+use crate::config::{Config, Preset, dynamic_gaussians, nerf_ca, nert_ca, r2_gaussian, sax_nerf, x_gaussian};
 use crate::error::{Error, Result};
 
-/// Constants of NeRF-CA's public code.
-const OF_NERF_CA: [&str; 7] =
-    ["gain", "change_weight", "least_change", "least_integral", "ramp", "stop_after", "stop_below"];
-/// Constants of R2-Gaussian's public code, and our choice of units and of what the total variation moves.
-const OF_R2: [&str; 6] = ["init", "normalise", "density_rescale", "density_thresh", "scale_min", "tv_moves_centres"];
-/// Constants of X-Gaussian's public code, and our choice of units.
-const OF_X: [&str; 7] = [
-    "normalise",
-    "extent_mm",
-    "first_opacity",
-    "position_lr_final",
-    "degree_every",
-    "max_screen_size",
-    "reset_opacity",
-];
-/// Constants of SAX-NeRF's public code, and our choice of units.
-const OF_SAX: [&str; 3] = ["normalise", "base_resolution", "lrate_gamma"];
-
-/// Tells whether a setting is a key of a preset.
-fn is_key(preset: Preset, section: &str, name: &str) -> bool {
-    use Preset::{Fast, FastMlp, NerfCa, Paper, PublicCode, R2Gaussian, SaxNerf, XGaussian};
-    let of = |presets: &[Preset]| presets.contains(&preset);
-    let is_published = of(&[Paper, PublicCode]);
-    let has_tensor_field = is_published || of(&[FastMlp, Fast]);
-    let has_network = is_published || of(&[FastMlp, NerfCa]);
-    match (section, name) {
-        ("train", "rays") | ("static", "lr" | "lr_end") => has_tensor_field || has_network,
-        ("train", "motion_share") => preset == NerfCa,
-        ("train", "validate_images") => false,
-        ("train" | "calibrate", _) | ("march", "render_samples") => true,
-        ("march", "static_samples") | ("static", "grid" | "ranks" | "tv") | ("dynamic", "half_extent_mm") => {
-            has_tensor_field
-        }
-        ("march", "dynamic_samples")
-        | ("dynamic", "layers" | "width" | "bands" | "window_iterations" | "lr" | "lr_end") => has_network,
-        ("dynamic", "latent" | "window_start" | "delay") => is_published || preset == FastMlp,
-        ("dynamic", "occlusion") | ("loss", "normalise") => is_published,
-        ("dynamic", "occlusion_share") => is_published || preset == NerfCa,
-        ("loss", "dynamic_target") | ("hull", "enabled") => preset == FastMlp,
-        ("networks", name) => preset == NerfCa && !OF_NERF_CA.contains(&name),
-        ("gaussians", "form" | "iterations" | "count") => preset == Fast,
-        ("r2", name) => preset == R2Gaussian && !OF_R2.contains(&name) && !name.ends_with("_lr_final"),
-        ("x", name) => preset == XGaussian && !OF_X.contains(&name),
-        ("sax", name) => preset == SaxNerf && !OF_SAX.contains(&name),
-        _ => false,
-    }
-}
-
-/// Tells whether a setting, by its key, is a key of a preset.
+/// Tells whether a setting, such as `train.rays`, is a key of a preset: one that all methods share, or one of its method.
 fn is_key_of(preset: Preset, key: &str) -> bool {
+    let of_method = || match Config::preset(preset).method() {
+        MethodKind::NertCa => nert_ca::is_key(preset, key),
+        MethodKind::NerfCa => nerf_ca::is_key(key),
+        MethodKind::DynamicGaussians => dynamic_gaussians::is_key(key),
+        MethodKind::R2Gaussian => r2_gaussian::is_key(key),
+        MethodKind::XGaussian => x_gaussian::is_key(key),
+        MethodKind::SaxNerf => sax_nerf::is_key(key),
+    };
     match key.split_once('.') {
-        None => true,
-        Some((section, name)) => is_key(preset, section, name),
+        None | Some(("calibrate", _)) | Some(("march", "render_samples")) => true,
+        Some(("train", name)) if !["rays", "motion_share", "validate_images"].contains(&name) => true,
+        Some(_) => of_method(),
     }
 }
 

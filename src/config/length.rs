@@ -6,7 +6,7 @@ use crate::error::Result;
 
 /// Minimum number of iterations between two density controls of a shortened run: an iteration with density control learns
 /// nothing.
-const LEAST_BETWEEN_DENSIFYING: u32 = 10;
+const MIN_BETWEEN_DENSIFYING: u32 = 10;
 
 /// Iterations of a dry run: enough for every event of the presets to have iterations before and after it.
 const DRY_RUN: u32 = 20;
@@ -20,13 +20,13 @@ impl Config {
     pub fn schedule_of_length(&self, iterations: u32) -> Vec<(&'static str, u32)> {
         let share = f64::from(iterations) / f64::from(self.train.iterations);
         let of = |count: u32| (share * f64::from(count)).round() as u32;
-        let densifying = |count: u32| if count == 0 { 0 } else { of(count).max(LEAST_BETWEEN_DENSIFYING) };
+        let densifying = |count: u32| if count == 0 { 0 } else { of(count).max(MIN_BETWEEN_DENSIFYING) };
         let mut schedule = vec![
             ("dynamic.delay", of(self.dynamic.delay)),
             ("dynamic.window_iterations", of(self.dynamic.window_iterations)),
             ("occupancy.start", of(self.occupancy.start)),
         ];
-        if self.method() == MethodKind::TwoNetworks {
+        if self.method() == MethodKind::NerfCa {
             schedule.extend([
                 ("networks.delay", of(self.networks.delay)),
                 ("networks.ramp", of(self.networks.ramp)),
@@ -101,7 +101,7 @@ impl Config {
             events.extend(self.restart());
             events.push(self.dynamic.delay.saturating_add(self.dynamic.window_iterations));
         }
-        if self.method() == MethodKind::TwoNetworks {
+        if self.method() == MethodKind::NerfCa {
             let n = &self.networks;
             events.extend([n.delay, n.delay.saturating_add(n.ramp), n.stop_after]);
         }

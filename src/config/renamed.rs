@@ -1,7 +1,14 @@
-//! Keys that were renamed: settings of the baselines have the names that the publications' codes give them. Earlier names are still read.
+//! Keys that were renamed: settings of the baselines have the names that the publications' codes give them, others the words of the field.
+//! Earlier names are still read.
 
 /// Section, earlier key and present key.
 const RENAMED: &[(&str, &str, &str)] = &[
+    ("dynamic", "least_slope", "min_slope"),
+    ("networks", "least_change", "min_change"),
+    ("networks", "least_integral", "min_integral"),
+    ("gaussians", "least_scale", "min_scale"),
+    ("gaussians", "greatest_scale", "max_scale"),
+    ("gaussians", "weakest", "prune_threshold"),
     ("r2", "count", "n_points"),
     ("r2", "density_share", "density_rescale"),
     ("r2", "candidate", "density_thresh"),

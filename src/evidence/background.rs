@@ -3,7 +3,7 @@
 use crate::evidence::drift::Drift;
 use crate::evidence::filters::map2;
 use crate::evidence::noise::{expected_minimum, noise_by_intensity};
-use crate::evidence::series::{LEAST_NOISE_SHARE, Series, blur, opening_radius};
+use crate::evidence::series::{MIN_NOISE_SHARE, Series, blur, opening_radius};
 use crate::raster::{Image, dilate, median, opening, percentile};
 use crate::scan::canvas::continued;
 use rayon::prelude::*;
@@ -87,20 +87,20 @@ impl Background {
         let bias = expected_minimum(images.len()) as f32;
         // A pixel without noise still has rounding errors.
         let span = images.iter().flat_map(|i| &i.values).fold([f32::MAX, f32::MIN], |[l, h], v| [l.min(*v), h.max(*v)]);
-        let least = 1e-6 * (span[1] - span[0]);
+        let min = 1e-6 * (span[1] - span[0]);
         let level: Vec<f32> = (0..width * height)
             .into_par_iter()
-            .map(|p| lower_mode(&images.iter().map(|i| i.values[p]).collect::<Vec<_>>(), noise[p].max(least), bias))
+            .map(|p| lower_mode(&images.iter().map(|i| i.values[p]).collect::<Vec<_>>(), noise[p].max(min), bias))
             .collect();
         let level = image(level);
         let wide = opening_radius(WIDE_SHARE, width, height);
         let changes: Vec<Option<Image>> =
             stilled.images.par_iter().map(|seen| Some(narrow_change(seen.as_ref()?, &level, wide))).collect();
         let smooth: Vec<Image> = changes.par_iter().flatten().map(|c| blur(c, STRONGEST_BLUR)).collect();
-        let most = |p: usize| smooth.iter().map(|c| c.values[p]).fold(f32::MIN, f32::max);
-        let largest: Vec<f32> = (0..width * height).map(most).collect();
+        let max = |p: usize| smooth.iter().map(|c| c.values[p]).fold(f32::MIN, f32::max);
+        let largest: Vec<f32> = (0..width * height).map(max).collect();
         let strongest = percentile(&largest, STRONGEST_PERCENTILE);
-        let floor = (LEAST_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
+        let floor = (MIN_NOISE_SHARE * strongest).max(f32::MIN_POSITIVE);
         noise.iter_mut().for_each(|s| *s = s.max(floor));
         // An opening of noise has a negative bias, an opening of the smoothed background a much smaller one.
         let mut low = opening(&blur(&level, STRONGEST_BLUR), opening_radius(OPENING_SHARE, width, height));

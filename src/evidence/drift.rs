@@ -4,7 +4,7 @@
 //! each pixel.
 
 use crate::evidence::filters::map2;
-use crate::evidence::series::{LEAST_NOISE_SHARE, Series, blur, opening_radius};
+use crate::evidence::series::{MIN_NOISE_SHARE, Series, blur, opening_radius};
 use crate::raster::{Image, median, median_filter, percentile};
 use rayon::prelude::*;
 
@@ -13,19 +13,19 @@ const SIDE: usize = 100;
 /// Radius of the median filter that removes vessels, as a share of the smaller side.
 const WIDE_SHARE: f64 = 0.09;
 /// Maximum number of courses of a view.
-const MOST_COURSES: usize = 3;
+const MAX_COURSES: usize = 3;
 /// Phases needed per course: with as many courses as independent phase differences, anything could be described, even a
 /// vessel.
 const PHASES_PER_COURSE: usize = 3;
 /// Rounds of the power iteration that finds a course.
 const POWER_ROUNDS: usize = 100;
 /// Minimum size of a visible mode: its root mean square over the phases, as a share of the strongest change.
-const LEAST_SIZE: f32 = 0.02;
+const MIN_SIZE: f32 = 0.02;
 /// Minimum share of a view in which a mode must be visible: the remainders of crossing vessels after the median filter
 /// cover few places.
-const LEAST_SPREAD: f64 = 0.03;
+const MIN_SPREAD: f64 = 0.03;
 /// Minimum share of the wide part that a course must explain: in noise, all courses explain equal shares.
-const LEAST_TOLD: f32 = 0.5;
+const MIN_TOLD: f32 = 0.5;
 /// Percentile of the narrow part that counts as the strongest change.
 const STRONGEST_PERCENTILE: f64 = 0.995;
 /// Iterations of the fit of a pixel.
@@ -41,7 +41,7 @@ const STANDS_OUT_SIGMAS: f32 = 4.0;
 const BELIEVED: [f32; 2] = [0.7, 0.9];
 /// Edges are explained almost completely, vessels by chance in varying degrees. Of the pixels explained by half or more, at
 /// least this share must be explained as well as the second of [`BELIEVED`]; otherwise all narrow parts are rejected.
-const LEAST_TOLD_WELL: f32 = 0.45;
+const MIN_TOLD_WELL: f32 = 0.45;
 
 /// The wide motion of a view.
 #[derive(Debug, Clone)]
@@ -73,7 +73,7 @@ impl Drift {
         if found.is_empty() {
             return Drift { modes: Vec::new() };
         }
-        let noise: Vec<f32> = noise.iter().map(|s| s.max(LEAST_NOISE_SHARE * strongest)).collect();
+        let noise: Vec<f32> = noise.iter().map(|s| s.max(MIN_NOISE_SHARE * strongest)).collect();
         let (courses, sizes): (Vec<Vec<f32>>, Vec<f32>) = found.into_iter().unzip();
         let images = Fit { deviations, courses: &courses, noise }.modes();
         let modes = courses.iter().zip(images).zip(sizes);
@@ -118,12 +118,12 @@ fn courses(deviations: &[Image]) -> (Vec<Course>, f32) {
         return (found, strongest);
     }
     centre(&mut wide);
-    while found.len() < MOST_COURSES.min((wide.len() - 1) / PHASES_PER_COURSE) {
+    while found.len() < MAX_COURSES.min((wide.len() - 1) / PHASES_PER_COURSE) {
         let Some(course) = strongest_course(&wide) else { break };
         let mode = mode(&wide, &course);
         let Some(size) = size_of_seen(&mode, (wide.len() as f32).sqrt() * strongest) else { break };
         let all: f32 = wide.iter().map(|w| dot(&w.values, &w.values)).sum();
-        if dot(&mode.values, &mode.values) < LEAST_TOLD * all {
+        if dot(&mode.values, &mode.values) < MIN_TOLD * all {
             break;
         }
         for (image, a) in wide.iter_mut().zip(&course) {
@@ -136,9 +136,9 @@ fn courses(deviations: &[Image]) -> (Vec<Course>, f32) {
 
 /// Mean size, in `unit`s, of a mode in the pixels where it is visible; `None` where these are too few.
 fn size_of_seen(mode: &Image, unit: f32) -> Option<f32> {
-    let seen: Vec<f32> = mode.values.iter().map(|m| m.abs() / unit).filter(|size| *size > LEAST_SIZE).collect();
+    let seen: Vec<f32> = mode.values.iter().map(|m| m.abs() / unit).filter(|size| *size > MIN_SIZE).collect();
     let spread = seen.len() as f64 / mode.values.len() as f64;
-    (spread >= LEAST_SPREAD).then(|| seen.iter().sum::<f32>() / seen.len() as f32)
+    (spread >= MIN_SPREAD).then(|| seen.iter().sum::<f32>() / seen.len() as f32)
 }
 
 /// The strongest course of images whose mean over the phases is 0; `None` where all are 0.
@@ -227,29 +227,29 @@ impl Fit<'_> {
         (before, after)
     }
 
-    /// Tells whether the narrow parts that follow the courses are edges of wide structures, by [`LEAST_TOLD_WELL`].
+    /// Tells whether the narrow parts that follow the courses are edges of wide structures, by [`MIN_TOLD_WELL`].
     fn are_edges(&self, before: &[f32], after: &[f32]) -> bool {
         let n = self.deviations.len() as f32;
         let stands_out = |p: &usize| before[*p] > n * (STANDS_OUT_SIGMAS * self.noise[*p]).powi(2);
         let told_by = |share: f32| {
             (0..before.len()).filter(stands_out).filter(|p| after[*p] < (1.0 - share) * before[*p]).count() as f32
         };
-        told_by(BELIEVED[1]) >= LEAST_TOLD_WELL * told_by(0.5)
+        told_by(BELIEVED[1]) >= MIN_TOLD_WELL * told_by(0.5)
     }
 }
 
 /// Coefficients of the courses in a pixel's values, without the influence of vessels: repeated projection of the residual,
 /// of which no more than `most` counts above the fit (Huber 1981, modified residuals). The start is the fit without this
 /// limit.
-fn followed(values: &[f32], courses: &[Vec<f32>], most: f32) -> Vec<f32> {
+fn followed(values: &[f32], courses: &[Vec<f32>], max: f32) -> Vec<f32> {
     let mut level = 0.0;
     let mut sizes = vec![0.0; courses.len()];
     let mut rest = vec![0.0; values.len()];
     for round in 0..=FIT_ROUNDS {
-        let most = if round == 0 { f32::INFINITY } else { most };
+        let max = if round == 0 { f32::INFINITY } else { max };
         for (t, rest) in rest.iter_mut().enumerate() {
             let fit = level + sizes.iter().zip(courses).map(|(m, a)| m * a[t]).sum::<f32>();
-            *rest = (values[t] - fit).min(most);
+            *rest = (values[t] - fit).min(max);
         }
         level += rest.iter().sum::<f32>() / rest.len() as f32;
         sizes.iter_mut().zip(courses).for_each(|(m, a)| *m += dot(a, &rest));

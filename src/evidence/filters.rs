@@ -4,7 +4,7 @@ use crate::raster::Image;
 use rayon::prelude::*;
 
 /// Taps of lines below this share of the middle one are dropped.
-const LEAST_TAP: f32 = 0.01;
+const MIN_TAP: f32 = 0.01;
 
 /// Weights of a Gaussian of `sigma` pixels; their sum is 1.
 pub(super) fn gaussian(sigma: f32) -> Vec<f32> {
@@ -80,7 +80,7 @@ impl LineFilter {
                 let weight = (-0.5 * (along / (length / 2.5)).powi(2) - 0.5 * (across / width).powi(2)).exp();
                 (x, y, weight)
             };
-            offsets.map(weigh).filter(|(_, _, weight)| *weight > LEAST_TAP).collect()
+            offsets.map(weigh).filter(|(_, _, weight)| *weight > MIN_TAP).collect()
         };
         let orientations = (0..count).map(|k| taps(k as f32 * std::f32::consts::PI / count as f32)).collect();
         LineFilter { radius: radius as usize, orientations }

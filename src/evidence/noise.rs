@@ -33,14 +33,14 @@ fn upper_tail(z: f64) -> f64 {
 pub fn noise_by_intensity(mean: &[f32], deviation: &[f32]) -> Vec<f32> {
     const GROUPS: usize = 24;
     const NOISIEST: f32 = 6.0;
-    let most = NOISIEST * median(&mut deviation.to_vec());
+    let max = NOISIEST * median(&mut deviation.to_vec());
     let mut order: Vec<u32> = (0..mean.len() as u32).collect();
     order.sort_unstable_by(|a, b| mean[*a as usize].total_cmp(&mean[*b as usize]));
     let mut noise = vec![0.0; mean.len()];
     for group in order.chunks(mean.len().div_ceil(GROUPS)) {
         let level = median(&mut group.iter().map(|i| deviation[*i as usize]).collect::<Vec<_>>());
         for i in group {
-            noise[*i as usize] = level.min(most);
+            noise[*i as usize] = level.min(max);
         }
     }
     noise

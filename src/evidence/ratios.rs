@@ -11,7 +11,7 @@ use crate::scan::canvas::continued;
 use rayon::prelude::*;
 
 /// Amplitude of the weakest vessel sought, as a share of the view's strongest change.
-const WEAKEST_SHARE: f32 = 0.08;
+const MIN_SHARE_OF_STRONGEST: f32 = 0.08;
 /// The noise of a filter is low enough when it is at most the weakest vessel divided by this.
 const QUIET_ENOUGH: f32 = 1.5;
 /// Gaussians of the ladder of filters, standard deviations in pixels.
@@ -89,7 +89,7 @@ fn largest_ratio<'a>(ratios: impl Iterator<Item = &'a Image>) -> Vec<f32> {
         if largest.is_empty() {
             largest.clone_from(&ratio.values);
         }
-        largest.iter_mut().zip(&ratio.values).for_each(|(most, v)| *most = most.max(*v));
+        largest.iter_mut().zip(&ratio.values).for_each(|(max, v)| *max = max.max(*v));
     }
     largest
 }
@@ -116,7 +116,7 @@ impl<'a> Ladder<'a> {
     fn new(background: &'a Background) -> Ladder<'a> {
         let noise = &background.noise;
         let weight = Image { values: noise.values.iter().map(|s| 1.0 / (s * s)).collect(), ..noise.clone() };
-        let weakest = WEAKEST_SHARE * background.strongest;
+        let weakest = MIN_SHARE_OF_STRONGEST * background.strongest;
         let quiet = weakest / QUIET_ENOUGH;
         // The noise of Gaussians does not depend on the image, so it is known at this point whether any pixel needs a line
         // filter.
@@ -202,8 +202,8 @@ impl<'a> Ladder<'a> {
             Estimate { amplitude: above, deviation: self.background.noise.clone() }
         };
         let mut ratio = self.ratio(&seen, &phase.weakest);
-        for ((covered, most), bare) in ratio.values.iter_mut().zip(largest).zip(&phase.ratio.values) {
-            *covered = bare.max(covered.min(*most) - COVERED_COST);
+        for ((covered, max), bare) in ratio.values.iter_mut().zip(largest).zip(&phase.ratio.values) {
+            *covered = bare.max(covered.min(*max) - COVERED_COST);
         }
         ratio
     }
@@ -225,9 +225,9 @@ fn log_ratio(a: f32, tau: f32, low: f32, high: f32) -> f32 {
         *exponent = (2.0 * a - amplitude) * amplitude * scale;
         amplitude *= step;
     }
-    let most = exponents.iter().copied().fold(f32::MIN, f32::max);
-    let sum: f32 = exponents.iter().map(|e| (e - most).exp()).sum();
-    (most + (sum / AMPLITUDES as f32).ln()).clamp(LEAST, MOST)
+    let max = exponents.iter().copied().fold(f32::MIN, f32::max);
+    let sum: f32 = exponents.iter().map(|e| (e - max).exp()).sum();
+    (max + (sum / AMPLITUDES as f32).ln()).clamp(LEAST, MOST)
 }
 
 #[cfg(test)]

@@ -5,9 +5,9 @@ use crate::raster::Image;
 use crate::scan::dataset::Dataset;
 
 /// Minimum noise, as a share of the strongest change: models have errors, too.
-pub(super) const LEAST_NOISE_SHARE: f32 = 0.01;
+pub(super) const MIN_NOISE_SHARE: f32 = 0.01;
 /// Minimum radius of an opening, pixels.
-const LEAST_OPENING_RADIUS: usize = 2;
+const MIN_OPENING_RADIUS: usize = 2;
 
 /// Line integrals of one training view over the beat.
 #[derive(Debug, Clone)]
@@ -46,7 +46,7 @@ fn mean_image(dataset: &Dataset, view: usize, phase: u32) -> Option<Image> {
 
 /// Radius of an opening, from its share of an image's smaller side.
 pub fn opening_radius(share: f64, width: usize, height: usize) -> usize {
-    ((share * width.min(height) as f64).round() as usize).max(LEAST_OPENING_RADIUS)
+    ((share * width.min(height) as f64).round() as usize).max(MIN_OPENING_RADIUS)
 }
 
 /// Gaussian blur; outside, the border's pixels are continued.

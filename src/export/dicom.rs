@@ -19,7 +19,7 @@ const LABEL: &str = "RESEARCH USE ONLY - NOT FOR DIAGNOSIS";
 /// Largest number of characters of a decimal string.
 const DECIMAL_CHARACTERS: usize = 16;
 /// Largest size of pixel data of explicit length, bytes.
-const MOST_BYTES: usize = u32::MAX as usize - 1;
+const MAX_BYTES: usize = u32::MAX as usize - 1;
 
 /// A view at some times of a beat.
 #[derive(Debug, Clone)]
@@ -63,7 +63,7 @@ pub fn write(path: &Path, view: &DicomView<'_>) -> Result<()> {
             "is out of range: sides of 1 to 65535 pixels are accepted",
         ));
     };
-    if view.frames.is_empty() || view.frames.len() * width * height * 2 > MOST_BYTES {
+    if view.frames.is_empty() || view.frames.len() * width * height * 2 > MAX_BYTES {
         return Err(Error::config(
             "frames",
             view.frames.len(),
@@ -186,15 +186,15 @@ fn pixels(object: &mut InMemDicomObject, view: &DicomView<'_>, [columns, rows]: 
     }
     let codes: Vec<u16> =
         view.frames.iter().flatten().map(|v| (WHITE * (-f64::from(*v)).exp()).round() as u16).collect();
-    let (least, most) = codes.iter().fold((u16::MAX, 0), |(least, most), code| (least.min(*code), most.max(*code)));
-    let (least, most) = (f64::from(least), f64::from(most));
+    let (min, max) = codes.iter().fold((u16::MAX, 0), |(min, max), code| (min.min(*code), max.max(*code)));
+    let (min, max) = (f64::from(min), f64::from(max));
     for (tag, vr, value) in [
         (tags::PHOTOMETRIC_INTERPRETATION, VR::CS, "MONOCHROME2"),
         (tags::PIXEL_INTENSITY_RELATIONSHIP, VR::CS, "LIN"),
         (tags::NUMBER_OF_FRAMES, VR::IS, &view.frames.len().to_string()),
         (tags::FRAME_TIME, VR::DS, &decimal(view.frame_ms)),
-        (tags::WINDOW_CENTER, VR::DS, &decimal(0.5 * (least + most))),
-        (tags::WINDOW_WIDTH, VR::DS, &decimal((most - least).max(1.0))),
+        (tags::WINDOW_CENTER, VR::DS, &decimal(0.5 * (min + max))),
+        (tags::WINDOW_WIDTH, VR::DS, &decimal((max - min).max(1.0))),
     ] {
         text(object, tag, vr, value);
     }

@@ -36,5 +36,5 @@ impl Iterations {
 pub(crate) fn pass_times(gpu: &Gpu, recording: Recording) -> Result<Vec<PassTime>> {
     let commands = recording.finish()?;
     gpu.wait(commands.submit()?)?;
-    commands.pass_times()
+    Ok(commands.pass_times()?)
 }

@@ -1,11 +1,12 @@
 //! Fits of static methods whose field consists of Gaussians, which are drawn while the fit runs.
 
 use crate::error::Result;
-use crate::fitting::fit::{FieldFeed, Fit, FitField, FitState, FitWork, SavedFit};
+use crate::fitting::fit::{FieldFeed, Fit, FitField, FitState, FitWork, PendingFit, SavedFit};
 use crate::fitting::losses::StepLoss;
 use crate::gaussians::field::{DynamicGaussians, GaussianFeed, Gaussians};
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::record::PassTime;
+use std::any::Any;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Iterations between updates of the Gaussians that are drawn: with half a million Gaussians per phase an update takes as long as
@@ -85,7 +86,7 @@ fn is_due(before: u32, now: u32, until: u32) -> bool {
     now >= until || now / SHOWN_EVERY > before / SHOWN_EVERY
 }
 
-impl<T: SetsFit> Fit for ShownFit<T> {
+impl<T: SetsFit + 'static> Fit for ShownFit<T> {
     fn step(&self) -> u32 {
         self.fit.step()
     }
@@ -103,17 +104,17 @@ impl<T: SetsFit> Fit for ShownFit<T> {
 
     fn outline(&self) -> FitField {
         let shown = self.feed.lock().unwrap_or_else(PoisonError::into_inner).1.clone();
-        FitField::Gaussians(Box::new(shown))
+        FitField::of_gaussians(shown)
     }
 
     fn feed(&self) -> FieldFeed {
-        FieldFeed::Gaussians(self.feed.clone())
+        FieldFeed { gaussians: Some(self.feed.clone()), ..FieldFeed::default() }
     }
 
-    fn state(&self) -> Result<SavedFit> {
+    fn snapshot(&self) -> Result<Box<dyn PendingFit>> {
         let state = self.fit.state()?;
         let field = DynamicGaussians::PerPhase(self.fit.field_of(&state));
-        Ok(SavedFit { field: FitField::Gaussians(Box::new(field)), state: Arc::new(state) })
+        Ok(Box::new(SavedFit { field: FitField::of_gaussians(field), state: Arc::new(state) }))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
@@ -122,6 +123,10 @@ impl<T: SetsFit> Fit for ShownFit<T> {
 
     fn work(&self) -> Result<Option<FitWork>> {
         Ok(Some(FitWork { count: self.fit.count(), work: self.fit.work()? }))
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
     }
 }
 

@@ -19,7 +19,7 @@ pub enum Encoding {
 
 /// Axes of a file in addition to its three spatial axes.
 #[derive(Clone, Copy)]
-enum Beside<'a> {
+enum ExtraAxes<'a> {
     /// No further axis: a single volume.
     Nothing,
     /// An axis of phases before the spatial axes.
@@ -39,31 +39,31 @@ struct MoreAxes {
 }
 
 impl MoreAxes {
-    fn of(beside: Beside<'_>) -> MoreAxes {
+    fn of(beside: ExtraAxes<'_>) -> MoreAxes {
         let names = |axis: usize, phases: &[u32]| {
             let values: Vec<_> = phases.iter().map(u32::to_string).collect();
             format!("axis {axis} index type:=numeric\naxis {axis} index values:={}\n", values.join(" "))
         };
         let none = String::new;
         match beside {
-            Beside::Nothing => {
+            ExtraAxes::Nothing => {
                 MoreAxes { sizes: [none(), none()], directions: ["", ""], kinds: ["", ""], names: none(), dimension: 3 }
             }
-            Beside::Phases(phases) => MoreAxes {
+            ExtraAxes::Phases(phases) => MoreAxes {
                 sizes: [format!("{} ", phases.len()), none()],
                 directions: ["none ", ""],
                 kinds: ["list ", ""],
                 names: names(0, phases),
                 dimension: 4,
             },
-            Beside::Vectors(None) => MoreAxes {
+            ExtraAxes::Vectors(None) => MoreAxes {
                 sizes: ["3 ".into(), none()],
                 directions: ["none ", ""],
                 kinds: ["vector ", ""],
                 names: none(),
                 dimension: 4,
             },
-            Beside::Vectors(Some(phases)) => MoreAxes {
+            ExtraAxes::Vectors(Some(phases)) => MoreAxes {
                 sizes: ["3 ".into(), format!(" {}", phases.len())],
                 directions: ["none ", " none"],
                 kinds: ["vector ", " list"],
@@ -78,7 +78,7 @@ impl MoreAxes {
 fn header(
     size: &str,
     index_to_lps: &DAffine3,
-    beside: Beside<'_>,
+    beside: ExtraAxes<'_>,
     encoding: Encoding,
     quantity: &str,
     comments: &[&str],
@@ -110,7 +110,7 @@ fn header(
 }
 
 /// Returns the header of a grid along the patient's axes.
-fn header_on_grid(h: &VolumeHeader, beside: Beside<'_>, encoding: Encoding, comments: &[&str]) -> Vec<u8> {
+fn header_on_grid(h: &VolumeHeader, beside: ExtraAxes<'_>, encoding: Encoding, comments: &[&str]) -> Vec<u8> {
     let [nx, ny, nz] = h.size;
     let axes = DMat3::from_diagonal(h.spacing_mm);
     let index_to_lps = DAffine3::from_mat3_translation(axes, h.origin_mm);
@@ -120,13 +120,13 @@ fn header_on_grid(h: &VolumeHeader, beside: Beside<'_>, encoding: Encoding, comm
 /// Returns the header of a file whose values are then written in pieces. In a sequence, the values of all phases of a voxel are
 /// adjacent.
 pub fn header_of(h: &VolumeHeader, encoding: Encoding) -> Vec<u8> {
-    header_on_grid(h, h.phases.as_deref().map_or(Beside::Nothing, Beside::Phases), encoding, &[])
+    header_on_grid(h, h.phases.as_deref().map_or(ExtraAxes::Nothing, ExtraAxes::Phases), encoding, &[])
 }
 
 /// Returns the header of a file of vectors with `comments`, whose values are then written in pieces. Values follow phase by
 /// phase, with the components of a vector adjacent. The list axis comes last, as in files that 3D Slicer writes itself.
 pub fn vector_header_of(h: &VolumeHeader, encoding: Encoding, comments: &[&str]) -> Vec<u8> {
-    header_on_grid(h, Beside::Vectors(h.phases.as_deref()), encoding, comments)
+    header_on_grid(h, ExtraAxes::Vectors(h.phases.as_deref()), encoding, comments)
 }
 
 /// Writes a gzip-compressed volume in LPS mm; `quantity` names the meaning of its values.
@@ -136,7 +136,7 @@ pub fn vector_header_of(h: &VolumeHeader, encoding: Encoding, comments: &[&str])
 pub fn write(path: &Path, volume: &Volume, quantity: &str) -> Result<()> {
     let [nx, ny, nz] = volume.size;
     let size = format!("{nx} {ny} {nz}");
-    let header = header(&size, &volume.index_to_lps, Beside::Nothing, Encoding::Gzip, quantity, &[]);
+    let header = header(&size, &volume.index_to_lps, ExtraAxes::Nothing, Encoding::Gzip, quantity, &[]);
     files::write_atomic_with(path, |file| {
         file.write_all(header.as_bytes())?;
         let mut gzip = flate2::write::GzEncoder::new(file, flate2::Compression::fast());

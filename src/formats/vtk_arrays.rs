@@ -9,13 +9,13 @@ use std::io::Read;
 use std::path::Path;
 
 /// Largest accepted array after decompression, bytes.
-const MOST_BYTES: usize = 1 << 27;
+const MAX_BYTES: usize = 1 << 27;
 const APPENDED: &[u8] = b"<AppendedData";
 const ROOT: &str = "VTKFile";
 const ZLIB: &str = "vtkZLibDataCompressor";
 
 /// A file split into its XML and the appended data, which need not be XML.
-pub(super) struct Parts<'a> {
+pub(super) struct SplitFile<'a> {
     /// The XML without the appended data.
     pub(super) text: String,
     appended: Option<Appended<'a>>,
@@ -27,11 +27,11 @@ struct Appended<'a> {
     data: &'a [u8],
 }
 
-impl<'a> Parts<'a> {
+impl<'a> SplitFile<'a> {
     /// Splits the bytes of a file.
-    pub(super) fn of(bytes: &'a [u8]) -> Parts<'a> {
+    pub(super) fn of(bytes: &'a [u8]) -> SplitFile<'a> {
         let Some(start) = bytes.windows(APPENDED.len()).position(|w| w == APPENDED) else {
-            return Parts { text: String::from_utf8_lossy(bytes).into_owned(), appended: None };
+            return SplitFile { text: String::from_utf8_lossy(bytes).into_owned(), appended: None };
         };
         let (head, tail) = bytes.split_at(start);
         let tag_end = tail.iter().position(|b| *b == b'>').unwrap_or(tail.len());
@@ -40,7 +40,7 @@ impl<'a> Parts<'a> {
         // The data begin after an underscore.
         let data = rest.iter().position(|b| *b == b'_').map_or(&rest[..0], |mark| &rest[mark + 1..]);
         let text = format!("{}</{ROOT}>", String::from_utf8_lossy(head));
-        Parts { text, appended: Some(Appended { base64, data }) }
+        SplitFile { text, appended: Some(Appended { base64, data }) }
     }
 }
 
@@ -58,7 +58,7 @@ impl<'a> Arrays<'a> {
     ///
     /// # Errors
     /// [`Error::Data`] for another kind of file and for a compression that is not read.
-    pub(super) fn of(file: &'a Path, document: &Document<'_>, parts: &Parts<'a>, kind: &str) -> Result<Arrays<'a>> {
+    pub(super) fn of(file: &'a Path, document: &Document<'_>, parts: &SplitFile<'a>, kind: &str) -> Result<Arrays<'a>> {
         let root = document.root_element();
         let found = root.attribute("type").unwrap_or_default();
         if root.tag_name().name() != ROOT || found != kind {
@@ -117,7 +117,7 @@ impl<'a> Arrays<'a> {
         let bytes = stream.take(if self.wide_lengths { 8 } else { 4 })?;
         let fold = |value: u64, byte: &u8| (value << 8) | u64::from(*byte);
         let value = if self.big_endian { bytes.iter().fold(0, fold) } else { bytes.iter().rev().fold(0, fold) };
-        usize::try_from(value).ok().filter(|length| *length <= MOST_BYTES)
+        usize::try_from(value).ok().filter(|length| *length <= MAX_BYTES)
     }
 
     /// Reads the uncompressed bytes of an array; none if there are fewer than the array states.
@@ -130,7 +130,7 @@ impl<'a> Arrays<'a> {
         // and the compressed size of each block.
         let (block, last) = (self.length(stream)?, self.length(stream)?);
         let packed: Vec<usize> = (0..first).map_while(|_| self.length(stream)).collect();
-        if packed.len() < first || first.checked_mul(block)? > MOST_BYTES {
+        if packed.len() < first || first.checked_mul(block)? > MAX_BYTES {
             return None;
         }
         let mut all = Vec::new();

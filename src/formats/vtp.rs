@@ -4,14 +4,14 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::formats::vtk_arrays::{Arrays, Parts};
+use crate::formats::vtk_arrays::{Arrays, SplitFile};
 use roxmltree::{Document, Node, ParsingOptions};
 use std::fmt::{Display, Write};
 use std::path::{Path, PathBuf};
 
-const MOST_FILE_BYTES: u64 = 1 << 30;
+const MAX_FILE_BYTES: u64 = 1 << 30;
 /// Largest accepted number of XML nodes: they may be nested to the same depth, and each level uses stack space.
-const MOST_NODES: u32 = 2048;
+const MAX_NODES: u32 = 2048;
 
 /// Named values, one per point or line.
 pub enum Values {
@@ -124,7 +124,7 @@ fn data_arrays<'a, 'input>(node: Option<Node<'a, 'input>>) -> impl Iterator<Item
 }
 
 fn parsed<'a>(path: &Path, text: &'a str) -> Result<Document<'a>> {
-    let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
+    let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
     Document::parse_with_options(text, options).map_err(|e| Error::data(path, "XML", e.to_string()))
 }
 
@@ -133,8 +133,8 @@ fn parsed<'a>(path: &Path, text: &'a str) -> Result<Document<'a>> {
 /// # Errors
 /// [`Error::Io`], and [`Error::Data`] naming the field.
 pub fn read(path: &Path) -> Result<ReadLines> {
-    let bytes = files::read_limited(path, MOST_FILE_BYTES)?;
-    let parts = Parts::of(&bytes);
+    let bytes = files::read_limited(path, MAX_FILE_BYTES)?;
+    let parts = SplitFile::of(&bytes);
     let document = parsed(path, &parts.text)?;
     let arrays = Arrays::of(path, &document, &parts, "PolyData")?;
     let data = child(document.root_element(), "PolyData");
@@ -189,8 +189,8 @@ fn lines(connectivity: &[f64], ends: &[f64], n_points: usize) -> Option<Vec<Vec<
 /// # Errors
 /// [`Error::Io`]; [`Error::Data`] for a file that is not a collection, and for two files with the same time.
 pub fn read_collection(path: &Path) -> Result<Vec<PathBuf>> {
-    let bytes = files::read_limited(path, MOST_FILE_BYTES)?;
-    let parts = Parts::of(&bytes);
+    let bytes = files::read_limited(path, MAX_FILE_BYTES)?;
+    let parts = SplitFile::of(&bytes);
     let document = parsed(path, &parts.text)?;
     Arrays::of(path, &document, &parts, "Collection")?;
     let sets = child(document.root_element(), "Collection");

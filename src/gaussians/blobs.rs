@@ -105,7 +105,7 @@ impl BlobSet {
 /// Creates a buffer of Gaussians, which is never empty.
 fn upload(gpu: &Gpu, blobs: Vec<Blob>) -> Result<Buffer> {
     let blobs = if blobs.is_empty() { vec![Blob::default()] } else { blobs };
-    gpu.buffer_with("blobs", &blobs)
+    Ok(gpu.buffer_with("blobs", &blobs)?)
 }
 
 /// Draws a dynamic field that consists of Gaussians.
@@ -213,12 +213,12 @@ impl Blobs {
         volume: &Buffer,
     ) -> Result<()> {
         // Groups along y are limited to 65535 on every device.
-        const MOST_ROWS: u32 = 65_535 * ROWS;
+        const MAX_ROWS: u32 = 65_535 * ROWS;
         let BlobList { blobs, range } = self.at(phase)?;
         let bound = [(Binding::blobs, (&blobs).into()), (Binding::volume, volume.into())];
         let points = &self.kernels.points;
-        for first_row in (0..n_rows).step_by(MOST_ROWS as usize) {
-            let rows = MOST_ROWS.min(n_rows - first_row);
+        for first_row in (0..n_rows).step_by(MAX_ROWS as usize) {
+            let rows = MAX_ROWS.min(n_rows - first_row);
             let (first_blob, n_blobs) = (range.start, range.len() as u32);
             let push = push::GaussianPoints { first_row, n_rows, first_blob, n_blobs, away };
             let groups = Groups::Direct([row_cells.div_ceil(points.local_size()), rows.div_ceil(ROWS), 1]);

@@ -85,13 +85,13 @@ impl Gaussians {
 
 /// Returns the standard deviations of a Gaussian along its own axes, clamped to the bounds, pixels.
 pub fn scales(g: &Gaussian, setup: &GaussianSetup) -> DVec3 {
-    DVec3::from_array(g.log_scale.map(|log| f64::from(log.exp().clamp(setup.least_scale, setup.greatest_scale))))
+    DVec3::from_array(g.log_scale.map(|log| f64::from(log.exp().clamp(setup.min_scale, setup.max_scale))))
 }
 
 /// Returns an approximate maximum of the line integrals through a Gaussian, from the scale of its thinnest axis.
 pub fn amplitude(g: &Gaussian, setup: &GaussianSetup) -> f64 {
     let thinnest = g.log_scale.iter().copied().fold(f32::INFINITY, f32::min).exp();
-    let scale = f64::from(thinnest.clamp(setup.least_scale, setup.greatest_scale));
+    let scale = f64::from(thinnest.clamp(setup.min_scale, setup.max_scale));
     f64::from(g.log_density).exp() * std::f64::consts::TAU.sqrt() * scale
 }
 
@@ -125,8 +125,8 @@ fn mass(g: &Gaussian, setup: &GaussianSetup) -> f64 {
 
 /// Tells for each Gaussian whether its density is at least a `share` of the vessels' density.
 pub fn dense(rows: &[Gaussian], setup: &GaussianSetup, share: f64) -> Vec<bool> {
-    let least = share * vessel_density(rows, setup);
-    rows.iter().map(|g| density(g) >= least).collect()
+    let min = share * vessel_density(rows, setup);
+    rows.iter().map(|g| density(g) >= min).collect()
 }
 
 /// Returns the nodes per pixel of a deformable set's grid of `n_nodes` nodes along each axis, which reaches `half_side` pixels to either
@@ -337,7 +337,7 @@ mod tests {
 
     #[test]
     fn broad_and_faint_is_no_vessel() {
-        let setup = GaussianSetup { least_scale: 0.5, greatest_scale: 4.0, ..GaussianSetup::default() };
+        let setup = GaussianSetup { min_scale: 0.5, max_scale: 4.0, ..GaussianSetup::default() };
         let gaussian = |density: f32, scale: f32| Gaussian {
             log_density: density.ln(),
             log_scale: [scale.ln(); 3],

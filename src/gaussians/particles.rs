@@ -94,7 +94,7 @@ impl ParticleBuffers {
 }
 
 /// Keeps the values of marked Gaussians; all Gaussians have the same number of values.
-pub(super) fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
+pub(crate) fn retain_marked<T>(values: &mut Vec<T>, keep: &[bool]) {
     let each = values.len() / keep.len().max(1);
     let mut at = 0..;
     values.retain(|_| at.next().is_some_and(|i| keep[i / each]));

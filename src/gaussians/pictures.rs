@@ -19,7 +19,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Maximum number of recorded pictures that are kept; a display needs far fewer.
-const MOST_RECORDED: usize = 256;
+const MAX_RECORDED: usize = 256;
 
 /// Builds the stage that writes a picture into a buffer; the other stages are those of fits.
 ///
@@ -129,7 +129,7 @@ impl Pictures {
     pub fn draw_at(&self, rays: &ViewRays, (width, height): (usize, usize), phases: f64) -> Result<Vec<f32>> {
         let key = Key { columns: width, rows: height, time: phases.to_bits() };
         let mut sums = vec![0i32; width * height];
-        if self.blended(key, rays, |picture| picture.read(&mut sums))?.is_some() {
+        if self.blended(key, rays, |picture| Ok(picture.read(&mut sums)?))?.is_some() {
             return Ok(sums.iter().map(|v| *v as f32 * picture::unit()).collect());
         }
         let (units, picture) = self.picture(key)?;
@@ -155,14 +155,14 @@ impl Pictures {
     ) -> Result<()> {
         let key = Key { columns: width, rows: height, time: f64::from(phase).to_bits() };
         let n_pixels = (width * height) as u32;
-        let into = |sums: &Buffer, unit: f32| {
+        let into = |sums: &Buffer, unit: f32| -> Result<Commands> {
             let push = push::GaussianPicture { n_pixels, unit, in_front: u32::from(in_front) };
             let bound = [(Binding::splat_images, sums.into()), (Binding::image, target.into())];
             let mut recording = Recording::new(&self.gpu, "picture of Gaussians into a buffer")?;
             dispatch(&mut recording, &self.show, self.show.groups_over(n_pixels), &bound, push)?;
-            recording.finish()
+            Ok(recording.finish()?)
         };
-        let show_blended = |sums: &Buffer| self.gpu.wait(into(sums, picture::unit())?.submit()?);
+        let show_blended = |sums: &Buffer| Ok(self.gpu.wait(into(sums, picture::unit())?.submit()?)?);
         if self.blended(key, rays, show_blended)?.is_some() {
             return Ok(());
         }
@@ -171,7 +171,7 @@ impl Pictures {
         picture.buffers.gaussian_views.write(&[SplatView::new(rays, units).to_device()])?;
         let shown = into(&picture.buffers.splat_images, line_integral(units))?;
         self.gpu.wait(picture.commands.submit()?)?;
-        self.gpu.wait(shown.submit()?)
+        Ok(self.gpu.wait(shown.submit()?)?)
     }
 
     /// Draws a view of Gaussians that hide each other and passes the fixed-point image to `take`; none where line integrals add
@@ -180,7 +180,7 @@ impl Pictures {
         let Some(kernels) = &self.blend else { return Ok(None) };
         let picture = {
             let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-            if state.blended.len() >= MOST_RECORDED {
+            if state.blended.len() >= MAX_RECORDED {
                 state.blended.clear();
             }
             match state.blended.get(&key) {
@@ -209,7 +209,7 @@ impl Pictures {
         if let Some(picture) = state.recorded.get(&key) {
             return Ok((units, picture.clone()));
         }
-        if state.recorded.len() >= MOST_RECORDED {
+        if state.recorded.len() >= MAX_RECORDED {
             state.recorded.clear();
         }
         let picture = Arc::new(self.record(&state.field, key)?);
@@ -235,7 +235,7 @@ impl Pictures {
             ..sets.setup
         };
         // Buffers are never empty.
-        let least = u64::from(n.max(1));
+        let min = u64::from(n.max(1));
         let rows = if rows.is_empty() { vec![Gaussian::default()] } else { rows };
         let buffers = PictureBuffers {
             gaussian_setup: gpu.buffer_with("gaussian_setup of a picture", &[setup])?,
@@ -246,8 +246,8 @@ impl Pictures {
             )?,
             image_of_view: gpu.buffer_with("image_of_view of a picture", &vec![0i32; sets.n_phases])?,
             gaussians: gpu.buffer_with("gaussians of a picture", &rows)?,
-            splats: gpu.buffer("splats of a picture", size_of::<Splat>() as u64 * least, Memory::Device)?,
-            image_of_splat: gpu.buffer("image_of_splat of a picture", 4 * least, Memory::Device)?,
+            splats: gpu.buffer("splats of a picture", size_of::<Splat>() as u64 * min, Memory::Device)?,
+            image_of_splat: gpu.buffer("image_of_splat of a picture", 4 * min, Memory::Device)?,
             splat_images: gpu.buffer("splat_images of a picture", 4 * u64::from(pixels), Memory::Readback)?,
         };
         let mut recording = Recording::new(gpu, "picture of Gaussians")?;

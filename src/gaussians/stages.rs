@@ -131,7 +131,7 @@ pub struct GaussianPass<'a> {
 
 impl GaussianPass<'_> {
     /// Records a stage that finds its buffers in this pass or in `more`.
-    pub(super) fn run<P: PushConstants>(
+    pub(crate) fn run<P: PushConstants>(
         &mut self,
         stage: &Stage<P>,
         groups: Groups<'_>,
@@ -145,13 +145,13 @@ impl GaussianPass<'_> {
     }
 
     /// Records the images of splats that have already been projected.
-    pub(super) fn splats(&mut self, n_splats: u32) -> Result<()> {
+    pub(crate) fn splats(&mut self, n_splats: u32) -> Result<()> {
         let splat = &self.kernels.splat;
         self.run(&splat.stage, splat.groups_for(n_splats), &[], push::GaussianSplat { n_splats })
     }
 
     /// Records the residuals of some images, and the moments of all splats.
-    pub(super) fn residual(&mut self, images: Range<u32>, n_splats: u32) -> Result<()> {
+    pub(crate) fn residual(&mut self, images: Range<u32>, n_splats: u32) -> Result<()> {
         let [first_quad, n_quads] = [images.start, images.len() as u32].map(|n| n * self.setup.image_stride / 4);
         let GaussianKernels { residual, moments, .. } = self.kernels;
         let push = push::GaussianResidual { first_quad, n_quads };
@@ -161,7 +161,7 @@ impl GaussianPass<'_> {
     }
 
     /// Records the end of an iteration: its loss and the step count.
-    pub(super) fn report(&mut self) -> Result<()> {
+    pub(crate) fn report(&mut self) -> Result<()> {
         self.run(&self.kernels.report, Groups::Direct([1, 1, 1]), &[], push::GaussianReport {})
     }
 }

@@ -13,8 +13,8 @@ pub(crate) const FORMAT: &str = "nertca-checkpoint-3";
 pub(crate) const SECTION: &str = "gaussians";
 
 /// Maximum number of nodes along an axis of a deformable set's grid, and of numbers per axis of own motion, far above those of any run.
-const MOST_NODES: u32 = 512;
-const MOST_BASIS: u32 = 256;
+const MAX_NODES: u32 = 512;
+const MAX_BASIS: u32 = 256;
 
 /// Properties of the Gaussians that tensors do not contain.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -25,9 +25,11 @@ pub(crate) struct GaussianHeader {
     strongest: f64,
     /// Number of standard deviations at which a Gaussian is cut off.
     cut: f32,
-    /// Bounds of the scales, pixels.
-    least_scale: f32,
-    greatest_scale: f32,
+    /// Bounds of the scales, pixels; files keep their first names.
+    #[serde(rename = "least_scale")]
+    min_scale: f32,
+    #[serde(rename = "greatest_scale")]
+    max_scale: f32,
     /// Iterations of the fit.
     step: u32,
     /// Number of views of the fit; 0 where it is not known.
@@ -65,8 +67,8 @@ pub(crate) fn header(field: &DynamicGaussians) -> GaussianHeader {
         pixel: sets.units.pixel,
         strongest: sets.units.strongest,
         cut: sets.setup.cut,
-        least_scale: sets.setup.least_scale,
-        greatest_scale: sets.setup.greatest_scale,
+        min_scale: sets.setup.min_scale,
+        max_scale: sets.setup.max_scale,
         step: sets.step,
         views: sets.setup.n_views,
         crowd: sets.is_crowd,
@@ -138,8 +140,8 @@ pub(crate) fn read_section(sections: &serde_json::Value, file: &File<'_>, n_phas
 /// Reads the Gaussians that [`header`] and [`tensors`] describe.
 pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) -> Result<DynamicGaussians> {
     let path = file.path;
-    let positive = [header.pixel, header.strongest, header.cut.into(), header.least_scale.into()];
-    if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || header.greatest_scale < header.least_scale {
+    let positive = [header.pixel, header.strongest, header.cut.into(), header.min_scale.into()];
+    if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || header.max_scale < header.min_scale {
         return Err(Error::data(
             path,
             "gaussians",
@@ -174,8 +176,8 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
             n_views: header.views,
             n_phases: n_phases as u32,
             cut: header.cut,
-            least_scale: header.least_scale,
-            greatest_scale: header.greatest_scale,
+            min_scale: header.min_scale,
+            max_scale: header.max_scale,
             ..GaussianSetup::default()
         },
         rows: (0..n).map(row).collect(),
@@ -184,8 +186,8 @@ pub(crate) fn read(header: &GaussianHeader, file: &File<'_>, n_phases: usize) ->
         intensities: header.blended.then(|| file.floats(INTENSITY, &[Some(n)])).transpose()?,
     };
     let Some(grid) = &header.grid else { return Ok(DynamicGaussians::PerPhase(sets)) };
-    if !(2..=MOST_NODES).contains(&grid.nodes)
-        || grid.basis > MOST_BASIS
+    if !(2..=MAX_NODES).contains(&grid.nodes)
+        || grid.basis > MAX_BASIS
         || grid.half_side.is_nan()
         || grid.half_side <= 0.0
     {

@@ -281,9 +281,9 @@ fn select(
             f64::from(percentile(&stand_out, 0.98))
         })
         .collect();
-    let most = contrast.iter().copied().fold(0.0, f64::max);
+    let max = contrast.iter().copied().fold(0.0, f64::max);
     // A frame that is not filled is appended to end a sequence that lasts to the last frame.
-    let filled = contrast.iter().map(|c| *c >= FILLED_SHARE * most).chain([false]);
+    let filled = contrast.iter().map(|c| *c >= FILLED_SHARE * max).chain([false]);
     // Find the longest sequence.
     let mut best = 0..0;
     let mut start = 0;

@@ -377,9 +377,9 @@ impl Reader<'_> {
 
     /// Columns and rows inside the collimator's shutters.
     fn open_area(&self, width: usize, height: usize) -> Result<(Range<usize>, Range<usize>)> {
-        let edge = |tag, name, otherwise: usize, most: usize| -> Result<usize> {
+        let edge = |tag, name, otherwise: usize, max: usize| -> Result<usize> {
             // Edges are counted from 1, and the edge itself belongs to the shutter.
-            Ok(self.number(tag, name)?.map_or(otherwise, |e| e.clamp(0.0, most as f64 + 1.0) as usize))
+            Ok(self.number(tag, name)?.map_or(otherwise, |e| e.clamp(0.0, max as f64 + 1.0) as usize))
         };
         let left = edge(tags::SHUTTER_LEFT_VERTICAL_EDGE, "ShutterLeftVerticalEdge", 0, width)?;
         let right = edge(tags::SHUTTER_RIGHT_VERTICAL_EDGE, "ShutterRightVerticalEdge", width + 1, width)?;

@@ -13,7 +13,7 @@ struct Version {
 }
 
 /// A file found by an earlier scan.
-struct Seen {
+struct ScannedFile {
     version: Version,
     /// Whether this version was already returned.
     told: bool,
@@ -22,7 +22,7 @@ struct Seen {
 /// A folder that is scanned repeatedly. Subfolders and hidden files are ignored.
 pub struct Folder {
     path: PathBuf,
-    seen: BTreeMap<PathBuf, Seen>,
+    seen: BTreeMap<PathBuf, ScannedFile>,
 }
 
 impl Folder {
@@ -54,9 +54,9 @@ impl Folder {
             let seen = self
                 .seen
                 .entry(path.clone())
-                .or_insert(Seen { version: Version { bytes: u64::MAX, modified: None }, told: false });
+                .or_insert(ScannedFile { version: Version { bytes: u64::MAX, modified: None }, told: false });
             if seen.version != version {
-                *seen = Seen { version, told: false };
+                *seen = ScannedFile { version, told: false };
             } else if !seen.told {
                 seen.told = true;
                 whole.push(path);

@@ -11,11 +11,11 @@ const SIDE: usize = 64;
 /// Accepted lengths of a beat, seconds: 35 to 180 beats per minute.
 const BEATS_S: std::ops::RangeInclusive<f64> = 60.0 / 180.0..=60.0 / 35.0;
 /// Minimum length of a run, beats, so that half a beat is seen twice.
-const LEAST_BEATS: f64 = 1.5;
+const MIN_BEATS: f64 = 1.5;
 /// Minimum rise of the correlation one beat later, as a share of its drop from neighbouring images to the least similar ones.
-const LEAST_RETURN: f64 = 0.2;
+const MIN_RETURN: f64 = 0.2;
 /// Minimum rise of the correlation in absolute terms, because noise alone causes some similarity.
-const LEAST_LIKENESS: f64 = 0.02;
+const MIN_LIKENESS: f64 = 0.02;
 /// Share of the highest rise that makes a time the length of a beat; the shortest such time is used, because longer ones are
 /// several beats.
 const AS_GOOD: f64 = 0.8;
@@ -111,7 +111,7 @@ fn likeness(images: &[Vec<f32>]) -> Vec<Vec<f64>> {
 /// Number of images per beat, if the images repeat.
 fn period(likeness: &[Vec<f64>], frame_s: f64) -> Option<f64> {
     let n = likeness.len();
-    let longest = (((n - 1) as f64) / LEAST_BEATS).min(BEATS_S.end() / frame_s).floor() as usize;
+    let longest = (((n - 1) as f64) / MIN_BEATS).min(BEATS_S.end() / frame_s).floor() as usize;
     let alike: Vec<f64> = (0..n).map(|lag| mean_after(likeness, lag)).collect();
     let valley = |lag: usize| alike[..lag].iter().copied().fold(f64::MAX, f64::min);
     let shortest = ((BEATS_S.start() / frame_s).floor() as usize).max(1);
@@ -120,15 +120,15 @@ fn period(likeness: &[Vec<f64>], frame_s: f64) -> Option<f64> {
         .collect();
     let returns = |lag: usize| alike[lag] - valley(lag);
     let best = peaks.iter().map(|lag| returns(*lag)).fold(0.0, f64::max);
-    let least = (LEAST_RETURN * (alike[1] - valley(n / 2))).max(LEAST_LIKENESS);
-    let first = peaks.into_iter().find(|lag| returns(*lag) >= AS_GOOD * best && best >= least)?;
+    let min = (MIN_RETURN * (alike[1] - valley(n / 2))).max(MIN_LIKENESS);
+    let first = peaks.into_iter().find(|lag| returns(*lag) >= AS_GOOD * best && best >= min)?;
     // Times of several beats determine the length of one beat more precisely.
     let mut found = summit(&alike, first);
     for beats in 2.. {
         let about = (found * f64::from(beats)).round() as usize;
         let around = about.saturating_sub(first / 4)..(about + first / 4 + 1).min(n);
         let Some(lag) = around.max_by(|a, b| alike[*a].total_cmp(&alike[*b])) else { break };
-        if lag as f64 > (n - 1) as f64 / LEAST_BEATS || lag + 1 >= n {
+        if lag as f64 > (n - 1) as f64 / MIN_BEATS || lag + 1 >= n {
             break;
         }
         found = summit(&alike, lag) / f64::from(beats);

@@ -12,13 +12,13 @@ use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
 /// Largest accepted number of runs.
-pub const MOST_RUNS: usize = 64;
+pub const MAX_RUNS: usize = 64;
 /// Difference of angles, in degrees, below which two views are almost the same.
 const SAME_ANGLE_DEG: f64 = 5.0;
 
 /// Properties of an accepted run with which other runs are compared.
 #[derive(Clone)]
-struct Taken {
+struct AcceptedRun {
     name: String,
     identity: [u64; 2],
     instance: Option<u64>,
@@ -27,10 +27,10 @@ struct Taken {
     angles_deg: [f64; 2],
 }
 
-impl Taken {
-    fn of(run: &Run) -> Taken {
+impl AcceptedRun {
+    fn of(run: &Run) -> AcceptedRun {
         let first = &run.c_arms[0];
-        Taken {
+        AcceptedRun {
             name: run.name(),
             identity: run.identity,
             instance: run.instance,
@@ -43,7 +43,7 @@ impl Taken {
 /// Runs that were accepted, with the options of their import.
 pub struct Intake {
     options: ImportOptions,
-    taken: Vec<Taken>,
+    taken: Vec<AcceptedRun>,
     runs: Vec<Prepared>,
 }
 
@@ -70,7 +70,7 @@ impl Intake {
 
     /// Name of the accepted run that a run is a copy of.
     pub fn copy_of(&self, run: &Run) -> Option<&str> {
-        let same = |taken: &&Taken| taken.instance.is_some() && taken.instance == run.instance;
+        let same = |taken: &&AcceptedRun| taken.instance.is_some() && taken.instance == run.instance;
         self.taken.iter().find(same).map(|taken| taken.name.as_str())
     }
 
@@ -79,11 +79,11 @@ impl Intake {
     /// # Errors
     /// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option.
     pub fn take(&mut self, mut runs: Vec<Run>) -> Result<Vec<String>> {
-        if self.runs() + runs.len() > MOST_RUNS {
+        if self.runs() + runs.len() > MAX_RUNS {
             return Err(Error::config(
                 "FILE",
                 self.runs() + runs.len(),
-                format!("is out of range: 1 to {MOST_RUNS} runs are accepted"),
+                format!("is out of range: 1 to {MAX_RUNS} runs are accepted"),
             ));
         }
         let mut notes: Vec<String> =
@@ -91,7 +91,7 @@ impl Intake {
         let mut taken = self.taken.clone();
         for run in &mut runs {
             notes.extend(check(run, &taken));
-            taken.push(Taken::of(run));
+            taken.push(AcceptedRun::of(run));
             let first_mm = taken[0].table_mm;
             for c_arm in &mut run.c_arms {
                 c_arm.table_mm.iter_mut().zip(first_mm).for_each(|(now, first)| *now -= first);
@@ -167,8 +167,8 @@ fn trainable(run: &Run, prepared: &Prepared, options: &ImportOptions) -> Result<
 }
 
 /// Notes and warnings on differences between a run and the earlier runs.
-fn check(run: &Run, before: &[Taken]) -> Vec<String> {
-    let (mut notes, name, this) = (Vec::new(), run.name(), Taken::of(run));
+fn check(run: &Run, before: &[AcceptedRun]) -> Vec<String> {
+    let (mut notes, name, this) = (Vec::new(), run.name(), AcceptedRun::of(run));
     let Some(first) = before.first() else { return notes };
     if this.identity[0] != first.identity[0] {
         notes.push(format!("warning: {name} belongs to another patient than {}", first.name));
@@ -183,7 +183,7 @@ fn check(run: &Run, before: &[Taken]) -> Vec<String> {
             first.name
         ));
     }
-    let near = |other: &&Taken| (0..2).all(|k| (other.angles_deg[k] - this.angles_deg[k]).abs() < SAME_ANGLE_DEG);
+    let near = |other: &&AcceptedRun| (0..2).all(|k| (other.angles_deg[k] - this.angles_deg[k]).abs() < SAME_ANGLE_DEG);
     let near = before.iter().filter(near);
     notes.extend(near.map(|other| format!("warning: {} and {name} have almost the same viewing angle", other.name)));
     notes
@@ -195,8 +195,8 @@ fn check(run: &Run, before: &[Taken]) -> Vec<String> {
 /// [`Error::Data`] naming file and tag; [`Error::Config`] naming an option; [`Error::Io`]. In these cases no dataset is
 /// written.
 pub fn import_dicom(files: &[PathBuf], options: &ImportOptions, out: &Path) -> Result<Vec<String>> {
-    if files.is_empty() || files.len() > MOST_RUNS {
-        return Err(Error::config("FILE", files.len(), format!("is out of range: 1 to {MOST_RUNS} runs are accepted")));
+    if files.is_empty() || files.len() > MAX_RUNS {
+        return Err(Error::config("FILE", files.len(), format!("is out of range: 1 to {MAX_RUNS} runs are accepted")));
     }
     let runs = files.iter().map(|file| Run::read(file, options.pixel_mm)).collect::<Result<Vec<_>>>()?;
     let mut intake = Intake::new(options.clone());

@@ -2,7 +2,6 @@
 
 use crate::error::{Error, Result};
 use crate::gpu::buffer::Buffer;
-use crate::gpu::image::Image3d;
 use crate::gpu::record::{Bound, Groups, Recording};
 use crate::kernels::push::PushConstants;
 use crate::kernels::stages::Stage;
@@ -33,18 +32,6 @@ macro_rules! buffer_set {
     };
 }
 pub(crate) use buffer_set;
-
-impl<'a> From<&'a Buffer> for Bound<'a> {
-    fn from(buffer: &'a Buffer) -> Bound<'a> {
-        Bound::Buffer(buffer)
-    }
-}
-
-impl<'a> From<&'a Image3d> for Bound<'a> {
-    fn from(volume: &'a Image3d) -> Bound<'a> {
-        Bound::Image(volume)
-    }
-}
 
 /// Records `stage`; `bound` must provide everything that its shader binds.
 ///
@@ -81,5 +68,5 @@ pub fn dispatch_finding<'a, P: PushConstants>(
         Ok((name.name(), source))
     };
     let bound = P::BINDINGS.iter().map(|name| source(*name)).collect::<Result<Vec<_>>>()?;
-    recording.dispatch(stage.pipeline(), groups, &bound, &push)
+    Ok(recording.dispatch(stage.pipeline(), groups, &bound, &push)?)
 }

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 use crate::gpu::buffer::Operands;
 use crate::gpu::device::Gpu;
 use crate::gpu::pipeline::{BindingCode, BindingKind, KernelCode, Pipeline};
-use crate::gpu::record::{Groups, MOST_GROUPS};
+use crate::gpu::record::{Groups, MAX_GROUPS};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
 use std::collections::BTreeSet;
@@ -62,7 +62,7 @@ impl<P: PushConstants> Stage<P> {
 
 /// Returns at least `groups` workgroups, spread over two axes where one axis does not take them all.
 pub fn along_two_axes(groups: u32) -> Groups<'static> {
-    let rows = groups.div_ceil(MOST_GROUPS).max(1);
+    let rows = groups.div_ceil(MAX_GROUPS).max(1);
     Groups::Direct([groups.div_ceil(rows).max(1), rows, 1])
 }
 

@@ -21,9 +21,9 @@ pub(crate) mod twin_shape;
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};
 use crate::error::Result;
+use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
-use crate::fitting::field::Field;
-use crate::fitting::fit::{FieldVolume, Fit, FitData, FitField, FitState, Method, SavedAt, SavedFit};
+use crate::fitting::fit::{Fit, FitData, FitField, FitStart, FitState, Method, PlannedFit, SavedAt, SavedFit};
 use crate::fitting::sets::ignored;
 use crate::fitting::shown::ShownFit;
 use crate::gaussians::blobs::BlobKernels;
@@ -33,6 +33,8 @@ use crate::gpu::device::Gpu;
 use crate::kernels::push;
 use crate::kernels::stages::Build;
 use crate::kernels::tuning::Tuning;
+use crate::model::Model;
+use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
 use crate::tensors::{File, FileTensor};
 use data::R2Data;
@@ -54,18 +56,16 @@ impl Method for R2Gaussian {
         crate::gaussians::tensors::FORMAT
     }
 
-    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<Box<dyn FitData>> {
-        Ok(Box::new(data_of(config, dataset, notes)?))
-    }
-
-    fn volume(&self, config: &Config, dataset: &Dataset) -> FieldVolume {
-        FieldVolume { half: volume_half(config.r2.half_extent_mm, dataset), attenuation: None }
+    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+        let volume = FieldVolume { half: volume_half(config.r2.half_extent_mm, dataset), attenuation: None };
+        let data = Box::new(data_of(config, dataset, notes)?);
+        Ok(PlannedFit { scene: Scene::of_volume(config, dataset, volume)?, data })
     }
 
     fn read(&self, sections: &serde_json::Value, _: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
         let gaussians = crate::gaussians::tensors::read_section(sections, file, at.n_phases)?;
         let state = tensors::read(file, at.n_phases)?;
-        Ok(SavedFit { field: FitField::Gaussians(Box::new(gaussians)), state: Arc::new(state) })
+        Ok(SavedFit { field: FitField::of_gaussians(gaussians), state: Arc::new(state) })
     }
 
     fn rays_per_iteration(&self, _: &Config) -> u32 {
@@ -123,18 +123,13 @@ fn data_of(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Resul
 }
 
 impl FitData for R2Data {
-    fn begin(
-        &self,
-        gpu: &Gpu,
-        config: &Config,
-        saved: Option<&SavedFit>,
-        notes: &mut Vec<String>,
-    ) -> Result<Box<dyn Fit>> {
+    fn begin(&self, start: &FitStart<'_>, notes: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+        let FitStart { gpu, config, .. } = *start;
         let own = |saved: &SavedFit| -> Option<(R2State, u32)> {
-            let FitField::Gaussians(field) = &saved.field else { return None };
+            let field = saved.field.gaussians.as_ref()?;
             Some((saved.state.as_any().downcast_ref::<R2State>()?.clone(), field.rows().step))
         };
-        let trainer = match saved.and_then(own) {
+        let trainer = match start.from.resumed().and_then(own) {
             Some((state, step)) => R2Trainer::with(gpu, self.clone(), config, &state, step)?,
             None => {
                 let (trainer, more) = R2Trainer::new(gpu, self.clone(), config)?;
@@ -148,10 +143,14 @@ impl FitData for R2Data {
     fn as_any(&self) -> &dyn Any {
         self
     }
+
+    fn as_any_mut(&mut self) -> &mut dyn Any {
+        self
+    }
 }
 
 impl FitState for R2State {
-    fn tensors(&self, _: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
+    fn tensors(&self, _: &Model) -> Result<Vec<FileTensor>> {
         Ok(tensors::tensors(self))
     }
 

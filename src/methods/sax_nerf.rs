@@ -20,11 +20,13 @@ pub mod twin;
 use crate::config::method::MethodKind;
 use crate::config::{Config, StaticData};
 use crate::error::{Error, Result};
+use crate::fields::scale::FieldVolume;
 use crate::fitting::extent::volume_half;
-use crate::fitting::fit::{FieldVolume, Fit, FitData, FitField, Method, SavedAt, SavedFit};
+use crate::fitting::fit::{Fit, FitData, FitField, FitStart, Method, PlannedFit, SavedAt, SavedFit};
 use crate::fitting::sets::ignored;
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
+use crate::model::scene::Scene;
 use crate::scan::dataset::Dataset;
 use crate::tensors::File;
 use data::SaxData;
@@ -47,25 +49,22 @@ impl Method for SaxNerf {
         "nertca-checkpoint-4"
     }
 
-    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<Box<dyn FitData>> {
-        let data = SaxData::new(dataset, &config.sax, self.volume(config, dataset).half)?;
-        notes.extend(notes_of(config, dataset, &data));
-        Ok(Box::new(data))
-    }
-
-    fn volume(&self, config: &Config, dataset: &Dataset) -> FieldVolume {
-        FieldVolume {
+    fn plan(&self, config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<PlannedFit> {
+        let volume = FieldVolume {
             half: volume_half(config.sax.half_extent_mm, dataset),
             // Volumes are kept in units of the attenuation of a density of 1.
             attenuation: Some(dataset.vessel_attenuation.filter(|_| config.sax.normalise).unwrap_or(1.0)),
-        }
+        };
+        let data = SaxData::new(dataset, &config.sax, volume.half)?;
+        notes.extend(notes_of(config, dataset, &data));
+        Ok(PlannedFit { scene: Scene::of_volume(config, dataset, volume)?, data: Box::new(data) })
     }
 
     fn read(&self, sections: &serde_json::Value, config: &Config, at: SavedAt, file: &File<'_>) -> Result<SavedFit> {
         let bad = |e: serde_json::Error| Error::data(file.path, KEY, e.to_string());
         let about = serde_json::from_value(sections[KEY].clone()).map_err(bad)?;
         let (field, state) = tensors::read(&about, SaxShape::of(&config.sax), file, at)?;
-        Ok(SavedFit { field: FitField::Own(Arc::new(field)), state: Arc::new(state) })
+        Ok(SavedFit { field: FitField::of_own(Arc::new(field)), state: Arc::new(state) })
     }
 
     fn rays_per_iteration(&self, config: &Config) -> u32 {
@@ -111,19 +110,23 @@ fn notes_of(config: &Config, dataset: &Dataset, data: &SaxData) -> Vec<String> {
 }
 
 impl FitData for SaxData {
-    fn begin(&self, gpu: &Gpu, config: &Config, saved: Option<&SavedFit>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+    fn begin(&self, start: &FitStart<'_>, _: &mut Vec<String>) -> Result<Box<dyn Fit>> {
+        let FitStart { gpu, config, .. } = *start;
         let own = |saved: &SavedFit| -> Option<(SaxField, SaxState)> {
-            let FitField::Own(field) = &saved.field else { return None };
-            let field = field.as_any().downcast_ref::<SaxField>()?;
+            let field = saved.field.own.as_ref()?.as_any().downcast_ref::<SaxField>()?;
             Some((field.clone(), saved.state.as_any().downcast_ref::<SaxState>()?.clone()))
         };
-        Ok(match saved.and_then(own) {
+        Ok(match start.from.resumed().and_then(own) {
             Some((field, state)) => Box::new(SaxTrainer::with(gpu, self.clone(), config, &field, &state)?),
             None => Box::new(SaxTrainer::new(gpu, self.clone(), config)?),
         })
     }
 
     fn as_any(&self) -> &dyn Any {
+        self
+    }
+
+    fn as_any_mut(&mut self) -> &mut dyn Any {
         self
     }
 }

@@ -82,7 +82,7 @@ mod tests {
             rest: Gaussians {
                 units: Units { pixel: 0.01, strongest: 0.5 },
                 n_phases: N_PHASES,
-                setup: GaussianSetup { least_scale: 0.1, greatest_scale: 9.0, ..GaussianSetup::default() },
+                setup: GaussianSetup { min_scale: 0.1, max_scale: 9.0, ..GaussianSetup::default() },
                 rows: (0..4).map(row).collect(),
                 step: 9,
                 is_crowd: false,

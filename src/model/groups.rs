@@ -7,7 +7,7 @@ use glam::{DVec3, IVec3};
 use std::collections::HashMap;
 
 /// Minimum number of connected Gaussians that form a piece of a vessel.
-const LEAST_OF_A_VESSEL: usize = 4;
+const MIN_OF_A_VESSEL: usize = 4;
 /// Percentile of the breadths of connected Gaussians that is taken as the breadth of vessels.
 const BROAD_PERCENTILE: f64 = 0.95;
 /// Factor on the breadth of vessels above which an isolated Gaussian is no vessel.
@@ -18,7 +18,7 @@ const BROADER: f64 = 1.2;
 /// explains noise of several views at once. All Gaussians are kept where none are connected.
 pub fn vessels(rows: &[Gaussian], setup: &GaussianSetup, link: f64) -> Vec<bool> {
     let sizes = group_sizes(rows, link);
-    let grouped = sizes.iter().map(|size| *size >= LEAST_OF_A_VESSEL);
+    let grouped = sizes.iter().map(|size| *size >= MIN_OF_A_VESSEL);
     let breadths: Vec<f32> = rows.iter().map(|g| breadth(g, setup)).collect();
     let of_vessels: Vec<f32> =
         breadths.iter().zip(grouped.clone()).filter(|(_, grouped)| *grouped).map(|b| *b.0).collect();
@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     const SETUP: fn() -> GaussianSetup =
-        || GaussianSetup { least_scale: 0.4, greatest_scale: 6.0, ..GaussianSetup::default() };
+        || GaussianSetup { min_scale: 0.4, max_scale: 6.0, ..GaussianSetup::default() };
 
     fn at(x: f32, phase: u32, scales: [f32; 3]) -> Gaussian {
         Gaussian { position: [x, 0.0, 0.0], phase, log_scale: scales.map(f32::ln), ..Gaussian::default() }

@@ -324,8 +324,8 @@ mod tests {
         ] {
             let tensor = map.tensors().into_iter().find(|t| t.name == name).unwrap();
             let largest = tensor.positions.iter().map(|at| params[*at as usize].abs()).fold(0.0, f32::max);
-            let most = 1.0 / f32::sqrt(inputs);
-            assert!(largest <= most && largest > 0.9 * most, "{name}: {largest} of {most}");
+            let max = 1.0 / f32::sqrt(inputs);
+            assert!(largest <= max && largest > 0.9 * max, "{name}: {largest} of {max}");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Chunks: rays of a batch whose samples are handled at once.
 
 use crate::error::{Error, Result};
-use crate::gpu::record::{Groups, MOST_GROUPS};
+use crate::gpu::record::{Groups, MAX_GROUPS};
 use crate::kernels::layout::Setup;
 
 /// Rays whose samples are handled at once.
@@ -43,7 +43,7 @@ pub fn chunk_samples(setup: &Setup) -> u32 {
 /// Number of rays handled at once: their samples fit one chunk even if all are live, and one dispatch can have a workgroup for
 /// each.
 pub fn chunk_rays(setup: &Setup) -> u32 {
-    (chunk_samples(setup) / setup.n_dynamic_samples).clamp(1, MOST_GROUPS)
+    (chunk_samples(setup) / setup.n_dynamic_samples).clamp(1, MAX_GROUPS)
 }
 
 /// Splits a batch into chunks of as many rays as possible such that the `live` samples of each chunk fit into `room`. There are
@@ -61,7 +61,7 @@ pub fn packed(live: &[u32], room: u32) -> Result<Vec<Chunk>> {
             )));
         }
         let n_rays = ray - first_ray;
-        if n_rays == MOST_GROUPS || taken + u64::from(*samples) > u64::from(room) {
+        if n_rays == MAX_GROUPS || taken + u64::from(*samples) > u64::from(room) {
             chunks.push(Chunk { first_ray, n_rays });
             (first_ray, taken) = (ray, 0);
         }
@@ -94,8 +94,8 @@ mod tests {
         assert_eq!(in_chunks(&[0; 5], 8), [(0, 5)], "nothing to look at");
         assert_eq!(in_chunks(&[8, 8, 0, 1], 8), [(0, 1), (1, 2), (3, 1)]);
         assert_eq!(in_chunks(&[3, 5, 0, 4, 4, 1], 8), [(0, 3), (3, 2), (5, 1)]);
-        let many = vec![0; MOST_GROUPS as usize + 2];
-        assert_eq!(in_chunks(&many, 8), [(0, MOST_GROUPS), (MOST_GROUPS, 2)], "a workgroup for each ray");
+        let many = vec![0; MAX_GROUPS as usize + 2];
+        assert_eq!(in_chunks(&many, 8), [(0, MAX_GROUPS), (MAX_GROUPS, 2)], "a workgroup for each ray");
         assert!(packed(&[1, 9], 8).unwrap_err().to_string().contains("ray 1 has 9 live samples"));
     }
 

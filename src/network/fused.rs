@@ -11,6 +11,7 @@ mod shape;
 mod span;
 
 use crate::error::{Error, Result};
+use crate::fitting::ledger::Ledger;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::capabilities::MatrixShape;
 use crate::gpu::device::Gpu;
@@ -24,8 +25,7 @@ use crate::kernels::tuning::{MatrixTuning, Tuning};
 use crate::model::params::NetworkMap;
 use crate::network::chunk::Chunk;
 use crate::network::fused::shape::Shape;
-use crate::network::fused::span::{Part, Span, recomputes, spans, work};
-use crate::network::ledger::Ledger;
+use crate::network::fused::span::{LayerInput, Span, recomputes, spans, work};
 use crate::network::pass::Pass;
 use crate::network::{PartialSums, Path, Purpose, Tiles, built_for_rendering};
 
@@ -125,10 +125,10 @@ impl Builder<'_> {
         self.build(self.shape.subgroups, self.tuning.unroll_forward, &constants).stage(self.gpu)
     }
 
-    fn columns(&self, part: Part) -> u32 {
+    fn columns(&self, part: LayerInput) -> u32 {
         match part {
-            Part::Hidden(_) => self.params.width as u32,
-            Part::Encoded(_) => self.shape.encoded as u32,
+            LayerInput::Hidden(_) => self.params.width as u32,
+            LayerInput::Encoded(_) => self.shape.encoded as u32,
         }
     }
 
@@ -155,7 +155,7 @@ impl Builder<'_> {
             ("shares", self.shares(columns)),
             ("lower_shares", lower_shares),
         ]);
-        if sizes.recompute && span.last() == Part::Encoded(0) {
+        if sizes.recompute && span.last() == LayerInput::Encoded(0) {
             return Ok(BackwardStage::Recomputed(
                 self.build(sizes.subgroups, self.tuning.unroll_backward, &constants).stage(self.gpu)?,
             ));
@@ -255,10 +255,10 @@ impl FusedNetwork {
     }
 
     /// Returns the buffer of a part's inputs, and their position in it.
-    fn inputs(&self, map: &NetworkMap, part: Part, pass: &Pass<'_>) -> (&Buffer, u32) {
+    fn inputs(&self, map: &NetworkMap, part: LayerInput, pass: &Pass<'_>) -> (&Buffer, u32) {
         match part {
-            Part::Hidden(layer) => (&self.buffers.activations16, self.activations_at(map, layer - 1, pass)),
-            Part::Encoded(_) => (&self.buffers.features16, 0),
+            LayerInput::Hidden(layer) => (&self.buffers.activations16, self.activations_at(map, layer - 1, pass)),
+            LayerInput::Encoded(_) => (&self.buffers.features16, 0),
         }
     }
 
@@ -267,7 +267,7 @@ impl FusedNetwork {
         let (shape, dz16, groups) = (&self.shape, &self.training()?.dz16, Groups::Direct([self.workgroups, 1, 1]));
         let BackwardPass { span, stage, reads, sums_dz } = backward;
         let position = |at: Option<usize>| at.map_or(NOWHERE, |at| at as u32);
-        let bias = |part: Part| position(shape.layers[part.layer()].bias);
+        let bias = |part: LayerInput| position(shape.layers[part.layer()].bias);
         let (weights_at, n_partials) = (position(shape.weights_of(span.upper)), shape.partials_len as u32);
         let lower_weights_at = position(span.lower.and_then(|part| shape.weights_of(part)));
         let upper_bias = if *sums_dz { bias(span.upper) } else { NOWHERE };
@@ -407,7 +407,7 @@ mod tests {
             let spans = spans(&ParamMap::new(&config, 10).dynamic_network.unwrap().layers, pairs);
             spans.iter().map(|span| (span.upper, span.lower)).collect::<Vec<_>>()
         };
-        use Part::{Encoded, Hidden};
+        use LayerInput::{Encoded, Hidden};
         assert_eq!(spans_of(4, 0, true), [(Hidden(3), Some(Hidden(2))), (Hidden(1), Some(Encoded(0)))]);
         assert_eq!(spans_of(3, 0, true), [(Hidden(2), None), (Hidden(1), Some(Encoded(0)))]);
         assert_eq!(spans_of(1, 0, true), [(Encoded(0), None)]);

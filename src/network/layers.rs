@@ -1,6 +1,7 @@
 //! The network in f32, one pass per layer: runs on every device, and is the reference for [`super::fused`].
 
 use crate::error::Result;
+use crate::fitting::ledger::{Ledger, StageWork, add};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Groups;
@@ -12,7 +13,6 @@ use crate::kernels::stages::LayerKernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::params::{Layer, NetworkMap};
 use crate::network::chunk::{Chunk, chunk_rays};
-use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::pass::Pass;
 use crate::network::{F32_BYTES, PartialSums, Path, Purpose, SAMPLE_BYTES, Tiles, built_for_rendering};
 
@@ -88,7 +88,7 @@ impl LayerNetwork {
             },
             activations: (0..params.layers.len())
                 .map(|i| operand(&format!("activations_{i}"), neurons_bytes))
-                .collect::<Result<_>>()?,
+                .collect::<std::result::Result<_, _>>()?,
             training,
         })
     }

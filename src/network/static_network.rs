@@ -32,12 +32,12 @@ struct StaticTraining {
 }
 
 /// Buffers of this network's backward pass: its own gradient at samples comes first.
-struct Own<'a> {
+struct BackwardBuffers<'a> {
     gradient: &'a Buffer,
     rest: Option<&'a dyn BufferSet>,
 }
 
-impl BufferSet for Own<'_> {
+impl BufferSet for BackwardBuffers<'_> {
     fn find(&self, name: Binding) -> Option<&Buffer> {
         match name {
             Binding::sigma_gradient => Some(self.gradient),
@@ -100,7 +100,10 @@ impl StaticNetwork {
 
     /// Records `stages` for this network, with the buffers of `pass` except its own.
     fn with(&self, pass: &mut Pass<'_>, stages: impl FnOnce(&Network, &mut Pass<'_>) -> Result<()>) -> Result<()> {
-        let own = self.training.as_ref().map(|training| Own { gradient: &training.gradient, rest: pass.training });
+        let own = self
+            .training
+            .as_ref()
+            .map(|training| BackwardBuffers { gradient: &training.gradient, rest: pass.training });
         let mut own = Pass {
             recording: &mut *pass.recording,
             kernels: pass.kernels,

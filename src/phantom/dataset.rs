@@ -342,18 +342,18 @@ impl<'a> Camera<'a> {
     /// Makes a blade that hides a share of the moving part of a view's vessels.
     fn blade(&mut self, view: usize, shots: &[Option<Shot>], shooting: &Shooting<'_>) -> Result<Blade> {
         let pixels = shooting.size * shooting.size;
-        let (mut sum, mut least, mut densest, mut images) = (vec![0f64; pixels], vec![f32::MAX; pixels], 0f32, 0);
+        let (mut sum, mut min, mut densest, mut images) = (vec![0f64; pixels], vec![f32::MAX; pixels], 0f32, 0);
         for shot in shots.iter().flatten() {
             let exposure = self.expose(view, shot, shooting.degradations.catheter)?;
             densest = exposure.image.iter().copied().fold(densest, f32::max);
             for (pixel, value) in exposure.vessels.iter().flatten().enumerate() {
                 sum[pixel] += f64::from(*value);
-                least[pixel] = least[pixel].min(*value);
+                min[pixel] = min[pixel].min(*value);
             }
             images += 1;
         }
         // In a single image all vessels count as moving, because there is no other image to compare with.
-        let still = |pixel: usize| if images > 1 { f64::from(images) * f64::from(least[pixel]) } else { 0.0 };
+        let still = |pixel: usize| if images > 1 { f64::from(images) * f64::from(min[pixel]) } else { 0.0 };
         let moving: Vec<f64> = sum.iter().enumerate().map(|(pixel, sum)| sum - still(pixel)).collect();
         let share = shooting.degradations.collimated_share;
         Ok(Blade::hiding(share, &moving, shooting.size, BLADE_DENSITY * densest, shooting.chance(view)))

@@ -3,7 +3,7 @@
 use crate::random::{STREAM_PHOTON, normal, uniform01};
 
 /// Minimum count of a pixel, so that its logarithm exists.
-const LEAST_COUNTS: f64 = 0.5;
+const MIN_COUNTS: f64 = 0.5;
 /// Expected count above which a normal distribution replaces the Poisson distribution.
 const MANY: f64 = 200.0;
 
@@ -39,7 +39,7 @@ pub fn add_noise(image: &mut [f32], photons: Photons, seed: u32, stream: u32) {
         } else {
             poisson(expected, seed, stream, pixel as u32)
         };
-        *value = -(counts.max(LEAST_COUNTS) / photons).ln() as f32;
+        *value = -(counts.max(MIN_COUNTS) / photons).ln() as f32;
     }
 }
 

@@ -19,7 +19,7 @@ const CONTRAST_WAVE_S: f64 = 3.0;
 /// Variation of contrast within a run as a share of its variation between runs.
 const CONTRAST_WITHIN: f64 = 0.5;
 /// Lower bound of the factor on the vessels' contrast.
-const LEAST_CONTRAST: f64 = 0.1;
+const MIN_CONTRAST: f64 = 0.1;
 
 /// An image to be taken.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -108,7 +108,7 @@ fn contrast_gain(variation: f64, time_s: f64, chance: Chance) -> f64 {
     let course = chance.uniform(Draw::ContrastCourse) + time_s / CONTRAST_WAVE_S;
     let wave = std::f64::consts::SQRT_2 * (std::f64::consts::TAU * course).sin();
     let gain = 1.0 + variation * (chance.normal(Draw::Contrast) + CONTRAST_WITHIN * wave);
-    gain.max(LEAST_CONTRAST)
+    gain.max(MIN_CONTRAST)
 }
 
 #[cfg(test)]

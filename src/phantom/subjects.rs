@@ -253,17 +253,17 @@ impl Reading<'_> {
         let (Some(first), 2..) = (paths.next(), self.paths.len()) else {
             return Ok(None);
         };
-        let mut least = self.volume(first)?;
+        let mut min = self.volume(first)?;
         for path in paths {
             let volume = self.volume(path)?;
-            if volume.size != least.size || volume.index_to_lps != least.index_to_lps {
+            if volume.size != min.size || volume.index_to_lps != min.index_to_lps {
                 let problem = "differs from the grid of the first volume; breathing needs volumes on the same grid, to \
                                separate the heart from static tissue";
                 return Err(Error::data(path, "grid", problem));
             }
-            least.values.iter_mut().zip(&volume.values).for_each(|(a, b)| *a = a.min(*b));
+            min.values.iter_mut().zip(&volume.values).for_each(|(a, b)| *a = a.min(*b));
         }
-        Ok(Some(least))
+        Ok(Some(min))
     }
 }
 
@@ -295,7 +295,7 @@ impl Volumes {
             });
             let vessels = vessels.map(|v| projector.load(v)).transpose()?.map(Arc::new);
             if let Some(still) = &still {
-                volume.values.iter_mut().zip(&still.values).for_each(|(v, least)| *v -= least);
+                volume.values.iter_mut().zip(&still.values).for_each(|(v, min)| *v -= min);
             }
             moving.push((Arc::new(projector.load(volume)?), vessels));
         }

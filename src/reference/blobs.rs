@@ -15,7 +15,7 @@ pub struct Gauss {
     density: f64,
     /// Axes in rows, divided by their standard deviations.
     whiten: DMat3,
-    least: f64,
+    min: f64,
     cut: f64,
 }
 
@@ -29,8 +29,7 @@ pub struct Along {
 }
 
 fn gauss(g: &Gaussian, units: Units, setup: &GaussianSetup) -> Gauss {
-    let deviation =
-        |log: f32| f64::from(log).exp().clamp(setup.least_scale.into(), setup.greatest_scale.into()) * units.pixel;
+    let deviation = |log: f32| f64::from(log).exp().clamp(setup.min_scale.into(), setup.max_scale.into()) * units.pixel;
     let scale = DVec3::from_array(g.log_scale.map(deviation));
     let [w, x, y, z] = g.rotation.map(f64::from);
     let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
@@ -38,7 +37,7 @@ fn gauss(g: &Gaussian, units: Units, setup: &GaussianSetup) -> Gauss {
         centre: DVec3::from_array(g.position.map(f64::from)) * units.pixel,
         density: f64::from(g.log_density).exp() * units.attenuation(),
         whiten: DMat3::from_diagonal(1.0 / scale) * axes.transpose(),
-        least: scale.min_element(),
+        min: scale.min_element(),
         cut: setup.cut.into(),
     }
 }
@@ -74,7 +73,7 @@ pub fn along(field: &[Gauss], (anchor, direction): (DVec3, DVec3)) -> Along {
         }
     }
     let sum = |depth: f64| met.iter().map(|(at, s, h)| h * (-0.5 * ((depth - at) / s).powi(2)).exp()).sum::<f64>();
-    let step = field.iter().map(|g| g.least).fold(f64::INFINITY, f64::min) / STEPS / direction.length();
+    let step = field.iter().map(|g| g.min).fold(f64::INFINITY, f64::min) / STEPS / direction.length();
     let (low, high) = met.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), m| (l.min(m.0), h.max(m.0)));
     let steps = if met.is_empty() { 0 } else { ((high - low) / step).ceil() as usize + 1 };
     let maximum = (0..steps).map(|k| sum(low + k as f64 * step)).fold(0.0, f64::max);

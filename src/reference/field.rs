@@ -140,14 +140,14 @@ pub struct NetworkTrace {
 /// Phases that a ray shows, and their shares; see [`BeatTime::shown`].
 ///
 /// [`BeatTime::shown`]: crate::scan::gating::BeatTime::shown
-pub type Shown = [(usize, f64); 2];
+pub type ShownPhases = [(usize, f64); 2];
 
 /// Evaluates the network at one encoded point, at one phase or between two.
 pub fn network_fwd(
     p: &NetworkMap,
     params: &[f64],
     encoded: &[f64],
-    shown: Shown,
+    shown: ShownPhases,
     precision: Precision,
 ) -> NetworkTrace {
     let round = |x: f64| precision.round(x);
@@ -191,7 +191,7 @@ pub fn network_bwd(
     p: &NetworkMap,
     params: &[f64],
     trace: &NetworkTrace,
-    shown: Shown,
+    shown: ShownPhases,
     dl_dfeature: f64,
     precision: Precision,
     gradient: &mut [f64],

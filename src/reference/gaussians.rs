@@ -26,7 +26,7 @@ fn position(p: &Params) -> DVec3 {
 
 /// Standard deviations along the axes.
 fn scale(p: &Params, setup: &GaussianSetup) -> DVec3 {
-    let bounds = (f64::from(setup.least_scale), f64::from(setup.greatest_scale));
+    let bounds = (f64::from(setup.min_scale), f64::from(setup.max_scale));
     DVec3::new(p[4], p[5], p[6]).exp().clamp(DVec3::splat(bounds.0), DVec3::splat(bounds.1))
 }
 
@@ -194,7 +194,7 @@ pub fn gradient(p: &Params, view: &SplatView, setup: &GaussianSetup, moments: [f
     d_depth -= 2.0 * h / z;
     let d_position = d_mean.x * seen.slopes[0] + d_mean.y * seen.slopes[1] + d_depth * view.rows[0];
     let free = DVec3::new(p[4], p[5], p[6]).exp();
-    let inside = |k: usize| free[k] > f64::from(setup.least_scale) && free[k] < f64::from(setup.greatest_scale);
+    let inside = |k: usize| free[k] > f64::from(setup.min_scale) && free[k] < f64::from(setup.max_scale);
     let d_scale = |k: usize| if inside(k) { seen.alpha[k] * d_alpha[k] + seen.beta[k] * d_beta[k] + h } else { 0.0 };
     let column = |k: usize| scale[k] * (d_alpha[k] * seen.slopes[0] + d_beta[k] * seen.slopes[1]);
     let d_rotation = rotation_gradient(p, DMat3::from_cols(column(0), column(1), column(2)));

@@ -1,10 +1,10 @@
 //! f64 reference implementations (twins) of ray drawing, depths and the march.
 
+use crate::fields::data::FieldData;
 use crate::kernels::layout::Setup;
 use crate::model::params::ParamMap;
-use crate::plan::Plan;
 use crate::random::{STREAM_DEPTH, STREAM_MOTION_RAY, STREAM_RAY, permute, uniform01};
-use crate::reference::field::{self, NetworkTrace, Precision, Shown};
+use crate::reference::field::{self, NetworkTrace, Precision, ShownPhases};
 use glam::DVec3;
 
 /// One ray; see `Ray` in the shaders.
@@ -15,7 +15,7 @@ pub struct Ray {
     /// Direction of unit depth.
     pub direction: DVec3,
     /// Phases that it shows.
-    pub shown: Shown,
+    pub shown: ShownPhases,
     /// Measured line integral.
     pub target: f64,
     /// Bounds of the integral above the pixel's static background.
@@ -27,7 +27,7 @@ pub struct Ray {
 }
 
 /// Draws the rays of iteration `step` (twin of `batch`).
-pub fn batch(plan: &Plan, step: u32) -> Vec<Ray> {
+pub fn batch(plan: &FieldData, step: u32) -> Vec<Ray> {
     let s = &plan.setup;
     let draw = |slot: u32, per_step: u32, n: u32, stream: u32| {
         let counter = step * per_step + slot;
@@ -50,7 +50,7 @@ pub fn batch(plan: &Plan, step: u32) -> Vec<Ray> {
 }
 
 /// Returns a training ray by its id.
-pub fn ray(plan: &Plan, id: u32) -> Ray {
+pub fn ray(plan: &FieldData, id: u32) -> Ray {
     let s = &plan.setup;
     let frame = plan.frames[(id / s.n_pixels) as usize];
     let view = plan.views[frame.view as usize];
@@ -101,7 +101,7 @@ pub enum NearPart {
 
 impl NearPart {
     /// Returns the near part of the rays of a batch at iteration `step`.
-    pub fn of(plan: &Plan, step: u32, batch: &[Ray]) -> NearPart {
+    pub fn of(plan: &FieldData, step: u32, batch: &[Ray]) -> NearPart {
         let s = &plan.setup;
         let share = f64::from(s.occlusion_share);
         match batch.last().filter(|_| share > 0.0) {
@@ -128,14 +128,14 @@ impl NearPart {
 }
 
 /// Tells whether the dynamic field may exist at a point at a phase, by its box and, if used, the hull.
-pub fn dynamic_inside(plan: &Plan, x: DVec3, phase: usize) -> bool {
+pub fn dynamic_inside(plan: &FieldData, x: DVec3, phase: usize) -> bool {
     let s = &plan.setup;
     let (low, high) = (field::point(s.dynamic_min), field::point(s.dynamic_max));
     x.cmpge(low).all() && x.cmple(high).all() && plan.hull.as_ref().is_none_or(|h| h.contains_point(x, phase))
 }
 
 /// Tells whether the dynamic field is evaluated at a point of a ray (twin of `searched`); `occupied` decides for a phase.
-pub fn searched(plan: &Plan, x: DVec3, ray: &Ray, occupied: impl Fn(usize) -> bool) -> bool {
+pub fn searched(plan: &FieldData, x: DVec3, ray: &Ray, occupied: impl Fn(usize) -> bool) -> bool {
     let shows = |(phase, share): &(usize, f64)| *share > 0.0 && dynamic_inside(plan, x, *phase) && occupied(*phase);
     ray.shown.iter().any(shows)
 }
@@ -177,7 +177,7 @@ pub struct March {
 }
 
 /// Marches one ray through the static field only, or through no field.
-pub fn statics(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: bool) -> March {
+pub fn statics(plan: &FieldData, params: &[f64], step: u32, ray: &Ray, with_static: bool) -> March {
     let (s, p): (&Setup, &ParamMap) = (&plan.setup, &plan.params);
     let mut out = March {
         statics: Vec::new(),
@@ -202,7 +202,7 @@ pub fn statics(plan: &Plan, params: &[f64], step: u32, ray: &Ray, with_static: b
 
 /// Marches one ray (twin of `march_count`..`march_emit`, `march_fwd` and `march_loss`).
 pub fn fwd(
-    plan: &Plan,
+    plan: &FieldData,
     params: &[f64],
     step: u32,
     ray: &Ray,
@@ -231,7 +231,7 @@ pub fn fwd(
 
 /// Adds the gradient of a ray, given dL/dS and dL/dD of its integrals (twin of `march_loss`, `mlp_*_bwd`).
 pub fn bwd(
-    plan: &Plan,
+    plan: &FieldData,
     params: &[f64],
     ray: &Ray,
     march: &March,
@@ -253,9 +253,9 @@ pub fn bwd(
 
 /// Adds the gradient of a live sample, given dL/dD of its ray (twin of `mlp_*_bwd`).
 pub fn sample_bwd(
-    plan: &Plan,
+    plan: &FieldData,
     params: &[f64],
-    shown: Shown,
+    shown: ShownPhases,
     sample: &DynamicSample,
     dl_dd: f64,
     precision: Precision,
@@ -265,6 +265,6 @@ pub fn sample_bwd(
     let s = &plan.setup;
     let slope = f64::from(s.dynamic_gain) * field::sigmoid(sample.trace.feature + f64::from(s.dynamic_shift));
     let per_integral = dl_dd + if sample.near { f64::from(s.occlusion_weight) } else { 0.0 };
-    let slope = if per_integral < 0.0 { slope.max(s.least_slope.into()) } else { slope };
+    let slope = if per_integral < 0.0 { slope.max(s.min_slope.into()) } else { slope };
     field::network_bwd(network, params, &sample.trace, shown, per_integral * sample.dl * slope, precision, gradient);
 }

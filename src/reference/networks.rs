@@ -1,8 +1,8 @@
 //! f64 reference implementation (twin) for two networks as fields: integrals of both along a ray, their losses, and the
 //! gradient at each sample (`march_fwd_samples`, `loss_samples`).
 
-use crate::plan::Plan;
-use crate::reference::field::{self, NetworkTrace, Precision, Shown};
+use crate::fields::data::FieldData;
+use crate::reference::field::{self, NetworkTrace, Precision, ShownPhases};
 use crate::reference::losses::Losses;
 use crate::reference::march::{self, Ray};
 use glam::DVec3;
@@ -69,7 +69,7 @@ pub struct PairLoss {
 
 /// Losses of one of `n_rays` rays at a step, whose integrals of both fields are S and D (twin of `loss_samples`).
 pub fn ray_loss(
-    plan: &Plan,
+    plan: &FieldData,
     step: u32,
     n_rays: usize,
     ray: &Ray,
@@ -80,7 +80,7 @@ pub fn ray_loss(
     let (per_ray, per_depth) = (1.0 / n_rays as f64, 1.0 / (n_rays as f64 * f64::from(setup.n_dynamic_samples)));
     let weight = 1.0 + f64::from(setup.change_weight) * ray.change;
     let residual = s + d - ray.target;
-    let counts = d >= f64::from(setup.least_integral) || ray.change > f64::from(setup.least_change);
+    let counts = d >= f64::from(setup.min_integral) || ray.change > f64::from(setup.min_change);
     let entropy_scale = if counts { per_ray } else { 0.0 };
     let integral = d.max(SMALLEST);
     let share = |sample: &PairSample| sample.sigma[1] * sample.dl / integral;
@@ -116,19 +116,19 @@ pub fn ray_loss(
 
 /// Place at which a network is evaluated.
 #[derive(Debug, Clone, Copy)]
-pub struct Place {
+pub struct SamplePlace {
     /// The point.
     pub x: DVec3,
     /// Phases that its ray shows.
-    pub shown: Shown,
+    pub shown: ShownPhases,
 }
 
 /// Evaluates both networks at a place, the static field's first.
 pub fn traces(
-    plan: &Plan,
+    plan: &FieldData,
     params: &[f64],
     step: u32,
-    Place { x, shown }: Place,
+    SamplePlace { x, shown }: SamplePlace,
     precision: Precision,
 ) -> [NetworkTrace; 2] {
     let encoded = field::encode(&plan.setup, plan.schedule[step as usize].window.into(), x);
@@ -137,7 +137,7 @@ pub fn traces(
 }
 
 /// Attenuations of both networks, and their derivatives by the features.
-pub fn attenuations(plan: &Plan, traces: &[NetworkTrace; 2]) -> [[f64; 2]; 2] {
+pub fn attenuations(plan: &FieldData, traces: &[NetworkTrace; 2]) -> [[f64; 2]; 2] {
     let s = &plan.setup;
     let [of_static, of_dynamic] = [(s.static_gain, s.static_shift), (s.dynamic_gain, s.dynamic_shift)];
     let of = |trace: &NetworkTrace, (gain, shift): (f32, f32)| {
@@ -149,9 +149,9 @@ pub fn attenuations(plan: &Plan, traces: &[NetworkTrace; 2]) -> [[f64; 2]; 2] {
 
 /// Adds the gradient of a sample, given the derivative of the objective by both attenuations.
 pub fn sample_bwd(
-    plan: &Plan,
+    plan: &FieldData,
     params: &[f64],
-    Place { shown, .. }: Place,
+    SamplePlace { shown, .. }: SamplePlace,
     traces: &[NetworkTrace; 2],
     by_sigma: [f64; 2],
     precision: Precision,
@@ -164,12 +164,12 @@ pub fn sample_bwd(
 }
 
 /// Places of a ray with their path lengths and whether they are near, which are shared by both fields.
-fn places(plan: &Plan, step: u32, ray: &Ray) -> Vec<(Place, f64, bool)> {
+fn places(plan: &FieldData, step: u32, ray: &Ray) -> Vec<(SamplePlace, f64, bool)> {
     let s = &plan.setup;
     march::depths(s, s.n_dynamic_samples, s.dynamic_near, s.dynamic_far, step, ray)
         .into_iter()
         .map(|(t, dl)| {
-            let place = Place { x: ray.anchor + t * ray.direction, shown: ray.shown };
+            let place = SamplePlace { x: ray.anchor + t * ray.direction, shown: ray.shown };
             (place, dl, t < f64::from(s.occlusion_depth))
         })
         .filter(|(place, ..)| march::searched(plan, place.x, ray, |_| true))
@@ -177,8 +177,8 @@ fn places(plan: &Plan, step: u32, ray: &Ray) -> Vec<(Place, f64, bool)> {
 }
 
 /// Integrals of a ray at a step, for fields with these parameters.
-pub fn seen(plan: &Plan, params: &[f64], step: u32, ray: &Ray, precision: Precision) -> PairIntegrals {
-    let sample = |(place, dl, near): (Place, f64, bool)| {
+pub fn seen(plan: &FieldData, params: &[f64], step: u32, ray: &Ray, precision: Precision) -> PairIntegrals {
+    let sample = |(place, dl, near): (SamplePlace, f64, bool)| {
         let sigma = attenuations(plan, &traces(plan, params, step, place, precision)).map(|[sigma, _]| sigma);
         PairSample { dl, near, sigma }
     };
@@ -187,7 +187,7 @@ pub fn seen(plan: &Plan, params: &[f64], step: u32, ray: &Ray, precision: Precis
 
 /// Loss and gradient of given rays at a step.
 pub fn loss_and_gradient(
-    plan: &Plan,
+    plan: &FieldData,
     params: &[f64],
     step: u32,
     rays: &[Ray],
@@ -199,7 +199,7 @@ pub fn loss_and_gradient(
     for ray in rays {
         let places = places(plan, step, ray);
         let all: Vec<_> = places.iter().map(|(place, ..)| traces(plan, params, step, *place, precision)).collect();
-        let sample = |((_, dl, near), traces): (&(Place, f64, bool), &[NetworkTrace; 2])| PairSample {
+        let sample = |((_, dl, near), traces): (&(SamplePlace, f64, bool), &[NetworkTrace; 2])| PairSample {
             dl: *dl,
             near: *near,
             sigma: attenuations(plan, traces).map(|[sigma, _]| sigma),

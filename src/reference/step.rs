@@ -1,6 +1,6 @@
 //! f64 reference implementation (twin) of one training iteration: loss, gradient, Adam.
 
-use crate::plan::Plan;
+use crate::fields::data::FieldData;
 use crate::reference::adam::Adam;
 use crate::reference::field::Precision;
 use crate::reference::losses::Losses;
@@ -8,7 +8,7 @@ use crate::reference::march::{self, NearPart, Ray};
 use crate::reference::networks;
 
 /// Tells whether a ray of the batch omits the static field (twin of `skips_static`).
-pub fn skips_static(plan: &Plan, r: usize) -> bool {
+pub fn skips_static(plan: &FieldData, r: usize) -> bool {
     let s = &plan.setup;
     s.temporal_target != 0 && (r as u32) < s.n_motion_rays && s.n_motion_rays < s.n_rays
 }
@@ -34,7 +34,7 @@ pub struct RayLoss {
 }
 
 /// Losses of ray `r` of `n_rays` rays, whose integrals are S and D (twin of `march_loss`).
-pub fn ray_loss(plan: &Plan, r: usize, n_rays: usize, ray: &Ray, [s_integral, d]: [f64; 2]) -> RayLoss {
+pub fn ray_loss(plan: &FieldData, r: usize, n_rays: usize, ray: &Ray, [s_integral, d]: [f64; 2]) -> RayLoss {
     let s = &plan.setup;
     let temporal = s.temporal_target != 0;
     let n_static = (0..n_rays).filter(|r| !skips_static(plan, *r)).count() as f64;
@@ -53,7 +53,7 @@ pub fn ray_loss(plan: &Plan, r: usize, n_rays: usize, ray: &Ray, [s_integral, d]
 
 /// Loss and gradient of given rays at a step.
 pub fn loss_and_gradient(
-    plan: &Plan,
+    plan: &FieldData,
     params: &[f64],
     step: u32,
     rays: &[Ray],
@@ -80,7 +80,7 @@ pub fn loss_and_gradient(
 }
 
 /// Value of the total variation; adds its gradient (twin of `gradient_static`; method, section 4).
-pub fn total_variation(plan: &Plan, params: &[f64], gradient: &mut [f64]) -> f64 {
+pub fn total_variation(plan: &FieldData, params: &[f64], gradient: &mut [f64]) -> f64 {
     let (s, p) = (&plan.setup, &plan.params);
     let (d, ranks) = (p.grid, p.ranks);
     let mut value = 0.0;
@@ -113,7 +113,7 @@ pub fn total_variation(plan: &Plan, params: &[f64], gradient: &mut [f64]) -> f64
 }
 
 /// One Adam update (twin of `adam`).
-pub fn adam(plan: &Plan, step: u32, gradient: &[f64], params: &mut [f64], moments: &mut [[f64; 2]]) {
+pub fn adam(plan: &FieldData, step: u32, gradient: &[f64], params: &mut [f64], moments: &mut [[f64; 2]]) {
     let (s, row) = (&plan.setup, plan.schedule[step as usize]);
     for (i, g) in gradient.iter().enumerate() {
         let is_static = i < plan.params.static_len;

@@ -22,7 +22,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// Cells of a baked volume along its longest side.
 pub const BAKED_CELLS: u32 = 192;
 /// Minimum number of cells along the longest side.
-const LEAST_BAKED_CELLS: u32 = 32;
+const MIN_BAKED_CELLS: u32 = 32;
 
 /// A model baked into volumes: every phase's dynamic field over its box, and the static field. Renders at display rates; finer
 /// detail than a cell is lost, except for Gaussians, which are drawn themselves in front of the baked static field. Volumes are
@@ -38,7 +38,7 @@ pub struct Baked {
 }
 
 /// Maximum number of recorded frames kept; a viewer in use has far fewer.
-const MOST_RECORDED: usize = 256;
+const MAX_RECORDED: usize = 256;
 
 /// Columns, rows, phase, quantity.
 type RecordedKey = (usize, usize, u32, Quantity);
@@ -78,11 +78,11 @@ impl Baked {
     pub fn for_display(renderer: Arc<Renderer>, model: &Model, cell_mm: f64) -> Baked {
         let scene = &model.scene;
         let extent = (0..3).map(|i| scene.dynamic_max[i] - scene.dynamic_min[i]).fold(0.0, f64::max);
-        let dynamic_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(LEAST_BAKED_CELLS, BAKED_CELLS);
+        let dynamic_cells = ((extent * MM_PER_UNIT / cell_mm).ceil() as u32).clamp(MIN_BAKED_CELLS, BAKED_CELLS);
         let static_cells = match model.config.static_field.form {
-            StaticForm::Tensor => (2 * model.config.static_field.grid).clamp(LEAST_BAKED_CELLS, BAKED_CELLS),
+            StaticForm::Tensor => (2 * model.config.static_field.grid).clamp(MIN_BAKED_CELLS, BAKED_CELLS),
             StaticForm::Network => dynamic_cells,
-            StaticForm::None => LEAST_BAKED_CELLS,
+            StaticForm::None => MIN_BAKED_CELLS,
         };
         Self::empty(renderer, static_cells, dynamic_cells)
     }
@@ -123,7 +123,7 @@ impl Baked {
         let cells: Vec<f16> = cells.iter().map(|x| f16::from_f32(x / gain)).collect();
         let mut volumes = self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
         match &mut volumes[slot(field, phase)] {
-            Some(volume) => volume.fill(&cells),
+            Some(volume) => Ok(volume.fill(&cells)?),
             none => {
                 let volume = self.renderer.gpu.image_3d("baked", grid.size)?;
                 let filling = volume.fill(&cells)?;
@@ -211,7 +211,7 @@ impl Baked {
         let view = self.renderer.gpu.buffer("view", size_of::<View>() as u64, Memory::Upload)?;
         view.write(&[View::of(rays)])?;
         let commands = self.record(&view, target, (width, height), phase, quantity)?;
-        self.renderer.gpu.wait(commands.submit()?)
+        Ok(self.renderer.gpu.wait(commands.submit()?)?)
     }
 
     /// Draws [`Baked::render_gaussians`] into a buffer. Only maxima along rays come by way of the host.
@@ -225,7 +225,7 @@ impl Baked {
     ) -> Result<()> {
         if quantity.projection == Projection::Mip {
             let image = self.render_gaussians(rays, size, phase, quantity)?;
-            return self.renderer.gpu.upload(target, 0, &image);
+            return Ok(self.renderer.gpu.upload(target, 0, &image)?);
         }
         let has_static = quantity.component.has_static();
         if has_static {
@@ -240,7 +240,7 @@ impl Baked {
         if let Some(recorded) = all.get(&key) {
             return Ok(recorded.clone());
         }
-        if all.len() >= MOST_RECORDED {
+        if all.len() >= MAX_RECORDED {
             all.clear();
         }
         let (gpu, pixels) = (&self.renderer.gpu, (width * height) as u32);
@@ -285,6 +285,6 @@ impl Baked {
         let stage = &self.renderer.kernels.baked_march;
         let mut recording = Recording::new(gpu, "baked render")?;
         dispatch(&mut recording, stage, stage.groups_over(pixels), &bound, push)?;
-        recording.finish()
+        Ok(recording.finish()?)
     }
 }

@@ -27,18 +27,16 @@ const REST: u32 = 4;
 /// Data of a run in training that a view needs.
 #[derive(Clone)]
 pub struct Source {
-    /// Model that is drawn, with its parameters if `params` has none.
+    /// Model that is drawn, with its parameters if `feed` has none.
     pub outline: Model,
-    /// Parameters of the model on the device.
-    pub params: Option<Buffer>,
-    /// Numbers of the field, where they are not those of `params`.
-    pub feed: Option<FieldFeed>,
+    /// Numbers of the field.
+    pub feed: FieldFeed,
 }
 
 impl Source {
     /// Returns the source of a model that does not change.
     pub fn of(model: &Model) -> Source {
-        Source { outline: model.clone(), params: None, feed: None }
+        Source { outline: model.clone(), feed: FieldFeed::default() }
     }
 }
 
@@ -64,18 +62,15 @@ impl Live {
     pub fn new(gpu: &Gpu, source: &Source, tuning: Tuning) -> Result<Live> {
         let model = &source.outline;
         let renderer = Arc::new(Renderer::new(gpu, model, tuning)?);
-        if let Some(FieldFeed::Params(params)) = &source.feed {
-            renderer.follow_fit(params);
+        if !source.feed.own.is_empty() {
+            renderer.follow_fit(&source.feed.own);
         }
         Ok(Live {
             baked: Baked::for_display(renderer, model, CELL_MM),
             config: model.config.clone(),
             scene: model.scene.clone(),
-            params: source.params.clone(),
-            gaussians: match &source.feed {
-                Some(FieldFeed::Gaussians(feed)) => Some(feed.clone()),
-                _ => None,
-            },
+            params: source.feed.params.clone(),
+            gaussians: source.feed.gaussians.clone(),
             gaussians_at: AtomicU64::new(u64::MAX),
             baked_at: vec![0; 1 + model.param_map.phases],
             rest_until: Instant::now(),

@@ -1,7 +1,7 @@
 //! Projections of a reconstruction for any pose and phase, through the kernels that train it.
 
 use crate::error::{Error, Result};
-use crate::fitting::field::FieldDrawing;
+use crate::fields::setup::sample_capacity;
 use crate::gaussians::blobs::{BlobList, Blobs};
 use crate::gaussians::field::DynamicGaussians;
 use crate::gaussians::pictures::Pictures;
@@ -9,15 +9,15 @@ use crate::geometry::ViewRays;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
 use crate::gpu::pace::SubmitPace;
-use crate::gpu::record::{Commands, MOST_GROUPS, Recording};
+use crate::gpu::record::{Commands, MAX_GROUPS, Recording};
 use crate::kernels::layout::{DeviceState, Pose, RayOut, Schedule, Setup, View};
 use crate::kernels::push;
 use crate::kernels::stages::Kernels;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
 use crate::model::component::Component;
+use crate::model::field::FieldDrawing;
 use crate::model::params::ParamMap;
-use crate::model::setup::sample_capacity;
 use crate::network::chunk::{Chunk, chunk_rays, chunk_samples, packed};
 use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
@@ -32,7 +32,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 /// Pixels rendered by one submit, which has a workgroup for each.
-pub(super) const RAYS_PER_SUBMIT: u32 = MOST_GROUPS;
+pub(super) const RAYS_PER_SUBMIT: u32 = MAX_GROUPS;
 
 /// Pixels rendered by the first submits, whose times tell how many the next may have.
 const FIRST_RAYS: u32 = 4096;
@@ -210,7 +210,7 @@ impl Renderer {
 
     fn set_params(&self, model: &Model) -> Result<()> {
         self.gpu.upload(&self.buffers.params, 0, &model.params)?;
-        self.buffers.schedule.write(&[model.config.schedule(model.step)])
+        Ok(self.buffers.schedule.write(&[model.config.schedule(model.step)])?)
     }
 
     /// Takes the parameters in `params`, of a run in training, as they are after everything submitted so far; returns
@@ -283,7 +283,7 @@ impl Renderer {
     /// # Errors
     /// [`Error::Config`] for a phase the model does not have; device errors.
     pub fn render(&self, rays: &ViewRays, width: usize, height: usize, phase: u32) -> Result<Rendering> {
-        self.render_parts(rays, (width, height), phase, Parts { static_field: true, maxima: true })
+        self.render_parts(rays, (width, height), phase, RenderedParts { static_field: true, maxima: true })
     }
 
     /// Renders the quantity that a `width` x `height` view shows at a phase, rows first; maxima per world unit. Where Gaussians
@@ -306,7 +306,7 @@ impl Renderer {
             return pictures.draw(rays, (width, height), phase);
         }
         let static_field = self.blobs.is_none() || quantity.component.has_static();
-        let parts = Parts { static_field, maxima: quantity.projection == Projection::Mip };
+        let parts = RenderedParts { static_field, maxima: quantity.projection == Projection::Mip };
         Ok(self.render_parts(rays, (width, height), phase, parts)?.show(quantity))
     }
 
@@ -362,7 +362,7 @@ impl Renderer {
         rays: &ViewRays,
         (width, height): (usize, usize),
         phase: u32,
-        parts: Parts,
+        parts: RenderedParts,
     ) -> Result<Rendering> {
         self.check_phase(phase)?;
         let blobs = self.blobs.as_ref().map(|blobs| blobs.at(phase)).transpose()?;
@@ -397,7 +397,7 @@ impl Renderer {
             return Err(Error::config("phase", phase, format!("is out of range: phases go from 0 to {last}")));
         }
         if phase.fract() != 0.0 {
-            let all = Parts { static_field: true, maxima: true };
+            let all = RenderedParts { static_field: true, maxima: true };
             let taken = BeatTime::of(phase, self.setup.n_phases);
             let whole_phases = self.blobs.is_some() || self.field.is_some();
             let blobs = whole_phases.then(|| self.between(phase)).transpose()?;
@@ -420,7 +420,7 @@ impl Renderer {
         (width, height): (usize, usize),
         taken: BeatTime,
         blobs: Option<&BlobList>,
-        parts: Parts,
+        parts: RenderedParts,
     ) -> Result<Rendering> {
         let (pixels, image_width) = ((width * height) as u32, width as u32);
         let pace = &self.paces[usize::from(parts.static_field) + 2 * usize::from(parts.maxima)];
@@ -462,11 +462,11 @@ impl Renderer {
     }
 
     /// Records the commands that draw a strip whose samples were counted, in chunks that have room for them.
-    fn record_counted(&self, chunks: &[Chunk], n_rays: u32, parts: Parts, seen: &Buffer) -> Result<Commands> {
+    fn record_counted(&self, chunks: &[Chunk], n_rays: u32, parts: RenderedParts, seen: &Buffer) -> Result<Commands> {
         let mut recording = Recording::new(&self.gpu, "render counted")?;
         self.pass(&mut recording, &self.buffers, &self.setup).render_counted(chunks, parts.maxima)?;
         recording.copy(&self.buffers.ray_out, 0, seen, 0, u64::from(n_rays) * size_of::<RayOut>() as u64)?;
-        recording.finish()
+        Ok(recording.finish()?)
     }
 
     /// Records the commands that draw a strip, or count its samples.
@@ -515,7 +515,7 @@ fn rays_at_once(pace: &SubmitPace, image_width: u32) -> u32 {
 struct Strip {
     n_rays: u32,
     image_width: u32,
-    parts: Parts,
+    parts: RenderedParts,
 }
 
 /// Commands that draw a strip of any view, and the buffers that select view and pose.
@@ -529,7 +529,7 @@ struct RecordedStrip {
 }
 
 /// Maximum number of strips kept recorded; a display in use has far fewer.
-const MOST_RECORDED: usize = 16;
+const MAX_RECORDED: usize = 16;
 
 /// Strips drawn so far.
 #[derive(Default)]
@@ -552,7 +552,7 @@ impl Drawn {
         if !renderer.network_moves() {
             return Ok(self.once.insert(renderer.record_strip(strip, taken, blobs)?));
         }
-        if self.recorded.len() >= MOST_RECORDED && !self.recorded.contains_key(&strip) {
+        if self.recorded.len() >= MAX_RECORDED && !self.recorded.contains_key(&strip) {
             self.recorded.clear();
         }
         match self.recorded.entry(strip) {
@@ -570,7 +570,7 @@ pub(super) fn pose(taken: BeatTime, setup: &Setup, first_pixel: u32) -> Pose {
 
 /// Parts of a rendering that are wanted; the rest is undefined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-struct Parts {
+struct RenderedParts {
     /// The static field.
     static_field: bool,
     /// Maxima along rays.

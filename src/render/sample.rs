@@ -1,7 +1,6 @@
 //! Fields sampled on a regular grid.
 
 use crate::error::{Error, Result};
-use crate::fitting::field::Row;
 use crate::geometry::{MM_PER_UNIT, world_from_lps_mm};
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::record::Recording;
@@ -9,6 +8,7 @@ use crate::kernels::dispatch::Binding;
 use crate::kernels::layout::{Setup, View};
 use crate::kernels::push;
 use crate::model::component::Component;
+use crate::model::field::Row;
 use crate::network::forward::{ForwardBuffers, PoseBuffers};
 use crate::network::pass::Pass;
 use crate::network::static_network::static_setup;

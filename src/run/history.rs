@@ -48,13 +48,13 @@ pub struct Losses {
 
 /// Times of one part, as far as its lines state them.
 #[derive(Default)]
-struct Part {
+struct PartTimes {
     elapsed_s: f64,
     /// Seconds of training only, if the part was completed.
     train_s: Option<f64>,
 }
 
-impl Part {
+impl PartTimes {
     fn train_s(&self) -> f64 {
         self.train_s.unwrap_or(self.elapsed_s)
     }
@@ -67,7 +67,7 @@ impl History {
     }
 
     fn of(log: &str) -> History {
-        let (mut history, mut part) = (History::default(), Part::default());
+        let (mut history, mut part) = (History::default(), PartTimes::default());
         for line in log.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok()) {
             let number = |key: &str| line[key].as_f64();
             part.elapsed_s = number("elapsed_s").unwrap_or(part.elapsed_s);
@@ -76,7 +76,7 @@ impl History {
                     history.train_s += part.train_s();
                     history.before_s += part.elapsed_s;
                     history.parts += 1;
-                    part = Part::default();
+                    part = PartTimes::default();
                 }
                 Some("finished") => part.train_s = number("train_s"),
                 Some("validation") => history.curve.push(Validated {

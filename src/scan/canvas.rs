@@ -8,7 +8,7 @@ use crate::scan::frame_checks::Complaint;
 use std::borrow::Cow;
 
 /// Largest accepted number of pixels of all images together once they are extended to a larger canvas.
-const MOST_PIXELS: usize = 1 << 30;
+const MAX_PIXELS: usize = 1 << 30;
 
 /// Returns the upper left corner of `size` (columns, rows) of an array with `width` columns.
 pub fn corner<T: Copy>(values: &[T], width: usize, [columns, rows]: [usize; 2]) -> Vec<T> {
@@ -42,10 +42,10 @@ pub(crate) fn onto_canvas(views: &[View], frames: &mut [Frame]) -> Result<Option
         return Ok(Some(canvas));
     }
     let [width, height] = canvas;
-    if frames.len() * width * height > MOST_PIXELS {
+    if frames.len() * width * height > MAX_PIXELS {
         let value = format!("{} images, of which the largest has {width} columns and {height} rows", frames.len());
         let problem = format!(
-            "would have more than {MOST_PIXELS} pixels in total if all had the largest size: reduce the large images"
+            "would have more than {MAX_PIXELS} pixels in total if all had the largest size: reduce the large images"
         );
         return Err(Complaint::new("size", value, problem));
     }

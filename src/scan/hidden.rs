@@ -55,9 +55,9 @@ impl Dataset {
 fn hidden(images: &[Cow<'_, [f32]>], width: usize, height: usize) -> Vec<bool> {
     let mut dark = vec![!images.is_empty(); width * height];
     for image in images {
-        let [least, most] = image.iter().fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
-        let limit = most - AS_DARK * (most - least);
-        dark.iter_mut().zip(image.as_ref()).for_each(|(dark, v)| *dark &= least < most && *v >= limit);
+        let [min, max] = image.iter().fold([f32::MAX, f32::MIN], |[l, m], v| [l.min(*v), m.max(*v)]);
+        let limit = max - AS_DARK * (max - min);
+        dark.iter_mut().zip(image.as_ref()).for_each(|(dark, v)| *dark &= min < max && *v >= limit);
     }
     let border = (0..dark.len()).filter(|p| dark[*p] && at_border(*p, width, height));
     let reached = flood(border, width, height, |p| dark[p]);

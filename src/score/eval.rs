@@ -276,8 +276,8 @@ fn strongest_change(dataset: &Dataset) -> Option<(&Frame, f64)> {
     let changes = dataset.training_views().into_iter().flat_map(|view| {
         let frames: Vec<&Frame> = dataset.training().iter().filter(|f| f.view == view).collect();
         let images: Vec<_> = frames.iter().map(|f| dataset.own(view, &f.integrals)).collect();
-        let least = |p: usize| images.iter().map(|image| image[p]).fold(f32::INFINITY, f32::min);
-        let still: Vec<f32> = (0..images[0].len()).map(least).collect();
+        let min = |p: usize| images.iter().map(|image| image[p]).fold(f32::INFINITY, f32::min);
+        let still: Vec<f32> = (0..images[0].len()).map(min).collect();
         frames.into_iter().zip(images).map(move |(frame, image)| {
             let above: Vec<f32> = image.iter().zip(&still).map(|(v, s)| v - s).collect();
             (frame, f64::from(percentile(&above, 1.0 - STRONGEST)))

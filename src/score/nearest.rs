@@ -7,13 +7,13 @@ const STEPS: usize = 16;
 
 /// A place on a line: the share of the distance from one point to the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Place {
+pub(super) struct LinePlace {
     pub(super) line: usize,
     pub(super) from: usize,
     pub(super) share: f64,
 }
 
-impl Place {
+impl LinePlace {
     pub(super) fn on<T, M>(&self, values: &[T], mix: M) -> T
     where
         T: Copy,
@@ -53,7 +53,7 @@ impl<'a> Lines<'a> {
     }
 
     /// Returns the distance to the nearest place, and the place; `None` without lines.
-    pub(super) fn nearest(&self, point: DVec3) -> (f64, Option<Place>) {
+    pub(super) fn nearest(&self, point: DVec3) -> (f64, Option<LinePlace>) {
         let mut best = (f64::INFINITY, None);
         for stretch in &self.stretches {
             if point.distance_squared(stretch.centre) > (best.0 + stretch.radius).powi(2) {
@@ -63,7 +63,7 @@ impl<'a> Lines<'a> {
             for from in stretch.first..(stretch.first + STEPS).min(points.len() - 1) {
                 let (share, away) = on_step([points[from], points[from + 1]], point);
                 if away < best.0 {
-                    best = (away, Some(Place { line: stretch.line, from, share }));
+                    best = (away, Some(LinePlace { line: stretch.line, from, share }));
                 }
             }
         }
@@ -98,10 +98,10 @@ mod tests {
             let of_line = |points: &&[DVec3]| -> f64 {
                 points.windows(2).map(|ends| on_step([ends[0], ends[1]], point).1).fold(f64::INFINITY, f64::min)
             };
-            let least = lines.iter().map(of_line).fold(f64::INFINITY, f64::min);
+            let min = lines.iter().map(of_line).fold(f64::INFINITY, f64::min);
             let (away, there) = index.nearest(point);
             let there = there.unwrap();
-            assert_eq!(away, least);
+            assert_eq!(away, min);
             assert!((there.on(lines[there.line], DVec3::lerp).distance(point) - away).abs() < 1e-9);
         }
         assert_eq!(Lines::new(&[]).nearest(DVec3::ZERO), (f64::INFINITY, None));

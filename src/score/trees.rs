@@ -8,7 +8,7 @@ use crate::scan::gating::BeatTime;
 use crate::scan::truth::Truth;
 use crate::score::calibrated::{TrueFrames, shift_of, true_rays};
 use crate::score::dice::mean;
-use crate::score::nearest::{Lines, Place};
+use crate::score::nearest::{LinePlace, Lines};
 use crate::score::shapes::WITHIN_MM;
 use crate::trees::tree::{BeatTree, PhaseTree};
 use glam::{DVec2, DVec3};
@@ -157,12 +157,12 @@ fn is_near(away_mm: f64) -> f64 {
 }
 
 /// Places on lines at most [`STEP_MM`] apart, and the length that each represents, mm.
-fn finely(lines: &[&[DVec3]]) -> Vec<(Place, f64)> {
+fn finely(lines: &[&[DVec3]]) -> Vec<(LinePlace, f64)> {
     let of_line = |(line, points): (usize, &&[DVec3])| {
         let steps = points.windows(2).enumerate().flat_map(move |(from, ends)| {
             let length = ends[0].distance(ends[1]);
             let n = (length / STEP_MM).ceil().max(1.0);
-            (0..n as usize).map(move |i| (Place { line, from, share: (i as f64 + 0.5) / n }, length / n))
+            (0..n as usize).map(move |i| (LinePlace { line, from, share: (i as f64 + 0.5) / n }, length / n))
         });
         steps.collect::<Vec<_>>()
     };

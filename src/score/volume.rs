@@ -29,7 +29,7 @@ const FAR_MM: f64 = 2.0;
 /// Side of the minimum cube that counts as a component, pixels.
 const COMPONENT_PIXELS: f64 = 1.0;
 /// Maximum number of voxels that are compared.
-pub(crate) const MOST_VOXELS: u64 = 1 << 26;
+pub(crate) const MAX_VOXELS: u64 = 1 << 26;
 
 /// Scores of one phase, or their means.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -242,11 +242,11 @@ impl TrueVessels {
         let before = ((own.low_mm - corners.low_mm) / spacing_mm).ceil().max(DVec3::ZERO);
         let after = ((corners.high_mm - own.high_mm) / spacing_mm).ceil().max(DVec3::ZERO);
         let grown = DVec3::from_array(size.map(f64::from)) + before + after;
-        if grown.element_product() > MOST_VOXELS as f64 {
+        if grown.element_product() > MAX_VOXELS as f64 {
             let [x, y, z] = grown.to_array();
             let problem = format!(
                 "these vessels and the dynamic field together cover {x} x {y} x {z} voxels of this size, but at most \
-                 {MOST_VOXELS} are compared"
+                 {MAX_VOXELS} are compared"
             );
             return Err(Error::data(file, "sizes", problem));
         }

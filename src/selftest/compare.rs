@@ -54,8 +54,8 @@ impl Tolerance {
     /// Returns the tolerance multiplied by a factor.
     pub fn times(self, factor: f64) -> Tolerance {
         match self {
-            Tolerance::OfLargest(most) => Tolerance::OfLargest(factor * most),
-            Tolerance::OfNorm(most) => Tolerance::OfNorm(factor * most),
+            Tolerance::OfLargest(max) => Tolerance::OfLargest(factor * max),
+            Tolerance::OfNorm(max) => Tolerance::OfNorm(factor * max),
         }
     }
 }
@@ -124,14 +124,14 @@ impl Findings {
             return self.add(stages, &format!("{quantity}: all reference values are zero"), f64::INFINITY, 1.0);
         }
         match tolerance {
-            Tolerance::OfNorm(most) => self.add(stages, quantity, relative_distance(got, want), most),
-            Tolerance::OfLargest(most) => {
+            Tolerance::OfNorm(max) => self.add(stages, quantity, relative_distance(got, want), max),
+            Tolerance::OfLargest(max) => {
                 let (error, at) = relative_error(got, want);
                 let place = match (got.get(at), want.get(at)) {
                     (Some(got), Some(want)) => format!("{quantity}[{at}], {got:e} instead of {want:e}"),
                     _ => format!("{quantity}: {} numbers instead of {}", got.len(), want.len()),
                 };
-                self.add(stages, &place, error, most);
+                self.add(stages, &place, error, max);
             }
         }
     }

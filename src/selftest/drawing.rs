@@ -3,6 +3,7 @@
 use crate::choice::Choice;
 use crate::config::Preset;
 use crate::error::Result;
+use crate::fields::data::FieldData;
 use crate::gpu::device::Gpu;
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::{Layers, Tuning};
@@ -11,7 +12,7 @@ use crate::model::component::Component;
 use crate::network::FIRST_LOSS_SCALE;
 use crate::plan::Plan;
 use crate::reference::field::{self, Precision};
-use crate::reference::networks::Place;
+use crate::reference::networks::SamplePlace;
 use crate::reference::{march, networks};
 use crate::render::baked::Baked;
 use crate::render::grid::Grid;
@@ -43,7 +44,7 @@ const CELL_ON_MATRICES: Tolerance = Tolerance::OfLargest(2e-3);
 struct Trained {
     dataset: Dataset,
     model: Model,
-    plan: Plan,
+    plan: FieldData,
     params: Vec<f64>,
     precision: Precision,
 }
@@ -56,7 +57,8 @@ impl Trained {
             trainer.advance(ITERATIONS)?;
         }
         let model = trainer.model()?;
-        let mut plan = Plan::new(&config, &dataset)?.in_scene(model.scene.clone());
+        let plan = Plan::new(&config, &dataset)?.in_scene(model.scene.clone());
+        let mut plan = plan.data::<FieldData>()?.clone();
         plan.setup.jitter = 0;
         plan.setup.n_static_samples = config.march.render_samples;
         plan.setup.n_dynamic_samples = config.march.render_samples;
@@ -142,7 +144,7 @@ fn compare_cells(trained: &Trained, renderer: &Renderer, sine_factor: f64, findi
     let s = &plan.setup;
     let window = trained.model.config.schedule(trained.model.step).window;
     let of_two = |x: DVec3| {
-        let traces = networks::traces(plan, params, trained.model.step, Place { x, shown }, trained.precision);
+        let traces = networks::traces(plan, params, trained.model.step, SamplePlace { x, shown }, trained.precision);
         networks::attenuations(plan, &traces).map(|[sigma, _]| sigma)
     };
     let of_two_networks = plan.params.static_network.is_some();
@@ -185,7 +187,7 @@ fn compare_baked(trained: &Trained, renderer: Arc<Renderer>, findings: &mut Find
     let baked = Baked::for_display(renderer, &trained.model, CELL_MM);
     let (drr, mip) = (Projection::Drr, Projection::Mip);
     let total = exact.total_integral();
-    for (quantity, component, projection, want, most) in [
+    for (quantity, component, projection, want, max) in [
         ("static", Component::Static, drr, &exact.static_integral, 5e-2),
         ("dynamic", Component::Dynamic, drr, &exact.dynamic_integral, 5e-2),
         ("total", Component::Total, drr, &total, 5e-2),
@@ -194,7 +196,7 @@ fn compare_baked(trained: &Trained, renderer: Arc<Renderer>, findings: &mut Find
     ] {
         let want: Vec<f64> = want.iter().map(|v| f64::from(*v)).collect();
         let got = baked.render(rays, 24, 20, 1, Quantity { component, projection })?;
-        findings.numbers(BAKED, quantity, &got, &want, Tolerance::OfNorm(most));
+        findings.numbers(BAKED, quantity, &got, &want, Tolerance::OfNorm(max));
     }
     Ok(())
 }

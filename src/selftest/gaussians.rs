@@ -7,12 +7,12 @@ use crate::gaussians::stages::TargetBuffers;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{GaussianSetup, Splat};
 use crate::kernels::push::{self, PushConstants};
-use crate::plan::fit;
-use crate::plan::targets::Targets;
+use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use crate::methods::dynamic_gaussians::setup;
+use crate::methods::dynamic_gaussians::targets::Targets;
 use crate::reference::gaussians::{self as reference, N_PARAMS, Params, Projection, params};
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::problems::{hard_case, with_gaussians};
-use crate::train::gaussians::GaussianTrainer;
 
 const PROJECT: &[&str] = &[push::GaussianProject::SHADER];
 pub(crate) const SPLAT: &[&str] = &[push::GaussianSplat::SHADER];
@@ -106,7 +106,7 @@ pub(crate) fn f32s(values: &[f64]) -> Vec<f32> {
 /// Distance of a splat from the twin's: in pixels, or as a share of its own size.
 fn splat_error(got: &Splat, want: &Projection) -> f64 {
     let conic = [want.conic.x_axis.x, want.conic.x_axis.y, want.conic.y_axis.y];
-    let largest = conic.iter().fold(0f64, |most, c| most.max(c.abs()));
+    let largest = conic.iter().fold(0f64, |max, c| max.max(c.abs()));
     let axis = |k: usize| {
         let half_box = (f64::from(got.half_box[k]) - want.half_box[k]).abs() / want.half_box[k];
         [(f64::from(got.mean[k]) - want.mean[k]).abs(), half_box]
@@ -124,7 +124,7 @@ pub(crate) fn compare_splats(
     particles: &ParticleBuffers,
     setup: &GaussianSetup,
     stages: &[&'static str],
-    seen: &[Seen],
+    seen: &[TwinSplat],
     findings: &mut Findings,
 ) -> Result<()> {
     let splats: Vec<Splat> = gpu.download(&particles.splats, 0, seen.len())?;
@@ -152,7 +152,7 @@ pub(crate) fn compare_splats(
 }
 
 /// A splat as the twin sees it, and the image it belongs to; none where a view lacks the phase.
-pub(crate) type Seen = Option<(usize, Option<Projection>)>;
+pub(crate) type TwinSplat = Option<(usize, Option<Projection>)>;
 
 /// Compares residuals with those of the device's own images, and moments with those of the device's own residuals; returns the
 /// twin's loss of the images, and the device's moments.
@@ -161,7 +161,7 @@ pub(crate) fn compare_backward(
     (targets, setup): (&Targets, &GaussianSetup),
     (buffers, particles): (&TargetBuffers, &ParticleBuffers),
     images: &[f32],
-    seen: &[Seen],
+    seen: &[TwinSplat],
     findings: &mut Findings,
 ) -> Result<(f64, Vec<[f64; 6]>)> {
     let (n, stride) = (targets.n_pixels(), setup.image_stride as usize);
@@ -176,7 +176,7 @@ pub(crate) fn compare_backward(
     findings.require(RESIDUAL, "sums cleared for the next iteration", left.iter().all(|sum| *sum == 0));
     let rows: Vec<[f32; 8]> = gpu.download(&particles.splat_moments, 0, seen.len())?;
     let of_splats: Vec<[f32; 6]> = rows.iter().map(|r| [0, 1, 2, 4, 5, 6].map(|k| r[k])).collect();
-    let want = |seen: &Seen| match seen {
+    let want = |seen: &TwinSplat| match seen {
         Some((image, Some(projection))) => projection.moments(setup, &image_gradient[*image]),
         _ => [0.0; 6],
     };
@@ -201,7 +201,7 @@ pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let setup = *trainer.setup();
     let all: Vec<(Params, usize)> = rows.iter().map(|g| (params(g), g.phase as usize)).collect();
     let images = trainer.images()?;
-    let seen: Vec<Seen> = (0..targets.n_views)
+    let seen: Vec<TwinSplat> = (0..targets.n_views)
         .flat_map(|view| all.iter().map(move |(p, phase)| (view, p, *phase)))
         .map(|(view, p, phase)| {
             let image = targets.image_of[phase * targets.n_views + view]?;
@@ -252,7 +252,7 @@ fn compare_ten_updates(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
     let setup = *trainer.setup();
     let mut all: Vec<(Params, usize)> = rows.iter().map(|g| (params(g), g.phase as usize)).collect();
     let mut moments = vec![[[0.0; 2]; N_PARAMS]; all.len()];
-    for row in &fit::schedule(&config.gaussians)[..10] {
+    for row in &setup::schedule(&config.gaussians)[..10] {
         let (_, _, gradient) = twin(&targets, &setup, &all);
         for (((p, _), g), moments) in all.iter_mut().zip(&gradient).zip(&mut moments) {
             reference::adam(&setup, row, g, p, moments);

@@ -4,6 +4,9 @@
 use crate::choice::Choice;
 use crate::config::Preset;
 use crate::error::Result;
+use crate::fields::data::FieldData;
+use crate::fields::step::tv_parts;
+use crate::fields::trainer::FieldsFit;
 use crate::fitting::losses::{NetworkLosses, StepLoss};
 use crate::gpu::capabilities::DeviceInfo;
 use crate::gpu::device::Gpu;
@@ -16,12 +19,11 @@ use crate::network::chunk::chunks;
 use crate::network::fused::computes_again;
 use crate::network::{FIRST_LOSS_SCALE, FIRST_LOSS_SCALE_OF_TWO};
 use crate::plan::Plan;
-use crate::reference::field::{self, Precision, Shown};
+use crate::reference::field::{self, Precision, ShownPhases};
 use crate::reference::{march, step};
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::{Findings, Tolerance, told};
 use crate::selftest::problems::small_config;
-use crate::train::step::tv_parts;
 use crate::train::trainer::Trainer;
 use glam::DVec3;
 
@@ -53,9 +55,9 @@ impl Case {
     pub fn plan(&self, dataset: &Dataset) -> Result<Plan> {
         let settings = [STEADY, self.settings].concat();
         let mut plan = Plan::new(&small_config(self.preset, &settings)?, dataset)?;
-        if self.settings.iter().any(|setting| setting.starts_with("dynamic.least_slope")) {
+        if self.settings.iter().any(|setting| setting.starts_with("dynamic.min_slope")) {
             // Every ray asks for more attenuation.
-            plan.images.iter_mut().for_each(|value| *value += 1.0);
+            plan.data_mut::<FieldData>()?.images.iter_mut().for_each(|value| *value += 1.0);
         }
         Ok(plan)
     }
@@ -74,7 +76,7 @@ pub const F32_CASES: &[Case] = &[
     // more than 32 depths a lane
     case(Preset::FastMlp, &["march.dynamic_samples=1100", "train.rays=3", "train.chunk_samples=3500"]),
     // a field far below the bend of its softplus, which rays bring back
-    case(Preset::FastMlp, &["dynamic.best_start=false", "dynamic.normalised_shift=-9", "dynamic.least_slope=0.05"]),
+    case(Preset::FastMlp, &["dynamic.best_start=false", "dynamic.normalised_shift=-9", "dynamic.min_slope=0.05"]),
     // a single hidden layer, skip in a deep net, wide layers
     case(Preset::Paper, &["dynamic.layers=1", "dynamic.width=16", "loss.normalise=true"]),
     case(Preset::PublicCode, &["dynamic.layers=6", "dynamic.skip_layer=3", "dynamic.width=48", "dynamic.latent=12"]),
@@ -146,7 +148,7 @@ const UPDATE: Tolerance = Tolerance::OfLargest(2e-3);
 
 /// The twin's side of a comparison.
 struct Twin<'a> {
-    plan: &'a Plan,
+    plan: &'a FieldData,
     step: u32,
     params: &'a [f64],
     rays: Vec<march::Ray>,
@@ -157,7 +159,7 @@ struct Twin<'a> {
 }
 
 /// Results of an iteration on the device.
-struct Seen {
+struct DeviceResults {
     loss: StepLoss,
     rays: Vec<layout::Ray>,
     ray_out: Vec<RayOut>,
@@ -179,12 +181,12 @@ pub(super) struct Sample {
     pub(super) sigma: [f32; 2],
 }
 
-impl Seen {
-    fn download(gpu: &Gpu, trainer: &Trainer, loss: StepLoss) -> Result<Seen> {
-        let (forward, training, plan) = (trainer.fields()?.forward(), trainer.fields()?.training(), trainer.plan());
+impl DeviceResults {
+    fn download(gpu: &Gpu, fit: &FieldsFit, loss: StepLoss) -> Result<DeviceResults> {
+        let (forward, training, plan) = (fit.forward(), fit.training(), fit.data());
         let n = plan.setup.n_rays as usize;
         let one_chunk = chunks(&plan.setup, plan.setup.n_rays).count() == 1;
-        Ok(Seen {
+        Ok(DeviceResults {
             loss,
             rays: gpu.download(&forward.rays, 0, n)?,
             ray_out: gpu.download(&forward.ray_out, 0, n)?,
@@ -192,7 +194,7 @@ impl Seen {
             ray_loss: gpu.download(&training.ray_loss, 0, n)?,
             tv_parts: gpu.download(&training.tv_parts, 0, tv_parts(&plan.params) as usize)?,
             gradient: gpu.download(&training.gradient, 0, plan.params.len)?,
-            samples: one_chunk.then(|| samples(gpu, trainer, loss.live_samples as usize)).transpose()?,
+            samples: one_chunk.then(|| samples(gpu, fit, loss.live_samples as usize)).transpose()?,
         })
     }
 
@@ -202,8 +204,8 @@ impl Seen {
 }
 
 /// The live samples of an iteration, which one chunk held.
-pub(super) fn samples(gpu: &Gpu, trainer: &Trainer, live: usize) -> Result<Vec<Sample>> {
-    let (forward, capacity) = (trainer.fields()?.forward(), trainer.plan().setup.sample_capacity as usize);
+pub(super) fn samples(gpu: &Gpu, fit: &FieldsFit, live: usize) -> Result<Vec<Sample>> {
+    let (forward, capacity) = (fit.forward(), fit.data().setup.sample_capacity as usize);
     // A larger count would be a fault of the counter, which is compared anyway.
     let live = live.min(capacity);
     let points: Vec<[f32; 4]> = gpu.download(&forward.sample_points, 0, live)?;
@@ -252,10 +254,10 @@ fn compare_stages(
 ) -> Result<()> {
     let step = trainer.step();
     let loss = one_iteration(trainer)?;
-    let seen = Seen::download(gpu, trainer, loss)?;
+    let seen = DeviceResults::download(gpu, trainer.fields()?, loss)?;
     let params: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
-    let precision = precision_of(trainer);
-    let plan = trainer.plan();
+    let precision = precision_of(trainer.fields()?);
+    let plan = trainer.fields()?.data();
     let tolerances = Tolerances::of(precision, gpu.info());
     let network = plan.params.dynamic_network.as_ref();
     let computes_again = network.is_some_and(|network| computes_again(&tuning.matrices, network));
@@ -279,9 +281,9 @@ fn compare_stages(
 }
 
 /// Precision of the path that a run takes, for as long as its loss scale is the first.
-pub(super) fn precision_of(trainer: &Trainer) -> Precision {
-    let of_two = trainer.plan().params.static_network.is_some();
-    match trainer.tuning().layers {
+pub(super) fn precision_of(fit: &FieldsFit) -> Precision {
+    let of_two = fit.data().params.static_network.is_some();
+    match fit.device_tuning().layers {
         Layers::F32 => Precision::Exact,
         Layers::Matrices if of_two => Precision::F16 { loss_scale: FIRST_LOSS_SCALE_OF_TWO.into() },
         Layers::Matrices => Precision::F16 { loss_scale: FIRST_LOSS_SCALE.into() },
@@ -349,7 +351,7 @@ impl Twin<'_> {
         [backward, backward, LATENTS_BACKWARD_ON_MATRICES]
     }
 
-    fn compare_rays(&self, seen: &Seen, findings: &mut Findings) {
+    fn compare_rays(&self, seen: &DeviceResults, findings: &mut Findings) {
         let mut worst = 0f64;
         for (got, want) in seen.rays.iter().zip(&self.rays) {
             let [(nearest, _), (beyond, share)] = want.shown;
@@ -367,7 +369,7 @@ impl Twin<'_> {
     }
 
     /// Compares the number of live samples and, where both have as many on a ray, their places.
-    fn compare_samples(&self, samples: &[Sample], seen: &Seen, findings: &mut Findings) {
+    fn compare_samples(&self, samples: &[Sample], seen: &DeviceResults, findings: &mut Findings) {
         let s = &self.plan.setup;
         let (mut strays, mut worst) = (0, 0f64);
         for (r, ray) in self.rays.iter().enumerate() {
@@ -400,7 +402,7 @@ impl Twin<'_> {
         network.map(trace).unwrap_or_default()
     }
 
-    fn shown(&self, sample: &Sample) -> Shown {
+    fn shown(&self, sample: &Sample) -> ShownPhases {
         self.rays.get(sample.ray).map_or([(0, 1.0), (0, 0.0)], |ray| ray.shown)
     }
 
@@ -419,7 +421,7 @@ impl Twin<'_> {
     }
 
     /// Compares integrals of the device's samples, and of the twin's static field.
-    fn compare_integrals(&self, seen: &Seen, findings: &mut Findings) {
+    fn compare_integrals(&self, seen: &DeviceResults, findings: &mut Findings) {
         let statics = |r: usize| self.march_statics(r).static_integral;
         let want: Vec<f64> = (0..self.rays.len()).map(statics).collect();
         let got: Vec<f32> = seen.ray_out.iter().map(|out| out.static_integral).collect();
@@ -445,7 +447,7 @@ impl Twin<'_> {
     }
 
     /// Compares losses and their gradient, from the device's integrals.
-    fn compare_loss(&self, seen: &Seen, findings: &mut Findings) {
+    fn compare_loss(&self, seen: &DeviceResults, findings: &mut Findings) {
         let n = self.rays.len();
         let loss = |(r, out): (usize, &RayOut)| {
             let integrals = [out.static_integral, out.dynamic_integral].map(f64::from);
@@ -462,13 +464,13 @@ impl Twin<'_> {
         findings.numbers(LOSS, "dynamic data terms", &got(1), &dynamic, F32_SUMS);
     }
 
-    fn compare_total_variation(&self, seen: &Seen, findings: &mut Findings) {
+    fn compare_total_variation(&self, seen: &DeviceResults, findings: &mut Findings) {
         let value = step::total_variation(self.plan, self.params, &mut vec![0.0; self.plan.params.len]);
         findings.add(TOTAL_VARIATION, "value", relative(seen.total_variation(), value), IN_F32.loss);
     }
 
     /// Compares the gradient of the static field, from the device's ray gradients and the total variation.
-    fn compare_static_gradient(&self, seen: &Seen, findings: &mut Findings) {
+    fn compare_static_gradient(&self, seen: &DeviceResults, findings: &mut Findings) {
         let params = &self.plan.params;
         let mut want = vec![0.0; params.len];
         for (r, ray) in self.rays.iter().enumerate() {
@@ -484,7 +486,7 @@ impl Twin<'_> {
     }
 
     /// Compares the gradient of the network, from the device's samples and ray gradients.
-    fn compare_backward(&self, samples: &[Sample], seen: &Seen, findings: &mut Findings) {
+    fn compare_backward(&self, samples: &[Sample], seen: &DeviceResults, findings: &mut Findings) {
         let params = &self.plan.params;
         let mut want = vec![0.0; params.len];
         for sample in samples.iter().filter(|sample| sample.ray < self.rays.len()) {
@@ -494,14 +496,14 @@ impl Twin<'_> {
             let shown = self.shown(sample);
             march::sample_bwd(self.plan, self.params, shown, &trace, by_integral, self.precision, &mut want);
         }
-        for Part { stages, name, positions } in parts(params, self.backward_stages()) {
+        for GradientPart { stages, name, positions } in parts(params, self.backward_stages()) {
             let (got, want) = (pick(&positions, &seen.gradient), pick(&positions, &want));
             findings.numbers(stages, &name, &got, &want, self.tolerances.gradient);
         }
     }
 
     /// Compares sums over the results of the device's rays.
-    fn compare_report(&self, seen: &Seen, findings: &mut Findings) {
+    fn compare_report(&self, seen: &DeviceResults, findings: &mut Findings) {
         let sum = |k: usize| seen.ray_loss.iter().map(|loss| f64::from(loss[k])).sum::<f64>();
         let occlusion = f64::from(self.plan.setup.occlusion_weight) * sum(2);
         let loss = &seen.loss;
@@ -517,7 +519,7 @@ impl Twin<'_> {
     }
 
     /// Compares losses and gradients with those that the twin computes by itself.
-    fn compare_whole(&self, seen: &Seen, findings: &mut Findings) {
+    fn compare_whole(&self, seen: &DeviceResults, findings: &mut Findings) {
         let whole = |precision| step::loss_and_gradient(self.plan, self.params, self.step, &self.rays, precision);
         let (want, gradient) = whole(self.precision);
         let (loss, tolerance) = (&seen.loss, self.tolerances.loss);
@@ -542,21 +544,21 @@ impl Twin<'_> {
 }
 
 /// A part of the network's gradient, and the stages that compute it.
-struct Part {
+struct GradientPart {
     stages: &'static [&'static str],
     name: String,
     positions: Vec<u32>,
 }
 
 /// Splits the network's gradient by the stages that compute it: the columns of latents are apart from the weights beside them.
-fn parts(params: &ParamMap, [output, layers, latents]: [&'static [&'static str]; 3]) -> Vec<Part> {
+fn parts(params: &ParamMap, [output, layers, latents]: [&'static [&'static str]; 3]) -> Vec<GradientPart> {
     let Some(network) = &params.dynamic_network else { return Vec::new() };
     let mut parts = Vec::new();
     let mut last = Vec::new();
     for tensor in params.tensors().into_iter().filter(|tensor| !is_static(tensor)) {
         let layer = layer_of(&tensor).map(|i| &network.layers[i]);
         let sees_input = layer.is_some_and(|layer| layer.latent.is_some());
-        let part = |stages, name: String, positions| Part { stages, name, positions };
+        let part = |stages, name: String, positions| GradientPart { stages, name, positions };
         match tensor.name.as_str() {
             name if name.starts_with("dynamic.out") => parts.push(part(output, tensor.name, tensor.positions)),
             name if name.ends_with(".weight") => {
@@ -617,7 +619,7 @@ pub(super) fn compare_update(
     moments: &[[f32; 2]],
     findings: &mut Findings,
 ) -> Result<(Vec<f32>, Vec<[f32; 2]>)> {
-    let (plan, n) = (trainer.plan(), params.len());
+    let (plan, n) = (trainer.fields()?.data(), params.len());
     let gradient: Vec<f32> = gpu.download(&trainer.fields()?.training().gradient, 0, n)?;
     let after: Vec<f32> = gpu.download(&trainer.fields()?.forward().params, 0, n)?;
     let moments_after: Vec<[f32; 2]> = gpu.download(&trainer.fields()?.training().moments, 0, n)?;

@@ -2,15 +2,16 @@
 
 use crate::config::Preset;
 use crate::error::{Error, Result};
+use crate::fields::trainer::FieldsFit;
 use crate::fitting::losses::{NetworkLosses, StepLoss};
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::{Ray, RayOut};
 use crate::kernels::push::{self, PushConstants};
 use crate::kernels::tuning::Tuning;
 use crate::network::static_network::StaticNetwork;
-use crate::reference::field::NetworkTrace;
+use crate::reference::field::{NetworkTrace, Precision};
 use crate::reference::march;
-use crate::reference::networks::{self, PairLoss, PairSample, Place};
+use crate::reference::networks::{self, PairLoss, PairSample, SamplePlace};
 use crate::reference::step;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
@@ -74,7 +75,7 @@ const WHOLE: &[&str] = &["whole iteration of two networks"];
 const CHANGE: f64 = 1e-7;
 
 /// Results of an iteration on the device.
-struct Seen {
+struct DeviceResults {
     loss: StepLoss,
     networks: NetworkLosses,
     rays: Vec<Ray>,
@@ -93,18 +94,15 @@ struct Pairs {
 }
 
 impl Pairs {
-    fn download(gpu: &Gpu, trainer: &Trainer, static_network: &StaticNetwork, loss: &StepLoss) -> Result<Pairs> {
-        let of_dynamic = samples(gpu, trainer, loss.live_samples as usize)?;
+    fn download(gpu: &Gpu, fit: &FieldsFit, static_network: &StaticNetwork, loss: &StepLoss) -> Result<Pairs> {
+        let of_dynamic = samples(gpu, fit, loss.live_samples as usize)?;
         let n = of_dynamic.len();
         let gradient = static_network
             .sigma_gradient()
             .ok_or_else(|| Error::Internal("the network was not created for training".into()))?;
         Ok(Pairs {
             of_static: gpu.download(static_network.sigma(), 0, n)?,
-            gradient: [
-                gpu.download(gradient, 0, n)?,
-                gpu.download(&trainer.fields()?.training().sigma_gradient, 0, n)?,
-            ],
+            gradient: [gpu.download(gradient, 0, n)?, gpu.download(&fit.training().sigma_gradient, 0, n)?],
             of_dynamic,
         })
     }
@@ -123,7 +121,8 @@ impl Pairs {
 
 /// The twin's side of a comparison.
 struct Twin<'a> {
-    trainer: &'a Trainer,
+    fit: &'a FieldsFit,
+    precision: Precision,
     step: u32,
     params: &'a [f64],
     rays: Vec<march::Ray>,
@@ -137,15 +136,16 @@ struct Twin<'a> {
 pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), &case.name());
     let mut trainer = Trainer::new(gpu, case.plan(dataset)?, dataset, tuning.clone())?;
-    let mut params = trainer.plan().params.initial(&trainer.plan().config);
+    let mut params = trainer.fields()?.data().params.initial(&trainer.fields()?.data().config);
     let mut moments = vec![[0f32; 2]; params.len()];
     for _ in 0..ITERATIONS {
         let step = trainer.step();
         let loss = one_iteration(&mut trainer)?;
         let exact: Vec<f64> = params.iter().map(|v| f64::from(*v)).collect();
-        let tolerances = Tolerances::of(precision_of(&trainer), gpu.info());
-        let rays = march::batch(trainer.plan(), step);
-        Twin { trainer: &trainer, step, params: &exact, rays, tolerances }.compare(gpu, loss, findings)?;
+        let (fit, precision) = (trainer.fields()?, precision_of(trainer.fields()?));
+        let tolerances = Tolerances::of(precision, gpu.info());
+        let rays = march::batch(fit.data(), step);
+        Twin { fit, precision, step, params: &exact, rays, tolerances }.compare(gpu, loss, findings)?;
         (params, moments) = compare_update(gpu, &trainer, &params, &moments, findings)?;
     }
     Ok(())
@@ -153,13 +153,12 @@ pub fn compare(gpu: &Gpu, dataset: &Dataset, case: &Case, tuning: &Tuning, findi
 
 impl Twin<'_> {
     fn compare(&self, gpu: &Gpu, loss: StepLoss, findings: &mut Findings) -> Result<()> {
-        let (forward, training, plan) =
-            (self.trainer.fields()?.forward(), self.trainer.fields()?.training(), self.trainer.plan());
+        let (forward, training, plan) = (self.fit.forward(), self.fit.training(), self.fit.data());
         let missing = || Error::Internal("the static field is not a network".into());
         let (static_network, networks) =
-            (self.trainer.fields()?.static_network().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
+            (self.fit.static_network().ok_or_else(missing)?, loss.networks.ok_or_else(missing)?);
         let n = self.rays.len();
-        let seen = Seen {
+        let seen = DeviceResults {
             loss,
             networks,
             rays: gpu.download(&forward.rays, 0, n)?,
@@ -171,7 +170,7 @@ impl Twin<'_> {
         let changes = seen.rays.iter().zip(&self.rays).map(|(got, want)| (f64::from(got.change) - want.change).abs());
         findings.add(RAYS, "changes of pixels", changes.fold(0.0, f64::max), CHANGE);
         if crate::network::chunk::chunks(&plan.setup, plan.setup.n_rays).count() == 1 {
-            let pairs = Pairs::download(gpu, self.trainer, static_network, &loss)?;
+            let pairs = Pairs::download(gpu, self.fit, static_network, &loss)?;
             let traces = self.traces(&pairs);
             self.compare_forward(&pairs, &traces, findings);
             self.compare_integrals(&pairs, &seen, findings);
@@ -183,19 +182,19 @@ impl Twin<'_> {
         Ok(())
     }
 
-    fn place(&self, sample: &Sample) -> Place {
-        Place { x: sample.x, shown: self.rays[sample.ray].shown }
+    fn place(&self, sample: &Sample) -> SamplePlace {
+        SamplePlace { x: sample.x, shown: self.rays[sample.ray].shown }
     }
 
     fn traces(&self, pairs: &Pairs) -> Vec<[NetworkTrace; 2]> {
-        let (plan, precision) = (self.trainer.plan(), precision_of(self.trainer));
+        let (plan, precision) = (self.fit.data(), self.precision);
         let at = |sample: &Sample| networks::traces(plan, self.params, self.step, self.place(sample), precision);
         pairs.of_dynamic.iter().map(at).collect()
     }
 
     /// Compares attenuations and their slopes at the device's samples.
     fn compare_forward(&self, pairs: &Pairs, traces: &[[NetworkTrace; 2]], findings: &mut Findings) {
-        let want: Vec<_> = traces.iter().map(|traces| networks::attenuations(self.trainer.plan(), traces)).collect();
+        let want: Vec<_> = traces.iter().map(|traces| networks::attenuations(self.fit.data(), traces)).collect();
         for (k, what) in ["attenuation", "slope"].into_iter().enumerate() {
             let of_dynamic: Vec<f32> = pairs.of_dynamic.iter().map(|sample| sample.sigma[k]).collect();
             let of_static: Vec<f32> = pairs.of_static.iter().map(|sigma| sigma[k]).collect();
@@ -208,7 +207,7 @@ impl Twin<'_> {
     }
 
     /// Compares integrals of the device's samples.
-    fn compare_integrals(&self, pairs: &Pairs, seen: &Seen, findings: &mut Findings) {
+    fn compare_integrals(&self, pairs: &Pairs, seen: &DeviceResults, findings: &mut Findings) {
         let want: Vec<_> = (0..self.rays.len()).map(|r| networks::integrals(&pairs.of_ray(r).1)).collect();
         let column =
             |name: &str, got: fn(&RayOut) -> f32, of: fn(&networks::PairIntegrals) -> f64, f: &mut Findings| {
@@ -221,8 +220,8 @@ impl Twin<'_> {
     }
 
     /// Compares losses of the device's integrals and samples, and their gradient at each.
-    fn compare_losses(&self, pairs: &Pairs, seen: &Seen, findings: &mut Findings) {
-        let (plan, n) = (self.trainer.plan(), self.rays.len());
+    fn compare_losses(&self, pairs: &Pairs, seen: &DeviceResults, findings: &mut Findings) {
+        let (plan, n) = (self.fit.data(), self.rays.len());
         let mut gradient = [vec![0.0; pairs.of_dynamic.len()], vec![0.0; pairs.of_dynamic.len()]];
         let mut losses: Vec<PairLoss> = Vec::new();
         for (r, ray) in self.rays.iter().enumerate() {
@@ -253,8 +252,14 @@ impl Twin<'_> {
     }
 
     /// Compares the gradient of both networks, from the device's gradients at samples.
-    fn compare_backward(&self, pairs: &Pairs, traces: &[[NetworkTrace; 2]], seen: &Seen, findings: &mut Findings) {
-        let (plan, precision) = (self.trainer.plan(), precision_of(self.trainer));
+    fn compare_backward(
+        &self,
+        pairs: &Pairs,
+        traces: &[[NetworkTrace; 2]],
+        seen: &DeviceResults,
+        findings: &mut Findings,
+    ) {
+        let (plan, precision) = (self.fit.data(), self.precision);
         let mut want = vec![0.0; plan.params.len];
         for (s, (sample, traces)) in pairs.of_dynamic.iter().zip(traces).enumerate() {
             let by_sigma = [0, 1].map(|field| f64::from(pairs.gradient[field][s]));
@@ -264,16 +269,16 @@ impl Twin<'_> {
     }
 
     /// Compares tensor by tensor, so that a missing small gradient cannot hide behind a large one.
-    fn compare_tensors(&self, stages: &[&'static str], want: &[f64], seen: &Seen, findings: &mut Findings) {
-        for tensor in self.trainer.plan().params.tensors() {
+    fn compare_tensors(&self, stages: &[&'static str], want: &[f64], seen: &DeviceResults, findings: &mut Findings) {
+        for tensor in self.fit.data().params.tensors() {
             let (got, want) = (pick(&tensor.positions, &seen.gradient), pick(&tensor.positions, want));
             findings.numbers(stages, &tensor.name, &got, &want, self.tolerances.gradient);
         }
     }
 
     /// Compares sums over the results of the device's rays.
-    fn compare_report(&self, seen: &Seen, findings: &mut Findings) {
-        let row = self.trainer.plan().schedule[self.step as usize];
+    fn compare_report(&self, seen: &DeviceResults, findings: &mut Findings) {
+        let row = self.fit.data().schedule[self.step as usize];
         let sum = |all: &[[f32; 4]], k: usize| all.iter().map(|loss| f64::from(loss[k])).sum::<f64>();
         let weighted = |weight: f32, k: usize| f64::from(weight) * sum(&seen.regularisers, k);
         for (name, got, want) in [
@@ -294,8 +299,8 @@ impl Twin<'_> {
     }
 
     /// Compares losses and gradients with those that the twin computes by itself.
-    fn compare_whole(&self, seen: &Seen, findings: &mut Findings) {
-        let (plan, precision) = (self.trainer.plan(), precision_of(self.trainer));
+    fn compare_whole(&self, seen: &DeviceResults, findings: &mut Findings) {
+        let (plan, precision) = (self.fit.data(), self.precision);
         let (want, gradient) = step::loss_and_gradient(plan, self.params, self.step, &self.rays, precision);
         for (name, got, want) in [
             ("objective", seen.loss.total(), want.total()),

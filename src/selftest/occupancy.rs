@@ -1,7 +1,9 @@
 //! Cells in which the dynamic field has been seen empty: the notes of an iteration, and their use by later ones.
 
+use crate::config::Config;
 use crate::config::Preset;
 use crate::error::{Error, Result};
+use crate::fields::data::FieldData;
 use crate::fitting::losses::StepLoss;
 use crate::gpu::device::Gpu;
 use crate::kernels::constants::{CELLS_PER_WORD, NEAR_SAMPLE, OCCUPANCY_EPOCH, OCCUPIED, SEEN};
@@ -34,15 +36,16 @@ const SETTINGS: &[&str] =
 pub fn compare(gpu: &Gpu, dataset: &Dataset, tuning: &Tuning, findings: &mut Findings) -> Result<()> {
     findings.begin(path_name(tuning.layers), "fast-mlp, a field that does not change");
     let mut plan = Plan::new(&small_config(Preset::FastMlp, SETTINGS)?, dataset)?;
-    plan.setup.occupancy_threshold = threshold(gpu, dataset, &plan, tuning)?;
+    let limit = threshold(gpu, dataset, &plan.config, tuning)?;
+    plan.data_mut::<FieldData>()?.setup.occupancy_threshold = limit;
     let mut trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
     compare_notes(gpu, &mut trainer, findings)?;
     compare_use(gpu, &mut trainer, findings)
 }
 
 /// A threshold that nine tenths of the values are below, so that both kinds of cells occur.
-fn threshold(gpu: &Gpu, dataset: &Dataset, plan: &Plan, tuning: &Tuning) -> Result<f32> {
-    let mut trainer = Trainer::new(gpu, Plan::new(&plan.config, dataset)?, dataset, tuning.clone())?;
+fn threshold(gpu: &Gpu, dataset: &Dataset, config: &Config, tuning: &Tuning) -> Result<f32> {
+    let mut trainer = Trainer::new(gpu, Plan::new(config, dataset)?, dataset, tuning.clone())?;
     let live = advance(&mut trainer, 1)?.live_samples as usize;
     let mut sigma: Vec<[f32; 2]> = gpu.download(&trainer.fields()?.forward().sample_sigma, 0, live)?;
     sigma.sort_by(|a, b| a[0].total_cmp(&b[0]));
@@ -58,7 +61,7 @@ fn advance(trainer: &mut Trainer, until: u32) -> Result<StepLoss> {
 }
 
 fn notes(gpu: &Gpu, trainer: &Trainer) -> Result<Vec<u32>> {
-    gpu.download(&trainer.fields()?.forward().occupancy, 0, 3 * trainer.plan().setup.occupancy_words())
+    Ok(gpu.download(&trainer.fields()?.forward().occupancy, 0, 3 * trainer.fields()?.data().setup.occupancy_words())?)
 }
 
 /// Compares the notes of one iteration, the first of the second epoch. The epoch before is left alone.
@@ -67,7 +70,7 @@ fn compare_notes(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> R
     let before = notes(gpu, trainer)?;
     let live = advance(trainer, OCCUPANCY_EPOCH + 1)?.live_samples as usize;
     let after = notes(gpu, trainer)?;
-    let setup = trainer.plan().setup;
+    let setup = trainer.fields()?.data().setup;
     let points: Vec<[f32; 4]> = gpu.download(&trainer.fields()?.forward().sample_points, 0, live)?;
     let rays: Vec<u32> = gpu.download(&trainer.fields()?.forward().sample_rays, 0, live)?;
     let sigma: Vec<[f32; 2]> = gpu.download(&trainer.fields()?.forward().sample_sigma, 0, live)?;
@@ -98,7 +101,7 @@ fn compare_use(gpu: &Gpu, trainer: &mut Trainer, findings: &mut Findings) -> Res
     advance(trainer, HEEDING)?;
     let noted = notes(gpu, trainer)?;
     let live = advance(trainer, HEEDING + 1)?.live_samples;
-    let plan = trainer.plan();
+    let plan = trainer.fields()?.data();
     let s = &plan.setup;
     let (mut all, mut kept) = (0u64, 0u64);
     for ray in march::batch(plan, HEEDING) {

@@ -7,10 +7,10 @@ use crate::gaussians::field::{DeformableGaussians, DynamicGaussians, Gaussians, 
 use crate::gaussians::view::SplatView;
 use crate::geometry::{CArm, Geometry, ViewRays};
 use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup};
-use crate::plan::lengths::Lengths;
-use crate::plan::targets::{Place, Targets};
+use crate::methods::dynamic_gaussians::lengths::Lengths;
+use crate::methods::dynamic_gaussians::targets::{PossibleVessel, Targets};
+use crate::methods::dynamic_gaussians::twin::DeformableParams;
 use crate::random::{STREAM_JITTER, normal};
-use crate::reference::deformable::DeformableParams;
 use crate::reference::gaussians::params;
 use crate::scan::dataset::{Dataset, Frame, Layout, Split, View};
 use glam::DVec3;
@@ -184,7 +184,7 @@ pub fn targets(width: usize, height: usize, n_phases: usize) -> Result<Targets> 
         lengths: Lengths { factor: 1.0, smoothing: 1.0 },
         rest_phase: 0,
         images: Vec::new(),
-        most: Vec::new(),
+        max: Vec::new(),
         places: vec![Vec::new(); n_phases],
         cell: 1.0,
     })
@@ -224,7 +224,7 @@ pub fn deformable_case() -> Result<(Targets, Vec<Gaussian>, Config)> {
         .for_each(|(view, after)| view.after_phase = after);
     targets.rest_phase = 3;
     // The grid covers the places.
-    let corner = Place { position: DVec3::splat(14.0), evidence: 18.0 };
+    let corner = PossibleVessel { position: DVec3::splat(14.0), evidence: 18.0 };
     targets.places[0].push(corner);
     let mut rows = random_gaussians(31, 1, 11.0, 8);
     rows[3].position = [300.0, 0.0, 0.0];
@@ -260,7 +260,7 @@ fn drawn_set(n: usize, n_phases: u32) -> Gaussians {
         phase: i as u32 % n_phases,
         rotation: [7, 8, 9, 10].map(|k| value(i, k) as f32),
     });
-    let setup = GaussianSetup { n_phases, cut: 3.2, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() };
+    let setup = GaussianSetup { n_phases, cut: 3.2, min_scale: 0.4, max_scale: 3.0, ..GaussianSetup::default() };
     Gaussians {
         units: DRAWN_UNITS,
         n_phases: n_phases as usize,

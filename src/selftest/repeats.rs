@@ -6,13 +6,13 @@ use crate::gaussians::particles::Particles;
 use crate::gpu::device::Gpu;
 use crate::kernels::layout::Gaussian;
 use crate::kernels::tuning::Tuning;
+use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
 use crate::selftest::compare::Findings;
 use crate::selftest::iteration::path_name;
 use crate::selftest::problems::{deformable_case, hard_case, small_config, with_gaussians};
-use crate::train::deformable::DeformableTrainer;
-use crate::train::gaussians::GaussianTrainer;
 use crate::train::trainer::Trainer;
 
 const REPEATS: &[&str] = &["equal runs have equal bits"];

@@ -2,12 +2,12 @@
 
 use crate::calibrate::calibrate;
 use crate::calibrate::correction::Calibration;
-use crate::config::method::MethodKind;
+use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
+use crate::methods;
 use crate::model::Model;
-use crate::model::checkpoint::Checkpoint;
 use crate::model::scene::Scene;
 use crate::plan::Plan;
 use crate::render::live::{Live, Source};
@@ -195,8 +195,7 @@ impl Shared {
         let trainer = match &engine.saved {
             None => Trainer::start_over(gpu, fresh, &dataset, tuning, earlier.as_ref())?,
             Some(state) => {
-                // Boxes of two networks are those of the rays there are.
-                let plan = if config.method() == MethodKind::TwoNetworks {
+                let plan = if methods::of(&config).boxes_hold_all_rays() {
                     fresh
                 } else {
                     fresh.in_scene(state.model.scene.clone())
@@ -212,8 +211,7 @@ impl Shared {
         let took = begin.elapsed();
         engine.settling = Some(Settling { until: Instant::now() + took * SETTLE, quiet: took.max(QUIET) });
         self.step.store(trainer.step(), Ordering::Release);
-        let params = trainer.fields().ok().map(|fields| fields.forward().params.clone());
-        self.publish(Source { outline: trainer.outline(), params, feed: trainer.feed() });
+        self.publish(Source { outline: trainer.outline(), feed: trainer.feed() });
         engine.training = Some(Training::new(trainer));
         Ok(())
     }
@@ -341,13 +339,13 @@ impl Shared {
 }
 
 /// Tells whether fields trained in an old scene can go on in a new one: their box must hold the new one, and scales must be
-/// similar. Two networks are functions of all space, whose boxes hold rays and do not bound the fields: their boxes may grow.
+/// similar. Boxes that hold all rays do not bound the fields and may grow.
 fn holds(model: &Model, new: &Scene) -> bool {
     let old = &model.scene;
     let slack = 0.02 * (0..3).map(|i| old.dynamic_max[i] - old.dynamic_min[i]).fold(0.0, f64::max);
     let within =
         |i: usize| new.dynamic_min[i] >= old.dynamic_min[i] - slack && new.dynamic_max[i] <= old.dynamic_max[i] + slack;
-    let inside = model.config.method() == MethodKind::TwoNetworks || (0..3).all(within);
+    let inside = methods::of(&model.config).boxes_hold_all_rays() || (0..3).all(within);
     let alike = |a: f64, b: f64| a / b < 2.0 && b / a < 2.0;
     let static_alike = old.static_gain == new.static_gain || alike(old.static_gain, new.static_gain);
     inside && static_alike && alike(old.dynamic_gain, new.dynamic_gain)

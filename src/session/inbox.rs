@@ -27,7 +27,7 @@ pub struct SessionOptions {
 
 /// When a frame was taken.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Moment {
+pub enum FrameTime {
     /// At a known cardiac phase, from 0.
     Phase(u32),
     /// At a known time of the beat, which may lie between two phases.
@@ -42,7 +42,7 @@ pub struct NewFrame {
     /// Geometry by which it was taken.
     pub geometry: Geometry,
     /// Moment at which it was taken.
-    pub moment: Moment,
+    pub moment: FrameTime,
     /// Whether to train on it, or to score with it.
     pub split: Split,
     /// Columns.
@@ -67,7 +67,7 @@ fn told(complaint: Complaint) -> Error {
 pub(super) struct Inbox {
     pub(super) options: SessionOptions,
     pub(super) views: Vec<View>,
-    pub(super) frames: Vec<(Frame, Moment)>,
+    pub(super) frames: Vec<(Frame, FrameTime)>,
     pub(super) r_peaks: Option<RPeaks>,
 }
 
@@ -80,25 +80,25 @@ impl Inbox {
         }
         check_values(&new.integrals, new.width).map_err(told)?;
         match new.moment {
-            Moment::Phase(phase) => check_phase(phase.into(), self.options.phases).map_err(told)?,
-            Moment::Beat(BeatTime { after_phase, .. }) if !(-0.5..=0.5).contains(&after_phase) => {
+            FrameTime::Phase(phase) => check_phase(phase.into(), self.options.phases).map_err(told)?,
+            FrameTime::Beat(BeatTime { after_phase, .. }) if !(-0.5..=0.5).contains(&after_phase) => {
                 return Err(bad(
                     "time",
                     after_phase.to_string(),
                     "is out of range: -0.5 to 0.5 phases after the nearest phase are accepted".into(),
                 ));
             }
-            Moment::Beat(taken) => check_phase(taken.phase.into(), self.options.phases).map_err(told)?,
-            Moment::TimeS(time) if !time.is_finite() => {
+            FrameTime::Beat(taken) => check_phase(taken.phase.into(), self.options.phases).map_err(told)?,
+            FrameTime::TimeS(time) if !time.is_finite() => {
                 return Err(bad("time", time.to_string(), "is not a time in seconds".into()));
             }
-            Moment::TimeS(_) => (),
+            FrameTime::TimeS(_) => (),
         }
         let view = self.view(new.geometry, [new.width, new.height])?;
         let frame = Frame {
             name: format!("frame-{}", self.frames.len()),
             view,
-            phase: if let Moment::Phase(phase) = new.moment { phase } else { 0 },
+            phase: if let FrameTime::Phase(phase) = new.moment { phase } else { 0 },
             split: new.split,
             integrals: new.integrals,
             mask: new.mask,
@@ -117,7 +117,7 @@ impl Inbox {
     }
 
     /// A frame, counted from 0 as they were added.
-    pub(super) fn frame(&self, index: usize) -> Result<&(Frame, Moment)> {
+    pub(super) fn frame(&self, index: usize) -> Result<&(Frame, FrameTime)> {
         let none = || {
             Error::config(
                 "frame",
@@ -139,12 +139,12 @@ impl Inbox {
     }
 
     /// Returns the time in the beat of a moment, where that is known.
-    pub(super) fn beat_time(&self, moment: Moment) -> Option<BeatTime> {
+    pub(super) fn beat_time(&self, moment: FrameTime) -> Option<BeatTime> {
         match (moment, &self.r_peaks) {
-            (Moment::Phase(phase), _) => Some(BeatTime::at_phase(phase)),
-            (Moment::Beat(taken), _) => Some(taken),
-            (Moment::TimeS(time), Some(peaks)) => peaks.beat_time(time, self.options.phases, BeatScaling::default()),
-            (Moment::TimeS(_), None) => None,
+            (FrameTime::Phase(phase), _) => Some(BeatTime::at_phase(phase)),
+            (FrameTime::Beat(taken), _) => Some(taken),
+            (FrameTime::TimeS(time), Some(peaks)) => peaks.beat_time(time, self.options.phases, BeatScaling::default()),
+            (FrameTime::TimeS(_), None) => None,
         }
     }
 

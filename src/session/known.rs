@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 /// True vessels, by phase.
 #[derive(Default)]
-pub(super) struct Known {
+pub(super) struct TrueShapes {
     pub(super) volumes: BTreeMap<u32, TrueVessels>,
     pub(super) trees: BTreeMap<u32, Vec<TrueLine>>,
 }

@@ -5,7 +5,7 @@ use crate::geometry::MM_PER_UNIT;
 use crate::scan::gating::BeatTime;
 use crate::score::eval::{Evaluation, evaluate, moving_field_warning};
 use crate::score::trees::{self, TrueLine};
-use crate::score::volume::{MOST_VOXELS, TrueVessels, pixel_mm, score_known};
+use crate::score::volume::{MAX_VOXELS, TrueVessels, pixel_mm, score_known};
 use crate::session::Session;
 use crate::session::engine::lock;
 use crate::session::known::{between, check_lines};
@@ -29,11 +29,11 @@ impl Session {
             let problem = format!("is not the number of voxels of this grid, {voxels}");
             return Err(Error::config("vessels", vessels.inside.len(), problem));
         }
-        if voxels > MOST_VOXELS {
+        if voxels > MAX_VOXELS {
             return Err(Error::config(
                 "vessels",
                 voxels,
-                format!("exceeds the maximum number of voxels, {MOST_VOXELS}"),
+                format!("exceeds the maximum number of voxels, {MAX_VOXELS}"),
             ));
         }
         lock(&self.known).volumes.insert(phase, vessels);

@@ -37,7 +37,7 @@ pub enum Score {
 }
 
 /// Presentation of a score.
-struct Look {
+struct Presentation {
     heading: &'static str,
     meaning: &'static str,
     digits: usize,
@@ -45,7 +45,7 @@ struct Look {
 }
 
 impl Score {
-    fn look(self) -> Look {
+    fn look(self) -> Presentation {
         let (heading, meaning, digits, more_is_better) = match self {
             Score::Dice => {
                 let meaning = "dynamic field on all unseen images, thresholded at a fifth of the stated attenuation of \
@@ -80,7 +80,7 @@ impl Score {
                 ("FPS", "frames per second of renderings of all scored fields, at the size of the images", 2, true)
             }
         };
-        Look { heading, meaning, digits, more_is_better }
+        Presentation { heading, meaning, digits, more_is_better }
     }
 
     /// Heading of the score's column.

@@ -1,12 +1,12 @@
 //! One run of a study, from its data to its result.
 
+use crate::checkpoint::{self, newest_model};
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::files::{self, Lock};
 use crate::gpu::device::Gpu;
 use crate::kernels::tuning::Tuning;
 use crate::model::Model;
-use crate::model::checkpoint::{self, newest_model};
 use crate::render::renderer::Renderer;
 use crate::run::events::Event;
 use crate::run::history::History;

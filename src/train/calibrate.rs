@@ -1,8 +1,7 @@
 //! Some drivers offer cooperative matrices that are slower than f32: both paths are timed once per device, driver and
 //! network, and the verdict is kept.
 
-use crate::config::Config;
-use crate::config::method::MethodKind;
+use crate::config::{Config, StaticForm};
 use crate::error::Result;
 use crate::files;
 use crate::gpu::capabilities::DeviceInfo;
@@ -64,7 +63,7 @@ const FILE: &str = "paths.json";
 /// Key of the device, driver and network that a verdict holds for.
 fn key(info: &DeviceInfo, config: &Config) -> String {
     let (d, rays, samples) = (&config.dynamic, config.train.rays, config.march.dynamic_samples);
-    let networks = if config.method() == MethodKind::TwoNetworks { "two networks of " } else { "" };
+    let networks = if config.static_field.form == StaticForm::Network { "two networks of " } else { "" };
     format!(
         "{} | {} | {} | {networks}{} layers of {}, skip {}, {} bands | {rays} rays of {samples} samples",
         info.uuid,

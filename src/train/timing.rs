@@ -2,9 +2,9 @@
 
 use crate::choice::Choice;
 use crate::config::Config;
-use crate::config::sections::Deformable;
 use crate::error::{Error, Result};
-use crate::fitting::fit::{Fit, FitData, FitWork};
+use crate::fitting::fit::{Beginning, FitData, FitStart, TimedFit};
+use crate::fitting::ledger::Ledger;
 use crate::gaussians::work::GaussianWork;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
@@ -12,11 +12,8 @@ use crate::gpu::sensors::{Readings, Watch};
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::network::cost::NetworkCost;
-use crate::network::ledger::Ledger;
 use crate::plan::Plan;
-use crate::plan::targets::Targets;
 use crate::scan::dataset::Dataset;
-use crate::train::run_gaussians::GaussianFit;
 use crate::train::trainer::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -118,15 +115,15 @@ fn cpu_time() -> Option<Duration> {
 }
 
 /// State of the host and the device at the beginning of a measurement.
-struct Meanwhile {
+struct Measurement {
     cpu: Option<Duration>,
     begin: Instant,
     watch: Option<Watch>,
 }
 
-impl Meanwhile {
-    fn begin(gpu: &Gpu) -> Meanwhile {
-        Meanwhile { cpu: cpu_time(), begin: Instant::now(), watch: Watch::begin(gpu.info()) }
+impl Measurement {
+    fn begin(gpu: &Gpu) -> Measurement {
+        Measurement { cpu: cpu_time(), begin: Instant::now(), watch: Watch::begin(gpu.info()) }
     }
 
     /// Returns CPU seconds per second, and the readings of the device's sensors.
@@ -166,13 +163,13 @@ pub struct Subject {
     cost: NetworkCost,
     n_rays: u32,
     /// Iterations that there is a schedule for.
-    most: u32,
+    max: u32,
 }
 
 /// Learning rate of a timed run, as a share of the last rates of its configuration.
 const SLOWLY: f64 = 0.1;
 /// Maximum number of iterations that a schedule is made for; nothing is timed longer.
-const MOST_ITERATIONS: u32 = 300_000;
+const MAX_ITERATIONS: u32 = 300_000;
 /// Minimum number of iterations before anything is timed: a CPU's driver compiles in the first.
 const WARM_UP: u32 = 4;
 
@@ -184,24 +181,15 @@ impl Subject {
     /// Errors of the configuration, the data and the device.
     pub fn new(gpu: &Gpu, config: &Config, dataset: &Dataset, tuning: &Tuning, with_network: bool) -> Result<Subject> {
         let mut config = config.clone();
-        let most = MOST_ITERATIONS.min(u32::MAX / config.train.rays);
-        config.train.iterations = most;
-        let (dynamic, static_field) = (&mut config.dynamic, &mut config.static_field);
-        dynamic.window_start = dynamic.bands.into();
-        dynamic.lr_end *= SLOWLY;
-        static_field.lr_end *= SLOWLY;
-        (dynamic.lr, static_field.lr) = (dynamic.lr_end, static_field.lr_end);
-        if let Some(method) = methods::of(&config) {
-            method.lower_rates(&mut config, SLOWLY);
-        }
-        // The minimum number of Gaussians' iterations, which leave the static field the same work.
-        config.gaussians.iterations = 1;
-        config.deformable = Deformable { warm_iterations: 1, take: 0.0, track_iterations: 0, ..config.deformable };
+        let max = MAX_ITERATIONS.min(u32::MAX / config.train.rays);
+        config.train.iterations = max;
+        let method = methods::of(&config);
+        method.lower_rates(&mut config, SLOWLY);
         config.dynamic.delay = if with_network { 0 } else { config.train.iterations };
         let plan = Plan::new(&config, dataset)?;
-        let (cost, n_rays) = (NetworkCost::of(&plan.params), plan.setup.n_rays);
+        let (cost, n_rays) = (NetworkCost::of(&plan.params), method.rays_per_iteration(&config));
         let trainer = Trainer::new(gpu, plan, dataset, tuning.clone())?;
-        let mut subject = Subject { gpu: gpu.clone(), trainer, cost, n_rays, most };
+        let mut subject = Subject { gpu: gpu.clone(), trainer, cost, n_rays, max };
         subject.run(config.gaussian_iterations() + WARM_UP)?;
         Ok(subject)
     }
@@ -247,13 +235,13 @@ impl Subject {
     /// [`Error::Diverged`]; device errors.
     pub fn time(&mut self, pace: &Pace) -> Result<Timing> {
         let ms_before = self.warm_up(pace.warm_up_s)?;
-        let left = self.most.saturating_sub(self.trainer.step()) / 2 / pace.repeats;
+        let left = self.max.saturating_sub(self.trainer.step()) / 2 / pace.repeats;
         let iterations = match pace.length {
             Length::Iterations(n) => n,
             Length::Seconds(seconds) => ((1e3 * seconds / ms_before).ceil() as u32).clamp(1, left.max(1)),
         };
         let (learned, mut live_samples, mut ms) = (self.trainer.step(), 0, Vec::new());
-        let meanwhile = Meanwhile::begin(&self.gpu);
+        let meanwhile = Measurement::begin(&self.gpu);
         for _ in 0..pace.repeats {
             let begin = Instant::now();
             live_samples += self.run(iterations)?;
@@ -268,10 +256,10 @@ impl Subject {
     /// Runs for this many seconds, an iteration at least; returns the milliseconds of one.
     fn warm_up(&mut self, seconds: f64) -> Result<f64> {
         let (begin, mut done) = (Instant::now(), 0);
-        while done == 0 || (begin.elapsed().as_secs_f64() < seconds && self.trainer.step() < self.most / 2) {
+        while done == 0 || (begin.elapsed().as_secs_f64() < seconds && self.trainer.step() < self.max / 2) {
             // As many as the time so far makes a tenth of the whole, so that submits stay full.
             let rate = f64::from(done) / begin.elapsed().as_secs_f64().max(1e-9);
-            let n = ((0.1 * seconds * rate) as u32).clamp(1, (self.most / 20).max(1));
+            let n = ((0.1 * seconds * rate) as u32).clamp(1, (self.max / 20).max(1));
             self.run(n)?;
             done += n;
         }
@@ -294,75 +282,22 @@ impl Subject {
 /// Fits of Gaussians to time: real ones from their seeds on, as their work depends on how large Gaussians become.
 pub struct GaussianSubject {
     gpu: Gpu,
-    data: TimedData,
+    data: Box<dyn FitData>,
     config: Config,
     /// Iterations of a fit that are timed.
     timed: u32,
     notes: Vec<String>,
 }
 
-/// Data of the fits that are timed.
-enum TimedData {
-    /// Bounds of the dynamic field's images, for Gaussians in front of a static field.
-    Targets(Box<Targets>),
-    /// Whole images, for a method of `crate::methods`.
-    Own(Box<dyn FitData>),
-}
-
-/// A fit that is timed.
-enum TimedGaussians {
-    Run(GaussianFit),
-    Own(Box<dyn Fit>),
-}
-
-impl TimedGaussians {
-    fn step(&self) -> u32 {
-        match self {
-            TimedGaussians::Run(fit) => fit.step(),
-            TimedGaussians::Own(fit) => fit.step(),
-        }
-    }
-
-    /// Runs one submit and returns the number of iterations that it did.
-    fn advance(&mut self, until: u32) -> Result<usize> {
-        match self {
-            TimedGaussians::Run(fit) => fit.advance(until).map(|losses| losses.len()),
-            TimedGaussians::Own(fit) => fit.advance(until).map(|losses| losses.len()),
-        }
-    }
-
-    fn is_prepared(&self) -> bool {
-        match self {
-            TimedGaussians::Run(fit) => fit.preparation().is_none(),
-            TimedGaussians::Own(_) => true,
-        }
-    }
-
-    /// Returns the number of Gaussians and the work of the last iteration.
-    fn work(&self) -> Result<FitWork> {
-        match self {
-            TimedGaussians::Run(fit) => Ok(FitWork { count: fit.count(), work: fit.work()? }),
-            TimedGaussians::Own(fit) => fit.work()?.ok_or_else(|| Error::Internal("the fit has no Gaussians".into())),
-        }
-    }
-
-    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        match self {
-            TimedGaussians::Run(fit) => fit.profile_step(),
-            TimedGaussians::Own(fit) => fit.profile_step(),
-        }
-    }
-}
-
 /// Timed iterations of R2-Gaussian and X-Gaussian, out of thousands that come before their Gaussians become more.
 const ALONE_TIMED: u32 = 200;
 
 /// Minimum number of fits: one says nothing of how they differ.
-const LEAST_FITS: usize = 3;
+const MIN_FITS: usize = 3;
 
 /// A fit that was timed.
-struct TimedFit {
-    fit: TimedGaussians,
+struct TimedGaussians {
+    fit: Box<dyn TimedFit>,
     preparation_s: f64,
     /// Milliseconds per iteration.
     ms: f64,
@@ -388,21 +323,23 @@ impl GaussianSubject {
             Length::Iterations(n) => n,
             Length::Seconds(_) => of_fit.saturating_sub(WARM_UP).max(1),
         };
-        let least = WARM_UP + timed;
-        config.gaussians.iterations = config.gaussians.iterations.max(least) + profiled;
+        let min = WARM_UP + timed;
+        config.gaussians.iterations = config.gaussians.iterations.max(min) + profiled;
         if is_alone {
-            config.train.iterations = config.train.iterations.max(least) + profiled;
+            config.train.iterations = config.train.iterations.max(min) + profiled;
         }
         let mut plan = Plan::new(&config, dataset)?;
-        let data = match (plan.targets.take(), plan.fit.take()) {
-            (Some(targets), _) => TimedData::Targets(Box::new(targets)),
-            (None, Some(data)) => TimedData::Own(data),
-            (None, None) => {
-                let form = config.gaussians.form.name();
-                return Err(Error::config("gaussians.form", form, "this configuration has no Gaussians to time"));
-            }
-        };
-        Ok(GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes })
+        let data = plan.data.take().ok_or_else(|| Error::Internal("the plan has no data".into()))?;
+        let subject = GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes };
+        // Refuses a method without Gaussians before anything is timed.
+        subject.begin()?;
+        Ok(subject)
+    }
+
+    fn begin(&self) -> Result<Box<dyn TimedFit>> {
+        let tuning = Tuning::for_device(self.gpu.info());
+        let (gpu, config) = (&self.gpu, &self.config);
+        self.data.begin_timed(&FitStart { gpu, config, tuning: &tuning, from: Beginning::Scratch })
     }
 
     /// Choices about data and settings.
@@ -410,31 +347,18 @@ impl GaussianSubject {
         &self.notes
     }
 
-    /// Returns the form of the Gaussians of a fit; `auto` is one of the others.
-    fn form(&self, fit: &TimedGaussians) -> &'static str {
-        match fit {
-            TimedGaussians::Run(fit) => fit.form().name(),
-            TimedGaussians::Own(_) => self.config.gaussians.form.name(),
-        }
-    }
-
-    fn fit(&self) -> Result<TimedFit> {
+    fn fit(&self) -> Result<TimedGaussians> {
         let begin = Instant::now();
-        let mut fit = match &self.data {
-            TimedData::Targets(targets) => {
-                TimedGaussians::Run(GaussianFit::new(&self.gpu, Targets::clone(targets), &self.config)?)
-            }
-            TimedData::Own(data) => TimedGaussians::Own(data.begin(&self.gpu, &self.config, None, &mut Vec::new())?),
-        };
+        let mut fit = self.begin()?;
         while !fit.is_prepared() {
             fit.advance(0)?;
         }
         let preparation_s = begin.elapsed().as_secs_f64();
-        run_fit(&mut fit, WARM_UP)?;
+        run_fit(fit.as_mut(), WARM_UP)?;
         let begin = Instant::now();
-        run_fit(&mut fit, WARM_UP + self.timed)?;
+        run_fit(fit.as_mut(), WARM_UP + self.timed)?;
         let ms = begin.elapsed().as_secs_f64() * 1e3 / f64::from(self.timed);
-        Ok(TimedFit { fit, preparation_s, ms })
+        Ok(TimedGaussians { fit, preparation_s, ms })
     }
 
     /// Warms up by whole fits, times others, and says what the passes of an iteration after the last of them take.
@@ -446,13 +370,13 @@ impl GaussianSubject {
         while begin.elapsed().as_secs_f64() < pace.warm_up_s {
             self.fit()?;
         }
-        let (begin, meanwhile) = (Instant::now(), Meanwhile::begin(&self.gpu));
+        let (begin, meanwhile) = (Instant::now(), Measurement::begin(&self.gpu));
         let mut last = self.fit()?;
         let (mut ms, mut preparation_s) = (vec![last.ms], vec![last.preparation_s]);
         let more = |done: usize| match pace.length {
             Length::Iterations(_) => done < pace.repeats as usize,
             Length::Seconds(seconds) => {
-                done < LEAST_FITS || begin.elapsed().as_secs_f64() < seconds * f64::from(pace.repeats)
+                done < MIN_FITS || begin.elapsed().as_secs_f64() < seconds * f64::from(pace.repeats)
             }
         };
         while more(ms.len()) {
@@ -463,7 +387,7 @@ impl GaussianSubject {
         let (host_cpu_share, readings) = meanwhile.end();
         let work = last.fit.work()?;
         let timing = GaussianTiming {
-            form: self.form(&last.fit).into(),
+            form: last.fit.form().unwrap_or_else(|| self.config.gaussians.form.name()).into(),
             count: work.count,
             preparation_s: median(&preparation_s),
             ms,
@@ -481,7 +405,7 @@ impl GaussianSubject {
 }
 
 /// Runs a fit up to an iteration.
-fn run_fit(fit: &mut TimedGaussians, until: u32) -> Result<()> {
+fn run_fit(fit: &mut dyn TimedFit, until: u32) -> Result<()> {
     while fit.step() < until {
         if fit.advance(until)? == 0 {
             return Err(Error::Internal("the timed fit is over".into()));

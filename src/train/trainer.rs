@@ -1,40 +1,29 @@
 //! A training run: the fit that its method chose, its losses, and snapshots of it.
 
-use crate::config::Config;
-use crate::config::method::MethodKind;
+use crate::checkpoint::Checkpoint;
 use crate::error::{Error, Result};
+use crate::fields::trainer::FieldsFit;
 use crate::fingerprint::Fingerprint;
-use crate::fitting::field::Field;
-use crate::fitting::fit::{FieldFeed, Fit, FitField, SavedFit};
-use crate::fitting::losses::{LargeLoss, LossWatch, SMALLER_STEPS, StepLoss};
-use crate::gaussians::field::{self, DynamicGaussians};
+use crate::fitting::fit::{Beginning, FieldFeed, Fit, FitField, FitStart};
+use crate::fitting::ledger::Ledger;
+use crate::fitting::losses::{LargeLoss, LossWatch, StepLoss};
+use crate::gaussians::field::DynamicGaussians;
 use crate::geometry::CArm;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::PassTime;
 use crate::kernels::tuning::Tuning;
 use crate::methods;
 use crate::model::Model;
-use crate::model::checkpoint::Checkpoint;
-use crate::network::ledger::Ledger;
 use crate::plan::Plan;
 use crate::scan::dataset::Dataset;
-use crate::train::fields::FieldsFit;
 use crate::train::snapshot::Snapshot;
-use std::sync::Arc;
-
-/// The fit of a run.
-enum RunFit {
-    /// Fields that rays are marched through.
-    Fields(Box<FieldsFit>),
-    /// Fit of a method of `crate::methods`.
-    Own(Box<dyn Fit>),
-}
+use std::any::Any;
 
 /// A training run on a device.
 pub struct Trainer {
     plan: Plan,
     tuning: Tuning,
-    fit: RunFit,
+    fit: Box<dyn Fit>,
     watch: LossWatch,
     large_loss: Option<LargeLoss>,
     vessel_attenuation: Option<f64>,
@@ -45,38 +34,18 @@ pub struct Trainer {
 
 /// Refuses to continue with fields of another shape.
 fn check_shape(plan: &Plan, checkpoint: &Checkpoint) -> Result<()> {
-    let same_method = checkpoint.fit.is_some() == plan.fit.is_some()
-        && (plan.fit.is_some() || checkpoint.model.gaussians.is_some() == plan.targets.is_some());
-    if checkpoint.model.param_map == plan.params && same_method {
+    let saved = &checkpoint.model;
+    if saved.param_map == plan.params && saved.config.method() == plan.config.method() {
         return Ok(());
     }
     Err(Error::config(
         "checkpoint",
-        checkpoint.model.param_map.len,
+        saved.param_map.len,
         "its parameters do not have the shape that the configuration and the dataset need",
     ))
 }
 
-/// Returns the field and state of a fit that was saved; none for fields that rays are marched through.
-fn saved_fit(saved: &Checkpoint) -> Option<SavedFit> {
-    let field = match (&saved.model.gaussians, &saved.model.field) {
-        (_, Some(field)) => FitField::Own(field.clone()),
-        (Some(gaussians), None) => FitField::Gaussians(Box::new(gaussians.clone())),
-        (None, None) => return None,
-    };
-    Some(SavedFit { field, state: saved.fit.clone()? })
-}
-
-/// Returns the settings of the configuration's method that make its steps smaller, as advice.
-fn smaller_steps(config: &Config) -> &'static str {
-    match methods::of(config) {
-        Some(method) => method.smaller_steps(),
-        None if config.method() == MethodKind::Gaussians => field::SMALLER_STEPS,
-        None => SMALLER_STEPS,
-    }
-}
-
-/// Fingerprint of the training images: of their bits and geometry.
+/// Returns the fingerprint of the training images: of their bits and geometry.
 pub fn data_fingerprint(dataset: &Dataset) -> String {
     let mut fingerprint = Fingerprint::default();
     let mut eat = |bits: u32| fingerprint.word(bits);
@@ -104,14 +73,14 @@ impl Trainer {
     /// [`Error::Config`] when `tuning` asks for what the device lacks; device errors, [`Error::OutOfMemory`] first of
     /// all.
     pub fn new(gpu: &Gpu, plan: Plan, dataset: &Dataset, tuning: Tuning) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, None, None)
+        Self::start(gpu, plan, dataset, tuning, Beginning::Scratch)
     }
 
     /// Starts a run from scratch but for its Gaussians, which go on from those that were fitted to `earlier` data as in
     /// [`Trainer::carry_on`].
     ///
     /// # Errors
-    /// As [`Trainer::new`].
+    /// Errors of [`Trainer::new`].
     pub fn start_over(
         gpu: &Gpu,
         plan: Plan,
@@ -119,7 +88,7 @@ impl Trainer {
         tuning: Tuning,
         earlier: Option<&DynamicGaussians>,
     ) -> Result<Trainer> {
-        Self::start(gpu, plan, dataset, tuning, None, earlier)
+        Self::start(gpu, plan, dataset, tuning, earlier.map_or(Beginning::Scratch, Beginning::AfterGaussians))
     }
 
     /// Continues a run: the result is the same as without interruption.
@@ -141,7 +110,7 @@ impl Trainer {
             ));
         }
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), None)
+        Self::start(gpu, plan, dataset, tuning, Beginning::Resumed(&checkpoint.saved_fit()))
     }
 
     /// Continues a run on other images than it was begun on, for example when more of them arrived. Gaussians go on from those
@@ -157,47 +126,26 @@ impl Trainer {
         checkpoint: &Checkpoint,
     ) -> Result<Trainer> {
         check_shape(&plan, checkpoint)?;
-        Self::start(gpu, plan, dataset, tuning, Some(checkpoint), checkpoint.model.gaussians.as_ref())
+        let saved = checkpoint.saved_fit();
+        let is_same = checkpoint.data_fingerprint == data_fingerprint(dataset);
+        let from = if is_same { Beginning::Resumed(&saved) } else { Beginning::CarriedOn(&saved) };
+        Self::start(gpu, plan, dataset, tuning, from)
     }
 
-    fn start(
-        gpu: &Gpu,
-        mut plan: Plan,
-        dataset: &Dataset,
-        tuning: Tuning,
-        saved: Option<&Checkpoint>,
-        earlier: Option<&DynamicGaussians>,
-    ) -> Result<Trainer> {
+    fn start(gpu: &Gpu, mut plan: Plan, dataset: &Dataset, tuning: Tuning, from: Beginning<'_>) -> Result<Trainer> {
         let tuning = tuning.for_network(plan.config.method().has_network());
-        let data_fingerprint = data_fingerprint(dataset);
-        let of_these_data = saved.filter(|saved| saved.data_fingerprint == data_fingerprint);
-        let earlier = earlier.filter(|_| of_these_data.is_none());
-        let fit = match plan.fit.take() {
-            Some(data) => {
-                let mut config = plan.config.clone();
-                config.train.iterations_per_submit =
-                    tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
-                let saved = of_these_data.and_then(saved_fit);
-                RunFit::Own(data.begin(gpu, &config, saved.as_ref(), &mut plan.notes)?)
-            }
-            None => RunFit::Fields(Box::new(FieldsFit::start(
-                gpu,
-                &mut plan,
-                dataset,
-                tuning.clone(),
-                saved,
-                of_these_data,
-                earlier,
-            )?)),
-        };
+        let mut config = plan.config.clone();
+        config.train.iterations_per_submit = tuning.iterations_per_submit.unwrap_or(config.train.iterations_per_submit);
+        let data = plan.data.take().ok_or_else(|| Error::Internal("a fit has begun with these data".into()))?;
+        let fit = data.begin(&FitStart { gpu, config: &config, tuning: &tuning, from }, &mut plan.notes)?;
         Ok(Trainer {
-            watch: LossWatch::new(&plan.config, smaller_steps(&plan.config)),
+            watch: LossWatch::new(&plan.config, methods::of(&plan.config).smaller_steps()),
             large_loss: None,
             // A blended picture is no sum of attenuations.
             vessel_attenuation: dataset.vessel_attenuation.filter(|_| !plan.config.method().is_blended()),
             c_arm: dataset.reference_c_arm(),
             image_size: dataset.reference_view().size,
-            data_fingerprint,
+            data_fingerprint: data_fingerprint(dataset),
             plan,
             tuning,
             fit,
@@ -206,53 +154,49 @@ impl Trainer {
 
     /// Returns the number of iterations done.
     pub fn step(&self) -> u32 {
-        match &self.fit {
-            RunFit::Fields(fit) => fit.step(),
-            RunFit::Own(fit) => fit.step(),
-        }
+        self.fit.step()
     }
 
     /// Returns the number of iterations handed to the device.
     pub fn submitted(&self) -> u32 {
-        match &self.fit {
-            RunFit::Fields(fit) => fit.submitted(),
-            RunFit::Own(fit) => fit.step(),
-        }
+        self.fit.submitted()
     }
 
-    /// Returns the plan that the run was prepared from.
+    /// Returns the plan that the run was prepared from, without its data.
     pub fn plan(&self) -> &Plan {
         &self.plan
     }
 
     /// Returns the choices made for the device.
     pub fn tuning(&self) -> &Tuning {
-        match &self.fit {
-            RunFit::Fields(fit) => fit.tuning(),
-            RunFit::Own(_) => &self.tuning,
-        }
+        self.fit.tuning().unwrap_or(&self.tuning)
     }
 
-    /// Returns the fields that rays are marched through, for tests and measurements.
+    /// Returns the fit as the type of its method, for tests and measurements.
     ///
     /// # Errors
-    /// [`Error::Internal`] for a method that marches no rays through fields.
+    /// [`Error::Internal`] for a fit of another method.
+    pub fn fit<T: Any>(&self) -> Result<&T> {
+        let other = || Error::Internal("the fit is that of another method".into());
+        self.fit.as_any().downcast_ref().ok_or_else(other)
+    }
+
+    /// Returns the fit of fields that rays are marched through, for tests and measurements.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] for a method that has no such fields, or has Gaussians in front of them.
     pub fn fields(&self) -> Result<&FieldsFit> {
-        match &self.fit {
-            RunFit::Fields(fit) => Ok(fit),
-            RunFit::Own(_) => Err(Error::Internal("the method marches no rays through fields".into())),
-        }
+        self.fit()
     }
 
-    /// Returns the number of barriers of an iteration; none where no rays are marched through fields.
+    /// Returns the number of barriers of an iteration, where it is known.
     pub fn barriers(&self) -> Option<u32> {
-        self.fields().ok().map(FieldsFit::barriers)
+        self.fit.barriers()
     }
 
-    /// Returns the minimum work of an iteration's stages with `live_samples` live samples; empty where no rays are marched
-    /// through fields.
+    /// Returns the minimum work of an iteration's stages with `live_samples` live samples; empty where it is not known.
     pub fn work(&self, live_samples: u64) -> Ledger {
-        self.fields().map_or_else(|_| Ledger::new(), |fit| fit.work(self.plan.params.len as u64, live_samples))
+        self.fit.ledger(live_samples)
     }
 
     /// Keeps the device busy towards `until` and returns the losses that became known. Returns with work
@@ -262,36 +206,22 @@ impl Trainer {
     /// # Errors
     /// [`Error::Diverged`] on a loss that is not finite, or at which the configuration ends a run; device errors.
     pub fn advance(&mut self, until: u32) -> Result<Vec<StepLoss>> {
-        let (losses, ends_gaussians) = match &mut self.fit {
-            RunFit::Fields(fit) => {
-                let advanced = fit.advance(&self.plan, until)?;
-                (advanced.losses, advanced.ends_gaussians)
-            }
-            RunFit::Own(fit) => (fit.advance(until)?, false),
-        };
+        let losses = self.fit.advance(until)?;
         losses.iter().try_for_each(|loss| self.watch_loss(loss))?;
-        if ends_gaussians {
-            // The losses of the static field are different ones.
-            self.watch = LossWatch::new(&self.plan.config, SMALLER_STEPS);
+        if let Some(smaller_steps) = self.fit.new_objective() {
+            self.watch = LossWatch::new(&self.plan.config, smaller_steps);
         }
         Ok(losses)
     }
 
     /// Returns the share done of the preparation before the first iteration; none when that has begun.
     pub fn preparation(&self) -> Option<f64> {
-        match &self.fit {
-            RunFit::Fields(fit) => fit.preparation(),
-            RunFit::Own(_) => None,
-        }
+        self.fit.preparation()
     }
 
-    /// Returns the numbers of the field, for those who draw it; `None` where its parameters are those of
-    /// [`FieldsFit::forward`].
-    pub fn feed(&self) -> Option<FieldFeed> {
-        match &self.fit {
-            RunFit::Fields(fit) => fit.gaussian_feed().map(FieldFeed::Gaussians),
-            RunFit::Own(fit) => Some(fit.feed()),
-        }
+    /// Returns the numbers of the field, for those who draw it.
+    pub fn feed(&self) -> FieldFeed {
+        self.fit.feed()
     }
 
     /// Watches a loss for one that ends the run, and for the first one that is large.
@@ -312,31 +242,24 @@ impl Trainer {
     /// # Errors
     /// Device errors.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
-        match &mut self.fit {
-            RunFit::Fields(fit) => fit.profile_step(&self.plan),
-            RunFit::Own(fit) => fit.profile_step(),
-        }
+        self.fit.profile_step()
     }
 
     /// Returns the model without its parameters, which are on the device, for a renderer that follows the run.
     pub fn outline(&self) -> Model {
-        let (gaussians, field) = match &self.fit {
-            RunFit::Fields(fit) => (fit.gaussians(), None),
-            RunFit::Own(fit) => fit.outline().split(),
-        };
-        self.model_of(gaussians, field)
+        self.model_of(self.fit.outline())
     }
 
-    fn model_of(&self, gaussians: Option<DynamicGaussians>, field: Option<Arc<dyn Field>>) -> Model {
+    fn model_of(&self, field: FitField) -> Model {
+        let FitField { params, hull, gaussians, own } = field;
         Model {
             config: self.plan.config.clone(),
             scene: self.plan.scene.clone(),
             param_map: self.plan.params.clone(),
-            // Gaussians need no hull once they are seeded.
-            hull: self.plan.hull.clone().filter(|_| gaussians.is_none()),
+            hull,
             gaussians,
-            field,
-            params: Vec::new(),
+            field: own,
+            params,
             step: self.submitted(),
             vessel_attenuation: self.vessel_attenuation,
             c_arm: self.c_arm.clone(),
@@ -344,27 +267,23 @@ impl Trainer {
         }
     }
 
-    /// Copies the state after the iterations submitted so far, behind them on the device; returns at once, and training
-    /// may go on.
+    /// Copies the state after the iterations submitted so far, behind them on the device; returns at once where the method can, and
+    /// training may go on.
     ///
     /// # Errors
     /// Device errors.
     pub fn snapshot(&self) -> Result<Snapshot> {
-        let (model, fields, fit) = match &self.fit {
-            RunFit::Fields(fit) => (self.outline(), Some(fit.snapshot(&self.plan)?), None),
-            RunFit::Own(fit) => {
-                let SavedFit { field, state } = fit.state()?;
-                let (gaussians, field) = field.split();
-                (self.model_of(gaussians, field), None, Some(state))
-            }
-        };
-        Ok(Snapshot { model, fields, fit, data_fingerprint: self.data_fingerprint.clone() })
+        Ok(Snapshot {
+            model: self.model_of(FitField::default()),
+            fit: self.fit.snapshot()?,
+            data_fingerprint: self.data_fingerprint.clone(),
+        })
     }
 
     /// Returns the fields after the iterations submitted so far; waits for them.
     ///
     /// # Errors
-    /// As [`Snapshot::wait`].
+    /// Errors of [`Snapshot::wait`].
     pub fn model(&mut self) -> Result<Model> {
         Ok(self.checkpoint()?.model)
     }
@@ -372,9 +291,9 @@ impl Trainer {
     /// Returns everything needed to continue; waits for the iterations submitted so far.
     ///
     /// # Errors
-    /// As [`Snapshot::wait`].
+    /// Errors of [`Snapshot::wait`].
     pub fn checkpoint(&mut self) -> Result<Checkpoint> {
-        while self.fields().is_ok_and(FieldsFit::is_under_way) {
+        while self.fit.step() < self.fit.submitted() {
             self.advance(self.submitted())?;
         }
         self.snapshot()?.wait()

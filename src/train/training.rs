@@ -43,8 +43,7 @@ struct Clock {
 impl Training {
     /// Takes over a trainer and starts the clock.
     pub fn new(trainer: Trainer) -> Training {
-        let span = |(low, high): (f32, f32), v: &f32| (low.min(*v), high.max(*v));
-        let (low, high) = trainer.plan().images.iter().fold((f32::INFINITY, f32::NEG_INFINITY), span);
+        let [low, high] = trainer.plan().image_range;
         let clock = Clock { begin: Instant::now(), first_step: trainer.step() };
         let image_range = if high > low { f64::from(high - low) } else { 1.0 };
         Training { trainer, image_range, smoothed_log_mse: None, clock, train_s: 0.0 }

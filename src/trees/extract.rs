@@ -26,11 +26,11 @@ use glam::DVec3;
 /// Step of the grid on which a field is sampled, in units of the field's resolution.
 const GRID_STEP: f64 = 0.5;
 /// Maximum number of points of that grid; vessels that need more are sampled more coarsely.
-const MOST_POINTS: f64 = (1u64 << 26) as f64;
+const MAX_POINTS: f64 = (1u64 << 26) as f64;
 /// Resolution of a field of Gaussians, in units of their minimum standard deviation.
 const RESOLVED_DEVIATIONS: f64 = 2.5;
 /// Minimum length of a branch, in units of the field's resolution.
-const LEAST_BRANCH: f64 = 3.0;
+const MIN_BRANCH: f64 = 3.0;
 /// Number of times that lines are moved to the ridge.
 const CENTRINGS: usize = 2;
 
@@ -113,11 +113,11 @@ impl Finder<'_> {
     fn new<'a>(renderer: &'a Renderer, model: &'a Model, options: &TreeOptions) -> Result<Finder<'a>> {
         let c_arm = &model.c_arm;
         let pixel_mm = c_arm.pixel_mm[0] * c_arm.sod_mm / c_arm.sid_mm;
-        let least_deviation_mm = model.gaussians.as_ref().map_or(0.0, |gaussians| {
+        let min_deviation_mm = model.gaussians.as_ref().map_or(0.0, |gaussians| {
             let rows = gaussians.rows();
-            f64::from(rows.setup.least_scale) * rows.units.pixel * MM_PER_UNIT
+            f64::from(rows.setup.min_scale) * rows.units.pixel * MM_PER_UNIT
         });
-        let resolution_mm = pixel_mm.max(RESOLVED_DEVIATIONS * least_deviation_mm);
+        let resolution_mm = pixel_mm.max(RESOLVED_DEVIATIONS * min_deviation_mm);
         let threshold_per_mm = match options.threshold_per_mm {
             Some(threshold) => positive("threshold_per_mm", threshold)?,
             None => {
@@ -126,7 +126,7 @@ impl Finder<'_> {
             }
         };
         let least_branch_mm =
-            options.least_branch_mm.map_or(Ok(LEAST_BRANCH * resolution_mm), |mm| positive("least_branch_mm", mm))?;
+            options.least_branch_mm.map_or(Ok(MIN_BRANCH * resolution_mm), |mm| positive("least_branch_mm", mm))?;
         let finder =
             Finder { renderer, model, pixel_mm, resolution_mm, threshold_per_mm, least_branch_mm, spacing_mm: 0.0 };
         // The rule gives zero where the field vanishes at the first phase.
@@ -152,7 +152,7 @@ impl Finder<'_> {
     fn field(&mut self, phase: u32, boxes: &[Corners]) -> Result<Option<SampledField>> {
         let Some(reach) = boxes.iter().copied().reduce(Corners::joined) else { return Ok(None) };
         let extent_mm = reach.high_mm - reach.low_mm;
-        let fitting_mm = (extent_mm.element_product() / MOST_POINTS).cbrt();
+        let fitting_mm = (extent_mm.element_product() / MAX_POINTS).cbrt();
         let spacing_mm = fitting_mm.max(GRID_STEP * self.resolution_mm);
         self.spacing_mm = self.spacing_mm.max(spacing_mm);
         let size = ((extent_mm / spacing_mm).ceil().as_uvec3() + 1).to_array();
@@ -251,7 +251,7 @@ mod tests {
     use std::f64::consts::TAU;
 
     fn found(tubes: &[Tube]) -> Vec<Line> {
-        centrelines(&vessels(tubes), 0.2 * VESSEL_PER_MM, RESOLUTION_MM, LEAST_BRANCH * RESOLUTION_MM)
+        centrelines(&vessels(tubes), 0.2 * VESSEL_PER_MM, RESOLUTION_MM, MIN_BRANCH * RESOLUTION_MM)
     }
 
     /// Maximum distance of a line's points from the nearest true point, mm.

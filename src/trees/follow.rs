@@ -84,7 +84,7 @@ mod tests {
             rest: Gaussians {
                 units: Units { pixel: PIXEL, strongest: 1.0 },
                 n_phases: 2,
-                setup: GaussianSetup { cut: 3.2, least_scale: 0.4, greatest_scale: 3.0, ..GaussianSetup::default() },
+                setup: GaussianSetup { cut: 3.2, min_scale: 0.4, max_scale: 3.0, ..GaussianSetup::default() },
                 rows: vec![gaussian(-15.0), gaussian(15.0)],
                 step: 1,
                 is_crowd: false,

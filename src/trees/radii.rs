@@ -69,18 +69,18 @@ impl Lumen<'_> {
 
     fn flank(&self, point_mm: DVec3, direction: DVec3, peak: f64) -> Flank {
         let step_mm = PROFILE_STEP * self.resolution_mm;
-        let (mut area, mut half_mm, mut before, mut least) = (0.0, None, peak, peak);
+        let (mut area, mut half_mm, mut before, mut min) = (0.0, None, peak, peak);
         for i in 1..=PROFILE_STEPS {
             let away_mm = f64::from(i) * step_mm;
             let here = self.field.at(point_mm + direction * away_mm);
             if here < 0.5 * peak && half_mm.is_none() {
                 half_mm = Some(away_mm - step_mm * (0.5 * peak - here) / (before - here));
             }
-            if here < FOOT * peak || (here > RISE * least && least < FALLEN * peak) {
+            if here < FOOT * peak || (here > RISE * min && min < FALLEN * peak) {
                 break;
             }
             area += here * away_mm * step_mm;
-            (before, least) = (here, least.min(here));
+            (before, min) = (here, min.min(here));
         }
         Flank { area, half_mm: half_mm.unwrap_or(f64::from(PROFILE_STEPS) * step_mm) }
     }

@@ -31,7 +31,7 @@ impl Branch {
     }
 
     /// Minimum diameter of the lumen, mm.
-    pub fn least_diameter_mm(&self) -> f64 {
+    pub fn min_diameter_mm(&self) -> f64 {
         2.0 * self.radius_mm.iter().copied().fold(f64::INFINITY, f64::min)
     }
 }

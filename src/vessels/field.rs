@@ -98,9 +98,9 @@ impl VesselField<'_> {
     }
 
     /// Returns the blocks that the bounds of cubes leave undecided, and marks those that are entirely vessel.
-    fn undecided(&self, grid: &PatientGrid, [least, most]: [Vec<f32>; 2], inside: &mut [bool]) -> Vec<Block> {
+    fn undecided(&self, grid: &PatientGrid, [min, max]: [Vec<f32>; 2], inside: &mut [bool]) -> Vec<Block> {
         let above = |bounds: Vec<f32>| bounds.into_iter().map(|v| f64::from(v) > self.threshold_per_mm).collect();
-        let (surely, maybe): (Vec<bool>, Vec<bool>) = (above(least), above(most));
+        let (surely, maybe): (Vec<bool>, Vec<bool>) = (above(min), above(max));
         let [nx, ny, _] = cubes(grid).size.map(|n| n as usize);
         let mut undecided = Vec::new();
         for place in all_blocks(grid) {

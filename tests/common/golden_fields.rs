@@ -132,6 +132,7 @@ impl Golden {
                 settings.extend([format!("{section}.{key}={start}"), format!("{section}.{key}_end={end}")]);
             }
         }
+        // The script has the earlier names of two settings.
         for key in ["gain", "ramp", "least_change", "least_integral", "change_weight"] {
             settings.push(format!("networks.{key}={}", n(key)));
         }

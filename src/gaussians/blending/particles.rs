@@ -79,5 +79,5 @@ impl BlendedGaussians {
 }
 
 fn lists(gpu: &Gpu, capacity: u32) -> Result<Buffer> {
-    gpu.buffer(Binding::x_list_items.name(), 4 * u64::from(capacity), Memory::Device)
+    Ok(gpu.buffer(Binding::x_list_items.name(), 4 * u64::from(capacity), Memory::Device)?)
 }

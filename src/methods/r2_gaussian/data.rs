@@ -105,8 +105,8 @@ impl R2Data {
     /// Returns the attenuation of a drawn density of 1 over that of a stored one. It is so large that pictures, which are sums
     /// of integers, hold the images' maximum line integral many times.
     fn drawn_scale(&self) -> f64 {
-        let greatest = self.images.iter().copied().fold(0f32, f32::max);
-        (f64::from(greatest) * self.half / self.pixel / DRAWN_RANGE).max(1.0)
+        let max = self.images.iter().copied().fold(0f32, f32::max);
+        (f64::from(max) * self.half / self.pixel / DRAWN_RANGE).max(1.0)
     }
 
     /// The field of stored Gaussians after `step` iterations, in the units that Gaussians are drawn and exported in.
@@ -126,8 +126,8 @@ impl R2Data {
             setup: GaussianSetup {
                 n_phases: self.n_phases as u32,
                 cut: DRAWN_CUT,
-                least_scale: (bounds.least * pixels * (1.0 - SLACK)) as f32,
-                greatest_scale: (bounds.greatest * pixels * (1.0 + SLACK)) as f32,
+                min_scale: (bounds.min * pixels * (1.0 - SLACK)) as f32,
+                max_scale: (bounds.max * pixels * (1.0 + SLACK)) as f32,
                 ..GaussianSetup::default()
             },
             rows: of_phases.into_iter().map(|(i, phase)| convert(&rows[i], phase)).collect(),
@@ -144,7 +144,7 @@ mod tests {
 
     #[test]
     fn large_line_integrals_fit_the_drawn_field() {
-        let bounds = ScaleBounds { least: 0.001, greatest: 1.0 };
+        let bounds = ScaleBounds { min: 0.001, max: 1.0 };
         let gaussian = R2Gaussian { density: 1.0, ..R2Gaussian::default() };
         let density = gaussian.attenuation();
         for (integral, largest_units) in [(2.0f32, 200.0), (30.0, DRAWN_RANGE)] {

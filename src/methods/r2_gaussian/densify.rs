@@ -44,7 +44,8 @@ pub fn densified(before: &R2State, n_sets: usize, settings: &R2, seed: u32, step
         let of = |i: usize| split(&before.rows[i], bounds, |axis| deviate(seed, step, i, 3 * child + axis));
         after.append(chosen(Fate::Split).into_iter().map(of).collect());
     }
-    let stays = |g: &R2Gaussian| g.attenuation() >= settings.weakest && g.centre().abs().max_element() <= 1.0;
+    let stays =
+        |g: &R2Gaussian| g.attenuation() >= settings.density_min_threshold && g.centre().abs().max_element() <= 1.0;
     after.retain(&after.rows.iter().map(stays).collect::<Vec<_>>());
     after.statistics = vec![[0.0; 2]; after.rows.len()];
     after
@@ -60,7 +61,7 @@ fn fates(particles: &R2State, n_sets: usize, settings: &R2, bounds: ScaleBounds)
     };
     let fate = |(i, g): (usize, &R2Gaussian)| {
         let count = &mut counts[g.set as usize];
-        if !pulled(i) || *count >= settings.most {
+        if !pulled(i) || *count >= settings.max_num_gaussians {
             return Fate::Stays;
         }
         *count += 1;
@@ -165,9 +166,9 @@ mod tests {
         let after = densified(&particles, 2, &settings(), 1, 600);
         assert_eq!(after.rows, particles.rows[..2]);
         // A set that is full takes no more.
-        let full = R2 { most: 2, count: 1, ..settings() };
+        let full = R2 { max_num_gaussians: 2, count: 1, ..settings() };
         assert_eq!(densified(&four(), 2, &full, 1, 600).rows, four().rows);
-        let room_for_one = R2 { most: 3, count: 1, ..settings() };
+        let room_for_one = R2 { max_num_gaussians: 3, count: 1, ..settings() };
         assert_eq!(densified(&four(), 2, &room_for_one, 1, 600).rows.len(), 6);
     }
 }

@@ -6,7 +6,7 @@ use crate::kernels::layout::R2Gaussian;
 use glam::{DMat3, DQuat, DVec3};
 
 /// Share of their range by which stored scales keep away from its ends.
-const LEAST_SHARE: f64 = 1e-6;
+const MIN_SHARE: f64 = 1e-6;
 
 /// ln(1 + e^x) without loss of small values.
 pub fn softplus(x: f64) -> f64 {
@@ -22,26 +22,26 @@ pub fn softplus_inverse(density: f64) -> f64 {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScaleBounds {
     /// Minimum.
-    pub least: f64,
+    pub min: f64,
     /// Maximum.
-    pub greatest: f64,
+    pub max: f64,
 }
 
 impl ScaleBounds {
     /// Bounds from the settings, which are shares of the volume's side.
     pub fn of(settings: &R2) -> ScaleBounds {
-        ScaleBounds { least: 2.0 * settings.least_scale, greatest: 2.0 * settings.greatest_scale }
+        ScaleBounds { min: 2.0 * settings.min_scale, max: 2.0 * settings.max_scale }
     }
 
     /// Stored form of a scale; one beyond the bounds counts as the bound.
     pub fn stored(self, scale: f64) -> f64 {
-        let share = ((scale - self.least) / (self.greatest - self.least)).clamp(LEAST_SHARE, 1.0 - LEAST_SHARE);
+        let share = ((scale - self.min) / (self.max - self.min)).clamp(MIN_SHARE, 1.0 - MIN_SHARE);
         (share / (1.0 - share)).ln()
     }
 
     /// Scale of a stored value.
     pub fn scale(self, stored: f64) -> f64 {
-        self.least + (self.greatest - self.least) / (1.0 + (-stored).exp())
+        self.min + (self.max - self.min) / (1.0 + (-stored).exp())
     }
 }
 
@@ -88,7 +88,7 @@ mod tests {
         for density in [1e-9, 1e-5, 0.15, 1.0, 40.0] {
             assert!((softplus(softplus_inverse(density)) / density - 1.0).abs() < 1e-12, "{density}");
         }
-        let bounds = ScaleBounds { least: 0.001, greatest: 1.0 };
+        let bounds = ScaleBounds { min: 0.001, max: 1.0 };
         for scale in [0.002, 0.02, 0.5, 0.99] {
             assert!((bounds.scale(bounds.stored(scale)) / scale - 1.0).abs() < 1e-12);
         }

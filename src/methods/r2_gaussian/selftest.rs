@@ -12,7 +12,7 @@ use crate::methods::r2_gaussian::data::R2Data;
 use crate::methods::r2_gaussian::setup::{schedule, turns};
 use crate::methods::r2_gaussian::state::R2State;
 use crate::methods::r2_gaussian::trainer::R2Trainer;
-use crate::methods::r2_gaussian::twin::{self as reference, Projection, Sight, VoxelBox, params};
+use crate::methods::r2_gaussian::twin::{self as reference, Projection, ViewProjection, VoxelBox, params};
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::reference::gaussians::{N_PARAMS, Params};
@@ -77,9 +77,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
 pub fn hard_case(config: &Config) -> Result<(R2Data, Vec<R2Gaussian>)> {
     let dataset = small_dataset(33, 27, 3)?;
     let plan = Plan::new(config, &dataset)?;
-    let missing = || crate::error::Error::Internal("the plan has no data of R2-Gaussian".into());
-    let data = plan.fit.as_ref().and_then(|data| data.as_any().downcast_ref::<R2Data>()).cloned();
-    let data = data.ok_or_else(missing)?;
+    let data = plan.data::<R2Data>()?.clone();
     let value = |i: u32, k: u32| normal(9, STREAM_JITTER, i, k);
     let n_sets = data.n_sets() as u32;
     let row = |i: u32| R2Gaussian {
@@ -120,8 +118,8 @@ impl<'a> Turn<'a> {
         self.data.images[self.image * n..][..n].iter().map(|v| f64::from(*v)).collect()
     }
 
-    fn see(&self, p: &Params) -> Option<Sight> {
-        Sight::of(p, &self.data.views[self.image], self.voxels.setup, self.voxels.r2)
+    fn see(&self, p: &Params) -> Option<ViewProjection> {
+        ViewProjection::of(p, &self.data.views[self.image], self.voxels.setup, self.voxels.r2)
     }
 
     /// Gradient of the stored parameters from the moments in the view and in the box, and the image's contribution to density
@@ -195,7 +193,7 @@ struct Iteration<'a> {
 
 impl Iteration<'_> {
     fn floats(&self, buffer: &Buffer, n: usize) -> Result<Vec<f32>> {
-        self.gpu.download(buffer, 0, n)
+        Ok(self.gpu.download(buffer, 0, n)?)
     }
 
     fn compare(mut self, findings: &mut Findings) -> Result<()> {
@@ -206,7 +204,7 @@ impl Iteration<'_> {
             .map(|turn| Turn::new(self.fit.data(), self.fit.setups(), turn))
             .collect();
         let all: Vec<(Params, usize)> = self.rows.iter().map(|g| (params(g), g.set as usize)).collect();
-        let seen: Vec<Option<Sight>> = all.iter().map(|(p, set)| shown[*set].see(p)).collect();
+        let seen: Vec<Option<ViewProjection>> = all.iter().map(|(p, set)| shown[*set].see(p)).collect();
         self.compare_splats(&seen, findings)?;
         let of_pictures = self.compare_pictures(&shown, &all, &seen, findings)?;
         let (of_voxels, variation) = self.compare_voxels(&shown, &all, findings)?;
@@ -218,7 +216,7 @@ impl Iteration<'_> {
         Ok(())
     }
 
-    fn compare_splats(&self, seen: &[Option<Sight>], findings: &mut Findings) -> Result<()> {
+    fn compare_splats(&self, seen: &[Option<ViewProjection>], findings: &mut Findings) -> Result<()> {
         let (particles, setup) = (self.fit.particles(), self.fit.setups().0);
         let splats: Vec<Splat> = self.gpu.download(&particles.splats, 0, seen.len())?;
         let pictures: Vec<i32> = self.gpu.download(&particles.image_of_splat, 0, seen.len())?;
@@ -244,7 +242,7 @@ impl Iteration<'_> {
         &self,
         shown: &[Turn<'_>],
         all: &[(Params, usize)],
-        seen: &[Option<Sight>],
+        seen: &[Option<ViewProjection>],
         findings: &mut Findings,
     ) -> Result<OfPictures> {
         let (buffers, data, (setup, r2)) = (self.fit.buffers(), self.fit.data(), self.fit.setups());
@@ -346,7 +344,7 @@ impl Iteration<'_> {
         Ok((got.iter().map(|m| m.map(f64::from)).collect(), variation))
     }
 
-    /// Moments of the pictures, laid out as by [`Sight::moments`].
+    /// Moments of the pictures, laid out as by [`ViewProjection::moments`].
     fn picture_moments(&self, n: usize) -> Result<Vec<[f32; 10]>> {
         let moments = &self.fit.particles().splat_moments;
         if self.fit.setups().1.exact != 0 {
@@ -390,10 +388,10 @@ struct OfPictures {
 }
 
 /// How far a splat is from where the twin has it: in pixels, or as a share of its own size.
-fn splat_error(got: &Splat, want: &Sight) -> f64 {
+fn splat_error(got: &Splat, want: &ViewProjection) -> f64 {
     match want {
-        Sight::Affine(want) => affine_error(got, want),
-        Sight::Exact(want) => {
+        ViewProjection::Affine(want) => affine_error(got, want),
+        ViewProjection::Exact(want) => {
             let mean = [0, 1].map(|k| (f64::from(got.mean[k]) - want.mean[k]).abs());
             let half = [0, 1].map(|k| (f64::from(got.half_box[k]) / want.half_box[k] - 1.0).abs());
             worst_of(mean.into_iter().chain(half))
@@ -403,7 +401,7 @@ fn splat_error(got: &Splat, want: &Sight) -> f64 {
 
 fn affine_error(got: &Splat, want: &Projection) -> f64 {
     let conic = [want.conic.x_axis.x, want.conic.x_axis.y, want.conic.y_axis.y];
-    let largest = conic.iter().fold(0f64, |most, c| most.max(c.abs()));
+    let largest = conic.iter().fold(0f64, |max, c| max.max(c.abs()));
     let mean = [0, 1].map(|k| (f64::from(got.mean[k]) - want.mean[k]).abs());
     // Rounded up, so that a pixel more or less may come of rounding where numbers are whole.
     let radius = got.half_box.map(|half| if f64::from(half) == want.radius { 0.0 } else { f64::INFINITY });

@@ -29,8 +29,8 @@ pub fn gaussian_setup(data: &R2Data, config: &Config) -> GaussianSetup {
         width: data.width as u32,
         height: data.height as u32,
         cut: CUT,
-        least_scale: bounds.least as f32,
-        greatest_scale: bounds.greatest as f32,
+        min_scale: bounds.min as f32,
+        max_scale: bounds.max as f32,
         fixed_point: 2f32.powi(FIXED_POINT_BITS),
         // Each set has its own loss; their mean is reported.
         loss_weight: 1.0 / n_sets as f32,

@@ -12,7 +12,7 @@ use crate::random::{STREAM_JITTER, STREAM_PLACE, permute, uniform01};
 use glam::DVec3;
 
 /// Minimum density that can be stored and fitted.
-const LEAST_DENSITY: f64 = 1e-9;
+const MIN_DENSITY: f64 = 1e-9;
 
 /// First Gaussians of all sets, and notes about them for the user.
 pub fn first_rows(data: &R2Data, settings: &R2, seed: u32) -> (Vec<R2Gaussian>, Vec<String>) {
@@ -66,5 +66,5 @@ fn gaussians(places: &[(DVec3, f64)], bounds: ScaleBounds, set: u32) -> Vec<R2Ga
     let points: Vec<DVec3> = places.iter().map(|(x, _)| *x).collect();
     let spacings = spacings(&points);
     let pairs = places.iter().zip(spacings);
-    pairs.map(|((x, density), scale)| round(*x, density.max(LEAST_DENSITY), scale, bounds, set)).collect()
+    pairs.map(|((x, density), scale)| round(*x, density.max(MIN_DENSITY), scale, bounds, set)).collect()
 }

@@ -46,12 +46,12 @@ impl R2Trainer {
     /// [`Error::Config`] for impossible settings; device errors.
     pub fn new(gpu: &Gpu, data: R2Data, config: &Config) -> Result<(R2Trainer, Vec<String>)> {
         let (rows, mut notes) = first_rows(&data, &config.r2, config.seed);
-        let most = most_of_set(gpu, &data);
-        if most < config.r2.most {
+        let max = max_of_set(gpu, &data);
+        if max < config.r2.max_num_gaussians {
             notes.push(format!(
-                "a set has at most {most} Gaussians instead of r2.max_num_gaussians = {}, because a buffer of this device has no \
+                "a set has at most {max} Gaussians instead of r2.max_num_gaussians = {}, because a buffer of this device has no \
                  room for more",
-                config.r2.most
+                config.r2.max_num_gaussians
             ));
         }
         Ok((Self::with(gpu, data, config, &R2State::fresh(rows), 0)?, notes))
@@ -64,7 +64,7 @@ impl R2Trainer {
     pub fn with(gpu: &Gpu, data: R2Data, config: &Config, state: &R2State, step: u32) -> Result<R2Trainer> {
         config.check()?;
         let mut config = config.clone();
-        config.r2.most = config.r2.most.min(most_of_set(gpu, &data));
+        config.r2.max_num_gaussians = config.r2.max_num_gaussians.min(max_of_set(gpu, &data));
         let config = &config;
         let n = check_count(state, &data)?;
         let (setup, r2) = (gaussian_setup(&data, config), r2_setup(&data, &config.r2));
@@ -174,7 +174,7 @@ impl SetsFit for R2Trainer {
 }
 
 /// Maximum number of Gaussians of a set, such that all sets fit the device's buffers.
-fn most_of_set(gpu: &Gpu, data: &R2Data) -> u32 {
+fn max_of_set(gpu: &Gpu, data: &R2Data) -> u32 {
     gpu.info().max_storage_buffer_range / size_of::<R2Gaussian>() as u32 / data.n_sets() as u32
 }
 
@@ -238,11 +238,11 @@ fn buffers(
     })
 }
 
-type Parts<'a> = (&'a R2Kernels, &'a R2Buffers, &'a R2ParticleBuffers);
+type DeviceParts<'a> = (&'a R2Kernels, &'a R2Buffers, &'a R2ParticleBuffers);
 
 fn pass<'a>(
     recording: &'a mut Recording,
-    (kernels, buffers, particles): Parts<'a>,
+    (kernels, buffers, particles): DeviceParts<'a>,
     (setup, r2): (&'a GaussianSetup, &'a R2Setup),
     n: u32,
 ) -> R2Pass<'a> {
@@ -251,7 +251,7 @@ fn pass<'a>(
 
 fn record(
     gpu: &Gpu,
-    parts: Parts<'_>,
+    parts: DeviceParts<'_>,
     setups: (&GaussianSetup, &R2Setup),
     n: u32,
     per_submit: u32,
@@ -262,6 +262,6 @@ fn record(
         for _ in 0..iterations {
             record_step(&mut pass)?;
         }
-        recording.finish()
+        Ok(recording.finish()?)
     })
 }

@@ -13,7 +13,7 @@ use glam::{DMat2, DMat3, DVec2, DVec3};
 /// Distance from the image's centre at which slopes stop following the Gaussian's centre, in half images.
 const SLOPES_END: f64 = 1.3;
 /// Minimum squared difference of variances in the computation of a radius, pixels^4.
-const LEAST_SPREAD: f64 = 0.1;
+const MIN_SPREAD: f64 = 0.1;
 /// Standard deviations along its longest axis at which a Gaussian is cut off among voxels.
 const VOXEL_CUT: f64 = 3.0;
 
@@ -33,10 +33,10 @@ fn sigmoid(x: f64) -> f64 {
 pub fn to_stored(p: &Params, setup: &GaussianSetup, by_logarithms: &Params) -> Params {
     let mut out = *by_logarithms;
     out[3] *= sigmoid(p[3]) / softplus(p[3]);
-    let ScaleBounds { least, greatest } = bounds(setup);
+    let ScaleBounds { min, max } = bounds(setup);
     for k in 4..7 {
         let share = sigmoid(p[k]);
-        out[k] *= (greatest - least) * share * (1.0 - share) / bounds(setup).scale(p[k]);
+        out[k] *= (max - min) * share * (1.0 - share) / bounds(setup).scale(p[k]);
     }
     out
 }
@@ -81,7 +81,7 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup) -> Option<Pr
         softplus(p[3]) * std::f64::consts::TAU.sqrt() * scale.element_product() * ray.length() * view.inverse_det()
             / (depth * depth * det.sqrt());
     let half_sum = 0.5 * (uu + vv);
-    let largest = half_sum + (half_sum * half_sum - det).max(LEAST_SPREAD).sqrt();
+    let largest = half_sum + (half_sum * half_sum - det).max(MIN_SPREAD).sqrt();
     Some(Projection {
         mean,
         conic: DMat2::from_cols(DVec2::new(vv, -uv), DVec2::new(-uv, uu)) * (1.0 / det),
@@ -260,62 +260,62 @@ fn along_axes_gradient(p: &Params, setup: &GaussianSetup, [h, x, y, z, xx, yy, z
 
 /// Projection of a Gaussian into a view, by either kind of line integral.
 #[derive(Debug, Clone)]
-pub enum Sight {
+pub enum ViewProjection {
     /// Affine projection.
     Affine(Projection),
     /// Exact integrals along the pixels' own rays.
     Exact(Chords),
 }
 
-impl Sight {
+impl ViewProjection {
     /// Projects a Gaussian into a view; `None` behind the source.
-    pub fn of(p: &Params, view: &SplatView, setup: &GaussianSetup, r2: &R2Setup) -> Option<Sight> {
+    pub fn of(p: &Params, view: &SplatView, setup: &GaussianSetup, r2: &R2Setup) -> Option<ViewProjection> {
         match r2.exact {
-            0 => project(p, view, setup).map(Sight::Affine),
-            _ => Chords::of(p, view, setup).map(Sight::Exact),
+            0 => project(p, view, setup).map(ViewProjection::Affine),
+            _ => Chords::of(p, view, setup).map(ViewProjection::Exact),
         }
     }
 
     /// Index and offset from the centre of every pixel of its box.
     pub fn pixels(&self, setup: &GaussianSetup) -> Box<dyn Iterator<Item = (usize, DVec2)>> {
         match self {
-            Sight::Affine(seen) => Box::new(seen.pixels(setup)),
-            Sight::Exact(seen) => Box::new(seen.pixels(setup)),
+            ViewProjection::Affine(seen) => Box::new(seen.pixels(setup)),
+            ViewProjection::Exact(seen) => Box::new(seen.pixels(setup)),
         }
     }
 
     /// Adds the Gaussian to a picture.
     pub fn splat(&self, setup: &GaussianSetup, picture: &mut [f64]) {
         match self {
-            Sight::Affine(seen) => seen.splat(setup, picture),
-            Sight::Exact(seen) => seen.splat(setup, picture),
+            ViewProjection::Affine(seen) => seen.splat(setup, picture),
+            ViewProjection::Exact(seen) => seen.splat(setup, picture),
         }
     }
 
     /// [`Projection::moments`] and four zeros, or [`Chords::moments`].
     pub fn moments(&self, setup: &GaussianSetup, gradient: &[f64]) -> [f64; 10] {
         match self {
-            Sight::Affine(seen) => {
+            ViewProjection::Affine(seen) => {
                 let [h, u, v, uu, uv, vv] = seen.moments(setup, gradient);
                 [h, u, v, uu, uv, vv, 0.0, 0.0, 0.0, 0.0]
             }
-            Sight::Exact(seen) => seen.moments(setup, gradient),
+            ViewProjection::Exact(seen) => seen.moments(setup, gradient),
         }
     }
 
     /// Gradient by position, the logarithms of density and scales, and the quaternion, from these moments.
     pub fn gradient(&self, p: &Params, view: &SplatView, setup: &GaussianSetup, moments: [f64; 10]) -> Params {
         match self {
-            Sight::Affine(_) => gradient(p, view, setup, plane(moments)),
-            Sight::Exact(_) => along_axes_gradient(p, setup, moments),
+            ViewProjection::Affine(_) => gradient(p, view, setup, plane(moments)),
+            ViewProjection::Exact(_) => along_axes_gradient(p, setup, moments),
         }
     }
 
     /// Length of the gradient by the centre in the image, in half images.
     pub fn pull(&self, setup: &GaussianSetup, moments: [f64; 10]) -> f64 {
         match self {
-            Sight::Affine(seen) => seen.pull(setup, plane(moments)),
-            Sight::Exact(seen) => seen.pull(setup, moments),
+            ViewProjection::Affine(seen) => seen.pull(setup, plane(moments)),
+            ViewProjection::Exact(seen) => seen.pull(setup, moments),
         }
     }
 }

@@ -29,5 +29,5 @@ pub(super) fn pixels_within(
 }
 
 pub(super) fn bounds(setup: &GaussianSetup) -> ScaleBounds {
-    ScaleBounds { least: setup.least_scale.into(), greatest: setup.greatest_scale.into() }
+    ScaleBounds { min: setup.min_scale.into(), max: setup.max_scale.into() }
 }

@@ -218,7 +218,7 @@ mod tests {
     use crate::methods::sax_nerf::setup::n_parts;
 
     /// Minimum buffer size that every device supports, bytes.
-    const LEAST_STORAGE_BUFFER: u64 = 128 << 20;
+    const MIN_STORAGE_BUFFER: u64 = 128 << 20;
 
     #[test]
     fn the_published_field_fits_the_buffers_of_every_device() {
@@ -236,7 +236,7 @@ mod tests {
             ..SaxSetup::default()
         };
         let memory = SaxMemory::of(&setup);
-        assert!(memory.of_field_buffer < LEAST_STORAGE_BUFFER && memory.of_batch_buffer < LEAST_STORAGE_BUFFER);
+        assert!(memory.of_field_buffer < MIN_STORAGE_BUFFER && memory.of_batch_buffer < MIN_STORAGE_BUFFER);
         assert_eq!((memory.of_field_buffer / MIB, memory.of_batch_buffer / MIB, memory.total / MIB), (109, 100, 2041));
     }
 

@@ -1,7 +1,6 @@
 //! Drawing of SAX-NeRF's field along rays and at the cells of volumes.
 
 use crate::error::{Error, Result};
-use crate::fitting::field::{Field, FieldDrawing, Row};
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
 use crate::gpu::record::Recording;
@@ -10,6 +9,7 @@ use crate::methods::sax_nerf::buffers::{Passes, params_buffer, sample_buffers};
 use crate::methods::sax_nerf::field::SaxField;
 use crate::methods::sax_nerf::setup::drawing_setup;
 use crate::methods::sax_nerf::stages::{SaxFieldKernels, SaxSampleBuffers, SaxSampling, record_view};
+use crate::model::field::{Field, FieldDrawing, Row};
 use std::sync::{Mutex, PoisonError};
 
 /// Number of samples evaluated at once: 16 MiB of features with 16 levels.

@@ -18,7 +18,7 @@ const PAIR: usize = 2;
 
 /// Group of parameters of a field that form one tensor.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Part {
+pub struct ParamGroup {
     /// Name of the group in files.
     pub name: &'static str,
     /// Shape of the group: outputs before inputs.
@@ -27,7 +27,7 @@ pub struct Part {
     pub first: usize,
 }
 
-impl Part {
+impl ParamGroup {
     /// Returns the number of parameters of the group.
     pub fn len(&self) -> usize {
         self.shape.iter().product()
@@ -93,11 +93,11 @@ impl SaxShape {
 
     /// Returns the number of parameters of the field without padding.
     pub fn n_meant(&self) -> usize {
-        self.parts().iter().map(Part::len).sum()
+        self.parts().iter().map(ParamGroup::len).sum()
     }
 
     /// Returns the groups of parameters in their order.
-    pub fn parts(&self) -> Vec<Part> {
+    pub fn parts(&self) -> Vec<ParamGroup> {
         let input = self.n_features();
         let parts = [
             ("norm1.weight", vec![WIDTH]),
@@ -122,7 +122,7 @@ impl SaxShape {
         ];
         let mut first = 0;
         let place = |(name, shape): (&'static str, Vec<usize>)| {
-            let part = Part { name, shape, first };
+            let part = ParamGroup { name, shape, first };
             // A single number is padded to a row.
             first += part.len().max(WIDTH);
             part
@@ -195,7 +195,7 @@ mod tests {
     #[test]
     fn sizes_are_those_of_the_published_field() {
         assert_eq!(CHEST.n_grid(), 14_262_438);
-        let lineformer: usize = CHEST.parts().iter().filter(|part| part.name != "grid").map(Part::len).sum();
+        let lineformer: usize = CHEST.parts().iter().filter(|part| part.name != "grid").map(ParamGroup::len).sum();
         assert_eq!(lineformer, 32_033);
         let levels = CHEST.grid();
         assert_eq!(

@@ -1,12 +1,13 @@
 //! SAX-NeRF's field and the state of its fit behind the interfaces that all methods share.
 
 use crate::error::{Error, Result};
-use crate::fitting::field::{Field, FieldDrawing};
 use crate::fitting::fit::FitState;
 use crate::gpu::device::Gpu;
 use crate::methods::sax_nerf::drawing::SaxDrawing;
 use crate::methods::sax_nerf::field::{SaxField, SaxState};
 use crate::methods::sax_nerf::tensors;
+use crate::model::Model;
+use crate::model::field::{Field, FieldDrawing};
 use crate::tensors::FileTensor;
 use std::any::Any;
 
@@ -46,8 +47,8 @@ impl Field for SaxField {
 }
 
 impl FitState for SaxState {
-    fn tensors(&self, field: Option<&dyn Field>) -> Result<Vec<FileTensor>> {
-        match field.and_then(|field| field.as_any().downcast_ref::<SaxField>()) {
+    fn tensors(&self, model: &Model) -> Result<Vec<FileTensor>> {
+        match model.field.as_ref().and_then(|field| field.as_any().downcast_ref::<SaxField>()) {
             Some(field) => Ok(tensors::tensors(field, self)),
             None => {
                 Err(Error::Internal("a training state of SAX-NeRF was combined with a field of another method".into()))

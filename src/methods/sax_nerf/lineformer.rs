@@ -21,7 +21,7 @@ const WIDE: u32 = 4;
 
 /// Maximum number of samples of a chunk: all vectors of a backward pass take 105 MiB, less than the buffer size that every
 /// device supports.
-pub const MOST_SAMPLES: u32 = 16_384;
+pub const MAX_SAMPLES: u32 = 16_384;
 /// Number of samples that one workgroup sums for a gradient.
 pub const PART_SAMPLES: u32 = 512;
 /// Padding that makes strides no power of two, which avoids cache conflicts.
@@ -29,7 +29,7 @@ const PADDING: u32 = 8;
 
 /// Returns the number of samples for which the vectors' buffer of a chunk of `n_samples` has room.
 pub fn capacity(n_samples: u32) -> u32 {
-    n_samples.min(MOST_SAMPLES) + PADDING
+    n_samples.min(MAX_SAMPLES) + PADDING
 }
 
 /// Returns the bytes of `n_vectors` vectors of a chunk.
@@ -48,17 +48,17 @@ pub struct Chunk {
     pub along: u32,
 }
 
-/// Returns the chunks of `n_rays` rays of `row` samples, each of at most [`MOST_SAMPLES`]: whole rays, or parts of a ray with
+/// Returns the chunks of `n_rays` rays of `row` samples, each of at most [`MAX_SAMPLES`]: whole rays, or parts of a ray with
 /// an even number of samples, so that pairs stay together.
 pub fn chunks(n_rays: u32, row: u32) -> Vec<Chunk> {
-    if row > MOST_SAMPLES {
+    if row > MAX_SAMPLES {
         let of_ray = |ray: u32| {
-            let part = move |along: u32| Chunk { first: ray * row + along, n: MOST_SAMPLES.min(row - along), along };
-            (0..row).step_by(MOST_SAMPLES as usize).map(part)
+            let part = move |along: u32| Chunk { first: ray * row + along, n: MAX_SAMPLES.min(row - along), along };
+            (0..row).step_by(MAX_SAMPLES as usize).map(part)
         };
         return (0..n_rays).flat_map(of_ray).collect();
     }
-    let rays = MOST_SAMPLES / row;
+    let rays = MAX_SAMPLES / row;
     let chunk = |ray: u32| Chunk { first: ray * row, n: rays.min(n_rays - ray) * row, along: 0 };
     (0..n_rays).step_by(rays as usize).map(chunk).collect()
 }
@@ -370,12 +370,12 @@ mod tests {
 
     #[test]
     fn chunks_hold_all_samples_once_and_no_pair_apart() {
-        for (n_rays, row) in [(3, 7), (5000, 33), (2, 40_001), (1, MOST_SAMPLES), (400, 256)] {
+        for (n_rays, row) in [(3, 7), (5000, 33), (2, 40_001), (1, MAX_SAMPLES), (400, 256)] {
             let all = chunks(n_rays, row);
             let mut next = 0;
             for chunk in &all {
                 assert_eq!((chunk.first, chunk.along), (next, next % row));
-                assert!(chunk.n > 0 && chunk.n <= MOST_SAMPLES && chunk.along % 2 == 0);
+                assert!(chunk.n > 0 && chunk.n <= MAX_SAMPLES && chunk.along % 2 == 0);
                 next += chunk.n;
             }
             assert_eq!(next, n_rays * row);

@@ -3,7 +3,6 @@
 
 use crate::config::{Config, Preset};
 use crate::error::Result;
-use crate::fitting::field::{FieldDrawing, Row};
 use crate::fitting::sets::seed_of_set;
 use crate::gpu::buffer::{Buffer, Memory};
 use crate::gpu::device::Gpu;
@@ -17,6 +16,7 @@ use crate::methods::sax_nerf::setup::{drawing_setup, outline, schedule};
 use crate::methods::sax_nerf::start::first_params;
 use crate::methods::sax_nerf::trainer::SaxTrainer;
 use crate::methods::sax_nerf::twin::{self as reference, Lineformer};
+use crate::model::field::{FieldDrawing, Row};
 use crate::plan::Plan;
 use crate::random::{STREAM_JITTER, normal};
 use crate::selftest::compare::{Findings, Tolerance, told};
@@ -79,9 +79,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
 /// As [`small_dataset`] and [`Plan::new`].
 pub fn hard_case(config: &Config) -> Result<(SaxData, SaxField, SaxState)> {
     let dataset = small_dataset(33, 27, 3)?;
-    let missing = || crate::error::Error::Internal("the plan has no data of SAX-NeRF".into());
-    let planned = Plan::new(config, &dataset)?.fit;
-    let data = planned.as_ref().and_then(|data| data.as_any().downcast_ref::<SaxData>()).ok_or_else(missing)?.clone();
+    let data = Plan::new(config, &dataset)?.data::<SaxData>()?.clone();
     let outline = outline(&data, &config.sax, 0);
     let parts = outline.shape.parts();
     let params = |set: usize| {
@@ -137,7 +135,7 @@ struct Iteration<'a> {
 }
 
 /// Results of the device for the last field's batch.
-struct Made {
+struct DeviceResults {
     rays: Vec<Ray>,
     points: Vec<[f32; 4]>,
     encoding: Vec<f32>,
@@ -148,7 +146,7 @@ struct Made {
 
 impl Iteration<'_> {
     fn floats(&self, buffer: &Buffer, n: usize) -> Result<Vec<f32>> {
-        self.gpu.download(buffer, 0, n)
+        Ok(self.gpu.download(buffer, 0, n)?)
     }
 
     fn last_set(&self) -> usize {
@@ -174,12 +172,12 @@ impl Iteration<'_> {
         self.compare_grid(&made, findings)
     }
 
-    fn made(&self) -> Result<Made> {
+    fn made(&self) -> Result<DeviceResults> {
         let (setup, (samples, fit)) = (self.fit.setup(), self.fit.buffers());
         let n_rays = setup.n_rays as usize;
         let n = n_rays * setup.n_samples as usize;
         let n_features = n * self.field.shape.n_features();
-        Ok(Made {
+        Ok(DeviceResults {
             rays: self.gpu.download(&fit.rays, 0, n_rays)?,
             points: self.gpu.download(&samples.sax_points, 0, n)?,
             encoding: self.floats(&samples.sax_encoding, n_features)?,
@@ -189,7 +187,7 @@ impl Iteration<'_> {
         })
     }
 
-    fn compare_batch(&self, made: &Made, findings: &mut Findings) {
+    fn compare_batch(&self, made: &DeviceResults, findings: &mut Findings) {
         let data = self.fit.data();
         let want = reference::batch(data, self.fit.setup(), self.last_set(), self.seed(), 0);
         let same = want.iter().zip(&made.rays).filter(|(want, ray)| **want == ray.id as usize).count();
@@ -212,7 +210,7 @@ impl Iteration<'_> {
         findings.numbers(BATCH, "directions", &directions, &lines.collect::<Vec<_>>(), NUMBERS);
     }
 
-    fn compare_samples(&self, made: &Made, findings: &mut Findings) {
+    fn compare_samples(&self, made: &DeviceResults, findings: &mut Findings) {
         let (setup, shape) = (self.fit.setup(), self.field.shape);
         let points = points(setup, self.seed(), &made.rays);
         let got: Vec<f32> = made.points.iter().flat_map(|p| p[..3].to_vec()).collect();
@@ -231,7 +229,7 @@ impl Iteration<'_> {
         findings.numbers(LINEFORMER, "densities", &made.sigma, &want, NUMBERS);
     }
 
-    fn compare_loss(&self, made: &Made, loss: f64, findings: &mut Findings) -> Result<()> {
+    fn compare_loss(&self, made: &DeviceResults, loss: f64, findings: &mut Findings) -> Result<()> {
         let setup = self.fit.setup();
         let row = setup.n_samples as usize;
         let integral = |ray: usize| -> f64 {
@@ -250,7 +248,7 @@ impl Iteration<'_> {
         Ok(())
     }
 
-    fn compare_lineformer(&self, made: &Made, findings: &mut Findings) -> Result<()> {
+    fn compare_lineformer(&self, made: &DeviceResults, findings: &mut Findings) -> Result<()> {
         let (setup, shape, params) = (self.fit.setup(), self.field.shape, self.params());
         let (width, row) = (shape.n_features(), setup.n_samples as usize);
         let features = f64s(&by_sample(&made.encoding, made.points.len()));
@@ -299,7 +297,7 @@ impl Iteration<'_> {
     }
 
     /// Compares the scatter, run once more by itself, since the stage behind it clears its sums.
-    fn compare_grid(&self, made: &Made, findings: &mut Findings) -> Result<()> {
+    fn compare_grid(&self, made: &DeviceResults, findings: &mut Findings) -> Result<()> {
         let (setup, shape) = (self.fit.setup(), self.field.shape);
         let (n_weights, n_grid) = (setup.n_weights as usize, setup.n_grid as usize);
         let (levels, width) = (shape.grid(), shape.n_features());

@@ -10,7 +10,7 @@ const GRID: f64 = 1e-4;
 const CUT: f64 = 2.0;
 /// Index of the first draw of these biases, after all other random numbers; one draw in twenty is beyond the cut.
 const FIRST_ATTEMPT: u32 = 1000;
-const MOST_ATTEMPTS: usize = 100;
+const MAX_ATTEMPTS: usize = 100;
 
 /// Returns the initial parameters of a field for the random `seed`.
 pub fn first_params(shape: SaxShape, seed: u32) -> Vec<f32> {
@@ -40,7 +40,7 @@ pub fn first_params(shape: SaxShape, seed: u32) -> Vec<f32> {
 /// Returns a normal number that is not beyond [`CUT`]: the first such number drawn for `index`.
 fn cut_normal(seed: u32, index: u32) -> f64 {
     let draws = (0..).map(|attempt| normal(seed, STREAM_INIT, index, FIRST_ATTEMPT + attempt));
-    draws.take(MOST_ATTEMPTS).find(|x| x.abs() <= CUT).unwrap_or(0.0)
+    draws.take(MAX_ATTEMPTS).find(|x| x.abs() <= CUT).unwrap_or(0.0)
 }
 
 #[cfg(test)]
@@ -55,7 +55,7 @@ mod tests {
         for part in shape.parts() {
             let numbers = &params[part.first..][..part.len()];
             let largest = numbers.iter().fold(0f32, |m, v| m.max(v.abs()));
-            let (least, most) = match part.name {
+            let (min, max) = match part.name {
                 "norm1.weight" | "norm2.weight" => (1.0, 1.0),
                 "norm1.bias" | "norm2.bias" => (0.0, 0.0),
                 "grid" => (0.99e-4, 1e-4),
@@ -66,7 +66,7 @@ mod tests {
                 "density.bias" => (0.0, 32f32.powf(-0.5)),
                 _ => (0.15, 32f32.powf(-0.5)),
             };
-            assert!((least..=most).contains(&largest), "{}: {largest}", part.name);
+            assert!((min..=max).contains(&largest), "{}: {largest}", part.name);
         }
     }
 

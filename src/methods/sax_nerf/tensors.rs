@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::fitting::fit::SavedAt;
-use crate::methods::sax_nerf::field::{Part, SaxField, SaxShape, SaxState};
+use crate::methods::sax_nerf::field::{ParamGroup, SaxField, SaxShape, SaxState};
 use crate::tensors::{File, FileTensor};
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
@@ -34,7 +34,7 @@ pub(super) fn header(field: &SaxField) -> SaxHeader {
 }
 
 /// Returns the name of the tensor of a group of parameters, and its shape for `n_sets` sets.
-fn described(prefix: &str, part: &Part, n_sets: usize) -> (String, Vec<usize>) {
+fn described(prefix: &str, part: &ParamGroup, n_sets: usize) -> (String, Vec<usize>) {
     (format!("sax.{prefix}{}", part.name), [&[n_sets], &part.shape[..]].concat())
 }
 
@@ -84,7 +84,7 @@ pub(super) fn read(
     let n_sets = header.sets;
     // Memory is allocated only for data that the file really holds, in case it is damaged.
     let parts = shape.parts();
-    let of_part = |prefix: &str, part: &Part| -> Result<Vec<f32>> {
+    let of_part = |prefix: &str, part: &ParamGroup| -> Result<Vec<f32>> {
         let (name, shape) = described(prefix, part, n_sets);
         file.floats(&name, &shape.iter().map(|n| Some(*n)).collect::<Vec<_>>())
     };

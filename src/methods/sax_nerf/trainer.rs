@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::fitting::fit::{FieldFeed, Fit, FitField, SavedFit};
+use crate::fitting::fit::{FieldFeed, Fit, FitField, PendingFit, SavedFit};
 use crate::fitting::iterations::{Iterations, pass_times};
 use crate::fitting::losses::StepLoss;
 use crate::fitting::ring::losses;
@@ -20,6 +20,7 @@ use crate::methods::sax_nerf::stages::{
     SaxFitBuffers, SaxKernels, SaxPass, SaxSampleBuffers, SaxSetBuffers, record_step,
 };
 use crate::methods::sax_nerf::start::first_params;
+use std::any::Any;
 use std::sync::Arc;
 
 /// Maximum number of passes of an iteration of a field, and of all fields together, without those over chunks of samples.
@@ -92,7 +93,7 @@ impl SaxTrainer {
                 let shape = outline.shape;
                 record_step(&mut SaxPass { recording, kernels, samples, fit, sets: &sets, shape, setup: &setup })?;
             }
-            recording.finish()
+            Ok(recording.finish()?)
         })?;
         let (gpu, config, step) = (gpu.clone(), config.clone(), field.step);
         Ok(SaxTrainer { gpu, data, config, outline, setup, kernels, samples, fit, sets, iterations, step })
@@ -155,9 +156,10 @@ impl SaxTrainer {
     pub fn state(&self) -> Result<(SaxField, SaxState)> {
         let n = self.outline.shape.n_params();
         let params: Vec<Vec<f32>> =
-            self.sets.iter().map(|set| self.gpu.download(&set.params, 0, n)).collect::<Result<_>>()?;
+            self.sets.iter().map(|set| self.gpu.download(&set.params, 0, n)).collect::<std::result::Result<_, _>>()?;
         check_params(&params, self.step)?;
-        let moments = self.sets.iter().map(|set| self.gpu.download(&set.moments, 0, n)).collect::<Result<_>>()?;
+        let moments =
+            self.sets.iter().map(|set| self.gpu.download(&set.moments, 0, n)).collect::<std::result::Result<_, _>>()?;
         Ok((SaxField { params, ..self.outline() }, SaxState { moments }))
     }
 
@@ -199,19 +201,23 @@ impl Fit for SaxTrainer {
     }
 
     fn outline(&self) -> FitField {
-        FitField::Own(Arc::new(SaxTrainer::outline(self)))
+        FitField::of_own(Arc::new(SaxTrainer::outline(self)))
     }
 
     fn feed(&self) -> FieldFeed {
-        FieldFeed::Params(self.params())
+        FieldFeed { own: self.params(), ..FieldFeed::default() }
     }
 
-    fn state(&self) -> Result<SavedFit> {
+    fn snapshot(&self) -> Result<Box<dyn PendingFit>> {
         let (field, state) = SaxTrainer::state(self)?;
-        Ok(SavedFit { field: FitField::Own(Arc::new(field)), state: Arc::new(state) })
+        Ok(Box::new(SavedFit { field: FitField::of_own(Arc::new(field)), state: Arc::new(state) }))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         SaxTrainer::profile_step(self)
+    }
+
+    fn as_any(&self) -> &dyn Any {
+        self
     }
 }

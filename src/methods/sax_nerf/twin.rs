@@ -14,7 +14,7 @@ const HEAD: usize = 4;
 const HEADS: usize = WIDTH / HEAD;
 const WIDE: usize = 4 * WIDTH;
 const LEAK: f64 = 0.01;
-const LEAST_VARIANCE: f64 = 1e-5;
+const MIN_VARIANCE: f64 = 1e-5;
 /// Primes of the hash, along each axis.
 const PRIMES: [u64; 3] = [1, 19_349_663, 83_492_791];
 /// Minimum distance of points from the faces of the unit box, in box sides.
@@ -163,7 +163,7 @@ fn dot(x: &[f64], y: &[f64]) -> f64 {
 fn normalised(x: &[f64]) -> (Vec<f64>, f64) {
     let n = x.len() as f64;
     let mean = x.iter().sum::<f64>() / n;
-    let inverse = 1.0 / (x.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n + LEAST_VARIANCE).sqrt();
+    let inverse = 1.0 / (x.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n + MIN_VARIANCE).sqrt();
     (map(x, |x| (x - mean) * inverse), inverse)
 }
 

@@ -74,15 +74,15 @@ impl XData {
     pub fn new(dataset: &Dataset, settings: &X, half: f64) -> Result<XData> {
         check_sizes(dataset, "X-Gaussian")?;
         let unit = dataset.vessel_attenuation.filter(|_| settings.normalise).unwrap_or(1.0);
-        let greatest = if settings.clamp > 0.0 { settings.clamp } else { f64::INFINITY };
+        let max = if settings.clamp > 0.0 { settings.clamp } else { f64::INFINITY };
         let training = dataset.training();
         let (mut images, mut beyond) = (Vec::with_capacity(training.len() * dataset.n_pixels()), 0);
         for frame in training {
             check_finite(dataset, frame)?;
             let in_units = frame.integrals.iter().map(|v| f64::from(*v) / unit);
-            beyond += in_units.clone().filter(|v| *v > greatest).count();
+            beyond += in_units.clone().filter(|v| *v > max).count();
             let low = if settings.clamp > 0.0 { 0.0 } else { f64::NEG_INFINITY };
-            let clamped: Vec<f32> = in_units.map(|v| v.clamp(low, greatest) as f32).collect();
+            let clamped: Vec<f32> = in_units.map(|v| v.clamp(low, max) as f32).collect();
             images.extend(normalised(&clamped));
         }
         let units = Units { pixel: 1.0 / MM_PER_UNIT, strongest: 1.0 };
@@ -140,8 +140,8 @@ impl XData {
             setup: GaussianSetup {
                 n_phases: self.n_phases as u32,
                 cut: DRAWN_CUT,
-                least_scale: DRAWN_SCALES[0],
-                greatest_scale: DRAWN_SCALES[1],
+                min_scale: DRAWN_SCALES[0],
+                max_scale: DRAWN_SCALES[1],
                 ..GaussianSetup::default()
             },
             rows,

@@ -46,9 +46,9 @@ pub fn densified(before: &XState, n_sets: usize, settings: &X, extent_mm: f64, (
     }
     let large_ones_go = settings.reset_every > 0 && step > settings.reset_every;
     let stays = |(g, statistics): (&XGaussian, &XStatistics)| {
-        let too_wide = g.scales().max_element() > settings.greatest_scale * extent_mm;
-        let too_large = settings.greatest_radius > 0.0 && f64::from(statistics.radius) > settings.greatest_radius;
-        g.shown_opacity() >= settings.weakest && !(large_ones_go && (too_wide || too_large))
+        let too_wide = g.scales().max_element() > settings.max_scale * extent_mm;
+        let too_large = settings.max_radius > 0.0 && f64::from(statistics.radius) > settings.max_radius;
+        g.shown_opacity() >= settings.min_opacity && !(large_ones_go && (too_wide || too_large))
     };
     after.retain(&after.rows.iter().zip(&after.statistics).map(stays).collect::<Vec<_>>());
     after.statistics = vec![XStatistics::default(); after.rows.len()];
@@ -61,7 +61,7 @@ fn fates(state: &XState, n_sets: usize, settings: &X, extent_mm: f64) -> Vec<Fat
     let fate = |i: usize| {
         let (count, of) = (&mut counts[state.sets[i] as usize], state.statistics[i]);
         let pulled = of.seen > 0.0 && f64::from(of.pull) / f64::from(of.seen) >= settings.densify_gradient;
-        if !pulled || *count >= settings.most {
+        if !pulled || *count >= settings.max_gaussians {
             return Fate::Stays;
         }
         *count += 1;
@@ -159,11 +159,11 @@ mod tests {
         assert_eq!(left(&settings(), 600), [0.0, 2.0]);
         assert_eq!(left(&settings(), 4200), [0.0]);
         assert_eq!(left(&X { reset_every: 0, ..settings() }, 4200), [0.0, 2.0], "nothing is ever reset");
-        assert_eq!(left(&X { greatest_radius: 20.0, ..settings() }, 600), [0.0, 2.0]);
-        assert!(left(&X { greatest_radius: 20.0, ..settings() }, 4200).is_empty());
-        let full = X { most: 2, ..settings() };
+        assert_eq!(left(&X { max_radius: 20.0, ..settings() }, 600), [0.0, 2.0]);
+        assert!(left(&X { max_radius: 20.0, ..settings() }, 4200).is_empty());
+        let full = X { max_gaussians: 2, ..settings() };
         assert_eq!(densified(&four(), 2, &full, EXTENT_MM, AT).rows, four().rows);
-        let room_for_one = X { most: 3, ..settings() };
+        let room_for_one = X { max_gaussians: 3, ..settings() };
         assert_eq!(densified(&four(), 2, &room_for_one, EXTENT_MM, AT).rows.len(), 6);
     }
 

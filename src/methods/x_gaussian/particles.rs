@@ -53,7 +53,7 @@ impl XLearningBuffers {
 }
 
 fn entries(gpu: &Gpu, capacity: u32) -> Result<Buffer> {
-    gpu.buffer(Binding::x_entries.name(), 4 * u64::from(SUMS) * u64::from(capacity), Memory::Device)
+    Ok(gpu.buffer(Binding::x_entries.name(), 4 * u64::from(SUMS) * u64::from(capacity), Memory::Device)?)
 }
 
 /// Reads the state of Gaussians back, whose sets are known.

@@ -2,7 +2,7 @@
 //! Gaussians than a block of the sort holds, and the optimiser over ten iterations.
 
 use crate::config::{Config, Preset};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::fitting::shown::SetsFit;
 use crate::gpu::buffer::Buffer;
 use crate::gpu::device::Gpu;
@@ -60,7 +60,7 @@ pub const TENSORS: [(&str, Range<usize>); 5] =
 /// A configuration small enough for the twin.
 ///
 /// # Errors
-/// [`Error::Config`] for a setting that is not usable.
+/// [`crate::error::Error::Config`] for a setting that is not usable.
 pub fn small_config(settings: &[&str]) -> Result<Config> {
     let small = [
         "train.iterations=40",
@@ -76,9 +76,7 @@ pub fn small_config(settings: &[&str]) -> Result<Config> {
 
 fn data_of(config: &Config, width: usize, height: usize) -> Result<XData> {
     let dataset = small_dataset(width, height, 3)?;
-    let missing = || Error::Internal("the plan has no data of X-Gaussian".into());
-    let planned = Plan::new(config, &dataset)?.fit;
-    planned.and_then(|data| data.as_any().downcast_ref::<XData>().cloned()).ok_or_else(missing)
+    Ok(Plan::new(config, &dataset)?.data::<XData>()?.clone())
 }
 
 /// `n` Gaussians all over the volume, some so far beyond it that views look past them.
@@ -219,7 +217,7 @@ struct Iteration<'a> {
 
 impl Iteration<'_> {
     fn get<T: bytemuck::Pod>(&self, buffer: &Buffer, n: usize) -> Result<Vec<T>> {
-        self.gpu.download(buffer, 0, n)
+        Ok(self.gpu.download(buffer, 0, n)?)
     }
 
     fn compare(&self, loss: f64, findings: &mut Findings) -> Result<()> {
@@ -431,7 +429,7 @@ fn entry_of(span: &XSpan, tile: u32, tile_columns: u32) -> usize {
 fn splat_error(got: &Splat, want: &Projection) -> f64 {
     let blot = &want.blot;
     let conic = [blot.conic.x_axis.x, blot.conic.x_axis.y, blot.conic.y_axis.y];
-    let largest = conic.iter().fold(0f64, |most, c| most.max(c.abs()));
+    let largest = conic.iter().fold(0f64, |max, c| max.max(c.abs()));
     let mean = [0, 1].map(|k| (f64::from(got.mean[k]) - blot.mean[k]).abs());
     // Rounded up, so that a pixel more or less may come of rounding where numbers are whole.
     let radius = got.half_box.map(|half| if f64::from(half) == want.radius { 0.0 } else { f64::INFINITY });

@@ -60,9 +60,9 @@ impl XState {
     }
 
     /// Limits the opacity of all Gaussians to `most` and resets the optimiser's moments of opacities.
-    pub fn reset_opacities(&mut self, most: f64) {
-        let most = stored_opacity(most.ln()) as f32;
-        self.rows.iter_mut().for_each(|g| g.opacity = g.opacity.min(most));
+    pub fn reset_opacities(&mut self, max: f64) {
+        let max = stored_opacity(max.ln()) as f32;
+        self.rows.iter_mut().for_each(|g| g.opacity = g.opacity.min(max));
         self.first.iter_mut().chain(&mut self.second).for_each(|moments| moments[OPACITY] = 0.0);
     }
 

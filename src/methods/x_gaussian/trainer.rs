@@ -60,12 +60,12 @@ impl XTrainer {
     /// [`Error::Config`] for impossible settings; device errors.
     pub fn new(gpu: &Gpu, data: XData, config: &Config) -> Result<(XTrainer, Vec<String>)> {
         let state = first_state(&data, &config.x);
-        let (most, mut notes) = (most_of_set(gpu, &data), Vec::new());
-        if most < config.x.most {
+        let (max, mut notes) = (max_of_set(gpu, &data), Vec::new());
+        if max < config.x.max_gaussians {
             notes.push(format!(
-                "a set has at most {most} Gaussians instead of x.max_gaussians = {}, because a buffer of this device has no \
+                "a set has at most {max} Gaussians instead of x.max_gaussians = {}, because a buffer of this device has no \
                  room for more",
-                config.x.most
+                config.x.max_gaussians
             ));
         }
         Ok((Self::with(gpu, data, config, &state, 0)?, notes))
@@ -78,8 +78,8 @@ impl XTrainer {
     pub fn with(gpu: &Gpu, data: XData, config: &Config, state: &XState, step: u32) -> Result<XTrainer> {
         config.check()?;
         let mut config = config.clone();
-        config.x.most = config.x.most.min(most_of_set(gpu, &data));
-        let n = check_count(state, &data, config.x.weakest)?;
+        config.x.max_gaussians = config.x.max_gaussians.min(max_of_set(gpu, &data));
+        let n = check_count(state, &data, config.x.min_opacity)?;
         let setup = gaussian_setup(&data, &config);
         let capacity = first_capacity(n, capacity_limit(gpu));
         let x = x_setup(&config.x, data.n_sets() as u32, [setup.width, setup.height], capacity);
@@ -154,7 +154,7 @@ impl XTrainer {
             self.set_capacity(more_capacity(
                 status[0].entries,
                 capacity_limit(&self.gpu),
-                ("x.max_gaussians", self.config.x.most.into()),
+                ("x.max_gaussians", self.config.x.max_gaussians.into()),
             )?)?;
         }
         Ok(had_room)
@@ -208,7 +208,7 @@ impl XTrainer {
         if resets(x, self.step) {
             state.reset_opacities(x.reset_opacity);
         }
-        check_count(&state, &self.data, self.config.x.weakest)?;
+        check_count(&state, &self.data, self.config.x.min_opacity)?;
         self.seen = BlendedGaussians::new(&self.gpu, &state.rows, &state.sets, self.data.n_sets(), self.x.capacity)?;
         self.learning = XLearningBuffers::new(&self.gpu, &state, self.x.capacity)?;
         self.sets = state.sets;
@@ -283,7 +283,7 @@ impl SetsFit for XTrainer {
 }
 
 /// Maximum number of Gaussians of a set, such that all sets fit the device's buffers.
-fn most_of_set(gpu: &Gpu, data: &XData) -> u32 {
+fn max_of_set(gpu: &Gpu, data: &XData) -> u32 {
     gpu.info().max_storage_buffer_range / size_of::<XGaussian>() as u32 / data.n_sets() as u32
 }
 
@@ -360,6 +360,6 @@ fn record(gpu: &Gpu, parts: XParts<'_>, per_submit: u32) -> Result<Iterations> {
         for _ in 0..iterations {
             parts.record_step(&mut recording)?;
         }
-        recording.finish()
+        Ok(recording.finish()?)
     })
 }

@@ -16,15 +16,15 @@ pub type Sums = [f64; 7];
 /// Distance from the image's centre at which slopes stop following the Gaussian's centre, in half images.
 const SLOPES_END: f64 = 1.3;
 /// Minimum squared difference of variances in the computation of a radius, pixels^4.
-const LEAST_SPREAD: f64 = 0.1;
+const MIN_SPREAD: f64 = 0.1;
 /// Variance added to each splat, pixels^2.
 const LOW_PASS: f64 = 0.3;
 /// Extent of a splat in standard deviations along its longest axis.
 const REACH: f64 = 3.0;
 const TILE: usize = 16;
-const MOST_OPAQUE: f64 = 0.99;
-const LEAST_ALPHA: f64 = 1.0 / 255.0;
-const LEAST_LIGHT: f64 = 1e-4;
+const MAX_OPAQUE: f64 = 0.99;
+const MIN_ALPHA: f64 = 1.0 / 255.0;
+const MIN_LIGHT: f64 = 1e-4;
 
 /// Returns the stored parameters of a Gaussian.
 pub fn params(g: &XGaussian) -> Params {
@@ -75,8 +75,8 @@ impl Blot {
     /// Opacity at a pixel, and whether it depends on the parameters; `None` where it is too faint.
     fn alpha(&self, d: DVec2) -> Option<(f64, bool)> {
         let alpha = self.opacity * (-0.5 * d.dot(self.conic * d)).exp();
-        let follows = alpha <= MOST_OPAQUE;
-        (alpha >= LEAST_ALPHA).then_some((alpha.min(MOST_OPAQUE), follows))
+        let follows = alpha <= MAX_OPAQUE;
+        (alpha >= MIN_ALPHA).then_some((alpha.min(MAX_OPAQUE), follows))
     }
 }
 
@@ -112,7 +112,7 @@ pub fn project(p: &Params, view: &SplatView, setup: &GaussianSetup, x: &XSetup) 
     let (uu, uv, vv) = (alpha.dot(alpha) + LOW_PASS, alpha.dot(beta), beta.dot(beta) + LOW_PASS);
     let det = uu * vv - uv * uv;
     let half_sum = 0.5 * (uu + vv);
-    let largest = half_sum + (half_sum * half_sum - det).max(LEAST_SPREAD).sqrt();
+    let largest = half_sum + (half_sum * half_sum - det).max(MIN_SPREAD).sqrt();
     let conic = DMat2::from_cols(DVec2::new(vv, -uv), DVec2::new(-uv, uu)) * (1.0 / det);
     Some(Projection {
         blot: Blot { mean, conic, opacity: sigmoid(p[3]), intensity: p[7].max(0.0) },
@@ -154,7 +154,7 @@ fn shown(list: &[Blot], at: DVec2) -> (f64, f64, usize) {
     for (place, blot) in list.iter().enumerate() {
         let Some((alpha, _)) = blot.alpha(at - blot.mean) else { continue };
         let left = light * (1.0 - alpha);
-        if left < LEAST_LIGHT {
+        if left < MIN_LIGHT {
             break;
         }
         sum += blot.intensity * alpha * light;

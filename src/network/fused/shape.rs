@@ -6,7 +6,7 @@ use crate::kernels::constants::{NOWHERE, PHASE_BIAS};
 use crate::kernels::tuning::MatrixTuning;
 use crate::model::params::NetworkMap;
 use crate::network::fused::computes_again;
-use crate::network::fused::span::Part;
+use crate::network::fused::span::LayerInput;
 
 /// Shared memory reserved for everything but the tiles, bytes.
 const SHARED_RESERVE: u32 = 512;
@@ -95,8 +95,8 @@ impl Shape {
         let width = params.width as u32;
         let encoded = (params.encoded_len + params.phases).next_multiple_of(16);
         let unfit = |what: String| Error::config("dynamic.width", width, what);
-        let most = (info.max_workgroup_invocations / info.matrix_subgroup).min(info.max_workgroup_subgroups);
-        let subgroups = (1..=most.min(8)).rev().find(|s| (width / n).is_multiple_of(*s)).unwrap_or(1);
+        let max = (info.max_workgroup_invocations / info.matrix_subgroup).min(info.max_workgroup_subgroups);
+        let subgroups = (1..=max.min(8)).rev().find(|s| (width / n).is_multiple_of(*s)).unwrap_or(1);
         if subgroups * info.matrix_subgroup < width / 8 {
             return Err(unfit("is too wide for the matrix kernels on this device".into()));
         }
@@ -124,7 +124,7 @@ impl Shape {
         let fits = |b: &Backward| {
             let columns = width / n;
             let row_shares = b.subgroups / columns.min(b.subgroups);
-            b.subgroups <= most
+            b.subgroups <= max
                 && b.subgroups * info.matrix_subgroup <= tuning.backward_lanes.max(subgroups * info.matrix_subgroup)
                 && (b.subgroups <= columns || b.subgroups.is_multiple_of(columns))
                 && (b.tile / m).is_multiple_of(row_shares)
@@ -179,10 +179,10 @@ impl Shape {
     }
 
     /// Position of a part's weights, both packed and in the partial sums.
-    pub(super) fn weights_of(&self, part: Part) -> Option<usize> {
+    pub(super) fn weights_of(&self, part: LayerInput) -> Option<usize> {
         match part {
-            Part::Hidden(layer) => self.layers[layer].hidden,
-            Part::Encoded(layer) => self.layers[layer].encoded,
+            LayerInput::Hidden(layer) => self.layers[layer].hidden,
+            LayerInput::Encoded(layer) => self.layers[layer].encoded,
         }
     }
 

@@ -1,23 +1,23 @@
 //! Grouping of layers into backward passes, and the work of these passes.
 
+use crate::fitting::ledger::{Ledger, StageWork, add};
 use crate::model::params::{Layer, NetworkMap};
 use crate::network::fused::shape::Backward;
-use crate::network::ledger::{Ledger, StageWork, add};
 use crate::network::{F16_BYTES, SAMPLE_BYTES};
 
 /// Weights of a layer on one of its inputs; layers count from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Part {
+pub(super) enum LayerInput {
     /// Weights on the layer below.
     Hidden(usize),
     /// Weights on the encoding.
     Encoded(usize),
 }
 
-impl Part {
+impl LayerInput {
     pub(super) fn layer(self) -> usize {
         match self {
-            Part::Hidden(layer) | Part::Encoded(layer) => layer,
+            LayerInput::Hidden(layer) | LayerInput::Encoded(layer) => layer,
         }
     }
 }
@@ -25,19 +25,19 @@ impl Part {
 /// One backward pass. If it has a lower part, dz of the layer in between stays on the multiprocessor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Span {
-    pub(super) upper: Part,
-    pub(super) lower: Option<Part>,
+    pub(super) upper: LayerInput,
+    pub(super) lower: Option<LayerInput>,
 }
 
 impl Span {
     /// Returns the part that is processed last.
-    pub(super) fn last(self) -> Part {
+    pub(super) fn last(self) -> LayerInput {
         self.lower.unwrap_or(self.upper)
     }
 
     /// Tells whether the pass writes dz of a layer below.
     pub(super) fn with_input(self) -> bool {
-        matches!(self.last(), Part::Hidden(_))
+        matches!(self.last(), LayerInput::Hidden(_))
     }
 }
 
@@ -45,9 +45,11 @@ impl Span {
 /// pairs are made from the first layer up, so that a single remaining layer is the last one.
 pub(super) fn spans(layers: &[Layer], pairs: bool) -> Vec<Span> {
     let parts = |(l, layer): (usize, &Layer)| {
-        [layer.hidden.map(|_| Part::Hidden(l)), layer.encoded.map(|_| Part::Encoded(l))].into_iter().flatten()
+        [layer.hidden.map(|_| LayerInput::Hidden(l)), layer.encoded.map(|_| LayerInput::Encoded(l))]
+            .into_iter()
+            .flatten()
     };
-    let mut parts: Vec<Part> = layers.iter().enumerate().rev().flat_map(parts).collect();
+    let mut parts: Vec<LayerInput> = layers.iter().enumerate().rev().flat_map(parts).collect();
     let mut spans = Vec::new();
     while let Some(last) = parts.pop() {
         let above = parts.last().copied().filter(|above| pairs && joins(layers, *above, last));
@@ -64,16 +66,16 @@ pub(super) fn spans(layers: &[Layer], pairs: bool) -> Vec<Span> {
 }
 
 /// Tells whether one pass may go through both. A layer that sees both inputs needs its dz twice, hence in memory.
-fn joins(layers: &[Layer], upper: Part, lower: Part) -> bool {
+fn joins(layers: &[Layer], upper: LayerInput, lower: LayerInput) -> bool {
     let below = &layers[lower.layer()];
-    matches!(upper, Part::Hidden(layer) if layer == lower.layer() + 1)
+    matches!(upper, LayerInput::Hidden(layer) if layer == lower.layer() + 1)
         && !(below.hidden.is_some() && below.encoded.is_some())
 }
 
 /// Tells whether the last pass can recompute the encoding and the first layer: nothing else reads them, and the pass does not
 /// begin at the output, whose gradient has buffers of its own.
 pub(super) fn recomputes(spans: &[Span]) -> bool {
-    let encoded = |part: Part| matches!(part, Part::Encoded(_));
+    let encoded = |part: LayerInput| matches!(part, LayerInput::Encoded(_));
     let readers = spans.iter().flat_map(|span| [Some(span.upper), span.lower]).flatten().filter(|part| encoded(*part));
     spans.len() > 1 && readers.count() == 1 && spans.last().is_some_and(|span| span.lower.is_some_and(encoded))
 }
@@ -92,21 +94,21 @@ pub(super) fn work(params: &NetworkMap, encoded: u64, samples: u64, backward: Ba
     let kept_layers = (params.layers.len() - usize::from(recompute)) as u64;
     let kept_features = if recompute { 0 } else { encoded };
     count("mlp_fused_fwd", 2 * width, kept_features + kept_layers * width, SAMPLE_BYTES);
-    let products = |part: Part| match part {
-        Part::Hidden(_) => 2 * width * width,
-        Part::Encoded(_) => first,
+    let products = |part: LayerInput| match part {
+        LayerInput::Hidden(_) => 2 * width * width,
+        LayerInput::Encoded(_) => first,
     };
     let spans = spans(&params.layers, pairs);
     for (i, span) in spans.iter().enumerate() {
         let recomputed = recompute && i + 1 == spans.len();
-        let read = |part: Part| match part {
+        let read = |part: LayerInput| match part {
             _ if recomputed => 0,
-            Part::Hidden(_) => width,
-            Part::Encoded(_) => encoded,
+            LayerInput::Hidden(_) => width,
+            LayerInput::Encoded(_) => encoded,
         };
         for part in [Some(span.upper), span.lower].into_iter().flatten() {
             count("mlp_fused_fwd", products(part), 0, 0);
-            let gradients = if matches!(part, Part::Hidden(_)) { 2 } else { 1 };
+            let gradients = if matches!(part, LayerInput::Hidden(_)) { 2 } else { 1 };
             count("mlp_fused_bwd", gradients * products(part), read(part), 0);
         }
         if recomputed {

@@ -1,0 +1,100 @@
+//! Data of a fit: targets of the Gaussians, and the images of the static field behind them.
+
+use crate::config::{Config, GaussianForm};
+use crate::error::Result;
+use crate::fields::data::{FieldData, RayLists};
+use crate::fields::motion;
+use crate::fields::scale::dynamic_half;
+use crate::fitting::extent::between_phases;
+use crate::geometry::ViewRays;
+use crate::methods::dynamic_gaussians::soft_hull::carve::SoftMotion;
+use crate::methods::dynamic_gaussians::targets::Targets;
+use crate::model::hull::Hull;
+use crate::model::scene::Scene;
+use crate::scan::dataset::{Dataset, Frame};
+
+/// Data of a fit.
+#[derive(Clone)]
+pub struct GaussianData {
+    /// Targets of the Gaussians.
+    pub targets: Targets,
+    /// Data of the static field.
+    pub fields: FieldData,
+    /// View of each training image, and its time, counted in phases.
+    pub shots: Vec<(ViewRays, f64)>,
+}
+
+impl GaussianData {
+    /// Prepares the data of a fit and appends remarks for the user to `notes`.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Config`] where nothing moves, or too little is known to tell.
+    pub fn new(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<GaussianData> {
+        let motion = motion::analyse(dataset, &config.hull);
+        let (hull, targets) = hull_and_targets(config, dataset, notes)?;
+        let scene = Scene::new(config, dataset, &motion, Some(&hull))?;
+        let lists = RayLists::of_hull(config, dataset, &motion, Some(&hull));
+        let fields = FieldData::new(config, dataset, &motion, Some(hull), scene, lists)?;
+        let shot = |frame: &Frame| (dataset.heart_rays(frame), frame.beat_time().phases(dataset.n_phases));
+        Ok(GaussianData { targets, fields, shots: dataset.training().iter().map(shot).collect() })
+    }
+}
+
+/// Cells along each axis of the soft hull that Gaussians are seeded in.
+const SOFT_HULL_CELLS: usize = 112;
+
+/// Computes where vessels may be, and the targets that Gaussians are fitted to.
+fn hull_and_targets(config: &Config, dataset: &Dataset, notes: &mut Vec<String>) -> Result<(Hull, Targets)> {
+    let soft = SoftMotion::new(dataset, dynamic_half(config, dataset), SOFT_HULL_CELLS);
+    let targets = Targets::new(dataset, &soft, &config.gaussians)?;
+    let form = targets.form(config.gaussians.form);
+    notes.extend(between_phases(
+        dataset,
+        match form {
+            GaussianForm::Deformable => {
+                "are fitted at their own time (at the mean time of the frames that share a phase and a view)"
+            }
+            _ => "are used as frames of the nearest phase",
+        },
+    ));
+    notes.extend(wide_motion(&soft));
+    notes.extend(without_motion(dataset, &soft));
+    notes.push(format!("the soft motion hull keeps {:.3} % of the box", 100.0 * soft.hull.share()));
+    notes.push(match form {
+        GaussianForm::Deformable => match targets.rest_phase {
+            0 => "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"deformable\")".into(),
+            phase => format!(
+                "one deformable set of Gaussians is fitted to all phases (gaussians.form = \"deformable\"), starting from \
+                 phase {phase}, which shows more of the vessels than phase 0"
+            ),
+        },
+        _ if targets.contrast_comes_and_goes() => {
+            "each phase has its own set of Gaussians (gaussians.form = \"phase\"), because contrast agent flows in or \
+             out during the beat"
+                .into()
+        }
+        _ => "each phase has its own set of Gaussians (gaussians.form = \"phase\")".into(),
+    });
+    Ok((soft.hull.to_hull(), targets))
+}
+
+/// Returns a note on the frames that Gaussians are not fitted to: frames of views with a single phase.
+fn without_motion(dataset: &Dataset, soft: &SoftMotion) -> Option<String> {
+    let fitted = |view: usize| soft.views.iter().any(|v| v.view == view);
+    let left = dataset.training().iter().filter(|frame| !fitted(frame.view)).count();
+    (left > 0).then(|| {
+        format!(
+            "{left} of {} frames are the only phase of their view, e.g. because the C-arm or the table moves: only the \
+             static field is fitted to them",
+            dataset.training().len()
+        )
+    })
+}
+
+/// Returns a note on the views in which more than vessels moves.
+fn wide_motion(soft: &SoftMotion) -> Option<String> {
+    let views: Vec<usize> = soft.views.iter().filter(|v| v.background.drift.size().is_some()).map(|v| v.view).collect();
+    let what = "wide structures move as well as vessels, e.g. the heart, the diaphragm or the lungs: their motion is \
+                removed from the images to which vessels are fitted";
+    (!views.is_empty()).then(|| format!("views {views:?}: {what}"))
+}

@@ -1,0 +1,392 @@
+//! Fits a deformable set: Gaussians of one phase, carried through the beat by a grid, all of it together. [`crate::methods::dynamic_gaussians::start`] prepares
+//! it.
+
+use crate::config::{Config, sections};
+use crate::error::{Error, Result};
+use crate::evidence::series::blur;
+use crate::fitting::iterations::{Iterations, pass_times};
+use crate::fitting::ring::{losses, ring};
+use crate::gaussians::field::{DeformableGaussians, Gaussians, SMALLER_STEPS, dense};
+use crate::gaussians::particles::{ParticleBuffers, Particles};
+use crate::gaussians::stages::{GaussianKernels, GaussianPass, TargetBuffers};
+use crate::gaussians::view::SplatView;
+use crate::gaussians::work::{GaussianWork, SplatCost};
+use crate::gpu::device::Gpu;
+use crate::gpu::record::{PassTime, Recording};
+use crate::kernels::layout::{DeformableSetup, Gaussian, GaussianSetup, GaussianView};
+use crate::methods::dynamic_gaussians::per_phase::{MAX_PASSES, check_count, strong};
+use crate::methods::dynamic_gaussians::stages::{
+    DeformableKernels, DeformablePass, GridBuffers, OwnMotion, OwnMotionBuffers, Track,
+};
+use crate::methods::dynamic_gaussians::stages::{record_guess, record_images, record_step, record_track};
+use crate::methods::dynamic_gaussians::target_buffers::{padded, renew_bounds, take_images, target_buffers};
+use crate::methods::dynamic_gaussians::targets::Targets;
+use crate::methods::dynamic_gaussians::{seeds, setup};
+use crate::model::groups::vessels;
+use crate::raster::Image;
+use glam::DVec3;
+
+/// A run on a device.
+pub struct DeformableTrainer {
+    gpu: Gpu,
+    targets: Targets,
+    config: Config,
+    kernels: (GaussianKernels, DeformableKernels),
+    joint: Fit,
+    particles: ParticleBuffers,
+    own: OwnMotionBuffers,
+    n: u32,
+    iterations: Iterations,
+    step: u32,
+}
+
+/// Setup, schedule and buffers of iterations of one kind: the joint fit of everything, or the tracking of a phase.
+pub(super) struct Fit {
+    setup: GaussianSetup,
+    deformable: DeformableSetup,
+    targets: TargetBuffers,
+    grid: GridBuffers,
+}
+
+impl Fit {
+    /// A fit of everything, with a grid at rest.
+    fn joint(gpu: &Gpu, targets: &Targets, config: &Config) -> Result<Fit> {
+        let settings = targets.lengths.gaussians(&config.gaussians);
+        let setup = setup::gaussian_setup(targets, &settings);
+        let deformable = setup::deformable_setup(targets, &targets.lengths.deformable(&config.deformable));
+        let buffers = target_buffers(gpu, targets, &setup, &setup::schedule(&settings))?;
+        Ok(Fit { setup, deformable, targets: buffers, grid: GridBuffers::new(gpu, &deformable, targets.n_phases)? })
+    }
+
+    /// A fit of the same grid to the same images, blurred, a phase at a time.
+    fn tracking(&self, gpu: &Gpu, targets: &Targets, settings: &sections::Deformable) -> Result<Fit> {
+        let setup = setup::track_setup(&self.setup, settings);
+        let deformable = DeformableSetup { grid_rate: settings.track_rate as f32, ..self.deformable };
+        let blurred = |values: &[f32]| {
+            let images = values.chunks(targets.n_pixels()).flat_map(|image| {
+                let image = Image { width: targets.width, height: targets.height, values: image.to_vec() };
+                blur(&image, settings.track_blur as f32).values
+            });
+            padded(&images.collect::<Vec<_>>(), targets, &setup)
+        };
+        // One phase at a time: the motion beyond it is not known yet.
+        let at_phase = |view: &SplatView| SplatView { after_phase: 0.0, ..view.clone() }.to_device();
+        let views: Vec<GaussianView> = targets.views.iter().map(at_phase).collect();
+        let buffers = TargetBuffers {
+            gaussian_setup: gpu.buffer_with("gaussian_setup of tracking", &[setup])?,
+            gaussian_views: gpu.buffer_with("gaussian_views of tracking", &views)?,
+            bound_low: gpu.buffer_with("bound_low of tracking", &blurred(&targets.low))?,
+            bound_high: gpu.buffer_with("bound_high of tracking", &blurred(&targets.high))?,
+            gaussian_schedule: gpu.buffer_with("gaussian_schedule of tracking", &setup::track_schedule(settings))?,
+            gaussian_step: gpu.buffer_with("gaussian_step of tracking", &[0u32])?,
+            gaussian_ring: ring(gpu, "gaussian_ring of tracking")?,
+            ..self.targets.clone()
+        };
+        Ok(Fit { setup, deformable, targets: buffers, grid: self.grid.under(gpu, &deformable)? })
+    }
+}
+
+impl DeformableTrainer {
+    /// Starts from given Gaussians at rest.
+    ///
+    /// # Errors
+    /// [`Error::Config`] for impossible settings; device errors.
+    pub fn with(gpu: &Gpu, targets: Targets, config: &Config, particles: &Particles) -> Result<DeformableTrainer> {
+        config.check()?;
+        let n = check_count(particles)?;
+        let kernels = (GaussianKernels::new(gpu)?, DeformableKernels::new(gpu)?);
+        let joint = Fit::joint(gpu, &targets, config)?;
+        let own = OwnMotion::fresh(vec![[0.0; 4]; n as usize * joint.deformable.n_basis as usize]);
+        let (particles, own) = upload(gpu, &joint.setup, particles, &own)?;
+        let iterations = record(gpu, &kernels, &joint, (&particles, &own), n, config.train.iterations_per_submit)?;
+        let (gpu, config) = (gpu.clone(), config.clone());
+        Ok(DeformableTrainer { gpu, targets, config, kernels, joint, particles, own, n, iterations, step: 0 })
+    }
+
+    /// Returns the fit by which the grid is tracked.
+    pub(super) fn tracking(&self) -> Result<Fit> {
+        self.joint.tracking(&self.gpu, &self.targets, &self.targets.lengths.deformable(&self.config.deformable))
+    }
+
+    /// Tracks the grid to a phase from those before it, on blurred images, in submits as long as those of the fit.
+    pub(super) fn track(&self, tracking: &Fit, track: &Track) -> Result<()> {
+        let submit = |record: &dyn Fn(&mut DeformablePass<'_>) -> Result<()>| -> Result<()> {
+            let mut recording = Recording::new(&self.gpu, "tracking")?;
+            let bound = (&self.particles, &self.own);
+            record(&mut pass(&mut recording, &self.kernels, tracking, bound, self.n))?;
+            Ok(self.gpu.wait(recording.finish()?.submit()?)?)
+        };
+        submit(&|pass| record_guess(pass, track))?;
+        let mut left = if track.images.is_empty() { 0 } else { self.config.deformable.track_iterations };
+        while left > 0 {
+            let n = left.min(self.config.train.iterations_per_submit);
+            submit(&|pass| record_track(pass, track, n))?;
+            left -= n;
+        }
+        Ok(())
+    }
+
+    /// Clears the optimiser's momentum, so that iterations after tracking begin without it.
+    pub(super) fn forget_momentum(&self) -> Result<()> {
+        let mut recording = Recording::new(&self.gpu, "clear momentum")?;
+        recording.fill(&self.joint.grid.motion_grid_first, 0);
+        recording.fill(&self.joint.grid.motion_grid_second, 0);
+        Ok(self.gpu.wait(recording.finish()?.submit()?)?)
+    }
+
+    /// Iterations done, those of the sets per phase and of tracking not counted.
+    pub fn step(&self) -> u32 {
+        self.step
+    }
+
+    /// Number of Gaussians of the deformable set.
+    pub fn count(&self) -> u32 {
+        self.n
+    }
+
+    /// Targets of the run.
+    pub fn targets(&self) -> &Targets {
+        &self.targets
+    }
+
+    /// Returns the targets when the run is not wanted.
+    pub(super) fn into_targets(self) -> Targets {
+        self.targets
+    }
+
+    /// Gives the Gaussians, which were fitted before, the motion of a deformable set of the same Gaussians on the same grid; iterations
+    /// go on from where the background is estimated anew.
+    pub(super) fn move_as(&mut self, deformable: &DeformableGaussians) -> Result<()> {
+        self.gpu.upload(&self.joint.grid.motion_grid, 0, &deformable.grid)?;
+        self.gpu.upload(&self.own.own_motion, 0, &deformable.own)?;
+        self.step = setup::carried_step(&self.config.gaussians);
+        Ok(self.gpu.upload(&self.joint.targets.gaussian_step, 0, &[self.step])?)
+    }
+
+    /// Constants of the run.
+    pub fn setup(&self) -> &GaussianSetup {
+        &self.joint.setup
+    }
+
+    /// Constants of the grid.
+    pub fn deformable_setup(&self) -> &DeformableSetup {
+        &self.joint.deformable
+    }
+
+    /// The Gaussians on the device, for rendering while training and for tests.
+    pub fn particles(&self) -> &ParticleBuffers {
+        &self.particles
+    }
+
+    /// Target buffers on the device, for tests.
+    pub fn target_buffers(&self) -> &TargetBuffers {
+        &self.joint.targets
+    }
+
+    /// The grid on the device, as [`DeformableTrainer::particles`].
+    pub fn grid(&self) -> &GridBuffers {
+        &self.joint.grid
+    }
+
+    /// Own motion on the device, as [`DeformableTrainer::particles`].
+    pub fn own_motion(&self) -> &OwnMotionBuffers {
+        &self.own
+    }
+
+    /// Runs a submit's worth of iterations towards `until`, at most to where the number of Gaussians changes; returns the
+    /// losses of the iterations done, penalties not included. An empty list means the target was reached before.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] on a loss that is not finite; device errors.
+    pub fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        let until = until.min(self.config.gaussians.iterations);
+        if self.step >= until {
+            return Ok(Vec::new());
+        }
+        let settings = &self.config.gaussians;
+        let (renew, grow) = (setup::renews_background(settings, self.step), setup::grows(settings, self.step));
+        let clear = setup::clears(settings, self.step);
+        let stop = setup::next_stop(settings, self.step, until);
+        if renew {
+            let images = self.images()?;
+            renew_bounds(&self.gpu, &mut self.targets, &self.joint.targets, &self.joint.setup, &images)?;
+        }
+        if grow {
+            self.grow()?;
+        }
+        if clear {
+            self.clear()?;
+        }
+        let first = self.step;
+        self.step += self.iterations.run(&self.gpu, first, stop)?;
+        if setup::parts_from_strays(&self.config.gaussians, self.step) {
+            self.drop_strays()?;
+        }
+        losses(&self.gpu, &self.joint.targets.gaussian_ring, first..self.step, SMALLER_STEPS)
+    }
+
+    /// Drops weak Gaussians and places new ones where data are missing at half the phases. This happens once in a run, on the
+    /// host, as with a set per phase.
+    fn grow(&mut self) -> Result<()> {
+        let (weakest, setup) = (self.config.gaussians.prune_threshold, self.joint.setup);
+        let (mut particles, mut own) = self.retain(|rows| strong(rows, &setup, weakest))?;
+        let deformable = self.deformable()?;
+        let carried = |x: DVec3, phase: f64| deformable.carried(x, phase);
+        let (settings, seed) = (self.targets.lengths.gaussians(&self.config.gaussians), self.config.seed);
+        let additions = seeds::deformable_additions(&self.targets, &settings, seed, &self.images()?, carried);
+        // New Gaussians move as their nearest neighbours do.
+        let n_basis = self.joint.deformable.n_basis as usize;
+        for g in &additions {
+            let nearest = deformable.nearest(DVec3::from_array(g.position.map(f64::from)));
+            own.append(deformable.own[nearest * n_basis..][..n_basis].to_vec());
+        }
+        particles.append(additions);
+        self.replace(&particles, &own)
+    }
+
+    /// Drops Gaussians that are too faint for vessels: they stand for other motion.
+    fn clear(&mut self) -> Result<()> {
+        let (faint, setup) = (self.config.gaussians.faint, self.joint.setup);
+        self.retain(|rows| dense(rows, &setup, faint)).map(|_| ())
+    }
+
+    /// Drops Gaussians that are alone and broad.
+    fn drop_strays(&mut self) -> Result<()> {
+        let (link, setup) = (self.targets.lengths.gaussians(&self.config.gaussians).link, self.joint.setup);
+        self.retain(|rows| vessels(rows, &setup, link)).map(|_| ())
+    }
+
+    /// Keeps some of the Gaussians on the device, and returns them.
+    fn retain(&mut self, kept: impl Fn(&[Gaussian]) -> Vec<bool>) -> Result<(Particles, OwnMotion)> {
+        let n = self.n as usize;
+        let mut particles = self.particles.download(&self.gpu, n)?;
+        let mut own = self.own.download(&self.gpu, n * self.joint.deformable.n_basis as usize)?;
+        let keep = kept(&particles.rows);
+        particles.retain(&keep);
+        own.retain(&keep);
+        self.replace(&particles, &own)?;
+        Ok((particles, own))
+    }
+
+    fn replace(&mut self, particles: &Particles, own: &OwnMotion) -> Result<()> {
+        self.n = check_count(particles)?;
+        (self.particles, self.own) = upload(&self.gpu, &self.joint.setup, particles, own)?;
+        let (bound, per_submit) = ((&self.particles, &self.own), self.config.train.iterations_per_submit);
+        self.iterations = record(&self.gpu, &self.kernels, &self.joint, bound, self.n, per_submit)?;
+        Ok(())
+    }
+
+    /// Images of the present field, `[image][pixel]`, shares of the strongest change.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn images(&self) -> Result<Vec<f32>> {
+        let mut recording = Recording::new(&self.gpu, "images of a deformable")?;
+        let mut pass = pass(&mut recording, &self.kernels, &self.joint, (&self.particles, &self.own), self.n);
+        record_images(&mut pass, 0..self.joint.setup.n_phases)?;
+        self.gpu.wait(recording.finish()?.submit()?)?;
+        take_images(&self.gpu, &self.joint.targets, &self.targets, &self.joint.setup)
+    }
+
+    /// The deformable set after the iterations done.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`] when a parameter is not finite; device errors.
+    pub fn deformable(&self) -> Result<DeformableGaussians> {
+        let (n, deformable) = (self.n as usize, self.joint.deformable);
+        let grid: Vec<[f32; 4]> =
+            self.gpu.download(&self.joint.grid.motion_grid, 0, self.targets.n_phases * deformable.nodes())?;
+        let own: Vec<[f32; 4]> = self.gpu.download(&self.own.own_motion, 0, n * deformable.n_basis as usize)?;
+        if let Some(bad) = grid.iter().chain(&own).flatten().find(|v| !v.is_finite()) {
+            let step = u64::from(self.step);
+            let (quantity, value) = ("the motion of the deformable set", f64::from(*bad));
+            return Err(Error::Diverged {
+                step,
+                quantity,
+                value,
+                advice: "a lower deformable.grid_rate and deformable.own_rate",
+            });
+        }
+        let rest = Gaussians {
+            units: self.targets.units,
+            n_phases: self.targets.n_phases,
+            setup: self.joint.setup,
+            rows: self.gpu.download(&self.particles.gaussians, 0, n)?,
+            step: self.step,
+            is_crowd: false,
+            intensities: None,
+        };
+        rest.check()?;
+        Ok(DeformableGaussians { rest, setup: deformable, grid, own })
+    }
+
+    /// Runs one iteration with a timestamp around each pass.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        let mut recording = Recording::timed(&self.gpu, "profiled iteration of a deformable", MAX_PASSES)?;
+        let bound = (&self.particles, &self.own);
+        record_step(&mut pass(&mut recording, &self.kernels, &self.joint, bound, self.n))?;
+        self.step += 1;
+        pass_times(&self.gpu, recording)
+    }
+
+    /// Work of the last iteration.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub fn work(&self) -> Result<GaussianWork> {
+        let setup = &self.joint.setup;
+        let splats = (&self.particles.splats, &self.particles.image_of_splat);
+        GaussianWork::of(&self.gpu, setup, splats, self.n * setup.n_views * setup.n_phases, SplatCost::AFFINE)
+    }
+}
+
+/// Gaussians and their own motion on the device.
+type Bound<'a> = (&'a ParticleBuffers, &'a OwnMotionBuffers);
+
+fn upload(
+    gpu: &Gpu,
+    setup: &GaussianSetup,
+    particles: &Particles,
+    own: &OwnMotion,
+) -> Result<(ParticleBuffers, OwnMotionBuffers)> {
+    let n_places = particles.rows.len() as u64 * u64::from(setup.n_phases);
+    Ok((particles.upload(gpu, setup.n_views * setup.n_phases)?, own.upload(gpu, n_places)?))
+}
+
+fn pass<'a>(
+    recording: &'a mut Recording,
+    kernels: &'a (GaussianKernels, DeformableKernels),
+    fit: &'a Fit,
+    (particles, own): Bound<'a>,
+    n: u32,
+) -> DeformablePass<'a> {
+    let (common, kernels) = kernels;
+    DeformablePass {
+        gaussians: GaussianPass { recording, kernels: common, targets: &fit.targets, particles, setup: &fit.setup, n },
+        kernels,
+        grid: &fit.grid,
+        own,
+        setup: &fit.deformable,
+    }
+}
+
+fn record(
+    gpu: &Gpu,
+    kernels: &(GaussianKernels, DeformableKernels),
+    fit: &Fit,
+    bound: Bound<'_>,
+    n: u32,
+    per_submit: u32,
+) -> Result<Iterations> {
+    Iterations::record(gpu, per_submit, |iterations| {
+        let mut recording = Recording::new(gpu, &format!("{iterations} iterations of a deformable"))?;
+        let mut pass = pass(&mut recording, kernels, fit, bound, n);
+        for _ in 0..iterations {
+            record_step(&mut pass)?;
+        }
+        Ok(recording.finish()?)
+    })
+}

@@ -1,0 +1,185 @@
+//! Fit of the Gaussians in the form that configuration and data ask for.
+
+use crate::choice::Choice;
+use crate::config::{Config, GaussianForm};
+use crate::error::{Error, Result};
+use crate::fitting::fit::{FitWork, TimedFit};
+use crate::gaussians::field::DynamicGaussians;
+use crate::gaussians::work::GaussianWork;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::PassTime;
+use crate::methods::dynamic_gaussians::carried::Carried;
+use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::per_phase::GaussianTrainer;
+use crate::methods::dynamic_gaussians::start::DeformableStart;
+use crate::methods::dynamic_gaussians::targets::Targets;
+
+/// A fit under way.
+pub(crate) enum GaussianFit {
+    /// A set per phase.
+    PerPhase(Box<GaussianTrainer>),
+    /// One set for the beat, in preparation.
+    Start(Box<DeformableStart>),
+    /// One set for the beat.
+    Deformable(Box<DeformableTrainer>),
+}
+
+impl GaussianFit {
+    /// Begins a fit of the form that configuration and data ask for.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::new`] and [`DeformableStart::new`].
+    pub(crate) fn new(gpu: &Gpu, targets: Targets, config: &Config) -> Result<GaussianFit> {
+        Ok(match targets.form(config.gaussians.form) {
+            GaussianForm::Deformable => GaussianFit::Start(Box::new(DeformableStart::new(gpu, targets, config)?)),
+            _ => GaussianFit::PerPhase(Box::new(GaussianTrainer::new(gpu, targets, config)?)),
+        })
+    }
+
+    /// As [`GaussianFit::new`], but goes on from what was fitted to `earlier` data where that is of use.
+    ///
+    /// # Errors
+    /// As [`GaussianFit::new`] and [`Carried::new`].
+    pub(crate) fn after(
+        gpu: &Gpu,
+        mut targets: Targets,
+        config: &Config,
+        earlier: &DynamicGaussians,
+    ) -> Result<GaussianFit> {
+        if let (GaussianForm::Deformable, Some(deformable)) =
+            (targets.form(config.gaussians.form), earlier.deformable())
+        {
+            match Carried::new(gpu, targets, config, deformable)? {
+                Carried::On(fit) => return Ok(GaussianFit::Deformable(fit)),
+                Carried::Anew(same) => targets = *same,
+            }
+        }
+        GaussianFit::new(gpu, targets, config)
+    }
+
+    /// Tells whether the field of a fit of `end` iterations is worth more than one that was fitted to fewer frames.
+    pub(crate) fn is_presentable(&self, end: u32) -> bool {
+        match self {
+            GaussianFit::PerPhase(fit) => fit.step() >= end / 2,
+            GaussianFit::Start(_) => false,
+            GaussianFit::Deformable(_) => true,
+        }
+    }
+
+    /// Iterations done.
+    pub(crate) fn step(&self) -> u32 {
+        match self {
+            GaussianFit::PerPhase(fit) => fit.step(),
+            GaussianFit::Start(_) => 0,
+            GaussianFit::Deformable(fit) => fit.step(),
+        }
+    }
+
+    /// Share done of the preparation before the first iteration; none when that has begun.
+    pub(crate) fn preparation(&self) -> Option<f64> {
+        match self {
+            GaussianFit::Start(start) => Some(start.share()),
+            GaussianFit::PerPhase(_) | GaussianFit::Deformable(_) => None,
+        }
+    }
+
+    /// Runs some iterations towards `until`; returns their losses, none while a deformable set is in preparation.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::advance`] and [`DeformableStart::advance`].
+    pub(crate) fn advance(&mut self, until: u32) -> Result<Vec<f64>> {
+        match self {
+            GaussianFit::PerPhase(fit) => fit.advance(until),
+            GaussianFit::Start(start) => {
+                if let Some(deformable) = start.advance()? {
+                    *self = GaussianFit::Deformable(Box::new(deformable));
+                }
+                Ok(Vec::new())
+            }
+            GaussianFit::Deformable(fit) => fit.advance(until),
+        }
+    }
+
+    /// The field after the iterations done.
+    ///
+    /// # Errors
+    /// As [`GaussianTrainer::model`].
+    pub(crate) fn field(&self) -> Result<DynamicGaussians> {
+        Ok(match self {
+            GaussianFit::PerPhase(fit) => DynamicGaussians::PerPhase(fit.model()?),
+            GaussianFit::Start(start) => DynamicGaussians::PerPhase(start.field()?),
+            GaussianFit::Deformable(fit) => DynamicGaussians::Deformable(fit.deformable()?),
+        })
+    }
+
+    /// Number of Gaussians.
+    pub(crate) fn count(&self) -> u32 {
+        match self {
+            GaussianFit::PerPhase(fit) => fit.count(),
+            GaussianFit::Start(start) => start.count(),
+            GaussianFit::Deformable(fit) => fit.count(),
+        }
+    }
+
+    /// Form of the field that it fits.
+    pub(crate) fn form(&self) -> GaussianForm {
+        match self {
+            GaussianFit::PerPhase(_) => GaussianForm::Phase,
+            GaussianFit::Start(_) | GaussianFit::Deformable(_) => GaussianForm::Deformable,
+        }
+    }
+
+    /// Runs one iteration with a timestamp around each pass.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub(crate) fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        match self {
+            GaussianFit::PerPhase(fit) => fit.profile_step(),
+            GaussianFit::Start(_) => Err(not_begun()),
+            GaussianFit::Deformable(fit) => fit.profile_step(),
+        }
+    }
+
+    /// Work of the last iteration.
+    ///
+    /// # Errors
+    /// Device errors.
+    pub(crate) fn work(&self) -> Result<GaussianWork> {
+        match self {
+            GaussianFit::PerPhase(fit) => fit.work(),
+            GaussianFit::Start(_) => Err(not_begun()),
+            GaussianFit::Deformable(fit) => fit.work(),
+        }
+    }
+}
+
+fn not_begun() -> Error {
+    Error::Internal("the iterations of the deformable set have not begun".into())
+}
+
+impl TimedFit for GaussianFit {
+    fn form(&self) -> Option<&'static str> {
+        Some(GaussianFit::form(self).name())
+    }
+
+    fn step(&self) -> u32 {
+        GaussianFit::step(self)
+    }
+
+    fn is_prepared(&self) -> bool {
+        self.preparation().is_none()
+    }
+
+    fn advance(&mut self, until: u32) -> Result<usize> {
+        GaussianFit::advance(self, until).map(|losses| losses.len())
+    }
+
+    fn work(&self) -> Result<FitWork> {
+        Ok(FitWork { count: self.count(), work: GaussianFit::work(self)? })
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        GaussianFit::profile_step(self)
+    }
+}

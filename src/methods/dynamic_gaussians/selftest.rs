@@ -1,0 +1,171 @@
+//! One set of Gaussians that moves over the beat: an iteration of its fit, stage by stage.
+
+use crate::error::Result;
+use crate::gaussians::particles::Particles;
+use crate::gpu::buffer::Buffer;
+use crate::gpu::device::Gpu;
+use crate::gpu::record::Recording;
+use crate::kernels::dispatch::{BufferSet, dispatch_finding};
+use crate::kernels::layout::{DeformableSetup, GaussianSetup};
+use crate::kernels::push::{self, PushConstants};
+use crate::kernels::stages::{Build, Stage};
+use crate::methods::dynamic_gaussians::deformable::DeformableTrainer;
+use crate::methods::dynamic_gaussians::targets::Targets;
+use crate::methods::dynamic_gaussians::twin::{DeformableParams, loss_and_gradient, phases_shown, shown};
+use crate::reference::gaussians::{self as reference, N_PARAMS, Params};
+use crate::selftest::compare::{Findings, Tolerance, told};
+use crate::selftest::gaussians::{
+    LOSS, NUMBERS, REPORT, SPLAT, TwinSplat, compare_backward, compare_gradient, compare_splats, device_gradient, f32s,
+};
+use crate::selftest::problems::{deformable_case, deformable_set};
+use glam::DVec3;
+
+const PROJECT: &[&str] = &[push::DeformableProject::SHADER];
+const GRADIENT: &[&str] = &[push::DeformableGradient::SHADER];
+const GRID_GRADIENT: &[&str] = &[push::DeformableGridGradient::SHADER];
+const UPDATE: &[&str] = &[push::DeformableUpdate::SHADER];
+const GRID_UPDATE: &[&str] = &[push::DeformableGridUpdate::SHADER];
+const GUESS: &[&str] = &[push::DeformableGuess::SHADER];
+
+/// First steps of Adam, all of nearly the same length, which f32 displacements lose a little of.
+const FIRST_STEP: Tolerance = Tolerance::OfLargest(2e-3);
+/// Minimum slope that makes a full first step.
+const STEEP: f64 = 1e-3;
+
+fn flat(all: &[DVec3]) -> Vec<f64> {
+    all.iter().flat_map(|v| v.to_array()).collect()
+}
+
+fn vectors(gpu: &Gpu, buffer: &Buffer, n: usize) -> Result<Vec<f32>> {
+    let all: Vec<[f32; 4]> = gpu.download(buffer, 0, n)?;
+    Ok(all.iter().flat_map(|v| v[..3].to_vec()).collect())
+}
+
+fn upload(gpu: &Gpu, buffer: &Buffer, all: &[DVec3]) -> Result<()> {
+    Ok(gpu.upload(buffer, 0, &all.iter().map(|v| v.extend(0.0).as_vec4().to_array()).collect::<Vec<_>>())?)
+}
+
+/// Compares the stages of an iteration.
+///
+/// # Errors
+/// Device errors.
+pub fn compare(gpu: &Gpu, findings: &mut Findings) -> Result<()> {
+    findings.begin("deformable", "31 Gaussians, 14 images of 33 x 27 pixels");
+    let (targets, rows, config) = deformable_case()?;
+    let mut trainer = DeformableTrainer::with(gpu, targets.clone(), &config, &Particles::fresh(rows.clone()))?;
+    let (setup, deformable) = (*trainer.setup(), *trainer.deformable_setup());
+    let p = deformable_set(&rows, &deformable, targets.n_phases);
+    upload(gpu, &trainer.grid().motion_grid, &p.grid)?;
+    upload(gpu, &trainer.own_motion().own_motion, &p.own)?;
+    let images = trainer.images()?;
+    let (n, n_views, n_phases) = (rows.len(), targets.n_views, targets.n_phases);
+    let shown_at = |splat: usize| {
+        let (phase_and_view, i) = (splat / n, splat % n);
+        let (phase, image) = (phase_and_view / n_views, targets.image_of[phase_and_view]?);
+        Some((phase, image, shown(&deformable, &p, i, phase, &targets.views[image], n_phases)))
+    };
+    let shown: Vec<Option<(usize, usize, Params)>> = (0..n_phases * n_views * n).map(shown_at).collect();
+    let project = |(image, moved): (usize, &Params)| reference::project(moved, &targets.views[image], &setup);
+    let seen: Vec<TwinSplat> =
+        shown.iter().map(|s| s.as_ref().map(|(_, image, moved)| (*image, project((*image, moved))))).collect();
+    compare_splats(gpu, trainer.particles(), &setup, PROJECT, &seen, findings)?;
+    findings.numbers(SPLAT, "images", &images, &drawn(&targets, &setup, &seen), NUMBERS);
+    let loss = told(trainer.advance(1))?.first().copied().unwrap_or(f64::NAN);
+    let buffers = (trainer.target_buffers(), trainer.particles());
+    let (twin_loss, moments) = compare_backward(gpu, (&targets, &setup), buffers, &images, &seen, findings)?;
+    // By the device's moments: gradients of each Gaussian, and of its place at each phase.
+    let (mut want, mut places) = (vec![[0.0; N_PARAMS]; n], vec![DVec3::ZERO; n_phases * n]);
+    for (splat, shown) in shown.iter().enumerate() {
+        let Some((phase, image, moved)) = shown else { continue };
+        let view = &targets.views[*image];
+        let one = reference::gradient(moved, view, &setup, moments[splat]);
+        want[splat % n].iter_mut().zip(one).for_each(|(sum, g)| *sum += g);
+        for (phase, share) in phases_shown(*phase, view, n_phases) {
+            places[phase * n + splat % n] += share * DVec3::new(one[0], one[1], one[2]);
+        }
+    }
+    compare_gradient(&device_gradient(gpu, trainer.particles(), n)?, &want, GRADIENT, findings);
+    let got = vectors(gpu, &trainer.own_motion().place_gradient, places.len())?;
+    let want: Vec<f64> = places.iter().flat_map(DVec3::to_array).collect();
+    findings.numbers(GRADIENT, "gradient of positions", &got, &want, NUMBERS);
+    let (_, _, gradient) = loss_and_gradient(&targets, &setup, &deformable, &p);
+    compare_motion(gpu, &trainer, &deformable, (&p, &gradient), findings)?;
+    findings.add(REPORT, "loss", (loss / twin_loss - 1.0).abs(), LOSS);
+    compare_guess(gpu, &trainer, &p, n_phases, findings)
+}
+
+/// Images of splats as the twin sees them.
+fn drawn(targets: &Targets, setup: &GaussianSetup, seen: &[TwinSplat]) -> Vec<f64> {
+    let mut images = vec![0.0; targets.n_images * targets.n_pixels()];
+    for (image, projection) in seen.iter().flatten() {
+        if let Some(projection) = projection {
+            projection.splat(setup, &mut images[image * targets.n_pixels()..][..targets.n_pixels()]);
+        }
+    }
+    images
+}
+
+/// Compares gradients of grid and own motion, and the first step along them.
+fn compare_motion(
+    gpu: &Gpu,
+    trainer: &DeformableTrainer,
+    deformable: &DeformableSetup,
+    (p, gradient): (&DeformableParams, &DeformableParams),
+    findings: &mut Findings,
+) -> Result<()> {
+    let (grid, own) = (trainer.grid(), trainer.own_motion());
+    let slopes = flat(&gradient.grid);
+    let got = vectors(gpu, &grid.motion_grid_gradient, p.grid.len())?;
+    findings.numbers(GRID_GRADIENT, "gradient of the grid", &got, &slopes, NUMBERS);
+    // After one update Adam's first moment is a tenth of the gradient.
+    let first: Vec<f64> = flat(&gradient.own).iter().map(|g| 0.1 * g).collect();
+    let got = vectors(gpu, &own.own_motion_first, p.own.len())?;
+    findings.numbers(UPDATE, "first moments of own motion", &got, &first, NUMBERS);
+    let first: Vec<f64> = slopes.iter().map(|g| 0.1 * g).collect();
+    let got_first = vectors(gpu, &grid.motion_grid_first, p.grid.len())?;
+    let got_own = vectors(gpu, &own.own_motion, p.own.len())?;
+    let got_grid = vectors(gpu, &grid.motion_grid, p.grid.len())?;
+    compare_step(UPDATE, &got_own, (&p.own, &gradient.own), deformable.own_rate.into(), findings);
+    findings.numbers(GRID_UPDATE, "first moments of the grid", &got_first, &first, NUMBERS);
+    compare_step(GRID_UPDATE, &got_grid, (&p.grid, &gradient.grid), deformable.grid_rate.into(), findings);
+    Ok(())
+}
+
+/// Compares the first step: every number that has a slope moves by its rate, against the gradient.
+fn compare_step(
+    stages: &[&'static str],
+    got: &[f32],
+    (start, gradient): (&[DVec3], &[DVec3]),
+    rate: f64,
+    findings: &mut Findings,
+) {
+    let (start, slopes) = (flat(start), flat(gradient));
+    let steep: Vec<usize> = (0..got.len()).filter(|i| slopes[*i].abs() > STEEP).collect();
+    let moved: Vec<f64> = steep.iter().map(|i| f64::from(got[*i]) - start[*i]).collect();
+    let want: Vec<f64> = steep.iter().map(|i| -rate * slopes[*i].signum()).collect();
+    findings.numbers(stages, "first step", &f32s(&moved), &want, FIRST_STEP);
+}
+
+/// Compares where tracking begins: at the position of the phase before, plus half of its last step.
+fn compare_guess(
+    gpu: &Gpu,
+    trainer: &DeformableTrainer,
+    p: &DeformableParams,
+    n_phases: usize,
+    findings: &mut Findings,
+) -> Result<()> {
+    let (grid, nodes) = (trainer.grid(), p.grid.len() / n_phases);
+    upload(gpu, &grid.motion_grid, &p.grid)?;
+    let stage: Stage<push::DeformableGuess> = Build::default().stage(gpu)?;
+    let mut recording = Recording::new(gpu, "guess")?;
+    let push = push::DeformableGuess { phase: 3, before: 2, before_that: 1 };
+    dispatch_finding(&mut recording, &stage, stage.groups_for(nodes as u32), &[], |name| grid.find(name), push)?;
+    gpu.wait(recording.finish()?.submit()?)?;
+    let mut want = p.grid.clone();
+    for node in 0..nodes {
+        let (last, before) = (p.grid[2 * nodes + node], p.grid[nodes + node]);
+        want[3 * nodes + node] = last + 0.5 * (last - before);
+    }
+    findings.numbers(GUESS, "grid", &vectors(gpu, &grid.motion_grid, p.grid.len())?, &flat(&want), NUMBERS);
+    Ok(())
+}

@@ -1,0 +1,281 @@
+//! Combines the views' evidence at pixels into evidence at cells: sums over views, and support from the neighbouring phases.
+
+use crate::evidence::ratios::{LEAST, MOST, ViewEvidence};
+use crate::evidence::series::Series;
+use crate::fields::carve::Projector;
+use crate::geometry::ViewRays;
+use crate::model::hull::Hull;
+use crate::scan::dataset::Dataset;
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// Weight of the best neighbour at the phase before, and of the one after.
+const SUPPORT: f32 = 0.25;
+/// Minimum sum of a kept cell that four views or more see; the largest possible is 18 with four.
+const KEEP_FOUR_VIEWS: f32 = 9.5;
+/// Minimum sum per view of a kept cell that fewer views see; the largest possible is 4.5.
+const KEEP_PER_VIEW: f32 = 7.0 / 3.0;
+/// Lower limit of the neighbours' evidence, in units of a single view's strongest evidence against a cell.
+const MIN_SUPPORT: f32 = 2.5;
+
+/// A cell that may hold a moving vessel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HullCell {
+    /// Position on the grid, x fastest.
+    pub index: u32,
+    /// Evidence of all views and of the neighbouring phases for it: a log-likelihood ratio.
+    pub evidence: f32,
+}
+
+/// Cells that may hold a moving vessel, per phase, on a regular grid in world units.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SoftHull {
+    /// Cells along each axis.
+    pub resolution: usize,
+    /// Lower corner.
+    pub min: DVec3,
+    /// Side of a cell.
+    pub cell: f64,
+    /// Kept cells of each phase, by ascending index.
+    pub cells: Vec<Vec<HullCell>>,
+}
+
+/// The evidence of every training view with at least two phases, and the hull carved by it.
+#[derive(Debug, Clone)]
+pub struct SoftMotion {
+    /// Evidence of the views, on the dataset's canvas.
+    pub views: Vec<ViewEvidence>,
+    /// Cells that remain.
+    pub hull: SoftHull,
+}
+
+impl SoftMotion {
+    /// Analyses the training views and carves a cube of half side `half` (world units) into `resolution` (even) cells
+    /// along each axis.
+    pub fn new(dataset: &Dataset, half: f64, resolution: usize) -> SoftMotion {
+        let series = Series::of(dataset);
+        let views: Vec<ViewEvidence> =
+            series.par_iter().map(|s| ViewEvidence::new(s).on_canvas(dataset.canvas())).collect();
+        let hull = SoftHull::carve(dataset, &views, half, resolution.next_multiple_of(2));
+        SoftMotion { views, hull }
+    }
+}
+
+/// Evidence below which a cell is dropped, seen by so many views.
+fn threshold(n_views: usize) -> f32 {
+    KEEP_FOUR_VIEWS.min(KEEP_PER_VIEW * n_views as f32)
+}
+
+/// Pixels of the views under points, and the sums of their evidence.
+struct Votes<'a> {
+    /// Projectors of each view, or of each view at each phase where the heart's displacement differs from frame to frame.
+    projectors: Vec<Vec<Projector<'a>>>,
+    views: &'a [ViewEvidence],
+    /// Largest ratio of each pixel over the phases, per view.
+    largest: Vec<Vec<f32>>,
+    /// Views that must see a point.
+    needed: usize,
+}
+
+impl<'a> Votes<'a> {
+    fn new(dataset: &'a Dataset, views: &'a [ViewEvidence]) -> Votes<'a> {
+        let projectors = |v: &ViewEvidence| -> Vec<Projector> {
+            let projector = |rays: &ViewRays| Projector::new(dataset, v.view, rays);
+            if !dataset.heart_shifts() {
+                return vec![projector(&dataset.views[v.view].rays)];
+            }
+            (0..dataset.n_phases).map(|phase| projector(&dataset.heart_rays_at(v.view, phase))).collect()
+        };
+        let largest = |v: &ViewEvidence| {
+            let mut max = vec![LEAST; dataset.n_pixels()];
+            for ratio in v.ratios.iter().flatten() {
+                max.iter_mut().zip(&ratio.values).for_each(|(m, v)| *m = m.max(*v));
+            }
+            max
+        };
+        Votes {
+            projectors: views.iter().map(projectors).collect(),
+            views,
+            largest: views.iter().map(largest).collect(),
+            needed: views.len().min(2),
+        }
+    }
+
+    /// Number of views that have the phase.
+    fn n_at(&self, phase: usize) -> usize {
+        self.views.iter().filter(|v| v.ratios[phase].is_some()).count()
+    }
+
+    /// Tells whether the pixels of a point differ from phase to phase.
+    fn moves(&self) -> bool {
+        self.projectors.iter().any(|of_view| of_view.len() > 1)
+    }
+
+    fn pixels(&self, point: DVec3, phase: usize, pixels: &mut [Option<usize>]) {
+        for (pixel, of_view) in pixels.iter_mut().zip(&self.projectors) {
+            *pixel = of_view[if of_view.len() > 1 { phase } else { 0 }].pixel(point);
+        }
+    }
+
+    /// Sum of the ratios at a phase over the views that see the point then; `None` where too few do.
+    fn at(&self, phase: usize, pixels: &[Option<usize>]) -> Option<f32> {
+        let seen = self.views.iter().zip(pixels).filter_map(|(v, p)| Some(v.ratios[phase].as_ref()?.values[(*p)?]));
+        let (sum, count) = seen.fold((0.0, 0), |(sum, count), ratio| (sum + ratio, count + 1));
+        (count >= self.needed).then_some(sum)
+    }
+
+    /// Upper bound of the sums of all phases.
+    fn at_most(&self, pixels: &[Option<usize>]) -> Option<f32> {
+        let seen = self.largest.iter().zip(pixels).filter_map(|(max, p)| Some(max[(*p)?]));
+        let (sum, count) = seen.fold((0.0, 0), |(sum, count), ratio| (sum + ratio, count + 1));
+        // A view without the phase adds 0, which may exceed its evidence against the cell at other phases.
+        (count >= self.needed).then_some(sum.max(0.0))
+    }
+}
+
+fn centre(min: DVec3, cell: f64, n: usize, index: usize) -> DVec3 {
+    let at = DVec3::new((index % n) as f64, (index / n % n) as f64, (index / (n * n)) as f64);
+    min + (at + 0.5) * cell
+}
+
+/// Evidence of the neighbours at the previous and the next phase for each cell of a grid of `n` cells a side, per phase: a
+/// vessel moves at most a coarse cell per phase.
+fn support(votes: &Votes<'_>, min: DVec3, cell: f64, n: usize, n_phases: usize) -> Vec<Vec<f32>> {
+    let least = MIN_SUPPORT * LEAST;
+    let mut sums = vec![vec![least; n * n * n]; n_phases];
+    let slabs: Vec<Vec<f32>> = (0..n)
+        .into_par_iter()
+        .map(|z| {
+            let mut slab = vec![least; n_phases * n * n];
+            let mut pixels = vec![None; votes.views.len()];
+            for at in 0..n * n {
+                let point = centre(min, cell, n, z * n * n + at);
+                for phase in 0..n_phases {
+                    if phase == 0 || votes.moves() {
+                        votes.pixels(point, phase, &mut pixels);
+                    }
+                    slab[phase * n * n + at] = votes.at(phase, &pixels).unwrap_or(least).max(least);
+                }
+            }
+            slab
+        })
+        .collect();
+    for (phase, sums) in sums.iter_mut().enumerate() {
+        for (z, slab) in slabs.iter().enumerate() {
+            sums[z * n * n..][..n * n].copy_from_slice(&slab[phase * n * n..][..n * n]);
+        }
+    }
+    let best: Vec<Vec<f32>> = sums.par_iter().map(|sums| largest_neighbour(sums, n)).collect();
+    // The phases cover a whole beat, so the last is next to the first.
+    (0..n_phases)
+        .into_par_iter()
+        .map(|t| {
+            let (before, after) = (&best[(t + n_phases - 1) % n_phases], &best[(t + 1) % n_phases]);
+            before.iter().zip(after).map(|(a, b)| SUPPORT * (a + b)).collect()
+        })
+        .collect()
+}
+
+/// Largest value of the 3 x 3 x 3 cells around each, axis by axis.
+fn largest_neighbour(values: &[f32], n: usize) -> Vec<f32> {
+    let mut out = values.to_vec();
+    for stride in [1, n, n * n] {
+        let source = out.clone();
+        for (i, value) in out.iter_mut().enumerate() {
+            let along = i / stride % n;
+            if along > 0 {
+                *value = value.max(source[i - stride]);
+            }
+            if along + 1 < n {
+                *value = value.max(source[i + stride]);
+            }
+        }
+    }
+    out
+}
+
+impl SoftHull {
+    /// Carves a cube of half side `half` (world units) into `resolution` (even) cells a side. A cell stays at a phase when the
+    /// summed evidence of the views that see it, and the support of its neighbours at the adjacent phases, reach a threshold:
+    /// no single view can veto it.
+    pub fn carve(dataset: &Dataset, views: &[ViewEvidence], half: f64, resolution: usize) -> SoftHull {
+        let n = resolution;
+        let cell = 2.0 * half / n as f64;
+        let min = DVec3::splat(-half);
+        let n_phases = dataset.n_phases as usize;
+        let empty = SoftHull { resolution: n, min, cell, cells: vec![Vec::new(); n_phases] };
+        if views.is_empty() {
+            return empty;
+        }
+        let votes = Votes::new(dataset, views);
+        let coarse = n / 2;
+        let support = support(&votes, min, 2.0 * cell, coarse, n_phases);
+        let mut max_support = vec![f32::MIN; coarse.pow(3)];
+        for phase in &support {
+            max_support.iter_mut().zip(phase).for_each(|(max, v)| *max = max.max(*v));
+        }
+        let thresholds: Vec<f32> = (0..n_phases).map(|phase| threshold(votes.n_at(phase))).collect();
+        let least = thresholds.iter().copied().fold(f32::MAX, f32::min);
+        let slabs: Vec<Vec<Vec<HullCell>>> = (0..n)
+            .into_par_iter()
+            .map(|z| {
+                let mut kept = vec![Vec::new(); n_phases];
+                let mut pixels = vec![None; views.len()];
+                for at in 0..n * n {
+                    let index = z * n * n + at;
+                    let beside = ((z / 2) * coarse + at / n / 2) * coarse + at % n / 2;
+                    // The evidence of a view never exceeds MOST: many cells are settled without looking at a pixel.
+                    if MOST * views.len() as f32 + max_support[beside] < least {
+                        continue;
+                    }
+                    let point = centre(min, cell, n, index);
+                    votes.pixels(point, 0, &mut pixels);
+                    let hopeless = || votes.at_most(&pixels).is_none_or(|max| max + max_support[beside] < least);
+                    if !votes.moves() && hopeless() {
+                        continue;
+                    }
+                    for (phase, kept) in kept.iter_mut().enumerate() {
+                        if votes.moves() {
+                            votes.pixels(point, phase, &mut pixels);
+                        }
+                        let Some(sum) = votes.at(phase, &pixels) else { continue };
+                        let evidence = sum + support[phase][beside];
+                        if evidence >= thresholds[phase] {
+                            kept.push(HullCell { index: index as u32, evidence });
+                        }
+                    }
+                }
+                kept
+            })
+            .collect();
+        let mut hull = empty;
+        for slab in slabs {
+            hull.cells.iter_mut().zip(slab).for_each(|(all, kept)| all.extend(kept));
+        }
+        hull
+    }
+
+    /// Centre of a cell, world units.
+    pub fn centre(&self, index: u32) -> DVec3 {
+        centre(self.min, self.cell, self.resolution, index as usize)
+    }
+
+    /// Kept share of all cells, averaged over phases.
+    pub fn share(&self) -> f64 {
+        let kept: usize = self.cells.iter().map(Vec::len).sum();
+        kept as f64 / (self.resolution.pow(3) * self.cells.len().max(1)) as f64
+    }
+
+    /// Returns the hull's cells as bits, which training masks samples with, and which are drawn and exported.
+    pub fn to_hull(&self) -> Hull {
+        let n = self.resolution;
+        let words = n.pow(3).div_ceil(32);
+        let mut bits = vec![0u32; words * self.cells.len()];
+        for (cells, bits) in self.cells.iter().zip(bits.chunks_mut(words)) {
+            for cell in cells {
+                bits[cell.index as usize / 32] |= 1 << (cell.index % 32);
+            }
+        }
+        Hull { size: [n; 3], min: self.min, cell: self.cell, n_phases: self.cells.len(), bits }
+    }
+}
