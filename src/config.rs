@@ -11,7 +11,6 @@ mod length;
 pub mod method;
 mod nerf_ca;
 mod nert_ca;
-mod presets;
 mod r2_gaussian;
 pub(crate) mod renamed;
 mod sax_nerf;

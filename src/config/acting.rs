@@ -3,20 +3,12 @@
 //! recorded in checkpoints, so that a run continues with the numbers that it began with.
 
 use crate::choice::Choice;
-use crate::config::method::MethodKind;
-use crate::config::{Config, Preset, dynamic_gaussians, nerf_ca, nert_ca, r2_gaussian, sax_nerf, x_gaussian};
+use crate::config::{Config, Preset};
 use crate::error::{Error, Result};
 
 /// Tells whether a setting, such as `train.rays`, is a key of a preset: one that all methods share, or one of its method.
 fn is_key_of(preset: Preset, key: &str) -> bool {
-    let of_method = || match Config::preset(preset).method() {
-        MethodKind::NertCa => nert_ca::is_key(preset, key),
-        MethodKind::NerfCa => nerf_ca::is_key(key),
-        MethodKind::DynamicGaussians => dynamic_gaussians::is_key(key),
-        MethodKind::R2Gaussian => r2_gaussian::is_key(key),
-        MethodKind::XGaussian => x_gaussian::is_key(key),
-        MethodKind::SaxNerf => sax_nerf::is_key(key),
-    };
+    let of_method = || Config::preset(preset).method().settings().is_key(preset, key);
     match key.split_once('.') {
         None | Some(("calibrate", _)) | Some(("march", "render_samples")) => true,
         Some(("train", name)) if !["rays", "motion_share", "validate_images"].contains(&name) => true,

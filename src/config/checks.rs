@@ -53,7 +53,7 @@ impl Config {
             return Err(Error::config("train.iterations", t.iterations, "iterations x rays must stay below 2^32"));
         }
         self.check_forms()?;
-        self.method().check(self)?;
+        self.method().settings().check(self)?;
         if m.along_axis && self.gaussians.form != GaussianForm::None {
             let problem = "is not supported with Gaussians, which are integrated along rays; set it to false, or set \
                            gaussians.form = \"none\"";

@@ -1,6 +1,7 @@
 //! Settings of Gaussians in front of a static tensor field: the preset `fast`.
 
 use crate::config::fields::TENSOR_KEYS;
+use crate::config::method::MethodSettings;
 use crate::config::section::section;
 use crate::config::sections::{DynamicField, March, Occupancy, StaticField, Train};
 use crate::config::{Config, GaussianForm, Preset, nert_ca};
@@ -167,7 +168,7 @@ pub(super) fn fast() -> Config {
         // Three or four views do not determine how a low-rank field looks from other angles; smoothness does. Few iterations
         // need large steps.
         static_field: StaticField { tv: 100.0, lr: 3e-2, lr_end: 3e-3, ..mlp.static_field },
-        // The network is never evaluated; the smallest one takes hardly any memory.
+        // There is no network; its settings are recorded only.
         dynamic: DynamicField {
             layers: 1,
             width: 16,
@@ -183,23 +184,23 @@ pub(super) fn fast() -> Config {
     }
 }
 
-/// Refuses settings that contradict each other.
-///
-/// # Errors
-/// [`Error::Config`] naming the key.
-pub(super) fn check(config: &Config) -> Result<()> {
-    let Gaussians { min_scale, max_scale, .. } = config.gaussians;
-    if min_scale > max_scale {
-        return Err(Error::config(
-            "gaussians.min_scale",
-            min_scale,
-            format!("exceeds gaussians.max_scale = {max_scale}"),
-        ));
-    }
-    Ok(())
-}
+/// Settings of the method, for [`MethodKind::settings`](crate::config::method::MethodKind::settings).
+pub(super) struct Settings;
 
-/// Tells whether a setting, such as `gaussians.count`, is a key of this method.
-pub(super) fn is_key(key: &str) -> bool {
-    TENSOR_KEYS.contains(&key) || ["gaussians.form", "gaussians.iterations", "gaussians.count"].contains(&key)
+impl MethodSettings for Settings {
+    fn check(&self, config: &Config) -> Result<()> {
+        let Gaussians { min_scale, max_scale, .. } = config.gaussians;
+        if min_scale > max_scale {
+            return Err(Error::config(
+                "gaussians.min_scale",
+                min_scale,
+                format!("exceeds gaussians.max_scale = {max_scale}"),
+            ));
+        }
+        Ok(())
+    }
+
+    fn is_key(&self, _: Preset, key: &str) -> bool {
+        TENSOR_KEYS.contains(&key) || ["gaussians.form", "gaussians.iterations", "gaussians.count"].contains(&key)
+    }
 }

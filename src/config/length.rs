@@ -1,57 +1,26 @@
 //! Runs of another length: schedules that keep their shares of the run, and the iterations at which they change something.
 
-use crate::config::method::MethodKind;
+use crate::config::method::Scaled;
 use crate::config::{Config, GaussianForm};
 use crate::error::Result;
 
-/// Minimum number of iterations between two density controls of a shortened run: an iteration with density control learns
-/// nothing.
-const MIN_BETWEEN_DENSIFYING: u32 = 10;
-
 /// Iterations of a dry run: enough for every event of the presets to have iterations before and after it.
-const DRY_RUN: u32 = 20;
+pub(super) const DRY_RUN: u32 = 20;
 /// Iterations of a dry run with density control, which happens at most every ten iterations.
-const DRY_RUN_WITH_DENSIFYING: u32 = 60;
+pub(super) const DRY_RUN_WITH_DENSIFYING: u32 = 60;
 /// Minimum number of iterations of a dry run after its last event.
 const AFTER_THE_LAST: u32 = 4;
 
 impl Config {
     /// Returns the settings, with their keys, that keep the schedule's shares of a run of so many iterations.
     pub fn schedule_of_length(&self, iterations: u32) -> Vec<(&'static str, u32)> {
-        let share = f64::from(iterations) / f64::from(self.train.iterations);
-        let of = |count: u32| (share * f64::from(count)).round() as u32;
-        let densifying = |count: u32| if count == 0 { 0 } else { of(count).max(MIN_BETWEEN_DENSIFYING) };
+        let scaled = Scaled(f64::from(iterations) / f64::from(self.train.iterations));
         let mut schedule = vec![
-            ("dynamic.delay", of(self.dynamic.delay)),
-            ("dynamic.window_iterations", of(self.dynamic.window_iterations)),
-            ("occupancy.start", of(self.occupancy.start)),
+            ("dynamic.delay", scaled.count(self.dynamic.delay)),
+            ("dynamic.window_iterations", scaled.count(self.dynamic.window_iterations)),
+            ("occupancy.start", scaled.count(self.occupancy.start)),
         ];
-        if self.method() == MethodKind::NerfCa {
-            schedule.extend([
-                ("networks.delay", of(self.networks.delay)),
-                ("networks.ramp", of(self.networks.ramp)),
-                ("networks.stop_after", of(self.networks.stop_after)),
-            ]);
-        }
-        if self.method() == MethodKind::R2Gaussian {
-            schedule.extend([
-                ("r2.densification_interval", densifying(self.r2.densify_every)),
-                ("r2.densify_from_iter", of(self.r2.densify_from)),
-                ("r2.densify_until_iter", of(self.r2.densify_until)),
-            ]);
-        }
-        if self.method() == MethodKind::XGaussian {
-            schedule.extend([
-                ("x.densification_interval", densifying(self.x.densify_every)),
-                ("x.densify_from_iter", of(self.x.densify_from)),
-                ("x.densify_until_iter", of(self.x.densify_until)),
-                ("x.opacity_reset_interval", of(self.x.reset_every)),
-                ("x.degree_every", of(self.x.degree_every)),
-            ]);
-        }
-        if self.method() == MethodKind::SaxNerf {
-            schedule.push(("sax.lrate_step", of(self.sax.rate_falls_at)));
-        }
+        schedule.extend(self.method().settings().schedule(self, &scaled));
         schedule
     }
 
@@ -72,10 +41,8 @@ impl Config {
     /// # Errors
     /// [`crate::error::Error::Config`] when so short a run is refused.
     pub fn of_dry_run(&self) -> Result<Config> {
-        let iterations = match self.method() {
-            MethodKind::R2Gaussian | MethodKind::XGaussian => DRY_RUN_WITH_DENSIFYING,
-            _ => DRY_RUN,
-        };
+        let method = self.method().settings();
+        let iterations = method.dry_run_length();
         if self.train.iterations <= iterations {
             return Ok(self.clone());
         }
@@ -84,10 +51,7 @@ impl Config {
             // A fit of Gaussians has its own number of iterations, which does not scale with the run.
             short.train.iterations = short.gaussians.iterations.saturating_add(iterations).min(self.train.iterations);
         }
-        if short.method() == MethodKind::SaxNerf {
-            // Its only event lies within the last iterations of the publication.
-            short.sax.rate_falls_at = short.sax.rate_falls_at.min(iterations / 2);
-        }
+        method.shorten(&mut short, iterations);
         let last = short.schedule_events().last().copied().unwrap_or(0);
         short.train.iterations = short.train.iterations.max(last.saturating_add(AFTER_THE_LAST));
         Ok(short)
@@ -101,19 +65,7 @@ impl Config {
             events.extend(self.restart());
             events.push(self.dynamic.delay.saturating_add(self.dynamic.window_iterations));
         }
-        if self.method() == MethodKind::NerfCa {
-            let n = &self.networks;
-            events.extend([n.delay, n.delay.saturating_add(n.ramp), n.stop_after]);
-        }
-        if self.method() == MethodKind::R2Gaussian {
-            events.extend([self.r2.densify_from, self.r2.densify_until]);
-        }
-        if self.method() == MethodKind::XGaussian {
-            events.extend([self.x.degree_every, self.x.densify_from, self.x.reset_every, self.x.densify_until]);
-        }
-        if self.method() == MethodKind::SaxNerf {
-            events.push(self.sax.rate_falls_at);
-        }
+        events.extend(self.method().settings().events(self));
         if self.occupancy.enabled {
             events.push(self.dynamic.delay.saturating_add(self.occupancy.start));
         }

@@ -1,6 +1,7 @@
 //! Methods of reconstruction, as a configuration chooses them.
 
-use crate::config::{Config, dynamic_gaussians, nerf_ca, r2_gaussian, sax_nerf, x_gaussian};
+use crate::config::length::DRY_RUN;
+use crate::config::{Config, Preset, dynamic_gaussians, nerf_ca, nert_ca, r2_gaussian, sax_nerf, x_gaussian};
 use crate::error::Result;
 
 /// A method of reconstruction. Each has settings of its own beside those that all methods share.
@@ -20,19 +21,83 @@ pub enum MethodKind {
     SaxNerf,
 }
 
-impl MethodKind {
+impl Config {
+    /// Returns the defaults of a preset.
+    pub fn preset(preset: Preset) -> Config {
+        match preset {
+            Preset::Fast => dynamic_gaussians::fast(),
+            Preset::FastMlp => nert_ca::fast_mlp(),
+            Preset::Paper => nert_ca::paper(),
+            Preset::PublicCode => nert_ca::public_code(),
+            Preset::NerfCa => nerf_ca::nerf_ca(),
+            Preset::R2Gaussian => r2_gaussian::r2_gaussian(),
+            Preset::XGaussian => x_gaussian::x_gaussian(),
+            Preset::SaxNerf => sax_nerf::sax_nerf(),
+        }
+    }
+}
+
+/// Share of a schedule's length that a run of another length has.
+pub(super) struct Scaled(pub(super) f64);
+
+impl Scaled {
+    /// Minimum number of iterations between two density controls of a shortened run: an iteration with density control learns
+    /// nothing.
+    const MIN_INTERVAL: u32 = 10;
+
+    /// Returns a number of iterations of the run of another length.
+    pub(super) fn count(&self, iterations: u32) -> u32 {
+        (self.0 * f64::from(iterations)).round() as u32
+    }
+
+    /// Returns the number of iterations between two density controls of the run of another length; 0 stays 0.
+    pub(super) fn interval(&self, iterations: u32) -> u32 {
+        if iterations == 0 { 0 } else { self.count(iterations).max(Self::MIN_INTERVAL) }
+    }
+}
+
+/// Settings of a method: the checks of their combinations, the keys, and the schedule.
+pub(super) trait MethodSettings {
     /// Refuses settings that the method does not support, or that contradict each other.
     ///
     /// # Errors
     /// [`crate::error::Error::Config`] naming the key.
-    pub(super) fn check(self, config: &Config) -> Result<()> {
+    fn check(&self, _config: &Config) -> Result<()> {
+        Ok(())
+    }
+
+    /// Tells whether a setting, such as `static.lr`, is a key of a preset of this method.
+    fn is_key(&self, preset: Preset, key: &str) -> bool;
+
+    /// Returns the method's own settings, with their keys, that keep the schedule's shares of a run of another length.
+    fn schedule(&self, _config: &Config, _scaled: &Scaled) -> Vec<(&'static str, u32)> {
+        Vec::new()
+    }
+
+    /// Returns the iterations at which the method's own schedule changes something, in any order.
+    fn events(&self, _config: &Config) -> Vec<u32> {
+        Vec::new()
+    }
+
+    /// Returns the iterations of a dry run.
+    fn dry_run_length(&self) -> u32 {
+        DRY_RUN
+    }
+
+    /// Moves events that the schedule of a dry run of so many iterations would leave out.
+    fn shorten(&self, _config: &mut Config, _iterations: u32) {}
+}
+
+impl MethodKind {
+    /// Returns the settings of the method.
+    pub(super) fn settings(self) -> &'static dyn MethodSettings {
         match self {
-            MethodKind::NertCa => Ok(()),
-            MethodKind::NerfCa => nerf_ca::check(config),
-            MethodKind::DynamicGaussians => dynamic_gaussians::check(config),
-            MethodKind::R2Gaussian => r2_gaussian::check(config),
-            MethodKind::XGaussian => x_gaussian::check(config),
-            MethodKind::SaxNerf => sax_nerf::check(config),
+            MethodKind::NertCa => &nert_ca::Settings,
+            MethodKind::NerfCa => &nerf_ca::Settings,
+            MethodKind::DynamicGaussians => &dynamic_gaussians::Settings,
+            MethodKind::R2Gaussian => &r2_gaussian::Settings,
+            MethodKind::XGaussian => &x_gaussian::Settings,
+            MethodKind::SaxNerf => &sax_nerf::Settings,
         }
     }
 

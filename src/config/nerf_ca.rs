@@ -1,6 +1,7 @@
 //! Settings of NeRF-CA: the preset `nerf-ca`.
 
 use crate::config::fields::NETWORK_KEYS;
+use crate::config::method::{MethodSettings, Scaled};
 use crate::config::section::section;
 use crate::config::sections::{Adam, DynamicField, March, StaticField, Train};
 use crate::config::{Config, DynamicTarget, OcclusionRegion, Preset, StaticForm, nert_ca};
@@ -114,69 +115,86 @@ pub(super) fn nerf_ca() -> Config {
     }
 }
 
-/// Refuses settings that two networks do not support.
-pub(super) fn check(config: &Config) -> Result<()> {
-    let form = "is not supported with static.form = \"network\"";
-    let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
-        Err(Error::config(field, value, format!("{form}: {instead}")))
-    };
-    for (field, is_on) in [
-        ("hull.enabled", config.hull.enabled),
-        ("occupancy.enabled", config.occupancy.enabled),
-        ("loss.normalise", config.loss.normalise),
-        ("dynamic.encode_box", config.dynamic.encode_box),
-        ("march.fit_dynamic_range", config.march.fit_dynamic_range),
-        ("march.fit_static_range", config.march.fit_static_range),
-    ] {
-        if is_on {
-            return refuse(field, &true, "both fields are evaluated everywhere, in world units; set it to false");
-        }
-    }
-    if config.loss.dynamic_target != DynamicTarget::Absolute {
-        return refuse(
-            "loss.dynamic_target",
-            &"temporal",
-            "both fields are trained on the same residual; set it to \"absolute\"",
-        );
-    }
-    for (field, value) in [
-        ("dynamic.delay", f64::from(config.dynamic.delay)),
-        ("dynamic.min_slope", config.dynamic.min_slope),
-        ("dynamic.occlusion", config.dynamic.occlusion),
-    ] {
-        if value != 0.0 {
-            let instead = "set it to 0 (networks.near_integral is the weight near the source; networks.delay and \
-                           networks.ramp are its times)";
-            return refuse(field, &value, instead);
-        }
-    }
-    if config.dynamic.occlusion_region != OcclusionRegion::DepthRange {
-        return refuse(
-            "dynamic.occlusion_region",
-            &"last-ray",
-            "it belongs to dynamic.occlusion, which is not used; set it to \"depth-range\"",
-        );
-    }
-    let preset = Config::preset(config.preset);
-    for (field, value, unused) in [
-        ("dynamic.half_extent_mm", config.dynamic.half_extent_mm, preset.dynamic.half_extent_mm),
-        ("dynamic.normalised_shift", config.dynamic.normalised_shift, preset.dynamic.normalised_shift),
-        ("march.static_samples", config.march.static_samples.into(), preset.march.static_samples.into()),
-    ] {
-        if value != unused {
-            let instead = format!("it has no effect there; leave it at the preset's value, {unused}");
-            return refuse(field, &value, &instead);
-        }
-    }
-    Ok(())
-}
-
 /// Constants of NeRF-CA's public code.
 const CONSTANTS: [&str; 7] =
     ["gain", "change_weight", "min_change", "min_integral", "ramp", "stop_after", "stop_below"];
 
-/// Tells whether a setting, such as `networks.delay`, is a key of this method.
-pub(super) fn is_key(key: &str) -> bool {
-    let of_networks = key.strip_prefix("networks.").is_some_and(|name| !CONSTANTS.contains(&name));
-    of_networks || NETWORK_KEYS.contains(&key) || ["train.motion_share", "dynamic.occlusion_share"].contains(&key)
+/// Settings of the method, for [`MethodKind::settings`](crate::config::method::MethodKind::settings).
+pub(super) struct Settings;
+
+impl MethodSettings for Settings {
+    fn check(&self, config: &Config) -> Result<()> {
+        let form = "is not supported with static.form = \"network\"";
+        let refuse = |field: &str, value: &dyn std::fmt::Display, instead: &str| {
+            Err(Error::config(field, value, format!("{form}: {instead}")))
+        };
+        for (field, is_on) in [
+            ("hull.enabled", config.hull.enabled),
+            ("occupancy.enabled", config.occupancy.enabled),
+            ("loss.normalise", config.loss.normalise),
+            ("dynamic.encode_box", config.dynamic.encode_box),
+            ("march.fit_dynamic_range", config.march.fit_dynamic_range),
+            ("march.fit_static_range", config.march.fit_static_range),
+        ] {
+            if is_on {
+                return refuse(field, &true, "both fields are evaluated everywhere, in world units; set it to false");
+            }
+        }
+        if config.loss.dynamic_target != DynamicTarget::Absolute {
+            return refuse(
+                "loss.dynamic_target",
+                &"temporal",
+                "both fields are trained on the same residual; set it to \"absolute\"",
+            );
+        }
+        for (field, value) in [
+            ("dynamic.delay", f64::from(config.dynamic.delay)),
+            ("dynamic.min_slope", config.dynamic.min_slope),
+            ("dynamic.occlusion", config.dynamic.occlusion),
+        ] {
+            if value != 0.0 {
+                let instead = "set it to 0 (networks.near_integral is the weight near the source; networks.delay and \
+                               networks.ramp are its times)";
+                return refuse(field, &value, instead);
+            }
+        }
+        if config.dynamic.occlusion_region != OcclusionRegion::DepthRange {
+            return refuse(
+                "dynamic.occlusion_region",
+                &"last-ray",
+                "it belongs to dynamic.occlusion, which is not used; set it to \"depth-range\"",
+            );
+        }
+        let preset = Config::preset(config.preset);
+        for (field, value, unused) in [
+            ("dynamic.half_extent_mm", config.dynamic.half_extent_mm, preset.dynamic.half_extent_mm),
+            ("dynamic.normalised_shift", config.dynamic.normalised_shift, preset.dynamic.normalised_shift),
+            ("march.static_samples", config.march.static_samples.into(), preset.march.static_samples.into()),
+        ] {
+            if value != unused {
+                let instead = format!("it has no effect there; leave it at the preset's value, {unused}");
+                return refuse(field, &value, &instead);
+            }
+        }
+        Ok(())
+    }
+
+    fn is_key(&self, _: Preset, key: &str) -> bool {
+        let of_networks = key.strip_prefix("networks.").is_some_and(|name| !CONSTANTS.contains(&name));
+        of_networks || NETWORK_KEYS.contains(&key) || ["train.motion_share", "dynamic.occlusion_share"].contains(&key)
+    }
+
+    fn schedule(&self, config: &Config, scaled: &Scaled) -> Vec<(&'static str, u32)> {
+        let n = &config.networks;
+        vec![
+            ("networks.delay", scaled.count(n.delay)),
+            ("networks.ramp", scaled.count(n.ramp)),
+            ("networks.stop_after", scaled.count(n.stop_after)),
+        ]
+    }
+
+    fn events(&self, config: &Config) -> Vec<u32> {
+        let n = &config.networks;
+        vec![n.delay, n.delay.saturating_add(n.ramp), n.stop_after]
+    }
 }

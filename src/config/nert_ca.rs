@@ -1,6 +1,7 @@
 //! Settings of NerT-CA: the presets `paper`, `public-code` and `fast-mlp`.
 
 use crate::config::fields::{NETWORK_KEYS, TENSOR_KEYS};
+use crate::config::method::MethodSettings;
 use crate::config::sections::{Adam, Calibrate, DynamicField, Hull, Loss, March, Occupancy, StaticField, Train};
 use crate::config::{
     CalibrateMode, Config, Decay, DynamicForm, DynamicTarget, OcclusionRegion, Preset, StaticForm, dynamic_gaussians,
@@ -169,12 +170,16 @@ pub(super) fn fast_mlp() -> Config {
     }
 }
 
-/// Tells whether a setting, such as `static.lr`, is a key of a preset of this method.
-pub(super) fn is_key(preset: Preset, key: &str) -> bool {
-    let of_preset: &[&str] = match preset {
-        Preset::FastMlp => &["loss.dynamic_target", "hull.enabled"],
-        _ => &["dynamic.occlusion", "dynamic.occlusion_share", "loss.normalise"],
-    };
-    let own = ["dynamic.latent", "dynamic.window_start", "dynamic.delay"];
-    [&TENSOR_KEYS[..], &NETWORK_KEYS[..], &own[..], of_preset].iter().any(|keys| keys.contains(&key))
+/// Settings of the method, for [`MethodKind::settings`](crate::config::method::MethodKind::settings).
+pub(super) struct Settings;
+
+impl MethodSettings for Settings {
+    fn is_key(&self, preset: Preset, key: &str) -> bool {
+        let of_preset: &[&str] = match preset {
+            Preset::FastMlp => &["loss.dynamic_target", "hull.enabled"],
+            _ => &["dynamic.occlusion", "dynamic.occlusion_share", "loss.normalise"],
+        };
+        let own = ["dynamic.latent", "dynamic.window_start", "dynamic.delay"];
+        [&TENSOR_KEYS[..], &NETWORK_KEYS[..], &own[..], of_preset].iter().any(|keys| keys.contains(&key))
+    }
 }

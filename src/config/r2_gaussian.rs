@@ -1,6 +1,8 @@
 //! Settings of R2-Gaussian: the preset `r2-gaussian`.
 
 use crate::config::checks::check_alone;
+use crate::config::length::DRY_RUN_WITH_DENSIFYING;
+use crate::config::method::{MethodSettings, Scaled};
 use crate::config::section::section;
 use crate::config::sections::{Adam, DynamicField, Gaussians, March, StaticField, Train};
 use crate::config::{Config, GaussianForm, Preset, R2Integral, R2Start, StaticData, StaticForm, nert_ca};
@@ -153,7 +155,7 @@ pub(super) fn r2_gaussian() -> Config {
         // Rays are marched through neither field, and there is no static field.
         march: March { static_samples: 2, dynamic_samples: 2, render_samples: 2, ..paper.march },
         static_field: StaticField { form: StaticForm::None, ..paper.static_field },
-        // The network is never evaluated; the smallest one takes hardly any memory.
+        // There is no network; its settings are recorded only.
         dynamic: DynamicField { layers: 1, width: 16, latent: 4, bands: 1, delay: 0, ..paper.dynamic },
         adam: Adam { beta2: 0.999, epsilon: 1e-15, ..paper.adam },
         gaussians: Gaussians { form: GaussianForm::R2, ..paper.gaussians },
@@ -161,32 +163,51 @@ pub(super) fn r2_gaussian() -> Config {
     }
 }
 
-/// Refuses settings of R2-Gaussian that contradict each other.
-pub(super) fn check(config: &Config) -> Result<()> {
-    check_alone(config)?;
-    let r2 = &config.r2;
-    if r2.tv_box > r2.voxels {
-        return Err(Error::config("r2.tv_vol_size", r2.tv_box, format!("exceeds r2.voxels = {}", r2.voxels)));
-    }
-    if r2.min_scale >= r2.max_scale {
-        let problem = format!("is not below r2.scale_max = {}", r2.max_scale);
-        return Err(Error::config("r2.scale_min", r2.min_scale, problem));
-    }
-    if r2.count > r2.max_num_gaussians {
-        return Err(Error::config(
-            "r2.n_points",
-            r2.count,
-            format!("exceeds r2.max_num_gaussians = {}", r2.max_num_gaussians),
-        ));
-    }
-    Ok(())
-}
-
 /// Constants of R2-Gaussian's public code, and our choice of units and of what the total variation moves.
 const CONSTANTS: [&str; 6] =
     ["init", "normalise", "density_rescale", "density_thresh", "scale_min", "tv_moves_centres"];
 
-/// Tells whether a setting, such as `r2.n_points`, is a key of this method.
-pub(super) fn is_key(key: &str) -> bool {
-    key.strip_prefix("r2.").is_some_and(|name| !CONSTANTS.contains(&name) && !name.ends_with("_lr_final"))
+/// Settings of the method, for [`MethodKind::settings`](crate::config::method::MethodKind::settings).
+pub(super) struct Settings;
+
+impl MethodSettings for Settings {
+    fn check(&self, config: &Config) -> Result<()> {
+        check_alone(config)?;
+        let r2 = &config.r2;
+        if r2.tv_box > r2.voxels {
+            return Err(Error::config("r2.tv_vol_size", r2.tv_box, format!("exceeds r2.voxels = {}", r2.voxels)));
+        }
+        if r2.min_scale >= r2.max_scale {
+            let problem = format!("is not below r2.scale_max = {}", r2.max_scale);
+            return Err(Error::config("r2.scale_min", r2.min_scale, problem));
+        }
+        if r2.count > r2.max_num_gaussians {
+            return Err(Error::config(
+                "r2.n_points",
+                r2.count,
+                format!("exceeds r2.max_num_gaussians = {}", r2.max_num_gaussians),
+            ));
+        }
+        Ok(())
+    }
+
+    fn is_key(&self, _: Preset, key: &str) -> bool {
+        key.strip_prefix("r2.").is_some_and(|name| !CONSTANTS.contains(&name) && !name.ends_with("_lr_final"))
+    }
+
+    fn schedule(&self, config: &Config, scaled: &Scaled) -> Vec<(&'static str, u32)> {
+        vec![
+            ("r2.densification_interval", scaled.interval(config.r2.densify_every)),
+            ("r2.densify_from_iter", scaled.count(config.r2.densify_from)),
+            ("r2.densify_until_iter", scaled.count(config.r2.densify_until)),
+        ]
+    }
+
+    fn events(&self, config: &Config) -> Vec<u32> {
+        vec![config.r2.densify_from, config.r2.densify_until]
+    }
+
+    fn dry_run_length(&self) -> u32 {
+        DRY_RUN_WITH_DENSIFYING
+    }
 }

@@ -2,6 +2,7 @@
 
 use crate::choice::Choice;
 use crate::config::checks::check_alone;
+use crate::config::method::{MethodSettings, Scaled};
 use crate::config::section::section;
 use crate::config::sections::{Adam, DynamicField, March, StaticField, Train};
 use crate::config::{Config, DynamicForm, GaussianForm, Preset, StaticData, StaticForm, nert_ca};
@@ -94,7 +95,7 @@ pub(super) fn sax_nerf() -> Config {
         // Rays are marched through neither field, and there is no static field.
         march: March { static_samples: 2, dynamic_samples: 2, render_samples: 2, ..paper.march },
         static_field: StaticField { form: StaticForm::None, ..paper.static_field },
-        // The network is never evaluated; the smallest one takes hardly any memory.
+        // There is no network; its settings are recorded only.
         dynamic: DynamicField {
             form: DynamicForm::Lineformer,
             layers: 1,
@@ -109,37 +110,53 @@ pub(super) fn sax_nerf() -> Config {
     }
 }
 
-/// Refuses settings that SAX-NeRF does not support.
-pub(super) fn check(config: &Config) -> Result<()> {
-    check_alone(config)?;
-    let gaussians = config.gaussians.form;
-    if gaussians != GaussianForm::None {
-        let problem = "is not supported with dynamic.form = \"lineformer\": only one of the two settings can choose the field; set \
-                       it to \"none\"";
-        return Err(Error::config("gaussians.form", gaussians.name(), problem));
-    }
-    let sax = &config.sax;
-    for (field, value) in [("sax.num_levels", sax.levels), ("sax.n_samples", sax.samples)] {
-        if value % 2 != 0 {
-            return Err(Error::config(field, value, "is not an even number"));
-        }
-    }
-    let finest = u64::from(sax.base) << (sax.levels - 1);
-    if finest > MAX_CELLS {
-        let problem = format!(
-            "the finest of {} levels would have {finest} cells along a side; at most {MAX_CELLS} are supported: \
-             lower sax.base_resolution or sax.num_levels",
-            sax.levels
-        );
-        return Err(Error::config("sax.base_resolution", sax.base, problem));
-    }
-    Ok(())
-}
-
 /// Constants of SAX-NeRF's public code, and our choice of units.
 const CONSTANTS: [&str; 3] = ["normalise", "base_resolution", "lrate_gamma"];
 
-/// Tells whether a setting, such as `sax.n_rays`, is a key of this method.
-pub(super) fn is_key(key: &str) -> bool {
-    key.strip_prefix("sax.").is_some_and(|name| !CONSTANTS.contains(&name))
+/// Settings of the method, for [`MethodKind::settings`](crate::config::method::MethodKind::settings).
+pub(super) struct Settings;
+
+impl MethodSettings for Settings {
+    fn check(&self, config: &Config) -> Result<()> {
+        check_alone(config)?;
+        let gaussians = config.gaussians.form;
+        if gaussians != GaussianForm::None {
+            let problem = "is not supported with dynamic.form = \"lineformer\": only one of the two settings can choose the field; set \
+                           it to \"none\"";
+            return Err(Error::config("gaussians.form", gaussians.name(), problem));
+        }
+        let sax = &config.sax;
+        for (field, value) in [("sax.num_levels", sax.levels), ("sax.n_samples", sax.samples)] {
+            if value % 2 != 0 {
+                return Err(Error::config(field, value, "is not an even number"));
+            }
+        }
+        let finest = u64::from(sax.base) << (sax.levels - 1);
+        if finest > MAX_CELLS {
+            let problem = format!(
+                "the finest of {} levels would have {finest} cells along a side; at most {MAX_CELLS} are supported: \
+                 lower sax.base_resolution or sax.num_levels",
+                sax.levels
+            );
+            return Err(Error::config("sax.base_resolution", sax.base, problem));
+        }
+        Ok(())
+    }
+
+    fn is_key(&self, _: Preset, key: &str) -> bool {
+        key.strip_prefix("sax.").is_some_and(|name| !CONSTANTS.contains(&name))
+    }
+
+    fn schedule(&self, config: &Config, scaled: &Scaled) -> Vec<(&'static str, u32)> {
+        vec![("sax.lrate_step", scaled.count(config.sax.rate_falls_at))]
+    }
+
+    fn events(&self, config: &Config) -> Vec<u32> {
+        vec![config.sax.rate_falls_at]
+    }
+
+    /// The only event of the method lies within the last iterations of the publication.
+    fn shorten(&self, config: &mut Config, iterations: u32) {
+        config.sax.rate_falls_at = config.sax.rate_falls_at.min(iterations / 2);
+    }
 }

@@ -1,6 +1,8 @@
 //! Settings of X-Gaussian: the preset `x-gaussian`.
 
 use crate::config::checks::check_alone;
+use crate::config::length::DRY_RUN_WITH_DENSIFYING;
+use crate::config::method::{MethodSettings, Scaled};
 use crate::config::section::section;
 use crate::config::sections::{Gaussians, Train};
 use crate::config::{Config, GaussianForm, Preset, StaticData, r2_gaussian};
@@ -134,28 +136,6 @@ pub(super) fn x_gaussian() -> Config {
     }
 }
 
-/// Refuses settings of X-Gaussian that contradict each other.
-pub(super) fn check(config: &Config) -> Result<()> {
-    check_alone(config)?;
-    let x = &config.x;
-    if x.interval > x.voxels {
-        return Err(Error::config("x.interval", x.interval, format!("exceeds x.voxels = {}", x.voxels)));
-    }
-    let count = u64::from(x.voxels.div_ceil(x.interval)).pow(3);
-    if count > u64::from(x.max_gaussians) {
-        let problem = format!(
-            "is less than the {count} initial Gaussians that x.voxels = {} and x.interval = {} give",
-            x.voxels, x.interval
-        );
-        return Err(Error::config("x.max_gaussians", x.max_gaussians, problem));
-    }
-    if x.first_opacity < x.min_opacity {
-        let problem = format!("is below x.min_opacity = {}: all Gaussians would be pruned", x.min_opacity);
-        return Err(Error::config("x.first_opacity", x.first_opacity, problem));
-    }
-    Ok(())
-}
-
 /// Constants of X-Gaussian's public code, and our choice of units.
 const CONSTANTS: [&str; 7] = [
     "normalise",
@@ -167,7 +147,51 @@ const CONSTANTS: [&str; 7] = [
     "reset_opacity",
 ];
 
-/// Tells whether a setting, such as `x.voxels`, is a key of this method.
-pub(super) fn is_key(key: &str) -> bool {
-    key.strip_prefix("x.").is_some_and(|name| !CONSTANTS.contains(&name))
+/// Settings of the method, for [`MethodKind::settings`](crate::config::method::MethodKind::settings).
+pub(super) struct Settings;
+
+impl MethodSettings for Settings {
+    fn check(&self, config: &Config) -> Result<()> {
+        check_alone(config)?;
+        let x = &config.x;
+        if x.interval > x.voxels {
+            return Err(Error::config("x.interval", x.interval, format!("exceeds x.voxels = {}", x.voxels)));
+        }
+        let count = u64::from(x.voxels.div_ceil(x.interval)).pow(3);
+        if count > u64::from(x.max_gaussians) {
+            let problem = format!(
+                "is less than the {count} initial Gaussians that x.voxels = {} and x.interval = {} give",
+                x.voxels, x.interval
+            );
+            return Err(Error::config("x.max_gaussians", x.max_gaussians, problem));
+        }
+        if x.first_opacity < x.min_opacity {
+            let problem = format!("is below x.min_opacity = {}: all Gaussians would be pruned", x.min_opacity);
+            return Err(Error::config("x.first_opacity", x.first_opacity, problem));
+        }
+        Ok(())
+    }
+
+    fn is_key(&self, _: Preset, key: &str) -> bool {
+        key.strip_prefix("x.").is_some_and(|name| !CONSTANTS.contains(&name))
+    }
+
+    fn schedule(&self, config: &Config, scaled: &Scaled) -> Vec<(&'static str, u32)> {
+        vec![
+            ("x.densification_interval", scaled.interval(config.x.densify_every)),
+            ("x.densify_from_iter", scaled.count(config.x.densify_from)),
+            ("x.densify_until_iter", scaled.count(config.x.densify_until)),
+            ("x.opacity_reset_interval", scaled.count(config.x.reset_every)),
+            ("x.degree_every", scaled.count(config.x.degree_every)),
+        ]
+    }
+
+    fn events(&self, config: &Config) -> Vec<u32> {
+        let x = &config.x;
+        vec![x.degree_every, x.densify_from, x.reset_every, x.densify_until]
+    }
+
+    fn dry_run_length(&self) -> u32 {
+        DRY_RUN_WITH_DENSIFYING
+    }
 }

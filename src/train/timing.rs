@@ -308,7 +308,7 @@ impl GaussianSubject {
     /// timed pass by pass.
     ///
     /// # Errors
-    /// [`Error::Config`] where a network is the dynamic field; errors of the configuration and the data.
+    /// Errors of the configuration and the data.
     pub fn new(
         gpu: &Gpu,
         config: &Config,
@@ -330,10 +330,7 @@ impl GaussianSubject {
         }
         let mut plan = Plan::new(&config, dataset)?;
         let data = plan.data.take().ok_or_else(|| Error::Internal("the plan has no data".into()))?;
-        let subject = GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes };
-        // Refuses a method without Gaussians before anything is timed.
-        subject.begin()?;
-        Ok(subject)
+        Ok(GaussianSubject { gpu: gpu.clone(), data, config, timed, notes: plan.notes })
     }
 
     fn begin(&self) -> Result<Box<dyn TimedFit>> {
@@ -364,7 +361,7 @@ impl GaussianSubject {
     /// Warms up by whole fits, times others, and says what the passes of an iteration after the last of them take.
     ///
     /// # Errors
-    /// Device errors.
+    /// [`Error::Config`] for a method without Gaussians; device errors.
     pub fn time(&self, pace: &Pace, profiled: u32) -> Result<(GaussianTiming, Passes)> {
         let begin = Instant::now();
         while begin.elapsed().as_secs_f64() < pace.warm_up_s {
