@@ -43,11 +43,11 @@ R2Chord chord_at(R2Sight s, GaussianView view, vec2 d) {
 
 // Half sides, in pixels, of the box around the centre's pixel that contains all rays which pass within the cut.
 vec2 chord_box(R2Projection p, GaussianView view, GaussianSetup setup) {
-    vec3 far = p.scale * (view.depth.xyz * p.axes);
-    vec3 column = p.scale * ((view.column.xyz - p.splat.mean.x * view.depth.xyz) * p.axes);
-    vec3 row = p.scale * ((view.row.xyz - p.splat.mean.y * view.depth.xyz) * p.axes);
+    vec3 far = p.at.scale * (view.depth.xyz * p.at.axes);
+    vec3 column = p.at.scale * ((view.column.xyz - p.splat.mean.x * view.depth.xyz) * p.at.axes);
+    vec3 row = p.at.scale * ((view.row.xyz - p.splat.mean.y * view.depth.xyz) * p.at.axes);
     float cut2 = setup.cut * setup.cut;
-    float behind = p.depth * p.depth - cut2 * dot(far, far);
+    float behind = p.at.depth * p.at.depth - cut2 * dot(far, far);
     // The Gaussian reaches the source, so the box contains all pixels.
     if (!(behind > 0.0)) return abs(p.splat.mean) + vec2(float(setup.width), float(setup.height));
     vec2 slant = cut2 * vec2(dot(far, column), dot(far, row));

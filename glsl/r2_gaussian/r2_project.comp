@@ -25,7 +25,7 @@ void main() {
     R2Turn turn = r2_turns[gaussian_step * r2_setup.n_sets + g.set];
     GaussianView view = gaussian_views[turn.image];
     R2Projection p = project_r2(g, view, gaussian_setup);
-    if (r2_setup.exact != 0u && p.depth > 0.0) p.splat.half_box = chord_box(p, view, gaussian_setup);
+    if (r2_setup.exact != 0u && p.at.depth > 0.0) p.splat.half_box = chord_box(p, view, gaussian_setup);
     splats[i] = p.splat;
     image_of_splat[i] = int(g.set);
 }

@@ -30,12 +30,12 @@ layout(binding = 13) readonly buffer B13 { Splat splats[]; };
 // Adds the gradient from contributions at points or along rays, given as sums of h times (c, 1), of h times the squares and of
 // h times the mixed products of coordinates along the Gaussian's axes.
 void add_along_axes(vec4 linear, vec3 square, vec3 mixed, R2Gaussian g, R2Projection p, inout GaussianGradient sum) {
-    sum.position += p.axes * (linear.xyz / p.scale);
+    sum.position += p.at.axes * (linear.xyz / p.at.scale);
     sum.log_density += linear.w;
     sum.log_scale += square;
     mat3 second = mat3(square.x, mixed.x, mixed.y, mixed.x, square.y, mixed.z, mixed.y, mixed.z, square.z);
     mat3 d_axes;
-    for (int k = 0; k < 3; k++) d_axes[k] = -(p.axes * (p.scale * second[k])) / p.scale[k];
+    for (int k = 0; k < 3; k++) d_axes[k] = -(p.at.axes * (p.at.scale * second[k])) / p.at.scale[k];
     sum.rotation += rotation_gradient(g.rotation, d_axes);
 }
 
@@ -51,8 +51,8 @@ vec2 add_picture(uint i, R2Gaussian g, R2Projection p, GaussianView view, inout 
     if (r2_setup.exact != 0u) {
         vec4 linear = splat_moments[3u * i];
         add_along_axes(linear, splat_moments[3u * i + 1u].xyz, splat_moments[3u * i + 2u].xyz, g, p, sum);
-        vec3 by_centre = p.axes * (linear.xyz / p.scale);
-        return p.depth * vec2(dot(view.du.xyz, by_centre), dot(view.dv.xyz, by_centre));
+        vec3 by_centre = p.at.axes * (linear.xyz / p.at.scale);
+        return p.at.depth * vec2(dot(view.du.xyz, by_centre), dot(view.dv.xyz, by_centre));
     }
     vec3 linear = splat_moments[2u * i].xyz;
     sum = gradient_r2(g, p, view, linear, splat_moments[2u * i + 1u].xyz);

@@ -47,7 +47,7 @@ void main() {
         splats[i] = p.splat;
         tiles = tiles_of(p.splat, x_setup);
         own = count_in(tiles, set);
-        if (own > 0u) depth = floatBitsToUint(p.depth);
+        if (own > 0u) depth = floatBitsToUint(p.at.depth);
         x_keys[i] = XKey(depth, i);
     }
     n_entries[lane] = own;

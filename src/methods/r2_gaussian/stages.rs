@@ -134,10 +134,9 @@ pub fn box_parts(box_side: u32) -> u32 {
     box_side.pow(3).div_ceil(push::R2VoxelTv::LOCAL_SIZE)
 }
 
-/// A recording of stages on `n` Gaussians.
-pub struct R2Pass<'a> {
-    /// Recording that the stages are added to.
-    pub recording: &'a mut Recording,
+/// Inputs of the stages of a fit.
+#[derive(Clone, Copy)]
+pub struct R2Parts<'a> {
     /// The stages.
     pub kernels: &'a R2Kernels,
     /// Buffers of the fit.
@@ -152,17 +151,25 @@ pub struct R2Pass<'a> {
     pub n: u32,
 }
 
+/// A recording of stages.
+pub struct R2Pass<'a> {
+    /// Recording that the stages are added to.
+    pub recording: &'a mut Recording,
+    /// Inputs of the stages.
+    pub parts: R2Parts<'a>,
+}
+
 impl R2Pass<'_> {
     fn run<P: PushConstants>(&mut self, stage: &Stage<P>, groups: Groups<'_>, push: P) -> Result<()> {
-        let (buffers, particles) = (self.buffers, self.particles);
+        let R2Parts { buffers, particles, .. } = self.parts;
         let find = |name| buffers.find(name).or_else(|| particles.find(name));
         dispatch_finding(self.recording, stage, groups, &[], find, push)
     }
 
     /// Records the pictures that the views of this iteration take.
     fn pictures(&mut self) -> Result<()> {
-        let (kernels, n) = (self.kernels, self.n);
-        self.recording.fill(&self.buffers.splat_images, 0);
+        let R2Parts { kernels, n, buffers, .. } = self.parts;
+        self.recording.fill(&buffers.splat_images, 0);
         self.run(&kernels.project, kernels.project.groups_over(n), push::R2Project { n_gaussians: n })?;
         match &kernels.pictures {
             R2PictureKernels::Affine { splat, .. } => {
@@ -176,9 +183,8 @@ impl R2Pass<'_> {
 
     /// Records the loss of the pictures, its gradient, and the moments that gradients of Gaussians need of it.
     fn compare_pictures(&mut self) -> Result<()> {
-        let (kernels, n, n_sets) = (self.kernels, self.n, self.r2.n_sets);
-        let n_pixels = self.setup.width * self.setup.height;
-        kernels.comparison.record(self, n_pixels, n_sets)?;
+        let R2Parts { kernels, n, setup, r2, .. } = self.parts;
+        kernels.comparison.record(self, setup.width * setup.height, r2.n_sets)?;
         match &kernels.pictures {
             R2PictureKernels::Affine { moments, .. } => {
                 self.run(&moments.stage, moments.groups_for(n), push::GaussianMoments { n_splats: n })
@@ -191,12 +197,12 @@ impl R2Pass<'_> {
 
     /// Records the total variation of this iteration's boxes, and the moments that gradients need of it.
     fn smooth_voxels(&mut self) -> Result<()> {
-        let (kernels, n, r2) = (self.kernels, self.n, self.r2);
-        self.recording.fill(&self.buffers.r2_voxel_sums, 0);
+        let R2Parts { kernels, n, buffers, setup, r2, .. } = self.parts;
+        self.recording.fill(&buffers.r2_voxel_sums, 0);
         let splat = &kernels.voxel_splat;
         self.run(&splat.stage, splat.groups_for(n), push::R2VoxelSplat { n_gaussians: n })?;
         let groups = Groups::Direct([box_parts(r2.box_side), r2.n_sets, 1]);
-        let first_part = picture_parts(self.setup.width * self.setup.height) * r2.n_sets;
+        let first_part = picture_parts(setup.width * setup.height) * r2.n_sets;
         self.run(&kernels.voxel_tv, groups, push::R2VoxelTv { first_part })?;
         let moments = &kernels.voxel_moments;
         self.run(&moments.stage, moments.groups_for(n), push::R2VoxelMoments { n_gaussians: n })
@@ -214,10 +220,10 @@ impl RecordStage for R2Pass<'_> {
 /// # Errors
 /// [`crate::error::Error::Internal`] when a stage and its buffers do not fit.
 pub fn record_step(pass: &mut R2Pass<'_>) -> Result<()> {
-    let (kernels, n) = (pass.kernels, pass.n);
+    let R2Parts { kernels, n, r2, .. } = pass.parts;
     pass.pictures()?;
     pass.compare_pictures()?;
-    if pass.r2.tv_weight > 0.0 {
+    if r2.tv_weight > 0.0 {
         pass.smooth_voxels()?;
     }
     pass.run(&kernels.update, kernels.update.groups_over(n), push::R2Update { n_gaussians: n })?;

@@ -17,7 +17,7 @@ use crate::methods::r2_gaussian::densify::{densified, densifies};
 use crate::methods::r2_gaussian::parameters::ScaleBounds;
 use crate::methods::r2_gaussian::particles::R2ParticleBuffers;
 use crate::methods::r2_gaussian::setup::{gaussian_setup, r2_setup, schedule, turns};
-use crate::methods::r2_gaussian::stages::{R2Buffers, R2Kernels, R2Pass, record_step};
+use crate::methods::r2_gaussian::stages::{R2Buffers, R2Kernels, R2Parts, R2Pass, record_step};
 use crate::methods::r2_gaussian::start::first_rows;
 use crate::methods::r2_gaussian::state::{R2State, SMALLER_STEPS};
 
@@ -72,7 +72,8 @@ impl R2Trainer {
         let buffers = buffers(gpu, &data, config, (&setup, &r2), step)?;
         let particles = R2ParticleBuffers::new(gpu, state)?;
         let per_submit = config.train.iterations_per_submit;
-        let iterations = record(gpu, (&kernels, &buffers, &particles), (&setup, &r2), n, per_submit)?;
+        let parts = R2Parts { kernels: &kernels, buffers: &buffers, particles: &particles, setup: &setup, r2: &r2, n };
+        let iterations = record(gpu, parts, per_submit)?;
         let (gpu, config) = (gpu.clone(), config.clone());
         Ok(R2Trainer { gpu, data, config, setup, r2, kernels, buffers, particles, n, iterations, step })
     }
@@ -103,10 +104,13 @@ impl R2Trainer {
         let state = densified(&self.state()?, n_sets, r2, self.config.seed, self.step);
         self.n = check_count(&state, &self.data)?;
         self.particles = R2ParticleBuffers::new(&self.gpu, &state)?;
-        let parts = (&self.kernels, &self.buffers, &self.particles);
-        let per_submit = self.config.train.iterations_per_submit;
-        self.iterations = record(&self.gpu, parts, (&self.setup, &self.r2), self.n, per_submit)?;
+        self.iterations = record(&self.gpu, self.parts(), self.config.train.iterations_per_submit)?;
         Ok(())
+    }
+
+    fn parts(&self) -> R2Parts<'_> {
+        let (setup, r2) = (&self.setup, &self.r2);
+        R2Parts { kernels: &self.kernels, buffers: &self.buffers, particles: &self.particles, setup, r2, n: self.n }
     }
 }
 
@@ -152,8 +156,7 @@ impl SetsFit for R2Trainer {
             return Err(Error::Internal("the fit has ended, so no iteration is left to be timed".into()));
         }
         let mut recording = Recording::timed(&self.gpu, "profiled iteration of R2-Gaussian", MAX_PASSES)?;
-        let parts = (&self.kernels, &self.buffers, &self.particles);
-        record_step(&mut pass(&mut recording, parts, (&self.setup, &self.r2), self.n))?;
+        record_step(&mut R2Pass { recording: &mut recording, parts: self.parts() })?;
         self.step += 1;
         let times = pass_times(&self.gpu, recording)?;
         if densifies(&self.config.r2, self.step) {
@@ -238,27 +241,10 @@ fn buffers(
     })
 }
 
-type DeviceParts<'a> = (&'a R2Kernels, &'a R2Buffers, &'a R2ParticleBuffers);
-
-fn pass<'a>(
-    recording: &'a mut Recording,
-    (kernels, buffers, particles): DeviceParts<'a>,
-    (setup, r2): (&'a GaussianSetup, &'a R2Setup),
-    n: u32,
-) -> R2Pass<'a> {
-    R2Pass { recording, kernels, buffers, particles, setup, r2, n }
-}
-
-fn record(
-    gpu: &Gpu,
-    parts: DeviceParts<'_>,
-    setups: (&GaussianSetup, &R2Setup),
-    n: u32,
-    per_submit: u32,
-) -> Result<Iterations> {
+fn record(gpu: &Gpu, parts: R2Parts<'_>, per_submit: u32) -> Result<Iterations> {
     Iterations::record(gpu, per_submit, |iterations| {
         let mut recording = Recording::new(gpu, &format!("{iterations} iterations of R2-Gaussian"))?;
-        let mut pass = pass(&mut recording, parts, setups, n);
+        let mut pass = R2Pass { recording: &mut recording, parts };
         for _ in 0..iterations {
             record_step(&mut pass)?;
         }

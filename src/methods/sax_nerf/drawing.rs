@@ -10,6 +10,7 @@ use crate::methods::sax_nerf::field::SaxField;
 use crate::methods::sax_nerf::setup::drawing_setup;
 use crate::methods::sax_nerf::stages::{SaxFieldKernels, SaxSampleBuffers, SaxSampling, record_view};
 use crate::model::field::{Field, FieldDrawing, Row};
+use crate::network::chunk::Chunk;
 use std::sync::{Mutex, PoisonError};
 
 /// Number of samples evaluated at once: 16 MiB of features with 16 levels.
@@ -33,6 +34,15 @@ enum Target<'a> {
     View(&'a Buffer),
     /// Attenuation per world unit at samples, `[ray][sample]`.
     Cells(&'a Buffer),
+}
+
+/// Rays that are drawn, and the buffers in which their samples are evaluated.
+struct DrawnRays<'a> {
+    buffers: &'a SaxSampleBuffers,
+    setup: &'a SaxSetup,
+    rays: &'a Buffer,
+    phase: u32,
+    n_rays: u32,
 }
 
 impl SaxDrawing {
@@ -76,9 +86,7 @@ impl SaxDrawing {
     fn record(
         &self,
         recording: &mut Recording,
-        (buffers, setup): (&SaxSampleBuffers, &SaxSetup),
-        rays: &Buffer,
-        (phase, n_rays): (u32, u32),
+        DrawnRays { buffers, setup, rays, phase, n_rays }: DrawnRays<'_>,
         target: Target<'_>,
     ) -> Result<()> {
         let all = self.params.lock().unwrap_or_else(PoisonError::into_inner).clone();
@@ -88,14 +96,14 @@ impl SaxDrawing {
         let attenuation = self.field.attenuation as f32;
         let at_once = (SAMPLES_AT_ONCE / setup.n_samples).max(1);
         for first in (0..n_rays).step_by(at_once as usize) {
-            let n = at_once.min(n_rays - first);
+            let chunk = Chunk { first_ray: first, n_rays: at_once.min(n_rays - first) };
             let out = match target {
                 Target::View(_) => None,
                 Target::Cells(volume) => Some((volume, first * setup.n_samples)),
             };
-            sampling.record(recording, (0, first, n), attenuation, out)?;
+            sampling.record(recording, 0, chunk, attenuation, out)?;
             if let Target::View(ray_out) = target {
-                record_view(recording, &sampling, ray_out, (first, n))?;
+                record_view(recording, &sampling, ray_out, chunk)?;
             }
         }
         Ok(())
@@ -124,8 +132,8 @@ impl FieldDrawing for SaxDrawing {
         phase: u32,
         n_rays: u32,
     ) -> Result<()> {
-        let parts = (&self.buffers, &self.setup);
-        self.record(recording, parts, rays, (phase, n_rays), Target::View(ray_out))
+        let drawn = DrawnRays { buffers: &self.buffers, setup: &self.setup, rays, phase, n_rays };
+        self.record(recording, drawn, Target::View(ray_out))
     }
 
     fn record_cells(
@@ -145,6 +153,7 @@ impl FieldDrawing for SaxDrawing {
             sax_setup: self.gpu.buffer_with("sax_setup of rows", &[setup])?,
             ..self.buffers.clone()
         };
-        self.record(recording, (&buffers, &setup), rays, (phase, n_rows), Target::Cells(volume))
+        let drawn = DrawnRays { buffers: &buffers, setup: &setup, rays, phase, n_rays: n_rows };
+        self.record(recording, drawn, Target::Cells(volume))
     }
 }

@@ -19,6 +19,7 @@ use crate::methods::sax_nerf::field::SaxShape;
 use crate::methods::sax_nerf::lineformer::{
     Lineformer, LineformerBackKernels, LineformerKernels, Recorder, capacity, chunks,
 };
+use crate::network::chunk::Chunk;
 
 /// Pipelines that evaluate a field.
 pub struct SaxFieldKernels {
@@ -211,7 +212,8 @@ impl SaxSampling<'_> {
     pub fn record(
         &self,
         recording: &mut Recording,
-        (seed, first_ray, n_rays): (u32, u32, u32),
+        seed: u32,
+        Chunk { first_ray, n_rays }: Chunk,
         scale: f32,
         out: Option<(&Buffer, u32)>,
     ) -> Result<()> {
@@ -306,7 +308,7 @@ impl SaxPass<'_> {
             params: &set.params,
             rays: &self.fit.rays,
         };
-        sampling.record(self.recording, (set.seed, 0, n_rays), 1.0, None)?;
+        sampling.record(self.recording, set.seed, Chunk { first_ray: 0, n_rays }, 1.0, None)?;
         let push = push::SaxLoss { first_loss: index * n_rays };
         self.run(set, &kernels.loss, along_two_axes(n_rays), push)
     }
@@ -382,7 +384,7 @@ pub fn record_step(pass: &mut SaxPass<'_>) -> Result<()> {
     pass.run(&sets[0], report, Groups::Direct([1, 1, 1]), push::SaxReport {})
 }
 
-/// Records the rendering of `n_rays` rays of a view from `first_ray` on, from the attenuations at their samples.
+/// Records the rendering of a chunk of the rays of a view, from the attenuations at their samples.
 ///
 /// # Errors
 /// Errors of [`record_step`].
@@ -390,7 +392,7 @@ pub fn record_view(
     recording: &mut Recording,
     sampling: &SaxSampling<'_>,
     ray_out: &Buffer,
-    (first_ray, n_rays): (u32, u32),
+    Chunk { first_ray, n_rays }: Chunk,
 ) -> Result<()> {
     let stage = &sampling.kernels.view;
     let bound = [(Binding::ray_out, ray_out.into())];
